@@ -1,0 +1,577 @@
+"""Prediction: what a scene says that a capture set should look like, frame by frame, and how that changes.
+
+Light is linear in every LED, so each LED is rendered once per geometry at power 1 and kept; powers, exposure, colour and
+response act on the kept images. One sample per pixel is exact away from edges: pixels at the rim of a shadow or of the
+gel are sampled 16 times on a stratified grid. Derivative images come from Dr.Jit in forward mode through the shading,
+with the primary hits and shadows kept; at rims, where that misses the moving edge, and for everything that moves geometry
+they are central differences with common samples (`Parameter.how`).
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable, Iterator, Mapping, Sequence
+
+import numpy as np
+
+from optics.captures import Captures, Frame
+from optics.develop import Developer
+from optics.effect import registry
+from optics.errors import BadScene, UnknownKey
+from optics.noise import Noise
+from optics.parameter import Parameter, Values, Variable
+from optics.scene import Scene
+
+RIM_GRID = 4  # samples per pixel side at rims
+BOUNCE_SAMPLES = 64  # directions per pixel for the second bounce
+
+
+class Renderer:
+    """Linear images of a scene, one LED at a time, with a memory for what was rendered before."""
+
+    def __init__(self, scene: Scene, remember: int = 24):
+        if scene.camera is None or scene.integrator is None:
+            raise BadScene(f"{scene.path}: a prediction needs a part of the type 'camera' and the integrator 'tactile'")
+        if not scene.leds:
+            raise BadScene(f"{scene.path}: the scene has no LED (an emitter of the type 'led')")
+        self.scene = scene
+        self.width, self.height = scene.camera.resolution
+        self.bands = len(scene.integrator.bands or (0,))
+        self.remember = remember
+        self._hits: OrderedDict = OrderedDict()
+        self._images: OrderedDict = OrderedDict()
+        image_keys = {k for k, p in scene.parameters.items() if p.how == "image"}
+        led_keys = {k for k in scene.parameters if k.rsplit(".", 1)[0] in scene.leds}
+        own = [k for k in scene.parameters if k not in image_keys and k not in led_keys]
+        self.bounce_key = f"{scene.integrator.name}.interreflection"
+        self.geometry_keys = [k for k in own if self.kind(k) in ("camera", "interface", "") or
+                              (self.kind(k) == "gel" and k.rsplit(".", 1)[1] in scene.shaping)]
+        ambient = {n for e in registry().at_stage("membrane", "ambient") for n in e.parameter_names}
+        self.ambient_keys = [k for k in own if self.kind(k) == "membrane" and k.rsplit(".", 1)[1] in ambient]
+        self.shading_keys = [k for k in own if k not in self.geometry_keys and k != self.bounce_key
+                             and k not in self.ambient_keys]
+        self.led_keys = {n: [k for k in led_keys if k.rsplit(".", 1)[0] == n and not k.endswith(".power")]
+                         for n in scene.leds}
+
+    def kind(self, key: str) -> str:
+        part = self.scene.parts.get(key.rsplit(".", 1)[0])
+        return part.kind if part is not None else ""
+
+    # -- geometry -----------------------------------------------------------------------------------------------------
+
+    def geometry(self, values: Mapping) -> tuple:
+        return tuple(values[k] for k in self.geometry_keys)
+
+    def _apply(self, values: Mapping) -> None:
+        """Set everything but the LEDs' powers, which stay at 1: images are kept per unit of power."""
+        now = {k: v for k, v in values.items() if k in self.scene.parameters}
+        now.update({f"{n}.power": 1.0 for n in self.scene.leds})
+        self.scene.set(now)
+
+    def _trace(self, u: np.ndarray, v: np.ndarray) -> tuple:
+        import drjit as dr
+        import mitsuba as mi
+
+        with dr.suspend_grad():
+            si, weight, origin = self.scene.integrator.hits(
+                self.scene.mitsuba, self.scene.camera, mi.Float(u.astype(np.float32)), mi.Float(v.astype(np.float32)))
+            dr.eval(si, weight, origin)
+        return si, weight, origin
+
+    def hits(self, values: Mapping) -> "Hits":
+        """Primary hits at pixel centres for a geometry; kept."""
+        key = self.geometry(values)
+        if key in self._hits:
+            self._hits.move_to_end(key)
+            return self._hits[key]
+        self._apply(values)
+        v, u = np.mgrid[:self.height, :self.width] + 0.5
+        hits = Hits(*self._trace(u.ravel(), v.ravel()), self.height, self.width)
+        self._hits[key] = hits
+        while len(self._hits) > self.remember:
+            self._hits.popitem(last=False)
+        return hits
+
+    # -- one LED ------------------------------------------------------------------------------------------------------
+
+    def _led_key(self, values: Mapping, led: str) -> tuple:
+        return (led, self.geometry(values), tuple(values[k] for k in self.shading_keys),
+                tuple(values[k] for k in self.led_keys[led]))
+
+    def led(self, values: Mapping, led: str) -> "LedImage":
+        """The image that one LED makes at power 1 by direct light, kept with what its derivatives need."""
+        key = self._led_key(values, led)
+        if key in self._images:
+            self._images.move_to_end(key)
+            return self._images[key]
+        hits = self.hits(values)
+        self._apply(values)
+        image = self._render_led(hits, led)
+        self._images[key] = image
+        while len(self._images) > self.remember * len(self.scene.leds):
+            self._images.popitem(last=False)
+        return image
+
+    def _render_led(self, hits: "Hits", led: str, rim: np.ndarray | None = None) -> "LedImage":
+        part = self.scene.leds[led]
+        visible = self._visible(hits.si, part)
+        lit = np.array(visible).reshape(self.height, self.width)
+        if rim is None:
+            rim = _edges(lit & hits.valid) | hits.edges
+        index = np.flatnonzero(rim)
+        samples = self._rim_samples(hits, index)
+        rim_visible = self._visible(samples[0], part) if len(index) else None
+        image = LedImage(led, hits, rim, index, samples, visible, rim_visible, lit)
+        image.radiance = self._combine(image, lambda: self._shade(hits.sample, part, visible),
+                                       lambda: self._shade(samples, part, rim_visible))
+        return image
+
+    def _rim_samples(self, hits: "Hits", index: np.ndarray):
+        key = index.tobytes()
+        if key not in hits.rims:
+            offsets = (np.arange(RIM_GRID) + 0.5) / RIM_GRID
+            dv, du = (a.ravel() for a in np.meshgrid(offsets, offsets, indexing="ij"))
+            u = (index % self.width)[:, None] + du
+            v = (index // self.width)[:, None] + dv
+            hits.rims = {key: self._trace(u.ravel(), v.ravel()) if len(index) else None}  # only the latest is kept
+        return hits.rims[key]
+
+    def _discs(self, part) -> list:
+        """Sample positions on the emitting disc, as points of the unit square; [None] for a point source."""
+        if part.number("area") == 0:
+            return [None]
+        return [((i + 0.5) / 4, (j + 0.5) / 4) for i in range(4) for j in range(4)]
+
+    def _visible(self, si, part):
+        """Share of the LED that each hit sees; a Float (a mask for a point source)."""
+        import drjit as dr
+        import mitsuba as mi
+
+        integrator = self.scene.integrator
+        share = []
+        for place in self._discs(part):
+            point = part.position() if place is None else part.point(mi.Point2f(*place))
+            share.append(integrator.visible(self.scene.mitsuba, si, dr.detach(point)))
+        dr.eval(share)
+        return share[0] if len(share) == 1 else share
+
+    def _shade(self, sample: tuple, part, visible):
+        """Direct radiance per band at hits, an UnpolarizedSpectrum attached to whatever carries gradients."""
+        import mitsuba as mi
+
+        integrator, scene = self.scene.integrator, self.scene.mitsuba
+        places = self._discs(part)
+        if len(places) == 1:
+            return integrator.direct(scene, *sample, part, visible)
+        parts = [integrator.direct(scene, *sample, part, seen, mi.Point2f(*place)) for place, seen in zip(places, visible)]
+        return sum(parts[1:], parts[0]) / len(parts)
+
+    def _combine(self, image: "LedImage", centre: Callable, rim: Callable) -> np.ndarray:
+        """(H, W, B) from shading at pixel centres and, where the rim is, from the mean of the finer samples."""
+        result = self._bands(centre()).reshape(self.height * self.width, self.bands)
+        if len(image.index):
+            fine = self._bands(rim()).reshape(len(image.index), RIM_GRID**2, self.bands)
+            result[image.index] = fine.mean(1)
+        return result.reshape(self.height, self.width, self.bands)
+
+    def _bands(self, spectrum) -> np.ndarray:
+        import drjit as dr
+
+        dr.eval(spectrum)  # lane by lane: one array of all lanes would carry its size into the kernel
+        return np.stack([np.array(spectrum[i]) for i in range(self.bands)], -1)
+
+    def led_tangent(self, values: Mapping, led: str, key: str) -> np.ndarray:
+        """d radiance / d parameter of one LED's image, forward mode; rims by central differences where the LED moves."""
+        import drjit as dr
+        import mitsuba as mi
+
+        image = self.led(values, led)
+        self._apply(values)
+        name, parameter = key.rsplit(".", 1)
+        part, lamp = self.scene.parts[name], self.scene.leds[led]
+        value = getattr(part, parameter)
+        moves = part.kind == "led" and parameter in ("x", "y", "z")
+
+        def tangent(sample, visible):
+            attached = mi.Float(dr.detach(value))
+            dr.enable_grad(attached)
+            setattr(part, parameter, attached)
+            try:
+                shaded = self._shade(sample, lamp, visible)
+                dr.set_grad(attached, 1.0)
+                return dr.forward_to(shaded, flags=dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
+            finally:
+                setattr(part, parameter, value)
+
+        def moved_rim():
+            step = 0.1 * part.numbers[parameter].plausible
+            sides = []
+            for sign in (1, -1):
+                setattr(part, parameter, dr.opaque(mi.Float, float(value[0]) + sign * step))
+                try:
+                    sides.append(self._shade(image.samples, lamp, self._visible(image.samples[0], lamp)))
+                finally:
+                    setattr(part, parameter, value)
+            return (sides[0] - sides[1]) / (2 * step)
+
+        return self._combine(image, lambda: tangent(image.hits.sample, image.visible),
+                             moved_rim if moves else lambda: tangent(image.samples, image.rim_visible))
+
+    def bounced(self, values: Mapping, led: str, seed: int = 0) -> np.ndarray:
+        """(H, W, B): light of one LED at power 1 after two reflections; Monte Carlo over the second direction."""
+        import drjit as dr
+        import mitsuba as mi
+
+        key = ("bounced", seed, *self._led_key(values, led))
+        if key in self._images:
+            self._images.move_to_end(key)
+            return self._images[key]
+        self._apply(values)
+        v, u = np.mgrid[:self.height, :self.width]
+        rng = np.random.default_rng([seed, 77])
+        total = np.zeros((self.height * self.width, self.bands))
+        chunk = 8
+        for start in range(0, BOUNCE_SAMPLES, chunk):
+            u8 = np.repeat(u.ravel(), chunk) + rng.random(u.size * chunk)
+            v8 = np.repeat(v.ravel(), chunk) + rng.random(u.size * chunk)
+            sample = self._trace(u8, v8)
+            sampler = mi.load_dict({"type": "independent"})
+            sampler.seed(int(rng.integers(2**31)), u8.size)
+            light = self.scene.integrator.bounced(self.scene.mitsuba, *sample, self.scene.leds[led], 1, sampler)
+            dr.eval(light)
+            total += self._bands(light).reshape(-1, chunk, self.bands).mean(1)
+        image = (total / (BOUNCE_SAMPLES // chunk)).reshape(self.height, self.width, self.bands)
+        self._images[key] = image
+        return image
+
+    def ambient(self, values: Mapping) -> np.ndarray:
+        """(H, W, B): radiance of the membranes that no LED made."""
+        key = ("ambient", self.geometry(values), tuple(values[k] for k in self.shading_keys + self.ambient_keys))
+        if key not in self._images:
+            hits = self.hits(values)
+            self._apply(values)
+            total = sum(self._bands(self.scene.integrator.ambient(self.scene.mitsuba, hits.si, hits.weight, m)
+                                    + 0 * hits.si.t) for m in self.scene.membranes.values())
+            self._images[key] = np.broadcast_to(total, (self.height * self.width, self.bands)).reshape(
+                self.height, self.width, self.bands)
+        return self._images[key]
+
+
+class Hits:
+    """Primary hits of one geometry: si, weight, origin (Dr.Jit), and what they show as numpy images."""
+
+    def __init__(self, si, weight, origin, height: int, width: int):
+        self.si, self.weight, self.origin = si, weight, origin
+        self.shape = (height, width)
+        self.rims: dict = {}
+        self.valid = np.array(si.is_valid()).reshape(height, width)
+        self.edges = _edges(self.valid)
+
+    @property
+    def sample(self) -> tuple:
+        return self.si, self.weight, self.origin
+
+    def image(self, values) -> np.ndarray:
+        return np.array(values).reshape(self.shape)
+
+    @property
+    def position(self) -> np.ndarray:
+        return np.array(self.si.p).T.reshape(*self.shape, 3)
+
+    @property
+    def normal(self) -> np.ndarray:
+        return np.array(self.si.sh_frame.n).T.reshape(*self.shape, 3)
+
+
+class LedImage:
+    """One LED's image with the hits, rim pixels and shadows that it was made from."""
+
+    def __init__(self, led, hits, rim, index, samples, visible, rim_visible, lit):
+        self.led, self.hits, self.rim, self.index, self.samples = led, hits, rim, index, samples
+        self.visible, self.rim_visible, self.lit = visible, rim_visible, lit
+        self.radiance: np.ndarray | None = None
+
+
+class Model:
+    """A scene held against a capture set: predictions, derivative images, masks and coordinates, frame by frame.
+
+    base         scene values overlaid with what holds in every frame, by key
+    parameters   key -> Parameter
+    shape        (H, W, C)
+    """
+
+    def __init__(self, scene: Scene, captures: Captures, noise: Noise | None = None, flat_field: bool = True):
+        noise = noise or captures.noise
+        if noise is None:
+            raise BadScene(f"{captures.folder}: no noise model; give [noise] in captures.toml or repeats to estimate it from")
+        self.scene, self.captures, self.noise = scene, captures, noise
+        self.frames: list[Frame] = captures.frames
+        self.renderer = Renderer(scene)
+        self.parameters: dict[str, Parameter] = scene.parameters
+        self.base = {**scene.values(), **scene.check(captures.parameters, f"{captures.folder}/captures.toml [parameters]")}
+        for frame in self.frames:
+            scene.check(frame.parameters, f"{frame.file or captures.folder}: frame {frame.name}")
+        # A power that frames set is a drive level: what a calibration finds is the LED's power at drive 1.
+        self.driven = {f"{n}.power" for n in scene.leds} & {k for f in self.frames for k in f.parameters}
+        self.base.update({k: 1.0 for k in self.driven})
+        self.shape = self.frames[0].image.shape
+        height, width = self.shape[:2]
+        if (width, height) != scene.camera.resolution:
+            raise BadScene(
+                f"{captures.folder}: images of {width} x {height} px, but the scene's camera has "
+                f"{scene.camera.resolution[0]} x {scene.camera.resolution[1]} px; load the scene with "
+                f"-D width={width} -D height={height}")
+        self.developer = Developer(scene.camera, scene.integrator.bands or (0.0,), noise.black_level, noise.saturation)
+        if self.developer.matrix.shape[0] != self.shape[2]:
+            raise BadScene(f"{captures.folder}: images have {self.shape[2]} channels, the scene's camera "
+                           f"{self.developer.matrix.shape[0]}")
+        self.flat = self._flat_field() if flat_field and captures.flat_field is not None else None
+
+    def _flat_field(self):
+        """Measured background over the predicted one is a declared multiplicative nuisance; see `predict`."""
+        return np.maximum(np.asarray(self.captures.flat_field, float) - self.noise.black_level, 1e-3)
+
+    # -- values -------------------------------------------------------------------------------------------------------
+
+    def at(self, values: Values, index: int) -> dict:
+        """Every parameter's value in a frame: base <- fitted in all frames <- set in this frame <- fitted in this frame.
+
+        The power of an LED that frames set is the product of the setting and of the fitted power.
+        """
+        now = {**self.base, **values.common}
+        for key, value in self.frames[index].parameters.items():
+            now[key] = value * now[key] if key in self.driven else value
+        now.update(values.frame.get(index, {}))
+        return now
+
+    def _acts(self, variable: Variable, index: int) -> dict[str, float]:
+        """The keys through which a variable acts in a frame, each with d key / d variable."""
+        own = self.frames[index].parameters
+        if variable.frames is not None:
+            return dict.fromkeys(variable.keys, 1.0)
+        return {k: float(own[k]) if k in own else 1.0 for k in variable.keys if k not in own or k in self.driven}
+
+    def check_variables(self, variables: Sequence[Variable]) -> None:
+        for variable in variables:
+            for key in variable.keys:
+                if key not in self.parameters:
+                    raise UnknownKey(key, self.parameters, "parameter", hint="`optics params SCENE` lists them")
+
+    def lit(self, now: Mapping) -> dict[str, float]:
+        """The LEDs that are on and their powers."""
+        return {n: now[f"{n}.power"] for n in self.scene.leds if now[f"{n}.power"] != 0}
+
+    # -- prediction ---------------------------------------------------------------------------------------------------
+
+    def radiance(self, now: Mapping, seed: int = 0) -> np.ndarray:
+        """(H, W, B): linear image of a frame."""
+        total = np.array(self.renderer.ambient(now), dtype=np.float64)
+        bounce = now[self.renderer.bounce_key]
+        for led, power in self.lit(now).items():
+            total += power * self.renderer.led(now, led).radiance
+            if bounce:
+                total += power * bounce * self.renderer.bounced(now, led, seed)
+        return total
+
+    def untouched(self, now: Mapping) -> dict:
+        """The same frame with the gel at rest."""
+        return {**now, f"{self.scene.gel.name}.press_depth": 0.0}
+
+    def predict(self, values: Values, frames: Sequence[int] | None = None, seed: int = 0) -> list[np.ndarray]:
+        """Noise-free DN (H, W, C) of each frame.
+
+        With a flat field B (the measured background of the untouched sensor): black + (P - black) (B - black)/(P0 - black),
+        with P0 the prediction for the gel at rest in the same frame.
+        """
+        return [self._predict(self.at(values, i), seed) for i in self._indices(frames)]
+
+    def _develop(self, now: Mapping, seed: int) -> np.ndarray:
+        return self.developer.develop(self.radiance(now, seed), now)
+
+    def _predict(self, now: Mapping, seed: int = 0) -> np.ndarray:
+        image = self._develop(now, seed)
+        if self.flat is None:
+            return image
+        black = self.noise.black_level
+        rest = np.maximum(self._develop(self.untouched(now), seed) - black, 1e-6)
+        return black + (image - black) * self.flat / rest
+
+    def _indices(self, frames) -> list[int]:
+        return list(range(len(self.frames))) if frames is None else list(frames)
+
+    def derivatives(self, values: Values, variables: Sequence[Variable], frames: Sequence[int] | None = None,
+                    secant: Mapping[str, float] | None = None, seed: int = 0,
+                    ) -> Iterator[tuple[np.ndarray, dict[str, np.ndarray]]]:
+        """Per frame: prediction (H, W, C) in DN and {variable's name: d prediction / d value}, float32.
+
+        `secant` gives, by name, a finite step to take from the present value in place of the tangent. Variables that do
+        nothing in a frame are left out of its dictionary.
+        """
+        self.check_variables(variables)
+        for index in self._indices(frames):
+            yield self._differentiate(values, [v for v in variables if v.holds_in(index)], secant or {}, seed, index)
+
+    def _differentiate(self, values: Values, variables: Sequence[Variable], secant: Mapping[str, float], seed: int,
+                       index: int):
+        now = self.at(values, index)
+        black = self.noise.black_level
+        linear = self.developer.linearise(self.radiance(now, seed), now)
+        prediction, scale, share = linear.image, 1.0, 0.0
+        if self.flat is not None:
+            at_rest = self.untouched(now)
+            rest = self.developer.linearise(self.radiance(at_rest, seed), at_rest)
+            level = np.maximum(rest.image - black, 1e-6)
+            scale, share = self.flat / level, (linear.image - black) / level
+            prediction = black + (linear.image - black) * scale
+        images = {}
+        for variable in variables:
+            acts = self._acts(variable, index)
+            if not acts:
+                continue
+            if variable.name in secant:
+                image = self._secant(values, variable, index, secant[variable.name], prediction, seed)
+            else:
+                image = self._tangent(linear, now, acts, seed)
+                if self.flat is not None:
+                    still = self._tangent(rest, at_rest, acts, seed, "rest")
+                    if image is not None or still is not None:
+                        image = scale * ((0 if image is None else image) - share * (0 if still is None else still))
+            if image is not None:
+                images[variable.name] = image.astype(np.float32)
+        return prediction, images
+
+    def _secant(self, values: Values, variable: Variable, index: int, step: float, prediction, seed: int) -> np.ndarray:
+        """[f(value + step) - f(value)] / step of the whole prediction; the step turns round at a bound."""
+        value = values.get(variable, self.base)
+        if not variable.parameter.bounds[0] <= value + step <= variable.parameter.bounds[1]:
+            step = -step
+        moved = values.copy()
+        moved.put(variable, value + step)
+        return (self._predict(self.at(moved, index), seed) - prediction) / step
+
+    def _tangent(self, linear, now: Mapping, acts: Mapping[str, float], seed: int, memory: str = "") -> np.ndarray | None:
+        """d DN / d value in a frame for keys that share one value; None where nothing depends on them."""
+        camera = tuple(k for k in acts if self.parameters[k].how == "image")
+        light = None
+        for key, factor in acts.items():
+            if key in camera:
+                continue
+            change = self._light_tangent(now, key, factor, seed)
+            if change is not None:
+                light = change if light is None else light + change
+        total = None if light is None else linear.of_image(light)
+        if camera:
+            total = linear.of_parameter(camera) + (0 if total is None else total)
+        return total
+
+    def _light_tangent(self, now: Mapping, key: str, factor: float, seed: int) -> np.ndarray | None:
+        """factor times d radiance / d key in a frame."""
+        name, parameter = key.rsplit(".", 1)
+        kind = self.renderer.kind(key)
+        bounce, lit = now[self.renderer.bounce_key], self.lit(now)
+        if key == self.renderer.bounce_key:
+            return factor * sum(power * self.renderer.bounced(now, led, seed) for led, power in lit.items())
+        if kind == "led" and parameter == "power":
+            if factor == 0:
+                return None
+            image = self.renderer.led(now, name).radiance
+            return factor * (image + bounce * self.renderer.bounced(now, name, seed) if bounce else image)
+        if kind == "led" and name not in lit:
+            return None
+        if key in self.renderer.ambient_keys:
+            return factor * self._difference_ambient(now, key)
+        if self.parameters[key].how == "difference" and kind != "led":
+            return factor * self._difference(now, key, seed)
+        if kind == "led":
+            image = (self._difference_led(now, name, key) if self.parameters[key].how == "difference"
+                     else self.renderer.led_tangent(now, name, key))
+            return factor * lit[name] * image
+        total = sum(power * self.renderer.led_tangent(now, led, key) for led, power in lit.items())
+        return factor * (total + self._difference_ambient(now, key))
+
+    def _sides(self, key: str, now: Mapping) -> tuple[float, float]:
+        parameter = self.parameters[key]
+        step = 0.1 * parameter.plausible
+        return max(now[key] - step, parameter.bounds[0]), min(now[key] + step, parameter.bounds[1])
+
+    def _difference(self, now: Mapping, key: str, seed: int) -> np.ndarray:
+        """Central difference of the linear image, one-sided at a bound; common samples."""
+        low, high = self._sides(key, now)
+        return (self.radiance({**now, key: high}, seed) - self.radiance({**now, key: low}, seed)) / (high - low)
+
+    def _difference_led(self, now: Mapping, led: str, key: str) -> np.ndarray:
+        low, high = self._sides(key, now)
+        return (self.renderer.led({**now, key: high}, led).radiance
+                - self.renderer.led({**now, key: low}, led).radiance) / (high - low)
+
+    def _difference_ambient(self, now: Mapping, key: str) -> np.ndarray:
+        low, high = self._sides(key, now)
+        return (self.renderer.ambient({**now, key: high}) - self.renderer.ambient({**now, key: low})) / (high - low)
+
+    # -- what a fit and a diagnosis need of the data --------------------------------------------------------------------
+
+    def usable(self, index: int) -> np.ndarray:
+        """(H, W, C) pixels to use: not saturated, not clipped at black, not masked by the user."""
+        frame = self.frames[index]
+        mask = self.noise.usable(frame.image)
+        mask = np.broadcast_to(mask if mask.ndim == 3 else mask[..., None], frame.image.shape).copy()
+        if frame.mask is not None:
+            mask &= np.asarray(frame.mask, bool)[..., None]
+        return mask
+
+    def coordinates(self, values: Values, index: int) -> dict[str, np.ndarray]:
+        """What is known of every pixel of a frame; see `optics.compare` and `optics.diagnose` for their use."""
+        from scipy.ndimage import distance_transform_edt
+
+        now = self.at(values, index)
+        hits = self.renderer.hits(now)
+        view = self.developer.view(now)
+        p, n = hits.position, hits.normal
+        lit = self.lit(now)
+        height, width = self.shape[:2]
+        shadow = np.zeros((height, width), bool)
+        rim = hits.edges.copy()
+        incidence, distance, best = np.full((height, width), 90.0), np.zeros((height, width)), np.full((height, width), -1.0)
+        for led in lit:
+            image = self.renderer.led(now, led)
+            shadow |= ~image.lit & hits.valid
+            rim |= image.rim
+            to = np.array([now[f"{led}.{a}"] for a in "xyz"]) - p
+            length = np.linalg.norm(to, axis=-1)
+            cos = np.clip((to * n).sum(-1) / np.maximum(length, 1e-9), -1, 1)
+            strength = lit[led] * image.radiance.sum(-1)
+            brightest = strength > best
+            best = np.where(brightest, strength, best)
+            incidence = np.where(brightest, np.degrees(np.arccos(cos)), incidence)
+            distance = np.where(brightest, length, distance)
+        origin = np.array(hits.origin).T.reshape(p.shape) if np.array(hits.origin).size == p.size else np.array(hits.origin)
+        to_camera = origin - p
+        emission = np.degrees(np.arccos(np.clip((to_camera * n).sum(-1) / np.maximum(
+            np.linalg.norm(to_camera, axis=-1), 1e-9), -1, 1)))
+        known = {
+            "radius": view.tan * view.focal, "row": view.v, "column": view.u, "emission": emission,
+            "incidence": incidence, "led_distance": distance, "intensity": self.radiance(now).mean(-1),
+            "shadow": shadow, "rim": rim & hits.valid,
+            "frame": np.full((height, width), float(index)),
+        }
+        if self.scene.gel is not None:
+            gel = self.scene.gel
+            self.renderer._apply(now)
+            x, y = np.where(hits.valid, p[..., 0], 0), np.where(hits.valid, p[..., 1], 0)
+            touch = gel.contact_weight(x.ravel(), y.ravel()).reshape(height, width) > 0.5
+            slope = np.degrees(np.arccos(np.clip(-n[..., 2], -1, 1)))
+            known.update({
+                "height": np.where(hits.valid, -p[..., 2], 0), "slope": slope, "contact": touch & hits.valid,
+                "curvature": np.gradient(n[..., 0], axis=1) + np.gradient(n[..., 1], axis=0),
+                "contact_distance": distance_transform_edt(~touch) if touch.any() else np.full((height, width), np.nan),
+                "gel_path": np.array(gel.number("thickness") + p[..., 2]) / np.maximum(np.cos(np.radians(emission)), 1e-3),
+            })
+        known["far"] = ~(known.get("contact", shadow) | known["rim"] | shadow) & hits.valid
+        return known
+
+
+def _edges(mask: np.ndarray) -> np.ndarray:
+    """Pixels whose neighbourhood (3 x 3) is not all of one kind."""
+    from scipy.ndimage import maximum_filter, minimum_filter
+
+    return maximum_filter(mask, 3) != minimum_filter(mask, 3)

@@ -1,0 +1,194 @@
+"""Scene XML in and out; the only file that knows Mitsuba's parameter paths.
+
+A scene is a Mitsuba XML file. Every part of ours in it (LED, membrane, camera, gel, interface, integrator) has an id, and its
+parameters have the keys `id.name`. Parameters of stock Mitsuba plugins are reachable under Mitsuba's own keys.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+
+from optics.effect import DEFAULT_VARIANT, Declared, Effect, collecting, is_part, registry, shipped, use_variant
+from optics.errors import BadScene, UnknownKey
+from optics.parameter import Parameter, Variable
+
+
+def find(name: str | Path) -> Path:
+    """The XML file of a shipped scene's name or of a path."""
+    path = Path(name)
+    if path.suffix == ".xml":
+        if not path.is_file():
+            raise BadScene(f"{path}: no such scene file; shipped scenes: {', '.join(shipped_scenes())}")
+        return path.resolve()
+    if str(name) not in shipped_scenes():
+        raise UnknownKey(str(name), shipped_scenes(), "scene", hint="give a shipped scene's name or a path ending in .xml")
+    return shipped("scenes") / f"{name}.xml"
+
+
+def shipped_scenes() -> list[str]:
+    return sorted(p.stem for p in shipped("scenes").glob("*.xml"))
+
+
+def load(name: str | Path, defines: Mapping[str, str] | None = None, variant: str = DEFAULT_VARIANT,
+         plugins: Path | None = None) -> "Scene":
+    """Load a scene by its name or path; `defines` replace the XML's <default>s; `plugins` is a further folder of plugins.
+
+    A folder `plugins` beside the user's scene is scanned as well.
+    """
+    path = find(name)
+    for folder in (plugins, path.parent / "plugins"):
+        if folder is not None and (folder == plugins or folder.is_dir()):
+            registry().scan(Path(folder))
+    return Scene(path, dict(defines or {}), variant)
+
+
+class Scene:
+    """A loaded scene: its parts by id, its parameters by key, their values.
+
+    parts        id -> Mitsuba plugin object of ours
+    parameters   key -> Parameter, in the order of the file
+    camera, integrator, gel, leds, membranes    the parts by role (None or empty where the scene has none)
+    """
+
+    def __init__(self, path: Path, defines: Mapping[str, str], variant: str = DEFAULT_VARIANT):
+        self.path, self.defines, self.variant = Path(path), dict(defines), variant
+        text = self.path.read_text(encoding="utf-8")
+        known = re.findall(r'<default\s+name="([^"]+)"', text)
+        for key in self.defines:
+            if key not in known:
+                raise UnknownKey(key, known, "definition", str(self.path), "-D sets what the XML names in <default>")
+        use_variant(variant)
+        import mitsuba as mi
+
+        with collecting() as created:
+            try:
+                self.mitsuba = mi.load_file(str(self.path), optimize=False, **{k: str(v) for k, v in self.defines.items()})
+            except (RuntimeError, ValueError, TypeError, KeyError) as error:
+                raise BadScene(f"{self.path}: {_reason(error)}") from error
+        self.parts: dict[str, Declared] = {}
+        for part in created:
+            name = part.name
+            if not name or name.startswith(("object_", "_unnamed", "_")) or name in ("", "plugin"):
+                name = part.kind
+            if name in self.parts:
+                raise BadScene(f"{self.path}: two parts have the id '{name}'; give every part its own id=\"...\"")
+            part.name = name
+            self.parts[name] = part
+        self.camera = self._one("camera")
+        self.integrator = self._one("tactile")
+        self.gel = self._one("gel")
+        self.leds = {n: p for n, p in self.parts.items() if p.kind == "led"}
+        self.membranes = {n: p for n, p in self.parts.items() if p.kind == "membrane"}
+        self.parameters: dict[str, Parameter] = {}
+        for name, part in self.parts.items():
+            for p in registry().parameters_of(part.kind):
+                self.parameters[f"{name}.{p.name}"] = p
+        self._stock = self._stock_parameters()
+        self.parameters.update({k: p for k, (p, _) in self._stock.items() if k not in self.parameters})
+        self._now = self._read()
+
+    def _one(self, kind: str):
+        found = [p for p in self.parts.values() if p.kind == kind]
+        if len(found) > 1:
+            raise BadScene(f"{self.path}: {len(found)} parts of the kind '{kind}'; one is allowed")
+        return found[0] if found else None
+
+    def _stock_parameters(self) -> dict[str, tuple[Parameter, str]]:
+        """Scalar parameters of stock plugins, under Mitsuba's own keys."""
+        import mitsuba as mi
+
+        found = {}
+        self._traversed = mi.traverse(self.mitsuba)
+        for key, (_, _, node, flags) in self._traversed.properties.items():
+            if is_part(node):
+                continue
+            value = self._traversed[key]
+            if type(value) is mi.Float and len(value) == 1 and not key.endswith("silhouette_sampling_weight"):
+                found[key] = (Parameter(key.rsplit(".", 1)[-1], "", float(value[0]), doc="parameter of a stock Mitsuba plugin",
+                                        plausible=max(abs(float(value[0])) * 0.05, 1e-3), how="difference"), key)
+        return found
+
+    # -- values ---------------------------------------------------------------------------------------------------------
+
+    def values(self) -> dict[str, float | str]:
+        """The present value of every parameter."""
+        return dict(self._now)
+
+    def _read(self) -> dict[str, float | str]:
+        now = {}
+        for name, part in self.parts.items():
+            now.update({f"{name}.{n}": part.number(n) for n in part.numbers})
+            now.update({f"{name}.{n}": getattr(part, n) for n in part.words})
+        now.update({k: float(self._traversed[m][0]) for k, (_, m) in self._stock.items()})
+        return now
+
+    def check(self, values: Mapping[str, float | str], where: str = "") -> dict[str, float | str]:
+        """Checked copies of values by key; raises UnknownKey, OutOfBounds or ValueError."""
+        checked = {}
+        for key, value in values.items():
+            if key not in self.parameters:
+                raise UnknownKey(key, self.parameters, "parameter", where, "`optics params SCENE` lists them")
+            checked[key] = self.parameters[key].check(value, key, where)
+        return checked
+
+    def set(self, values: Mapping[str, float | str], where: str = "") -> None:
+        """Set parameters by key; geometry is rebuilt once, and only if it changed."""
+        import mitsuba as mi
+
+        changed = {k: v for k, v in self.check(values, where).items() if self._now[k] != v}
+        rebuild, stock = False, False
+        for key, value in changed.items():
+            if key in self._stock:
+                self._traversed[self._stock[key][1]] = mi.Float(value)
+                stock = True
+                continue
+            name, parameter = key.rsplit(".", 1)
+            part = self.parts[name]
+            if parameter in part.words:
+                setattr(part, parameter, value)
+            else:
+                part.hold(parameter, value)
+            rebuild |= part.kind == "gel" and parameter in self.shaping
+        self._now.update(changed)
+        if stock:
+            self._traversed.update()
+        if rebuild:
+            self.gel.rebuild(mi.traverse(self.gel))
+            self.mitsuba.parameters_changed([])
+
+    @property
+    def shaping(self) -> set[str]:
+        """Names of gel parameters that move its surface."""
+        effects = registry().effects.values()
+        return {p.name for p in registry().parts["gel"].parameters} | {
+            n for e in effects if "surface" in e.stages for n in (*e.parameter_names, *(p.name for p in e.shape))}
+
+    def keys_of(self, effect: Effect) -> dict[str, list[str]]:
+        """The effect's parameter names, each with the keys it has in this scene (empty where the scene lacks the part)."""
+        holders = [n for n, p in self.parts.items() if p.kind == effect.part]
+        return {name: [f"{h}.{name}" for h in holders] for name in effect.parameter_names}
+
+    def can_express(self, effect: Effect) -> bool:
+        return all(self.keys_of(effect).values())
+
+    def variables_of(self, effect: Effect, frames: int = 0) -> list[Variable]:
+        """What a calibration frees to add the effect: shared or per part, for all frames or for each."""
+        variables = []
+        for name, keys in self.keys_of(effect).items():
+            parameter = registry().parameter(effect.part, name)
+            groups = [(f"{effect.part}.{name}" if len(keys) > 1 else keys[0], tuple(keys))] if effect.per == "kind" else \
+                [(key, (key,)) for key in keys]
+            for label, group in groups:
+                if effect.scope == "frame":
+                    variables += [Variable(f"{label}[{i}]", group, parameter, (i,)) for i in range(frames)]
+                else:
+                    variables.append(Variable(label, group, parameter))
+        return variables
+
+
+def _reason(error: Exception) -> str:
+    """Mitsuba's message without its prefixes and in one line."""
+    text = " ".join(str(error).split())
+    return re.sub(r"^(\[[^\]]*\]\s*)+", "", text)

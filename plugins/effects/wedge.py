@@ -1,0 +1,30 @@
+"""Gel wedge: the coated face is tilted against the camera's window.
+
+Definition
+    z'(x, y) = z(x, y) + x tan(w_x) + y tan(w_y)
+Fingerprint
+    a smooth gradient across every frame that turns with the side the light comes from. Positions and axes of the LEDs absorb most
+    of it; presses at different places keep a share.
+Validity
+    a plane face; a bent one needs more terms.
+References
+    F-TAC Hand supplementary information, S1.1 ("uniform and known elastomer thickness" is assumed there).
+"""
+
+import numpy as np
+
+from optics.effect import Effect
+from optics.parameter import Parameter
+
+
+def tilt(x, y, gel):
+    return x * np.tan(np.radians(gel.number("wedge_x"))) + y * np.tan(np.radians(gel.number("wedge_y")))
+
+
+effect = Effect(
+    name="gel wedge", part="gel", stages={"surface": tilt},
+    parameters=(Parameter("wedge_x", "deg", 0.0, (-20.0, 20.0), "tilt w_x along x", neutral=0.0, plausible=0.5,
+                          how="difference"),
+                Parameter("wedge_y", "deg", 0.0, (-20.0, 20.0), "tilt w_y along y", neutral=0.0, plausible=0.5,
+                          how="difference")),
+    acts=("row", "column", "led"), needs="frames lit from different sides, one LED each")

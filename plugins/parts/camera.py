@@ -1,0 +1,137 @@
+"""Camera: pinhole with lens distortion, pose, channel sensitivities and a cubic response per channel.
+
+Definition
+    x_n = (u - c_x)/f_x,  y_n = (v - c_y)/f_y                    u, v: pixel position, centre of a pixel at +0.5
+    distorted = undistorted (1 + k1 r^2 + k2 r^4 + k3 r^6) + tangential(p1, p2)      (OpenCV's order and signs)
+    I_c = exposure gain sum_b M_cb L_b                           irradiance of channel c; 1 = full scale
+    G_c(m) = m + a_c (m^2 - m) + b_c (m^3 - m),  m = G_c^-1(I)   response, inverse of a cubic (S1.1)
+    DN = black + (saturation - black) m + offset
+with f_x from the horizontal field of view, f_y = f_x aspect, principal point (c_x, c_y) given as an offset from the middle of
+the image, L_b the radiance in band b, and M the sensitivities of the channels in the bands (identity, or a measured
+camera of the colour-science library by its name). XML may give `fx`, `fy`, `cx`, `cy` (px) in place of the field of view.
+Frame: x right, y down, z forward (OpenCV); the transform `to_world` gives the nominal pose, `x` ... `roll` what departs from it.
+Fingerprint
+    principal point and pose shift the image; distortion grows with the third power of the radius; exposure scales all.
+Validity
+    central projection; a fisheye needs another part. Monotone response: G'(m) > 0 on [0, 1].
+References
+    F-TAC Hand supplementary information, S1.1, eq. (S1); Mitsunaga & Nayar, CVPR 1999.
+"""
+
+import math
+
+from optics.effect import Declared, Part
+from optics.parameter import Parameter
+
+PARAMETERS = (
+    Parameter("x_fov", "deg", 40.0, (1.0, 170.0), "horizontal field of view", plausible=0.5, how="difference"),
+    Parameter("aspect", "1", 1.0, (0.5, 2.0), "f_y / f_x", plausible=0.01, how="difference"),
+    Parameter("principal_x", "px", 0.0, (-4000.0, 4000.0), "c_x minus half the width", plausible=2.0, how="difference"),
+    Parameter("principal_y", "px", 0.0, (-4000.0, 4000.0), "c_y minus half the height", plausible=2.0, how="difference"),
+    Parameter("k1", "1", 0.0, (-2.0, 2.0), "radial distortion, r^2", neutral=0.0, plausible=0.02, how="difference"),
+    Parameter("k2", "1", 0.0, (-5.0, 5.0), "radial distortion, r^4", neutral=0.0, plausible=0.05, how="difference"),
+    Parameter("k3", "1", 0.0, (-20.0, 20.0), "radial distortion, r^6", neutral=0.0, plausible=0.2, how="difference"),
+    Parameter("p1", "1", 0.0, (-1.0, 1.0), "tangential distortion", neutral=0.0, plausible=0.005, how="difference"),
+    Parameter("p2", "1", 0.0, (-1.0, 1.0), "tangential distortion", neutral=0.0, plausible=0.005, how="difference"),
+    Parameter("x", "mm", 0.0, (-100.0, 100.0), "shift from the nominal pose, right", plausible=0.2, how="difference"),
+    Parameter("y", "mm", 0.0, (-100.0, 100.0), "shift from the nominal pose, down", plausible=0.2, how="difference"),
+    Parameter("z", "mm", 0.0, (-100.0, 100.0), "shift from the nominal pose, forward", plausible=0.2, how="difference"),
+    Parameter("pan", "deg", 0.0, (-80.0, 80.0), "turn about the y axis", plausible=0.5, how="difference"),
+    Parameter("tilt", "deg", 0.0, (-80.0, 80.0), "turn about the x axis", plausible=0.5, how="difference"),
+    Parameter("roll", "deg", 0.0, (-180.0, 180.0), "turn about the z axis", plausible=0.5, how="difference"),
+    Parameter("exposure", "1", 1.0, (0.0, 1e6), "full scale per unit of radiance", plausible=0.1, how="image"),
+    Parameter("gain", "1", 1.0, (0.0, 100.0), "gain of a frame relative to the others", neutral=1.0, plausible=0.02,
+              how="image"),
+    Parameter("offset", "DN", 0.0, (-1e4, 1e4), "added to every pixel after the response", neutral=0.0, plausible=1.0,
+              how="image"),
+    *(Parameter(f"response2_{c}", "1", 0.0, (-0.9, 0.9), f"a_c: quadratic term of the inverse response, channel {c}",
+                neutral=0.0, plausible=0.1, how="image") for c in "rgb"),
+    *(Parameter(f"response3_{c}", "1", 0.0, (-0.45, 0.45), f"b_c: cubic term of the inverse response, channel {c}",
+                neutral=0.0, plausible=0.1, how="image") for c in "rgb"),
+)
+
+
+def build():
+    import drjit as dr
+    import mitsuba as mi
+
+    class Camera(Declared.on(mi.Sensor)):
+        kind = "camera"
+
+        def __init__(self, props):
+            nominal = props.get("to_world", mi.ScalarAffineTransform4f())
+            mi.Sensor.__init__(self, props)
+            width, height = (int(v) for v in self.film().size())
+            if props.has_property("fx"):
+                fx = float(props.get("fx", 1.0))
+                props["x_fov"] = math.degrees(2 * math.atan(width / 2 / fx))
+                props["aspect"] = float(props.get("fy", fx)) / fx
+                props["principal_x"] = float(props.get("cx", width / 2)) - width / 2
+                props["principal_y"] = float(props.get("cy", height / 2)) - height / 2
+            self.sensitivity = props.get("sensitivity", "identity")
+            self.declare(props)
+            self.resolution = (width, height)
+            matrix = [[float(nominal.matrix[i, j]) for j in range(4)] for i in range(3)]
+            self.columns = [dr.opaque(mi.Vector3f, [matrix[i][j] for i in range(3)]) for j in range(4)]
+            self.m_needs_sample_3 = False
+
+        def traverse(self, cb):
+            mi.Sensor.traverse(self, cb)
+            self.put_parameters(cb)
+
+        def parameters_changed(self, keys=()):
+            self.reread(keys)
+
+        def focal(self):
+            """f_x, f_y in px."""
+            fx = self.resolution[0] / 2 / dr.tan(dr.deg2rad(self.x_fov) / 2)
+            return fx, fx * self.aspect
+
+        def undistort(self, xd, yd):
+            """Undistorted normalised coordinates, by fixed-point iteration (10 steps: below 1e-7 for |k1| r^2 < 0.1)."""
+            x, y = xd, yd
+            for _ in range(10):
+                r2 = x * x + y * y
+                radial = 1 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
+                dx = 2 * self.p1 * x * y + self.p2 * (r2 + 2 * x * x)
+                dy = self.p1 * (r2 + 2 * y * y) + 2 * self.p2 * x * y
+                x, y = (xd - dx) / radial, (yd - dy) / radial
+            return x, y
+
+        def to_world(self, v):
+            return self.columns[0] * v.x + self.columns[1] * v.y + self.columns[2] * v.z
+
+        def ray(self, u, v):
+            """Origin and unit direction in the world for a position in pixels."""
+            fx, fy = self.focal()
+            width, height = self.resolution
+            x, y = self.undistort((u - width / 2 - self.principal_x) / fx, (v - height / 2 - self.principal_y) / fy)
+            d = dr.normalize(mi.Vector3f(x, y, 1))
+            for angle, (i, j) in ((self.roll, (0, 1)), (self.tilt, (1, 2)), (self.pan, (2, 0))):
+                s, c = dr.sincos(dr.deg2rad(angle))
+                d = mi.Vector3f(d)
+                d[i], d[j] = c * d[i] - s * d[j], s * d[i] + c * d[j]
+            origin = self.columns[3] + self.to_world(mi.Vector3f(self.x, self.y, self.z))
+            return mi.Point3f(origin) + dr.zeros(mi.Point3f, dr.width(u)), self.to_world(d)
+
+        def sample_ray(self, time, sample1, sample2, sample3, active=True):
+            wavelengths, weight = self.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), sample1, active)
+            o, d = self.ray(sample2.x * self.resolution[0], sample2.y * self.resolution[1])
+            return mi.Ray3f(o, d, time, wavelengths), mi.Spectrum(weight)
+
+        def sample_ray_differential(self, time, sample1, sample2, sample3, active=True):
+            ray, weight = self.sample_ray(time, sample1, sample2, sample3, active)
+            differential = mi.RayDifferential3f(ray)
+            differential.has_differentials = False
+            return differential, weight
+
+        def bbox(self):
+            return mi.ScalarBoundingBox3f()
+
+        def to_string(self):
+            return f"Camera[{self.name}]"
+
+    return Camera
+
+
+part = Part("camera", "sensor", PARAMETERS, build)

@@ -1,0 +1,146 @@
+"""Gel: the soft layer of the sensor and its coated face, pressed by an indenter.
+
+Definition
+    z(x, y) = -D(x - press_x, y - press_y) + sum of `surface` effects          the coated face; flat at z = 0
+    D = contact depth clipped to [0, thickness], smoothed by a pyramid of Gaussians outside the contact (S1.6)
+The gel fills -thickness < z < 0; the camera stands at z < -thickness. The face is a triangle mesh on a graded grid that
+is fine around the contact and moves with it, so that images vary smoothly with the press.
+Indenters: sphere (`indenter_size` = radius), cylinder lying on its side (radius), cube face down (edge), or a mesh file
+(STL, OBJ, PLY; `indenter_size` = scale).
+Fingerprint
+    position and depth of the press move the dent; `smoothing` widens its skirt.
+Validity
+    quasi-static presses; the skirt is a smoothing, not elasticity. The gel's far side rests on a rigid window.
+References
+    F-TAC Hand supplementary information, S1.2 and S1.6.
+"""
+
+from optics.effect import Declared, Part
+from optics.parameter import Parameter
+
+PARAMETERS = (
+    Parameter("width", "mm", 20.0, (0.1, 1000.0), "size along x", plausible=0.1, how="difference"),
+    Parameter("length", "mm", 16.0, (0.1, 1000.0), "size along y", plausible=0.1, how="difference"),
+    Parameter("thickness", "mm", 4.0, (0.01, 100.0), "from the window to the coated face", plausible=0.1, how="difference"),
+    Parameter("press_x", "mm", 0.0, (-500.0, 500.0), "where the indenter's axis meets the face, right", plausible=0.1,
+              how="difference"),
+    Parameter("press_y", "mm", 0.0, (-500.0, 500.0), "where the indenter's axis meets the face, down", plausible=0.1,
+              how="difference"),
+    Parameter("press_depth", "mm", 0.0, (0.0, 50.0), "how far the indenter's lowest point is below the face",
+              plausible=0.05, how="difference"),
+    Parameter("press_rx", "deg", 0.0, (-180.0, 180.0), "turn of the indenter about x", plausible=1.0, how="difference"),
+    Parameter("press_ry", "deg", 0.0, (-180.0, 180.0), "turn of the indenter about y", plausible=1.0, how="difference"),
+    Parameter("press_rz", "deg", 0.0, (-180.0, 180.0), "turn of the indenter about z", plausible=1.0, how="difference"),
+    Parameter("indenter", "-", "sphere", choices=("sphere", "cylinder", "cube"), doc="sphere, cylinder, cube or a mesh file"),
+    Parameter("indenter_size", "mm", 1.5, (1e-3, 1000.0), "radius, radius, edge, or scale of the mesh", plausible=0.02,
+              how="difference"),
+    Parameter("smoothing", "mm", 0.25, (0.01, 5.0), "standard deviation of the widest kernel of S1.6", plausible=0.05,
+              how="difference"),
+)
+
+
+def build():
+    import drjit as dr
+    import mitsuba as mi
+    import numpy as np
+
+    from optics.gel import contact
+
+    class Gel(Declared.on(mi.Mesh)):
+        kind = "gel"
+
+        def __init__(self, props):
+            self.pitch = float(props.get("pitch", 0.06))  # mm, of the fine part of the grid
+            self.extent = float(props.get("extent", 3.0))  # mm, half width of the fine part
+            self.columns, self.rows = int(props.get("columns", 181)), int(props.get("rows", 161))
+            index = np.arange(self.columns * self.rows).reshape(self.rows, self.columns)
+            a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]
+            faces = np.stack([a, d, c, a, c, b], -1).reshape(-1, 3)  # normals towards the camera (-z)
+            mi.Mesh.__init__(self, "gel", index.size, len(faces), props, True, False)
+            self.declare(props)
+            if self.indenter.endswith((".stl", ".obj", ".ply")):
+                self.indenter = str(mi.file_resolver().resolve(self.indenter))
+            params = mi.traverse(self)
+            params["faces"] = mi.UInt32(faces.astype(np.uint32).ravel())
+            self.rebuild(params)
+
+        def traverse(self, cb):
+            super().traverse(cb)
+            self.put_parameters(cb)
+
+        def parameters_changed(self, keys=()):
+            if any(key in self.numbers for key in keys) or not keys:
+                self.reread(keys)
+                self.rebuild(mi.traverse(self))
+            else:
+                super().parameters_changed(list(keys))
+
+        def press(self):
+            """Displacement and contact maps on the indenter's own grid (optics.gel.contact)."""
+            n = self.number
+            profile = contact.indenter_profile(self.indenter, n("indenter_size"),
+                                               (n("press_rx"), n("press_ry"), n("press_rz")), self.extent, self.pitch)
+            return contact.displacement(profile, n("press_depth"), n("thickness"), n("smoothing"))
+
+        def heights(self, x, y):
+            """z of the coated face (mm) at x (columns,) and y (rows,), mm, with every `surface` effect: (rows, columns)."""
+            n = self.number
+            self.map, self.touch = self.press()
+            x, y = np.asarray(x, float)[None, :], np.asarray(y, float)[:, None]
+            z = -contact.surface(x, y, n("press_x"), n("press_y"), self.map)
+            for function in self.functions("surface"):
+                z = z + function(x, y, self)
+            return z
+
+        def axes(self):
+            """Coordinates of the grid's columns and rows, mm."""
+            n = self.number
+            half = (n("width") / 2, n("length") / 2)
+            return tuple(contact.graded_axis(-h, h, n(press), min(self.extent, h), self.pitch, count)
+                         for h, press, count in zip(half, ("press_x", "press_y"), (self.columns, self.rows)))
+
+        def rebuild(self, params):
+            """Vertices of the face for the present parameters."""
+            xs, ys = self.axes()
+            z = self.heights(xs, ys)
+            x, y = np.broadcast_to(xs, z.shape), np.broadcast_to(ys[:, None], z.shape)
+            params["vertex_positions"] = mi.Float(np.stack([x, y, z], -1).astype(np.float32).ravel())
+            params.update()
+
+        def contact_weight(self, x, y):
+            """1 inside the contact, 0 outside, at points (x, y) of any shape."""
+            from scipy.ndimage import map_coordinates
+
+            values, pitch = self.touch.values, self.touch.pitch
+            middle = (len(values) - 1) / 2
+            at = [(np.asarray(y) - self.number("press_y")) / pitch + middle,
+                  (np.asarray(x) - self.number("press_x")) / pitch + middle]
+            return map_coordinates(values, at, order=1, mode="constant")
+
+        # -- the way of light in the gel ------------------------------------------------------------------------------
+
+        def length_inside(self, p, q):
+            """Length (mm) of the part of the segment p-q that lies in the gel, z > -thickness, for p inside."""
+            share = (p.z + self.thickness) / dr.maximum(p.z - q.z, 1e-6)
+            share = dr.select(q.z >= -self.thickness, 1.0, dr.clip(share, 0, 1))
+            return dr.norm(q - p) * share
+
+        def path(self, p, camera, lamp, led, si):
+            return Path(self, p, camera, lamp, led, si)
+
+        def to_string(self):
+            return f"Gel[{self.name}]"
+
+    class Path:
+        """What a `segment` or `volume` function sees: lit point, camera, lamp, LED and the lengths inside the gel (mm)."""
+
+        def __init__(self, gel, p, camera, lamp, led, si):
+            self.p, self.camera, self.lamp, self.led, self.si = p, camera, lamp, led, si
+            self.view = gel.length_inside(p, camera)
+            self.light = gel.length_inside(p, lamp)
+            self.wavelengths = si.wavelengths
+
+    return Gel
+
+
+part = Part("gel", "shape", PARAMETERS, build)

@@ -1,0 +1,102 @@
+"""Interface: a flat, clear boundary between two media that the camera looks through.
+
+Definition
+    n1 sin(theta1) = n2 sin(theta2)                              Snell, `index` = n2/n1
+    T_s = 1 - ((c1 - n c2)/(c1 + n c2))^2,  T_p = 1 - ((n c1 - c2)/(n c1 + c2))^2
+    L1 = T L2 / n^2                                              radiance seen from the side of medium 1
+with c = cos(theta), n = index; medium 1 is on the side that the surface's normal points to (the camera's side). Light is
+always transmitted; the reflected share is lost (its weight is the transmitted one), so that a ray never branches and the
+index never enters a sampling probability. Two of them make a window: air to acrylic, acrylic to gel.
+Fingerprint
+    the picture shrinks towards the axis, more with depth; a small fall-off towards the corners.
+Validity
+    no reflection from the window; flat and parallel to itself. At index 1 the interface is not there.
+References
+    Born & Wolf, Principles of Optics, 1.5.2 (Fresnel's formulae).
+"""
+
+from optics.effect import Declared, Part
+from optics.parameter import Parameter
+
+PARAMETERS = (
+    Parameter("index", "1", 1.0, (0.4, 2.5), "n2/n1: index of the far side relative to the camera's side", neutral=1.0,
+              plausible=0.4, how="difference"),
+)
+
+
+def build():
+    import drjit as dr
+    import mitsuba as mi
+
+    class Interface(Declared.on(mi.BSDF)):
+        kind = "interface"
+
+        def __init__(self, props):
+            mi.BSDF.__init__(self, props)
+            self.declare(props)
+            flags = mi.BSDFFlags.DeltaTransmission | mi.BSDFFlags.FrontSide | mi.BSDFFlags.BackSide
+            self.m_components = [flags]
+            self.m_flags = flags
+
+        def traverse(self, cb):
+            self.put_parameters(cb)
+
+        def parameters_changed(self, keys=()):
+            self.reread(keys)
+
+        def refract(self, wi):
+            """Direction beyond the interface, transmittances T_s and T_p, relative index met; for a local direction wi."""
+            front = mi.Frame3f.cos_theta(wi) >= 0
+            n = dr.select(front, self.index, 1 / self.index)
+            c1 = dr.abs(mi.Frame3f.cos_theta(wi))
+            c2 = dr.sqrt(dr.maximum(1 - (1 - dr.square(c1)) / dr.square(n), 0))
+            wo = mi.Vector3f(-wi.x / n, -wi.y / n, dr.select(front, -c2, c2))
+            t_s = 1 - dr.square((c1 - n * c2) / (c1 + n * c2))
+            t_p = 1 - dr.square((n * c1 - c2) / (n * c1 + c2))
+            total = (1 - dr.square(c1)) / dr.square(n) >= 1  # total internal reflection: nothing is transmitted
+            return wo, dr.select(total, 0, t_s), dr.select(total, 0, t_p), n
+
+        def sample(self, ctx, si, sample1, sample2, active=True):
+            wo, t_s, t_p, n = self.refract(si.wi)
+            bs = dr.zeros(mi.BSDFSample3f)
+            bs.wo = wo
+            bs.pdf = mi.Float(1.0)
+            bs.eta = n
+            bs.sampled_type = mi.UInt32(+mi.BSDFFlags.DeltaTransmission)
+            bs.sampled_component = mi.UInt32(0)
+            scale = 1 / dr.square(n)
+            if mi.is_polarized:
+                a, b, c = (t_s + t_p) / 2, (t_s - t_p) / 2, dr.sqrt(t_s * t_p)
+                matrix = mi.Spectrum(a, b, 0, 0, b, a, 0, 0, 0, 0, c, 0, 0, 0, 0, c)
+                normal = mi.Vector3f(0, 0, 1)
+                side_in, side_out = dr.cross(normal, -wo), dr.cross(normal, si.wi)
+                level = dr.squared_norm(side_in) < 1e-12  # at normal incidence every basis serves
+                side_in = dr.select(level, mi.mueller.stokes_basis(-wo), dr.normalize(side_in))
+                side_out = dr.select(level, mi.mueller.stokes_basis(si.wi), dr.normalize(side_out))
+                weight = mi.mueller.rotate_mueller_basis(matrix, -wo, side_in, mi.mueller.stokes_basis(-wo),
+                                                         si.wi, side_out, mi.mueller.stokes_basis(si.wi)) * scale
+            else:
+                weight = mi.Spectrum((t_s + t_p) / 2 * scale)
+            return bs, weight & active
+
+        def eval(self, ctx, si, wo, active=True):
+            return mi.Spectrum(0.0)
+
+        def pdf(self, ctx, si, wo, active=True):
+            return mi.Float(0.0)
+
+        def eval_pdf(self, ctx, si, wo, active=True):
+            return mi.Spectrum(0.0), mi.Float(0.0)
+
+        def eval_null_transmission(self, si, active=True):
+            _, t_s, t_p, _ = self.refract(si.wi)
+            mean = mi.UnpolarizedSpectrum((t_s + t_p) / 2)
+            return mi.mueller.absorber(mean) if mi.is_polarized else mi.Spectrum(mean)
+
+        def to_string(self):
+            return f"Interface[{self.name}]"
+
+    return Interface
+
+
+part = Part("interface", "bsdf", PARAMETERS, build)

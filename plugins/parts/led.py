@@ -1,0 +1,158 @@
+"""LED: a point (or small disc) source with an axially symmetric lobe.
+
+Definition
+    radiant intensity  I(s) = eta (-s.p)^mu w(lambda)            [W/sr, relative]
+    irradiance factor  kappa = eta (-s.p)^mu / |s|^2             (S2)
+with the unit vector s from the LED's position S to the lit point reversed (so that -s.p is the cosine to the axis p), the
+power eta, the lobe exponent mu (1 for a Lambertian chip, larger for a lens) and the relative spectrum w: a Gaussian of
+the given peak wavelength and full width at half maximum, or 1 in every band when `wavelength` is 0 (a white LED).
+With an emitting area A > 0 the source is a disc across the axis, of radius sqrt(A/pi): shadows get a penumbra.
+Fingerprint
+    position and power shape the field of every frame in which the LED is lit; mu shows far from the axis.
+Validity
+    distances much larger than the die; no colour change over the lobe.
+References
+    F-TAC Hand supplementary information, S1.3, eq. (S2).
+"""
+
+import math
+
+from optics.effect import Declared, Part
+from optics.parameter import Parameter
+
+PARAMETERS = (
+    Parameter("x", "mm", 0.0, doc="position S, to the right in the image", plausible=0.5, how="ad"),
+    Parameter("y", "mm", 0.0, doc="position S, down in the image", plausible=0.5, how="ad"),
+    Parameter("z", "mm", -5.0, doc="position S, from the camera towards the skin", plausible=0.5, how="ad"),
+    Parameter("pan", "deg", 0.0, (-89.0, 89.0), "turn of the axis p from its nominal direction, about the local up axis",
+              plausible=5.0),
+    Parameter("tilt", "deg", 0.0, (-89.0, 89.0), "turn of the axis p from its nominal direction, about the local side "
+              "axis", plausible=5.0),
+    Parameter("mu", "1", 1.2, (0.0, 200.0), "lobe exponent mu of (S2)", plausible=0.3),
+    Parameter("power", "1", 1.0, (0.0, 1e6), "power eta of (S2), relative; 0 switches the LED off", plausible=0.1,
+              linear=True),
+    Parameter("area", "mm^2", 0.0, (0.0, 25.0), "emitting area A of the disc", neutral=0.0, plausible=1.0,
+              how="difference"),
+    Parameter("wavelength", "nm", 0.0, (0.0, 2000.0), "peak wavelength; 0: the same in every band", plausible=3.0),
+    Parameter("fwhm", "nm", 30.0, (1.0, 1000.0), "full width at half maximum of the spectrum", plausible=5.0),
+)
+
+
+def build():
+    import drjit as dr
+    import mitsuba as mi
+
+    class LED(Declared.on(mi.Emitter)):
+        kind = "led"
+
+        def __init__(self, props):
+            mi.Emitter.__init__(self, props)
+            position = props.get("position", None)
+            target = props.get("target", mi.ScalarPoint3f(0, 0, 0))
+            if position is not None:
+                for name, value in zip("xyz", position):
+                    props[name] = float(value)
+            self.declare(props)
+            nominal = [float(t) - self.number(n) for t, n in zip(target, "xyz")]
+            length = math.sqrt(sum(c * c for c in nominal))
+            if length == 0:
+                raise ValueError(f"led '{self.name}': position and target are the same point; the axis has no direction")
+            axis = [c / length for c in nominal]
+            # a side axis that does not degenerate for the usual LEDs, which shine along +-z or towards the middle
+            helper = [0.0, 1.0, 0.0] if abs(axis[1]) < 0.9 else [1.0, 0.0, 0.0]
+            side = [helper[1] * axis[2] - helper[2] * axis[1], helper[2] * axis[0] - helper[0] * axis[2],
+                    helper[0] * axis[1] - helper[1] * axis[0]]
+            norm = math.sqrt(sum(c * c for c in side))
+            side = [c / norm for c in side]
+            up = [axis[1] * side[2] - axis[2] * side[1], axis[2] * side[0] - axis[0] * side[2],
+                  axis[0] * side[1] - axis[1] * side[0]]
+            self.frame = [dr.opaque(mi.Vector3f, v) for v in (side, up, axis)]
+            self.m_flags = +mi.EmitterFlags.DeltaPosition
+            self.m_needs_sample_3 = False
+
+        def traverse(self, cb):
+            self.put_parameters(cb)
+
+        def parameters_changed(self, keys=()):
+            self.reread(keys)
+
+        def position(self):
+            return mi.Point3f(self.x, self.y, self.z)
+
+        def axis(self):
+            side, up, forward = self.frame
+            return dr.normalize(forward + dr.tan(dr.deg2rad(self.pan)) * side + dr.tan(dr.deg2rad(self.tilt)) * up)
+
+        def spectrum(self, wavelengths):
+            """Relative spectrum w at the given wavelengths (nm); 1 in mono variants and for white LEDs."""
+            if dr.size_v(mi.UnpolarizedSpectrum) == 1:
+                return mi.UnpolarizedSpectrum(1.0)
+            u = (mi.UnpolarizedSpectrum(wavelengths) - self.wavelength) / self.fwhm
+            return dr.select(self.wavelength > 0, dr.exp(-4 * math.log(2) * dr.square(u)), 1.0)
+
+        def point(self, sample):
+            """A point of the emitting disc for a sample of the unit square; the centre when the area is 0."""
+            radius = dr.sqrt(dr.maximum(self.area, 1e-12) / dr.pi)
+            disc = mi.warp.square_to_uniform_disk_concentric(sample) * radius
+            side, up, _ = self.frame
+            return self.position() + side * disc.x + up * disc.y
+
+        def radiance(self, it, to_led, distance):
+            """kappa of (S2) per band, for a unit vector from the lit point to the LED and their distance in mm."""
+            cos = dr.dot(-to_led, self.axis())
+            lobe = dr.select(cos > 1e-4, dr.power(dr.maximum(cos, 1e-4), self.mu), 0.0)
+            kappa = mi.UnpolarizedSpectrum(self.power * lobe / dr.square(distance)) * self.spectrum(it.wavelengths)
+            for function in self.functions("emission"):
+                kappa *= function(Beam(cos, distance, to_led, it.p, it.wavelengths), self)
+            return kappa
+
+        # -- Mitsuba ------------------------------------------------------------------------------------------------
+
+        def sample_direction(self, it, sample, active=True):
+            ds = dr.zeros(mi.DirectionSample3f)
+            ds.p = self.point(sample)
+            ds.n = mi.Normal3f(self.axis())
+            ds.time = it.time
+            ds.pdf = mi.Float(1.0)
+            ds.delta = mi.Bool(True)
+            ds.emitter = mi.EmitterPtr(self)
+            to_led = ds.p - it.p
+            ds.dist = dr.norm(to_led)
+            ds.d = to_led / ds.dist
+            kappa = self.radiance(it, ds.d, ds.dist)
+            return ds, mi.mueller.depolarizer(kappa) if mi.is_polarized else mi.Spectrum(kappa)
+
+        def eval_direction(self, it, ds, active=True):
+            to_led = ds.p - it.p
+            distance = dr.norm(to_led)
+            kappa = self.radiance(it, to_led / distance, distance)
+            return mi.mueller.depolarizer(kappa) if mi.is_polarized else mi.Spectrum(kappa)
+
+        def pdf_direction(self, it, ds, active=True):
+            return mi.Float(0.0)
+
+        def eval(self, si, active=True):
+            return mi.Spectrum(0.0)
+
+        def bbox(self):
+            return mi.ScalarBoundingBox3f(mi.ScalarPoint3f(*[self.number(n) for n in "xyz"]))
+
+        def sample_wavelengths(self, si, sample, active=True):
+            wavelengths, weight = mi.sample_rgb_spectrum(mi.sample_shifted(sample)) if mi.is_spectral else (
+                mi.Color0f(), mi.UnpolarizedSpectrum(1.0))
+            return wavelengths, weight * self.spectrum(wavelengths)
+
+        def to_string(self):
+            return f"LED[{self.name}]"
+
+    return LED
+
+
+class Beam:
+    """What an `emission` function sees: cosine to the LED's axis, distance (mm), unit vector to the LED, point, nm."""
+
+    def __init__(self, cos, distance, to_led, point, wavelengths):
+        self.cos, self.distance, self.to_led, self.point, self.wavelengths = cos, distance, to_led, point, wavelengths
+
+
+part = Part("led", "emitter", PARAMETERS, build)

@@ -1,0 +1,119 @@
+"""Membrane: the coated inner face of the skin, a generalised Lambertian reflector.
+
+Definition
+    f(wi, wo) = rho_c / pi (A + B max(0, cos(phi_r - phi_i)) sin(alpha) tan(beta))      (S3)
+    A = 1 - 0.5 s2/(s2 + 0.33)      B = 0.45 s2/(s2 + 0.09)      s2 = sigma^2
+with the reflectance rho_c of each band (red, green, blue: the first three bands of the integrator, times an optional
+texture `reflectance`), the roughness sigma (rad) of the facets, alpha and beta the larger and the smaller of the angles
+to the normal. With s = wi.wo - cos_i cos_o the product cos(phi) sin(alpha) tan(beta) is s / max(cos_i, cos_o), which has
+no singularity (Oren & Nayar's qualitative model).
+Fingerprint
+    rho scales a band everywhere; sigma brightens grazing views of slopes that face the light and flattens the shading.
+Validity
+    opaque coating, no lobe towards the mirror direction (the effect "specular lobe" adds one); depolarizes fully.
+References
+    F-TAC Hand supplementary information, S1.4, eq. (S3); Oren & Nayar, IJCV 14, 227 (1995).
+"""
+
+from optics.effect import Declared, Part
+from optics.parameter import Parameter
+
+PARAMETERS = (
+    Parameter("rho_r", "1", 1.0, (0.0, 10.0), "reflectance rho in the first band (red)", plausible=0.1, linear=True),
+    Parameter("rho_g", "1", 1.0, (0.0, 10.0), "reflectance rho in the second band (green)", plausible=0.1, linear=True),
+    Parameter("rho_b", "1", 1.0, (0.0, 10.0), "reflectance rho in the third band (blue)", plausible=0.1, linear=True),
+    Parameter("sigma", "rad", 0.2, (0.0, 1.5), "roughness sigma of (S3)", plausible=0.05),
+)
+
+
+def build():
+    import drjit as dr
+    import mitsuba as mi
+
+    class Membrane(Declared.on(mi.BSDF)):
+        kind = "membrane"
+
+        def __init__(self, props):
+            mi.BSDF.__init__(self, props)
+            self.reflectance = props.get_texture("reflectance", 1.0)
+            self.declare(props)
+            flags = mi.BSDFFlags.DiffuseReflection | mi.BSDFFlags.FrontSide
+            self.m_components = [flags]
+            self.m_flags = flags
+
+        def traverse(self, cb):
+            self.put_parameters(cb)
+            cb.put("reflectance", self.reflectance, mi.ParamFlags.Differentiable)
+
+        def parameters_changed(self, keys=()):
+            self.reread(keys)
+
+        def albedo(self, si, active=True):
+            """rho_c times the texture, per band."""
+            rho = (self.rho_r, self.rho_g, self.rho_b, mi.Float(1.0))
+            bands = mi.UnpolarizedSpectrum(*rho[:dr.size_v(mi.UnpolarizedSpectrum)])
+            return bands * self.reflectance.eval(si, active)
+
+        def brdf(self, si, wo, active=True):
+            """f(wi, wo) per band, 1/sr, without the cosine."""
+            cos_v, cos_l = mi.Frame3f.cos_theta(si.wi), mi.Frame3f.cos_theta(wo)
+            s2 = dr.square(self.sigma)
+            a = 1 - 0.5 * s2 / (s2 + 0.33)
+            b = 0.45 * s2 / (s2 + 0.09)
+            s = dr.dot(si.wi, wo) - cos_v * cos_l
+            tilt = dr.select(s > 0, s / dr.maximum(dr.maximum(cos_v, cos_l), 1e-6), 0.0)
+            albedo = self.albedo(si, active)
+            value = albedo * ((a + b * tilt) * dr.inv_pi)
+            for function in self.functions("reflection"):
+                value += function(Geometry(si, wo, cos_v, cos_l, albedo), self)
+            return value
+
+        def ambient_radiance(self, si):
+            """Radiance that no LED made, per band (0 unless an effect adds some)."""
+            value = mi.UnpolarizedSpectrum(0.0)
+            for function in self.functions("ambient"):
+                value += function(Geometry(si, si.wi, mi.Frame3f.cos_theta(si.wi), None, self.albedo(si)), self)
+            return value
+
+        # -- Mitsuba ------------------------------------------------------------------------------------------------
+
+        def sample(self, ctx, si, sample1, sample2, active=True):
+            bs = dr.zeros(mi.BSDFSample3f)
+            bs.wo = mi.warp.square_to_cosine_hemisphere(sample2)
+            bs.pdf = mi.warp.square_to_cosine_hemisphere_pdf(bs.wo)
+            bs.eta = mi.Float(1.0)
+            bs.sampled_type = mi.UInt32(+mi.BSDFFlags.DiffuseReflection)
+            bs.sampled_component = mi.UInt32(0)
+            weight = self.brdf(si, bs.wo, active) * dr.pi
+            weight = mi.mueller.depolarizer(weight) if mi.is_polarized else mi.Spectrum(weight)
+            lit = active & (mi.Frame3f.cos_theta(si.wi) > 0) & (bs.pdf > 0)
+            return bs, dr.select(lit, weight, mi.Spectrum(0.0))
+
+        def eval(self, ctx, si, wo, active=True):
+            cos_v, cos_l = mi.Frame3f.cos_theta(si.wi), mi.Frame3f.cos_theta(wo)
+            lit = active & (cos_v > 0) & (cos_l > 0)
+            value = dr.select(lit, self.brdf(si, wo, active) * cos_l, 0.0)
+            return mi.mueller.depolarizer(value) if mi.is_polarized else mi.Spectrum(value)
+
+        def pdf(self, ctx, si, wo, active=True):
+            lit = active & (mi.Frame3f.cos_theta(si.wi) > 0) & (mi.Frame3f.cos_theta(wo) > 0)
+            return dr.select(lit, mi.warp.square_to_cosine_hemisphere_pdf(wo), 0.0)
+
+        def eval_pdf(self, ctx, si, wo, active=True):
+            return self.eval(ctx, si, wo, active), self.pdf(ctx, si, wo, active)
+
+        def to_string(self):
+            return f"Membrane[{self.name}]"
+
+    return Membrane
+
+
+class Geometry:
+    """What a `reflection` or `ambient` function sees: surface interaction, local direction to the light, cosines, rho."""
+
+    def __init__(self, si, wo, cos_view, cos_light, albedo):
+        self.si, self.wi, self.wo = si, si.wi, wo
+        self.cos_view, self.cos_light, self.albedo = cos_view, cos_light, albedo
+
+
+part = Part("membrane", "bsdf", PARAMETERS, build)

@@ -1,0 +1,250 @@
+"""Tactile: the integrator that serves every sensor; polarized, in fixed bands, with Stokes channels.
+
+Definition
+    L(x -> camera) = sum_k V(x, S_k) T_gel f(wi, s_k) cos(theta_k) kappa_k + ambient + volume            (S5)
+                   + s sum (one more bounce), s = `interreflection`
+in the bands given by `bands` (nm, at most four; red first), so that a spectral render has no spectral noise. The camera's
+ray passes flat interfaces (part `interface`) by Snell's law with the transmitted share as weight; LEDs are sampled through
+null and index-matched surfaces; homogeneous media are followed analytically, exp(-sigma_a d) per segment; the gel's own
+effects (stages `segment` and `volume`) act on the path inside -thickness < z < 0. Every bounce after the first is scaled by
+`interreflection`: 1 is physics, 0 is direct light only.
+Fingerprint
+    interreflection fills shadows and the inner flanks of a dent.
+Validity
+    scattering media only to first order (effect "gel haze"); refraction of the light on its way from an LED to the membrane
+    is not followed: LEDs belong on the gel's side of a refracting interface.
+References
+    F-TAC Hand supplementary information, S1.4-S1.5, eq. (S5); Veach, thesis (1997), ch. 8, for the direct-light estimator.
+"""
+
+from optics.effect import Declared, Part
+from optics.parameter import Parameter
+
+PARAMETERS = (
+    Parameter("interreflection", "1", 0.0, (0.0, 4.0), "scale of every bounce after the first; 1 is physics",
+              neutral=0.0, plausible=1.0, linear=True),
+)
+
+
+def build():
+    import drjit as dr
+    import mitsuba as mi
+    from mitsuba.python.ad.integrators.common import ADIntegrator, mis_weight
+
+    lanes = dr.size_v(mi.UnpolarizedSpectrum)
+
+    def product(a, b):
+        return a @ b if mi.is_polarized else a * b
+
+    def scaled(value):
+        """A spectrum as the Mueller matrix of an absorber (polarized variants) or as it is."""
+        return mi.mueller.absorber(value) if mi.is_polarized else mi.Spectrum(value)
+
+    class Tactile(Declared.on(ADIntegrator)):
+        kind = "tactile"
+
+        def __init__(self, props):
+            super().__init__(props)
+            self.stokes = props.get("stokes", False)
+            self.max_depth = props.get("max_depth", 2)  # edges of a path between surfaces: 2 is direct light
+            self.max_null = props.get("max_null", 8)
+            text = str(props.get("bands", ""))
+            self.bands = tuple(float(w) for w in text.replace(",", " ").split())
+            if len(self.bands) > max(lanes, 1) and mi.is_spectral:
+                raise ValueError(f"tactile: {len(self.bands)} bands, but a render carries at most {lanes}; "
+                                 "render the others in a second scene")
+            self.declare(props)
+            self.gel_of = {}
+
+        def traverse(self, cb):
+            self.put_parameters(cb)
+
+        def wavelengths(self, size):
+            """The bands as a ray's wavelengths; unused lanes repeat the last band."""
+            if not mi.is_spectral:
+                return mi.Color0f()
+            bands = (self.bands or (620.0, 540.0, 460.0)) + (self.bands or (460.0,))[-1:] * lanes
+            return dr.zeros(type(mi.Ray3f().wavelengths), size) + mi.UnpolarizedSpectrum(*bands[:lanes])
+
+        def gel(self, scene):
+            """The gel part of the scene, if it has one."""
+            key = scene.ptr if hasattr(scene, "ptr") else id(scene)
+            if key not in self.gel_of:
+                self.gel_of[key] = next((s for s in scene.shapes() if getattr(s, "kind", "") == "gel"), None)
+            return self.gel_of[key]
+
+        # -- one LED at a time: what calibration and batches use ---------------------------------------------------------
+
+        def hits(self, scene, camera, u, v):
+            """Where the camera's rays through the pixel positions (u, v) meet the membrane: (si, weight, origin)."""
+            o, d = camera.ray(u, v)
+            ray = mi.Ray3f(o, d, mi.Float(0), self.wavelengths(dr.width(u)))
+            si = scene.ray_intersect(ray)
+            weight = mi.UnpolarizedSpectrum(1.0)
+            for _ in range(sum(1 for s in scene.shapes() if getattr(s.bsdf(), "kind", "") == "interface")):
+                flat = si.is_valid() & mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.DeltaTransmission)
+                bs, passed = si.bsdf().sample(mi.BSDFContext(), si, mi.Float(0.5), mi.Point2f(0.5), flat)
+                through = scene.ray_intersect(si.spawn_ray(si.to_world(bs.wo)), flat)
+                weight = dr.select(flat, weight * mi.unpolarized_spectrum(passed), weight)
+                si = dr.select(flat, through, si)
+            return si, weight, dr.select(si.is_valid(), si.p + si.to_world(si.wi) * si.t, o)
+
+        def visible(self, scene, si, point):
+            """Whether the straight line from the surface to a point meets nothing (detached)."""
+            with dr.suspend_grad():
+                ray = si.spawn_ray_to(point)
+                return si.is_valid() & ~scene.ray_test(ray, si.is_valid())
+
+        def direct(self, scene, si, weight, origin, led, visibility, sample=None):
+            """Radiance per band that one LED sends to the camera by one reflection (S3, S5), and by the gel itself."""
+            point = led.position() if sample is None else led.point(sample)
+            to_led = point - si.p
+            distance = dr.norm(to_led)
+            s = to_led / distance
+            value = mi.unpolarized_spectrum(si.bsdf().eval(mi.BSDFContext(), si, si.to_local(s), si.is_valid()))
+            light = value * led.radiance(si, s, distance) & visibility
+            gel = self.gel(scene)
+            if gel is not None:
+                path = gel.path(si.p, origin, point, led, si)
+                for function in gel.functions("segment"):
+                    light *= function(path, gel)
+                for function in gel.functions("volume"):
+                    light += dr.select(si.is_valid(), function(path, gel), 0.0)
+            return light * weight
+
+        def ambient(self, scene, si, weight, membrane):
+            """Radiance per band that no LED made."""
+            return dr.select(si.is_valid(), membrane.ambient_radiance(si), 0.0) * weight
+
+        def bounced(self, scene, si, weight, origin, led, count, sampler):
+            """Radiance per band that one LED sends to the camera by two reflections, mean of `count` directions."""
+            total = mi.UnpolarizedSpectrum(0.0)
+            context = mi.BSDFContext()
+            for _ in range(count):
+                bs, factor = si.bsdf().sample(context, si, sampler.next_1d(), sampler.next_2d(), si.is_valid())
+                second = scene.ray_intersect(si.spawn_ray(si.to_world(bs.wo)), si.is_valid())
+                light = self.direct(scene, second, 1.0, si.p, led, self.visible(scene, second, led.position()))
+                total += dr.select(second.is_valid(), mi.unpolarized_spectrum(factor) * light, 0.0)
+            return total * weight / count
+
+        # -- any scene, any light: what mi.render calls --------------------------------------------------------------------
+
+        def aov_names(self):
+            return [f"S{i}.{j}" for i in range(4) for j in range(lanes)] if self.stokes and mi.is_polarized else []
+
+        def sample_rays(self, scene, sensor, sampler, *args, **kwargs):
+            ray, weight, position = super().sample_rays(scene, sensor, sampler, *args, **kwargs)
+            if mi.is_spectral and self.bands:
+                ray.wavelengths = self.wavelengths(dr.width(ray.o))
+                weight = mi.Spectrum(1.0)
+            return ray, weight, position
+
+        def absorption(self, medium, si, active):
+            """sigma_a of a homogeneous medium in each band, 1/mm."""
+            mei = dr.zeros(mi.MediumInteraction3f, dr.width(si))
+            mei.p, mei.wavelengths, mei.medium = si.p, si.wavelengths, medium
+            sigma_s, _, sigma_t = medium.get_scattering_coefficients(mei, active)
+            return sigma_t - sigma_s
+
+        @dr.syntax
+        def transmittance(self, scene, si, ds, medium, active):
+            """Mueller matrix of the straight way from the surface to a light: null surfaces and absorbing media."""
+            through = mi.Spectrum(1.0)
+            ray = si.spawn_ray_to(ds.p)
+            remaining = mi.Float(ray.maxt)
+            inside = mi.MediumPtr(medium)
+            going = mi.Bool(active)
+            step = mi.UInt32(0)
+            while going:
+                ray.maxt = remaining
+                hit = scene.ray_intersect(ray, mi.RayFlags.All, coherent=False, active=going)
+                met = going & hit.is_valid()
+                length = dr.select(met, hit.t, remaining)
+                filled = going & (inside != None)  # noqa: E711 (a Dr.Jit comparison)
+                fade = dr.select(filled, dr.exp(-self.absorption(inside, hit, filled) * length), 1.0)
+                through = product(through, scaled(fade))
+                passed = hit.bsdf().eval_null_transmission(hit, met)
+                passed = hit.to_world_mueller(passed, hit.wi, hit.wi)
+                through = dr.select(met, product(through, passed), through)
+                inside = dr.select(met & hit.is_medium_transition(), hit.target_medium(ray.d), inside)
+                remaining = remaining - length
+                ray = dr.select(met, hit.spawn_ray(ray.d), ray)
+                step += 1
+                going = met & (remaining > 1e-4) & (step < self.max_null) & (
+                    dr.max(mi.unpolarized_spectrum(through)) > 0)
+            return through
+
+        @dr.syntax
+        def sample(self, mode, scene, sampler, ray, δL=None, state_in=None, active=True, **_):
+            context = mi.BSDFContext()
+            ray = mi.Ray3f(ray)
+            first = mi.Vector3f(ray.d)
+            bounce = mi.UInt32(0)  # scattering events so far
+            light = mi.Spectrum(0.0)
+            throughput = mi.Spectrum(1.0)
+            active = mi.Bool(active)
+            previous = dr.zeros(mi.Interaction3f)
+            pdf = mi.Float(1.0)
+            delta = mi.Bool(True)
+            medium = dr.zeros(mi.MediumPtr)
+            step = mi.UInt32(0)
+            while active:
+                si = scene.ray_intersect(ray, mi.RayFlags.All, coherent=False, active=active)
+                filled = active & (medium != None) & si.is_valid()  # noqa: E711
+                fade = dr.select(filled, dr.exp(-self.absorption(medium, si, filled) * si.t), 1.0)
+                throughput = product(throughput, scaled(fade))
+                bsdf = si.bsdf(ray)
+
+                # light that is hit
+                ds = mi.DirectionSample3f(scene, si=si, ref=previous)
+                mis = mis_weight(pdf, scene.pdf_emitter_direction(previous, ds, ~delta))
+                emitted = ds.emitter.eval(si, active) * dr.select(delta, 1.0, mis)
+                light = light + product(throughput, emitted)
+
+                # light that is sampled
+                onward = active & si.is_valid() & (bounce + 1 < self.max_depth)
+                lit = onward & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+                ds, sent = scene.sample_emitter_direction(si, sampler.next_2d(), False, lit)
+                lit &= ds.pdf != 0
+                start = dr.select(si.is_medium_transition(), si.target_medium(ds.d), medium)
+                way = self.transmittance(scene, si, ds, start, lit)
+                wo = si.to_local(ds.d)
+                value, density = bsdf.eval_pdf(context, si, wo, lit)
+                value = si.to_world_mueller(value, -wo, si.wi)
+                mis = dr.select(ds.delta, 1.0, mis_weight(ds.pdf, density))
+                added = product(product(product(throughput, value), way), sent) * mis
+                light = dr.select(lit, light + added, light)
+
+                # onward
+                bs, factor = bsdf.sample(context, si, sampler.next_1d(), sampler.next_2d(), onward)
+                factor = si.to_world_mueller(factor, -bs.wo, si.wi)
+                straight = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
+                smooth = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Smooth)
+                throughput = dr.select(onward, product(throughput, factor), throughput)
+                throughput = dr.select(onward & smooth, throughput * self.interreflection, throughput)
+                direction = si.to_world(bs.wo)
+                medium = dr.select(onward & si.is_medium_transition(), si.target_medium(direction), medium)
+                ray = si.spawn_ray(direction)
+                scattered = onward & ~straight
+                previous = dr.select(scattered, dr.detach(mi.Interaction3f(si)), previous)
+                pdf = dr.select(scattered, dr.detach(bs.pdf), pdf)
+                delta = dr.select(scattered, mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta), delta)
+                bounce = dr.select(scattered, bounce + 1, bounce)
+                step += 1
+                active = onward & (dr.max(mi.unpolarized_spectrum(throughput)) > 0) & (
+                    step < self.max_depth + self.max_null)
+            channels = []
+            if dr.hint(self.stokes and mi.is_polarized, mode="scalar"):
+                basis = mi.mueller.stokes_basis(-first)
+                up = dr.normalize(dr.cross(first, mi.Vector3f(0, -1, 0)))
+                vector = mi.mueller.rotate_stokes_basis_m(-first, basis, up) @ light
+                channels = [vector[i, 0][j] for i in range(4) for j in range(lanes)]
+            return light, mi.Bool(True), channels, None
+
+        def to_string(self):
+            return f"Tactile[bands={self.bands}]"
+
+    return Tactile
+
+
+part = Part("tactile", "integrator", PARAMETERS, build)
