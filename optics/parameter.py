@@ -27,6 +27,8 @@ class Parameter:
     plausible   the size of a change that a real sensor shows; sets steps and scales, > 0
     how         how its derivative image is made: 'ad' (forward mode through the render), 'difference' (central, common
                 random numbers: it moves shadows or geometry), 'image' (arithmetic on the linear images)
+    squared     True where the image depends on the square of it (a roughness): a fit steps in the square, whose onset is
+                linear, and stays above a thousandth of `plausible`
     linear      True where the image is exactly linear in it (one render serves every value)
     choices     the allowed words, for a parameter that is a choice and not a number
     """
@@ -40,6 +42,7 @@ class Parameter:
     plausible: float = 1.0
     how: str = "ad"
     linear: bool = False
+    squared: bool = False
     choices: tuple[str, ...] = ()
 
     def __post_init__(self):

@@ -1,0 +1,345 @@
+"""Calibration: the values of free parameters that explain the captures, by Levenberg-Marquardt on derivative images.
+
+    minimise  sum_pixels ((y - f(theta)) / sigma)^2 + sum_priors ((theta - mean) / sd)^2
+
+with sigma from the prediction (not from the data), re-evaluated at every step; masks from data and noise only. The
+priors hold the lambda term of S4. Frames are streamed: only the normal equations are kept.
+"""
+
+from __future__ import annotations
+
+import fnmatch
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from optics.errors import Underdetermined, UnknownKey
+from optics.parameter import Values, Variable
+
+TRUNCATION = 1e-12  # eigenvalues of the scaled normal matrix below this share of the largest count as undetermined
+
+
+@dataclass
+class Fit:
+    """What a calibration found.
+
+    values       start values with the estimates put in
+    estimate     (p,) in the order of `variables`; covariance (p, p) from the noise model and the priors
+    chi2, dof    of the data, without priors; per frame in frame_chi2, frame_n
+    converged    whether the predicted further fall is below 0.1 per variable; `reason` says why it stopped
+    undetermined combinations of variables that the captures say nothing about, as sentences
+    """
+
+    values: Values
+    variables: list[Variable]
+    estimate: np.ndarray
+    covariance: np.ndarray
+    chi2: float
+    dof: int
+    frames: list[int]
+    frame_chi2: list[float]
+    frame_n: list[int]
+    converged: bool
+    reason: str
+    history: list[float] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+    start: np.ndarray | None = None
+    at_bound: list[str] = field(default_factory=list)
+
+    @property
+    def sd(self) -> np.ndarray:
+        return np.sqrt(np.maximum(np.diag(self.covariance), 0))
+
+    @property
+    def correlation(self) -> np.ndarray:
+        sd = np.where((self.sd > 0) & np.isfinite(self.sd), self.sd, 1)
+        return self.covariance / np.outer(sd, sd)
+
+    @property
+    def chi2_per_dof(self) -> float:
+        return self.chi2 / max(self.dof, 1)
+
+    def table(self) -> str:
+        """One line per variable: estimate, standard deviation, unit, start, and what it correlates with most."""
+        lines = [f"{'variable':<28}{'estimate':>12}{'+- sd':>11}  {'unit':<6}{'start':>11}   strongest correlation"]
+        correlation = np.abs(self.correlation - np.eye(len(self.variables)))
+        for i, variable in enumerate(self.variables):
+            j = int(np.argmax(correlation[i])) if len(self.variables) > 1 else i
+            other = f"{self.correlation[i, j]:+.2f} {self.variables[j].name}" if j != i else ""
+            start = "" if self.start is None else f"{self.start[i]:11.5g}"
+            bound = "  at its bound" if variable.name in self.at_bound else ""
+            lines.append(f"{variable.name:<28}{self.estimate[i]:12.5g}{self.sd[i]:11.2g}  {variable.parameter.unit:<6}"
+                         f"{start}   {other}{bound}")
+        lines.append(f"chi2 per degree of freedom {self.chi2_per_dof:.4f} ({self.dof} degrees of freedom); {self.reason}")
+        return "\n".join([*lines, *(f"warning: {w}" for w in self.warnings)])
+
+
+@dataclass
+class Normal:
+    """Normal equations at one point: A = J'WJ + priors, b = J'Wr + priors, chi2 of data and of priors."""
+
+    a: np.ndarray
+    b: np.ndarray
+    chi2: float
+    prior: float
+    frame_chi2: list[float]
+    frame_n: list[int]
+
+
+def variables_from(model, free: Sequence[str], per_group: Sequence[str] = (), priors: Mapping[str, tuple] | None = None,
+                   frames: Sequence[int] | None = None) -> list[Variable]:
+    """Variables for key patterns: `free` in all frames (`led_*.x`), `per_group` with a value per group of frames.
+
+    priors: pattern -> (mean or None for the present value, standard deviation).
+    Raises UnknownKey for a pattern that matches no number of the scene.
+    """
+    numbers = [k for k, p in model.parameters.items() if p.is_number]
+    variables = []
+
+    def matching(pattern):
+        found = fnmatch.filter(numbers, pattern)
+        if not found:
+            raise UnknownKey(pattern, numbers, "parameter", hint="`optics params SCENE` lists them; * and ? match")
+        return found
+
+    for pattern in free:
+        variables += [Variable(k, (k,), model.parameters[k]) for k in matching(pattern)
+                      if all(k != v.name for v in variables)]
+    groups: dict[str, list[int]] = {}
+    for index in range(len(model.frames)) if frames is None else frames:
+        frame = model.frames[index]
+        groups.setdefault(frame.group or frame.name, []).append(index)
+    for pattern in per_group:
+        for key in matching(pattern):
+            variables += [Variable(f"{key}[{g}]", (key,), model.parameters[key], tuple(ii)) for g, ii in groups.items()]
+    for pattern, (mean, sd) in (priors or {}).items():
+        hit = False
+        for i, v in enumerate(variables):
+            if fnmatch.fnmatch(v.keys[0], pattern) or fnmatch.fnmatch(v.name, pattern):
+                variables[i] = v.with_prior(start_of(model, v, Values()) if mean is None else mean, sd)
+                hit = True
+        if not hit:
+            raise UnknownKey(pattern, [v.name for v in variables], "free parameter for a prior")
+    return variables
+
+
+def start_of(model, variable: Variable, values: Values) -> float:
+    """The value that a variable starts from: the fitted one, else what its frames set, else the scene's."""
+    if variable.frames is not None:
+        return float(model.at(values, variable.frames[0])[variable.keys[0]])
+    return float(values.common.get(variable.keys[0], model.base[variable.keys[0]]))
+
+
+def with_start(model, variables: Sequence[Variable], values: Values) -> Values:
+    """Values in which every variable is put explicitly."""
+    filled = values.copy()
+    for variable in variables:
+        filled.put(variable, start_of(model, variable, values))
+    return filled
+
+
+def pose_variables(variables: Sequence[Variable]) -> list[Variable]:
+    """The variables of single frames or groups: what is fitted again on frames that were held out."""
+    return [v for v in variables if v.frames is not None]
+
+
+def huber(whitened: np.ndarray, limit: float = 3.0) -> np.ndarray:
+    """Weights min(1, limit/|r|): what robust fitting multiplies into 1/sigma^2."""
+    return np.minimum(1.0, limit / np.maximum(np.abs(whitened), 1e-12))
+
+
+def normal_equations(model, variables: Sequence[Variable], values: Values, frames: Sequence[int], robust: bool = False,
+                     tick: Callable[[], None] | None = None) -> Normal:
+    """J'WJ, J'Wr and chi2 of the frames at the values, with the priors' rows."""
+    p = len(variables)
+    a, b = np.zeros((p, p)), np.zeros(p)
+    index_of = {v.name: i for i, v in enumerate(variables)}
+    total, frame_chi2, frame_n = 0.0, [], []
+    for frame, (prediction, images) in zip(frames, model.derivatives(values, variables, frames)):
+        mask = model.usable(frame)
+        weight = mask / model.noise.variance(prediction)
+        residual = np.where(mask, model.frames[frame].image - prediction, 0.0)
+        if robust:
+            weight = weight * huber(residual * np.sqrt(weight))
+        whitened = (residual * np.sqrt(weight)).ravel().astype(np.float32)
+        names = list(images)
+        scale = np.sqrt(weight).astype(np.float32)
+        j = np.stack([(images[n] * scale).ravel() for n in names]) if names else np.zeros((0, whitened.size), np.float32)
+        where = [index_of[n] for n in names]
+        a[np.ix_(where, where)] += (j @ j.T).astype(float)
+        b[where] += (j @ whitened).astype(float)
+        frame_chi2.append(float(whitened.astype(float) @ whitened))
+        frame_n.append(int(mask.sum()))
+        total += frame_chi2[-1]
+        if tick:
+            tick()
+    prior = 0.0
+    for i, v in enumerate(variables):
+        if v.prior is not None:
+            mean, sd = v.prior
+            gap = mean - start_of(model, v, values)
+            a[i, i] += 1 / sd**2
+            b[i] += gap / sd**2
+            prior += (gap / sd) ** 2
+    return Normal(a, b, total, prior, frame_chi2, frame_n)
+
+
+def misfit(model, variables: Sequence[Variable], values: Values, frames: Sequence[int], weights_at: Values,
+           robust: bool = False, predicted: Sequence[np.ndarray] | None = None) -> float:
+    """chi2 + priors at `values` with the weights of `weights_at` (so that two points compare on one scale)."""
+    total = 0.0
+    reference = predicted if predicted is not None else model.predict(weights_at, frames)
+    for frame, prediction, other in zip(frames, model.predict(values, frames), reference):
+        mask = model.usable(frame)
+        weight = mask / model.noise.variance(other)
+        residual = np.where(mask, model.frames[frame].image - prediction, 0.0)
+        if robust:
+            whitened = residual * np.sqrt(weight)
+            size = np.abs(whitened)
+            total += float(np.where(size < 3, size**2, 6 * size - 9).sum())
+        else:
+            total += float((residual**2 * weight).sum())
+    for v in variables:
+        if v.prior is not None:
+            total += ((start_of(model, v, values) - v.prior[0]) / v.prior[1]) ** 2
+    return total
+
+
+def solve(a: np.ndarray, b: np.ndarray, damping: float) -> tuple[np.ndarray, np.ndarray]:
+    """Damped step in the eigenbasis of the scaled matrix; directions below TRUNCATION stay put. Returns step, kept share."""
+    scale = np.sqrt(np.maximum(np.diag(a), 1e-300))
+    eigen, vectors = np.linalg.eigh(a / np.outer(scale, scale))
+    kept = eigen > TRUNCATION * max(eigen.max(), 1e-300)
+    projected = vectors.T @ (b / scale)
+    step = vectors @ np.where(kept, projected / (np.where(kept, eigen, 1) + damping), 0)
+    return step / scale, kept
+
+
+def fit(model, variables: Sequence[Variable], start: Values | None = None, frames: Sequence[int] | None = None, *,
+        max_iterations: int = 40, robust: bool = False, tolerance: float = 0.01,
+        progress: Callable[[str, int, int], None] | None = None) -> Fit:
+    """Levenberg-Marquardt within bounds.
+
+    A variable that stands at a bound and is pushed outwards is held for that step. Stops when the fall of chi2 that the linear
+    model still predicts is below `tolerance` per variable, or when no damping gives a lower chi2.
+    Raises Underdetermined when no pixel is usable or no variable does anything.
+    """
+    variables = list(variables)
+    frames = list(range(len(model.frames))) if frames is None else list(frames)
+    values = with_start(model, variables, start or Values())
+    first = np.array([start_of(model, v, values) for v in variables])
+    for v, value in zip(variables, first):
+        v.parameter.check(value, v.name, "start value")
+    low = np.array([v.parameter.bounds[0] for v in variables])
+    high = np.array([v.parameter.bounds[1] for v in variables])
+    squared = np.array([v.parameter.squared for v in variables], bool)
+    floor = np.array([1e-3 * v.parameter.plausible for v in variables])
+    low = np.where(squared, np.maximum(low, floor), low)
+    theta = np.clip(first, low, high)
+    for v, value in zip(variables, theta):
+        values.put(v, float(value))
+    damping, history, reason, converged = 1e-3, [], "", False
+    done = 0
+
+    def tick():
+        nonlocal done
+        done += 1
+        if progress:
+            progress("calibrate", done, max_iterations * len(frames))
+
+    for iteration in range(max_iterations):
+        normal = normal_equations(model, variables, values, frames, robust, tick)
+        if sum(normal.frame_n) == 0:
+            raise Underdetermined("no usable pixel: every pixel is saturated, at black, or masked; check [noise] "
+                                  "black_level and saturation in captures.toml, and the masks")
+        history.append(normal.chi2 + normal.prior)
+        # steps are taken in theta, or in theta^2 where the image depends on that
+        slope = np.where(squared, 1 / (2 * np.where(squared, theta, 1)), 1.0)
+        normal.a *= np.outer(slope, slope)
+        normal.b *= slope
+        silent = [v.name for i, v in enumerate(variables) if normal.a[i, i] == 0]
+        if len(silent) == len(variables) and variables:
+            raise Underdetermined(f"none of the {len(variables)} free parameters changes any frame: {', '.join(silent[:6])}")
+        if not variables:
+            reason, converged = "nothing to fit", True
+            break
+        held = ((theta <= low) & (normal.b < 0)) | ((theta >= high) & (normal.b > 0)) | (np.diag(normal.a) == 0)
+        free = ~held
+        still, _ = solve(normal.a[np.ix_(free, free)], normal.b[free], 0.0)
+        predicted = float(normal.b[free] @ still)
+        if predicted < tolerance * max(free.sum(), 1):
+            reason, converged = f"converged after {iteration} steps", True
+            break
+        reference = model.predict(values, frames)
+        before = misfit(model, variables, values, frames, values, robust, reference)
+        for _ in range(9):
+            step = np.zeros_like(theta)
+            step[free], _ = solve(normal.a[np.ix_(free, free)], normal.b[free], damping)
+            trial = np.where(squared, np.sqrt(np.maximum(theta**2 + step, 0)), theta + step)
+            trial = np.clip(trial, low, high)
+            moved = values.copy()
+            for v, value in zip(variables, trial):
+                moved.put(v, float(value))
+            after = misfit(model, variables, moved, frames, values, robust, reference)
+            if np.isfinite(after) and after < before:
+                theta, values = trial, moved
+                damping = max(damping / 10, 1e-9)
+                break
+            damping = max(damping * 10, 1e-6)
+        else:
+            # what is left to gain is below what moving shadow rims can follow
+            reason, converged = f"no lower misfit within reach; the linear model still promised {predicted:.3g}", predicted < len(theta)
+            break
+        if before - after < tolerance * max(free.sum(), 1) and predicted < len(theta):
+            reason, converged = f"converged after {iteration + 1} steps", True
+            break
+    else:
+        reason = f"stopped after {max_iterations} steps without converging; allow more or start nearer"
+    normal = normal_equations(model, variables, values, frames, robust)
+    result = Fit(values, variables, theta, covariance_of(normal.a), normal.chi2,
+                 sum(normal.frame_n) - len(variables) + sum(v.prior is not None for v in variables), frames,
+                 normal.frame_chi2, normal.frame_n, converged, reason, history, start=first)
+    result.at_bound = [v.name for v, t, lo, hi in zip(variables, theta, low, high) if t <= lo or t >= hi]
+    result.warnings = warnings_of(result, normal.a)
+    return result
+
+
+def covariance_of(a: np.ndarray) -> np.ndarray:
+    """Inverse of the normal matrix on what is determined; undetermined variables get an infinite variance."""
+    if not len(a):
+        return np.zeros((0, 0))
+    scale = np.sqrt(np.where(np.diag(a) > 0, np.diag(a), 1))
+    eigen, vectors = np.linalg.eigh(a / np.outer(scale, scale))
+    kept = eigen > TRUNCATION * max(eigen.max(), 1e-300)
+    inverse = (vectors[:, kept] / eigen[kept]) @ vectors[:, kept].T / np.outer(scale, scale)
+    lost = (np.abs(vectors[:, ~kept]) > 1e-2).any(1) | (np.diag(a) == 0)
+    inverse[lost, lost] = np.inf
+    return inverse
+
+
+def warnings_of(result: Fit, a: np.ndarray) -> list[str]:
+    """Sentences about variables that cannot be told apart, that do nothing, or that stand at a bound."""
+    texts = []
+    names = [v.name for v in result.variables]
+    silent = [n for n, d in zip(names, np.diag(a)) if d == 0]
+    if silent:
+        texts.append(f"nothing in the frames depends on {', '.join(silent)}")
+    if len(a):
+        scale = np.sqrt(np.where(np.diag(a) > 0, np.diag(a), 1))
+        eigen, vectors = np.linalg.eigh(a / np.outer(scale, scale))
+        for value, vector in zip(eigen, vectors.T):
+            if value < 1e-7 * eigen.max():
+                part = [n for n, c in zip(names, vector) if abs(c) > 0.15 and n not in silent]
+                if len(part) > 1:
+                    texts.append(f"the captures cannot tell apart {', '.join(part[:8])}{' ...' if len(part) > 8 else ''}: only "
+                                 "a combination is determined; hold one of them, or give it a prior")
+    correlation = result.correlation
+    for i in range(len(names)):
+        for j in range(i):
+            if np.isfinite(correlation[i, j]) and abs(correlation[i, j]) > 0.995:
+                texts.append(f"{names[j]} and {names[i]} are correlated to {correlation[i, j]:+.4f}")
+    texts += [f"{n} ended at its bound" for n in result.at_bound]
+    if not result.converged:
+        texts.append(result.reason)
+    return texts
