@@ -77,7 +77,10 @@ class Fit:
 
 @dataclass
 class Normal:
-    """Normal equations at one point: A = J'WJ + priors, b = J'Wr + priors, chi2 of data and of priors."""
+    """Normal equations at one point: A = J'WJ + priors, b = J'Wr + priors, chi2 of data and of priors.
+
+    rows   per frame: which variables act in it, their whitened derivative images (k, n), sqrt(weight), residual whitened
+    """
 
     a: np.ndarray
     b: np.ndarray
@@ -85,6 +88,11 @@ class Normal:
     prior: float
     frame_chi2: list[float]
     frame_n: list[int]
+    rows: list[tuple[list[int], np.ndarray, np.ndarray]]
+
+    @property
+    def total(self) -> float:
+        return self.chi2 + self.prior
 
 
 def variables_from(model, free: Sequence[str], per_group: Sequence[str] = (), priors: Mapping[str, tuple] | None = None,
@@ -155,55 +163,53 @@ def normal_equations(model, variables: Sequence[Variable], values: Values, frame
     p = len(variables)
     a, b = np.zeros((p, p)), np.zeros(p)
     index_of = {v.name: i for i, v in enumerate(variables)}
-    total, frame_chi2, frame_n = 0.0, [], []
+    frame_chi2, frame_n, rows = [], [], []
     for frame, (prediction, images) in zip(frames, model.derivatives(values, variables, frames)):
         mask = model.usable(frame)
-        weight = mask / model.noise.variance(prediction)
-        residual = np.where(mask, model.frames[frame].image - prediction, 0.0)
+        scale = np.sqrt(mask / model.noise.variance(prediction)).astype(np.float32)
         if robust:
-            weight = weight * huber(residual * np.sqrt(weight))
-        whitened = (residual * np.sqrt(weight)).ravel().astype(np.float32)
-        names = list(images)
-        scale = np.sqrt(weight).astype(np.float32)
-        j = np.stack([(images[n] * scale).ravel() for n in names]) if names else np.zeros((0, whitened.size), np.float32)
-        where = [index_of[n] for n in names]
+            scale *= np.sqrt(huber((model.frames[frame].image - prediction) * scale)).astype(np.float32)
+        whitened = whiten(model, frame, prediction, scale)
+        j = (np.stack([(image * scale).ravel() for image in images.values()]) if images
+             else np.zeros((0, whitened.size), np.float32))
+        where = [index_of[n] for n in images]
         a[np.ix_(where, where)] += (j @ j.T).astype(float)
         b[where] += (j @ whitened).astype(float)
         frame_chi2.append(float(whitened.astype(float) @ whitened))
         frame_n.append(int(mask.sum()))
-        total += frame_chi2[-1]
+        rows.append((where, j, scale))
         if tick:
             tick()
-    prior = 0.0
+    pull, curvature, prior = prior_terms(model, variables, values)
+    return Normal(a + np.diag(curvature), b + pull, sum(frame_chi2), prior, frame_chi2, frame_n, rows)
+
+
+def whiten(model, frame: int, prediction: np.ndarray, scale: np.ndarray) -> np.ndarray:
+    """Residual times sqrt(weight), flat; 0 where a pixel is not used."""
+    return np.where(scale > 0, (model.frames[frame].image - prediction) * scale, 0).ravel().astype(np.float32)
+
+
+def prior_terms(model, variables: Sequence[Variable], values: Values) -> tuple[np.ndarray, np.ndarray, float]:
+    """Gradient, curvature and value of the priors' share of the misfit."""
+    pull, curvature, total = np.zeros(len(variables)), np.zeros(len(variables)), 0.0
     for i, v in enumerate(variables):
         if v.prior is not None:
             mean, sd = v.prior
             gap = mean - start_of(model, v, values)
-            a[i, i] += 1 / sd**2
-            b[i] += gap / sd**2
-            prior += (gap / sd) ** 2
-    return Normal(a, b, total, prior, frame_chi2, frame_n)
+            pull[i], curvature[i] = gap / sd**2, 1 / sd**2
+            total += (gap / sd) ** 2
+    return pull, curvature, total
 
 
-def misfit(model, variables: Sequence[Variable], values: Values, frames: Sequence[int], weights_at: Values,
-           robust: bool = False, predicted: Sequence[np.ndarray] | None = None) -> float:
-    """chi2 + priors at `values` with the weights of `weights_at` (so that two points compare on one scale)."""
-    total = 0.0
-    reference = predicted if predicted is not None else model.predict(weights_at, frames)
-    for frame, prediction, other in zip(frames, model.predict(values, frames), reference):
-        mask = model.usable(frame)
-        weight = mask / model.noise.variance(other)
-        residual = np.where(mask, model.frames[frame].image - prediction, 0.0)
-        if robust:
-            whitened = residual * np.sqrt(weight)
-            size = np.abs(whitened)
-            total += float(np.where(size < 3, size**2, 6 * size - 9).sum())
-        else:
-            total += float((residual**2 * weight).sum())
-    for v in variables:
-        if v.prior is not None:
-            total += ((start_of(model, v, values) - v.prior[0]) / v.prior[1]) ** 2
-    return total
+def again(model, variables: Sequence[Variable], values: Values, frames: Sequence[int], normal: Normal) -> Normal:
+    """The normal equations at other values with the derivative images and weights of `normal`: one prediction, no derivative."""
+    b, frame_chi2 = np.zeros(len(variables)), []
+    for frame, prediction, (where, j, scale) in zip(frames, model.predict(values, frames), normal.rows):
+        whitened = whiten(model, frame, prediction, scale)
+        b[where] += (j @ whitened).astype(float)
+        frame_chi2.append(float(whitened.astype(float) @ whitened))
+    pull, _, prior = prior_terms(model, variables, values)
+    return Normal(normal.a, b + pull, sum(frame_chi2), prior, frame_chi2, normal.frame_n, normal.rows)
 
 
 def solve(a: np.ndarray, b: np.ndarray, damping: float) -> tuple[np.ndarray, np.ndarray]:
@@ -240,7 +246,7 @@ def fit(model, variables: Sequence[Variable], start: Values | None = None, frame
     for v, value in zip(variables, theta):
         values.put(v, float(value))
     damping, history, reason, converged = 1e-3, [], "", False
-    done = 0
+    done, accuracy = 0, tolerance * max(len(variables), 1)
 
     def tick():
         nonlocal done
@@ -248,55 +254,66 @@ def fit(model, variables: Sequence[Variable], start: Values | None = None, frame
         if progress:
             progress("calibrate", done, max_iterations * len(frames))
 
+    def step_from(now: Normal) -> tuple[Values, np.ndarray, float]:
+        """Damped step in theta, or in theta^2 where the image depends on that; and the fall that no damping would bring."""
+        slope = np.where(squared, 1 / (2 * np.where(squared, theta, 1)), 1.0)
+        a, b = now.a * np.outer(slope, slope), now.b * slope
+        free = ~(((theta <= low) & (b < 0)) | ((theta >= high) & (b > 0)) | (np.diag(a) == 0))
+        promised = float(b[free] @ solve(a[np.ix_(free, free)], b[free], 0.0)[0])
+        step = np.zeros_like(theta)
+        step[free], _ = solve(a[np.ix_(free, free)], b[free], damping)
+        trial = np.clip(np.where(squared, np.sqrt(np.maximum(theta**2 + step, 0)), theta + step), low, high)
+        moved = values.copy()
+        for v, value in zip(variables, trial):
+            moved.put(v, float(value))
+        return moved, trial, promised
+
     for iteration in range(max_iterations):
         normal = normal_equations(model, variables, values, frames, robust, tick)
         if sum(normal.frame_n) == 0:
             raise Underdetermined("no usable pixel: every pixel is saturated, at black, or masked; check [noise] "
                                   "black_level and saturation in captures.toml, and the masks")
-        history.append(normal.chi2 + normal.prior)
-        # steps are taken in theta, or in theta^2 where the image depends on that
-        slope = np.where(squared, 1 / (2 * np.where(squared, theta, 1)), 1.0)
-        normal.a *= np.outer(slope, slope)
-        normal.b *= slope
         silent = [v.name for i, v in enumerate(variables) if normal.a[i, i] == 0]
         if len(silent) == len(variables) and variables:
             raise Underdetermined(f"none of the {len(variables)} free parameters changes any frame: {', '.join(silent[:6])}")
-        if not variables:
-            reason, converged = "nothing to fit", True
+        history.append(normal.total)
+        first_promise = step_from(normal)[2] if variables else 0.0
+        here = normal
+        if first_promise < accuracy:
+            reason, converged = f"converged after {iteration} linearisations", True
             break
-        held = ((theta <= low) & (normal.b < 0)) | ((theta >= high) & (normal.b > 0)) | (np.diag(normal.a) == 0)
-        free = ~held
-        still, _ = solve(normal.a[np.ix_(free, free)], normal.b[free], 0.0)
-        predicted = float(normal.b[free] @ still)
-        if predicted < tolerance * max(free.sum(), 1):
-            reason, converged = f"converged after {iteration} steps", True
-            break
-        reference = model.predict(values, frames)
-        before = misfit(model, variables, values, frames, values, robust, reference)
-        for _ in range(9):
-            step = np.zeros_like(theta)
-            step[free], _ = solve(normal.a[np.ix_(free, free)], normal.b[free], damping)
-            trial = np.where(squared, np.sqrt(np.maximum(theta**2 + step, 0)), theta + step)
-            trial = np.clip(trial, low, high)
-            moved = values.copy()
-            for v, value in zip(variables, trial):
-                moved.put(v, float(value))
-            after = misfit(model, variables, moved, frames, values, robust, reference)
-            if np.isfinite(after) and after < before:
-                theta, values = trial, moved
-                damping = max(damping / 10, 1e-9)
+        # A linearisation serves for several steps while they keep the misfit falling fast (a chord method): derivative
+        # images cost many times what a prediction does.
+        gained, stuck = 0.0, False
+        for _ in range(12):
+            moved, trial, promised = step_from(here)
+            if promised < accuracy / 10 or (gained and promised > 0.3 * first_promise):
                 break
-            damping = max(damping * 10, 1e-6)
-        else:
-            # what is left to gain is below what moving shadow rims can follow
-            reason, converged = f"no lower misfit within reach; the linear model still promised {predicted:.3g}", predicted < len(theta)
-            break
-        if before - after < tolerance * max(free.sum(), 1) and predicted < len(theta):
-            reason, converged = f"converged after {iteration + 1} steps", True
+            there = again(model, variables, moved, frames, here)
+            if np.isfinite(there.total) and there.total < here.total:
+                gain = here.total - there.total
+                theta, values, here = trial, moved, there
+                gained += gain
+                damping = max(damping / 10, 1e-9)
+                if gain < 0.25 * promised and gain > accuracy:
+                    break
+                if gain < accuracy / 10:
+                    break
+            else:
+                damping = max(damping * 10, 1e-6)
+                if damping > 1e4:
+                    stuck = True
+                    break
+        if stuck or gained < accuracy / 10:
+            # what is left to gain is less than what derivative images at moving shadow rims can follow
+            converged = first_promise < max(len(theta), 1)
+            reason = (f"converged after {iteration + 1} linearisations" if converged else
+                      f"no lower misfit within reach; the linear model still promised {first_promise:.3g}")
             break
     else:
-        reason = f"stopped after {max_iterations} steps without converging; allow more or start nearer"
-    normal = normal_equations(model, variables, values, frames, robust)
+        reason = f"stopped after {max_iterations} linearisations without converging; allow more or start nearer"
+    if here is not normal:  # the last steps moved on from where the derivative images were made
+        normal = normal_equations(model, variables, values, frames, robust)
     result = Fit(values, variables, theta, covariance_of(normal.a), normal.chi2,
                  sum(normal.frame_n) - len(variables) + sum(v.prior is not None for v in variables), frames,
                  normal.frame_chi2, normal.frame_n, converged, reason, history, start=first)

@@ -1,7 +1,7 @@
 """What the camera makes of the light: bands to irradiance, channels, response, digital numbers.
 
     I_b  = lens(L_b)                        effects of the stage `lens`
-    I_c  = exposure gain sum_b M_cb I_b     then effects of the stage `sensor`
+    I_c  = exposure gain gain_c sum_b M_cb I_b     then effects of the stage `sensor`
     m_c  = G_c^-1(I_c)                      then effects of the stage `response`
     DN   = black + (saturation - black) m_c + offset
 
@@ -80,7 +80,11 @@ class Developer:
         """Irradiance per channel, 1 = full scale, of an image per band (H, W, B)."""
         image = self._stage("lens", image, view)
         image = image @ self.matrix.T
-        return self._stage("sensor", image * (view.exposure * view.gain), view)
+        return self._stage("sensor", image * (view.exposure * self.gains(view)), view)
+
+    def gains(self, view) -> np.ndarray:
+        """(C,) gain of each channel."""
+        return view.gain * np.array([getattr(view, f"gain_{'rgb'[min(c, 2)]}") for c in range(len(self.matrix))])
 
     def respond(self, irradiance, view):
         """DN of an irradiance per channel."""

@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 import numpy as np
 
 from optics.captures import Captures, Frame
-from optics.develop import Developer
+from optics.develop import STEP, Developer
 from optics.effect import registry
 from optics.errors import BadScene, UnknownKey
 from optics.noise import Noise
@@ -23,6 +23,8 @@ from optics.parameter import Parameter, Values, Variable
 from optics.scene import Scene
 
 RIM_GRID = 4  # samples per pixel side at rims
+POWERS = ("power", "power_r", "power_g", "power_b")  # images are kept per unit of each
+FLAT_FIELDS = ("multiplicative", "additive")
 BOUNCE_SAMPLES = 64  # directions per pixel for the second bounce
 
 
@@ -50,8 +52,10 @@ class Renderer:
         self.ambient_keys = [k for k in own if self.kind(k) == "membrane" and k.rsplit(".", 1)[1] in ambient]
         self.shading_keys = [k for k in own if k not in self.geometry_keys and k != self.bounce_key
                              and k not in self.ambient_keys]
-        self.led_keys = {n: [k for k in led_keys if k.rsplit(".", 1)[0] == n and not k.endswith(".power")]
+        self.led_keys = {n: [k for k in led_keys if k.rsplit(".", 1)[0] == n and k.rsplit(".", 1)[1] not in POWERS]
                          for n in scene.leds}
+        self._tangents: OrderedDict = OrderedDict()
+        self.together: set[str] = set()  # LEDs whose images are wanted of the same geometry
 
     def kind(self, key: str) -> str:
         part = self.scene.parts.get(key.rsplit(".", 1)[0])
@@ -65,7 +69,7 @@ class Renderer:
     def _apply(self, values: Mapping) -> None:
         """Set everything but the LEDs' powers, which stay at 1: images are kept per unit of power."""
         now = {k: v for k, v in values.items() if k in self.scene.parameters}
-        now.update({f"{n}.power": 1.0 for n in self.scene.leds})
+        now.update({f"{n}.{power}": 1.0 for n in self.scene.leds for power in POWERS})
         self.scene.set(now)
 
     def _trace(self, u: np.ndarray, v: np.ndarray) -> tuple:
@@ -106,7 +110,14 @@ class Renderer:
             return self._images[key]
         hits = self.hits(values)
         self._apply(values)
-        image = self._render_led(hits, led)
+        image = self._keep(key, self._render_led(hits, led))
+        for other in self.together - {led}:  # moving the geometry costs more than an image: make what will be asked for next
+            key = self._led_key(values, other)
+            if key not in self._images:
+                self._keep(key, self._render_led(hits, other))
+        return image
+
+    def _keep(self, key: tuple, image: "LedImage") -> "LedImage":
         self._images[key] = image
         while len(self._images) > self.remember * len(self.scene.leds):
             self._images.popitem(last=False)
@@ -115,9 +126,10 @@ class Renderer:
     def _render_led(self, hits: "Hits", led: str, rim: np.ndarray | None = None) -> "LedImage":
         part = self.scene.leds[led]
         visible = self._visible(hits.si, part)
-        lit = np.array(visible).reshape(self.height, self.width)
+        seen = np.array(visible).reshape(-1, self.height, self.width)  # one for each point of the source
+        lit = seen.mean(0) > 0.5
         if rim is None:
-            rim = _edges(lit & hits.valid) | hits.edges
+            rim = np.logical_or.reduce([_edges(s & hits.valid) for s in seen]) | hits.edges
         index = np.flatnonzero(rim)
         samples = self._rim_samples(hits, index)
         rim_visible = self._visible(samples[0], part) if len(index) else None
@@ -151,7 +163,7 @@ class Renderer:
         share = []
         for place in self._discs(part):
             point = part.position() if place is None else part.point(mi.Point2f(*place))
-            share.append(integrator.visible(self.scene.mitsuba, si, dr.detach(point)))
+            share.append(integrator.visible(self.scene.mitsuba, si, dr.detach(point), part))
         dr.eval(share)
         return share[0] if len(share) == 1 else share
 
@@ -179,6 +191,20 @@ class Renderer:
 
         dr.eval(spectrum)  # lane by lane: one array of all lanes would carry its size into the kernel
         return np.stack([np.array(spectrum[i]) for i in range(self.bands)], -1)
+
+    def powers(self, values: Mapping, led: str) -> np.ndarray:
+        """(B,) power of an LED in each band, relative to its image."""
+        shares = [values[f"{led}.{name}"] for name in POWERS[1:]] + [1.0] * self.bands
+        return values[f"{led}.power"] * np.array(shares[:self.bands])
+
+    def led_tangent_at_rest(self, values: Mapping, led: str, key: str) -> np.ndarray:
+        """`led_tangent`, kept: all frames share the gel at rest."""
+        known = (key, *self._led_key(values, led))
+        if known not in self._tangents:
+            self._tangents[known] = self.led_tangent(values, led, key).astype(np.float32)
+            while len(self._tangents) > 8 * len(self.scene.leds):
+                self._tangents.popitem(last=False)
+        return self._tangents[known]
 
     def led_tangent(self, values: Mapping, led: str, key: str) -> np.ndarray:
         """d radiance / d parameter of one LED's image, forward mode; rims by central differences where the LED moves."""
@@ -298,9 +324,12 @@ class Model:
     base         scene values overlaid with what holds in every frame, by key
     parameters   key -> Parameter
     shape        (H, W, C)
+    flat_field   how the measured background B of the untouched sensor enters: "multiplicative" (True), what the scene
+                 does not know of the background is a gain; "additive", it is light that a press leaves as it is; None
     """
 
-    def __init__(self, scene: Scene, captures: Captures, noise: Noise | None = None, flat_field: bool = True):
+    def __init__(self, scene: Scene, captures: Captures, noise: Noise | None = None,
+                 flat_field: bool | str | None = True):
         noise = noise or captures.noise
         if noise is None:
             raise BadScene(f"{captures.folder}: no noise model; give [noise] in captures.toml or repeats to estimate it from")
@@ -311,6 +340,7 @@ class Model:
         self.base = {**scene.values(), **scene.check(captures.parameters, f"{captures.folder}/captures.toml [parameters]")}
         for frame in self.frames:
             scene.check(frame.parameters, f"{frame.file or captures.folder}: frame {frame.name}")
+        self.companions = self._companions()
         # A power that frames set is a drive level: what a calibration finds is the LED's power at drive 1.
         self.driven = {f"{n}.power" for n in scene.leds} & {k for f in self.frames for k in f.parameters}
         self.base.update({k: 1.0 for k in self.driven})
@@ -325,10 +355,13 @@ class Model:
         if self.developer.matrix.shape[0] != self.shape[2]:
             raise BadScene(f"{captures.folder}: images have {self.shape[2]} channels, the scene's camera "
                            f"{self.developer.matrix.shape[0]}")
-        self.flat = self._flat_field() if flat_field and captures.flat_field is not None else None
+        if flat_field not in (True, False, None, *FLAT_FIELDS):
+            raise UnknownKey(str(flat_field), FLAT_FIELDS, "flat-field mode")
+        self.flat_field = {True: FLAT_FIELDS[0], False: None}.get(flat_field, flat_field)
+        self.flat = self._flat_field() if self.flat_field and captures.flat_field is not None else None
 
     def _flat_field(self):
-        """Measured background over the predicted one is a declared multiplicative nuisance; see `predict`."""
+        """The measured background above black, a declared nuisance; see `predict`."""
         return np.maximum(np.asarray(self.captures.flat_field, float) - self.noise.black_level, 1e-3)
 
     # -- values -------------------------------------------------------------------------------------------------------
@@ -351,15 +384,26 @@ class Model:
             return dict.fromkeys(variable.keys, 1.0)
         return {k: float(own[k]) if k in own else 1.0 for k in variable.keys if k not in own or k in self.driven}
 
+    def _companions(self) -> list[set[str]]:
+        """For each frame the LEDs that are lit in any frame of the same press: they share its geometry."""
+        presses: dict[tuple, set[str]] = {}
+        keys = []
+        for frame in self.frames:
+            own = {**self.base, **frame.parameters}
+            key = (frame.group, *(own[k] for k in self.renderer.geometry_keys))
+            presses.setdefault(key, set()).update(n for n in self.scene.leds if own[f"{n}.power"] != 0)
+            keys.append(key)
+        return [presses[key] for key in keys]
+
     def check_variables(self, variables: Sequence[Variable]) -> None:
         for variable in variables:
             for key in variable.keys:
                 if key not in self.parameters:
                     raise UnknownKey(key, self.parameters, "parameter", hint="`optics params SCENE` lists them")
 
-    def lit(self, now: Mapping) -> dict[str, float]:
-        """The LEDs that are on and their powers."""
-        return {n: now[f"{n}.power"] for n in self.scene.leds if now[f"{n}.power"] != 0}
+    def lit(self, now: Mapping) -> dict[str, np.ndarray]:
+        """The LEDs that are on and their powers per band (B,)."""
+        return {n: self.renderer.powers(now, n) for n in self.scene.leds if now[f"{n}.power"] != 0}
 
     # -- prediction ---------------------------------------------------------------------------------------------------
 
@@ -375,15 +419,28 @@ class Model:
 
     def untouched(self, now: Mapping) -> dict:
         """The same frame with the gel at rest."""
-        return {**now, f"{self.scene.gel.name}.press_depth": 0.0}
+        gel = self.scene.gel.name
+        return {**now, **dict.fromkeys((f"{gel}.press_x", f"{gel}.press_y", f"{gel}.press_depth"), 0.0)}
+
+    def _rests(self, key: str) -> bool:
+        """Whether a parameter does nothing while the gel is untouched."""
+        name, _, parameter = key.rpartition(".")
+        return self.renderer.kind(key) == "gel" and parameter in self.scene.gel.pressing
 
     def predict(self, values: Values, frames: Sequence[int] | None = None, seed: int = 0) -> list[np.ndarray]:
         """Noise-free DN (H, W, C) of each frame.
 
-        With a flat field B (the measured background of the untouched sensor): black + (P - black) (B - black)/(P0 - black),
-        with P0 the prediction for the gel at rest in the same frame.
+        With a flat field B (the measured background of the untouched sensor), P0 the prediction for the gel at rest in the
+        same frame, and the frame's gain g per channel:
+            multiplicative   black + g (B - black) (P - black)/(P0 - black)
+            additive         black + g (B - black) + P - P0             (light adds up: exact for a linear response)
         """
-        return [self._predict(self.at(values, i), seed) for i in self._indices(frames)]
+        return [self._predict(self._turn_to(values, i), seed) for i in self._indices(frames)]
+
+    def _turn_to(self, values: Values, index: int) -> dict:
+        """A frame's values, and word to the renderer of what else is wanted of its geometry."""
+        self.renderer.together = self.companions[index]
+        return self.at(values, index)
 
     def _develop(self, now: Mapping, seed: int) -> np.ndarray:
         return self.developer.develop(self.radiance(now, seed), now)
@@ -393,8 +450,30 @@ class Model:
         if self.flat is None:
             return image
         black = self.noise.black_level
-        rest = np.maximum(self._develop(self.untouched(now), seed) - black, 1e-6)
-        return black + (image - black) * self.flat / rest
+        flat = self.flat * self._gains(now)
+        rest = self._develop(self.untouched(now), seed)
+        if self.flat_field == "additive":
+            return black + flat + image - rest
+        return black + (image - black) * flat / np.maximum(rest - black, 1e-6)
+
+    def _gains(self, now: Mapping) -> np.ndarray:
+        """(C,) gain of a frame by which its background is scaled."""
+        return self.developer.gains(self.developer.view(now))
+
+    def background_share(self, values: Values | None = None, index: int = 0) -> list[dict[str, float]]:
+        """How much of the flat field the scene explains by itself, per channel: rms of the flat field's structure about
+        its mean, rms of what is left of it after the predicted background, both in DN, and the share 1 - (left/structure)^2.
+
+        A multiplicative flat field divides what is left out, an additive one adds it; either way it is not explained.
+        """
+        if self.flat is None:
+            raise BadScene(f"{self.captures.folder}: no flat field in use")
+        rest = self._develop(self.untouched(self.at(values or Values(), index)), 0) - self.noise.black_level
+        found = []
+        for c in range(self.shape[2]):
+            structure, left = np.std(self.flat[..., c]), np.sqrt(np.mean((self.flat - rest)[..., c] ** 2))
+            found.append({"structure": float(structure), "left": float(left), "share": float(1 - (left / structure) ** 2)})
+        return found
 
     def _indices(self, frames) -> list[int]:
         return list(range(len(self.frames))) if frames is None else list(frames)
@@ -413,16 +492,20 @@ class Model:
 
     def _differentiate(self, values: Values, variables: Sequence[Variable], secant: Mapping[str, float], seed: int,
                        index: int):
-        now = self.at(values, index)
+        now = self._turn_to(values, index)
         black = self.noise.black_level
         linear = self.developer.linearise(self.radiance(now, seed), now)
-        prediction, scale, share = linear.image, 1.0, 0.0
+        prediction = linear.image
         if self.flat is not None:
             at_rest = self.untouched(now)
             rest = self.developer.linearise(self.radiance(at_rest, seed), at_rest)
-            level = np.maximum(rest.image - black, 1e-6)
-            scale, share = self.flat / level, (linear.image - black) / level
-            prediction = black + (linear.image - black) * scale
+            flat = self.flat * self._gains(now)
+            if self.flat_field == "additive":
+                prediction, scale, share, gained = black + flat + linear.image - rest.image, 1.0, 1.0, 1.0
+            else:
+                level = np.maximum(rest.image - black, 1e-6)
+                scale, share = flat / level, (linear.image - black) / level
+                prediction, gained = black + (linear.image - black) * scale, share
         images = {}
         for variable in variables:
             acts = self._acts(variable, index)
@@ -433,9 +516,12 @@ class Model:
             else:
                 image = self._tangent(linear, now, acts, seed)
                 if self.flat is not None:
-                    still = self._tangent(rest, at_rest, acts, seed, "rest")
+                    still = self._tangent(rest, at_rest, {k: f for k, f in acts.items() if not self._rests(k)}, seed, True)
                     if image is not None or still is not None:
                         image = scale * ((0 if image is None else image) - share * (0 if still is None else still))
+                        if any(self.parameters[k].how == "image" for k in acts):
+                            stepped = {**now, **{k: now[k] + 1j * STEP for k in acts}}
+                            image = image + gained * self.flat * (self._gains(stepped).imag / STEP)
             if image is not None:
                 images[variable.name] = image.astype(np.float32)
         return prediction, images
@@ -449,14 +535,15 @@ class Model:
         moved.put(variable, value + step)
         return (self._predict(self.at(moved, index), seed) - prediction) / step
 
-    def _tangent(self, linear, now: Mapping, acts: Mapping[str, float], seed: int, memory: str = "") -> np.ndarray | None:
+    def _tangent(self, linear, now: Mapping, acts: Mapping[str, float], seed: int,
+                 at_rest: bool = False) -> np.ndarray | None:
         """d DN / d value in a frame for keys that share one value; None where nothing depends on them."""
         camera = tuple(k for k in acts if self.parameters[k].how == "image")
         light = None
         for key, factor in acts.items():
             if key in camera:
                 continue
-            change = self._light_tangent(now, key, factor, seed)
+            change = self._light_tangent(now, key, factor, seed, at_rest)
             if change is not None:
                 light = change if light is None else light + change
         total = None if light is None else linear.of_image(light)
@@ -464,15 +551,23 @@ class Model:
             total = linear.of_parameter(camera) + (0 if total is None else total)
         return total
 
-    def _light_tangent(self, now: Mapping, key: str, factor: float, seed: int) -> np.ndarray | None:
+    def _light_tangent(self, now: Mapping, key: str, factor: float, seed: int, at_rest: bool) -> np.ndarray | None:
         """factor times d radiance / d key in a frame."""
         name, parameter = key.rsplit(".", 1)
         kind = self.renderer.kind(key)
         bounce, lit = now[self.renderer.bounce_key], self.lit(now)
+        tangent = self.renderer.led_tangent_at_rest if at_rest else self.renderer.led_tangent
         if key == self.renderer.bounce_key:
             return factor * sum(power * self.renderer.bounced(now, led, seed) for led, power in lit.items())
-        if kind == "led" and parameter == "power":
+        if kind == "led" and parameter in POWERS:
             if factor == 0:
+                return None
+            # the power is a product of four: the derivative by one of them is the product of the others
+            others = self.renderer.powers({**now, key: 1.0}, name)
+            if parameter != "power":
+                others = np.where(np.arange(self.renderer.bands) == POWERS.index(parameter) - 1, others, 0.0)
+            factor = factor * others
+            if not np.any(factor):
                 return None
             image = self.renderer.led(now, name).radiance
             return factor * (image + bounce * self.renderer.bounced(now, name, seed) if bounce else image)
@@ -484,9 +579,9 @@ class Model:
             return factor * self._difference(now, key, seed)
         if kind == "led":
             image = (self._difference_led(now, name, key) if self.parameters[key].how == "difference"
-                     else self.renderer.led_tangent(now, name, key))
+                     else tangent(now, name, key))
             return factor * lit[name] * image
-        total = sum(power * self.renderer.led_tangent(now, led, key) for led, power in lit.items())
+        total = sum(power * tangent(now, led, key) for led, power in lit.items())
         return factor * (total + self._difference_ambient(now, key))
 
     def _sides(self, key: str, now: Mapping) -> tuple[float, float]:
@@ -539,7 +634,7 @@ class Model:
             to = np.array([now[f"{led}.{a}"] for a in "xyz"]) - p
             length = np.linalg.norm(to, axis=-1)
             cos = np.clip((to * n).sum(-1) / np.maximum(length, 1e-9), -1, 1)
-            strength = lit[led] * image.radiance.sum(-1)
+            strength = (lit[led] * image.radiance).sum(-1)
             brightest = strength > best
             best = np.where(brightest, strength, best)
             incidence = np.where(brightest, np.degrees(np.arccos(cos)), incidence)

@@ -6,6 +6,7 @@ parameters have the keys `id.name`. Parameters of stock Mitsuba plugins are reac
 
 from __future__ import annotations
 
+import difflib
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -66,7 +67,7 @@ class Scene:
             try:
                 self.mitsuba = mi.load_file(str(self.path), optimize=False, **{k: str(v) for k, v in self.defines.items()})
             except (RuntimeError, ValueError, TypeError, KeyError) as error:
-                raise BadScene(f"{self.path}: {_reason(error)}") from error
+                raise BadScene(f"{self.path}: {_reason(error, self.path)}") from error
         self.parts: dict[str, Declared] = {}
         for part in created:
             name = part.name
@@ -188,7 +189,21 @@ class Scene:
         return variables
 
 
-def _reason(error: Exception) -> str:
-    """Mitsuba's message without its prefixes and in one line."""
-    text = " ".join(str(error).split())
-    return re.sub(r"^(\[[^\]]*\]\s*)+", "", text)
+def _reason(error: Exception, path: Path) -> str:
+    """Mitsuba's message in one line: what a part raised without its traceback, and the nearest name that exists."""
+    text = str(error)
+    if "Traceback (most recent call last)" in text:
+        before, _, trace = text.partition("Traceback (most recent call last)")
+        raised = re.findall(r"^[A-Za-z_][\w.]*: (.*(?:\n(?!\n|At:| ).+)*)", trace, flags=re.M)
+        text = before + (raised[-1] if raised else trace)
+    text = re.sub(r"(^|[:;] )(\[[^\]]*\]\s*)+", r"\1", " ".join(text.split()))
+    text = re.sub(rf'(At|(?:Error w|W)hile loading) "?{re.escape(str(path))}"? \((line[^)]*)\)', r"\2", text)
+    parts = registry().parts
+    if (unknown := re.search(r'Plugin "([^"]+)" not found', text)) is not None:
+        near = difflib.get_close_matches(unknown[1], parts, n=1)
+        text += f" Did you mean '{near[0]}'?" if near else f" Own types are {', '.join(sorted(parts))}; others are Mitsuba's."
+    unused = re.search(r'unreferenced propert.* plugin of type "([^"]+)": - \w+ "([^"]+)"', text)
+    if unused is not None and unused[1] in parts:
+        near = difflib.get_close_matches(unused[2], [p.name for p in registry().parameters_of(unused[1])], n=1)
+        text += f"; did you mean '{near[0]}'?" if near else "; `optics params SCENE` lists what it has"
+    return text

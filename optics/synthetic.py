@@ -42,12 +42,12 @@ class Maker:
     """
 
     def __init__(self, scene: Scene, values: Mapping[str, float] | None = None, effects: Mapping[str, float] | None = None,
-                 noise: Noise = CAMERA, seed: int = 0, spp: int = 256):
+                 noise: Noise = CAMERA, seed: int = 0, spp: int = 64):
         self.values = {**scene.values(), **(values or {})}
         self.leds = list(scene.leds)
         self.gel, self.camera, self.membrane = scene.gel.name, scene.camera.name, next(iter(scene.membranes))
         self.size = scene.camera.resolution
-        self.axes = {n: np.array([float(c[0]) for c in led.frame[2]]) for n, led in scene.leds.items()}
+        self.frames = {n: np.array([[float(c[0]) for c in axis] for axis in led.frame]) for n, led in scene.leds.items()}
         self.effects = dict(effects or {})
         unknown = set(self.effects) - set(MAKERS)
         if unknown:
@@ -58,18 +58,19 @@ class Maker:
 
     # -- the face ---------------------------------------------------------------------------------------------------------
 
-    def mesh(self, press: Sequence[float], pitch: float = 0.04) -> dict:
-        """A PLY file's worth of the coated face, on a uniform grid, as a Mitsuba mesh."""
+    def mesh(self, press: Sequence[float], pitch: float = 0.02):
+        """The coated face on a grid three times as fine as the model's around the dent, with its exact normals."""
         import mitsuba as mi
 
         from optics.gel import contact
 
         v, g = self.values, self.gel
         profile = contact.indenter_profile(v[f"{g}.indenter"], v[f"{g}.indenter_size"], (0.0, 0.0, 0.0), 3.0, 0.03)
-        pressed, touch = contact.displacement(profile, press[2], v[f"{g}.thickness"], v[f"{g}.smoothing"])
+        pressed, touch = contact.displacement(profile, press[2], v[f"{g}.thickness"], v[f"{g}.smoothing"],
+                                               skirt=v.get(f"{g}.skirt", 0.0))
         width, length = v[f"{g}.width"], v[f"{g}.length"]
-        x = np.linspace(-width / 2, width / 2, int(width / pitch) + 1)
-        y = np.linspace(-length / 2, length / 2, int(length / pitch) + 1)
+        x = contact.graded_axis(-width / 2, width / 2, press[0], 3.0, pitch, 481)
+        y = contact.graded_axis(-length / 2, length / 2, press[1], 3.0, pitch, 481)
         z = -contact.surface(x[None, :], y[:, None], press[0], press[1], pressed)
         if "gel bulge" in self.effects:
             ring = contact.ring_bulge(pressed, touch, v[f"{g}.thickness"])
@@ -106,37 +107,50 @@ class Maker:
         return {"type": "perspective", "fov": float(self.values[f"{self.camera}.x_fov"]), "fov_axis": "x",
                 "near_clip": 0.01, "far_clip": 1000.0, "to_world": looking,
                 "film": {"type": "hdrfilm", "width": width, "height": height, "rfilter": {"type": "box"},
-                         "pixel_format": "luminance", "component_format": "float32"}}
+                         "pixel_format": "luminance", "component_format": "float32"},
+                "sampler": {"type": "multijitter", "sample_count": self.spp}}
 
     def emitter(self, led: str) -> dict:
+        """The LED aimed by an axis of its own making: straight ahead, then panned and tilted to the true axis."""
         v = self.values
-        target = [float(v[f"{led}.{c}"] + a) for c, a in zip("xyz", self.axes[led])]
-        entry = {"type": "led", "power": 1.0, "target": target,
-                 "area": float(self.effects.get("LED size", v[f"{led}.area"]))}
-        entry.update({n: float(v[f"{led}.{n}"]) for n in ("x", "y", "z", "mu", "pan", "tilt")})
-        return entry
+        side, up, ahead = self.frames[led]
+        axis = ahead + np.tan(np.radians(v[f"{led}.pan"])) * side + np.tan(np.radians(v[f"{led}.tilt"])) * up
+        place = {n: float(v[f"{led}.{n}"]) for n in ("x", "y", "z", "mu")}
+        return {"type": "led", "power": 1.0, "target": [place["x"], place["y"], place["z"] + 1.0], **place,
+                "pan": float(np.degrees(np.arctan(axis[0] / axis[2]))), "tilt": float(np.degrees(np.arctan(axis[1] / axis[2])))}
 
-    def traced(self, mesh, light: dict, depth: int, rho: float) -> np.ndarray:
-        """(H, W) radiance by Mitsuba's path tracer."""
+    def disc(self, led: str) -> dict:
+        """The LED as a disc across its axis, for the hidden effect "LED size"."""
+        v = self.values
+        place = {n: float(v[f"{led}.{n}"]) for n in ("x", "y", "z", "mu", "pan", "tilt")}
+        return {"type": "led", "power": 1.0, "area": float(self.effects["LED size"]), **place,
+                "target": [float(v[f"{led}.{c}"] + a) for c, a in zip("xyz", self.frames[led][2])]}
+
+    def scene(self, mesh, light: dict, depth: int):
         import mitsuba as mi
 
-        params = mi.traverse(mesh)
-        params["bsdf.rho_r"] = mi.Float(float(rho))
-        params.update()
-        self.count += 1
         content = {"type": "scene", "integrator": {"type": "path", "max_depth": depth, "rr_depth": 1000},
                    "sensor": self.sensor(), "face": mesh, "light": light}
         if "refraction at the window" in self.effects:
             content["window"] = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -8]).rotate(
                 [1, 0, 0], 180).scale([30, 30, 1]), "bsdf": {"type": "dielectric", "ext_ior": 1.0, "int_ior": float(
                     self.effects["refraction at the window"])}}
-        scene = mi.load_dict(content, optimize=False)
-        image = np.zeros(self.size[::-1])
-        per_pass = 64
-        for k in range(max(1, self.spp // per_pass)):
-            image += np.array(mi.render(scene, spp=min(per_pass, self.spp), seed=self.seed * 100003 + self.count * 101 + k)
-                              )[..., 0] / max(1, self.spp // per_pass)
-        return image
+        return mi.load_dict(content, optimize=False)
+
+    def traced(self, scene, rho: float, led: str | None = None, depth: int = 2) -> np.ndarray:
+        """(H, W) radiance by Mitsuba's path tracer; the scene's light is moved to where the LED is."""
+        import mitsuba as mi
+
+        params = mi.traverse(scene)
+        params["face.bsdf.rho_r"] = mi.Float(float(rho))
+        if led is not None:
+            for name, value in self.emitter(led).items():
+                if name in ("x", "y", "z", "mu", "pan", "tilt"):
+                    params[f"light.{name}"] = mi.Float(value)
+        params.update()
+        self.count += 1
+        integrator = mi.load_dict({"type": "path", "max_depth": depth, "rr_depth": 1000})
+        return np.array(mi.render(scene, integrator=integrator, spp=self.spp, seed=self.seed * 100003 + self.count))[..., 0]
 
     def light(self, press: Sequence[float]) -> dict[str, np.ndarray]:
         """{LED: (H, W, 3) radiance at power 1}, and under 'ambient' what no LED made."""
@@ -147,20 +161,23 @@ class Maker:
             rho = [v[f"{self.membrane}.rho_{c}"] for c in "rgb"]
             bounce = self.effects.get("interreflection", 0.0)
             images = {}
+            scene = self.scene(mesh, self.emitter(self.leds[0]), 2)
             for led in self.leds:
-                if bounce or "specular lobe" in self.effects:
-                    stack = [self.traced(mesh, self.emitter(led), 3 if bounce else 2, r) for r in rho]
+                if "LED size" in self.effects:
+                    images[led] = self.traced(self.scene(mesh, self.disc(led), 2), 1.0)[..., None] * np.array(rho)
+                elif bounce or "specular lobe" in self.effects:
+                    stack = [self.traced(scene, r, led, 3 if bounce else 2) for r in rho]
                     if bounce and bounce != 1:
-                        direct = self.traced(mesh, self.emitter(led), 2, 1.0)
+                        direct = self.traced(scene, 1.0, led)
                         stack = [r * direct + bounce * (s - r * direct) for r, s in zip(rho, stack)]
                     images[led] = np.stack(stack, -1)
                 else:
-                    images[led] = self.traced(mesh, self.emitter(led), 2, 1.0)[..., None] * np.array(rho)
+                    images[led] = self.traced(scene, 1.0, led)[..., None] * np.array(rho)
                 if {"gel absorption", "gel haze"} & set(self.effects):
                     images[led] = self.through_gel(images[led], led, press)
             if "ambient light" in self.effects:
                 sky = {"type": "constant", "radiance": {"type": "uniform", "value": self.effects["ambient light"] / np.pi}}
-                images["ambient"] = self.traced(mesh, sky, 2, 1.0)[..., None] * np.array(rho)
+                images["ambient"] = self.traced(self.scene(mesh, sky, 2), 1.0)[..., None] * np.array(rho)
             return images
         finally:
             use_variant(DEFAULT_VARIANT)
@@ -182,7 +199,9 @@ class Maker:
         out = image * np.exp(-(a + h) * (view + inside(point, np.broadcast_to(lamp, point.shape))))[..., None]
         if h:
             toward = along / np.linalg.norm(along, axis=-1, keepdims=True)
-            axis = -lamp / np.linalg.norm(lamp)
+            side, up, ahead = self.frames[led]
+            axis = ahead + np.tan(np.radians(v[f"{led}.pan"])) * side + np.tan(np.radians(v[f"{led}.tilt"])) * up
+            axis = axis / np.linalg.norm(axis)
             steps = 64
             for k in range(steps):
                 s = view * (k + 0.5) / steps
@@ -203,7 +222,8 @@ class Maker:
         y, x = np.mgrid[:height, :width] + 0.5
         direction = np.stack([(x - width / 2) / focal, (y - height / 2) / focal, np.ones_like(x)], -1)
         profile = contact.indenter_profile(v[f"{g}.indenter"], v[f"{g}.indenter_size"], (0.0, 0.0, 0.0), 3.0, 0.03)
-        pressed, _ = contact.displacement(profile, press[2], v[f"{g}.thickness"], v[f"{g}.smoothing"])
+        pressed, _ = contact.displacement(profile, press[2], v[f"{g}.thickness"], v[f"{g}.smoothing"],
+                                               skirt=v.get(f"{g}.skirt", 0.0))
         camera = np.array([0.0, 0.0, self.camera_z])
         z = np.zeros_like(x)
         for _ in range(12):

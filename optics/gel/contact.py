@@ -126,11 +126,13 @@ class Profile:
     envelope  (n, n) finite: the lowest surface of slope <= tan(steepest) that holds the indenter, which is `height` on
               all but steep parts: min over the indenter's points (u', v', h') of h' + tan(steepest) |(u, v) - (u', v')|
     pitch     mm
+    ball      (radius in mm, steepest slope) of a sphere, whose skirt is a closed form; None: another indenter
     """
 
     height: np.ndarray
     envelope: np.ndarray
     pitch: float
+    ball: tuple[float, float] | None = None
 
     @property
     def axis(self) -> np.ndarray:
@@ -218,7 +220,7 @@ def _profile(shape, stamp, size, rx, ry, rz, extent, pitch, steepest) -> Profile
         height, envelope = mesh(axis, size, shape, stamp, (rx, ry, rz), extent, pitch, slope)
     for a in (height, envelope):
         a.flags.writeable = False
-    return Profile(height, envelope, pitch)
+    return Profile(height, envelope, pitch, (size, slope) if shape == "sphere" else None)
 
 
 def rotation_matrix(rx: float, ry: float, rz: float) -> np.ndarray:
@@ -461,7 +463,7 @@ def cone_envelope(height: np.ndarray, rise: float) -> np.ndarray:
 
 @lru_cache(maxsize=16)
 def displacement(
-    profile: Profile, depth: float, thickness: float, smoothing: float, levels: int = 4
+    profile: Profile, depth: float, thickness: float, smoothing: float, levels: int = 4, skirt: float = 0.0
 ) -> tuple[LocalMap, LocalMap]:
     """How far a skin is pushed towards the camera, D(u, v) >= 0 in mm, and where it touches (weight 0..1).
 
@@ -470,6 +472,7 @@ def displacement(
     thickness  mm of the gel: D0 = clip(depth - h, 0, thickness), h = Profile.envelope
     smoothing  mm, standard deviation of the widest Gaussian; 0: D = D0 but for the last blur
     levels     number of Gaussians, each half as wide as the one before
+    skirt      mm over which the skin beside the contact falls to 1/e, see `dragged`; 0: the pyramid alone makes the skirt
 
     Pyramid (S1.6): D <- max(D0, G_k * D) for the sd smoothing, smoothing/2, smoothing/4, ... The maximum restores the
     contact after each blur: the skin rests on the indenter where it would otherwise pass through it and leaves it where
@@ -483,10 +486,10 @@ def displacement(
 
     Both maps fade to zero over the outer eighth of the local grid. Results are cached: do not write into them.
     """
-    if not (math.isfinite(depth) and math.isfinite(smoothing) and smoothing >= 0 and thickness > 0):
+    if not (math.isfinite(depth) and math.isfinite(smoothing) and smoothing >= 0 and thickness > 0 and 0 <= skirt < 1e3):
         raise ValueError(
-            f"press: depth = {depth:g} mm, smoothing = {smoothing:g} mm, thickness = {thickness:g} mm; "
-            "need finite depth, smoothing >= 0 and thickness > 0"
+            f"press: depth = {depth:g} mm, smoothing = {smoothing:g} mm, thickness = {thickness:g} mm, skirt = {skirt:g} mm; "
+            "need finite depth, smoothing >= 0, thickness > 0 and skirt >= 0"
         )
     n, pitch = len(profile.height), profile.pitch
     pressed, touch = np.zeros((n, n)), np.zeros((n, n))
@@ -500,6 +503,12 @@ def displacement(
         d0 = d0 - soft_ramp(t - thickness, e)
     weight = smooth_step(np.clip(t / (2 * e) + 0.5, 0.0, 1.0))
     pressed[block] = d0
+    if skirt > 0:
+        pressed = dragged(profile, pressed, depth, thickness, skirt)
+        weight = weight * (1.0 - smooth_step(np.clip((pressed[block] - d0) / (DETACHING * d0 + 1e-300), 0.0, 1.0)))
+        block = (slice(0, n), slice(0, n))  # the skirt belongs to what the blurs below must not take away
+        d0, touch[profile.block(2 * depth)] = pressed, weight
+        weight = touch
     if smoothing > 0 and levels > 0:
         for level in range(levels):
             pressed = gaussian_blur(pressed, smoothing / pitch / 2**level)
@@ -510,6 +519,40 @@ def displacement(
     touch[block] = weight
     w = window(n)
     return LocalMap(pressed * w * w[:, None], pitch), LocalMap(touch * w * w[:, None], pitch)
+
+
+def dragged(profile: Profile, d0: np.ndarray, depth: float, thickness: float, skirt: float) -> np.ndarray:
+    """Displacement with an exponential skirt: D(x) = max over points p of D0(p) exp(-|x - p| / skirt), mm.
+
+    Every touched point drags the skin around it, and the drag falls by 1/e over `skirt`; the strongest wins. The skin
+    leaves the indenter where its slope is D0 / skirt, without a kink, and goes on as an exponential. (A membrane under
+    tension T on a bed of stiffness k falls over sqrt(T/k) in the same way, but for the curvature of the contact line.)
+    For a sphere the contact line is the root of D0(r) = skirt D0'(r), a closed form otherwise; other indenters take the
+    cone envelope of -log D0 on the grid, whose distances are up to 2.7 % too long.
+    """
+    if profile.ball is None or depth >= thickness:
+        low = -np.log(np.maximum(d0, 1e-12))
+        return np.exp(-cone_envelope(low, profile.pitch / skirt))
+    from scipy.optimize import brentq
+
+    radius, steep = profile.ball
+    edge = radius * steep / math.hypot(1.0, steep)  # beyond, the envelope is a cone
+
+    def lower(r):
+        if r > edge:
+            return radius - math.sqrt(radius**2 - edge**2) + steep * (r - edge), steep
+        root = math.sqrt(radius**2 - r * r)
+        return radius - root, r / root
+
+    def excess(r):
+        height, slope = lower(r)
+        return depth - height - skirt * slope
+
+    outer = edge + depth / steep  # the envelope is above the depth here
+    line = brentq(excess, 0.0, outer, xtol=1e-14, rtol=1e-14)
+    height, _ = lower(line)
+    r = np.hypot(*np.meshgrid(profile.axis, profile.axis))
+    return np.where(r < line, depth - profile.envelope, (depth - height) * np.exp(-np.maximum(r - line, 0.0) / skirt))
 
 
 @lru_cache(maxsize=16)

@@ -3,7 +3,7 @@
 Definition
     x_n = (u - c_x)/f_x,  y_n = (v - c_y)/f_y                    u, v: pixel position, centre of a pixel at +0.5
     distorted = undistorted (1 + k1 r^2 + k2 r^4 + k3 r^6) + tangential(p1, p2)      (OpenCV's order and signs)
-    I_c = exposure gain sum_b M_cb L_b                           irradiance of channel c; 1 = full scale
+    I_c = exposure gain gain_c sum_b M_cb L_b                    irradiance of channel c; 1 = full scale
     G_c(m) = m + a_c (m^2 - m) + b_c (m^3 - m),  m = G_c^-1(I)   response, inverse of a cubic (S1.1)
     DN = black + (saturation - black) m + offset
 with f_x from the horizontal field of view, f_y = f_x aspect, principal point (c_x, c_y) given as an offset from the middle of
@@ -42,6 +42,8 @@ PARAMETERS = (
     Parameter("exposure", "1", 1.0, (0.0, 1e6), "full scale per unit of radiance", plausible=0.1, how="image"),
     Parameter("gain", "1", 1.0, (0.0, 100.0), "gain of a frame relative to the others", neutral=1.0, plausible=0.02,
               how="image"),
+    *(Parameter(f"gain_{c}", "1", 1.0, (0.0, 100.0), f"gain of channel {c} in a frame, times `gain`", neutral=1.0,
+                plausible=0.02, how="image") for c in "rgb"),
     Parameter("offset", "DN", 0.0, (-1e4, 1e4), "added to every pixel after the response", neutral=0.0, plausible=1.0,
               how="image"),
     *(Parameter(f"response2_{c}", "1", 0.0, (-0.9, 0.9), f"a_c: quadratic term of the inverse response, channel {c}",
@@ -62,7 +64,7 @@ def build():
             nominal = props.get("to_world", mi.ScalarAffineTransform4f())
             mi.Sensor.__init__(self, props)
             width, height = (int(v) for v in self.film().size())
-            if props.has_property("fx"):
+            if "fx" in props:
                 fx = float(props.get("fx", 1.0))
                 props["x_fov"] = math.degrees(2 * math.atan(width / 2 / fx))
                 props["aspect"] = float(props.get("fy", fx)) / fx
@@ -101,18 +103,21 @@ def build():
         def to_world(self, v):
             return self.columns[0] * v.x + self.columns[1] * v.y + self.columns[2] * v.z
 
+        def turned(self, d):
+            """A direction of the camera's frame in the world: roll, then tilt, then pan, then the nominal pose."""
+            for angle, (i, j) in ((self.roll, (0, 1)), (self.tilt, (1, 2)), (self.pan, (2, 0))):
+                s, c = dr.sincos(dr.deg2rad(angle))
+                d = mi.Vector3f(d)
+                d[i], d[j] = c * d[i] - s * d[j], s * d[i] + c * d[j]
+            return self.to_world(d)
+
         def ray(self, u, v):
             """Origin and unit direction in the world for a position in pixels."""
             fx, fy = self.focal()
             width, height = self.resolution
             x, y = self.undistort((u - width / 2 - self.principal_x) / fx, (v - height / 2 - self.principal_y) / fy)
-            d = dr.normalize(mi.Vector3f(x, y, 1))
-            for angle, (i, j) in ((self.roll, (0, 1)), (self.tilt, (1, 2)), (self.pan, (2, 0))):
-                s, c = dr.sincos(dr.deg2rad(angle))
-                d = mi.Vector3f(d)
-                d[i], d[j] = c * d[i] - s * d[j], s * d[i] + c * d[j]
             origin = self.columns[3] + self.to_world(mi.Vector3f(self.x, self.y, self.z))
-            return mi.Point3f(origin) + dr.zeros(mi.Point3f, dr.width(u)), self.to_world(d)
+            return mi.Point3f(origin) + dr.zeros(mi.Point3f, dr.width(u)), self.turned(dr.normalize(mi.Vector3f(x, y, 1)))
 
         def sample_ray(self, time, sample1, sample2, sample3, active=True):
             wavelengths, weight = self.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), sample1, active)

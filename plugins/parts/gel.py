@@ -5,10 +5,12 @@ Definition
     D = contact depth clipped to [0, thickness], smoothed by a pyramid of Gaussians outside the contact (S1.6)
 The gel fills -thickness < z < 0; the camera stands at z < -thickness. The face is a triangle mesh on a graded grid that
 is fine around the contact and moves with it, so that images vary smoothly with the press.
+With `skirt` > 0 the skin beside the contact falls off as exp(-distance / skirt) before the smoothing: D = max over touched
+points p of D0(p) exp(-|x - p| / skirt).
 Indenters: sphere (`indenter_size` = radius), cylinder lying on its side (radius), cube face down (edge), or a mesh file
 (STL, OBJ, PLY; `indenter_size` = scale).
 Fingerprint
-    position and depth of the press move the dent; `smoothing` widens its skirt.
+    position and depth of the press move the dent; `smoothing` widens its skirt, `skirt` gives it a long tail.
 Validity
     quasi-static presses; the skirt is a smoothing, not elasticity. The gel's far side rests on a rigid window.
 References
@@ -36,6 +38,8 @@ PARAMETERS = (
               how="difference"),
     Parameter("smoothing", "mm", 0.25, (0.01, 5.0), "standard deviation of the widest kernel of S1.6", plausible=0.05,
               how="difference"),
+    Parameter("skirt", "mm", 0.0, (0.0, 5.0), "length over which the skin beside the contact falls to 1/e; 0: a Gaussian "
+              "skirt, by smoothing alone", neutral=0.0, plausible=0.3, how="difference"),
 )
 
 
@@ -48,9 +52,12 @@ def build():
 
     class Gel(Declared.on(mi.Mesh)):
         kind = "gel"
+        pressing = ("press_x", "press_y", "press_depth", "press_rx", "press_ry", "press_rz", "indenter", "indenter_size",
+                    "smoothing", "skirt")  # what does nothing while press_depth is 0
 
         def __init__(self, props):
-            self.pitch = float(props.get("pitch", 0.06))  # mm, of the fine part of the grid
+            self.pitch = float(props.get("pitch", 0.06))  # mm, of the fine part of the mesh
+            self.map_pitch = float(props.get("map_pitch", 0.03))  # mm, of the maps that hold the dent's shape
             self.extent = float(props.get("extent", 3.0))  # mm, half width of the fine part
             self.columns, self.rows = int(props.get("columns", 181)), int(props.get("rows", 161))
             index = np.arange(self.columns * self.rows).reshape(self.rows, self.columns)
@@ -79,8 +86,9 @@ def build():
             """Displacement and contact maps on the indenter's own grid (optics.gel.contact)."""
             n = self.number
             profile = contact.indenter_profile(self.indenter, n("indenter_size"),
-                                               (n("press_rx"), n("press_ry"), n("press_rz")), self.extent, self.pitch)
-            return contact.displacement(profile, n("press_depth"), n("thickness"), n("smoothing"))
+                                               (n("press_rx"), n("press_ry"), n("press_rz")), self.extent, self.map_pitch)
+            return contact.displacement(profile, n("press_depth"), n("thickness"), n("smoothing"),
+                                        skirt=n("skirt"))
 
         def heights(self, x, y):
             """z of the coated face (mm) at x (columns,) and y (rows,), mm, with every `surface` effect: (rows, columns)."""
@@ -102,7 +110,7 @@ def build():
         def rebuild(self, params):
             """Vertices of the face for the present parameters."""
             xs, ys = self.axes()
-            z = self.heights(xs, ys)
+            z = chord_corrected(self.heights(xs, ys), xs, ys)
             x, y = np.broadcast_to(xs, z.shape), np.broadcast_to(ys[:, None], z.shape)
             params["vertex_positions"] = mi.Float(np.stack([x, y, z], -1).astype(np.float32).ravel())
             params.update()
@@ -130,6 +138,19 @@ def build():
 
         def to_string(self):
             return f"Gel[{self.name}]"
+
+    def chord_corrected(z, x, y):
+        """Vertex heights whose linear interpolation has the surface's mean: z - (h_x^2 z_xx + h_y^2 z_yy)/12.
+
+        A mesh with its vertices on a dent lies inside the dent, by h^2/12 of its curvature on average; uncorrected, cast
+        shadows come out shorter, by 0.01 px at a pitch of 0.06 mm, which a calibration on many frames notices.
+        """
+        out = z.copy()
+        hx, hy = np.diff(x), np.diff(y)
+        out[:, 1:-1] -= (np.diff(z, axis=1)[:, 1:] / hx[1:] - np.diff(z, axis=1)[:, :-1] / hx[:-1]) * (hx[1:] + hx[:-1]) / 24
+        out[1:-1] -= (np.diff(z, axis=0)[1:] / hy[1:, None] - np.diff(z, axis=0)[:-1] / hy[:-1, None]) * (
+            (hy[1:] + hy[:-1]) / 24)[:, None]
+        return out
 
     class Path:
         """What a `segment` or `volume` function sees: lit point, camera, lamp, LED and the lengths inside the gel (mm)."""

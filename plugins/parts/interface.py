@@ -62,7 +62,8 @@ def build():
             bs.wo = wo
             bs.pdf = mi.Float(1.0)
             bs.eta = n
-            bs.sampled_type = mi.UInt32(+mi.BSDFFlags.DeltaTransmission)
+            # also Null: passing a window is no scattering event and takes nothing of an integrator's depth
+            bs.sampled_type = mi.UInt32(mi.BSDFFlags.DeltaTransmission | mi.BSDFFlags.Null)
             bs.sampled_component = mi.UInt32(0)
             scale = 1 / dr.square(n)
             if mi.is_polarized:

@@ -5,7 +5,9 @@ Definition
     irradiance factor  kappa = eta (-s.p)^mu / |s|^2             (S2)
 with the unit vector s from the LED's position S to the lit point reversed (so that -s.p is the cosine to the axis p), the
 power eta, the lobe exponent mu (1 for a Lambertian chip, larger for a lens) and the relative spectrum w: a Gaussian of
-the given peak wavelength and full width at half maximum, or 1 in every band when `wavelength` is 0 (a white LED).
+the given peak wavelength and full width at half maximum, or 1 in every band when `wavelength` is 0 (a white LED). In the first
+three bands w is multiplied by `power_r`, `power_g`, `power_b`: what an LED of unknown spectrum is calibrated by. They share a
+scale with `power` and, over all LEDs of a band, with the membrane's rho: hold one of them.
 With an emitting area A > 0 the source is a disc across the axis, of radius sqrt(A/pi): shadows get a penumbra.
 Fingerprint
     position and power shape the field of every frame in which the LED is lit; mu shows far from the axis.
@@ -31,6 +33,8 @@ PARAMETERS = (
     Parameter("mu", "1", 1.2, (0.0, 200.0), "lobe exponent mu of (S2)", plausible=0.3),
     Parameter("power", "1", 1.0, (0.0, 1e6), "power eta of (S2), relative; 0 switches the LED off", plausible=0.1,
               linear=True),
+    *(Parameter(f"power_{c}", "1", 1.0, (0.0, 1e6), f"share of the power in the {word} band ({colour})", plausible=0.1,
+                linear=True) for c, word, colour in (("r", "first", "red"), ("g", "second", "green"), ("b", "third", "blue"))),
     Parameter("area", "mm^2", 0.0, (0.0, 25.0), "emitting area A of the disc", neutral=0.0, plausible=1.0,
               how="difference"),
     Parameter("wavelength", "nm", 0.0, (0.0, 2000.0), "peak wavelength; 0: the same in every band", plausible=3.0),
@@ -90,6 +94,11 @@ def build():
             u = (mi.UnpolarizedSpectrum(wavelengths) - self.wavelength) / self.fwhm
             return dr.select(self.wavelength > 0, dr.exp(-4 * math.log(2) * dr.square(u)), 1.0)
 
+        def colour(self):
+            """Share of the power in each band."""
+            shares = (self.power_r, self.power_g, self.power_b, mi.Float(1.0))
+            return mi.UnpolarizedSpectrum(*shares[:dr.size_v(mi.UnpolarizedSpectrum)])
+
         def point(self, sample):
             """A point of the emitting disc for a sample of the unit square; the centre when the area is 0."""
             radius = dr.sqrt(dr.maximum(self.area, 1e-12) / dr.pi)
@@ -101,7 +110,7 @@ def build():
             """kappa of (S2) per band, for a unit vector from the lit point to the LED and their distance in mm."""
             cos = dr.dot(-to_led, self.axis())
             lobe = dr.select(cos > 1e-4, dr.power(dr.maximum(cos, 1e-4), self.mu), 0.0)
-            kappa = mi.UnpolarizedSpectrum(self.power * lobe / dr.square(distance)) * self.spectrum(it.wavelengths)
+            kappa = mi.UnpolarizedSpectrum(self.power * lobe / dr.square(distance)) * self.spectrum(it.wavelengths) * self.colour()
             for function in self.functions("emission"):
                 kappa *= function(Beam(cos, distance, to_led, it.p, it.wavelengths), self)
             return kappa
@@ -140,7 +149,7 @@ def build():
         def sample_wavelengths(self, si, sample, active=True):
             wavelengths, weight = mi.sample_rgb_spectrum(mi.sample_shifted(sample)) if mi.is_spectral else (
                 mi.Color0f(), mi.UnpolarizedSpectrum(1.0))
-            return wavelengths, weight * self.spectrum(wavelengths)
+            return wavelengths, weight * self.spectrum(wavelengths) * self.colour()
 
         def to_string(self):
             return f"LED[{self.name}]"

@@ -17,6 +17,8 @@ References
     F-TAC Hand supplementary information, S1.4-S1.5, eq. (S5); Veach, thesis (1997), ch. 8, for the direct-light estimator.
 """
 
+import math
+
 from optics.effect import Declared, Part
 from optics.parameter import Parameter
 
@@ -26,19 +28,21 @@ PARAMETERS = (
 )
 
 
+def product(a, b):
+    """a after b: of Mueller matrices in polarized variants, of spectra in others."""
+    return a @ b if mi.is_polarized else a * b
+
+
+def scaled(value):
+    """A spectrum as the Mueller matrix of an absorber (polarized variants) or as it is."""
+    return mi.mueller.absorber(value) if mi.is_polarized else mi.Spectrum(value)
+
+
 def build():
+    global dr, mi, mis_weight  # dr.syntax rewrites a function with the globals of its file and without its closure
     import drjit as dr
     import mitsuba as mi
     from mitsuba.python.ad.integrators.common import ADIntegrator, mis_weight
-
-    lanes = dr.size_v(mi.UnpolarizedSpectrum)
-
-    def product(a, b):
-        return a @ b if mi.is_polarized else a * b
-
-    def scaled(value):
-        """A spectrum as the Mueller matrix of an absorber (polarized variants) or as it is."""
-        return mi.mueller.absorber(value) if mi.is_polarized else mi.Spectrum(value)
 
     class Tactile(Declared.on(ADIntegrator)):
         kind = "tactile"
@@ -50,8 +54,9 @@ def build():
             self.max_null = props.get("max_null", 8)
             text = str(props.get("bands", ""))
             self.bands = tuple(float(w) for w in text.replace(",", " ").split())
-            if len(self.bands) > max(lanes, 1) and mi.is_spectral:
-                raise ValueError(f"tactile: {len(self.bands)} bands, but a render carries at most {lanes}; "
+            self.lanes = dr.size_v(mi.UnpolarizedSpectrum)
+            if len(self.bands) > self.lanes and mi.is_spectral:
+                raise ValueError(f"tactile: {len(self.bands)} bands, but a render carries at most {self.lanes}; "
                                  "render the others in a second scene")
             self.declare(props)
             self.gel_of = {}
@@ -63,8 +68,8 @@ def build():
             """The bands as a ray's wavelengths; unused lanes repeat the last band."""
             if not mi.is_spectral:
                 return mi.Color0f()
-            bands = (self.bands or (620.0, 540.0, 460.0)) + (self.bands or (460.0,))[-1:] * lanes
-            return dr.zeros(type(mi.Ray3f().wavelengths), size) + mi.UnpolarizedSpectrum(*bands[:lanes])
+            bands = (self.bands or (620.0, 540.0, 460.0)) + (self.bands or (460.0,))[-1:] * self.lanes
+            return dr.zeros(type(mi.Ray3f().wavelengths), size) + mi.UnpolarizedSpectrum(*bands[:self.lanes])
 
         def gel(self, scene):
             """The gel part of the scene, if it has one."""
@@ -89,11 +94,22 @@ def build():
                 si = dr.select(flat, through, si)
             return si, weight, dr.select(si.is_valid(), si.p + si.to_world(si.wi) * si.t, o)
 
-        def visible(self, scene, si, point):
-            """Whether the straight line from the surface to a point meets nothing (detached)."""
+        def windows(self, scene, led):
+            """How many flat interfaces stand between an LED and the skin."""
+            reach = math.sqrt(led.number("area") / math.pi)
+            return sum(1 for s in scene.shapes() if getattr(s.bsdf(), "kind", "") == "interface"
+                       and s.bbox().max.z > led.number("z") - reach)
+
+        def visible(self, scene, si, point, led):
+            """Whether the straight line from the surface to a point of an LED meets nothing but windows (detached)."""
             with dr.suspend_grad():
+                valid = si.is_valid()
                 ray = si.spawn_ray_to(point)
-                return si.is_valid() & ~scene.ray_test(ray, si.is_valid())
+                for _ in range(self.windows(scene, led)):
+                    hit = scene.ray_intersect(ray, valid)
+                    flat = hit.is_valid() & mi.has_flag(hit.bsdf().flags(), mi.BSDFFlags.DeltaTransmission)
+                    ray = dr.select(flat, hit.spawn_ray_to(point), ray)
+                return valid & ~scene.ray_test(ray, valid)
 
         def direct(self, scene, si, weight, origin, led, visibility, sample=None):
             """Radiance per band that one LED sends to the camera by one reflection (S3, S5), and by the gel itself."""
@@ -123,17 +139,19 @@ def build():
             for _ in range(count):
                 bs, factor = si.bsdf().sample(context, si, sampler.next_1d(), sampler.next_2d(), si.is_valid())
                 second = scene.ray_intersect(si.spawn_ray(si.to_world(bs.wo)), si.is_valid())
-                light = self.direct(scene, second, 1.0, si.p, led, self.visible(scene, second, led.position()))
+                light = self.direct(scene, second, 1.0, si.p, led, self.visible(scene, second, led.position(), led))
                 total += dr.select(second.is_valid(), mi.unpolarized_spectrum(factor) * light, 0.0)
             return total * weight / count
 
         # -- any scene, any light: what mi.render calls --------------------------------------------------------------------
 
         def aov_names(self):
-            return [f"S{i}.{j}" for i in range(4) for j in range(lanes)] if self.stokes and mi.is_polarized else []
+            return [f"S{i}.{j}" for i in range(4) for j in range(self.lanes)] if self.stokes and mi.is_polarized else []
 
         def sample_rays(self, scene, sensor, sampler, *args, **kwargs):
             ray, weight, position = super().sample_rays(scene, sensor, sampler, *args, **kwargs)
+            down = mi.Vector3f(0, 1, 0)  # of our camera's frame; up in a stock one's, which is the same for Stokes vectors
+            self.vertical = sensor.turned(down) if hasattr(sensor, "turned") else sensor.world_transform() @ down
             if mi.is_spectral and self.bands:
                 ray.wavelengths = self.wavelengths(dr.width(ray.o))
                 weight = mi.Spectrum(1.0)
@@ -180,6 +198,7 @@ def build():
             ray = mi.Ray3f(ray)
             first = mi.Vector3f(ray.d)
             bounce = mi.UInt32(0)  # scattering events so far
+            reflected = mi.Bool(False)  # by a rough surface before
             light = mi.Spectrum(0.0)
             throughput = mi.Spectrum(1.0)
             active = mi.Bool(active)
@@ -198,12 +217,16 @@ def build():
                 # light that is hit
                 ds = mi.DirectionSample3f(scene, si=si, ref=previous)
                 mis = mis_weight(pdf, scene.pdf_emitter_direction(previous, ds, ~delta))
-                emitted = ds.emitter.eval(si, active) * dr.select(delta, 1.0, mis)
+                emitted = ds.emitter.eval(si, active & (bounce < self.max_depth)) * dr.select(delta, 1.0, mis)
                 light = light + product(throughput, emitted)
 
                 # light that is sampled
-                onward = active & si.is_valid() & (bounce + 1 < self.max_depth)
-                lit = onward & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+                last = bounce + 1 >= self.max_depth
+                clear = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null) | (mi.has_flag(
+                    bsdf.flags(), mi.BSDFFlags.DeltaTransmission) & ~mi.has_flag(bsdf.flags(), mi.BSDFFlags.DeltaReflection))
+                onward = active & si.is_valid() & (~last | clear)
+                lit = onward & ~last & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+                throughput = dr.select(lit & reflected, throughput * self.interreflection, throughput)
                 ds, sent = scene.sample_emitter_direction(si, sampler.next_2d(), False, lit)
                 lit &= ds.pdf != 0
                 start = dr.select(si.is_medium_transition(), si.target_medium(ds.d), medium)
@@ -219,9 +242,8 @@ def build():
                 bs, factor = bsdf.sample(context, si, sampler.next_1d(), sampler.next_2d(), onward)
                 factor = si.to_world_mueller(factor, -bs.wo, si.wi)
                 straight = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
-                smooth = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Smooth)
+                reflected |= onward & mi.has_flag(bs.sampled_type, mi.BSDFFlags.Smooth)
                 throughput = dr.select(onward, product(throughput, factor), throughput)
-                throughput = dr.select(onward & smooth, throughput * self.interreflection, throughput)
                 direction = si.to_world(bs.wo)
                 medium = dr.select(onward & si.is_medium_transition(), si.target_medium(direction), medium)
                 ray = si.spawn_ray(direction)
@@ -236,9 +258,9 @@ def build():
             channels = []
             if dr.hint(self.stokes and mi.is_polarized, mode="scalar"):
                 basis = mi.mueller.stokes_basis(-first)
-                up = dr.normalize(dr.cross(first, mi.Vector3f(0, -1, 0)))
-                vector = mi.mueller.rotate_stokes_basis_m(-first, basis, up) @ light
-                channels = [vector[i, 0][j] for i in range(4) for j in range(lanes)]
+                side = dr.normalize(dr.cross(first, self.vertical))
+                vector = mi.mueller.rotate_stokes_basis_m(-first, basis, side) @ light
+                channels = [vector[i, 0][j] for i in range(4) for j in range(self.lanes)]
             return light, mi.Bool(True), channels, None
 
         def to_string(self):
