@@ -54,6 +54,8 @@ class Renderer:
                              and k not in self.ambient_keys]
         self.led_keys = {n: [k for k in led_keys if k.rsplit(".", 1)[0] == n and k.rsplit(".", 1)[1] not in POWERS]
                          for n in scene.leds}
+        self._fixed = set(self.geometry_keys)
+        self._still = {k: scene.parameters[k].neutral for k in self.ambient_keys}
         self._tangents: OrderedDict = OrderedDict()
         self.together: set[str] = set()  # LEDs whose images are wanted of the same geometry
 
@@ -66,9 +68,13 @@ class Renderer:
     def geometry(self, values: Mapping) -> tuple:
         return tuple(values[k] for k in self.geometry_keys)
 
-    def _apply(self, values: Mapping) -> None:
-        """Set everything but the LEDs' powers, which stay at 1: images are kept per unit of power."""
-        now = {k: v for k, v in values.items() if k in self.scene.parameters}
+    def _apply(self, values: Mapping, move: bool = True) -> None:
+        """Set everything but the LEDs' powers, which stay at 1: images are kept per unit of power.
+
+        move = False leaves the geometry where it is (rebuilding the gel costs more than an image): enough for shading at
+        hits that are kept, but not for tracing or for shadows.
+        """
+        now = {k: v for k, v in values.items() if k in self.scene.parameters and (move or k not in self._fixed)}
         now.update({f"{n}.{power}": 1.0 for n in self.scene.leds for power in POWERS})
         self.scene.set(now)
 
@@ -212,11 +218,11 @@ class Renderer:
         import mitsuba as mi
 
         image = self.led(values, led)
-        self._apply(values)
         name, parameter = key.rsplit(".", 1)
         part, lamp = self.scene.parts[name], self.scene.leds[led]
-        value = getattr(part, parameter)
         moves = part.kind == "led" and parameter in ("x", "y", "z")
+        self._apply(values, move=moves and len(image.index) > 0)
+        value = getattr(part, parameter)
 
         def tangent(sample, visible):
             attached = mi.Float(dr.detach(value))
@@ -272,15 +278,13 @@ class Renderer:
 
     def ambient(self, values: Mapping) -> np.ndarray:
         """(H, W, B): radiance of the membranes that no LED made."""
-        key = ("ambient", self.geometry(values), tuple(values[k] for k in self.shading_keys + self.ambient_keys))
-        if key not in self._images:
-            hits = self.hits(values)
-            self._apply(values)
-            total = sum(self._bands(self.scene.integrator.ambient(self.scene.mitsuba, hits.si, hits.weight, m)
-                                    + 0 * hits.si.t) for m in self.scene.membranes.values())
-            self._images[key] = np.broadcast_to(total, (self.height * self.width, self.bands)).reshape(
-                self.height, self.width, self.bands)
-        return self._images[key]
+        if all(values[k] == neutral for k, neutral in self._still.items()):
+            return np.zeros((self.height, self.width, self.bands))
+        hits = self.hits(values)
+        self._apply(values, move=False)
+        total = sum(self._bands(self.scene.integrator.ambient(self.scene.mitsuba, hits.si, hits.weight, m) + 0 * hits.si.t)
+                    for m in self.scene.membranes.values())
+        return np.broadcast_to(total, (self.height * self.width, self.bands)).reshape(self.height, self.width, self.bands)
 
 
 class Hits:
@@ -582,11 +586,15 @@ class Model:
                      else tangent(now, name, key))
             return factor * lit[name] * image
         total = sum(power * tangent(now, led, key) for led, power in lit.items())
-        return factor * (total + self._difference_ambient(now, key))
+        return factor * (total + self._difference_ambient(now, key) if kind == "membrane" else total)
 
     def _sides(self, key: str, now: Mapping) -> tuple[float, float]:
+        """The two values of a difference: about the present one, within bounds; from it, where moving it moves the gel and
+        it is no effect (a press), as the present geometry is rendered anyhow and a step of 0.005 mm is near enough."""
         parameter = self.parameters[key]
         step = 0.1 * parameter.plausible
+        if parameter.neutral is None and self.renderer.kind(key) == "gel" and now[key] + step / 2 <= parameter.bounds[1]:
+            return now[key], now[key] + step / 2
         return max(now[key] - step, parameter.bounds[0]), min(now[key] + step, parameter.bounds[1])
 
     def _difference(self, now: Mapping, key: str, seed: int) -> np.ndarray:

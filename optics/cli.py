@@ -1,0 +1,587 @@
+"""The command line: thin. Each command reads its arguments, calls one verb of the library and shows what came of it.
+
+Results go to stdout (`--json` for programs); progress and remarks to stderr, progress only on a terminal. Exit codes: 0 done,
+1 done with a negative finding, 2 an error of the input, said in one line. Heavy imports stand inside the commands.
+"""
+
+import functools
+import inspect
+import json
+import math
+import os
+import re
+import sys
+import time
+import traceback
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from optics import __version__
+
+app = typer.Typer(
+    add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110},
+    help="Optical models of camera-based touch sensors that can be held against a measurement.")
+
+
+# -- what every command shares --------------------------------------------------------------------------------------------
+
+class Terminal:
+    """Where a command speaks: `note` for remarks, `progress` for long work. Results are printed."""
+
+    quiet = False
+    debug = False
+
+    def note(self, text: str) -> None:
+        if not self.quiet:
+            print(text, file=sys.stderr)
+
+    @contextmanager
+    def progress(self) -> Iterator[Callable[[str, int, int], None] | None]:
+        """A function (what, done, total) that draws a bar; None where nobody looks."""
+        if self.quiet or not sys.stderr.isatty():
+            yield None
+            return
+        from rich.console import Console
+        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+        bars = Progress(TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
+                        console=Console(stderr=True), transient=True)
+        tasks: dict[str, int] = {}
+
+        def show(what: str, done: int, total: int) -> None:
+            if what not in tasks:
+                tasks[what] = bars.add_task(what, total=total)
+            bars.update(tasks[what], completed=done, total=total)
+
+        with bars:
+            yield show
+
+
+terminal = Terminal()
+
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no remarks.")]
+Debug = Annotated[bool, typer.Option("--debug", help="Show where in the program an error came from.")]
+AsJson = Annotated[bool, typer.Option("--json", help="The result for programs.")]
+SceneName = Annotated[str, typer.Argument(metavar="SCENE", help="A shipped scene's name (`optics scenes`) or an XML file.")]
+CaptureSet = Annotated[str, typer.Argument(metavar="CAPTURES", help="Folder with captures.toml.")]
+StudyFolder = Annotated[Path, typer.Argument(metavar="STUDY", help="Folder that `optics calibrate` made.")]
+Defines = Annotated[list[str] | None, typer.Option(
+    "-D", "--define", metavar="NAME=VALUE", help="Replace a <default> of the scene's XML. Repeatable.")]
+Settings = Annotated[list[str] | None, typer.Option(
+    "--set", metavar="KEY=VALUE", help="Set a parameter (`optics params SCENE` lists them). Repeatable.")]
+Plugins = Annotated[Path | None, typer.Option("--plugins", metavar="DIR", help="A further folder of plugins.")]
+Variant = Annotated[str | None, typer.Option("--variant", help="Mitsuba variant.", show_default=False)]
+Force = Annotated[bool, typer.Option("--force", help="Replace existing files.")]
+FlatField = Annotated[str | None, typer.Option(
+    "--flat-field", metavar="MODE", help="How a background image enters: multiplicative or additive.")]
+
+
+def command(function: Callable) -> Callable:
+    """Register a command, and give it the options that every command has."""
+    @functools.wraps(function)
+    def run(*args, quiet: bool = False, debug: bool = False, **options):
+        terminal.quiet, terminal.debug = quiet, debug
+        return function(*args, **options)
+
+    shared = [inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=False, annotation=kind)
+              for name, kind in (("quiet", Quiet), ("debug", Debug))]
+    signature = inspect.signature(function)
+    run.__signature__ = signature.replace(parameters=[*signature.parameters.values(), *shared])
+    run.__annotations__ = {**function.__annotations__, "quiet": Quiet, "debug": Debug}
+    return app.command()(run)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a command line and return its exit code."""
+    arguments = list(sys.argv[1:] if arguments is None else arguments) or ["--help"]
+    terminal.quiet, terminal.debug = False, "--debug" in arguments
+    with warnings.catch_warnings():
+        warnings.showwarning = lambda text, *_: terminal.note(f"warning: {_one_line(text)}")
+        try:
+            return int(app(args=arguments, prog_name="optics", standalone_mode=False) or 0)
+        except KeyboardInterrupt:
+            print("interrupted", file=sys.stderr)
+            return 130
+        except BrokenPipeError:  # whoever read our output has seen enough
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            return 0
+        except Exception as error:
+            return _report(error)
+
+
+def _report(error: Exception) -> int:
+    """Say an error in one line; a bug, which is no user's fault, with its traceback."""
+    expected = isinstance(error, (ValueError, LookupError, OSError, RuntimeError)) or hasattr(error, "format_message")
+    if terminal.debug or not expected:
+        traceback.print_exception(error, file=sys.stderr)
+    text = _usage(error) if hasattr(error, "format_message") else _text(error)
+    print(f"error: {_one_line(text)}" + ("" if expected else " (a bug: please report it with the lines above)"), file=sys.stderr)
+    return 2
+
+
+def _usage(error: Exception) -> str:
+    """A wrong option or argument, as typer says it, and where the right ones are listed."""
+    context = getattr(error, "ctx", None)
+    return error.format_message().rstrip(".") + (f"; see `{context.command_path} --help`" if context else "")
+
+
+def _text(error: Exception) -> str:
+    if isinstance(error, OSError) and error.strerror:
+        return f"{error.filename}: {error.strerror}" if error.filename else error.strerror
+    if type(error) is KeyError:
+        return f"no entry {error}"
+    return str(error) or type(error).__name__
+
+
+def _one_line(text: object) -> str:
+    return " ".join(str(text).split())
+
+
+def show(result: object) -> None:
+    """Print a result for programs."""
+    def plain(value):
+        if isinstance(value, Mapping):
+            return {str(k): plain(v) for k, v in value.items()}
+        if isinstance(value, (list, tuple)):
+            return [plain(v) for v in value]
+        return None if isinstance(value, float) and not math.isfinite(value) else value
+
+    print(json.dumps(plain(result), indent=1, allow_nan=False, default=str))
+
+
+def table(rows: Sequence[Sequence[str]]) -> str:
+    """Aligned columns; the last one is as long as it likes."""
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]) - 1)]
+    return "\n".join("  ".join([*(cell.ljust(w) for cell, w in zip(row, widths)), row[-1]]).rstrip() for row in rows)
+
+
+def pairs(items: Sequence[str] | None, option: str) -> dict[str, str]:
+    """{name: text} of NAME=TEXT arguments."""
+    found = {}
+    for item in items or ():
+        name, equals, text = item.partition("=")
+        if not equals or not name.strip():
+            raise ValueError(f"{option} {item}: no '='; allowed: {option} NAME=VALUE")
+        found[name.strip()] = text.strip()
+    return found
+
+
+def settings(items: Sequence[str] | None) -> dict[str, float | str]:
+    """{key: number or word} of --set arguments."""
+    def value(text):
+        try:
+            return float(text)
+        except ValueError:
+            return text
+
+    return {key: value(text) for key, text in pairs(items, "--set").items()}
+
+
+def priors(items: Sequence[str] | None) -> dict[str, tuple[float | None, float]]:
+    """{pattern: (mean, sd)} of PATTERN=MEAN+-SD arguments; without a mean (PATTERN=+-SD) it is the present value."""
+    found = {}
+    for pattern, text in pairs(items, "--prior").items():
+        number = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+        match = re.fullmatch(rf"({number})?\s*(?:\+-|\+/-|±)\s*({number})", text)
+        if match is None or not float(match[2]) > 0:
+            raise ValueError(f"--prior {pattern}={text}: allowed: PATTERN=MEAN+-SD with SD above 0, such as "
+                             "'led_*.x=11+-0.5', or PATTERN=+-SD about the present value")
+        found[pattern] = (float(match[1]) if match[1] else None, float(match[2]))
+    return found
+
+
+def load_scene(name: str, defines: Sequence[str] | None, plugins: Path | None, variant: str | None = None):
+    """The scene of a command line."""
+    from optics import scene
+    from optics.effect import DEFAULT_VARIANT
+
+    return scene.load(name, pairs(defines, "-D"), variant or DEFAULT_VARIANT, plugins)
+
+
+def setup_of(captures: str, defines: Sequence[str] | None, plugins: Path | None, values: Sequence[str] | None, **more):
+    """What a study starts from (optics.loop.Setup); places are absolute, so that any folder can go on with it."""
+    from optics import loop
+
+    return loop.Setup(captures=os.path.abspath(captures), defines=pairs(defines, "-D"), values=settings(values),
+                      plugins=os.path.abspath(plugins) if plugins else None, **more)
+
+
+def scan(plugins: Path | None):
+    """The registry, with a further folder."""
+    from optics.effect import registry
+
+    found = registry()
+    if plugins is not None:
+        found.scan(plugins)
+    return found
+
+
+@app.callback(invoke_without_command=True)
+def optics(version: Annotated[bool, typer.Option("--version", help="Print the version.", is_eager=True)] = False) -> None:
+    if version:
+        print(f"optics {__version__}")
+        raise typer.Exit()
+
+
+# -- looking around -------------------------------------------------------------------------------------------------------
+
+@command
+def scenes(as_json: AsJson = False) -> None:
+    """List the scenes that ship with the program."""
+    from optics import scene
+
+    rows = []
+    for name in scene.shipped_scenes():
+        path = scene.find(name)
+        comment = re.search(r"<!--(.*?)-->", path.read_text(encoding="utf-8"), re.DOTALL)
+        title = next((line.strip() for line in (comment[1] if comment else "").splitlines() if line.strip()), "")
+        rows.append({"name": name, "title": title, "file": str(path)})
+    show(rows) if as_json else print(table([(r["name"], r["title"]) for r in rows]))
+
+
+@command
+def params(scene: SceneName,
+           patterns: Annotated[list[str] | None, typer.Argument(metavar="[PATTERN]...", help="Keys to show: 'led_*', '*.x'.")] = None,
+           define: Defines = None, plugins: Plugins = None, variant: Variant = None, as_json: AsJson = False) -> None:
+    """List the parameters of a scene: value, unit, bounds, neutral value, derivative, meaning."""
+    from optics.effect import registry
+    from optics.errors import UnknownKey
+
+    loaded = load_scene(scene, define, plugins, variant)
+    values = loaded.values()
+    keys = list(values)
+    for pattern in patterns or ():
+        if not any(fnmatchcase(key, pattern) for key in keys):
+            raise UnknownKey(pattern, keys, "parameter", str(loaded.path), "(* and ? match)")
+    brought = {(e.part, name): e.name for e in registry().effects.values() for name in e.parameter_names}
+    rows = []
+    for key in keys:
+        if patterns and not any(fnmatchcase(key, pattern) for pattern in patterns):
+            continue
+        p = loaded.parameters[key]
+        part = loaded.parts.get(key.rsplit(".", 1)[0])
+        rows.append({
+            "key": key, "value": values[key], "unit": p.unit, "bounds": list(p.bounds) if p.is_number else None,
+            "choices": list(p.choices) or None, "neutral": p.neutral, "plausible": p.plausible if p.is_number else None,
+            "differentiable": p.differentiable, "derivative": p.how if p.differentiable else None, "linear": p.linear,
+            "squared": p.squared, "effect": brought.get((part.kind, p.name)) if part is not None else None, "meaning": p.doc})
+    if as_json:
+        return show(rows)
+    how = {"ad": "forward mode", "difference": "differences", "image": "complex step", None: "-"}
+    print(table([("key", "value", "unit", "bounds", "neutral", "derivative", "meaning"), *((
+        r["key"], _number(r["value"]), r["unit"], "|".join(r["choices"]) if r["choices"] else
+        "any" if math.inf in r["bounds"] else " .. ".join(f"{b:g}" for b in r["bounds"]),
+        "-" if r["neutral"] is None else f"{r['neutral']:g}",
+        how[r["derivative"]] + (", linear" if r["linear"] else ", of its square" if r["squared"] else ""),
+        r["meaning"] + (f" [effect: {r['effect']}]" if r["effect"] else "")) for r in rows)]))
+
+
+def _number(value: float | str) -> str:
+    return value if isinstance(value, str) else f"{value:.6g}"
+
+
+@command
+def effects(name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="Show the page of this effect.")] = None,
+            plugins: Plugins = None, as_json: AsJson = False) -> None:
+    """List the physical effects that can be added to a model, or show one's page."""
+    found = scan(plugins)
+    chosen = [found.find_effect(name)] if name else [found.effects[k] for k in sorted(found.effects)]
+    records = [{
+        "key": e.key, "name": e.name, "part": e.part, "stages": list(e.stages), "onset": e.onset, "scope": e.scope, "per": e.per,
+        "acts": list(e.acts), "needs": e.needs, "file": e.file, "parameters": [
+            {"name": p.name, "unit": p.unit, "neutral": p.neutral, "bounds": list(p.bounds), "plausible": p.plausible,
+             "meaning": p.doc} for p in found.effect_parameters(e)],
+        **({"page": e.doc} if name else {})} for e in chosen]
+    if as_json:
+        return show(records[0] if name else records)
+    if not name:
+        return print(table([("effect", "part", "parameters", "onset", "needs"), *(
+            (r["key"], r["part"], ", ".join(p["name"] for p in r["parameters"]), r["onset"], r["needs"] or "-") for r in records)]))
+    r = records[0]
+    print(f"{r['page'].strip()}\n\n{r['name']}: `{r['key']}`, {r['file']}")
+    print(table([("part", f"{r['part']}, one value for {'each ' + r['part'] if r['per'] == 'part' else 'all of the kind'}"
+                          f"{', in each frame' if r['scope'] == 'frame' else ''}"),
+                 ("enters at", ", ".join(r["stages"]) or "the part itself"), ("onset", r["onset"]),
+                 ("acts through", ", ".join(r["acts"]) or "-"), ("needs", r["needs"] or "-")]))
+    print("\n" + table([("parameter", "unit", "neutral", "bounds", "meaning"), *(
+        (p["name"], p["unit"], f"{p['neutral']:g}", f"{p['bounds'][0]:g} .. {p['bounds'][1]:g}", p["meaning"])
+        for p in r["parameters"])]))
+
+
+@command
+def doctor(as_json: AsJson = False) -> None:
+    """Say what this machine can run, and what to do about the rest."""
+    from optics import doctor as machine
+
+    rows = machine.report()
+    print(machine.report_json(rows) if as_json else machine.report_table(rows))
+    if not machine.is_sound(rows):
+        raise typer.Exit(1)
+
+
+# -- pictures -------------------------------------------------------------------------------------------------------------
+
+@command
+def render(scene: SceneName,
+           output: Annotated[Path, typer.Option("-o", "--output", metavar="FILE.exr", help="Where the picture goes.")],
+           define: Defines = None, sets: Settings = None, png: Annotated[bool, typer.Option(
+               "--png", help="Also FILE.png: the camera's digital numbers, free of noise.")] = False,
+           spp: Annotated[int | None, typer.Option("--spp", help="Monte Carlo with so many samples per pixel, and variances; "
+                                                   "without it a sensor is rendered LED by LED, free of noise.")] = None,
+           seed: Annotated[int, typer.Option("--seed", min=0, help="Of everything random.")] = 0, plugins: Plugins = None,
+           variant: Variant = None, force: Force = False, as_json: AsJson = False) -> None:
+    """Render one picture: an EXR with all that is known of it, and its provenance.
+
+    The channels are radiance per band, depth, normals, contact, one image per LED, variances; optics.picture lists them.
+    """
+    from optics.picture import Pictures, claim, write_json
+
+    if output.suffix.lower() != ".exr":
+        raise ValueError(f"-o {output}: '{output.suffix}' is no picture format of this command; allowed: a name ending in .exr")
+    record, preview = output.with_suffix(".json"), output.with_suffix(".png")
+    claim([output, record, *([preview] if png else [])], force)
+    loaded = load_scene(scene, define, plugins, variant)
+    values = loaded.check(settings(sets), "--set")
+    clock = time.perf_counter()
+    pictures = Pictures(loaded, spp=spp)
+    picture = pictures.take(values, seed)
+    seconds = time.perf_counter() - clock
+    if png:
+        picture.write_png(preview)
+    write_json(record, {**picture.header["provenance"], "command": ["optics", *sys.argv[1:]]})
+    picture.write_exr(output)
+    files = [output, record, *([preview] if png else [])]
+    if as_json:
+        return show({"files": [str(f) for f in files], "method": pictures.method, "seconds": seconds,
+                     "channels": list(picture.channels)})
+    for file in files:
+        print(file)
+    terminal.note(f"{pictures.method}, {seconds:.1f} s")
+
+
+@command
+def batch(job: Annotated[Path, typer.Argument(metavar="JOB.toml", help="What to make; optics.batch describes the file.")],
+          shard: Annotated[str, typer.Option("--shard", metavar="K/N", help="Make only every N-th sample, from the K-th on.")] = "1/1",
+          workers: Annotated[int | None, typer.Option("--workers", help="Processes.", show_default="one per core")] = None,
+          plugins: Plugins = None, as_json: AsJson = False) -> None:
+    """Make many pictures from a job file. May be stopped at any moment; the same command goes on."""
+    from optics import batch as work
+
+    part = work.parse_shard(shard)
+    try:
+        with terminal.progress() as progress:
+            result = work.run(job, part, workers, plugins, progress)
+    except KeyboardInterrupt:
+        print("interrupted: what was made is kept, the same command goes on", file=sys.stderr)
+        raise typer.Exit(130) from None
+    if as_json:
+        return show({"folder": str(result.folder), "total": result.total, "own": result.own, "made": result.made,
+                     "complete": result.complete})
+    print(f"{result.folder}: {result.own} of {result.total} samples, {result.made} of them made now"
+          + (", all complete: manifest.csv" if result.complete else ", other shards are still to come"))
+
+
+# -- models and measurements ----------------------------------------------------------------------------------------------
+
+@command
+def compare(captures: CaptureSet,
+            fit: Annotated[Path | None, typer.Option("--fit", metavar="FIT.toml", help="Calibrated values, from a study.")] = None,
+            output: Annotated[Path | None, typer.Option("-o", "--output", metavar="DIR", help="Write numbers and images here.")] = None,
+            define: Defines = None, sets: Settings = None, flat_field: FlatField = None, plugins: Plugins = None,
+            as_json: AsJson = False) -> None:
+    """Hold a scene against captures: misfit by frame, LED, region and channel."""
+    from optics import ladder, loop
+
+    if output is not None:
+        _check_new_folder(output)
+    setup = setup_of(captures, define, plugins, sets, flat_field=flat_field)
+    if fit is not None and not fit.is_file():
+        raise FileNotFoundError(f"{fit}: no such file; a study writes one to STUDY/steps/NN-name/fit.toml")
+    model = loop.open_model(setup)
+    values = values_of(model, fit, setup.values)
+    comparison = loop.comparison_of(model, values, [], 0, 0)
+    if output is not None:
+        worst = comparison.worst()[:ladder.SHOWN_MAX]
+        with _new_folder(output) as folder:
+            (folder / "comparison.txt").write_text(comparison.text() + "\n", encoding="utf-8")
+            (folder / "comparison.csv").write_text(comparison.to_csv(), encoding="utf-8")
+            (folder / "comparison.json").write_text(comparison.to_json() + "\n", encoding="utf-8")
+            for shown in ladder.shown_frames(model, values, frames=worst):
+                _write_frame(folder, shown, model.noise.saturation)
+    print(comparison.to_json() if as_json else comparison.text())
+    if output is not None:
+        terminal.note(f"{output}: the same numbers as text, CSV and JSON, and the worst frames")
+
+
+def values_of(model, fit: Path | None, sets: Mapping[str, float | str]):
+    """The values of a fit.toml, and above them those of --set."""
+    from optics import ladder
+    from optics.errors import UnknownKey
+    from optics.parameter import Values
+
+    data = {"parameters": {}, "frames": {}}
+    if fit is not None:
+        try:
+            data = ladder.read_fit(fit)
+        except ValueError as error:
+            raise ValueError(f"{fit}: not valid TOML: {error}") from error
+    common = model.scene.check({**data["parameters"]}, f"{fit}: [parameters]")
+    names = {f.name: i for i, f in enumerate(model.frames)}
+    own = {}
+    for name, values in data["frames"].items():
+        if name not in names:
+            raise UnknownKey(name, names, "frame", str(fit), "of the captures; the fit belongs to another set")
+        own[names[name]] = model.scene.check(values, f"{fit}: [frames.{name}]")
+    return Values({**common, **model.scene.check(sets, "--set")}, own)
+
+
+@command
+def calibrate(captures: CaptureSet,
+              output: Annotated[Path, typer.Option("-o", "--output", metavar="STUDY", help="Folder of the new study.")],
+              free: Annotated[list[str] | None, typer.Option(
+                  "--free", metavar="PATTERN", help="Parameters to solve for, such as 'led_*.x'. Repeatable. Without it: every "
+                  "LED's position, axis, lobe and power, every membrane's reflectance and roughness.")] = None,
+              per_group: Annotated[list[str] | None, typer.Option(
+                  "--per-group", metavar="PATTERN", help="Parameters with a value per group of frames. Without it: where and how "
+                  "deep each press is. 'none': none.")] = None,
+              prior: Annotated[list[str] | None, typer.Option(
+                  "--prior", metavar="PATTERN=MEAN+-SD", help="What is known beforehand. Repeatable.")] = None,
+              hold_out: Annotated[list[str] | None, typer.Option(
+                  "--hold-out", metavar="GROUP", help="Groups of frames to test on and not to fit. Repeatable. Without it: one in "
+                  "four. 'none': none.")] = None,
+              define: Defines = None, sets: Settings = None, flat_field: FlatField = None, plugins: Plugins = None,
+              seed: Annotated[int, typer.Option("--seed", min=0, help="Of everything random.")] = 0,
+              title: Annotated[str, typer.Option("--title", help="Of the study's report.")] = "",
+              resume: Annotated[bool, typer.Option("--resume", help="Go on with this study.")] = False,
+              as_json: AsJson = False) -> None:
+    """Start a study: solve for the free parameters of the base model, and test it on frames that were held out."""
+    from optics import loop
+    from optics.picture import check_folder
+
+    check_folder(output)
+    none = lambda names: [] if names == ["none"] else names  # noqa: E731
+    setup = setup_of(captures, define, plugins, sets, free=free or [], per_group=none(per_group), priors=priors(prior),
+                     held_out=none(hold_out), flat_field=flat_field, seed=seed)
+    with terminal.progress() as progress:
+        study, model, fit = loop.begin(setup, output, title=title, command=["optics", *sys.argv[1:]], resume=resume,
+                                       progress=progress)
+    for text in study.record["warnings"]:
+        terminal.note(f"warning: {_one_line(text)}")
+    show({"study": str(study.folder), **study.steps[0]}) if as_json else print(f"{fit.table()}\n\n{study.table()}\n{study.folder}")
+    if not fit.converged:
+        raise typer.Exit(1)
+
+
+@command
+def diagnose(study: StudyFolder, as_json: AsJson = False,
+             csv: Annotated[Path | None, typer.Option("--csv", metavar="FILE", help="Write the table of effects here.")] = None) -> None:
+    """Ask what the last step of a study lacks: every effect scored, the best ones added in earnest, one of six verdicts."""
+    from optics import loop
+    from optics.exr import replacing
+
+    found, model, setup = loop.take_up(study)
+    fit = loop.restore(found, model)
+    with terminal.progress() as progress:
+        result = loop.examine(found, model, setup, fit, progress)
+    if csv is not None:
+        with replacing(csv) as temporary:
+            Path(temporary).write_text(result.to_csv(), encoding="utf-8")
+    print(result.to_json() if as_json else result.text())
+    if result.word in ("UNKNOWN", "CANNOT_TELL"):
+        raise typer.Exit(1)
+
+
+@command
+def add(study: StudyFolder, effect: Annotated[str, typer.Argument(metavar="EFFECT", help="Its name (`optics effects`).")],
+        as_json: AsJson = False) -> None:
+    """Free an effect, calibrate everything again, and record it as the next step of the study."""
+    from optics import loop
+    from optics.effect import registry
+
+    found, model, setup = loop.take_up(study)
+    chosen = registry().find_effect(effect)
+    if found.has(chosen.key):
+        raise ValueError(f"{study}: '{chosen.name}' is part of the study already; `optics diagnose {study}` asks what else is missing")
+    fit = loop.restore(found, model)
+    with terminal.progress() as progress:
+        fit, _ = loop.extend(found, model, setup, fit, chosen, progress=progress)
+    show(found.steps[-1]) if as_json else print(f"{fit.table()}\n\n{found.table()}")
+
+
+@command
+def report(study: StudyFolder,
+           output: Annotated[Path | None, typer.Option("-o", "--output", metavar="PAGE.html", help="Default: STUDY/report.html.")] = None,
+           force: Force = False) -> None:
+    """Write a study as one HTML page: pictures, ranking, ladder."""
+    from optics.report import report as write
+
+    print(write(study, output or study / "report.html", overwrite=force))
+
+
+@command
+def demo(output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Where captures, study and report go.")] = Path("renders/demo"),
+         seed: Annotated[int, typer.Option("--seed", min=0, help="Chooses the sensor and its hidden effect.")] = 0,
+         effect: Annotated[str | None, typer.Option("--effect", help="Hide this effect instead.")] = None) -> None:
+    """Make a sensor with a secret, by another path than the model, and find what is missing."""
+    from optics import demo as story
+
+    clock = time.monotonic()
+    with terminal.progress() as progress:
+        found = story.run(output, seed, effect, progress, lambda text: print(text + "\n", flush=True))
+    hidden = found["hidden"]
+    print(f"hidden: {hidden['effect']}, strength {hidden['strength']:g}; named: {', '.join(found['claimed']) or 'nothing'}; last verdict: "
+          f"{found['verdict']}")
+    print(f"held-out chi2 per degree of freedom: {found['first']:.3f} before, {found['held_out']:.3f} after; "
+          f"{time.monotonic() - clock:.0f} s; {found['report']}")
+    if not found["right"]:
+        raise typer.Exit(1)
+
+
+# -- folders --------------------------------------------------------------------------------------------------------------
+
+def _check_new_folder(folder: Path) -> None:
+    from optics.errors import OutputExists
+    from optics.picture import check_folder
+
+    check_folder(folder)
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise OutputExists(f"{folder} exists and is not empty; choose another folder")
+
+
+@contextmanager
+def _new_folder(folder: Path) -> Iterator[Path]:
+    """A folder that appears whole or not at all."""
+    import shutil
+
+    temporary = folder.absolute().parent / f".{folder.name}.{os.getpid()}"
+    temporary.mkdir(parents=True)
+    try:
+        yield temporary
+        if folder.exists():
+            folder.rmdir()  # empty: `_check_new_folder`
+        temporary.rename(folder)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+def _write_frame(folder: Path, shown, saturation: float) -> None:
+    """measured | predicted | residual of a frame side by side; gray: no residual, black and white: 5 sigmas."""
+    import numpy as np
+
+    from optics.exr import write_png
+
+    residual = np.nan_to_num(shown.residual) / 10 + 0.5
+    images = [shown.measured / saturation, shown.predicted / saturation, residual]
+    name = re.sub(r"[^\w.+-]+", "_", shown.name)
+    write_png(folder / "images" / f"{name}.png", np.concatenate(images, 1), tone="linear")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,99 @@
+"""The demonstration: a sensor with a secret, and the loop that finds it.
+
+Captures of a GelSight-type sensor are made by another path than the model (`optics.synthetic`: stock Mitsuba, a denser mesh,
+photons, read noise, 8 bits), with one effect that the base model lacks, chosen by the seed. Then the loop runs blind: calibrate,
+compare, name the missing effect, add it, watch the error on held-out presses fall; and a report tells the story.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from optics import captures as capture_files, loop, scene as scenes, synthetic
+from optics.effect import registry
+
+# Hidden strengths, in the units of the effects' own parameters: a few percent of the picture, as real sensors have it.
+SECRETS = {
+    "lens vignetting": 0.8, "veiling glare": 0.03, "colour crosstalk": 0.03, "lens blur": 0.6, "interreflection": 1.0,
+    "gel absorption": 0.02, "specular lobe": 0.06, "LED size": 1.5, "residual response curve": 0.12,
+}
+SIZE = (160, 120)
+EXPOSURE = 200.0  # one LED at a time: its brightest spot comes near full scale
+PRESSES = 6
+STEPS = 3  # effects that the loop may add before it must stop
+
+
+def truth(scene, seed: int) -> dict[str, float]:
+    """A sensor as it was built and not as it was drawn: LEDs half a millimetre and some degrees off, powers by a tenth."""
+    rng = np.random.default_rng([seed, 1])
+    drawn, built = scene.values(), {}
+    for led in scene.leds:
+        for axis in "xyz":
+            built[f"{led}.{axis}"] = drawn[f"{led}.{axis}"] + 0.5 * rng.uniform(-1, 1)
+        built[f"{led}.pan"], built[f"{led}.tilt"] = (4 * rng.uniform(-1, 1) for _ in range(2))
+        built[f"{led}.power"] = 1 + 0.1 * rng.uniform(-1, 1)
+        built[f"{led}.mu"] = drawn[f"{led}.mu"] + 0.25 * rng.uniform(-1, 1)
+    built.update({"membrane.rho_r": 0.66, "membrane.rho_g": 0.52, "membrane.rho_b": 0.40, "membrane.sigma": 0.25})
+    return built
+
+
+def secret(seed: int, name: str | None = None) -> tuple[str, float]:
+    """The hidden effect of a seed, or the one of a name."""
+    names = sorted(SECRETS)
+    name = name or names[int(np.random.default_rng([seed, 2]).integers(len(names)))]
+    return registry().find_effect(name).name, SECRETS[registry().find_effect(name).name]
+
+
+def make(folder: Path, seed: int, name: str | None = None, progress: Callable | None = None) -> tuple[str, float]:
+    """Write the captures of a demonstration; returns the secret, which the captures do not tell."""
+    scene = scenes.load("gelsight", {"width": str(SIZE[0]), "height": str(SIZE[1])})
+    effect, strength = secret(seed, name)
+    hidden = {} if strength == 0 else {effect: strength}
+    built = {**truth(scene, seed), "camera.exposure": EXPOSURE}
+    maker = synthetic.Maker(scene, built, hidden, seed=seed + 1000)
+    found = maker.captures(synthetic.presses(PRESSES, seed), known_to=0.01, progress=progress)
+    found.parameters["camera.exposure"] = EXPOSURE
+    capture_files.write(found, folder, bits=8)
+    return effect, strength
+
+
+def run(folder: str | Path, seed: int = 0, effect: str | None = None, progress: Callable | None = None,
+        say: Callable[[str], None] = lambda text: None) -> dict:
+    """Make captures, run the loop, write the report; returns what happened.
+
+    folder   gets `captures/`, `study/` and `report.html`; what is there already from the same seed is taken up
+    say      receives the story, a paragraph at a time
+    """
+    from optics.report import report
+
+    folder = Path(folder)
+    note = folder / "secret.json"
+    if not (folder / "captures" / "captures.toml").is_file():
+        name, strength = make(folder / "captures", seed, effect, progress)
+        note.write_text(json.dumps({"effect": name, "strength": strength, "seed": seed}))
+    hidden = json.loads(note.read_text())
+    say(f"{PRESSES} presses under 6 LEDs, one at a time, made by stock Mitsuba with an effect that the base model lacks.")
+    setup = loop.Setup(captures=str(folder / "captures"), seed=seed)
+    study, model, fit = loop.begin(setup, folder / "study", title="Demonstration", resume=True, progress=progress)
+    say(study.table())
+    claimed = [e.name for e in loop.effects_of(study)]
+    diagnosis = None
+    for _ in range(STEPS + 1):
+        diagnosis = loop.examine(study, model, setup, fit, progress)
+        say(diagnosis.text())
+        if diagnosis.word != "CLAIM" or len(claimed) >= STEPS:
+            break
+        name = diagnosis.missing
+        start = diagnosis.fits[name].values if name in diagnosis.fits else None
+        fit, _ = loop.extend(study, model, setup, fit, registry().find_effect(name), start, progress)
+        claimed.append(name)
+        say(study.table())
+    page = report(study.folder, folder / "report.html", overwrite=True)
+    last = study.steps[-1]["held_out"]
+    return {"hidden": hidden, "claimed": claimed, "verdict": diagnosis.word, "held_out": last["chi2_per_dof"],
+            "first": study.steps[0]["held_out"]["chi2_per_dof"], "report": str(page),
+            "right": claimed[:1] == [hidden["effect"]] and last["chi2_per_dof"] <= 1.1}

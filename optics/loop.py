@@ -1,0 +1,299 @@
+"""The loop: calibrate the base model, ask what is missing, add it, watch the held-out error fall; step by step on disk.
+
+    study = begin(setup, folder)            base model, calibrated on the frames that are not held out
+    diagnosis = examine(study)              what does it lack?
+    extend(study, "lens vignetting")        free that effect, calibrate everything again
+    ... until the verdict is NOTHING, or UNKNOWN
+
+Every step is a folder of the study (optics.ladder), and each can be taken up again by another process from that folder.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field
+from fnmatch import fnmatch
+from pathlib import Path
+
+import numpy as np
+
+from optics import calibrate, captures as capture_files, ladder, scene as scenes
+from optics.compare import Comparison, compare
+from optics.effect import Effect, registry
+from optics.errors import BadCapture, Underdetermined, UnknownKey
+from optics.ladder import Study
+from optics.parameter import Values, Variable
+from optics.render import Model
+
+Progress = Callable[[str, int, int], None]
+
+POSE = ("press_x", "press_y", "press_depth")  # what is solved for per press, unless the user says otherwise
+POSE_SD = 0.05  # mm: how well a stage usually knows it
+
+
+@dataclass
+class Setup:
+    """What a study starts from; kept in its record, so that any process can go on with it.
+
+    captures    folder of the capture set
+    defines     -D of the scene; the image size is added where the scene names width and height
+    free        key patterns that are solved for in all frames; empty: every LED (position, axis, lobe, power), every
+                membrane (rho, sigma)
+    per_group   key patterns with a value per group of frames; None: the press, where groups are given
+    priors      pattern -> (mean or None for the present value, standard deviation)
+    held_out    names of groups that the calibration does not see; None: one in four, evenly spread
+    """
+
+    captures: str
+    defines: dict[str, str] = field(default_factory=dict)
+    plugins: str | None = None
+    free: list[str] = field(default_factory=list)
+    per_group: list[str] | None = None
+    priors: dict[str, tuple[float | None, float]] = field(default_factory=dict)
+    held_out: list[str] | None = None
+    values: dict[str, float] = field(default_factory=dict)
+    flat_field: str | None = None
+    seed: int = 0
+
+
+def open_model(setup: Setup, model_class: type = Model) -> Model:
+    """Captures and scene of a setup as a model; raises before anything is rendered when they contradict each other."""
+    found = capture_files.load(setup.captures)
+    path = scenes.find(found.scene)
+    defines = dict(setup.defines)
+    height, width = found.frames[0].image.shape[:2]
+    text = path.read_text(encoding="utf-8")
+    for name, size in (("width", width), ("height", height)):
+        if f'<default name="{name}"' in text:
+            defines.setdefault(name, str(size))
+    plugins = Path(setup.plugins) if setup.plugins else None
+    if plugins is None and (Path(setup.captures) / "plugins").is_dir():
+        plugins = Path(setup.captures) / "plugins"
+    loaded = scenes.load(path, defines, plugins=plugins)
+    capture_files.check(found, loaded.parameters)
+    noise = found.noise
+    if noise is None:
+        from optics.noise import estimate
+
+        noise = estimate(found)
+    options = {} if setup.flat_field is None else {"flat_field": setup.flat_field}
+    return model_class(loaded, found, noise, **options)
+
+
+def split(model: Model, setup: Setup) -> tuple[list[int], list[int]]:
+    """Indices of fitted and of held-out frames. Raises UnknownKey for a group that does not exist."""
+    groups = capture_files.groups(model.captures)
+    names = list(groups)
+    held = setup.held_out
+    if held is None:
+        held = names[1::4] if len(names) >= 4 else []
+    for name in held:
+        if name not in groups:
+            raise UnknownKey(name, names, "group of frames", setup.captures)
+    out = sorted(i for name in held for i in groups[name])
+    fitted = [i for i in range(len(model.frames)) if i not in set(out)]
+    if not fitted:
+        raise Underdetermined(f"{setup.captures}: every group is held out; leave some to calibrate on")
+    return fitted, out
+
+
+def default_free(model: Model) -> list[str]:
+    """Every LED's position, axis, lobe and power, and every membrane's reflectance and roughness."""
+    patterns = []
+    spectral = len(model.scene.integrator.bands or (0,))
+    for led in model.scene.leds:
+        patterns += [f"{led}.{n}" for n in ("x", "y", "z", "pan", "tilt", "mu", "power")]
+    for membrane in model.scene.membranes:
+        patterns += [f"{membrane}.rho_{c}" for c in "rgb"[:spectral]] + [f"{membrane}.sigma"]
+    return patterns
+
+
+def variables_of_base(model: Model, setup: Setup, frames: Sequence[int]) -> list[Variable]:
+    """The base model's variables: free ones in all frames, and those of each group."""
+    free = setup.free or default_free(model)
+    priors = {k: tuple(v) for k, v in setup.priors.items()}
+    if not setup.free:
+        # the lambda term of S4: powers and reflectances are only determined together
+        priors = {**{f"{led}.power": (None, 0.3) for led in model.scene.leds}, **priors}
+    per_group = setup.per_group
+    grouped = any(f.group for f in model.frames)
+    if per_group is None:
+        per_group = []
+        if grouped and model.scene.gel is not None:
+            per_group = [f"{model.scene.gel.name}.{n}" for n in POSE]
+            priors = {**{f"{p}*": (None, POSE_SD) for p in per_group}, **priors}
+    variables = calibrate.variables_from(model, free, per_group, None, frames)
+    for pattern, prior in priors.items():
+        variables = [_with_prior(model, v, pattern, prior) for v in variables]
+    return variables
+
+
+def _with_prior(model, variable: Variable, pattern: str, prior) -> Variable:
+    if not (fnmatch(variable.keys[0], pattern) or fnmatch(variable.name, pattern)):
+        return variable
+    mean = calibrate.start_of(model, variable, Values()) if prior[0] is None else prior[0]
+    return variable.with_prior(mean, prior[1])
+
+
+def effects_of(study: Study) -> list[Effect]:
+    """The effects that the study has added so far."""
+    return [registry().find_effect(step["effect"]) for step in study.steps if step["effect"]]
+
+
+def effect_variables(model: Model, effect: Effect) -> list[Variable]:
+    return model.scene.variables_of(effect, len(model.frames))
+
+
+def fit_base(model: Model, variables: Sequence[Variable], fitted: Sequence[int], start: Values,
+             progress: Progress | None = None) -> calibrate.Fit:
+    """Calibrate in two stages: what holds in all frames first, then the poses with it."""
+    common = [v for v in variables if v.frames is None]
+    if len(common) < len(variables) and common:
+        first = calibrate.fit(model, common, start, fitted, max_iterations=8, progress=progress)
+        start = first.values
+    return calibrate.fit(model, list(variables), start, fitted, progress=progress)
+
+
+def held_out_values(model: Model, found: calibrate.Fit, setup: Setup, held: Sequence[int], effects: Sequence[Effect] = ()
+                    ) -> tuple[Values, int]:
+    """Values for all frames: on held-out ones only what is solved for per frame is fitted. And how many those are."""
+    if not held:
+        return found.values, 0
+    pose = [v for v in variables_of_base(model, setup, held) if v.frames is not None]
+    pose += [v for e in effects if e.scope == "frame" for v in effect_variables(model, e)
+             if v.frames is not None and set(v.frames) <= set(held)]
+    if not pose:
+        return found.values, 0
+    return calibrate.fit(model, pose, found.values, held).values, len(pose)
+
+
+def comparison_of(model: Model, values: Values, held: Sequence[int], parameters: int, held_parameters: int) -> Comparison:
+    """All frames measured against predicted, by optics.compare."""
+    predicted = model.predict(values)
+    return compare([f.image for f in model.frames], predicted, [model.noise.sd(p) for p in predicted],
+                   [model.usable(i) for i in range(len(model.frames))],
+                   [model.coordinates(values, i) for i in range(len(model.frames))],
+                   [f.parameters for f in model.frames], [f.group or f.name for f in model.frames],
+                   names=[f.name for f in model.frames], full_scale=model.noise.saturation - model.noise.black_level,
+                   black_level=model.noise.black_level, held_out=held, parameters=parameters,
+                   held_out_parameters=held_parameters)
+
+
+def begin(setup: Setup, folder: str | Path, *, title: str = "", command: Sequence[str] = (), resume: bool = False,
+          progress: Progress | None = None) -> tuple[Study, Model, calibrate.Fit]:
+    """Start a study: calibrate the base model and record it as the first step."""
+    model = open_model(setup)
+    fitted, held = split(model, setup)
+    variables = variables_of_base(model, setup, fitted)
+    everywhere = variables_of_base(model, setup, range(len(model.frames)))
+    for pattern in setup.priors:
+        if not any(fnmatch(name, pattern) for v in everywhere for name in (v.keys[0], v.name)):
+            raise UnknownKey(pattern, [v.name for v in everywhere], "free parameter for a prior")
+    model.scene.check(setup.values, "start values")
+    usable = [model.usable(i) for i in range(len(model.frames))]
+    study = Study.create(
+        folder, scene=str(model.captures.scene), captures=str(setup.captures),
+        inputs=[setup.captures, model.scene.path, *registry().folders], seed=setup.seed, command=command, title=title,
+        noise=asdict(model.noise), warnings=_warnings(model), resume=resume,
+        facts={"frames": len(model.frames), "fitted": len(fitted), "held_out": len(held),
+               "image": list(model.shape), "masked": 1 - float(np.mean([u.mean() for u in usable])), "setup": asdict(setup)})
+    if study.steps:
+        return study, model, restore(study, model)
+    start = Values(dict(setup.values))
+    clock = time.perf_counter()
+    try:
+        found = fit_base(model, variables, fitted, start, progress)
+        record(study, model, setup, "base", None, found, held, time.perf_counter() - clock)
+    except BaseException:
+        study.discard()
+        raise
+    return study, model, found
+
+
+def _warnings(model: Model) -> list[str]:
+    from optics.noise import warnings_of
+
+    return list(dict.fromkeys([*model.captures.warnings, *warnings_of(model.noise, model.captures)]))
+
+
+def record(study: Study, model: Model, setup: Setup, name: str, effect: Effect | None, found: calibrate.Fit,
+           held: Sequence[int], seconds: float) -> Comparison:
+    """Write a calibrated model down as the next step of the study."""
+    added = effects_of(study) + ([effect] if effect else [])
+    values, extra = held_out_values(model, found, setup, held, added)
+    comparison = comparison_of(model, values, held, len(found.variables), extra)
+    everywhere = Values(dict(found.values.common), {**values.frame, **found.values.frame})
+    kept = calibrate.Fit(**{**found.__dict__, "values": everywhere})
+    study.add_step(name, effect.key if effect else None, kept, comparison,
+                   frames=ladder.shown_frames(model, everywhere, held), seconds=seconds)
+    return comparison
+
+
+def take_up(folder: str | Path) -> tuple[Study, Model, Setup]:
+    """A study that exists, with its model."""
+    study = Study.open(folder)
+    setup = Setup(**study.record["facts"]["setup"])
+    setup.priors = {k: tuple(v) for k, v in setup.priors.items()}
+    changed = study.changed_inputs()
+    if changed:
+        raise BadCapture(f"{folder}: changed since the study began: {', '.join(changed[:5])}; start a new study")
+    return study, open_model(setup), setup
+
+
+def restore(study: Study, model: Model, index: int = -1) -> calibrate.Fit:
+    """The fit of a step, from its folder: the same variables and values, with errors computed afresh."""
+    setup = Setup(**study.record["facts"]["setup"])
+    fitted, _ = split(model, setup)
+    steps = study.steps[:len(study.steps) + index + 1] if index < 0 else study.steps[:index + 1]
+    data = study.fit(len(steps) - 1)
+    names = {f.name: i for i, f in enumerate(model.frames)}
+    values = Values(dict(data["parameters"]), {names[n]: dict(own) for n, own in data["frames"].items()})
+    variables = variables_of_base(model, setup, fitted)
+    for step in steps:
+        if step["effect"]:
+            variables += [v for v in effect_variables(model, registry().find_effect(step["effect"]))
+                          if v.frames is None or set(v.frames) <= set(fitted)]
+    return calibrate.fit(model, variables, values, fitted, max_iterations=6)
+
+
+def candidates(model: Model, study: Study) -> list[Effect]:
+    """Every effect that the scene can express and the study has not added."""
+    done = {e.key for e in effects_of(study)}
+    return [e for k, e in sorted(registry().effects.items()) if k not in done and model.scene.can_express(e)]
+
+
+def examine(study: Study, model: Model, setup: Setup, found: calibrate.Fit, progress: Progress | None = None):
+    """Diagnose the last step and write the diagnosis, with the best effects' fingerprints, into it."""
+    from optics.diagnose import diagnose
+
+    fitted, held = split(model, setup)
+    result = diagnose(model, found, candidates(model, study), lambda e: effect_variables(model, e), held,
+                      fitted=fitted, seed=setup.seed, progress=progress)
+    worst = int(np.argmax(np.array(found.frame_chi2) / np.maximum(found.frame_n, 1)))
+    study.put_diagnosis(len(study.steps) - 1, result, ladder.fingerprints_of(model, found, result, found.frames[worst]))
+    return result
+
+
+def extend(study: Study, model: Model, setup: Setup, found: calibrate.Fit, effect: Effect, start: Values | None = None,
+           progress: Progress | None = None) -> tuple[calibrate.Fit, Comparison]:
+    """Free an effect, calibrate everything again, and record the step.
+
+    start   values to begin from, such as those of the diagnosis's refit; else the present ones with the effect moved off
+            neutral by a tenth of its plausible size (one-sided onsets have no slope to follow exactly at a bound)
+    """
+    fitted, held = split(model, setup)
+    if not model.scene.can_express(effect):
+        missing = [n for n, keys in model.scene.keys_of(effect).items() if not keys]
+        raise UnknownKey(effect.part, [p.kind for p in model.scene.parts.values()], "part of the scene",
+                         str(model.scene.path), f"the effect '{effect.name}' needs it for {', '.join(missing)}")
+    extra = [v for v in effect_variables(model, effect) if v.frames is None or set(v.frames) <= set(fitted)]
+    variables = [*found.variables, *extra]
+    if start is None:
+        start = found.values.copy()
+        for v in extra:
+            start.put(v, calibrate.start_of(model, v, start) + 0.1 * v.parameter.plausible)
+    clock = time.perf_counter()
+    best = calibrate.fit(model, variables, start, fitted, progress=progress)
+    comparison = record(study, model, setup, effect.name, effect, best, held, time.perf_counter() - clock)
+    return best, comparison

@@ -1,0 +1,310 @@
+"""One picture of a scene with everything that is known of it: what `optics render` and `optics batch` write.
+
+A sensor of this program's parts is rendered LED by LED, without noise (optics.render). Every other Mitsuba scene, and a
+sensor beside stock lights or behind stock glass, goes through `mi.render`, with the variance of each mean. An EXR holds
+
+    R, G, B                      preview, linear sRGB; of a sensor times its exposure, so that 1 is full scale
+    S0.610,000000nm ...          radiance per band; S1 to S3 where the integrator has `stokes`
+    depth.Z                      mm from the camera along its axis; infinite where a ray met nothing
+    normal.X, .Y, .Z             of the surface, in the scene's frame
+    contact.Y                    1 where the indenter touches
+    led_1.R, .G, .B ...          what one LED sends, in the first three bands; with the ambient light they add up to S0
+    variance.*                   variance of the mean of a Monte Carlo channel
+
+and its provenance: scene and plugins by hash, every parameter, versions, seed. It names no place and no time, so that on
+one thread (optics.batch) the same input gives the same bytes; with several, sums may differ in their last bit.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from optics import exr
+from optics.develop import Developer
+from optics.effect import is_part, registry
+from optics.errors import BadScene, OutputExists
+from optics.ladder import file_hash, versions
+from optics.render import Hits, Renderer
+from optics.scene import Scene
+
+UNITS = "W.mm^-2.sr^-1"  # of S0, for LED powers in W/sr
+PASSES = 8  # of a Monte Carlo render: their scatter is its variance
+LAYERS = ("spectral", "aov", "leds")
+
+
+@dataclass
+class Picture:
+    """A rendered picture.
+
+    channels   EXR name -> (H, W)
+    header     EXR header
+    camera     (H, W, C) DN of the camera, free of noise and not clipped; None for scenes without a camera of this program's
+    """
+
+    channels: dict[str, np.ndarray]
+    header: dict[str, object] = field(default_factory=dict)
+    camera: np.ndarray | None = None
+
+    def write_exr(self, path: Path) -> Path:
+        return exr.write(path, self.channels, self.header)
+
+    def write_png(self, path: Path, saturation: float = 255.0) -> Path:
+        """The camera's DN as they are; without a camera, the preview as sRGB."""
+        if self.camera is not None:
+            return exr.write_png(path, self.camera, white=saturation, tone="linear")
+        names = [n for n in "RGB" if n in self.channels] or ["Y"]
+        return exr.write_png(path, np.nan_to_num(np.stack([self.channels[n] for n in names], -1)))
+
+
+class Pictures:
+    """Makes pictures of one scene, with other values each time.
+
+    black, saturation   DN, of the camera
+    spp                 samples per pixel: render by Monte Carlo, even where LED by LED is possible
+    method              "LED by LED", or why the scene goes through `mi.render`
+    """
+
+    def __init__(self, scene: Scene, *, spp: int | None = None, black: float = 0.0, saturation: float = 255.0,
+                 layers: Sequence[str] = LAYERS):
+        if spp is not None and spp < 1:
+            raise ValueError(f"spp = {spp}; allowed: whole numbers from 1 on (samples per pixel)")
+        self.scene, self.spp, self.layers = scene, spp, tuple(layers)
+        self.base = scene.values()
+        sensors = scene.mitsuba.sensors()
+        if len(sensors) != 1:
+            raise BadScene(f"{scene.path}: {len(sensors)} cameras; one is allowed: write one <sensor>")
+        if not scene.mitsuba.emitters():
+            raise BadScene(f"{scene.path}: no light; add an LED, <emitter type=\"led\" id=\"led_1\">, or another emitter")
+        if scene.mitsuba.integrator() is None:
+            raise BadScene(f"{scene.path}: no integrator; add <integrator type=\"tactile\" id=\"integrator\">, or another one")
+        reason = "samples per pixel were asked for" if spp is not None else obstacle(scene)
+        self.renderer = None if reason else Renderer(scene, remember=2)
+        self.method = f"Monte Carlo: {reason}" if reason else "LED by LED"
+        self.developer = None
+        if scene.camera is not None and scene.integrator is not None:
+            self.bands = scene.integrator.bands
+            self.developer = Developer(scene.camera, self.bands or (0.0,), black, saturation)
+        self.record = {"scene": scene_record(scene), "plugins": plugins_record(), "variant": scene.variant,
+                       "method": self.method, "versions": versions()}
+
+    @property
+    def exact(self) -> bool:
+        """Whether pictures are made LED by LED."""
+        return self.renderer is not None
+
+    def take(self, values: Mapping[str, float | str] | None = None, seed: int = 0, lit: Sequence[str] | None = None) -> Picture:
+        """The picture for values that replace the scene's; lit: the LEDs that are on (None: all with power)."""
+        now = {**self.base, **self.scene.check(values or {})}
+        if lit is not None:
+            now.update({f"{led}.power": 0.0 for led in self.scene.leds if led not in lit})
+        picture = self._exact(now, seed) if self.renderer is not None else self._monte_carlo(now, seed)
+        picture.header["provenance"] = {**self.record, "seed": seed, "parameters": now}
+        return picture
+
+    def _exact(self, now: Mapping, seed: int) -> Picture:
+        renderer = self.renderer
+        total = np.array(renderer.ambient(now), float)
+        bounce = now[renderer.bounce_key]
+        alone = {}
+        for led in self.scene.leds:
+            if now[f"{led}.power"] == 0:
+                continue
+            image = renderer.led(now, led).radiance
+            if bounce:
+                image = image + bounce * renderer.bounced(now, led, seed)
+            alone[led] = renderer.powers(now, led) * image
+            total += alone[led]
+        channels = self._radiance_channels(total, now)
+        if "aov" in self.layers:
+            channels.update(self._surface(renderer.hits(now), now))
+        if "leds" in self.layers:
+            for led, image in alone.items():
+                channels.update(zip((f"{led}.{n}" for n in self._band_names()), np.moveaxis(image, -1, 0)))
+        header = exr.spectral_header(False, UNITS) if self.bands else {}
+        self.scene.set(now)  # the renderer leaves the LEDs at power 1
+        return Picture(channels, header, self.developer.develop(total, now))
+
+    def _monte_carlo(self, now: Mapping, seed: int) -> Picture:
+        scene = self.scene
+        scene.set(now)
+        polarized, ours = "polarized" in scene.variant, scene.integrator is not None
+        stokes = ours and scene.integrator.stokes
+        if ours:
+            scene.integrator.stokes = polarized  # its channels are the only way to the bands
+        try:
+            mean, variance, spp = self._passes(seed)
+        finally:
+            if ours:
+                scene.integrator.stokes = stokes
+        radiance = None
+        if ours and polarized:
+            mean, variance = ({name: image for name, image in c.items() if "." in name} for c in (mean, variance))
+            lanes = self.bands or (0.0,)
+            pick = lambda c, s: np.stack([c[f"S{s}.{j}"] for j in range(len(lanes))], -1)  # noqa: E731
+            radiance = pick(mean, 0)
+            components = range(4) if stokes else range(1)
+            channels = self._radiance_channels(np.stack([pick(mean, s) for s in components], -1), now)
+            if self.bands:
+                scatter = exr.spectral_channels(self.bands, np.stack([pick(variance, s) for s in range(4)], -1))
+                variance = {n: image for n, image in scatter.items() if n in channels}
+        else:
+            channels = mean
+        channels.update({f"variance.{name}": image for name, image in variance.items() if name in channels})
+        if "aov" in self.layers:
+            channels.update(self._surface(self._hits(), now))
+        header = {**(exr.spectral_header(stokes, UNITS) if radiance is not None and self.bands else {}), "samplesPerPixel": spp}
+        camera = self.developer.develop(radiance, now) if radiance is not None else None
+        return Picture(channels, header, camera)
+
+    def _passes(self, seed: int) -> tuple[dict, dict, int]:
+        """Mean and variance of the mean of every channel by name, and the samples per pixel; passes of different seeds."""
+        import mitsuba as mi
+
+        sensor = self.scene.mitsuba.sensors()[0]
+        spp = self.spp or int(sensor.sampler().sample_count())
+        passes = min(PASSES, spp)
+        per_pass = spp // passes
+        seeds = np.random.SeedSequence(seed).generate_state(passes)
+        total, squares = 0.0, 0.0
+        for k in range(passes):
+            image = np.array(mi.render(self.scene.mitsuba, spp=per_pass, seed=int(seeds[k])), float)
+            total, squares = total + image, squares + image * image
+        names = [f.name for f in sensor.film().bitmap(raw=False).struct_()]
+        total = total.reshape(*total.shape[:2], -1)
+        mean = total / passes
+        if len(names) != mean.shape[2]:
+            names = [f"channel{i}" for i in range(mean.shape[2])]
+        variance = np.maximum(squares.reshape(mean.shape) / passes - mean**2, 0) / max(passes - 1, 1)
+        split = [{name: image[..., i] for i, name in enumerate(names)} for image in (mean, variance)]
+        return split[0], split[1] if passes > 1 else {}, per_pass * passes
+
+    def _band_names(self) -> list[str]:
+        return list("RGB") if len(self.bands) == 3 else [exr.spectral_name(b)[3:] for b in self.bands] or ["Y"]
+
+    def _radiance_channels(self, radiance: np.ndarray, now: Mapping) -> dict[str, np.ndarray]:
+        """Preview and spectral channels of (H, W, B), or of Stokes vectors (H, W, B, 4)."""
+        s0 = radiance if radiance.ndim == 3 else radiance[..., 0]
+        if not self.bands:
+            return {"Y": s0[..., 0]}
+        channels = exr.preview_channels(self.bands, s0 * now[f"{self.scene.camera.name}.exposure"])
+        if "spectral" in self.layers:
+            parts = radiance[..., 0] if radiance.ndim == 4 and radiance.shape[3] == 1 else radiance
+            channels.update(exr.spectral_channels(self.bands, parts))
+        return channels
+
+    def _hits(self) -> Hits:
+        """What the rays through the pixels' centres meet."""
+        import drjit as dr
+        import mitsuba as mi
+
+        scene, sensor = self.scene.mitsuba, self.scene.mitsuba.sensors()[0]
+        width, height = (int(n) for n in sensor.film().crop_size())
+        v, u = (mi.Float((a.ravel() + 0.5).astype(np.float32)) for a in np.mgrid[:height, :width])
+        with dr.suspend_grad():
+            if self.developer is not None:
+                si, weight, origin = self.scene.integrator.hits(scene, self.scene.camera, u, v)
+            else:
+                ray, _ = sensor.sample_ray(mi.Float(0), mi.Float(0.5), mi.Point2f(u / width, v / height), mi.Point2f(0.5))
+                si, weight, origin = scene.ray_intersect(ray), None, ray.o
+        return Hits(si, weight, origin, height, width)
+
+    def _surface(self, hits: Hits, now: Mapping) -> dict[str, np.ndarray]:
+        """depth, normal and contact of what the pixels' centres see."""
+        origin, axis = self._view(now)
+        valid, position = hits.valid, hits.position
+        normal = np.where(valid[..., None], hits.normal, 0.0)
+        channels = {"depth.Z": np.where(valid, (position - origin) @ axis, np.inf)}
+        channels.update({f"normal.{name}": normal[..., i] for i, name in enumerate("XYZ")})
+        if self.scene.gel is not None:
+            x, y = (np.where(valid, position[..., i], 0.0) for i in (0, 1))
+            touched = self.scene.gel.contact_weight(x.ravel(), y.ravel()).reshape(valid.shape) > 0.5
+            channels["contact.Y"] = (touched & valid).astype(np.float32)
+        return channels
+
+    def _view(self, now: Mapping) -> tuple[np.ndarray, np.ndarray]:
+        """Position and axis of the camera."""
+        import mitsuba as mi
+
+        camera = self.scene.camera
+        if camera is not None:
+            width, height = camera.resolution
+            o, d = camera.ray(mi.Float(width / 2 + now[f"{camera.name}.principal_x"]),
+                              mi.Float(height / 2 + now[f"{camera.name}.principal_y"]))
+        else:
+            pose = self.scene.mitsuba.sensors()[0].world_transform()
+            o, d = pose @ mi.Point3f(0), pose @ mi.Vector3f(0, 0, 1)
+        return tuple(np.array(a, float).reshape(3, -1)[:, 0] for a in (o, d))
+
+
+def obstacle(scene: Scene) -> str:
+    """Why a scene cannot be rendered LED by LED; empty where it can."""
+    import mitsuba as mi
+
+    if scene.camera is None or scene.integrator is None or not scene.leds:
+        return "the scene has no camera, LED and integrator of this program's"
+    others = [e for e in scene.mitsuba.emitters() if not is_part(e)]
+    if others:
+        return f"{len(others)} of its lights are no LED"
+    for shape in scene.mitsuba.shapes():
+        bsdf = shape.bsdf()
+        if shape.is_medium_transition():
+            return "it has a medium"
+        if getattr(bsdf, "kind", "") != "interface" and mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta | mi.BSDFFlags.Null):
+            return "it has mirrors or clear surfaces that are no 'interface'"
+    return ""
+
+
+# -- provenance ---------------------------------------------------------------------------------------------------------
+
+def scene_record(scene: Scene) -> dict:
+    """Name and hash of the scene file, its definitions, and the hash of every file that it names."""
+    text = scene.path.read_text(encoding="utf-8")
+    named = re.findall(r'name="(?:filename|indenter)"\s+value="([^"$]+\.\w+)"', text)
+    named += [str(v) for v in scene.defines.values()] + [str(v) for v in scene.values().values() if isinstance(v, str)]
+    files = {}
+    for name in named:
+        for folder in (scene.path.parent, Path()):
+            if (folder / name).is_file():
+                files[Path(name).name] = file_hash(folder / name)
+                break
+    return {"name": scene.path.name, "hash": file_hash(scene.path), "files": dict(sorted(files.items())),
+            "defines": {k: str(v) for k, v in sorted(scene.defines.items())}}
+
+
+def plugins_record() -> dict[str, str]:
+    """Plugin file, relative to its folder, -> hash."""
+    return {file.relative_to(folder).as_posix(): file_hash(file) for folder in registry().folders
+            for file in sorted(folder.rglob("*.py")) if not file.name.startswith("_")}
+
+
+# -- files --------------------------------------------------------------------------------------------------------------
+
+def claim(paths: Sequence[Path], force: bool = False) -> None:
+    """Make sure, before any work, that files can be written: none exists (unless `force`), every folder can take them."""
+    for path in map(Path, paths):
+        if path.is_dir() or (path.exists() and not force):
+            raise OutputExists(f"{path} exists; choose another name" + ("" if path.is_dir() else ", or --force to replace it"))
+        check_folder(path.parent)
+
+
+def check_folder(folder: Path) -> None:
+    """Raises where a folder cannot be made or written to."""
+    folder = Path(folder).absolute()
+    there = next(p for p in (folder, *folder.parents) if p.exists())
+    if not there.is_dir():
+        raise NotADirectoryError(f"{folder}: '{there}' is a file and no folder; choose another place for the output")
+    if not os.access(there, os.W_OK):
+        raise PermissionError(f"{folder}: '{there}' cannot be written to; choose another place for the output")
+
+
+def write_json(path: Path, record: Mapping) -> Path:
+    with exr.replacing(path) as file:
+        file.write_text(json.dumps(record, indent=1, sort_keys=True) + "\n", encoding="utf-8")
+    return path
