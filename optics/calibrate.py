@@ -246,6 +246,7 @@ def fit(model, variables: Sequence[Variable], start: Values | None = None, frame
     for v, value in zip(variables, theta):
         values.put(v, float(value))
     damping, history, reason, converged = 1e-3, [], "", False
+    best, tries = (np.inf, theta, values), 0
     done, accuracy = 0, tolerance * max(len(variables), 1)
 
     def tick():
@@ -282,15 +283,24 @@ def fit(model, variables: Sequence[Variable], start: Values | None = None, frame
         if first_promise < accuracy:
             reason, converged = f"converged after {iteration} linearisations", True
             break
+        near = first_promise < 20 * len(theta)
+        if near:
+            tries += 1
+            if first_promise < best[0]:
+                best = (first_promise, theta.copy(), values)
+            if tries > 4 or (tries > 1 and best[0] < len(theta) / 2):
+                break
         # A linearisation serves for several steps while they keep the misfit falling fast (a chord method): derivative
         # images cost many times what a prediction does.
         gained = 0.0
-        for _ in range(12):
+        for _ in range(3 if near else 8):
             moved, trial, promised = step_from(here)
             if promised < accuracy / 10 or (gained and promised > 0.3 * first_promise):
                 break
             there = again(model, variables, moved, frames, here)
-            if np.isfinite(there.total) and there.total < here.total:
+            # Close to the best, chi2 is rough where shadow rims cross pixels: there the root of J'Wr is followed, not chi2.
+            allowed = promised if near and promised < 20 * len(theta) else 0.0
+            if np.isfinite(there.total) and there.total < here.total + allowed:
                 gain = here.total - there.total
                 theta, values, here = trial, moved, there
                 gained += gain
@@ -300,18 +310,21 @@ def fit(model, variables: Sequence[Variable], start: Values | None = None, frame
                 if gain < accuracy / 10:
                     break
             else:
-                # within a standard deviation of the best there is nothing to search for: shadow rims keep chi2 rough there
                 damping = max(damping * 10, 1e-3)
-                if damping > 1e4 or promised < len(theta):
+                if damping > 1e4:
                     break
-        if gained < accuracy:
-            # what is left to gain is less than what derivative images at moving shadow rims can follow
-            converged = first_promise < max(len(theta), 1)
-            reason = (f"converged after {iteration + 1} linearisations" if converged else
-                      f"no lower misfit within reach; the linear model still promised {first_promise:.3g}")
+        if gained < accuracy and not near:
+            reason = f"no lower misfit within reach; the linear model still promised {first_promise:.3g}"
             break
     else:
         reason = f"stopped after {max_iterations} linearisations without converging; allow more or start nearer"
+    if not reason:
+        converged = best[0] < len(theta)
+        reason = (f"converged after {iteration + 1} linearisations" if converged else
+                  f"the linear model still promised a fall of {best[0]:.3g}, which no step brought")
+        if not np.array_equal(best[1], theta):
+            theta, values = best[1], best[2]
+            normal = here = normal_equations(model, variables, values, frames, robust)
     if here is not normal:  # the last steps moved on from where the derivative images were made
         normal = normal_equations(model, variables, values, frames, robust)
     result = Fit(values, variables, theta, covariance_of(normal.a), normal.chi2,

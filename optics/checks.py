@@ -68,7 +68,7 @@ def existing(folder: Path, name: str, where: str) -> Path:
     """The file of this name, relative to `folder`."""
     file = folder / name
     if not file.is_file():
-        there = [p.relative_to(folder).as_posix() for p in (folder / Path(name).parent).glob("*")]
+        there = [Path(name).with_name(p.name).as_posix() for p in (folder / Path(name).parent).glob("*")]
         near = difflib.get_close_matches(name, there, n=1)
         raise BadCapture(f"{where} = '{name}': no such file in {folder}; allowed: a path relative to {folder.name}"
                          + (f"; did you mean '{near[0]}'?" if near else "; correct the path or add the file"))

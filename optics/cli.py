@@ -479,6 +479,42 @@ def calibrate(captures: CaptureSet,
         raise typer.Exit(1)
 
 
+@app.command("import", help="Read a measured data set of ball presses into a capture folder, with a scene to start from.")
+def import_(source: Annotated[Path, typer.Argument(metavar="SOURCE", help="An .npz calibration pack, or a folder of pictures.")],
+            output: Annotated[Path, typer.Option("-o", "--output", metavar="CAPTURES", help="Folder of the new capture set.")],
+            circles: Annotated[Path | None, typer.Option("--circles", metavar="CSV", help="For a folder: file, center_x_px, "
+                                                         "center_y_px, contact_radius_px.")] = None,
+            ball_radius: Annotated[float | None, typer.Option("--ball-radius", help="mm")] = None,
+            mm_per_pixel: Annotated[float | None, typer.Option("--mm-per-pixel", help="Scale of the pictures as they are.")] = None,
+            untouched: Annotated[Path | None, typer.Option("--untouched", metavar="IMAGE", help="For a folder: the sensor without "
+                                                           "contact; without it the median of the presses.")] = None,
+            leds: Annotated[int, typer.Option("--leds", help="LEDs of the scene to start from: 3 or 6.")] = 3,
+            bin: Annotated[int, typer.Option("--bin", min=1, help="Average this many pixels each way.")] = 1,
+            force: Force = False, quiet: Quiet = False, debug: Debug = False) -> None:
+    """Read presses, check labels and scale against each other, write captures.toml, a scene and what contradicts itself."""
+    from optics import importing
+
+    terminal.quiet, terminal.debug = quiet, debug
+    options = {"leds": leds, "bin": bin, "overwrite": force}
+    if ball_radius is not None:
+        options["ball_radius"] = ball_radius
+    if mm_per_pixel is not None:
+        options["mm_per_pixel"] = mm_per_pixel
+    if source.suffix == ".npz":
+        found = importing.import_taxim(source, output, **options)
+    else:
+        if circles is None:
+            raise ValueError(f"{source}: a folder of pictures needs --circles CSV with the columns file, center_x_px, center_y_px, "
+                             "contact_radius_px")
+        missing = [n for n, v in (("--ball-radius", ball_radius), ("--mm-per-pixel", mm_per_pixel)) if v is None]
+        if missing:
+            raise ValueError(f"{source}: {' and '.join(missing)} missing: the size of the ball and of a pixel cannot be read off circles")
+        found = importing.import_circles(source, circles, output, untouched=untouched, **options)
+    for text in found.warnings:
+        terminal.note(f"warning: {_one_line(text)}")
+    print(found.folder)
+
+
 @command
 def diagnose(study: StudyFolder, as_json: AsJson = False,
              csv: Annotated[Path | None, typer.Option("--csv", metavar="FILE", help="Write the table of effects here.")] = None) -> None:

@@ -155,6 +155,14 @@ class Study:
             record["shown"] = [f["name"] for f in record["steps"][0]["frames"]]
         return cls(folder, record)
 
+    def discard(self) -> None:
+        """Remove a study that has no step yet; one that has is left alone."""
+        if not self.steps:
+            shutil.rmtree(self.folder / "steps", ignore_errors=True)
+            (self.folder / "ladder.json").unlink(missing_ok=True)
+            with contextlib.suppress(OSError):  # it may hold other things
+                self.folder.rmdir()
+
     @property
     def steps(self) -> list[dict]:
         return self.record["steps"]

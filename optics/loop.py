@@ -150,7 +150,7 @@ def fit_base(model: Model, variables: Sequence[Variable], fitted: Sequence[int],
     """Calibrate in two stages: what holds in all frames first, then the poses with it."""
     common = [v for v in variables if v.frames is None]
     if len(common) < len(variables) and common:
-        first = calibrate.fit(model, common, start, fitted, max_iterations=8, progress=progress)
+        first = calibrate.fit(model, common, start, fitted, max_iterations=8, tolerance=20.0, progress=progress)
         start = first.values
     return calibrate.fit(model, list(variables), start, fitted, progress=progress)
 

@@ -2,7 +2,7 @@
 
 Light is linear in every LED, so each LED is rendered once per geometry at power 1 and kept; powers, exposure, colour and
 response act on the kept images. One sample per pixel is exact away from edges: pixels at the rim of a shadow or of the
-gel are sampled 16 times. Derivative images come from Dr.Jit in forward mode through the shading,
+gel are sampled 64 times. Derivative images come from Dr.Jit in forward mode through the shading,
 with the primary hits and shadows kept; at rims, where that misses the moving edge, and for everything that moves geometry
 they are central differences with common samples (`Parameter.how`).
 """
@@ -22,7 +22,7 @@ from optics.noise import Noise
 from optics.parameter import Parameter, Values, Variable
 from optics.scene import Scene
 
-RIM_SAMPLES = 16  # per pixel at rims; a power of two
+RIM_SAMPLES = 64  # per pixel at rims; a power of two
 POWERS = ("power", "power_r", "power_g", "power_b")  # images are kept per unit of each
 FLAT_FIELDS = ("multiplicative", "additive")
 BOUNCE_SAMPLES = 64  # directions per pixel for the second bounce
@@ -148,7 +148,7 @@ class Renderer:
         key = index.tobytes()
         if key not in hits.rims:
             # A Hammersley set, shifted from pixel to pixel: an edge in any direction crosses the samples one by one, and
-            # not in rows, so that a shadow that moves changes a pixel in sixteenths.
+            # not in rows, so that a shadow that moves changes a pixel in small steps.
             k = np.arange(RIM_SAMPLES)
             reversed_bits = sum(((k >> b) & 1) / 2 ** (b + 1) for b in range(RIM_SAMPLES.bit_length() - 1))
             shift = np.outer(index, (0.7548776662466927, 0.5698402909980532))  # the R2 sequence

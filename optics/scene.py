@@ -65,7 +65,9 @@ class Scene:
 
         with collecting() as created:
             try:
-                self.mitsuba = mi.load_file(str(self.path), optimize=False, **{k: str(v) for k, v in self.defines.items()})
+                # one by one: in parallel the parts are made, and then listed, in an order that changes from run to run
+                self.mitsuba = mi.load_file(str(self.path), parallel=False, optimize=False,
+                                            **{k: str(v) for k, v in self.defines.items()})
             except (RuntimeError, ValueError, TypeError, KeyError) as error:
                 raise BadScene(f"{self.path}: {_reason(error, self.path)}") from error
         self.parts: dict[str, Declared] = {}
@@ -103,7 +105,7 @@ class Scene:
         found = {}
         self._traversed = mi.traverse(self.mitsuba)
         for key, (_, _, node, flags) in self._traversed.properties.items():
-            if is_part(node):
+            if is_part(node) or re.match(r"object_\d+\.", key):  # without an id the key is an address of this run
                 continue
             value = self._traversed[key]
             if type(value) is mi.Float and len(value) == 1 and not key.endswith("silhouette_sampling_weight"):

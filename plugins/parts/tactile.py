@@ -89,7 +89,9 @@ def build():
             for _ in range(sum(1 for s in scene.shapes() if getattr(s.bsdf(), "kind", "") == "interface")):
                 flat = si.is_valid() & mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.DeltaTransmission)
                 bs, passed = si.bsdf().sample(mi.BSDFContext(), si, mi.Float(0.5), mi.Point2f(0.5), flat)
-                through = scene.ray_intersect(si.spawn_ray(si.to_world(bs.wo)), flat)
+                d = si.to_world(bs.wo)
+                start = si.p + d * (1e-4 * (1 + dr.max(dr.abs(si.p))))  # spawn_ray would shift it sideways, along the normal
+                through = scene.ray_intersect(mi.Ray3f(start, d, mi.Float(0), si.wavelengths), flat)
                 weight = dr.select(flat, weight * mi.unpolarized_spectrum(passed), weight)
                 si = dr.select(flat, through, si)
             return si, weight, dr.select(si.is_valid(), si.p + si.to_world(si.wi) * si.t, o)
@@ -129,8 +131,9 @@ def build():
             return light * weight
 
         def ambient(self, scene, si, weight, membrane):
-            """Radiance per band that no LED made."""
-            return dr.select(si.is_valid(), membrane.ambient_radiance(si), 0.0) * weight
+            """Radiance per band that no LED made, of one membrane."""
+            own = si.is_valid() & (si.bsdf() == mi.BSDFPtr(membrane))
+            return dr.select(own, membrane.ambient_radiance(si), 0.0) * weight
 
         def bounced(self, scene, si, weight, origin, led, count, sampler):
             """Radiance per band that one LED sends to the camera by two reflections, mean of `count` directions."""
@@ -141,6 +144,11 @@ def build():
                 second = scene.ray_intersect(si.spawn_ray(si.to_world(bs.wo)), si.is_valid())
                 light = self.direct(scene, second, 1.0, si.p, led, self.visible(scene, second, led.position(), led))
                 total += dr.select(second.is_valid(), mi.unpolarized_spectrum(factor) * light, 0.0)
+            gel = self.gel(scene)
+            if gel is not None:
+                last = gel.path(si.p, origin, si.p, led, si)  # `direct` followed the light up to the first surface only
+                for function in gel.functions("segment"):
+                    weight = weight * function(last, gel)
             return total * weight / count
 
         # -- any scene, any light: what mi.render calls --------------------------------------------------------------------

@@ -1,0 +1,838 @@
+"""From residual to verdict: which missing effect would explain what a calibrated model leaves over, if any does.
+
+`diagnose` scores every effect against the calibrated model, adds the best ones in earnest, tests the winner for
+evenness, on frames that were not fitted and against curves along every coordinate, and answers with one of six words
+(`optics.verdict`). Masks and sums are in `optics.evidence`, the algebra is in `optics.statistics`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from optics import statistics as st
+from optics.compare import led_label
+from optics.effect import Effect
+from optics.errors import Underdetermined
+from optics.evidence import Block, Candidate, Evidence, Progress, at_bound, measure, value_of
+from optics.parameter import Values, Variable
+from optics.verdict import (
+    CLEAR, EXCESS, LEVEL, MARGIN, UNEVEN, Basis, Diagnosis, Findings, Fingerprint, Level, Refit, Row, Shift, Split, decide,
+    is_structured, moved_by, rivals, sentence,
+)
+
+START = 0.7  # of the expected change, to begin a refit from: the linear estimate overshoots more often than not
+KAPPA = 0.1  # noise per pixel of derivative images over their signal, above which strengths are biased
+IMPLAUSIBLE = 10.0  # times the plausible strength: worth a look
+MAX_REFITS = 10
+MAX_SPLIT = 4  # members of an ambiguous set that are tested for evenness
+SIDE = 4  # cells per side of the coordinate 'place': a finer map would fit any clutter and forbid every claim
+NOT_A_COORDINATE = ("far",)  # regions that others make up
+NAMED_BINS = ("place", "frame", "channel", "LED")
+YES_NO = ("contact", "shadow", "rim")
+
+
+# -- the verb ---------------------------------------------------------------------------------------------------------
+
+
+def diagnose(model, fit, effects: Sequence[Effect], variables_of: Callable[[Effect], Sequence[Variable]],
+             held_out: Sequence[int] = (), *, fitted: Sequence[int], refit: Callable | None = None,
+             rows_max: int = 400_000, seed: int = 0, top: int = 5, progress: Progress | None = None) -> Diagnosis:
+    """Score, refit and judge: what a calibrated model lacks.
+
+    model         optics.render.Model, or anything with its predict, derivatives, usable, coordinates, frames, noise, base
+    fit           optics.calibrate.Fit of the base on the frames `fitted`, converged
+    effects       candidates; those that the base has already are passed over
+    variables_of  the variables that an effect frees; one per frame for the scope 'frame'
+    held_out      frames that were not fitted; only what is solved for per frame is fitted there
+    refit         optics.calibrate.fit, or a function with its arguments
+    rows_max      values (pixel x channel) that curves, splits and alternative weights may use
+    seed          of the simulations and of derivative images; the same seed gives the same table
+    top           how many of the best effects are added in earnest, besides those that cannot be told from the best
+
+    Raises Underdetermined when the base is not calibrated to convergence, or black level or saturation are not known.
+    """
+    if refit is None:
+        from optics.calibrate import fit as refit
+    say = progress or (lambda what, done, total: None)
+    fitted, held_out = [int(i) for i in fitted], [int(i) for i in held_out]
+    if not fitted:
+        raise ValueError("diagnose: no fitted frames given; name the frames that the base was calibrated on")
+    both = sorted(set(fitted) & set(held_out))
+    if both:
+        raise ValueError(f"diagnose: frames {both} are fitted and held out at once; a frame is one or the other")
+    _require_noise(model)
+
+    base, dropped = _base_variables(model, fit, fitted)
+    candidates, not_tested = _candidates(model, fit, effects, variables_of, fitted)
+    evidence = measure(model, fit.values, base, candidates, fitted, rows_max, seed, say)
+    _require_convergence(evidence, fit)
+    table = _rank(evidence, candidates, seed)
+    structure = evidence.structure(evidence.whitened, evidence.base)
+    basis = _basis(model, evidence, structure)
+    significant = table.p_best < LEVEL
+    chosen = _choose(table, top) if significant or is_structured(structure.p, basis.excess_sd) else []
+    fits = _refit(model, fit, evidence, table, chosen, refit, fitted, say)
+
+    rows = [c.row for c in table.order]
+    done = sorted((c for c in chosen if c.row.refit is not None), key=lambda c: -c.row.net_refit)
+    winner = done[0] if done and done[0].row.net_refit > 0 else None
+    places = _places(model, fit.values, evidence)
+    reference = winner.row.net_refit if winner else max([c.row.net for c in table.order], default=0.0)
+    fingerprints = _fingerprints(model, evidence, places, max(reference, 1.0), say)
+
+    members = [c for c in done if c.row.net_refit > 0 and _close(winner.row.net_refit, c.row.net_refit)] if winner else []
+    splits = []
+    if winner and significant:
+        for c in members[:MAX_SPLIT]:
+            splits += _split(model, evidence, c, fits[c.effect.name], places, rows_max, seed, say)
+    levels = _held_out(model, fit, evidence, winner if significant else None, fits, refit, held_out, variables_of, say)
+    shifts = _shifts(model, fit, winner, fits) if winner and significant else []
+
+    findings = _findings(table, winner, done, members, fingerprints, splits, levels, basis, structure)
+    word, conditions = decide(findings)
+    _write_limits(model, evidence, table, winner if word == "CLAIM" else None, fits, basis, rows_max, seed, say)
+    _write_verdicts(table, word, winner, members, splits, levels)
+    text = sentence(word, conditions, findings, rows, [c.row for c in members], fingerprints, levels, shifts, basis)
+    names = [c.effect.name for c in chosen]
+    gaps, correct = _gaps(evidence, chosen)
+    return Diagnosis(
+        word=word, sentence=text, conditions=conditions, basis=basis, rows=rows,
+        ambiguous=[c.effect.name for c in members] if word == "AMBIGUOUS" else [],
+        compared=names, gaps=gaps, correct=correct, splits=splits, levels=levels, fingerprints=fingerprints, shifts=shifts,
+        hints=_hints(word, conditions, members, gaps, names), not_tested=not_tested,
+        warnings=_warnings(model, fit, evidence, table, winner, shifts, dropped, structure, basis),
+        claimed=winner.effect.name if word == "CLAIM" else "", fits=fits)
+
+
+# -- what must hold before any score ----------------------------------------------------------------------------------
+
+
+def _require_noise(model) -> None:
+    """Refuse to judge images whose saturation or black level nobody knows: both fake effects at any significance."""
+    noise = getattr(model, "noise", None)
+    for name, cost in (("saturation", "unmasked saturation makes the right effect lose in four of five cases"),
+                       ("black_level", "half a DN of black level looks like glare")):
+        value = getattr(noise, name, None)
+        if value is None or not math.isfinite(value):
+            raise Underdetermined(f"diagnose: the camera's {name} is not known, and {cost}; give it under [noise] in "
+                                  "captures.toml, or estimate the noise from dark and repeated frames")
+
+
+def _base_variables(model, fit, fitted: Sequence[int]) -> tuple[list[Variable], list[str]]:
+    """The variables that the base may move in the fitted frames, and names of those that rest at a bound."""
+    present = [v for v in fit.variables if v.frames is None or set(v.frames) & set(fitted)]
+    stuck = set(getattr(fit, "at_bound", ()))
+    bound = [v.name for v in present if v.name in stuck or at_bound(v, value_of(model, fit.values, v))]
+    return [v for v in present if v.name not in bound], bound
+
+
+def _candidates(model, fit, effects, variables_of, fitted) -> tuple[list[Candidate], dict[str, str]]:
+    taken = {key for v in fit.variables for key in v.keys}
+    found, not_tested = [], {}
+    for effect in effects:
+        variables = [v for v in variables_of(effect) if v.frames is None or set(v.frames) & set(fitted)]
+        if not variables:
+            not_tested[effect.name] = "the scene has no part that carries it"
+            continue
+        if any(key in taken for v in variables for key in v.keys):
+            not_tested[effect.name] = "in the model already"
+            continue
+        start = np.array([value_of(model, fit.values, v) for v in variables])
+        sides = []
+        for v, value in zip(variables, start):
+            low, high = v.parameter.bounds
+            near = 1e-6 * abs(v.parameter.plausible)
+            sides.append(1 if value <= low + near else -1 if value >= high - near else 0)
+        found.append(Candidate(effect, variables, start, sides, np.array([v.parameter.plausible for v in variables])))
+    return found, not_tested
+
+
+def _require_convergence(evidence: "Evidence", fit) -> None:
+    """Refuse a base that is not calibrated: |Q'r|^2 would be chi2 of a parameter, not of a missing effect."""
+    if evidence.gradient >= 1:
+        how = "" if getattr(fit, "converged", True) else f" (it stopped: {fit.reason})"
+        raise Underdetermined(
+            f"diagnose: the base model is not calibrated to convergence{how}: moving its {evidence.projected.rank} parameters "
+            f"would lower chi2 by {evidence.projected.absorbed:.3g}, {evidence.gradient:.3g} per parameter; allowed: below 1; "
+            "calibrate again from this result, without robust weights, on the frames given as fitted")
+
+
+# -- ranking ----------------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class Table:
+    """All candidates, best first, and the family-wise test that they share."""
+
+    order: list[Candidate]
+    family: st.Family
+    p_best: float
+    winner_uniform: str
+    winner_dilated: str
+
+
+def _rank(evidence: Evidence, candidates: list[Candidate], seed: int) -> Table:
+    projected, first = evidence.projected, len(evidence.base)
+    visible = projected.survival > st.VISIBLE
+    for c in candidates:
+        if c.broken:
+            visible[[i - first for columns in c.forms.values() for i in columns]] = False
+    information = projected.information * np.outer(visible, visible)
+    score = projected.score * visible
+    shared = []
+    for c in candidates:
+        best = None
+        for form, columns in c.forms.items():
+            own = np.array(columns) - first
+            cone = st.Cone(information[np.ix_(own, own)], c.sides, seed)
+            shared.append((own, cone))
+            fall, linear = cone.solve(score[own])
+            if best is None or fall - cone.expectation > best[0]:
+                best = (fall - cone.expectation, form, own, cone, fall, linear)
+        _, c.form, own, c.cone, fall, c.linear = best
+        c.columns = [int(i) + first for i in own]
+        c.row = _row(evidence, c, own, fall)
+    family = st.Family(information, shared, seed)
+    critical = family.critical(LEVEL)
+    uniform_gram = evidence.thinned(lambda block: block.sigma)
+    chi2, dof = projected.chi2, max(evidence.normal.count - projected.rank, 1)
+    for c in candidates:
+        row = c.row
+        row.p_family = family.p(row.p)
+        row.power = c.cone.power(c.linear_of(c.plausible * np.where(np.array(c.sides) < 0, -1, 1) / 10),
+                                 c.cone.critical(critical))
+        raw = uniform_gram.gram[np.ix_(c.columns, c.columns)]
+        row.image = math.sqrt(max(c.linear @ raw @ c.linear, 0.0) / max(uniform_gram.count, 1)) / evidence.signal
+        row.misfit_after = evidence.noise * math.sqrt(max(chi2 - row.fall, 0.0) / dof)
+        excess = chi2 - dof
+        row.share = row.net / excess if excess > EXCESS * math.sqrt(2 * dof) else math.nan
+        row.confused_with, row.cos = _confused(information, c, candidates, first)
+        if row.survival <= st.VISIBLE or not len(c.cone.live):
+            row.flags.append("a derivative image is not finite" if c.broken else "nothing visible")
+        if row.kappa > KAPPA:
+            row.flags.append("noisy derivative")
+        if any(v.parameter.neutral is not None and abs(value - v.parameter.neutral) > 1e-9 * abs(v.parameter.plausible)
+               for v, value in zip(c.variables, c.start)):
+            row.flags.append("not at neutral: tests a change of the value assumed")
+    order = sorted(candidates, key=lambda c: (not len(c.cone.live), -c.row.net, c.effect.name))
+    p_best = min((c.row.p_family for c in candidates), default=1.0)
+    uniform = _winner(evidence, uniform_gram, candidates)
+    dilated = _winner(evidence, evidence.thinned(lambda block: block.inner.astype(float)), candidates)
+    return Table(order, family, p_best, uniform, dilated)
+
+
+def _row(evidence: Evidence, c: Candidate, own: np.ndarray, fall: float) -> Row:
+    raw = np.diag(evidence.normal.gram)[c.columns] * c.plausible**2
+    survival = float(evidence.projected.survival[own] @ raw / raw.sum()) if raw.sum() > 0 else 0.0
+    kappa = evidence.normal.kappa()[c.columns]
+    seen = c.cone.live
+    change = c.change_of(c.linear)
+    return Row(
+        name=c.effect.name, variables=[v.name for v in c.variables], units=[v.parameter.unit for v in c.variables],
+        form=c.form, fall=fall, expected=c.cone.expectation, p=float(c.cone.p(fall)), p_family=1.0,
+        start=c.start.tolist(), change=change.tolist(), sd=c.sd_of(c.cone.sd).tolist(),
+        of_plausible=float(np.max(np.abs(change) / c.plausible)), image=math.nan, misfit_after=math.nan, share=math.nan,
+        survival=survival, power=0.0, kappa=float(kappa[seen].max(initial=0.0)), confused_with="", cos=0.0,
+        upper=[math.nan] * len(c.variables))
+
+
+def _direction(c: Candidate) -> np.ndarray:
+    """Coefficients to compare effects at: as found, or the plausible ones where nothing was found."""
+    return c.linear if c.linear.any() else c.plausible * np.where(np.array(c.sides) < 0, -1.0, 1.0)
+
+
+def _confused(information: np.ndarray, c: Candidate, candidates: Sequence[Candidate], first: int) -> tuple[str, float]:
+    """The effect that mimics this one best, and |cos| of the angle between what survives of both."""
+    own = np.array(c.columns) - first
+    strength = _direction(c)
+    full = float(strength @ information[np.ix_(own, own)] @ strength)
+    best = ("", 0.0)
+    for other in candidates:
+        if other is c or not full > 0 or not other.columns or not len(other.cone.live):
+            continue
+        gap = st.gap(information, own, strength, np.array(other.columns) - first, other.cone)
+        cos = math.sqrt(max(1 - gap / full, 0.0))
+        if cos > best[1]:
+            best = (other.effect.name, cos)
+    return best
+
+
+def _winner(evidence: Evidence, normal: st.Normal, candidates: Sequence[Candidate]) -> str:
+    """The best effect with other weights; the scale of the weights cannot matter to an order."""
+    if not candidates:
+        return ""
+    projected = evidence.project(normal, evidence.base, evidence.rest, evidence.thinning)
+    first = len(evidence.base)
+    scale = projected.chi2 / max(normal.count - projected.rank, 1)
+    net = {}
+    for c in candidates:
+        if not len(c.cone.live):
+            continue
+        own = np.array(c.columns) - first
+        seen = (projected.survival[own] > st.VISIBLE).astype(float)
+        cone = st.Cone(projected.information[np.ix_(own, own)] * np.outer(seen, seen), c.sides, draws=1000)
+        net[c.effect.name] = cone.solve(projected.score[own] * seen)[0] / scale - cone.expectation
+    return max(net, key=net.get, default="")
+
+
+def _close(best: float, other: float) -> bool:
+    """Whether two falls are too close to be told apart."""
+    return best - other < max(CLEAR, MARGIN * best)
+
+
+def _choose(table: Table, top: int) -> list[Candidate]:
+    """The effects to add in earnest: the best ones, those that cannot be told from the best, winners of other weights."""
+    live = [c for c in table.order if c.row.net > 0]
+    if not live:
+        return []
+    chosen = live[:top]
+    chosen += [c for c in live[top:] if _close(live[0].row.net, c.row.net) and table.p_best < LEVEL]
+    chosen = chosen[:MAX_REFITS]
+    others = {table.winner_uniform, table.winner_dilated} - {c.effect.name for c in chosen}
+    return chosen + [c for c in live if c.effect.name in others]
+
+
+def _gaps(evidence: Evidence, chosen: Sequence[Candidate]) -> tuple[list[list[float]], list[list[float]]]:
+    """D[a][b], expected chi2 of a over b when a is true as found, and the probability to decide rightly."""
+    first, information = len(evidence.base), evidence.projected.information
+    gaps = [[0.0 if a is b else st.gap(information, np.array(a.columns) - first, _direction(a),
+                                       np.array(b.columns) - first, b.cone) for b in chosen] for a in chosen]
+    return gaps, [[st.probability_correct(d) for d in line] for line in gaps]
+
+
+# -- refit ------------------------------------------------------------------------------------------------------------
+
+
+def _refit(model, fit, evidence: Evidence, table: Table, chosen: Sequence[Candidate], refit: Callable,
+           fitted: Sequence[int], say: Progress) -> dict:
+    """Add each chosen effect, calibrate everything again, and write what came of it into its row."""
+    before = evidence.normal.square + _prior_chi2(model, fit.values, fit.variables)
+    base = [v for v in fit.variables if v.frames is None or set(v.frames) & set(fitted)]
+    fits = {}
+    for n, c in enumerate(chosen):
+        say("refit", n, len(chosen))
+        best = None
+        for fraction in (START, 0.1):
+            if fraction < START and best is not None and best[0] > 0.5 * c.row.fall:
+                break  # the first attempt was as good as predicted
+            if fraction < START and c.row.fall < CLEAR:
+                break  # nothing to win
+            start = _start(model, fit, evidence, c, fraction)
+            try:
+                found = refit(model, [*base, *c.variables], start, frames=list(fitted))
+            except (ValueError, ArithmeticError, np.linalg.LinAlgError) as error:
+                c.row.flags.append(f"refit failed: {error}")
+                continue
+            after, images = _chi2(model, found.values, evidence)
+            after += _prior_chi2(model, found.values, fit.variables)
+            if math.isfinite(after) and (best is None or before - after > best[0]):
+                best = (before - after, after, found, images)
+        if best is None:
+            c.row.flags.append("refit without a result")
+            continue
+        fall, after, found, images = best
+        fits[c.effect.name] = found
+        strength = [value_of(model, found.values, v) for v in c.variables]
+        sd = {v.name: float(s) for v, s in zip(found.variables, found.sd)}
+        ended = [v.name for v, s, at in zip(c.variables, strength, c.start) if at_bound(v, s) and abs(s - at) > 0]
+        ratio = fall / c.row.fall if c.row.fall > 0 else math.nan
+        dof = max(evidence.normal.count - evidence.projected.rank - len(c.cone.live), 1)
+        c.row.refit = Refit(fall, c.row.fall, ratio, before, after, strength,
+                            [sd.get(v.name, math.nan) for v in c.variables], ended,
+                            (after - dof) / math.sqrt(2 * dof), evidence.structure(images, [*evidence.base, *c.columns]).p,
+                            bool(found.converged), str(found.reason))
+        if not 0.5 <= ratio <= 2 and c.row.fall > CLEAR:
+            c.row.flags.append("nonlinear")
+        if ended:
+            c.row.flags.append("at a bound")
+        size = np.abs(np.array(strength) - c.start) / c.plausible
+        if size.max() > IMPLAUSIBLE and fall > CLEAR:
+            c.row.flags.append(f"{size.max():.2g} times the plausible strength")
+    say("refit", len(chosen), len(chosen))
+    return fits
+
+
+def _start(model, fit, evidence: Evidence, c: Candidate, fraction: float) -> Values:
+    """Effect at a fraction of its expected change, and the base where it would move to make room for it."""
+    values = fit.values.copy()
+    linear = c.linear * fraction
+    for v, start, step in zip(c.variables, c.start, c.change_of(linear)):
+        low, high = v.parameter.bounds
+        values.put(v, float(np.clip(start + step, start + 0.9 * (low - start) if math.isfinite(low) else -math.inf,
+                                    start + 0.9 * (high - start) if math.isfinite(high) else math.inf)))
+    first = len(evidence.base)
+    moves = evidence.projected.response[:, np.array(c.columns) - first] @ linear
+    for i, move in zip(evidence.base, moves):
+        v = evidence.columns[i]
+        low, high = v.parameter.bounds
+        here = value_of(model, fit.values, v)
+        limit = 3 * abs(v.parameter.plausible)  # beyond, the linear guess is no guide
+        to = here + float(np.clip(move, -limit, limit))
+        values.put(v, float(np.clip(to, low + 0.1 * (here - low) if math.isfinite(low) else to,
+                                    high - 0.1 * (high - here) if math.isfinite(high) else to)))
+    return values
+
+
+def _chi2(model, values: Values, evidence: Evidence) -> tuple[float, list[np.ndarray]]:
+    """chi2 of other values on the same pixels with the same weights, and the whitened residual images."""
+    total, images = 0.0, []
+    predicted = model.predict(values, evidence.frames)
+    for frame, prediction, sigma, use in zip(evidence.frames, predicted, evidence.sigma, evidence.use):
+        image = np.where(use, (np.asarray(model.frames[frame].image, float) - prediction) / sigma, 0.0)
+        total += float(np.sum(image**2))
+        images.append(image)
+    return total, images
+
+
+def _prior_chi2(model, values: Values, variables: Sequence[Variable]) -> float:
+    return sum(((value_of(model, values, v) - v.prior[0]) / v.prior[1]) ** 2 for v in variables if v.prior is not None)
+
+
+# -- fingerprints and splits ------------------------------------------------------------------------------------------
+
+
+def _places(model, values: Values, evidence: Evidence) -> list[dict[str, np.ndarray]]:
+    """Per block, the coordinates of every kept value (n,), those of the model and those that any image has."""
+    places = []
+    order = {frame: i for i, frame in enumerate(evidence.frames)}
+    settings = _settings(model, evidence)
+    lights = [led_label(model.frames[f].parameters) for f in evidence.frames]
+    kinds = sorted(set(lights))
+    for block in evidence.blocks:
+        shape = np.asarray(model.frames[block.frame].image).shape
+        row, column, channel = np.unravel_index(block.index, shape)
+        known = {}
+        for name, plane in model.coordinates(values, block.frame).items():
+            plane = np.asarray(plane)
+            if name in NOT_A_COORDINATE or plane.ndim not in (2, 3):
+                continue
+            plane = np.broadcast_to(plane if plane.ndim == 3 else plane[..., None], shape)
+            known[name] = plane.reshape(-1)[block.index].astype(np.float32)
+        known.update(row=row.astype(np.float32), column=column.astype(np.float32), channel=channel.astype(np.float32),
+                     frame=np.full(len(row), order[block.frame], np.float32))
+        known.update({key: np.full(len(row), values[order[block.frame]], np.float32) for key, values in settings.items()})
+        if len(kinds) > 1:
+            known["LED"] = np.full(len(row), kinds.index(lights[order[block.frame]]), np.float32)
+        if min(shape[:2]) >= 2 * SIDE:
+            known["place"] = (row * SIDE // shape[0] * SIDE + column * SIDE // shape[1]).astype(np.float32)
+        known["quadrant"] = (2 * (2 * row >= shape[0]) + (2 * column >= shape[1])).astype(np.float32)
+        places.append(known)
+    return places
+
+
+def _settings(model, evidence: Evidence) -> dict[str, list[float]]:
+    """key -> value per fitted frame of the numbers that the experimenter turned, other than which LED was on."""
+    turned: dict[str, list[float]] = {}
+    frames = [model.frames[f] for f in evidence.frames]
+    for key in sorted({key for f in frames for key in f.parameters if not key.endswith(".power")}):
+        values = [f.parameters.get(key, math.nan) for f in frames]
+        numbers = [float(v) if isinstance(v, (int, float)) else math.nan for v in values]
+        if len({v for v in numbers if math.isfinite(v)}) > 1:
+            turned[key] = numbers
+    return turned
+
+
+def _fingerprints(model, evidence: Evidence, places: list[dict], reference: float, say: Progress) -> list[Fingerprint]:
+    """The residual along every coordinate: bins of gain and offset, projected like effects; best first."""
+    from scipy.special import chdtrc
+
+    k = evidence.thinning
+    names = sorted(set.intersection(*[set(p) for p in places]) - {"quadrant"})
+    plain_normal = evidence.thinned(extra=2 * max(SIDE * SIDE, st.BINS, len(evidence.frames), evidence.channels))
+    middles = [block.middle for block in evidence.blocks]
+    found = []
+    for n, name in enumerate(names):
+        say("fingerprints", n, len(names))
+        x = np.concatenate([p[name] for p in places])
+        edges = st.bin_edges(x) if name not in NAMED_BINS else np.arange(x.min(), x.max() + 2) - 0.5
+        if edges is None or len(edges) < 3:
+            continue
+        count = len(edges) - 1
+        normal = _with_bins(evidence, plain_normal, middles, places, name, edges,
+                            lambda block: (block.prediction / block.sigma, 1 / block.sigma))
+        first = len(evidence.columns)
+        rest = list(range(first, first + 2 * count))
+        projected = evidence.project(normal, evidence.base, rest, k)
+        lengths = np.diag(normal.gram)[rest]
+        fall, dof, _, _ = st.joint(projected, lengths)
+        if dof == 0:
+            continue
+        curves = {}
+        for kind, own in (("gain", slice(0, count)), ("offset", slice(count, 2 * count))):
+            part = replace(projected, information=projected.information[own, own], score=projected.score[own])
+            curves[kind] = st.joint(part, lengths[own])
+        kind = max(curves, key=lambda name: curves[name][0] - curves[name][1])
+        _, _, curve, sd = curves[kind]
+        net = (fall - dof) * k
+        index = np.searchsorted(edges, x, side="right") - 1
+        index = np.where(np.isfinite(x), index, -1)
+        centres = [float(np.median(x[index == i])) if np.any(index == i) else math.nan for i in range(count)]
+        labels = _labels(evidence, model, name, centres)
+        found.append(Fingerprint(name, fall, dof, float(chdtrc(dof, fall)), net, net / reference, kind, centres,
+                                 curve.tolist(), sd.tolist(), labels))
+    say("fingerprints", len(names), len(names))
+    return sorted(found, key=lambda f: -f.net)
+
+
+def _labels(evidence: Evidence, model, name: str, centres: Sequence[float]) -> list[str]:
+    """Names of the bins of a coordinate that has no scale."""
+    if name == "frame":
+        return [str(getattr(model.frames[f], "name", f)) for f in evidence.frames]
+    if name == "LED":
+        return sorted({led_label(model.frames[f].parameters) for f in evidence.frames})
+    if name == "channel":
+        return _channels(evidence)
+    if name in YES_NO and len(centres) == 2:
+        return ["no", "yes"]
+    if name == "place":
+        return [f"row {i // SIDE + 1}, column {i % SIDE + 1} of {SIDE}" for i in range(len(centres))]
+    return []
+
+
+def _channels(evidence: Evidence) -> list[str]:
+    return ["R", "G", "B"] if evidence.channels == 3 else [str(i) for i in range(evidence.channels)]
+
+
+def _with_bins(evidence: Evidence, plain_normal: st.Normal, middles, places, name: str, edges: np.ndarray,
+               carriers: Callable[[Block], tuple]) -> st.Normal:
+    """A copy of the normal equations with bins of a coordinate after the columns of the evidence."""
+    first, count = len(evidence.columns), len(edges) - 1
+    normal = plain_normal.copy()
+    for block, middle, place in zip(evidence.blocks, middles, places):
+        x = place[name]
+        bins = np.where(np.isfinite(x), np.searchsorted(edges, x, side="right") - 1, -1)
+        st.add_bins(normal, block.where, middle, block.r, first, bins, count, carriers(block))
+    return normal
+
+
+def _split(model, evidence: Evidence, c: Candidate, found, places: list[dict], rows_max: int, seed: int,
+           say: Progress) -> list[Split]:
+    """Whether a fitted effect has the same strength in every part of the data.
+
+    With the effect in the base, its image e = sum_j s_j g_j is cut into parts e 1{part} and these are scored: a true
+    effect gains nothing by being cut, a proxy does.
+    """
+    from scipy.special import chdtrc
+
+    base = [v for v in [*(evidence.columns[i] for i in evidence.base), *c.variables]
+            if v in c.variables or not at_bound(v, value_of(model, found.values, v))]
+    own = measure(model, found.values, base, [], evidence.frames, rows_max, seed, say, f"evenness of {c.effect.name}")
+    change = np.array(c.row.refit.strength) - c.start
+    effect = [i for i, v in enumerate(base) if v in c.variables]
+    calibrated = [i for i in own.base if i not in effect]
+    own.precision, own.pull = own.precision[calibrated], own.pull[calibrated]  # effect variables follow the base's
+    middles = [block.middle for block in own.blocks]
+    images = []
+    for block, middle in zip(own.blocks, middles):
+        position = {int(w): i for i, w in enumerate(block.where)}
+        images.append(sum((s * middle[:, position[i]] for i, s in zip(effect, change) if i in position),
+                          np.zeros(len(block.r))))
+    parts = _parts(model, own, places)
+    plain_normal = own.thinned(extra=max([len(labels) for labels, _ in parts.values()], default=0))
+    results = []
+    for by, (labels, bins) in parts.items():
+        count, first = len(labels), len(base)
+        normal = plain_normal.copy()
+        for block, middle, image, index in zip(own.blocks, middles, images, bins):
+            st.add_bins(normal, block.where, middle, block.r, first, index, count, [image])
+        rest = list(range(first, first + count))
+        lengths = np.diag(normal.gram)[rest]
+        k = own.thinning
+        projected = own.project(normal, calibrated + effect, rest, k)
+        fall, dof, _, _ = st.joint(projected, lengths)
+        if dof == 0:
+            continue
+        _, _, delta, sd = st.joint(own.project(normal, calibrated, rest, k), lengths)
+        p = float(chdtrc(dof, fall))
+        h = max(fall - dof, 0.0) * k / max(c.row.net_refit, 1e-9)
+        results.append(Split(c.effect.name, by, labels, (1 + delta).tolist(), sd.tolist(), fall * k, dof, p, h, True))
+    chance = LEVEL / max(len(results), 1)
+    if c.row.refit.complete:  # nothing but noise is left, so that p means what it says
+        return [replace(s, holds=s.p >= chance) for s in results]
+    return [replace(s, holds=s.h <= UNEVEN or s.p >= chance) for s in results]
+
+
+def _parts(model, evidence: Evidence, places: list[dict]) -> dict[str, tuple[list[str], list[np.ndarray]]]:
+    """name -> (labels, per block the part that each value belongs to): channel, frame, LED, settings, contact, quadrant."""
+    frames = [model.frames[f] for f in evidence.frames]
+    names = [getattr(f, "name", str(i)) for i, f in enumerate(frames)]
+    parts: dict[str, tuple[list[str], list[np.ndarray]]] = {}
+
+    def of_coordinate(by, coordinate, labels):
+        if all(coordinate in p for p in places):
+            parts[by] = (labels, [np.nan_to_num(p[coordinate]).astype(int) for p in places])
+
+    def of_frame(by, labels):
+        kinds = sorted(set(labels))
+        numbers = [kinds.index(label) for label in labels]
+        known = [[int(index[0]) if len(index) else -1 for index in other] for _, other in parts.values()]
+        if 2 <= len(kinds) and numbers not in known:
+            parts[by] = (kinds, [np.full(len(p["row"]), i) for i, p in zip(numbers, places)])
+
+    of_coordinate("channel", "channel", _channels(evidence))
+    parts["frame"] = (names, [np.full(len(p["row"]), i) for i, p in enumerate(places)])
+    of_frame("LED", [led_label(f.parameters) for f in frames])
+    for key, numbers in _settings(model, evidence).items():
+        if len(set(numbers)) <= 8:
+            of_frame(key, [f"{v:g}" for v in numbers])
+    of_coordinate("contact", "contact", ["no contact", "contact"])
+    of_coordinate("quadrant", "quadrant", ["top left", "top right", "bottom left", "bottom right"])
+    return {by: given for by, given in parts.items() if len(given[0]) > 1}
+
+
+# -- held-out frames, shifts ------------------------------------------------------------------------------------------
+
+
+def _pose_variables(model, fit, held_out: Sequence[int]) -> list[Variable]:
+    """Per-frame variables of the base for the held-out frames: one per group where the base has one per group."""
+    def group(f: int) -> str:
+        frame = model.frames[f]
+        return getattr(frame, "group", None) or getattr(frame, "name", str(f))
+
+    variables = []
+    for keys in dict.fromkeys(v.keys for v in fit.variables if v.frames is not None):
+        alike = [v for v in fit.variables if v.keys == keys and v.frames is not None]
+        priors = {v.prior for v in alike}
+        prior = alike[0].prior if len(priors) == 1 else None  # a prior of one press says nothing about another
+        groups = [group(v.frames[0]) for v in alike]
+        single = len(set(groups)) < len(groups)  # several values within one group: each frame has its own
+        shared: dict[str, list[int]] = {}
+        for f in held_out:
+            shared.setdefault(getattr(model.frames[f], "name", str(f)) if single else group(f), []).append(f)
+        variables += [Variable(f"{keys[0]}[{name}]", keys, alike[0].parameter, tuple(frames), prior)
+                      for name, frames in shared.items()]
+    return variables
+
+
+def _held_out(model, fit, evidence: Evidence, winner: Candidate | None, fits: Mapping, refit: Callable,
+              held_out: Sequence[int], variables_of, say: Progress) -> list[Level]:
+    """Base and winner on frames that were not fitted: globals frozen, only what is per frame solved for, alike for both."""
+    n = evidence.normal.count
+    after = _chi2(model, fits[winner.effect.name].values, evidence)[0] if winner else math.nan
+
+    def level(name, chi2, held, count, fall=math.nan, better=0):
+        return Level(name, evidence.noise * math.sqrt(chi2 / n),
+                     evidence.noise * math.sqrt(held / count) if count else math.nan,
+                     chi2 / n, held / count if count else math.nan, n, count, fall, better, len(held_out))
+
+    if not held_out:
+        levels = [level("base", evidence.normal.square, math.nan, 0)]
+        return levels + ([level(winner.effect.name, after, math.nan, 0)] if winner else [])
+    say("held-out frames", 0, 2)
+    pose = _pose_variables(model, fit, held_out)
+    values = fit.values.copy()
+    if pose:
+        values = refit(model, pose, values, frames=list(held_out)).values
+    masks, sds, base = [], [], []
+    for f in held_out:
+        prediction = np.asarray(model.predict(values, [f])[0], float)
+        variance = model.noise.variance(prediction) * (1 + evidence.render_noise)
+        use = np.asarray(model.usable(f), bool) & np.isfinite(prediction)
+        masks.append(use)
+        sds.append(np.sqrt(np.where(use, variance, 1.0)))
+        base.append(_square(model, f, prediction, use, sds[-1]))
+    count = int(sum(m.sum() for m in masks))
+    levels = [level("base", evidence.normal.square, sum(base), count)]
+    if winner is None or not count:
+        return levels
+    say("held-out frames", 1, 2)
+    own = [v for v in variables_of(winner.effect) if v.frames is not None and set(v.frames) & set(held_out)]
+    values = fits[winner.effect.name].values.copy()
+    if pose or own:
+        values = refit(model, [*pose, *own], values, frames=list(held_out)).values
+    with_effect = [_square(model, f, np.asarray(model.predict(values, [f])[0], float), use, sd)
+                   for f, use, sd in zip(held_out, masks, sds)]
+    fall = sum(base) - sum(with_effect) - len(own)
+    better = int(sum(b > w for b, w in zip(base, with_effect)))
+    say("held-out frames", 2, 2)
+    return [*levels, level(winner.effect.name, after, sum(with_effect), count, fall, better)]
+
+
+def _square(model, frame: int, prediction: np.ndarray, use: np.ndarray, sd: np.ndarray) -> float:
+    residual = (np.asarray(model.frames[frame].image, float) - prediction) / sd
+    return float(np.sum(np.where(use & np.isfinite(residual), residual, 0.0) ** 2))
+
+
+def _shifts(model, fit, winner: Candidate, fits: Mapping) -> list[Shift]:
+    """How far the base's parameters moved when the winner was added, the farthest (in their own sd) first."""
+    found = fits[winner.effect.name]
+    sd = {v.name: float(s) for v, s in zip(fit.variables, fit.sd)}
+    present = {v.name for v in found.variables}
+    shifts = []
+    for v in fit.variables:
+        if v.name not in present:
+            continue
+        before, after = value_of(model, fit.values, v), value_of(model, found.values, v)
+        own = sd.get(v.name, math.nan)
+        in_sd = (after - before) / own if own > 0 else math.nan
+        out = v.prior is not None and abs(after - v.prior[0]) > 3 * v.prior[1]
+        shifts.append(Shift(winner.effect.name, v.name, v.parameter.unit, before, after, in_sd, bool(abs(in_sd) > 3 or out)))
+    return sorted(shifts, key=lambda s: -abs(s.in_sd) if math.isfinite(s.in_sd) else 0.0)
+
+
+# -- findings, limits, warnings ---------------------------------------------------------------------------------------
+
+
+def _findings(table, winner, done, members, fingerprints, splits, levels, basis, structure) -> Findings:
+    if winner is None:
+        best = max((c.row.net for c in table.order), default=0.0)
+        own = Findings(table.p_best, structure.p, fall=max(best, 0.0), excess_sd=basis.excess_sd)
+    else:
+        mine = [s for s in splits if s.effect == winner.effect.name]
+        even = {c.effect.name: all(s.holds for s in splits if s.effect == c.effect.name) for c in members[:MAX_SPLIT]}
+        worst = max(mine, key=lambda s: (not s.holds, s.h), default=None)
+        excess = basis.chi2 - basis.dof
+        own = Findings(
+            table.p_best, structure.p, winner.effect.name,
+            table.family.p(float(winner.cone.p(winner.row.refit.fall))), winner.row.net_refit,
+            max([c.row.net_refit for c in done[1:]] + [c.row.net for c in table.order if c not in done] + [0.0]),
+            refuted=winner.row.refit.complete and all(
+                c.row.refit is not None and c.row.refit.structure_p < LEVEL for c in table.order if c is not winner
+                and _close(winner.row.net_refit, max(c.row.net_refit, c.row.net if c not in done else 0.0))),
+            share=winner.row.net_refit / excess if excess > 0 else math.nan, excess_sd=basis.excess_sd,
+            uneven=worst.h if worst else 0.0, uneven_by=f" by {worst.by} ({_extremes(worst)})" if worst else "",
+            even=all(s.holds for s in mine),
+            some_even=any(even.values()) if even else True,
+            held_out=levels[-1].fall if len(levels) > 1 else math.nan)
+    if not fingerprints:
+        return own
+    better = rivals(fingerprints, own.fall)
+    best = better[0] if better else fingerprints[0]
+    return replace(own, ratio=best.ratio, rival=bool(better), coordinate=best.coordinate)
+
+
+def _extremes(split: Split) -> str:
+    """'R 2.75, B 0.03': the parts of a split where the strength is largest and smallest."""
+    order = np.argsort(split.strength)
+    return ", ".join(f"{split.labels[i]} {split.strength[i]:.2f}" for i in (order[-1], order[0]))
+
+
+def _basis(model, evidence: Evidence, structure: st.Structure) -> Basis:
+    n, rank = evidence.normal.count, evidence.projected.rank
+    dof = max(n - rank, 1)
+    chi2 = evidence.projected.chi2
+    frame_n = [max(int(u.sum()), 1) for u in evidence.use]
+    frame_chi2 = [float(np.sum(w.astype(float) ** 2)) for w in evidence.whitened]
+    return Basis(
+        frames=len(evidence.frames), values=n, masked=evidence.masked, not_finite=evidence.not_finite,
+        thinning=evidence.thinning, signal=evidence.signal, noise=evidence.noise,
+        misfit=evidence.noise * math.sqrt(chi2 / dof), chi2=chi2, dof=dof, rank=rank, phi=chi2 / dof,
+        excess_sd=(chi2 - dof) / math.sqrt(2 * dof), gradient=evidence.gradient,
+        structure_f=structure.f, structure_p=structure.p, high_frequency=structure.high,
+        render_noise=evidence.render_noise,
+        frame_names=[str(getattr(model.frames[f], "name", f)) for f in evidence.frames],
+        frame_phi=[c / m for c, m in zip(frame_chi2, frame_n)])
+
+
+def _write_limits(model, evidence: Evidence, table: Table, claimed: Candidate | None, fits: Mapping, basis: Basis,
+                  rows_max: int, seed: int, say: Progress) -> None:
+    """Upper limits of every effect; after a claim, at the values with the claimed effect, where it can mislead no more."""
+    others, widen = table.order, math.sqrt(max(basis.phi, 1.0))
+    if claimed is not None:
+        values, refit = fits[claimed.effect.name].values, claimed.row.refit
+        base = [v for v in [*(evidence.columns[i] for i in evidence.base), *claimed.variables]
+                if not at_bound(v, value_of(model, values, v))]
+        others = [replace(c, forms={}, broken=False) for c in table.order if c is not claimed]
+        evidence = measure(model, values, base, others, evidence.frames, rows_max, seed, say, "upper limits")
+        widen = math.sqrt(max(1 + refit.excess_sd * math.sqrt(2 / basis.dof), 1.0))
+    projected, first = evidence.projected, len(evidence.base)
+    for c in others:
+        best = -math.inf
+        for form, columns in c.forms.items():
+            seen = [j for j, i in enumerate(columns) if projected.survival[i - first] > st.VISIBLE]
+            if not seen or c.broken or (claimed is None and form != c.form):
+                continue
+            own = [columns[j] - first for j in seen]
+            cone = st.Cone(projected.information[np.ix_(own, own)], [c.sides[j] for j in seen], draws=1000)
+            fall, found = cone.solve(projected.score[own])
+            if fall - cone.expectation > best:
+                best = fall - cone.expectation
+                linear = np.full(len(c.variables), math.nan)
+                linear[seen] = np.abs(found) + 2 * widen * cone.sd
+                c.form = form
+                c.row.upper = c.change_of(linear).tolist()
+
+
+def _write_verdicts(table: Table, word: str, winner, members, splits, levels) -> None:
+    for c in table.order:
+        mine = [s for s in splits if s.effect == c.effect.name]
+        if mine and not all(s.holds for s in mine):
+            c.row.flags.append("uneven")
+        if c.row.refit is None and c.row.net <= 0 or c.row.p_family >= LEVEL:
+            c.row.verdict = "nothing visible" if "nothing visible" in c.row.flags else "no evidence"
+        elif word == "CLAIM" and c is winner:
+            c.row.verdict = "MISSING"
+        elif word == "AMBIGUOUS" and c in members:
+            c.row.verdict = "possible"
+        elif word == "PARTIAL" and c is winner:
+            c.row.verdict = "partial"
+        if c is winner and table.p_best < LEVEL and {table.winner_uniform, table.winner_dilated} - {c.effect.name}:
+            c.row.flags.append("fragile")
+
+
+def _warnings(model, fit, evidence, table, winner, shifts, dropped, structure, basis) -> list[str]:
+    """What weakens the verdict, in sentences."""
+    texts = list(getattr(fit, "warnings", []))
+    captures = getattr(model, "captures", None)
+    if captures is not None:
+        from optics.noise import warnings_of
+
+        texts += [w for w in warnings_of(model.noise, captures) if w not in texts]
+    if dropped:
+        texts.append(f"at a bound and taken as known: {', '.join(dropped)}")
+    if evidence.not_finite:
+        texts.append(f"{evidence.not_finite} values left out because prediction or derivative is not finite")
+    if evidence.render_noise > 0.01:
+        texts.append(f"Monte Carlo noise of the prediction adds {evidence.render_noise:.1%} to the variance; render with more "
+                     "samples")
+    noisy = [c.effect.name for c in table.order if c.row.kappa > KAPPA]
+    if noisy:
+        texts.append(f"derivative images are noisy (kappa above {KAPPA:g}): {', '.join(noisy)}; render with more samples")
+    if structure.high < 0.7:
+        texts.append(f"fine detail of the residual has {structure.high:.2f} of the noise expected: the images look interpolated "
+                     "or filtered, or the noise is overstated; neighbouring pixels then share their noise and p is too small")
+    if abs(basis.excess_sd) > EXCESS and not structure.p < LEVEL:
+        texts.append(f"chi2 is {basis.phi:.3g} per degree of freedom without structure: rather the noise model (gain, PRNU) is off "
+                     "than the physics")
+    if winner is not None and table.p_best < LEVEL:
+        for other, what in ((table.winner_uniform, "with uniform weights"),
+                            (table.winner_dilated, "with masks one pixel wider")):
+            if other and other != winner.effect.name:
+                texts.append(f"fragile: {what} the best effect is {other}, not {winner.effect.name}")
+    moved = [s for s in shifts if s.warn]
+    if moved:
+        texts.append("adding it moves " + ", ".join(moved_by(s) for s in moved[:3])
+                     + (f" and {len(moved) - 3} more" if len(moved) > 3 else "") + " by more than 3 sd or out of its prior")
+    return texts
+
+
+def _hints(word: str, conditions, members: Sequence[Candidate], gaps, names) -> list[str]:
+    """What to measure next, in words; ranked by declared needs, not by simulated shots."""
+    failed = {c.name for c in conditions if not c.holds}
+    hints = []
+    if word == "AMBIGUOUS" and len(members) > 1:
+        pairs = [(min(gaps[names.index(a.effect.name)][names.index(b.effect.name)],
+                      gaps[names.index(b.effect.name)][names.index(a.effect.name)]), a, b)
+                 for i, a in enumerate(members) for b in members[i + 1:]]
+        d, a, b = min(pairs, key=lambda pair: pair[0])
+        more = math.ceil(CLEAR / d) if d > 0 else 0
+        hints.append(f"hardest pair: {a.effect.name} / {b.effect.name}, expected chi2 between them D = {d:.3g}, "
+                     f"P(correct) = {st.probability_correct(d):.2f} in noise alone; " + (
+                         "noise would allow a decision, but not the misfit that both leave" if d >= CLEAR else
+                         f"{more} times as many frames of the same kind would decide in 95 % of cases" if 0 < more < 1000
+                         else "more frames of the same kind will not decide"))
+        for one, other in ((a, b), (b, a)):
+            alone = [x for x in one.effect.acts if x not in other.effect.acts]
+            if alone:
+                hints.append(f"only {one.effect.name} acts through {', '.join(alone)}: vary that and keep the rest")
+        hints += [f"{c.effect.name} needs: {c.effect.needs}" for c in members if c.effect.needs]
+        hints.append("the same press at 0.4 of the exposure, and one deeper press, often tell more than repeats")
+    if "held out" in failed and word != "NOTHING" and "held out" in {c.name for c in conditions}:
+        hints.append("hold out frames that the fit has not seen (other presses or places), or find why they do not improve")
+    if word == "UNKNOWN":
+        hints.append("draft an effect from the curve, add it, and diagnose again")
+    return hints

@@ -1,0 +1,508 @@
+"""The linear algebra of a diagnosis: how much of a residual an effect explains that no calibration can absorb.
+
+Notation, whitened throughout (divided by the standard deviation that the noise model gives each value):
+
+    r   residual, measured minus predicted                  J   derivative images of the calibrated parameters
+    g   derivative images of an effect at its start         Q   orthonormal basis of J
+    G = g - QQ'g        what of the effect a new calibration would leave visible
+    V = G'G             information that the data hold on its strength s
+    u = G'r             score
+    s = V^-1 u          expected change of the strength (EPC), covariance V^-1
+    T = u'V^-1 u        predicted fall of chi2 when the effect is freed and everything is calibrated again
+    survival = |G|^2 / |g|^2
+
+Everything is computed from normal equations, so images can be streamed. Nothing here knows a model or a file. Columns
+are scaled to unit length before any truncation: no result depends on the unit of a parameter.
+
+Sources: score test and EPC: Sorbom, Psychometrika 54, 371 (1989); cone tests: Silvapulle & Sen, Constrained Statistical
+Inference (2005); errors in variables: Fuller, Measurement Error Models (1987).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+
+TRUNCATION = 1e-9  # of the largest eigenvalue of unit-length columns: below, a direction is not calibrated but undetermined
+VISIBLE = 1e-6  # survival below which normal equations in double precision cannot tell what is left from rounding
+DRAWS = 40_000  # of the simulated maximum: 1 % of them are 400, known to 5 %
+BINS = 16  # of a curve along a coordinate
+NARROW = 8  # cosines per side that count as low frequency
+
+
+# -- normal equations -------------------------------------------------------------------------------------------------
+
+
+class Normal:
+    """Sums over pixels of products of whitened columns A (n, m) and residual r (n,): A'A, A'r, r'r.
+
+    With a twin B, an independent render of the same derivative images, products are taken across the two,
+    sym(A'B) and mean(A, B)'r: noise of one image then multiplies noise of another and averages out, where A'A would
+    add it up (a strength found with noise of 0.3 of the signal per pixel would come out at 0.7 of the truth).
+    """
+
+    def __init__(self, columns: int):
+        self.gram = np.zeros((columns, columns))
+        self.score = np.zeros(columns)
+        self.noise = np.zeros(columns)  # sum over pixels of the variance of one render
+        self.square = 0.0
+        self.count = 0
+
+    def add(self, where: Sequence[int], a: np.ndarray, r: np.ndarray, b: np.ndarray | None = None) -> None:
+        """Add pixels: a (n, k) in the columns `where`, r (n,); columns that are left out are zero in these pixels."""
+        where = np.asarray(where, int)
+        if b is None:
+            product, middle = a.T @ a, a
+        else:
+            product, middle = a.T @ b, (a + b) / 2
+            product = (product + product.T) / 2
+            self.noise[where] += ((a - b) ** 2).sum(0) / 2
+        self.gram[np.ix_(where, where)] += product
+        self.score[where] += middle.T @ r
+        self.square += float(r @ r)
+        self.count += len(r)
+
+    def copy(self) -> Normal:
+        twin = Normal(0)
+        twin.gram, twin.score, twin.noise = self.gram.copy(), self.score.copy(), self.noise.copy()
+        twin.square, twin.count = self.square, self.count
+        return twin
+
+    def kappa(self) -> np.ndarray:
+        """Noise over signal per pixel of one render of each column."""
+        signal = np.maximum(np.diag(self.gram), 1e-300)
+        return np.sqrt(self.noise / signal)
+
+    def truncation(self) -> float:
+        """Eigenvalues that noise of the images can make: kappa^2/sqrt(n), times 5, and never below TRUNCATION."""
+        kappa = self.kappa()[np.diag(self.gram) > 0]
+        return max(TRUNCATION, 5 * float(kappa.max(initial=0.0)) ** 2 / np.sqrt(max(self.count, 1)))
+
+
+def inverse(gram: np.ndarray, truncation: float = TRUNCATION) -> tuple[np.ndarray, int]:
+    """Eigen-truncated inverse and rank of a symmetric matrix whose columns may have any units."""
+    length = np.sqrt(np.maximum(np.diag(gram), 0.0))
+    scale = np.where(length > 0, 1 / np.where(length > 0, length, 1.0), 0.0)
+    if not len(gram) or not scale.any():
+        return np.zeros_like(gram), 0
+    values, vectors = np.linalg.eigh(gram * scale * scale[:, None])
+    keep = values > truncation * values[-1]
+    vectors = vectors[:, keep] * scale[:, None]
+    return (vectors / values[keep]) @ vectors.T, int(keep.sum())
+
+
+@dataclass(frozen=True)
+class Projected:
+    """What is left of some columns and of the residual when the base columns are projected off.
+
+    information  V (k, k); score: u (k,)
+    survival     (k,) V_jj / |g_j|^2, 0..1
+    response     (p, k) d base parameters / d strength: how a calibration would move to hide the effect
+    rank         of the base; absorbed: |Q'r|^2; chi2: r'r - |Q'r|^2
+    """
+
+    information: np.ndarray
+    score: np.ndarray
+    survival: np.ndarray
+    response: np.ndarray
+    rank: int
+    absorbed: float
+    chi2: float
+
+
+def project(normal: Normal, base: Sequence[int], rest: Sequence[int], precision: np.ndarray | None = None,
+            pull: np.ndarray | None = None, truncation: float | None = None, settled: bool = False) -> Projected:
+    """Project the columns `base` off the columns `rest` and the residual.
+
+    precision, pull   (p,) 1/tau^2 and (mean - value)/tau^2 of priors on the base: rows that a calibration sees as well
+    settled           the base is known to be at its optimum, where J'r = 0: what noise of the images makes of J'r is left
+                      out of the scores, and its expectation out of `absorbed`
+    """
+    base, rest = np.asarray(base, int), np.asarray(rest, int)
+    precision = np.zeros(len(base)) if precision is None else precision
+    pull = np.zeros(len(base)) if pull is None else pull
+    k = normal.gram[np.ix_(base, base)] + np.diag(precision)
+    b = normal.score[base] + pull
+    across = normal.gram[np.ix_(base, rest)]
+    raw = np.diag(normal.gram)[rest]
+    inv, rank = inverse(k, normal.truncation() if truncation is None else truncation)
+    x = inv @ across
+    v = normal.gram[np.ix_(rest, rest)] - across.T @ x
+    absorbed = float(b @ inv @ b)
+    if settled:
+        absorbed = max(absorbed - float(np.diag(inv) @ normal.noise[base]) * normal.square / max(normal.count, 1) / 2, 0.0)
+        b = np.zeros_like(b)
+    prior = float(np.sum(pull**2 / np.where(precision > 0, precision, 1.0)))
+    survival = np.clip(np.divide(np.diag(v), raw, out=np.zeros(len(rest)), where=raw > 0), 0.0, 1.0)
+    return Projected((v + v.T) / 2, normal.score[rest] - x.T @ b, survival, -x, rank, absorbed,
+                     normal.square + prior - absorbed)
+
+
+# -- one effect -------------------------------------------------------------------------------------------------------
+
+
+class Cone:
+    """Strengths that an effect may take: each free, >= 0 or <= 0, with the information V on them.
+
+    T = max over allowed s of 2 s'u - s'Vs. Under the null hypothesis T follows a mixture of chi2 distributions whose
+    weights (probability that j strengths come out off their bound) are exact for one strength and simulated for more.
+    """
+
+    def __init__(self, information: np.ndarray, sides: Sequence[int], seed: int = 0, draws: int = 10_000):
+        sides = np.asarray(sides, int)
+        self.information = np.asarray(information, float)
+        diagonal = np.diag(self.information)
+        self.live = np.flatnonzero(diagonal > 0)
+        sign = np.where(sides < 0, -1.0, 1.0)[self.live]
+        v = self.information[np.ix_(self.live, self.live)] * sign * sign[:, None]
+        self.sign, self.free, self.bound = sign, np.flatnonzero(sides[self.live] == 0), np.flatnonzero(sides[self.live])
+        across = v[np.ix_(self.bound, self.free)]
+        self.free_inverse, self.free_rank = inverse(v[np.ix_(self.free, self.free)])
+        self.across = across @ self.free_inverse  # (bound, free)
+        self.cone = v[np.ix_(self.bound, self.bound)] - self.across @ across.T
+        self.inverse, self.rank = inverse(self.information)
+        self.weights = self._weights(seed, draws)  # [j] = P(chi2 with j degrees of freedom)
+
+    def _weights(self, seed: int, draws: int) -> np.ndarray:
+        weights = np.zeros(len(self.live) + 1)
+        if len(self.bound) < 2:
+            active = np.array([1.0]) if not len(self.bound) else np.array([0.5, 0.5])
+        else:
+            z = _gaussian(self.cone, draws, np.random.default_rng([seed, 11]))
+            active = np.bincount((_descend(self.cone, z) > 0).sum(1), minlength=len(self.bound) + 1) / draws
+        weights[self.free_rank:self.free_rank + len(active)] = active
+        return weights
+
+    def _split(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        u = u[..., self.live] * self.sign
+        free = u[..., self.free]
+        return free, u[..., self.bound] - free @ self.across.T
+
+    def fall(self, scores: np.ndarray) -> np.ndarray:
+        """T of many scores (n, k) at once, (n,)."""
+        free, bound = self._split(np.asarray(scores, float))
+        fall = np.einsum("ni,ij,nj->n", free, self.free_inverse, free)
+        if len(self.bound) == 1:
+            fall = fall + np.maximum(bound[:, 0], 0.0) ** 2 / self.cone[0, 0]
+        elif len(self.bound):
+            x = _descend(self.cone, bound)
+            fall = fall + np.maximum(2 * (x * bound).sum(1) - np.einsum("ni,ij,nj->n", x, self.cone, x), 0.0)
+        return fall
+
+    def solve(self, u: np.ndarray) -> tuple[float, np.ndarray]:
+        """(T, s): predicted fall of chi2 and the change of the strengths, exact (NNLS)."""
+        from scipy.optimize import nnls
+
+        free, bound = self._split(np.asarray(u, float))
+        x = np.zeros(len(self.bound))
+        if len(self.bound) == 1:
+            x[0] = max(bound[0], 0.0) / self.cone[0, 0]
+        elif len(self.bound):
+            scale = 1 / np.sqrt(np.diag(self.cone))
+            values, vectors = np.linalg.eigh(self.cone * scale * scale[:, None])
+            keep = values > TRUNCATION * values[-1]
+            root, vectors = np.sqrt(values[keep]), vectors[:, keep]
+            x = scale * nnls((vectors * root).T, (vectors / root).T @ (bound * scale), maxiter=100 * len(x))[0]
+        s = np.zeros(len(self.information))
+        y = self.free_inverse @ free - self.across.T @ x
+        s[self.live[self.free]], s[self.live[self.bound]] = self.sign[self.free] * y, self.sign[self.bound] * x
+        return float(free @ self.free_inverse @ free + max(2 * x @ bound - x @ self.cone @ x, 0.0)), s
+
+    @property
+    def expectation(self) -> float:
+        """Mean of T when the effect is absent: 1 for a free strength, 1/2 for a one-sided one."""
+        return float(self.weights @ np.arange(len(self.weights)))
+
+    @property
+    def sd(self) -> np.ndarray:
+        """(k,) standard deviation of each strength, NaN where nothing is known of it."""
+        variance = np.diag(self.inverse)
+        return np.sqrt(np.where(variance > 0, variance, np.nan))
+
+    def p(self, fall) -> np.ndarray:
+        """Probability of a larger T when the effect is absent; an array like `fall`."""
+        from scipy.special import chdtrc
+
+        fall = np.asarray(fall, float)
+        p = np.where(fall > 0, 0.0, self.weights[0])
+        for dof in np.flatnonzero(self.weights[1:]) + 1:
+            p = p + self.weights[dof] * chdtrc(dof, fall)
+        return np.where(fall > 0, p, 1.0)
+
+    def critical(self, p: float) -> float:
+        """T at which `p` is reached."""
+        from scipy.optimize import brentq
+
+        if self.p(1e-9) <= p:
+            return 0.0
+        return float(brentq(lambda fall: float(self.p(fall)) - p, 1e-9, 1e4))
+
+    def power(self, strength: np.ndarray, critical: float) -> float:
+        """Probability that T exceeds `critical` when the strengths are `strength`: noncentral with ncp = s'Vs."""
+        from scipy.special import chndtr, ndtr
+
+        ncp = float(strength @ self.information @ strength)
+        dof = int(np.flatnonzero(self.weights)[-1])
+        if not ncp > 0 or dof == 0:
+            return 0.0
+        if dof == 1 and self.weights[0] > 0:
+            return float(ndtr(np.sqrt(ncp) - np.sqrt(critical)))
+        return float(1 - chndtr(critical, dof, ncp)) if ncp < 1e4 else 1.0
+
+
+def _gaussian(covariance: np.ndarray, draws: int, rng: np.random.Generator) -> np.ndarray:
+    """(draws, k) samples of N(0, covariance); the covariance may be singular."""
+    length = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    scale = np.where(length > 0, length, 1.0)
+    values, vectors = np.linalg.eigh(covariance / scale / scale[:, None])
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    return rng.standard_normal((draws, len(covariance))) @ root.T * length
+
+
+def _descend(v: np.ndarray, u: np.ndarray, sweeps: int = 100, tolerance: float = 1e-4) -> np.ndarray:
+    """argmax over x >= 0 of 2 x'u - x'vx for many u (n, k) at once: coordinate descent, to `tolerance` sd."""
+    x = np.zeros_like(u)
+    for _ in range(sweeps):
+        moved = 0.0
+        for j in range(len(v)):
+            fresh = np.maximum(x[:, j] + (u[:, j] - x @ v[:, j]) / v[j, j], 0.0)
+            moved = max(moved, float(np.abs(fresh - x[:, j]).max(initial=0.0)) * np.sqrt(v[j, j]))
+            x[:, j] = fresh
+        if moved < tolerance:
+            break
+    return x
+
+
+# -- many effects -----------------------------------------------------------------------------------------------------
+
+
+class Family:
+    """Probability that the best of all candidates looks as good as p by chance: the simulated maximum.
+
+    Scores are drawn from N(0, V) with the V of all candidates together, so that look-alikes count once.
+    Below the reach of the simulation the number of effectively independent candidates found there is kept.
+    """
+
+    def __init__(self, information: np.ndarray, candidates: Sequence[tuple[Sequence[int], Cone]], seed: int = 0,
+                 draws: int = DRAWS):
+        self.draws = draws
+        z = _gaussian(information, draws, np.random.default_rng([seed, 12]))
+        smallest = np.ones(draws)
+        for columns, cone in candidates:
+            np.minimum(smallest, cone.p(cone.fall(z[:, np.asarray(columns, int)])), out=smallest)
+        self.smallest = np.sort(smallest)
+
+    def p(self, p: float) -> float:
+        """Family-wise probability of a smallest p as small as this one."""
+        tail = 200
+        if self.draws >= 2 * tail and p < self.smallest[tail - 1]:
+            return float(p / self.smallest[tail - 1] * tail / self.draws)
+        return float(min(1.0, np.searchsorted(self.smallest, p, side="right") / self.draws)) if p < 1 else 1.0
+
+    def critical(self, p: float) -> float:
+        """Single p that has the family-wise probability `p`."""
+        return float(self.smallest[min(int(p * self.draws), self.draws - 1)])
+
+
+def gap(information: np.ndarray, a: Sequence[int], strength: np.ndarray, b: Sequence[int], rival: Cone) -> float:
+    """D: expected chi2 by which the data prefer effect a, true with `strength`, over effect b at its best."""
+    a, b = np.asarray(a, int), np.asarray(b, int)
+    full = float(strength @ information[np.ix_(a, a)] @ strength)
+    mimicked, _ = rival.solve(information[np.ix_(b, a)] @ strength)
+    return max(full - mimicked, 0.0)
+
+
+def probability_correct(d: float) -> float:
+    """P(the true one of two effects has the smaller chi2) = Phi(sqrt(D)/2)."""
+    from scipy.special import ndtr
+
+    return float(ndtr(np.sqrt(max(d, 0.0)) / 2))
+
+
+# -- bins: fingerprints and splits ------------------------------------------------------------------------------------
+
+
+def bin_edges(x: np.ndarray, bins: int = BINS) -> np.ndarray | None:
+    """Edges of at most `bins` bins: half of them hold equal counts, half are equally wide, so that neither a flat region
+    nor a long tail takes them all. One bin per value where there are few values; None where there is only one."""
+    x = x[np.isfinite(x)]
+    if not len(x):
+        return None
+    sample = x[:: max(1, len(x) // 200_000)].astype(float)
+    values = np.unique(sample)
+    if len(values) < 2:
+        return None
+    if len(values) <= bins:
+        return np.concatenate([[-np.inf], (values[1:] + values[:-1]) / 2, [np.inf]])
+    low, high = np.quantile(sample, [0.005, 0.995])
+    inner = np.concatenate([np.quantile(sample, np.linspace(0, 1, bins // 2 + 1))[1:-1],
+                            np.linspace(low, high, bins // 2 + 2)[1:-1]])
+    edges = np.unique(inner)
+    keep, floor = [], max(20, len(sample) // 2000)
+    last = 0
+    counts = np.searchsorted(np.sort(sample), edges)
+    for edge, count in zip(edges, counts):
+        if count - last >= floor and len(sample) - count >= floor:
+            keep.append(edge)
+            last = count
+    return np.concatenate([[-np.inf], keep, [np.inf]]) if keep else None
+
+
+def add_bins(normal: Normal, where: Sequence[int], a: np.ndarray, r: np.ndarray, first: int, bins: np.ndarray, count: int,
+             carriers: Sequence[np.ndarray]) -> None:
+    """Add columns 1{bin} * carrier, starting at column `first`: bins (n,) in 0..count-1 or -1 for none.
+
+    Only products with the new columns are added; those of `a` (n, k) among themselves are there already.
+    """
+    from scipy.sparse import csr_array
+
+    rows = np.flatnonzero(bins >= 0)
+    index = np.concatenate([bins[rows] + i * count for i in range(len(carriers))])
+    data = np.concatenate([carrier[rows] for carrier in carriers])
+    width = count * len(carriers)
+    b = csr_array((data, (np.tile(rows, len(carriers)), index)), shape=(len(r), width)).T.tocsr()
+    new = np.arange(first, first + width)
+    where = np.asarray(where, int)
+    across = b @ a
+    normal.gram[np.ix_(new, where)] += across
+    normal.gram[np.ix_(where, new)] += across.T
+    normal.gram[np.ix_(new, new)] += (b @ b.T).toarray()
+    normal.score[new] += b @ r
+
+
+def joint(projected: Projected, scale: np.ndarray, truncation: float = 1e-6) -> tuple[float, int, np.ndarray, np.ndarray]:
+    """(T, dof, s, sd) of columns that may be dependent among themselves or absorbed by the base.
+
+    scale  (k,) squared lengths of the columns before projection: what survives of them below `truncation` is no column
+    """
+    length = np.sqrt(np.maximum(scale, 0.0))
+    unit = np.where(length > 0, 1 / np.where(length > 0, length, 1.0), 0.0)
+    values, vectors = np.linalg.eigh(projected.information * unit * unit[:, None])
+    keep = values > truncation
+    vectors = vectors[:, keep] * unit[:, None]
+    z = vectors.T @ projected.score
+    fall = float(np.sum(z**2 / values[keep]))
+    return fall, int(keep.sum()), vectors @ (z / values[keep]), np.sqrt(np.sum(vectors**2 / values[keep], 1))
+
+
+# -- structure --------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Structure:
+    """Test of low against high spatial frequencies: F, its degrees of freedom and p; NaN where images are too small.
+
+    high  mean power of the high frequencies, 1 where the noise model is right and pixels are independent
+    """
+
+    f: float
+    p: float
+    dof_low: float
+    dof_high: float
+    high: float
+
+
+@cache
+def cosines(n: int) -> np.ndarray:
+    """(n, n) orthonormal DCT-II: row k is the cosine of k half periods."""
+    x = np.arange(n) + 0.5
+    basis = np.sqrt(2 / n) * np.cos(np.pi * np.outer(np.arange(n), x) / n)
+    basis[0] /= np.sqrt(2)
+    return basis
+
+
+def planes_of(use: np.ndarray) -> list[tuple]:
+    """Indices (rows, columns, channel) of the planes of a mask (H, W, C) that hold pixels on a regular grid.
+
+    A raw mosaic fills only some of the four positions of a 2 x 2 cell in a channel: each is a plane of its own.
+    """
+    planes = []
+    for c in range(use.shape[2]):
+        cells = [(slice(i, None, 2), slice(j, None, 2), c) for i in (0, 1) for j in (0, 1)]
+        filled = [use[cell].any() for cell in cells]
+        planes += [(slice(None), slice(None), c)] if all(filled) else [cell for cell, full in zip(cells, filled) if full]
+    return planes
+
+
+class Spectrum:
+    """Power of whitened residuals in the lowest NARROW x NARROW cosines against the highest quarter.
+
+    White noise has the same power in both, whatever its size: an error of the gain changes nothing, structure does.
+    The degrees of freedom that a calibration takes from the low frequencies are counted from the images of J.
+    """
+
+    def __init__(self, columns: int):
+        self.low_gram = np.zeros((columns, columns))
+        self.planes: list[list[tuple]] = []
+        self.trace = self.square = self.high_count = 0.0
+
+    def add(self, use: np.ndarray, where: Sequence[int], columns: np.ndarray) -> None:
+        """Add a frame: use (H, W, C) bool; columns (H, W, C, k), whitened and zero outside, in the places `where`."""
+        planes = [p for p in planes_of(use) if min(use[p].shape) >= 16 and use[p].mean() > 0.2]
+        self.planes.append(planes)
+        where = np.asarray(where, int)
+        for plane in planes:
+            mask = use[plane].astype(float)
+            rows, cols = self._low(mask.shape)
+            basis = np.einsum("ah,bw->abhw", rows, cols).reshape(len(rows) * len(cols), -1)
+            covariance = (basis * mask.ravel()) @ basis.T  # of the low coefficients of masked white noise
+            self.trace += float(np.trace(covariance))
+            self.square += float(np.sum(covariance**2))
+            self.high_count += (mask.shape[0] // 2) * (mask.shape[1] // 2) * float(mask.mean())
+            low = basis @ columns[plane].reshape(mask.size, -1)
+            self.low_gram[np.ix_(where, where)] += low.T @ low
+
+    @staticmethod
+    def _low(shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+        return tuple(cosines(n)[:min(NARROW, n // 4)] for n in shape)
+
+    def test(self, residuals: Sequence[np.ndarray], base: Sequence[int], inverse_gram: np.ndarray) -> Structure:
+        """F test of whitened residuals (H, W, C), zero outside the masks; base and (J'J)^-1 name what was calibrated."""
+        from scipy.fft import dctn
+        from scipy.special import fdtrc
+
+        if not any(self.planes):
+            return Structure(*[float("nan")] * 5)
+        low = high = 0.0
+        for residual, planes in zip(residuals, self.planes):
+            for plane in planes:
+                power = dctn(residual[plane], norm="ortho") ** 2
+                h, w = power.shape
+                low += float(power[:min(NARROW, h // 4), :min(NARROW, w // 4)].sum())
+                high += float(power[h - h // 2:, w - w // 2:].sum())
+        base = np.asarray(base, int)
+        taken = float(np.sum(inverse_gram * self.low_gram[np.ix_(base, base)]))
+        expected = max(self.trace - taken, 1e-9)
+        dof_low = max(self.trace**2 / self.square * expected / self.trace, 1.0)
+        dof_high = max(self.high_count, 1.0)
+        mean_high = high / dof_high
+        f = low / expected / max(mean_high, 1e-300)
+        return Structure(f, float(fdtrc(dof_low, dof_high, f)), dof_low, dof_high, mean_high)
+
+
+# -- thinning ---------------------------------------------------------------------------------------------------------
+
+
+def thinning(values: int, limit: int) -> int:
+    """Smallest odd k so that every k-th of `values` pixels are at most `limit`; odd, so that a mosaic is thinned evenly."""
+    k = max(1, -(-values // max(limit, 1)))
+    return k + 1 - k % 2
+
+
+def lattice(shape: tuple[int, int, int], k: int, shift: int = 0) -> np.ndarray:
+    """(H, W, C) bool: every k-th pixel on the most even lattice (column + s row = const mod k), shifted by channel."""
+    if k == 1:
+        return np.ones(shape, bool)
+    reach = np.arange(-k, k + 1)
+
+    def distance(s):
+        column, row = np.meshgrid(reach, reach)
+        hit = ((column + s * row) % k == 0) & ((column != 0) | (row != 0))
+        return (column**2 + row**2)[hit].min()
+
+    s = max(range(1, k), key=distance)
+    row, column, channel = np.ogrid[:shape[0], :shape[1], :shape[2]]
+    return (column + s * row + channel + shift) % k == 0

@@ -1,0 +1,77 @@
+"""A measured background enters a prediction by name, and every derivative follows it."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from optics.captures import Captures, Frame
+from optics.errors import UnknownKey
+from optics.noise import Noise
+from optics.parameter import Values, Variable
+
+WIDTH, HEIGHT = 48, 36  # px
+PRESSED = {"gel.press_x": 1.0, "gel.press_y": -0.5, "gel.press_depth": 0.4}
+KEYS = {"camera.gain": 1.03, "camera.gain_g": 0.98, "led_1.power": 1.2, "led_1.power_b": 0.7, "led_2.mu": 1.6,
+        "membrane.ground_g": 2e-3, "gel.height_loss": 0.2, "gel.skirt": 0.4, "gel.press_depth": 0.4}
+
+
+@pytest.fixture(scope="module")
+def models(mitsuba):
+    from optics import scene
+    from optics.render import Model
+
+    loaded = scene.load("gelsight", {"width": WIDTH, "height": HEIGHT})
+    frame = Frame("press", np.zeros((HEIGHT, WIDTH, 3), np.float32), parameters=dict(PRESSED))
+    flat = (80 + np.arange(WIDTH)[None, :, None] * np.array([1.0, 0.5, 0.2]) + np.zeros((HEIGHT, 1, 1))).astype(np.float32)
+    captures = Captures(Path("."), str(loaded.path), [frame], noise=Noise(0.1, 1.0, 2.0, 255.0, 0.0), flat_field=flat)
+    return {mode: Model(loaded, captures, flat_field=mode) for mode in ("multiplicative", "additive", None)}
+
+
+def test_modes_are_named_and_others_refused(models):
+    from optics.render import Model
+
+    model = models["additive"]
+    assert Model(model.scene, model.captures).flat_field == "multiplicative" and models[None].flat is None
+    with pytest.raises(UnknownKey, match="did you mean 'additive'"):
+        Model(model.scene, model.captures, flat_field="aditive")
+
+
+@pytest.mark.parametrize("mode", ["multiplicative", "additive"])
+def test_the_untouched_sensor_is_the_background_times_its_gain(models, mode):
+    model = models[mode]
+    values = Values(frame={0: {"gel.press_depth": 0.0, "camera.gain": 1.1, "camera.gain_b": 0.9}})
+    expected = 2 + (model.captures.flat_field - 2) * 1.1 * np.array([1, 1, 0.9])
+    # both sides come from the same image; rims of the gel are the same as well
+    assert np.abs(model.predict(values)[0] - expected).max() < 1e-3
+
+
+@pytest.mark.parametrize("mode", ["multiplicative", "additive"])
+@pytest.mark.parametrize("key", KEYS)
+def test_derivatives_agree_with_differences(models, mode, key):
+    model = models[mode]
+    values = Values(frame={0: dict(KEYS)})
+    variable = Variable(key, (key,), model.parameters[key], (0,))
+    prediction, images = next(iter(model.derivatives(values, [variable], [0])))
+    assert np.abs(prediction - model.predict(values)[0]).max() < 1e-4
+    step = (0.1 if model.parameters[key].how == "difference" else 0.3) * model.parameters[key].plausible
+    sides = []
+    for sign in (1, -1):
+        moved = values.copy()
+        moved.put(variable, KEYS[key] + sign * step)
+        sides.append(model.predict(moved)[0])
+    expected = (sides[0] - sides[1]) / (2 * step)
+    # steps wide enough for float32 images; the same steps for what is a difference itself
+    assert np.linalg.norm(images[key] - expected) < 0.01 * np.linalg.norm(expected)
+
+
+def test_the_share_of_the_background_that_the_scene_explains(models):
+    share = models["additive"].background_share()
+    assert len(share) == 3 and all(s["share"] <= 1 and s["structure"] > 0 for s in share)
+
+
+def test_a_power_per_band_scales_that_band_alone(models):
+    model = models[None]
+    dim = model.predict(Values(common={f"led_{k}.power_g": 0.5 for k in range(1, 7)}))[0] - 2
+    full = model.predict(Values())[0] - 2
+    assert dim[..., 1] == pytest.approx(full[..., 1] / 2, rel=1e-6) and np.array_equal(dim[..., [0, 2]], full[..., [0, 2]])

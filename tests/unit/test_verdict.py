@@ -1,0 +1,431 @@
+"""Verdicts on a mock sensor whose truth is known: what is claimed, what is not, and that only a claim names a cause."""
+
+import csv
+import io
+import math
+import re
+import sys
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from optics import statistics as st
+from optics.diagnose import diagnose
+from optics.effect import Effect
+from optics.errors import Underdetermined
+from optics.evidence import Candidate, measure
+from optics.parameter import Values
+from optics.verdict import CLEAR, MARGIN, WORDS, Diagnosis, Findings, decide
+
+sys.path.insert(0, str(Path(__file__).parent))
+from mock_model import LIBRARY, MockModel, PointModel, mock_fit, simulate  # noqa: E402
+
+PRESSES, HELD = 6, (4, 5)
+FITTED = (0, 1, 2, 3)
+
+
+def library(*names):
+    return tuple(e for e in LIBRARY if e.name in names)
+
+
+def calibrated(truth=None, seed=1, clutter=0.0, unit=None, side=22, extra=(), priors=False):
+    """A model with simulated frames and its calibrated base; `extra` effects are in the base."""
+    model = MockModel(PRESSES, side, unit=unit)
+    start = simulate(model, np.random.default_rng(seed), truth, clutter)
+    variables = model.base_variables(FITTED) + [v for e in LIBRARY if e.name in extra for v in model.variables_of(e)]
+    if priors:
+        variables = [v.with_prior(start.common[v.name], 0.3) if v.name in start.common else v for v in variables]
+    return model, mock_fit(model, variables, start, FITTED)
+
+
+def judge(model, fit, effects=LIBRARY, held=HELD, **options):
+    return diagnose(model, fit, effects, model.variables_of, held, fitted=FITTED, **{"refit": mock_fit, "top": 3, **options})
+
+
+@cache
+def case(name):
+    truth, effects = {
+        "null": ({}, LIBRARY),
+        "vignetting": ({"vignetting": 0.3}, LIBRARY),
+        "weak": ({"vignetting": 0.012}, library("vignetting", "LED lobe", "glare")),
+        "defocus": ({"defocus": 0.35}, library("defocus", "glare", "absorption", "crosstalk")),
+        "flicker": ({"flicker": [0.01, -0.02, 0.015, 0.0, 0.01, -0.01]}, library("flicker", "gamma", "glare")),
+        "stain": ({"stain": 0.06}, library("vignetting", "crosstalk", "albedo gradient", "LED lobe")),
+        "height": ({"height_gain": 0.04}, library("vignetting", "absorption", "crosstalk", "defocus")),
+        "drift": ({"red_drift": [0.01, -0.02, 0.015, 0.0, 0.01, -0.01]}, library("flicker", "gamma", "crosstalk")),
+    }[name]
+    return judge(*calibrated(truth, seed=2), effects)
+
+
+# -- what is claimed --------------------------------------------------------------------------------------------------
+
+
+def test_nothing_is_said_of_a_complete_model():
+    d = case("null")
+    assert d.word == "NOTHING" and len(d.rows) == len(LIBRARY)
+    assert all(r.p_family >= 0.01 and r.refit is None for r in d.rows)
+    assert all(np.nanmax(r.upper) < 0.3 * MockModel(1).parameters[f"sensor.{v.split('.')[1].split('[')[0]}"].plausible
+               for r in d.rows for v in r.variables[:1])  # "not present" is a result too
+    assert abs(d.basis.phi - 1) < 5 * math.sqrt(2 / d.basis.dof)
+    assert d.basis.gradient < 0.1
+
+
+def test_a_missing_effect_is_claimed_with_its_strength():
+    d = case("vignetting")
+    assert d.word == "CLAIM" and d.missing == "vignetting" == d.rows[0].name
+    row = d.row("vignetting")
+    assert abs(row.refit.strength[0] - 0.3) < 4 * row.refit.sd[0] and row.refit.sd[0] < 0.01
+    assert 0.8 < row.refit.ratio < 1.25  # predicted against actual fall (at 6 % raw change the effect is not linear)
+    assert row.survival < 0.3 and row.confused_with == "LED lobe" and 0.8 < row.cos < 1
+    assert d.levels[1].held_out < 0.6 * d.levels[0].held_out and d.levels[1].fall > 0
+    assert d.levels[1].held_out == pytest.approx(d.basis.noise, rel=0.05)
+    assert d.shifts[0].warn and d.fits["vignetting"].converged
+    assert all(s.holds for s in d.splits if s.effect == "vignetting")
+    assert {s.by for s in d.splits} == {"channel", "frame", "contact", "quadrant"}
+    assert "does not prove" in d.text() and f"strength {row.refit.strength[0]:.4f}" in d.sentence
+
+
+def test_an_onset_that_is_not_linear_is_claimed_with_its_strength():
+    d = case("defocus")
+    row = d.row("defocus")
+    assert d.missing == "defocus" and row.form == "secant"
+    assert row.refit.strength[0] == pytest.approx(0.35, abs=4 * row.refit.sd[0])
+    assert row.start[0] + row.change[0] == pytest.approx(0.35, rel=0.25)  # from a step of 0.7, before any refit
+    assert row.sd[0] == pytest.approx(row.refit.sd[0], rel=0.5)
+
+
+def test_an_effect_with_a_strength_per_frame_is_claimed():
+    d = case("flicker")
+    row = d.row("flicker")
+    assert d.missing == "flicker" and len(row.variables) == len(row.change) == len(FITTED)
+    assert row.expected == pytest.approx(len(FITTED) - 1, abs=0.1)  # the common gain is absorbed by the LEDs
+    found = np.array(row.refit.strength)
+    assert found - found.mean() == pytest.approx(np.array([0.01, -0.02, 0.015, 0.0]) - 0.00125, abs=0.002)
+
+
+def test_after_it_is_added_nothing_is_left():
+    model, fit = calibrated({"vignetting": 0.3}, extra=("vignetting",))
+    d = judge(model, fit, library("vignetting", "LED lobe", "gamma", "absorption", "glare"))
+    assert d.word == "NOTHING" and d.not_tested == {"vignetting": "in the model already"}
+
+
+# -- what is not claimed ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name, coordinates", [("stain", {"place", "row", "column"}), ("height", {"height"})])
+def test_what_the_library_lacks_is_unknown_and_named_by_its_coordinate(name, coordinates):
+    d = case(name)
+    assert d.word == "UNKNOWN"
+    assert re.search("depends on '(.*?)'", d.sentence)[1] in coordinates
+    best = d.fingerprints[0]
+    assert best.ratio > 1.25 and len(best.curve) == len(best.sd) == len(best.centres) and best.p < 1e-6
+
+
+def test_a_curve_is_the_shape_that_is_missing():
+    curve = next(f for f in case("height").fingerprints if f.coordinate == "height")
+    assert curve.kind == "gain"
+    x, y, sd = (np.array(a) for a in (curve.centres, curve.curve, curve.sd))
+    fit = np.polynomial.polynomial.polyfit(x, y, 1, w=1 / sd)
+    assert fit[1] == pytest.approx(0.04, rel=0.5)  # 4 % per mm; calibration absorbs a part
+
+
+def test_a_proxy_is_uneven():
+    d = case("drift")
+    assert d.word in ("PARTIAL", "UNKNOWN") and "uneven" in d.row("flicker").flags
+    split = next(s for s in d.splits if s.by == "channel")
+    assert not split.holds and split.h > 0.1 and split.strength[0] > 2 > 0.5 > abs(split.strength[1])
+
+
+def test_what_the_data_cannot_tell_apart_is_a_set():
+    d = case("weak")
+    assert d.word == "AMBIGUOUS" and set(d.ambiguous) == {"vignetting", "LED lobe"}
+    i, j = d.compared.index("vignetting"), d.compared.index("LED lobe")
+    assert 0 < d.gaps[i][j] < 40 and 0.5 < d.correct[i][j] < 1
+    assert any("needs" in h for h in d.hints) and any("radius" in h for h in d.hints)
+
+
+def test_clutter_alone_is_not_an_effect():
+    d = judge(*calibrated(clutter=0.5), library("vignetting", "LED lobe", "crosstalk", "gamma", "albedo gradient"))
+    assert d.word in ("UNKNOWN", "CANNOT_TELL") and d.basis.excess_sd > 20
+    assert min(r.p_family for r in d.rows) < 0.01  # significance alone would have cried wolf
+
+
+def test_without_held_out_frames_there_is_no_claim():
+    d = judge(*calibrated({"crosstalk": 0.03}), library("crosstalk", "glare"), held=())
+    assert d.word == "CANNOT_TELL" and "held out" in d.sentence and any("hold out" in h for h in d.hints)
+
+
+# -- only a claim names a cause ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["null", "weak", "stain", "height", "drift"])
+def test_no_cause_without_a_claim(name):
+    """R10: neither the attribute nor any text names a missing effect."""
+    d = case(name)
+    with pytest.raises(Underdetermined, match=d.word):
+        d.missing
+    assert d.claimed == ""
+    assert not re.search(r"is missing|MISSING", d.text() + d.to_json() + d.to_csv())
+
+
+def test_a_cause_cannot_be_put_where_there_is_no_claim():
+    with pytest.raises(ValueError, match="only a CLAIM"):
+        replace(case("null"), claimed="vignetting")
+    with pytest.raises(ValueError, match="only a CLAIM"):
+        replace(case("vignetting"), word="PARTIAL")
+    with pytest.raises(ValueError, match="only a CLAIM"):
+        Diagnosis.from_json(case("weak").to_json().replace('"claimed": ""', '"claimed": "vignetting"'))
+    with pytest.raises(ValueError, match="none of"):
+        replace(case("null"), word="PROBABLY")
+
+
+GOOD = Findings(p_family=1e-6, structure_p=1e-6, winner="a", p_winner=1e-6, fall=1000.0, runner_up=100.0, ratio=0.9,
+                share=0.9, excess_sd=50.0, uneven=0.01, held_out=200.0)
+
+
+@pytest.mark.parametrize("changes, word", [
+    ({}, "CLAIM"),
+    ({"p_family": 0.02, "structure_p": 0.02}, "NOTHING"),
+    ({"p_family": 0.02, "structure_p": math.nan, "excess_sd": 1.0}, "NOTHING"),
+    ({"p_family": 0.02, "structure_p": math.nan}, "CANNOT_TELL"),
+    ({"p_family": 0.02, "structure_p": math.nan, "rival": True, "ratio": 3.0}, "UNKNOWN"),
+    ({"p_family": 0.02}, "CANNOT_TELL"),
+    ({"p_family": 0.02, "rival": True, "ratio": 3.0}, "UNKNOWN"),
+    ({"runner_up": 1000 * (1 - MARGIN) + 1}, "AMBIGUOUS"),
+    ({"runner_up": 1000 * (1 - MARGIN) + 1, "refuted": True}, "CLAIM"),
+    ({"fall": 30.0, "runner_up": 30.5 - CLEAR}, "AMBIGUOUS"),
+    ({"fall": 30.0, "runner_up": 30.5 - CLEAR, "refuted": True}, "AMBIGUOUS"),
+    ({"runner_up": 990.0, "some_even": False, "even": False}, "CANNOT_TELL"),
+    ({"share": 0.02}, "PARTIAL"),
+    ({"share": 0.02, "excess_sd": 3.0}, "CLAIM"),
+    ({"share": math.nan, "excess_sd": 0.1}, "CLAIM"),
+    ({"even": False, "uneven": 0.4}, "PARTIAL"),
+    ({"rival": True, "ratio": 2.0}, "UNKNOWN"),
+    ({"rival": True, "ratio": 2.0, "runner_up": 990.0}, "UNKNOWN"),
+    ({"rival": True, "ratio": 2.0, "structure_p": 0.5}, "CANNOT_TELL"),
+    ({"held_out": -3.0}, "CANNOT_TELL"),
+    ({"held_out": math.nan}, "CANNOT_TELL"),
+    ({"p_winner": 0.5}, "CANNOT_TELL"),
+    ({"winner": ""}, "CANNOT_TELL"),
+])
+def test_the_rule(changes, word):
+    got, conditions = decide(replace(GOOD, **changes))
+    assert got == word in WORDS
+    assert all(c.text for c in conditions)
+    if word not in ("CLAIM", "NOTHING", "UNKNOWN") and "winner" not in changes:
+        assert any(not c.holds for c in conditions)
+
+
+def test_every_condition_is_needed_for_a_claim():
+    for broken in ({"p_winner": 0.1}, {"runner_up": 999.0}, {"rival": True}, {"share": 0.01}, {"even": False},
+                   {"held_out": 0.0}, {"winner": ""}):
+        assert decide(replace(GOOD, **broken))[0] != "CLAIM"
+
+
+# -- views ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["null", "vignetting", "flicker", "drift"])
+def test_json_brings_everything_back(name):
+    d = case(name)
+    again = Diagnosis.from_json(d.to_json())
+    assert again.to_json() == d.to_json() and again.text() == d.text() and again.to_csv() == d.to_csv()
+    assert again.word == d.word and len(again.rows) == len(d.rows) and again.fits == {}
+
+
+def test_csv_has_a_line_per_effect():
+    lines = list(csv.DictReader(io.StringIO(case("vignetting").to_csv())))
+    assert [line["name"] for line in lines] == [r.name for r in case("vignetting").rows]
+    assert float(lines[0]["fall"]) == case("vignetting").rows[0].fall
+    assert float(lines[0]["refit_fall"]) == case("vignetting").rows[0].refit.fall
+    assert len(lines[-1]["change"].split(";")) == len(case("vignetting").rows[-1].change)
+
+
+def test_the_report_can_be_read():
+    text = case("vignetting").text()
+    assert text.startswith("diagnose: 4 frames,") and "\nCLAIM: " in text and "nan" not in text
+    assert max(len(line) for line in text.splitlines() if line.startswith("vignetting ")) < 220
+    for part in ("upper limits", "evenness", "held out", "curves along coordinates", "calibrated parameters had moved"):
+        assert part in text
+
+
+# -- invariance, determinism, refusal ---------------------------------------------------------------------------------
+
+
+def test_units_change_nothing_and_one_seed_gives_one_table():
+    """R7 and R20: T, p, survival and cos to 1e-6 under other units of effects and base parameters; same seed, same bytes."""
+    effects = library("vignetting", "glare", "defocus", "albedo gradient")
+    unit = {"vignetting": 100.0, "albedo_x": 1e-3, "defocus": 5.0, "led0.x": 10.0, "led3.power": 1e-3, "gel.press_x": 1e3}
+    first, second = (judge(*calibrated({"glare": 0.02}, unit=u), effects) for u in (None, unit))
+    assert [r.name for r in first.rows] == [r.name for r in second.rows]
+    for a, b in zip(first.rows, second.rows):
+        for name in ("fall", "p", "p_family", "survival", "cos", "image", "of_plausible", "power"):
+            assert getattr(b, name) == pytest.approx(getattr(a, name), rel=1e-6, abs=1e-9), (a.name, name)
+        scale = [unit.get(v.removeprefix("sensor."), 1.0) for v in a.variables]
+        assert np.array(b.change) == pytest.approx(np.array(a.change) * scale, rel=1e-6, abs=1e-12)
+    assert judge(*calibrated({"glare": 0.02}), effects).to_json() == first.to_json()
+
+
+def test_a_base_that_is_not_calibrated_is_refused():
+    model, fit = calibrated()
+    fit.values.common["led2.x"] += 0.05
+    with pytest.raises(Underdetermined, match="not calibrated"):
+        judge(model, fit, library("glare"))
+
+
+@pytest.mark.parametrize("name", ["saturation", "black_level"])
+def test_unknown_saturation_or_black_level_is_refused(name):
+    model, fit = calibrated()
+
+    class Blind:
+        saturation, black_level, variance, usable = 1023.0, 64.0, model.noise.variance, model.noise.usable
+
+    setattr(Blind, name, None)
+    model.noise = Blind()
+    with pytest.raises(Underdetermined, match=name):
+        judge(model, fit, library("glare"))
+
+
+def test_frames_are_fitted_or_held_out():
+    model, fit = calibrated()
+    with pytest.raises(ValueError, match="one or the other"):
+        judge(model, fit, held=(3, 4))
+    with pytest.raises(ValueError, match="no fitted frames"):
+        diagnose(model, fit, LIBRARY, model.variables_of, HELD, fitted=(), refit=mock_fit)
+
+
+# -- awkward effects and models ---------------------------------------------------------------------------------------
+
+
+def test_what_cannot_be_seen_or_is_not_finite_never_wins():
+    model, fit = calibrated({"crosstalk": 0.03})
+    plain = model.derivatives
+
+    def derivatives(values, variables, frames=None, secant=None, seed=0):
+        for prediction, images in plain(values, variables, frames, secant, seed):
+            yield prediction, {k: image * np.nan if k == "sensor.gamma" else image for k, image in images.items()}
+
+    model.derivatives = derivatives
+    absorbed = Effect("overall gain", "camera", ("flicker",))  # no different from all LEDs' powers
+    d = judge(model, fit, (*library("crosstalk", "gamma"), absorbed))
+    assert d.missing == "crosstalk"
+    for name, flag in (("overall gain", "nothing visible"), ("gamma", "a derivative image is not finite")):
+        row = d.row(name)
+        assert flag in row.flags and row.fall == 0 and row.p == 1 and row.p_family == 1
+        assert d.rows.index(row) > 0 and math.isnan(row.upper[0])
+    assert "overall gain: nothing visible" in d.text()
+
+
+def test_one_sided_effects_are_never_found_below_their_bound():
+    for name in ("null", "vignetting", "height", "drift", "stain"):
+        for row in case(name).rows:
+            if row.name in ("vignetting", "glare", "absorption", "crosstalk", "defocus", "interreflection"):
+                assert row.change[0] >= 0 and row.expected == pytest.approx(0.5)
+
+
+def test_a_base_parameter_at_its_bound_is_taken_as_known():
+    model, fit = calibrated()
+    low, high = model.parameters["led1.z"].bounds
+    edge = fit.values.get(model.variable("led1.z"), model.base)
+    model.parameters["led1.z"] = replace(model.parameters["led1.z"], default=edge, bounds=(low, edge))
+    fit.variables = [model.variable(v.name) if v.name == "led1.z" else v for v in fit.variables]
+    d = judge(model, fit, library("glare"))
+    assert d.basis.rank == len(fit.variables) - 1 and any("led1.z" in w for w in d.warnings)
+
+
+def test_priors_are_rows_of_the_base():
+    d = judge(*calibrated({"crosstalk": 0.03}, priors=True), library("crosstalk", "glare", "gamma"))
+    free = judge(*calibrated({"crosstalk": 0.03}), library("crosstalk", "glare", "gamma"))
+    assert d.missing == "crosstalk"
+    assert d.row("gamma").survival > free.row("gamma").survival  # what is known cannot absorb
+
+
+def test_thinning_is_stated_and_changes_neither_ranking_nor_verdict():
+    model, fit = calibrated({"crosstalk": 0.03})
+    effects = library("crosstalk", "glare", "gamma", "LED lobe")
+    whole, thin = judge(model, fit, effects), judge(model, fit, effects, rows_max=1400)
+    assert (whole.basis.thinning, thin.basis.thinning) == (1, 5)
+    assert "1 in 5 pixels" in thin.text() and thin.word == whole.word == "CLAIM"
+    assert [r.fall for r in thin.rows] == [r.fall for r in whole.rows]
+    for a, b in zip(whole.fingerprints[:1], thin.fingerprints[:1]):
+        assert b.net == pytest.approx(a.net, rel=0.5)  # scaled up to all pixels
+
+
+def test_noisy_derivatives_are_rendered_twice_with_seeds_of_their_own():
+    """R8: strength within 5 % at kappa = 0.1, kappa reported, seeds of derivatives differ and are not the prediction's 0."""
+    model, fit = calibrated({"vignetting": 0.1}, side=32)
+    clean = judge(model, fit, library("vignetting", "glare")).row("vignetting")
+    model.render_noise = 0.1
+    seeds, plain = set(), model.derivatives
+
+    def derivatives(values, variables, frames=None, secant=None, seed=0):
+        seeds.add(seed)
+        return plain(values, variables, frames, secant, seed)
+
+    def refit(model, *arguments, **options):
+        model.render_noise, noise = 0.0, model.render_noise
+        try:
+            return mock_fit(model, *arguments, **options)
+        finally:
+            model.render_noise = noise
+
+    model.derivatives = derivatives
+    d = judge(model, fit, library("vignetting", "glare"), refit=refit)
+    row = d.row("vignetting")
+    assert row.kappa == pytest.approx(0.1, rel=0.1)
+    assert row.change[0] == pytest.approx(clean.change[0], rel=0.05) and d.missing == "vignetting"
+    assert len(seeds - {0}) == 2
+
+
+def test_family_wise_alarms_on_the_images_of_the_mock():
+    """R9: at most 2 % in 2000 nulls at nominal 1 %, for the very columns that a diagnosis uses."""
+    model, fit = calibrated()
+    candidates = []
+    for e in LIBRARY:
+        variables = [v for v in model.variables_of(e) if v.frames is None or v.frames[0] in FITTED]
+        sides = [1 if v.parameter.bounds[0] == 0 else 0 for v in variables]
+        candidates.append(Candidate(e, variables, np.zeros(len(variables)), sides,
+                                    np.array([v.parameter.plausible for v in variables])))
+    base = [v for v in fit.variables]
+    evidence = measure(model, fit.values, base, candidates, FITTED, 10**6, 0, lambda *a: None)
+    rng = np.random.default_rng(3)
+    gram = evidence.normal.gram
+    scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
+    values, vectors = np.linalg.eigh(gram / np.outer(scale, scale))
+    scores = scale * (rng.standard_normal((2000, len(gram))) @ (vectors * np.sqrt(np.maximum(values, 0))).T)
+    projected, first = evidence.projected, len(base)
+    u = scores[:, first:] + scores[:, :first] @ projected.response
+    forms = []
+    for c in candidates:
+        for columns in c.forms.values():
+            own = np.array(columns) - first
+            forms.append((own, st.Cone(projected.information[np.ix_(own, own)], c.sides)))
+    family = st.Family(projected.information, forms, seed=5)
+    best = np.min([cone.p(cone.fall(u[:, own])) for own, cone in forms], axis=0)
+    assert 0.003 <= np.mean([family.p(p) < 0.01 for p in best]) <= 0.02
+
+
+@pytest.mark.parametrize("truth, word", [({}, "NOTHING"), ({"polarizer.leak": 0.02}, "CLAIM"),
+                                         ({"lamp.ripple": 0.02}, "UNKNOWN")])
+def test_point_readings_are_judged_like_images(truth, word):
+    """One value per frame: no structure test, curves along the settings, and no claim of what the library lacks."""
+    model = PointModel(np.arange(0, 360, 4.0), np.random.default_rng(4), **truth)
+    fitted, held = [i for i in range(90) if i % 5], [i for i in range(90) if not i % 5]
+    fit = mock_fit(model, [model.variable("lamp.power"), model.variable("polarizer.angle")], Values(), fitted)
+    d = diagnose(model, fit, model.library, model.variables_of, held, fitted=fitted, refit=mock_fit)
+    assert d.word == word and math.isnan(d.basis.structure_p)
+    assert "analyzer.angle" in {f.coordinate for f in d.fingerprints}
+    if word == "CLAIM":
+        row = d.row("extinction")
+        assert d.missing == "extinction" and abs(row.refit.strength[0] - 0.02) < 4 * row.refit.sd[0]
+    assert Diagnosis.from_json(d.to_json()).text() == d.text()
+
+
+def test_values_are_not_changed_by_a_diagnosis():
+    model, fit = calibrated({"crosstalk": 0.03})
+    before = Values(dict(fit.values.common), {k: dict(v) for k, v in fit.values.frame.items()})
+    judge(model, fit, library("crosstalk", "glare"))
+    assert fit.values == before

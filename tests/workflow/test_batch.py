@@ -1,0 +1,315 @@
+"""A batch ends the same, whatever happened on the way: kills, shards, workers, damage."""
+
+import csv
+import hashlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from optics import batch, exr
+from optics.cli import main
+from optics.errors import OutputExists
+from optics.picture import Pictures
+
+JOB = """
+scene = "gelsight"
+out = "out"
+count = 5
+seed = 7
+outputs = ["exr", "png", "dn"]
+[defines]
+width = 32
+height = 24
+[parameters]
+"gel.indenter_size" = 2.0
+[sample]
+"gel.press_x" = { uniform = [-4, 4] }
+"led_1.power" = { normal = [1, 0.05] }
+"gel.press_depth" = { grid = [0.2, 0.6] }
+[noise]
+system_gain = 0.05
+dark_noise = 1.0
+black_level = 8.0
+saturation = 255.0
+prnu = 0.01
+"""
+TOTAL = 10
+
+
+def content(folder):
+    """Every file by its hash; locks hold nothing."""
+    return {p.relative_to(folder).as_posix(): hashlib.sha256(p.read_bytes()).hexdigest() for p in sorted(folder.rglob("*"))
+            if p.is_file() and not p.name.startswith(".lock")}
+
+
+@pytest.fixture
+def job(tmp_path):
+    (tmp_path / "job.toml").write_text(JOB)
+    return tmp_path / "job.toml"
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """The folder of an uninterrupted run in one process."""
+    folder = tmp_path_factory.mktemp("whole")
+    (folder / "job.toml").write_text(JOB)
+    result = batch.run(folder / "job.toml", workers=1)
+    assert (result.total, result.own, result.made, result.complete) == (TOTAL, TOTAL, TOTAL, True)
+    return folder / "out"
+
+
+# -- what is drawn --------------------------------------------------------------------------------------------------------
+
+def draws(tmp_path, sample, count=400, **more):
+    text = f'scene = "gelsight"\nout = "out"\ncount = {count}\n' + "".join(f"{k} = {v}\n" for k, v in more.items())
+    (tmp_path / "draws.toml").write_text(text + "[sample]\n" + sample)
+    job = batch.read(tmp_path / "draws.toml")
+    return [job.values(i) for i in range(job.total)]
+
+
+def test_distributions(tmp_path):
+    found = draws(tmp_path, "a = {uniform = [2, 4]}\nb = {log_uniform = [0.01, 100]}\nc = {normal = [5, 2]}\n"
+                            'd = {choice = ["x", "y", 3]}\n', 4000)
+    a, b, c = (np.array([v[k] for v in found]) for k in "abc")
+    # 4000 draws: standard errors 0.009, 0.06 (of ln b, sd 2.66: 0.042), 0.03; four of each
+    assert a.min() >= 2 and a.max() <= 4 and a.mean() == pytest.approx(3, abs=0.037)
+    assert b.min() >= 0.01 and b.max() <= 100 and np.log(b).mean() == pytest.approx(0, abs=0.17)
+    assert c.mean() == pytest.approx(5, abs=0.13) and c.std() == pytest.approx(2, abs=0.09)
+    assert all(abs(n - 4000 / 3) < 4 * 30 for n in Counter(v["d"] for v in found).values())
+    assert abs(np.corrcoef([a, np.log(b), c]) - np.eye(3)).max() < 4 / np.sqrt(4000)
+
+
+def test_a_draw_depends_on_seed_index_and_key_alone(tmp_path):
+    one = draws(tmp_path, "a = {uniform = [0, 1]}\nb = {uniform = [0, 1]}\n")
+    assert draws(tmp_path, "b = {uniform = [0, 1]}\na = {uniform = [0, 1]}\n", 10) == one[:10]
+    assert [v["a"] for v in draws(tmp_path, "a = {uniform = [0, 1]}\n", 10)] == [v["a"] for v in one[:10]]
+    assert all(v["a"] != w["a"] for v, w in zip(one, draws(tmp_path, "a = {uniform = [0, 1]}\n", seed=1)))
+    assert all(v["a"] != v["b"] for v in one)
+
+
+def test_grids_multiply_and_the_last_is_fastest(tmp_path):
+    found = draws(tmp_path, 'a = {grid = [1, 2]}\nb = {grid = ["x", "y", "z"]}\nc = {uniform = [0, 1]}\n', 2)
+    assert [(v["a"], v["b"]) for v in found[::2]] == [(a, b) for a in (1, 2) for b in "xyz"]
+    assert len({v["c"] for v in found}) == 12
+    (tmp_path / "draws.toml").write_text('scene = "gelsight"\nout = "out"\n[sample]\na = {grid = [1, 2, 3]}\n')
+    assert batch.read(tmp_path / "draws.toml").total == 3
+
+
+@pytest.mark.parametrize(("text", "shard"), [("1/1", (1, 1)), ("3/4", (3, 4)), ("12/12", (12, 12))])
+def test_shards(text, shard):
+    assert batch.parse_shard(text) == shard
+
+
+# -- what is written ------------------------------------------------------------------------------------------------------
+
+def test_files_tell_how_they_were_made(whole):
+    names = [f"{i:06d}{end}" for i in range(TOTAL) for end in ("-dn.png", ".exr", ".png")]
+    assert sorted(p.name for p in (whole / "images").iterdir()) == names
+    records = [json.loads(line) for line in (whole / "manifest.jsonl").read_text().splitlines()]
+    assert [r["index"] for r in records] == list(range(TOTAL))
+    with open(whole / "manifest.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    for record, row in zip(records, rows):
+        assert float(row["gel.press_x"]) == record["sample"]["gel.press_x"] and float(row["gel.indenter_size"]) == 2
+        for role, entry in record["files"].items():
+            data = (whole / entry["file"]).read_bytes()
+            assert row[role] == entry["file"] and len(data) == entry["size"]
+            assert entry["hash"] == "sha256:" + hashlib.sha256(data).hexdigest()
+    channels, header = exr.read(whole / rows[7]["exr"])
+    made = json.loads(header["provenance"])
+    assert made["parameters"]["gel.press_x"] == records[7]["sample"]["gel.press_x"] and made["parameters"]["gel.press_depth"] == 0.6
+    assert channels["depth.Z"].min() == pytest.approx(24 - 0.6, abs=0.1)  # pixels of 0.56 mm
+
+
+def test_noise_is_the_cameras(whole):
+    def read(end):
+        images = []
+        for i in range(TOTAL):
+            with Image.open(whole / "images" / f"{i:06d}{end}.png") as opened:
+                images.append(np.asarray(opened, float))
+        return np.array(images)
+
+    clean, noisy = read(""), read("-dn")
+    difference = noisy - clean
+    expected = 0.05 * (clean - 8) + 1 + 2 / 12 + (0.01 * (clean - 8)) ** 2  # both are rounded to 1 DN
+    assert difference.mean() == pytest.approx(0, abs=0.1)
+    assert (difference**2).mean() == pytest.approx(expected.mean(), rel=0.05)  # 23040 values: 1 %
+    assert len({image.tobytes() for image in difference}) == TOTAL
+
+
+def test_each_light_alone(tmp_path):
+    (tmp_path / "job.toml").write_text(JOB.replace("count = 5", 'count = 1\nlights = "each"\nlayers = ["spectral"]').replace(
+        "grid = [0.2, 0.6]", "grid = [0.6]"))
+    result = batch.run(tmp_path / "job.toml", workers=1)
+    record = json.loads((result.folder / "manifest.jsonl").read_text())
+    assert len(record["files"]) == 18 and record["files"]["led_3.exr"]["file"] == "images/000000-led_3.exr"
+    alone = [exr.read(result.folder / record["files"][f"led_{i}.exr"]["file"])[0] for i in range(1, 7)]
+    assert set(alone[0]) == {"R", "G", "B", *(exr.spectral_name(b) for b in (610, 540, 460))}
+    job = batch.read(tmp_path / "job.toml")
+    from optics import scene
+
+    together = Pictures(scene.load("gelsight", {"width": "32", "height": "24"})).take({**job.parameters, **job.values(0)})
+    np.testing.assert_allclose(sum(c["S0.540,000000nm"] for c in alone), together.channels["S0.540,000000nm"], rtol=1e-5)
+
+
+# -- what happens on the way ----------------------------------------------------------------------------------------------
+
+def test_nothing_is_made_twice(whole):
+    before = content(whole)
+    result = batch.run(whole.parent / "job.toml", workers=1)
+    assert (result.made, result.complete) == (0, True) and content(whole) == before
+
+
+def test_shards_are_together_the_whole(whole, job):
+    first = batch.run(job, (1, 3), workers=1)
+    assert (first.own, first.made, first.complete) == (4, 4, False) and not (first.folder / "manifest.csv").exists()
+    assert batch.run(job, (3, 3), workers=1).own == 3
+    assert batch.run(job, (2, 2), workers=1).complete is False  # what other shards made already is not made again
+    last = batch.run(job, (2, 3), workers=1)
+    assert last.complete and content(last.folder) == content(whole)
+
+
+def command(job, *options):
+    return [sys.executable, "-m", "optics.cli", "batch", str(job), *options]
+
+
+def started(job, *options):
+    """A process at work, once it has made three samples."""
+    process = subprocess.Popen(command(job, *options), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+                               env={**os.environ, "PYTHONPATH": str(Path(batch.__file__).parents[1])})
+    manifest = job.parent / "out" / "manifest.jsonl"
+    deadline = time.monotonic() + 60
+    while not manifest.exists() or manifest.read_text().count("\n") < 3:
+        assert process.poll() is None and time.monotonic() < deadline, process.communicate()
+        time.sleep(0.01)
+    return process
+
+
+def children(pid):
+    """Processes whose parent is `pid`."""
+    found = []
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            if int(stat.read_text().rsplit(")", 1)[1].split()[1]) == pid:
+                found.append(int(stat.parent.name))
+        except (OSError, IndexError):
+            continue
+    return found
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for orphans in /proc")
+def test_killed_in_the_middle_and_resumed(whole, job):
+    process = started(job, "--workers", "2")
+    workers = children(process.pid)
+    assert len(workers) >= 2
+    process.kill()
+    process.communicate()
+    deadline = time.monotonic() + 30
+    while any(Path(f"/proc/{pid}").exists() for pid in workers):
+        assert time.monotonic() < deadline, "workers outlive the process that started them"
+        time.sleep(0.05)
+    out = job.parent / "out"
+    done = (out / "manifest.jsonl").read_text().count("\n")
+    assert 3 <= done < TOTAL
+    (out / "images" / ".000009.0123456789abcdef.exr").write_bytes(b"half a picture")  # as a kill in mid-write leaves it
+    with open(out / "manifest.jsonl", "a") as file:
+        file.write('{"index": 9, "sam')
+    result = batch.run(job, workers=1)
+    assert result.complete and result.made == TOTAL - done
+    assert content(out) == content(whole)
+
+
+def test_interrupted_says_how_to_go_on(whole, job):
+    process = started(job, "--workers", "1")
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=30)
+    assert process.returncode == 130 and err.splitlines()[-1] == "interrupted: what was made is kept, the same command goes on"
+    assert "Traceback" not in err and out == ""
+    assert not [p for p in (job.parent / "out" / "images").iterdir() if p.name.startswith(".")]
+    assert batch.run(job, workers=1).complete and content(job.parent / "out") == content(whole)
+
+
+def test_damage_is_found_and_mended(whole, tmp_path):
+    import shutil
+
+    shutil.copytree(whole, tmp_path / "out")
+    (tmp_path / "job.toml").write_text(JOB)
+    images = tmp_path / "out" / "images"
+    (images / "000001.exr").write_bytes((images / "000001.exr").read_bytes()[:-7])  # cut short
+    data = bytearray((images / "000004-dn.png").read_bytes())
+    data[len(data) // 2] ^= 1  # the same size
+    (images / "000004-dn.png").write_bytes(bytes(data))
+    (images / "000008.png").unlink()
+    result = batch.run(tmp_path / "job.toml", workers=1)
+    assert result.made == 3 and content(tmp_path / "out") == content(whole)
+
+
+@pytest.mark.parametrize(("old", "new", "changed"), [
+    ("seed = 7", "seed = 8", "job.seed"), ("[-4, 4]", "[-4, 5]", r"job.sample.gel.press_x.uniform"),
+    ("width = 32", "width = 40", "job.defines.width"), ('"dn"]', '"dn"]\nspp = 4', "job.spp"),
+])
+def test_another_job_is_refused(whole, tmp_path, old, new, changed):
+    (tmp_path / "job.toml").write_text(JOB.replace(old, new).replace('"out"', f'"{whole}"'))
+    before = content(whole)
+    with pytest.raises(OutputExists, match=f"made from another job: changed {changed}"):
+        batch.run(tmp_path / "job.toml", workers=1)
+    assert content(whole) == before
+
+
+def test_a_changed_plugin_is_another_job(whole, tmp_path, monkeypatch):
+    from optics import picture
+
+    (tmp_path / "job.toml").write_text(JOB.replace('"out"', f'"{whole}"'))
+    monkeypatch.setattr(batch, "Pictures", picture.Pictures)
+    monkeypatch.setattr(picture, "plugins_record", lambda: {"effects/vignetting.py": "sha256:0"})
+    with pytest.raises(OutputExists, match="changed plugins"):
+        batch.run(tmp_path / "job.toml", workers=1)
+
+
+def test_a_sample_that_fails_is_named_and_the_others_are_kept(job, monkeypatch):
+    make = batch.Maker.make
+
+    def failing(self, index):
+        if index == 2:
+            raise OSError(28, "No space left on device")
+        return make(self, index)
+
+    monkeypatch.setattr(batch.Maker, "make", failing)
+    with pytest.raises(batch.SampleFailed, match=r"sample 2 \(gel.press_x = .*No space left on device; what was made"):
+        batch.run(job, workers=1)
+    assert (job.parent / "out" / "manifest.jsonl").read_text().count("\n") == 2
+
+
+def test_one_process_per_shard(whole, job):
+    folder = whole
+    with batch._alone(folder, (1, 1)), pytest.raises(OutputExists, match="another process works on shard 1/1"):
+        batch.run(whole.parent / "job.toml", workers=1)
+    with batch._alone(folder, (1, 1)):
+        assert batch.run(whole.parent / "job.toml", (1, 2), workers=1).made == 0
+
+
+def test_a_stock_scene_is_the_same_bit_by_bit(tmp_path):
+    (tmp_path / "stock.xml").write_text("""<scene version="3.0.0"><integrator type="path"/><sensor type="perspective">
+        <transform name="to_world"><lookat origin="0,-4,4" target="0,0,0" up="0,0,1"/></transform><film type="hdrfilm">
+        <integer name="width" value="48"/><integer name="height" value="32"/></film></sensor>
+        <shape type="sphere"><bsdf type="diffuse"/></shape><emitter type="constant" id="sky"/></scene>""")
+    for name in ("a", "b"):
+        (tmp_path / f"{name}.toml").write_text(f'scene = "stock.xml"\nout = "{name}"\ncount = 2\nspp = 32\nvariant = "llvm_ad_rgb"\n')
+        assert batch.run(tmp_path / f"{name}.toml", workers=1).complete
+    assert content(tmp_path / "a") == content(tmp_path / "b")
+
+
+def test_command_line(whole, capsys):
+    assert main(["batch", str(whole.parent / "job.toml"), "--workers", "1"]) == 0
+    assert capsys.readouterr().out == f"{whole}: 10 of 10 samples, 0 of them made now, all complete: manifest.csv\n"
+    assert main(["batch", str(whole.parent / "job.toml"), "--shard", "2/5", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == {"folder": str(whole), "total": 10, "own": 2, "made": 0, "complete": True}

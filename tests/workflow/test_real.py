@@ -1,0 +1,61 @@
+"""Two real sensors: the physical model beats three null models on presses that no fit has seen.
+
+The pictures lie beside the repository (`../shared/data`), never in it; without them these tests are skipped.
+"""
+
+import importlib.util
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from optics import importing, nulls
+
+ROOT = Path(__file__).resolve().parents[2]
+DATA = ROOT.parent / "shared" / "data"
+TAXIM = DATA / "taxim_gelsight_ball" / "dataPack_small.npz"
+DIGIT = DATA / "digitdepth_digit_ball"
+pytestmark = pytest.mark.skipif(not (TAXIM.is_file() and DIGIT.is_dir()), reason=f"no real pictures in {DATA}")
+
+spec = importlib.util.spec_from_file_location("real_ball_presses", ROOT / "examples" / "real_ball_presses.py")
+example = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(example)
+
+
+def test_the_gelsight_pack_contradicts_itself_and_says_so(tmp_path):
+    found = importing.import_taxim(TAXIM, tmp_path / "set", **example.TAXIM)
+    text = "\n".join(found.warnings)
+    assert "40 of 49 labelled circles are larger than the ball itself: radius up to 17 px = 2.12 mm, ball radius 2.00 mm" in text
+    assert "0.1245 mm/px and 0.12 mm/px, -3.6%" in text
+    assert "not the background of these presses" in text
+    assert not list(tmp_path.glob(".*"))
+
+
+def test_the_digit_set_is_imported_with_one_group_per_press(tmp_path):
+    from optics import captures
+
+    found = importing.import_circles(DIGIT / "images", DIGIT / "labels.csv", tmp_path / "set", **example.DIGIT)
+    loaded = captures.load(found.folder)
+    assert loaded.frames[0].image.shape == (80, 60, 3) and len(captures.groups(loaded)) == 14
+    # frame gains of 1 to 2 % are in the data; the median background makes their mean 1
+    gains = np.array(found.facts["frame_gain"])
+    assert 0.002 < gains.std() < 0.03 and abs(gains.mean() - 1) < 0.01
+
+
+@pytest.mark.slow
+def test_gelsight_physical_model_beats_the_nulls(mitsuba, tmp_path):
+    found = importing.import_taxim(TAXIM, tmp_path / "set", **example.TAXIM)
+    fit, table = example.study(found.folder, list(range(0, 48, 4)), list(range(1, 49, 6)))
+    assert sum(table.wins()) >= 2, table.text()
+
+
+@pytest.mark.slow
+def test_digit_physical_model_beats_the_nulls_over_three_folds(mitsuba, tmp_path):
+    found = importing.import_circles(DIGIT / "images", DIGIT / "labels.csv", tmp_path / "set", **example.DIGIT)
+    order = np.random.default_rng(5).permutation(14)
+    tables = []
+    for fold in range(3):  # three presses each: one fold alone is at the mercy of one press
+        held_out = sorted(int(i) for i in order[3 * fold:3 * fold + 3])
+        tables.append(example.study(found.folder, [i for i in range(14) if i not in held_out], held_out)[1])
+    table = nulls.pooled(tables)
+    assert sum(table.wins()) >= 2, table.text()
