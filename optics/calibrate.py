@@ -46,6 +46,7 @@ class Fit:
     warnings: list[str] = field(default_factory=list)
     start: np.ndarray | None = None
     at_bound: list[str] = field(default_factory=list)
+    normal: "Normal | None" = None  # the last linearisation, for `extended`
 
     @property
     def sd(self) -> np.ndarray:
@@ -332,7 +333,65 @@ def fit(model, variables: Sequence[Variable], start: Values | None = None, frame
                  normal.frame_chi2, normal.frame_n, converged, reason, history, start=first)
     result.at_bound = [v.name for v, t, lo, hi in zip(variables, theta, low, high) if t <= lo or t >= hi]
     result.warnings = warnings_of(result, normal.a)
+    result.normal = normal
     return result
+
+
+def extended(model, base: Fit, extra: Sequence[Variable], secant: Mapping[str, float] | None = None, steps: int = 10) -> Fit:
+    """Free further variables and calibrate everything again, by chord steps on the derivative images of a fit that has converged.
+
+    Each step costs one prediction, where `fit` would make all derivative images afresh: what ranks many effects. The extra
+    variables' images are tangents at the base's values, or secants of the sizes in `secant`. The steps follow the true
+    prediction, so that the result is a true minimum along them; only its last digits, and the errors, are those of the base's
+    linearisation. `converged` says whether the fall that it still predicts is below 1 per variable.
+    """
+    variables = [*base.variables, *extra]
+    p, first = len(variables), len(base.variables)
+    index_of = {v.name: i for i, v in enumerate(variables)}
+    values = with_start(model, extra, base.values)
+    a, b, rows = np.zeros((p, p)), np.zeros(p), []
+    a[:first, :first] = base.normal.a
+    derivatives = model.derivatives(values, list(extra), base.frames, secant=secant or {})
+    for frame, (where, j, scale), (prediction, images) in zip(base.frames, base.normal.rows, derivatives):
+        new = np.stack([(i * scale).ravel() for i in images.values()]) if images else np.zeros((0, j.shape[1]), np.float32)
+        there = [index_of[n] for n in images]
+        whitened = whiten(model, frame, prediction, scale)
+        a[np.ix_(there, there)] += (new @ new.T).astype(float)
+        cross = (j @ new.T).astype(float)
+        a[np.ix_(where, there)] += cross
+        a[np.ix_(there, where)] += cross.T
+        rows.append(([*where, *there], np.concatenate([j, new]), scale))
+        b[rows[-1][0]] += (rows[-1][1] @ whitened).astype(float)
+    pull, curvature, prior = prior_terms(model, variables, values)
+    a[first:, first:] += np.diag(curvature[first:])
+    here = Normal(a, b + pull, base.chi2, prior, base.frame_chi2, base.frame_n, rows)
+    theta = np.array([start_of(model, v, values) for v in variables])
+    low, high = (np.array([v.parameter.bounds[k] for v in variables]) for k in (0, 1))
+    damping, promised = 1e-6, np.inf
+    history = [here.total]
+    for _ in range(steps):
+        free = ~(((theta <= low) & (here.b < 0)) | ((theta >= high) & (here.b > 0)) | (np.diag(here.a) == 0))
+        promised = float(here.b[free] @ solve(here.a[np.ix_(free, free)], here.b[free], 0.0)[0])
+        if promised < 0.1 * p:
+            break
+        step = np.zeros(p)
+        step[free], _ = solve(here.a[np.ix_(free, free)], here.b[free], damping)
+        trial = np.clip(theta + step, low, high)
+        moved = values.copy()
+        for v, value in zip(variables, trial):
+            moved.put(v, float(value))
+        there = again(model, variables, moved, base.frames, here)
+        if np.isfinite(there.total) and there.total < here.total:
+            gain, theta, values, here = here.total - there.total, trial, moved, there
+            history.append(here.total)
+            if gain < 0.1 * p:
+                break
+        else:
+            damping = max(damping * 30, 1e-2)
+            if damping > 1e3:
+                break
+    return Fit(values, variables, theta, covariance_of(here.a), here.chi2, base.dof - len(extra), base.frames,
+               here.frame_chi2, here.frame_n, promised < p, f"{len(history) - 1} chord steps", history)
 
 
 def covariance_of(a: np.ndarray) -> np.ndarray:

@@ -21,7 +21,7 @@ from optics.evidence import Block, Candidate, Evidence, Progress, at_bound, meas
 from optics.parameter import Values, Variable
 from optics.verdict import (
     CLEAR, EXCESS, LEVEL, MARGIN, UNEVEN, Basis, Diagnosis, Findings, Fingerprint, Level, Refit, Row, Shift, Split, decide,
-    is_structured, moved_by, rivals, sentence,
+    moved_by, rivals, sentence,
 )
 
 START = 0.7  # of the expected change, to begin a refit from: the linear estimate overshoots more often than not
@@ -73,8 +73,7 @@ def diagnose(model, fit, effects: Sequence[Effect], variables_of: Callable[[Effe
     table = _rank(evidence, candidates, seed)
     structure = evidence.structure(evidence.whitened, evidence.base)
     basis = _basis(model, evidence, structure)
-    significant = table.p_best < LEVEL
-    chosen = _choose(table, top) if significant or is_structured(structure.p, basis.excess_sd) else []
+    chosen = _choose(table, top)
     fits = _refit(model, fit, evidence, table, chosen, refit, fitted, say)
 
     rows = [c.row for c in table.order]
@@ -86,12 +85,11 @@ def diagnose(model, fit, effects: Sequence[Effect], variables_of: Callable[[Effe
 
     members = [c for c in done if c.row.net_refit > 0 and _close(winner.row.net_refit, c.row.net_refit)] if winner else []
     splits = []
-    if winner and significant:
+    if winner:
         for c in members[:MAX_SPLIT]:
             splits += _split(model, evidence, c, fits[c.effect.name], places, rows_max, seed, say)
-    levels = _held_out(model, fit, evidence, winner if significant else None, fits, refit, held_out, variables_of, say)
-    shifts = _shifts(model, fit, winner, fits) if winner and significant else []
-
+    levels = _held_out(model, fit, evidence, winner, fits, refit, held_out, variables_of, say)
+    shifts = _shifts(model, fit, winner, fits) if winner else []
     findings = _findings(table, winner, done, members, fingerprints, splits, levels, basis, structure)
     word, conditions = decide(findings)
     _write_limits(model, evidence, table, winner if word == "CLAIM" else None, fits, basis, rows_max, seed, say)
@@ -285,12 +283,12 @@ def _close(best: float, other: float) -> bool:
 
 
 def _choose(table: Table, top: int) -> list[Candidate]:
-    """The effects to add in earnest: the best ones, those that cannot be told from the best, winners of other weights."""
-    live = [c for c in table.order if c.row.net > 0]
-    if not live:
-        return []
-    chosen = live[:top]
-    chosen += [c for c in live[top:] if _close(live[0].row.net, c.row.net) and table.p_best < LEVEL]
+    """The effects to add in earnest: the best ones, those that cannot be told from the best, winners of other weights.
+
+    What chance explains is not added: a refit is as dear as a calibration.
+    """
+    live = [c for c in table.order if c.row.net > 0 and c.row.p_family < LEVEL]
+    chosen = live[:top] + [c for c in live[top:] if _close(live[0].row.net, c.row.net)]
     chosen = chosen[:MAX_REFITS]
     others = {table.winner_uniform, table.winner_dilated} - {c.effect.name for c in chosen}
     return chosen + [c for c in live if c.effect.name in others]

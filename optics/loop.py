@@ -268,8 +268,19 @@ def examine(study: Study, model: Model, setup: Setup, found: calibrate.Fit, prog
     from optics.diagnose import diagnose
 
     fitted, held = split(model, setup)
-    result = diagnose(model, found, candidates(model, study), lambda e: effect_variables(model, e), held,
-                      fitted=fitted, seed=setup.seed, progress=progress)
+    tested = candidates(model, study)
+    known = {v.name for v in found.variables}
+    steps = {v.name: v.parameter.plausible for e in tested if e.onset != "tangent" for v in effect_variables(model, e)}
+
+    def refit(model, variables, start, frames):
+        """Chord steps on the base's derivative images where an effect is added to it; a full fit otherwise."""
+        extra = [v for v in variables if v.name not in known]
+        if found.normal is None or not extra or list(frames) != list(found.frames):
+            return calibrate.fit(model, variables, start, frames)
+        return calibrate.extended(model, found, extra, {v.name: steps[v.name] for v in extra if v.name in steps})
+
+    result = diagnose(model, found, tested, lambda e: effect_variables(model, e), held, fitted=fitted, refit=refit,
+                      seed=setup.seed, progress=progress)
     worst = int(np.argmax(np.array(found.frame_chi2) / np.maximum(found.frame_n, 1)))
     study.put_diagnosis(len(study.steps) - 1, result, ladder.fingerprints_of(model, found, result, found.frames[worst]))
     return result
