@@ -360,13 +360,22 @@ def extended(model, base: Fit, extra: Sequence[Variable], secant: Mapping[str, f
         cross = (j @ new.T).astype(float)
         a[np.ix_(where, there)] += cross
         a[np.ix_(there, where)] += cross.T
-        rows.append(([*where, *there], np.concatenate([j, new]), scale))
+        rows.append((np.array([*where, *there]), np.concatenate([j, new]), scale))
         b[rows[-1][0]] += (rows[-1][1] @ whitened).astype(float)
     pull, curvature, prior = prior_terms(model, variables, values)
     a[first:, first:] += np.diag(curvature[first:])
     here = Normal(a, b + pull, base.chi2, prior, base.frame_chi2, base.frame_n, rows)
     theta = np.array([start_of(model, v, values) for v in variables])
     low, high = (np.array([v.parameter.bounds[k] for v in variables]) for k in (0, 1))
+    # where the image depends on the square, the coordinate is the square, as in `fit`
+    squared = np.array([v.parameter.squared for v in variables], bool)
+    slope = np.where(squared, 1 / (2 * np.maximum(theta, 1e-9)), 1.0)
+    here.a, here.b = here.a * np.outer(slope, slope), here.b * slope
+    for where, j, _ in rows:
+        j *= slope[where][:, None].astype(np.float32)
+    theta = np.where(squared, theta**2, theta)
+    low, high = np.where(squared, (1e-3 * np.array([v.parameter.plausible for v in variables])) ** 2, low), np.where(
+        squared, high**2, high)
     damping, promised = 1e-6, np.inf
     history = [here.total]
     for _ in range(steps):
@@ -378,9 +387,10 @@ def extended(model, base: Fit, extra: Sequence[Variable], secant: Mapping[str, f
         step[free], _ = solve(here.a[np.ix_(free, free)], here.b[free], damping)
         trial = np.clip(theta + step, low, high)
         moved = values.copy()
-        for v, value in zip(variables, trial):
+        for v, value in zip(variables, np.where(squared, np.sqrt(np.abs(trial)), trial)):
             moved.put(v, float(value))
         there = again(model, variables, moved, base.frames, here)
+        there.b = there.b + (slope - 1) * prior_terms(model, variables, moved)[0]
         if np.isfinite(there.total) and there.total < here.total:
             gain, theta, values, here = here.total - there.total, trial, moved, there
             history.append(here.total)
@@ -390,7 +400,10 @@ def extended(model, base: Fit, extra: Sequence[Variable], secant: Mapping[str, f
             damping = max(damping * 30, 1e-2)
             if damping > 1e3:
                 break
-    return Fit(values, variables, theta, covariance_of(here.a), here.chi2, base.dof - len(extra), base.frames,
+    estimate = np.where(squared, np.sqrt(np.abs(theta)), theta)
+    back = np.where(squared, 1 / (2 * np.maximum(estimate, 1e-9)), 1.0)  # d sigma / d sigma^2, where it ended
+    covariance = covariance_of(here.a) * np.outer(back, back)
+    return Fit(values, variables, estimate, covariance, here.chi2, base.dof - len(extra), base.frames,
                here.frame_chi2, here.frame_n, promised < p, f"{len(history) - 1} chord steps", history)
 
 

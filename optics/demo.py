@@ -18,12 +18,12 @@ from optics.effect import registry
 
 # Hidden strengths, in the units of the effects' own parameters: a few percent of the picture, as real sensors have it.
 SECRETS = {
-    "lens vignetting": 0.8, "veiling glare": 0.03, "colour crosstalk": 0.03, "lens blur": 0.6, "interreflection": 1.0,
+    "lens vignetting": 0.8, "veiling glare": 0.03, "colour crosstalk": 0.03, "lens blur": 0.6,
     "gel absorption": 0.02, "specular lobe": 0.06, "LED size": 1.5, "residual response curve": 0.12,
 }
 SIZE = (160, 120)
 EXPOSURE = 200.0  # one LED at a time: its brightest spot comes near full scale
-PRESSES = 6
+PRESSES = 4
 STEPS = 3  # effects that the loop may add before it must stop
 
 
@@ -55,7 +55,7 @@ def make(folder: Path, seed: int, name: str | None = None, progress: Callable | 
     hidden = {} if strength == 0 else {effect: strength}
     built = {**truth(scene, seed), "camera.exposure": EXPOSURE}
     maker = synthetic.Maker(scene, built, hidden, seed=seed + 1000)
-    found = maker.captures(synthetic.presses(PRESSES, seed), known_to=0.01, progress=progress)
+    found = maker.captures(synthetic.presses(PRESSES, seed), progress=progress)
     found.parameters["camera.exposure"] = EXPOSURE
     capture_files.write(found, folder, bits=8)
     return effect, strength
@@ -77,7 +77,8 @@ def run(folder: str | Path, seed: int = 0, effect: str | None = None, progress: 
         note.write_text(json.dumps({"effect": name, "strength": strength, "seed": seed}))
     hidden = json.loads(note.read_text())
     say(f"{PRESSES} presses under 6 LEDs, one at a time, made by stock Mitsuba with an effect that the base model lacks.")
-    setup = loop.Setup(captures=str(folder / "captures"), seed=seed)
+    # The stage is trusted (S1.2): solving for every press as well takes three times as long and tells the same story.
+    setup = loop.Setup(captures=str(folder / "captures"), per_group=[], seed=seed)
     study, model, fit = loop.begin(setup, folder / "study", title="Demonstration", resume=True, progress=progress)
     say(study.table())
     claimed = [e.name for e in loop.effects_of(study)]

@@ -555,25 +555,27 @@ def _split(model, evidence: Evidence, c: Candidate, found, places: list[dict], r
 
 
 def _parts(model, evidence: Evidence, places: list[dict]) -> dict[str, tuple[list[str], list[np.ndarray]]]:
-    """name -> (labels, per block the part that each value belongs to): channel, frame, LED, settings, contact, quadrant."""
+    """name -> (labels, per block the part of each value): channel, frame, LED, group, settings, contact, quadrant."""
     frames = [model.frames[f] for f in evidence.frames]
     names = [getattr(f, "name", str(i)) for i, f in enumerate(frames)]
     parts: dict[str, tuple[list[str], list[np.ndarray]]] = {}
+    seen: list[list[int]] = []
 
     def of_coordinate(by, coordinate, labels):
         if all(coordinate in p for p in places):
             parts[by] = (labels, [np.nan_to_num(p[coordinate]).astype(int) for p in places])
 
     def of_frame(by, labels):
-        kinds = sorted(set(labels))
+        kinds = list(dict.fromkeys(labels))  # by first occurrence, so that equal partitions have equal numbers
         numbers = [kinds.index(label) for label in labels]
-        known = [[int(index[0]) if len(index) else -1 for index in other] for _, other in parts.values()]
-        if 2 <= len(kinds) and numbers not in known:
+        if 2 <= len(kinds) and numbers not in seen:
+            seen.append(numbers)
             parts[by] = (kinds, [np.full(len(p["row"]), i) for i, p in zip(numbers, places)])
 
     of_coordinate("channel", "channel", _channels(evidence))
-    parts["frame"] = (names, [np.full(len(p["row"]), i) for i, p in enumerate(places)])
+    of_frame("frame", names)
     of_frame("LED", [led_label(f.parameters) for f in frames])
+    of_frame("group", [getattr(f, "group", None) or name for f, name in zip(frames, names)])
     for key, numbers in _settings(model, evidence).items():
         if len(set(numbers)) <= 8:
             of_frame(key, [f"{v:g}" for v in numbers])
@@ -774,7 +776,7 @@ def _write_verdicts(table: Table, word: str, winner, members, splits, levels) ->
 
 def _warnings(model, fit, evidence, table, winner, shifts, dropped, structure, basis) -> list[str]:
     """What weakens the verdict, in sentences."""
-    texts = list(getattr(fit, "warnings", []))
+    texts = [] if getattr(fit, "converged", True) else [f"the base stopped before it converged: {fit.reason}"]
     captures = getattr(model, "captures", None)
     if captures is not None:
         from optics.noise import warnings_of

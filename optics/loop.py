@@ -269,7 +269,7 @@ def examine(study: Study, model: Model, setup: Setup, found: calibrate.Fit, prog
 
     fitted, held = split(model, setup)
     tested = candidates(model, study)
-    known = {v.name for v in found.variables}
+    known, falls = {v.name for v in found.variables}, []
     steps = {v.name: v.parameter.plausible for e in tested if e.onset != "tangent" for v in effect_variables(model, e)}
 
     def refit(model, variables, start, frames):
@@ -277,7 +277,14 @@ def examine(study: Study, model: Model, setup: Setup, found: calibrate.Fit, prog
         extra = [v for v in variables if v.name not in known]
         if found.normal is None or not extra or list(frames) != list(found.frames):
             return calibrate.fit(model, variables, start, frames)
-        return calibrate.extended(model, found, extra, {v.name: steps[v.name] for v in extra if v.name in steps})
+        quick = calibrate.extended(model, found, extra, {v.name: steps[v.name] for v in extra if v.name in steps})
+        fall = found.chi2 - quick.chi2
+        leads = fall > 0.7 * max(falls, default=0.0)
+        falls.append(fall)
+        if quick.converged or not leads:
+            return quick
+        # far from the base its derivative images no longer serve: the leaders are calibrated in full
+        return calibrate.fit(model, variables, quick.values, frames, max_iterations=4, tolerance=0.5)
 
     result = diagnose(model, found, tested, lambda e: effect_variables(model, e), held, fitted=fitted, refit=refit,
                       seed=setup.seed, progress=progress)

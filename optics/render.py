@@ -16,7 +16,7 @@ import numpy as np
 
 from optics.captures import Captures, Frame
 from optics.develop import STEP, Developer
-from optics.effect import registry
+from optics.effect import DEFAULT_VARIANT, registry
 from optics.errors import BadScene, UnknownKey
 from optics.noise import Noise
 from optics.parameter import Parameter, Values, Variable
@@ -25,7 +25,8 @@ from optics.scene import Scene
 RIM_SAMPLES = 64  # per pixel at rims; a power of two
 POWERS = ("power", "power_r", "power_g", "power_b")  # images are kept per unit of each
 FLAT_FIELDS = ("multiplicative", "additive")
-BOUNCE_SAMPLES = 64  # directions per pixel for the second bounce
+BOUNCE_SAMPLES = 32  # directions per cell for the second bounce
+BOUNCE_CELL = 2  # px each way of a cell
 
 
 class Renderer:
@@ -39,6 +40,9 @@ class Renderer:
         self.scene = scene
         self.width, self.height = scene.camera.resolution
         self.bands = len(scene.integrator.bands or (0,))
+        if self.bands > scene.integrator.lanes:
+            raise BadScene(f"{scene.path}: {self.bands} bands, but the variant {scene.variant} carries {scene.integrator.lanes}; "
+                           f"load the scene with variant='{DEFAULT_VARIANT}' or name one band")
         self.remember = remember
         self._hits: OrderedDict = OrderedDict()
         self._images: OrderedDict = OrderedDict()
@@ -253,29 +257,32 @@ class Renderer:
                              moved_rim if moves else lambda: tangent(image.samples, image.rim_visible))
 
     def bounced(self, values: Mapping, led: str, seed: int = 0) -> np.ndarray:
-        """(H, W, B): light of one LED at power 1 after two reflections; Monte Carlo over the second direction."""
+        """(H, W, B): light of one LED at power 1 after two reflections; Monte Carlo over the second direction.
+
+        Light from all around varies slowly: it is gathered for every second pixel each way, over the area of the four,
+        and interpolated linearly in between. The samples are the same for every geometry and LED of a seed.
+        """
         import drjit as dr
         import mitsuba as mi
+        from scipy.ndimage import zoom
 
         key = ("bounced", seed, *self._led_key(values, led))
         if key in self._images:
             self._images.move_to_end(key)
             return self._images[key]
         self._apply(values)
-        v, u = np.mgrid[:self.height, :self.width]
+        rows, columns = -(-self.height // BOUNCE_CELL), -(-self.width // BOUNCE_CELL)
+        v, u = np.mgrid[:rows, :columns]
         rng = np.random.default_rng([seed, 77])
-        total = np.zeros((self.height * self.width, self.bands))
-        chunk = 8
-        for start in range(0, BOUNCE_SAMPLES, chunk):
-            u8 = np.repeat(u.ravel(), chunk) + rng.random(u.size * chunk)
-            v8 = np.repeat(v.ravel(), chunk) + rng.random(u.size * chunk)
-            sample = self._trace(u8, v8)
-            sampler = mi.load_dict({"type": "independent"})
-            sampler.seed(int(rng.integers(2**31)), u8.size)
-            light = self.scene.integrator.bounced(self.scene.mitsuba, *sample, self.scene.leds[led], 1, sampler)
-            dr.eval(light)
-            total += self._bands(light).reshape(-1, chunk, self.bands).mean(1)
-        image = (total / (BOUNCE_SAMPLES // chunk)).reshape(self.height, self.width, self.bands)
+        count = u.size * BOUNCE_SAMPLES
+        at = [np.repeat(a.ravel(), BOUNCE_SAMPLES) + rng.random(count) for a in (u, v)]
+        sample = self._trace(*(np.minimum(a * BOUNCE_CELL, size - 1e-3) for a, size in zip(at, (self.width, self.height))))
+        sampler = mi.load_dict({"type": "independent"})
+        sampler.seed(int(rng.integers(2**31)), count)
+        light = self.scene.integrator.bounced(self.scene.mitsuba, *sample, self.scene.leds[led], 1, sampler)
+        coarse = self._bands(light).reshape(rows, columns, BOUNCE_SAMPLES, self.bands).mean(2)
+        image = zoom(coarse, (BOUNCE_CELL, BOUNCE_CELL, 1), order=1, mode="nearest", grid_mode=True)
+        image = image[:self.height, :self.width].astype(float)
         self._images[key] = image
         return image
 

@@ -10,7 +10,8 @@ no singularity (Oren & Nayar's qualitative model).
 Fingerprint
     rho scales a band everywhere; sigma brightens grazing views of slopes that face the light and flattens the shading.
 Validity
-    opaque coating, no lobe towards the mirror direction (the effect "specular lobe" adds one); depolarizes fully.
+    opaque coating, no lobe towards the mirror direction (the effect "specular lobe" adds one); depolarizes fully. The formula as
+    published returns up to 1.5 % more light than it gets from beyond 65 deg for sigma of 0.05 to 0.3; over all directions less.
 References
     F-TAC Hand supplementary information, S1.4, eq. (S3); Oren & Nayar, IJCV 14, 227 (1995).
 """

@@ -172,6 +172,31 @@ def build():
             sigma_s, _, sigma_t = medium.get_scattering_coefficients(mei, active)
             return sigma_t - sigma_s
 
+        def look_up(self, scene):
+            """What acts in a scene besides its surfaces and lights: the gel and its effects, LEDs, membranes that shine."""
+            self.inside = gel = self.gel(scene)
+            self.fading, self.veils = (gel.functions(s) if gel is not None else () for s in ("segment", "volume"))
+            self.lamps = [e for e in scene.emitters() if getattr(e, "kind", "") == "led"] if self.veils else []
+            self.shining = [m for m in {s.bsdf() for s in scene.shapes()} if getattr(m, "kind", "") == "membrane"
+                            and m.functions("ambient")]
+
+        def kept(self, si, origin, point):
+            """Share of the light that effects of the gel leave on its way from a point over the surface to where a ray began."""
+            share = mi.UnpolarizedSpectrum(1.0)
+            for function in self.fading:
+                share *= function(self.inside.path(si.p, origin, point, None, si), self.inside)
+            return scaled(share)
+
+        def own_light(self, scene, si, origin):
+            """Light that the gel and the membranes add by themselves at a surface: stages `volume` and `ambient`."""
+            added = mi.UnpolarizedSpectrum(0.0)
+            for function in self.veils:
+                for led in self.lamps:
+                    added += function(self.inside.path(si.p, origin, led.position(), led, si), self.inside)
+            for membrane in self.shining:
+                added += self.ambient(scene, si, 1.0, membrane)
+            return mi.mueller.depolarizer(added) if mi.is_polarized else mi.Spectrum(added)
+
         @dr.syntax
         def transmittance(self, scene, si, ds, medium, active):
             """Mueller matrix of the straight way from the surface to a light: null surfaces and absorbing media."""
@@ -202,6 +227,7 @@ def build():
 
         @dr.syntax
         def sample(self, mode, scene, sampler, ray, δL=None, state_in=None, active=True, **_):
+            self.look_up(scene)
             context = mi.BSDFContext()
             ray = mi.Ray3f(ray)
             first = mi.Vector3f(ray.d)
@@ -237,12 +263,14 @@ def build():
                 throughput = dr.select(lit & reflected, throughput * self.interreflection, throughput)
                 ds, sent = scene.sample_emitter_direction(si, sampler.next_2d(), False, lit)
                 lit &= ds.pdf != 0
+                light = dr.select(lit, light + product(throughput, self.own_light(scene, si, ray.o)), light)
                 start = dr.select(si.is_medium_transition(), si.target_medium(ds.d), medium)
                 way = self.transmittance(scene, si, ds, start, lit)
                 wo = si.to_local(ds.d)
                 value, density = bsdf.eval_pdf(context, si, wo, lit)
                 value = si.to_world_mueller(value, -wo, si.wi)
                 mis = dr.select(ds.delta, 1.0, mis_weight(ds.pdf, density))
+                way = product(way, self.kept(si, ray.o, ds.p))
                 added = product(product(product(throughput, value), way), sent) * mis
                 light = dr.select(lit, light + added, light)
 
@@ -251,6 +279,7 @@ def build():
                 factor = si.to_world_mueller(factor, -bs.wo, si.wi)
                 straight = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
                 reflected |= onward & mi.has_flag(bs.sampled_type, mi.BSDFFlags.Smooth)
+                factor = dr.select(lit, product(factor, self.kept(si, ray.o, si.p)), factor)
                 throughput = dr.select(onward, product(throughput, factor), throughput)
                 direction = si.to_world(bs.wo)
                 medium = dr.select(onward & si.is_medium_transition(), si.target_medium(direction), medium)
