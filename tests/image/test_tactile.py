@@ -375,6 +375,25 @@ def test_stokes_channels_follow_the_stock_convention(variant, angle):
     assert np.abs(ours[..., 0].mean() / stock[..., 0].mean() - 1) < 1e-3
 
 
+@pytest.mark.parametrize("variant", [MONO], indirect=True)
+def test_metal_polarizes_in_the_stock_frame(variant):
+    """A rough, dark conductor lit by a lamp: light that is sampled and light that is hit, each turned into the sensor's frame."""
+    import mitsuba as mi
+
+    turned = mi.ScalarTransform4f().rotate([1, 2, 0], 12).rotate([0, 0, 1], 40).scale(6)  # its own frame is not the world's
+    metal = {"type": "rectangle", "to_world": turned, "bsdf": {"type": "roughconductor", "alpha": 0.4, "eta": 1.5, "k": 0.1}}
+    scene = built(sensor=sensor(mi, (9, 7), distance=3.0, tilt=(1.0, -5.0, 0.0)), metal=metal, lamp=lamp(mi, half=1.5))
+    ours = stokes(scene, 4096)
+    stock = np.array(mi.render(scene, integrator=mi.load_dict(
+        {"type": "stokes", "inner": {"type": "path", "max_depth": 3}}), spp=4096), float)
+    stock = stock[..., stock.shape[-1] - 12::3]
+    bright = stock[..., 0] > 0.2 * stock[..., 0].max()
+    degree = stock[bright][:, 1:] / stock[bright][:, :1]
+    assert np.abs(degree[:, 0]).max() > 0.3 and np.abs(degree[:, 1]).max() > 0.1  # there is something to compare
+    # 4096 samples of a relative noise near 0.3 leave 0.5 %
+    assert np.abs(ours[bright][:, 1:] / ours[bright][:, :1] - degree).max() < 0.005
+
+
 def test_a_membrane_depolarizes(mitsuba, tmp_path):
     scene = gelsight(tmp_path, SPECTRAL, stokes=True)
     import mitsuba as mi
