@@ -599,12 +599,13 @@ class Model:
         return factor * (total + self._difference_ambient(now, key) if kind == "membrane" else total)
 
     def _sides(self, key: str, now: Mapping) -> tuple[float, float]:
-        """The two values of a difference: about the present one, within bounds; from it, where moving it moves the gel and
-        it is no effect (a press), as the present geometry is rendered anyhow and a step of 0.005 mm is near enough."""
+        """The two values of a central difference, a tenth of the plausible change to either side, within bounds.
+
+        A compromise: wider steps bend (3 % away from rims at twice the step), narrower ones drown at rims, where a moving
+        edge changes a pixel by jumps of 1/64 (a press: 18 % over the whole image at this step, 10 % at twice).
+        """
         parameter = self.parameters[key]
         step = 0.1 * parameter.plausible
-        if parameter.neutral is None and self.renderer.kind(key) == "gel" and now[key] + step / 2 <= parameter.bounds[1]:
-            return now[key], now[key] + step / 2
         return max(now[key] - step, parameter.bounds[0]), min(now[key] + step, parameter.bounds[1])
 
     def _difference(self, now: Mapping, key: str, seed: int) -> np.ndarray:
