@@ -563,7 +563,7 @@ def report(study: StudyFolder,
 
 @command
 def demo(output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Where captures, study and report go.")] = Path("renders/demo"),
-         seed: Annotated[int, typer.Option("--seed", min=0, help="Chooses the sensor and its hidden effect.")] = 0,
+         seed: Annotated[int, typer.Option("--seed", min=0, help="Chooses the sensor and its hidden effect.")] = 2,
          effect: Annotated[str | None, typer.Option("--effect", help="Hide this effect instead.")] = None) -> None:
     """Make a sensor with a secret, by another path than the model, and find what is missing."""
     from optics import demo as story
