@@ -83,8 +83,8 @@ def main() -> int:
                           [renderer.led(now, led) for led in scene.leds]), 3)
     row("ours / stock path at equal error", f"{warm / path:.2f} x", "below 1 is faster; ours gives six LEDs apart, three bands")
 
-    from optics import captures as files, demo, diagnose as diagnosis, evidence  # noqa: F401
-    from optics import loop
+    from optics import captures as files, demo, diagnose as diagnosis, loop
+    from optics.parameter import Values
 
     with tempfile.TemporaryDirectory() as folder:
         small = scenes.load("gelsight", {"width": "160", "height": "120"})
@@ -94,7 +94,7 @@ def main() -> int:
         setup = loop.Setup(captures=str(Path(folder) / "captures"), held_out=[])
         model = loop.open_model(setup)
         fit = loop.fit_base(model, loop.variables_of_base(model, setup, range(16)), list(range(16)),
-                            loop.Values(demo.truth(small, 1)))
+                            Values(demo.truth(small, 1)))
         from optics.effect import registry
 
         effects = [e for e in registry().effects.values() if model.scene.can_express(e)]

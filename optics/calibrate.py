@@ -28,7 +28,7 @@ class Fit:
     estimate     (p,) in the order of `variables`; covariance (p, p) from the noise model and the priors
     chi2, dof    of the data, without priors; per frame in frame_chi2, frame_n
     converged    whether the fall of chi2 still predicted is below 1 per variable; `reason` says why it stopped
-    undetermined combinations of variables that the captures say nothing about, as sentences
+    warnings     sentences: combinations that the captures cannot tell apart, variables that do nothing or stand at a bound
     """
 
     values: Values
@@ -146,11 +146,6 @@ def with_start(model, variables: Sequence[Variable], values: Values) -> Values:
     for variable in variables:
         filled.put(variable, start_of(model, variable, values))
     return filled
-
-
-def pose_variables(variables: Sequence[Variable]) -> list[Variable]:
-    """The variables of single frames or groups: what is fitted again on frames that were held out."""
-    return [v for v in variables if v.frames is not None]
 
 
 def huber(whitened: np.ndarray, limit: float = 3.0) -> np.ndarray:

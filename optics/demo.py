@@ -52,9 +52,8 @@ def make(folder: Path, seed: int, name: str | None = None, progress: Callable | 
     """Write the captures of a demonstration; returns the secret, which the captures do not tell."""
     scene = scenes.load("gelsight", {"width": str(SIZE[0]), "height": str(SIZE[1])})
     effect, strength = secret(seed, name)
-    hidden = {} if strength == 0 else {effect: strength}
     built = {**truth(scene, seed), "camera.exposure": EXPOSURE}
-    maker = synthetic.Maker(scene, built, hidden, seed=seed + 1000)
+    maker = synthetic.Maker(scene, built, {effect: strength}, seed=seed + 1000)
     found = maker.captures(synthetic.presses(PRESSES, seed), progress=progress)
     found.parameters["camera.exposure"] = EXPOSURE
     capture_files.write(found, folder, bits=8)

@@ -38,7 +38,6 @@ STAGES = {
     "surface": "gel", "emission": "led", "segment": "gel", "reflection": "membrane", "volume": "gel",
     "ambient": "membrane", "lens": "camera", "sensor": "camera", "response": "camera",
 }
-IMAGE_STAGES = ("lens", "sensor", "response")
 CATEGORIES = ("bsdf", "emitter", "sensor", "shape", "integrator")
 
 

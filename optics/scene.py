@@ -104,7 +104,7 @@ class Scene:
 
         found = {}
         self._traversed = mi.traverse(self.mitsuba)
-        for key, (_, _, node, flags) in self._traversed.properties.items():
+        for key, (_, _, node, _) in self._traversed.properties.items():
             if is_part(node) or re.match(r"object_\d+\.", key):  # without an id the key is an address of this run
                 continue
             value = self._traversed[key]
