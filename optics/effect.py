@@ -38,6 +38,7 @@ STAGES = {
     "surface": "gel", "emission": "led", "segment": "gel", "reflection": "membrane", "volume": "gel",
     "ambient": "membrane", "lens": "camera", "sensor": "camera", "response": "camera",
 }
+IMAGE_STAGES = ("lens", "sensor", "response")
 CATEGORIES = ("bsdf", "emitter", "sensor", "shape", "integrator")
 
 
