@@ -13,10 +13,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy.optimize import lsq_linear
 
 from optics.errors import Underdetermined, UnknownKey
 from optics.parameter import Values, Variable
 
+CORRECTIONS = 3  # steps back to the floor of a curved valley
 TRUNCATION = 1e-12  # eigenvalues of the scaled normal matrix below this share of the largest count as undetermined
 
 
@@ -208,14 +210,118 @@ def again(model, variables: Sequence[Variable], values: Values, frames: Sequence
     return Normal(normal.a, b + pull, sum(frame_chi2), prior, frame_chi2, normal.frame_n, normal.rows)
 
 
-def solve(a: np.ndarray, b: np.ndarray, damping: float) -> tuple[np.ndarray, np.ndarray]:
-    """Damped step in the eigenbasis of the scaled matrix; directions below TRUNCATION stay put. Returns step, kept share."""
-    scale = np.sqrt(np.maximum(np.diag(a), 1e-300))
+def solve(a: np.ndarray, b: np.ndarray, low: np.ndarray, high: np.ndarray, damping: float = 0.0) -> np.ndarray:
+    """The x in [low, high] that minimises x'(A + damping diag A)x/2 - b'x.
+
+    In the eigenbasis of the scaled matrix; directions below TRUNCATION stay put. Bounds are kept by an active-set method
+    (Stark & Parker's bounded-variable least squares), so that what is free makes up for what is held.
+    """
+    scale = np.sqrt(np.where(np.diag(a) > 0, np.diag(a), 1.0))
+    low, high = np.where(np.diag(a) > 0, low, 0.0), np.where(np.diag(a) > 0, high, 0.0)
     eigen, vectors = np.linalg.eigh(a / np.outer(scale, scale))
-    kept = eigen > TRUNCATION * max(eigen.max(), 1e-300)
-    projected = vectors.T @ (b / scale)
-    step = vectors @ np.where(kept, projected / (np.where(kept, eigen, 1) + damping), 0)
-    return step / scale, kept
+    kept = eigen > TRUNCATION * max(eigen.max(initial=0.0), 1e-300)
+    root, basis = np.sqrt(eigen[kept] + damping), vectors[:, kept].T
+    target = basis @ (b / scale) / root
+    step = basis.T @ (target / root) / scale
+    if np.all((low <= step) & (step <= high)):
+        return step
+    open_ = high > low
+    bounded = lsq_linear((root[:, None] * basis)[:, open_], target, ((low * scale)[open_], (high * scale)[open_]), method="bvls")
+    step = np.zeros(len(b))
+    step[open_] = bounded.x / scale[open_]
+    return np.clip(step, low, high)
+
+
+class Descent:
+    """Damped steps down chi2 + priors, with the derivative images of one linearisation at a time.
+
+    Steps are taken in `Parameter.coordinate`. State: theta, values, `here` (the normal equations at theta, on the images of
+    the last `linearise`), damping.
+    """
+
+    def __init__(self, model, variables: Sequence[Variable], values: Values, frames: Sequence[int], robust: bool = False,
+                 damping: float = 1e-3):
+        self.model, self.variables, self.frames, self.robust = model, list(variables), list(frames), robust
+        self.low, self.high = (np.array([v.parameter.bounds[k] for v in variables], float) for k in (0, 1))
+        for i, v in enumerate(variables):
+            if v.parameter.squared:
+                self.low[i] = max(self.low[i], 1e-3 * v.parameter.plausible)
+        self.theta = np.clip([start_of(model, v, values) for v in variables], self.low, self.high)
+        self.values, self.damping, self.here = self.moved(values, self.theta), damping, None
+
+    def moved(self, values: Values, theta: np.ndarray) -> Values:
+        values = values.copy()
+        for v, value in zip(self.variables, theta):
+            values.put(v, float(value))
+        return values
+
+    def linearise(self, tick: Callable[[], None] | None = None) -> Normal:
+        self.take(normal_equations(self.model, self.variables, self.values, self.frames, self.robust, tick))
+        return self.here
+
+    def take(self, normal: Normal) -> None:
+        """Go on from normal equations at theta."""
+        self.here, self.at = normal, self.theta
+        self.slope = np.array([v.parameter.per_coordinate(t) for v, t in zip(self.variables, self.theta)])
+
+    def _step(self, damping: float, theta: np.ndarray, normal: Normal) -> tuple[np.ndarray, float]:
+        """Where a damped step from theta leads, and the fall of the misfit that the linear model expects of it."""
+        u, low, high = (np.array([v.parameter.coordinate(t) for v, t in zip(self.variables, values)])
+                        for values in (theta, self.low, self.high))
+        a, b = normal.a * np.outer(self.slope, self.slope), normal.b * self.slope
+        step = solve(a, b, low - u, high - u, damping)
+        fall = float(2 * b @ step - step @ a @ step)
+        moved = [v.parameter.at_coordinate(t) for v, t in zip(self.variables, u + step)]
+        return np.clip(moved, self.low, self.high), fall
+
+    @property
+    def promised(self) -> float:
+        """The fall of the misfit that the linear model still expects."""
+        return self._step(0.0, self.theta, self.here)[1] if self.variables else 0.0
+
+    def _try(self, theta: np.ndarray, normal: Normal) -> tuple[np.ndarray, Values, Normal]:
+        """A damped step from theta, with the misfit where it leads."""
+        theta, _ = self._step(self.damping, theta, normal)
+        values = self.moved(self.values, theta)
+        return theta, values, again(self.model, self.variables, values, self.frames, self.here)
+
+    def chord(self, steps: int, enough: float, rough: float = 0.0, part: float = 0.0) -> float:
+        """Up to `steps` steps on the same derivative images, which cost many times what a prediction does; the total fall.
+
+        A step along a curved valley (reflectance against roughness, say) ends on its wall, far above: a second step from there
+        leads back to its floor, further down. Only when that fails is the damping raised.
+
+        enough   a promised fall, or a gain, not worth another step
+        rough    chi2 may rise by a promise below this: close to the best, where chi2 is rough as shadow rims cross pixels,
+                 the root of J'Wr is followed, not chi2
+        part     share of the first promise, of which no step beyond the first is worth its prediction
+        """
+        gained, first = 0.0, self.promised
+        for _ in range(steps):
+            promised = self.promised
+            if promised < enough or (gained and promised > part * first > 0):
+                break
+            before, worst = self.here.total, -promised if promised < rough else 0.0
+            theta, values, there = self._try(self.theta, self.here)
+            for _ in range(CORRECTIONS):
+                if not np.isfinite(there.total) or before - there.total > worst:
+                    break
+                height = there.total - before
+                theta, values, there = self._try(theta, there)
+                if there.total - before > height / 4:
+                    break
+            gain = before - there.total
+            if np.isfinite(there.total) and gain > worst:
+                self.theta, self.values, self.here = theta, values, there
+                gained += gain
+                self.damping = max(self.damping / 10, 1e-9)
+                if gain < enough or 10 * enough < gain < 0.25 * promised:
+                    break
+            else:
+                self.damping = max(self.damping * 10, 1e-3)
+                if self.damping > 1e4:
+                    break
+        return gained
 
 
 def fit(model, variables: Sequence[Variable], start: Values | None = None, frames: Sequence[int] | None = None, *,
@@ -223,26 +329,18 @@ def fit(model, variables: Sequence[Variable], start: Values | None = None, frame
         progress: Callable[[str, int, int], None] | None = None) -> Fit:
     """Levenberg-Marquardt within bounds.
 
-    A variable that stands at a bound and is pushed outwards is held for that step. Stops when the fall of chi2 that the linear
-    model still predicts is below `tolerance` per variable, or when no damping gives a lower chi2.
-    Raises Underdetermined when no pixel is usable or no variable does anything.
+    Stops when the fall of chi2 that the linear model still predicts is below `tolerance` per variable, or when no damping
+    gives a lower chi2. Raises Underdetermined when no pixel is usable or no variable does anything.
     """
     variables = list(variables)
     frames = list(range(len(model.frames))) if frames is None else list(frames)
-    values = with_start(model, variables, start or Values())
-    first = np.array([start_of(model, v, values) for v in variables])
+    filled = with_start(model, variables, start or Values())
+    first = np.array([start_of(model, v, filled) for v in variables])
     for v, value in zip(variables, first):
         v.parameter.check(value, v.name, "start value")
-    low = np.array([v.parameter.bounds[0] for v in variables])
-    high = np.array([v.parameter.bounds[1] for v in variables])
-    squared = np.array([v.parameter.squared for v in variables], bool)
-    floor = np.array([1e-3 * v.parameter.plausible for v in variables])
-    low = np.where(squared, np.maximum(low, floor), low)
-    theta = np.clip(first, low, high)
-    for v, value in zip(variables, theta):
-        values.put(v, float(value))
-    damping, history, reason, converged = 1e-3, [], "", False
-    best, tries = (np.inf, theta, values), 0
+    descent = Descent(model, variables, filled, frames, robust)
+    history, reason = [], ""
+    best, tries = (np.inf, descent.theta, descent.values), 0
     done, accuracy = 0, tolerance * max(len(variables), 1)
 
     def tick():
@@ -251,22 +349,8 @@ def fit(model, variables: Sequence[Variable], start: Values | None = None, frame
         if progress:
             progress("calibrate", done, max_iterations * len(frames))
 
-    def step_from(now: Normal) -> tuple[Values, np.ndarray, float]:
-        """Damped step in theta, or in theta^2 where the image depends on that; and the fall that no damping would bring."""
-        slope = np.where(squared, 1 / (2 * np.where(squared, theta, 1)), 1.0)
-        a, b = now.a * np.outer(slope, slope), now.b * slope
-        free = ~(((theta <= low) & (b < 0)) | ((theta >= high) & (b > 0)) | (np.diag(a) == 0))
-        promised = float(b[free] @ solve(a[np.ix_(free, free)], b[free], 0.0)[0])
-        step = np.zeros_like(theta)
-        step[free], _ = solve(a[np.ix_(free, free)], b[free], damping)
-        trial = np.clip(np.where(squared, np.sqrt(np.maximum(theta**2 + step, 0)), theta + step), low, high)
-        moved = values.copy()
-        for v, value in zip(variables, trial):
-            moved.put(v, float(value))
-        return moved, trial, promised
-
     for iteration in range(max_iterations):
-        normal = normal_equations(model, variables, values, frames, robust, tick)
+        normal = descent.linearise(tick)
         if sum(normal.frame_n) == 0:
             raise Underdetermined("no usable pixel: every pixel is saturated, at black, or masked; check [noise] "
                                   "black_level and saturation in captures.toml, and the masks")
@@ -274,59 +358,34 @@ def fit(model, variables: Sequence[Variable], start: Values | None = None, frame
         if len(silent) == len(variables) and variables:
             raise Underdetermined(f"none of the {len(variables)} free parameters changes any frame: {', '.join(silent[:6])}")
         history.append(normal.total)
-        first_promise = step_from(normal)[2] if variables else 0.0
-        here = normal
-        if first_promise < accuracy:
-            reason, converged = f"converged after {iteration} linearisations", True
+        promise = descent.promised
+        if promise < accuracy:
+            best, reason = (promise, descent.theta, descent.values), f"converged after {iteration} linearisations"
             break
-        near = first_promise < 20 * len(theta)
+        near = promise < 20 * len(variables)
         if near:
             tries += 1
-            if first_promise < best[0]:
-                best = (first_promise, theta.copy(), values)
-            if tries > 4 or (tries > 1 and best[0] < len(theta) / 2):
+            if promise < best[0]:
+                best = (promise, descent.theta, descent.values)
+            if tries > 4 or (tries > 1 and best[0] < len(variables) / 2):
                 break
-        # A linearisation serves for several steps while they keep the misfit falling fast (a chord method): derivative
-        # images cost many times what a prediction does.
-        gained = 0.0
-        for _ in range(3 if near else 8):
-            moved, trial, promised = step_from(here)
-            if promised < accuracy / 10 or (gained and promised > 0.3 * first_promise):
-                break
-            there = again(model, variables, moved, frames, here)
-            # Close to the best, chi2 is rough where shadow rims cross pixels: there the root of J'Wr is followed, not chi2.
-            allowed = promised if near and promised < 20 * len(theta) else 0.0
-            if np.isfinite(there.total) and there.total < here.total + allowed:
-                gain = here.total - there.total
-                theta, values, here = trial, moved, there
-                gained += gain
-                damping = max(damping / 10, 1e-9)
-                if gain < 0.25 * promised and gain > accuracy:
-                    break
-                if gain < accuracy / 10:
-                    break
-            else:
-                damping = max(damping * 10, 1e-3)
-                if damping > 1e4:
-                    break
+        gained = descent.chord(3 if near else 8, accuracy / 10, 20 * len(variables) if near else 0.0, 0.3)
         if gained < accuracy and not near:
-            reason = f"no lower misfit within reach; the linear model still promised {first_promise:.3g}"
+            reason = f"no lower misfit within reach; the linear model still promised {promise:.3g}"
             break
     else:
         reason = f"stopped after {max_iterations} linearisations without converging; allow more or start nearer"
     if not reason:
-        converged = best[0] < len(theta)
-        reason = (f"converged after {iteration + 1} linearisations" if converged else
+        reason = (f"converged after {iteration + 1} linearisations" if best[0] < len(variables) else
                   f"the linear model still promised a fall of {best[0]:.3g}, which no step brought")
-        if not np.array_equal(best[1], theta):
-            theta, values = best[1], best[2]
-            normal = here = normal_equations(model, variables, values, frames, robust)
-    if here is not normal:  # the last steps moved on from where the derivative images were made
-        normal = normal_equations(model, variables, values, frames, robust)
-    result = Fit(values, variables, theta, covariance_of(normal.a), normal.chi2,
+        descent.theta, descent.values = best[1:]
+    if descent.at is not descent.theta:  # the last steps moved on from where the derivative images were made
+        normal = descent.linearise()
+    theta, converged = descent.theta, reason.startswith("converged")
+    result = Fit(descent.values, variables, theta, covariance_of(normal.a), normal.chi2,
                  sum(normal.frame_n) - len(variables) + sum(v.prior is not None for v in variables), frames,
                  normal.frame_chi2, normal.frame_n, converged, reason, history, start=first)
-    result.at_bound = [v.name for v, t, lo, hi in zip(variables, theta, low, high) if t <= lo or t >= hi]
+    result.at_bound = [v.name for v, t, lo, hi in zip(variables, theta, descent.low, descent.high) if t <= lo or t >= hi]
     result.warnings = warnings_of(result, normal.a)
     result.normal = normal
     return result
@@ -359,47 +418,13 @@ def extended(model, base: Fit, extra: Sequence[Variable], secant: Mapping[str, f
         b[rows[-1][0]] += (rows[-1][1] @ whitened).astype(float)
     pull, curvature, prior = prior_terms(model, variables, values)
     a[first:, first:] += np.diag(curvature[first:])
-    here = Normal(a, b + pull, base.chi2, prior, base.frame_chi2, base.frame_n, rows)
-    theta = np.array([start_of(model, v, values) for v in variables])
-    low, high = (np.array([v.parameter.bounds[k] for v in variables]) for k in (0, 1))
-    # where the image depends on the square, the coordinate is the square, as in `fit`
-    squared = np.array([v.parameter.squared for v in variables], bool)
-    slope = np.where(squared, 1 / (2 * np.maximum(theta, 1e-9)), 1.0)
-    here.a, here.b = here.a * np.outer(slope, slope), here.b * slope
-    for where, j, _ in rows:
-        j *= slope[where][:, None].astype(np.float32)
-    theta = np.where(squared, theta**2, theta)
-    low, high = np.where(squared, (1e-3 * np.array([v.parameter.plausible for v in variables])) ** 2, low), np.where(
-        squared, high**2, high)
-    damping, promised = 1e-6, np.inf
-    history = [here.total]
-    for _ in range(steps):
-        free = ~(((theta <= low) & (here.b < 0)) | ((theta >= high) & (here.b > 0)) | (np.diag(here.a) == 0))
-        promised = float(here.b[free] @ solve(here.a[np.ix_(free, free)], here.b[free], 0.0)[0])
-        if promised < 0.1 * p:
-            break
-        step = np.zeros(p)
-        step[free], _ = solve(here.a[np.ix_(free, free)], here.b[free], damping)
-        trial = np.clip(theta + step, low, high)
-        moved = values.copy()
-        for v, value in zip(variables, np.where(squared, np.sqrt(np.abs(trial)), trial)):
-            moved.put(v, float(value))
-        there = again(model, variables, moved, base.frames, here)
-        there.b = there.b + (slope - 1) * prior_terms(model, variables, moved)[0]
-        if np.isfinite(there.total) and there.total < here.total:
-            gain, theta, values, here = here.total - there.total, trial, moved, there
-            history.append(here.total)
-            if gain < 0.1 * p:
-                break
-        else:
-            damping = max(damping * 30, 1e-2)
-            if damping > 1e3:
-                break
-    estimate = np.where(squared, np.sqrt(np.abs(theta)), theta)
-    back = np.where(squared, 1 / (2 * np.maximum(estimate, 1e-9)), 1.0)  # d sigma / d sigma^2, where it ended
-    covariance = covariance_of(here.a) * np.outer(back, back)
-    return Fit(values, variables, estimate, covariance, here.chi2, base.dof - len(extra), base.frames,
-               here.frame_chi2, here.frame_n, promised < p, f"{len(history) - 1} chord steps", history)
+    descent = Descent(model, variables, values, base.frames, damping=1e-6)
+    descent.take(Normal(a, b + pull, base.chi2, prior, base.frame_chi2, base.frame_n, rows))
+    before = descent.here.total
+    descent.chord(steps, 0.1 * p)
+    here = descent.here
+    return Fit(descent.values, variables, descent.theta, covariance_of(here.a), here.chi2, base.dof - len(extra), base.frames,
+               here.frame_chi2, here.frame_n, descent.promised < p, "chord steps", [before, here.total])
 
 
 def covariance_of(a: np.ndarray) -> np.ndarray:

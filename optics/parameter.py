@@ -29,6 +29,7 @@ class Parameter:
                 random numbers: it moves shadows or geometry), 'image' (arithmetic on the linear images)
     squared     True where the image depends on the square of it (a roughness): a fit steps in the square, whose onset is
                 linear, and stays above a thousandth of `plausible`
+    saturates   of a squared parameter s: the value v beyond which its effect levels off; a fit steps in s^2/(1 + s^2/v^2)
     linear      True where the image is exactly linear in it (one render serves every value)
     choices     the allowed words, for a parameter that is a choice and not a number
     """
@@ -43,6 +44,7 @@ class Parameter:
     how: str = "ad"
     linear: bool = False
     squared: bool = False
+    saturates: float = math.inf
     choices: tuple[str, ...] = ()
 
     def __post_init__(self):
@@ -58,6 +60,18 @@ class Parameter:
     @property
     def differentiable(self) -> bool:
         return self.is_number
+
+    def coordinate(self, value: float) -> float:
+        """u(value): what a fit steps in, so that the image is nearly linear in it."""
+        return value**2 / (1 + (value / self.saturates) ** 2) if self.squared else value
+
+    def at_coordinate(self, u: float) -> float:
+        """The inverse of `coordinate`; u below 0 counts as 0."""
+        return math.sqrt(max(u, 0.0) / max(1 - u / self.saturates**2, 1e-12)) if self.squared else u
+
+    def per_coordinate(self, value: float) -> float:
+        """d value / d u; infinite at 0 of a squared parameter."""
+        return (1 + (value / self.saturates) ** 2) ** 2 / (2 * value) if self.squared else 1.0
 
     def check(self, value, key: str, where: str = ""):
         """Return the value in its own type, or raise: not a number, not finite, out of bounds, not a choice."""

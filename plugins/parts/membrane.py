@@ -23,7 +23,8 @@ PARAMETERS = (
     Parameter("rho_r", "1", 1.0, (0.0, 10.0), "reflectance rho in the first band (red)", plausible=0.1, linear=True),
     Parameter("rho_g", "1", 1.0, (0.0, 10.0), "reflectance rho in the second band (green)", plausible=0.1, linear=True),
     Parameter("rho_b", "1", 1.0, (0.0, 10.0), "reflectance rho in the third band (blue)", plausible=0.1, linear=True),
-    Parameter("sigma", "rad", 0.2, (0.0, 1.5), "roughness sigma of (S3)", plausible=0.1, squared=True),
+    Parameter("sigma", "rad", 0.2, (0.0, 1.5), "roughness sigma of (S3)", plausible=0.1, squared=True,
+              saturates=0.3),
 )
 
 
