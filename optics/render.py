@@ -571,6 +571,8 @@ class Model:
         kind = self.renderer.kind(key)
         bounce, lit = now[self.renderer.bounce_key], self.lit(now)
         tangent = self.renderer.led_tangent_at_rest if at_rest else self.renderer.led_tangent
+        if not lit and kind != "membrane" and self.parameters[key].how != "difference":
+            return None  # a dark frame
         if key == self.renderer.bounce_key:
             return factor * sum(power * self.renderer.bounced(now, led, seed) for led, power in lit.items())
         if kind == "led" and parameter in POWERS:
@@ -596,7 +598,9 @@ class Model:
                      else tangent(now, name, key))
             return factor * lit[name] * image
         total = sum(power * tangent(now, led, key) for led, power in lit.items())
-        return factor * (total + self._difference_ambient(now, key) if kind == "membrane" else total)
+        if kind == "membrane":
+            total = total + self._difference_ambient(now, key)
+        return factor * total
 
     def _sides(self, key: str, now: Mapping) -> tuple[float, float]:
         """The two values of a central difference, a tenth of the plausible change to either side, within bounds.
