@@ -146,13 +146,21 @@ def effect_variables(model: Model, effect: Effect) -> list[Variable]:
 
 
 def fit_base(model: Model, variables: Sequence[Variable], fitted: Sequence[int], start: Values,
-             progress: Progress | None = None) -> calibrate.Fit:
+             progress: Progress | None = None, tolerance: float = 0.05) -> calibrate.Fit:
     """Calibrate in two stages: what holds in all frames first, then the poses with it."""
     common = [v for v in variables if v.frames is None]
     if len(common) < len(variables) and common:
         first = calibrate.fit(model, common, start, fitted, max_iterations=8, tolerance=20.0, progress=progress)
         start = first.values
-    return calibrate.fit(model, list(variables), start, fitted, progress=progress)
+    return calibrate.fit(model, list(variables), start, fitted, tolerance=tolerance, progress=progress)
+
+
+def off_neutral(model: Model, values: Values, variables: Sequence[Variable]) -> Values:
+    """Values with variables a tenth of their plausible size off: one-sided onsets have no slope to follow at a bound."""
+    moved = values.copy()
+    for v in variables:
+        moved.put(v, calibrate.start_of(model, v, moved) + 0.1 * v.parameter.plausible)
+    return moved
 
 
 def held_out_values(model: Model, found: calibrate.Fit, setup: Setup, held: Sequence[int], effects: Sequence[Effect] = ()
@@ -269,7 +277,7 @@ def examine(study: Study, model: Model, setup: Setup, found: calibrate.Fit, prog
 
     fitted, held = split(model, setup)
     tested = candidates(model, study)
-    known, falls = {v.name for v in found.variables}, []
+    known, results = {v.name for v in found.variables}, {}
     steps = {v.name: v.parameter.plausible for e in tested if e.onset != "tangent" for v in effect_variables(model, e)}
 
     def refit(model, variables, start, frames):
@@ -277,13 +285,21 @@ def examine(study: Study, model: Model, setup: Setup, found: calibrate.Fit, prog
         extra = [v for v in variables if v.name not in known]
         if found.normal is None or not extra or list(frames) != list(found.frames):
             return calibrate.fit(model, variables, start, frames)
-        quick = calibrate.extended(model, found, extra, {v.name: steps[v.name] for v in extra if v.name in steps})
-        fall = found.chi2 - quick.chi2
-        leads = fall > 0.7 * max(falls, default=0.0)
-        falls.append(fall)
-        if quick.converged or not leads:
-            return quick
-        # far from the base its derivative images no longer serve: the leaders are calibrated in full
+        names = tuple(v.name for v in extra)
+        if names not in results:  # chord steps have a start of their own
+            leader = max((found.chi2 - f.chi2 for f in results.values()), default=0.0)
+            quick = calibrate.extended(model, found, extra, {v.name: steps[v.name] for v in extra if v.name in steps})
+            if not quick.converged and found.chi2 - quick.chi2 > 0.7 * leader:
+                quick = afresh(variables, extra, frames, quick)
+            results[names] = quick
+        return results[names]
+
+    def afresh(variables, extra, frames, quick):
+        """Calibrate from the study's start: nearer than the base's values, which a strong effect has bent far away."""
+        values = off_neutral(model, Values(dict(setup.values)), extra)
+        best = fit_base(model, variables, frames, values, tolerance=0.5)
+        if best.chi2 < quick.chi2:
+            return best
         return calibrate.fit(model, variables, quick.values, frames, max_iterations=4, tolerance=0.5)
 
     result = diagnose(model, found, tested, lambda e: effect_variables(model, e), held, fitted=fitted, refit=refit,
@@ -297,8 +313,7 @@ def extend(study: Study, model: Model, setup: Setup, found: calibrate.Fit, effec
            progress: Progress | None = None) -> tuple[calibrate.Fit, Comparison]:
     """Free an effect, calibrate everything again, and record the step.
 
-    start   values to begin from, such as those of the diagnosis's refit; else the present ones with the effect moved off
-            neutral by a tenth of its plausible size (one-sided onsets have no slope to follow exactly at a bound)
+    start   values to begin from, such as those of the diagnosis's refit; else the present ones with the effect off neutral
     """
     fitted, held = split(model, setup)
     if not model.scene.can_express(effect):
@@ -308,9 +323,7 @@ def extend(study: Study, model: Model, setup: Setup, found: calibrate.Fit, effec
     extra = [v for v in effect_variables(model, effect) if v.frames is None or set(v.frames) <= set(fitted)]
     variables = [*found.variables, *extra]
     if start is None:
-        start = found.values.copy()
-        for v in extra:
-            start.put(v, calibrate.start_of(model, v, start) + 0.1 * v.parameter.plausible)
+        start = off_neutral(model, found.values, extra)
     clock = time.perf_counter()
     best = calibrate.fit(model, variables, start, fitted, progress=progress)
     comparison = record(study, model, setup, effect.name, effect, best, held, time.perf_counter() - clock)
