@@ -24,5 +24,5 @@ variables = calibrate.variables_from(
 fit = calibrate.fit(model, variables, Values(), fitted)
 print(fit.table())
 
-comparison = loop.comparison_of(model, loop.held_out_values(model, fit, setup, held_out)[0], held_out, len(variables), 0)
+comparison = loop.comparison_of(model, loop.held_out_values(model, fit, held_out)[0], held_out, len(variables), 0)
 print(comparison.text())

@@ -18,7 +18,6 @@ from scipy.optimize import lsq_linear
 from optics.errors import Underdetermined, UnknownKey
 from optics.parameter import Values, Variable
 
-CORRECTIONS = 3  # steps back to the floor of a curved valley
 TRUNCATION = 1e-12  # eigenvalues of the scaled normal matrix below this share of the largest count as undetermined
 
 
@@ -135,6 +134,41 @@ def variables_from(model, free: Sequence[str], per_group: Sequence[str] = (), pr
     return variables
 
 
+def for_frames(model, variables: Sequence[Variable], frames: Sequence[int]) -> list[Variable]:
+    """What a fit's per-frame variables are called in other frames: one per group where the fit has one per group.
+
+    A prior goes along when it is the same for all, or stands about what every frame sets.
+    """
+    def group(f: int) -> str:
+        frame = model.frames[f]
+        return getattr(frame, "group", None) or getattr(frame, "name", str(f))
+
+    def noted(key: str, f: int) -> float:
+        return float(model.frames[f].parameters.get(key, model.base[key]))
+
+    def prior_in(alike: Sequence[Variable], f: int) -> tuple[float, float] | None:
+        priors = {v.prior for v in alike}
+        if len(priors) == 1:
+            return alike[0].prior
+        same = None not in priors and len({sd for _, sd in priors}) == 1
+        key = alike[0].keys[0]
+        if same and all(v.prior[0] == noted(key, v.frames[0]) for v in alike):
+            return noted(key, f), alike[0].prior[1]
+        return None
+
+    found = []
+    for keys in dict.fromkeys(v.keys for v in variables if v.frames is not None):
+        alike = [v for v in variables if v.keys == keys and v.frames is not None]
+        groups = [group(v.frames[0]) for v in alike]
+        single = len(set(groups)) < len(groups)  # several values within one group: each frame has its own
+        shared: dict[str, list[int]] = {}
+        for f in frames:
+            shared.setdefault(getattr(model.frames[f], "name", str(f)) if single else group(f), []).append(f)
+        found += [Variable(f"{keys[0]}[{name}]", keys, alike[0].parameter, tuple(own), prior_in(alike, own[0]))
+                  for name, own in shared.items()]
+    return found
+
+
 def start_of(model, variable: Variable, values: Values) -> float:
     """The value that a variable starts from: the fitted one, else what its frames set, else the scene's."""
     if variable.frames is not None:
@@ -248,6 +282,8 @@ class Descent:
                 self.low[i] = max(self.low[i], 1e-3 * v.parameter.plausible)
         self.theta = np.clip([start_of(model, v, values) for v in variables], self.low, self.high)
         self.values, self.damping, self.here = self.moved(values, self.theta), damping, None
+        linear = getattr(model, "linear_in", lambda variable: False)
+        self.powers = {v.name for v in self.variables if linear(v)}
 
     def moved(self, values: Values, theta: np.ndarray) -> Values:
         values = values.copy()
@@ -264,11 +300,11 @@ class Descent:
         self.here, self.at = normal, self.theta
         self.slope = np.array([v.parameter.per_coordinate(t) for v, t in zip(self.variables, self.theta)])
 
-    def _step(self, damping: float, theta: np.ndarray, normal: Normal) -> tuple[np.ndarray, float]:
-        """Where a damped step from theta leads, and the fall of the misfit that the linear model expects of it."""
+    def _step(self, damping: float) -> tuple[np.ndarray, float]:
+        """Where a damped step leads, and the fall of the misfit that the linear model expects of it."""
         u, low, high = (np.array([v.parameter.coordinate(t) for v, t in zip(self.variables, values)])
-                        for values in (theta, self.low, self.high))
-        a, b = normal.a * np.outer(self.slope, self.slope), normal.b * self.slope
+                        for values in (self.theta, self.low, self.high))
+        a, b = self.here.a * np.outer(self.slope, self.slope), self.here.b * self.slope
         step = solve(a, b, low - u, high - u, damping)
         fall = float(2 * b @ step - step @ a @ step)
         moved = [v.parameter.at_coordinate(t) for v, t in zip(self.variables, u + step)]
@@ -277,19 +313,30 @@ class Descent:
     @property
     def promised(self) -> float:
         """The fall of the misfit that the linear model still expects."""
-        return self._step(0.0, self.theta, self.here)[1] if self.variables else 0.0
+        return self._step(0.0)[1] if self.variables else 0.0
 
-    def _try(self, theta: np.ndarray, normal: Normal) -> tuple[np.ndarray, Values, Normal]:
-        """A damped step from theta, with the misfit where it leads."""
-        theta, _ = self._step(self.damping, theta, normal)
+    def _try(self) -> tuple[np.ndarray, Values, Normal]:
+        """A damped step, with the misfit where it leads."""
+        return self._at(self._step(self.damping)[0])
+
+    def _at(self, theta: np.ndarray) -> tuple[np.ndarray, Values, Normal]:
         values = self.moved(self.values, theta)
         return theta, values, again(self.model, self.variables, values, self.frames, self.here)
+
+    def _settled(self, theta: np.ndarray, values: Values) -> tuple[np.ndarray, Values, Normal]:
+        """Theta with the powers, in which the image is linear, solved for where all else is (variable projection)."""
+        index = [i for i, v in enumerate(self.variables) if v.name in self.powers]
+        powers = [self.variables[i] for i in index]
+        normal = normal_equations(self.model, powers, values, self.frames, self.robust)
+        theta = theta.copy()
+        theta[index] += solve(normal.a, normal.b, (self.low - theta)[index], (self.high - theta)[index])
+        return self._at(np.clip(theta, self.low, self.high))
 
     def chord(self, steps: int, enough: float, rough: float = 0.0, part: float = 0.0) -> float:
         """Up to `steps` steps on the same derivative images, which cost many times what a prediction does; the total fall.
 
-        A step along a curved valley (reflectance against roughness, say) ends on its wall, far above: a second step from there
-        leads back to its floor, further down. Only when that fails is the damping raised.
+        Lights that move or widen change their brightness by far more than their pattern: a long step ends on the wall of a
+        narrow valley. There the powers are solved for once more, which costs about a prediction, before a step is given up.
 
         enough   a promised fall, or a gain, not worth another step
         rough    chi2 may rise by a promise below this: close to the best, where chi2 is rough as shadow rims cross pixels,
@@ -301,16 +348,11 @@ class Descent:
             promised = self.promised
             if promised < enough or (gained and promised > part * first > 0):
                 break
-            before, worst = self.here.total, -promised if promised < rough else 0.0
-            theta, values, there = self._try(self.theta, self.here)
-            for _ in range(CORRECTIONS):
-                if not np.isfinite(there.total) or before - there.total > worst:
-                    break
-                height = there.total - before
-                theta, values, there = self._try(theta, there)
-                if there.total - before > height / 4:
-                    break
-            gain = before - there.total
+            worst = -promised if promised < rough else 0.0
+            theta, values, there = self._try()
+            if self.powers and not self.here.total - there.total > max(worst, promised / 2):
+                theta, values, there = min((theta, values, there), self._settled(theta, values), key=lambda t: t[2].total)
+            gain = self.here.total - there.total
             if np.isfinite(there.total) and gain > worst:
                 self.theta, self.values, self.here = theta, values, there
                 gained += gain
@@ -367,7 +409,8 @@ def fit(model, variables: Sequence[Variable], start: Values | None = None, frame
             tries += 1
             if promise < best[0]:
                 best = (promise, descent.theta, descent.values)
-            if tries > 4 or (tries > 1 and best[0] < len(variables) / 2):
+            stuck = len(history) > 1 and history[-2] - promise / 4 < history[-1]
+            if (tries > 4 and stuck) or (tries > 1 and best[0] < len(variables) / 2):
                 break
         gained = descent.chord(3 if near else 8, accuracy / 10, 20 * len(variables) if near else 0.0, 0.3)
         if gained < accuracy and not near:

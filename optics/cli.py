@@ -80,7 +80,7 @@ Plugins = Annotated[Path | None, typer.Option("--plugins", metavar="DIR", help="
 Variant = Annotated[str | None, typer.Option("--variant", help="Mitsuba variant.", show_default=False)]
 Force = Annotated[bool, typer.Option("--force", help="Replace existing files.")]
 FlatField = Annotated[str | None, typer.Option(
-    "--flat-field", metavar="MODE", help="How a background image enters: multiplicative or additive.")]
+    "--flat-field", metavar="MODE", help="How a background image enters: multiplicative, additive or none.")]
 
 
 def command(function: Callable) -> Callable:
@@ -209,8 +209,8 @@ def setup_of(captures: str, defines: Sequence[str] | None, plugins: Path | None,
     """What a study starts from (optics.loop.Setup); places are absolute, so that any folder can go on with it."""
     from optics import loop
 
-    return loop.Setup(captures=os.path.abspath(captures), defines=pairs(defines, "-D"), values=settings(values),
-                      plugins=os.path.abspath(plugins) if plugins else None, **more)
+    return loop.setup_for(os.path.abspath(captures), defines=pairs(defines, "-D"), values=settings(values),
+                          plugins=os.path.abspath(plugins) if plugins else None, **more)
 
 
 def scan(plugins: Path | None):
@@ -474,9 +474,23 @@ def calibrate(captures: CaptureSet,
                                        progress=progress)
     for text in study.record["warnings"]:
         terminal.note(f"warning: {_one_line(text)}")
-    show({"study": str(study.folder), **study.steps[0]}) if as_json else print(f"{fit.table()}\n\n{study.table()}\n{study.folder}")
+    show({"study": str(study.folder), **study.steps[0]}) if as_json else print(
+        f"{fit.table()}\n\n{study.table()}\n{null_text(study)}{study.folder}")
     if not fit.converged:
         raise typer.Exit(1)
+
+
+def null_text(study) -> str:
+    """The last step beside models without physics, and the share of the background that the scene explains; '' without either."""
+    from optics.nulls import NullTable
+
+    metrics, text = study.metrics(len(study.steps) - 1), ""
+    if metrics.get("nulls"):
+        text += f"\n{NullTable.from_json(metrics['nulls']).text()}\n"
+    if metrics.get("background"):
+        shares = " / ".join(f"{max(c['share'], 0):.0%}" for c in metrics["background"]["channels"])
+        text += f"\nof the background's structure the scene explains {shares} by itself; the flat field is {metrics['background']['mode']}\n"
+    return text
 
 
 @app.command("import", help="Read a measured data set of ball presses into a capture folder, with a scene to start from.")
@@ -490,12 +504,13 @@ def import_(source: Annotated[Path, typer.Argument(metavar="SOURCE", help="An .n
                                                            "contact; without it the median of the presses.")] = None,
             leds: Annotated[int, typer.Option("--leds", help="LEDs of the scene to start from: 3 or 6.")] = 3,
             bin: Annotated[int, typer.Option("--bin", min=1, help="Average this many pixels each way.")] = 1,
+            every: Annotated[int, typer.Option("--every", min=1, help="Take every n-th press.")] = 1,
             force: Force = False, quiet: Quiet = False, debug: Debug = False) -> None:
     """Read presses, check labels and scale against each other, write captures.toml, a scene and what contradicts itself."""
     from optics import importing
 
     terminal.quiet, terminal.debug = quiet, debug
-    options = {"leds": leds, "bin": bin, "overwrite": force}
+    options = {"leds": leds, "bin": bin, "every": every, "overwrite": force}
     if ball_radius is not None:
         options["ball_radius"] = ball_radius
     if mm_per_pixel is not None:
@@ -548,7 +563,7 @@ def add(study: StudyFolder, effect: Annotated[str, typer.Argument(metavar="EFFEC
     fit = loop.restore(found, model)
     with terminal.progress() as progress:
         fit, _ = loop.extend(found, model, setup, fit, chosen, progress=progress)
-    show(found.steps[-1]) if as_json else print(f"{fit.table()}\n\n{found.table()}")
+    show(found.steps[-1]) if as_json else print(f"{fit.table()}\n\n{found.table()}{null_text(found)}")
 
 
 @command
@@ -572,8 +587,10 @@ def demo(output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", h
     with terminal.progress() as progress:
         found = story.run(output, seed, effect, progress, lambda text: print(text + "\n", flush=True))
     hidden = found["hidden"]
-    print(f"hidden: {hidden['effect']}, strength {hidden['strength']:g}; named: {', '.join(found['claimed']) or 'nothing'}; last verdict: "
-          f"{found['verdict']}")
+    strengths = [f"{name} = {value:.4g} +- {sd:.2g}" for name, (value, sd) in found["strengths"].items()]
+    print(f"hidden: {hidden['effect']}, strength {hidden['strength']:g}; named: {', '.join(found['claimed']) or 'nothing'}"
+          f"{' (' + ', '.join(strengths[:3]) + (' ...' if len(strengths) > 3 else '') + ')' if strengths else ''}; "
+          f"last verdict: {found['verdict']}")
     print(f"held-out chi2 per degree of freedom: {found['first']:.3f} before, {found['held_out']:.3f} after; "
           f"{time.monotonic() - clock:.0f} s; {found['report']}")
     if not found["right"]:

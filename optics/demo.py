@@ -15,6 +15,7 @@ import numpy as np
 
 from optics import captures as capture_files, loop, scene as scenes, synthetic
 from optics.effect import registry
+from optics.errors import OutputExists
 
 # Hidden strengths, in the units of the effects' own parameters: a few percent of the picture, as real sensors have it.
 # Not here: colour crosstalk, which white LEDs cannot show, and interreflection, 0.2 % of the light under a dent this shallow.
@@ -79,6 +80,9 @@ def run(folder: str | Path, seed: int = 0, effect: str | None = None, progress: 
         name, strength = make(folder / "captures", seed, effect, progress)
         note.write_text(json.dumps({"effect": name, "strength": strength, "seed": seed}))
     hidden = json.loads(note.read_text())
+    if hidden["seed"] != seed or effect and registry().find_effect(effect).name != hidden["effect"]:
+        raise OutputExists(f"{folder} holds the demonstration of seed {hidden['seed']} with a secret of its own; choose another "
+                           "folder for this one (-o)")
     say(f"{PRESSES} presses under 6 LEDs, one at a time and in the dark, made by stock Mitsuba with an effect that the base model lacks.")
     # The stage is trusted (S1.2): solving for every press as well takes three times as long and tells the same story.
     setup = loop.Setup(captures=str(folder / "captures"), per_group=[], seed=seed)
@@ -98,6 +102,8 @@ def run(folder: str | Path, seed: int = 0, effect: str | None = None, progress: 
         say(study.table())
     page = report(study.folder, folder / "report.html", overwrite=True)
     last = study.steps[-1]["held_out"]
-    return {"hidden": hidden, "claimed": claimed, "verdict": diagnosis.word, "held_out": last["chi2_per_dof"],
+    keys = {key for name in claimed for key in sum(model.scene.keys_of(registry().find_effect(name)).values(), [])}
+    strengths = {v["name"]: (v["value"], v["sd"]) for v in study.steps[-1]["variables"] if keys & set(v["keys"])}
+    return {"hidden": hidden, "claimed": claimed, "strengths": strengths, "verdict": diagnosis.word, "held_out": last["chi2_per_dof"],
             "first": study.steps[0]["held_out"]["chi2_per_dof"], "report": str(page),
             "right": claimed[:1] == [hidden["effect"]] and last["chi2_per_dof"] <= 1.1}

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from optics import statistics as st
+from optics.calibrate import for_frames
 from optics.compare import led_label
 from optics.effect import Effect
 from optics.errors import Underdetermined
@@ -587,27 +588,6 @@ def _parts(model, evidence: Evidence, places: list[dict]) -> dict[str, tuple[lis
 # -- held-out frames, shifts ------------------------------------------------------------------------------------------
 
 
-def _pose_variables(model, fit, held_out: Sequence[int]) -> list[Variable]:
-    """Per-frame variables of the base for the held-out frames: one per group where the base has one per group."""
-    def group(f: int) -> str:
-        frame = model.frames[f]
-        return getattr(frame, "group", None) or getattr(frame, "name", str(f))
-
-    variables = []
-    for keys in dict.fromkeys(v.keys for v in fit.variables if v.frames is not None):
-        alike = [v for v in fit.variables if v.keys == keys and v.frames is not None]
-        priors = {v.prior for v in alike}
-        prior = alike[0].prior if len(priors) == 1 else None  # a prior of one press says nothing about another
-        groups = [group(v.frames[0]) for v in alike]
-        single = len(set(groups)) < len(groups)  # several values within one group: each frame has its own
-        shared: dict[str, list[int]] = {}
-        for f in held_out:
-            shared.setdefault(getattr(model.frames[f], "name", str(f)) if single else group(f), []).append(f)
-        variables += [Variable(f"{keys[0]}[{name}]", keys, alike[0].parameter, tuple(frames), prior)
-                      for name, frames in shared.items()]
-    return variables
-
-
 def _held_out(model, fit, evidence: Evidence, winner: Candidate | None, fits: Mapping, refit: Callable,
               held_out: Sequence[int], variables_of, say: Progress) -> list[Level]:
     """Base and winner on frames that were not fitted: globals frozen, only what is per frame solved for, alike for both."""
@@ -623,7 +603,7 @@ def _held_out(model, fit, evidence: Evidence, winner: Candidate | None, fits: Ma
         levels = [level("base", evidence.normal.square, math.nan, 0)]
         return levels + ([level(winner.effect.name, after, math.nan, 0)] if winner else [])
     say("held-out frames", 0, 2)
-    pose = _pose_variables(model, fit, held_out)
+    pose = for_frames(model, fit.variables, held_out)
     values = fit.values.copy()
     if pose:
         values = refit(model, pose, values, frames=list(held_out)).values

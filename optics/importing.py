@@ -14,7 +14,9 @@ Derived, not measured, and said so in these files:
     background per-pixel median of all presses, or a given picture
     noise      variance against signal of half the squared differences of successive frames beyond three circle radii
     lights     per channel the direction l of the least-squares fit I - B = l.(n - n0) on the labelled balls, at 16 mm
-A circle drawn by eye is a start: calibrate press_x, press_y and press_depth for every press.
+A circle drawn by eye is a start: what to solve for from there stands in import.json under `setup`, and `optics calibrate`
+follows it: the lights, the skirt, and every press's position and depth, with priors about the imported values; the ball's
+radius too, where circles are drawn larger than the ball.
 """
 
 from __future__ import annotations
@@ -41,6 +43,10 @@ from optics.noise import SATURATED, Noise, photon_transfer
 COLUMNS = ("file", "center_x_px", "center_y_px", "contact_radius_px")
 FAR = 3.0  # circle radii beyond which a press leaves the picture alone, but for a skirt of a few per mille
 LED_DISTANCE = 16.0  # mm from the middle of the face, where no better is known
+POSE = ("gel.press_x", "gel.press_y", "gel.press_depth")
+LIGHTS = ("led_*.[xyz]", "led_*.pan", "led_*.tilt", "led_*.mu")
+PRIORS = {"led_*.[xy]": 8.0, "led_*.z": 3.0, "led_*.pan": 20.0, "led_*.tilt": 20.0, "led_*.mu": 4.0, "gel.skirt": 0.15,
+          "gel.indenter_size": 0.15, "gel.press_[xy]": 0.4, "gel.press_depth": 0.5}  # sd about the imported value, in the parameter's unit
 EXTRAS = ("scene.xml", "import.json", "README.txt")
 BACKGROUNDS = ("median", "given")
 
@@ -187,7 +193,7 @@ def _picture(file: Path, where: str, shape: tuple | None) -> np.ndarray:
 def import_presses(presses: Presses, folder: str | Path, *, ball_radius: float, mm_per_pixel: float,
                    mm_per_pixel_check: float | None = None, camera_distance: float = 30.0, gel_thickness: float = 4.0,
                    skirt: float = 0.8, contact_share: float = 0.85, background: str = "median", leds: int = 3, bin: int = 1,
-                   saturation: float = 255.0, overwrite: bool = False,
+                   every: int = 1, saturation: float = 255.0, overwrite: bool = False,
                    progress: Callable[[str, int, int], None] | None = None) -> Imported:
     """Write presses as a capture set with its scene; see the module's text for what is derived.
 
@@ -198,6 +204,7 @@ def import_presses(presses: Presses, folder: str | Path, *, ball_radius: float, 
     background          'median' of the presses or 'given' (the picture of the untouched sensor)
     leds                3: one per channel; 6: shared by the channels, each with a power per channel
     bin                 pixels per side that are averaged into one; a block with a saturated pixel stays saturated
+    every               take every n-th press; background and noise come from all of them
     Raises BadCapture, OutputExists.
     """
     for name, value in {"ball_radius": ball_radius, "mm_per_pixel": mm_per_pixel, "camera_distance": camera_distance,
@@ -209,6 +216,8 @@ def import_presses(presses: Presses, folder: str | Path, *, ball_radius: float, 
     if background == "given" and presses.given is None:
         raise BadCapture(f"{presses.source}: background = 'given', but there is no picture of the untouched sensor; take "
                          "'median'")
+    if not 1 <= every <= len(presses.images):
+        raise BadCapture(f"{presses.source}: every = {every}; allowed: 1 to {len(presses.images)}, the number of presses")
     if leds not in (3, 6):
         raise BadCapture(f"{presses.source}: leds = {leds}; allowed: 3 (one per channel) or 6 (shared)")
     _check(presses, bin)
@@ -233,24 +242,30 @@ def import_presses(presses: Presses, folder: str | Path, *, ball_radius: float, 
     fov = math.degrees(2 * math.atan(width * scale / 2 / camera_distance))
     middle = np.array([width / 2, height / 2])
     frames, touched = [], np.minimum(contact_share * circles[:, 2] * scale, 0.93 * ball_radius)
-    for name, image, circle, gain, a in zip(presses.names, images, circles, gains, touched):
+    taken = slice(None, None, every)
+    for name, image, circle, gain, a in zip(*(v[taken] for v in (presses.names, images, circles, gains, touched))):
         x, y = (circle[:2] - middle) * scale
         settings = {"gel.press_x": x, "gel.press_y": y, "gel.press_depth": depth_of(a, ball_radius, skirt),
                     **{f"camera.gain_{c}": g for c, g in zip("rgb", gain)}}
         settings = {key: round(float(value), 6) for key, value in settings.items()}
         frames.append(Frame(name, image.astype(np.float32), None, name, settings))
+    free = ["led_*.power_?" if leds > 3 else "led_*.power", *LIGHTS, "gel.skirt"]
+    if np.any(circles[taken, 2] * scale > ball_radius):  # ball, scale or labels are wrong: the pictures decide
+        free.append("gel.indenter_size")
     directions = light_directions(images, flat * gains[:, None, None], circles, ball_radius / scale)
     facts = {
-        "source": presses.source, "presses": len(frames), "size_px": [height, width], "bin": bin,
+        "source": presses.source, "presses": len(frames), "every": every, "size_px": [height, width], "bin": bin,
         "ball_radius_mm": ball_radius, "mm_per_pixel": mm_per_pixel, "mm_per_pixel_after_binning": scale,
         "camera_distance_mm": camera_distance, "x_fov_deg": fov, "skirt_mm": skirt, "contact_share": contact_share,
         "background": background, "labelled_radius_mm": _span(circles[:, 2] * scale),
-        "circles_px": circles.round(4).tolist(),
+        "circles_px": circles[taken].round(4).tolist(),
         "frame_gain_sd": gains.std(0).tolist(), "frame_gain": gains.round(5).tolist(),
         "noise": {"system_gain": noise.system_gain, "dark_noise": noise.dark_noise, "levels": levels,
                   "how": "half the squared differences of successive frames beyond three circle radii, after their gains: "
                          "temporal noise, banding and drift together"},
         "light_directions": {c: d for c, d in zip("rgb", directions)},
+        "setup": {"free": free, "per_group": list(POSE), "flat_field": "additive", "priors": {
+            pattern: [None, sd] for pattern, sd in PRIORS.items() if pattern in free or not pattern.startswith("gel.ind")}},
     }
     warnings = contradictions(presses, facts, images, median, given, far, gains, noise, saturation, mm_per_pixel_check)
     facts["warnings"] = warnings
@@ -485,50 +500,3 @@ def circles_of(captures: Captures) -> np.ndarray:
     if not path.is_file():
         raise BadCapture(f"{path}: no such file; labelled circles are known for imported sets only")
     return np.array(json.loads(path.read_text(encoding="utf-8"))["circles_px"], float)
-
-
-# -- Calibrating ----------------------------------------------------------------------------------------------------------
-
-POSE = ("gel.press_x", "gel.press_y", "gel.press_depth")
-LIGHTS = ("led_*.[xyz]", "led_*.pan", "led_*.tilt", "led_*.mu")
-EFFECTS = ("membrane.ground_?", "gel.height_loss")
-SHAPE = ("gel.indenter_size", "gel.skirt")
-PRIORS = {"led_*.[xyz]": 8.0, "led_*.pan": 20.0, "led_*.tilt": 20.0, "led_*.mu": 4.0, "gel.indenter_size": 0.15,
-          "gel.skirt": 0.15, "gel.press_[xy]": 0.4, "gel.press_depth": 0.5}  # sd about the start, in the parameters' units
-
-
-def calibrate_presses(model, frames: Sequence[int], *, start=None, effects: Sequence[str] = EFFECTS,
-                      steps: Sequence[int] = (3, 5, 3, 5), progress: Callable[[str, int, int], None] | None = None):
-    """Fit of an imported set in four rounds: powers; powers and lights; every press's pose; all, and the ball's shape.
-
-    The rounds save time, as only the last two move the gel. Starts and priors are the imported scene's values.
-    frames  indices to fit;   effects  patterns of further parameters;   steps  most Levenberg-Marquardt steps per round
-    """
-    powers = ("led_*.power_?",) if len(model.scene.leds) > 3 else ("led_*.power",)
-    fit, values = None, start
-    rounds = ((*powers, *effects), (*powers, *effects, *LIGHTS), (), (*powers, *effects, *LIGHTS, *SHAPE))
-    for stage, (free, most) in enumerate(zip(rounds, steps)):
-        if most == 0:
-            continue
-        if stage == 2:
-            values = refine_poses(model, values, frames, steps=most, progress=progress)
-            continue
-        fit = _fit(model, free, POSE if stage == 3 else (), values, frames, most, progress)
-        values = fit.values
-    return fit
-
-
-def refine_poses(model, values, frames: Sequence[int], *, steps: int = 8, progress=None):
-    """Values in which every frame's pose is fitted by itself, all else held: for presses that were held out."""
-    values = values.copy()
-    for index in frames:
-        values.frame[index] = dict(_fit(model, (), POSE, values, [index], steps, progress).values.frame[index])
-    return values
-
-
-def _fit(model, free, pose, values, frames, most, progress):
-    from optics import calibrate
-
-    priors = {pattern: (None, sd) for pattern, sd in PRIORS.items() if pattern in free or (pose and "press" in pattern)}
-    variables = calibrate.variables_from(model, free, pose, priors, frames)
-    return calibrate.fit(model, variables, values, frames, max_iterations=most, tolerance=2.0, progress=progress)

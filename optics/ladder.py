@@ -179,7 +179,7 @@ class Study:
 
     def add_step(self, name: str, effect: str | None, fit, comparison: Comparison, diagnosis=None,
                  frames: Sequence[Shown] = (), fingerprints: Sequence[Fingerprint] = (), *, nulls: Mapping | None = None,
-                 seconds: float | None = None, warnings: Sequence[str] = ()) -> Path:
+                 background: Mapping | None = None, seconds: float | None = None, warnings: Sequence[str] = ()) -> Path:
         """Append a step and return its folder.
 
         name         as in a sentence: "base", "lens vignetting"; the folder becomes NN-lens-vignetting
@@ -189,7 +189,8 @@ class Study:
         diagnosis    optics.diagnose.Diagnosis, or its dictionary
         frames       all frames or some; at most 8 are kept: the worst of the first step, the same ones in every later
                      step, and at least one held-out frame where there is one
-        nulls        name -> {"l1": .., "ssim": .., "psnr": .., "chi2_per_dof": ..} of models without physics
+        nulls        optics.nulls.NullTable.json(): errors of models without physics
+        background   mode of the flat field, and per channel how much of the background the scene explains
 
         Raises OutputExists when the effect has a step already.
         """
@@ -217,7 +218,8 @@ class Study:
         with self._new_folder(folder) as new:
             (new / "images").mkdir()
             (new / "fit.toml").write_text(fit_toml(record, name), encoding="utf-8")
-            (new / "metrics.json").write_text(_dumps({**comparison.to_dict(), "nulls": nulls or {}}), encoding="utf-8")
+            (new / "metrics.json").write_text(_dumps({
+                **comparison.to_dict(), "nulls": nulls or {}, "background": background or {}}), encoding="utf-8")
             if diagnosis is not None:
                 (new / "diagnosis.json").write_text(_dumps(diagnosis), encoding="utf-8")
             for item, f in zip(entry["frames"], kept):

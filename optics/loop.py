@@ -10,6 +10,7 @@ Every step is a folder of the study (optics.ladder), and each can be taken up ag
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
@@ -55,6 +56,21 @@ class Setup:
     values: dict[str, float] = field(default_factory=dict)
     flat_field: str | None = None
     seed: int = 0
+
+
+def setup_for(captures: str | Path, **given) -> Setup:
+    """A setup of what is given (None and empty: not given); an imported set says the rest by itself, in import.json.
+
+    Where `free` or `per_group` are given, the advised priors, which belong to other parameters, are left out.
+    """
+    note = Path(captures) / "import.json"
+    advised = json.loads(note.read_text(encoding="utf-8")).get("setup", {}) if note.is_file() else {}
+    own = {name: value for name, value in given.items() if value or (value == [] and name in ("per_group", "held_out"))}
+    if {"free", "per_group"} & set(own):
+        advised = {name: value for name, value in advised.items() if name == "flat_field"}
+    setup = Setup(captures=str(captures), **{**advised, **own})
+    setup.priors = {pattern: tuple(prior) for pattern, prior in setup.priors.items()}
+    return setup
 
 
 def open_model(setup: Setup, model_class: type = Model) -> Model:
@@ -147,12 +163,22 @@ def effect_variables(model: Model, effect: Effect) -> list[Variable]:
 
 def fit_base(model: Model, variables: Sequence[Variable], fitted: Sequence[int], start: Values,
              progress: Progress | None = None, tolerance: float = 0.05) -> calibrate.Fit:
-    """Calibrate in two stages: what holds in all frames first, then the poses with it."""
+    """Calibrate in three stages: what holds in all frames, then the poses, a press at a time, then everything together."""
+    variables = list(variables)
     common = [v for v in variables if v.frames is None]
-    if len(common) < len(variables) and common:
-        first = calibrate.fit(model, common, start, fitted, max_iterations=8, tolerance=20.0, progress=progress)
-        start = first.values
-    return calibrate.fit(model, list(variables), start, fitted, tolerance=tolerance, progress=progress)
+    if len(common) < len(variables):
+        values = calibrate.fit(model, common, start, fitted, max_iterations=12, tolerance=20.0, progress=progress).values if \
+            common else start
+        start = values.copy()
+        groups: dict[tuple[int, ...], list[Variable]] = {}
+        for v in variables:
+            if v.frames is not None:
+                groups.setdefault(v.frames, []).append(v)
+        for frames, own in groups.items():
+            found = calibrate.fit(model, own, values, frames, max_iterations=6, tolerance=2.0, progress=progress)
+            for index in frames:
+                start.frame.setdefault(index, {}).update(found.values.frame[index])
+    return calibrate.fit(model, variables, start, fitted, tolerance=tolerance, progress=progress)
 
 
 def off_neutral(model: Model, values: Values, variables: Sequence[Variable]) -> Values:
@@ -163,17 +189,10 @@ def off_neutral(model: Model, values: Values, variables: Sequence[Variable]) -> 
     return moved
 
 
-def held_out_values(model: Model, found: calibrate.Fit, setup: Setup, held: Sequence[int], effects: Sequence[Effect] = ()
-                    ) -> tuple[Values, int]:
+def held_out_values(model: Model, found: calibrate.Fit, held: Sequence[int]) -> tuple[Values, int]:
     """Values for all frames: on held-out ones only what is solved for per frame is fitted. And how many those are."""
-    if not held:
-        return found.values, 0
-    pose = [v for v in variables_of_base(model, setup, held) if v.frames is not None]
-    pose += [v for e in effects if e.scope == "frame" for v in effect_variables(model, e)
-             if v.frames is not None and set(v.frames) <= set(held)]
-    if not pose:
-        return found.values, 0
-    return calibrate.fit(model, pose, found.values, held).values, len(pose)
+    own = calibrate.for_frames(model, found.variables, held)
+    return (calibrate.fit(model, own, found.values, held).values if own else found.values), len(own)
 
 
 def comparison_of(model: Model, values: Values, held: Sequence[int], parameters: int, held_parameters: int) -> Comparison:
@@ -228,14 +247,28 @@ def _warnings(model: Model) -> list[str]:
 def record(study: Study, model: Model, setup: Setup, name: str, effect: Effect | None, found: calibrate.Fit,
            held: Sequence[int], seconds: float) -> Comparison:
     """Write a calibrated model down as the next step of the study."""
-    added = effects_of(study) + ([effect] if effect else [])
-    values, extra = held_out_values(model, found, setup, held, added)
+    values, extra = held_out_values(model, found, held)
     comparison = comparison_of(model, values, held, len(found.variables), extra)
     everywhere = Values(dict(found.values.common), {**values.frame, **found.values.frame})
     kept = calibrate.Fit(**{**found.__dict__, "values": everywhere})
     study.add_step(name, effect.key if effect else None, kept, comparison,
-                   frames=ladder.shown_frames(model, everywhere, held), seconds=seconds)
+                   frames=ladder.shown_frames(model, everywhere, held), seconds=seconds,
+                   nulls=null_models(model, values, found.frames, held), background=background_of(model, values))
     return comparison
+
+
+def null_models(model: Model, values: Values, fitted: Sequence[int], held: Sequence[int]) -> dict | None:
+    """How an imported set's model stands beside models without physics (optics.nulls); None where there is nothing to compare."""
+    from optics import importing, nulls
+
+    if model.flat is None or not held or not (model.captures.folder / "import.json").is_file():
+        return None
+    return nulls.compare(model, values, fitted, held, importing.circles_of(model.captures)).json()
+
+
+def background_of(model: Model, values: Values) -> dict | None:
+    """The flat field's mode, and how much of the background the scene explains without it, per channel."""
+    return None if model.flat is None else {"mode": model.flat_field, "channels": model.background_share(values)}
 
 
 def take_up(folder: str | Path) -> tuple[Study, Model, Setup]:

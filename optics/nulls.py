@@ -78,6 +78,10 @@ class NullTable:
         lines.append(f"the physical model beats every null on held-out frames in {won} (rms near the contact)")
         return "\n".join(lines)
 
+    @classmethod
+    def from_json(cls, data: dict) -> "NullTable":
+        return cls([Score(**score) for score in data["scores"]], data["noise"], data["fitted"], data["held_out"])
+
     def json(self) -> dict:
         return {"scores": [asdict(s) for s in self.scores], "noise": self.noise, "fitted": self.fitted,
                 "held_out": self.held_out, "wins": self.wins()}

@@ -25,6 +25,8 @@ class Parameter:
     doc         what it means, in one sentence, with its symbol in the source
     neutral     value at which its effect vanishes; None where it has none (a position has no neutral value)
     plausible   the size of a change that a real sensor shows; sets steps and scales, > 0
+    step        half width of a central difference, in plausible sizes: narrow where the image bends, wide where an edge that
+                moves changes a rim's pixel by jumps of one sample
     how         how its derivative image is made: 'ad' (forward mode through the render), 'difference' (central, common
                 random numbers: it moves shadows or geometry), 'image' (arithmetic on the linear images)
     squared     True where the image depends on the square of it (a roughness): a fit steps in the square, whose onset is
@@ -42,6 +44,7 @@ class Parameter:
     neutral: float | None = None
     plausible: float = 1.0
     how: str = "ad"
+    step: float = 0.1
     linear: bool = False
     squared: bool = False
     saturates: float = math.inf

@@ -11,10 +11,11 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
-from optics.captures import Captures, Frame
+from optics.captures import Captures, cfa_channel
 from optics.develop import STEP, Developer
 from optics.effect import DEFAULT_VARIANT, registry
 from optics.errors import BadScene, UnknownKey
@@ -24,7 +25,7 @@ from optics.scene import Scene
 
 RIM_SAMPLES = 64  # per pixel at rims; a power of two
 POWERS = ("power", "power_r", "power_g", "power_b")  # images are kept per unit of each
-FLAT_FIELDS = ("multiplicative", "additive")
+FLAT_FIELDS = ("multiplicative", "additive", "none")
 BOUNCE_SAMPLES = 32  # directions per cell for the second bounce
 BOUNCE_CELL = 2  # px each way of a cell
 
@@ -162,10 +163,15 @@ class Renderer:
         return hits.rims[key]
 
     def _discs(self, part) -> list:
-        """Sample positions on the emitting disc, as points of the unit square; [None] for a point source."""
+        """Sample positions on the emitting disc, as points of the unit square; [None] for a point source.
+
+        Four points stand for the inner quarter of the disc's area and twelve for the ring around it, each on the circle
+        that has its part's mean square radius, 1/8 and 5/8: the width of a penumbra is that of the whole disc.
+        """
         if part.number("area") == 0:
             return [None]
-        return [((i + 0.5) / 4, (j + 0.5) / 4) for i in range(4) for j in range(4)]
+        at = [0.5 + sign * (mean_square**0.5) / 2 for sign, mean_square in ((-1, 5 / 8), (-1, 1 / 8), (1, 1 / 8), (1, 5 / 8))]
+        return [(a, b) for a in at for b in at]
 
     def _visible(self, si, part):
         """Share of the LED that each hit sees; a Float (a mask for a point source)."""
@@ -243,7 +249,7 @@ class Renderer:
                 setattr(part, parameter, value)
 
         def moved_rim():
-            step = 0.1 * part.numbers[parameter].plausible
+            step = part.numbers[parameter].step * part.numbers[parameter].plausible
             sides = []
             for sign in (1, -1):
                 setattr(part, parameter, dr.opaque(mi.Float, float(value[0]) + sign * step))
@@ -335,6 +341,7 @@ class LedImage:
 class Model:
     """A scene held against a capture set: predictions, derivative images, masks and coordinates, frame by frame.
 
+    frames       of the captures; a raw mosaic stands in all three channels, and `usable` takes each pixel in its own
     base         scene values overlaid with what holds in every frame, by key
     parameters   key -> Parameter
     shape        (H, W, C)
@@ -348,7 +355,12 @@ class Model:
         if noise is None:
             raise BadScene(f"{captures.folder}: no noise model; give [noise] in captures.toml or repeats to estimate it from")
         self.scene, self.captures, self.noise = scene, captures, noise
-        self.frames: list[Frame] = captures.frames
+        self.mosaic, self.frames = None, captures.frames
+        background = captures.flat_field
+        if captures.cfa is not None:
+            self.mosaic = cfa_channel(captures.frames[0].image.shape, captures.cfa)[..., None] == np.arange(3)
+            self.frames = [replace(f, image=np.repeat(f.image, 3, axis=2)) for f in captures.frames]
+            background = None if background is None else np.repeat(background, 3, axis=2)
         self.renderer = Renderer(scene)
         self.parameters: dict[str, Parameter] = scene.parameters
         self.base = {**scene.values(), **scene.check(captures.parameters, f"{captures.folder}/captures.toml [parameters]")}
@@ -371,12 +383,10 @@ class Model:
                            f"{self.developer.matrix.shape[0]}")
         if flat_field not in (True, False, None, *FLAT_FIELDS):
             raise UnknownKey(str(flat_field), FLAT_FIELDS, "flat-field mode")
-        self.flat_field = {True: FLAT_FIELDS[0], False: None}.get(flat_field, flat_field)
-        self.flat = self._flat_field() if self.flat_field and captures.flat_field is not None else None
-
-    def _flat_field(self):
-        """The measured background above black, a declared nuisance; see `predict`."""
-        return np.maximum(np.asarray(self.captures.flat_field, float) - self.noise.black_level, 1e-3)
+        self.flat_field = {True: FLAT_FIELDS[0], False: None, "none": None}.get(flat_field, flat_field)
+        self.flat = None  # the measured background above black, a declared nuisance; see `predict`
+        if self.flat_field and background is not None:
+            self.flat = np.maximum(np.asarray(background, float) - self.noise.black_level, 1e-3)
 
     # -- values -------------------------------------------------------------------------------------------------------
 
@@ -408,6 +418,10 @@ class Model:
             presses.setdefault(key, set()).update(n for n in self.scene.leds if own[f"{n}.power"] != 0)
             keys.append(key)
         return [presses[key] for key in keys]
+
+    def linear_in(self, variable: Variable) -> bool:
+        """Whether predictions are linear in a variable together with all others of which this holds: the LEDs' powers."""
+        return all(self.renderer.kind(k) == "led" and k.rsplit(".", 1)[1] in POWERS for k in variable.keys)
 
     def check_variables(self, variables: Sequence[Variable]) -> None:
         for variable in variables:
@@ -603,13 +617,9 @@ class Model:
         return factor * total
 
     def _sides(self, key: str, now: Mapping) -> tuple[float, float]:
-        """The two values of a central difference, a tenth of the plausible change to either side, within bounds.
-
-        A compromise: wider steps bend (3 % away from rims at twice the step), narrower ones drown at rims, where a moving
-        edge changes a pixel by jumps of 1/64 (a press: 18 % over the whole image at this step, 10 % at twice).
-        """
+        """The two values of a central difference, `Parameter.step` to either side, within bounds."""
         parameter = self.parameters[key]
-        step = 0.1 * parameter.plausible
+        step = parameter.step * parameter.plausible
         return max(now[key] - step, parameter.bounds[0]), min(now[key] + step, parameter.bounds[1])
 
     def _difference(self, now: Mapping, key: str, seed: int) -> np.ndarray:
@@ -629,12 +639,14 @@ class Model:
     # -- what a fit and a diagnosis need of the data --------------------------------------------------------------------
 
     def usable(self, index: int) -> np.ndarray:
-        """(H, W, C) pixels to use: not saturated, not clipped at black, not masked by the user."""
+        """(H, W, C) pixels to use: not saturated, not clipped at black, not masked by the user, of a mosaic's own channel."""
         frame = self.frames[index]
         mask = self.noise.usable(frame.image)
         mask = np.broadcast_to(mask if mask.ndim == 3 else mask[..., None], frame.image.shape).copy()
         if frame.mask is not None:
             mask &= np.asarray(frame.mask, bool)[..., None]
+        if self.mosaic is not None:
+            mask &= self.mosaic
         return mask
 
     def coordinates(self, values: Values, index: int) -> dict[str, np.ndarray]:

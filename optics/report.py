@@ -74,7 +74,8 @@ def render(study: Study) -> str:
         fingerprints=[fingerprint_pictures(study.fingerprints(i)) for i in range(len(study.steps))],
         readings=[] if viewer["frames"] else reading_charts(comparisons),
         curves=residual_curves(comparisons), maps=map_pictures(comparisons, study.steps), facts=facts(study.record["facts"]),
-        numbers=number_tables(comparisons), nulls=study.metrics(len(study.steps) - 1).get("nulls") or {},
+        numbers=number_tables(comparisons), nulls=null_table(study.metrics(len(study.steps) - 1)),
+        background=study.metrics(len(study.steps) - 1).get("background") or {},
         parameters=parameter_tables(study.steps), comparisons=comparisons,
     )
 
@@ -123,6 +124,22 @@ def facts(record: Mapping) -> dict[str, list[tuple[str, str]]]:
     folded = [(k.replace("_", " "), text(k, v)) for table in record.values() if isinstance(table, Mapping)
               for k, v in table.items() if v not in (None, "", [], {})]
     return {"plain": plain, "folded": folded}
+
+
+def null_table(metrics: Mapping) -> dict:
+    """The null models of a step beside its own; empty where there are none."""
+    if not metrics.get("nulls"):
+        return {}
+    from optics import nulls
+
+    table = nulls.NullTable.from_json(metrics["nulls"])
+    channels = "RGB" if len(table.noise) == 3 else [str(c) for c in range(len(table.noise))]
+    tables = [{"title": f"{split}, {len(names)} frames", "rows": [
+        {"name": "this model" if s.model == nulls.PHYSICAL else s.model, "own": s.model == nulls.PHYSICAL,
+         "errors": [*s.rms_near, *s.rms_whole]} for s in table.scores if s.split == split]}
+        for split, names in (("held out", table.held_out), ("fitted", table.fitted))]
+    return {"tables": tables, "noise": table.noise, "channels": list(channels), "near": f"{nulls.NEAR:g}",
+            "won": ", ".join(c for c, w in zip(channels, table.wins()) if w)}
 
 
 def _level(step: Mapping) -> dict:
@@ -632,9 +649,9 @@ def parameter_tables(steps: Sequence[Mapping]) -> dict:
         values = [variables.get(name) for variables in by_step]
         present = [v for v in values if v]
         first, last = present[0], present[-1]
-        moved = math.nan
-        if len(present) > 1 and first.get("sd") and first["sd"] > 0:
-            moved = (last["value"] - first["value"]) / first["sd"]
+        moved, sd = math.nan, _finite(first.get("sd"))
+        if len(present) > 1 and sd > 0:  # not where nothing determined it: infinite
+            moved = (last["value"] - first["value"]) / sd
         row = {"name": name, "unit": last.get("unit", ""), "values": values, "pull": last.get("pull"), "moved": moved,
                "shift": last["value"] - first["value"] if len(present) > 1 else math.nan,
                "added": values[0] is None, "at_bound": bool(last.get("at_bound")), "far": abs(moved) > MOVED_SHOWN}

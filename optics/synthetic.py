@@ -269,10 +269,12 @@ class Maker:
         return n.expose(n.black_level + (n.saturation - n.black_level) * signal, rng)
 
     def captures(self, at: np.ndarray, drives: Sequence[Mapping[str, float]] | None = None, known_to: float = 0.0,
+                 cfa: str | None = None,
                  progress: Callable[[str, int, int], None] | None = None, scene_name: str = "gelsight") -> capture_files.Captures:
         """A capture set: every press under every lighting of `drives` (default: each LED alone).
 
         known_to   mm: standard deviation of the error of the press positions that are written down
+        cfa        pattern of a raw mosaic; None: three values per pixel
         """
         rng = np.random.default_rng([self.seed, 3])
         drives = drives or [{led: 1.0} for led in self.leds]
@@ -289,11 +291,14 @@ class Maker:
                 settings.update({f"{self.gel}.press_x": float(noted[0]), f"{self.gel}.press_y": float(noted[1]),
                                  f"{self.gel}.press_depth": float(max(noted[2], 0.0))})
                 on = "+".join(led for led, p in drive.items() if p) or "dark"
+                image = self.photograph(radiance, rng, len(frames)).astype(np.float32)
+                if cfa is not None:
+                    image = np.take_along_axis(image, capture_files.cfa_channel(image.shape, cfa)[..., None], axis=2)
                 frames.append(capture_files.Frame(
-                    name=f"press{k:02d}-{on}", image=self.photograph(radiance, rng, len(frames)).astype(np.float32), mask=None,
+                    name=f"press{k:02d}-{on}", image=image, mask=None,
                     group=f"press-{k:02d}", parameters=settings, repeats=[], file=f"frames/press{k:02d}-{on}.png"))
             if progress:
                 progress("captures", k + 1, len(at))
         return capture_files.Captures(
-            folder=Path("."), scene=scene_name, frames=frames, parameters={}, noise=self.noise, flat_field=None, cfa=None,
+            folder=Path("."), scene=scene_name, frames=frames, parameters={}, noise=self.noise, flat_field=None, cfa=cfa,
             values_are="DN", table=None, warnings=[])

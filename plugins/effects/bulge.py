@@ -26,5 +26,5 @@ def rise(x, y, gel):
 effect = Effect(
     name="gel bulge", part="gel", stages={"surface": rise},
     parameters=(Parameter("bulge", "1", 0.0, (0.0, 2.0), "share b of the displaced volume that comes back", neutral=0.0,
-                          plausible=0.5, how="difference"),),
+                          plausible=0.5, how="difference", step=0.8),),
     acts=("contact_distance", "slope"), needs="deep presses, seen with their surroundings")

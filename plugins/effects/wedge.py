@@ -24,7 +24,7 @@ def tilt(x, y, gel):
 effect = Effect(
     name="gel wedge", part="gel", stages={"surface": tilt},
     parameters=(Parameter("wedge_x", "deg", 0.0, (-20.0, 20.0), "tilt w_x along x", neutral=0.0, plausible=0.5,
-                          how="difference"),
+                          how="difference", step=0.8),
                 Parameter("wedge_y", "deg", 0.0, (-20.0, 20.0), "tilt w_y along y", neutral=0.0, plausible=0.5,
-                          how="difference")),
+                          how="difference", step=0.8)),
     acts=("row", "column", "led"), needs="frames lit from different sides, one LED each")

@@ -176,7 +176,11 @@ def build():
             """What acts in a scene besides its surfaces and lights: the gel and its effects, LEDs, membranes that shine."""
             self.inside = gel = self.gel(scene)
             self.fading, self.veils = (gel.functions(s) if gel is not None else () for s in ("segment", "volume"))
-            self.lamps = [e for e in scene.emitters() if getattr(e, "kind", "") == "led"] if self.veils else []
+            emitters = scene.emitters()
+            points = [i for i, e in enumerate(emitters) if mi.has_flag(e.flags(), mi.EmitterFlags.DeltaPosition)]
+            self.points, self.others = len(points), len(points) < len(emitters)
+            self.point_lights = dr.gather(mi.EmitterPtr, scene.emitters_dr(), mi.UInt32(points)) if points else None
+            self.lamps = [e for e in emitters if getattr(e, "kind", "") == "led"] if self.veils else []
             self.shining = [m for m in {s.bsdf() for s in scene.shapes()} if getattr(m, "kind", "") == "membrane"
                             and m.functions("ambient")]
 
@@ -225,6 +229,31 @@ def build():
                     dr.max(mi.unpolarized_spectrum(through)) > 0)
             return through
 
+        def sent(self, scene, si, origin, medium, ds, weight, active):
+            """What a light sends from a surface to where a ray began: a Mueller matrix or a spectrum."""
+            start = dr.select(si.is_medium_transition(), si.target_medium(ds.d), medium)
+            way = self.transmittance(scene, si, ds, start, active)
+            wo = si.to_local(ds.d)
+            value, density = si.bsdf().eval_pdf(mi.BSDFContext(), si, wo, active)
+            value = si.to_world_mueller(value, -wo, si.wi)
+            mis = dr.select(ds.delta, 1.0, mis_weight(ds.pdf, density))
+            way = product(way, self.kept(si, origin, ds.p))
+            return dr.select(active, product(product(value, way), weight) * mis, 0.0)
+
+        @dr.syntax
+        def from_points(self, scene, sampler, si, origin, medium, active):
+            """What all point lights send: to draw one of them would be most of the noise of a scene lit by LEDs."""
+            total = mi.Spectrum(0.0)
+            k = mi.UInt32(0)
+            going = mi.Bool(active)
+            while going:
+                light = dr.gather(mi.EmitterPtr, self.point_lights, k, going)
+                ds, weight = light.sample_direction(si, sampler.next_2d(), going)
+                total = total + self.sent(scene, si, origin, medium, ds, weight, going & (ds.pdf != 0))
+                k += 1
+                going = going & (k < self.points)
+            return total
+
         @dr.syntax
         def sample(self, mode, scene, sampler, ray, δL=None, state_in=None, active=True, **_):
             self.look_up(scene)
@@ -254,25 +283,20 @@ def build():
                 emitted = ds.emitter.eval(si, active & (bounce < self.max_depth)) * dr.select(delta, 1.0, mis)
                 light = light + product(throughput, emitted)
 
-                # light that is sampled
+                # light that is sampled: of every point light, and of one of the others
                 last = bounce + 1 >= self.max_depth
                 clear = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null) | (mi.has_flag(
                     bsdf.flags(), mi.BSDFFlags.DeltaTransmission) & ~mi.has_flag(bsdf.flags(), mi.BSDFFlags.DeltaReflection))
                 onward = active & si.is_valid() & (~last | clear)
                 lit = onward & ~last & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
                 throughput = dr.select(lit & reflected, throughput * self.interreflection, throughput)
-                ds, sent = scene.sample_emitter_direction(si, sampler.next_2d(), False, lit)
-                lit &= ds.pdf != 0
                 light = dr.select(lit, light + product(throughput, self.own_light(scene, si, ray.o)), light)
-                start = dr.select(si.is_medium_transition(), si.target_medium(ds.d), medium)
-                way = self.transmittance(scene, si, ds, start, lit)
-                wo = si.to_local(ds.d)
-                value, density = bsdf.eval_pdf(context, si, wo, lit)
-                value = si.to_world_mueller(value, -wo, si.wi)
-                mis = dr.select(ds.delta, 1.0, mis_weight(ds.pdf, density))
-                way = product(way, self.kept(si, ray.o, ds.p))
-                added = product(product(product(throughput, value), way), sent) * mis
-                light = dr.select(lit, light + added, light)
+                if dr.hint(self.points > 0, mode="scalar"):
+                    light = light + product(throughput, self.from_points(scene, sampler, si, ray.o, medium, lit))
+                if dr.hint(self.others, mode="scalar"):
+                    ds, sent = scene.sample_emitter_direction(si, sampler.next_2d(), False, lit)
+                    one = lit & (ds.pdf != 0) & ~mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.DeltaPosition)
+                    light = light + product(throughput, self.sent(scene, si, ray.o, medium, ds, sent, one))
 
                 # onward
                 bs, factor = bsdf.sample(context, si, sampler.next_1d(), sampler.next_2d(), onward)

@@ -379,7 +379,7 @@ def check_model_derivative(bench, kind, name, tolerance):
         found = bench.derivative(key, {**base, key: value})
         step = 0.05 * p.plausible
         reference, used = differences(lambda v: bench.image({**base, key: v}), value, step, p.bounds)
-        own = [min(max(value + s * 0.1 * p.plausible, p.bounds[0]), p.bounds[1]) for s in (-1, 1)]  # the model's own steps
+        own = [min(max(value + s * p.step * p.plausible, p.bounds[0]), p.bounds[1]) for s in (-1, 1)]  # the model's own steps
         keep = calm(bench, key, [value, *used, *own], base) if moves(bench, key) else True
         compare(found, reference, bench.image({**base, key: value}), step, tolerance, keep, f"{key} = {value:g}")
         strongest = max(strongest, np.abs(reference).max() * p.plausible)
@@ -455,7 +455,7 @@ def test_derivatives_with_a_flat_field(bench, mode):
         value = bench.values[key] + 0.5 * p.plausible
         step = 0.05 * p.plausible
         reference, used = differences(lambda x: flattened.image({key: x}), value, step, p.bounds)
-        own = [value + s * 0.1 * p.plausible for s in (-1, 0.5, 1)]
+        own = [value + s * p.step * p.plausible for s in (-1, 0.5, 1)]
         keep = True
         if moves(bench, key):
             keep = calm(bench, key, [value, *used, *own], bench.values)

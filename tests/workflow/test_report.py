@@ -18,6 +18,7 @@ import pytest
 from optics.compare import compare
 from optics.errors import BadCapture, OutputExists
 from optics.ladder import Fingerprint, Shown, Study, read_fit
+from optics.nulls import PHYSICAL, NullTable, Score
 from optics.parameter import Parameter, Values, Variable
 from optics.report import number, report
 
@@ -150,10 +151,17 @@ def demo(folder: Path, height=72, width=96, presses=4, seed=3, steps=3) -> Study
         frames = [Shown(n, m, p, s, u, found.frames[i]["led"], shots[i][0], i in held_out)
                   for i, (n, m, p, s, u) in enumerate(zip(names, measured, predicted, spread, usable))]
         study.add_step(name, effect, fit, found, diagnosis, frames, [fingerprints[i] for i in order],
-                       nulls={"mean of the fitted frames": {"chi2_per_dof": 412.0, "l1": 0.0412, "psnr": 24.1, "ssim": 0.871},
-                              "quadratic table": {"chi2_per_dof": 5.31, "l1": 0.0121, "psnr": 35.2, "ssim": 0.958}},
-                       seconds=12.0)
+                       nulls=null_models(), background={"mode": "additive", "channels": [
+                           {"structure": 12.0, "left": 6.0, "share": 0.75}] * 3}, seconds=12.0)
     return study
+
+
+def null_models() -> dict:
+    """Errors of a physical model that wins two channels, as optics.nulls writes them."""
+    scores = [Score(name, split, "own", [near, near, near + worse], [1.5] * 3, [near] * 3, [1.0] * 3)
+              for split in ("held out", "fitted")
+              for name, near, worse in ((PHYSICAL, 4.25, 9.0), ("background", 28.5, 0.0), ("linear in the normal", 5.5, 0.0))]
+    return NullTable(scores, [1.9] * 3, ["a", "b"], ["c"]).json()
 
 
 def demo_diagnosis(rows, found, index, names) -> dict:
@@ -286,7 +294,7 @@ def test_step_folder_can_be_read_without_this_program(studied):
     assert fit["uncertainty"]["camera.vignetting"] == 0.004
     assert set(fit["frames"]) == {f["frame"] for f in study.comparison(1).frames}
     assert fit["frames_uncertainty"]["press-01 all"] == {"gel.press_x": 0.0021}
-    assert json.loads((step / "metrics.json").read_text())["nulls"]["quadratic table"]["l1"] == 0.0121
+    assert json.loads((step / "metrics.json").read_text())["nulls"]["wins"] == [True, True, False]
     with np.load(step / "images" / "frame-00.npz") as a:
         assert a["measured"].dtype == np.float32 and a["usable"].dtype == bool and a["sd"].shape == a["measured"].shape
 
