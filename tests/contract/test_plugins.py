@@ -330,7 +330,7 @@ def check_forward_mode(bench, kind, name):
     r = bench.renderer
     for value in places(bench, key, p):
         now = {**base, key: value}
-        step = 0.05 * p.plausible
+        step = 0.5 * p.step * p.plausible
         reference, used = differences(lambda v: r.led({**base, key: v}, led).radiance, value, step, p.bounds)
         keep = calm(bench, key, [value, *used], base) if moves(bench, key) else True
         # 5e-4: what the third derivative leaves of a step of 5 % of a plausible change; where the LED moves, some pixels cross
@@ -377,7 +377,7 @@ def check_model_derivative(bench, kind, name, tolerance):
     strongest = 0.0
     for value in places(bench, key, p):
         found = bench.derivative(key, {**base, key: value})
-        step = 0.05 * p.plausible
+        step = 0.5 * p.step * p.plausible
         reference, used = differences(lambda v: bench.image({**base, key: v}), value, step, p.bounds)
         own = [min(max(value + s * p.step * p.plausible, p.bounds[0]), p.bounds[1]) for s in (-1, 1)]  # the model's own steps
         keep = calm(bench, key, [value, *used, *own], base) if moves(bench, key) else True
@@ -433,7 +433,7 @@ def test_derivatives_through_a_bent_response(bench):
     for key in ("led_1.mu", "membrane.sigma", "gel.absorption", "led_3.power"):
         p = bench.scene.parameters[key]
         value = bench.values[key] + 0.5 * p.plausible
-        step = 0.05 * p.plausible
+        step = 0.5 * p.step * p.plausible
         reference, _ = differences(lambda v: bench.image({**camera, key: v}), value, step, p.bounds)
         found = bench.derivative(key, {**camera, key: value})
         compare(found, reference, bench.image({**camera, key: value}), step, 1e-3, what=key)
@@ -453,15 +453,16 @@ def test_derivatives_with_a_flat_field(bench, mode):
                 "gel.press_depth"):
         p = bench.scene.parameters[key]
         value = bench.values[key] + 0.5 * p.plausible
-        step = 0.05 * p.plausible
+        step = 0.5 * p.step * p.plausible
         reference, used = differences(lambda x: flattened.image({key: x}), value, step, p.bounds)
         own = [value + s * p.step * p.plausible for s in (-1, 0.5, 1)]
         keep = True
         if moves(bench, key):
             keep = calm(bench, key, [value, *used, *own], bench.values)
             keep &= calm(bench, key, [value, *used, *own], {**bench.values, "gel.press_depth": 0.0})
+        # what a wedge does to the face at rest and to the dented face nearly cancels: 0.3 % of either is 6 % of the rest
         compare(flattened.derivative(key, {key: value}), reference, flattened.image({key: value}), step,
-                0.03 if moves(bench, key) else 1e-3, keep, key)
+                0.1 if moves(bench, key) else 1e-3, keep, key)
 
 
 def test_moved_rims_carry_about_the_right_light(bench):

@@ -236,16 +236,25 @@ def test_all_leds_and_two_bounces_are_what_the_integrator_renders(mitsuba, tmp_p
     values = {**fine.values(), **powers, "membrane.rho_r": 0.9, "membrane.rho_b": 0.3, "integrator.interreflection": 1.0,
               "gel.absorption": 0.05}
     renderer = Renderer(fine)
-    ours = sum(renderer.powers(values, n) * (renderer.led(values, n).radiance + renderer.bounced(values, n))
-               for n in fine.leds).reshape(30, 4, 40, 4, 3).mean((1, 3))
+
+    def ours(image):
+        total = sum(renderer.powers(values, n) * image(values, n) for n in fine.leds)
+        return total.reshape(30, 4, 40, 4, -1).mean((1, 3))
+
+    direct, second = ours(lambda v, n: renderer.led(v, n).radiance), np.mean(
+        [ours(lambda v, n: renderer.bounced(v, n, seed)) for seed in range(16)], 0)  # noqa: B023
     small = gelsight(tmp_path, SPECTRAL, size=(40, 30), stokes=True)
     small.set(values)
+    once = band_images(small, spp=512, seeds=6)
     small.integrator.max_depth = 3
-    images = band_images(small, spp=512, seeds=6)
-    noise = images.std(0, ddof=1) / np.sqrt(6)
-    # 0.2 %: where in a pixel the samples lie, and the second bounce (0.2 % of the light), which our side draws by chance too
-    assert (np.abs(images.mean(0) - ours) <= 5 * noise + 2e-3 * ours.max()).all()
-    assert images.mean() == pytest.approx(ours.mean(), rel=5e-4)
+    twice = band_images(small, spp=512, seeds=6)
+    noise = once.std(0, ddof=1) / np.sqrt(6)
+    over = np.abs(once.mean(0) - direct) - 5 * noise
+    # 0.1 %: where in a pixel the samples lie, as above
+    assert over.max() <= 1e-3 * direct.max(), f"{over.max() / direct.max():.2g} of the brightest pixel beyond the noise"
+    # the second bounce is 0.2 % of the light; six LEDs share 16 x 32 directions per cell, which leaves 2 % of noise in its sum
+    more = twice.mean(0) - once.mean(0)
+    assert more.mean() == pytest.approx(second.mean(), rel=0.06)
 
 
 EFFECTS = {"gel.absorption": 0.05, "gel.haze": 0.03, "gel.height_loss": 0.2, "membrane.ambient": 2e-3, "membrane.specular": 0.1}

@@ -54,7 +54,8 @@ def test_derivatives_agree_with_differences(models, mode, key):
     variable = Variable(key, (key,), model.parameters[key], (0,))
     prediction, images = next(iter(model.derivatives(values, [variable], [0])))
     assert np.abs(prediction - model.predict(values)[0]).max() < 1e-4
-    step = (0.1 if model.parameters[key].how == "difference" else 0.3) * model.parameters[key].plausible
+    p = model.parameters[key]
+    step = (p.step if p.how == "difference" else 0.3) * p.plausible
     sides = []
     for sign in (1, -1):
         moved = values.copy()
