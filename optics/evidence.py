@@ -196,7 +196,7 @@ def measure(model, values: Values, base: Sequence[Variable], candidates: Sequenc
     total, used = 0, 0
     for frame in frames:
         mask = model.usable(frame)
-        total, used = total + mask.size, used + int(mask.sum())
+        total, used = total + getattr(model, "size", mask.size), used + int(mask.sum())
     k = st.thinning(used, rows_max)
     normal, spectrum = st.Normal(len(columns)), st.Spectrum(len(columns))
     evidence = Evidence(columns, list(range(len(base))), list(range(len(base), len(columns))), values, normal, [],

@@ -224,7 +224,7 @@ def begin(setup: Setup, folder: str | Path, *, title: str = "", command: Sequenc
         inputs=[setup.captures, model.scene.path, *registry().folders], seed=setup.seed, command=command, title=title,
         noise=asdict(model.noise), warnings=_warnings(model), resume=resume,
         facts={"frames": len(model.frames), "fitted": len(fitted), "held_out": len(held),
-               "image": list(model.shape), "masked": 1 - float(np.mean([u.mean() for u in usable])), "setup": asdict(setup)})
+               "image": list(model.shape), "masked": 1 - float(np.mean([u.sum() / model.size for u in usable])), "setup": asdict(setup)})
     if study.steps:
         return study, model, restore(study, model)
     start = Values(dict(setup.values))
@@ -295,7 +295,7 @@ def restore(study: Study, model: Model, index: int = -1) -> calibrate.Fit:
         if step["effect"]:
             variables += [v for v in effect_variables(model, registry().find_effect(step["effect"]))
                           if v.frames is None or set(v.frames) <= set(fitted)]
-    return calibrate.fit(model, variables, values, fitted, max_iterations=6)
+    return calibrate.fit(model, variables, values, fitted, max_iterations=6 if steps[-1]["converged"] else 30)
 
 
 def candidates(model: Model, study: Study) -> list[Effect]:

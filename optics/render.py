@@ -649,6 +649,11 @@ class Model:
             mask &= self.mosaic
         return mask
 
+    @property
+    def size(self) -> int:
+        """Values that a frame holds: pixels x channels, or the pixels of a mosaic."""
+        return int(np.prod(self.shape[:2])) * (1 if self.mosaic is not None else self.shape[2])
+
     def coordinates(self, values: Values, index: int) -> dict[str, np.ndarray]:
         """What is known of every pixel of a frame; see `optics.compare` and `optics.diagnose` for their use."""
         from scipy.ndimage import distance_transform_edt

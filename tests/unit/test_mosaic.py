@@ -29,9 +29,9 @@ def models(mitsuba):
 
 
 def test_every_pixel_counts_once_in_the_channel_of_its_filter(models):
-    _, mosaic, channel = models
+    full, mosaic, channel = models
     use = mosaic.usable(0)
-    assert use.shape == (20, 24, 3) and np.array_equal(use.sum(-1), np.ones((20, 24)))
+    assert use.shape == (20, 24, 3) and mosaic.size == 480 and full.size == 1440 and np.array_equal(use.sum(-1), np.ones((20, 24)))
     assert np.array_equal(use.argmax(-1), channel[..., 0]) and channel[0, 0, 0] == 1 and channel[1, 0, 0] == 0
 
 

@@ -1,5 +1,7 @@
 """Synthetic calibration with known truth: captures by stock Mitsuba, starts displaced by 2 mm and 30 %."""
 
+import time
+
 import numpy as np
 import pytest
 
@@ -21,6 +23,17 @@ def truth_of(sensor, rng) -> dict[str, float]:
     return values
 
 
+def displaced(truth, rng) -> Values:
+    """A start 2 mm and 30 % off."""
+    start = Values()
+    for key, value in truth.items():
+        if key.endswith((".x", ".y", ".z")):
+            start.common[key] = value + 2 / np.sqrt(3) * rng.choice([-1, 1])
+        elif not key.endswith((".pan", ".tilt")) and key not in ("camera.exposure", "led_1.power"):
+            start.common[key] = value * rng.choice([0.7, 1.3])
+    return start
+
+
 @pytest.fixture(scope="module")
 def solved():
     rng = np.random.default_rng(1)
@@ -29,13 +42,7 @@ def solved():
     captures = synthetic.Maker(sensor, truth, seed=5).captures(synthetic.presses(4, 1))
     captures.parameters["camera.exposure"] = 150.0
     model = Model(sensor, captures)
-    start = Values()
-    for key, value in truth.items():
-        if key.endswith((".x", ".y", ".z")):
-            start.common[key] = value + 2 / np.sqrt(3) * rng.choice([-1, 1])  # 2 mm from the truth
-        elif not key.endswith((".pan", ".tilt")) and key not in ("camera.exposure", "led_1.power"):
-            start.common[key] = value * rng.choice([0.7, 1.3])
-    return model, truth, calibrate.fit(model, calibrate.variables_from(model, FREE), start)
+    return model, truth, calibrate.fit(model, calibrate.variables_from(model, FREE), displaced(truth, rng))
 
 
 def test_the_truth_is_found_from_two_millimetres_and_thirty_per_cent_off(solved):
@@ -77,3 +84,39 @@ def test_a_saturated_set_and_an_unknown_pattern_are_refused(solved):
     finally:
         for f, image in zip(model.frames, bright):
             f.image = image
+
+
+@pytest.mark.slow
+def test_pulls_of_twenty_repeats_at_full_size():
+    """4 presses, 6 LEDs, 320 x 240: twenty sets of photons and read noise, starts 2 mm and 30 % off."""
+    rng = np.random.default_rng(2)
+    sensor = scene.load("gelsight", {"width": "320", "height": "240"})
+    truth = {**truth_of(sensor, rng), "camera.exposure": 150.0}
+    maker = synthetic.Maker(sensor, truth, seed=5)
+    light = {tuple(p): maker.light(p) for p in synthetic.presses(4, 1)}
+    maker.light = lambda press: light[tuple(press)]  # traced once; the camera exposes it twenty times
+    errors, pulls, seconds = [], [], []
+    for repeat in range(20):
+        maker.seed = 100 + repeat
+        captures = maker.captures(synthetic.presses(4, 1))
+        captures.parameters["camera.exposure"] = 150.0
+        model = Model(sensor, captures)
+        clock = time.perf_counter()
+        fit = calibrate.fit(model, calibrate.variables_from(model, FREE), displaced(truth, rng))
+        seconds.append(time.perf_counter() - clock)
+        assert fit.converged, fit.reason
+        errors.append(fit.estimate - [truth[v.keys[0]] for v in fit.variables])
+        pulls.append(errors[-1] / fit.sd)
+        print(f"{repeat}: {seconds[-1]:.0f} s, {fit.reason}, rms pull {np.sqrt(np.mean(pulls[-1] ** 2)):.2f}", flush=True)
+    names, pulls, errors = [v.name for v in fit.variables], np.array(pulls), np.abs(errors)
+    relative = errors / [abs(truth[n]) for n in names]
+    print("pulls: mean of all", pulls.mean(), "sd of all", pulls.std(), "worst mean", names[np.argmax(np.abs(pulls.mean(0)))],
+          np.abs(pulls.mean(0)).max(), "median time", np.median(seconds), "s")
+
+    def worst(of, *ends):
+        return max(of[:, i].max() for i, n in enumerate(names) if n.endswith(ends))
+
+    assert worst(errors, ".x", ".y", ".z") < 0.05  # mm
+    assert worst(relative, ".rho_r", ".rho_g", ".rho_b", ".power") < 0.01
+    assert worst(relative, ".mu", ".sigma") < 0.03
+    assert abs(pulls.mean()) < 0.3 and 0.8 < pulls.std() < 1.2
