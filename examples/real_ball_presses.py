@@ -4,7 +4,7 @@
 
 TAXIM is the calibration pack of a GelSight sensor (Si & Yuan, Taxim, RA-L 7, 2361, 2022), DIGIT_FOLDER holds `images/` and
 `labels.csv` of a DIGIT (github.com/vocdex/digit-depth). Pictures are averaged over blocks of 2 x 2 and 4 x 4 px, as a ball's
-shading needs no more; either sensor takes some minutes on two cores. OUTPUT gets the captures, the studies, and a report each.
+shading needs no more; either sensor takes ten minutes on two cores. OUTPUT gets the captures, the studies, and a report each.
 """
 
 import sys
@@ -15,7 +15,7 @@ from optics.effect import registry
 from optics.nulls import NullTable
 from optics.report import report
 
-TAXIM = dict(bin=2, every=2, camera_distance=40.0, skirt=0.88, contact_share=0.79)
+TAXIM = dict(bin=2, every=2, leds=6, camera_distance=40.0, skirt=0.88, contact_share=0.79)
 DIGIT = dict(bin=4, camera_distance=28.0, skirt=0.81, contact_share=0.85, gel_thickness=4.6, leds=6, ball_radius=3.0,
              mm_per_pixel=1 / 17.15)
 ADDED = ("light from the surrounding face", "height fall-off")  # what `optics diagnose` ranks first on both
@@ -28,7 +28,6 @@ def study(captures: Path, folder: Path, held_out: list[str] | None = None, added
     for name in added:
         fit, _ = loop.extend(record, model, setup, fit, registry().find_effect(name))
     print(fit.table(), record.table(), sep="\n\n")
-    report(folder, folder / "report.html")
     return [NullTable.from_json(record.metrics(i)["nulls"]) for i in range(len(record.steps))]
 
 
@@ -36,7 +35,11 @@ def main(taxim: Path, digit: Path, output: Path) -> None:
     for name, found in (("gelsight", importing.import_taxim(taxim, output / "gelsight", **TAXIM)),
                         ("digit", importing.import_circles(digit / "images", digit / "labels.csv", output / "digit", **DIGIT))):
         print(f"\n{name}: contradictions in the data", *found.warnings, sep="\n- ")
-        print(study(found.folder, output / f"{name}-study")[-1].text())
+        folder = output / f"{name}-study"
+        print(study(found.folder, folder)[-1].text())
+        record, model, setup = loop.take_up(folder)
+        print("\nwhat remains above the noise:", loop.examine(record, model, setup, loop.restore(record, model)).text())
+        print(report(folder, folder / "report.html"))
 
 
 if __name__ == "__main__":

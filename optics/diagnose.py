@@ -26,7 +26,7 @@ from optics.verdict import (
 )
 
 START = 0.7  # of the expected change, to begin a refit from: the linear estimate overshoots more often than not
-SETTLED = 0.005  # of the excess of chi2: what a calibrated base may still absorb
+SETTLED = 0.01  # of the excess of chi2: what a calibrated base may still absorb
 KAPPA = 0.1  # noise per pixel of derivative images over their signal, above which strengths are biased
 IMPLAUSIBLE = 10.0  # times the plausible strength: worth a look
 MAX_REFITS = 10
@@ -154,7 +154,7 @@ def _candidates(model, fit, effects, variables_of, fitted) -> tuple[list[Candida
 def _require_convergence(evidence: "Evidence", fit) -> None:
     """Refuse a base that is not calibrated: |Q'r|^2 would be chi2 of a parameter, not of a missing effect.
 
-    Allowed is 1 per parameter or, where the model misses the data by more than noise, half a percent of that excess: derivative
+    Allowed is 1 per parameter or, where the model misses the data by more than noise, a percent of that excess: derivative
     images of moving edges are finite samples, which no calibration can make orthogonal to a residual with structure.
     """
     rank = max(evidence.projected.rank, 1)
