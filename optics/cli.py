@@ -394,6 +394,8 @@ def batch(job: Annotated[Path, typer.Argument(metavar="JOB.toml", help="What to 
 def compare(captures: CaptureSet,
             fit: Annotated[Path | None, typer.Option("--fit", metavar="FIT.toml", help="Calibrated values, from a study.")] = None,
             output: Annotated[Path | None, typer.Option("-o", "--output", metavar="DIR", help="Write numbers and images here.")] = None,
+            hold_out: Annotated[list[str] | None, typer.Option(
+                "--hold-out", metavar="GROUP", help="Groups of frames that the fit has not seen, to be told apart. Repeatable.")] = None,
             define: Defines = None, sets: Settings = None, flat_field: FlatField = None, plugins: Plugins = None,
             as_json: AsJson = False) -> None:
     """Hold a scene against captures: misfit by frame, LED, region and channel."""
@@ -401,12 +403,12 @@ def compare(captures: CaptureSet,
 
     if output is not None:
         _check_new_folder(output)
-    setup = setup_of(captures, define, plugins, sets, flat_field=flat_field)
+    setup = setup_of(captures, define, plugins, sets, flat_field=flat_field, held_out=hold_out or [])
     if fit is not None and not fit.is_file():
         raise FileNotFoundError(f"{fit}: no such file; a study writes one to STUDY/steps/NN-name/fit.toml")
     model = loop.open_model(setup)
     values = values_of(model, fit, setup.values)
-    comparison = loop.comparison_of(model, values, [], 0, 0)
+    comparison = loop.comparison_of(model, values, loop.split(model, setup)[1], 0, 0)
     if output is not None:
         worst = comparison.worst()[:ladder.SHOWN_MAX]
         with _new_folder(output) as folder:
@@ -457,6 +459,7 @@ def calibrate(captures: CaptureSet,
                   "--hold-out", metavar="GROUP", help="Groups of frames to test on and not to fit. Repeatable. Without it: one in "
                   "four. 'none': none.")] = None,
               define: Defines = None, sets: Settings = None, flat_field: FlatField = None, plugins: Plugins = None,
+              robust: Annotated[bool, typer.Option("--robust", help="Let residuals beyond three sigmas count less (Huber).")] = False,
               seed: Annotated[int, typer.Option("--seed", min=0, help="Of everything random.")] = 0,
               title: Annotated[str, typer.Option("--title", help="Of the study's report.")] = "",
               resume: Annotated[bool, typer.Option("--resume", help="Go on with this study.")] = False,
@@ -468,7 +471,7 @@ def calibrate(captures: CaptureSet,
     check_folder(output)
     none = lambda names: [] if names == ["none"] else names  # noqa: E731
     setup = setup_of(captures, define, plugins, sets, free=free or [], per_group=none(per_group), priors=priors(prior),
-                     held_out=none(hold_out), flat_field=flat_field, seed=seed)
+                     held_out=none(hold_out), flat_field=flat_field, robust=robust, seed=seed)
     with terminal.progress() as progress:
         study, model, fit = loop.begin(setup, output, title=title, command=["optics", *sys.argv[1:]], resume=resume,
                                        progress=progress)
@@ -578,7 +581,7 @@ def report(study: StudyFolder,
 
 @command
 def demo(output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Where captures, study and report go.")] = Path("renders/demo"),
-         seed: Annotated[int, typer.Option("--seed", min=0, help="Chooses the sensor and its hidden effect.")] = 2,
+         seed: Annotated[int, typer.Option("--seed", min=0, help="Chooses the sensor and its hidden effect.")] = 1,
          effect: Annotated[str | None, typer.Option("--effect", help="Hide this effect instead.")] = None) -> None:
     """Make a sensor with a secret, by another path than the model, and find what is missing."""
     from optics import demo as story

@@ -65,7 +65,7 @@ def make(folder: Path, seed: int, name: str | None = None, progress: Callable | 
     return effect, strength
 
 
-def run(folder: str | Path, seed: int = 0, effect: str | None = None, progress: Callable | None = None,
+def run(folder: str | Path, seed: int = 1, effect: str | None = None, progress: Callable | None = None,
         say: Callable[[str], None] = lambda text: None) -> dict:
     """Make captures, run the loop, write the report; returns what happened.
 

@@ -44,6 +44,8 @@ class Setup:
     per_group   key patterns with a value per group of frames; None: the press, where groups are given
     priors      pattern -> (mean or None for the present value, standard deviation)
     held_out    names of groups that the calibration does not see; None: one in four, evenly spread
+    values      start values, by key;   flat_field  how a background image enters, see `optics.render.Model`
+    robust      residuals beyond three sigmas count less (Huber), as dirt and glints ask for; a diagnosis weighs all alike
     """
 
     captures: str
@@ -55,6 +57,7 @@ class Setup:
     held_out: list[str] | None = None
     values: dict[str, float] = field(default_factory=dict)
     flat_field: str | None = None
+    robust: bool = False
     seed: int = 0
 
 
@@ -162,23 +165,25 @@ def effect_variables(model: Model, effect: Effect) -> list[Variable]:
 
 
 def fit_base(model: Model, variables: Sequence[Variable], fitted: Sequence[int], start: Values,
-             progress: Progress | None = None, tolerance: float = 0.05) -> calibrate.Fit:
+             progress: Progress | None = None, tolerance: float = 0.05, robust: bool = False) -> calibrate.Fit:
     """Calibrate in three stages: what holds in all frames, then the poses, a press at a time, then everything together."""
     variables = list(variables)
     common = [v for v in variables if v.frames is None]
     if len(common) < len(variables):
-        values = calibrate.fit(model, common, start, fitted, max_iterations=12, tolerance=20.0, progress=progress).values if \
-            common else start
+        values = start
+        if common:
+            values = calibrate.fit(model, common, start, fitted, max_iterations=12, tolerance=20.0, robust=robust,
+                                   progress=progress).values
         start = values.copy()
         groups: dict[tuple[int, ...], list[Variable]] = {}
         for v in variables:
             if v.frames is not None:
                 groups.setdefault(v.frames, []).append(v)
         for frames, own in groups.items():
-            found = calibrate.fit(model, own, values, frames, max_iterations=6, tolerance=2.0, progress=progress)
+            found = calibrate.fit(model, own, values, frames, max_iterations=6, tolerance=2.0, robust=robust, progress=progress)
             for index in frames:
                 start.frame.setdefault(index, {}).update(found.values.frame[index])
-    return calibrate.fit(model, variables, start, fitted, tolerance=tolerance, progress=progress)
+    return calibrate.fit(model, variables, start, fitted, tolerance=tolerance, robust=robust, progress=progress)
 
 
 def off_neutral(model: Model, values: Values, variables: Sequence[Variable]) -> Values:
@@ -230,7 +235,7 @@ def begin(setup: Setup, folder: str | Path, *, title: str = "", command: Sequenc
     start = Values(dict(setup.values))
     clock = time.perf_counter()
     try:
-        found = fit_base(model, variables, fitted, start, progress)
+        found = fit_base(model, variables, fitted, start, progress, robust=setup.robust)
         record(study, model, setup, "base", None, found, held, time.perf_counter() - clock)
     except BaseException:
         study.discard()
@@ -358,6 +363,6 @@ def extend(study: Study, model: Model, setup: Setup, found: calibrate.Fit, effec
     if start is None:
         start = off_neutral(model, found.values, extra)
     clock = time.perf_counter()
-    best = calibrate.fit(model, variables, start, fitted, progress=progress)
+    best = calibrate.fit(model, variables, start, fitted, robust=setup.robust, progress=progress)
     comparison = record(study, model, setup, effect.name, effect, best, held, time.perf_counter() - clock)
     return best, comparison

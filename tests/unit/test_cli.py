@@ -298,6 +298,9 @@ def test_calibrate_writes_a_study_that_compare_can_use(optics, measured, tmp_pat
     assert step["held_out"]["chi2_per_dof"] == pytest.approx(1, abs=0.06)  # 10368 values: sd 0.014
     rows = json.loads(optics("compare", measured, "--json", "--fit", study / "steps" / "00-base" / "fit.toml")[1])["rows"]
     assert rows[0]["chi2"] / rows[0]["dof"] == pytest.approx(1, abs=0.03)
+    apart = json.loads(optics("compare", measured, "--json", "--hold-out", "press-2")[1])["rows"]
+    assert {"fitted", "held out"} <= {r["scope"].get("role") for r in apart}
+    assert "held out" not in {r["scope"].get("role") for r in rows}
 
 
 def test_values_of_a_fit_hold_for_their_frames(measured, tmp_path):

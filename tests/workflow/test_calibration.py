@@ -71,6 +71,20 @@ def test_power_and_reflectance_are_reported_as_one(solved):
     assert any("cannot tell apart" in w and "power" in w and "rho" in w for w in both.warnings), both.warnings
 
 
+def test_robust_weights_shrug_off_glints(solved):
+    """A glint of 60 DN in one pixel of a hundred: Huber's weights leave a tenth of its bias."""
+    model, _, fit = solved
+    free = calibrate.variables_from(model, ["membrane.rho_*"])
+    clean = calibrate.fit(model, free, fit.values, [0])
+    before, rng = model.frames[0].image, np.random.default_rng(4)
+    model.frames[0].image = np.where(rng.random(before.shape) < 0.01, np.minimum(before + 60, 250), before).astype(np.float32)
+    try:
+        plain, robust = (calibrate.fit(model, free, fit.values, [0], robust=r) for r in (False, True))
+    finally:
+        model.frames[0].image = before
+    assert np.abs(robust.estimate - clean.estimate).max() < 0.25 * np.abs(plain.estimate - clean.estimate).min()
+
+
 def test_a_saturated_set_and_an_unknown_pattern_are_refused(solved):
     model, _, _ = solved
     with pytest.raises(UnknownKey, match="led_1.x"):
