@@ -50,6 +50,7 @@ def test_the_physical_model_beats_the_nulls_in_two_channels(mitsuba, tmp_path, s
         found = importing.import_circles(DIGIT / "images", DIGIT / "labels.csv", tmp_path / "set", **example.DIGIT)
         order = [captures.load(found.folder).frames[i].name for i in np.random.default_rng(5).permutation(14)]
         folds = [order[3 * k:3 * k + 3] for k in range(3)]
-    last = [example.study(found.folder, tmp_path / f"study-{k}", example.ADDED[sensor], held_out)[-1] for k, held_out in enumerate(folds)]
+    last = [example.study(found.folder, tmp_path / f"study-{k}", example.ADDED[sensor], held_out)[-1]
+            for k, held_out in enumerate(folds)]
     table = nulls.pooled(last)
     assert sum(table.wins()) >= 2, table.text()
