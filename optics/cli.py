@@ -582,13 +582,17 @@ def report(study: StudyFolder,
 @command
 def demo(output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Where captures, study and report go.")] = Path("renders/demo"),
          seed: Annotated[int, typer.Option("--seed", min=0, help="Chooses the sensor and its hidden effect.")] = 1,
-         effect: Annotated[str | None, typer.Option("--effect", help="Hide this effect instead.")] = None) -> None:
+         effect: Annotated[str | None, typer.Option("--effect", help="Hide this effect instead.")] = None,
+         sensor: Annotated[str, typer.Option("--sensor", help="gelsight (six white LEDs) or digit (red, green, blue).")] = "gelsight") -> None:
     """Make a sensor with a secret, by another path than the model, and find what is missing."""
     from optics import demo as story
+    from optics.errors import UnknownKey
 
     clock = time.monotonic()
     with terminal.progress() as progress:
-        found = story.run(output, seed, effect, progress, lambda text: print(text + "\n", flush=True))
+        if sensor not in story.SENSORS:
+            raise UnknownKey(sensor, story.SENSORS, "sensor")
+        found = story.run(output, seed, effect, sensor, progress, lambda text: print(text + "\n", flush=True))
     hidden = found["hidden"]
     strengths = [f"{name} = {value:.4g} +- {sd:.2g}" for name, (value, sd) in found["strengths"].items()]
     print(f"hidden: {hidden['effect']}, strength {hidden['strength']:g}; named: {', '.join(found['claimed']) or 'nothing'}"

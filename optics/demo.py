@@ -1,6 +1,6 @@
 """The demonstration: a sensor with a secret, and the loop that finds it.
 
-Captures of a GelSight-type sensor are made by another path than the model (`optics.synthetic`: stock Mitsuba, a denser mesh,
+Captures of a shipped sensor are made by another path than the model (`optics.synthetic`: stock Mitsuba, a denser mesh,
 photons, read noise, 8 bits), with one effect that the base model lacks, chosen by the seed. Then the loop runs blind: calibrate,
 compare, name the missing effect, add it, watch the error on held-out presses fall; and a report tells the story.
 """
@@ -15,17 +15,17 @@ import numpy as np
 
 from optics import captures as capture_files, loop, scene as scenes, synthetic
 from optics.effect import registry
-from optics.errors import OutputExists
+from optics.errors import OutputExists, UnknownKey
 
 # Hidden strengths, in the units of the effects' own parameters: a few percent of the picture, as real sensors have it.
-# Not here: colour crosstalk, which white LEDs cannot show, and interreflection, 0.2 % of the light under a dent this shallow.
+# Not here: interreflection, 0.2 % of the light under a dent this shallow. White LEDs cannot show colour crosstalk: it is to be
+# had on request, with the coloured ones of digit.
 SECRETS = {
     "lens vignetting": 0.8, "veiling glare": 0.03, "ambient light": 1e-4, "lens blur": 0.6, "radial distortion": 0.03,
     "gel absorption": 0.02, "gel haze": 0.005, "gel wedge": 0.4, "gel bulge": 0.5, "specular lobe": 0.06, "LED size": 1.5,
     "residual response curve": 0.12, "gain drift": 0.02,
 }
-SIZE = (160, 120)
-EXPOSURE = 200.0  # one LED at a time: its brightest spot comes near full scale
+SENSORS = {"gelsight": ((160, 120), 200.0), "digit": ((120, 160), 700.0)}  # px; exposure: one LED at a time is near full scale
 PRESSES = 4
 STEPS = 3  # effects that the loop may add before it must stop
 
@@ -38,7 +38,7 @@ def truth(scene, seed: int) -> dict[str, float]:
         for axis in "xyz":
             built[f"{led}.{axis}"] = drawn[f"{led}.{axis}"] + 0.5 * rng.uniform(-1, 1)
         built[f"{led}.pan"], built[f"{led}.tilt"] = (4 * rng.uniform(-1, 1) for _ in range(2))
-        built[f"{led}.power"] = 1 + 0.1 * rng.uniform(-1, 1)
+        built[f"{led}.power"] = drawn[f"{led}.power"] * (1 + 0.1 * rng.uniform(-1, 1))
         built[f"{led}.mu"] = drawn[f"{led}.mu"] + 0.25 * rng.uniform(-1, 1)
     built.update({"membrane.rho_r": 0.66, "membrane.rho_g": 0.52, "membrane.rho_b": 0.40, "membrane.sigma": 0.25})
     return built
@@ -48,25 +48,31 @@ def secret(seed: int, name: str | None = None) -> tuple[str, float]:
     """The hidden effect of a seed, or the one of a name."""
     names = sorted(SECRETS)
     name = name or names[int(np.random.default_rng([seed, 2]).integers(len(names)))]
-    return registry().find_effect(name).name, SECRETS[registry().find_effect(name).name]
+    known = {**SECRETS, "colour crosstalk": 0.03}
+    effect = registry().find_effect(name).name
+    if effect not in known:
+        raise UnknownKey(effect, known, "secret", hint="the demonstration knows no independent way to make it")
+    return effect, known[effect]
 
 
-def make(folder: Path, seed: int, name: str | None = None, progress: Callable | None = None) -> tuple[str, float]:
+def make(folder: Path, seed: int, name: str | None = None, progress: Callable | None = None,
+         sensor: str = "gelsight") -> tuple[str, float]:
     """Write the captures of a demonstration; returns the secret, which the captures do not tell."""
-    scene = scenes.load("gelsight", {"width": str(SIZE[0]), "height": str(SIZE[1])})
+    (width, height), exposure = SENSORS[sensor]
+    scene = scenes.load(sensor, {"width": str(width), "height": str(height)})
     effect, strength = secret(seed, name)
-    built = {**truth(scene, seed), "camera.exposure": EXPOSURE}
+    built = {**truth(scene, seed), "camera.exposure": exposure}
     maker = synthetic.Maker(scene, built, {effect: strength}, seed=seed + 1000)
     # each LED alone, and none: the dark frame tells light from outside from light that the camera scatters
     drives = [*({led: 1.0} for led in scene.leds), {}]
-    found = maker.captures(synthetic.presses(PRESSES, seed), drives, progress=progress)
-    found.parameters["camera.exposure"] = EXPOSURE
+    found = maker.captures(synthetic.presses(PRESSES, seed), drives, progress=progress, scene_name=sensor)
+    found.parameters["camera.exposure"] = exposure
     capture_files.write(found, folder, bits=8)
     return effect, strength
 
 
-def run(folder: str | Path, seed: int = 1, effect: str | None = None, progress: Callable | None = None,
-        say: Callable[[str], None] = lambda text: None) -> dict:
+def run(folder: str | Path, seed: int = 1, effect: str | None = None, sensor: str = "gelsight",
+        progress: Callable | None = None, say: Callable[[str], None] = lambda text: None) -> dict:
     """Make captures, run the loop, write the report; returns what happened.
 
     folder   gets `captures/`, `study/` and `report.html`; what is there already from the same seed is taken up
@@ -77,13 +83,15 @@ def run(folder: str | Path, seed: int = 1, effect: str | None = None, progress: 
     folder = Path(folder)
     note = folder / "secret.json"
     if not (folder / "captures" / "captures.toml").is_file():
-        name, strength = make(folder / "captures", seed, effect, progress)
-        note.write_text(json.dumps({"effect": name, "strength": strength, "seed": seed}))
+        name, strength = make(folder / "captures", seed, effect, progress, sensor)
+        note.write_text(json.dumps({"effect": name, "strength": strength, "seed": seed, "sensor": sensor}))
     hidden = json.loads(note.read_text())
-    if hidden["seed"] != seed or effect and registry().find_effect(effect).name != hidden["effect"]:
-        raise OutputExists(f"{folder} holds the demonstration of seed {hidden['seed']} with a secret of its own; choose another "
-                           "folder for this one (-o)")
-    say(f"{PRESSES} presses under 6 LEDs, one at a time and in the dark, made by stock Mitsuba with an effect that the base model lacks.")
+    asked = (seed, sensor, registry().find_effect(effect).name if effect else hidden["effect"])
+    if asked != (hidden["seed"], hidden["sensor"], hidden["effect"]):
+        raise OutputExists(f"{folder} holds the demonstration of {hidden['sensor']}, seed {hidden['seed']}, with a secret of its "
+                           "own; choose another folder for this one (-o)")
+    say(f"{PRESSES} presses under the LEDs of {sensor}, one at a time and in the dark, made by stock Mitsuba with an effect that "
+        "the base model lacks.")
     # The stage is trusted (S1.2): solving for every press as well takes three times as long and tells the same story.
     setup = loop.Setup(captures=str(folder / "captures"), per_group=[], seed=seed)
     study, model, fit = loop.begin(setup, folder / "study", title="Demonstration", resume=True, progress=progress)

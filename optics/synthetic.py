@@ -4,7 +4,7 @@ Nothing of `optics.render` or of the `tactile` integrator takes part. The light 
 variant, one channel and one LED at a time, with its `perspective` camera, on a uniform mesh three times denser than the model's;
 effects are made by stock means (more bounces, a `constant` emitter, an LED's disc sampled at random) or by scipy on the
 image, not by the functions that a fit uses; then photons, read noise and 8 bits. What is shared is the LED's and the
-membrane's formula, which tests hold to closed forms, and the shape of a dent.
+membrane's formula, which tests hold to closed forms, the shape of a dent, and measured sensitivities of a camera.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from optics import captures as capture_files
+from optics.develop import sensitivities
 from optics.effect import DEFAULT_VARIANT, use_variant
 from optics.noise import Noise
 from optics.scene import Scene
@@ -55,6 +56,8 @@ class Maker:
         self.noise, self.seed, self.spp = noise, seed, spp
         self.count = 0
         self.camera_z = float(scene.camera.columns[3].z[0])
+        self.bands = np.array(scene.integrator.bands)
+        self.matrix = sensitivities(scene.camera.sensitivity, scene.integrator.bands)  # of the camera's channels, (3, 3)
 
     # -- the face ---------------------------------------------------------------------------------------------------------
 
@@ -119,6 +122,13 @@ class Maker:
         return {"type": "led", "power": 1.0, "target": [place["x"], place["y"], place["z"] + 1.0], **place,
                 "pan": float(np.degrees(np.arctan(axis[0] / axis[2]))), "tilt": float(np.degrees(np.arctan(axis[1] / axis[2])))}
 
+    def colour(self, led: str) -> np.ndarray:
+        """(3,) share of an LED's power in each band: a Gaussian about its wavelength, or white, times its power per band."""
+        v = self.values
+        peak, width = v[f"{led}.wavelength"], v[f"{led}.fwhm"]
+        line = np.exp(-4 * np.log(2) * ((self.bands - peak) / width) ** 2) if peak > 0 else np.ones(3)
+        return line * [v[f"{led}.power_{c}"] for c in "rgb"]
+
     def disc(self, led: str) -> dict:
         """The LED as a disc across its axis, for the hidden effect "LED size"."""
         v = self.values
@@ -175,6 +185,7 @@ class Maker:
                     images[led] = self.traced(scene, 1.0, led)[..., None] * np.array(rho)
                 if {"gel absorption", "gel haze"} & set(self.effects):
                     images[led] = self.through_gel(images[led], led, press)
+                images[led] = images[led] * self.colour(led)
             if "ambient light" in self.effects:
                 sky = {"type": "constant", "radiance": {"type": "uniform", "value": self.effects["ambient light"] / np.pi}}
                 images["ambient"] = self.traced(self.scene(mesh, sky, 2), 1.0)[..., None] * np.array(rho)
@@ -257,7 +268,7 @@ class Maker:
             image = np.stack([gaussian_filter(image[..., c], sd, mode="reflect", truncate=6) for c in range(3)], -1)
         if "veiling glare" in e:
             image = image + e["veiling glare"] * (image.mean((0, 1)) - image)
-        signal = image * v[f"{cam}.exposure"]
+        signal = image @ self.matrix.T * v[f"{cam}.exposure"]
         if "gain drift" in e:
             signal = signal * (1 + e["gain drift"] * np.random.default_rng([self.seed, frame, 5]).standard_normal())
         if "colour crosstalk" in e:
