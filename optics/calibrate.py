@@ -18,6 +18,7 @@ from scipy.optimize import lsq_linear
 from optics.errors import Underdetermined, UnknownKey
 from optics.parameter import Values, Variable
 
+REACH = 4.0  # plausible sizes that one step may change what the image is not linear in
 TRUNCATION = 1e-12  # eigenvalues of the scaled normal matrix below this share of the largest count as undetermined
 
 
@@ -280,6 +281,7 @@ class Descent:
         for i, v in enumerate(variables):
             if v.parameter.squared:
                 self.low[i] = max(self.low[i], 1e-3 * v.parameter.plausible)
+        self.reach = np.array([np.inf if v.parameter.linear else REACH * v.parameter.plausible for v in variables])
         self.theta = np.clip([start_of(model, v, values) for v in variables], self.low, self.high)
         self.values, self.damping, self.here = self.moved(values, self.theta), damping, None
         linear = getattr(model, "linear_in", lambda variable: False)
@@ -301,9 +303,14 @@ class Descent:
         self.slope = np.array([v.parameter.per_coordinate(t) for v, t in zip(self.variables, self.theta)])
 
     def _step(self, damping: float) -> tuple[np.ndarray, float]:
-        """Where a damped step leads, and the fall of the misfit that the linear model expects of it."""
-        u, low, high = (np.array([v.parameter.coordinate(t) for v, t in zip(self.variables, values)])
-                        for values in (self.theta, self.low, self.high))
+        """Where a damped step leads, and the fall of the misfit that the linear model expects of it.
+
+        A damped step keeps within REACH, in which a linearisation may be trusted at all: a light that is sent round the sensor
+        does not come back.
+        """
+        reach = self.reach if damping else np.inf
+        box = (self.theta, np.maximum(self.low, self.theta - reach), np.minimum(self.high, self.theta + reach))
+        u, low, high = (np.array([v.parameter.coordinate(t) for v, t in zip(self.variables, values)]) for values in box)
         a, b = self.here.a * np.outer(self.slope, self.slope), self.here.b * self.slope
         step = solve(a, b, low - u, high - u, damping)
         fall = float(2 * b @ step - step @ a @ step)
