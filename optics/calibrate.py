@@ -284,6 +284,7 @@ class Descent:
         self.reach = np.array([np.inf if v.parameter.linear else REACH * v.parameter.plausible for v in variables])
         self.theta = np.clip([start_of(model, v, values) for v in variables], self.low, self.high)
         self.values, self.damping, self.here = self.moved(values, self.theta), damping, None
+        self.trust = 1.0
         linear = getattr(model, "linear_in", lambda variable: False)
         self.powers = {v.name for v in self.variables if linear(v)}
 
@@ -305,10 +306,10 @@ class Descent:
     def _step(self, damping: float) -> tuple[np.ndarray, float]:
         """Where a damped step leads, and the fall of the misfit that the linear model expects of it.
 
-        A damped step keeps within REACH, in which a linearisation may be trusted at all: a light that is sent round the sensor
-        does not come back.
+        A damped step keeps within REACH, in which a linearisation may be trusted at all (a light that is sent round the sensor does
+        not come back), or further where steps have brought what they promised.
         """
-        reach = self.reach if damping else np.inf
+        reach = self.trust * self.reach if damping else np.inf
         box = (self.theta, np.maximum(self.low, self.theta - reach), np.minimum(self.high, self.theta + reach))
         u, low, high = (np.array([v.parameter.coordinate(t) for v, t in zip(self.variables, values)]) for values in box)
         a, b = self.here.a * np.outer(self.slope, self.slope), self.here.b * self.slope
@@ -362,11 +363,13 @@ class Descent:
             gain = self.here.total - there.total
             if np.isfinite(there.total) and gain > worst:
                 self.theta, self.values, self.here = theta, values, there
+                self.trust = min(2 * self.trust, 1e3) if gain > promised / 2 else max(self.trust / 2, 1.0)
                 gained += gain
                 self.damping = max(self.damping / 10, 1e-9)
                 if gain < enough or 10 * enough < gain < 0.25 * promised:
                     break
             else:
+                self.trust = max(self.trust / 2, 1.0)
                 self.damping = max(self.damping * 10, 1e-3)
                 if self.damping > 1e4:
                     break

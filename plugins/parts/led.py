@@ -23,9 +23,9 @@ from optics.effect import Declared, Part
 from optics.parameter import Parameter
 
 PARAMETERS = (
-    Parameter("x", "mm", 0.0, doc="position S, to the right in the image", plausible=0.5, how="ad"),
-    Parameter("y", "mm", 0.0, doc="position S, down in the image", plausible=0.5, how="ad"),
-    Parameter("z", "mm", -5.0, doc="position S, from the camera towards the skin", plausible=0.5, how="ad"),
+    Parameter("x", "mm", 0.0, doc="position S, to the right in the image", plausible=0.5, how="ad", step=0.2),
+    Parameter("y", "mm", 0.0, doc="position S, down in the image", plausible=0.5, how="ad", step=0.2),
+    Parameter("z", "mm", -5.0, doc="position S, from the camera towards the skin", plausible=0.5, how="ad", step=0.2),
     Parameter("pan", "deg", 0.0, (-89.0, 89.0), "turn of the axis p from its nominal direction, about the local up axis",
               plausible=5.0),
     Parameter("tilt", "deg", 0.0, (-89.0, 89.0), "turn of the axis p from its nominal direction, about the local side "
