@@ -71,7 +71,7 @@ def main() -> int:
         reference[name] = np.mean(images, 0)
         row(f"{name}, 16 samples per pixel", f"{cost[name] * 1e3:.0f} ms", f"variance {variance[name]:.3g}")
     ratio = cost["tactile"] * variance["tactile"] / (cost["path"] * variance["path"])
-    row("tactile / stock path at equal noise", f"{ratio:.3f} x", "time x variance; below 1 is faster; target 1")
+    row("tactile / stock path at equal noise", f"{ratio:.2g} x", "time x variance; below 1 is faster; target 1")
 
     # Our error: against many samples of `tactile`, less their own noise.
     use_variant("llvm_ad_spectral_polarized")
@@ -83,7 +83,7 @@ def main() -> int:
     own = float(np.mean(np.var(many, 0, ddof=1))) / len(many)
     error = max(float(np.mean((ours_image - np.mean(many, 0)) ** 2)) - own, own)
     needed = 16 * variance["path"] / error
-    row("ours / stock path at equal error", f"{ours / (cost['path'] * needed / 16):.4f} x",
+    row("ours / stock path at equal error", f"{ours / (cost['path'] * needed / 16):.2g} x",
         f"path needs {needed:.3g} samples for our rms error of {error**0.5:.1e}; its time extrapolated from 16")
     use_variant("llvm_ad_spectral_polarized")
 
