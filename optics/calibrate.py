@@ -286,7 +286,7 @@ class Descent:
         self.values, self.damping, self.here = self.moved(values, self.theta), damping, None
         self.trust = 1.0
         linear = getattr(model, "linear_in", lambda variable: False)
-        self.powers = {v.name for v in self.variables if linear(v)}
+        self.powers = [i for i, v in enumerate(self.variables) if linear(v)]
 
     def moved(self, values: Values, theta: np.ndarray) -> Values:
         values = values.copy()
@@ -323,20 +323,15 @@ class Descent:
         """The fall of the misfit that the linear model still expects."""
         return self._step(0.0)[1] if self.variables else 0.0
 
-    def _try(self) -> tuple[np.ndarray, Values, Normal]:
-        """A damped step, with the misfit where it leads."""
-        return self._at(self._step(self.damping)[0])
-
     def _at(self, theta: np.ndarray) -> tuple[np.ndarray, Values, Normal]:
+        """Theta, with its values and its misfit."""
         values = self.moved(self.values, theta)
         return theta, values, again(self.model, self.variables, values, self.frames, self.here)
 
     def _settled(self, theta: np.ndarray, values: Values) -> tuple[np.ndarray, Values, Normal]:
         """Theta with the powers, in which the image is linear, solved for where all else is (variable projection)."""
-        index = [i for i, v in enumerate(self.variables) if v.name in self.powers]
-        powers = [self.variables[i] for i in index]
-        normal = normal_equations(self.model, powers, values, self.frames, self.robust)
-        theta = theta.copy()
+        index, theta = self.powers, theta.copy()
+        normal = normal_equations(self.model, [self.variables[i] for i in index], values, self.frames, self.robust)
         theta[index] += solve(normal.a, normal.b, (self.low - theta)[index], (self.high - theta)[index])
         return self._at(np.clip(theta, self.low, self.high))
 
@@ -351,13 +346,14 @@ class Descent:
                  the root of J'Wr is followed, not chi2
         part     share of the first promise, of which no step beyond the first is worth its prediction
         """
-        gained, first = 0.0, self.promised
+        gained = first = 0.0
         for _ in range(steps):
             promised = self.promised
+            first = first or promised
             if promised < enough or (gained and promised > part * first > 0):
                 break
             worst = -promised if promised < rough else 0.0
-            theta, values, there = self._try()
+            theta, values, there = self._at(self._step(self.damping)[0])
             if self.powers and not self.here.total - there.total > max(worst, promised / 2):
                 theta, values, there = min((theta, values, there), self._settled(theta, values), key=lambda t: t[2].total)
             gain = self.here.total - there.total

@@ -265,7 +265,7 @@ def import_presses(presses: Presses, folder: str | Path, *, ball_radius: float, 
                          "temporal noise, banding and drift together"},
         "light_directions": {c: d for c, d in zip("rgb", directions)},
         "setup": {"free": free, "per_group": list(POSE), "flat_field": "additive", "priors": {
-            pattern: [None, sd] for pattern, sd in PRIORS.items() if pattern in free or not pattern.startswith("gel.ind")}},
+            pattern: [None, sd] for pattern, sd in PRIORS.items() if pattern in free or pattern != "gel.indenter_size"}},
     }
     warnings = contradictions(presses, facts, images, median, given, far, gains, noise, saturation, mm_per_pixel_check)
     facts["warnings"] = warnings

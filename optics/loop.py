@@ -229,14 +229,15 @@ def begin(setup: Setup, folder: str | Path, *, title: str = "", command: Sequenc
         inputs=[setup.captures, model.scene.path, *registry().folders], seed=setup.seed, command=command, title=title,
         noise=asdict(model.noise), warnings=_warnings(model), resume=resume,
         facts={"frames": len(model.frames), "fitted": len(fitted), "held_out": len(held),
-               "image": list(model.shape), "masked": 1 - float(np.mean([u.sum() / model.size for u in usable])), "setup": asdict(setup)})
+               "image": list(model.shape), "masked": 1 - float(np.mean([u.sum() / model.size for u in usable])),
+               "setup": asdict(setup)})
     if study.steps:
         return study, model, restore(study, model)
     start = Values(dict(setup.values))
     clock = time.perf_counter()
     try:
         found = fit_base(model, variables, fitted, start, progress, robust=setup.robust)
-        record(study, model, setup, "base", None, found, held, time.perf_counter() - clock)
+        record(study, model, "base", None, found, held, time.perf_counter() - clock)
     except BaseException:
         study.discard()
         raise
@@ -249,7 +250,7 @@ def _warnings(model: Model) -> list[str]:
     return list(dict.fromkeys([*model.captures.warnings, *warnings_of(model.noise, model.captures)]))
 
 
-def record(study: Study, model: Model, setup: Setup, name: str, effect: Effect | None, found: calibrate.Fit,
+def record(study: Study, model: Model, name: str, effect: Effect | None, found: calibrate.Fit,
            held: Sequence[int], seconds: float) -> Comparison:
     """Write a calibrated model down as the next step of the study."""
     values, extra = held_out_values(model, found, held)
@@ -324,7 +325,7 @@ def examine(study: Study, model: Model, setup: Setup, found: calibrate.Fit, prog
         if found.normal is None or not extra or list(frames) != list(found.frames):
             return calibrate.fit(model, variables, start, frames)
         names = tuple(v.name for v in extra)
-        if names not in results:  # chord steps have a start of their own
+        if names not in results:  # a diagnosis asks again from another start, which chord steps do not use
             leader = max((found.chi2 - f.chi2 for f in results.values()), default=0.0)
             quick = calibrate.extended(model, found, extra, {v.name: steps[v.name] for v in extra if v.name in steps})
             if not quick.converged and found.chi2 - quick.chi2 > 0.7 * leader:
@@ -364,5 +365,5 @@ def extend(study: Study, model: Model, setup: Setup, found: calibrate.Fit, effec
         start = off_neutral(model, found.values, extra)
     clock = time.perf_counter()
     best = calibrate.fit(model, variables, start, fitted, robust=setup.robust, progress=progress)
-    comparison = record(study, model, setup, effect.name, effect, best, held, time.perf_counter() - clock)
+    comparison = record(study, model, effect.name, effect, best, held, time.perf_counter() - clock)
     return best, comparison

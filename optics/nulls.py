@@ -74,9 +74,17 @@ class NullTable:
                     cells = [" / ".join(f"{v:.2f}" for v in getattr(s, m)) for m in MEASURES]
                     lines.append(f"  {s.model:<28}{s.poses:<10}" + "".join(f"{c:>24}" for c in cells))
         lines.append(f"{'noise of the camera':<40}{' / '.join(f'{v:.2f}' for v in self.noise):>24}")
-        won = ", ".join("RGB"[c] if len(self.wins()) == 3 else str(c) for c, w in enumerate(self.wins()) if w) or "no channel"
-        lines.append(f"the physical model beats every null on held-out frames in {won} (rms near the contact)")
+        lines.append(f"the physical model beats every null on held-out frames in {self.won or 'no channel'} (rms near the contact)")
         return "\n".join(lines)
+
+    @property
+    def channels(self) -> list[str]:
+        return list("RGB") if len(self.noise) == 3 else [str(c) for c in range(len(self.noise))]
+
+    @property
+    def won(self) -> str:
+        """The channels in which the physical model beats every null near the contact; '' for none."""
+        return ", ".join(c for c, w in zip(self.channels, self.wins()) if w)
 
     @classmethod
     def from_json(cls, data: dict) -> "NullTable":

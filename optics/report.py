@@ -133,13 +133,11 @@ def null_table(metrics: Mapping) -> dict:
     from optics import nulls
 
     table = nulls.NullTable.from_json(metrics["nulls"])
-    channels = "RGB" if len(table.noise) == 3 else [str(c) for c in range(len(table.noise))]
     tables = [{"title": f"{split}, {len(names)} frames", "rows": [
         {"name": "this model" if s.model == nulls.PHYSICAL else s.model, "own": s.model == nulls.PHYSICAL,
          "errors": [*s.rms_near, *s.rms_whole]} for s in table.scores if s.split == split]}
         for split, names in (("held out", table.held_out), ("fitted", table.fitted))]
-    return {"tables": tables, "noise": table.noise, "channels": list(channels), "near": f"{nulls.NEAR:g}",
-            "won": ", ".join(c for c, w in zip(channels, table.wins()) if w)}
+    return {"tables": tables, "noise": table.noise, "channels": table.channels, "near": f"{nulls.NEAR:g}", "won": table.won}
 
 
 def _level(step: Mapping) -> dict:

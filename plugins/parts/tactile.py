@@ -295,9 +295,9 @@ def build():
                 if dr.hint(self.points > 0, mode="scalar"):
                     light = light + product(throughput, self.from_points(scene, sampler, si, ray.o, medium, lit))
                 if dr.hint(self.others, mode="scalar"):
-                    ds, sent = scene.sample_emitter_direction(si, sampler.next_2d(), False, lit)
+                    ds, weight = scene.sample_emitter_direction(si, sampler.next_2d(), False, lit)
                     one = lit & (ds.pdf != 0) & ~mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.DeltaPosition)
-                    light = light + product(throughput, self.sent(scene, si, ray.o, medium, ds, sent, one))
+                    light = light + product(throughput, self.sent(scene, si, ray.o, medium, ds, weight, one))
 
                 # onward
                 bs, factor = bsdf.sample(context, si, sampler.next_1d(), sampler.next_2d(), onward)

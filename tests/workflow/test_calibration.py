@@ -72,7 +72,7 @@ def test_power_and_reflectance_are_reported_as_one(solved):
 
 
 def test_robust_weights_shrug_off_glints(solved):
-    """A glint of 60 DN in one pixel of a hundred: Huber's weights leave a tenth of its bias."""
+    """A glint of 60 DN in one pixel of a hundred: Huber's weights leave less than a quarter of its bias."""
     model, _, fit = solved
     free = calibrate.variables_from(model, ["membrane.rho_*"])
     clean = calibrate.fit(model, free, fit.values, [0])
