@@ -44,6 +44,7 @@ class Frame:
     parameters: dict[str, float | str] = field(default_factory=dict)  # by scene parameter key
     repeats: list[np.ndarray] = field(default_factory=list)  # same settings, same shape
     file: str = ""
+    readings: dict[str, np.ndarray] = field(default_factory=dict)  # of a sweep: (N, 1, 1) settings of each reading, by key
 
 
 @dataclass
@@ -239,6 +240,37 @@ def subset(captures: Captures, frames: Sequence[int]) -> Captures:
         if not 0 <= index < count:
             raise IndexError(f"frame {index}: {captures.folder} has {count} frames; allowed: 0 to {count - 1}")
     return replace(captures, frames=[captures.frames[i] for i in frames], warnings=list(captures.warnings))
+
+
+def sweeps(captures: Captures, parameters: Mapping[str, Parameter], lights: Sequence[str]) -> Captures:
+    """The rows of a table as a few frames of many readings, (N, 1, C), which are predicted at once.
+
+    Readings are ordered by the setting that takes the most values and dealt out to 8 sweeps (4 of fewer than 32 readings, 1 of
+    fewer than 8), so that each covers the whole range. Settings that move the scene's geometry keep sweeps of their own.
+    """
+    settings = [f.parameters for f in captures.frames]
+    keys = sorted({k for own in settings for k in own})
+    powers = {f"{name}.power" for name in lights}
+    still = [k for k in keys if parameters[k].how not in ("layer", "image") and k not in powers]
+    found: dict[tuple, list[int]] = {}
+    for index, own in enumerate(settings):
+        found.setdefault((tuple(sorted(own)), *(own.get(k) for k in still)), []).append(index)
+    frames = []
+    for rows in found.values():
+        own = settings[rows[0]]
+        moving = [k for k in own if k not in still and len({settings[i][k] for i in rows}) > 1]
+        if moving:
+            first = max(moving, key=lambda k: (parameters[k].unit == "deg", len({settings[i][k] for i in rows})))
+            rows = sorted(rows, key=lambda i: settings[i][first])
+        count = 8 if len(rows) >= 32 else 4 if len(rows) >= 8 else 1
+        for part in range(count):
+            mine = rows[part::count]
+            readings = {k: np.array([settings[i][k] for i in mine], float).reshape(-1, 1, 1) for k in moving}
+            image = np.concatenate([captures.frames[i].image for i in mine])
+            name = f"readings {mine[0]} ... {mine[-1]}" if len(mine) > 1 else f"reading {mine[0]}"
+            frames.append(Frame(name, image, None, None, {k: v for k, v in own.items() if k not in moving}, [],
+                                captures.frames[mine[0]].file, readings))
+    return replace(captures, frames=frames, warnings=list(captures.warnings))
 
 
 def groups(captures: Captures) -> dict[str, list[int]]:

@@ -12,6 +12,7 @@ Where an effect enters, in the order that light takes (`STAGES`):
     reflection  membrane  fr = f(geometry, membrane)  added to the BRDF, 1/sr; Dr.Jit
     volume      gel       L  = f(path, gel)           radiance added by the gel itself, per LED; Dr.Jit
     ambient     membrane  L  = f(geometry, membrane)  radiance added that no LED made; Dr.Jit
+    layer       a layer   M  = f(crossing, layer)     Mueller matrix that light passes after the layer's own (optics.layers)
     lens        camera    I  = f(image, camera)       irradiance per band, (H, W, B); numpy
     sensor      camera    I  = f(image, camera)       signal per channel, (H, W, C), 1 = full scale; numpy
     response    camera    m  = f(image, camera)       response per channel, 1 = full scale; numpy
@@ -36,7 +37,7 @@ from optics.parameter import Parameter
 
 STAGES = {
     "surface": "gel", "emission": "led", "segment": "gel", "reflection": "membrane", "volume": "gel",
-    "ambient": "membrane", "lens": "camera", "sensor": "camera", "response": "camera",
+    "ambient": "membrane", "layer": "", "lens": "camera", "sensor": "camera", "response": "camera",
 }
 IMAGE_STAGES = ("lens", "sensor", "response")
 CATEGORIES = ("bsdf", "emitter", "sensor", "shape", "integrator")
@@ -48,6 +49,7 @@ class Part:
 
     build   called once per Mitsuba variant, returns the plugin class (a subclass of mi.BSDF, mi.Emitter, ...)
     checks  functions without arguments that raise AssertionError: the closed forms that the part must meet
+    mueller of a layer: its Mueller matrix (optics.layers);   stokes   of a source: the Stokes vector that it sends
     """
 
     kind: str
@@ -56,6 +58,8 @@ class Part:
     build: Callable[[], type]
     checks: tuple[Callable[[], None], ...] = ()
     doc: str = ""
+    mueller: Callable | None = None
+    stokes: Callable | None = None
 
 
 @dataclass(frozen=True)
@@ -71,6 +75,8 @@ class Effect:
                 `plausible` is used) or 'both'
     scope       'common' (one value in all frames) or 'frame' (a value per frame)
     per         'kind' (one value shared by all parts of the kind, such as all LEDs) or 'part' (each its own)
+    requires    kinds of further parts that a scene must have for the effect to make sense in it
+    pictures    True where it mixes the pixels of a picture: point readings cannot have it
     acts        coordinates that it acts through: radius, height, slope, led, channel, frame, intensity ...
     needs       what a capture set must vary for it to be seen, in words
     checks      closed forms, as in Part
@@ -84,6 +90,8 @@ class Effect:
     onset: str = "tangent"
     scope: str = "common"
     per: str = "kind"
+    requires: tuple[str, ...] = ()
+    pictures: bool = False
     acts: tuple[str, ...] = ()
     needs: str = ""
     checks: tuple[Callable[[], None], ...] = ()
@@ -155,7 +163,7 @@ class Registry:
         for stage in item.stages:
             if stage not in STAGES:
                 raise BadPlugin(f"{file}: stage {stage!r} is none of {', '.join(STAGES)}")
-            if STAGES[stage] != item.part:
+            if STAGES[stage] not in ("", item.part):
                 raise BadPlugin(f"{file}: stage '{stage}' belongs to the part '{STAGES[stage]}', not to '{item.part}'")
         if item.onset not in ("tangent", "secant", "both"):
             raise BadPlugin(f"{file}: onset {item.onset!r} is none of tangent, secant, both")
@@ -167,8 +175,9 @@ class Registry:
     def check(self) -> None:
         """After a scan: every effect's part exists, and no two declare the same parameter."""
         for effect in self.effects.values():
-            if effect.part not in self.parts:
-                raise BadPlugin(f"{effect.file}: part '{effect.part}' is none of {', '.join(sorted(self.parts))}")
+            for kind in (effect.part, *effect.requires):
+                if kind not in self.parts:
+                    raise BadPlugin(f"{effect.file}: part '{kind}' is none of {', '.join(sorted(self.parts))}")
             for name in effect.parameter_names:
                 if self.parameter(effect.part, name).neutral is None:
                     raise BadPlugin(f"{effect.file}: {effect.part}.{name} has no neutral value to rest at")

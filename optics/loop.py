@@ -40,7 +40,7 @@ class Setup:
     captures    folder of the capture set
     defines     -D of the scene; the image size is added where the scene names width and height
     free        key patterns that are solved for in all frames; empty: every LED (position, axis, lobe, power), every
-                membrane (rho, sigma)
+                membrane (rho, sigma), every source (power)
     per_group   key patterns with a value per group of frames; None: the press, where groups are given
     priors      pattern -> (mean or None for the present value, standard deviation)
     held_out    names of groups that the calibration does not see; None: one in four, evenly spread
@@ -118,11 +118,13 @@ def split(model: Model, setup: Setup) -> tuple[list[int], list[int]]:
 
 
 def default_free(model: Model) -> list[str]:
-    """Every LED's position, axis, lobe and power, and every membrane's reflectance and roughness."""
+    """Every LED's position, axis, lobe and power, every membrane's reflectance and roughness, every source's power."""
     patterns = []
     spectral = len(model.scene.integrator.bands or (0,))
     for led in model.scene.leds:
         patterns += [f"{led}.{n}" for n in ("x", "y", "z", "pan", "tilt", "mu", "power")]
+    for source in model.scene.sources:
+        patterns += [f"{source}.power"] if spectral == 1 else [f"{source}.power_{c}" for c in "rgb"[:spectral]]
     for membrane in model.scene.membranes:
         patterns += [f"{membrane}.rho_{c}" for c in "rgb"[:spectral]] + [f"{membrane}.sigma"]
     return patterns
@@ -307,7 +309,8 @@ def restore(study: Study, model: Model, index: int = -1) -> calibrate.Fit:
 def candidates(model: Model, study: Study) -> list[Effect]:
     """Every effect that the scene can express and the study has not added."""
     done = {e.key for e in effects_of(study)}
-    return [e for k, e in sorted(registry().effects.items()) if k not in done and model.scene.can_express(e)]
+    return [e for k, e in sorted(registry().effects.items()) if k not in done and model.scene.can_express(e)
+            and not (e.pictures and model.captures.table is not None)]
 
 
 def examine(study: Study, model: Model, setup: Setup, found: calibrate.Fit, progress: Progress | None = None):

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 
 from optics.errors import OutOfBounds, UnknownKey
 
-HOW = ("ad", "difference", "image")
+HOW = ("ad", "difference", "image", "layer")
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,8 @@ class Parameter:
     step        half width of a central difference, in plausible sizes: narrow where the image bends, wide where an edge that
                 moves changes a rim's pixel by jumps of one sample
     how         how its derivative image is made: 'ad' (forward mode through the render), 'difference' (central, common
-                random numbers: it moves shadows or geometry), 'image' (arithmetic on the linear images)
+                random numbers: it moves shadows or geometry), 'image' (arithmetic on the linear images), 'layer' (complex step
+                through the Mueller matrices of the layers and the Stokes vectors of sources)
     squared     True where the image depends on the square of it (a roughness): a fit steps in the square, whose onset is
                 linear, and stays above a thousandth of `plausible`
     saturates   of a squared parameter s: the value v beyond which its effect levels off; a fit steps in s^2/(1 + s^2/v^2)

@@ -12,10 +12,12 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
-from optics.captures import Captures, cfa_channel
+from optics import paths
+from optics.captures import Captures, cfa_channel, sweeps
 from optics.develop import STEP, Developer
 from optics.effect import DEFAULT_VARIANT, registry
 from optics.errors import BadScene, UnknownKey
@@ -24,6 +26,7 @@ from optics.parameter import Parameter, Values, Variable
 from optics.scene import Scene
 
 RIM_SAMPLES = 64  # per pixel at rims; a power of two
+LAYERED_RIM_SAMPLES = 16  # in scenes with layers, whose matrices are multiplied for every sample
 POWERS = ("power", "power_r", "power_g", "power_b")  # images are kept per unit of each
 FLAT_FIELDS = ("multiplicative", "additive", "none")
 BOUNCE_SAMPLES = 32  # directions per cell for the second bounce
@@ -36,29 +39,35 @@ class Renderer:
     def __init__(self, scene: Scene, remember: int = 24):
         if scene.camera is None or scene.integrator is None:
             raise BadScene(f"{scene.path}: a prediction needs a part of the type 'camera' and the integrator 'tactile'")
-        if not scene.leds:
-            raise BadScene(f"{scene.path}: the scene has no LED (an emitter of the type 'led')")
+        if not scene.lights:
+            raise BadScene(f"{scene.path}: the scene has no light (an emitter of the type 'led' or 'source')")
+        paths.check(scene)
         self.scene = scene
         self.width, self.height = scene.camera.resolution
         self.bands = len(scene.integrator.bands or (0,))
         if self.bands > scene.integrator.lanes:
             raise BadScene(f"{scene.path}: {self.bands} bands, but the variant {scene.variant} carries {scene.integrator.lanes}; "
                            f"load the scene with variant='{DEFAULT_VARIANT}' or name one band")
+        self.layered = any(registry().parts[p.kind].mueller is not None for p in scene.parts.values()) or bool(scene.sources)
+        self.rim_samples = LAYERED_RIM_SAMPLES if self.layered else RIM_SAMPLES
+        self.wavelengths = np.array(scene.integrator.bands or (540.0,))
         self.remember = remember
+        self._transmissions: OrderedDict = OrderedDict()
         self._hits: OrderedDict = OrderedDict()
         self._images: OrderedDict = OrderedDict()
         image_keys = {k for k, p in scene.parameters.items() if p.how == "image"}
-        led_keys = {k for k in scene.parameters if k.rsplit(".", 1)[0] in scene.leds}
-        own = [k for k in scene.parameters if k not in image_keys and k not in led_keys]
+        self.layer_keys = {k for k, p in scene.parameters.items() if p.how == "layer"}
+        led_keys = {k for k in scene.parameters if k.rsplit(".", 1)[0] in scene.lights} - self.layer_keys
+        own = [k for k in scene.parameters if k not in image_keys and k not in led_keys and k not in self.layer_keys]
         self.bounce_key = f"{scene.integrator.name}.interreflection"
-        self.geometry_keys = [k for k in own if self.kind(k) in ("camera", "interface", "") or
+        self.geometry_keys = [k for k in own if self.kind(k) in ("camera", "interface", "", *scene.MOVED) or
                               (self.kind(k) == "gel" and k.rsplit(".", 1)[1] in scene.shaping)]
         ambient = {n for e in registry().at_stage("membrane", "ambient") for n in e.parameter_names}
         self.ambient_keys = [k for k in own if self.kind(k) == "membrane" and k.rsplit(".", 1)[1] in ambient]
         self.shading_keys = [k for k in own if k not in self.geometry_keys and k != self.bounce_key
                              and k not in self.ambient_keys]
         self.led_keys = {n: [k for k in led_keys if k.rsplit(".", 1)[0] == n and k.rsplit(".", 1)[1] not in POWERS]
-                         for n in scene.leds}
+                         for n in scene.lights}
         self._fixed = set(self.geometry_keys)
         self._still = {k: scene.parameters[k].neutral for k in self.ambient_keys}
         self._tangents: OrderedDict = OrderedDict()
@@ -79,8 +88,9 @@ class Renderer:
         move = False leaves the geometry where it is (rebuilding the gel costs more than an image): enough for shading at
         hits that are kept, but not for tracing or for shadows.
         """
-        now = {k: v for k, v in values.items() if k in self.scene.parameters and (move or k not in self._fixed)}
-        now.update({f"{n}.{power}": 1.0 for n in self.scene.leds for power in POWERS})
+        now = {k: v for k, v in values.items() if k in self.scene.parameters and k not in self.layer_keys
+               and not isinstance(v, np.ndarray) and (move or k not in self._fixed)}
+        now.update({f"{n}.{power}": 1.0 for n in self.scene.lights for power in POWERS})
         self.scene.set(now)
 
     def _trace(self, u: np.ndarray, v: np.ndarray) -> tuple:
@@ -88,10 +98,13 @@ class Renderer:
         import mitsuba as mi
 
         with dr.suspend_grad():
+            if self.layered:
+                path = paths.trace(self.scene, u, v)
+                return Sample(path.si, mi.UnpolarizedSpectrum(1.0), path.origin, path)
             si, weight, origin = self.scene.integrator.hits(
                 self.scene.mitsuba, self.scene.camera, mi.Float(u.astype(np.float32)), mi.Float(v.astype(np.float32)))
             dr.eval(si, weight, origin)
-        return si, weight, origin
+        return Sample(si, weight, origin)
 
     def hits(self, values: Mapping) -> "Hits":
         """Primary hits at pixel centres for a geometry; kept."""
@@ -101,7 +114,7 @@ class Renderer:
             return self._hits[key]
         self._apply(values)
         v, u = np.mgrid[:self.height, :self.width] + 0.5
-        hits = Hits(*self._trace(u.ravel(), v.ravel()), self.height, self.width)
+        hits = Hits(self._trace(u.ravel(), v.ravel()), self.height, self.width)
         self._hits[key] = hits
         while len(self._hits) > self.remember:
             self._hits.popitem(last=False)
@@ -130,34 +143,99 @@ class Renderer:
 
     def _keep(self, key: tuple, image: "LedImage") -> "LedImage":
         self._images[key] = image
-        while len(self._images) > self.remember * len(self.scene.leds):
+        while len(self._images) > self.remember * len(self.scene.lights):
             self._images.popitem(last=False)
         return image
 
-    def _render_led(self, hits: "Hits", led: str, rim: np.ndarray | None = None) -> "LedImage":
+    def _render_led(self, hits: "Hits", led: str) -> "LedImage":
+        if led in self.scene.sources:  # what it sends lies in the weights
+            rim = self._joint_rim(hits)
+            index = np.flatnonzero(rim)
+            image = LedImage(led, hits, rim, index, self._rim_samples(hits, index), None, None, hits.valid)
+            image.raw = (np.ones((1, self.bands)), np.ones((1, 1, self.bands)))
+            return image
         part = self.scene.leds[led]
         visible = self._visible(hits.si, part)
-        seen = np.array(visible).reshape(-1, self.height, self.width)  # one for each point of the source
-        lit = seen.mean(0) > 0.5
-        if rim is None:
-            rim = np.logical_or.reduce([_edges(s & hits.valid) for s in seen]) | hits.edges
+        rim = self._joint_rim(hits) if self.layered else self._rim(hits, visible)
         index = np.flatnonzero(rim)
         samples = self._rim_samples(hits, index)
-        rim_visible = self._visible(samples[0], part) if len(index) else None
-        image = LedImage(led, hits, rim, index, samples, visible, rim_visible, lit)
-        image.radiance = self._combine(image, lambda: self._shade(hits.sample, part, visible),
-                                       lambda: self._shade(samples, part, rim_visible))
+        rim_visible = self._visible(samples.si, part) if len(index) else None
+        image = LedImage(led, hits, rim, index, samples, visible, rim_visible, self._seen(visible).mean(0) > 0.5)
+        image.raw = self._raw(image, lambda: self._shade(hits.sample, part, visible),
+                              lambda: self._shade(samples, part, rim_visible))
+        if not self.layered:
+            image.radiance = self._mix(image, image.raw)
         return image
+
+    def _seen(self, visible) -> np.ndarray:
+        """(points of the source, H, W)"""
+        return np.array(visible).reshape(-1, self.height, self.width)
+
+    def _rim(self, hits: "Hits", visible) -> np.ndarray:
+        return np.logical_or.reduce([_edges(s & hits.valid) for s in self._seen(visible)]) | hits.edges
+
+    def _joint_rim(self, hits: "Hits") -> np.ndarray:
+        """Pixels at a rim for any light: in scenes with layers one set of finer samples serves all."""
+        if hits.joint is None:
+            rims = [self._rim(hits, self._visible(hits.si, part)) for part in self.scene.leds.values()]
+            hits.joint = np.logical_or.reduce([hits.edges, *rims])
+        return hits.joint
+
+    # -- what layers leave of it ----------------------------------------------------------------------------------------
+
+    def image(self, values: Mapping, light: str, component: int = 0) -> np.ndarray:
+        """(H, W, B) what one light makes at power 1, layers and all; (N, 1, B) where `values` hold arrays of readings.
+
+        component  of the Stokes vector in the camera's axes
+        """
+        image = self.led(values, light)
+        if not self.layered:
+            return image.radiance if component == 0 else np.zeros_like(image.radiance)
+        return self._mix(image, image.raw, self.weights(values, image, component))
+
+    def weights(self, values: Mapping, image: "LedImage", component: int = 0) -> tuple:
+        """What the layers leave of a light: (H W, B) at the pixels' centres, (n, S, B) at the finer samples of rims."""
+        centre = self._weight(values, image.led, image.hits.path, component, ())
+        fine = None
+        if len(image.index):
+            fine = self._weight(values, image.led, image.samples.path, component, (image.index.tobytes(),))
+            fine = fine.reshape(len(image.index), self.rim_samples, self.bands)
+        return centre, fine
+
+    def _weight(self, values: Mapping, light: str, path, component: int, where: tuple) -> np.ndarray:
+        key = (self.geometry(values), component, *where, *(v.tobytes() if isinstance(v, np.ndarray) else v for v in (
+            values[k] for k in sorted(self.layer_keys))))
+        if key not in self._transmissions:
+            self._transmissions[key] = paths.transmission(self.scene, path, values, self.wavelengths, component)
+            while len(self._transmissions) > 2 * self.remember:
+                self._transmissions.popitem(last=False)
+        row = self._transmissions[key]
+        if light not in self.scene.sources:
+            return row[0]
+        sent = paths.emitted(self.scene, light, path, values, self.wavelengths)
+        return sum(r * s for r, s in zip(row, sent) if not isinstance(s, int))
+
+    def stokes(self, values: Mapping, lights: Sequence[str] | None = None) -> np.ndarray:
+        """(4, H, W, B): Stokes vectors at the camera, of all lights or of some; what no light made counts as unpolarized."""
+        wanted = self.scene.lights if lights is None else lights
+        total = np.zeros((4, self.height, self.width, self.bands))
+        for component in range(4):
+            for light in wanted:
+                if np.any(values[f"{light}.power"] != 0):
+                    total[component] += self.powers(values, light) * self.image(values, light, component)
+        total[0] += self.ambient(values) if lights is None else 0
+        return total
 
     def _rim_samples(self, hits: "Hits", index: np.ndarray):
         key = index.tobytes()
         if key not in hits.rims:
             # A Hammersley set, shifted from pixel to pixel: an edge in any direction crosses the samples one by one, and
             # not in rows, so that a shadow that moves changes a pixel in small steps.
-            k = np.arange(RIM_SAMPLES)
-            reversed_bits = sum(((k >> b) & 1) / 2 ** (b + 1) for b in range(RIM_SAMPLES.bit_length() - 1))
+            count = self.rim_samples
+            k = np.arange(count)
+            reversed_bits = sum(((k >> b) & 1) / 2 ** (b + 1) for b in range(count.bit_length() - 1))
             shift = np.outer(index, (0.7548776662466927, 0.5698402909980532))  # the R2 sequence
-            u = (index % self.width)[:, None] + (k / RIM_SAMPLES + shift[:, :1]) % 1.0
+            u = (index % self.width)[:, None] + (k / count + shift[:, :1]) % 1.0
             v = (index // self.width)[:, None] + (reversed_bits + shift[:, 1:]) % 1.0
             hits.rims = {key: self._trace(u.ravel(), v.ravel()) if len(index) else None}  # only the latest is kept
         return hits.rims[key]
@@ -186,24 +264,29 @@ class Renderer:
         dr.eval(share)
         return share[0] if len(share) == 1 else share
 
-    def _shade(self, sample: tuple, part, visible):
+    def _shade(self, sample: Sample, part, visible):
         """Direct radiance per band at hits, an UnpolarizedSpectrum attached to whatever carries gradients."""
         import mitsuba as mi
 
         integrator, scene = self.scene.integrator, self.scene.mitsuba
         places = self._discs(part)
         if len(places) == 1:
-            return integrator.direct(scene, *sample, part, visible)
-        parts = [integrator.direct(scene, *sample, part, seen, mi.Point2f(*place)) for place, seen in zip(places, visible)]
+            return integrator.direct(scene, *sample[:3], part, visible)
+        parts = [integrator.direct(scene, *sample[:3], part, seen, mi.Point2f(*place)) for place, seen in zip(places, visible)]
         return sum(parts[1:], parts[0]) / len(parts)
 
-    def _combine(self, image: "LedImage", centre: Callable, rim: Callable) -> np.ndarray:
-        """(H, W, B) from shading at pixel centres and, where the rim is, from the mean of the finer samples."""
-        result = self._bands(centre()).reshape(self.height * self.width, self.bands)
+    def _raw(self, image: "LedImage", centre: Callable, rim: Callable) -> tuple:
+        """Shading at pixel centres (H W, B) and at the finer samples of rims (n, S, B), None without rims."""
+        fine = self._bands(rim()).reshape(len(image.index), self.rim_samples, self.bands) if len(image.index) else None
+        return self._bands(centre()).reshape(self.height * self.width, self.bands), fine
+
+    def _mix(self, image: "LedImage", raw: tuple, weights: tuple = (1.0, 1.0)) -> np.ndarray:
+        """(H, W, B) from pixel centres and, where the rim is, from the mean of the finer samples."""
+        result = raw[0] * weights[0] if self.layered else raw[0].copy()
         if len(image.index):
-            fine = self._bands(rim()).reshape(len(image.index), RIM_SAMPLES, self.bands)
-            result[image.index] = fine.mean(1)
-        return result.reshape(self.height, self.width, self.bands)
+            result[image.index] = (raw[1] * weights[1]).mean(1)
+        return result.reshape(-1, self.width, self.bands) if len(result) != self.height * self.width else result.reshape(
+            self.height, self.width, self.bands)
 
     def _bands(self, spectrum) -> np.ndarray:
         import drjit as dr
@@ -218,10 +301,10 @@ class Renderer:
 
     def led_tangent_at_rest(self, values: Mapping, led: str, key: str) -> np.ndarray:
         """`led_tangent`, kept: all frames share the gel at rest."""
-        known = (key, *self._led_key(values, led))
+        known = (key, *self._led_key(values, led), *(values[k] for k in sorted(self.layer_keys)))
         if known not in self._tangents:
             self._tangents[known] = self.led_tangent(values, led, key).astype(np.float32)
-            while len(self._tangents) > 8 * len(self.scene.leds):
+            while len(self._tangents) > 8 * len(self.scene.lights):
                 self._tangents.popitem(last=False)
         return self._tangents[known]
 
@@ -233,7 +316,7 @@ class Renderer:
         image = self.led(values, led)
         name, parameter = key.rsplit(".", 1)
         part, lamp = self.scene.parts[name], self.scene.leds[led]
-        moves = part.kind == "led" and parameter in ("x", "y", "z")
+        moves = part is lamp and parameter in ("x", "y", "z")
         self._apply(values, move=moves and len(image.index) > 0)
         value = getattr(part, parameter)
 
@@ -254,13 +337,14 @@ class Renderer:
             for sign in (1, -1):
                 setattr(part, parameter, dr.opaque(mi.Float, float(value[0]) + sign * step))
                 try:
-                    sides.append(self._shade(image.samples, lamp, self._visible(image.samples[0], lamp)))
+                    sides.append(self._shade(image.samples, lamp, self._visible(image.samples.si, lamp)))
                 finally:
                     setattr(part, parameter, value)
             return (sides[0] - sides[1]) / (2 * step)
 
-        return self._combine(image, lambda: tangent(image.hits.sample, image.visible),
-                             moved_rim if moves else lambda: tangent(image.samples, image.rim_visible))
+        raw = self._raw(image, lambda: tangent(image.hits.sample, image.visible),
+                        moved_rim if moves else lambda: tangent(image.samples, image.rim_visible))
+        return self._mix(image, raw, self.weights(values, image) if self.layered else (1.0, 1.0))
 
     def bounced(self, values: Mapping, led: str, seed: int = 0) -> np.ndarray:
         """(H, W, B): light of one LED at power 1 after two reflections; Monte Carlo over the second direction.
@@ -272,10 +356,12 @@ class Renderer:
         import mitsuba as mi
         from scipy.ndimage import zoom
 
+        if led in self.scene.sources:  # it lights nothing
+            return np.zeros((1, 1, self.bands))
         key = ("bounced", seed, *self._led_key(values, led))
         if key in self._images:
             self._images.move_to_end(key)
-            return self._images[key]
+            return self._bounced(values, led, self._images[key])
         self._apply(values)
         rows, columns = -(-self.height // BOUNCE_CELL), -(-self.width // BOUNCE_CELL)
         v, u = np.mgrid[:rows, :columns]
@@ -285,12 +371,18 @@ class Renderer:
         sample = self._trace(*(np.minimum(a * BOUNCE_CELL, size - 1e-3) for a, size in zip(at, (self.width, self.height))))
         sampler = mi.load_dict({"type": "independent"})
         sampler.seed(int(rng.integers(2**31)), count)
-        light = self.scene.integrator.bounced(self.scene.mitsuba, *sample, self.scene.leds[led], 1, sampler)
+        light = self.scene.integrator.bounced(self.scene.mitsuba, *sample[:3], self.scene.leds[led], 1, sampler)
         coarse = self._bands(light).reshape(rows, columns, BOUNCE_SAMPLES, self.bands).mean(2)
         image = zoom(coarse, (BOUNCE_CELL, BOUNCE_CELL, 1), order=1, mode="nearest", grid_mode=True)
-        image = image[:self.height, :self.width].astype(float)
-        self._images[key] = image
-        return image
+        self._images[key] = image[:self.height, :self.width].astype(float)
+        return self._bounced(values, led, self._images[key])
+
+    def _bounced(self, values: Mapping, led: str, image: np.ndarray) -> np.ndarray:
+        """A bounced image behind the layers."""
+        if not self.layered:
+            return image
+        weight = self._weight(values, led, self.hits(values).path, 0, ())
+        return image * weight.reshape(-1, self.width, self.bands)
 
     def ambient(self, values: Mapping) -> np.ndarray:
         """(H, W, B): radiance of the membranes that no LED made."""
@@ -300,22 +392,35 @@ class Renderer:
         self._apply(values, move=False)
         total = sum(self._bands(self.scene.integrator.ambient(self.scene.mitsuba, hits.si, hits.weight, m) + 0 * hits.si.t)
                     for m in self.scene.membranes.values())
-        return np.broadcast_to(total, (self.height * self.width, self.bands)).reshape(self.height, self.width, self.bands)
+        total = np.broadcast_to(total, (self.height * self.width, self.bands))
+        if self.layered:
+            total = total * self._weight(values, "", hits.path, 0, ())
+        return total.reshape(-1, self.width, self.bands)
+
+
+class Sample(NamedTuple):
+    """Camera rays at their ends (Dr.Jit), and in a scene with layers the paths that they took."""
+
+    si: object
+    weight: object
+    origin: object
+    path: paths.Path | None = None
 
 
 class Hits:
     """Primary hits of one geometry: si, weight, origin (Dr.Jit), and what they show as numpy images."""
 
-    def __init__(self, si, weight, origin, height: int, width: int):
-        self.si, self.weight, self.origin = si, weight, origin
+    def __init__(self, sample: Sample, height: int, width: int):
+        self.sample = sample
+        self.si, self.weight, self.origin, self.path = sample
         self.shape = (height, width)
         self.rims: dict = {}
-        self.valid = np.array(si.is_valid()).reshape(height, width)
+        self.joint: np.ndarray | None = None
+        self.valid = np.array(self.si.is_valid()).reshape(height, width)
         self.edges = _edges(self.valid)
-
-    @property
-    def sample(self) -> tuple:
-        return self.si, self.weight, self.origin
+        if self.path is not None:  # what is passed, and what is met, changes at an edge
+            for met in (self.path.shape, *(step.part for step in self.path.steps)):
+                self.edges |= _edges(met.reshape(height, width))
 
     def image(self, values) -> np.ndarray:
         return np.array(values).reshape(self.shape)
@@ -335,7 +440,8 @@ class LedImage:
     def __init__(self, led, hits, rim, index, samples, visible, rim_visible, lit):
         self.led, self.hits, self.rim, self.index, self.samples = led, hits, rim, index, samples
         self.visible, self.rim_visible, self.lit = visible, rim_visible, lit
-        self.radiance: np.ndarray | None = None
+        self.raw: tuple | None = None  # what the light makes before layers: at centres, at finer samples
+        self.radiance: np.ndarray | None = None  # the image, in scenes without layers
 
 
 class Model:
@@ -354,6 +460,8 @@ class Model:
         noise = noise or captures.noise
         if noise is None:
             raise BadScene(f"{captures.folder}: no noise model; give [noise] in captures.toml or repeats to estimate it from")
+        if captures.table is not None:
+            captures = sweeps(captures, scene.parameters, scene.lights)
         self.scene, self.captures, self.noise = scene, captures, noise
         self.mosaic, self.frames = None, captures.frames
         background = captures.flat_field
@@ -368,10 +476,10 @@ class Model:
             scene.check(frame.parameters, f"{frame.file or captures.folder}: frame {frame.name}")
         self.companions = self._companions()
         # A power that frames set is a drive level: what a calibration finds is the LED's power at drive 1.
-        self.driven = {f"{n}.power" for n in scene.leds} & {k for f in self.frames for k in f.parameters}
+        self.driven = {f"{n}.power" for n in scene.lights} & {k for f in self.frames for k in (*f.parameters, *f.readings)}
         self.base.update({k: 1.0 for k in self.driven})
         self.shape = self.frames[0].image.shape
-        height, width = self.shape[:2]
+        height, width = self.shape[:2] if captures.table is None else (1, 1)
         if (width, height) != scene.camera.resolution:
             raise BadScene(
                 f"{captures.folder}: images of {width} x {height} px, but the scene's camera has "
@@ -396,32 +504,37 @@ class Model:
         The power of an LED that frames set is the product of the setting and of the fitted power.
         """
         now = {**self.base, **values.common}
-        for key, value in self.frames[index].parameters.items():
+        frame = self.frames[index]
+        for key, value in (*frame.parameters.items(), *frame.readings.items()):
             now[key] = value * now[key] if key in self.driven else value
         now.update(values.frame.get(index, {}))
         return now
 
     def _acts(self, variable: Variable, index: int) -> dict[str, float]:
         """The keys through which a variable acts in a frame, each with d key / d variable."""
-        own = self.frames[index].parameters
+        own = {**self.frames[index].parameters, **self.frames[index].readings}
         if variable.frames is not None:
             return dict.fromkeys(variable.keys, 1.0)
-        return {k: float(own[k]) if k in own else 1.0 for k in variable.keys if k not in own or k in self.driven}
+        return {k: own[k] if k in own else 1.0 for k in variable.keys if k not in own or k in self.driven}
 
     def _companions(self) -> list[set[str]]:
         """For each frame the LEDs that are lit in any frame of the same press: they share its geometry."""
         presses: dict[tuple, set[str]] = {}
         keys = []
         for frame in self.frames:
-            own = {**self.base, **frame.parameters}
+            own = {**self.base, **frame.parameters, **frame.readings}
             key = (frame.group, *(own[k] for k in self.renderer.geometry_keys))
-            presses.setdefault(key, set()).update(n for n in self.scene.leds if own[f"{n}.power"] != 0)
+            presses.setdefault(key, set()).update(n for n in self.scene.lights if np.any(own[f"{n}.power"] != 0))
             keys.append(key)
         return [presses[key] for key in keys]
 
     def linear_in(self, variable: Variable) -> bool:
         """Whether predictions are linear in a variable together with all others of which this holds: the LEDs' powers."""
-        return all(self.renderer.kind(k) == "led" and k.rsplit(".", 1)[1] in POWERS for k in variable.keys)
+        return all(self._is_power(k) for k in variable.keys)
+
+    def _is_power(self, key: str) -> bool:
+        name, _, parameter = key.rpartition(".")
+        return name in self.scene.lights and parameter in POWERS
 
     def check_variables(self, variables: Sequence[Variable]) -> None:
         for variable in variables:
@@ -430,19 +543,19 @@ class Model:
                     raise UnknownKey(key, self.parameters, "parameter", hint="`optics params SCENE` lists them")
 
     def lit(self, now: Mapping) -> dict[str, np.ndarray]:
-        """The LEDs that are on and their powers per band (B,)."""
-        return {n: self.renderer.powers(now, n) for n in self.scene.leds if now[f"{n}.power"] != 0}
+        """The lights that are on and their powers per band (B,), or (N, 1, B) of readings."""
+        return {n: self.renderer.powers(now, n) for n in self.scene.lights if np.any(now[f"{n}.power"] != 0)}
 
     # -- prediction ---------------------------------------------------------------------------------------------------
 
     def radiance(self, now: Mapping, seed: int = 0) -> np.ndarray:
         """(H, W, B): linear image of a frame."""
-        total = np.array(self.renderer.ambient(now), dtype=np.float64)
+        total = np.asarray(self.renderer.ambient(now), np.float64)
         bounce = now[self.renderer.bounce_key]
         for led, power in self.lit(now).items():
-            total += power * self.renderer.led(now, led).radiance
+            total = total + power * self.renderer.image(now, led)
             if bounce:
-                total += power * bounce * self.renderer.bounced(now, led, seed)
+                total = total + power * bounce * self.renderer.bounced(now, led, seed)
         return total
 
     def untouched(self, now: Mapping) -> dict:
@@ -589,8 +702,12 @@ class Model:
             return None  # a dark frame
         if key == self.renderer.bounce_key:
             return factor * sum(power * self.renderer.bounced(now, led, seed) for led, power in lit.items())
-        if kind == "led" and parameter in POWERS:
-            if factor == 0:
+        if self.parameters[key].how == "layer":
+            stepped = {**now, key: now[key] + 1j * STEP}
+            total = self.renderer.ambient(stepped) + sum(power * self.renderer.image(stepped, n) for n, power in lit.items())
+            return factor * (np.imag(total) / STEP)
+        if self._is_power(key):
+            if np.all(factor == 0):
                 return None
             # the power is a product of four: the derivative by one of them is the product of the others
             others = self.renderer.powers({**now, key: 1.0}, name)
@@ -599,7 +716,7 @@ class Model:
             factor = factor * others
             if not np.any(factor):
                 return None
-            image = self.renderer.led(now, name).radiance
+            image = self.renderer.image(now, name)
             return factor * (image + bounce * self.renderer.bounced(now, name, seed) if bounce else image)
         if kind == "led" and name not in lit:
             return None
@@ -629,8 +746,7 @@ class Model:
 
     def _difference_led(self, now: Mapping, led: str, key: str) -> np.ndarray:
         low, high = self._sides(key, now)
-        return (self.renderer.led({**now, key: high}, led).radiance
-                - self.renderer.led({**now, key: low}, led).radiance) / (high - low)
+        return (self.renderer.image({**now, key: high}, led) - self.renderer.image({**now, key: low}, led)) / (high - low)
 
     def _difference_ambient(self, now: Mapping, key: str) -> np.ndarray:
         low, high = self._sides(key, now)
@@ -650,9 +766,9 @@ class Model:
         return mask
 
     @property
-    def size(self) -> int:
-        """Values that a frame holds: pixels x channels, or the pixels of a mosaic."""
-        return int(np.prod(self.shape[:2])) * (1 if self.mosaic is not None else self.shape[2])
+    def size(self) -> float:
+        """Values that a frame holds (on average, of readings): pixels x channels, or the pixels of a mosaic."""
+        return float(np.mean([f.image.size for f in self.frames])) / (3 if self.mosaic is not None else 1)
 
     def coordinates(self, values: Values, index: int) -> dict[str, np.ndarray]:
         """What is known of every pixel of a frame; see `optics.compare` and `optics.diagnose` for their use."""
@@ -668,13 +784,15 @@ class Model:
         rim = hits.edges.copy()
         incidence, distance, best = np.full((height, width), 90.0), np.zeros((height, width)), np.full((height, width), -1.0)
         for led in lit:
+            if led in self.scene.sources:
+                continue
             image = self.renderer.led(now, led)
             shadow |= ~image.lit & hits.valid
             rim |= image.rim
             to = np.array([now[f"{led}.{a}"] for a in "xyz"]) - p
             length = np.linalg.norm(to, axis=-1)
             cos = np.clip((to * n).sum(-1) / np.maximum(length, 1e-9), -1, 1)
-            strength = (lit[led] * image.radiance).sum(-1)
+            strength = (lit[led] * self.renderer.image(now, led)).sum(-1)
             brightest = strength > best
             best = np.where(brightest, strength, best)
             incidence = np.where(brightest, np.degrees(np.arccos(cos)), incidence)
@@ -702,7 +820,12 @@ class Model:
                 "gel_path": np.array(gel.number("thickness") + p[..., 2]) / np.maximum(np.cos(np.radians(emission)), 1e-3),
             })
         known["far"] = ~(known.get("contact", shadow) | known["rim"] | shadow) & hits.valid
-        return known
+        readings = self.frames[index].readings
+        if self.captures.table is None:
+            return known
+        count = self.frames[index].image.shape[0]  # of one place: only what is set tells readings apart
+        return {"intensity": np.broadcast_to(known["intensity"], (count, 1)), "far": np.ones((count, 1), bool),
+                "frame": np.full((count, 1), float(index)), **{k: v[..., 0] for k, v in readings.items()}}
 
 
 def _edges(mask: np.ndarray) -> np.ndarray:

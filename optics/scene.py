@@ -53,6 +53,8 @@ class Scene:
     camera, integrator, gel, leds, membranes    the parts by role (None or empty where the scene has none)
     """
 
+    MOVED = ("carried", "markers", "target")  # kinds of shapes besides the gel whose parameters move geometry
+
     def __init__(self, path: Path, defines: Mapping[str, str], variant: str = DEFAULT_VARIANT):
         self.path, self.defines, self.variant = Path(path), dict(defines), variant
         text = self.path.read_text(encoding="utf-8")
@@ -83,6 +85,8 @@ class Scene:
         self.integrator = self._one("tactile")
         self.gel = self._one("gel")
         self.leds = {n: p for n, p in self.parts.items() if p.kind == "led"}
+        self.sources = {n: p for n, p in self.parts.items() if p.kind == "source"}
+        self.lights = {**self.leds, **self.sources}
         self.membranes = {n: p for n, p in self.parts.items() if p.kind == "membrane"}
         self.parameters: dict[str, Parameter] = {}
         for name, part in self.parts.items():
@@ -174,7 +178,8 @@ class Scene:
         return {name: [f"{h}.{name}" for h in holders] for name in effect.parameter_names}
 
     def can_express(self, effect: Effect) -> bool:
-        return all(self.keys_of(effect).values())
+        kinds = {p.kind for p in self.parts.values()}
+        return all(self.keys_of(effect).values()) and kinds.issuperset(effect.requires)
 
     def variables_of(self, effect: Effect, frames: int = 0) -> list[Variable]:
         """What a calibration frees to add the effect: shared or per part, for all frames or for each."""

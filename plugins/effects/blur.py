@@ -30,7 +30,7 @@ def smear(image, camera):
 
 
 effect = Effect(
-    name="lens blur", part="camera", stages={"lens": smear}, onset="both",
+    name="lens blur", part="camera", stages={"lens": smear}, onset="both", pictures=True,
     parameters=(Parameter("blur", "px^2", 0.0, (0.0, 400.0), "variance V of the blur", neutral=0.0, plausible=1.0,
                           how="image"),),
     acts=("curvature", "rim"), needs="sharp edges: deep presses with shadows, small indenters")

@@ -22,6 +22,6 @@ def spread(image, camera):
 
 
 effect = Effect(
-    name="veiling glare", part="camera", stages={"lens": spread},
+    name="veiling glare", part="camera", stages={"lens": spread}, pictures=True,
     parameters=(Parameter("glare", "1", 0.0, (0.0, 1.0), "glare fraction g", neutral=0.0, plausible=0.02, how="image"),),
     acts=("intensity", "frame"), needs="deep shadows, and frames of different total light")

@@ -14,5 +14,5 @@ References
 
 from optics.effect import Effect
 
-effect = Effect(name="interreflection", part="tactile", parameters=("interreflection",),
+effect = Effect(name="interreflection", part="tactile", requires=("membrane",), parameters=("interreflection",),
                 acts=("height", "slope", "shadow", "channel"), needs="deep presses with steep flanks")

@@ -20,7 +20,7 @@ PARTS = sorted(registry().parts)
 EFFECTS = sorted(registry().effects)
 NUMBERS = [(kind, p.name) for kind in PARTS for p in registry().parameters_of(kind) if p.is_number]
 SECTIONS = ("Definition", "Fingerprint", "Validity", "References")
-UNITS = {"1", "mm", "mm^2", "deg", "rad", "nm", "px", "px^2", "DN", "1/mm", "1/mm^2", "-"}
+UNITS = {"1", "mm", "mm^2", "deg", "rad", "nm", "px", "px^2", "DN", "1/mm", "1/mm^2", "MPa", "1e-12/Pa", "-"}
 
 IDENTITY = 1e-6  # of full scale: ten roundings of float32
 FLOAT = 3e-7  # relative rounding of an image in float32: what a difference of two images cannot resolve

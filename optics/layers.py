@@ -1,0 +1,196 @@
+"""Layers: thin sheets that change light as it passes, as Mueller matrices in the light's own axes.
+
+A layer is a part of the category `bsdf` on a flat or curved surface. Its physics is one function of what a ray meets:
+
+    mueller(crossing, layer) -> Mueller          crossing: how the light passes (`Crossing`); layer: the part's parameters
+
+in arithmetic that numpy arrays and Dr.Jit share (optics.mueller). The prediction follows each camera ray through the layers
+(optics.paths) and multiplies these matrices in numpy; mi.render meets the same function inside a null BSDF (`bsdf`).
+Effects add to it at the stage `layer`, with a function of the same form.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from types import SimpleNamespace
+
+from optics.effect import Declared, Part, registry
+from optics.mueller import Mueller, cos, sin, sqrt, where
+
+
+
+MONO = 540.0  # nm: the wavelength of variants that know none
+
+
+def dot(a, b):
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def cross(a, b):
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+class Crossing:
+    """How light passes a layer, in the layer's own axes: z the normal (towards the viewer), x the layer's zero direction.
+
+    k            unit vector of the light's direction, (kx, ky, kz)
+    x, y         the axes that the Stokes vectors refer to, unit vectors with k = x cross y
+    u, v         where it passes, mm along the layer's x and y axes from the layer's middle
+    wavelengths  nm
+    """
+
+    def __init__(self, k, x, u, v, wavelengths):
+        self.k, self.x, self.u, self.v, self.wavelengths = k, x, u, v, wavelengths
+        self.y = cross(k, x)
+
+    @property
+    def cos(self):
+        """Cosine of the angle of incidence."""
+        return where(self.k[2] < 0, -self.k[2], self.k[2])
+
+    def _doubled(self, axis):
+        """(cos 2 phi, sin 2 phi) of a direction across k, of any length, against the axes x, y."""
+        c, s = dot(axis, self.x), dot(axis, self.y)
+        norm = c * c + s * s
+        return (c * c - s * s) / norm, 2 * c * s / norm
+
+    def polarizer_axis(self, angle) -> tuple:
+        """(q, u) of the transmitted direction of a sheet polarizer whose transmission axis lies at `angle` (deg).
+
+        Across the ray and across the absorbing molecules a: t = k x a (Korger et al., Opt. Express 21, 27032 (2013)).
+        """
+        angle = angle * (math.pi / 180)
+        return self._doubled(cross(self.k, (-sin(angle), cos(angle), 0 * angle)))
+
+    def axis(self, angle) -> tuple:
+        """(q, u) of a direction in the sheet at `angle` (deg), seen along the ray."""
+        angle = angle * (math.pi / 180)
+        a = (cos(angle), sin(angle), 0 * angle)
+        along = dot(a, self.k)
+        return self._doubled(tuple(c - along * k for c, k in zip(a, self.k)))
+
+    def plane(self) -> tuple:
+        """(q, u) of the s direction, across the plane of incidence; that of the layer's x axis at normal incidence."""
+        level = 1 - self.k[2] * self.k[2] < 1e-12
+        return self._doubled((where(level, 0.0 * self.k[1] + 1, -self.k[1]), where(level, 0.0, self.k[0]), 0 * self.k[2]))
+
+    def retardance(self, a, b, index) -> tuple:
+        """Components against the axes x, y of a retardance that is (a, b) against the sheet's own axes at normal incidence.
+
+        The sheet's birefringence is the tensor [[a, b], [b, -a]]/2 in its plane (a along x less along y, b along the diagonals),
+        without part along its normal; a ray sees what of it lies across the ray inside the sheet, over a path longer by 1/cos.
+        Small birefringence: Yeh & Gu, Optics of Liquid Crystal Displays, 2nd ed., 3.2.
+        """
+        inner = sqrt(1 - (1 - self.k[2] * self.k[2]) / (index * index))
+        bent = (self.k[0] / index, self.k[1] / index, where(self.k[2] < 0, -inner, inner))
+        middle = tuple(p + q for p, q in zip(self.k, bent))
+        share = 1 + dot(self.k, bent)
+        x, y = (tuple(c - dot(bent, axis) / share * m for c, m in zip(axis, middle)) for axis in (self.x, self.y))
+
+        def tensor(p, q):
+            return (a * (p[0] * q[0] - p[1] * q[1]) + b * (p[0] * q[1] + p[1] * q[0])) / 2
+
+        return (tensor(x, x) - tensor(y, y)) / inner, 2 * tensor(x, y) / inner
+
+
+def evaluate(kind: str, own: Callable, crossing: Crossing, layer, active=None) -> Mueller:
+    """The layer's matrix with those of its effects, in the order of their keys; `active` are the stage's effects."""
+    matrix = own(crossing, layer)
+    for effect in registry().at_stage(kind, "layer") if active is None else active:
+        matrix = effect.stages["layer"](crossing, layer) @ matrix
+    return matrix
+
+
+def active_effects(kind: str, values: Mapping) -> list:
+    """Effects of the stage `layer` that do not rest at neutral, for values by parameter name (numbers, arrays, complex)."""
+    import numpy as np
+
+    neutral = {p.name: p.neutral for p in registry().parameters_of(kind)}
+    return [e for e in registry().at_stage(kind, "layer")
+            if any(np.any(np.asarray(values[n]) != neutral[n]) for n in e.parameter_names)]
+
+
+def crossing_of(si) -> Crossing:
+    """How light that leaves a surface interaction towards si.wi passes the surface, in Mitsuba's implicit axes (Dr.Jit)."""
+    import drjit as dr
+    import mitsuba as mi
+
+    normal = si.sh_frame.n
+    across = dr.normalize(si.dp_du - normal * dr.dot(normal, si.dp_du))
+    frame = mi.Frame3f(across, dr.cross(normal, across), normal)
+    world = si.to_world(si.wi)
+    k, x = frame.to_local(world), frame.to_local(mi.mueller.stokes_basis(world))
+    wavelengths = mi.UnpolarizedSpectrum(si.wavelengths) if mi.is_spectral else mi.UnpolarizedSpectrum(MONO)
+    v = (si.uv.y - 0.5) * dr.norm(si.dp_dv) * dr.sign(dr.dot(si.dp_dv, frame.t))
+    return Crossing((k.x, k.y, k.z), (x.x, x.y, x.z), (si.uv.x - 0.5) * dr.norm(si.dp_du), v, wavelengths)
+
+
+def numbers_of(part) -> SimpleNamespace:
+    """A part's parameters as its functions read them, in Dr.Jit."""
+    return SimpleNamespace(name=part.name, **{n: getattr(part, n) for n in (*part.numbers, *part.words)})
+
+
+def layer(kind: str, parameters: tuple, mueller: Callable) -> Part:
+    """The declaration of a layer: its name in XML, its parameters, its Mueller matrix."""
+    return Part(kind, "bsdf", parameters, lambda: bsdf(kind, mueller), mueller=mueller)
+
+
+def bsdf(kind: str, own: Callable) -> type:
+    """A null BSDF of the present Mitsuba variant that weighs passing light with the layer's matrix."""
+    import drjit as dr
+    import mitsuba as mi
+
+    class Layer(Declared.on(mi.BSDF)):
+        is_layer = True
+
+        def __init__(self, props):
+            mi.BSDF.__init__(self, props)
+            self.declare(props)
+            self.m_components = [mi.BSDFFlags.Null | mi.BSDFFlags.FrontSide | mi.BSDFFlags.BackSide]
+            self.m_flags = self.m_components[0]
+
+        def traverse(self, cb):
+            self.put_parameters(cb)
+
+        def parameters_changed(self, keys=()):
+            self.reread(keys)
+
+        def matrix(self, si):
+            """What light that leaves towards si.wi went through, in Mitsuba's implicit axes."""
+            stages = [e for e in registry().at_stage(kind, "layer") if e.stages["layer"] in self.functions("layer")]
+            return evaluate(kind, own, crossing_of(si), numbers_of(self), stages)
+
+        def weight(self, si, active):
+            matrix = self.matrix(si)
+            value = matrix.mitsuba() if mi.is_polarized else mi.Spectrum(matrix.rows[0][0])
+            if mi.is_polarized:  # in BSDF code matrices stand in the implicit axes of local directions
+                value = si.to_local_mueller(value, si.to_world(si.wi), si.to_world(si.wi))
+            return dr.select(active, value, 0.0)
+
+        def sample(self, ctx, si, sample1, sample2, active=True):
+            bs = dr.zeros(mi.BSDFSample3f)
+            bs.wo = -si.wi
+            bs.pdf = mi.Float(1.0)
+            bs.eta = mi.Float(1.0)
+            bs.sampled_type = mi.UInt32(+mi.BSDFFlags.Null)
+            bs.sampled_component = mi.UInt32(0)
+            return bs, self.weight(si, active)
+
+        def eval(self, ctx, si, wo, active=True):
+            return mi.Spectrum(0.0)
+
+        def pdf(self, ctx, si, wo, active=True):
+            return mi.Float(0.0)
+
+        def eval_pdf(self, ctx, si, wo, active=True):
+            return mi.Spectrum(0.0), mi.Float(0.0)
+
+        def eval_null_transmission(self, si, active=True):
+            return self.weight(si, active)
+
+        def to_string(self):
+            return f"Layer[{self.kind}, {self.name}]"
+
+    Layer.kind = kind
+    return Layer

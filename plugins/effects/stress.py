@@ -1,0 +1,64 @@
+"""Stress birefringence: a sheet under stress delays light between its principal stresses.
+
+Definition
+    delta(lambda) = 2 pi C (sigma_1 - sigma_2) d/lambda          stress-optic law
+in components: (a, b) = 2 pi C d/lambda stress (P_q, P_u), with the coefficient C = `stress_optic`, the thickness d =
+`stress_thickness`, and the pattern (P_q, P_u) = (s_xx - s_yy, 2 s_xy) per unit of `stress`:
+    even    (1, 0): uniform tension along the sheet's x axis
+    disc    a disc of the diameter `stress_size` pressed along its y axis: s_ij of the two point loads, in units of 2P/(pi D d)
+    bend    a bar along x, bent: (2 y/size, 0)
+    gel     of the skin that the present press deforms (set by the scene), stress in units of its shear modulus, thickness included
+    a file  an image (H, W, 2) in NPY or EXR: P_q and P_u over the square of `stress_size`
+Fingerprint
+    a pattern of fringes that follows the stress; between crossed polarizers dark where a principal stress is along a polarizer.
+    The second order of a faint one hides; see `retardance`.
+Validity
+    linear elasticity in the sheet's plane, stress constant through the thickness (or integrated through it: `gel`).
+References
+    Frocht, Photoelasticity II (1948), 4.19 (disc); Goldstein, Polarized Light, 3rd ed., 24.6; Brewster's law 1 B = 1e-12/Pa.
+"""
+
+import math
+
+from optics.effect import Effect
+from optics.mueller import real, retarder, where
+from optics.parameter import Parameter
+
+
+def strain(crossing, sheet):
+    p_q, p_u = pattern(crossing, sheet)
+    factor = 2 * math.pi * sheet.stress_optic * sheet.stress_thickness * sheet.stress / crossing.wavelengths
+    index = where(real(sheet.index) > 1, sheet.index, 1.5 + 0 * sheet.index)
+    return retarder(*crossing.retardance(p_q * factor, p_u * factor, index))
+
+
+def pattern(crossing, sheet):
+    if sheet.stress_pattern == "even":
+        one = 1.0 + 0 * crossing.u
+        return one, 0 * one
+    if sheet.stress_pattern == "bend":
+        return 2 * crossing.v / sheet.stress_size, 0 * crossing.u
+    if sheet.stress_pattern == "disc":
+        return disc(crossing.u, crossing.v, sheet.stress_size / 2)
+    return sheet.field(crossing.u, crossing.v, sheet.stress_size)
+
+
+def disc(x, y, radius):
+    """(s_xx - s_yy, 2 s_xy) of a disc pressed at (0, +-R) by P, over 2P/(pi D thickness) D = P/(pi R d); 0 outside."""
+    inside = real(x * x + y * y) < real(radius * radius) * 0.9999
+    up, down = radius - y, radius + y
+    r1, r2 = x * x + up * up, x * x + down * down
+    q = -(2 * radius) * (up * (x * x - up * up) / (r1 * r1) + down * (x * x - down * down) / (r2 * r2))
+    u = 2 * (2 * radius) * (up * up * x / (r1 * r1) - down * down * x / (r2 * r2))
+    return where(inside, q, 0.0 * q), where(inside, u, 0.0 * u)
+
+
+effect = Effect(
+    name="stress birefringence", part="sheet", stages={"layer": strain}, onset="both",
+    parameters=(Parameter("stress", "MPa", 0.0, (-1e3, 1e3), "stress of the pattern", neutral=0.0, plausible=0.2, how="layer"),),
+    shape=(Parameter("stress_optic", "1e-12/Pa", 5.0, (-1e5, 1e5), "stress-optic coefficient C, in Brewster", plausible=0.5,
+                     how="layer"),
+           Parameter("stress_thickness", "mm", 3.0, (1e-6, 100.0), "thickness d", plausible=0.1, how="layer"),
+           Parameter("stress_size", "mm", 20.0, (1e-3, 1000.0), "size of the pattern", plausible=1.0, how="layer"),
+           Parameter("stress_pattern", "-", "even", choices=("even", "disc", "bend", "gel"), doc="even, disc, bend, gel or a file")),
+    acts=("analyzer.angle", "sample.angle", "radius"), needs="the sheet at two angles, best behind a quarter-wave plate")

@@ -1,0 +1,38 @@
+"""Sheet: a thin clear layer in the light's way: a plate, a foil, the sample slot of a bench.
+
+Definition
+    M = t F                    transmittance t = transmittance exp(transmittance_slope (lambda - 540)/100)
+    F = diattenuator(s, (1 - R_s)^2, (1 - R_p)^2)      both faces of an index n = `index` (1: no faces), Fresnel's R_s, R_p
+What the sheet does to polarization besides are effects: `retardance`, `stress`, `depolarization`. With them it is a wave plate, a
+stressed plate, or a depolarizing foil; their axes turn with the sheet's `angle`.
+Angles count from the surface's x axis to its y axis: counterclockwise for a viewer at whom the surface's normal points.
+Fingerprint
+    weakens the light behind it; a tilted one polarizes weakly, across the plane of incidence.
+Validity
+    thin: a ray is not shifted; reflections between its own faces are left out (4 % of 4 % at n = 1.5).
+References
+    Born & Wolf, Principles of Optics, 1.5.2.
+"""
+
+from optics.layers import layer
+from optics.mueller import diattenuator, exp, fresnel
+from optics.parameter import Parameter
+
+PARAMETERS = (
+    Parameter("transmittance", "1", 1.0, (0.0, 1.0), "transmittance at 540 nm without the faces' losses", neutral=1.0,
+              plausible=0.05, how="layer"),
+    Parameter("transmittance_slope", "1", 0.0, (-2.0, 2.0), "change of ln t per 100 nm", neutral=0.0, plausible=0.05, how="layer"),
+    Parameter("index", "1", 1.0, (1.0, 2.5), "refractive index n of the faces; 1: none", neutral=1.0, plausible=0.1, how="layer"),
+    Parameter("angle", "deg", 0.0, (-7200.0, 7200.0), "turn of the sheet about its normal", plausible=1.0, how="layer"),
+)
+
+
+def pass_sheet(crossing, sheet):
+    q, u = crossing.plane()
+    r_s, r_p, _ = fresnel(crossing.cos, sheet.index)
+    steps = (crossing.wavelengths - 540.0) / 100
+    t = sheet.transmittance * exp(sheet.transmittance_slope * steps)
+    return diattenuator(q, u, t * ((1 - r_s) * (1 - r_s)), t * ((1 - r_p) * (1 - r_p)))
+
+
+part = layer("sheet", PARAMETERS, pass_sheet)

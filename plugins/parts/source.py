@@ -1,0 +1,112 @@
+"""Source: a luminous area that a camera or a photodiode looks at: a lamp behind a diffuser, a screen.
+
+Definition
+    S = L (1, q, u, 0)                    Stokes vector, the same in all directions
+    L = power power_c w(lambda) (1 + drift time)
+with the power (radiance, relative), the shares of the first three bands, the spectrum w of an LED (a Gaussian; 1 in every band
+when `wavelength` is 0), and the linear polarization q = `dop_q` = p cos(2a), u = `dop_u` = p sin(2a) of the degree p along the
+angle a, from the surface's x axis to its y axis. `time` is the experimenter's clock, a setting of a frame or a reading.
+Fingerprint
+    power scales a reading; polarized light makes the first polarizer's own angle count; a drift grows with time, whatever is set.
+Validity
+    an even surface; it lights nothing else.
+References
+    Goldstein, Polarized Light, 3rd ed., ch. 4.
+"""
+
+import math
+
+from optics.effect import Declared, Part
+from optics.mueller import exp, where
+from optics.parameter import Parameter
+
+PARAMETERS = (
+    Parameter("power", "1", 1.0, (0.0, 1e6), "radiance L, relative; 0 switches the source off", plausible=0.1, linear=True),
+    *(Parameter(f"power_{c}", "1", 1.0, (0.0, 1e6), f"share of the power in the {word} band ({colour})", plausible=0.1,
+                linear=True) for c, word, colour in (("r", "first", "red"), ("g", "second", "green"), ("b", "third", "blue"))),
+    Parameter("dop_q", "1", 0.0, (-1.0, 1.0), "linear polarization along 0 deg, less that along 90", neutral=0.0, plausible=0.05,
+              how="layer"),
+    Parameter("dop_u", "1", 0.0, (-1.0, 1.0), "linear polarization along 45 deg, less that along 135", neutral=0.0,
+              plausible=0.05, how="layer"),
+    Parameter("drift", "1", 0.0, (-1.0, 1.0), "relative change per unit of time", neutral=0.0, plausible=0.01, how="layer"),
+    Parameter("time", "1", 0.0, (-1e6, 1e6), "the clock: minutes, or any unit that `drift` is meant in", plausible=1.0, how="layer"),
+    Parameter("wavelength", "nm", 0.0, (0.0, 2000.0), "peak wavelength; 0: the same in every band", plausible=3.0, how="layer"),
+    Parameter("fwhm", "nm", 30.0, (1.0, 1000.0), "full width at half maximum of the spectrum", plausible=5.0, how="layer"),
+)
+
+
+def stokes(crossing, source):
+    """Stokes vector at power 1, against the crossing's axes."""
+    u = (crossing.wavelengths - source.wavelength) / source.fwhm
+    line = exp(-4 * math.log(2) * u * u)
+    level = where(source.wavelength > 0, line, 1.0 + 0.0 * line) * (1 + source.drift * source.time)
+    q, u = crossing.axis(0.0)  # of the surface's x axis, against the crossing's axes
+    return level, level * (source.dop_q * q - source.dop_u * u), level * (source.dop_q * u + source.dop_u * q), 0
+
+
+def build():
+    import drjit as dr
+    import mitsuba as mi
+
+    from optics.layers import crossing_of, numbers_of
+
+    class Source(Declared.on(mi.Emitter)):
+        kind = "source"
+
+        def __init__(self, props):
+            mi.Emitter.__init__(self, props)
+            self.declare(props)
+            self.m_flags = +mi.EmitterFlags.Surface
+            self.m_needs_sample_3 = True
+
+        def traverse(self, cb):
+            self.put_parameters(cb)
+
+        def parameters_changed(self, keys=()):
+            self.reread(keys)
+
+        def colour(self):
+            shares = (self.power_r, self.power_g, self.power_b, mi.Float(1.0))
+            return self.power * mi.UnpolarizedSpectrum(*shares[:dr.size_v(mi.UnpolarizedSpectrum)])
+
+        def emitted(self, si):
+            """What leaves towards si.wi, in Mitsuba's implicit axes; light leaves on the side of the normal."""
+            vector = stokes(crossing_of(si), numbers_of(self))
+            colour = dr.select(mi.Frame3f.cos_theta(si.wi) > 0, self.colour(), 0.0)
+            if not mi.is_polarized:
+                return mi.Spectrum(vector[0] * colour)
+            rows = [[mi.UnpolarizedSpectrum(component) * colour, 0, 0, 0] for component in vector]
+            return mi.Spectrum(*[mi.UnpolarizedSpectrum(e) for row in rows for e in row])
+
+        def eval(self, si, active=True):
+            return dr.select(active, self.emitted(si), 0.0)
+
+        def sample_direction(self, it, sample, active=True):
+            ds = self.get_shape().sample_direction(it, sample, active)
+            active &= (dr.dot(ds.d, ds.n) < 0) & (ds.pdf != 0)
+            ds.emitter = mi.EmitterPtr(self)
+            return ds, dr.select(active, self.eval_direction(it, ds, active) / ds.pdf, 0.0)
+
+        def eval_direction(self, it, ds, active=True):
+            level = mi.UnpolarizedSpectrum(self.level(it.wavelengths)) * self.colour()
+            level = dr.select(dr.dot(ds.d, ds.n) < 0, level, 0.0)
+            return mi.mueller.depolarizer(level) if mi.is_polarized else mi.Spectrum(level)
+
+        def level(self, wavelengths):
+            bands = mi.UnpolarizedSpectrum(wavelengths) if mi.is_spectral else mi.UnpolarizedSpectrum(540.0)
+            u = (bands - self.wavelength) / self.fwhm
+            return dr.select(self.wavelength > 0, dr.exp(-4 * math.log(2) * dr.square(u)), 1.0) * (1 + self.drift * self.time)
+
+        def pdf_direction(self, it, ds, active=True):
+            return dr.select(dr.dot(ds.d, ds.n) < 0, self.get_shape().pdf_direction(it, ds, active), 0.0)
+
+        def bbox(self):
+            return self.get_shape().bbox()
+
+        def to_string(self):
+            return f"Source[{self.name}]"
+
+    return Source
+
+
+part = Part("source", "emitter", PARAMETERS, build, stokes=stokes)
