@@ -353,16 +353,17 @@ class Descent:
             if promised < enough or (gained and promised > part * first > 0):
                 break
             worst = -promised if promised < rough else 0.0
-            theta, values, there = self._at(self._step(self.damping)[0])
-            if self.powers and not self.here.total - there.total > max(worst, promised / 2):
+            target, expected = self._step(self.damping)  # within reach, of which less may be expected
+            theta, values, there = self._at(target)
+            if self.powers and not self.here.total - there.total > max(worst, expected / 2):
                 theta, values, there = min((theta, values, there), self._settled(theta, values), key=lambda t: t[2].total)
             gain = self.here.total - there.total
             if np.isfinite(there.total) and gain > worst:
                 self.theta, self.values, self.here = theta, values, there
-                self.trust = min(2 * self.trust, 1e3) if gain > promised / 2 else max(self.trust / 2, 1.0)
+                self.trust = min(2 * self.trust, 1e3) if gain > expected / 2 else max(self.trust / 2, 1.0)
                 gained += gain
                 self.damping = max(self.damping / 10, 1e-9)
-                if gain < enough or 10 * enough < gain < 0.25 * promised:
+                if gain < enough or 10 * enough < gain < 0.25 * expected:
                     break
             else:
                 self.trust = max(self.trust / 2, 1.0)

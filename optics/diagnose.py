@@ -32,6 +32,7 @@ IMPLAUSIBLE = 10.0  # times the plausible strength: worth a look
 MAX_REFITS = 10
 MAX_SPLIT = 4  # members of an ambiguous set that are tested for evenness
 SIDE = 4  # cells per side of the coordinate 'place': a finer map would fit any clutter and forbid every claim
+HAIR = 0.01  # of the fall: a split that gains less says nothing about what the effect is
 NOT_A_COORDINATE = ("far",)  # regions that others make up
 NAMED_BINS = ("place", "frame", "channel", "LED")
 YES_NO = ("contact", "shadow", "rim")
@@ -80,12 +81,16 @@ def diagnose(model, fit, effects: Sequence[Effect], variables_of: Callable[[Effe
 
     rows = [c.row for c in table.order]
     done = sorted((c for c in chosen if c.row.refit is not None), key=lambda c: -c.row.net_refit)
-    winner = done[0] if done and done[0].row.net_refit > 0 else None
+    winner = _simplest(done) if done and done[0].row.net_refit > 0 else None
+    done = [c for c in done if not any(_contains(c, d) and c.row.net_refit - d.row.net_refit < CLEAR for d in done)]
     places = _places(model, fit.values, evidence)
     reference = winner.row.net_refit if winner else max([c.row.net for c in table.order], default=0.0)
     fingerprints = _fingerprints(model, evidence, places, max(reference, 1.0), say)
 
-    members = [c for c in done if c.row.net_refit > 0 and _close(winner.row.net_refit, c.row.net_refit)] if winner else []
+    if winner:
+        done.sort(key=lambda c: c is not winner)
+    members = [c for c in done if c.row.net_refit > 0 and _close(winner.row.net_refit, c.row.net_refit)
+               and not _refuted(winner, c)] if winner else []
     splits = []
     if winner:
         for c in members[:MAX_SPLIT]:
@@ -558,8 +563,8 @@ def _split(model, evidence: Evidence, c: Candidate, found, places: list[dict], r
         h = max(fall - dof, 0.0) * k / max(c.row.net_refit, 1e-9)
         results.append(Split(c.effect.name, by, labels, (1 + delta).tolist(), sd.tolist(), fall * k, dof, p, h, True))
     chance = LEVEL / max(len(results), 1)
-    if c.row.refit.complete:  # nothing but noise is left, so that p means what it says
-        return [replace(s, holds=s.p >= chance) for s in results]
+    if c.row.refit.complete:  # nothing but noise is left, so that p means what it says, but for a hair of the fall
+        return [replace(s, holds=s.p >= chance or s.h < HAIR) for s in results]
     return [replace(s, holds=s.h <= UNEVEN or s.p >= chance) for s in results]
 
 
@@ -665,22 +670,42 @@ def _shifts(model, fit, winner: Candidate, fits: Mapping) -> list[Shift]:
 # -- findings, limits, warnings ---------------------------------------------------------------------------------------
 
 
+def _contains(one: Candidate, other: Candidate) -> bool:
+    """Whether an effect frees all that another frees, and more: it fits as well by itself and rivals nothing."""
+    keys = [{(key, v.frames) for v in c.variables for key in v.keys} for c in (one, other)]
+    return keys[0] > keys[1]
+
+
+def _refuted(winner: Candidate, other: Candidate) -> bool:
+    """Whether the winner leaves nothing to explain, and another, refitted, does."""
+    left = other.row.refit
+    return other is not winner and winner.row.refit.complete and left is not None and left.converged and (
+        left.structure_p < LEVEL or left.excess_sd > 2 * EXCESS)
+
+
+def _simplest(done: Sequence[Candidate]) -> Candidate:
+    """The best effect, or one that it contains and that does as well."""
+    best = done[0]
+    return next((c for c in done[1:] if _contains(best, c) and best.row.net_refit - c.row.net_refit < CLEAR), best)
+
+
 def _findings(table, winner, done, members, fingerprints, splits, levels, basis, structure) -> Findings:
     if winner is None:
         best = max((c.row.net for c in table.order), default=0.0)
         own = Findings(table.p_best, structure.p, fall=max(best, 0.0), excess_sd=basis.excess_sd)
     else:
         mine = [s for s in splits if s.effect == winner.effect.name]
+        others = [c for c in table.order if c is not winner and not _contains(c, winner)]
         even = {c.effect.name: all(s.holds for s in splits if s.effect == c.effect.name) for c in members[:MAX_SPLIT]}
         worst = max(mine, key=lambda s: (not s.holds, s.h), default=None)
         excess = basis.chi2 - basis.dof
         own = Findings(
             table.p_best, structure.p, winner.effect.name,
             table.family.p(float(winner.cone.p(winner.row.refit.fall))), winner.row.net_refit,
-            max([c.row.net_refit for c in done[1:]] + [c.row.net for c in table.order if c not in done] + [0.0]),
+            max([c.row.net_refit for c in done[1:]] + [c.row.net for c in others if c not in done] + [0.0]),
             refuted=winner.row.refit.complete and all(
-                c.row.refit is not None and c.row.refit.structure_p < LEVEL for c in table.order if c is not winner
-                and _close(winner.row.net_refit, max(c.row.net_refit, c.row.net if c not in done else 0.0))),
+                _refuted(winner, c) for c in others
+                if _close(winner.row.net_refit, max(c.row.net_refit, 0.0 if c in done else c.row.net))),
             share=winner.row.net_refit / excess if excess > 0 else math.nan, excess_sd=basis.excess_sd,
             uneven=worst.h if worst else 0.0, uneven_by=f" by {worst.by} ({_extremes(worst)})" if worst else "",
             even=all(s.holds for s in mine),

@@ -92,6 +92,9 @@ class Scene:
         for name, part in self.parts.items():
             for p in registry().parameters_of(part.kind):
                 self.parameters[f"{name}.{p.name}"] = p
+        if carried := [p for p in self.parts.values() if hasattr(p, "carry")]:
+            self._place(carried)
+            self.mitsuba.parameters_changed([])
         self._stock = self._stock_parameters()
         self.parameters.update({k: p for k, (p, _) in self._stock.items() if k not in self.parameters})
         self._now = self._read()
@@ -145,7 +148,7 @@ class Scene:
         import mitsuba as mi
 
         changed = {k: v for k, v in self.check(values, where).items() if self._now[k] != v}
-        rebuild, stock = False, False
+        rebuild, moved, stock = False, set(), False
         for key, value in changed.items():
             if key in self._stock:
                 self._traversed[self._stock[key][1]] = mi.Float(value)
@@ -158,12 +161,27 @@ class Scene:
             else:
                 part.hold(parameter, value)
             rebuild |= part.kind == "gel" and parameter in self.shaping
+            if part.kind in self.MOVED:
+                moved.add(name)
         self._now.update(changed)
         if stock:
             self._traversed.update()
         if rebuild:
             self.gel.rebuild(mi.traverse(self.gel))
+            moved.update(n for n, p in self.parts.items() if hasattr(p, "carry"))
+        self._place([self.parts[n] for n in moved])
+        if rebuild or moved:
             self.mitsuba.parameters_changed([])
+
+    def _place(self, shapes: list) -> None:
+        """Rebuild shapes besides the gel; those in the skin where its present dent carries them."""
+        import mitsuba as mi
+
+        for part in shapes:
+            if self.gel is not None and hasattr(part, "carry"):
+                part.carry(self.gel)
+            else:
+                part.rebuild(mi.traverse(part))
 
     @property
     def shaping(self) -> set[str]:

@@ -353,8 +353,8 @@ class Findings:
     p_family     of the best of all candidates; structure_p: of low-frequency structure (NaN: images too small to tell)
     winner       the effect with the largest fall after refit, '' if none; p_winner: family-wise, of that fall
     fall, runner_up   net falls of the winner and of the next one
-    refuted      with the winner nothing is left to explain, and every effect within the margin leaves structure behind:
-                 the misfit that makes small differences worthless is then not there
+    refuted      with the winner nothing is left to explain, and every effect within the margin leaves structure, or an
+                 excess of 2 EXCESS sd, behind: the misfit that makes small differences worthless is then not there
     ratio        the best curve's net fall over the winner's
     rival        a curve does better by RIVAL (a map) or RIVAL_CURVE, significantly
     share        of the excess, where excess_sd > EXCESS

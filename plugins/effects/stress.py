@@ -2,7 +2,7 @@
 
 Definition
     delta(lambda) = 2 pi C (sigma_1 - sigma_2) d/lambda          stress-optic law
-in components: (a, b) = 2 pi C d/lambda stress (P_q, P_u), with the coefficient C = `stress_optic`, the thickness d =
+the pattern turns with the sheet's `angle`. In components: (a, b) = 2 pi C d/lambda stress (P_q, P_u), with the coefficient C = `stress_optic`, the thickness d =
 `stress_thickness`, and the pattern (P_q, P_u) = (s_xx - s_yy, 2 s_xy) per unit of `stress`:
     even    (1, 0): uniform tension along the sheet's x axis
     disc    a disc of the diameter `stress_size` pressed along its y axis: s_ij of the two point loads, in units of 2P/(pi D d)
@@ -21,26 +21,29 @@ References
 import math
 
 from optics.effect import Effect
-from optics.mueller import real, retarder, where
+from optics.mueller import cos, real, retarder, sin, where
 from optics.parameter import Parameter
 
 
 def strain(crossing, sheet):
-    p_q, p_u = pattern(crossing, sheet)
+    turn = sheet.angle * (math.pi / 180)
+    c, s = cos(turn), sin(turn)
+    x, y = crossing.u * c + crossing.v * s, crossing.v * c - crossing.u * s  # the pattern's own axes
+    q, u = pattern(x, y, sheet)
+    p_q, p_u = q * (c * c - s * s) - u * (2 * c * s), q * (2 * c * s) + u * (c * c - s * s)
     factor = 2 * math.pi * sheet.stress_optic * sheet.stress_thickness * sheet.stress / crossing.wavelengths
     index = where(real(sheet.index) > 1, sheet.index, 1.5 + 0 * sheet.index)
     return retarder(*crossing.retardance(p_q * factor, p_u * factor, index))
 
 
-def pattern(crossing, sheet):
+def pattern(x, y, sheet):
     if sheet.stress_pattern == "even":
-        one = 1.0 + 0 * crossing.u
-        return one, 0 * one
+        return 1.0 + 0 * x, 0 * x
     if sheet.stress_pattern == "bend":
-        return 2 * crossing.v / sheet.stress_size, 0 * crossing.u
+        return 2 * y / sheet.stress_size, 0 * x
     if sheet.stress_pattern == "disc":
-        return disc(crossing.u, crossing.v, sheet.stress_size / 2)
-    return sheet.field(crossing.u, crossing.v, sheet.stress_size)
+        return disc(x, y, sheet.stress_size / 2)
+    return sheet.field(x, y, sheet.stress_size)
 
 
 def disc(x, y, radius):

@@ -45,7 +45,7 @@ PARAMETERS = (
     *(Parameter(f"gain_{c}", "1", 1.0, (0.0, 100.0), f"gain of channel {c} in a frame, times `gain`", neutral=1.0,
                 plausible=0.02, how="image") for c in "rgb"),
     Parameter("offset", "DN", 0.0, (-1e4, 1e4), "added to every pixel after the response", neutral=0.0, plausible=1.0,
-              how="image"),
+              how="image", linear=True),
     *(Parameter(f"response2_{c}", "1", 0.0, (-0.9, 0.9), f"a_c: quadratic term of the inverse response, channel {c}",
                 neutral=0.0, plausible=0.1, how="image") for c in "rgb"),
     *(Parameter(f"response3_{c}", "1", 0.0, (-0.45, 0.45), f"b_c: cubic term of the inverse response, channel {c}",
