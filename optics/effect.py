@@ -304,12 +304,13 @@ class Declared:
     """
 
     kind: str
+    band: float | None = None  # nm: what a mono variant renders, where the scene's integrator names one band
 
     @staticmethod
     def on(base: type) -> type:
         """A subclass of a Mitsuba class that has the methods of this one."""
         return type(f"Declared{base.__name__}", (base,), {n: f for n, f in vars(Declared).items()
-                                                          if callable(f) and not n.startswith("__") and n != "on"})
+                                                          if (callable(f) or n == "band") and not n.startswith("__") and n != "on"})
 
     def declare(self, props) -> None:
         """Read every declared parameter from `props` (unknown ones stay for Mitsuba to complain about)."""

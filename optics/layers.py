@@ -111,7 +111,7 @@ def active_effects(kind: str, values: Mapping) -> list:
             if any(np.any(np.asarray(values[n]) != neutral[n]) for n in e.parameter_names)]
 
 
-def crossing_of(si) -> Crossing:
+def crossing_of(si, band: float | None = None) -> Crossing:
     """How light that leaves a surface interaction towards si.wi passes the surface, in Mitsuba's implicit axes (Dr.Jit)."""
     import drjit as dr
     import mitsuba as mi
@@ -121,7 +121,7 @@ def crossing_of(si) -> Crossing:
     frame = mi.Frame3f(across, dr.cross(normal, across), normal)
     world = si.to_world(si.wi)
     k, x = frame.to_local(world), frame.to_local(mi.mueller.stokes_basis(world))
-    wavelengths = mi.UnpolarizedSpectrum(si.wavelengths) if mi.is_spectral else mi.UnpolarizedSpectrum(MONO)
+    wavelengths = mi.UnpolarizedSpectrum(si.wavelengths) if mi.is_spectral else mi.UnpolarizedSpectrum(band or MONO)
     v = (si.uv.y - 0.5) * dr.norm(si.dp_dv) * dr.sign(dr.dot(si.dp_dv, frame.t))
     return Crossing((k.x, k.y, k.z), (x.x, x.y, x.z), (si.uv.x - 0.5) * dr.norm(si.dp_du), v, wavelengths)
 
@@ -159,7 +159,7 @@ def bsdf(kind: str, own: Callable) -> type:
         def matrix(self, si):
             """What light that leaves towards si.wi went through, in Mitsuba's implicit axes."""
             stages = [e for e in registry().at_stage(kind, "layer") if e.stages["layer"] in self.functions("layer")]
-            return evaluate(kind, own, crossing_of(si), numbers_of(self), stages)
+            return evaluate(kind, own, crossing_of(si, self.band), numbers_of(self), stages)
 
         def weight(self, si, active):
             matrix = self.matrix(si)

@@ -27,6 +27,7 @@ from optics.scene import Scene
 
 RIM_SAMPLES = 64  # per pixel at rims; a power of two
 LAYERED_RIM_SAMPLES = 16  # in scenes with layers, whose matrices are multiplied for every sample
+CREASE = 25.0  # deg from pixel to pixel: what is no smooth surface
 POWERS = ("power", "power_r", "power_g", "power_b")  # images are kept per unit of each
 FLAT_FIELDS = ("multiplicative", "additive", "none")
 BOUNCE_SAMPLES = 32  # directions per cell for the second bounce
@@ -216,14 +217,15 @@ class Renderer:
         return sum(r * s for r, s in zip(row, sent) if not isinstance(s, int))
 
     def stokes(self, values: Mapping, lights: Sequence[str] | None = None) -> np.ndarray:
-        """(4, H, W, B): Stokes vectors at the camera, of all lights or of some; what no light made counts as unpolarized."""
+        """(4, H, W, B): Stokes vectors at the camera, of all lights or of some."""
         wanted = self.scene.lights if lights is None else lights
         total = np.zeros((4, self.height, self.width, self.bands))
         for component in range(4):
             for light in wanted:
                 if np.any(values[f"{light}.power"] != 0):
                     total[component] += self.powers(values, light) * self.image(values, light, component)
-        total[0] += self.ambient(values) if lights is None else 0
+            if lights is None:
+                total[component] += self.ambient(values, component)
         return total
 
     def _rim_samples(self, hits: "Hits", index: np.ndarray):
@@ -384,18 +386,25 @@ class Renderer:
         weight = self._weight(values, led, self.hits(values).path, 0, ())
         return image * weight.reshape(-1, self.width, self.bands)
 
-    def ambient(self, values: Mapping) -> np.ndarray:
+    def ambient(self, values: Mapping, component: int = 0) -> np.ndarray:
         """(H, W, B): radiance of the membranes that no LED made."""
         if all(values[k] == neutral for k, neutral in self._still.items()):
             return np.zeros((self.height, self.width, self.bands))
         hits = self.hits(values)
         self._apply(values, move=False)
-        total = sum(self._bands(self.scene.integrator.ambient(self.scene.mitsuba, hits.si, hits.weight, m) + 0 * hits.si.t)
-                    for m in self.scene.membranes.values())
-        total = np.broadcast_to(total, (self.height * self.width, self.bands))
-        if self.layered:
-            total = total * self._weight(values, "", hits.path, 0, ())
-        return total.reshape(-1, self.width, self.bands)
+
+        def shade(sample):
+            return sum(self._bands(self.scene.integrator.ambient(self.scene.mitsuba, sample.si, sample.weight, m)
+                                   + 0 * sample.si.t) for m in self.scene.membranes.values())
+
+        if not self.layered:
+            return np.broadcast_to(shade(hits.sample), (self.height * self.width, self.bands)).reshape(
+                self.height, self.width, self.bands)
+        rim = self._joint_rim(hits)
+        index = np.flatnonzero(rim)
+        image = LedImage("", hits, rim, index, self._rim_samples(hits, index), None, None, hits.valid)
+        fine = shade(image.samples).reshape(len(index), self.rim_samples, self.bands) if len(index) else None
+        return self._mix(image, (shade(hits.sample), fine), self.weights(values, image, component))
 
 
 class Sample(NamedTuple):
@@ -421,6 +430,7 @@ class Hits:
         if self.path is not None:  # what is passed, and what is met, changes at an edge
             for met in (self.path.shape, *(step.part for step in self.path.steps)):
                 self.edges |= _edges(met.reshape(height, width))
+            self.edges |= _creases(np.where(self.valid[..., None], self.normal, 0.0))
 
     def image(self, values) -> np.ndarray:
         return np.array(values).reshape(self.shape)
@@ -826,6 +836,18 @@ class Model:
         count = self.frames[index].image.shape[0]  # of one place: only what is set tells readings apart
         return {"intensity": np.broadcast_to(known["intensity"], (count, 1)), "far": np.ones((count, 1), bool),
                 "frame": np.full((count, 1), float(index)), **{k: v[..., 0] for k, v in readings.items()}}
+
+
+def _creases(normal: np.ndarray) -> np.ndarray:
+    """Pixels on either side of a sharp edge of a body: normals (H, W, 3) that turn by more than CREASE from one to the next."""
+    found = np.zeros(normal.shape[:2], bool)
+    for axis in (0, 1):
+        near, far = (np.take(normal, range(k, normal.shape[axis] - 1 + k), axis) for k in (0, 1))
+        turned = (near * far).sum(-1) < np.cos(np.radians(CREASE)) * np.linalg.norm(near, axis=-1) * np.linalg.norm(far, axis=-1)
+        first, second = ((slice(None),) * axis + (slice(k, normal.shape[axis] - 1 + k),) for k in (0, 1))
+        found[first] |= turned
+        found[second] |= turned
+    return found
 
 
 def _edges(mask: np.ndarray) -> np.ndarray:

@@ -84,6 +84,9 @@ class Scene:
         self.camera = self._one("camera")
         self.integrator = self._one("tactile")
         self.gel = self._one("gel")
+        if self.integrator is not None and self.integrator.lanes == 1 and len(self.integrator.bands) == 1:
+            for part in self.parts.values():
+                part.band = self.integrator.bands[0]
         self.leds = {n: p for n, p in self.parts.items() if p.kind == "led"}
         self.sources = {n: p for n, p in self.parts.items() if p.kind == "source"}
         self.lights = {**self.leds, **self.sources}

@@ -88,9 +88,12 @@ def build():
             return dr.normalize(forward + dr.tan(dr.deg2rad(self.pan)) * side + dr.tan(dr.deg2rad(self.tilt)) * up)
 
         def spectrum(self, wavelengths):
-            """Relative spectrum w at the given wavelengths (nm); 1 in mono variants and for white LEDs."""
+            """Relative spectrum w at the given wavelengths (nm); 1 for white LEDs, and in a mono variant that
+            names no single band."""
             if dr.size_v(mi.UnpolarizedSpectrum) == 1:
-                return mi.UnpolarizedSpectrum(1.0)
+                if self.band is None:
+                    return mi.UnpolarizedSpectrum(1.0)
+                wavelengths = self.band
             u = (mi.UnpolarizedSpectrum(wavelengths) - self.wavelength) / self.fwhm
             return dr.select(self.wavelength > 0, dr.exp(-4 * math.log(2) * dr.square(u)), 1.0)
 
@@ -106,11 +109,16 @@ def build():
             side, up, _ = self.frame
             return self.position() + side * disc.x + up * disc.y
 
-        def radiance(self, it, to_led, distance):
-            """kappa of (S2) per band, for a unit vector from the lit point to the LED and their distance in mm."""
+        def kappa(self, it, to_led, distance):
+            """kappa of (S2), for a unit vector from the lit point to the LED and their distance in mm; a Float."""
             cos = dr.dot(-to_led, self.axis())
             lobe = dr.select(cos > 1e-4, dr.power(dr.maximum(cos, 1e-4), self.mu), 0.0)
-            kappa = mi.UnpolarizedSpectrum(self.power * lobe / dr.square(distance)) * self.spectrum(it.wavelengths) * self.colour()
+            return self.power * lobe / dr.square(distance)
+
+        def radiance(self, it, to_led, distance):
+            """kappa of (S2) per band, with all that effects do to it."""
+            cos = dr.dot(-to_led, self.axis())
+            kappa = mi.UnpolarizedSpectrum(self.kappa(it, to_led, distance)) * self.spectrum(it.wavelengths) * self.colour()
             for function in self.functions("emission"):
                 kappa *= function(Beam(cos, distance, to_led, it.p, it.wavelengths), self)
             return kappa

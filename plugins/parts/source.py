@@ -71,7 +71,7 @@ def build():
 
         def emitted(self, si):
             """What leaves towards si.wi, in Mitsuba's implicit axes; light leaves on the side of the normal."""
-            vector = stokes(crossing_of(si), numbers_of(self))
+            vector = stokes(crossing_of(si, self.band), numbers_of(self))
             colour = dr.select(mi.Frame3f.cos_theta(si.wi) > 0, self.colour(), 0.0)
             if not mi.is_polarized:
                 return mi.Spectrum(vector[0] * colour)

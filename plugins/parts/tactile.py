@@ -61,6 +61,7 @@ def build():
                                  "render the others in a second scene")
             self.declare(props)
             self.gel_of = {}
+            self.glowing_of = {}
 
         def traverse(self, cb):
             self.put_parameters(cb)
@@ -78,6 +79,22 @@ def build():
             if key not in self.gel_of:
                 self.gel_of[key] = next((s for s in scene.shapes() if getattr(s, "kind", "") == "gel"), None)
             return self.gel_of[key]
+
+        def glowing(self, scene):
+            """The fluorescent pigments of the scene."""
+            key = scene.ptr if hasattr(scene, "ptr") else id(scene)
+            if key not in self.glowing_of:
+                found = {s.bsdf().name: s.bsdf() for s in scene.shapes() if getattr(s.bsdf(), "kind", "") == "fluorescent"}
+                self.glowing_of[key] = tuple(found.values())
+            return self.glowing_of[key]
+
+        def excited(self, scene, si, led, to_led, distance):
+            """Radiance per band of the fluorescence that one LED excites."""
+            total = mi.UnpolarizedSpectrum(0.0)
+            for pigment in self.glowing(scene):
+                own = si.is_valid() & (si.bsdf() == mi.BSDFPtr(pigment))
+                total += dr.select(own, pigment.fluorescence(si, led, to_led, distance), 0.0)
+            return total
 
         # -- one LED at a time: what calibration and batches use ---------------------------------------------------------
 
@@ -121,7 +138,8 @@ def build():
             distance = dr.norm(to_led)
             s = to_led / distance
             value = mi.unpolarized_spectrum(si.bsdf().eval(mi.BSDFContext(), si, si.to_local(s), si.is_valid()))
-            light = value * led.radiance(si, s, distance) & visibility
+            light = value * led.radiance(si, s, distance) + self.excited(scene, si, led, s, distance)
+            light = light & visibility
             gel = self.gel(scene)
             if gel is not None:
                 path = gel.path(si.p, origin, point, led, si)
@@ -181,7 +199,7 @@ def build():
             points = [i for i, e in enumerate(emitters) if mi.has_flag(e.flags(), mi.EmitterFlags.DeltaPosition)]
             self.points, self.others = len(points), len(points) < len(emitters)
             self.point_lights = dr.gather(mi.EmitterPtr, scene.emitters_dr(), mi.UInt32(points)) if points else None
-            self.lamps = [e for e in emitters if getattr(e, "kind", "") == "led"] if self.veils else []
+            self.lamps = [e for e in emitters if getattr(e, "kind", "") == "led"] if self.veils or self.glowing(scene) else []
             self.shining = [m for m in {s.bsdf() for s in scene.shapes()} if getattr(m, "kind", "") == "membrane"
                             and m.functions("ambient")]
 
@@ -195,6 +213,11 @@ def build():
         def own_light(self, scene, si, origin):
             """Light that the gel and the membranes add by themselves at a surface: stages `volume` and `ambient`."""
             added = mi.UnpolarizedSpectrum(0.0)
+            for led in self.lamps if self.glowing(scene) else ():
+                to_led = led.position() - si.p
+                distance = dr.norm(to_led)
+                clear = ~scene.ray_test(si.spawn_ray_to(led.position()), si.is_valid())
+                added += dr.select(clear, self.excited(scene, si, led, to_led / distance, distance), 0.0)
             for function in self.veils:
                 for led in self.lamps:
                     added += function(self.inside.path(si.p, origin, led.position(), led, si), self.inside)

@@ -1,0 +1,111 @@
+"""Markers: short cylinders in rows and columns on the skin's inner face, carried along when the skin is pressed.
+
+Definition
+    base   (x, y, -depth) -> (x + u_x, y + u_y, -depth - u_z)     middle of a marker's foot; u as in the part `carried`
+    axis   across the face: normal to its mean slopes over the foot, (u(x + r) - u(x - r))/(2r)
+    cap    base + height axis, radius r, facing the camera (-z)
+`columns` x `rows` of them (XML integers, 5 x 4) at pitch_x, pitch_y around the world's z axis. The cap moves as a rigid disc, the
+foot's rim stays on the face, and the wall runs straight between them, so that no light passes under a marker on a bent face. The
+foot is open: the skin is there.
+Fingerprint
+    a press moves markers outwards and towards the camera and tilts them away from the contact.
+Validity
+    markers as soft as the skin or small against the bend of its face; otherwise as for the part `carried`.
+References
+    Vi2TaP (RA-L 2025), II.B: 5 x 4 markers, 9.5 x 8.5 mm apart, cast in holes of 1.5 mm radius and 1 mm depth.
+"""
+
+from optics.effect import Declared, Part
+from optics.parameter import Parameter
+
+PARAMETERS = (
+    Parameter("pitch_x", "mm", 9.5, (0.0, 100.0), "distance of columns", plausible=0.05, how="difference"),
+    Parameter("pitch_y", "mm", 8.5, (0.0, 100.0), "distance of rows", plausible=0.05, how="difference"),
+    Parameter("radius", "mm", 1.5, (0.01, 50.0), "radius r", plausible=0.05, how="difference"),
+    Parameter("height", "mm", 1.0, (0.001, 50.0), "from the face to the cap", plausible=0.05, how="difference"),
+    Parameter("depth", "mm", 5.0, (0.0, 100.0), "of the face that they stand on, below the untouched outer face",
+              plausible=0.1, how="difference"),
+)
+SEGMENTS = 48  # of a circle: 0.3 % of the area is lost
+
+
+def build():
+    import mitsuba as mi
+    import numpy as np
+
+    from optics.gel.halfspace import displaced
+
+    class Markers(Declared.on(mi.Mesh)):
+        kind = "markers"
+
+        def __init__(self, props):
+            self.columns, self.rows = int(props.get("columns", 5)), int(props.get("rows", 4))
+            count = self.columns * self.rows
+            i = np.arange(SEGMENTS)
+            j = (i + 1) % SEGMENTS
+            foot, top, rim, middle = i, i + SEGMENTS, i + 2 * SEGMENTS, 3 * SEGMENTS  # the cap's rim is its own: a sharp edge
+            faces = np.concatenate([np.stack([foot, foot[j], top[j]], -1), np.stack([foot, top[j], top], -1),
+                                    np.stack([rim, rim[j], np.full_like(i, middle)], -1)])
+            faces = faces + (middle + 1) * np.arange(count)[:, None, None]
+            mi.Mesh.__init__(self, "markers", (middle + 1) * count, faces.size // 3, props, True, False)
+            self.declare(props)
+            self.carrier = None
+            angle = 2 * np.pi / SEGMENTS * i
+            self.circle = np.stack([np.cos(angle), -np.sin(angle)], -1)  # counterclockwise as the camera sees it
+            params = mi.traverse(self)
+            params["faces"] = mi.UInt32(faces.astype(np.uint32).ravel())
+            self.rebuild(params)
+
+        def traverse(self, cb):
+            super().traverse(cb)
+            self.put_parameters(cb)
+
+        def parameters_changed(self, keys=()):
+            if any(key in self.numbers for key in keys) or not keys:
+                self.reread(keys)
+                self.rebuild(mi.traverse(self))
+            else:
+                super().parameters_changed(list(keys))
+
+        def carry(self, gel):
+            """Move with the present dent of a gel, from now on."""
+            self.carrier = gel
+            self.rebuild(mi.traverse(self))
+
+        def rest(self):
+            """(N, 2) places (x, y) of the feet's middles at rest, mm: row by row, from low y to high and from low x to high."""
+            x = self.number("pitch_x") * (np.arange(self.columns) - (self.columns - 1) / 2)
+            y = self.number("pitch_y") * (np.arange(self.rows) - (self.rows - 1) / 2)
+            return np.stack([np.tile(x, self.rows), np.repeat(y, self.columns)], -1)
+
+        def centres(self):
+            """(N, 3) present middles of the caps, mm, in the order of `rest`."""
+            return self.caps.copy()
+
+        def rebuild(self, params):
+            """Vertices for the present parameters and dent."""
+            n = self.number
+            radius = n("radius")
+            # the foot's middle, four points of its rim along x and y, and the rim itself
+            around = radius * np.concatenate([[(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)], self.circle])
+            at = self.rest()[:, None] + around
+            points = displaced(self.carrier, at[..., 0], at[..., 1], n("depth"))
+            base, foot = points[:, 0], points[:, 5:]
+            axis = np.cross(points[:, 3] - points[:, 4], points[:, 1] - points[:, 2])  # y cross x: towards the camera
+            axis /= np.linalg.norm(axis, axis=-1, keepdims=True)
+            e1 = points[:, 1] - points[:, 2]
+            e1 /= np.linalg.norm(e1, axis=-1, keepdims=True)
+            e2 = np.cross(e1, axis)  # y, at rest
+            self.caps = base + n("height") * axis
+            rim = self.caps[:, None] + radius * (self.circle[:, :1] * e1[:, None] + self.circle[:, 1:] * e2[:, None])
+            vertices = np.concatenate([foot, rim, rim, self.caps[:, None]], 1)
+            params["vertex_positions"] = mi.Float(vertices.astype(np.float32).ravel())
+            params.update()
+
+        def to_string(self):
+            return f"Markers[{self.name}]"
+
+    return Markers
+
+
+part = Part("markers", "shape", PARAMETERS, build)
