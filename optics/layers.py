@@ -111,8 +111,11 @@ def active_effects(kind: str, values: Mapping) -> list:
             if any(np.any(np.asarray(values[n]) != neutral[n]) for n in e.parameter_names)]
 
 
-def crossing_of(si, band: float | None = None) -> Crossing:
-    """How light that leaves a surface interaction towards si.wi passes the surface, in Mitsuba's implicit axes (Dr.Jit)."""
+def crossing_of(si, band: float | None = None, extent: tuple[float, float] | None = None) -> Crossing:
+    """How light that leaves a surface interaction towards si.wi passes the surface, in Mitsuba's implicit axes (Dr.Jit).
+
+    band    nm, of mono variants;   extent  width and length at rest of a sheet that stretches
+    """
     import drjit as dr
     import mitsuba as mi
 
@@ -122,13 +125,14 @@ def crossing_of(si, band: float | None = None) -> Crossing:
     world = si.to_world(si.wi)
     k, x = frame.to_local(world), frame.to_local(mi.mueller.stokes_basis(world))
     wavelengths = mi.UnpolarizedSpectrum(si.wavelengths) if mi.is_spectral else mi.UnpolarizedSpectrum(band or MONO)
-    v = (si.uv.y - 0.5) * dr.norm(si.dp_dv) * dr.sign(dr.dot(si.dp_dv, frame.t))
-    return Crossing((k.x, k.y, k.z), (x.x, x.y, x.z), (si.uv.x - 0.5) * dr.norm(si.dp_du), v, wavelengths)
+    width, length = extent or (dr.norm(si.dp_du), dr.norm(si.dp_dv))
+    v = (si.uv.y - 0.5) * length * dr.sign(dr.dot(si.dp_dv, frame.t))
+    return Crossing((k.x, k.y, k.z), (x.x, x.y, x.z), (si.uv.x - 0.5) * width, v, wavelengths)
 
 
 def numbers_of(part) -> SimpleNamespace:
     """A part's parameters as its functions read them, in Dr.Jit."""
-    return SimpleNamespace(name=part.name, **{n: getattr(part, n) for n in (*part.numbers, *part.words)})
+    return SimpleNamespace(name=part.name, field=getattr(part, "field", None), **{n: getattr(part, n) for n in (*part.numbers, *part.words)})
 
 
 def layer(kind: str, parameters: tuple, mueller: Callable) -> Part:
@@ -142,7 +146,10 @@ def bsdf(kind: str, own: Callable) -> type:
     import mitsuba as mi
 
     class Layer(Declared.on(mi.BSDF)):
-        is_layer = True
+        carrier = None  # the stretching shape that it lies on, if it does
+
+        def extent(self):
+            return None if self.carrier is None else (self.carrier.number("width"), self.carrier.number("length"))
 
         def __init__(self, props):
             mi.BSDF.__init__(self, props)
@@ -159,7 +166,7 @@ def bsdf(kind: str, own: Callable) -> type:
         def matrix(self, si):
             """What light that leaves towards si.wi went through, in Mitsuba's implicit axes."""
             stages = [e for e in registry().at_stage(kind, "layer") if e.stages["layer"] in self.functions("layer")]
-            return evaluate(kind, own, crossing_of(si, self.band), numbers_of(self), stages)
+            return evaluate(kind, own, crossing_of(si, self.band, self.extent()), numbers_of(self), stages)
 
         def weight(self, si, active):
             matrix = self.matrix(si)

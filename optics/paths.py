@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from types import SimpleNamespace
+from types import MappingProxyType, SimpleNamespace
 
 import numpy as np
 
@@ -47,6 +47,7 @@ class Path:
     origin: object
     end: Step
     shape: np.ndarray  # (N,) index of the scene's shape that a path ends on, -1 for none
+    fields: dict  # the layers' stress patterns when the rays were traced
     lost: np.ndarray  # (N,) bool: reflected totally, or after STEPS surfaces
 
     def sequences(self) -> list[tuple[tuple[int, ...], np.ndarray]]:
@@ -79,6 +80,7 @@ def trace(scene, u: np.ndarray, v: np.ndarray) -> Path:
     origin = np.array(o, float).T + np.zeros((n, 3))
     wavelengths = scene.integrator.wavelengths(n)
     steps, lost = [], np.zeros(n, bool)
+    extents = {i: e for i, name in enumerate(names) if (e := getattr(scene.parts[name], "extent", lambda: None)())}
     pointers = [mi.BSDFPtr(scene.parts[name]) for name in names]
     for _ in range(STEPS + 1):
         ray = mi.Ray3f(mi.Point3f(*origin.T.astype(np.float32)), mi.Vector3f(*direction.T.astype(np.float32)), mi.Float(0),
@@ -88,7 +90,7 @@ def trace(scene, u: np.ndarray, v: np.ndarray) -> Path:
         part = np.full(n, -1)
         for index, pointer in enumerate(pointers):
             part[np.array(met == pointer) & ~lost] = index
-        step, frame = _step(part, si, -direction, x)
+        step, frame = _step(part, si, -direction, x, extents)
         if not (part >= 0).any():
             break
         steps.append(step)
@@ -108,7 +110,8 @@ def trace(scene, u: np.ndarray, v: np.ndarray) -> Path:
     shape = np.full(n, -1)
     for index, own in enumerate(scene.mitsuba.shapes()):
         shape[np.array(si.shape == mi.ShapePtr(own))] = index
-    return Path(names, steps, si, mi.Point3f(*origin.T.astype(np.float32)), step, shape, lost)
+    return Path(names, steps, si, mi.Point3f(*origin.T.astype(np.float32)), step, shape,
+                {n: scene.parts[n].field for n in names if getattr(scene.parts[n], "field", None) is not None}, lost)
 
 
 def across(axis: np.ndarray, k: np.ndarray) -> np.ndarray:
@@ -117,8 +120,8 @@ def across(axis: np.ndarray, k: np.ndarray) -> np.ndarray:
     return x / np.linalg.norm(x, axis=-1, keepdims=True)
 
 
-def _step(part: np.ndarray, si, k: np.ndarray, x: np.ndarray) -> tuple[Step, tuple]:
-    """A surface in its own axes: z the normal, x the first direction of its coordinates."""
+def _step(part: np.ndarray, si, k: np.ndarray, x: np.ndarray, extents: Mapping) -> tuple[Step, tuple]:
+    """A surface in its own axes: z the normal, x the first direction of its coordinates; `extents` of parts that stretch."""
     normal, du, dv, uv = (np.array(a, float).T for a in (si.sh_frame.n, si.dp_du, si.dp_dv, si.uv))
     ok = np.linalg.norm(du, axis=-1) > 0
     du = np.where(ok[:, None], du, (1.0, 0.0, 0.0))
@@ -128,6 +131,8 @@ def _step(part: np.ndarray, si, k: np.ndarray, x: np.ndarray) -> tuple[Step, tup
     axes = np.stack([e1, e2, normal], -2)
     local = [np.einsum("nij,nj->ni", axes, a) for a in (k, x)]
     size_u, size_v = np.linalg.norm(du, axis=-1), np.linalg.norm(dv, axis=-1)
+    for index, (width, length) in extents.items():
+        size_u, size_v = np.where(part == index, width, size_u), np.where(part == index, length, size_v)
     v = (uv[:, 1] - 0.5) * size_v * np.where((dv * e2).sum(-1) < 0, -1, 1)
     return Step(part, *local, (uv[:, 0] - 0.5) * size_u, v), (e1, e2, normal)
 
@@ -158,7 +163,7 @@ def _refract(here: np.ndarray, direction: np.ndarray, x: np.ndarray, normal: np.
 # -- what light loses -------------------------------------------------------------------------------------------------
 
 
-def part_values(scene, name: str, values: Mapping) -> SimpleNamespace:
+def part_values(scene, name: str, values: Mapping, fields: Mapping) -> SimpleNamespace:
     """A part's parameters as its functions read them; arrays of readings stand along the first axis."""
     part = scene.parts[name]
 
@@ -166,7 +171,7 @@ def part_values(scene, name: str, values: Mapping) -> SimpleNamespace:
         return np.reshape(value, (-1, 1)) if isinstance(value, np.ndarray) else value
 
     return SimpleNamespace(name=name, **{n: shaped(values[f"{name}.{n}"]) for n in (*part.numbers, *part.words)},
-                           field=getattr(part, "field", None))
+                           field=fields.get(name))
 
 
 def _crossing(step: Step, rays, bands: np.ndarray) -> Crossing:
@@ -174,10 +179,10 @@ def _crossing(step: Step, rays, bands: np.ndarray) -> Crossing:
     return Crossing(k, x, step.u[rays][:, None], step.v[rays][:, None], bands)
 
 
-def layer_matrix(scene, name: str, crossing: Crossing, values: Mapping) -> Mueller:
+def layer_matrix(scene, name: str, crossing: Crossing, values: Mapping, fields: Mapping = MappingProxyType({})) -> Mueller:
     """Mueller matrix of one part for light that crosses it towards the camera."""
     part = scene.parts[name]
-    own = part_values(scene, name, values)
+    own = part_values(scene, name, values, fields)
     if part.kind == "interface":
         # the camera's side is the one that the normal points to: seen from there the relative index is `index`
         front = crossing.k[2] > 0
@@ -211,7 +216,8 @@ def transmission(scene, path: Path, values: Mapping, bands: np.ndarray, componen
     out = [np.zeros((count, len(bands)), kind) for _ in range(4)]
     for parts, rays in path.sequences():
         names = [(path.names[index], step) for step, index in zip(path.steps, parts) if index >= 0]
-        matrices = [layer_matrix(scene, name, _crossing(step, rays, bands), values) for name, step in names]
+        matrices = [layer_matrix(scene, name, _crossing(step, rays, bands), values, path.fields)
+                    for name, step in names]
         row = tuple(1.0 if j == component else 0 for j in range(4))
         if any(np.any(np.asarray(values.get(f"{name}.face", 0.0)) != 0) for name, _ in names):
             stack = None
@@ -236,7 +242,7 @@ def emitted(scene, name: str, path: Path, values: Mapping, bands: np.ndarray) ->
 
     source = scene.parts[name]
     on = np.array(path.si.emitter(scene.mitsuba) == mi.EmitterPtr(source)) & (path.end.k[:, 2] > 0)
-    vector = registry().parts[source.kind].stokes(_crossing(path.end, slice(None), bands), part_values(scene, name, values))
+    vector = registry().parts[source.kind].stokes(_crossing(path.end, slice(None), bands), part_values(scene, name, values, {}))
     return tuple(0 if isinstance(c, int) else c * on[:, None] for c in vector)
 
 

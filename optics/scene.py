@@ -8,12 +8,20 @@ from __future__ import annotations
 
 import difflib
 import re
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 
 from optics.effect import DEFAULT_VARIANT, Declared, Effect, collecting, is_part, registry, shipped, use_variant
 from optics.errors import BadScene, UnknownKey
 from optics.parameter import Parameter, Variable
+
+
+KEEPS = "use 'interface', 'rough_interface' or 'sheet', which keep it"
+DEPOLARIZERS = {  # stock materials without a Mueller matrix, by the name that Mitsuba prints
+    "ThinDielectric": KEEPS, "RoughDielectric": KEEPS, "SmoothPlastic": "use 'pplastic'", "RoughPlastic": "use 'pplastic'",
+    "Principled": KEEPS, "The Thin Principled": KEEPS, "Hair": "leave it out",
+}
 
 
 def find(name: str | Path) -> Path:
@@ -101,6 +109,18 @@ class Scene:
         self._stock = self._stock_parameters()
         self.parameters.update({k: p for k, (p, _) in self._stock.items() if k not in self.parameters})
         self._now = self._read()
+        self._warn_of_depolarizers()
+
+    def _warn_of_depolarizers(self) -> None:
+        """Say which stock materials lose all polarization, and nobody says so, in a scene with polarizers."""
+        shapes = self.mitsuba.shapes()
+        if not any(p.kind == "polarizer_film" for p in self.parts.values()) and not any("LinearPolarizer[" in str(s.bsdf()) for s in shapes):
+            return
+        for shape in shapes:
+            for name, advice in DEPOLARIZERS.items():
+                if re.search(rf"\b{name}(\[| BSDF)", str(shape.bsdf())):
+                    warnings.warn(f"{self.path}: the material '{name}' of the shape '{shape.id()}' takes all polarization out of the "
+                                  f"light that it lets through or reflects, whatever the physics; {advice}", stacklevel=2)
 
     def _one(self, kind: str):
         found = [p for p in self.parts.values() if p.kind == kind]
@@ -180,11 +200,30 @@ class Scene:
         """Rebuild shapes besides the gel; those in the skin where its present dent carries them."""
         import mitsuba as mi
 
+        if self.gel is not None:
+            self._strain()
         for part in shapes:
             if self.gel is not None and hasattr(part, "carry"):
                 part.carry(self.gel)
             else:
                 part.rebuild(mi.traverse(part))
+
+    def _strain(self) -> None:
+        """Hand the present press's stress to the sheets in the skin that ask for it, from their depth on both sides alike up to
+        the skin's inner face."""
+        from optics.gel.halfspace import SkinStress
+
+        for shape in self.mitsuba.shapes():
+            sheet = shape.bsdf()
+            if hasattr(shape, "carry") and hasattr(sheet, "carrier"):
+                sheet.carrier = shape
+            if getattr(sheet, "stress_pattern", "") == "gel":
+                if not hasattr(shape, "carry"):
+                    raise BadScene(f"{self.path}: '{sheet.name}': stress_pattern = 'gel' needs a sheet in the skin, a shape of the "
+                                   "type 'carried'")
+                thickness = self.gel.number("thickness")
+                near = max(2 * shape.number("depth") - thickness, 0.0)
+                sheet.field = SkinStress(self.gel, near, thickness)
 
     @property
     def shaping(self) -> set[str]:

@@ -42,7 +42,9 @@ NODES = 8  # per depth: exp(-kh) leaves little that is finer; a cubic spline err
 WIDEST = 1001  # nodes a side
 
 
-def carried(dent: LocalMap | np.ndarray, pitch: float, depth: float, poisson: float = 0.5) -> tuple[LocalMap, LocalMap, LocalMap]:
+def carried(
+    dent: LocalMap | np.ndarray, pitch: float, depth: float, poisson: float = 0.5
+) -> tuple[LocalMap, LocalMap, LocalMap]:
     """Displacement (ux, uy, uz) in mm at a depth below the face: ux, uy along x and y, uz into the skin (-z) like the dent.
 
     dent     (n, n) D in mm, n odd, [v, u] around the press axis, zero at the border
@@ -139,6 +141,49 @@ class Plane:
 
 
 def _check(pitch: float, poisson: float, *depths: float) -> None:
-    if not (pitch > 0 and 0 <= poisson <= 0.5 and all(map(math.isfinite, depths)) and sorted(depths) == [*depths] and depths[0] >= 0):
-        raise ValueError(f"half-space: pitch = {pitch:g} mm, Poisson's ratio {poisson:g}, depth "
-                         f"{' to '.join(f'{d:g}' for d in depths)} mm; need pitch > 0, a ratio in 0 ... 0.5 and depths >= 0 in order")
+    in_order = all(map(math.isfinite, depths)) and sorted(depths) == [*depths] and depths[0] >= 0
+    if not (pitch > 0 and 0 <= poisson <= 0.5 and in_order):
+        raise ValueError(
+            f"half-space: pitch = {pitch:g} mm, Poisson's ratio {poisson:g}, depth {' to '.join(f'{d:g}' for d in depths)} mm; "
+            "need pitch > 0, a ratio in 0 ... 0.5 and depths >= 0 in rising order"
+        )
+
+
+class SkinStress:
+    """The stress pattern of a pressed skin for a sheet in it (plugins/effects/stress.py): f(x, y, size) -> (P_q, P_u) in mm.
+
+    x, y are the sheet's own axes as the camera sees it (x right, y up): y of the world and 2 s_xy change their signs. The integral
+    runs from h1 to h2. Taken over by whoever traces rays, as the scene moves on to other presses.
+    """
+
+    def __init__(self, gel, h1: float, h2: float):
+        self.press = gel.number("press_x"), gel.number("press_y")
+        self.maps = _stress(gel.map, h1, h2) if gel.map.values.any() else None
+        self.texture = None
+
+    def __call__(self, x, y, size):
+        if self.maps is None:
+            return 0.0 * x, 0.0 * x
+        if not isinstance(x, np.ndarray):
+            return self._sampled(x, y)
+        q, u = (surface(np.real(x).ravel(), -np.real(y).ravel(), *self.press, m).reshape(x.shape) for m in self.maps)
+        return q, -u
+
+    def _sampled(self, x, y):
+        """The same from a texture, linear between the maps' nodes (Dr.Jit)."""
+        import drjit as dr
+        import mitsuba as mi
+
+        n, pitch = len(self.maps[0].values), self.maps[0].pitch
+        if self.texture is None:
+            values = np.stack([m.values for m in self.maps], -1).astype(np.float32)
+            self.texture = mi.Texture2f(mi.TensorXf(values), wrap_mode=dr.WrapMode.Clamp)
+        at = mi.Point2f((x - self.press[0]) / (n * pitch) + 0.5, (-y - self.press[1]) / (n * pitch) + 0.5)
+        q, u = self.texture.eval(at)
+        return q, -u
+
+
+@lru_cache(maxsize=8)
+def _stress(dent: LocalMap, h1: float, h2: float) -> tuple[LocalMap, LocalMap]:
+    """`stress_integrals`, kept."""
+    return stress_integrals(dent, dent.pitch, h1, h2)

@@ -10,8 +10,9 @@ stressed plate) moves, tilts and turns with it.
 Fingerprint
     a press tilts and shifts the sheet over about its depth around the contact; without a press nothing.
 Validity
-    dents shallower than `depth`, small strains; effects of the face's shape other than the press are not carried. The sheet stretches with the skin and does not stiffen it: a film resists. On a mesh of `columns` x `rows` vertices
-    (XML integers, 121 x 109) heights are linear and the first direction is constant in each triangle.
+    dents shallower than `depth`, small strains; effects of the face's shape other than the press are not carried. The sheet
+    stretches with the skin and does not stiffen it: a film resists. On the mesh of `columns` x `rows` vertices (XML integers,
+    121 x 109) heights are linear and the first direction is constant in each triangle.
 References
     Vi2TaP (RA-L 2025), II.B: a film embedded in a silicone skin of 5 mm. Johnson, Contact Mechanics (1985), 3.2.
 """

@@ -108,12 +108,12 @@ def build():
 
         def share(self, ctx, facet, reflected):
             """Probability of the way that is taken: by the reflectance, unless only one way is asked for."""
-            both = ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 0), ctx.is_enabled(mi.BSDFFlags.GlossyTransmission, 1)
-            r = {(True, True): facet.r, (True, False): mi.Float(1), (False, True): mi.Float(0)}.get(both)
-            return mi.Float(0) if r is None else dr.select(reflected, r, 1 - r)
+            ways = ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 0), ctx.is_enabled(mi.BSDFFlags.GlossyTransmission, 1)
+            r = facet.r if all(ways) else mi.Float(float(ways[0]))
+            return dr.select(reflected, r, 1 - r) * float(any(ways))
 
         def passed(self, ctx, wi, wo, facet, reflected):
-            """M of a facet between Mitsuba's axes of both rays, over nu^2 where radiance is refracted; M_00 without polarization."""
+            """M of a facet between Mitsuba's axes of both rays, over nu^2 where radiance is refracted; else M_00 as a spectrum."""
             to_source = ctx.mode == mi.TransportMode.Radiance
             scale = dr.select(reflected | (not to_source), 1, 1 / dr.square(facet.nu))
             matrix = dr.select(reflected, facet.reflection(), facet.transmission()) * scale
@@ -126,7 +126,7 @@ def build():
             s = dr.select(level, basis_out, dr.normalize(s))
             return mi.Spectrum(turn(leaving, s, basis_out) @ matrix @ turn(arriving, basis_in, s))
 
-        def spread(self, wi, wo, along, across, nu, reflected):
+        def spread(self, along, across, nu, reflected):
             """J = d omega_m / d omega_o for along = wi.m and across = wo.m."""
             return dr.select(reflected, 0.25 / dr.abs(across), dr.abs(across) * dr.square(nu / (along + nu * across)))
 
@@ -148,7 +148,8 @@ def build():
 
             bs = dr.zeros(mi.BSDFSample3f)
             bs.wo, bs.eta = wo, dr.select(reflected, 1, nu)
-            bs.pdf = dr.select(sharp, 1, density * self.spread(wi, wo, along, dr.dot(wo, m), nu, reflected)) * probability & valid
+            density = dr.select(sharp, 1, density * self.spread(along, dr.dot(wo, m), nu, reflected))
+            bs.pdf = dr.select(valid, density * probability, 0)
             f = mi.BSDFFlags
             through = dr.select(self.absent(), mi.UInt32(f.DeltaTransmission | f.Null), mi.UInt32(+f.DeltaTransmission))
             bs.sampled_type = dr.select(
@@ -168,7 +169,7 @@ def build():
             asked = ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 0) & reflected | (
                 ctx.is_enabled(mi.BSDFFlags.GlossyTransmission, 1) & ~reflected)
             valid = active & asked & (along * wi.z > 0) & (across * wo.z > 0) & ~self.sharp(reflected)
-            density = facets.pdf(dr.mulsign(wi, wi.z), m) * self.spread(wi, wo, along, across, nu, reflected)
+            density = facets.pdf(dr.mulsign(wi, wi.z), m) * self.spread(along, across, nu, reflected)
             value = self.passed(ctx, wi, wo, facet, reflected) * (density * facets.smith_g1(wo, m))
             return dr.select(valid, value, 0), dr.select(valid, density * self.share(ctx, facet, reflected), 0)
 

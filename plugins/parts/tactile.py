@@ -40,10 +40,12 @@ def scaled(value):
 
 
 def build():
-    global dr, mi, mis_weight  # dr.syntax rewrites a function with the globals of its file and without its closure
+    global dr, mi, mis_weight, REFLECTED  # dr.syntax rewrites a function with the globals of its file and without its closure
     import drjit as dr
     import mitsuba as mi
     from mitsuba.python.ad.integrators.common import ADIntegrator, mis_weight
+
+    REFLECTED = int(mi.BSDFFlags.DiffuseReflection | mi.BSDFFlags.GlossyReflection)  # by a rough surface, not through it
 
     class Tactile(Declared.on(ADIntegrator)):
         kind = "tactile"
@@ -326,7 +328,7 @@ def build():
                 bs, factor = bsdf.sample(context, si, sampler.next_1d(), sampler.next_2d(), onward)
                 factor = si.to_world_mueller(factor, -bs.wo, si.wi)
                 straight = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
-                reflected |= onward & mi.has_flag(bs.sampled_type, mi.BSDFFlags.Smooth)
+                reflected |= onward & ((bs.sampled_type & REFLECTED) != 0)
                 factor = dr.select(lit, product(factor, self.kept(si, ray.o, si.p)), factor)
                 throughput = dr.select(onward, product(throughput, factor), throughput)
                 direction = si.to_world(bs.wo)

@@ -95,7 +95,7 @@ def test_every_bit_of_a_dent_pushes_straight_away_from_itself(depth):
         return (weight * dx).sum(), (weight * dy).sum(), depth * weight.sum()
 
     largest = maps[2].values.max()
-    # 6e-5 from the spline, for so narrow a dent, up to where maps fade; there the R^-4 tail over 10 depths: 3 V/(2 pi h^2) 1e-4, some um per mm of dent
+    # 6e-5 from the spline, for so narrow a dent, up to where maps fade; there an R^-4 tail is cut off 9 depths away: 1.5e-4
     for low, high, tolerance in ((0, 4, 1e-4), (4, 0.85 * half, 1e-4), (0.87 * half, 1.2 * half, 3e-4)):
         angle, r = np.linspace(0, 6, 12), np.linspace(low, high, 12)
         x, y = r * np.cos(angle), r * np.sin(angle)

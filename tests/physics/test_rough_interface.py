@@ -85,7 +85,7 @@ def grid(mi, size):
 
 
 def met(index, wi, wo):
-    """The facet that joins two directions: relative index nu, reflected or not, normal, (nu times the cosine beyond it) squared."""
+    """The facet that joins two directions: relative index nu, reflected or not, normal, square of nu times the refracted cosine."""
     nu = np.where(wi[:, 2] > 0, index, 1 / index)
     back = wi[:, 2] * wo[:, 2] > 0
     m = unit(wi + np.where(back, 1, nu)[:, None] * wo)
@@ -200,7 +200,7 @@ def test_forward_derivatives_of_every_element_are_those_of_the_formula(mitsuba, 
 
 @pytest.mark.parametrize("variant", ["llvm_ad_rgb", "llvm_ad_mono", "llvm_ad_mono_polarized", "llvm_ad_spectral_polarized"],
                          indirect=True)
-def test_intensity_and_density_are_those_of_the_stock_rough_dielectric(variant):
+def test_intensities_densities_and_draws_are_those_of_the_stock_rough_dielectric(variant):
     import mitsuba as mi
 
     for kind, index, alpha, mode in (("beckmann", 1.5, 0.2, "Radiance"), ("ggx", 0.8, 0.4, "Importance")):
@@ -213,6 +213,13 @@ def test_intensity_and_density_are_those_of_the_stock_rough_dielectric(variant):
             there = expected > 0
             assert there.mean() > 0.5 and (found[~there] == 0).all()
             assert np.abs(found / np.where(there, expected, 1) - 1)[there].max() <= CLOSE
+        (drawn, weight), (stock_drawn, stock_weight) = (
+            b.sample(context(mi, mode=mode), surface(mi, wi), *draws(mi, RNG(13), len(wi)), True) for b in both)
+        there = (np.array(drawn.pdf) > 0) & (np.abs(np.array(drawn.wo)[2]) > 0.05)
+        assert there.mean() > 0.8
+        assert np.abs(np.array(drawn.wo) - np.array(stock_drawn.wo))[:, there].max() <= CLOSE
+        assert (np.array(drawn.sampled_type) == np.array(stock_drawn.sampled_type))[there].all()
+        assert np.abs(intensity(mi, weight, len(wi)) - intensity(mi, stock_weight, len(wi)))[there].max() <= CLOSE
 
 
 @pytest.mark.parametrize("index", [1.5, 0.75])
