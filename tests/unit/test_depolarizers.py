@@ -7,7 +7,7 @@ import pytest
 from optics import scene as scenes
 
 WINDOW = """
-    <shape type="rectangle" id="window">
+    <shape type="rectangle" id="extra">
         <transform name="to_world"><translate z="20"/></transform>
         {bsdf}
     </shape>
@@ -26,7 +26,7 @@ def bench_with(tmp_path, bsdf):
     ('<bsdf type="twosided"><bsdf type="roughplastic"/></bsdf>', "RoughPlastic"),
     ('<bsdf type="mask"><bsdf type="roughdielectric"/></bsdf>', "RoughDielectric")])
 def test_a_depolarizing_material_is_named(bsdf, name, tmp_path):
-    with pytest.warns(UserWarning, match=f"'{name}' of the shape 'window' takes all polarization"):
+    with pytest.warns(UserWarning, match=f"'{name}' of the shape 'extra' takes all polarization"):
         scenes.load(bench_with(tmp_path, bsdf))
 
 
