@@ -11,7 +11,7 @@ that travels towards the camera.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from types import MappingProxyType, SimpleNamespace
 
 import numpy as np
@@ -47,16 +47,33 @@ class Path:
     origin: object
     end: Step
     shape: np.ndarray  # (N,) index of the scene's shape that a path ends on, -1 for none
-    fields: dict  # the layers' stress patterns when the rays were traced
     lost: np.ndarray  # (N,) bool: reflected totally, or after STEPS surfaces
+    fields: dict  # the layers' stress patterns when the rays were traced
+    matrices: dict = field(default_factory=dict)  # of layers at real values: a derivative by one layer leaves the others
+    groups: list = field(default_factory=list)
 
     def sequences(self) -> list[tuple[tuple[int, ...], np.ndarray]]:
         """Rays by the parts that they pass: (indices of the parts, from the camera on; which rays)."""
         if not self.steps:
             return [((), np.arange(len(self.lost)))]
-        table = np.stack([s.part for s in self.steps], -1)
-        kinds, which = np.unique(table, axis=0, return_inverse=True)
-        return [(tuple(int(i) for i in kind), np.flatnonzero(which.ravel() == n)) for n, kind in enumerate(kinds)]
+        if not self.groups:
+            table, code = np.stack([s.part for s in self.steps], -1), np.zeros(len(self.lost), np.int64)
+            for column in table.T:  # one number for each sequence met so far
+                code = np.unique(code * (len(self.names) + 1) + column + 1, return_inverse=True)[1]
+            firsts = np.unique(code, return_index=True)[1]
+            self.groups = [(tuple(int(i) for i in table[first]), np.flatnonzero(code == code[first])) for first in firsts]
+        return self.groups
+
+    def kept(self, group: int, place: int, name: str, scene, values: Mapping, make) -> Mueller:
+        """A layer's matrix for a group of rays; the last one made at real values is kept."""
+        own = tuple(values[f"{name}.{n}"] for n in (*scene.parts[name].numbers, *scene.parts[name].words))
+        if any(isinstance(v, (complex, np.ndarray)) for v in own):
+            return make()
+        known, matrix = self.matrices.get((group, place), (None, None))
+        if known != own:
+            matrix = make()
+            self.matrices[group, place] = own, matrix
+        return matrix
 
 
 def passable(scene) -> list[str]:
@@ -81,15 +98,15 @@ def trace(scene, u: np.ndarray, v: np.ndarray) -> Path:
     wavelengths = scene.integrator.wavelengths(n)
     steps, lost = [], np.zeros(n, bool)
     extents = {i: e for i, name in enumerate(names) if (e := getattr(scene.parts[name], "extent", lambda: None)())}
-    pointers = [mi.BSDFPtr(scene.parts[name]) for name in names]
+    layers = [mi.BSDFPtr(scene.parts[name]) for name in names]
+    shapes = [mi.ShapePtr(shape) for shape in scene.mitsuba.shapes()]
     for _ in range(STEPS + 1):
         ray = mi.Ray3f(mi.Point3f(*origin.T.astype(np.float32)), mi.Vector3f(*direction.T.astype(np.float32)), mi.Float(0),
                        wavelengths)
         si = scene.mitsuba.ray_intersect(ray)
-        met = si.bsdf()
-        part = np.full(n, -1)
-        for index, pointer in enumerate(pointers):
-            part[np.array(met == pointer) & ~lost] = index
+        part, shape = (_which(met, pointers) for met, pointers in ((si.bsdf(), layers), (si.shape, shapes)))
+        dr.eval(si, part, shape)  # at once: piece by piece, every array would trace the rays anew
+        part, shape = np.where(lost, -1, np.array(part)), np.array(shape)
         step, frame = _step(part, si, -direction, x, extents)
         if not (part >= 0).any():
             break
@@ -106,12 +123,19 @@ def trace(scene, u: np.ndarray, v: np.ndarray) -> Path:
     else:
         lost |= part >= 0
     # the ray that reaches the end is straight; light that it brings to `origin` leaves the surface towards it
-    dr.eval(si)
-    shape = np.full(n, -1)
-    for index, own in enumerate(scene.mitsuba.shapes()):
-        shape[np.array(si.shape == mi.ShapePtr(own))] = index
     return Path(names, steps, si, mi.Point3f(*origin.T.astype(np.float32)), step, shape,
-                {n: scene.parts[n].field for n in names if getattr(scene.parts[n], "field", None) is not None}, lost)
+                lost, {n: scene.parts[n].field for n in names if getattr(scene.parts[n], "field", None) is not None})
+
+
+def _which(met, pointers: list):
+    """Index of the pointer that each ray met, -1 for none of them (Dr.Jit)."""
+    import drjit as dr
+    import mitsuba as mi
+
+    found = mi.Int32(-1)
+    for index, pointer in enumerate(pointers):
+        found = dr.select(met == pointer, mi.Int32(index), found)
+    return found
 
 
 def across(axis: np.ndarray, k: np.ndarray) -> np.ndarray:
@@ -214,10 +238,11 @@ def transmission(scene, path: Path, values: Mapping, bands: np.ndarray, componen
     count = max([len(path.lost), *(np.size(v) for v in values.values() if isinstance(v, np.ndarray))])
     kind = complex if any(np.iscomplexobj(v) for v in values.values()) else float
     out = [np.zeros((count, len(bands)), kind) for _ in range(4)]
-    for parts, rays in path.sequences():
+    for group, (parts, rays) in enumerate(path.sequences()):
         names = [(path.names[index], step) for step, index in zip(path.steps, parts) if index >= 0]
-        matrices = [layer_matrix(scene, name, _crossing(step, rays, bands), values, path.fields)
-                    for name, step in names]
+        matrices = [path.kept(group, place, name, scene, values,
+                              lambda: layer_matrix(scene, name, _crossing(step, rays, bands), values, path.fields))
+                    for place, (name, step) in enumerate(names)]
         row = tuple(1.0 if j == component else 0 for j in range(4))
         if any(np.any(np.asarray(values.get(f"{name}.face", 0.0)) != 0) for name, _ in names):
             stack = None

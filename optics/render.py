@@ -26,7 +26,7 @@ from optics.parameter import Parameter, Values, Variable
 from optics.scene import Scene
 
 RIM_SAMPLES = 64  # per pixel at rims; a power of two
-LAYERED_RIM_SAMPLES = 16  # in scenes with layers, whose matrices are multiplied for every sample
+LAYERED_RIM_SAMPLES = 32  # in scenes with layers, whose matrices are multiplied for every sample
 CREASE = 25.0  # deg from pixel to pixel: what is no smooth surface
 POWERS = ("power", "power_r", "power_g", "power_b")  # images are kept per unit of each
 FLAT_FIELDS = ("multiplicative", "additive", "none")
@@ -54,6 +54,7 @@ class Renderer:
         self.wavelengths = np.array(scene.integrator.bands or (540.0,))
         self.remember = remember
         self._transmissions: OrderedDict = OrderedDict()
+        self._recent: list[paths.Path] = []
         self._hits: OrderedDict = OrderedDict()
         self._images: OrderedDict = OrderedDict()
         image_keys = {k for k, p in scene.parameters.items() if p.how == "image"}
@@ -207,6 +208,10 @@ class Renderer:
         key = (self.geometry(values), component, *where, *(v.tobytes() if isinstance(v, np.ndarray) else v for v in (
             values[k] for k in sorted(self.layer_keys))))
         if key not in self._transmissions:
+            if all(path is not other for other in self._recent):  # matrices are large: those of the last two paths are kept
+                self._recent.append(path)
+                if len(self._recent) > 4:
+                    self._recent.pop(0).matrices.clear()
             self._transmissions[key] = paths.transmission(self.scene, path, values, self.wavelengths, component)
             while len(self._transmissions) > 2 * self.remember:
                 self._transmissions.popitem(last=False)

@@ -83,7 +83,7 @@ class Scene:
         self.parts: dict[str, Declared] = {}
         for part in created:
             name = part.name
-            if not name or name.startswith(("object_", "_unnamed", "_")) or name in ("", "plugin"):
+            if not name or re.fullmatch(r"object_\d+|_.*|plugin", name):
                 name = part.kind
             if name in self.parts:
                 raise BadScene(f"{self.path}: two parts have the id '{name}'; give every part its own id=\"...\"")

@@ -26,7 +26,7 @@ PARAMETERS = (
     Parameter("depth", "mm", 5.0, (0.0, 100.0), "of the face that they stand on, below the untouched outer face",
               plausible=0.1, how="difference"),
 )
-SEGMENTS = 48  # of a circle: 0.3 % of the area is lost
+SEGMENTS = 96  # of a circle: 0.07 % of the area is lost
 
 
 def build():
