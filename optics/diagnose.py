@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from optics import statistics as st
+from optics import pairs, statistics as st
 from optics.calibrate import for_frames
 from optics.compare import led_label
 from optics.effect import Effect
@@ -99,9 +99,16 @@ def diagnose(model, fit, effects: Sequence[Effect], variables_of: Callable[[Effe
     shifts = _shifts(model, fit, winner, fits) if winner else []
     findings = _findings(table, winner, done, members, fingerprints, splits, levels, basis, structure)
     word, conditions = decide(findings)
+    found = []
+    if winner and word not in ("NOTHING", "CLAIM") and not any(c.row.refit.complete for c in done):
+        found = pairs.search(evidence, table.order, winner.row.net_refit,
+                             lambda both: _add_both(model, fit, evidence, both, refit, fitted))
+        word = "PARTIAL" if any(p.complete for p in found) else word
     _write_limits(model, evidence, table, winner if word == "CLAIM" else None, fits, basis, rows_max, seed, say)
     _write_verdicts(table, word, winner, members, splits, levels)
     text = sentence(word, conditions, findings, rows, [c.row for c in members], fingerprints, levels, shifts, basis)
+    if any(p.complete for p in found):
+        text = pairs.words(found, {row.name: row.share for row in rows})
     names = [c.effect.name for c in chosen]
     gaps, correct = _gaps(evidence, chosen)
     return Diagnosis(
@@ -110,7 +117,7 @@ def diagnose(model, fit, effects: Sequence[Effect], variables_of: Callable[[Effe
         compared=names, gaps=gaps, correct=correct, splits=splits, levels=levels, fingerprints=fingerprints, shifts=shifts,
         hints=_hints(word, conditions, members, gaps, names), not_tested=not_tested,
         warnings=_warnings(model, fit, evidence, table, winner, shifts, dropped, structure, basis),
-        claimed=winner.effect.name if word == "CLAIM" else "", fits=fits)
+        claimed=winner.effect.name if word == "CLAIM" else "", pairs=found, fits=fits)
 
 
 # -- what must hold before any score ----------------------------------------------------------------------------------
@@ -333,7 +340,7 @@ def _refit(model, fit, evidence: Evidence, table: Table, chosen: Sequence[Candid
                 break  # the first attempt was as good as predicted
             if fraction < START and c.row.fall < CLEAR:
                 break  # nothing to win
-            start = _start(model, fit, evidence, c, fraction)
+            start = _start(model, fit, evidence, [c], fraction)
             try:
                 found = refit(model, [*base, *c.variables], start, frames=list(fitted))
             except (ValueError, ArithmeticError, np.linalg.LinAlgError) as error:
@@ -368,16 +375,32 @@ def _refit(model, fit, evidence: Evidence, table: Table, chosen: Sequence[Candid
     return fits
 
 
-def _start(model, fit, evidence: Evidence, c: Candidate, fraction: float) -> Values:
-    """Effect at a fraction of its expected change, and the base where it would move to make room for it."""
-    values = fit.values.copy()
-    linear = c.linear * fraction
-    for v, start, step in zip(c.variables, c.start, c.change_of(linear)):
-        low, high = v.parameter.bounds
-        values.put(v, float(np.clip(start + step, start + 0.9 * (low - start) if math.isfinite(low) else -math.inf,
-                                    start + 0.9 * (high - start) if math.isfinite(high) else math.inf)))
-    first = len(evidence.base)
-    moves = evidence.projected.response[:, np.array(c.columns) - first] @ linear
+def _add_both(model, fit, evidence: Evidence, both: list[Candidate], refit: Callable, fitted: Sequence[int]):
+    """Fall of chi2, excess and structure after two effects were added together; None where no refit succeeds."""
+    base = [v for v in fit.variables if v.frames is None or set(v.frames) & set(fitted)]
+    start = _start(model, fit, evidence, both, START)
+    try:
+        found = refit(model, [*base, *(v for c in both for v in c.variables)], start, frames=list(fitted))
+    except (ValueError, ArithmeticError, np.linalg.LinAlgError):
+        return None
+    after, images = _chi2(model, found.values, evidence)
+    after += _prior_chi2(model, found.values, fit.variables)
+    fall = evidence.normal.square + _prior_chi2(model, fit.values, fit.variables) - after
+    dof = max(evidence.normal.count - evidence.projected.rank - sum(len(c.cone.live) for c in both), 1)
+    columns = [*evidence.base, *(i for c in both for i in c.columns)]
+    return fall, (after - dof) / math.sqrt(2 * dof), evidence.structure(images, columns).p
+
+
+def _start(model, fit, evidence: Evidence, effects: Sequence[Candidate], fraction: float) -> Values:
+    """Effects at a fraction of their expected change, and the base where it would move to make room for them."""
+    values, first, moves = fit.values.copy(), len(evidence.base), 0.0
+    for c in effects:
+        linear = c.linear * fraction
+        for v, start, step in zip(c.variables, c.start, c.change_of(linear)):
+            low, high = v.parameter.bounds
+            values.put(v, float(np.clip(start + step, start + 0.9 * (low - start) if math.isfinite(low) else -math.inf,
+                                        start + 0.9 * (high - start) if math.isfinite(high) else math.inf)))
+        moves = moves + evidence.projected.response[:, np.array(c.columns) - first] @ linear
     for i, move in zip(evidence.base, moves):
         v = evidence.columns[i]
         low, high = v.parameter.bounds
@@ -677,10 +700,10 @@ def _contains(one: Candidate, other: Candidate) -> bool:
 
 
 def _refuted(winner: Candidate, other: Candidate) -> bool:
-    """Whether the winner leaves nothing to explain, and another, refitted, does."""
+    """Whether the winner leaves nothing to explain, and another, refitted, does: more than could hide beside the winner."""
     left = other.row.refit
     return other is not winner and winner.row.refit.complete and left is not None and left.converged and (
-        left.structure_p < LEVEL or left.excess_sd > 2 * EXCESS)
+        left.structure_p < LEVEL or left.excess_sd - winner.row.refit.excess_sd > EXCESS)
 
 
 def _simplest(done: Sequence[Candidate]) -> Candidate:

@@ -219,12 +219,13 @@ def layer_matrix(scene, name: str, crossing: Crossing, values: Mapping, fields: 
 
 
 def slab(name: str, matrix: Mueller, values: Mapping) -> Slab:
-    """A layer with the reflections of its faces, where it declares any (`face`)."""
+    """A layer with the reflections of its faces, where it declares any (`face`); its matrix holds their losses already."""
     share = values.get(f"{name}.face", 0.0) * values.get(f"{name}.inserted", 1.0)
     if np.all(np.asarray(share) == 0):
         return Slab(matrix)
-    side = face(np.reshape(share, (-1, 1)) if isinstance(share, np.ndarray) else share)
-    return side.after(Slab(matrix)).after(side)
+    share = np.reshape(share, (-1, 1)) if isinstance(share, np.ndarray) else share
+    side = face(share)
+    return side.after(Slab(matrix * (1 / ((1 - share) * (1 - share))))).after(side)
 
 
 def transmission(scene, path: Path, values: Mapping, bands: np.ndarray, component: int = 0) -> tuple:

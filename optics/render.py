@@ -485,6 +485,7 @@ class Model:
             self.frames = [replace(f, image=np.repeat(f.image, 3, axis=2)) for f in captures.frames]
             background = None if background is None else np.repeat(background, 3, axis=2)
         self.renderer = Renderer(scene)
+        self._edges_kept: dict[int, np.ndarray] = {}
         self.parameters: dict[str, Parameter] = scene.parameters
         self.base = {**scene.values(), **scene.check(captures.parameters, f"{captures.folder}/captures.toml [parameters]")}
         for frame in self.frames:
@@ -778,7 +779,31 @@ class Model:
             mask &= np.asarray(frame.mask, bool)[..., None]
         if self.mosaic is not None:
             mask &= self.mosaic
+        if self.renderer.layered and self.captures.table is None:
+            mask &= self._resolved(index)
         return mask
+
+    def _resolved(self, index: int) -> np.ndarray:
+        """(H, W, C) False at sharp edges that the finer samples resolve worse than the noise: where the step across a pixel,
+        over the number of samples, is more than a third of the noise. At the base's values, so that a fit cannot move it."""
+        if index not in self._edges_kept:
+            now = self.at(Values(), index)
+            low = high = 0.0
+            for light, power in self.lit(now).items():
+                image = self.renderer.led(now, light)
+                if not len(image.index):
+                    continue
+                fine = image.raw[1] * self.renderer.weights(now, image)[1]
+                low, high = low + power * fine.min(1), high + power * fine.max(1)
+            known = np.ones(self.shape, bool)
+            if np.ndim(high):
+                view = self.developer.view(now)
+                full = self.noise.saturation - self.noise.black_level
+                step = ((high - low) @ self.developer.matrix.T) * np.abs(view.exposure * self.developer.gains(view)) * full
+                level = self.predict(Values(), [index])[0].reshape(-1, self.shape[2])[image.index]
+                known.reshape(-1, self.shape[2])[image.index] = step / self.renderer.rim_samples < self.noise.sd(level) / 3
+            self._edges_kept[index] = known
+        return self._edges_kept[index]
 
     @property
     def size(self) -> float:

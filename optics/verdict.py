@@ -82,6 +82,21 @@ class Refit:
 
 
 @dataclass
+class Pair:
+    """Two effects that were added together: fall of chi2, and what is left (as in Refit)."""
+
+    effects: list[str]
+    fall: float
+    excess_sd: float
+    structure_p: float
+
+    @property
+    def complete(self) -> bool:
+        """Whether nothing is left to explain."""
+        return self.excess_sd < EXCESS and not is_structured(self.structure_p, self.excess_sd)
+
+
+@dataclass
 class Row:
     """What was found about one effect. Fractions are fractions (0.01 is 1 %).
 
@@ -260,6 +275,7 @@ class Diagnosis:
     not_tested: dict[str, str]
     warnings: list[str]
     claimed: str = ""
+    pairs: list[Pair] = field(default_factory=list)  # of effects that were tried together (optics.pairs)
     fits: dict = field(default_factory=dict, repr=False, compare=False)  # effect -> Fit of the refit; not written
 
     def __post_init__(self):
@@ -354,7 +370,7 @@ class Findings:
     winner       the effect with the largest fall after refit, '' if none; p_winner: family-wise, of that fall
     fall, runner_up   net falls of the winner and of the next one
     refuted      with the winner nothing is left to explain, and every effect within the margin leaves structure, or an
-                 excess of 2 EXCESS sd, behind: the misfit that makes small differences worthless is then not there
+                 excess EXCESS sd above the winner's, behind: the misfit that makes small differences worthless is then not there
     ratio        the best curve's net fall over the winner's
     rival        a curve does better by RIVAL (a map) or RIVAL_CURVE, significantly
     share        of the excess, where excess_sd > EXCESS

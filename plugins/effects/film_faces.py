@@ -3,8 +3,8 @@
 Definition
     each film is face - absorber - face, each face reflects the share r = `face`; all orders of reflections between all faces of
     all films are summed as Mueller matrices (adding method), light from behind by reciprocity.
-For two ideal films at the angle d the first order adds r^2 (3 cos(d)^2 + cos(d)^6) to the (1 - r)^4 cos(d)^2 that passes: light that
-went through the absorber again has been filtered again.
+A film's transmittances are those of the whole film, the faces' losses included. For two ideal films at the angle d the first
+order adds r^2 (3 cos(d)^2 + cos(d)^6) to the cos(d)^2 that passes: light that went through the absorber again was filtered again.
 Fingerprint
     Malus' curve becomes a little narrower, by a cos^6 that no leak and no offset makes; 0.2 % at r = 0.04.
 Validity

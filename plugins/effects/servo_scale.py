@@ -1,7 +1,7 @@
-"""Servo scale: the polarizers turn by more or less than their dials say.
+"""Servo scale: a polarizer turns by more or less than its dial says.
 
 Definition
-    axis = scale angle + offset
+    axis = scale angle + offset                                  one scale for each dial
 Fingerprint
     the period of Malus' curve is not 180 degrees: an error of the angle that grows with it. An offset is the same everywhere.
 Validity
@@ -12,5 +12,6 @@ References
 
 from optics.effect import Effect
 
-effect = Effect(name="servo scale", part="polarizer_film", parameters=("scale",), acts=("analyzer.angle",),
+effect = Effect(name="servo scale", part="polarizer_film", parameters=("scale",), per="part",
+                acts=("analyzer.angle",),
                 needs="angles over half a turn or more")

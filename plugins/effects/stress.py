@@ -2,7 +2,7 @@
 
 Definition
     delta(lambda) = 2 pi C (sigma_1 - sigma_2) d/lambda          stress-optic law
-the pattern turns with the sheet's `angle`. In components: (a, b) = 2 pi C d/lambda stress (P_q, P_u), with the coefficient C = `stress_optic`, the thickness d =
+the pattern turns with the sheet's `angle`, but for the skin's. In components: (a, b) = 2 pi C d/lambda stress (P_q, P_u), with the coefficient C = `stress_optic`, the thickness d =
 `stress_thickness`, and the pattern (P_q, P_u) = (s_xx - s_yy, 2 s_xy) per unit of `stress`:
     even    (1, 0): uniform tension along the sheet's x axis
     disc    a disc of the diameter `stress_size` pressed along its y axis: s_ij of the two point loads, in units of 2P/(pi D d)
@@ -26,7 +26,7 @@ from optics.parameter import Parameter
 
 
 def strain(crossing, sheet):
-    turn = sheet.angle * (math.pi / 180)
+    turn = 0.0 if sheet.stress_pattern == "gel" else sheet.angle * (math.pi / 180)
     c, s = cos(turn), sin(turn)
     x, y = crossing.u * c + crossing.v * s, crossing.v * c - crossing.u * s  # the pattern's own axes
     q, u = pattern(x, y, sheet)

@@ -2,7 +2,7 @@
 
 Definition
     I' = I (1 + w_c cos(psi) + w_s sin(psi))                     psi: what the dial says
-from a wedge that makes the beam walk over the detector, or a film that is denser on one side. All dials alike.
+from a wedge that makes the beam walk over the detector, or a film that is denser on one side; each dial has its own.
 Fingerprint
     one cycle per turn, where Malus has two: curves of the first and the second half turn differ.
 Validity
@@ -13,5 +13,5 @@ References
 
 from optics.effect import Effect
 
-effect = Effect(name="analyzer wobble", part="polarizer_film", parameters=("wobble_c", "wobble_s"), acts=("analyzer.angle",),
+effect = Effect(name="analyzer wobble", part="polarizer_film", parameters=("wobble_c", "wobble_s"), per="part", acts=("analyzer.angle",),
                 needs="a whole turn of the analyser")

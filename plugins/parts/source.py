@@ -17,7 +17,7 @@ References
 import math
 
 from optics.effect import Declared, Part
-from optics.mueller import exp, where
+from optics.mueller import exp, real, where
 from optics.parameter import Parameter
 
 PARAMETERS = (
@@ -39,7 +39,7 @@ def stokes(crossing, source):
     """Stokes vector at power 1, against the crossing's axes."""
     u = (crossing.wavelengths - source.wavelength) / source.fwhm
     line = exp(-4 * math.log(2) * u * u)
-    level = where(source.wavelength > 0, line, 1.0 + 0.0 * line) * (1 + source.drift * source.time)
+    level = where(real(source.wavelength) > 0, line, 1.0 + 0.0 * line) * (1 + source.drift * source.time)
     q, u = crossing.axis(0.0)  # of the surface's x axis, against the crossing's axes
     return level, level * (source.dop_q * q - source.dop_u * u), level * (source.dop_q * u + source.dop_u * q), 0
 

@@ -1,0 +1,78 @@
+"""Two effects at once: where no single one explains a residual, the pairs that leave nothing of it.
+
+Pairs are ranked by the linear fall of chi2, T = u' V^-1 u over the columns of both, and the best are refitted together with
+everything else. Only a pair after which nothing is left counts: two more numbers cannot do that by luck.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from itertools import combinations
+
+import numpy as np
+
+from optics import statistics as st
+from optics.evidence import Candidate, Evidence
+from optics.parameter import Values
+from optics.verdict import CLEAR, LEVEL, MARGIN, Pair
+
+CONSIDERED = 10  # effects, the best by themselves: 45 pairs
+REFITTED = 4  # pairs
+
+
+def ranked(evidence: Evidence, candidates: Sequence[Candidate]) -> list[tuple[float, Candidate, Candidate, np.ndarray]]:
+    """(expected fall less its degrees of freedom, a, b, coefficients of both), best first."""
+    projected, first, found = evidence.projected, len(evidence.base), []
+    for a, b in combinations(candidates, 2):
+        if any(_contains(c, d) for c in (a, b) for d in candidates):
+            continue  # its simpler part is tried
+        if {key for v in a.variables for key in v.keys} & {key for v in b.variables for key in v.keys}:
+            continue
+        own = np.array([*a.columns, *b.columns]) - first
+        inverse, rank = st.inverse(projected.information[np.ix_(own, own)], 1e-10)[:2]
+        linear = inverse @ projected.score[own]
+        signs = [s * x >= 0 for s, x in zip([*a.sides, *b.sides], linear) if s]
+        if all(signs):  # no effect below its neutral value, where that is a bound
+            found.append((float(projected.score[own] @ linear) - rank, a, b, linear))
+    return sorted(found, key=lambda t: -t[0])
+
+
+def _contains(one: Candidate, other: Candidate) -> bool:
+    """Whether an effect frees all that another frees, and more."""
+    keys = [{key for v in c.variables for key in v.keys} for c in (one, other)]
+    return keys[0] > keys[1]
+
+
+def search(evidence: Evidence, order: Sequence[Candidate], alone: float, add: Callable[[list[Candidate]], tuple]) -> list[Pair]:
+    """The best pairs, refitted; `alone` is the best single effect's net fall.
+
+    add   (effects with their `linear` set) -> (fall, excess_sd, structure_p) after a refit, or None
+    """
+    live = [c for c in order if c.row.p_family < LEVEL and len(c.cone.live) and not c.broken][:CONSIDERED]
+    best = [t for t in ranked(evidence, live) if t[0] - alone > max(CLEAR, MARGIN / 4 * alone)]
+    pairs = []
+    for _, a, b, linear in best[:REFITTED]:
+        kept = a.linear, b.linear
+        a.linear, b.linear = linear[:len(a.columns)], linear[len(a.columns):]
+        try:
+            result = add([a, b])
+        finally:
+            a.linear, b.linear = kept
+        if result is not None and math.isfinite(result[0]):
+            pairs.append(Pair([a.effect.name, b.effect.name], *result))
+    return sorted(pairs, key=lambda p: -p.fall)
+
+
+def words(pairs: Sequence[Pair], share: dict[str, float]) -> str:
+    """The pairs that leave nothing, in a sentence; `share` of the excess that each effect explains alone."""
+    complete = [p for p in pairs if p.complete]
+    common = [n for n in complete[0].effects if all(n in p.effects for p in complete)]
+    if not common:
+        named = ", or ".join(" with ".join(p.effects) for p in complete)
+        return f"no one effect explains the residual, two do and leave nothing: {named}."
+    one = max(common, key=lambda n: share.get(n, 0.0))
+    others = [next(n for n in p.effects if n != one) for p in complete]
+    part = f" {one} alone explains {share[one]:.0%}." if math.isfinite(share.get(one, math.nan)) else ""
+    return (f"no one effect explains the residual, but {one} together with {' or with '.join(others)} leaves nothing.{part} "
+            f"Add {one}, calibrate and diagnose again.")
