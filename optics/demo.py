@@ -26,6 +26,11 @@ SECRETS = {
     "residual response curve": 0.12, "gain drift": 0.02,
 }
 SENSORS = {"gelsight": ((160, 120), 200.0), "digit": ((120, 160), 700.0)}  # px; exposure: one LED at a time is near full scale
+BENCH = "polarizer_bench"  # 1000 readings of a photodiode, by coherency matrices (optics.jones); of effects that can be told apart
+BENCH_SECRETS = {
+    "polarizer misalignment": 1.0, "servo scale": 1.01, "servo backlash": 1.0, "analyzer wobble": 0.01, "retardance": 12.0,
+    "camera gamma": 0.03, "polarized source": 0.02, "extinction leak": 0.004,
+}
 PRESSES = 4
 STEPS = 3  # effects that the loop may add before it must stop
 
@@ -44,11 +49,12 @@ def truth(scene, seed: int) -> dict[str, float]:
     return built
 
 
-def secret(seed: int, name: str | None = None) -> tuple[str, float]:
+def secret(seed: int, name: str | None = None, sensor: str = "gelsight") -> tuple[str, float]:
     """The hidden effect of a seed, or the one of a name."""
-    names = sorted(SECRETS)
+    choices = BENCH_SECRETS if sensor == BENCH else SECRETS
+    names = sorted(choices)
     name = name or names[int(np.random.default_rng([seed, 2]).integers(len(names)))]
-    known = {**SECRETS, "colour crosstalk": 0.03}
+    known = choices if sensor == BENCH else {**SECRETS, "colour crosstalk": 0.03}
     effect = registry().find_effect(name).name
     if effect not in known:
         raise UnknownKey(effect, known, "secret", hint="the demonstration knows no independent way to make it")
@@ -58,9 +64,12 @@ def secret(seed: int, name: str | None = None) -> tuple[str, float]:
 def make(folder: Path, seed: int, name: str | None = None, progress: Callable | None = None,
          sensor: str = "gelsight") -> tuple[str, float]:
     """Write the captures of a demonstration; returns the secret, which the captures do not tell."""
+    effect, strength = secret(seed, name, sensor)
+    if sensor == BENCH:
+        make_bench(folder, seed, effect, strength)
+        return effect, strength
     (width, height), exposure = SENSORS[sensor]
     scene = scenes.load(sensor, {"width": str(width), "height": str(height)})
-    effect, strength = secret(seed, name)
     built = {**truth(scene, seed), "camera.exposure": exposure}
     maker = synthetic.Maker(scene, built, {effect: strength}, seed=seed + 1000)
     # each LED alone, and none: the dark frame tells light from outside from light that the camera scatters
@@ -69,6 +78,30 @@ def make(folder: Path, seed: int, name: str | None = None, progress: Callable | 
     found.parameters["camera.exposure"] = exposure
     capture_files.write(found, folder, bits=8)
     return effect, strength
+
+
+def make_bench(folder: Path, seed: int, effect: str, strength: float) -> None:
+    """Readings of the polarizer bench with one effect: P1 at five angles, the analyser round and back, two powers of the lamp."""
+    from optics.jones import Photodiode, Polarizer, Sample, Source, Truth, malus_sweep, write
+    from optics.noise import Noise
+
+    film = {"polarizer misalignment": "offset", "servo scale": "scale", "servo backlash": "backlash", "analyzer wobble": "wobble_c"}
+    p1, p2, source, sample, gamma = Polarizer(), Polarizer(), Source(), Sample(), 1.0
+    if effect in film:
+        p2 = Polarizer(**{film[effect]: strength})
+    elif effect == "extinction leak":
+        p1 = p2 = Polarizer(leak=strength)
+    elif effect == "retardance":
+        sample = Sample(retardance=strength, axis=20.0)
+    elif effect == "polarized source":
+        source = Source(dop=strength, dop_angle=30.0)
+    else:
+        gamma += strength
+    settings = malus_sweep(1000, polarizer_angles=(0.0, 60.0, 100.0, 190.0, 250.0))
+    for i, own in enumerate(settings):
+        own.update({"source.power": (1.0, 0.5)[i % 2], "sample.angle": (0.0, 45.0)[i // 2 % 2]})
+    truth = Truth(p1=p1, p2=p2, source=source, sample=sample, photodiode=Photodiode(gain=2.2, gamma=gamma))
+    write(folder, truth, settings, Noise(0.05, 2.0, 64.0, 4095.0, 0.0), seed + 1000)
 
 
 def run(folder: str | Path, seed: int = 1, effect: str | None = None, sensor: str = "gelsight",
@@ -90,7 +123,9 @@ def run(folder: str | Path, seed: int = 1, effect: str | None = None, sensor: st
     if asked != (hidden["seed"], hidden["sensor"], hidden["effect"]):
         raise OutputExists(f"{folder} holds the demonstration of {hidden['sensor']}, seed {hidden['seed']}, with a secret of its "
                            "own; choose another folder for this one (-o)")
-    say(f"{PRESSES} presses under the LEDs of {sensor}, one at a time and in the dark, made by stock Mitsuba with an effect that "
+    say("1000 readings of a photodiode behind two polarizers, made by coherency matrices with an effect that the base model lacks."
+        if sensor == BENCH else
+        f"{PRESSES} presses under the LEDs of {sensor}, one at a time and in the dark, made by stock Mitsuba with an effect that "
         "the base model lacks.")
     # The stage is trusted (S1.2): solving for every press as well takes three times as long and tells the same story.
     setup = loop.Setup(captures=str(folder / "captures"), per_group=[], seed=seed)

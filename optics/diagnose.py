@@ -831,7 +831,7 @@ def _warnings(model, fit, evidence, table, winner, shifts, dropped, structure, b
     if structure.high < 0.7:
         texts.append(f"fine detail of the residual has {structure.high:.2f} of the noise expected: the images look interpolated "
                      "or filtered, or the noise is overstated; neighbouring pixels then share their noise and p is too small")
-    if abs(basis.excess_sd) > EXCESS and not structure.p < LEVEL:
+    if abs(basis.excess_sd) > EXCESS and structure.p >= LEVEL:
         texts.append(f"chi2 is {basis.phi:.3g} per degree of freedom without structure: rather the noise model (gain, PRNU) is off "
                      "than the physics")
     if winner is not None and table.p_best < LEVEL:
