@@ -12,6 +12,7 @@ Where an effect enters, in the order that light takes (`STAGES`):
     reflection  membrane  fr = f(geometry, membrane)  added to the BRDF, 1/sr; Dr.Jit
     volume      gel       L  = f(path, gel)           radiance added by the gel itself, per LED; Dr.Jit
     ambient     membrane  L  = f(geometry, membrane)  radiance added that no LED made; Dr.Jit
+    glow        interface L  = f(glow, interface)     (B,) radiance that a boundary sends to the camera, per light; numpy
     layer       a layer   M  = f(crossing, layer)     Mueller matrix that light passes after the layer's own (optics.layers)
     lens        camera    I  = f(image, camera)       irradiance per band, (H, W, B); numpy
     sensor      camera    I  = f(image, camera)       signal per channel, (H, W, C), 1 = full scale; numpy
@@ -37,7 +38,7 @@ from optics.parameter import Parameter
 
 STAGES = {
     "surface": "gel", "emission": "led", "segment": "gel", "reflection": "membrane", "volume": "gel",
-    "ambient": "membrane", "layer": "", "lens": "camera", "sensor": "camera", "response": "camera",
+    "ambient": "membrane", "glow": "interface", "layer": "", "lens": "camera", "sensor": "camera", "response": "camera",
 }
 IMAGE_STAGES = ("lens", "sensor", "response")
 CATEGORIES = ("bsdf", "emitter", "sensor", "shape", "integrator")

@@ -228,12 +228,12 @@ def slab(name: str, matrix: Mueller, values: Mapping) -> Slab:
     return side.after(Slab(matrix * (1 / ((1 - share) * (1 - share))))).after(side)
 
 
-def transmission(scene, path: Path, values: Mapping, bands: np.ndarray, component: int = 0) -> tuple:
+def transmission(scene, path: Path, values: Mapping, bands: np.ndarray, component: int = 0, until: str = "") -> tuple:
     """A row of the Mueller matrix from a path's end to the camera: how much of each of S0 ... S3 there becomes the
     `component` here; 4 entries (N, B).
 
     N is the number of rays, or of the readings that `values` holds arrays for (then one ray serves them all). Rays that are
-    lost transmit nothing.
+    lost transmit nothing. `until` a part: from that part, without it, to the camera; nothing where a ray does not meet it.
     """
     one = len(path.lost) == 1
     count = max([len(path.lost), *(np.size(v) for v in values.values() if isinstance(v, np.ndarray))])
@@ -241,6 +241,11 @@ def transmission(scene, path: Path, values: Mapping, bands: np.ndarray, componen
     out = [np.zeros((count, len(bands)), kind) for _ in range(4)]
     for group, (parts, rays) in enumerate(path.sequences()):
         names = [(path.names[index], step) for step, index in zip(path.steps, parts) if index >= 0]
+        if until:
+            met = [name for name, _ in names]
+            if until not in met:
+                continue
+            names = names[:met.index(until)]
         matrices = [path.kept(group, place, name, scene, values,
                               lambda: layer_matrix(scene, name, _crossing(step, rays, bands), values, path.fields))
                     for place, (name, step) in enumerate(names)]

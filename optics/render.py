@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import NamedTuple
 
 import numpy as np
@@ -193,7 +194,30 @@ class Renderer:
         image = self.led(values, light)
         if not self.layered:
             return image.radiance if component == 0 else np.zeros_like(image.radiance)
-        return self._mix(image, image.raw, self.weights(values, image, component))
+        seen = [None if r is None or w is None else r * w for r, w in zip(image.raw, self.weights(values, image, component))]
+        for add in self._glows(values, image, component):
+            seen = [s if s is None else s + a for s, a in zip(seen, add)]
+        return self._mix(image, seen)
+
+    def _glows(self, values: Mapping, image: "LedImage", component: int) -> Iterator[tuple]:
+        """What boundaries send to the camera by themselves while one light is on (stage `glow`): at centres, at finer samples."""
+        effects = registry().at_stage("interface", "glow")
+        names = [n for n, p in self.scene.parts.items() if p.kind == "interface"] if image.led in self.scene.leds else []
+        for name in names:
+            own = paths.part_values(self.scene, name, values, {})
+            functions = [e.stages["glow"] for e in effects
+                         if any(getattr(own, n) != self.scene.parts[name].numbers[n].neutral for n in e.parameter_names)]
+            if not functions:
+                continue
+            shines = [i for i, s in enumerate(self.scene.mitsuba.shapes()) if getattr(s.bsdf(), "kind", "") == "fluorescent"]
+            marked = np.isin(image.hits.path.shape, shines)
+            glow = SimpleNamespace(markers=image.raw[0][marked].mean(0) if marked.any() else np.zeros(self.bands),
+                                   wavelengths=self.wavelengths)
+            light = sum(function(glow, own) for function in functions)
+            yield tuple(None if path is None else light * paths.transmission(
+                self.scene, path, values, self.wavelengths, component, name)[0].reshape(shape) for path, shape in (
+                (image.hits.path, (-1, self.bands)),
+                (image.samples.path if len(image.index) else None, (len(image.index), self.rim_samples, self.bands))))
 
     def weights(self, values: Mapping, image: "LedImage", component: int = 0) -> tuple:
         """What the layers leave of a light: (H W, B) at the pixels' centres, (n, S, B) at the finer samples of rims."""

@@ -84,11 +84,13 @@ class FingerMaker:
         uv = np.stack(np.broadcast_arrays(x / width + 0.5, y / length + 0.5), -1)
         return self.mesh(points, faces, bsdf, name, uv)
 
-    def mesh(self, points, faces, bsdf, name: str, uv=None):
+    def mesh(self, points, faces, bsdf, name: str, uv=None, shines: bool = False):
         import mitsuba as mi
 
         properties = mi.Properties()
         properties["bsdf"] = mi.load_dict(bsdf)
+        if shines:
+            properties["emitter"] = mi.load_dict({"type": "area", "radiance": {"type": "uniform", "value": 1.0}})
         mesh = mi.Mesh(name, len(points), len(faces), properties, has_vertex_normals=False, has_vertex_texcoords=uv is not None)
         params = mi.traverse(mesh)
         params["vertex_positions"] = mi.Float(np.asarray(points, np.float32).ravel())
@@ -98,7 +100,7 @@ class FingerMaker:
         params.update()
         return mesh
 
-    def markers(self, dent, press, bsdf):
+    def markers(self, dent, press, bsdf, shines: bool = False):
         """The twenty markers as cylinders of 96 sides that stand on the inner face."""
         from optics.gel import contact
 
@@ -133,7 +135,7 @@ class FingerMaker:
                            (foot + height * axis)[None]]
                 faces += [base + np.stack(f, -1) for f in ((i, j, sides + j), (i, sides + j, sides + i), (
                     2 * sides + i, 2 * sides + j, np.full(sides, 3 * sides)))]
-        return self.mesh(np.concatenate(points), np.concatenate(faces), bsdf, "markers")
+        return self.mesh(np.concatenate(points), np.concatenate(faces), bsdf, "markers", None, shines)
 
     def cylinder(self, distance: float, bsdf):
         v, sides, half = self.values, 512, self.values["object.length"] / 2
@@ -184,7 +186,7 @@ class FingerMaker:
                                                    "color0": {"type": "uniform", "value": float(self.wall_dark)},
                                                    "color1": {"type": "uniform", "value": 1.0}}}
         scene = {
-            "type": "scene", "integrator": {"type": "path", "max_depth": 8 if what != "markers" else 4, "hide_emitters": True},
+            "type": "scene", "integrator": {"type": "path", "max_depth": 8 if what in ("object", "wall") else 4},
             "sensor": {"type": "perspective", "fov": float(self.values["camera.x_fov"]), "fov_axis": "x", "near_clip": 0.01,
                        "far_clip": 1e4, "to_world": looking, "film": {
                            "type": "hdrfilm", "width": width, "height": height, "rfilter": {"type": "box"},
@@ -194,11 +196,11 @@ class FingerMaker:
             "film": self.face(dent, press, 2.5, ideal(film), "film"),
             "outer": self.face(dent, press, 0.0, {"type": "interface", "index": float(self.values["outer_face.index"])}, "outer"),
             "inner": self.face(dent, press, 5.0, {"type": "interface", "index": float(self.values["inner_face.index"])}, "inner"),
-            "markers": self.markers(dent, press, paint("markers")),
+            "markers": self.markers(dent, press, paint("markers"), what == "coverage"),
             "object": self.cylinder(distance, paint("object")),
             "wall": self.rectangle(160, 1000, wall if what == "wall" else black),
         }
-        if self.effects.get("retardance") and what != "markers":  # degrees at 540 nm, fast axis at 30 degrees
+        if self.effects.get("retardance") and what in ("object", "wall"):  # degrees at 540 nm, fast axis at 30 degrees
             scene["retarder"] = self.rectangle(-15, 21, {
                 "type": "retarder", "theta": {"type": "uniform", "value": -30.0},
                 "delta": {"type": "uniform", "value": float(self.effects["retardance"])}})
@@ -237,6 +239,15 @@ class FingerMaker:
         # markers are in front of the skin's film, and their light is unpolarized: one render serves all four
         one = self.kept("markers", lambda: self.render(geometry, 0.0, film, "markers"))
         found["markers"] = np.broadcast_to(one / 2, (2, 2, *one.shape))
+        if "marker leak" in e:  # behind one ideal film a surface of radiance 1 shows half of it
+            cover = 2 * self.kept("coverage", lambda: self.render(geometry, 0.0, film, "coverage"))
+            width, height = self.size
+            focal = width / 2 / np.tan(np.radians(v["camera.x_fov"]) / 2)
+            y, x = np.mgrid[:height, :width] + 0.5
+            at = 20 / focal  # mm per px in the plane of the inner face, 20 mm before the camera
+            skin = (np.abs(x - width / 2) * at < v["skin.width"] / 2) & (np.abs(y - height / 2) * at < v["skin.length"] / 2)
+            mean = one.sum() / np.maximum(cover.sum() / 2, 1e-9)
+            found["glow"] = e["marker leak"] * mean * (skin * (1 - np.clip(cover, 0, 1)))
         return found
 
     def radiance(self, parts: Mapping[str, np.ndarray], dial: float) -> np.ndarray:
@@ -250,6 +261,9 @@ class FingerMaker:
         paints = {"object": "object_paint", "wall": "wall_paint"}
         weights = [[t1["analyzer"] + 0 * leak, leak], [t1["film"] + 0 * leak, leak]]
         for what, images in parts.items():
+            if what == "glow":
+                total = total + images[..., None] * (weights[0][0] + weights[0][1]) / 2 * self.excitation()
+                continue
             if what == "markers":  # half of unpolarized light passes each of the two ideal analysers
                 through = (weights[0][0] + weights[0][1]) * self.excitation()
                 light = images[0, 0][..., None] * 2 * through

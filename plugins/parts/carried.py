@@ -21,10 +21,10 @@ from optics.effect import Declared, Part
 from optics.parameter import Parameter
 
 PARAMETERS = (
-    Parameter("width", "mm", 48.0, (0.1, 1000.0), "size along x", plausible=0.1, how="difference"),
-    Parameter("length", "mm", 43.0, (0.1, 1000.0), "size along y", plausible=0.1, how="difference"),
+    Parameter("width", "mm", 48.0, (0.1, 1000.0), "size along x", plausible=0.1, how="difference", step=1.0),
+    Parameter("length", "mm", 43.0, (0.1, 1000.0), "size along y", plausible=0.1, how="difference", step=1.0),
     Parameter("depth", "mm", 2.5, (0.0, 100.0), "below the untouched face; at most the gel's thickness", plausible=0.1,
-              how="difference"),
+              how="difference", step=1.0),
 )
 
 

@@ -19,12 +19,12 @@ from optics.effect import Declared, Part
 from optics.parameter import Parameter
 
 PARAMETERS = (
-    Parameter("pitch_x", "mm", 9.5, (0.0, 100.0), "distance of columns", plausible=0.05, how="difference"),
-    Parameter("pitch_y", "mm", 8.5, (0.0, 100.0), "distance of rows", plausible=0.05, how="difference"),
-    Parameter("radius", "mm", 1.5, (0.01, 50.0), "radius r", plausible=0.05, how="difference"),
-    Parameter("height", "mm", 1.0, (0.001, 50.0), "from the face to the cap", plausible=0.05, how="difference"),
+    Parameter("pitch_x", "mm", 9.5, (0.0, 100.0), "distance of columns", plausible=0.05, how="difference", step=1.0),
+    Parameter("pitch_y", "mm", 8.5, (0.0, 100.0), "distance of rows", plausible=0.05, how="difference", step=1.0),
+    Parameter("radius", "mm", 1.5, (0.01, 50.0), "radius r", plausible=0.05, how="difference", step=1.0),
+    Parameter("height", "mm", 1.0, (0.001, 50.0), "from the face to the cap", plausible=0.05, how="difference", step=1.0),
     Parameter("depth", "mm", 5.0, (0.0, 100.0), "of the face that they stand on, below the untouched outer face",
-              plausible=0.1, how="difference"),
+              plausible=0.1, how="difference", step=1.0),
 )
 SEGMENTS = 96  # of a circle: 0.07 % of the area is lost
 

@@ -16,12 +16,12 @@ from optics.effect import Declared, Part
 from optics.parameter import Parameter
 
 PARAMETERS = (
-    Parameter("diameter", "mm", 20.0, (0.1, 1000.0), "of the cylinder", plausible=0.1, how="difference"),
-    Parameter("length", "mm", 80.0, (0.1, 2000.0), "along its axis", plausible=0.2, how="difference"),
+    Parameter("diameter", "mm", 20.0, (0.1, 1000.0), "of the cylinder", plausible=0.1, how="difference", step=1.0),
+    Parameter("length", "mm", 80.0, (0.1, 2000.0), "along its axis", plausible=0.2, how="difference", step=1.0),
     Parameter("distance", "mm", 20.0, (-5.0, 2000.0), "from the untouched face to its nearest point", plausible=0.2,
-              how="difference"),
-    Parameter("x", "mm", 0.0, (-1000.0, 1000.0), "its middle, right", plausible=0.2, how="difference"),
-    Parameter("y", "mm", 0.0, (-1000.0, 1000.0), "its middle, down", plausible=0.2, how="difference"),
+              how="difference", step=1.0),
+    Parameter("x", "mm", 0.0, (-1000.0, 1000.0), "its middle, right", plausible=0.2, how="difference", step=1.0),
+    Parameter("y", "mm", 0.0, (-1000.0, 1000.0), "its middle, down", plausible=0.2, how="difference", step=1.0),
     Parameter("stance", "-", "lying", choices=("lying", "standing"), doc="lying across the view along x, or standing on end"),
 )
 SEGMENTS = 256
