@@ -237,8 +237,8 @@ class Maker:
     def check(self) -> None:
         """Hold every value that can be drawn against the scene; raises before anything is rendered."""
         job, scene = self.job, self.pictures.scene
-        if job.lights == "each" and not scene.leds:
-            raise BadJob(f"{self.file}: lights = \"each\", but {scene.path} has no LED; allowed: \"together\"")
+        if job.lights == "each" and not scene.lights:
+            raise BadJob(f"{self.file}: lights = \"each\", but {scene.path} has no LED or source; allowed: \"together\"")
         if "dn" in job.outputs and self.pictures.developer is None:
             raise BadJob(f"{self.file}: outputs names \"dn\", but {scene.path} has no part 'camera' to make DN; allowed: exr, png")
         scene.check(job.parameters, f"{self.file}: [parameters]")
@@ -277,7 +277,7 @@ class Maker:
         """Write the files of one sample, each whole or not at all, and return its line of the manifest."""
         job = self.job
         values = job.values(index)
-        lights = [None] if job.lights == "together" else list(self.pictures.scene.leds)
+        lights = [None] if job.lights == "together" else list(self.pictures.scene.lights)
         files = {}
         for led in lights:
             stem = self.folder / "images" / (f"{index:06d}" if led is None else f"{index:06d}-{led}")

@@ -79,6 +79,8 @@ Settings = Annotated[list[str] | None, typer.Option(
 Plugins = Annotated[Path | None, typer.Option("--plugins", metavar="DIR", help="A further folder of plugins.")]
 Variant = Annotated[str | None, typer.Option("--variant", help="Mitsuba variant.", show_default=False)]
 Force = Annotated[bool, typer.Option("--force", help="Replace existing files.")]
+At = Annotated[str | None, typer.Option(
+    "--at", metavar="U,V", help="Pixel position, u right and v down from the top left.", show_default="the picture's centre")]
 FlatField = Annotated[str | None, typer.Option(
     "--flat-field", metavar="MODE", help="How a background image enters: multiplicative, additive or none.")]
 
@@ -333,31 +335,40 @@ def render(scene: SceneName,
            output: Annotated[Path, typer.Option("-o", "--output", metavar="FILE.exr", help="Where the picture goes.")],
            define: Defines = None, sets: Settings = None, png: Annotated[bool, typer.Option(
                "--png", help="Also FILE.png: the camera's digital numbers, free of noise.")] = False,
+           stokes: Annotated[bool, typer.Option(
+               "--stokes", help="Also FILE.dolp.png and FILE.aolp.png: degree and angle of linear polarization per band; S0 to S3 in "
+                                "the EXR, which scenes with layers have anyway.")] = False,
            spp: Annotated[int | None, typer.Option("--spp", help="Monte Carlo with so many samples per pixel, and variances; "
                                                    "without it a sensor is rendered LED by LED, free of noise.")] = None,
            seed: Annotated[int, typer.Option("--seed", min=0, help="Of everything random.")] = 0, plugins: Plugins = None,
            variant: Variant = None, force: Force = False, as_json: AsJson = False) -> None:
     """Render one picture: an EXR with all that is known of it, and its provenance.
 
-    The channels are radiance per band, depth, normals, contact, one image per LED, variances; optics.picture lists them.
+    The channels are radiance (with layers: Stokes vectors) per band, depth, normals, contact, one image per LED, variances;
+    optics.picture lists them.
     """
     from optics.picture import Pictures, claim, write_json
 
     if output.suffix.lower() != ".exr":
         raise ValueError(f"-o {output}: '{output.suffix}' is no picture format of this command; allowed: a name ending in .exr")
     record, preview = output.with_suffix(".json"), output.with_suffix(".png")
-    claim([output, record, *([preview] if png else [])], force)
+    maps = tuple(output.with_suffix(f".{name}.png") for name in ("dolp", "aolp"))
+    files = [output, record, *([preview] if png else []), *(maps if stokes else ())]
+    claim(files, force)
     loaded = load_scene(scene, define, plugins, variant)
     values = loaded.check(settings(sets), "--set")
     clock = time.perf_counter()
-    pictures = Pictures(loaded, spp=spp)
+    pictures = Pictures(loaded, spp=spp, stokes=stokes)
     picture = pictures.take(values, seed)
     seconds = time.perf_counter() - clock
     if png:
         picture.write_png(preview)
+    if stokes:
+        from optics.polarimetry import write_maps
+
+        write_maps(maps, *picture.stokes())
     write_json(record, {**picture.header["provenance"], "command": ["optics", *sys.argv[1:]]})
     picture.write_exr(output)
-    files = [output, record, *([preview] if png else [])]
     if as_json:
         return show({"files": [str(f) for f in files], "method": pictures.method, "seconds": seconds,
                      "channels": list(picture.channels)})
@@ -386,6 +397,177 @@ def batch(job: Annotated[Path, typer.Argument(metavar="JOB.toml", help="What to 
                      "complete": result.complete})
     print(f"{result.folder}: {result.own} of {result.total} samples, {result.made} of them made now"
           + (", all complete: manifest.csv" if result.complete else ", other shards are still to come"))
+
+
+# -- polarized light -------------------------------------------------------------------------------------------------------
+
+@command
+def mueller(scene: SceneName, at: At = None, sets: Settings = None,
+            wavelength: Annotated[list[float] | None, typer.Option(
+                "--wavelength", metavar="NM", help="Repeatable.", show_default="the scene's bands")] = None,
+            part: Annotated[list[str] | None, typer.Option(
+                "--part", metavar="NAME", help="Only these layers, and their product. Repeatable.")] = None,
+            define: Defines = None, plugins: Plugins = None, variant: Variant = None, as_json: AsJson = False) -> None:
+    """Show what the layers on a camera ray do to polarization.
+
+    The Mueller matrix of each layer, their product, and what it means. Axes: x right, y up in the image, angles from x to y.
+    Layers are named from the camera on: the last one is the first that light meets.
+    """
+    from optics import paths, polarimetry
+
+    loaded = load_scene(scene, define, plugins, variant)
+    values = {**loaded.values(), **loaded.check(settings(sets), "--set")}
+    u, v = polarimetry.pixel(loaded, at)
+    bands = wavelength or list(loaded.integrator.bands) or [540.0]
+    if not all(100 <= b <= 10000 for b in bands):
+        raise ValueError(f"--wavelength {' '.join(f'{b:g}' for b in bands)}: allowed: 100 to 10000 nm")
+    ray = polarimetry.follow(loaded, values, u, v)
+    if not ray.names:
+        there = paths.passable(loaded)
+        raise ValueError(f"{loaded.path}: the ray through {u:g},{v:g} passes no layer; " + (
+            f"the scene has {', '.join(there)}: give another place with --at U,V" if there else "the scene has none"))
+    names, matrices, whole = polarimetry.stack(loaded, values, u, v, bands, part, ray)
+    shown = [*zip(names, matrices), *([("product", whole)] if len(names) > 1 else [])]
+    if as_json:
+        def record(own):
+            return {"matrix": own.tolist(), "bands": [polarimetry.decompose(m).numbers() for m in own]}
+
+        layers = [{"name": n, "kind": loaded.parts[n].kind, **record(own)} for n, own in zip(names, matrices)]
+        return show({"scene": str(loaded.path), "at": [u, v], "wavelengths": bands, "ends_on": ray.end, "lost": ray.lost,
+                     "layers": layers, "product": record(whole)})
+    print(f"the ray through {u:g},{v:g} passes, from the camera on: {', '.join(ray.names)}; "
+          + (f"it ends on {ray.end}" if ray.end else "it meets nothing"))
+    for name, own in shown:
+        title = name if name != "product" else f"product: {' '.join(names)}"
+        print(f"\n{title}\n" + _matrices(own, bands))
+    print("\n" + _meanings(shown, bands))
+    if any(loaded.parts[n].kind == "interface" for n in names):
+        terminal.note("the transmittance of an interface is of radiance, which grows with n^2; at the way out it falls again")
+    if ray.lost:
+        terminal.note("this ray is reflected totally on its way: nothing of what stands here arrives at the camera")
+
+
+def _alike(own, bands) -> list[tuple[str, object]]:
+    """(band, matrix) of matrices (B, 4, 4); one for all bands where they are the same."""
+    import numpy as np
+
+    if len(bands) > 1 and np.ptp(own, 0).max() < 5e-7:
+        return [("all bands", own[0])]
+    return [(f"{band:g} nm", matrix) for band, matrix in zip(bands, own)]
+
+
+def _matrices(own, bands) -> str:
+    """Matrices (B, 4, 4) side by side, with their bands above."""
+    def entry(value):
+        return f"{value:9.5f}" if abs(value) >= 5e-7 else f"{'0':>9}"
+
+    found = _alike(own, bands)
+    return "\n".join(["    ".join(f"{band:<38}" for band, _ in found).rstrip(),
+                      *("    ".join(f"[{''.join(map(entry, m[i]))}]" for _, m in found) for i in range(4))])
+
+
+def _meanings(shown, bands) -> str:
+    """The decompositions of layers and of their product as a table."""
+    from optics.polarimetry import decompose
+
+    def cell(value, digits=4, small=5e-7):
+        return "-" if math.isnan(value) else f"{0 if abs(value) < small else value:.{digits}g}"
+
+    def axis(angle, ellipticity):
+        return cell(angle, 4, 1e-4) + ("" if math.isnan(ellipticity) or abs(ellipticity) < 0.05 else f" ({ellipticity:+.1f})")
+
+    lines = [("", "", "T", "T max", "T min", "diattenuation", "axis", "retardance", "fast axis", "depolarization", "index",
+              "physical")]
+    for name, own in shown:
+        for band, matrix in _alike(own, bands):
+            d = decompose(matrix)
+            lines.append((name, band, cell(d.transmittance), cell(d.largest), cell(d.smallest), cell(d.diattenuation, 5),
+                          axis(d.axis, d.axis_ellipticity), cell(d.retardance, 4, 1e-4), axis(d.fast_axis, d.fast_ellipticity),
+                          cell(d.depolarization), cell(d.depolarization_index, 5), "no" if d.realisable < -1e-9 else "yes"))
+    return (table(lines) + "\nT: transmittance of unpolarized light. Axes and retardance in deg, an ellipticity (+-45: circular) in "
+            "brackets. Depolarization: 0 none;\nindex: 1 none. '-': no meaning here, such as the retardance of a perfect polarizer.")
+
+
+@command
+def sweep(scene: SceneName,
+          key: Annotated[str, typer.Option("--key", metavar="KEY", help="What is turned or changed.")] = "analyzer.angle",
+          first: Annotated[float | None, typer.Option(
+              "--from", metavar="VALUE", help="First value.", show_default="0 of an angle")] = None,
+          last: Annotated[float | None, typer.Option(
+              "--to", metavar="VALUE", help="Last value.", show_default="180 of an angle")] = None,
+          steps: Annotated[int, typer.Option("--steps", min=2, max=10000, help="Values, both ends included.")] = 37, at: At = None,
+          output: Annotated[Path | None, typer.Option("-o", "--output", metavar="FILE.png", help="Plot the curve.")] = None,
+          csv: Annotated[Path | None, typer.Option("--csv", metavar="FILE", help="Write the curve as a table.")] = None,
+          captures: Annotated[Path | None, typer.Option(
+              "--captures", metavar="CAPTURES", help="Measured readings to hold beside it: a folder with captures.toml.")] = None,
+          fit: Annotated[Path | None, typer.Option("--fit", metavar="FIT.toml", help="Calibrated values, from a study.")] = None,
+          radiance: Annotated[bool, typer.Option("--radiance", help="Radiance per band in place of the camera's DN.")] = False,
+          define: Defines = None, sets: Settings = None, plugins: Plugins = None, variant: Variant = None, force: Force = False,
+          as_json: AsJson = False) -> None:
+    """Predict a reading against an angle, or any parameter.
+
+    What a pixel or a photodiode reads, its extinction ratio, how far it is from Malus' cos^2; -o draws the curves.
+    """
+    import numpy as np
+
+    from optics import captures as capture_files, ladder, picture, polarimetry
+    from optics.exr import replacing
+
+    if output is not None and output.suffix.lower() not in (".png", ".pdf", ".svg"):
+        raise ValueError(f"-o {output}: '{output.suffix}' is no format of a plot; allowed: a name ending in .png, .pdf or .svg")
+    picture.claim([f for f in (output, csv) if f is not None], force)
+    if radiance and captures is not None:
+        raise ValueError("--radiance and --captures: readings are DN; leave out one of them")
+    loaded = load_scene(scene, define, plugins, variant)
+    place = polarimetry.pixel(loaded, at)
+    if reason := picture.obstacle(loaded):
+        raise ValueError(f"{loaded.path}: no prediction light by light: {reason}; `optics render` goes through Mitsuba")
+    values = {}
+    if fit is not None:
+        if not fit.is_file():
+            raise FileNotFoundError(f"{fit}: no such file; a study writes one to STUDY/steps/NN-name/fit.toml")
+        values = loaded.check(ladder.read_fit(fit)["parameters"], f"{fit}: [parameters]")
+    chosen = loaded.check(settings(sets), "--set")
+    first, last = polarimetry.span(loaded, key, first, last)
+    readings = capture_files.load(captures) if captures is not None else None
+    with terminal.progress() as progress:
+        found = polarimetry.sweep(loaded, key, np.linspace(first, last, steps), place, {**values, **chosen}, radiance=radiance,
+                                  captures=readings, only=chosen, progress=progress)
+    if csv is not None:
+        with replacing(csv) as temporary:
+            temporary.write_text(found.to_csv(), encoding="utf-8")
+    if output is not None:
+        found.plot(output)
+    for text in found.notes:
+        terminal.note(text)
+    rows = found.summary()
+    if as_json:
+        curves = [{"settings": c.settings, "values": c.x.tolist(), "readings": c.y.tolist()} for c in found.curves]
+        return show({"scene": str(loaded.path), "key": key, "unit": found.unit, "at": list(place), "black": found.black,
+                     "quantity": "radiance" if radiance else "DN", "channels": found.channels, "summary": rows, "curves": curves,
+                     "files": [str(f) for f in (output, csv) if f]})
+    print(f"{key} from {first:g} to {last:g} {found.unit}, {'radiance per band' if radiance else 'DN'} at pixel "
+          f"{place[0]:g},{place[1]:g}" + (f", black {found.black:g}" if found.black else ""))
+    print(_readings(found, rows))
+    for file in (output, csv):
+        if file is not None:
+            print(file)
+
+
+def _readings(found, rows) -> str:
+    """The summary of a sweep as a table."""
+    several, ideal, measured = (any(r.get(k) is not None for r in rows) for k in ("settings", "from_ideal", "from_measured"))
+    at_unit = "at" if found.unit in ("", "1") else f"at {found.unit}"
+    lines = [(*(["settings"] if several else []), "channel", "largest", at_unit, "smallest", at_unit,
+              "extinction ratio" if found.turns else "ratio", "contrast", *(["from cos^2"] if ideal else []),
+              *(["measured - predicted, rms"] if measured else []))]
+    for r in rows:
+        own = ", ".join(f"{k} = {_number(v)}" for k, v in r.get("settings", {}).items())
+        numbers = [f"{r[k]:.5g}" for k in ("largest", "at", "smallest", "dark_at", "extinction_ratio", "contrast")]
+        departure = "-" if r["from_ideal"] is None else f"{r['from_ideal']:.2%}"
+        lines.append((*([own] if several else []), r["channel"], *numbers, *([departure] if ideal else []),
+                      *([f"{r['from_measured']:.4g}"] if measured else [])))
+    return table(lines)
 
 
 # -- models and measurements ----------------------------------------------------------------------------------------------
@@ -583,15 +765,15 @@ def report(study: StudyFolder,
 def demo(output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Where captures, study and report go.")] = Path("renders/demo"),
          seed: Annotated[int, typer.Option("--seed", min=0, help="Chooses the sensor and its hidden effect.")] = 1,
          effect: Annotated[str | None, typer.Option("--effect", help="Hide this effect instead.")] = None,
-         sensor: Annotated[str, typer.Option("--sensor", help="gelsight (six white LEDs) or digit (red, green, blue).")] = "gelsight") -> None:
+         sensor: Annotated[str, typer.Option("--sensor", help="gelsight (six white LEDs), digit (red, green, blue) or polarizer_bench.")] = "gelsight") -> None:
     """Make a sensor with a secret, by another path than the model, and find what is missing."""
     from optics import demo as story
     from optics.errors import UnknownKey
 
     clock = time.monotonic()
     with terminal.progress() as progress:
-        if sensor not in story.SENSORS:
-            raise UnknownKey(sensor, story.SENSORS, "sensor")
+        if sensor not in (*story.SENSORS, story.BENCH):
+            raise UnknownKey(sensor, (*story.SENSORS, story.BENCH), "sensor")
         found = story.run(output, seed, effect, sensor, progress, lambda text: print(text + "\n", flush=True))
     hidden = found["hidden"]
     strengths = [f"{name} = {value:.4g} +- {sd:.2g}" for name, (value, sd) in found["strengths"].items()]

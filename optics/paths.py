@@ -198,7 +198,8 @@ def part_values(scene, name: str, values: Mapping, fields: Mapping) -> SimpleNam
                            field=fields.get(name))
 
 
-def _crossing(step: Step, rays, bands: np.ndarray) -> Crossing:
+def crossing_at(step: Step, rays, bands: np.ndarray) -> Crossing:
+    """How some of the rays pass the surface of a step; arrays (n, 1) against bands (B,)."""
     k, x = (tuple(a[rays][:, i:i + 1] for i in range(3)) for a in (step.k, step.x))
     return Crossing(k, x, step.u[rays][:, None], step.v[rays][:, None], bands)
 
@@ -247,7 +248,7 @@ def transmission(scene, path: Path, values: Mapping, bands: np.ndarray, componen
                 continue
             names = names[:met.index(until)]
         matrices = [path.kept(group, place, name, scene, values,
-                              lambda: layer_matrix(scene, name, _crossing(step, rays, bands), values, path.fields))
+                              lambda: layer_matrix(scene, name, crossing_at(step, rays, bands), values, path.fields))
                     for place, (name, step) in enumerate(names)]
         row = tuple(1.0 if j == component else 0 for j in range(4))
         if any(np.any(np.asarray(values.get(f"{name}.face", 0.0)) != 0) for name, _ in names):
@@ -273,7 +274,7 @@ def emitted(scene, name: str, path: Path, values: Mapping, bands: np.ndarray) ->
 
     source = scene.parts[name]
     on = np.array(path.si.emitter(scene.mitsuba) == mi.EmitterPtr(source)) & (path.end.k[:, 2] > 0)
-    vector = registry().parts[source.kind].stokes(_crossing(path.end, slice(None), bands), part_values(scene, name, values, {}))
+    vector = registry().parts[source.kind].stokes(crossing_at(path.end, slice(None), bands), part_values(scene, name, values, {}))
     return tuple(0 if isinstance(c, int) else c * on[:, None] for c in vector)
 
 

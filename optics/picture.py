@@ -1,13 +1,14 @@
 """One picture of a scene with everything that is known of it: what `optics render` and `optics batch` write.
 
-A sensor of this program's parts is rendered LED by LED, without noise (optics.render). Every other Mitsuba scene, and a
-sensor beside stock lights or behind stock glass, goes through `mi.render`, with the variance of each mean. An EXR holds
+A sensor of this program's parts is rendered LED by LED, without noise (optics.render), through polarizing layers as well. Every
+other Mitsuba scene, and a sensor beside stock lights or behind stock glass, goes through `mi.render`, with the variance of each
+mean. An EXR holds
 
     R, G, B                      preview, linear sRGB; of a sensor times its exposure, so that 1 is full scale
-    S0.610,000000nm ...          radiance per band; S1 to S3 where the integrator has `stokes`
+    S0.610,000000nm ...          radiance per band; S1 to S3 in scenes with layers, and where the integrator has `stokes`
     depth.Z                      mm from the camera along its axis; infinite where a ray met nothing
     normal.X, .Y, .Z             of the surface, in the scene's frame
-    contact.Y                    1 where the indenter touches
+    contact.Y                    1 where the indenter touches what is seen
     led_1.R, .G, .B ...          what one LED sends, in the first three bands; with the ambient light they add up to S0
     variance.*                   variance of the mean of a Monte Carlo channel
 
@@ -26,12 +27,12 @@ from pathlib import Path
 
 import numpy as np
 
-from optics import exr
+from optics import exr, paths
 from optics.develop import Developer
 from optics.effect import is_part, registry
 from optics.errors import BadScene, OutputExists
 from optics.ladder import file_hash, versions
-from optics.render import Hits, Renderer
+from optics.render import POWERS, Hits, Renderer, Sample
 from optics.scene import Scene
 
 UNITS = "W.mm^-2.sr^-1"  # of S0, for LED powers in W/sr
@@ -52,6 +53,13 @@ class Picture:
     header: dict[str, object] = field(default_factory=dict)
     camera: np.ndarray | None = None
 
+    def stokes(self) -> tuple[np.ndarray, np.ndarray]:
+        """Bands in nm (B,) and Stokes vectors (H, W, B, 4); raises ValueError where the picture has none."""
+        bands, vectors = exr.spectral_image(self.channels)
+        if vectors.shape[3] != 4:
+            raise ValueError("the picture holds no Stokes vectors: S0 only; allowed: pictures with S0 to S3")
+        return bands, vectors
+
     def write_exr(self, path: Path) -> Path:
         return exr.write(path, self.channels, self.header)
 
@@ -68,11 +76,12 @@ class Pictures:
 
     black, saturation   DN, of the camera
     spp                 samples per pixel: render by Monte Carlo, even where LED by LED is possible
+    stokes              S1 to S3 in every scene; without it, where there are layers or the integrator has `stokes`
     method              "LED by LED", or why the scene goes through `mi.render`
     """
 
     def __init__(self, scene: Scene, *, spp: int | None = None, black: float = 0.0, saturation: float = 255.0,
-                 layers: Sequence[str] = LAYERS):
+                 layers: Sequence[str] = LAYERS, stokes: bool = False):
         if spp is not None and spp < 1:
             raise ValueError(f"spp = {spp}; allowed: whole numbers from 1 on (samples per pixel)")
         self.scene, self.spp, self.layers = scene, spp, tuple(layers)
@@ -84,8 +93,17 @@ class Pictures:
             raise BadScene(f"{scene.path}: no light; add an LED, <emitter type=\"led\" id=\"led_1\">, or another emitter")
         if scene.mitsuba.integrator() is None:
             raise BadScene(f"{scene.path}: no integrator; add <integrator type=\"tactile\" id=\"integrator\">, or another one")
+        if stokes and not (scene.integrator is not None and scene.integrator.bands and "polarized" in scene.variant):
+            raise BadScene(f"{scene.path}: no Stokes vectors from this integrator and the variant {scene.variant}; allowed: the "
+                           "integrator 'tactile' with `bands`, and a variant with 'polarized' in its name")
         reason = "samples per pixel were asked for" if spp is not None else obstacle(scene)
+        if not reason and stokes and not layered(scene):
+            reason = "Stokes vectors were asked for of a scene without layers"
         self.renderer = None if reason else Renderer(scene, remember=2)
+        if self.renderer is not None and self.renderer.layered:
+            reason = veiled(self.renderer, self.base)
+            self.renderer = None if reason else self.renderer
+        self.stokes = stokes or layered(scene) or (scene.integrator is not None and scene.integrator.stokes)
         self.method = f"Monte Carlo: {reason}" if reason else "LED by LED"
         self.developer = None
         if scene.camera is not None and scene.integrator is not None:
@@ -100,56 +118,69 @@ class Pictures:
         return self.renderer is not None
 
     def take(self, values: Mapping[str, float | str] | None = None, seed: int = 0, lit: Sequence[str] | None = None) -> Picture:
-        """The picture for values that replace the scene's; lit: the LEDs that are on (None: all with power)."""
+        """The picture for values that replace the scene's; lit: the lights that are on (None: all with power)."""
         now = {**self.base, **self.scene.check(values or {})}
         if lit is not None:
-            now.update({f"{led}.power": 0.0 for led in self.scene.leds if led not in lit})
+            now.update({f"{led}.power": 0.0 for led in self.scene.lights if led not in lit})
         picture = self._exact(now, seed) if self.renderer is not None else self._monte_carlo(now, seed)
         picture.header["provenance"] = {**self.record, "seed": seed, "parameters": now}
         return picture
 
     def _exact(self, now: Mapping, seed: int) -> Picture:
         renderer = self.renderer
-        total = np.array(renderer.ambient(now), float)
+        lit = [light for light in self.scene.lights if now[f"{light}.power"] != 0]
         bounce = now[renderer.bounce_key]
-        alone = {}
-        for led in self.scene.leds:
-            if now[f"{led}.power"] == 0:
-                continue
-            image = renderer.led(now, led).radiance
-            if bounce:
-                image = image + bounce * renderer.bounced(now, led, seed)
-            alone[led] = renderer.powers(now, led) * image
-            total += alone[led]
-        channels = self._radiance_channels(total, now)
+        totals, alone = [], {}  # by component of the Stokes vector; of S0 by light
+        for component in range(4 if renderer.layered else 1):
+            total = np.array(renderer.ambient(now, component), float)
+            for light in lit:
+                image = renderer.image(now, light, component)
+                if bounce:
+                    image = image + bounce * self._bounced(now, light, seed, component)
+                own = renderer.powers(now, light) * image
+                total += own
+                if component == 0:
+                    alone[light] = own
+            totals.append(total)
+        channels = self._radiance_channels(np.stack(totals, -1), now)
         if "aov" in self.layers:
             channels.update(self._surface(renderer.hits(now), now))
         if "leds" in self.layers:
-            for led, image in alone.items():
-                channels.update(zip((f"{led}.{n}" for n in self._band_names()), np.moveaxis(image, -1, 0)))
-        header = exr.spectral_header(False, UNITS) if self.bands else {}
+            for light, image in alone.items():
+                channels.update(zip((f"{light}.{n}" for n in self._band_names()), np.moveaxis(image, -1, 0)))
+        header = exr.spectral_header(renderer.layered, UNITS) if self.bands else {}
         self.scene.set(now)  # the renderer leaves the LEDs at power 1
-        return Picture(channels, header, self.developer.develop(total, now))
+        return Picture(channels, header, self.developer.develop(totals[0], now))
+
+    def _bounced(self, now: Mapping, light: str, seed: int, component: int) -> np.ndarray:
+        """Light after two reflections, unpolarized before the layers, as a component of the Stokes vector behind them."""
+        image = self.renderer.bounced(now, light, seed)
+        if component == 0 or light in self.scene.sources:
+            return image
+        path = self.renderer.hits(now).path
+        whole, part = (self.renderer._weight(now, light, path, c, ()) for c in (0, component))
+        share = np.divide(part, whole, out=np.zeros_like(part), where=whole != 0)
+        return image * share.reshape(image.shape)
 
     def _monte_carlo(self, now: Mapping, seed: int) -> Picture:
         scene = self.scene
         scene.set(now)
         polarized, ours = "polarized" in scene.variant, scene.integrator is not None
-        stokes = ours and scene.integrator.stokes
+        asked = ours and scene.integrator.stokes
         if ours:
             scene.integrator.stokes = polarized  # its channels are the only way to the bands
         try:
             mean, variance, spp = self._passes(seed)
         finally:
             if ours:
-                scene.integrator.stokes = stokes
+                scene.integrator.stokes = asked
         radiance = None
         if ours and polarized:
             mean, variance = ({name: image for name, image in c.items() if "." in name} for c in (mean, variance))
             lanes = self.bands or (0.0,)
             pick = lambda c, s: np.stack([c[f"S{s}.{j}"] for j in range(len(lanes))], -1)  # noqa: E731
             radiance = pick(mean, 0)
-            components = range(4) if stokes else range(1)
+            components = range(4) if self.stokes else range(1)
             channels = self._radiance_channels(np.stack([pick(mean, s) for s in components], -1), now)
             if self.bands:
                 scatter = exr.spectral_channels(self.bands, np.stack([pick(variance, s) for s in range(4)], -1))
@@ -159,7 +190,7 @@ class Pictures:
         channels.update({f"variance.{name}": image for name, image in variance.items() if name in channels})
         if "aov" in self.layers:
             channels.update(self._surface(self._hits(), now))
-        header = {**(exr.spectral_header(stokes, UNITS) if radiance is not None and self.bands else {}), "samplesPerPixel": spp}
+        header = {**(exr.spectral_header(self.stokes, UNITS) if radiance is not None and self.bands else {}), "samplesPerPixel": spp}
         camera = self.developer.develop(radiance, now) if radiance is not None else None
         return Picture(channels, header, camera)
 
@@ -192,7 +223,8 @@ class Pictures:
         """Preview and spectral channels of (H, W, B), or of Stokes vectors (H, W, B, 4)."""
         s0 = radiance if radiance.ndim == 3 else radiance[..., 0]
         if not self.bands:
-            return {"Y": s0[..., 0]}
+            parts = radiance[..., 0, :] if radiance.ndim == 4 and radiance.shape[3] == 4 else ()
+            return {"Y": s0[..., 0], **{f"S{i}.Y": parts[..., i] for i in range(4) if len(parts)}}
         channels = exr.preview_channels(self.bands, s0 * now[f"{self.scene.camera.name}.exposure"])
         if "spectral" in self.layers:
             parts = radiance[..., 0] if radiance.ndim == 4 and radiance.shape[3] == 1 else radiance
@@ -208,15 +240,20 @@ class Pictures:
         width, height = (int(n) for n in sensor.film().crop_size())
         v, u = (mi.Float((a.ravel() + 0.5).astype(np.float32)) for a in np.mgrid[:height, :width])
         with dr.suspend_grad():
+            if self.developer is not None and layered(self.scene):
+                path = paths.trace(self.scene, np.array(u), np.array(v))
+                return Hits(Sample(path.si, None, path.origin, path), height, width)
             if self.developer is not None:
                 si, weight, origin = self.scene.integrator.hits(scene, self.scene.camera, u, v)
             else:
                 ray, _ = sensor.sample_ray(mi.Float(0), mi.Float(0.5), mi.Point2f(u / width, v / height), mi.Point2f(0.5))
                 si, weight, origin = scene.ray_intersect(ray), None, ray.o
-        return Hits(si, weight, origin, height, width)
+        return Hits(Sample(si, weight, origin), height, width)
 
     def _surface(self, hits: Hits, now: Mapping) -> dict[str, np.ndarray]:
         """depth, normal and contact of what the pixels' centres see."""
+        import mitsuba as mi
+
         origin, axis = self._view(now)
         valid, position = hits.valid, hits.position
         normal = np.where(valid[..., None], hits.normal, 0.0)
@@ -225,6 +262,8 @@ class Pictures:
         if self.scene.gel is not None:
             x, y = (np.where(valid, position[..., i], 0.0) for i in (0, 1))
             touched = self.scene.gel.contact_weight(x.ravel(), y.ravel()).reshape(valid.shape) > 0.5
+            if hits.path is not None:  # what lies behind a clear skin is not touched
+                touched &= hits.image(hits.si.shape == mi.ShapePtr(self.scene.gel)).astype(bool)
             channels["contact.Y"] = (touched & valid).astype(np.float32)
         return channels
 
@@ -247,7 +286,7 @@ def obstacle(scene: Scene) -> str:
     """Why a scene cannot be rendered LED by LED; empty where it can."""
     import mitsuba as mi
 
-    if scene.camera is None or scene.integrator is None or not scene.leds:
+    if scene.camera is None or scene.integrator is None or not scene.lights:
         return "the scene has no camera, LED and integrator of this program's"
     others = [e for e in scene.mitsuba.emitters() if not is_part(e)]
     if others:
@@ -256,9 +295,74 @@ def obstacle(scene: Scene) -> str:
         bsdf = shape.bsdf()
         if shape.is_medium_transition():
             return "it has a medium"
-        if getattr(bsdf, "kind", "") != "interface" and mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta | mi.BSDFFlags.Null):
+        kind = getattr(bsdf, "kind", "")
+        if kind == "interface" or kind and registry().parts[kind].mueller is not None:
+            continue
+        if mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta | mi.BSDFFlags.Null):
             return "it has mirrors or clear surfaces that are no 'interface'"
+        if layered(scene) and polarizes(bsdf):
+            return f"its surface '{shape.id()}' polarizes the light that it reflects"
+    if layered(scene):
+        try:
+            paths.check(scene)
+        except BadScene as error:
+            return str(error)
     return ""
+
+
+def layered(scene: Scene) -> bool:
+    """Whether a scene has polarizing layers, or sources that may be polarized."""
+    return bool(scene.sources) or any(registry().parts[p.kind].mueller is not None for p in scene.parts.values())
+
+
+def polarizes(bsdf) -> bool:
+    """Whether a surface makes polarized light of unpolarized light, or keeps polarization; in unpolarized variants nothing does."""
+    import drjit as dr
+    import mitsuba as mi
+
+    if not mi.is_polarized:
+        return False
+    n = 64
+    rng = np.random.default_rng(0)
+    si = dr.zeros(mi.SurfaceInteraction3f, n)
+    si.t, si.n, si.sh_frame, si.uv = mi.Float(1), mi.Normal3f(0, 0, 1), mi.Frame3f(mi.Vector3f(0, 0, 1)), mi.Point2f(0.5)
+    if mi.is_spectral:
+        si.wavelengths = mi.UnpolarizedSpectrum(540.0)
+    si.wi, wo = (mi.warp.square_to_uniform_hemisphere(mi.Point2f(*rng.random((2, n)).astype(np.float32))) for _ in range(2))
+    matrix = bsdf.eval(mi.BSDFContext(), si, wo)
+    own = [np.abs(np.array(matrix[i, j])).max() for i in range(4) for j in range(4)]
+    return max(own[1:]) > 1e-5 * own[0]  # rounding leaves 1e-7
+
+
+def veiled(renderer: Renderer, values: Mapping) -> str:
+    """What LEDs light the picture through layers, by more than a thousandth of their light: LED by LED, a layer in the way of
+    their light is taken for a wall. Empty for none."""
+    import drjit as dr
+    import mitsuba as mi
+
+    hits, scene = renderer.hits(values), renderer.scene
+    scene.set({**values, **{f"{name}.{power}": 1.0 for name in scene.lights for power in POWERS}})
+    passing = int(mi.BSDFFlags.Null | mi.BSDFFlags.DeltaTransmission)
+    found = []
+    with dr.suspend_grad():
+        for name, led in scene.leds.items():
+            point = led.position()
+            seen = scene.integrator.visible(scene.mitsuba, hits.si, point, led)
+            ray, going, behind = hits.si.spawn_ray_to(point), hits.si.is_valid() & ~seen, mi.Bool(False)
+            for _ in range(paths.STEPS):
+                met = scene.mitsuba.ray_intersect(ray, going)
+                behind |= going & ~met.is_valid()
+                going &= met.is_valid() & ((met.bsdf().flags() & passing) != 0)
+                ray = dr.select(going, met.spawn_ray_to(point), ray)
+                dr.eval(ray, going, behind)
+                if not np.any(np.array(going)):
+                    break
+            if np.any(np.array(behind)):
+                light = [scene.integrator.direct(scene.mitsuba, hits.si, 1.0, hits.origin, led, way) for way in (seen, behind)]
+                direct, through = (np.array([float(np.array(a[i]).sum()) for i in range(renderer.bands)]) for a in light)
+                if np.any(through > 1e-3 * direct):
+                    found.append(name)
+    return f"the light of {' and '.join(found)} passes layers before it meets anything" if found else ""
 
 
 # -- provenance ---------------------------------------------------------------------------------------------------------

@@ -281,7 +281,7 @@ CASES = [
     ("compare captures/sceneless", r"captures\.toml: scene is missing"),
     ("compare captures/elsewhere", r"absent\.xml': no such file"),
     ("compare captures/size", r"images of 48 x 36 px, but the scene's camera has 20 x 20 px"),
-    ("compare captures/dark", r"dark\.xml: the scene has no LED"),
+    ("compare captures/dark", r"dark\.xml: the scene has no light"),
     ("compare captures/black", r"no usable value in any frame"),
     ("compare captures/good --set led_7.x=1", r"unknown parameter 'led_7\.x'"),
     ("compare captures/good --fit absent.toml", r"absent\.toml: no such file"),

@@ -1,0 +1,86 @@
+"""The loop on the Vi2TaP finger: pictures by stock Mitsuba's `path` and finer meshes (optics.synthetic_finger), effects hidden in turn.
+
+Four scenes (skin untouched and pressed, the object at four distances) at five angles of the analyser, 8 bits. Free are the
+paints and the pigment's yield; held out is one scene.
+"""
+
+import numpy as np
+import pytest
+
+from optics import captures as capture_files, loop, scene as scenes
+from optics.effect import registry
+from optics.synthetic_finger import FingerMaker
+
+DEFINES = {"width": "64", "height": "48", "wall_dark": "1"}  # an even wall: its chequers have edges that nobody measures
+SCENES = [((0, 0, 0), 30.0), ((4, 3, 2.0), 15.0), ((-6, 2, 1.2), 45.0), ((2, -6, 1.6), 22.0)]
+ANGLES = [0.0, 40.0, 75.0, 90.0, 120.0]
+BUILT = {"camera.exposure": 6.5, "object_paint.rho_r": 0.7, "object_paint.rho_g": 0.45, "wall_paint.rho_b": 0.3, "pigment.yield": 0.47}
+FREE = ["object_paint.rho_*", "wall_paint.rho_*", "pigment.yield"]
+
+# hidden: (strength, look-alikes, {variable: true value})
+HIDDEN = {
+    "extinction leak": (0.012, ("depolarization",), {"polarizer_film.leak": 0.012}),
+    "depolarization": (0.02, ("extinction leak",), {"silicone.depolarization": 0.02}),
+    "polarizer misalignment": (2.0, (), {}),
+    "servo scale": (1.02, ("polarizer misalignment",), {}),
+    "servo backlash": (2.0, (), {"polarizer_film.backlash": 2.0}),
+    "oblique leak": (0.02, (), {"polarizer_film.leak_oblique": 0.02}),
+    "stray light": (0.002, ("dark offset", "ambient light"), {"camera.stray": 0.002}),
+    "dark offset": (2.0, ("stray light", "ambient light"), {"camera.offset": 2.0}),
+    "camera gamma": (0.05, (), {"camera.gamma": 0.05}),
+    "retardance": (15.0, (), {}),
+    "marker leak": (0.03, (), {"inner_face.marker_leak": 0.03}),
+    "gain drift": (0.02, (), {}),
+    "lens vignetting": (0.3, (), {"camera.vignetting": 0.3}),
+}
+
+
+def study_of(folder, effects, seed=5):
+    scene = scenes.load("vi2tap", DEFINES)
+    maker = FingerMaker(scene, BUILT, effects, spp=144, seed=seed)
+    capture_files.write(maker.captures(SCENES, ANGLES), folder / "captures", bits=8)
+    setup = loop.Setup(captures=str(folder / "captures"), defines={"wall_dark": "1"}, free=FREE, per_group=[])
+    return (setup, *loop.begin(setup, folder / "study"))
+
+
+def test_the_maker_and_the_model_are_two_accounts_of_one_finger():
+    """At the true values, without a fit: what differs is noise, and two per cent of its variance for the edges."""
+    from optics.parameter import Values
+    from optics.render import Model
+
+    maker = FingerMaker(scenes.load("vi2tap", DEFINES), BUILT, {}, spp=64, seed=2)
+    captures = maker.captures(SCENES[1:2], [0.0, 90.0])
+    model = Model(scenes.load("vi2tap", DEFINES), captures)
+    for index, predicted in enumerate(model.predict(Values({k: v for k, v in BUILT.items() if k != "camera.exposure"}))):
+        use = model.usable(index)
+        z = ((model.frames[index].image - predicted) / model.noise.sd(predicted))[use]
+        assert use.mean() > 0.8  # edges that the samples do not resolve are masked, not more
+        assert abs(np.mean(z**2) - 1) < 0.02 + 5 * np.sqrt(2 / z.size)
+        assert abs(z.mean()) < 0.05  # a twentieth of the noise: far below what an effect of interest makes
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", HIDDEN)
+def test_a_hidden_effect_is_found(name, tmp_path):
+    strength, alike, truth = HIDDEN[name]
+    setup, study, model, fit = study_of(tmp_path, {name: strength})
+    diagnosis = loop.examine(study, model, setup, fit)
+    if diagnosis.word == "AMBIGUOUS":
+        assert name in diagnosis.ambiguous and set(diagnosis.ambiguous) <= {name, *alike}, diagnosis.sentence
+    else:
+        assert diagnosis.word == "CLAIM" and diagnosis.missing == name, f"{diagnosis.word}: {diagnosis.sentence}"
+    start = diagnosis.fits[name].values if name in diagnosis.fits else None
+    fit, _ = loop.extend(study, model, setup, fit, registry().find_effect(name), start)
+    held = study.steps[-1]["held_out"]["chi2_per_dof"]
+    assert fit.chi2 / fit.dof < 1.05 and held < 1.05  # the noise floor; edges add two per cent
+    for variable, sd in zip(fit.variables, fit.sd):
+        if variable.name in truth:  # four standard deviations, and a fiftieth for what the two accounts differ by at edges
+            found = fit.values.get(variable, model.base)
+            assert abs(found - truth[variable.name]) < 4 * sd + 0.02 * truth[variable.name], f"{variable.name}: {found} +- {sd}"
+
+
+@pytest.mark.slow
+def test_nothing_is_claimed_of_a_perfect_finger(tmp_path):
+    setup, study, model, fit = study_of(tmp_path, {})
+    assert loop.examine(study, model, setup, fit).word != "CLAIM"
+    assert fit.chi2 / fit.dof < 1.03  # edges add two per cent
