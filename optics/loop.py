@@ -248,8 +248,12 @@ def begin(setup: Setup, folder: str | Path, *, title: str = "", command: Sequenc
 
 def _warnings(model: Model) -> list[str]:
     from optics.noise import warnings_of
+    from optics.picture import veiled
 
-    return list(dict.fromkeys([*model.captures.warnings, *warnings_of(model.noise, model.captures)]))
+    texts = [*model.captures.warnings, *warnings_of(model.noise, model.captures)]
+    if model.renderer.layered and model.captures.table is None and (what := veiled(model.renderer, model.at(Values(), 0))):
+        texts.append(f"the model leaves out light that comes through layers: {what}")
+    return list(dict.fromkeys(texts))
 
 
 def record(study: Study, model: Model, name: str, effect: Effect | None, found: calibrate.Fit,

@@ -76,6 +76,11 @@ class Path:
         return matrix
 
 
+def layered(scene) -> bool:
+    """Whether a scene has layers, or sources that may be polarized."""
+    return bool(scene.sources) or any(registry().parts[p.kind].mueller is not None for p in scene.parts.values())
+
+
 def passable(scene) -> list[str]:
     """Names of the parts that a camera ray passes: layers and clear boundaries."""
     parts = registry().parts

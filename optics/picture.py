@@ -97,13 +97,13 @@ class Pictures:
             raise BadScene(f"{scene.path}: no Stokes vectors from this integrator and the variant {scene.variant}; allowed: the "
                            "integrator 'tactile' with `bands`, and a variant with 'polarized' in its name")
         reason = "samples per pixel were asked for" if spp is not None else obstacle(scene)
-        if not reason and stokes and not layered(scene):
+        if not reason and stokes and not paths.layered(scene):
             reason = "Stokes vectors were asked for of a scene without layers"
         self.renderer = None if reason else Renderer(scene, remember=2)
         if self.renderer is not None and self.renderer.layered:
             reason = veiled(self.renderer, self.base)
             self.renderer = None if reason else self.renderer
-        self.stokes = stokes or layered(scene) or (scene.integrator is not None and scene.integrator.stokes)
+        self.stokes = stokes or paths.layered(scene) or (scene.integrator is not None and scene.integrator.stokes)
         self.method = f"Monte Carlo: {reason}" if reason else "LED by LED"
         self.developer = None
         if scene.camera is not None and scene.integrator is not None:
@@ -240,7 +240,7 @@ class Pictures:
         width, height = (int(n) for n in sensor.film().crop_size())
         v, u = (mi.Float((a.ravel() + 0.5).astype(np.float32)) for a in np.mgrid[:height, :width])
         with dr.suspend_grad():
-            if self.developer is not None and layered(self.scene):
+            if self.developer is not None and paths.layered(self.scene):
                 path = paths.trace(self.scene, np.array(u), np.array(v))
                 return Hits(Sample(path.si, None, path.origin, path), height, width)
             if self.developer is not None:
@@ -300,19 +300,14 @@ def obstacle(scene: Scene) -> str:
             continue
         if mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta | mi.BSDFFlags.Null):
             return "it has mirrors or clear surfaces that are no 'interface'"
-        if layered(scene) and polarizes(bsdf):
+        if paths.layered(scene) and polarizes(bsdf):
             return f"its surface '{shape.id()}' polarizes the light that it reflects"
-    if layered(scene):
+    if paths.layered(scene):
         try:
             paths.check(scene)
         except BadScene as error:
             return str(error)
     return ""
-
-
-def layered(scene: Scene) -> bool:
-    """Whether a scene has polarizing layers, or sources that may be polarized."""
-    return bool(scene.sources) or any(registry().parts[p.kind].mueller is not None for p in scene.parts.values())
 
 
 def polarizes(bsdf) -> bool:

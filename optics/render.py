@@ -50,7 +50,7 @@ class Renderer:
         if self.bands > scene.integrator.lanes:
             raise BadScene(f"{scene.path}: {self.bands} bands, but the variant {scene.variant} carries {scene.integrator.lanes}; "
                            f"load the scene with variant='{DEFAULT_VARIANT}' or name one band")
-        self.layered = any(registry().parts[p.kind].mueller is not None for p in scene.parts.values()) or bool(scene.sources)
+        self.layered = paths.layered(scene)
         self.rim_samples = LAYERED_RIM_SAMPLES if self.layered else RIM_SAMPLES
         self.wavelengths = np.array(scene.integrator.bands or (540.0,))
         self.remember = remember
