@@ -111,6 +111,48 @@ def active_effects(kind: str, values: Mapping) -> list:
             if any(np.any(np.asarray(values[n]) != neutral[n]) for n in e.parameter_names)]
 
 
+class PatternImage:
+    """A pattern of two numbers from an image (H, W, 2 or more): f(x, y, size) over a square of `size` mm about the layer's middle,
+    row 0 at +y, linear between the pixels' centres, 0 outside. numpy only."""
+
+    def __init__(self, path):
+        from pathlib import Path
+
+        import numpy as np
+
+        from optics.errors import BadScene
+
+        path = Path(path)
+        if not path.is_file():
+            raise BadScene(f"{path}: no such file; allowed: an image of a pattern, (H, W, 2), as .npy or .exr")
+        if path.suffix == ".npy":
+            values = np.load(path)
+        else:
+            from optics.images import read_image
+
+            values, _ = read_image(path, str(path))
+        if values.ndim != 3 or values.shape[2] < 2 or not np.isfinite(values).all():
+            raise BadScene(f"{path}: shape {values.shape}; allowed: (H, W, 2 or more), all finite: s_xx - s_yy and 2 s_xy")
+        self.values = np.asarray(values[..., :2], float)
+
+    def __call__(self, x, y, size):
+        import numpy as np
+        from scipy.ndimage import map_coordinates
+
+        from optics.errors import BadScene
+
+        if not isinstance(x, np.ndarray):
+            raise BadScene("a pattern from a file serves the prediction, not mi.render; allowed there: even, disc, bend, gel")
+        height, width = self.values.shape[:2]
+        x, y, size = np.real(x), np.real(y), float(np.real(size))
+        at = [(0.5 - y / size) * height - 0.5, (0.5 + x / size) * width - 0.5]
+        shape = np.broadcast_shapes(*(a.shape for a in at))
+        at = [np.broadcast_to(a, shape).ravel() for a in at]
+        inside = (np.abs(x) <= size / 2) & (np.abs(y) <= size / 2)
+        return tuple(np.where(inside, map_coordinates(self.values[..., i], at, order=1, mode="nearest").reshape(shape), 0.0)
+                     for i in (0, 1))
+
+
 def crossing_of(si, band: float | None = None, extent: tuple[float, float] | None = None) -> Crossing:
     """How light that leaves a surface interaction towards si.wi passes the surface, in Mitsuba's implicit axes (Dr.Jit).
 

@@ -34,7 +34,7 @@ class Parameter:
                 linear, and stays above a thousandth of `plausible`
     saturates   of a squared parameter s: the value v beyond which its effect levels off; a fit steps in s^2/(1 + s^2/v^2)
     linear      True where the image is exactly linear in it (one render serves every value)
-    choices     the allowed words, for a parameter that is a choice and not a number
+    choices     the allowed words, for a parameter that is a choice and not a number; files: endings of files that serve as well
     """
 
     name: str
@@ -50,6 +50,7 @@ class Parameter:
     squared: bool = False
     saturates: float = math.inf
     choices: tuple[str, ...] = ()
+    files: tuple[str, ...] = ()
 
     def __post_init__(self):
         if self.how not in HOW:
@@ -80,8 +81,9 @@ class Parameter:
     def check(self, value, key: str, where: str = ""):
         """Return the value in its own type, or raise: not a number, not finite, out of bounds, not a choice."""
         if self.choices:
-            if value not in self.choices and not str(value).endswith((".stl", ".obj", ".ply")):
-                raise UnknownKey(str(value), self.choices, f"choice for {key}", where)
+            if value not in self.choices and not (self.files and str(value).endswith(self.files)):
+                raise UnknownKey(str(value), self.choices, f"choice for {key}", where,
+                                 f"or a file ({', '.join(self.files)})" if self.files else "")
             return str(value)
         try:
             number = float(value)

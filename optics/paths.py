@@ -258,8 +258,13 @@ def transmission(scene, path: Path, values: Mapping, bands: np.ndarray, componen
         row = tuple(1.0 if j == component else 0 for j in range(4))
         if any(np.any(np.asarray(values.get(f"{name}.face", 0.0)) != 0) for name, _ in names):
             stack = None
-            for (name, _), matrix in reversed(list(zip(names, matrices))):  # light meets the farthest first
-                own = slab(name, matrix, values)
+            for (name, step), matrix in reversed(list(zip(names, matrices))):  # light meets the farthest first
+                if scene.parts[name].kind == "interface":  # a radiance grows by n^2 one way and shrinks by it the other
+                    index = values[f"{name}.index"]
+                    back = np.where(step.k[rays][:, 2:] > 0, index, 1 / index) ** 4
+                    own = Slab(matrix, t_back=matrix.reversed * back)
+                else:
+                    own = slab(name, matrix, values)
                 stack = own if stack is None else own.after(stack)
             row = stack.t.after(row)
         else:

@@ -60,6 +60,8 @@ class Renderer:
         self._images: OrderedDict = OrderedDict()
         image_keys = {k for k, p in scene.parameters.items() if p.how == "image"}
         self.layer_keys = {k for k, p in scene.parameters.items() if p.how == "layer"}
+        words = {f"{n}.{w}" for n, p in scene.parts.items() if registry().parts[p.kind].mueller is not None for w in p.words}
+        self.layer_order = sorted(self.layer_keys | words)  # what the layers' matrices depend on
         led_keys = {k for k in scene.parameters if k.rsplit(".", 1)[0] in scene.lights} - self.layer_keys
         own = [k for k in scene.parameters if k not in image_keys and k not in led_keys and k not in self.layer_keys]
         self.bounce_key = f"{scene.integrator.name}.interreflection"
@@ -230,7 +232,7 @@ class Renderer:
 
     def _weight(self, values: Mapping, light: str, path, component: int, where: tuple) -> np.ndarray:
         key = (self.geometry(values), component, *where, *(v.tobytes() if isinstance(v, np.ndarray) else v for v in (
-            values[k] for k in sorted(self.layer_keys))))
+            values[k] for k in self.layer_order)))
         if key not in self._transmissions:
             if all(path is not other for other in self._recent):  # matrices are large: those of the last two paths are kept
                 self._recent.append(path)
@@ -332,7 +334,7 @@ class Renderer:
 
     def led_tangent_at_rest(self, values: Mapping, led: str, key: str) -> np.ndarray:
         """`led_tangent`, kept: all frames share the gel at rest."""
-        known = (key, *self._led_key(values, led), *(values[k] for k in sorted(self.layer_keys)))
+        known = (key, *self._led_key(values, led), *(values[k] for k in self.layer_order))
         if known not in self._tangents:
             self._tangents[known] = self.led_tangent(values, led, key).astype(np.float32)
             while len(self._tangents) > 8 * len(self.scene.lights):

@@ -14,6 +14,7 @@ from pathlib import Path
 
 from optics.effect import DEFAULT_VARIANT, Declared, Effect, collecting, is_part, registry, shipped, use_variant
 from optics.errors import BadScene, UnknownKey
+from optics.layers import PatternImage
 from optics.parameter import Parameter, Variable
 
 
@@ -103,6 +104,7 @@ class Scene:
         for name, part in self.parts.items():
             for p in registry().parameters_of(part.kind):
                 self.parameters[f"{name}.{p.name}"] = p
+        self._strain()
         if carried := [p for p in self.parts.values() if hasattr(p, "carry")]:
             self._place(carried)
             self.mitsuba.parameters_changed([])
@@ -171,7 +173,7 @@ class Scene:
         import mitsuba as mi
 
         changed = {k: v for k, v in self.check(values, where).items() if self._now[k] != v}
-        rebuild, moved, stock = False, set(), False
+        rebuild, strained, moved, stock = False, False, set(), False
         for key, value in changed.items():
             if key in self._stock:
                 self._traversed[self._stock[key][1]] = mi.Float(value)
@@ -181,6 +183,7 @@ class Scene:
             part = self.parts[name]
             if parameter in part.words:
                 setattr(part, parameter, value)
+                strained |= parameter == "stress_pattern"
             else:
                 part.hold(parameter, value)
             rebuild |= part.kind == "gel" and parameter in self.shaping
@@ -192,6 +195,8 @@ class Scene:
         if rebuild:
             self.gel.rebuild(mi.traverse(self.gel))
             moved.update(n for n, p in self.parts.items() if hasattr(p, "carry"))
+        if rebuild or strained:
+            self._strain()
         self._place([self.parts[n] for n in moved])
         if rebuild or moved:
             self.mitsuba.parameters_changed([])
@@ -200,8 +205,6 @@ class Scene:
         """Rebuild shapes besides the gel; those in the skin where its present dent carries them."""
         import mitsuba as mi
 
-        if self.gel is not None:
-            self._strain()
         for part in shapes:
             if self.gel is not None and hasattr(part, "carry"):
                 part.carry(self.gel)
@@ -209,16 +212,19 @@ class Scene:
                 part.rebuild(mi.traverse(part))
 
     def _strain(self) -> None:
-        """Hand the present press's stress to the sheets in the skin that ask for it, from their depth on both sides alike up to
-        the skin's inner face."""
+        """Hand the sheets their stress patterns: from a file, or the present press's stress in the skin, from their depth on
+        both sides alike up to the skin's inner face."""
         from optics.gel.halfspace import SkinStress
 
         for shape in self.mitsuba.shapes():
             sheet = shape.bsdf()
             if hasattr(shape, "carry") and hasattr(sheet, "carrier"):
                 sheet.carrier = shape
-            if getattr(sheet, "stress_pattern", "") == "gel":
-                if not hasattr(shape, "carry"):
+            pattern = getattr(sheet, "stress_pattern", "")
+            if pattern.endswith((".npy", ".exr")):
+                sheet.field = PatternImage(self.path.parent / pattern)
+            if pattern == "gel":
+                if self.gel is None or not hasattr(shape, "carry"):
                     raise BadScene(f"{self.path}: '{sheet.name}': stress_pattern = 'gel' needs a sheet in the skin, a shape of the "
                                    "type 'carried'")
                 thickness = self.gel.number("thickness")

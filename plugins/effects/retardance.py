@@ -34,9 +34,9 @@ def retard(crossing, sheet):
 
 effect = Effect(
     name="retardance", part="sheet", stages={"layer": retard}, onset="both",
-    parameters=(Parameter("retard_0", "deg", 0.0, (-720.0, 720.0), "retardance at 540 nm along 0 deg of the sheet (less that along "
-                          "90)", neutral=0.0, plausible=10.0, how="layer"),
-                Parameter("retard_45", "deg", 0.0, (-720.0, 720.0), "retardance at 540 nm along 45 deg of the sheet (less that "
-                          "along 135)", neutral=0.0, plausible=10.0, how="layer")),
+    parameters=(Parameter("retard_0", "deg", 0.0, (-720.0, 720.0), "retardance at 540 nm with the fast axis at 0 deg of the "
+                          "sheet (less that at 90)", neutral=0.0, plausible=10.0, how="layer"),
+                Parameter("retard_45", "deg", 0.0, (-720.0, 720.0), "retardance at 540 nm with the fast axis at 45 deg of "
+                          "the sheet (less that at 135)", neutral=0.0, plausible=10.0, how="layer")),
     shape=(Parameter("retard_dispersion", "1", 0.0, (-1.0, 1.0), "dispersion of the birefringence", neutral=0.0, plausible=0.05, how="layer"),),
     acts=("analyzer.angle", "sample.angle"), needs="the sheet at two angles or more, best behind a quarter-wave plate")

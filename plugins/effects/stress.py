@@ -2,13 +2,14 @@
 
 Definition
     delta(lambda) = 2 pi C (sigma_1 - sigma_2) d/lambda          stress-optic law
-the pattern turns with the sheet's `angle`, but for the skin's. In components: (a, b) = 2 pi C d/lambda stress (P_q, P_u), with the coefficient C = `stress_optic`, the thickness d =
-`stress_thickness`, and the pattern (P_q, P_u) = (s_xx - s_yy, 2 s_xy) per unit of `stress`:
+The pattern turns with the sheet's `angle`, but for the skin's. In components (a, b) = 2 pi C d/lambda stress (P_q, P_u), with the
+coefficient C = `stress_optic` (C > 0: the larger tension is the fast axis), the thickness d = `stress_thickness`, and the pattern
+(P_q, P_u) = (s_xx - s_yy, 2 s_xy) per unit of `stress`:
     even    (1, 0): uniform tension along the sheet's x axis
     disc    a disc of the diameter `stress_size` pressed along its y axis: s_ij of the two point loads, in units of 2P/(pi D d)
     bend    a bar along x, bent: (2 y/size, 0)
     gel     of the skin that the present press deforms (set by the scene), stress in units of its shear modulus, thickness included
-    a file  an image (H, W, 2) in NPY or EXR: P_q and P_u over the square of `stress_size`
+    a file  an image (H, W, 2 or more) in NPY or EXR: P_q and P_u over the square of `stress_size`, row 0 on top
 Fingerprint
     a pattern of fringes that follows the stress; between crossed polarizers dark where a principal stress is along a polarizer.
     The second order of a faint one hides; see `retardance`.
@@ -63,5 +64,6 @@ effect = Effect(
                      how="layer"),
            Parameter("stress_thickness", "mm", 3.0, (1e-6, 100.0), "thickness d", plausible=0.1, how="layer"),
            Parameter("stress_size", "mm", 20.0, (1e-3, 1000.0), "size of the pattern", plausible=1.0, how="layer"),
-           Parameter("stress_pattern", "-", "even", choices=("even", "disc", "bend", "gel"), doc="even, disc, bend, gel or a file")),
+           Parameter("stress_pattern", "-", "even", choices=("even", "disc", "bend", "gel"), doc="even, disc, bend, gel or a file",
+                     files=(".npy", ".exr"))),
     acts=("analyzer.angle", "sample.angle", "radius"), needs="the sheet at two angles, best behind a quarter-wave plate")

@@ -46,7 +46,7 @@ PARAMETERS = (
               plausible=0.01, how="layer"),
     Parameter("wobble_s", "1", 0.0, (-0.5, 0.5), "change of transmittance once per turn, sine part w_s", neutral=0.0,
               plausible=0.01, how="layer"),
-    Parameter("face", "1", 0.0, (0.0, 0.5), "reflectance of each face; 0: reflections between films are left out", neutral=0.0,
+    Parameter("face", "1", 0.0, (0.0, 0.1), "reflectance r of each face, T1 <= (1 - r)^2; 0: reflections are left out", neutral=0.0,
               plausible=0.04, how="layer"),
 )
 

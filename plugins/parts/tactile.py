@@ -68,6 +68,14 @@ def build():
         def traverse(self, cb):
             self.put_parameters(cb)
 
+        def render_forward(self, *given, **more):
+            with dr.scoped_set_flag(dr.JitFlag.SymbolicLoops, False):  # recorded loops cannot be differentiated
+                return super().render_forward(*given, **more)
+
+        def render_backward(self, *given, **more):
+            with dr.scoped_set_flag(dr.JitFlag.SymbolicLoops, False):
+                return super().render_backward(*given, **more)
+
         def wavelengths(self, size):
             """The bands as a ray's wavelengths; unused lanes repeat the last band."""
             if not mi.is_spectral:

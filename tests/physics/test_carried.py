@@ -90,7 +90,7 @@ def test_an_untouched_skin_is_flat(load, variant):
         assert (p[:, :2].min(0) == (-24, -21.5)).all() and (p[:, :2].max(0) == (24, 21.5)).all()
         np.testing.assert_allclose(n, np.broadcast_to((0, 0, -1), n.shape), atol=1e-6)
     si = rays(scene, np.array([4.8, -17.0]), np.array([8.6, 13.0]))
-    # uv differ by 1/120 within a face, and are rounded to 6e-8: 48 * 120 * 6e-8
+    # uv differ by 1/120 within a face, and are rounded to 6e-8: 96 * 120 * 6e-8
     np.testing.assert_allclose(numbers(si.dp_du), [(48, 0, 0)] * 2, atol=6e-4)
     np.testing.assert_allclose(numbers(si.dp_dv), [(0, 43, 0)] * 2, atol=6e-4)
     np.testing.assert_allclose(numbers(si.uv)[0], (0.6, 0.7), atol=1e-6)
@@ -110,9 +110,9 @@ def test_markers_at_rest(load, variant):
     np.testing.assert_allclose(r[:, -1], 0, atol=FLOAT)
     np.testing.assert_allclose(r[:, :-1], 1.5, atol=FLOAT)
     assert set(np.round(off[..., 2].ravel(), 5)) == {0.0, 1.0}
-    wall = off[:, :96] * (1, 1, 0) / 1.5
-    np.testing.assert_allclose(n[:, :96], wall, atol=2e-3)  # the two triangles of a side weigh differently on its ends
-    np.testing.assert_allclose(n[:, 96:], np.broadcast_to((0, 0, -1), n[:, 96:].shape), atol=1e-6)
+    wall = off[:, :192] * (1, 1, 0) / 1.5
+    np.testing.assert_allclose(n[:, :192], wall, atol=2e-3)  # the two triangles of a side weigh differently on its ends
+    np.testing.assert_allclose(n[:, 192:], np.broadcast_to((0, 0, -1), n[:, 192:].shape), atol=1e-6)
     # seen from the camera: caps where markers are, the face beside them, and walls from aside
     for shift, z in ((0.0, -6.0), (1.45, -6.0), (1.55, -5.0)):
         np.testing.assert_allclose(numbers(rays(scene, centres[:, 0] + shift, centres[:, 1]).p)[:, 2], z, atol=ORIGIN)
@@ -228,9 +228,9 @@ def test_the_foot_of_a_marker_stays_on_the_face(load):
     """No light passes under a marker: the foot's rim lies on the inner face's mesh, which is linear between its vertices."""
     scene = load((SCENE % '<shape type="markers" id="markers"> <float name="height" value="0.5"/> </shape>')
                  .replace('name="press_x" value="3"', 'name="press_x" value="0"'), 2.0)
-    foot = vertices(scene.parts["markers"]).reshape(20, -1, 3)[:, :48].reshape(-1, 3)
-    middles = foot.reshape(20, 48, 3).mean(1, keepdims=True)[..., :2]
-    x, y = (middles + 1.002 * (foot[:, :2].reshape(20, 48, 2) - middles)).reshape(-1, 2).T
+    foot = vertices(scene.parts["markers"]).reshape(20, -1, 3)[:, :96].reshape(-1, 3)
+    middles = foot.reshape(20, 96, 3).mean(1, keepdims=True)[..., :2]
+    x, y = (middles + 1.002 * (foot[:, :2].reshape(20, 96, 2) - middles)).reshape(-1, 2).T
     height = numbers(rays(scene, x, y, start=foot[:, 2] + 0.4, ahead=False).p)[:, 2]
     # 0.4^2/8 of a curvature of 0.1/mm along x and along y, and 0.003 mm of a slope of 0.2
     assert np.abs(height - foot[:, 2]).max() < 5e-3

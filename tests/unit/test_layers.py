@@ -1,0 +1,70 @@
+"""Layers in a scene: stress patterns from files, changes of a pattern, layers on shapes that cannot carry them."""
+
+import shutil
+
+import numpy as np
+import pytest
+
+from optics import scene as scenes
+from optics.effect import registry
+from optics.errors import BadScene, UnknownKey
+from optics.render import Renderer
+
+CAMERA = {"width": "24", "height": "24", "x_fov": "6", "analyzer": "90"}
+
+
+def bench(folder, **defines):
+    shutil.copy(scenes.find("polarizer_bench"), folder / "bench.xml")
+    return scenes.load(folder / "bench.xml", {**CAMERA, **defines})
+
+
+def picture(scene, **values):
+    renderer = Renderer(scene)
+    now = {**scene.values(), "sample.angle": 20.0, "sample.stress": 3.0, "sample.stress_size": 24.0, **values}
+    return renderer, renderer.image(now, "source")
+
+
+def test_a_pattern_from_a_file_is_the_formula_that_it_was_made_from(tmp_path):
+    disc = next(e for e in registry().effects.values() if e.name == "stress birefringence").stages["layer"].__globals__["disc"]
+    n = 480
+    x, y = np.meshgrid((np.arange(n) + 0.5) / n * 24 - 12, 12 - (np.arange(n) + 0.5) / n * 24)  # row 0 at +y
+    np.save(tmp_path / "disc.npy", np.stack(disc(x, y, 12.0), -1).clip(-40, 40))  # the loads' points are infinite
+    _, want = picture(bench(tmp_path, pattern="disc"))
+    _, got = picture(bench(tmp_path, pattern="disc.npy"))
+    assert want.max() > 0.1  # fringes
+    # linear between pixels of 0.05 mm, a fiftieth of the narrowest fringe away from the loads
+    assert np.median(np.abs(got - want)) < 1e-4 and np.abs(got - want)[6:18].max() < 5e-3
+
+
+def test_a_pattern_that_is_changed_changes_the_picture(tmp_path):
+    scene = bench(tmp_path, pattern="even")
+    renderer, even = picture(scene)
+    now = {**scene.values(), "sample.angle": 20.0, "sample.stress": 3.0, "sample.stress_size": 24.0, "sample.stress_pattern": "disc"}
+    assert np.abs(renderer.image(now, "source") - even).max() > 0.1
+
+
+@pytest.mark.parametrize("name, array, text", [
+    ("flat.npy", np.zeros((4, 4)), r"flat.npy: shape \(4, 4\); allowed: \(H, W, 2 or more\)"),
+    ("hole.npy", np.full((4, 4, 2), np.nan), "all finite"), ("none.npy", None, "no such file")])
+def test_a_bad_pattern_is_refused(name, array, text, tmp_path):
+    if array is not None:
+        np.save(tmp_path / name, array)
+    with pytest.raises(BadScene, match=text):
+        bench(tmp_path, pattern=name)
+
+
+def test_an_unknown_pattern_names_the_known_ones(tmp_path):
+    with pytest.raises((BadScene, UnknownKey), match="disk.*disc"):
+        bench(tmp_path, pattern="disk")
+
+
+def test_the_skin_s_stress_needs_a_sheet_in_the_skin(tmp_path):
+    with pytest.raises(BadScene, match="a shape of the type 'carried'"):
+        bench(tmp_path, pattern="gel")
+
+
+def test_a_film_on_a_disk_is_refused(tmp_path):
+    text = scenes.find("polarizer_bench").read_text(encoding="utf-8")
+    (tmp_path / "disk.xml").write_text(text.replace('type="rectangle" id="analyzer_plate"', 'type="disk" id="analyzer_plate"'))
+    with pytest.raises(BadScene, match="'analyzer' stands on a disk"):
+        Renderer(scenes.load(tmp_path / "disk.xml"))
