@@ -7,7 +7,8 @@ A study is a folder that a later run, a report or a reader without this program 
                         fit.toml       [parameters] to lay over the scene again, [uncertainty], [frames.NAME]
                         metrics.json   optics.compare, and null models where given
                         diagnosis.json optics.diagnose
-                        images/*.npz   measured, predicted, sd, usable of the frames shown; fingerprints; maps
+                        images/*.npz   measured, predicted, sd, usable of the frames shown, and of a sweep of readings
+                                       the settings of each; fingerprints; maps
     STUDY/steps/01-lens-vignetting/...
 
 A step is written beside its place and renamed into it, so it is whole or absent; nothing is ever overwritten.
@@ -40,11 +41,15 @@ FORMAT = 1
 SHOWN_MAX = 8
 PACKAGES = ("mitsuba", "drjit", "numpy", "scipy", "scikit-image")
 CORRELATION_SHOWN = 0.9
+SETTING = "setting "  # begins the names of a sweep's settings in its file
 
 
 @dataclass(frozen=True)
 class Shown:
-    """A frame for the eye: (H, W, C) DN measured, predicted and sd, bool usable, and what was lit and pressed."""
+    """A frame for the eye: (H, W, C) DN measured, predicted and sd, bool usable, and what was lit and pressed.
+
+    settings  of a sweep of point readings, (N, 1, C): (N,) what was set at each, by parameter key; units: of these keys
+    """
 
     name: str
     measured: np.ndarray
@@ -54,6 +59,8 @@ class Shown:
     led: str = ""
     group: str = ""
     held_out: bool = False
+    settings: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
+    units: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
     @property
     def residual(self) -> np.ndarray:
@@ -188,7 +195,7 @@ class Study:
         comparison   of all frames, with held_out given where there are any
         diagnosis    optics.diagnose.Diagnosis, or its dictionary
         frames       all frames or some; at most 8 are kept: the worst of the first step, the same ones in every later
-                     step, and at least one held-out frame where there is one
+                     step, and at least one held-out frame where there is one; of sweeps of readings, every one
         nulls        optics.nulls.NullTable.json(): errors of models without physics
         background   mode of the flat field, and per channel how much of the background the scene explains
 
@@ -210,7 +217,8 @@ class Study:
             "converged": record["converged"], "reason": record["reason"], "variables": record["variables"],
             "correlations": record["correlations"], "warnings": [*record["warnings"], *warnings],
             "frames": [{"file": f"images/frame-{i:02d}.npz", "name": f.name, "led": f.led, "group": f.group,
-                        "held_out": bool(f.held_out)} for i, f in enumerate(kept)],
+                        "held_out": bool(f.held_out), **({"units": dict(f.units)} if f.settings else {})}
+                       for i, f in enumerate(kept)],
             "fingerprints": [{"file": f"images/fingerprint-{i:02d}.npz", "effect": f.effect, "frame": f.frame,
                               "strength": float(f.strength)} for i, f in enumerate(fingerprints)],
         }
@@ -227,7 +235,8 @@ class Study:
                 use = np.asarray(f.usable, bool)
                 use = np.broadcast_to(use[..., None] if use.ndim < len(shape) else use, shape)
                 np.savez_compressed(new / item["file"], measured=_single(f.measured), predicted=_single(f.predicted),
-                                    sd=_single(np.broadcast_to(f.sd, shape)), usable=use)
+                                    sd=_single(np.broadcast_to(f.sd, shape)), usable=use,
+                                    **{SETTING + key: np.asarray(value) for key, value in f.settings.items()})
             for item, f in zip(entry["fingerprints"], fingerprints):
                 np.savez_compressed(new / item["file"], image=_single(f.image), residual=_single(f.residual))
             if comparison.rms_map is not None:
@@ -298,8 +307,9 @@ class Study:
         out = []
         for f in self.steps[index]["frames"]:
             with np.load(self.path(index) / f["file"]) as a:
+                settings = {k.removeprefix(SETTING): a[k] for k in a.files if k.startswith(SETTING)}
                 out.append(Shown(f["name"], a["measured"], a["predicted"], a["sd"], a["usable"], f["led"], f["group"],
-                                 f["held_out"]))
+                                 f["held_out"], settings, f.get("units", {})))
         return out
 
     def fingerprints(self, index: int) -> list[Fingerprint]:
@@ -349,8 +359,11 @@ def shown_frames(model, values, held_out: Sequence[int] = (), frames: Sequence[i
     out = []
     for i in indices:
         f, prediction = model.frames[i], np.asarray(model.predict(values, [i])[0])
+        settings = {} if model.captures.table is None else {
+            key: np.broadcast_to(np.ravel(value), len(prediction)) for key, value in (*f.parameters.items(), *f.readings.items())}
         out.append(Shown(f.name, np.asarray(f.image), prediction, model.noise.sd(prediction), model.usable(i),
-                         led_label(f.parameters), f.group or "", i in set(held_out)))
+                         led_label(f.parameters), f.group or "", i in set(held_out), settings,
+                         {key: model.parameters[key].unit for key in settings}))
     return out
 
 
@@ -501,8 +514,10 @@ def input_hashes(inputs: Sequence[str | Path]) -> dict[str, str]:
 # -- small things -------------------------------------------------------------------------------------------------------
 
 def _choose(frames: Sequence[Shown], comparison: Comparison) -> list[str]:
-    """At most SHOWN_MAX names, worst first, with a held-out one among them where there is one."""
+    """At most SHOWN_MAX names, worst first, with a held-out one among them where there is one; every sweep of readings."""
     given = {f.name: f for f in frames}
+    if any(f.settings for f in frames):
+        return list(given)
     order = [comparison.frames[i]["frame"] for i in comparison.worst()]
     order = [n for n in order if n in given] + [n for n in given if n not in order]
     kept = order[:SHOWN_MAX]

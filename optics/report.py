@@ -11,7 +11,9 @@ import io
 import json
 import math
 import os
+import re
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -28,12 +30,21 @@ SIGMA_RANGE = 5.0  # the residual colour bar is symmetric, +- this
 CODES_PER_SIGMA = 4  # residual pictures carry quarters of a sigma, so that the page can colour and read them
 FINGERPRINTS_SHOWN = 4
 FINGERPRINT_SIDE = 128  # px
+FEW = 8  # values of a setting that colours or panels can tell apart
+LINES = 24  # values of a setting above which no predicted curve is drawn for each
+PANELS = 6
+MARKS = 60_000  # readings drawn on a page, over steps and channels
+LINEAR_TO = 15.0  # sigmas; residuals beyond bend their axis
+PLACE = "place in the sweep"
 MOVED_SHOWN = 3.0  # standard deviations; beyond, a parameter's move is marked
 
 # Blue, paper, red: told apart with every kind of colour vision, lightness falls evenly to both ends.
 DIVERGING = ("#08306b", "#1d5fa6", "#6aa5d8", "#bcd6ea", "#f5f3ef", "#f3c3a8", "#dd7c5c", "#b22f33", "#650a1c")
 SEQUENTIAL = ("#f5f3ef", "#e6d9c0", "#d9b36c", "#b9762f", "#7a3d1a", "#33160b")
 MASKED = "#8a8a8a"
+NO_PICTURES = {"frames": [], "steps": [], "channels": [], "note": ""}
+FRAMES = {"frame": "frame", "frames": "frames", "data": "frames"}  # what the page calls the parts of the data
+SWEEPS = {"frame": "sweep", "frames": "sweeps", "data": "readings"}
 CHANNEL_STYLE = {"R": "red", "G": "green", "B": "blue"}
 
 
@@ -65,16 +76,21 @@ def render(study: Study) -> str:
     environment.filters.update(number=number, fixed=fixed, figures=figures, measure=measure, percent=percent, pvalue=pvalue)
     environment.globals.update(measure=measure)
     comparisons = [study.comparison(i) for i in range(len(study.steps))]
-    verdicts = [verdict(study.diagnosis(i)) for i in range(len(study.steps))]
-    viewer = pictures(study)
+    shown = [study.frames(i) for i in range(len(study.steps))]
+    points = Readings.of(shown)
+    viewer = pictures(study, shown) if points is None else NO_PICTURES
+    nouns = FRAMES if points is None else SWEEPS
+    verdicts = [verdict(told(study.diagnosis(i), points)) for i in range(len(study.steps))]
     return environment.get_template("report.html.j2").render(
-        study=study.record, steps=study.steps, headline=headline(study, verdicts), verdicts=verdicts,
+        study=study.record, steps=study.steps, headline=headline(study, verdicts, nouns), verdicts=verdicts,
         tiles=tiles(study.steps), viewer=viewer, payload=_script(viewer), colour_bar=colour_bar(),
-        ladder_wide=ladder_chart(study, 920, 330), ladder_narrow=ladder_chart(study, 360, 300),
-        fingerprints=[fingerprint_pictures(study.fingerprints(i)) for i in range(len(study.steps))],
-        readings=[] if viewer["frames"] else reading_charts(comparisons),
-        curves=residual_curves(comparisons), maps=map_pictures(comparisons, study.steps), facts=facts(study.record["facts"]),
-        numbers=number_tables(comparisons), nulls=null_table(study.metrics(len(study.steps) - 1)),
+        nouns=nouns, points=points, plots=reading_plots(points, study.steps, comparisons[0].channels) if points else {},
+        ladder_wide=ladder_chart(study, 920, 330, nouns), ladder_narrow=ladder_chart(study, 360, 300, nouns),
+        fingerprints=[[] if points else fingerprint_pictures(study.fingerprints(i)) for i in range(len(study.steps))],
+        readings=[] if viewer["frames"] or points else reading_charts(comparisons),
+        curves=residual_curves(comparisons, points), maps=map_pictures(comparisons, study.steps) if points is None else [],
+        facts=facts(study.record["facts"], points), numbers=number_tables(comparisons, nouns),
+        nulls=null_table(study.metrics(len(study.steps) - 1)),
         background=study.metrics(len(study.steps) - 1).get("background") or {},
         parameters=parameter_tables(study.steps), comparisons=comparisons,
     )
@@ -82,11 +98,11 @@ def render(study: Study) -> str:
 
 # -- words --------------------------------------------------------------------------------------------------------------
 
-def headline(study: Study, verdicts: list) -> dict:
+def headline(study: Study, verdicts: list, nouns: Mapping[str, str]) -> dict:
     """One sentence with the numbers that matter, and the last verdict."""
     first, last = _level(study.steps[0]), _level(study.steps[-1])
     floor = study.record["noise_floor"]["chi2_per_dof"]
-    where = "on held-out frames" if study.steps[-1]["held_out"] else "on the fitted frames"
+    where = f"on held-out {nouns['data']}" if study.steps[-1]["held_out"] else f"on the fitted {nouns['data']}"
     added = _and([s["name"] for s in study.steps[1:]])
     now = f"{percent(last['misfit'])} of the signal, where noise alone is {percent(last['noise'])}"
     at_floor = last["chi2_per_dof"] <= floor * (1 + max(0.02, 4 * math.sqrt(2 / max(last["dof"], 1))))
@@ -111,7 +127,7 @@ def tiles(steps: Sequence[Mapping]) -> list[dict]:
             for key, label, form in rows if math.isfinite(last[key])]
 
 
-def facts(record: Mapping) -> dict[str, list[tuple[str, str]]]:
+def facts(record: Mapping, points: Readings | None = None) -> dict[str, list[tuple[str, str]]]:
     """What a study notes about its data, as text: plain values to list, and tables of settings to fold away."""
     def text(key: str, value) -> str:
         if isinstance(value, float):
@@ -121,6 +137,9 @@ def facts(record: Mapping) -> dict[str, list[tuple[str, str]]]:
         return json.dumps(value) if isinstance(value, Mapping) else str(value)
 
     plain = [(k.replace("_", " "), text(k, v)) for k, v in record.items() if not isinstance(v, Mapping)]
+    if points is not None:
+        plain = [("readings", f"{len(points.measured)} in {points.sweeps} sweeps"), ("channels", str(points.measured.shape[1])),
+                 *((f"{k} sweeps" if k in ("fitted", "held out") else k, v) for k, v in plain if k not in ("frames", "image"))]
     folded = [(k.replace("_", " "), text(k, v)) for table in record.values() if isinstance(table, Mapping)
               for k, v in table.items() if v not in (None, "", [], {})]
     return {"plain": plain, "folded": folded}
@@ -206,15 +225,14 @@ def pvalue(value) -> str:
 
 # -- pictures -----------------------------------------------------------------------------------------------------------
 
-def pictures(study: Study) -> dict:
+def pictures(study: Study, steps: list[list[Shown]]) -> dict:
     """What the viewer shows: measured once per frame, predicted and residual per frame and step.
 
     Fewer frames, then binned pixels, keep the page small; `note` says so.
     """
-    steps = [study.frames(i) for i in range(len(study.steps))]
     names = [n for n in study.record["shown"] if all(any(f.name == n for f in frames) for frames in steps)]
     if not names or max(steps[0][0].measured.shape[:2]) < SIDE_MIN:
-        return {"frames": [], "steps": [], "channels": [], "note": ""}
+        return NO_PICTURES
     table = [{f.name: f for f in frames} for frames in steps]
     held = next((n for n in names if table[0][n].held_out), None)
     if held in names[FRAMES_MIN:]:  # stays when frames are left out
@@ -394,9 +412,218 @@ def _script(viewer: dict) -> str:
     return json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")
 
 
+# -- readings -----------------------------------------------------------------------------------------------------------
+
+@dataclass(frozen=True)
+class Readings:
+    """All point readings of a study: (M,) settings by key, (M, C) DN measured, and of each step (M, C) predicted and residual.
+
+    residual  measured minus predicted in sigmas, NaN where not usable
+    """
+
+    settings: dict[str, np.ndarray]
+    units: Mapping[str, str]
+    held_out: np.ndarray
+    measured: np.ndarray
+    predicted: list[np.ndarray]
+    residual: list[np.ndarray]
+    sweeps: int
+
+    @classmethod
+    def of(cls, steps: Sequence[Sequence[Shown]]) -> Readings | None:
+        """The readings of a study's frames, step by step; None where they are pictures or single readings without settings."""
+        shown = steps[0]
+        names = [f.name for f in shown]
+        if not shown or not all(f.settings or _column(f) for f in shown) or any([f.name for f in s] != names for s in steps):
+            return None
+        own = [f.settings or {PLACE: np.arange(len(f.measured))} for f in shown]
+        settings = {k: np.concatenate([o[k] for o in own]) for k in own[0] if all(k in o for o in own)}
+        settings = {k: np.round(v.astype(float), 6) if v.dtype.kind in "fiu" else v for k, v in settings.items()}
+
+        def joined(values) -> np.ndarray:
+            return np.concatenate([np.reshape(v, (len(v), -1)) for v in values])
+
+        return cls(settings, shown[0].units, np.concatenate([np.full(len(f.measured), f.held_out) for f in shown]),
+                   joined(f.measured for f in shown), [joined(f.predicted for f in s) for s in steps],
+                   [joined(f.residual for f in s) for s in steps], len(shown))
+
+    def folds(self) -> tuple[str, list[str], list[str]]:
+        """The setting to draw along, the one told apart by colour (or none), and those told apart by panels.
+
+        Along: of those with many values an angle before others and time last, then the one with the most.
+        """
+        count = {k: len(np.unique(v)) for k, v in self.settings.items()}
+        numbers = [k for k in count if self.settings[k].dtype.kind == "f"]
+        if not numbers:
+            return "", [], []
+        many = [k for k in numbers if count[k] > FEW] or numbers
+        unit = self.units.get
+        along = max(many, key=lambda k: (unit(k) == "deg", unit(k) not in ("s", "min", "h"), count[k]))
+        few = sorted((k for k in count if k != along and 1 < count[k] <= FEW), key=lambda k: -count[k])
+        panels: list[str] = []
+        for key in few[1:]:
+            if len(self.cells([*panels, key])[1]) <= PANELS:
+                panels.append(key)
+        return along, few[:1], panels
+
+    def cells(self, keys: Sequence[str]) -> tuple[np.ndarray, list[str]]:
+        """(M,) which combination of these settings each reading has, and the combinations in words."""
+        if not keys:
+            return np.zeros(len(self.measured), int), [""]
+        codes = np.stack([np.unique(self.settings[k], return_inverse=True)[1] for k in keys], 1)
+        _, first, cell = np.unique(codes, axis=0, return_index=True, return_inverse=True)
+        return cell.ravel(), [", ".join(self.words(k, self.settings[k][i]) for k in keys) for i in first]
+
+    def words(self, key: str, value) -> str:
+        unit = self.units.get(key, "")
+        text = number(value, 4) if isinstance(value, float) else str(value)
+        return f"{key} {text}" + (f" {unit}" if unit not in ("", "1") else "")
+
+
+def _column(f: Shown) -> bool:
+    """A sweep that was recorded without its settings."""
+    return f.measured.shape[1] == 1 and len(f.measured) >= SIDE_MIN
+
+
+def reading_plots(r: Readings, steps: Sequence[Mapping], channels: Sequence[str]) -> dict:
+    """Per step and channel the panels of readings and residuals against one setting, on the same scales throughout."""
+    along, colour, panel_keys = r.folds()
+    if not along:
+        return {}
+    hue, hues = r.cells(colour) if colour else (np.full(len(r.measured), -1), [])  # class k-1: ink
+    panel, titles = r.cells(panel_keys)
+    lines = [k for k, v in r.settings.items() if k != along and len(np.unique(v)) <= LINES]
+    line, _ = r.cells(lines)
+    plots = len(steps) * r.measured.shape[1]
+    stride = math.ceil(len(r.measured) * plots / MARKS)
+    drawn = np.arange(len(r.measured)) % stride == 0
+    finite = [np.abs(z[np.isfinite(z)]) for z in r.residual]
+    top = max(4.0, *(float(z.max(initial=0)) for z in finite))
+    values = np.concatenate([r.measured, *r.predicted])
+    low, high = float(np.nanmin(values)), float(np.nanmax(values))
+    scales = (float(r.settings[along].min()), float(r.settings[along].max())), (min(low, 0.0), high), top
+    axis = f"{_spoken(along)}, {r.units[along]}" if r.units.get(along, "1") not in ("", "1") else _spoken(along)
+    out = []
+    for i, step in enumerate(steps):
+        for c in range(r.measured.shape[1]):
+            z = r.residual[i][:, c]
+            beyond = float(np.mean(np.abs(z[np.isfinite(z)]) > 3)) if np.isfinite(z).any() else math.nan
+            out.append({"step": i, "channel": c, "beyond": percent(beyond, 2), "panels": [
+                reading_panel(r, i, c, along, axis, (panel == p) & drawn, panel == p, hue, line, scales, title)
+                for p, title in enumerate(titles)]})
+    return {"plots": out, "channels": list(channels), "along": _spoken(along), "hues": hues,
+            "panels": len(titles), "merged": [k for k in lines if k not in (*colour, *panel_keys)
+                                              and len(np.unique(r.settings[k])) > 1],
+            "note": f"one reading in {stride} is drawn" if stride > 1 else ""}
+
+
+def reading_panel(r: Readings, step: int, channel: int, along: str, axis: str, drawn: np.ndarray, mine: np.ndarray,
+                  hue: np.ndarray, line: np.ndarray, scales: tuple, title: str, width: int = 460) -> str:
+    """SVG: readings as points (held out: rings) on the predicted curves, and below them the residual in sigmas.
+
+    The residual's axis is linear to about 3 sigmas and logarithmic beyond where some step leaves more than 15.
+    """
+    left, right, top, bottom, split, floor = 50, 8, 26, 326, 200, 364
+    (x_low, x_high), (y_low, y_high), z_top = scales
+    bent = z_top > LINEAR_TO
+
+    def shape(value):
+        return np.arcsinh(np.asarray(value) / 3) if bent else np.asarray(value)
+
+    def z(value):
+        return z_at(shape(value))
+
+    pad = 0.04 * ((y_high - y_low) or 1.0)
+    x, y = _scale(x_low, x_high, left + 6, width - right - 6), _scale(y_low - pad, y_high + pad, split - 12, top)
+    reach = 1.06 * float(shape(z_top))
+    z_at = _scale(-reach, reach, bottom, split)
+
+    def grid(at: float, text: str, style: str = "grid") -> str:
+        return (f'<line class="{style}" x1="{left}" x2="{width - right}" y1="{at:.1f}" y2="{at:.1f}"/>'
+                f'<text class="tick" x="{left - 6}" y="{at + 4:.1f}" text-anchor="end">{text}</text>')
+
+    parts = [f'<text class="title" x="{left}" y="14">{_escape(title)}</text>'] if title else []
+    parts += [grid(y(t), number(t, 4)) for t in _ticks(y_low, y_high, 4)]
+    for sigmas in (3, 1):
+        parts.append(f'<rect class="sigmas" x="{left}" width="{width - left - right}" y="{z(sigmas):.1f}" '
+                     f'height="{z(-sigmas) - z(sigmas):.1f}"/>')
+    marks = [t for t in (3, 10, 30, 100, 300, 1000, 3000, 10000) if t <= z_top] if bent else [3, *([10] if z_top > 10 else [])]
+    parts += [grid(float(z(s * t)), ("+" if s > 0 else "−") + number(t, 5)) for t in marks for s in (1, -1)]
+    parts.append(grid(float(z(0)), "0 σ", "zero"))
+    parts += [f'<text class="tick" x="{x(t):.1f}" y="{bottom + 16}" text-anchor="middle">{number(t, 4)}</text>'
+              for t in _angles(x_low, x_high, r.units.get(along, ""))]
+    parts.append(f'<text class="axis" x="{(left + width - right) / 2:.0f}" y="{floor - 6}" text-anchor="middle">'
+                 f'{_escape(axis)}</text>')
+    at, predicted, measured, sigma = (v[..., channel] if v.ndim > 1 else v for v in (
+        r.settings[along], r.predicted[step], r.measured, r.residual[step]))
+    for h in np.unique(hue[mine]):
+        own = mine & (hue == h)
+        parts.append(_predictions(at[own], predicted[own], line[own], x, y, f"k{h}", 0.05 * (y_high - y_low)))
+    for values, scale in ((measured, y), (sigma, z)):
+        good = drawn & np.isfinite(sigma)
+        if scale is y:
+            parts.append(_dots("mark off", x(at[drawn & ~good]), y(measured[drawn & ~good])))
+        for h in np.unique(hue[good]):
+            for held in (False, True):
+                own = good & (hue == h) & (r.held_out == held)
+                where = x(at[own]), scale(values[own])
+                parts.append(_dots(f"mark k{h}{' held' if held else ''}", *where) + (_dots("hole", *where) if held else ""))
+    used = sigma[mine & np.isfinite(sigma)]
+    rms = number(math.sqrt(np.mean(used**2))) if len(used) else "–"
+    return _svg(width, floor, parts, f"Readings and predictions against {along}{', ' if title else ''}{title}, residual below: "
+                                     f"{mine.sum()} readings, rms residual {rms} sigmas")
+
+
+def _dots(style: str, xs: np.ndarray, ys: np.ndarray) -> str:
+    """Points as one path of strokes without length: a round cap makes each a dot."""
+    return f'<path class="{style}" d="{"".join(f"M{a:.1f} {b:.1f}h0" for a, b in zip(xs, ys))}"/>' if len(xs) else ""
+
+
+def _predictions(at: np.ndarray, predicted: np.ndarray, line: np.ndarray, x, y, style: str, tolerance: float) -> str:
+    """Curves through the predictions of each line, or of all where lines are too short; a dash each where none is smooth."""
+    for group in (line, np.zeros_like(line)):
+        curves = [_averaged(at[group == g], predicted[group == g]) for g in np.unique(group)]
+        if all(_smooth(*curve, tolerance) for curve in curves):
+            return "".join(f'<path class="curve {style}" d="{_bezier(x(a), y(b))}"/>' for a, b, _ in curves)
+    return f'<path class="curve {style}" d="{"".join(f"M{a - 4:.1f} {b:.1f}h8" for a, b in zip(x(at), y(predicted)))}"/>'
+
+
+def _averaged(at: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+    """Sorted abscissas, each once, with the mean there, and the largest distance of a value from its mean."""
+    centres, which = np.unique(at, return_inverse=True)
+    mean = np.bincount(which, values) / np.bincount(which)
+    return centres, mean, float(np.abs(values - mean[which]).max())
+
+
+def _smooth(at: np.ndarray, values: np.ndarray, spread: float, tolerance: float) -> bool:
+    """Whether every value lies within the tolerance of the cubic through its four neighbours."""
+    if len(at) < 6 or not spread <= tolerance:
+        return False
+    near = (-2, -1, 1, 2)
+    a = [at[2 + j:len(at) - 2 + j] for j in near]
+    cubic = sum(values[2 + j:len(at) - 2 + j] * math.prod((at[2:-2] - a[m]) / (a[n] - a[m]) for m in range(4) if m != n)
+                for n, j in enumerate(near))
+    return bool(np.all(np.abs(cubic - values[2:-2]) <= tolerance))
+
+
+def _bezier(x: np.ndarray, y: np.ndarray) -> str:
+    """A path through the points with continuous slopes."""
+    slope, third = np.gradient(y, x), np.diff(x) / 3
+    segments = np.stack([x[:-1] + third, y[:-1] + third * slope[:-1], x[1:] - third, y[1:] - third * slope[1:], x[1:], y[1:]], 1)
+    return f"M{x[0]:.1f} {y[0]:.1f}" + "".join("C" + " ".join(f"{v:.1f}" for v in row) for row in segments)
+
+
+def _angles(low: float, high: float, unit: str) -> list[float]:
+    """Ticks; of angles over more than a right angle, whole parts of a turn."""
+    if unit != "deg" or high - low < 90:
+        return _ticks(low, high, 6)
+    step = next(s for s in (30, 45, 90, 180, 360, 720, 1e9) if (high - low) / s <= 9)
+    return [k * step for k in range(math.ceil(low / step), math.floor(high / step) + 1)]
+
+
 # -- charts -------------------------------------------------------------------------------------------------------------
 
-def ladder_chart(study: Study, width: int, height: int) -> str:
+def ladder_chart(study: Study, width: int, height: int, nouns: Mapping[str, str] = FRAMES) -> str:
     """SVG: chi2/dof of every step, held out and fitted, over the noise floor, on a logarithmic scale."""
     steps = study.steps
     floor = study.record["noise_floor"]["chi2_per_dof"]
@@ -437,7 +664,7 @@ def ladder_chart(study: Study, width: int, height: int) -> str:
                          f'{_escape(words)}</text>')
     parts.append(f'<text class="tick" x="{left}" y="14">χ²/dof</text>')
     legend = width - right
-    for key, words, wide in (("fitted", "fitted frames", 92), ("held_out", "held-out frames", 122)):
+    for key, words, wide in (("fitted", f"fitted {nouns['data']}", 92), ("held_out", f"held-out {nouns['data']}", 122)):
         if any(math.isfinite(v) for v in dict(lines)[key]):
             legend -= wide
             parts.append(f'<circle class="dot {key}" cx="{legend:.0f}" cy="10" r="5"/>'
@@ -447,14 +674,18 @@ def ladder_chart(study: Study, width: int, height: int) -> str:
     return _svg(width, height, parts, f"Chi-squared per degree of freedom. {said}. Noise floor {number(floor)}.")
 
 
-def residual_curves(comparisons: list[Comparison]) -> list[dict]:
+def residual_curves(comparisons: list[Comparison], points: Readings | None = None) -> list[dict]:
     """One small chart per coordinate: the first step's curve, in colour channels too, and the last step's."""
-    last = {c.coordinate: c for c in comparisons[-1].curves if c.channel == "all"}
+    first, final = comparisons[0].curves, comparisons[-1].curves
+    if points is not None:
+        first, final = ([replace(c, coordinate="sweep" if c.coordinate == "frame" else c.coordinate,
+                                 unit=points.units.get(c.coordinate, c.unit)) for c in curves] for curves in (first, final))
+    last = {c.coordinate: c for c in final if c.channel == "all"}
     out = []
-    for curve in (c for c in comparisons[0].curves if c.channel == "all"):
-        channels = [c for c in comparisons[0].curves if c.coordinate == curve.coordinate and c.channel in CHANNEL_STYLE]
+    for curve in (c for c in first if c.channel == "all"):
+        channels = [c for c in first if c.coordinate == curve.coordinate and c.channel in CHANNEL_STYLE]
         after = last.get(curve.coordinate) if len(comparisons) > 1 else None
-        own = [c for c in comparisons[-1].curves if c.coordinate == curve.coordinate and c.channel in CHANNEL_STYLE]
+        own = [c for c in final if c.coordinate == curve.coordinate and c.channel in CHANNEL_STYLE]
         out.append({"svg": curve_chart(curve, channels, after), "alone": curve_chart(after, own) if after is not None else ""})
     return out
 
@@ -491,7 +722,7 @@ def curve_chart(curve: Curve, channels: Sequence[Curve] = (), after: Curve | Non
     parts += [f'<text class="tick" x="{x(t):.1f}" y="{height - bottom + 16}" text-anchor="middle">{label}</text>'
               for t, label in ticks]
     unit = f", {curve.unit}" if curve.unit and curve.unit != "1" else ""
-    number_of = " number" if curve.coordinate == "frame" else ""
+    number_of = " number" if curve.coordinate in ("frame", "sweep") else ""
     parts.append(f'<text class="axis" x="{(left + width - right) / 2:.0f}" y="{height - 4}" text-anchor="middle">'
                  f'{_escape(_spoken(curve.coordinate))}{number_of}{unit}</text>')
     for c in channels:
@@ -619,11 +850,12 @@ def step_name(step: Mapping) -> str:
     return ("+ " if step["index"] else "") + step["name"]
 
 
-def number_tables(comparisons: list[Comparison]) -> list[dict]:
+def number_tables(comparisons: list[Comparison], nouns: Mapping[str, str] = FRAMES) -> list[dict]:
     """Rows of the last step by frame, LED, group, channel and region, each with the first step's chi2/dof."""
     first, last = comparisons[0], comparisons[-1]
     out = []
-    for scope, title in (("role", "Frames fitted and held out"), ("frame", "Frames"), ("led", "LEDs"), ("group", "Presses"),
+    data, frames = nouns["data"].capitalize(), nouns["frames"].capitalize()
+    for scope, title in (("role", f"{data} fitted and held out"), ("frame", frames), ("led", "LEDs"), ("group", "Presses"),
                          ("channel", "Channels"), ("region", "Regions")):
         before = {r.label: r.chi2_per_dof for r in first.by(scope)}
         rows = [{"label": r.label, "before": before.get(r.label, math.nan), "row": r} for r in last.by(scope)]
@@ -690,6 +922,21 @@ def verdict(diagnosis: Mapping | None) -> dict | None:
         "shifts": [s for s in d.get("shifts") or ()][:8], "curves": [_draft(f) for f in curves[:3]],
         "pairs": _pairs(d),
     }
+
+
+def told(diagnosis: Mapping | None, points: Readings | None) -> Mapping | None:
+    """A diagnosis in the words of readings: frames are sweeps, and a split by their place in a picture is left out."""
+    if not diagnosis or points is None:
+        return diagnosis
+
+    def spoken(value):
+        if isinstance(value, str):
+            return re.sub(r"\bframe(s?)\b", r"sweep\1", value)
+        if isinstance(value, Mapping):
+            return {k: spoken(v) for k, v in value.items()}
+        return [spoken(v) for v in value] if isinstance(value, (list, tuple)) else value
+
+    return spoken({**diagnosis, "splits": [s for s in diagnosis.get("splits") or () if s.get("by") != "quadrant"]})
 
 
 def _candidate(r: Mapping) -> dict:

@@ -389,6 +389,101 @@ def test_point_readings_are_drawn_against_their_setting(tmp_path):
     assert "Readings and predictions against analyzer.angle" in html and 'id="data"' not in html
 
 
+@pytest.fixture(scope="module")
+def swept(tmp_path_factory):
+    """A study of 96 readings of a leaky polarizer bench, the leak found in a second step; and its page."""
+    from optics import jones, loop
+    from optics.effect import registry
+    from optics.noise import Noise
+
+    folder = tmp_path_factory.mktemp("swept")
+    truth = jones.Truth(photodiode=jones.Photodiode(gain=2.2), p1=jones.Polarizer(leak=0.02), p2=jones.Polarizer(leak=0.02))
+    settings = [{"polarizer.angle": a, "analyzer.angle": 11.25 * i, "source.power": p, "source.time": i / 9}
+                for a in (0.0, 60.0, 100.0) for p in (0.5, 1.0) for i in range(16)]
+    jones.write(folder / "captures", truth, settings, Noise(0.05, 2.0, 64.0, 4095.0, 0.0), 3)
+    setup = loop.Setup(captures=str(folder / "captures"))
+    study, model, fit = loop.begin(setup, folder / "study")
+    loop.extend(study, model, setup, fit, registry().find_effect("extinction leak"), None)
+    return study, model, report(study.folder, folder / "report.html").read_text(encoding="utf-8")
+
+
+def panels_in(html: str) -> list[list[str]]:
+    """Per step the charts of readings."""
+    found = re.findall(r'<div class="sweep".*?</div>\n  </div>', html, re.S)
+    return [[svg for svg in re.findall(r"<svg.*?</svg>", block, re.S) if "Readings and predictions" in svg] for block in found]
+
+
+def test_a_sweep_keeps_the_settings_of_its_readings(swept):
+    study, model, _ = swept
+    frames = Study.open(study.folder).frames(1)
+    assert len(frames) == len(model.frames) and any(f.held_out for f in frames)
+    for f, g in zip(frames, model.frames):
+        assert f.name == g.name and f.units["analyzer.angle"] == "deg"
+        assert np.array_equal(f.settings["analyzer.angle"], g.readings["analyzer.angle"].ravel())
+        assert set(f.settings) == {*g.readings, *g.parameters}
+
+
+def test_sweeps_are_drawn_as_curves_with_residuals(swept):
+    """Along the analyzer; colours tell the polarizer's angles, panels the powers; every reading once above and once below."""
+    study, _, html = swept
+    steps = panels_in(html)
+    assert [len(p) for p in steps] == [2, 2] and 'id="data"' not in html and "<img" not in html
+    assert "source.power 0.5" in steps[0][0] and "source.power 1" in steps[0][1] and "polarizer.angle 60 deg" in html
+    for panels in steps:
+        for svg in panels:
+            marks = re.findall(r'<path class="mark (k\d)( held)?" d="([^"]*)"', svg)
+            assert sum(d.count("h0") for _, _, d in marks) == 2 * 48 and {k for k, _, _ in marks} == {"k0", "k1", "k2"}
+            assert "analyzer.angle, deg" in svg and svg.count('class="sigmas"') == 2
+            assert re.search(r'class="curve k0" d="M[^"]*C', svg), "predictions are smooth, so a curve goes through them"
+        held = re.findall(r'class="mark k\d held" d="([^"]*)"', "".join(panels))
+        assert sum(d.count("h0") for d in held) == 2 * sum(len(f.measured) for f in study.frames(0) if f.held_out)
+    rms = [[float(re.search(r"rms residual ([\d.]+)", svg)[1]) for svg in panels] for panels in steps]
+    assert min(rms[0]) > 3 > 1.5 > max(rms[1])  # 96 residuals of noise: 1 within 0.07 a standard deviation
+    for step in study.steps:
+        assert f'id="step-{step["index"]}"' in html
+
+
+def test_the_page_speaks_of_readings(swept):
+    _, _, html = swept
+    page = re.sub(r"<style>.*?</style>", "", html, flags=re.S)
+    assert "on held-out readings" in page and "96 readings in 8 sweeps" in page
+    for word in ("frames", "pixel", "picture"):
+        assert word not in page, word
+
+
+def test_sweeps_recorded_without_settings_still_show(swept, tmp_path):
+    """Older studies hold no settings: their readings are drawn in the order of the sweep."""
+    import shutil
+
+    shutil.copytree(swept[0].folder, tmp_path / "study")
+    for file in tmp_path.glob("study/steps/*/images/frame-*.npz"):
+        with np.load(file) as a:
+            kept = {k: a[k] for k in a.files if not k.startswith("setting ")}
+        np.savez_compressed(file, **kept)
+    for file in tmp_path.glob("study/steps/*/step.json"):
+        step = json.loads(file.read_text())
+        for f in step["frames"]:
+            del f["units"]
+        file.write_text(json.dumps(step))
+    html = report(tmp_path / "study", tmp_path / "r.html").read_text(encoding="utf-8")
+    assert "Readings and predictions against place in the sweep" in html and 'id="data"' not in html
+
+
+@pytest.mark.parametrize("along, other, expected", [
+    ("analyzer.angle", "source.power", ("analyzer.angle", ["source.power"], [])),  # an angle before what has few values
+    ("source.time", "source.power", ("source.time", ["source.power"], [])),  # time where nothing else takes many
+    ("source.power", "source.time", ("source.power", [], [])),  # time last where both take many
+])
+def test_readings_are_drawn_along_the_setting_with_most_values(along, other, expected):
+    from optics.report import Readings
+
+    count = np.arange(40.0)
+    settings = {other: count if other.endswith("time") else count % 2, along: count % 20}
+    none = np.zeros((40, 1))
+    units = {"analyzer.angle": "deg", "source.time": "min", "source.power": "1"}
+    assert Readings(settings, units, none[:, 0] > 0, none, [none], [none], 1).folds() == expected
+
+
 def test_large_frames_are_made_to_fit(tmp_path, monkeypatch):
     import optics.report
 
@@ -440,6 +535,7 @@ def test_images_of_a_model_become_frames_and_fingerprints():
 
     class Model:
         noise = SimpleNamespace(sd=lambda signal: np.ones_like(signal))
+        captures = SimpleNamespace(table=None)
         frames = [SimpleNamespace(name="a", image=np.full((4, 5, 1), 12.0), group=None, parameters={"led.power": 1.0})]
 
         def predict(self, values, frames):
