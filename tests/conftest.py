@@ -6,6 +6,8 @@ plugins, which then has to meet the same contract as those that ship.
 
 from __future__ import annotations
 
+import re
+from functools import lru_cache
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -107,22 +109,67 @@ WORKING_POINT = {
 }
 
 
+# Light comes in aslant (13 to 23 deg), passes three films and a sheet that does all that a sheet can, and no two axes agree.
+# Nothing rests at neutral that an effect needs to be seen: a retardance for its dispersion, a leak for its slope, a clock for a drift.
+FILMS = ("analyzer", "middle", "polarizer")
+POLARIZER_POINT = {
+    "camera.x": -40.0, "camera.y": -50.0, "camera.pan": 11.0, "camera.tilt": -14.0, "camera.exposure": 5.0,
+    "analyzer.angle": 35.0, "middle.angle": 75.0, "polarizer.angle": -20.0, "analyzer.offset": 2.0, "polarizer.scale": 1.01,
+    **{f"{film}.{name}": value for film in FILMS for name, value in (("leak", 0.01), ("approach", 0.7), ("backlash", 1.5))},
+    "sample.transmittance": 0.8, "sample.transmittance_slope": 0.05, "sample.index": 1.3, "sample.angle": 20.0,
+    "sample.retard_0": 40.0, "sample.retard_45": -25.0, "sample.retard_dispersion": 0.1,
+    "sample.stress": 4.0, "sample.stress_size": 60.0, "sample.depolarization": 0.05, "sample.alpha": 0.2,
+    "source.power": 0.8, "source.power_r": 0.9, "source.power_g": 1.1, "source.power_b": 0.7,
+    "source.dop_q": 0.1, "source.dop_u": -0.05, "source.drift": 0.02, "source.time": 3.0,
+    "source.wavelength": 560.0, "source.fwhm": 150.0,
+}
+
+# A press beside the middle, under stress; the film and the object end within the view. One of the LEDs in the body is blue, so that
+# the markers both glow and reflect.
+FINGER_POINT = {
+    "camera.exposure": 8.0, "analyzer.angle": 50.0, "film.angle": 10.0, "silicone.stress": 0.0133, "silicone.index": 1.2,
+    "skin.press_x": 3.0, "skin.press_y": -2.0, "film_sheet.width": 15.0, "film_sheet.length": 12.0,
+    "uv_left.wavelength": 440.0, "uv_left.fwhm": 120.0, "uv_left.power": 500.0, "uv_left.power_g": 0.8,
+    "pigment.absorptance": 0.6, "object.x": 2.0, "object.y": -6.0, "object.length": 14.0,
+    "uv_right.power": 0.0, "room_right.power": 0.0, "wall_paint.ambient": 0.3, "markers.pitch_x": 6.0, "markers.pitch_y": 6.0,
+}
+
+POINTS = {  # scene: (what replaces its <default>s, values)
+    "gelsight": ({"width": WIDTH, "height": HEIGHT, "depth": 0.5}, WORKING_POINT),
+    "polarizer_bench": ({"width": 8, "height": 6, "x_fov": 7, "bands": "620, 540, 460", "middle": 1, "pattern": "disc"},
+                        POLARIZER_POINT),
+    "vi2tap": ({"width": 32, "height": 24, "x_fov": 45, "depth": 1, "wall_dark": 1}, FINGER_POINT),
+}
+SLOT = r'<bsdf type="sheet" id="sample">.*?</bsdf>'
+
+
 @pytest.fixture(scope="session")
-def benches(mitsuba):
-    """Shipped scenes as benches by name, each loaded once, small and pressed."""
+def load_bench(mitsuba, tmp_path_factory):
+    """Loads a shipped scene as a bench, small and pressed.
+
+    slot     puts a material of this kind in the sample slot of the polarizer bench, as the part `sample`
+    plugins  a further folder of plugins
+    """
     from optics import scene
 
-    loaded = {}
+    def load(name="gelsight", slot=None, plugins=None):
+        defines, values = POINTS.get(name, POINTS["gelsight"])
+        text, file = scene.find(name).read_text(encoding="utf-8"), name
+        if slot is not None:
+            text, count = re.subn(SLOT, f'<bsdf type="{slot}" id="sample"/>', text, flags=re.S)
+            assert count == 1, f"{name}.xml has no sample slot"
+            file = tmp_path_factory.mktemp("scenes") / f"{name}.xml"
+            file.write_text(text, encoding="utf-8")
+        asked = {k: v for k, v in defines.items() if f'"${k}"' in text}
+        return Bench(scene.load(file, asked, plugins=plugins), values)
 
-    def bench(name="gelsight"):
-        if name not in loaded:
-            defines = {"width": WIDTH, "height": HEIGHT, "depth": 0.5}
-            text = scene.find(name).read_text(encoding="utf-8")
-            known = {k: v for k, v in defines.items() if f'<default name="{k}"' in text}
-            loaded[name] = Bench(scene.load(name, known), WORKING_POINT)
-        return loaded[name]
+    return load
 
-    return bench
+
+@pytest.fixture(scope="session")
+def benches(load_bench):
+    """`load_bench`, each bench loaded once."""
+    return lru_cache(None)(load_bench)
 
 
 @pytest.fixture
