@@ -82,7 +82,7 @@ def diagnose(model, fit, effects: Sequence[Effect], variables_of: Callable[[Effe
     rows = [c.row for c in table.order]
     done = sorted((c for c in chosen if c.row.refit is not None), key=lambda c: -c.row.net_refit)
     winner = _simplest(done) if done and done[0].row.net_refit > 0 else None
-    done = [c for c in done if not any(_contains(c, d) and c.row.net_refit - d.row.net_refit < CLEAR for d in done)]
+    done = [c for c in done if not any(c.contains(d) and c.row.net_refit - d.row.net_refit < CLEAR for d in done)]
     places = _places(model, fit.values, evidence)
     reference = winner.row.net_refit if winner else max([c.row.net for c in table.order], default=0.0)
     fingerprints = _fingerprints(model, evidence, places, max(reference, 1.0), say)
@@ -693,12 +693,6 @@ def _shifts(model, fit, winner: Candidate, fits: Mapping) -> list[Shift]:
 # -- findings, limits, warnings ---------------------------------------------------------------------------------------
 
 
-def _contains(one: Candidate, other: Candidate) -> bool:
-    """Whether an effect frees all that another frees, and more: it fits as well by itself and rivals nothing."""
-    keys = [{(key, v.frames) for v in c.variables for key in v.keys} for c in (one, other)]
-    return keys[0] > keys[1]
-
-
 def _refuted(winner: Candidate, other: Candidate) -> bool:
     """Whether the winner leaves nothing to explain, and another, refitted, does: more than could hide beside the winner."""
     left = other.row.refit
@@ -709,7 +703,7 @@ def _refuted(winner: Candidate, other: Candidate) -> bool:
 def _simplest(done: Sequence[Candidate]) -> Candidate:
     """The best effect, or one that it contains and that does as well."""
     best = done[0]
-    return next((c for c in done[1:] if _contains(best, c) and best.row.net_refit - c.row.net_refit < CLEAR), best)
+    return next((c for c in done[1:] if best.contains(c) and best.row.net_refit - c.row.net_refit < CLEAR), best)
 
 
 def _findings(table, winner, done, members, fingerprints, splits, levels, basis, structure) -> Findings:
@@ -718,7 +712,7 @@ def _findings(table, winner, done, members, fingerprints, splits, levels, basis,
         own = Findings(table.p_best, structure.p, fall=max(best, 0.0), excess_sd=basis.excess_sd)
     else:
         mine = [s for s in splits if s.effect == winner.effect.name]
-        others = [c for c in table.order if c is not winner and not _contains(c, winner)]
+        others = [c for c in table.order if c is not winner and not c.contains(winner)]
         even = {c.effect.name: all(s.holds for s in splits if s.effect == c.effect.name) for c in members[:MAX_SPLIT]}
         worst = max(mine, key=lambda s: (not s.holds, s.h), default=None)
         excess = basis.chi2 - basis.dof

@@ -55,6 +55,11 @@ class Candidate:
     linear: np.ndarray | None = None  # coefficients of the columns; see `change_of`
     row: Row | None = None
 
+    def contains(self, other: "Candidate") -> bool:
+        """Whether it frees all that another frees, and more: it fits as well by itself and rivals nothing."""
+        mine, others = ({(key, v.frames) for v in c.variables for key in v.keys} for c in (self, other))
+        return mine > others
+
     def _squares(self) -> np.ndarray:
         """Variables whose effect grows with their square: a secant to the plausible size is linear in s^2/plausible."""
         own = [v.parameter.squared and abs(start) < 1e-3 * v.parameter.plausible for v, start in zip(self.variables, self.start)]

@@ -25,7 +25,7 @@ def ranked(evidence: Evidence, candidates: Sequence[Candidate]) -> list[tuple[fl
     """(expected fall less its degrees of freedom, a, b, coefficients of both), best first."""
     projected, first, found = evidence.projected, len(evidence.base), []
     for a, b in combinations(candidates, 2):
-        if any(_contains(c, d) for c in (a, b) for d in candidates):
+        if any(c.contains(d) for c in (a, b) for d in candidates):
             continue  # its simpler part is tried
         if {key for v in a.variables for key in v.keys} & {key for v in b.variables for key in v.keys}:
             continue
@@ -36,12 +36,6 @@ def ranked(evidence: Evidence, candidates: Sequence[Candidate]) -> list[tuple[fl
         if all(signs):  # no effect below its neutral value, where that is a bound
             found.append((float(projected.score[own] @ linear) - rank, a, b, linear))
     return sorted(found, key=lambda t: -t[0])
-
-
-def _contains(one: Candidate, other: Candidate) -> bool:
-    """Whether an effect frees all that another frees, and more."""
-    keys = [{key for v in c.variables for key in v.keys} for c in (one, other)]
-    return keys[0] > keys[1]
 
 
 def search(evidence: Evidence, order: Sequence[Candidate], alone: float, add: Callable[[list[Candidate]], tuple]) -> list[Pair]:

@@ -14,8 +14,8 @@ Fingerprint
     two of them follow Malus, cos^2 of the angle between; a leak lifts the dark end, an offset shifts the curve, a wobble returns
     once per turn (Malus twice), a backlash splits the curves turned one way and the other.
 Validity
-    thin sheets, no refraction in them; reflections between films as at normal incidence. At T2 = 0 the film in the
-    middle of three has a leak that starts as a square root, whose slope is left out.
+    thin sheets, no refraction in them; reflections between films as at normal incidence. At T2 = 0 the leak of a film that
+    polarized light reaches (the middle one of three, one behind a tilted face) starts as a square root, whose slope is left out.
 References
     Vi2TaP (RA-L 2025), eq. (1); Korger et al., Opt. Express 21, 27032 (2013), oblique incidence; Goldstein, Polarized Light,
     3rd ed., 5.2.
