@@ -811,7 +811,7 @@ class Model:
 
     def _resolved(self, index: int) -> np.ndarray:
         """(H, W, C) False at sharp edges that the finer samples resolve worse than the noise: where the step across a pixel,
-        over the number of samples, is more than a third of the noise. At the base's values, so that a fit cannot move it."""
+        over the number of samples, is more than a sixth of the noise. At the base's values, so that a fit cannot move it."""
         if index not in self._edges_kept:
             now = self.at(Values(), index)
             low = high = 0.0
@@ -827,7 +827,7 @@ class Model:
                 full = self.noise.saturation - self.noise.black_level
                 step = ((high - low) @ self.developer.matrix.T) * np.abs(view.exposure * self.developer.gains(view)) * full
                 level = self.predict(Values(), [index])[0].reshape(-1, self.shape[2])[image.index]
-                known.reshape(-1, self.shape[2])[image.index] = step / self.renderer.rim_samples < self.noise.sd(level) / 3
+                known.reshape(-1, self.shape[2])[image.index] = step / self.renderer.rim_samples < self.noise.sd(level) / 6
             self._edges_kept[index] = known
         return self._edges_kept[index]
 
