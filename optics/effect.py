@@ -179,6 +179,9 @@ class Registry:
             for kind in (effect.part, *effect.requires):
                 if kind not in self.parts:
                     raise BadPlugin(f"{effect.file}: part '{kind}' is none of {', '.join(sorted(self.parts))}")
+            if "layer" in effect.stages and self.parts[effect.part].mueller is None:
+                raise BadPlugin(f"{effect.file}: stage 'layer' belongs to a layer (a part with a Mueller matrix), which "
+                                f"'{effect.part}' is not")
             for name in effect.parameter_names:
                 if self.parameter(effect.part, name).neutral is None:
                     raise BadPlugin(f"{effect.file}: {effect.part}.{name} has no neutral value to rest at")

@@ -213,7 +213,7 @@ class Renderer:
                 continue
             shines = [i for i, s in enumerate(self.scene.mitsuba.shapes()) if getattr(s.bsdf(), "kind", "") == "fluorescent"]
             marked = np.isin(image.hits.path.shape, shines)
-            glow = SimpleNamespace(markers=image.raw[0][marked].mean(0) if marked.any() else np.zeros(self.bands),
+            glow = SimpleNamespace(markers=image.raw[0][marked].mean(0, dtype=float) if marked.any() else np.zeros(self.bands),
                                    wavelengths=self.wavelengths)
             light = sum(function(glow, own) for function in functions)
             yield tuple(None if path is None else light * paths.transmission(

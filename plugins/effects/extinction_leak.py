@@ -15,5 +15,5 @@ References
 
 from optics.effect import Effect
 
-effect = Effect(name="extinction leak", part="polarizer_film", parameters=("leak",), acts=("intensity", "analyzer.angle"),
-                needs="crossed polarizers, and readings at another power of the source")
+effect = Effect(name="extinction leak", part="polarizer_film", parameters=("leak",), onset="both",
+                acts=("intensity", "analyzer.angle"), needs="crossed polarizers, and readings at another power of the source")

@@ -13,5 +13,5 @@ References
 
 from optics.effect import Effect
 
-effect = Effect(name="coloured leak", part="polarizer_film", parameters=("leak", "leak_tilt"), acts=("channel", "intensity"),
-                needs="crossed polarizers in two colours or more")
+effect = Effect(name="coloured leak", part="polarizer_film", parameters=("leak", "leak_tilt"), onset="both",
+                acts=("channel", "intensity"), needs="crossed polarizers in two colours or more")

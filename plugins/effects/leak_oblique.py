@@ -13,5 +13,5 @@ References
 
 from optics.effect import Effect
 
-effect = Effect(name="oblique leak", part="polarizer_film", parameters=("leak_oblique",), acts=("radius", "intensity"),
+effect = Effect(name="oblique leak", part="polarizer_film", parameters=("leak_oblique",), onset="both", acts=("radius", "intensity"),
                 needs="crossed polarizers in a wide field")
