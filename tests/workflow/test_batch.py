@@ -229,9 +229,15 @@ def test_killed_in_the_middle_and_resumed(whole, job):
 
 
 def test_interrupted_says_how_to_go_on(whole, job):
-    process = started(job, "--workers", "1")
-    process.send_signal(signal.SIGINT)
-    out, err = process.communicate(timeout=30)
+    import shutil
+
+    for _ in range(4):  # on a busy machine the job may be done before the signal is out
+        process = started(job, "--workers", "1")
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=60)
+        if process.returncode != 0:
+            break
+        shutil.rmtree(job.parent / "out")
     assert process.returncode == 130 and err.splitlines()[-1] == "interrupted: what was made is kept, the same command goes on"
     assert "Traceback" not in err and out == ""
     assert not [p for p in (job.parent / "out" / "images").iterdir() if p.name.startswith(".")]
