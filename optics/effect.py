@@ -314,7 +314,26 @@ class Declared:
     def on(base: type) -> type:
         """A subclass of a Mitsuba class that has the methods of this one."""
         return type(f"Declared{base.__name__}", (base,), {n: f for n, f in vars(Declared).items()
-                                                          if (callable(f) or n == "band") and not n.startswith("__") and n != "on"})
+                                                          if (callable(f) or n == "band") and not n.startswith("__") and n not in ("on", "on_mesh")})
+
+    @staticmethod
+    def on_mesh() -> type:
+        """`on(mi.Mesh)` for a shape that makes its own vertices: `rebuild(params)` follows every change of its parameters."""
+        import mitsuba as mi
+
+        class DeclaredMesh(Declared.on(mi.Mesh)):
+            def traverse(self, cb):
+                mi.Mesh.traverse(self, cb)
+                self.put_parameters(cb)
+
+            def parameters_changed(self, keys=()):
+                if any(key in self.numbers for key in keys) or not keys:
+                    self.reread(keys)
+                    self.rebuild(mi.traverse(self))
+                else:
+                    mi.Mesh.parameters_changed(self, list(keys))
+
+        return DeclaredMesh
 
     def declare(self, props) -> None:
         """Read every declared parameter from `props` (unknown ones stay for Mitsuba to complain about)."""

@@ -4,8 +4,8 @@ A ray passes layers (optics.layers) unbent and boundaries (part `interface`) by 
 cannot pass. The geometry is traced once by Mitsuba; the Mueller matrices of what was passed are multiplied in numpy, for any
 values of the layers' parameters: numbers, one per ray, or complex ones that carry a derivative.
 
-Stokes vectors at the camera refer to the image's horizontal axis x (right, across the ray and the vertical) and to y (up): optics.mueller's axes for light
-that travels towards the camera.
+Stokes vectors at the camera refer to the image's horizontal axis x (right, across the ray and the vertical) and to y (up):
+optics.mueller's axes for light that travels towards the camera.
 """
 
 from __future__ import annotations
@@ -289,7 +289,7 @@ def emitted(scene, name: str, path: Path, values: Mapping, bands: np.ndarray) ->
 
 
 def check(scene) -> None:
-    """Refuse what the paths cannot follow, and say what loses polarization without a word."""
+    """Refuse layers on shapes whose first direction turns with the place."""
     for shape in scene.mitsuba.shapes():
         kind = getattr(shape.bsdf(), "kind", "")
         if kind and registry().parts[kind].mueller is not None and str(shape).startswith("Disk"):

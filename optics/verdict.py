@@ -89,11 +89,7 @@ class Pair:
     fall: float
     excess_sd: float
     structure_p: float
-
-    @property
-    def complete(self) -> bool:
-        """Whether nothing is left to explain."""
-        return self.excess_sd < EXCESS and not is_structured(self.structure_p, self.excess_sd)
+    complete = Refit.complete  # the same question
 
 
 @dataclass

@@ -34,7 +34,7 @@ def build():
 
     from optics.gel.halfspace import displaced
 
-    class Carried(Declared.on(mi.Mesh)):
+    class Carried(Declared.on_mesh()):
         kind = "carried"
 
         def __init__(self, props):
@@ -51,17 +51,6 @@ def build():
             uv = np.stack(np.broadcast_arrays(self.u, self.v), -1)
             params["vertex_texcoords"] = mi.Float(uv.astype(np.float32).ravel())
             self.rebuild(params)
-
-        def traverse(self, cb):
-            super().traverse(cb)
-            self.put_parameters(cb)
-
-        def parameters_changed(self, keys=()):
-            if any(key in self.numbers for key in keys) or not keys:
-                self.reread(keys)
-                self.rebuild(mi.traverse(self))
-            else:
-                super().parameters_changed(list(keys))
 
         def carry(self, gel):
             """Move with the present dent of a gel, from now on."""

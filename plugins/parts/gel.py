@@ -51,7 +51,7 @@ def build():
 
     from optics.gel import contact
 
-    class Gel(Declared.on(mi.Mesh)):
+    class Gel(Declared.on_mesh()):
         kind = "gel"
         pressing = ("press_x", "press_y", "press_depth", "press_rx", "press_ry", "press_rz", "indenter", "indenter_size",
                     "smoothing", "skirt")  # what does nothing while press_depth is 0
@@ -71,17 +71,6 @@ def build():
             params = mi.traverse(self)
             params["faces"] = mi.UInt32(faces.astype(np.uint32).ravel())
             self.rebuild(params)
-
-        def traverse(self, cb):
-            super().traverse(cb)
-            self.put_parameters(cb)
-
-        def parameters_changed(self, keys=()):
-            if any(key in self.numbers for key in keys) or not keys:
-                self.reread(keys)
-                self.rebuild(mi.traverse(self))
-            else:
-                super().parameters_changed(list(keys))
 
         def press(self):
             """Displacement and contact maps on the indenter's own grid (optics.gel.contact)."""

@@ -35,7 +35,7 @@ def build():
 
     from optics.gel.halfspace import displaced
 
-    class Markers(Declared.on(mi.Mesh)):
+    class Markers(Declared.on_mesh()):
         kind = "markers"
 
         def __init__(self, props):
@@ -55,17 +55,6 @@ def build():
             params = mi.traverse(self)
             params["faces"] = mi.UInt32(faces.astype(np.uint32).ravel())
             self.rebuild(params)
-
-        def traverse(self, cb):
-            super().traverse(cb)
-            self.put_parameters(cb)
-
-        def parameters_changed(self, keys=()):
-            if any(key in self.numbers for key in keys) or not keys:
-                self.reread(keys)
-                self.rebuild(mi.traverse(self))
-            else:
-                super().parameters_changed(list(keys))
 
         def carry(self, gel):
             """Move with the present dent of a gel, from now on."""

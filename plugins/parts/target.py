@@ -31,7 +31,7 @@ def build():
     import mitsuba as mi
     import numpy as np
 
-    class Target(Declared.on(mi.Mesh)):
+    class Target(Declared.on_mesh()):
         kind = "target"
 
         def __init__(self, props):
@@ -48,17 +48,6 @@ def build():
             params = mi.traverse(self)
             params["faces"] = mi.UInt32(faces.astype(np.uint32).ravel())
             self.rebuild(params)
-
-        def traverse(self, cb):
-            super().traverse(cb)
-            self.put_parameters(cb)
-
-        def parameters_changed(self, keys=()):
-            if any(key in self.numbers for key in keys) or not keys:
-                self.reread(keys)
-                self.rebuild(mi.traverse(self))
-            else:
-                super().parameters_changed(list(keys))
 
         def rebuild(self, params):
             """Vertices for the present parameters."""
