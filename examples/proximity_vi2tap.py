@@ -9,6 +9,7 @@ Prints the curves, how far they agree, and what is read at 10 mm; the paper read
 """
 
 import sys
+from pathlib import Path
 
 import numpy as np
 
@@ -80,6 +81,7 @@ def main(picture_file: str = "renders/proximity.png") -> None:
     axes[0].set_ylabel("r")
     axes[0].legend()
     figure.tight_layout()
+    Path(picture_file).parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(picture_file, dpi=110)
 
 
