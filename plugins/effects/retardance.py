@@ -10,7 +10,7 @@ Fingerprint
     between crossed polarizers, light returns as sin(delta/2)^2 sin(2 psi)^2, without first order: a faint retardance hides, and its
     sign does not show. Behind a quarter-wave plate it shows in first order, and with its sign.
 Validity
-    a sheet whose birefringence is small against its index; index of the sheet, 1.5 where it declares none.
+    a sheet whose birefringence is small against its index. Rays run in it as its `index` bends them.
 References
     Goldstein, Polarized Light, 3rd ed., 5.3; Yeh & Gu, Optics of Liquid Crystal Displays, 2nd ed., 3.2 (oblique rays).
 """
@@ -18,7 +18,7 @@ References
 import math
 
 from optics.effect import Effect
-from optics.mueller import cos, real, retarder, sin, where
+from optics.mueller import cos, retarder, sin
 from optics.parameter import Parameter
 
 
@@ -26,10 +26,9 @@ def retard(crossing, sheet):
     turn = 2 * sheet.angle * (math.pi / 180)
     a = sheet.retard_0 * cos(turn) - sheet.retard_45 * sin(turn)
     b = sheet.retard_0 * sin(turn) + sheet.retard_45 * cos(turn)
-    index = where(real(sheet.index) > 1, sheet.index, 1.5 + 0 * sheet.index)
     ratio = 540.0 / crossing.wavelengths
     radians = (math.pi / 180) * ratio * (1 + sheet.retard_dispersion * (ratio * ratio - 1))
-    return retarder(*(c * radians for c in crossing.retardance(a, b, index)))
+    return retarder(*(c * radians for c in crossing.retardance(a, b, sheet.index)))
 
 
 effect = Effect(

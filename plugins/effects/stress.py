@@ -33,8 +33,7 @@ def strain(crossing, sheet):
     q, u = pattern(x, y, sheet)
     p_q, p_u = q * (c * c - s * s) - u * (2 * c * s), q * (2 * c * s) + u * (c * c - s * s)
     factor = 2 * math.pi * sheet.stress_optic * sheet.stress_thickness * sheet.stress / crossing.wavelengths
-    index = where(real(sheet.index) > 1, sheet.index, 1.5 + 0 * sheet.index)
-    return retarder(*crossing.retardance(p_q * factor, p_u * factor, index))
+    return retarder(*crossing.retardance(p_q * factor, p_u * factor, sheet.index))
 
 
 def pattern(x, y, sheet):

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from optics.effect import IMAGE_STAGES, Effect, Registry, registry, shipped
+from optics.errors import BadPlugin
 from optics.render import POWERS
 
 PARTS = sorted(registry().parts)
@@ -36,8 +37,6 @@ SURROUNDINGS = {  # parameter: what has to stand about it for it to be seen, and
     "polarizer_film.leak": {"middle.inserted": 0.0, "source.dop_q": 0.0, "source.dop_u": 0.0},
     # below 0 a leak is cut off
     "polarizer_film.leak_tilt": {f"{film}.leak": 0.01 for film in FILMS},
-    # inside a sheet that declares no faces oblique rays run as in one of index 1.5
-    "sheet.index": {"sample.retard_0": 0.0, "sample.retard_45": 0.0, "sample.stress": 0.0},
     # what a ball does not show
     **{f"gel.press_r{axis}": {"gel.indenter": "cube", "gel.indenter_size": 6.0, "gel.press_rx": 25.0, "gel.press_ry": 20.0,
                               "gel.press_rz": 30.0} for axis in "xyz"},
@@ -110,8 +109,6 @@ def check_effect_declaration(effect, reg):
         how = {p.how for p in parameters}
         for own, stages in (("image", IMAGE_STAGES), ("layer", LAYERED)):
             assert (stage in stages) == (how == {own}), f"{effect.name}: derivatives by {how} at the stage '{stage}'"
-    if "layer" in effect.stages:
-        assert reg.parts[effect.part].mueller is not None, f"{effect.name}: '{effect.part}' is no layer; nobody calls the function"
 
 
 @pytest.mark.parametrize("kind", PARTS)
@@ -982,7 +979,6 @@ BAD_LAYER = {
     "is another one in a render": ([("1.0 - cell.cloud", "1.0 - cell.cloud - (0 if hasattr(crossing.u, 'shape') and "
                                      "type(crossing.u).__module__ == 'numpy' else 0.1)")], check_both_arithmetics),
     "differentiates another way": ([("plausible=0.05, how=\"layer\"),))", "plausible=0.05),))")], check_effect_declaration),
-    "acts on what is no layer": ([("part=\"sugar_cell\", stages", "part=\"led\", stages")], check_effect_declaration),
 }
 
 
@@ -1071,6 +1067,11 @@ def test_the_contract_notices_in_layers(fault, user_bench, mitsuba):
     }.get(check, (bench, effect))
     with pytest.raises((AssertionError, ValueError)):  # an array that is asked for its truth raises by itself
         check(*arguments)
+
+
+def test_a_layers_effect_of_what_is_no_layer_is_refused(user_bench):
+    with pytest.raises(BadPlugin, match="'led' is not"):
+        user_bench(spoil(CELL, [("part=\"sugar_cell\", stages", "part=\"led\", stages")]), "polarizer_bench", "sugar_cell")
 
 
 def test_the_contract_notices_light_polarized_beyond_itself(benches, monkeypatch):

@@ -249,16 +249,15 @@ def sheet_by_hand(own, wavelength, k, x, e1, e2, u, v):
     s = np.where(np.linalg.norm(s, axis=-1, keepdims=True) > 1e-9, s, x)
     total = at(azimuth(s, k, x), polarizer(t * (1 - np.abs(r_s) ** 2) ** 2, t * (1 - np.abs(r_p) ** 2) ** 2))
     total = np.diag([1.0] + [1 - own("depolarization")] * 3) @ total
-    index = own("index") if own("index") > 1 else 1.5
     dial, ratio = np.radians(own("angle")), 540 / wavelength
     delta = np.hypot(own("retard_0"), own("retard_45")) * ratio * (1 + own("retard_dispersion") * (ratio**2 - 1))
     axis = np.arctan2(own("retard_45"), own("retard_0")) / 2 + dial
-    total = birefringent(np.radians(delta) + 0 * u, axis + 0 * u, k, x, e1, e2, index) @ total
+    total = birefringent(np.radians(delta) + 0 * u, axis + 0 * u, k, x, e1, e2, own("index")) @ total
     c, s = np.cos(dial), np.sin(dial)
     q, p = stress_by_hand(own("stress_pattern"), u * c + v * s, v * c - u * s, own("stress_size"))
     metres = own("stress_optic") * 1e-12 * own("stress") * 1e6 * own("stress_thickness") * 1e-3  # path difference per pattern
     return birefringent(2 * np.pi * metres / (wavelength * 1e-9) * np.hypot(q, p), np.arctan2(p, q) / 2 + dial, k, x, e1, e2,
-                        index) @ total
+                        own("index")) @ total
 
 
 def camera_rays(size, x_fov, roll=0.0):
@@ -303,7 +302,7 @@ def source_by_hand(values, k, x, e1):
 FILM = {"inserted": (0.5, 1), "angle": (-180, 180), "transmittance": (0.6, 0.95), "transmittance_slope": (-0.05, 0.05),
         "leak": (0.01, 0.3), "leak_tilt": (-0.02, 0.02), "leak_oblique": (0, 0.1), "offset": (-20, 20), "scale": (0.9, 1.1),
         "approach": (-1, 1), "backlash": (-5, 5), "wobble_c": (-0.03, 0.03), "wobble_s": (-0.03, 0.03)}
-SHEET = {"transmittance": (0.6, 1), "transmittance_slope": (-0.2, 0.2), "index": (1.2, 1.7), "angle": (-180, 180),
+SHEET = {"transmittance": (0.6, 1), "transmittance_slope": (-0.2, 0.2), "index": (1.0, 1.7), "angle": (-180, 180),
          "depolarization": (0, 0.5), "retard_0": (-300, 300), "retard_45": (-300, 300), "retard_dispersion": (-0.5, 0.5),
          "stress": (-5, 5), "stress_optic": (1, 6), "stress_thickness": (1, 3), "stress_size": (500, 800)}
 SOURCE = {"dop_q": (-0.7, 0.7), "dop_u": (-0.7, 0.7)}
