@@ -16,9 +16,7 @@ from collections.abc import Callable, Mapping
 from types import SimpleNamespace
 
 from optics.effect import Declared, Part, registry
-from optics.mueller import Mueller, cos, sin, sqrt, where
-
-
+from optics.mueller import Mueller, cos, real, sin, sqrt, where
 
 MONO = 540.0  # nm: the wavelength of variants that know none
 
@@ -113,7 +111,7 @@ def active_effects(kind: str, values: Mapping) -> list:
 
 class PatternImage:
     """A pattern of two numbers from an image (H, W, 2 or more): f(x, y, size) over a square of `size` mm about the layer's middle,
-    row 0 at +y, linear between the pixels' centres, 0 outside. numpy only."""
+    row 0 at +y, linear between the pixels' centres, 0 outside; x, y and size may be numpy's (complex ones too) or Dr.Jit's."""
 
     def __init__(self, path):
         from pathlib import Path
@@ -134,23 +132,49 @@ class PatternImage:
         if values.ndim != 3 or values.shape[2] < 2 or not np.isfinite(values).all():
             raise BadScene(f"{path}: shape {values.shape}; allowed: (H, W, 2 or more), all finite: s_xx - s_yy and 2 s_xy")
         self.values = np.asarray(values[..., :2], float)
+        self.texture = Texture(self.values)
 
     def __call__(self, x, y, size):
         import numpy as np
-        from scipy.ndimage import map_coordinates
 
-        from optics.errors import BadScene
+        s, t = 0.5 + x / size, 0.5 - y / size
+        inside = (real(s) >= 0) & (real(s) <= 1) & (real(t) >= 0) & (real(t) <= 1)
+        if isinstance(s, np.ndarray):
+            s, t = np.broadcast_arrays(s, t)
+            found = self._linear(s, t)
+        else:
+            found = self.texture(s, t)
+        return tuple(where(inside, f, 0.0 * f) for f in found)
 
-        if not isinstance(x, np.ndarray):
-            raise BadScene("a pattern from a file serves the prediction, not mi.render; allowed there: even, disc, bend, gel")
-        height, width = self.values.shape[:2]
-        x, y, size = np.real(x), np.real(y), float(np.real(size))
-        at = [(0.5 - y / size) * height - 0.5, (0.5 + x / size) * width - 0.5]
-        shape = np.broadcast_shapes(*(a.shape for a in at))
-        at = [np.broadcast_to(a, shape).ravel() for a in at]
-        inside = (np.abs(x) <= size / 2) & (np.abs(y) <= size / 2)
-        return tuple(np.where(inside, map_coordinates(self.values[..., i], at, order=1, mode="nearest").reshape(shape), 0.0)
-                     for i in (0, 1))
+    def _linear(self, s, t) -> tuple:
+        import numpy as np
+
+        low, share = [], []
+        for place, count in zip((t, s), self.values.shape):
+            place = place * count - 0.5
+            place = np.where(np.real(place) < 0, 0.0, np.where(np.real(place) > count - 1, count - 1, place))
+            low.append(np.minimum(np.real(place).astype(int), max(count - 2, 0)))
+            share.append(place - low[-1])
+        (i, j), (a, b) = low, share
+        down, right = (np.minimum(k + 1, count - 1) for k, count in zip(low, self.values.shape))
+        for v in np.moveaxis(self.values, -1, 0):
+            yield (1 - a) * ((1 - b) * v[i, j] + b * v[i, right]) + a * ((1 - b) * v[down, j] + b * v[down, right])
+
+
+class Texture:
+    """An image (H, W, C) for Dr.Jit: f(s, t) -> C values at s along the columns and t along the rows, both from 0 to 1 over
+    the whole pixels, linear between their centres and constant beyond."""
+
+    def __init__(self, values):
+        self.values, self.made = values, {}
+
+    def __call__(self, s, t):
+        import drjit as dr
+        import mitsuba as mi
+
+        if mi.variant() not in self.made:
+            self.made[mi.variant()] = mi.Texture2f(mi.TensorXf(self.values.astype("float32")), wrap_mode=dr.WrapMode.Clamp)
+        return self.made[mi.variant()].eval(mi.Point2f(s, t))
 
 
 def crossing_of(si, band: float | None = None, extent: tuple[float, float] | None = None) -> Crossing:

@@ -128,20 +128,10 @@ class Pictures:
 
     def _exact(self, now: Mapping, seed: int) -> Picture:
         renderer = self.renderer
-        lit = [light for light in self.scene.lights if now[f"{light}.power"] != 0]
-        bounce = now[renderer.bounce_key]
-        totals, alone = [], {}  # by component of the Stokes vector; of S0 by light
-        for component in range(4 if renderer.layered else 1):
-            total = np.array(renderer.ambient(now, component), float)
-            for light in lit:
-                image = renderer.image(now, light, component)
-                if bounce:
-                    image = image + bounce * self._bounced(now, light, seed, component)
-                own = renderer.powers(now, light) * image
-                total += own
-                if component == 0:
-                    alone[light] = own
-            totals.append(total)
+        alone = {light: renderer.light(now, light, seed) for light in renderer.lit(now)}
+        totals = [sum(alone.values(), renderer.ambient(now))]
+        if renderer.layered:
+            totals += [renderer.radiance(now, seed, component) for component in (1, 2, 3)]
         channels = self._radiance_channels(np.stack(totals, -1), now)
         if "aov" in self.layers:
             channels.update(self._surface(renderer.hits(now), now))
@@ -151,16 +141,6 @@ class Pictures:
         header = exr.spectral_header(renderer.layered, UNITS) if self.bands else {}
         self.scene.set(now)  # the renderer leaves the LEDs at power 1
         return Picture(channels, header, self.developer.develop(totals[0], now))
-
-    def _bounced(self, now: Mapping, light: str, seed: int, component: int) -> np.ndarray:
-        """Light after two reflections, unpolarized before the layers, as a component of the Stokes vector behind them."""
-        image = self.renderer.bounced(now, light, seed)
-        if component == 0 or light in self.scene.sources:
-            return image
-        path = self.renderer.hits(now).path
-        whole, part = (self.renderer._weight(now, light, path, c, ()) for c in (0, component))
-        share = np.divide(part, whole, out=np.zeros_like(part), where=whole != 0)
-        return image * share.reshape(image.shape)
 
     def _monte_carlo(self, now: Mapping, seed: int) -> Picture:
         scene = self.scene

@@ -328,17 +328,6 @@ class Spot(Renderer):
     def _trace(self, u: np.ndarray, v: np.ndarray):
         return super()._trace(u + self.corner[0], v + self.corner[1])
 
-    def radiance(self, values: Mapping, seed: int = 0) -> np.ndarray:
-        """(H, W, B) of the pixels that are rendered."""
-        total = np.array(self.ambient(values), float)
-        for light in self.scene.lights:
-            if values[f"{light}.power"] != 0:
-                image = self.image(values, light)
-                if values[self.bounce_key]:
-                    image = image + values[self.bounce_key] * self.bounced(values, light, seed)
-                total = total + self.powers(values, light) * image
-        return total
-
 
 @dataclass
 class Curve:

@@ -247,17 +247,27 @@ class Renderer:
         sent = paths.emitted(self.scene, light, path, values, self.wavelengths)
         return sum(r * s for r, s in zip(row, sent) if not isinstance(s, int))
 
-    def stokes(self, values: Mapping, lights: Sequence[str] | None = None) -> np.ndarray:
-        """(4, H, W, B): Stokes vectors at the camera, of all lights or of some."""
-        wanted = self.scene.lights if lights is None else lights
-        total = np.zeros((4, self.height, self.width, self.bands))
-        for component in range(4):
-            for light in wanted:
-                if np.any(values[f"{light}.power"] != 0):
-                    total[component] += self.powers(values, light) * self.image(values, light, component)
-            if lights is None:
-                total[component] += self.ambient(values, component)
-        return total
+    # -- all lights ---------------------------------------------------------------------------------------------------
+
+    def lit(self, values: Mapping) -> list[str]:
+        """The lights that are on."""
+        return [n for n in self.scene.lights if np.any(values[f"{n}.power"] != 0)]
+
+    def light(self, values: Mapping, light: str, seed: int = 0, component: int = 0) -> np.ndarray:
+        """(H, W, B) what one light makes at its power, by one reflection and by two."""
+        image = self.image(values, light, component)
+        if values[self.bounce_key]:
+            image = image + values[self.bounce_key] * self.bounced(values, light, seed, component)
+        return self.powers(values, light) * image
+
+    def radiance(self, values: Mapping, seed: int = 0, component: int = 0) -> np.ndarray:
+        """(H, W, B): linear image; complex where `values` hold a complex step of a layer's parameter."""
+        lights = (self.light(values, n, seed, component) for n in self.lit(values))
+        return sum(lights, self.ambient(values, component))
+
+    def stokes(self, values: Mapping, seed: int = 0) -> np.ndarray:
+        """(4, H, W, B): Stokes vectors at the camera; (4, N, 1, B) where `values` hold arrays of readings."""
+        return np.stack([self.radiance(values, seed, component) for component in range(4)])
 
     def _rim_samples(self, hits: "Hits", index: np.ndarray):
         key = index.tobytes()
@@ -379,8 +389,9 @@ class Renderer:
                         moved_rim if moves else lambda: tangent(image.samples, image.rim_visible))
         return self._mix(image, raw, self.weights(values, image) if self.layered else (1.0, 1.0))
 
-    def bounced(self, values: Mapping, led: str, seed: int = 0) -> np.ndarray:
-        """(H, W, B): light of one LED at power 1 after two reflections; Monte Carlo over the second direction.
+    def bounced(self, values: Mapping, led: str, seed: int = 0, component: int = 0) -> np.ndarray:
+        """(H, W, B): light of one LED at power 1 after two reflections, unpolarized before any layers, as a component of the
+        Stokes vector; Monte Carlo over the second direction.
 
         Light from all around varies slowly: it is gathered for every second pixel each way, over the area of the four,
         and interpolated linearly in between. The samples are the same for every geometry and LED of a seed.
@@ -394,7 +405,7 @@ class Renderer:
         key = ("bounced", seed, *self._led_key(values, led))
         if key in self._images:
             self._images.move_to_end(key)
-            return self._bounced(values, led, self._images[key])
+            return self._bounced(values, led, self._images[key], component)
         self._apply(values)
         rows, columns = -(-self.height // BOUNCE_CELL), -(-self.width // BOUNCE_CELL)
         v, u = np.mgrid[:rows, :columns]
@@ -408,18 +419,18 @@ class Renderer:
         coarse = self._bands(light).reshape(rows, columns, BOUNCE_SAMPLES, self.bands).mean(2)
         image = zoom(coarse, (BOUNCE_CELL, BOUNCE_CELL, 1), order=1, mode="nearest", grid_mode=True)
         self._images[key] = image[:self.height, :self.width].astype(float)
-        return self._bounced(values, led, self._images[key])
+        return self._bounced(values, led, self._images[key], component)
 
-    def _bounced(self, values: Mapping, led: str, image: np.ndarray) -> np.ndarray:
+    def _bounced(self, values: Mapping, led: str, image: np.ndarray, component: int) -> np.ndarray:
         """A bounced image behind the layers."""
         if not self.layered:
-            return image
-        weight = self._weight(values, led, self.hits(values).path, 0, ())
+            return image if component == 0 else np.zeros_like(image)
+        weight = self._weight(values, led, self.hits(values).path, component, ())
         return image * weight.reshape(-1, self.width, self.bands)
 
     def ambient(self, values: Mapping, component: int = 0) -> np.ndarray:
         """(H, W, B): radiance of the membranes that no LED made."""
-        if all(values[k] == neutral for k, neutral in self._still.items()):
+        if all(values[k] == neutral for k, neutral in self._still.items()) or component and not self.layered:
             return np.zeros((self.height, self.width, self.bands))
         hits = self.hits(values)
         self._apply(values, move=False)
@@ -430,7 +441,7 @@ class Renderer:
 
         if not self.layered:
             return np.broadcast_to(shade(hits.sample), (self.height * self.width, self.bands)).reshape(
-                self.height, self.width, self.bands)
+                self.height, self.width, self.bands).astype(float)
         rim = self._joint_rim(hits)
         index = np.flatnonzero(rim)
         image = LedImage("", hits, rim, index, self._rim_samples(hits, index), None, None, hits.valid)
@@ -586,19 +597,13 @@ class Model:
 
     def lit(self, now: Mapping) -> dict[str, np.ndarray]:
         """The lights that are on and their powers per band (B,), or (N, 1, B) of readings."""
-        return {n: self.renderer.powers(now, n) for n in self.scene.lights if np.any(now[f"{n}.power"] != 0)}
+        return {n: self.renderer.powers(now, n) for n in self.renderer.lit(now)}
 
     # -- prediction ---------------------------------------------------------------------------------------------------
 
     def radiance(self, now: Mapping, seed: int = 0) -> np.ndarray:
         """(H, W, B): linear image of a frame."""
-        total = np.asarray(self.renderer.ambient(now), np.float64)
-        bounce = now[self.renderer.bounce_key]
-        for led, power in self.lit(now).items():
-            total = total + power * self.renderer.image(now, led)
-            if bounce:
-                total = total + power * bounce * self.renderer.bounced(now, led, seed)
-        return total
+        return self.renderer.radiance(now, seed)
 
     def untouched(self, now: Mapping) -> dict:
         """The same frame with the gel at rest."""
@@ -745,9 +750,7 @@ class Model:
         if key == self.renderer.bounce_key:
             return factor * sum(power * self.renderer.bounced(now, led, seed) for led, power in lit.items())
         if self.parameters[key].how == "layer":
-            stepped = {**now, key: now[key] + 1j * STEP}
-            total = self.renderer.ambient(stepped) + sum(power * self.renderer.image(stepped, n) for n, power in lit.items())
-            return factor * (np.imag(total) / STEP)
+            return factor * (np.imag(self.radiance({**now, key: now[key] + 1j * STEP}, seed)) / STEP)
         if self._is_power(key):
             if np.all(factor == 0):
                 return None

@@ -36,6 +36,7 @@ from functools import lru_cache
 import numpy as np
 
 from optics.gel.contact import LocalMap, local_axis, surface, window
+from optics.layers import Texture
 
 REACH = 10.0  # depths by which maps are wider than the dent on each side: what is cut off there is 1e-4 of the largest
 NODES = 8  # per depth: exp(-kh) leaves little that is finer; a cubic spline errs by 1e-4 of the largest at most
@@ -159,27 +160,16 @@ class SkinStress:
     def __init__(self, gel, h1: float, h2: float):
         self.press = gel.number("press_x"), gel.number("press_y")
         self.maps = _stress(gel.map, h1, h2) if gel.map.values.any() else None
-        self.texture = None
+        self.texture = None if self.maps is None else Texture(np.stack([m.values for m in self.maps], -1))
 
     def __call__(self, x, y, size):
         if self.maps is None:
             return 0.0 * x, 0.0 * x
-        if not isinstance(x, np.ndarray):
-            return self._sampled(x, y)
-        q, u = (surface(np.real(x).ravel(), -np.real(y).ravel(), *self.press, m).reshape(x.shape) for m in self.maps)
-        return q, -u
-
-    def _sampled(self, x, y):
-        """The same from a texture, linear between the maps' nodes (Dr.Jit)."""
-        import drjit as dr
-        import mitsuba as mi
-
-        n, pitch = len(self.maps[0].values), self.maps[0].pitch
-        if self.texture is None:
-            values = np.stack([m.values for m in self.maps], -1).astype(np.float32)
-            self.texture = mi.Texture2f(mi.TensorXf(values), wrap_mode=dr.WrapMode.Clamp)
-        at = mi.Point2f((x - self.press[0]) / (n * pitch) + 0.5, (-y - self.press[1]) / (n * pitch) + 0.5)
-        q, u = self.texture.eval(at)
+        if isinstance(x, np.ndarray):
+            q, u = (surface(x.ravel(), -y.ravel(), *self.press, m).reshape(x.shape) for m in self.maps)
+        else:  # linear between the maps' nodes
+            width = len(self.maps[0].values) * self.maps[0].pitch
+            q, u = self.texture((x - self.press[0]) / width + 0.5, (-y - self.press[1]) / width + 0.5)
         return q, -u
 
 

@@ -964,10 +964,14 @@ def by_hand(finger, values, where, wavelength=540.0):
     return follow(plates, values, wavelength, finger.d[where], finger.vertical, o)[0][:, 0, 0]
 
 
+def lit_by(finger, lights):
+    return {**finger.values, **{f"{n}.power": 0.0 for n in finger.scene.lights if n not in lights}}
+
+
 def test_the_room_behind_the_finger_fades_by_malus(finger):
     """Near the axis cos^2 + T_crossed/T_parallel sin^2; everywhere what oblique films and refracting faces make of it."""
     wall, values = finger.on["wall"], finger.values
-    image = {a: finger.renderer.stokes({**values, "analyzer.angle": a}, ROOM)[0, wall, 1] for a in (0.0, 30.0, 60.0, 90.0)}
+    image = {a: finger.renderer.stokes({**lit_by(finger, ROOM), "analyzer.angle": a})[0, wall, 1] for a in (0.0, 30.0, 60.0, 90.0)}
     near = (np.degrees(np.arccos(finger.d[..., 2])) < 6)[wall]
     assert near.sum() >= 4 and len(near) > 100
     t1, t2 = values["film.transmittance"], values["film.leak"]
@@ -980,15 +984,39 @@ def test_the_room_behind_the_finger_fades_by_malus(finger):
         assert off(found / image[0.0], expected, 1.0) < GEOMETRY
 
 
+@JUST_MONO
+def test_stokes_vectors_of_many_readings_are_those_of_each(variant, tmp_path):
+    scene, renderer = loaded("polarizer_bench", variant, bands="540")
+    dial, power = np.array([0.0, 20.0, 75.0]), np.array([1.0, 0.5, 2.0])
+    values = {**scene.values(), "sample.retard_0": 60.0, "sample.angle": 30.0}
+    found = renderer.stokes({**values, "analyzer.angle": dial[:, None, None], "source.power": power[:, None, None]})
+    each = [renderer.stokes({**values, "analyzer.angle": a, "source.power": p})[:, 0] for a, p in zip(dial, power)]
+    np.testing.assert_allclose(found, np.stack(each, 1), rtol=0, atol=1e-15)
+
+
+def test_light_that_is_reflected_twice_has_its_derivative_by_a_layer(finger):
+    """Of the share of two reflections alone: the derivative with it less the one without."""
+    key, step = "film.angle", 1e-4
+    values = {**finger.values, "analyzer.angle": 30.0, finger.renderer.bounce_key: 1.0}
+
+    def twice(angle):
+        now = {**values, key: angle}
+        return finger.renderer.radiance(now) - finger.renderer.radiance({**now, finger.renderer.bounce_key: 0.0})
+
+    found, expected = np.imag(twice(20.0 + 1e-30j)) / 1e-30, (twice(20.0 + step) - twice(20.0 - step)) / (2 * step)
+    assert np.abs(expected).max() > 1e-3 * np.abs(twice(20.0)).max()
+    assert off(found, expected, np.abs(expected).max()) < 1e-6
+
+
 def test_markers_shine_at_every_angle_of_the_analyser_and_polarized_by_it(finger):
     """Unpolarized light: (T1 + T2)/2 of it passes whatever the angle, as S = (1, P cos 2a, P sin 2a, 0) along the seen axis a."""
-    markers, values = finger.on["markers"], finger.values
+    markers, values, uv = finger.on["markers"], finger.values, lit_by(finger, ("uv_left", "uv_right"))
     assert markers.sum() > 10
     t1, t2 = values["analyzer.transmittance"], values["analyzer.leak"]
-    bare = finger.renderer.stokes({**values, "analyzer.inserted": 0.0}, ("uv_left", "uv_right"))[:, markers, 1]
+    bare = finger.renderer.stokes({**uv, "analyzer.inserted": 0.0})[:, markers, 1]
     assert np.abs(bare[1:]).max() == 0 and bare[0].min() > 0
     for angle in (0.0, 37.0, 90.0):
-        found = finger.renderer.stokes({**values, "analyzer.angle": angle}, ("uv_left", "uv_right"))[:, markers, 1]
+        found = finger.renderer.stokes({**uv, "analyzer.angle": angle})[:, markers, 1]
         d = finger.d[markers]
         molecules = np.array([-np.sin(np.radians(angle)), -np.cos(np.radians(angle)), 0])
         axis = azimuth(np.cross(-d, molecules), -d, unit(np.cross(finger.vertical, d)))

@@ -8,6 +8,7 @@ import pytest
 from optics import scene as scenes
 from optics.effect import registry
 from optics.errors import BadScene, UnknownKey
+from optics.layers import PatternImage
 from optics.render import Renderer
 
 CAMERA = {"width": "24", "height": "24", "x_fov": "6", "analyzer": "90"}
@@ -34,6 +35,33 @@ def test_a_pattern_from_a_file_is_the_formula_that_it_was_made_from(tmp_path):
     assert want.max() > 0.1  # fringes
     # linear between pixels of 0.05 mm, a fiftieth of the narrowest fringe away from the loads
     assert np.median(np.abs(got - want)) < 1e-4 and np.abs(got - want)[6:18].max() < 5e-3
+
+
+def test_a_pattern_from_a_file_is_one_function_in_both_arithmetics(mitsuba, tmp_path):
+    rng = np.random.default_rng(3)
+    np.save(tmp_path / "p.npy", rng.normal(size=(7, 5, 2)))
+    pattern = PatternImage(tmp_path / "p.npy")
+    x, y = rng.uniform(-6, 6, (2, 4000, 1))
+    exact = pattern(x, y, 10.0)
+    found = pattern(mitsuba.Float(x.ravel().astype(np.float32)), mitsuba.Float(y.ravel().astype(np.float32)), 10.0)
+    clear = (np.abs(np.abs(x) - 5) > 1e-4) & (np.abs(np.abs(y) - 5) > 1e-4)  # not on the border, where rounding decides
+    for e, f in zip(exact, found):
+        np.testing.assert_allclose(np.array(f)[clear.ravel()], e[clear], rtol=0, atol=2e-5)  # float32 of coordinates up to 7
+        assert (e[(np.abs(x) > 5) | (np.abs(y) > 5)] == 0).all() and np.ptp(e) > 2
+
+
+def test_a_pattern_from_a_file_has_its_derivatives(tmp_path):
+    n = 40
+    x, y = np.meshgrid((np.arange(n) + 0.5) / n * 24 - 12, 12 - (np.arange(n) + 0.5) / n * 24)
+    np.save(tmp_path / "p.npy", np.stack([np.cos(0.3 * x + 0.2 * y), np.sin(0.4 * y - 0.1 * x)], -1))
+    scene = bench(tmp_path, pattern="p.npy")
+    renderer, _ = picture(scene)
+    base = {**scene.values(), "sample.angle": 20.0, "sample.stress": 3.0, "sample.stress_size": 24.0}
+    for key, step in (("sample.angle", 1e-5), ("sample.stress_size", 1e-5)):  # so small that no ray changes its cell
+        found = renderer.image({**base, key: base[key] + 1e-30j}, "source").imag / 1e-30
+        high, low = (renderer.image({**base, key: base[key] + d}, "source") for d in (step, -step))
+        np.testing.assert_allclose(found, (high - low) / (2 * step), rtol=0, atol=1e-6 * np.abs(found).max())
+        assert np.abs(found).max() > 1e-3
 
 
 def test_a_pattern_that_is_changed_changes_the_picture(tmp_path):
