@@ -352,6 +352,12 @@ class Declared:
         if _created is not None:
             _created.append(self)
 
+    def traverse(self, cb) -> None:
+        self.put_parameters(cb)
+
+    def parameters_changed(self, keys=()) -> None:
+        self.reread(keys)
+
     def put_parameters(self, cb) -> None:
         import mitsuba as mi
 

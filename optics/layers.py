@@ -15,7 +15,8 @@ import math
 from collections.abc import Callable, Mapping
 from types import SimpleNamespace
 
-from optics.effect import Declared, Part, registry
+from optics.bsdf import passing
+from optics.effect import Part, registry
 from optics.mueller import Mueller, cos, real, sin, sqrt, where
 
 MONO = 540.0  # nm: the wavelength of variants that know none
@@ -211,23 +212,11 @@ def bsdf(kind: str, own: Callable) -> type:
     import drjit as dr
     import mitsuba as mi
 
-    class Layer(Declared.on(mi.BSDF)):
+    class Layer(passing(mi.BSDFFlags.Null)):
         carrier = None  # the stretching shape that it lies on, if it does
 
         def extent(self):
             return None if self.carrier is None else (self.carrier.number("width"), self.carrier.number("length"))
-
-        def __init__(self, props):
-            mi.BSDF.__init__(self, props)
-            self.declare(props)
-            self.m_components = [mi.BSDFFlags.Null | mi.BSDFFlags.FrontSide | mi.BSDFFlags.BackSide]
-            self.m_flags = self.m_components[0]
-
-        def traverse(self, cb):
-            self.put_parameters(cb)
-
-        def parameters_changed(self, keys=()):
-            self.reread(keys)
 
         def matrix(self, si):
             """What light that leaves towards si.wi went through, in Mitsuba's implicit axes."""
@@ -242,28 +231,10 @@ def bsdf(kind: str, own: Callable) -> type:
             return dr.select(active, value, 0.0)
 
         def sample(self, ctx, si, sample1, sample2, active=True):
-            bs = dr.zeros(mi.BSDFSample3f)
-            bs.wo = -si.wi
-            bs.pdf = mi.Float(1.0)
-            bs.eta = mi.Float(1.0)
-            bs.sampled_type = mi.UInt32(+mi.BSDFFlags.Null)
-            bs.sampled_component = mi.UInt32(0)
-            return bs, self.weight(si, active)
-
-        def eval(self, ctx, si, wo, active=True):
-            return mi.Spectrum(0.0)
-
-        def pdf(self, ctx, si, wo, active=True):
-            return mi.Float(0.0)
-
-        def eval_pdf(self, ctx, si, wo, active=True):
-            return mi.Spectrum(0.0), mi.Float(0.0)
+            return self.passed(-si.wi, 1.0, mi.BSDFFlags.Null), self.weight(si, active)
 
         def eval_null_transmission(self, si, active=True):
             return self.weight(si, active)
-
-        def to_string(self):
-            return f"Layer[{self.kind}, {self.name}]"
 
     Layer.kind = kind
     return Layer

@@ -18,7 +18,8 @@ References
 
 import math
 
-from optics.effect import Declared, Part
+from optics.bsdf import matt
+from optics.effect import Part
 from optics.parameter import Parameter
 
 PARAMETERS = (
@@ -38,20 +39,8 @@ def build():
     import drjit as dr
     import mitsuba as mi
 
-    class Fluorescent(Declared.on(mi.BSDF)):
+    class Fluorescent(matt()):
         kind = "fluorescent"
-
-        def __init__(self, props):
-            mi.BSDF.__init__(self, props)
-            self.declare(props)
-            self.m_components = [mi.BSDFFlags.DiffuseReflection | mi.BSDFFlags.FrontSide]
-            self.m_flags = self.m_components[0]
-
-        def traverse(self, cb):
-            self.put_parameters(cb)
-
-        def parameters_changed(self, keys=()):
-            self.reread(keys)
 
         def fluorescence(self, si, led, to_led, distance):
             """Radiance per nm that light of an LED excites, for a unit vector to it and its distance."""
@@ -68,34 +57,8 @@ def build():
             seen = mi.Frame3f.cos_theta(si.wi) > 0
             return dr.select(seen, getattr(self, "yield") * absorbed * photons / (bands * math.pi), 0.0)
 
-        def albedo(self):
-            rho = (self.rho_r, self.rho_g, self.rho_b, mi.Float(1.0))
-            return mi.UnpolarizedSpectrum(*rho[:dr.size_v(mi.UnpolarizedSpectrum)])
-
-        def sample(self, ctx, si, sample1, sample2, active=True):
-            bs = dr.zeros(mi.BSDFSample3f)
-            bs.wo = mi.warp.square_to_cosine_hemisphere(sample2)
-            bs.pdf = mi.warp.square_to_cosine_hemisphere_pdf(bs.wo)
-            bs.eta = mi.Float(1.0)
-            bs.sampled_type = mi.UInt32(+mi.BSDFFlags.DiffuseReflection)
-            bs.sampled_component = mi.UInt32(0)
-            weight = mi.mueller.depolarizer(self.albedo()) if mi.is_polarized else mi.Spectrum(self.albedo())
-            return bs, dr.select(active & (mi.Frame3f.cos_theta(si.wi) > 0) & (bs.pdf > 0), weight, mi.Spectrum(0.0))
-
-        def eval(self, ctx, si, wo, active=True):
-            cos_v, cos_l = mi.Frame3f.cos_theta(si.wi), mi.Frame3f.cos_theta(wo)
-            value = dr.select(active & (cos_v > 0) & (cos_l > 0), self.albedo() * (cos_l * dr.inv_pi), 0.0)
-            return mi.mueller.depolarizer(value) if mi.is_polarized else mi.Spectrum(value)
-
-        def pdf(self, ctx, si, wo, active=True):
-            lit = active & (mi.Frame3f.cos_theta(si.wi) > 0) & (mi.Frame3f.cos_theta(wo) > 0)
-            return dr.select(lit, mi.warp.square_to_cosine_hemisphere_pdf(wo), 0.0)
-
-        def eval_pdf(self, ctx, si, wo, active=True):
-            return self.eval(ctx, si, wo, active), self.pdf(ctx, si, wo, active)
-
-        def to_string(self):
-            return f"Fluorescent[{self.name}]"
+        def brdf(self, si, wo, active=True):
+            return self.rho() * dr.inv_pi
 
     return Fluorescent
 

@@ -15,7 +15,8 @@ References
     Born & Wolf, Principles of Optics, 1.5.2 (Fresnel's formulae).
 """
 
-from optics.effect import Declared, Part
+from optics.bsdf import passing
+from optics.effect import Part
 from optics.parameter import Parameter
 
 PARAMETERS = (
@@ -28,21 +29,8 @@ def build():
     import drjit as dr
     import mitsuba as mi
 
-    class Interface(Declared.on(mi.BSDF)):
+    class Interface(passing(mi.BSDFFlags.DeltaTransmission)):
         kind = "interface"
-
-        def __init__(self, props):
-            mi.BSDF.__init__(self, props)
-            self.declare(props)
-            flags = mi.BSDFFlags.DeltaTransmission | mi.BSDFFlags.FrontSide | mi.BSDFFlags.BackSide
-            self.m_components = [flags]
-            self.m_flags = flags
-
-        def traverse(self, cb):
-            self.put_parameters(cb)
-
-        def parameters_changed(self, keys=()):
-            self.reread(keys)
 
         def refract(self, wi):
             """Direction beyond the interface, transmittances T_s and T_p, relative index met; for a local direction wi."""
@@ -58,13 +46,8 @@ def build():
 
         def sample(self, ctx, si, sample1, sample2, active=True):
             wo, t_s, t_p, n = self.refract(si.wi)
-            bs = dr.zeros(mi.BSDFSample3f)
-            bs.wo = wo
-            bs.pdf = mi.Float(1.0)
-            bs.eta = n
             # also Null: passing a window is no scattering event and takes nothing of an integrator's depth
-            bs.sampled_type = mi.UInt32(mi.BSDFFlags.DeltaTransmission | mi.BSDFFlags.Null)
-            bs.sampled_component = mi.UInt32(0)
+            bs = self.passed(wo, n, mi.BSDFFlags.DeltaTransmission | mi.BSDFFlags.Null)
             scale = 1 / dr.square(n)
             if mi.is_polarized:
                 a, b, c = (t_s + t_p) / 2, (t_s - t_p) / 2, dr.sqrt(t_s * t_p)
@@ -80,22 +63,10 @@ def build():
                 weight = mi.Spectrum((t_s + t_p) / 2 * scale)
             return bs, weight & active
 
-        def eval(self, ctx, si, wo, active=True):
-            return mi.Spectrum(0.0)
-
-        def pdf(self, ctx, si, wo, active=True):
-            return mi.Float(0.0)
-
-        def eval_pdf(self, ctx, si, wo, active=True):
-            return mi.Spectrum(0.0), mi.Float(0.0)
-
         def eval_null_transmission(self, si, active=True):
             _, t_s, t_p, _ = self.refract(si.wi)
             mean = mi.UnpolarizedSpectrum((t_s + t_p) / 2)
             return mi.mueller.absorber(mean) if mi.is_polarized else mi.Spectrum(mean)
-
-        def to_string(self):
-            return f"Interface[{self.name}]"
 
     return Interface
 

@@ -74,12 +74,6 @@ def build():
             self.m_flags = +mi.EmitterFlags.DeltaPosition
             self.m_needs_sample_3 = False
 
-        def traverse(self, cb):
-            self.put_parameters(cb)
-
-        def parameters_changed(self, keys=()):
-            self.reread(keys)
-
         def position(self):
             return mi.Point3f(self.x, self.y, self.z)
 

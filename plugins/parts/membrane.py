@@ -16,7 +16,8 @@ References
     F-TAC Hand supplementary information, S1.4, eq. (S3); Oren & Nayar, IJCV 14, 227 (1995).
 """
 
-from optics.effect import Declared, Part
+from optics.bsdf import matt
+from optics.effect import Part
 from optics.parameter import Parameter
 
 PARAMETERS = (
@@ -32,29 +33,20 @@ def build():
     import drjit as dr
     import mitsuba as mi
 
-    class Membrane(Declared.on(mi.BSDF)):
+    class Membrane(matt()):
         kind = "membrane"
 
         def __init__(self, props):
-            mi.BSDF.__init__(self, props)
+            super().__init__(props)
             self.reflectance = props.get_texture("reflectance", 1.0)
-            self.declare(props)
-            flags = mi.BSDFFlags.DiffuseReflection | mi.BSDFFlags.FrontSide
-            self.m_components = [flags]
-            self.m_flags = flags
 
         def traverse(self, cb):
             self.put_parameters(cb)
             cb.put("reflectance", self.reflectance, mi.ParamFlags.Differentiable)
 
-        def parameters_changed(self, keys=()):
-            self.reread(keys)
-
         def albedo(self, si, active=True):
             """rho_c times the texture, per band."""
-            rho = (self.rho_r, self.rho_g, self.rho_b, mi.Float(1.0))
-            bands = mi.UnpolarizedSpectrum(*rho[:dr.size_v(mi.UnpolarizedSpectrum)])
-            return bands * self.reflectance.eval(si, active)
+            return self.rho() * self.reflectance.eval(si, active)
 
         def brdf(self, si, wo, active=True):
             """f(wi, wo) per band, 1/sr, without the cosine."""
@@ -76,36 +68,6 @@ def build():
             for function in self.functions("ambient"):
                 value += function(Geometry(si, si.wi, mi.Frame3f.cos_theta(si.wi), None, self.albedo(si)), self)
             return value
-
-        # -- Mitsuba ------------------------------------------------------------------------------------------------
-
-        def sample(self, ctx, si, sample1, sample2, active=True):
-            bs = dr.zeros(mi.BSDFSample3f)
-            bs.wo = mi.warp.square_to_cosine_hemisphere(sample2)
-            bs.pdf = mi.warp.square_to_cosine_hemisphere_pdf(bs.wo)
-            bs.eta = mi.Float(1.0)
-            bs.sampled_type = mi.UInt32(+mi.BSDFFlags.DiffuseReflection)
-            bs.sampled_component = mi.UInt32(0)
-            weight = self.brdf(si, bs.wo, active) * dr.pi
-            weight = mi.mueller.depolarizer(weight) if mi.is_polarized else mi.Spectrum(weight)
-            lit = active & (mi.Frame3f.cos_theta(si.wi) > 0) & (bs.pdf > 0)
-            return bs, dr.select(lit, weight, mi.Spectrum(0.0))
-
-        def eval(self, ctx, si, wo, active=True):
-            cos_v, cos_l = mi.Frame3f.cos_theta(si.wi), mi.Frame3f.cos_theta(wo)
-            lit = active & (cos_v > 0) & (cos_l > 0)
-            value = dr.select(lit, self.brdf(si, wo, active) * cos_l, 0.0)
-            return mi.mueller.depolarizer(value) if mi.is_polarized else mi.Spectrum(value)
-
-        def pdf(self, ctx, si, wo, active=True):
-            lit = active & (mi.Frame3f.cos_theta(si.wi) > 0) & (mi.Frame3f.cos_theta(wo) > 0)
-            return dr.select(lit, mi.warp.square_to_cosine_hemisphere_pdf(wo), 0.0)
-
-        def eval_pdf(self, ctx, si, wo, active=True):
-            return self.eval(ctx, si, wo, active), self.pdf(ctx, si, wo, active)
-
-        def to_string(self):
-            return f"Membrane[{self.name}]"
 
     return Membrane
 

@@ -86,12 +86,6 @@ def build():
                                  f.GlossyTransmission | f.DeltaTransmission | f.Null | f.NonSymmetric | sides]
             self.m_flags = self.m_components[0] | self.m_components[1]
 
-        def traverse(self, cb):
-            self.put_parameters(cb)
-
-        def parameters_changed(self, keys=()):
-            self.reread(keys)
-
         def facets(self):
             name = {"beckmann": "Beckmann", "ggx": "GGX"}[self.distribution]
             return mi.MicrofacetDistribution(getattr(mi.MicrofacetType, name), self.alpha)

@@ -59,12 +59,6 @@ def build():
             self.m_flags = +mi.EmitterFlags.Surface
             self.m_needs_sample_3 = True
 
-        def traverse(self, cb):
-            self.put_parameters(cb)
-
-        def parameters_changed(self, keys=()):
-            self.reread(keys)
-
         def colour(self):
             shares = (self.power_r, self.power_g, self.power_b, mi.Float(1.0))
             return self.power * mi.UnpolarizedSpectrum(*shares[:dr.size_v(mi.UnpolarizedSpectrum)])

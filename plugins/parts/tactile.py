@@ -65,9 +65,6 @@ def build():
             self.gel_of = {}
             self.glowing_of = {}
 
-        def traverse(self, cb):
-            self.put_parameters(cb)
-
         def render_forward(self, *given, **more):
             with dr.scoped_set_flag(dr.JitFlag.SymbolicLoops, False):  # recorded loops cannot be differentiated
                 return super().render_forward(*given, **more)
