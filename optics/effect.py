@@ -13,6 +13,8 @@ Where an effect enters, in the order that light takes (`STAGES`):
     volume      gel       L  = f(path, gel)           radiance added by the gel itself, per LED; Dr.Jit
     ambient     membrane  L  = f(geometry, membrane)  radiance added that no LED made; Dr.Jit
     glow        interface L  = f(glow, interface)     (B,) radiance that a boundary sends to the camera, per light; numpy
+    index       clear     n  = f(n, wavelengths, clear)       refractive index per band; Dr.Jit
+    absorption  clear     a  = f(a, wavelengths, clear)       absorption coefficient per band, 1/mm; Dr.Jit
     layer       a layer   M  = f(crossing, layer)     Mueller matrix that light passes after the layer's own (optics.layers)
     lens        camera    I  = f(image, camera)       irradiance per band, (H, W, B); numpy
     sensor      camera    I  = f(image, camera)       signal per channel, (H, W, C), 1 = full scale; numpy
@@ -38,7 +40,8 @@ from optics.parameter import Parameter
 
 STAGES = {
     "surface": "gel", "emission": "led", "segment": "gel", "reflection": "membrane", "volume": "gel",
-    "ambient": "membrane", "glow": "interface", "layer": "", "lens": "camera", "sensor": "camera", "response": "camera",
+    "ambient": "membrane", "glow": "interface", "index": "clear", "absorption": "clear", "layer": "", "lens": "camera",
+    "sensor": "camera", "response": "camera",
 }
 IMAGE_STAGES = ("lens", "sensor", "response")
 CATEGORIES = ("bsdf", "emitter", "sensor", "shape", "integrator")

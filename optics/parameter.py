@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 
 from optics.errors import OutOfBounds, UnknownKey
 
-HOW = ("ad", "difference", "image", "layer")
+HOW = ("ad", "difference", "image", "layer", "path")
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,8 @@ class Parameter:
                 moves changes a rim's pixel by jumps of one sample
     how         how its derivative image is made: 'ad' (forward mode through the render), 'difference' (central, common
                 random numbers: it moves shadows or geometry), 'image' (arithmetic on the linear images), 'layer' (complex step
-                through the Mueller matrices of the layers and the Stokes vectors of sources)
+                through the Mueller matrices of the layers and the Stokes vectors of sources), 'path' (by the lengths of the ways
+                that light took through clear bodies)
     squared     True where the image depends on the square of it (a roughness): a fit steps in the square, whose onset is
                 linear, and stays above a thousandth of `plausible`
     saturates   of a squared parameter s: the value v beyond which its effect levels off; a fit steps in s^2/(1 + s^2/v^2)

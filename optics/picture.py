@@ -28,6 +28,7 @@ from pathlib import Path
 import numpy as np
 
 from optics import exr, paths
+from optics.by_chance import renderer_of
 from optics.develop import Developer
 from optics.effect import is_part, registry
 from optics.errors import BadScene, OutputExists
@@ -77,7 +78,7 @@ class Pictures:
     black, saturation   DN, of the camera
     spp                 samples per pixel: render by Monte Carlo, even where LED by LED is possible
     stokes              S1 to S3 in every scene; without it, where there are layers or the integrator has `stokes`
-    method              "LED by LED", or why the scene goes through `mi.render`
+    method              "LED by LED", "from lights and camera" (clear bodies), or why the scene goes through `mi.render`
     """
 
     def __init__(self, scene: Scene, *, spp: int | None = None, black: float = 0.0, saturation: float = 255.0,
@@ -99,12 +100,12 @@ class Pictures:
         reason = "samples per pixel were asked for" if spp is not None else obstacle(scene)
         if not reason and stokes and not paths.layered(scene):
             reason = "Stokes vectors were asked for of a scene without layers"
-        self.renderer = None if reason else Renderer(scene, remember=2)
+        self.renderer = None if reason else renderer_of(scene, remember=2)
         if self.renderer is not None and self.renderer.layered:
             reason = veiled(self.renderer, self.base)
             self.renderer = None if reason else self.renderer
         self.stokes = stokes or paths.layered(scene) or (scene.integrator is not None and scene.integrator.stokes)
-        self.method = f"Monte Carlo: {reason}" if reason else "LED by LED"
+        self.method = f"Monte Carlo: {reason}" if reason else "from lights and camera" if self.renderer.by_chance else "LED by LED"
         self.developer = None
         if scene.camera is not None and scene.integrator is not None:
             self.bands = scene.integrator.bands
@@ -276,7 +277,7 @@ def obstacle(scene: Scene) -> str:
         if shape.is_medium_transition():
             return "it has a medium"
         kind = getattr(bsdf, "kind", "")
-        if kind == "interface" or kind and registry().parts[kind].mueller is not None:
+        if kind in ("interface", "clear") or kind and registry().parts[kind].mueller is not None:
             continue
         if mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta | mi.BSDFFlags.Null):
             return "it has mirrors or clear surfaces that are no 'interface'"

@@ -38,6 +38,8 @@ BOUNCE_CELL = 2  # px each way of a cell
 class Renderer:
     """Linear images of a scene, one LED at a time, with a memory for what was rendered before."""
 
+    by_chance = False  # whether pictures are Monte Carlo estimates
+
     def __init__(self, scene: Scene, remember: int = 24):
         if scene.camera is None or scene.integrator is None:
             raise BadScene(f"{scene.path}: a prediction needs a part of the type 'camera' and the integrator 'tactile'")
@@ -510,6 +512,8 @@ class Model:
     def __init__(self, scene: Scene, captures: Captures, noise: Noise | None = None,
                  flat_field: bool | str | None = True):
         noise = noise or captures.noise
+        from optics.by_chance import renderer_of
+
         if noise is None:
             raise BadScene(f"{captures.folder}: no noise model; give [noise] in captures.toml or repeats to estimate it from")
         if captures.table is not None:
@@ -521,7 +525,7 @@ class Model:
             self.mosaic = cfa_channel(captures.frames[0].image.shape, captures.cfa)[..., None] == np.arange(3)
             self.frames = [replace(f, image=np.repeat(f.image, 3, axis=2)) for f in captures.frames]
             background = None if background is None else np.repeat(background, 3, axis=2)
-        self.renderer = Renderer(scene)
+        self.renderer = renderer_of(scene)
         self._edges_kept: dict[int, np.ndarray] = {}
         self.parameters: dict[str, Parameter] = scene.parameters
         self.base = {**scene.values(), **scene.check(captures.parameters, f"{captures.folder}/captures.toml [parameters]")}
@@ -765,6 +769,8 @@ class Model:
             return factor * (image + bounce * self.renderer.bounced(now, name, seed) if bounce else image)
         if kind == "led" and name not in lit:
             return None
+        if self.renderer.by_chance:
+            return factor * self.renderer.tangent(now, key, seed)
         if key in self.renderer.ambient_keys:
             return factor * self._difference_ambient(now, key)
         if self.parameters[key].how == "difference" and kind != "led":

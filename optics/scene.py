@@ -62,7 +62,7 @@ class Scene:
     camera, integrator, gel, leds, membranes    the parts by role (None or empty where the scene has none)
     """
 
-    MOVED = ("carried", "markers", "target")  # kinds of shapes besides the gel whose parameters move geometry
+    MOVED = ("carried", "markers", "target", "cells")  # kinds of shapes besides the gel whose parameters move geometry
 
     def __init__(self, path: Path, defines: Mapping[str, str], variant: str = DEFAULT_VARIANT):
         self.path, self.defines, self.variant = Path(path), dict(defines), variant
@@ -90,6 +90,7 @@ class Scene:
                 raise BadScene(f"{self.path}: two parts have the id '{name}'; give every part its own id=\"...\"")
             part.name = name
             self.parts[name] = part
+        self._nest()
         self.camera = self._one("camera")
         self.integrator = self._one("tactile")
         self.gel = self._one("gel")
@@ -123,6 +124,15 @@ class Scene:
                 if re.search(rf"\b{name}(\[| BSDF)", str(shape.bsdf())):
                     warnings.warn(f"{self.path}: the material '{name}' of the shape '{shape.id()}' takes all polarization out of the "
                                   f"light that it lets through or reflects, whatever the physics; {advice}", stacklevel=2)
+
+    def _nest(self) -> None:
+        """Tell each clear body which clear material is around it."""
+        clear = {n: p for n, p in self.parts.items() if p.kind == "clear"}
+        for name, part in clear.items():
+            if part.outside and part.outside not in clear:
+                raise BadScene(f"{self.path}: '{name}': outside = '{part.outside}'; allowed: the id of a clear material ("
+                               f"{', '.join(n for n in clear if n != name) or 'there is no other'}), or nothing for air")
+            part.around = clear.get(part.outside)
 
     def _one(self, kind: str):
         found = [p for p in self.parts.values() if p.kind == kind]

@@ -186,7 +186,8 @@ class FingerMaker:
                                                    "color0": {"type": "uniform", "value": float(self.wall_dark)},
                                                    "color1": {"type": "uniform", "value": 1.0}}}
         scene = {
-            "type": "scene", "integrator": {"type": "path", "max_depth": 8 if what in ("object", "wall") else 4},
+            "type": "scene", # `path` counts films as scattering: from the fifth surface on it would draw rays by lot
+            "integrator": {"type": "path", "max_depth": 8 if what in ("object", "wall") else 4, "rr_depth": 100},
             "sensor": {"type": "perspective", "fov": float(self.values["camera.x_fov"]), "fov_axis": "x", "near_clip": 0.01,
                        "far_clip": 1e4, "to_world": looking, "film": {
                            "type": "hdrfilm", "width": width, "height": height, "rfilter": {"type": "box"},
@@ -211,6 +212,7 @@ class FingerMaker:
             size = [15, y, 1] if axis == "x" else [x, 15, 1]
             scene[f"body_{name}"] = {"type": "rectangle", "to_world": t().translate(place) @ turn @ t().scale(size), "bsdf": black}
         lights = ("uv_left", "uv_right") if what == "markers" else ("room_left", "room_right")
+        lights = [n for n in lights if self.values[f"{n}.power"] > 0]  # `path` would draw a dark one as often as a bright one
         scene.update({name: self.led(name) for name in lights})
         self.count += 1
         image = np.array(mi.render(mi.load_dict(scene), seed=(self.seed * 7919 + self.count) % 2**31))

@@ -55,6 +55,7 @@ def build():
             self.stokes = props.get("stokes", False)
             self.max_depth = props.get("max_depth", 2)  # edges of a path between surfaces: 2 is direct light
             self.max_null = props.get("max_null", 8)
+            self.rays, self.packets = props.get("rays", 64), props.get("packets", 100_000)  # of optics.transport
             text = str(props.get("bands", ""))
             self.bands = tuple(float(w) for w in text.replace(",", " ").split())
             self.lanes = dr.size_v(mi.UnpolarizedSpectrum)

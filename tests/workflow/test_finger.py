@@ -20,29 +20,36 @@ FREE = ["object_paint.rho_*", "wall_paint.rho_*", "pigment.yield"]
 # case: (what is hidden, look-alikes, {variable: true value})
 HIDDEN = {
     "extinction leak": ({"extinction leak": 0.012}, ("depolarization",), {"polarizer_film.leak": 0.012}),
-    "coloured leak": ({"coloured leak": 0.5}, (), {}),  # an exponential in the pictures, a straight line in the model
+    "coloured leak": ({"coloured leak": 0.3}, (), {}),  # an exponential in the pictures, a straight line in the model
     "depolarization": ({"depolarization": 0.02}, ("extinction leak",), {"silicone.depolarization": 0.02}),
     "polarizer misalignment": ({"polarizer misalignment": 2.0}, (), {}),
     "servo scale": ({"servo scale": 1.02}, ("polarizer misalignment",), {}),
     "servo backlash": ({"servo backlash": 2.0}, (), {"polarizer_film.backlash": 2.0}),
-    "analyzer wobble": ({"analyzer wobble": 0.02}, (), {"analyzer.wobble_c": 0.02}),
+    # five angles: a gain per angle does what a wobble does
+    "analyzer wobble": ({"analyzer wobble": 0.02}, ("gain drift",), {"analyzer.wobble_c": 0.02}),
     "oblique leak": ({"oblique leak": 0.02}, (), {"polarizer_film.leak_oblique": 0.02}),
     "stray light": ({"stray light": 0.002}, ("dark offset", "ambient light"), {"camera.stray": 0.002}),
     "dark offset": ({"dark offset": 2.0}, ("stray light", "ambient light"), {"camera.offset": 2.0}),
     "camera gamma": ({"camera gamma": 0.05}, (), {"camera.gamma": 0.05}),
-    "retardance": ({"retardance": 15.0}, (), {}),
+    "retardance": ({"retardance": 15.0}, (), {}),  # on a narrow field: see NARROW
     "marker leak": ({"marker leak": 0.03}, (), {"inner_face.marker_leak": 0.03}),
     "gain drift": ({"gain drift": 0.02}, (), {}),
     "lens vignetting": ({"lens vignetting": 0.3}, (), {"camera.vignetting": 0.3}),
-    "two at once": ({"polarizer misalignment": 2.0, "camera gamma": 0.05}, (), {"camera.gamma": 0.05}),
+    "two at once": ({"polarizer misalignment": 2.0, "lens vignetting": 0.3}, (), {"camera.vignetting": 0.3}),
 }
 
 
-def study_of(folder, effects, seed=5):
-    scene = scenes.load("vi2tap", DEFINES)
-    maker = FingerMaker(scene, BUILT, effects, spp=144, seed=seed)
-    capture_files.write(maker.captures(SCENES, ANGLES), folder / "captures", bits=8)
-    setup = loop.Setup(captures=str(folder / "captures"), defines={"wall_dark": "1"}, free=FREE, per_group=[])
+# the stock retarder fades with the cosine of the incidence, where a plate's path grows: 15 degrees off the axis they differ by 5 %;
+# the near object then fills the picture, and one lamp lights it: to draw one of two would be noise above that of the photons
+# and the skin is left alone: so near, the two accounts of carried markers differ by more than the noise at their edges
+NARROW = {"retardance": {"x_fov": "30", "built": {"room_right.power": 0.0}, "views": [((0, 0, 0), d) for d in (30.0, 15.0, 45.0, 22.0)]}}
+
+
+def study_of(folder, effects, seed=5, built=None, views=SCENES, **defines):
+    scene = scenes.load("vi2tap", {**DEFINES, **defines})
+    maker = FingerMaker(scene, {**BUILT, **(built or {})}, effects, spp=144, seed=seed)
+    capture_files.write(maker.captures(views, ANGLES), folder / "captures", bits=8)
+    setup = loop.Setup(captures=str(folder / "captures"), defines={"wall_dark": "1", **defines}, free=FREE, per_group=[])
     return (setup, *loop.begin(setup, folder / "study"))
 
 
@@ -66,7 +73,7 @@ def test_the_maker_and_the_model_are_two_accounts_of_one_finger():
 @pytest.mark.parametrize("case", HIDDEN)
 def test_a_hidden_effect_is_found(case, tmp_path):
     hidden, alike, truth = HIDDEN[case]
-    setup, study, model, fit = study_of(tmp_path, hidden)
+    setup, study, model, fit = study_of(tmp_path, hidden, **NARROW.get(case, {}))
     diagnosis = loop.examine(study, model, setup, fit)
     first, known = next(iter(hidden)), {*hidden, *alike}
     if diagnosis.word == "AMBIGUOUS":

@@ -1,0 +1,510 @@
+"""Transport: light in clear bodies that reflect and refract it many times, from lights to the camera, by chance and by maps.
+
+In a printed grid a ray meets some hundred faces, and a pinhole camera never meets the small LEDs at the grid's sides. So light is
+followed from both ends to where it is scattered:
+
+    from the lights    packets of light fly through all faces, are absorbed along every stretch (exp(-alpha d)), scattered by the
+                       bodies and by matt surfaces, and leave what they are worth in two maps: the fluence in every cell of a
+                       grid, W/mm^2 times mm^3/mm^3 (track length by volume), and the irradiance on matt surfaces
+    from the camera    rays fly through all faces the same way; each ends on a matt surface, where it reads the irradiance, and
+                       gathers on its way what the bodies scatter towards it, sigma_s/(4 pi) of the fluence
+
+At every face the way is drawn by Fresnel's reflectance; absorption is weighed, never drawn, so that derivatives by absorption
+are exact: every contribution times the length of its way (d/d alpha exp(-alpha l) = -l exp(-alpha l)). Polarization is followed
+as the row (from the camera) or column (from a light) of the Mueller matrix of everything met so far, in axes that travel along.
+
+Without maps (`reach="paths"`) rays of the camera go on until they meet a luminous area: slower by orders of magnitude, without
+the maps' resolution. It is what the maps are tested against, beside stock Mitsuba.
+
+Source: Fan, Li, Cong & Zhang, MagicGripper, supplementary VII-A, eqs. (18)-(29); Veach, thesis (1997), 5.2, for radiance across
+a boundary (1/n^2) against power (1); Jensen, Realistic Image Synthesis Using Photon Mapping (2001), for maps of light.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from optics.errors import BadScene
+from optics.mueller import diattenuator, fresnel, fresnel_reflection, rotation
+
+DEPTH = 512  # faces that a ray may meet; printed grids need 256
+FAINT = 0.3  # below this share of its start, half of the packets go on with twice the weight
+BATCHES = 8  # independent parts of an image, maps and all, for its standard error
+AT_ONCE = 4_000_000  # rays that are followed together
+TEXELS = 64  # of an irradiance map, each way
+ASTRAY = 1e-3  # faces per ray that rounding may lead a ray past, at edges
+SPLIT = 2  # parts of a cell of the fluence map, each way
+AIR = "air"
+
+
+@dataclass(frozen=True)
+class Material:
+    """What a body is made of, per band: refractive index, absorption and scattering coefficients in 1/mm."""
+
+    name: str
+    index: np.ndarray
+    absorption: np.ndarray
+    scattering: np.ndarray
+
+
+@dataclass
+class Picture:
+    """Linear images of every light at power 1.
+
+    radiance   (L, H, W, B);   error   its standard error, from batches
+    slopes     material -> (L, H, W, B): derivative by its absorption coefficient, mm
+    lost       share of all rays and packets that were cut off after DEPTH faces
+    """
+
+    lights: list[str]
+    radiance: np.ndarray
+    error: np.ndarray
+    slopes: dict[str, np.ndarray]
+    lost: float
+
+
+class Transport:
+    """A scene of clear bodies, matt surfaces and lights, ready to be photographed at the scene's present values."""
+
+    def __init__(self, scene):
+        if scene.camera is None or scene.integrator is None:
+            raise BadScene(f"{scene.path}: a picture needs a part of the type 'camera' and the integrator 'tactile'")
+        if not scene.lights:
+            raise BadScene(f"{scene.path}: the scene has no light (an emitter of the type 'led' or 'source')")
+        self.scene = scene
+        self.bands = np.array(scene.integrator.bands or (540.0,))
+        self.lights = list(scene.lights)
+        self.width, self.height = scene.camera.resolution
+        self.materials = materials(scene, self.bands)
+        self.surfaces = [Surface(scene, shape, self.materials) for shape in scene.mitsuba.shapes()]
+        self.cells = [s.cells for s in self.surfaces if s.cells is not None]
+        matt, cells = 0, 0
+        for s in self.surfaces:
+            if s.cells is not None:
+                s.first, cells = cells, cells + len(s.cells.volumes)
+            elif s.matt:
+                s.first, matt = matt * TEXELS**2, matt + 1
+        self.voxels, self.texels = cells * SPLIT**3, matt * TEXELS**2
+
+    def take(self, rays: int = 64, packets: int = 400_000, seed: int = 0, slopes: bool = False, reach: str = "maps",
+             progress: Callable[[str, int, int], None] | None = None) -> Picture:
+        """The picture of every light.
+
+        rays     from the camera, per pixel;   packets   from each light, for the maps
+        slopes   also the derivative by each material's absorption
+        reach    "maps", or "paths": rays of the camera alone find the luminous areas (parts `source`)
+        """
+        if reach not in ("maps", "paths"):
+            raise ValueError(f"reach = {reach!r}; allowed: maps, paths")
+        if reach == "paths" and self.scene.leds:
+            raise BadScene(f"{self.scene.path}: rays of the camera never meet an LED, which is a point; allowed with reach = 'paths': "
+                           "luminous areas (emitters of the type 'source')")
+        # bands that go different ways are followed apart
+        same = all(np.ptp(m.index) == 0 for m in self.materials)
+        groups = [list(range(len(self.bands)))] if same else [[b] for b in range(len(self.bands))]
+        kinds = len(self.materials) if slopes else 1
+        images, followed, lost, astray = 0.0, 0, 0.0, 0.0
+        for group in groups:  # with the same random numbers: equal indices would give equal pictures
+            run = Run(self, group, kinds, seed, progress)
+            images = images + run.images(max(rays // BATCHES, 1), max(packets // BATCHES, 1), reach == "maps")
+            followed, lost, astray = followed + run.followed, lost + run.lost, astray + run.astray
+        if astray > ASTRAY * followed:
+            raise BadScene(f"{self.scene.path}: {astray / followed:.2g} times per ray a face of a clear body is met from a material that is not "
+                           "its neighbour: bodies overlap, a normal points inwards, or `outside` names the wrong material")
+        mean, error = images.mean(0), images.std(0, ddof=1) / np.sqrt(BATCHES)
+        return Picture(self.lights, mean[0], error[0], dict(zip([m.name for m in self.materials[1:]], mean[1:])), lost / followed)
+
+
+class Run:
+    """Packets and rays for bands that go the same way.
+
+    group      numbers of the bands;   kinds  1, or one more for each material: images and maps, then their derivatives by absorption
+    rows       (light, band) of the images and maps that are kept: what a light does not send needs none
+    followed   rays so far;   lost   cut off;   astray   met a face from the wrong side
+    """
+
+    def __init__(self, transport: Transport, group: Sequence[int], kinds: int, seed: int, progress: Callable | None = None):
+        import drjit as dr
+        import mitsuba as mi
+
+        self.of, self.group, self.kinds, self.seed = transport, list(group), kinds, seed
+        self.scene, self.progress = transport.scene, progress or (lambda what, done, total: None)
+        self.followed, self.lost, self.astray = 0, 0.0, 0.0
+        bands = (*transport.bands, *[transport.bands[-1]] * 4)[:dr.size_v(mi.UnpolarizedSpectrum)]
+        self.wavelengths = mi.UnpolarizedSpectrum(*[float(b) for b in bands]) if mi.is_spectral else mi.Color0f()
+        levels = np.array([self._level(n) for n in transport.lights])  # (L, B)
+        self.rows = [(light, b) for light, own in enumerate(levels) for b in self.group if own[b] > 1e-6 * own.max()]
+
+        def table(kind, values):
+            found = kind(np.ascontiguousarray(values))
+            dr.make_opaque(found)
+            return found
+
+        rows = np.full(levels.shape, -1)
+        for row, place in enumerate(self.rows):
+            rows[place] = row
+        self.levels, self.row = levels, [table(mi.Int32, rows[:, b]) for b in self.group]
+        self.level = [table(mi.Float, levels[:, b]) for b in self.group]
+        materials, surfaces = transport.materials, transport.surfaces
+        self.index = table(mi.Float, [m.index[group[0]] for m in materials])
+        self.scattering = table(mi.Float, [m.scattering[group[0]] for m in materials])
+        self.absorption = [table(mi.Float, [m.absorption[b] for m in materials]) for b in self.group]
+        self.pointers = [mi.ShapePtr(s.shape) for s in surfaces]
+        self.outside, self.inside, self.first, self.matt, self.grid, self.light = (table(mi.Int32, values) for values in (
+            [s.outside for s in surfaces], [s.inside for s in surfaces], [s.first for s in surfaces], [s.matt for s in surfaces],
+            [s.cells is not None for s in surfaces], [transport.lights.index(s.light) if s.light else -1 for s in surfaces]))
+        if transport.cells:
+            middles, sizes, volumes = (np.concatenate([getattr(c, n) for c in transport.cells]) for n in ("middles", "sizes", "volumes"))
+            self.middle, self.size = ([table(mi.Float, a[:, i]) for i in range(3)] for a in (middles, sizes))
+            self.volume = table(mi.Float, volumes / SPLIT**3)
+
+    def _level(self, light: str) -> list[float]:
+        """What a light at power 1 sends in each band, relative."""
+        import mitsuba as mi
+
+        part, wavelengths = self.scene.parts[light], self.wavelengths if mi.is_spectral else mi.UnpolarizedSpectrum(float(self.of.bands[0]))
+        level = part.level(wavelengths) if light in self.scene.sources else part.spectrum(wavelengths)
+        return [float(np.ravel(np.array(level[b]))[0]) for b in range(len(self.of.bands))]
+
+    def images(self, rays: int, packets: int, maps: bool) -> np.ndarray:
+        """(BATCHES, kinds, L, H, W, B), of so many rays per pixel and packets per light in each batch."""
+        import drjit as dr
+        import mitsuba as mi
+
+        of, lights = self.of, len(self.of.lights)
+        rows, pixels = BATCHES * len(self.rows) * self.kinds, self.of.height * self.of.width
+        self.maps = maps
+        self.fluence, self.irradiance = (dr.zeros(mi.Float, max(rows * size, 1)) for size in (of.voxels, of.texels))
+        self.out = dr.zeros(mi.Float, rows * pixels)
+        for name, follow, wanted, each in (("packets", self._shine, packets if maps else 0, lights), ("rays", self._look, rays, pixels)):
+            most, done = max(AT_ONCE // (BATCHES * each), 1), 0
+            while done < wanted:
+                count = min(most, wanted - done)
+                follow(count, wanted, done)
+                done += count
+                self.progress(name, done, wanted)
+        found = np.array(self.out).reshape(BATCHES, len(self.rows), self.kinds, of.height, of.width)
+        image = np.zeros((BATCHES, self.kinds, lights, of.height, of.width, len(of.bands)))
+        for row, (light, band) in enumerate(self.rows):
+            image[:, :, light, ..., band] = found[:, row]
+        return image / rays
+
+    def place(self, s, row, kind: int, size: int):
+        """Where a row of the state's batch begins in maps or images of a size."""
+        import mitsuba as mi
+
+        return ((s["batch"] * len(self.rows) + mi.UInt32(row)) * self.kinds + kind) * size
+
+    # -- places ------------------------------------------------------------------------------------------------------
+
+    def voxel(self, cell, p, active):
+        """Which part of its cell a place lies in."""
+        import drjit as dr
+        import mitsuba as mi
+
+        part = mi.UInt32(0)
+        for axis in range(3):
+            middle, size = (dr.gather(mi.Float, a[axis], cell, active) for a in (self.middle, self.size))
+            place = ((p[axis] - middle) / dr.select(active, size, 1.0) + 0.5) * SPLIT
+            part = part * SPLIT + mi.UInt32(dr.clip(place, 0, SPLIT - 1e-3))
+        return cell * SPLIT**3 + part
+
+    def texel(self, si, k, active):
+        import drjit as dr
+        import mitsuba as mi
+
+        column, row = (mi.UInt32(dr.clip(c, 0, 1 - 1e-6) * TEXELS) for c in si.uv)
+        return mi.UInt32(dr.gather(mi.Int32, self.first, k, active)) + row * TEXELS + column
+
+    def ways(self, s, length=None):
+        """Length of the way in each material so far, and `length` further in the present one."""
+        import drjit as dr
+
+        if length is None:
+            return s["ways"]
+        return [way + dr.select(s["medium"] == m, length, 0.0) for m, way in enumerate(s["ways"], 1)]
+
+    def faded(self, s, length, further=0.0):
+        """Weights per band after a stretch in the present material."""
+        import drjit as dr
+        import mitsuba as mi
+
+        return [t * dr.exp(-(dr.gather(mi.Float, a, s["medium"]) + further) * length) for t, a in zip(s["tau"], self.absorption)]
+
+    # -- flight ------------------------------------------------------------------------------------------------------
+
+    def fly(self, start: dict, forward: bool, drawn: bool, along: Callable, at: Callable) -> None:
+        """Follow rays through all faces until they end.
+
+        start    p, d, rng, x (axis across d that Stokes vectors refer to), tau (weight of each ray, per band of the group), and numbers
+                 that stay: pixel, light, batch
+        forward  from a light: the Stokes vector is carried along; else from the camera: what it is sensitive to
+        drawn    scattering is drawn by chance; else it only weakens, and `along` gathers it
+        along    f(s, length, sigma, active): what is left or found on a straight stretch of the state s
+        at       f(s, si, k, hit) -> mask: what is left or found on surface number k, and where the ray ends there
+        """
+        import drjit as dr
+        import mitsuba as mi
+
+        count, context = dr.width(start["d"]), mi.BSDFContext()
+
+        def onward(s):
+            s = dict(s)
+            active, rng, flight = s["active"], s["rng"], s["d"]
+            si = self.scene.mitsuba.ray_intersect(mi.Ray3f(s["p"], flight, mi.Float(0), self.wavelengths), mi.RayFlags.All, False, active)
+            hit = active & si.is_valid()
+            k = mi.UInt32(0)
+            for number, pointer in enumerate(self.pointers):
+                k = dr.select(si.shape == pointer, mi.UInt32(number), k)
+            sigma = dr.gather(mi.Float, self.scattering, s["medium"])
+            length, scattered = dr.select(hit, si.t, 0.0), mi.Bool(False)
+            if drawn:
+                free = -dr.log(1 - rng.next_float32()) / dr.maximum(sigma, 1e-12)
+                scattered = hit & (free < length)
+                length = dr.select(scattered, free, length)
+            along(s, length, sigma, hit)
+            s["tau"] = self.faded(s, length, 0.0 if drawn else sigma)
+            s["ways"] = self.ways(s, length)
+            hit &= ~scattered
+            ends = at(s, si, k, hit)
+
+            # at a face of a clear body: reflected or refracted
+            outside, inside = (dr.gather(mi.Int32, a, k) for a in (self.outside, self.inside))
+            face = hit & (inside >= 0)
+            front = dr.dot(flight, si.n) < 0
+            normal = mi.Vector3f(dr.select(front, si.n, -si.n))
+            here, there = mi.UInt32(dr.select(front, outside, inside)), mi.UInt32(dr.select(front, inside, outside))
+            n = dr.gather(mi.Float, self.index, there, face) / dr.select(face, dr.gather(mi.Float, self.index, here, face), 1.0)
+            n = dr.select(face, n, 1.0)
+            cos = dr.minimum(dr.abs(dr.dot(flight, normal)), 1.0)
+            r_s, r_p, cos2 = fresnel(cos, n)
+            share = (r_s + r_p) / 2
+            back = rng.next_float32() < share
+            bounced, passed = dr.maximum(share, 1e-9), dr.maximum(1 - share, 1e-9)
+            if not forward:
+                passed = passed * (n * n)  # of a radiance
+            across = dr.cross(flight, normal)
+            level = dr.squared_norm(across) < 1e-10  # at normal incidence every axis serves
+            axis = dr.select(level, s["x"], dr.normalize(across))
+            turned = self.turned(s["v"], s["x"], axis, flight, forward)
+            act = (lambda m: m @ tuple(turned)) if forward else (lambda m: m.after(tuple(turned)))
+            v = [dr.select(face, dr.select(back, a / bounced, b / passed), c) for a, b, c in zip(
+                act(fresnel_reflection(cos, n)), act(diattenuator(1.0, 0, 1 - r_s, 1 - r_p)), s["v"])]
+            d = dr.select(face, dr.select(back, flight + 2 * cos * normal, flight / n + (cos / n - cos2) * normal), flight)
+            s["astray"] = s["astray"] + dr.select(face & (here != s["medium"]), 1.0, 0.0)
+            s["medium"] = dr.select(face & ~back, there, s["medium"])
+            entered = face & ~back & front & (dr.gather(mi.Int32, self.grid, k) > 0)
+            s["cell"] = dr.select(entered, mi.UInt32(dr.gather(mi.Int32, self.first, k)) + si.prim_index // 12, s["cell"])
+
+            # at another surface, or within a body: into all directions, unpolarized
+            other = hit & ~face & ~ends
+            bs, weight = si.bsdf().sample(context, si, rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32()), other)
+            weight = mi.unpolarized_spectrum(weight)
+            s["tau"] = [dr.select(other, t * weight[b], t) for b, t in zip(self.group, s["tau"])]
+            sphere = mi.warp.square_to_uniform_sphere(mi.Point2f(rng.next_float32(), rng.next_float32()))
+            s["d"] = dr.normalize(dr.select(other, si.to_world(bs.wo), dr.select(scattered, sphere, d)))
+            mixed = other | scattered
+            s["v"] = [v[0]] + [dr.select(mixed, 0.0, entry) for entry in v[1:]]
+            s["x"] = dr.select(mixed, mi.Vector3f(mi.Frame3f(s["d"]).s), dr.select(face, axis, s["x"]))
+
+            # of the faint, half go on with twice the weight
+            brightest = dr.maximum(s["tau"][0], s["tau"][-1]) if len(s["tau"]) < 3 else dr.maximum(
+                dr.maximum(s["tau"][0], s["tau"][1]), dr.maximum(s["tau"][-2], s["tau"][-1]))
+            faint = brightest < FAINT
+            on = (face | mixed) & (brightest > 0) & (~faint | (rng.next_float32() < 0.5))
+            s["tau"] = [dr.select(faint, 2 * t, t) for t in s["tau"]]
+            s["depth"] = s["depth"] + 1
+            s["cut"] = on & (s["depth"] >= DEPTH)
+            s["active"] = on & ~s["cut"]
+            s["p"] = dr.select(scattered, s["p"] + length * flight, dr.select(hit, si.spawn_ray(s["d"]).o, s["p"]))
+            s["rng"] = rng
+            return (s,)
+
+        zero = dr.zeros(mi.Float, count)
+        state = {
+            **{name: mi.UInt32(start.get(name, 0)) + dr.zeros(mi.UInt32, count) for name in ("pixel", "light", "batch", "medium", "cell", "depth")},
+            "p": mi.Point3f(start["p"]), "d": mi.Vector3f(start["d"]), "x": mi.Vector3f(start["x"]), "rng": start["rng"],
+            "v": [zero + entry for entry in (1.0, 0.0, 0.0, 0.0)], "tau": [t + zero for t in start["tau"]],
+            "ways": [zero + 0.0 for _ in self.of.materials[1:]], "astray": zero + 0.0,
+            "active": dr.full(mi.Bool, True, count), "cut": dr.full(mi.Bool, False, count),
+        }
+        end = dr.while_loop((state,), lambda s: s["active"], onward)[0]
+        self.followed += count
+        self.lost += float(dr.count(end["cut"])[0])
+        self.astray += float(dr.sum(end["astray"])[0])
+
+    @staticmethod
+    def turned(v, x, axis, flight, forward: bool):
+        """A Stokes vector, or the row of a detector, in axes that begin with `axis` instead of x."""
+        import drjit as dr
+
+        light = flight if forward else -flight  # the way that the light goes
+        c, u = dr.dot(axis, x), dr.dot(dr.cross(light, axis), x)  # of the angle from `axis` to x
+        if forward:
+            return rotation(c * c - u * u, -2 * c * u) @ tuple(v)
+        return rotation(c * c - u * u, 2 * c * u).after(tuple(v))
+
+    # -- from the lights ---------------------------------------------------------------------------------------------
+
+    def _emitted(self, light: int, rng):
+        """Where packets of a light start, which way they go, and the power of all of them."""
+        import drjit as dr
+        import mitsuba as mi
+
+        name, count = self.of.lights[light], dr.width(rng.state)
+        part = self.scene.parts[name]
+        one, two = (mi.Point2f(rng.next_float32(), rng.next_float32()) for _ in range(2))
+        if name in self.scene.sources:
+            shape = next(s.shape for s in self.of.surfaces if s.light == name)
+            start = shape.sample_position(mi.Float(0), one)
+            d = mi.Frame3f(start.n).to_world(mi.warp.square_to_cosine_hemisphere(two))
+            return start.p + 1e-4 * (1 + dr.max(dr.abs(start.p))) * start.n, d, dr.pi / start.pdf
+        z = dr.power(1 - two.x, 1 / (part.mu + 1))  # of cos(theta)^mu
+        s, c = dr.sincos(2 * dr.pi * two.y)
+        d = mi.Frame3f(part.axis()).to_world(mi.Vector3f(c, s, 0) * dr.safe_sqrt(1 - z * z) + mi.Vector3f(0, 0, 1) * z)
+        p = part.point(one) if part.number("area") > 0 else part.position()
+        return p + dr.zeros(mi.Point3f, count), d, 2 * dr.pi / (part.mu + 1) + dr.zeros(mi.Float, count)
+
+    def _shine(self, packets: int, wanted: int, done: int) -> None:
+        """Packets of all lights, into the maps."""
+        import drjit as dr
+        import mitsuba as mi
+
+        lights, count = len(self.of.lights), len(self.of.lights) * BATCHES * packets
+        number = dr.arange(mi.UInt32, count)
+        light, batch = number // (BATCHES * packets), (number // packets) % BATCHES
+        rng = mi.PCG32(size=count, initstate=dr.opaque(mi.UInt64, (self.seed << 32) + 2 * done + 1))
+        p, d, power = self._emitted(0, rng)
+        for k in range(1, lights):
+            own = light == k
+            p, d, power = (dr.select(own, new, old) for new, old in zip(self._emitted(k, rng), (p, d, power)))
+        share = power / wanted
+
+        def leave(where, size, place, worth, tau, ways, s, active):
+            for column, row in enumerate(self.row):
+                own = dr.gather(mi.Int32, row, s["light"])
+                for kind in range(self.kinds):
+                    value = worth * tau[column] if kind == 0 else -worth * tau[column] * ways[kind - 1]
+                    dr.scatter_add(where, value, self.place(s, own, kind, size) + place, active & (own >= 0))
+
+        def along(s, length, sigma, hit):
+            """Track length by volume, at a random place of the stretch."""
+            if self.of.voxels:
+                active = hit & (sigma > 0)
+                u = s["rng"].next_float32() * length
+                volume = dr.select(active, dr.gather(mi.Float, self.volume, s["cell"], active), 1.0)
+                worth = s["v"][0] * dr.gather(mi.Float, shares, s["light"]) * length / volume
+                leave(self.fluence, self.of.voxels, self.voxel(s["cell"], s["p"] + u * s["d"], active), worth, self.faded(s, u),
+                      self.ways(s, u), s, active)
+
+        def at(s, si, k, hit):
+            if self.of.texels:
+                matt = hit & (dr.gather(mi.Int32, self.matt, k) > 0) & (mi.Frame3f.cos_theta(si.wi) > 0)
+                area = dr.select(matt, dr.norm(dr.cross(si.dp_du, si.dp_dv)) / TEXELS**2, 1.0)
+                leave(self.irradiance, self.of.texels, self.texel(si, k, matt), s["v"][0] * dr.gather(mi.Float, shares, s["light"]) / area,
+                      s["tau"], s["ways"], s, matt)
+            return mi.Bool(False)
+
+        # the power of a light is the same for all of its packets
+        shares = dr.gather(mi.Float, share, dr.arange(mi.UInt32, lights) * (BATCHES * packets))
+        dr.eval(p, d, shares, rng)
+        tau = [dr.gather(mi.Float, level, light) for level in self.level]
+        self.fly({"p": p, "d": d, "x": mi.Frame3f(d).s, "tau": tau, "rng": rng, "light": light, "batch": batch}, True, True, along, at)
+        dr.eval(self.fluence, self.irradiance)
+
+    # -- from the camera ---------------------------------------------------------------------------------------------
+
+    def _look(self, rays: int, wanted: int, done: int) -> None:
+        """Rays of the camera, into the images."""
+        import drjit as dr
+        import mitsuba as mi
+
+        camera, height, width = self.scene.camera, self.of.height, self.of.width
+        pixels, count = height * width, height * width * rays * BATCHES
+        number = dr.arange(mi.UInt32, count)
+        pixel, batch = (number // rays) % pixels, number // (rays * pixels)
+        rng = mi.PCG32(size=count, initstate=dr.opaque(mi.UInt64, (self.seed << 32) + 2 * done))
+        p, d = camera.ray(mi.Float(pixel % width) + rng.next_float32(), mi.Float(pixel // width) + rng.next_float32())
+        x = dr.normalize(dr.cross(d, camera.turned(mi.Vector3f(0, -1, 0))))
+
+        def see(s, row, kind, value, active):
+            dr.scatter_add(self.out, value, self.place(s, row, kind, pixels) + s["pixel"], active)
+
+        def read(where, size, place, worth, tau, ways, s, active):
+            for row, (_, band) in enumerate(self.rows):
+                own = worth * tau[self.group.index(band)]
+                held = [dr.gather(mi.Float, where, self.place(s, row, kind, size) + place, active) for kind in range(self.kinds)]
+                see(s, row, 0, own * held[0], active)
+                for kind in range(1, self.kinds):
+                    see(s, row, kind, own * (held[kind] - ways[kind - 1] * held[0]), active)
+
+        def along(s, length, sigma, hit):
+            """What the body scatters towards the camera, from a random place of the stretch."""
+            if self.maps and self.of.voxels:
+                active = hit & (sigma > 0)
+                u = s["rng"].next_float32() * length
+                read(self.fluence, self.of.voxels, self.voxel(s["cell"], s["p"] + u * s["d"], active),
+                     s["v"][0] * length * sigma / (4 * dr.pi), self.faded(s, u, sigma), self.ways(s, u), s, active)
+
+        def at(s, si, k, hit):
+            facing = hit & (mi.Frame3f.cos_theta(si.wi) > 0)
+            luminous = dr.gather(mi.Int32, self.light, k)
+            for row, (light, band) in enumerate(self.rows):
+                if self.of.lights[light] in self.scene.sources:
+                    value = s["v"][0] * s["tau"][self.group.index(band)] * float(self.levels[light, band])
+                    shines = facing & (luminous == light)
+                    see(s, row, 0, value, shines)
+                    for kind in range(1, self.kinds):
+                        see(s, row, kind, -value * s["ways"][kind - 1], shines)
+            if not self.maps or not self.of.texels:
+                return mi.Bool(False)
+            matt = facing & (dr.gather(mi.Int32, self.matt, k) > 0)
+            reflectance = mi.unpolarized_spectrum(si.bsdf().eval(mi.BSDFContext(), si, mi.Vector3f(0, 0, 1), matt))  # rho/pi
+            read(self.irradiance, self.of.texels, self.texel(si, k, matt), s["v"][0],
+                 [t * reflectance[b] for b, t in zip(self.group, s["tau"])], s["ways"], s, matt)
+            return matt
+
+        start = {"p": p, "d": d, "x": x, "tau": [mi.Float(1.0) for _ in self.group], "rng": rng, "pixel": pixel, "batch": batch}
+        self.fly(start, False, not self.maps, along, at)
+        dr.eval(self.out)
+
+
+# -- what a scene is made of --------------------------------------------------------------------------------------------
+
+
+class Surface:
+    """A shape as rays know it: `outside`, `inside` numbers of the materials that it parts (-1: it is no face of a clear body),
+    `light` the name of the source that it is, `matt` whether it keeps a map of its irradiance, `cells` of a grid."""
+
+    def __init__(self, scene, shape, known: Sequence[Material]):
+        import mitsuba as mi
+
+        names = [m.name for m in known]
+        self.shape, self.first = shape, 0
+        bsdf = shape.bsdf()
+        clear = getattr(bsdf, "kind", "") == "clear"
+        self.inside = names.index(bsdf.name) if clear else -1
+        self.outside = names.index(bsdf.outside or AIR) if clear else -1
+        self.light = next((n for n, part in scene.sources.items() if shape.emitter() is part), "")
+        # a map needs coordinates on the surface
+        diffuse = bsdf is not None and not clear and mi.has_flag(bsdf.flags(), mi.BSDFFlags.DiffuseReflection)
+        flat = not shape.is_mesh() or shape.has_vertex_texcoords()
+        self.matt = diffuse and flat and not self.light
+        self.cells = shape.cells() if getattr(shape, "kind", "") == "cells" else None
+
+
+def materials(scene, bands: np.ndarray) -> list[Material]:
+    """Air, then the scene's clear materials, at the present values."""
+    import mitsuba as mi
+
+    found = [Material(AIR, np.ones(len(bands)), np.zeros(len(bands)), np.zeros(len(bands)))]
+    for name, part in scene.parts.items():
+        if part.kind != "clear":
+            continue
+        wave = [mi.Float(float(b)) for b in bands]
+        index, absorption = ([np.array(f(w)).item() for w in wave] for f in (part.refractive, part.fading))
+        found.append(Material(name, np.array(index), np.array(absorption), np.full(len(bands), part.number("scattering"))))
+    return found

@@ -1,0 +1,27 @@
+"""Coloured absorption: a clear material absorbs some colours more than others.
+
+Definition
+    alpha(lambda) = absorption exp(absorption_slope (lambda - 540)/100)
+Fingerprint
+    the colour of the picture shifts with the length of the way through the material: printed resins turn yellow.
+Validity
+    an exponential over the bands; nothing where nothing is absorbed.
+References
+    Fan, Li, Cong & Zhang, MagicGripper, supplementary VII-A, eq. (27), for one wavelength.
+"""
+
+from optics.effect import Effect
+from optics.parameter import Parameter
+
+
+def fade(alpha, wavelengths, clear):
+    from optics.mueller import exp
+
+    return alpha * exp(clear.absorption_slope * (wavelengths - 540.0) / 100)
+
+
+effect = Effect(
+    name="coloured absorption", part="clear", stages={"absorption": fade}, per="part",
+    parameters=(Parameter("absorption_slope", "1", 0.0, (-10.0, 10.0), "change of ln(alpha) per 100 nm", neutral=0.0, plausible=0.2,
+                          how="path"),),
+    acts=("channel", "led_distance"), needs="LEDs of two colours at the same side")

@@ -1,0 +1,134 @@
+"""What every parameter of clear bodies must meet: as tests/contract/test_plugins.py asks it, where the light is followed by chance.
+
+A small printed block, one LED in each band. Derivatives are compared as weighted means over the picture, over seeds, in units of their
+own standard errors.
+"""
+
+import numpy as np
+import pytest
+
+from optics.effect import registry
+from optics.render import POWERS
+
+KINDS = ("clear", "cells")
+EFFECTS = sorted(k for k, e in registry().effects.items() if e.part in KINDS)
+SEEDS = 4
+DEFINES = {"width": 8, "height": 8, "x_fov": 6, "columns": 3, "rows": 3, "layers": 2, "half_width": 1.3, "half_length": 1.3, "distance": 0.4,
+           "scattering": 0.06, "rays": 128, "packets": 16_000}
+# so dark that few ways are long: a difference between pictures is the noise of the ways that part, and long ones part
+VALUES = {"filling.absorption": 0.6, "walls.absorption": 0.5, "filling.absorption_slope": 0.3, "walls.absorption_slope": 0.2,
+          "window.absorption": 0.05}
+KEYS = [f"{part}.{p.name}" for part, kind in (("walls", "clear"), ("filling", "clear"), ("grid", "cells"))
+        # the maps hold cells alone; what bends rays is noise on this bench and seen on a slab
+        for p in registry().parameters_of(kind) if p.name not in ("index", "dispersion") and f"{part}.{p.name}" != "walls.scattering"]
+
+
+@pytest.fixture(scope="module")
+def bench(mitsuba):
+    from optics import scene
+    from optics.by_chance import ClearRenderer
+
+    loaded = scene.load("magictac", {k: str(v) for k, v in DEFINES.items()})
+    loaded.set({**VALUES, **{f"led_{c}.{a}": v for c, a, v in (("red", "x", -2.0), ("green", "x", 2.0), ("blue", "y", 2.0))}})
+    return loaded, ClearRenderer(loaded, remember=4 * SEEDS), loaded.values()
+
+
+def weighed(image):
+    """(..., B, 6) of (..., H, W, B): the picture in six weights."""
+    v, u = np.mgrid[:image.shape[-3], :image.shape[-2]] / (image.shape[-3] - 1) - 0.5
+    return np.einsum("...hwb,khw->...bk", image, np.stack([np.ones_like(u), u, v, u * v, u**2, v**2])) / u.size
+
+
+def means(renderer, values, seed):
+    return weighed(renderer.picture(values, seed).radiance)
+
+
+def beside(p):
+    return 1e-30 if p.neutral == 0 else p.neutral
+
+
+@pytest.mark.parametrize("key", EFFECTS)
+def test_an_effect_at_neutral_is_not_there(key, bench):
+    """Its functions, evaluated next to neutral, leave the picture as it is, with the same random numbers."""
+    scene, renderer, values = bench
+    effect = registry().effects[key]
+    own = {f"{n}.{p.name}": p for n, part in scene.parts.items() if part.kind == effect.part for p in registry().effect_parameters(effect)}
+    one, other = (renderer.picture({**values, **{k: f(p) for k, p in own.items()}}).radiance for f in (lambda p: p.neutral, beside))
+    np.testing.assert_allclose(other, one, rtol=0, atol=1e-5 * one.max())  # atomic sums in float32, in another order
+
+
+@pytest.mark.parametrize("key", KEYS)
+def test_derivatives_against_differences(key, bench):
+    """The renderer's own against differences over a plausible change, both as means over seeds with common random numbers."""
+    scene, renderer, values = bench
+    p = scene.parameters[key]
+    if key != "filling.scattering":
+        values = {**values, "filling.scattering": 0.3}  # the cells show by what they scatter
+    low, high = max(values[key] - p.plausible, p.bounds[0]), min(values[key] + p.plausible, p.bounds[1])
+    sides = [np.array([means(renderer, {**values, key: v}, s) for s in range(SEEDS)]).sum(1) for v in (high, low)]
+    wide = (sides[0] - sides[1]) / (high - low)
+    own = np.array([weighed(renderer.tangent(values, key, s)) for s in range(SEEDS)])
+    error = np.hypot(*(a.std(0, ddof=1) for a in (wide, own))) / np.sqrt(SEEDS)
+    wide, own = wide.mean(0), own.mean(0)
+    size = np.abs(wide).max()
+    assert size > 4 * error.flat[np.abs(wide).argmax()], f"{key} does nothing to the bench that stands out of the noise"
+    assert (np.abs(own - wide) < 6 * error + 0.05 * size).all()  # straight over a plausible change to some per cent
+
+
+SLAB = """<scene version="3.0.0">
+    <integrator type="tactile" id="integrator"><string name="bands" value="620, 540, 460"/><integer name="rays" value="4000"/><integer name="packets" value="8"/></integrator>
+    <sensor type="camera" id="camera">
+        <film type="hdrfilm"><integer name="width" value="6"/><integer name="height" value="6"/></film>
+        <float name="x_fov" value="1"/><transform name="to_world"><translate x="0.01" y="0.02" z="-20"/></transform>
+    </sensor>
+    <shape type="cube" id="plate"><transform name="to_world"><scale x="9" y="9" z="1"/></transform>
+        <bsdf type="clear" id="glass"><float name="index" value="1.5"/></bsdf></shape>
+    <shape type="rectangle" id="screen"><transform name="to_world"><rotate x="1" angle="180"/><scale x="8" y="8"/><translate z="20"/></transform>
+        <bsdf type="diffuse"><spectrum name="reflectance" value="0"/></bsdf><emitter type="source" id="lamp"/></shape>
+</scene>"""
+
+
+@pytest.mark.parametrize("key, factor", [("glass.index", (1, 1, 1)), ("glass.dispersion", [(540 / w) ** 2 - 1 for w in (620, 540, 460)])])
+def test_derivatives_by_the_index(key, factor, mitsuba, tmp_path):
+    """Of a slab's transmittance T = 2n/(n^2 + 1): dT/dn = 2 (1 - n^2)/(n^2 + 1)^2, in every band by its dispersion."""
+    from optics import scene
+    from optics.by_chance import ClearRenderer
+
+    (tmp_path / "slab.xml").write_text(SLAB)
+    loaded = scene.load(tmp_path / "slab.xml")
+    renderer, p = ClearRenderer(loaded), loaded.parameters[key]
+    found = np.array([renderer.tangent(loaded.values(), key, seed).mean((0, 1)) for seed in range(8)])
+    error = found.std(0, ddof=1) / np.sqrt(8)
+    expected = 2 * (1 - 1.5**2) / (1.5**2 + 1) ** 2 * np.array(factor)
+    assert p.plausible > 0 and error.max() < 0.25 * np.abs(expected).max()
+    assert (np.abs(found.mean(0) - expected) <= 5 * error + 0.01 * np.abs(expected)).all(), (found.mean(0), error, expected)
+
+
+def test_no_light_no_picture(bench):
+    scene, renderer, values = bench
+    dark = {**values, **{f"{n}.{p}": 0.0 for n in scene.lights for p in POWERS[:1]}}
+    assert renderer.radiance(dark).max() == 0
+
+
+def test_the_model_differentiates_by_the_renderer(bench, tmp_path, monkeypatch):
+    """One derivative of each way, through development: absorption by the ways, index by differences, a power by linearity. Faint rays
+    are not thinned, which a difference would draw anew."""
+    from optics import transport
+    from optics.captures import Captures, Frame
+    from optics.noise import Noise
+    from optics.parameter import Values, Variable
+    from optics.render import Model
+
+    monkeypatch.setattr(transport, "FAINT", 0.0)
+    scene, _, values = bench
+    frame = Frame("one", np.zeros((*scene.camera.resolution[::-1], 3), np.float32))
+    model = Model(scene, Captures(tmp_path, str(scene.path), [frame], noise=Noise(0.1, 1.0, 0.0, 255.0, 0.0)))
+    now = Values({**values, "camera.exposure": 4000.0})
+    keys = ["filling.absorption", "walls.index", "led_red.power"]
+    prediction, images = next(iter(model.derivatives(now, [Variable(k, (k,), scene.parameters[k]) for k in keys])))
+    assert prediction.max() > 5 and images.keys() == set(keys)
+    for key, step, tolerance in (("led_red.power", 0.1, 1e-5), ("filling.absorption", 1e-3, 5e-3), ("walls.index", 1e-3, 1e-5)):
+        # of the index: the model's own step
+        sides = [model.predict(Values({**now.common, key: values[key] + d}))[0] for d in (step, -step)]
+        difference = (sides[0] - sides[1]) / (2 * step)
+        np.testing.assert_allclose(images[key].mean((0, 1)), difference.mean((0, 1)), rtol=tolerance, atol=1e-4 * np.abs(difference).max())
