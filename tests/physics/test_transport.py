@@ -15,7 +15,7 @@ SCENE = """<scene version="3.0.0">
     <default name="size" value="8"/>
     <integrator type="tactile"><string name="bands" value="BANDS"/></integrator>
     <sensor type="camera" id="camera">
-        <film type="hdrfilm"><integer name="width" value="$size"/><integer name="height" value="$size"/></film>
+        <film type="hdrfilm"><integer name="width" value="$size"/><integer name="height" value="$size"/><rfilter type="box"/></film>
         <float name="x_fov" value="FOV"/>
         <transform name="to_world"><translate x="0.013" y="0.007" z="-20"/></transform>
     </sensor>
@@ -273,6 +273,46 @@ def test_maps_and_paths_agree(tmp_path, mitsuba, scattering):
         off = quick.radiance[light].mean() / slow.radiance[light].mean() - 1
         error = slow.error[light].mean() / slow.radiance[light].mean() / 6
         assert abs(off) < 0.01 + SIGMAS * error, (light, off, error)
+
+
+def stock(folder, alpha_wall=0.05, alpha_fill=0.1, fill=1.4):
+    """The little grid of stock dielectrics and media, with stock lamps, for `volpath`."""
+    import mitsuba as mi
+
+    def medium(name, alpha):
+        return (f'<medium type="homogeneous" id="{name}"><spectrum name="sigma_t" value="{alpha}"/><spectrum name="albedo" value="0"/></medium>')
+
+    def dielectric(inside, outside, within, without=""):
+        around = f'<ref id="{without}" name="exterior"/>' if without else ""
+        return (f'<bsdf type="dielectric"><float name="int_ior" value="{inside}"/><float name="ext_ior" value="{outside}"/></bsdf>'
+                f'<ref id="{within}" name="interior"/>{around}')
+
+    lamps = [lamp[:lamp.index("<emitter")] + '<emitter type="area"><spectrum name="radiance" value="1"/></emitter></shape>' for lamp in LAMPS]
+    bodies = [medium("resin", alpha_wall), medium("support", alpha_fill),
+              box("block", dielectric(1.5, 1.0, "resin"), (1.8, 1.8, 1.2), (0, 0, -1.2)),
+              grid((3, 3, 2), dielectric(fill, 1.5, "support", "resin"), skin=0.4), *lamps, COAT]
+    text = SCENE.replace("BANDS", "540").replace("FOV", "9").replace("BODIES", "\n".join(bodies))
+    text = text.replace('<integrator type="tactile"><string name="bands" value="540"/></integrator>',
+                        '<integrator type="volpath"><integer name="max_depth" value="512"/><integer name="rr_depth" value="1000"/></integrator>')
+    (folder / "stock.xml").write_text(text)
+    return mi.load_file(str(folder / "stock.xml"), optimize=False, size="8")
+
+
+def test_stock_volpath_sees_the_same(tmp_path, mitsuba):
+    """The same grid by Mitsuba's own dielectrics, media and integrator, pixel by pixel: z has no mean and the spread of noise."""
+    import mitsuba as mi
+
+    t = load(tmp_path, little_grid(), fov=9, variant=MONO, bands="540", size=8)
+    ours = t.take(rays=4000, packets=400_000)
+    scene = stock(tmp_path)
+    runs = np.stack([np.array(mi.render(scene, spp=1500, seed=seed))[..., 0] for seed in range(12)]).astype(float)
+    theirs, error = runs.mean(0), runs.std(0, ddof=1) / np.sqrt(len(runs))
+    found, own = ours.radiance.sum(0)[..., 0], np.sqrt((ours.error**2).sum(0))[..., 0]
+    z = (found - theirs) / np.hypot(error, own)
+    assert theirs.mean() > 20 * np.sqrt((error**2).mean()) / 8
+    assert abs(z.mean()) < SIGMAS / 8 and 0.5 < np.mean(z**2) < 2.0, (z.mean(), np.mean(z**2))
+    # over all pixels to a per cent of what is seen, beside the noise
+    assert abs(found.mean() / theirs.mean() - 1) < 0.01 + SIGMAS * np.hypot(*(np.sqrt((e**2).mean()) / 8 for e in (error, own))) / theirs.mean()
 
 
 def test_derivatives_by_absorption(tmp_path, mitsuba, monkeypatch):
