@@ -212,11 +212,12 @@ class Run:
             part = part * SPLIT + mi.UInt32(dr.clip(place, 0, SPLIT - 1e-3))
         return cell * SPLIT**3 + part
 
-    def texel(self, si, k, active):
+    def texel(self, si, k, active, shift=(0.0, 0.0)):
+        """Where the map of surface k holds a place; `shift` in texels."""
         import drjit as dr
         import mitsuba as mi
 
-        column, row = (mi.UInt32(dr.clip(c, 0, 1 - 1e-6) * TEXELS) for c in si.uv)
+        column, row = (mi.UInt32(dr.clip(c * TEXELS + d, 0, TEXELS - 1e-3)) for c, d in zip(si.uv, shift))
         return mi.UInt32(dr.gather(mi.Int32, self.first, k, active)) + row * TEXELS + column
 
     def ways(self, s, length=None):
@@ -463,7 +464,8 @@ class Run:
                 return mi.Bool(False)
             matt = facing & (dr.gather(mi.Int32, self.matt, k) > 0)
             reflectance = mi.unpolarized_spectrum(si.bsdf().eval(mi.BSDFContext(), si, mi.Vector3f(0, 0, 1), matt))  # rho/pi
-            read(self.irradiance, self.of.texels, self.texel(si, k, matt), s["v"][0],
+            shift = [s["rng"].next_float32() - 0.5 for _ in range(2)]  # in the mean, the map is read linearly between its texels
+            read(self.irradiance, self.of.texels, self.texel(si, k, matt, shift), s["v"][0],
                  [t * reflectance[b] for b, t in zip(self.group, s["tau"])], s["ways"], s, matt)
             return matt
 
