@@ -31,6 +31,7 @@ Progress = Callable[[str, int, int], None]
 
 POSE = ("press_x", "press_y", "press_depth")  # what is solved for per press, unless the user says otherwise
 POSE_SD = 0.05  # mm: how well a stage usually knows it
+CHANCE = 0.3  # of the noise: error of a prediction that is followed by chance, below which it adds less than 5 % to the noise
 
 
 @dataclass
@@ -253,6 +254,9 @@ def _warnings(model: Model) -> list[str]:
     texts = [*model.captures.warnings, *warnings_of(model.noise, model.captures)]
     if model.renderer.layered and model.captures.table is None and (what := veiled(model.renderer, model.at(Values(), 0))):
         texts.append(f"the model leaves out light that comes through layers: {what}")
+    if model.renderer.by_chance and (share := model.chance()) > CHANCE:
+        texts.append(f"the prediction of clear bodies is an estimate by chance; its error is {share:.2g} of the noise in the first frame, and "
+                     f"a verdict takes it for exact: raise `rays` and `packets` of the scene's integrator until it is below {CHANCE:g}")
     return list(dict.fromkeys(texts))
 
 

@@ -845,6 +845,14 @@ class Model:
         """Values that a frame holds (on average, of readings): pixels x channels, or the pixels of a mosaic."""
         return float(np.mean([f.image.size for f in self.frames])) / (3 if self.mosaic is not None else 1)
 
+    def chance(self, index: int = 0) -> float:
+        """Error of the prediction itself over the noise of a frame, rms, where pictures are Monte Carlo estimates."""
+        now = self.at(Values(), index)
+        view = self.developer.view(now)
+        full = (self.noise.saturation - self.noise.black_level) * np.abs(view.exposure * self.developer.gains(view))
+        error = np.sqrt(self.renderer.error(now) ** 2 @ (self.developer.matrix**2).T) * full
+        return float(np.sqrt(np.mean((error / self.noise.sd(self.predict(Values(), [index])[0])) ** 2)))
+
     def coordinates(self, values: Values, index: int) -> dict[str, np.ndarray]:
         """What is known of every pixel of a frame; see `optics.compare` and `optics.diagnose` for their use."""
         from scipy.ndimage import distance_transform_edt

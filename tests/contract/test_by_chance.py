@@ -132,3 +132,25 @@ def test_the_model_differentiates_by_the_renderer(bench, tmp_path, monkeypatch):
         sides = [model.predict(Values({**now.common, key: values[key] + d}))[0] for d in (step, -step)]
         difference = (sides[0] - sides[1]) / (2 * step)
         np.testing.assert_allclose(images[key].mean((0, 1)), difference.mean((0, 1)), rtol=tolerance, atol=1e-4 * np.abs(difference).max())
+
+
+def test_a_study_is_told_of_the_error_of_its_predictions(bench, tmp_path):
+    """Four times the rays and packets halve it."""
+    from optics import loop
+    from optics.captures import Captures, Frame
+    from optics.noise import Noise
+    from optics.render import Model
+
+    scene, _, values = bench
+    frame = Frame("one", np.zeros((*scene.camera.resolution[::-1], 3), np.float32), parameters={**values, "camera.exposure": 4000.0})
+    rays, packets = scene.integrator.rays, scene.integrator.packets
+    shares = []
+    try:
+        for more in (1, 4):
+            scene.integrator.rays, scene.integrator.packets = rays * more, packets * more
+            model = Model(scene, Captures(tmp_path, str(scene.path), [frame], noise=Noise(0.1, 0.05, 0.0, 255.0, 0.0)))
+            shares.append(model.chance())
+    finally:
+        scene.integrator.rays, scene.integrator.packets = rays, packets
+    assert 1.4 < shares[0] / shares[1] < 2.8 and shares[0] > loop.CHANCE
+    assert any("an estimate by chance" in text for text in loop._warnings(model)) == (shares[1] > loop.CHANCE)
