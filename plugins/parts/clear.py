@@ -16,7 +16,8 @@ References
     Fan, Li, Cong & Zhang, MagicGripper, supplementary VII-A, eqs. (18)-(29); Born & Wolf, Principles of Optics, 1.5.
 """
 
-from optics.effect import Declared, Part
+from optics.bsdf import passing
+from optics.effect import Part
 from optics.parameter import Parameter
 
 PARAMETERS = (
@@ -32,14 +33,13 @@ def build():
 
     from optics.mueller import diattenuator, fresnel, fresnel_reflection
 
-    class Clear(Declared.on(mi.BSDF)):
+    class Clear(passing(mi.BSDFFlags.DeltaTransmission)):
         kind = "clear"
         around = None  # the clear material outside, set by the scene; None is air
 
         def __init__(self, props):
-            mi.BSDF.__init__(self, props)
             self.outside = str(props.get("outside", ""))
-            self.declare(props)
+            super().__init__(props)
             sides = mi.BSDFFlags.FrontSide | mi.BSDFFlags.BackSide
             self.m_components = [mi.BSDFFlags.DeltaReflection | sides,
                                  mi.BSDFFlags.DeltaTransmission | mi.BSDFFlags.NonSymmetric | sides]
@@ -100,18 +100,6 @@ def build():
             basis_in, basis_out = mi.mueller.stokes_basis(arriving), mi.mueller.stokes_basis(leaving)
             s = dr.select(level, basis_out, dr.normalize(s))
             return mi.mueller.rotate_mueller_basis(matrix, arriving, s, basis_in, leaving, s, basis_out)
-
-        def eval(self, ctx, si, wo, active=True):
-            return mi.Spectrum(0.0)
-
-        def pdf(self, ctx, si, wo, active=True):
-            return mi.Float(0.0)
-
-        def eval_pdf(self, ctx, si, wo, active=True):
-            return mi.Spectrum(0.0), mi.Float(0.0)
-
-        def to_string(self):
-            return f"Clear[{self.name}]"
 
     return Clear
 
