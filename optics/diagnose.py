@@ -421,11 +421,13 @@ def _signs(model, evidence: Evidence, c: Candidate, start: Values) -> Values:
     if c.effect.onset == "tangent" or not 2 <= len(free) <= MOST_SIGNS:
         return start
     starts = [start]
-    for signs in product((1, -1), repeat=len(free) - 1):
+    for estimated, *signs in product((True, False), *[(1, -1)] * (len(free) - 1)):
         values = start.copy()
         for (v, here), sign in zip(free, (1, *signs)):
-            away = sign * max(abs(value_of(model, start, v) - here), v.parameter.plausible / 2)
-            values.put(v, float(np.clip(here + away, *v.parameter.bounds)))
+            size = v.parameter.plausible
+            if estimated:  # where one parameter alone does nothing, its estimate is anything
+                size = np.clip(abs(value_of(model, start, v) - here), size / 2, 2 * size)
+            values.put(v, float(np.clip(here + sign * size, *v.parameter.bounds)))
         starts.append(values)
     return min(starts, key=lambda values: _chi2(model, values, evidence)[0])
 

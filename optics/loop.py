@@ -333,7 +333,8 @@ def examine(study: Study, model: Model, setup: Setup, found: calibrate.Fit, prog
     def refit(model, variables, start, frames):
         """Chord steps on the base's derivative images where an effect is added to it; a full fit otherwise."""
         extra = [v for v in variables if v.name not in known]
-        if found.normal is None or not extra or list(frames) != list(found.frames):
+        bent = sum(v.name in steps for v in extra) > 1  # a chord per parameter knows nothing of their products
+        if found.normal is None or not extra or bent or list(frames) != list(found.frames):
             return calibrate.fit(model, variables, start, frames)
         names = tuple(v.name for v in extra)
         if names not in results:  # a diagnosis asks again from another start, which chord steps do not use

@@ -31,7 +31,8 @@ HIDDEN = {
     "stray light": ({"stray light": 0.002}, ("dark offset", "ambient light"), {"camera.stray": 0.002}),
     "dark offset": ({"dark offset": 2.0}, ("stray light", "ambient light"), {"camera.offset": 2.0}),
     "camera gamma": ({"camera gamma": 0.05}, (), {"camera.gamma": 0.05}),
-    "retardance": ({"retardance": 15.0}, (), {}),  # on a narrow field: see NARROW
+    # on a narrow field, see NARROW; one angle of the sheet, without a wave plate: within a fifth of what a leak explains
+    "retardance": ({"retardance": 15.0}, ("extinction leak", "coloured leak", "depolarization"), {}),
     "marker leak": ({"marker leak": 0.03}, (), {"inner_face.marker_leak": 0.03}),
     "gain drift": ({"gain drift": 0.02}, (), {}),
     "lens vignetting": ({"lens vignetting": 0.3}, (), {"camera.vignetting": 0.3}),
