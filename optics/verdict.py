@@ -362,7 +362,7 @@ def _cell(value) -> str:
 class Findings:
     """The numbers that a verdict is made of.
 
-    p_family     of the best of all candidates; structure_p: of low-frequency structure (NaN: images too small to tell)
+    p_family     of the best of all candidates; structure_p: of low-frequency structure (NaN: readings, or images too small to show any)
     winner       the effect with the largest fall after refit, '' if none; p_winner: family-wise, of that fall
     fall, runner_up   net falls of the winner and of the next one
     refuted      with the winner nothing is left to explain, and every effect within the margin leaves structure, or an
@@ -407,7 +407,7 @@ def decide(f: Findings) -> tuple[str, list[Condition]]:
         Condition("an effect stands out", f.p_family, LEVEL, significant,
                   f"family-wise p {p_text(f.p_family)} against {LEVEL:g}"),
         Condition("structure is left", f.structure_p, LEVEL, structure,
-                  f"images too small to tell; excess {f.excess_sd:.2g} sd against {EXCESS:g}" if math.isnan(f.structure_p)
+                  f"readings, or images too small, show none; excess {f.excess_sd:.2g} sd against {EXCESS:g}" if math.isnan(f.structure_p)
                   else f"low-frequency test p {p_text(f.structure_p)} against {LEVEL:g}"),
     ]
     if not significant and not structure:
