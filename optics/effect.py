@@ -384,6 +384,10 @@ class Declared:
     def number(self, name: str) -> float:
         return self.held[name]
 
+    def takes(self, name: str) -> bool:
+        """Whether a parameter does anything where the part stands in its scene."""
+        return True
+
     def functions(self, stage: str) -> tuple[Callable, ...]:
         """The functions of effects at a stage, but for those that rest at neutral and carry no derivative.
 

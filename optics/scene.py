@@ -18,6 +18,7 @@ from optics.layers import PatternImage
 from optics.parameter import Parameter, Variable
 
 
+LED_BY_LED = {"emission", "segment", "volume", "reflection", "ambient"}  # stages that light followed by chance does not pass
 KEEPS = "use 'interface', 'rough_interface' or 'sheet', which keep it"
 DEPOLARIZERS = {  # stock materials without a Mueller matrix, by the name that Mitsuba prints
     "ThinDielectric": KEEPS, "RoughDielectric": KEEPS, "SmoothPlastic": "use 'pplastic'", "RoughPlastic": "use 'pplastic'",
@@ -128,6 +129,10 @@ class Scene:
     def _nest(self) -> None:
         """Tell each clear body which clear material is around it."""
         clear = {n: p for n, p in self.parts.items() if p.kind == "clear"}
+        self.by_chance = bool(clear)
+        for shape in self.mitsuba.shapes():
+            if getattr(shape, "kind", "") == "cells" and getattr(shape.bsdf(), "kind", "") == "clear":
+                shape.bsdf().fills_cells = True
         for name, part in clear.items():
             if part.outside and part.outside not in clear:
                 raise BadScene(f"{self.path}: '{name}': outside = '{part.outside}'; allowed: the id of a clear material ("
@@ -250,11 +255,13 @@ class Scene:
 
     def keys_of(self, effect: Effect) -> dict[str, list[str]]:
         """The effect's parameter names, each with the keys it has in this scene (empty where the scene lacks the part)."""
-        holders = [n for n, p in self.parts.items() if p.kind == effect.part]
-        return {name: [f"{h}.{name}" for h in holders] for name in effect.parameter_names}
+        holders = {n: p for n, p in self.parts.items() if p.kind == effect.part}
+        return {name: [f"{n}.{name}" for n, p in holders.items() if p.takes(name)] for name in effect.parameter_names}
 
     def can_express(self, effect: Effect) -> bool:
         kinds = {p.kind for p in self.parts.values()}
+        if self.by_chance and (set(effect.stages) & LED_BY_LED or effect.part == "tactile"):
+            return False
         return all(self.keys_of(effect).values()) and kinds.issuperset(effect.requires)
 
     def variables_of(self, effect: Effect, frames: int = 0) -> list[Variable]:

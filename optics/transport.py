@@ -13,6 +13,7 @@ At every face the way is drawn by Fresnel's reflectance; absorption is weighed, 
 are exact: every contribution times the length of its way (d/d alpha exp(-alpha l) = -l exp(-alpha l)). Polarization is followed
 as the row (from the camera) or column (from a light) of the Mueller matrix of everything met so far, in axes that travel along.
 
+The maps know cells and matt surfaces with coordinates on them (u, v); matt surfaces are taken as Lambertian.
 Without maps (`reach="paths"`) rays of the camera go on until they meet a luminous area: slower by orders of magnitude, without
 the maps' resolution. It is what the maps are tested against, beside stock Mitsuba.
 
@@ -24,6 +25,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import reduce
 
 import numpy as np
 
@@ -103,6 +105,8 @@ class Transport:
             raise BadScene(f"{self.scene.path}: rays of the camera never meet an LED, which is a point; allowed with reach = 'paths': "
                            "luminous areas (emitters of the type 'source')")
         # bands that go different ways are followed apart
+        if reach == "maps":
+            self._check_maps()
         same = all(np.ptp(m.index) == 0 for m in self.materials)
         groups = [list(range(len(self.bands)))] if same else [[b] for b in range(len(self.bands))]
         kinds = len(self.materials) if slopes else 1
@@ -116,6 +120,18 @@ class Transport:
                            "its neighbour: bodies overlap, a normal points inwards, or `outside` names the wrong material")
         mean, error = images.mean(0), images.std(0, ddof=1) / np.sqrt(BATCHES)
         return Picture(self.lights, mean[0], error[0], dict(zip([m.name for m in self.materials[1:]], mean[1:])), lost / followed)
+
+
+    def _check_maps(self) -> None:
+        """Refuse what the maps do not hold: scattering outside cells, polarized lights."""
+        filling = {s.inside for s in self.surfaces if s.cells is not None}
+        for number, m in enumerate(self.materials):
+            if number not in filling and m.scattering.max() > 1e-12:
+                raise BadScene(f"{self.scene.path}: {m.name}.scattering = {m.scattering.max():g} 1/mm; allowed: 0 in a material that fills no "
+                               "`cells`, as light is mapped in cells only (reach = 'paths' follows it everywhere)")
+        for name, part in self.scene.sources.items():
+            if part.number("dop_q") or part.number("dop_u"):
+                raise BadScene(f"{self.scene.path}: '{name}' sends polarized light; allowed among clear bodies: dop_q = dop_u = 0")
 
 
 class Run:
@@ -312,8 +328,7 @@ class Run:
             s["x"] = dr.select(mixed, mi.Vector3f(mi.Frame3f(s["d"]).s), dr.select(face, axis, s["x"]))
 
             # of the faint, half go on with twice the weight
-            brightest = dr.maximum(s["tau"][0], s["tau"][-1]) if len(s["tau"]) < 3 else dr.maximum(
-                dr.maximum(s["tau"][0], s["tau"][1]), dr.maximum(s["tau"][-2], s["tau"][-1]))
+            brightest = reduce(dr.maximum, s["tau"])
             faint = brightest < FAINT
             on = (face | mixed) & (brightest > 0) & (~faint | (rng.next_float32() < 0.5))
             s["tau"] = [dr.select(faint, 2 * t, t) for t in s["tau"]]

@@ -36,6 +36,7 @@ def build():
     class Clear(passing(mi.BSDFFlags.DeltaTransmission)):
         kind = "clear"
         around = None  # the clear material outside, set by the scene; None is air
+        fills_cells = False  # set by the scene as well: what light is scattered is known in cells only
 
         def __init__(self, props):
             self.outside = str(props.get("outside", ""))
@@ -44,6 +45,9 @@ def build():
             self.m_components = [mi.BSDFFlags.DeltaReflection | sides,
                                  mi.BSDFFlags.DeltaTransmission | mi.BSDFFlags.NonSymmetric | sides]
             self.m_flags = self.m_components[0] | self.m_components[1]
+
+        def takes(self, name):
+            return name != "scattering" or self.fills_cells
 
         def fading(self, wavelengths):
             """alpha per band, 1/mm."""

@@ -19,7 +19,7 @@ DEFINES = {"width": 8, "height": 8, "x_fov": 6, "columns": 3, "rows": 3, "layers
 VALUES = {"filling.absorption": 0.6, "walls.absorption": 0.5, "filling.absorption_slope": 0.3, "walls.absorption_slope": 0.2,
           "window.absorption": 0.05}
 KEYS = [f"{part}.{p.name}" for part, kind in (("walls", "clear"), ("filling", "clear"), ("grid", "cells"))
-        # the maps hold cells alone; what bends rays is noise on this bench and seen on a slab
+        # what bends rays is noise on this bench and seen on a slab
         for p in registry().parameters_of(kind) if p.name not in ("index", "dispersion") and f"{part}.{p.name}" != "walls.scattering"]
 
 
@@ -102,6 +102,20 @@ def test_derivatives_by_the_index(key, factor, mitsuba, tmp_path):
     expected = 2 * (1 - 1.5**2) / (1.5**2 + 1) ** 2 * np.array(factor)
     assert p.plausible > 0 and error.max() < 0.25 * np.abs(expected).max()
     assert (np.abs(found.mean(0) - expected) <= 5 * error + 0.01 * np.abs(expected)).all(), (found.mean(0), error, expected)
+
+
+def test_effects_are_offered_where_they_act(bench):
+    """Scattering in the filling and not in the walls, which it is refused in; nothing that belongs to light followed LED by LED."""
+    from optics.errors import BadScene
+
+    scene, renderer, values = bench
+    effects = registry().effects
+    assert scene.keys_of(effects["volume-scattering"]) == {"scattering": ["filling.scattering"]}
+    assert set(scene.keys_of(effects["dispersion"])["dispersion"]) == {f"{n}.dispersion" for n in ("window", "walls", "filling")}
+    assert all(scene.can_express(effects[k]) for k in EFFECTS)
+    assert not any(scene.can_express(e) for e in effects.values() if "emission" in e.stages or e.part == "tactile")
+    with pytest.raises(BadScene, match="walls.scattering = 0.1 1/mm; allowed: 0 in a material that fills no `cells`"):
+        renderer.radiance({**values, "walls.scattering": 0.1})
 
 
 def test_no_light_no_picture(bench):
