@@ -276,7 +276,8 @@ def params(scene: SceneName,
             "squared": p.squared, "effect": brought.get((part.kind, p.name)) if part is not None else None, "meaning": p.doc})
     if as_json:
         return show(rows)
-    how = {"ad": "forward mode", "difference": "differences", "image": "complex step", "layer": "complex step", None: "-"}
+    how = {"ad": "forward mode", "difference": "differences", "image": "complex step", "layer": "complex step", "path": "lengths of ways",
+           None: "-"}
     print(table([("key", "value", "unit", "bounds", "neutral", "derivative", "meaning"), *((
         r["key"], _number(r["value"]), r["unit"], "|".join(r["choices"]) if r["choices"] else
         "any" if math.inf in r["bounds"] else " .. ".join(f"{b:g}" for b in r["bounds"]),

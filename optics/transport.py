@@ -128,7 +128,7 @@ class Transport:
         for number, m in enumerate(self.materials):
             if number not in filling and m.scattering.max() > 1e-12:
                 raise BadScene(f"{self.scene.path}: {m.name}.scattering = {m.scattering.max():g} 1/mm; allowed: 0 in a material that fills no "
-                               "`cells`, as light is mapped in cells only (reach = 'paths' follows it everywhere)")
+                               "`cells`, as light is mapped in cells only")
         for name, part in self.scene.sources.items():
             if part.number("dop_q") or part.number("dop_u"):
                 raise BadScene(f"{self.scene.path}: '{name}' sends polarized light; allowed among clear bodies: dop_q = dop_u = 0")

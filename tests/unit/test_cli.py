@@ -95,6 +95,12 @@ def test_params_are_complete(optics):
     assert by_key["gel.indenter"]["choices"] and not by_key["gel.indenter"]["differentiable"]
 
 
+@pytest.mark.parametrize("name", scene.shipped_scenes())
+def test_params_of_every_scene(optics, name):
+    code, text, err = optics("params", name)
+    assert (code, err) == (0, "") and text.splitlines()[0].split() == ["key", "value", "unit", "bounds", "neutral", "derivative", "meaning"]
+
+
 def test_params_by_pattern_and_definition(optics):
     _, text, _ = optics("params", "gelsight", "gel.press_d*", "led_?.x", *SIZE, "-D", "depth=0.25")
     lines = text.splitlines()[1:]
