@@ -112,10 +112,11 @@ def printed_grid() -> None:
         file.write_text(text(ours, 160, 120))
         transport = Transport(scenes.load(file, variant="llvm_ad_mono_polarized"))
         start = time.perf_counter()
-        picture = transport.take(rays=512, packets=200_000)
+        picture = transport.take(rays=256, packets=1_500_000)
         cost = time.perf_counter() - start
-        noise = float((picture.error**2).sum(0).mean()) ** 0.5 / picture.radiance.sum(0).mean()
-        row("20x20x6 cells, 160x120", f"{cost:.0f} s", f"noise {noise:.1%} a pixel; target 5 % below 60 s")
+        image, error = picture.radiance.sum(0), (picture.error**2).sum(0) ** 0.5
+        row("20x20x6 cells, 160x120", f"{cost:.0f} s", f"noise {np.median(error / np.maximum(image, 1e-12)):.1%} in the median pixel, "
+            f"{(error**2).mean() ** 0.5 / image.mean():.0%} rms; target 5 % below 60 s")
     from optics.effect import use_variant
 
     use_variant("llvm_ad_spectral_polarized")
