@@ -11,11 +11,11 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from optics import paths
+from optics.develop import STEP
 from optics.render import POWERS, LedImage, Renderer
 from optics.scene import Scene
-from optics.transport import Picture, Transport
-
-STEP = 1e-3  # of a plausible change: for the derivative of an absorption coefficient by what it depends on
+from optics.transport import Picture, Transport, coefficient
 
 
 class ClearRenderer(Renderer):
@@ -27,7 +27,7 @@ class ClearRenderer(Renderer):
         super().__init__(scene, remember)
         self.layered = False
         silent = {k for k, p in scene.parameters.items() if p.how == "image"} | {
-            f"{n}.{p}" for n in scene.lights for p in ("power", "power_r", "power_g", "power_b")}
+            f"{n}.{p}" for n in scene.lights for p in POWERS}
         self.deciding = sorted(k for k in scene.parameters if k not in silent)
         self._pictures: OrderedDict = OrderedDict()
 
@@ -45,7 +45,7 @@ class ClearRenderer(Renderer):
         return known
 
     def image(self, values: Mapping, light: str, component: int = 0) -> np.ndarray:
-        return self.light({**values, **{f"{light}.{p}": 1.0 for p in POWERS}, self.bounce_key: 0.0}, light, 0, component)
+        return self.light({**values, **{f"{light}.{p}": 1.0 for p in POWERS}}, light, 0, component)
 
     def light(self, values: Mapping, light: str, seed: int = 0, component: int = 0) -> np.ndarray:
         found = self.picture(values, seed)
@@ -68,28 +68,16 @@ class ClearRenderer(Renderer):
     def tangent(self, values: Mapping, key: str, seed: int = 0) -> np.ndarray:
         """d radiance / d parameter: by the lengths of the ways for what changes an absorption, else a central difference with the
         same random numbers."""
-        name, parameter = key.rsplit(".", 1)
-        declared = self.scene.parameters[key]
-        if declared.how == "path":
-            h = STEP * declared.plausible
-            fading = [self._fading(values, key, values[key] + s * h) for s in (1, -1)]
+        name = key.rsplit(".", 1)[0]
+        if self.scene.parameters[key].how == "path":
+            own = paths.part_values(self.scene, name, {**values, key: values[key] + 1j * STEP}, {})
+            slope = np.imag(coefficient(own, "absorption", self.wavelengths)) / STEP  # of the coefficient, per band
             found = self.picture(values, seed, slopes=True)
-            return (fading[0] - fading[1]) / (2 * h) * sum(
-                self.powers(values, n) * found.slopes[name][found.lights.index(n)] for n in self.lit(values))
-        h = declared.step * declared.plausible
-        low, high = max(values[key] - h, declared.bounds[0]), min(values[key] + h, declared.bounds[1])
+            return slope * sum(self.powers(values, n) * found.slopes[name][found.lights.index(n)] for n in self.lit(values))
+        low, high = self.scene.parameters[key].sides(values[key])
         return (self.radiance({**values, key: high}, seed) - self.radiance({**values, key: low}, seed)) / (high - low)
-
-    def _fading(self, values: Mapping, key: str, value: float) -> np.ndarray:
-        """(B,) absorption coefficient of a material for another value of one of its parameters."""
-        import mitsuba as mi
-
-        self._apply({**values, key: value}, move=False)
-        part = self.scene.parts[key.rsplit(".", 1)[0]]
-        return np.array([np.array(part.fading(mi.Float(float(w)))).item() for w in self.wavelengths])
 
 
 def renderer_of(scene: Scene, remember: int = 24) -> Renderer:
     """The renderer that a scene's light needs."""
-    clear = any(p.kind == "clear" for p in scene.parts.values())
-    return (ClearRenderer if clear else Renderer)(scene, remember)
+    return (ClearRenderer if scene.by_chance else Renderer)(scene, remember)

@@ -13,8 +13,8 @@ Where an effect enters, in the order that light takes (`STAGES`):
     volume      gel       L  = f(path, gel)           radiance added by the gel itself, per LED; Dr.Jit
     ambient     membrane  L  = f(geometry, membrane)  radiance added that no LED made; Dr.Jit
     glow        interface L  = f(glow, interface)     (B,) radiance that a boundary sends to the camera, per light; numpy
-    index       clear     n  = f(n, wavelengths, clear)       refractive index per band; Dr.Jit
-    absorption  clear     a  = f(a, wavelengths, clear)       absorption coefficient per band, 1/mm; Dr.Jit
+    index       clear     n  = f(n, wavelengths, clear)  refractive index per band; arithmetic of optics.mueller
+    absorption  clear     a  = f(a, wavelengths, clear)  absorption coefficient per band, 1/mm; arithmetic of optics.mueller
     layer       a layer   M  = f(crossing, layer)     Mueller matrix that light passes after the layer's own (optics.layers)
     lens        camera    I  = f(image, camera)       irradiance per band, (H, W, B); numpy
     sensor      camera    I  = f(image, camera)       signal per channel, (H, W, C), 1 = full scale; numpy
@@ -317,7 +317,8 @@ class Declared:
     def on(base: type) -> type:
         """A subclass of a Mitsuba class that has the methods of this one."""
         return type(f"Declared{base.__name__}", (base,), {n: f for n, f in vars(Declared).items()
-                                                          if (callable(f) or n == "band") and not n.startswith("__") and n not in ("on", "on_mesh")})
+                                                          if (callable(f) or n == "band") and not n.startswith("__")
+                                                          and n not in ("on", "on_mesh")})
 
     @staticmethod
     def on_mesh() -> type:

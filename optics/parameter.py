@@ -79,6 +79,11 @@ class Parameter:
         """d value / d u; infinite at 0 of a squared parameter."""
         return (1 + (value / self.saturates) ** 2) ** 2 / (2 * value) if self.squared else 1.0
 
+    def sides(self, value: float) -> tuple[float, float]:
+        """The two values of a central difference, `step` to either side, within bounds."""
+        step = self.step * self.plausible
+        return max(value - step, self.bounds[0]), min(value + step, self.bounds[1])
+
     def check(self, value, key: str, where: str = ""):
         """Return the value in its own type, or raise: not a number, not finite, out of bounds, not a choice."""
         if self.choices:

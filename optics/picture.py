@@ -97,9 +97,12 @@ class Pictures:
         if stokes and not (scene.integrator is not None and scene.integrator.bands and "polarized" in scene.variant):
             raise BadScene(f"{scene.path}: no Stokes vectors from this integrator and the variant {scene.variant}; allowed: the "
                            "integrator 'tactile' with `bands`, and a variant with 'polarized' in its name")
-        reason = "samples per pixel were asked for" if spp is not None else obstacle(scene)
-        if not reason and stokes and not paths.layered(scene):
+        reason = "samples per pixel were asked for" if spp is not None else obstacle(scene, chance=True)
+        if not reason and stokes and (scene.by_chance or not paths.layered(scene)):
             reason = "Stokes vectors were asked for of a scene without layers"
+        if reason and scene.by_chance and scene.leds:
+            raise BadScene(f"{scene.path}: {reason}, but mi.render brings no light of an LED, which is a point, through clear bodies; allowed: "
+                           "without --spp and --stokes, or luminous areas (emitters of the type 'source') in place of LEDs")
         self.renderer = None if reason else renderer_of(scene, remember=2)
         if self.renderer is not None and self.renderer.layered:
             reason = veiled(self.renderer, self.base)
@@ -263,8 +266,8 @@ class Pictures:
         return tuple(np.array(a, float).reshape(3, -1)[:, 0] for a in (o, d))
 
 
-def obstacle(scene: Scene) -> str:
-    """Why a scene cannot be rendered LED by LED; empty where it can."""
+def obstacle(scene: Scene, chance: bool = False) -> str:
+    """Why a scene cannot be rendered LED by LED; empty where it can. chance: clear bodies are none, as light is followed by chance."""
     import mitsuba as mi
 
     if scene.camera is None or scene.integrator is None or not scene.lights:
@@ -277,7 +280,7 @@ def obstacle(scene: Scene) -> str:
         if shape.is_medium_transition():
             return "it has a medium"
         kind = getattr(bsdf, "kind", "")
-        if kind in ("interface", "clear") or kind and registry().parts[kind].mueller is not None:
+        if kind == "interface" or kind == "clear" and chance or kind and registry().parts[kind].mueller is not None:
             continue
         if mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta | mi.BSDFFlags.Null):
             return "it has mirrors or clear surfaces that are no 'interface'"

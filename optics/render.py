@@ -511,9 +511,9 @@ class Model:
 
     def __init__(self, scene: Scene, captures: Captures, noise: Noise | None = None,
                  flat_field: bool | str | None = True):
-        noise = noise or captures.noise
         from optics.by_chance import renderer_of
 
+        noise = noise or captures.noise
         if noise is None:
             raise BadScene(f"{captures.folder}: no noise model; give [noise] in captures.toml or repeats to estimate it from")
         if captures.table is not None:
@@ -747,7 +747,7 @@ class Model:
         """factor times d radiance / d key in a frame."""
         name, parameter = key.rsplit(".", 1)
         kind = self.renderer.kind(key)
-        bounce, lit = now[self.renderer.bounce_key], self.lit(now)
+        lit = self.lit(now)
         tangent = self.renderer.led_tangent_at_rest if at_rest else self.renderer.led_tangent
         if not lit and kind != "membrane" and self.parameters[key].how != "difference":
             return None  # a dark frame
@@ -765,8 +765,7 @@ class Model:
             factor = factor * others
             if not np.any(factor):
                 return None
-            image = self.renderer.image(now, name)
-            return factor * (image + bounce * self.renderer.bounced(now, name, seed) if bounce else image)
+            return factor * self.renderer.light({**now, **{f"{name}.{p}": 1.0 for p in POWERS}}, name, seed)
         if kind == "led" and name not in lit:
             return None
         if self.renderer.by_chance:
@@ -784,23 +783,17 @@ class Model:
             total = total + self._difference_ambient(now, key)
         return factor * total
 
-    def _sides(self, key: str, now: Mapping) -> tuple[float, float]:
-        """The two values of a central difference, `Parameter.step` to either side, within bounds."""
-        parameter = self.parameters[key]
-        step = parameter.step * parameter.plausible
-        return max(now[key] - step, parameter.bounds[0]), min(now[key] + step, parameter.bounds[1])
-
     def _difference(self, now: Mapping, key: str, seed: int) -> np.ndarray:
         """Central difference of the linear image, one-sided at a bound; common samples."""
-        low, high = self._sides(key, now)
+        low, high = self.parameters[key].sides(now[key])
         return (self.radiance({**now, key: high}, seed) - self.radiance({**now, key: low}, seed)) / (high - low)
 
     def _difference_led(self, now: Mapping, led: str, key: str) -> np.ndarray:
-        low, high = self._sides(key, now)
+        low, high = self.parameters[key].sides(now[key])
         return (self.renderer.image({**now, key: high}, led) - self.renderer.image({**now, key: low}, led)) / (high - low)
 
     def _difference_ambient(self, now: Mapping, key: str) -> np.ndarray:
-        low, high = self._sides(key, now)
+        low, high = self.parameters[key].sides(now[key])
         return (self.renderer.ambient({**now, key: high}) - self.renderer.ambient({**now, key: low})) / (high - low)
 
     # -- what a fit and a diagnosis need of the data --------------------------------------------------------------------

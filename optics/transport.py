@@ -5,7 +5,7 @@ followed from both ends to where it is scattered:
 
     from the lights    packets of light fly through all faces, are absorbed along every stretch (exp(-alpha d)), scattered by the
                        bodies and by matt surfaces, and leave what they are worth in two maps: the fluence in every cell of a
-                       grid, W/mm^2 times mm^3/mm^3 (track length by volume), and the irradiance on matt surfaces
+                       grid (track length by volume, 1/mm^2 per unit of power), and the irradiance on matt surfaces
     from the camera    rays fly through all faces the same way; each ends on a matt surface, where it reads the irradiance, and
                        gathers on its way what the bodies scatter towards it, sigma_s/(4 pi) of the fluence
 
@@ -14,8 +14,8 @@ are exact: every contribution times the length of its way (d/d alpha exp(-alpha 
 as the row (from the camera) or column (from a light) of the Mueller matrix of everything met so far, in axes that travel along.
 
 The maps know cells and matt surfaces with coordinates on them (u, v); matt surfaces are taken as Lambertian.
-Without maps (`reach="paths"`) rays of the camera go on until they meet a luminous area: slower by orders of magnitude, without
-the maps' resolution. It is what the maps are tested against, beside stock Mitsuba.
+Without maps (`reach="paths"`) rays of the camera go on until they meet a luminous area: without the maps' resolution, and slower
+the smaller the area. It is what the maps are tested against, beside stock Mitsuba.
 
 Source: Fan, Li, Cong & Zhang, MagicGripper, supplementary VII-A, eqs. (18)-(29); Veach, thesis (1997), 5.2, for radiance across
 a boundary (1/n^2) against power (1); Jensen, Realistic Image Synthesis Using Photon Mapping (2001), for maps of light.
@@ -29,10 +29,12 @@ from functools import reduce
 
 import numpy as np
 
+from optics.effect import registry
 from optics.errors import BadScene
 from optics.mueller import diattenuator, fresnel, fresnel_reflection, rotation
+from optics.paths import part_values
 
-DEPTH = 512  # faces that a ray may meet; printed grids need 256
+DEPTH = 512  # faces that a ray may meet; of the scene magictac's, 6e-5 would meet more
 FAINT = 0.3  # below this share of its start, half of the packets go on with twice the weight
 BATCHES = 8  # independent parts of an image, maps and all, for its standard error
 AT_ONCE = 4_000_000  # rays that are followed together
@@ -504,24 +506,35 @@ class Surface:
         bsdf = shape.bsdf()
         clear = getattr(bsdf, "kind", "") == "clear"
         self.inside = names.index(bsdf.name) if clear else -1
-        self.outside = names.index(bsdf.outside or AIR) if clear else -1
+        self.outside = names.index(bsdf.around.name if bsdf.around is not None else AIR) if clear else -1
         self.light = next((n for n, part in scene.sources.items() if shape.emitter() is part), "")
-        # a map needs coordinates on the surface
         diffuse = bsdf is not None and not clear and mi.has_flag(bsdf.flags(), mi.BSDFFlags.DiffuseReflection)
-        flat = not shape.is_mesh() or shape.has_vertex_texcoords()
-        self.matt = diffuse and flat and not self.light
+        self.matt = diffuse and not self.light
+        if self.matt and shape.is_mesh() and not shape.has_vertex_texcoords():
+            raise BadScene(f"{scene.path}: '{shape.id()}' is matt, and no map of its light can be kept on a mesh without texture coordinates; "
+                           "allowed among clear bodies: rectangles, cubes, spheres, meshes with coordinates")
+        if not (clear or diffuse or self.light) or mi.has_flag(bsdf.flags(), mi.BSDFFlags.Glossy) or not clear and mi.has_flag(
+                bsdf.flags(), mi.BSDFFlags.Delta | mi.BSDFFlags.Null):
+            raise BadScene(f"{scene.path}: the surface '{shape.id()}' is neither clear nor matt; allowed among clear bodies: materials of the type "
+                           "'clear', and matt ones (diffuse, membrane)")
         self.cells = shape.cells() if getattr(shape, "kind", "") == "cells" else None
 
 
 def materials(scene, bands: np.ndarray) -> list[Material]:
     """Air, then the scene's clear materials, at the present values."""
-    import mitsuba as mi
-
-    found = [Material(AIR, np.ones(len(bands)), np.zeros(len(bands)), np.zeros(len(bands)))]
+    found, values = [Material(AIR, np.ones(len(bands)), np.zeros(len(bands)), np.zeros(len(bands)))], scene.values()
     for name, part in scene.parts.items():
-        if part.kind != "clear":
-            continue
-        wave = [mi.Float(float(b)) for b in bands]
-        index, absorption = ([np.array(f(w)).item() for w in wave] for f in (part.refractive, part.fading))
-        found.append(Material(name, np.array(index), np.array(absorption), np.full(len(bands), part.number("scattering"))))
+        if part.kind == "clear":
+            own = part_values(scene, name, values, {})
+            found.append(Material(name, coefficient(own, "index", bands), coefficient(own, "absorption", bands),
+                                  np.full(len(bands), own.scattering)))
     return found
+
+
+def coefficient(clear, stage: str, wavelengths, functions: Sequence[Callable] | None = None):
+    """`index` or `absorption` (1/mm) of a clear material per band, with what effects of that stage make of it (`functions`: those that
+    act; None: all); for numpy, complex numbers among them, and for Dr.Jit."""
+    value = getattr(clear, stage) + 0 * wavelengths
+    for function in registry().functions("clear", stage) if functions is None else functions:
+        value = function(value, wavelengths, clear)
+    return value

@@ -180,6 +180,19 @@ def bench(benches):
     found.scene.set(found.values)
 
 
+@pytest.fixture
+def optics(capsys):
+    """Run a command line: (exit code, stdout, stderr)."""
+    from optics import cli
+
+    def run(*arguments):
+        code = cli.main([str(a) for a in arguments])
+        said = capsys.readouterr()
+        return code, said.out, said.err
+
+    return run
+
+
 @pytest.fixture(scope="session")
 def measures():
     """How far apart two images are."""

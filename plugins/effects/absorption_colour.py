@@ -11,12 +11,11 @@ References
 """
 
 from optics.effect import Effect
+from optics.mueller import exp
 from optics.parameter import Parameter
 
 
 def fade(alpha, wavelengths, clear):
-    from optics.mueller import exp
-
     return alpha * exp(clear.absorption_slope * (wavelengths - 540.0) / 100)
 
 

@@ -32,6 +32,7 @@ def build():
     import mitsuba as mi
 
     from optics.mueller import diattenuator, fresnel, fresnel_reflection
+    from optics.transport import coefficient
 
     class Clear(passing(mi.BSDFFlags.DeltaTransmission)):
         kind = "clear"
@@ -51,17 +52,11 @@ def build():
 
         def fading(self, wavelengths):
             """alpha per band, 1/mm."""
-            alpha = self.absorption + 0 * wavelengths
-            for function in self.functions("absorption"):
-                alpha = function(alpha, wavelengths, self)
-            return alpha
+            return coefficient(self, "absorption", wavelengths, self.functions("absorption"))
 
         def refractive(self, wavelengths):
             """n per band."""
-            n = self.index + 0 * wavelengths
-            for function in self.functions("index"):
-                n = function(n, wavelengths, self)
-            return n
+            return coefficient(self, "index", wavelengths, self.functions("index"))
 
         def sample(self, ctx, si, sample1, sample2, active=True):
             cos = mi.Frame3f.cos_theta(si.wi)

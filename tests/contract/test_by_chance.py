@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from optics.effect import registry
-from optics.render import POWERS
 
 KINDS = ("clear", "cells")
 EFFECTS = sorted(k for k, e in registry().effects.items() if e.part in KINDS)
@@ -75,6 +74,16 @@ def test_derivatives_against_differences(key, bench):
     assert (np.abs(own - wide) < 6 * error + 0.05 * size).all()  # straight over a plausible change to some per cent
 
 
+def test_a_material_that_absorbs_nothing_has_its_derivative(bench):
+    """At neutral, which is a bound: more absorption is less light, by the lengths of the ways."""
+    scene, renderer, values = bench
+    clear = {**values, "window.absorption": 0.0}
+    found = renderer.tangent(clear, "window.absorption").mean()
+    assert found == pytest.approx(renderer.tangent({**values, "window.absorption": 1e-6}, "window.absorption").mean(), rel=1e-2)
+    # the window is 4 mm thick and passed once by rays of the camera, near its axis, and by little else
+    assert -6 < found / renderer.radiance(clear).mean() < -3.9
+
+
 SLAB = """<scene version="3.0.0">
     <integrator type="tactile" id="integrator"><string name="bands" value="620, 540, 460"/><integer name="rays" value="4000"/><integer name="packets" value="8"/></integrator>
     <sensor type="camera" id="camera">
@@ -118,9 +127,32 @@ def test_effects_are_offered_where_they_act(bench):
         renderer.radiance({**values, "walls.scattering": 0.1})
 
 
+def test_what_light_by_chance_does_not_pass_is_refused(bench, tmp_path):
+    """A picture by mi.render, in which LEDs would be dark; a curve LED by LED; films and meshes without coordinates in between."""
+    from optics import cli, scene as scenes
+    from optics.by_chance import ClearRenderer
+    from optics.errors import BadScene
+    from optics.picture import Pictures, obstacle
+
+    scene, _, _ = bench
+    for more in ({"spp": 4}, {"stokes": True}):
+        with pytest.raises(BadScene, match="brings no light of an LED, which is a point, through clear bodies"):
+            Pictures(scene, **more)
+    assert obstacle(scene) and not obstacle(scene, chance=True)
+    text = scenes.find("magictac").read_text(encoding="utf-8")
+    film = '<shape type="rectangle"><bsdf type="polarizer_film" id="film"/></shape></scene>'
+    mesh = '<shape type="target" id="rod"><bsdf type="diffuse"/></shape></scene>'
+    for body, said in ((film, "neither clear nor matt"), (mesh, "'rod' is matt, and no map")):
+        (tmp_path / "more.xml").write_text(text.replace("</scene>", body))
+        loaded = scenes.load(tmp_path / "more.xml", {k: str(v) for k, v in DEFINES.items()})
+        with pytest.raises(BadScene, match=said):
+            ClearRenderer(loaded).radiance(loaded.values())
+    assert cli.main(["sweep", "magictac", "--key", "filling.absorption", "--from", "0", "--to", "1"]) == 2
+
+
 def test_no_light_no_picture(bench):
     scene, renderer, values = bench
-    dark = {**values, **{f"{n}.{p}": 0.0 for n in scene.lights for p in POWERS[:1]}}
+    dark = {**values, **{f"{n}.power": 0.0 for n in scene.lights}}
     assert renderer.radiance(dark).max() == 0
 
 

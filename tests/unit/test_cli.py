@@ -18,16 +18,6 @@ SIZE = ["-D", "width=64", "-D", "height=48"]
 HEAVY = ("mitsuba", "drjit", "numpy", "scipy", "matplotlib", "colour", "pydantic", "rich.console")
 
 
-@pytest.fixture
-def optics(capsys):
-    """Run a command line: (exit code, stdout, stderr)."""
-    def run(*arguments):
-        code = cli.main([str(a) for a in arguments])
-        said = capsys.readouterr()
-        return code, said.out, said.err
-    return run
-
-
 @pytest.fixture(scope="module")
 def measured(tmp_path_factory):
     """Six frames of a sensor with a known power, three presses under two LEDs."""

@@ -14,16 +14,6 @@ SMALL = ["-D", "width=48", "-D", "height=36"]
 BENCH = ["-D", "width=24", "-D", "height=16", "-D", "x_fov=8", "-D", "bands=620, 540, 460"]
 
 
-@pytest.fixture
-def optics(capsys):
-    """Run a command line: (exit code, stdout, stderr)."""
-    def run(*arguments):
-        code = cli.main([str(a) for a in arguments])
-        said = capsys.readouterr()
-        return code, said.out, said.err
-    return run
-
-
 def stokes_of(file):
     channels, header = exr.read(file)
     return (*exr.spectral_image(channels), channels, header)
