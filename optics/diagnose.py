@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import product
 
 import numpy as np
 
@@ -26,7 +25,6 @@ from optics.verdict import (
     moved_by, rivals, sentence,
 )
 
-MOST_SIGNS = 4  # parameters of one effect whose signs are tried against each other
 START = 0.7  # of the expected change, to begin a refit from: the linear estimate overshoots more often than not
 SETTLED = 0.01  # of the excess of chi2: what a calibrated base may still absorb
 KAPPA = 0.1  # noise per pixel of derivative images over their signal, above which strengths are biased
@@ -342,7 +340,7 @@ def _refit(model, fit, evidence: Evidence, table: Table, chosen: Sequence[Candid
                 break  # the first attempt was as good as predicted
             if fraction < START and c.row.fall < CLEAR:
                 break  # nothing to win
-            start = _signs(model, evidence, c, _start(model, fit, evidence, [c], fraction))
+            start = _start(model, fit, evidence, [c], fraction)
             try:
                 found = refit(model, [*base, *c.variables], start, frames=list(fitted))
             except (ValueError, ArithmeticError, np.linalg.LinAlgError) as error:
@@ -412,24 +410,6 @@ def _start(model, fit, evidence: Evidence, effects: Sequence[Candidate], fractio
         values.put(v, float(np.clip(to, low + 0.1 * (here - low) if math.isfinite(low) else to,
                                     high - 0.1 * (high - here) if math.isfinite(high) else to)))
     return values
-
-
-def _signs(model, evidence: Evidence, c: Candidate, start: Values) -> Values:
-    """Of an effect that sets in with the square, the best of several starts: images of one parameter at a time do not say whether two
-    of them have the same sign (a retardance along 30 or along -30 degrees), and a refit does not cross the ridge in between."""
-    free = [(v, float(here)) for v, here, side in zip(c.variables, c.start, c.sides) if side == 0]
-    if c.effect.onset == "tangent" or not 2 <= len(free) <= MOST_SIGNS:
-        return start
-    starts = [start]
-    for estimated, *signs in product((True, False), *[(1, -1)] * (len(free) - 1)):
-        values = start.copy()
-        for (v, here), sign in zip(free, (1, *signs)):
-            size = v.parameter.plausible
-            if estimated:  # where one parameter alone does nothing, its estimate is anything
-                size = np.clip(abs(value_of(model, start, v) - here), size / 2, 2 * size)
-            values.put(v, float(np.clip(here + sign * size, *v.parameter.bounds)))
-        starts.append(values)
-    return min(starts, key=lambda values: _chi2(model, values, evidence)[0])
 
 
 def _chi2(model, values: Values, evidence: Evidence) -> tuple[float, list[np.ndarray]]:

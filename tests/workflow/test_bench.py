@@ -26,6 +26,7 @@ class Case:
     alike      what nobody can tell from it with these settings: named together with it, or in its place
     strengths  {variable: true value}
     settings   further settings, each a list that the readings cycle through
+    polarizers angles of the first polarizer, deg
     """
 
     truth: Truth
@@ -34,6 +35,7 @@ class Case:
     strengths: dict[str, float] = field(default_factory=dict)
     settings: dict[str, list[float]] = field(default_factory=dict)
     noise: Noise = NOISE
+    polarizers: tuple[float, ...] = (0.0, 60.0, 100.0, 190.0, 250.0)
 
 
 def lamp(**more):
@@ -58,6 +60,9 @@ CASES = {
     "wobble": Case(Truth(**lamp(p2=Polarizer(wobble_c=0.01, wobble_s=-0.005))), ("analyzer wobble",)),
     "retardance": Case(Truth(**lamp(sample=Sample(retardance=12.0, axis=20.0))), ("retardance",), (), {},
                        {"sample.angle": [0.0, 45.0]}),
+    # light comes nearly along the sheet's 0 degrees: one component shows by its product with the other, which no chord knows
+    "retardance along a polarizer": Case(Truth(**lamp(sample=Sample(retardance=15.0, axis=-20.0))), ("retardance",),
+                                         polarizers=(0.0, 8.0)),
     "dispersive retardance": Case(
         Truth(**colours(sample=Sample(retardance=40.0, axis=20.0, dispersion=0.1))), ("retardance", "dispersive retardance"), (), {
             "sample.retard_dispersion": 0.1}, {"sample.angle": [0.0, 45.0]}),
@@ -83,7 +88,7 @@ CASES = {
 
 
 def study_of(case: Case, folder, seed: int = 7):
-    settings = jones.malus_sweep(READINGS, polarizer_angles=(0.0, 60.0, 100.0, 190.0, 250.0))
+    settings = jones.malus_sweep(READINGS, polarizer_angles=case.polarizers)
     for i, own in enumerate(settings):
         own["source.power"] = (1.0, 0.5)[i % 2]
         own.update({key: values[i % len(values)] for key, values in case.settings.items()})
