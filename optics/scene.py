@@ -60,10 +60,10 @@ class Scene:
 
     parts        id -> Mitsuba plugin object of ours
     parameters   key -> Parameter, in the order of the file
-    camera, integrator, gel, leds, membranes    the parts by role (None or empty where the scene has none)
+    camera, integrator, gel, block, leds, membranes    the parts by role (None or empty where the scene has none)
     """
 
-    MOVED = ("carried", "markers", "target", "cells")  # kinds of shapes besides the gel whose parameters move geometry
+    MOVED = ("carried", "markers", "target", "block", "cells")  # kinds of shapes besides the gel whose parameters move geometry
 
     def __init__(self, path: Path, defines: Mapping[str, str], variant: str = DEFAULT_VARIANT):
         self.path, self.defines, self.variant = Path(path), dict(defines), variant
@@ -94,12 +94,14 @@ class Scene:
         self._nest()
         self.camera = self._one("camera")
         self.integrator = self._one("tactile")
-        self.gel = self._one("gel")
+        self.gel, self.block = self._one("gel"), self._one("block")
+        if self.block is not None:
+            self.block.target = self._one("target")
         if self.integrator is not None and self.integrator.lanes == 1 and len(self.integrator.bands) == 1:
             for part in self.parts.values():
                 part.band = self.integrator.bands[0]
         self.leds = {n: p for n, p in self.parts.items() if p.kind == "led"}
-        self.sources = {n: p for n, p in self.parts.items() if p.kind == "source"}
+        self.sources = {n: p for n, p in self.parts.items() if p.kind in ("source", "room")}
         self.lights = {**self.leds, **self.sources}
         self.membranes = {n: p for n, p in self.parts.items() if p.kind == "membrane"}
         self.parameters: dict[str, Parameter] = {}
@@ -107,7 +109,7 @@ class Scene:
             for p in registry().parameters_of(part.kind):
                 self.parameters[f"{name}.{p.name}"] = p
         self._strain()
-        if carried := [p for p in self.parts.values() if hasattr(p, "carry")]:
+        if carried := [p for p in self.parts.values() if hasattr(p, "carry") or p is self.block]:
             self._place(carried)
             self.mitsuba.parameters_changed([])
         self._stock = self._stock_parameters()
@@ -210,6 +212,8 @@ class Scene:
         if rebuild:
             self.gel.rebuild(mi.traverse(self.gel))
             moved.update(n for n, p in self.parts.items() if hasattr(p, "carry"))
+        if self.block is not None and any(self.parts[n] in (self.block, self.block.target) for n in moved):
+            moved.update(n for n, p in self.parts.items() if p.kind in ("block", "cells"))
         if rebuild or strained:
             self._strain()
         self._place([self.parts[n] for n in moved])
@@ -217,12 +221,13 @@ class Scene:
             self.mitsuba.parameters_changed([])
 
     def _place(self, shapes: list) -> None:
-        """Rebuild shapes besides the gel; those in the skin where its present dent carries them."""
+        """Rebuild shapes besides the gel; those in a body that gives way where its present dent carries them."""
         import mitsuba as mi
 
-        for part in shapes:
-            if self.gel is not None and hasattr(part, "carry"):
-                part.carry(self.gel)
+        for part in sorted(shapes, key=lambda p: self.MOVED.index(p.kind)):
+            carrier = getattr(self, getattr(part, "rides", ""), None)
+            if carrier is not None:
+                part.carry(carrier)
             else:
                 part.rebuild(mi.traverse(part))
 

@@ -36,6 +36,7 @@ def build():
 
     class Carried(Declared.on_mesh()):
         kind = "carried"
+        rides = "gel"  # role of the part that carries it
 
         def __init__(self, props):
             self.columns, self.rows = int(props.get("columns", 121)), int(props.get("rows", 109))

@@ -37,6 +37,7 @@ def build():
 
     class Markers(Declared.on_mesh()):
         kind = "markers"
+        rides = "gel"  # role of the part that carries it
 
         def __init__(self, props):
             self.columns, self.rows = int(props.get("columns", 5)), int(props.get("rows", 4))

@@ -276,7 +276,7 @@ def test_silhouette_of_the_target(load, variant):
     np.testing.assert_allclose(numbers(si.n), [(0, 0, -1)] * 2, atol=1e-6)
     back = rays(scene, np.array([0.0]), np.array([0.0]), start=60.0, ahead=False)
     assert numbers(back.p)[0, 2] == pytest.approx(17, abs=ORIGIN) and numbers(back.n)[0, 2] == 1
-    assert set(np.round(vertices(part)[:, 2], 5)) == {5.0, 17.0}
+    assert vertices(part)[:, 2].min() == 5 and vertices(part)[:, 2].max() == 17
 
     scene.set({"target.x": 100.0})
     assert not np.array(rays(scene, np.array([0.0]), np.array([0.0])).is_valid())[0]
@@ -291,6 +291,7 @@ def test_the_target_is_closed(load):
     faces = np.array(mi.traverse(part)["faces"]).reshape(-1, 3)
     _, same = np.unique(np.round(vertices(part), 4), axis=0, return_inverse=True)
     corners = same.ravel()[faces]
+    corners = corners[[len(set(c)) == 3 for c in corners]]  # at the poles every other triangle has no area
     edges = np.concatenate([corners[:, [i, (i + 1) % 3]] for i in range(3)])
     forth, back = (sorted(map(tuple, e)) for e in (edges, edges[:, ::-1]))
     assert forth == back and len(set(forth)) == len(forth)
