@@ -19,9 +19,10 @@ from optics.transport import Picture, Transport, coefficient
 
 
 class ClearRenderer(Renderer):
-    """`optics.render.Renderer` for a scene with clear bodies: all lights in one picture."""
+    """`optics.render.Renderer` for a scene with clear bodies: the lights in one picture."""
 
     by_chance = True
+    progress = None  # called with what is followed ("packets", "rays"), how many are done, and of how many
 
     def __init__(self, scene: Scene, remember: int = 24):
         super().__init__(scene, remember)
@@ -29,16 +30,22 @@ class ClearRenderer(Renderer):
         silent = {k for k, p in scene.parameters.items() if p.how == "image"} | {
             f"{n}.{p}" for n in scene.lights for p in POWERS}
         self.deciding = sorted(k for k in scene.parameters if k not in silent)
+        # lights that are off at first are followed only where they are on
+        self.always = {n for n, p in scene.lights.items() if p.number("power") > 0}
         self._pictures: OrderedDict = OrderedDict()
+        self._sloped = False  # whether derivatives by absorption have been asked for: then they are made along with each picture
 
     def picture(self, values: Mapping, seed: int = 0, slopes: bool = False) -> Picture:
-        """All lights at power 1; kept. slopes: with the derivatives by absorption."""
-        key = (seed, *(values[k] for k in self.deciding))
+        """The lights at power 1; kept. slopes: with the derivatives by absorption."""
+        lights = tuple(n for n in self.scene.lights if n in self.always or values[f"{n}.power"] != 0)
+        key = (seed, lights, *(values[k] for k in self.deciding))
         known = self._pictures.get(key)
+        self._sloped |= slopes
         if known is None or slopes and not known.slopes:
             self._apply(values)
             integrator = self.scene.integrator
-            known = self._pictures[key] = Transport(self.scene).take(integrator.rays, integrator.packets, seed, slopes)
+            known = self._pictures[key] = Transport(self.scene, lights).take(
+                integrator.rays, integrator.packets, seed, self._sloped, progress=self.progress)
             while len(self._pictures) > self.remember:
                 self._pictures.popitem(last=False)
         self._pictures.move_to_end(key)

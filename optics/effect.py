@@ -83,6 +83,8 @@ class Effect:
     pictures    True where it mixes the pixels of a picture: point readings cannot have it
     acts        coordinates that it acts through: radius, height, slope, led, channel, frame, intensity ...
     needs       what a capture set must vary for it to be seen, in words
+    seek        where an effect has a place that no derivative leads to: f(model, values, frames) -> {key: value} of further parameters
+                that do nothing at neutral, found from the residual before the effect is scored or added
     checks      closed forms, as in Part
     """
 
@@ -98,6 +100,7 @@ class Effect:
     pictures: bool = False
     acts: tuple[str, ...] = ()
     needs: str = ""
+    seek: Callable | None = None
     checks: tuple[Callable[[], None], ...] = ()
     doc: str = ""
     file: str = ""

@@ -124,7 +124,7 @@ def default_free(model: Model) -> list[str]:
     spectral = len(model.scene.integrator.bands or (0,))
     for led in model.scene.leds:
         patterns += [f"{led}.{n}" for n in ("x", "y", "z", "pan", "tilt", "mu", "power")]
-    for source in model.scene.sources:
+    for source in (n for n, part in model.scene.sources.items() if part.kind == "source"):
         patterns += [f"{source}.power"] if spectral == 1 else [f"{source}.power_{c}" for c in "rgb"[:spectral]]
     for membrane in model.scene.membranes:
         patterns += [f"{membrane}.rho_{c}" for c in "rgb"[:spectral]] + [f"{membrane}.sigma"]
@@ -206,7 +206,7 @@ def held_out_values(model: Model, found: calibrate.Fit, held: Sequence[int]) -> 
 def comparison_of(model: Model, values: Values, held: Sequence[int], parameters: int, held_parameters: int) -> Comparison:
     """All frames measured against predicted, by optics.compare."""
     predicted = model.predict(values)
-    return compare([f.image for f in model.frames], predicted, [model.noise.sd(p) for p in predicted],
+    return compare([f.image for f in model.frames], predicted, [np.sqrt(model.variance(values, i, p)) for i, p in enumerate(predicted)],
                    [model.usable(i) for i in range(len(model.frames))],
                    [model.coordinates(values, i) for i in range(len(model.frames))],
                    [f.parameters for f in model.frames], [f.group or f.name for f in model.frames],
@@ -254,9 +254,10 @@ def _warnings(model: Model) -> list[str]:
     texts = [*model.captures.warnings, *warnings_of(model.noise, model.captures)]
     if model.renderer.layered and model.captures.table is None and (what := veiled(model.renderer, model.at(Values(), 0))):
         texts.append(f"the model leaves out light that comes through layers: {what}")
-    if model.renderer.by_chance and (share := model.chance()) > CHANCE:
-        texts.append(f"the prediction of clear bodies is an estimate by chance; its error is {share:.2g} of the noise in the first frame, and "
-                     f"a verdict takes it for exact: raise `rays` and `packets` of the scene's integrator until it is below {CHANCE:g}")
+    if model.by_chance and (share := model.chance()) > CHANCE:
+        texts.append(f"the prediction of clear bodies is an estimate by chance; its error is {share:.2g} of the noise in the first frame. It is "
+                     f"added to the noise, pixel by pixel, but is the same in frames of the same geometry: raise `rays` and `packets` of "
+                     f"the scene's integrator until it is below {CHANCE:g}")
     return list(dict.fromkeys(texts))
 
 
@@ -321,12 +322,20 @@ def candidates(model: Model, study: Study) -> list[Effect]:
             and not (e.pictures and model.captures.table is not None)]
 
 
+def seek(model: Model, values: Values, effects: Sequence[Effect], frames: Sequence[int]) -> None:
+    """Put into the values where effects that have a place would be, as their residual says."""
+    for effect in effects:
+        if effect.seek is not None:
+            values.common.update(model.scene.check(effect.seek(model, values, frames), effect.name))
+
+
 def examine(study: Study, model: Model, setup: Setup, found: calibrate.Fit, progress: Progress | None = None):
     """Diagnose the last step and write the diagnosis, with the best effects' fingerprints, into it."""
     from optics.diagnose import diagnose
 
     fitted, held = split(model, setup)
     tested = candidates(model, study)
+    seek(model, found.values, tested, fitted)
     known, results = {v.name for v in found.variables}, {}
     steps = {v.name: v.parameter.plausible for e in tested if e.onset != "tangent" for v in effect_variables(model, e)}
 
@@ -374,6 +383,7 @@ def extend(study: Study, model: Model, setup: Setup, found: calibrate.Fit, effec
     extra = [v for v in effect_variables(model, effect) if v.frames is None or set(v.frames) <= set(fitted)]
     variables = [*found.variables, *extra]
     if start is None:
+        seek(model, found.values, [effect], fitted)
         start = off_neutral(model, found.values, extra)
     clock = time.perf_counter()
     best = calibrate.fit(model, variables, start, fitted, robust=setup.robust, progress=progress)

@@ -12,13 +12,16 @@ followed from both ends to where it is scattered:
 At every face the way is drawn by Fresnel's reflectance; absorption is weighed, never drawn, so that derivatives by absorption
 are exact: every contribution times the length of its way (d/d alpha exp(-alpha l) = -l exp(-alpha l)). Polarization is followed
 as the row (from the camera) or column (from a light) of the Mueller matrix of everything met so far, in axes that travel along.
+On a rough face the ray meets a facet, drawn as often as it is seen (Beckmann's slopes), and all that a face does is done about the
+facet's normal m; the way on is weighed by Smith's G1(wo, m), and what leaves on the wrong side of the face is lost.
 
 The maps know cells and matt surfaces with coordinates on them (u, v); matt surfaces are taken as Lambertian.
 Without maps (`reach="paths"`) rays of the camera go on until they meet a luminous area: without the maps' resolution, and slower
 the smaller the area. It is what the maps are tested against, beside stock Mitsuba.
 
 Source: Fan, Li, Cong & Zhang, MagicGripper, supplementary VII-A, eqs. (18)-(29); Veach, thesis (1997), 5.2, for radiance across
-a boundary (1/n^2) against power (1); Jensen, Realistic Image Synthesis Using Photon Mapping (2001), for maps of light.
+a boundary (1/n^2) against power (1); Jensen, Realistic Image Synthesis Using Photon Mapping (2001), for maps of light; Walter,
+Marschner, Li & Torrance, EGSR 2007, and Heitz & d'Eon, CGF 33, 103 (2014), for rough faces.
 """
 
 from __future__ import annotations
@@ -39,19 +42,24 @@ FAINT = 0.3  # below this share of its start, half of the packets go on with twi
 BATCHES = 8  # independent parts of an image, maps and all, for its standard error
 AT_ONCE = 4_000_000  # rays that are followed together
 TEXELS = 64  # of an irradiance map, each way
-ASTRAY = 1e-3  # faces per ray that rounding may lead a ray past, at edges
+SMOOTH = 1e-4  # roughness up to which a face is smooth: Mitsuba's distributions know no less
+ASTRAY = 5e-3  # faces per ray that rounding may lead a ray past, at edges: 2e-5 in a grid at rest, 1e-3 in a pressed one
 SPLIT = 2  # parts of a cell of the fluence map, each way
 AIR = "air"
+STREAM = 0xDA3E39CB94B95BDB  # of random numbers, as Dr.Jit begins
 
 
 @dataclass(frozen=True)
 class Material:
-    """What a body is made of, per band: refractive index, absorption and scattering coefficients in 1/mm."""
+    """What a body is made of, per band: refractive index, absorption and scattering coefficients in 1/mm; roughness of its faces."""
 
     name: str
     index: np.ndarray
     absorption: np.ndarray
     scattering: np.ndarray
+    roughness: float = 0.0
+    of: str = ""  # the material that it is a share of
+    share: float = 1.0
 
 
 @dataclass
@@ -73,22 +81,26 @@ class Picture:
 class Transport:
     """A scene of clear bodies, matt surfaces and lights, ready to be photographed at the scene's present values."""
 
-    def __init__(self, scene):
+    def __init__(self, scene, lights: Sequence[str] | None = None):
+        """lights: those to follow; None: all. A light's picture does not depend on the others."""
         if scene.camera is None or scene.integrator is None:
             raise BadScene(f"{scene.path}: a picture needs a part of the type 'camera' and the integrator 'tactile'")
         if not scene.lights:
             raise BadScene(f"{scene.path}: the scene has no light (an emitter of the type 'led' or 'source')")
         self.scene = scene
         self.bands = np.array(scene.integrator.bands or (540.0,))
-        self.lights = list(scene.lights)
+        self.lights = [n for n in scene.lights if lights is None or n in lights]
         self.width, self.height = scene.camera.resolution
         self.materials = materials(scene, self.bands)
         self.surfaces = [Surface(scene, shape, self.materials) for shape in scene.mitsuba.shapes()]
+        for s in self.surfaces:
+            if s.cells is not None:
+                self._fill(s)
         self.cells = [s.cells for s in self.surfaces if s.cells is not None]
         matt, cells = 0, 0
         for s in self.surfaces:
             if s.cells is not None:
-                s.first, cells = cells, cells + len(s.cells.volumes)
+                s.first, cells = cells, cells + len(s.cells.rows)
             elif s.matt:
                 s.first, matt = matt * TEXELS**2, matt + 1
         self.voxels, self.texels = cells * SPLIT**3, matt * TEXELS**2
@@ -121,12 +133,29 @@ class Transport:
             raise BadScene(f"{self.scene.path}: {astray / followed:.2g} times per ray a face of a clear body is met from a material that is not "
                            "its neighbour: bodies overlap, a normal points inwards, or `outside` names the wrong material")
         mean, error = images.mean(0), images.std(0, ddof=1) / np.sqrt(BATCHES)
-        return Picture(self.lights, mean[0], error[0], dict(zip([m.name for m in self.materials[1:]], mean[1:])), lost / followed)
+        by = {}
+        for m, slope in zip(self.materials[1:], mean[1:]):
+            by[m.of or m.name] = by.get(m.of or m.name, 0.0) + m.share * slope
+        return Picture(self.lights, mean[0], error[0], by, lost / followed)
 
+    def _fill(self, grid: "Surface") -> None:
+        """Say what is in each cell, with a material of its own for one that lacks filling."""
+        cell, share = grid.shape.lacking()
+        grid.fillings = np.full(len(grid.cells.rows), grid.inside)
+        if share > 0 and grid.inside >= 0:
+            m = self.materials[grid.inside]
+            grid.fillings[cell] = len(self.materials)
+            self.materials.append(Material(f"{m.name}, unfilled", 1 + (m.index - 1) * (1 - share), m.absorption * (1 - share),
+                                           m.scattering * (1 - share), m.roughness, m.name, 1 - share))
+
+    def seen_through(self, rays: int, seed: int = 0) -> np.ndarray:
+        """(cells, H, W): length (mm) in each cell of the camera's rays of each pixel, in the mean, by their weight in the first band."""
+        run = Run(self, [0], 1, seed)
+        return run.lengths(rays)
 
     def _check_maps(self) -> None:
         """Refuse what the maps do not hold: scattering outside cells, polarized lights."""
-        filling = {s.inside for s in self.surfaces if s.cells is not None}
+        filling = {number for s in self.surfaces if s.cells is not None for number in (s.inside, *s.fillings)}
         for number, m in enumerate(self.materials):
             if number not in filling and m.scattering.max() > 1e-12:
                 raise BadScene(f"{self.scene.path}: {m.name}.scattering = {m.scattering.max():g} 1/mm; allowed: 0 in a material that fills no "
@@ -170,14 +199,25 @@ class Run:
         self.index = table(mi.Float, [m.index[group[0]] for m in materials])
         self.scattering = table(mi.Float, [m.scattering[group[0]] for m in materials])
         self.absorption = [table(mi.Float, [m.absorption[b] for m in materials]) for b in self.group]
+        rough = [materials[s.inside].roughness if s.inside >= 0 else 0.0 for s in surfaces]
+        self.roughness = table(mi.Float, rough) if any(rough) else None
         self.pointers = [mi.ShapePtr(s.shape) for s in surfaces]
         self.outside, self.inside, self.first, self.matt, self.grid, self.light = (table(mi.Int32, values) for values in (
             [s.outside for s in surfaces], [s.inside for s in surfaces], [s.first for s in surfaces], [s.matt for s in surfaces],
-            [s.cells is not None for s in surfaces], [transport.lights.index(s.light) if s.light else -1 for s in surfaces]))
+            [s.cells is not None for s in surfaces],
+            [transport.lights.index(s.light) if s.light in transport.lights else -1 for s in surfaces]))
+        boxes = [s.shape.bbox() for s in surfaces if s.inside >= 0]
+        low, high = np.min([np.ravel(b.min) for b in boxes], 0), np.max([np.ravel(b.max) for b in boxes], 0)
+        self.aim, self.reach = [float(c) for c in (low + high) / 2], float(np.linalg.norm(high - low) / 2)
+        self.filled = None
         if transport.cells:
-            middles, sizes, volumes = (np.concatenate([getattr(c, n) for c in transport.cells]) for n in ("middles", "sizes", "volumes"))
-            self.middle, self.size = ([table(mi.Float, a[:, i]) for i in range(3)] for a in (middles, sizes))
-            self.volume = table(mi.Float, volumes / SPLIT**3)
+            origins, turns, volumes = (np.concatenate([getattr(c, n) for c in transport.cells]) for n in ("origins", "rows", "volumes"))
+            self.origin = [table(mi.Float, origins[:, i]) for i in range(3)]
+            self.turn = [[table(mi.Float, turns[:, i, j]) for j in range(3)] for i in range(3)]
+            self.volume = table(mi.Float, volumes.ravel())
+            filled = np.concatenate([s.fillings for s in surfaces if s.cells is not None])
+            mixed = any((s.fillings != s.inside).any() for s in surfaces if s.cells is not None)
+            self.filled = table(mi.Int32, filled) if mixed else None
 
     def _level(self, light: str) -> list[float]:
         """What a light at power 1 sends in each band, relative."""
@@ -224,9 +264,9 @@ class Run:
         import mitsuba as mi
 
         part = mi.UInt32(0)
-        for axis in range(3):
-            middle, size = (dr.gather(mi.Float, a[axis], cell, active) for a in (self.middle, self.size))
-            place = ((p[axis] - middle) / dr.select(active, size, 1.0) + 0.5) * SPLIT
+        way = [p[i] - dr.gather(mi.Float, self.origin[i], cell, active) for i in range(3)]
+        for row in self.turn:
+            place = sum(dr.gather(mi.Float, row[i], cell, active) * way[i] for i in range(3)) * SPLIT
             part = part * SPLIT + mi.UInt32(dr.clip(place, 0, SPLIT - 1e-3))
         return cell * SPLIT**3 + part
 
@@ -258,8 +298,8 @@ class Run:
     def fly(self, start: dict, forward: bool, drawn: bool, along: Callable, at: Callable) -> None:
         """Follow rays through all faces until they end.
 
-        start    p, d, rng, x (axis across d that Stokes vectors refer to), tau (weight of each ray, per band of the group), and numbers
-                 that stay: pixel, light, batch
+        start    p, d, rng, x (axis across d that Stokes vectors refer to), tau (share of what each ray started with, per band of the
+                 group), weight (what that is; 1), and numbers that stay: pixel, light, batch
         forward  from a light: the Stokes vector is carried along; else from the camera: what it is sensitive to
         drawn    scattering is drawn by chance; else it only weakens, and `along` gathers it
         along    f(s, length, sigma, active): what is left or found on a straight stretch of the state s
@@ -292,12 +332,18 @@ class Run:
 
             # at a face of a clear body: reflected or refracted
             outside, inside = (dr.gather(mi.Int32, a, k) for a in (self.outside, self.inside))
+            cell = mi.UInt32(dr.gather(mi.Int32, self.first, k)) + si.prim_index // 12  # where it is one
+            if self.filled is not None:
+                grid = hit & (dr.gather(mi.Int32, self.grid, k) > 0)
+                inside = dr.select(grid, dr.gather(mi.Int32, self.filled, cell, grid), inside)
             face = hit & (inside >= 0)
             front = dr.dot(flight, si.n) < 0
             normal = mi.Vector3f(dr.select(front, si.n, -si.n))
             here, there = mi.UInt32(dr.select(front, outside, inside)), mi.UInt32(dr.select(front, inside, outside))
             n = dr.gather(mi.Float, self.index, there, face) / dr.select(face, dr.gather(mi.Float, self.index, here, face), 1.0)
             n = dr.select(face, n, 1.0)
+            if self.roughness is not None:
+                normal, seen = self.facet(flight, normal, dr.gather(mi.Float, self.roughness, k, face), rng)
             cos = dr.minimum(dr.abs(dr.dot(flight, normal)), 1.0)
             r_s, r_p, cos2 = fresnel(cos, n)
             share = (r_s + r_p) / 2
@@ -313,10 +359,12 @@ class Run:
             v = [dr.select(face, dr.select(back, a / bounced, b / passed), c) for a, b, c in zip(
                 act(fresnel_reflection(cos, n)), act(diattenuator(1.0, 0, 1 - r_s, 1 - r_p)), s["v"])]
             d = dr.select(face, dr.select(back, flight + 2 * cos * normal, flight / n + (cos / n - cos2) * normal), flight)
+            if self.roughness is not None:
+                s["tau"] = [dr.select(face, t * seen(d), t) for t in s["tau"]]
             s["astray"] = s["astray"] + dr.select(face & (here != s["medium"]), 1.0, 0.0)
-            s["medium"] = dr.select(face & ~back, there, s["medium"])
+            s["medium"] = dr.select(face, dr.select(back, here, there), s["medium"])  # what rounding led astray is back
             entered = face & ~back & front & (dr.gather(mi.Int32, self.grid, k) > 0)
-            s["cell"] = dr.select(entered, mi.UInt32(dr.gather(mi.Int32, self.first, k)) + si.prim_index // 12, s["cell"])
+            s["cell"] = dr.select(entered, cell, s["cell"])
 
             # at another surface, or within a body: into all directions, unpolarized
             other = hit & ~face & ~ends
@@ -345,7 +393,7 @@ class Run:
         state = {
             **{name: mi.UInt32(start.get(name, 0)) + dr.zeros(mi.UInt32, count) for name in ("pixel", "light", "batch", "medium", "cell", "depth")},
             "p": mi.Point3f(start["p"]), "d": mi.Vector3f(start["d"]), "x": mi.Vector3f(start["x"]), "rng": start["rng"],
-            "v": [zero + entry for entry in (1.0, 0.0, 0.0, 0.0)], "tau": [t + zero for t in start["tau"]],
+            "v": [zero + entry for entry in (start.get("weight", 1.0), 0.0, 0.0, 0.0)], "tau": [t + zero for t in start["tau"]],
             "ways": [zero + 0.0 for _ in self.of.materials[1:]], "astray": zero + 0.0,
             "active": dr.full(mi.Bool, True, count), "cut": dr.full(mi.Bool, False, count),
         }
@@ -353,6 +401,23 @@ class Run:
         self.followed += count
         self.lost += float(dr.count(end["cut"])[0])
         self.astray += float(dr.sum(end["astray"])[0])
+
+    @staticmethod
+    def facet(flight, normal, roughness, rng) -> tuple:
+        """The normal m of the facet that a ray meets on a face, and G1(d, m): the share of what leaves the facet along d that others let by,
+        0 on the wrong side of the face.
+
+        m is drawn by a hash of the generator's state: the same numbers at every roughness > 0, and all others those of a smooth face.
+        """
+        import drjit as dr
+        import mitsuba as mi
+
+        frame, smooth = mi.Frame3f(normal), roughness <= SMOOTH
+        facets = mi.MicrofacetDistribution(mi.MicrofacetType.Beckmann, roughness)
+        hidden = mi.sample_tea_32(mi.UInt32(rng.state), mi.UInt32(rng.state >> 32))
+        m, _ = facets.sample(frame.to_local(-flight), mi.Point2f(*[mi.Float(h >> 8) * 2.0**-24 for h in hidden]))
+        return (dr.select(smooth, normal, frame.to_world(mi.Vector3f(m))),
+                lambda d: dr.select(smooth, 1.0, facets.smith_g1(frame.to_local(d), mi.Vector3f(m))))
 
     @staticmethod
     def turned(v, x, axis, flight, forward: bool):
@@ -367,24 +432,34 @@ class Run:
 
     # -- from the lights ---------------------------------------------------------------------------------------------
 
-    def _emitted(self, light: int, rng):
-        """Where packets of a light start, which way they go, and the power of all of them."""
+    def _emitted(self, light: int, drawn: Sequence):
+        """Where packets of a light start, which way they go, the power of all of them, and the weight of each, by five random numbers."""
         import drjit as dr
         import mitsuba as mi
 
-        name, count = self.of.lights[light], dr.width(rng.state)
-        part = self.scene.parts[name]
-        one, two = (mi.Point2f(rng.next_float32(), rng.next_float32()) for _ in range(2))
+        name, count = self.of.lights[light], dr.width(drawn[0])
+        part, one, two = self.scene.parts[name], mi.Point2f(drawn[0], drawn[1]), mi.Point2f(drawn[2], drawn[3])
         if name in self.scene.sources:
             shape = next(s.shape for s in self.of.surfaces if s.light == name)
             start = shape.sample_position(mi.Float(0), one)
-            d = mi.Frame3f(start.n).to_world(mi.warp.square_to_cosine_hemisphere(two))
-            return start.p + 1e-4 * (1 + dr.max(dr.abs(start.p))) * start.n, d, dr.pi / start.pdf
+            # half of the packets by the cosine, half towards a ball around the clear bodies, which may be small and far away
+            cosine = mi.Frame3f(start.n).to_world(mi.warp.square_to_cosine_hemisphere(two))
+            to = mi.Point3f(*self.aim) - start.p
+            distance = dr.norm(to)
+            edge = dr.safe_sqrt(1 - dr.square(dr.minimum(self.reach / distance, 1.0)))  # cosine of the ball's radius; 0 from within
+            aimed = (edge > 0) & (drawn[4] < 0.5)
+            cone = mi.Frame3f(to / distance).to_world(mi.warp.square_to_uniform_cone(two, edge))
+            d = dr.select(aimed, cone, cosine)
+            cos = dr.maximum(dr.dot(d, start.n), 0.0)
+            inside = (edge > 0) & (dr.dot(d, to) > edge * distance)
+            chance = dr.select(edge > 0, cos / (2 * dr.pi), cos / dr.pi) + dr.select(inside, 1 / (4 * dr.pi * dr.maximum(1 - edge, 1e-9)), 0.0)
+            weight = cos / dr.pi / dr.maximum(chance, 1e-12)
+            return start.p + 1e-4 * (1 + dr.max(dr.abs(start.p))) * start.n, d, dr.pi / start.pdf, weight
         z = dr.power(1 - two.x, 1 / (part.mu + 1))  # of cos(theta)^mu
         s, c = dr.sincos(2 * dr.pi * two.y)
         d = mi.Frame3f(part.axis()).to_world(mi.Vector3f(c, s, 0) * dr.safe_sqrt(1 - z * z) + mi.Vector3f(0, 0, 1) * z)
         p = part.point(one) if part.number("area") > 0 else part.position()
-        return p + dr.zeros(mi.Point3f, count), d, 2 * dr.pi / (part.mu + 1) + dr.zeros(mi.Float, count)
+        return p + dr.zeros(mi.Point3f, count), d, 2 * dr.pi / (part.mu + 1) + dr.zeros(mi.Float, count), dr.full(mi.Float, 1.0, count)
 
     def _shine(self, packets: int, wanted: int, done: int) -> None:
         """Packets of all lights, into the maps."""
@@ -394,11 +469,15 @@ class Run:
         lights, count = len(self.of.lights), len(self.of.lights) * BATCHES * packets
         number = dr.arange(mi.UInt32, count)
         light, batch = number // (BATCHES * packets), (number // packets) % BATCHES
-        rng = mi.PCG32(size=count, initstate=dr.opaque(mi.UInt64, (self.seed << 32) + 2 * done + 1))
-        p, d, power = self._emitted(0, rng)
+        # a light has its own random numbers, whichever others are followed
+        places = [list(self.scene.lights).index(n) for n in self.of.lights]
+        lane = dr.gather(mi.UInt32, mi.UInt32(places), light) * (BATCHES * packets) + number % (BATCHES * packets)
+        rng = mi.PCG32(1, dr.opaque(mi.UInt64, (self.seed << 32) + 2 * done + 1) + lane, dr.opaque(mi.UInt64, STREAM) + lane)
+        drawn = [rng.next_float32() for _ in range(5)]
+        p, d, power, weight = self._emitted(0, drawn)
         for k in range(1, lights):
             own = light == k
-            p, d, power = (dr.select(own, new, old) for new, old in zip(self._emitted(k, rng), (p, d, power)))
+            p, d, power, weight = (dr.select(own, new, old) for new, old in zip(self._emitted(k, drawn), (p, d, power, weight)))
         share = power / wanted
 
         def leave(where, size, place, worth, tau, ways, s, active):
@@ -413,10 +492,10 @@ class Run:
             if self.of.voxels:
                 active = hit & (sigma > 0)
                 u = s["rng"].next_float32() * length
-                volume = dr.select(active, dr.gather(mi.Float, self.volume, s["cell"], active), 1.0)
+                voxel = self.voxel(s["cell"], s["p"] + u * s["d"], active)
+                volume = dr.select(active, dr.gather(mi.Float, self.volume, voxel, active), 1.0)
                 worth = s["v"][0] * dr.gather(mi.Float, shares, s["light"]) * length / volume
-                leave(self.fluence, self.of.voxels, self.voxel(s["cell"], s["p"] + u * s["d"], active), worth, self.faded(s, u),
-                      self.ways(s, u), s, active)
+                leave(self.fluence, self.of.voxels, voxel, worth, self.faded(s, u), self.ways(s, u), s, active)
 
         def at(s, si, k, hit):
             if self.of.texels:
@@ -428,25 +507,53 @@ class Run:
 
         # the power of a light is the same for all of its packets
         shares = dr.gather(mi.Float, share, dr.arange(mi.UInt32, lights) * (BATCHES * packets))
-        dr.eval(p, d, shares, rng)
+        dr.eval(p, d, shares, weight, rng)
         tau = [dr.gather(mi.Float, level, light) for level in self.level]
-        self.fly({"p": p, "d": d, "x": mi.Frame3f(d).s, "tau": tau, "rng": rng, "light": light, "batch": batch}, True, True, along, at)
+        self.fly({"p": p, "d": d, "x": mi.Frame3f(d).s, "tau": tau, "rng": rng, "light": light, "batch": batch, "weight": weight},
+                 True, True, along, at)
         dr.eval(self.fluence, self.irradiance)
 
     # -- from the camera ---------------------------------------------------------------------------------------------
+
+    def _seen(self, rays: int, batches: int, done: int) -> dict:
+        """Where rays of the camera start, so many per pixel and batch."""
+        import drjit as dr
+        import mitsuba as mi
+
+        camera, height, width = self.scene.camera, self.of.height, self.of.width
+        number = dr.arange(mi.UInt32, height * width * rays * batches)
+        pixel, batch = (number // rays) % (height * width), number // (rays * height * width)
+        rng = mi.PCG32(size=dr.width(number), initstate=dr.opaque(mi.UInt64, (self.seed << 32) + 2 * done))
+        p, d = camera.ray(mi.Float(pixel % width) + rng.next_float32(), mi.Float(pixel // width) + rng.next_float32())
+        x = dr.normalize(dr.cross(d, camera.turned(mi.Vector3f(0, -1, 0))))
+        return {"p": p, "d": d, "x": x, "tau": [mi.Float(1.0) for _ in self.group], "rng": rng, "pixel": pixel, "batch": batch}
+
+    def lengths(self, rays: int) -> np.ndarray:
+        """(cells, H, W): length in each cell of the camera's rays, so many per pixel, by their weight."""
+        import drjit as dr
+        import mitsuba as mi
+
+        pixels = self.of.height * self.of.width
+        fills = np.zeros(len(self.of.materials), bool)
+        fills[[number for s in self.of.surfaces if s.cells is not None for number in s.fillings]] = True
+        fills, found = mi.Float(fills.astype(np.float32)), dr.zeros(mi.Float, self.of.voxels // SPLIT**3 * pixels)
+
+        def along(s, length, sigma, hit):
+            within = hit & (dr.gather(mi.Float, fills, s["medium"]) > 0)
+            dr.scatter_add(found, s["v"][0] * s["tau"][0] * length, s["cell"] * pixels + s["pixel"], within)
+
+        def at(s, si, k, hit):
+            return hit & (dr.gather(mi.Int32, self.matt, k) > 0)
+
+        self.fly(self._seen(rays, 1, 0), False, False, along, at)
+        return np.array(found).reshape(-1, self.of.height, self.of.width) / rays
 
     def _look(self, rays: int, wanted: int, done: int) -> None:
         """Rays of the camera, into the images."""
         import drjit as dr
         import mitsuba as mi
 
-        camera, height, width = self.scene.camera, self.of.height, self.of.width
-        pixels, count = height * width, height * width * rays * BATCHES
-        number = dr.arange(mi.UInt32, count)
-        pixel, batch = (number // rays) % pixels, number // (rays * pixels)
-        rng = mi.PCG32(size=count, initstate=dr.opaque(mi.UInt64, (self.seed << 32) + 2 * done))
-        p, d = camera.ray(mi.Float(pixel % width) + rng.next_float32(), mi.Float(pixel // width) + rng.next_float32())
-        x = dr.normalize(dr.cross(d, camera.turned(mi.Vector3f(0, -1, 0))))
+        pixels = self.of.height * self.of.width
 
         def see(s, row, kind, value, active):
             dr.scatter_add(self.out, value, self.place(s, row, kind, pixels) + s["pixel"], active)
@@ -486,8 +593,7 @@ class Run:
                  [t * reflectance[b] for b, t in zip(self.group, s["tau"])], s["ways"], s, matt)
             return matt
 
-        start = {"p": p, "d": d, "x": x, "tau": [mi.Float(1.0) for _ in self.group], "rng": rng, "pixel": pixel, "batch": batch}
-        self.fly(start, False, not self.maps, along, at)
+        self.fly(self._seen(rays, BATCHES, done), False, not self.maps, along, at)
         dr.eval(self.out)
 
 
@@ -517,7 +623,7 @@ class Surface:
                 bsdf.flags(), mi.BSDFFlags.Delta | mi.BSDFFlags.Null):
             raise BadScene(f"{scene.path}: the surface '{shape.id()}' is neither clear nor matt; allowed among clear bodies: materials of the type "
                            "'clear', and matt ones (diffuse, membrane)")
-        self.cells = shape.cells() if getattr(shape, "kind", "") == "cells" else None
+        self.cells = shape.cells(SPLIT) if getattr(shape, "kind", "") == "cells" else None
 
 
 def materials(scene, bands: np.ndarray) -> list[Material]:
@@ -527,7 +633,7 @@ def materials(scene, bands: np.ndarray) -> list[Material]:
         if part.kind == "clear":
             own = part_values(scene, name, values, {})
             found.append(Material(name, coefficient(own, "index", bands), coefficient(own, "absorption", bands),
-                                  np.full(len(bands), own.scattering)))
+                                  np.full(len(bands), own.scattering), own.roughness))
     return found
 
 

@@ -11,7 +11,7 @@ filling; without it that is air.
 Fingerprint
     walls show as bright and dark lines, totally reflecting where they are met at grazing incidence; absorption darkens long ways.
 Validity
-    smooth faces, thicker than the coherence length of an LED's light (some 10 um): no interference.
+    thicker than the coherence length of an LED's light (some 10 um): no interference. Faces are smooth but for `rough walls`.
 References
     Fan, Li, Cong & Zhang, MagicGripper, supplementary VII-A, eqs. (18)-(29); Born & Wolf, Principles of Optics, 1.5.
 """

@@ -9,12 +9,14 @@ angle a, from the surface's x axis to its y axis. `time` is the experimenter's c
 Fingerprint
     power scales a reading; polarized light makes the first polarizer's own angle count; a drift grows with time, whatever is set.
 Validity
-    an even surface; it lights nothing else.
+    an even surface. Among clear bodies it lights what stands there; elsewhere it lights nothing else.
+A `room` is such a surface before the sensor, off (power 0) until somebody adds it: the light of the surroundings.
 References
     Goldstein, Polarized Light, 3rd ed., ch. 4.
 """
 
 import math
+from dataclasses import replace
 
 from optics.effect import Declared, Part
 from optics.mueller import exp, real, where
@@ -33,6 +35,7 @@ PARAMETERS = (
     Parameter("wavelength", "nm", 0.0, (0.0, 2000.0), "peak wavelength; 0: the same in every band", plausible=3.0, how="layer"),
     Parameter("fwhm", "nm", 30.0, (1.0, 1000.0), "full width at half maximum of the spectrum", plausible=5.0, how="layer"),
 )
+ROOM = (replace(PARAMETERS[0], default=0.0, neutral=0.0, plausible=1e-5, doc="radiance L of the surroundings, relative"), *PARAMETERS[1:])
 
 
 def stokes(crossing, source):
@@ -44,14 +47,14 @@ def stokes(crossing, source):
     return level, level * (source.dop_q * q - source.dop_u * u), level * (source.dop_q * u + source.dop_u * q), 0
 
 
-def build():
+def build(kind_of="source"):
     import drjit as dr
     import mitsuba as mi
 
     from optics.layers import crossing_of, numbers_of
 
     class Source(Declared.on(mi.Emitter)):
-        kind = "source"
+        kind = kind_of
 
         def __init__(self, props):
             mi.Emitter.__init__(self, props)
@@ -104,3 +107,4 @@ def build():
 
 
 part = Part("source", "emitter", PARAMETERS, build, stokes=stokes)
+room = Part("room", "emitter", ROOM, lambda: build("room"), stokes=stokes)

@@ -9,17 +9,18 @@ import pytest
 
 from optics.effect import registry
 
-KINDS = ("clear", "cells")
-EFFECTS = sorted(k for k, e in registry().effects.items() if e.part in KINDS)
+KINDS = ("clear", "cells", "block", "room")
+EFFECTS = sorted(k for k, e in registry().effects.items() if e.part in KINDS and e.part != "room")  # a light of its own
 SEEDS = 4
-DEFINES = {"width": 8, "height": 8, "x_fov": 6, "columns": 3, "rows": 3, "layers": 2, "half_width": 1.3, "half_length": 1.3, "distance": 0.4,
+DEFINES = {"width": 8, "height": 8, "x_fov": 6, "columns": 3, "rows": 3, "layers": 2, "block_width": 2.6, "block_length": 2.6, "distance": 0.4,
+           "stance": "standing", "diameter": 24,
            "scattering": 0.06, "rays": 128, "packets": 32_000}
 # so dark that few ways are long: a difference between pictures is the noise of the ways that part, and long ones part
 VALUES = {"filling.absorption": 0.6, "walls.absorption": 0.5, "filling.absorption_slope": 0.3, "walls.absorption_slope": 0.2,
           "window.absorption": 0.05}
 KEYS = [f"{part}.{p.name}" for part, kind in (("walls", "clear"), ("filling", "clear"), ("grid", "cells"))
         # what bends rays is noise on this bench and seen on a slab
-        for p in registry().parameters_of(kind) if p.name not in ("index", "dispersion") and f"{part}.{p.name}" != "walls.scattering"]
+        for p in registry().parameters_of(kind) if p.name not in ("index", "index_offset", "dispersion", "roughness") and not p.name.startswith("unfilled") and f"{part}.{p.name}" != "walls.scattering"]
 
 
 @pytest.fixture(scope="module")
@@ -97,7 +98,8 @@ SLAB = """<scene version="3.0.0">
 </scene>"""
 
 
-@pytest.mark.parametrize("key, factor", [("glass.index", (1, 1, 1)), ("glass.dispersion", [(540 / w) ** 2 - 1 for w in (620, 540, 460)])])
+@pytest.mark.parametrize("key, factor", [("glass.index", (1, 1, 1)), ("glass.index_offset", (1, 1, 1)),
+                                         ("glass.dispersion", [(540 / w) ** 2 - 1 for w in (620, 540, 460)])])
 def test_derivatives_by_the_index(key, factor, mitsuba, tmp_path):
     """Of a slab's transmittance T = 2n/(n^2 + 1): dT/dn = 2 (1 - n^2)/(n^2 + 1)^2, in every band by its dispersion."""
     from optics import scene
@@ -111,6 +113,39 @@ def test_derivatives_by_the_index(key, factor, mitsuba, tmp_path):
     expected = 2 * (1 - 1.5**2) / (1.5**2 + 1) ** 2 * np.array(factor)
     assert p.plausible > 0 and error.max() < 0.25 * np.abs(expected).max()
     assert (np.abs(found.mean(0) - expected) <= 5 * error + 0.01 * np.abs(expected)).all(), (found.mean(0), error, expected)
+
+
+def test_the_effect_of_roughness_is_its_square(mitsuba, tmp_path):
+    """Before the edge of a luminous half plane, a plate that hardly refracts turns rays by (n - 1) times the slope of a facet, twice: the
+    edge x = 0 is seen as wide as s^2 = (alpha (n - 1))^2/2 (L^2 + (L + d/n)^2), L behind the plate of the thickness d, and the integral of
+    x times the picture differs by -s^2/2, to second order in the slope (2 %); its derivative by the renderer's own difference."""
+    from optics import scene
+    from optics.by_chance import ClearRenderer
+
+    n, fov, width = 1.05, 4, 24
+    text = SLAB
+    for old, new in (('width" value="6"', f'width" value="{width}"'), ('x_fov" value="1"', f'x_fov" value="{fov}"'), ('value="1.5"', f'value="{n}"'),
+                     ('value="4000"', 'value="1000"'), ('<translate z="20"/>', '<translate x="8" z="20"/>')):
+        text = text.replace(old, new)
+    (tmp_path / "edge.xml").write_text(text)
+    loaded = scene.load(tmp_path / "edge.xml")
+    renderer, values, key = ClearRenderer(loaded), loaded.values(), "glass.roughness"
+    x = np.tan(np.radians(fov / 2)) * 40 * (2 * (np.arange(width) + 0.5) / width - 1)
+
+    def moment(image):
+        return (image.mean((0, 2)) * x).sum() * (x[1] - x[0])
+
+    def agrees(found, expected):
+        error = np.std(found, ddof=1) / np.sqrt(len(found))
+        assert error < 0.05 * expected
+        assert abs(np.mean(found) + expected) < 5 * error + 0.02 * expected, (np.mean(found), error, expected)
+
+    square = (n - 1) ** 2 / 2 * (19**2 + (19 + 2 / n) ** 2)  # s^2/alpha^2
+    pictures = {alpha: np.array([moment(renderer.radiance({**values, key: alpha}, seed)) for seed in range(4)]) for alpha in (0.1, 0.15, 0.2)}
+    for low, high in ((0.1, 0.2), (0.1, 0.15)):
+        agrees(pictures[high] - pictures[low], square / 2 * (high**2 - low**2))
+    assert loaded.parameters[key].squared
+    agrees([moment(renderer.tangent({**values, key: 0.15}, key, seed)) for seed in range(4)], square * 0.15)
 
 
 def test_effects_are_offered_where_they_act(bench):
@@ -141,13 +176,27 @@ def test_what_light_by_chance_does_not_pass_is_refused(bench, tmp_path):
     assert obstacle(scene) and not obstacle(scene, chance=True)
     text = scenes.find("magictac").read_text(encoding="utf-8")
     film = '<shape type="rectangle"><bsdf type="polarizer_film" id="film"/></shape></scene>'
-    mesh = '<shape type="target" id="rod"><bsdf type="diffuse"/></shape></scene>'
+    mesh = '<shape type="cells" id="rod"><bsdf type="diffuse"/></shape></scene>'
     for body, said in ((film, "neither clear nor matt"), (mesh, "'rod' is matt, and no map")):
         (tmp_path / "more.xml").write_text(text.replace("</scene>", body))
         loaded = scenes.load(tmp_path / "more.xml", {k: str(v) for k, v in DEFINES.items()})
         with pytest.raises(BadScene, match=said):
             ClearRenderer(loaded).radiance(loaded.values())
     assert cli.main(["sweep", "magictac", "--key", "filling.absorption", "--from", "0", "--to", "1"]) == 2
+
+
+def test_a_light_does_not_depend_on_the_others(bench):
+    """A room that is off is not followed, and changes no other light's picture when it is on; its picture goes with its power."""
+    scene, renderer, values = bench
+    without, beside = (renderer.picture({**values, "room.power": power}) for power in (0.0, 1e-4))
+    assert beside.lights == list(scene.lights) and "room" not in without.lights
+    for name in without.lights:
+        one, other = (p.radiance[p.lights.index(name)] for p in (without, beside))
+        np.testing.assert_allclose(other, one, rtol=0, atol=1e-5 * one.max())
+    dark = {**values, **{f"{n}.power": 0.0 for n in scene.lights}}
+    one, two = (renderer.radiance({**dark, "room.power": power}) for power in (1e-4, 2e-4))
+    np.testing.assert_allclose(two, 2 * one, rtol=1e-12)
+    assert 0 < one.max() < 1e-4  # what is seen through faces has the radiance of the room or less
 
 
 def test_no_light_no_picture(bench):
