@@ -199,7 +199,7 @@ def normal_equations(model, variables: Sequence[Variable], values: Values, frame
     frame_chi2, frame_n, rows = [], [], []
     for frame, (prediction, images) in zip(frames, model.derivatives(values, variables, frames)):
         mask = model.usable(frame)
-        scale = np.sqrt(mask / model.noise.variance(prediction)).astype(np.float32)
+        scale = np.sqrt(mask / model.variance(values, frame, prediction)).astype(np.float32)
         if robust:
             scale *= np.sqrt(huber((model.frames[frame].image - prediction) * scale)).astype(np.float32)
         whitened = whiten(model, frame, prediction, scale)

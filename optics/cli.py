@@ -360,7 +360,8 @@ def render(scene: SceneName,
     values = loaded.check(settings(sets), "--set")
     clock = time.perf_counter()
     pictures = Pictures(loaded, spp=spp, stokes=stokes)
-    picture = pictures.take(values, seed)
+    with terminal.progress() as progress:
+        picture = pictures.take(values, seed, progress=progress)
     seconds = time.perf_counter() - clock
     if png:
         picture.write_png(preview)

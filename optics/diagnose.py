@@ -646,7 +646,7 @@ def _held_out(model, fit, evidence: Evidence, winner: Candidate | None, fits: Ma
     masks, sds, base = [], [], []
     for f in held_out:
         prediction = np.asarray(model.predict(values, [f])[0], float)
-        variance = model.noise.variance(prediction) * (1 + evidence.render_noise)
+        variance = evidence.variance(model, f, prediction, values)
         use = np.asarray(model.usable(f), bool) & np.isfinite(prediction)
         masks.append(use)
         sds.append(np.sqrt(np.where(use, variance, 1.0)))

@@ -140,6 +140,11 @@ class Evidence:
         gram = self.normal.gram[np.ix_(base, base)] + np.diag(precision)
         return self.spectrum.test(whitened, base, st.inverse(gram, self.normal.truncation())[0])
 
+    def variance(self, model, frame: int, prediction: np.ndarray, values: Values | None = None) -> np.ndarray:
+        """Of a frame about its prediction, DN^2: where the model knows no error of its prediction, that between two seeds is added."""
+        known = model.variance(values or self.values, frame, prediction)
+        return known if model.by_chance else known * (1 + self.render_noise)
+
     def thinned(self, weight: Callable[[Block], np.ndarray] | None = None, extra: int = 0) -> st.Normal:
         """Normal equations of the kept pixels alone; `weight` (n,) multiplies rows, `extra` columns are left empty."""
         normal = st.Normal(len(self.columns) + extra)
@@ -251,7 +256,7 @@ def _priors(model, values: Values, base: Sequence[Variable]) -> tuple[np.ndarray
 def _add_frame(evidence: Evidence, model, frame: int, n: int, prediction, first: dict, second: dict, noisy: set,
                candidates: Sequence[Candidate], p: int) -> None:
     image = np.asarray(model.frames[frame].image, float)
-    variance = model.noise.variance(prediction) * (1 + evidence.render_noise)
+    variance = evidence.variance(model, frame, prediction)
     mask = np.asarray(model.usable(frame), bool)
     good = mask & np.isfinite(prediction) & np.isfinite(image) & (variance > 0)
     where = np.array(sorted(first), int)

@@ -361,7 +361,7 @@ def shown_frames(model, values, held_out: Sequence[int] = (), frames: Sequence[i
         f, prediction = model.frames[i], np.asarray(model.predict(values, [i])[0])
         settings = {} if model.captures.table is None else {
             key: np.broadcast_to(np.ravel(value), len(prediction)) for key, value in (*f.parameters.items(), *f.readings.items())}
-        out.append(Shown(f.name, np.asarray(f.image), prediction, model.noise.sd(prediction), model.usable(i),
+        out.append(Shown(f.name, np.asarray(f.image), prediction, np.sqrt(model.variance(values, i, prediction)), model.usable(i),
                          led_label(f.parameters), f.group or "", i in set(held_out), settings,
                          {key: model.parameters[key].unit for key in settings}))
     return out
@@ -375,7 +375,7 @@ def fingerprints_of(model, fit, diagnosis, frame: int, count: int = 4) -> list[F
     """
     base = np.asarray(model.predict(fit.values, [frame])[0])
     use = model.usable(frame)
-    sd = model.noise.sd(base)
+    sd = np.sqrt(model.variance(fit.values, frame, base))
     found = model.frames[frame]
     residual = np.where(use, (np.asarray(found.image) - base) / sd, np.nan)
     rows = [r for r in diagnosis.rows if r.name in diagnosis.fits][:count]

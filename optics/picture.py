@@ -21,7 +21,7 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -121,8 +121,11 @@ class Pictures:
         """Whether pictures are made LED by LED."""
         return self.renderer is not None
 
-    def take(self, values: Mapping[str, float | str] | None = None, seed: int = 0, lit: Sequence[str] | None = None) -> Picture:
+    def take(self, values: Mapping[str, float | str] | None = None, seed: int = 0, lit: Sequence[str] | None = None,
+             progress: Callable[[str, int, int], None] | None = None) -> Picture:
         """The picture for values that replace the scene's; lit: the lights that are on (None: all with power)."""
+        if self.exact and self.renderer.by_chance:
+            self.renderer.progress = progress
         now = {**self.base, **self.scene.check(values or {})}
         if lit is not None:
             now.update({f"{led}.power": 0.0 for led in self.scene.lights if led not in lit})
@@ -142,6 +145,9 @@ class Pictures:
         if "leds" in self.layers:
             for light, image in alone.items():
                 channels.update(zip((f"{light}.{n}" for n in self._band_names()), np.moveaxis(image, -1, 0)))
+        if renderer.by_chance:
+            scatter = exr.spectral_channels(self.bands, renderer.error(now) ** 2) if self.bands else {"Y": renderer.error(now)[..., 0] ** 2}
+            channels.update({f"variance.{name}": image for name, image in scatter.items() if name in channels})
         header = exr.spectral_header(renderer.layered, UNITS) if self.bands else {}
         self.scene.set(now)  # the renderer leaves the LEDs at power 1
         return Picture(channels, header, self.developer.develop(totals[0], now))

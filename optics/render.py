@@ -526,6 +526,7 @@ class Model:
             self.frames = [replace(f, image=np.repeat(f.image, 3, axis=2)) for f in captures.frames]
             background = None if background is None else np.repeat(background, 3, axis=2)
         self.renderer = renderer_of(scene)
+        self.by_chance = self.renderer.by_chance  # whether predictions are Monte Carlo estimates, whose error `variance` holds
         self._edges_kept: dict[int, np.ndarray] = {}
         self.parameters: dict[str, Parameter] = scene.parameters
         self.base = {**scene.values(), **scene.check(captures.parameters, f"{captures.folder}/captures.toml [parameters]")}
@@ -550,6 +551,9 @@ class Model:
             raise UnknownKey(str(flat_field), FLAT_FIELDS, "flat-field mode")
         self.flat_field = {True: FLAT_FIELDS[0], False: None, "none": None}.get(flat_field, flat_field)
         self.flat = None  # the measured background above black, a declared nuisance; see `predict`
+        if self.flat_field and background is not None and scene.gel is None:
+            raise BadScene(f"{captures.folder}: the set has a background, and the scene no gel that could be at rest in it; allowed: "
+                           "--flat-field none")
         if self.flat_field and background is not None:
             self.flat = np.maximum(np.asarray(background, float) - self.noise.black_level, 1e-3)
 
@@ -838,13 +842,27 @@ class Model:
         """Values that a frame holds (on average, of readings): pixels x channels, or the pixels of a mosaic."""
         return float(np.mean([f.image.size for f in self.frames])) / (3 if self.mosaic is not None else 1)
 
-    def chance(self, index: int = 0) -> float:
-        """Error of the prediction itself over the noise of a frame, rms, where pictures are Monte Carlo estimates."""
-        now = self.at(Values(), index)
+    def variance(self, values: Values, index: int, prediction: np.ndarray) -> np.ndarray:
+        """(H, W, C) in DN^2, of a frame about its prediction: the camera's noise, and the prediction's own error where pictures are
+        Monte Carlo estimates, averaged over 3 x 3 pixels (the error itself is known to a quarter)."""
+        noise = self.noise.variance(prediction)
+        return noise + self._error(values, index) if self.by_chance else noise
+
+    def _error(self, values: Values, index: int) -> np.ndarray:
+        """(H, W, C) variance of a Monte Carlo prediction, DN^2."""
+        from scipy.ndimage import uniform_filter
+
+        now = self.at(values, index)
         view = self.developer.view(now)
         full = (self.noise.saturation - self.noise.black_level) * np.abs(view.exposure * self.developer.gains(view))
-        error = np.sqrt(self.renderer.error(now) ** 2 @ (self.developer.matrix**2).T) * full
-        return float(np.sqrt(np.mean((error / self.noise.sd(self.predict(Values(), [index])[0])) ** 2)))
+        return uniform_filter((self.renderer.error(now) ** 2 @ (self.developer.matrix**2).T) * full**2, (3, 3, 0), mode="nearest")
+
+    def chance(self, index: int = 0) -> float:
+        """Error of the prediction itself over the camera's noise in a frame, rms; 0 where pictures are exact."""
+        if not self.by_chance:
+            return 0.0
+        prediction = self.predict(Values(), [index])[0]
+        return float(np.sqrt(np.mean(self._error(Values(), index) / self.noise.variance(prediction))))
 
     def coordinates(self, values: Values, index: int) -> dict[str, np.ndarray]:
         """What is known of every pixel of a frame; see `optics.compare` and `optics.diagnose` for their use."""

@@ -66,7 +66,16 @@ class Frame:
     file: str = ""
 
 
-class MockModel:
+class Exact:
+    """A model whose predictions have no error of their own."""
+
+    by_chance = False
+
+    def variance(self, values, frame, prediction):
+        return self.noise.variance(prediction)
+
+
+class MockModel(Exact):
     """The mock; `unit` rescales the unit of parameters, {'vignetting': 100} is per cent."""
 
     def __init__(self, presses: int, side: int = 28, noise: Noise | None = None, unit: dict | None = None,
@@ -236,7 +245,7 @@ class MockModel:
         return [self.variable(f"sensor.{name}", f) for name in effect.parameter_names for f in frames]
 
 
-class PointModel:
+class PointModel(Exact):
     """A photodiode behind a turned polarizer: one reading per frame, a cos^2(angle) + leak + dark + second harmonic."""
 
     shape, captures = (1, 1, 1), None

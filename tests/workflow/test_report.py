@@ -534,12 +534,14 @@ def test_images_of_a_model_become_frames_and_fingerprints():
     from optics.ladder import fingerprints_of, shown_frames
 
     class Model:
-        noise = SimpleNamespace(sd=lambda signal: np.ones_like(signal))
         captures = SimpleNamespace(table=None)
         frames = [SimpleNamespace(name="a", image=np.full((4, 5, 1), 12.0), group=None, parameters={"led.power": 1.0})]
 
         def predict(self, values, frames):
             return [np.full((4, 5, 1), 10.0 + values.common.get("glare", 0.0))]
+
+        def variance(self, values, index, prediction):
+            return np.ones_like(prediction)
 
         def usable(self, index):
             return np.ones((4, 5, 1), bool)
