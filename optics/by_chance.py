@@ -17,6 +17,8 @@ from optics.render import POWERS, LedImage, Renderer
 from optics.scene import Scene
 from optics.transport import Picture, Transport, coefficient
 
+MEMORY = 5e8  # bytes of pictures that are kept
+
 
 class ClearRenderer(Renderer):
     """`optics.render.Renderer` for a scene with clear bodies: the lights in one picture."""
@@ -33,6 +35,8 @@ class ClearRenderer(Renderer):
         # lights that are off at first are followed only where they are on
         self.always = {n for n, p in scene.lights.items() if p.number("power") > 0}
         self._pictures: OrderedDict = OrderedDict()
+        # all differences of a geometry, which each of its frames asks for: a picture, its error, and slopes by four materials
+        self.kept = max(remember, int(MEMORY / (48 * len(scene.lights) * self.width * self.height * self.bands)))
         self._sloped = False  # whether derivatives by absorption have been asked for: then they are made along with each picture
 
     def picture(self, values: Mapping, seed: int = 0, slopes: bool = False) -> Picture:
@@ -46,7 +50,7 @@ class ClearRenderer(Renderer):
             integrator = self.scene.integrator
             known = self._pictures[key] = Transport(self.scene, lights).take(
                 integrator.rays, integrator.packets, seed, self._sloped, progress=self.progress)
-            while len(self._pictures) > self.remember:
+            while len(self._pictures) > self.kept:
                 self._pictures.popitem(last=False)
         self._pictures.move_to_end(key)
         return known

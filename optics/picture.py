@@ -131,6 +131,9 @@ class Pictures:
             now.update({f"{led}.power": 0.0 for led in self.scene.lights if led not in lit})
         picture = self._exact(now, seed) if self.renderer is not None else self._monte_carlo(now, seed)
         picture.header["provenance"] = {**self.record, "seed": seed, "parameters": now}
+        pressed = None if self.scene.block is None else self.scene.block.press()
+        if pressed is not None:
+            picture.header["provenance"]["press"] = {"force": [float(f) for f in pressed.force], "unit": "N", "seconds": pressed.seconds}
         return picture
 
     def _exact(self, now: Mapping, seed: int) -> Picture:

@@ -34,7 +34,7 @@ import numpy as np
 
 from optics.effect import registry
 from optics.errors import BadScene
-from optics.mueller import diattenuator, fresnel, fresnel_reflection, rotation
+from optics.mueller import diattenuator, fresnel, fresnel_reflection, retarder, rotation
 from optics.paths import part_values
 
 DEPTH = 512  # faces that a ray may meet; of the scene magictac's, 6e-5 would meet more
@@ -51,13 +51,15 @@ STREAM = 0xDA3E39CB94B95BDB  # of random numbers, as Dr.Jit begins
 
 @dataclass(frozen=True)
 class Material:
-    """What a body is made of, per band: refractive index, absorption and scattering coefficients in 1/mm; roughness of its faces."""
+    """What a body is made of, per band: refractive index, absorption and scattering coefficients in 1/mm; roughness of its faces;
+    birefringence along x."""
 
     name: str
     index: np.ndarray
     absorption: np.ndarray
     scattering: np.ndarray
     roughness: float = 0.0
+    birefringence: float = 0.0
     of: str = ""  # the material that it is a share of
     share: float = 1.0
 
@@ -121,7 +123,7 @@ class Transport:
         # bands that go different ways are followed apart
         if reach == "maps":
             self._check_maps()
-        same = all(np.ptp(m.index) == 0 for m in self.materials)
+        same = all(np.ptp(m.index) == 0 and m.birefringence == 0 for m in self.materials)
         groups = [list(range(len(self.bands)))] if same else [[b] for b in range(len(self.bands))]
         kinds = len(self.materials) if slopes else 1
         images, followed, lost, astray = 0.0, 0, 0.0, 0.0
@@ -146,7 +148,7 @@ class Transport:
             m = self.materials[grid.inside]
             grid.fillings[cell] = len(self.materials)
             self.materials.append(Material(f"{m.name}, unfilled", 1 + (m.index - 1) * (1 - share), m.absorption * (1 - share),
-                                           m.scattering * (1 - share), m.roughness, m.name, 1 - share))
+                                           m.scattering * (1 - share), m.roughness, m.birefringence * (1 - share), m.name, 1 - share))
 
     def seen_through(self, rays: int, seed: int = 0) -> np.ndarray:
         """(cells, H, W): length (mm) in each cell of the camera's rays of each pixel, in the mean, by their weight in the first band."""
@@ -201,6 +203,8 @@ class Run:
         self.absorption = [table(mi.Float, [m.absorption[b] for m in materials]) for b in self.group]
         rough = [materials[s.inside].roughness if s.inside >= 0 else 0.0 for s in surfaces]
         self.roughness = table(mi.Float, rough) if any(rough) else None
+        turns = [2e6 * np.pi * m.birefringence / transport.bands[group[0]] for m in materials]  # rad/mm
+        self.retardance = table(mi.Float, turns) if any(turns) else None
         self.pointers = [mi.ShapePtr(s.shape) for s in surfaces]
         self.outside, self.inside, self.first, self.matt, self.grid, self.light = (table(mi.Int32, values) for values in (
             [s.outside for s in surfaces], [s.inside for s in surfaces], [s.first for s in surfaces], [s.matt for s in surfaces],
@@ -327,6 +331,8 @@ class Run:
             along(s, length, sigma, hit)
             s["tau"] = self.faded(s, length, 0.0 if drawn else sigma)
             s["ways"] = self.ways(s, length)
+            if self.retardance is not None:
+                s["v"], s["x"] = self.retarded(s, length, forward)
             hit &= ~scattered
             ends = at(s, si, k, hit)
 
@@ -401,6 +407,20 @@ class Run:
         self.followed += count
         self.lost += float(dr.count(end["cut"])[0])
         self.astray += float(dr.sum(end["astray"])[0])
+
+    def retarded(self, s, length, forward: bool) -> tuple:
+        """Stokes vector or row, and its axis, after a stretch of a material that is birefringent along the world's x axis."""
+        import drjit as dr
+        import mitsuba as mi
+
+        flight, along = s["d"], mi.Vector3f(1, 0, 0)
+        across = along - dr.dot(along, flight) * flight
+        square = dr.squared_norm(across)  # sin^2 of the angle between the ray and the axis
+        seen = square > 1e-10
+        axis = dr.select(seen, dr.normalize(across), s["x"])
+        plate = retarder(dr.gather(mi.Float, self.retardance, s["medium"]) * square * length, 0.0)
+        turned = tuple(self.turned(s["v"], s["x"], axis, flight, forward))
+        return [a + mi.Float(0) for a in (plate @ turned if forward else plate.after(turned))], axis
 
     @staticmethod
     def facet(flight, normal, roughness, rng) -> tuple:
@@ -633,7 +653,7 @@ def materials(scene, bands: np.ndarray) -> list[Material]:
         if part.kind == "clear":
             own = part_values(scene, name, values, {})
             found.append(Material(name, coefficient(own, "index", bands), coefficient(own, "absorption", bands),
-                                  np.full(len(bands), own.scattering), own.roughness))
+                                  np.full(len(bands), own.scattering), own.roughness, own.birefringence))
     return found
 
 

@@ -96,6 +96,24 @@ def test_tilted_plates_hand_polarization_on(tmp_path, mitsuba):
     near(found.radiance[0], found.error[0], both.mean())
 
 
+def test_a_wave_plate_between_tilted_plates(tmp_path, mitsuba):
+    """The plates above, turned by 45 degrees, and between them a body that neither reflects nor absorbs, birefringent along x:
+    T = ((T_s + T_p)^2 + (T_s - T_p)^2 cos delta)/4, delta = 2 pi dn d/lambda, for three wavelengths."""
+    n, angle, dn, d = 1.5, 60.0, 1e-4, 1.7
+    turn = f'<rotate x="1" angle="{angle}"/><rotate z="1" angle="45"/>'
+    bodies = [box("one", clear("glass", n), (60, 60, 0.5), (0, 0, 0), turn), box("two", clear("glass_2", n), (60, 60, 0.5), (0, 0, 300), turn),
+              box("plate", clear("plain", 1.0, more=f'<float name="birefringence" value="{dn}"/>'), (60, 60, d / 2), (0, 0, 150))]
+    t = load(tmp_path, [*bodies, screen(500, half=60)], fov=1)
+    found = t.take(rays=8000)
+    c, s = np.cos(np.radians(angle)), np.sin(np.radians(angle))
+    inside = np.sqrt(1 - (s / n) ** 2)
+    r = np.array([((c - n * inside) / (c + n * inside)) ** 2, ((n * c - inside) / (n * c + inside)) ** 2])
+    one = (1 - r) / (1 + r)
+    expected = (one.sum() ** 2 + (one[0] - one[1]) ** 2 * np.cos(2 * np.pi * dn * d * 1e6 / np.array([620, 540, 460]))) / 4
+    assert np.ptp(expected) > 0.01
+    near(found.radiance[0], found.error[0], expected)
+
+
 def test_the_furnace_neither_gains_nor_loses(tmp_path, mitsuba):
     """Radiance 1 from everywhere is radiance 1 behind any clear body, here a grid in a block (0.5 %)."""
     t = load(tmp_path, [box("block", clear("walls", 1.5), (2.2, 2.2, 1.5), (0, 0, -1.4)), grid((4, 4, 2), clear("filling", 1.4, outside="walls")),
