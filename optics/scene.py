@@ -91,9 +91,9 @@ class Scene:
                 raise BadScene(f"{self.path}: two parts have the id '{name}'; give every part its own id=\"...\"")
             part.name = name
             self.parts[name] = part
-        self._nest()
         self.camera = self._one("camera")
         self.integrator = self._one("tactile")
+        self._nest()
         self.gel, self.block = self._one("gel"), self._one("block")
         if self.block is not None:
             self.block.target = self._one("target")
@@ -140,6 +140,7 @@ class Scene:
                 raise BadScene(f"{self.path}: '{name}': outside = '{part.outside}'; allowed: the id of a clear material ("
                                f"{', '.join(n for n in clear if n != name) or 'there is no other'}), or nothing for air")
             part.around = clear.get(part.outside)
+            part.bands = len(self.integrator.bands) if self.integrator is not None else part.bands
 
     def _one(self, kind: str):
         found = [p for p in self.parts.values() if p.kind == kind]
@@ -265,7 +266,8 @@ class Scene:
 
     def can_express(self, effect: Effect) -> bool:
         kinds = {p.kind for p in self.parts.values()}
-        if self.by_chance and (set(effect.stages) & LED_BY_LED or effect.part == "tactile"):
+        layered = any(p.how == "layer" for p in registry().effect_parameters(effect))
+        if self.by_chance and (set(effect.stages) & LED_BY_LED or effect.part == "tactile" or layered):
             return False
         return all(self.keys_of(effect).values()) and kinds.issuperset(effect.requires)
 

@@ -16,6 +16,7 @@ On a rough face the ray meets a facet, drawn as often as it is seen (Beckmann's 
 facet's normal m; the way on is weighed by Smith's G1(wo, m), and what leaves on the wrong side of the face is lost.
 
 The maps know cells and matt surfaces with coordinates on them (u, v); matt surfaces are taken as Lambertian.
+Light that comes straight to a matt surface, through air, is left to the camera's rays, which look from there to every light.
 Without maps (`reach="paths"`) rays of the camera go on until they meet a luminous area: without the maps' resolution, and slower
 the smaller the area. It is what the maps are tested against, beside stock Mitsuba.
 
@@ -519,7 +520,8 @@ class Run:
 
         def at(s, si, k, hit):
             if self.of.texels:
-                matt = hit & (dr.gather(mi.Int32, self.matt, k) > 0) & (mi.Frame3f.cos_theta(si.wi) > 0)
+                # what comes straight from a light, the camera's rays find by themselves
+                matt = hit & (dr.gather(mi.Int32, self.matt, k) > 0) & (mi.Frame3f.cos_theta(si.wi) > 0) & (s["depth"] > 0)
                 area = dr.select(matt, dr.norm(dr.cross(si.dp_du, si.dp_dv)) / TEXELS**2, 1.0)
                 leave(self.irradiance, self.of.texels, self.texel(si, k, matt), s["v"][0] * dr.gather(mi.Float, shares, s["light"]) / area,
                       s["tau"], s["ways"], s, matt)
@@ -534,6 +536,27 @@ class Run:
         dr.eval(self.fluence, self.irradiance)
 
     # -- from the camera ---------------------------------------------------------------------------------------------
+
+    def straight(self, light: int, si, rng, active):
+        """Irradiance that a light at power 1 sends to a surface with nothing in between, from one random point of the light: a panel's is
+        cos_l cos_s A/r^2, an LED's cos_l^mu cos_s/r^2."""
+        import drjit as dr
+        import mitsuba as mi
+
+        name, sample = self.of.lights[light], mi.Point2f(rng.next_float32(), rng.next_float32())
+        part = self.scene.parts[name]
+        if name in self.scene.sources:
+            start = next(s.shape for s in self.of.surfaces if s.light == name).sample_position(mi.Float(0), sample)
+            p, axis, mu, area = start.p, start.n, 1.0, 1 / start.pdf
+        else:
+            p, axis, mu, area = part.point(sample) if part.number("area") > 0 else part.position(), part.axis(), part.mu, 1.0
+        to = p - si.p
+        square = dr.maximum(dr.squared_norm(to), 1e-12)
+        d = to * dr.rsqrt(square)
+        cos_l, cos_s = dr.maximum(-dr.dot(d, axis), 0.0), dr.maximum(dr.dot(d, si.n), 0.0)
+        lit = active & (cos_l > 0) & (cos_s > 0)
+        lit &= ~self.scene.mitsuba.ray_test(si.spawn_ray_to(p), lit)
+        return dr.select(lit, dr.power(dr.maximum(cos_l, 1e-9), mu) * cos_s * area / square, 0.0)
 
     def _seen(self, rays: int, batches: int, done: int) -> dict:
         """Where rays of the camera start, so many per pixel and batch."""
@@ -609,8 +632,15 @@ class Run:
             matt = facing & (dr.gather(mi.Int32, self.matt, k) > 0)
             reflectance = mi.unpolarized_spectrum(si.bsdf().eval(mi.BSDFContext(), si, mi.Vector3f(0, 0, 1), matt))  # rho/pi
             shift = [s["rng"].next_float32() - 0.5 for _ in range(2)]  # in the mean, the map is read linearly between its texels
-            read(self.irradiance, self.of.texels, self.texel(si, k, matt, shift), s["v"][0],
-                 [t * reflectance[b] for b, t in zip(self.group, s["tau"])], s["ways"], s, matt)
+            tau = [t * reflectance[b] for b, t in zip(self.group, s["tau"])]
+            read(self.irradiance, self.of.texels, self.texel(si, k, matt, shift), s["v"][0], tau, s["ways"], s, matt)
+            in_air = matt & (s["medium"] == 0)
+            straight = [self.straight(number, si, s["rng"], in_air) for number in range(len(self.of.lights))]
+            for row, (light, band) in enumerate(self.rows):
+                value = s["v"][0] * tau[self.group.index(band)] * straight[light] * float(self.levels[light, band])
+                see(s, row, 0, value, in_air)
+                for kind in range(1, self.kinds):
+                    see(s, row, kind, -value * s["ways"][kind - 1], in_air)
             return matt
 
         self.fly(self._seen(rays, BATCHES, done), False, not self.maps, along, at)

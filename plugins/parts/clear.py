@@ -38,6 +38,7 @@ def build():
         kind = "clear"
         around = None  # the clear material outside, set by the scene; None is air
         fills_cells = False  # set by the scene as well: what light is scattered is known in cells only
+        bands = 3  # of the scene
 
         def __init__(self, props):
             self.outside = str(props.get("outside", ""))
@@ -48,6 +49,8 @@ def build():
             self.m_flags = self.m_components[0] | self.m_components[1]
 
         def takes(self, name):
+            if name in ("dispersion", "absorption_slope"):  # of one band they say no more than the coefficient itself
+                return self.bands > 1
             return name != "scattering" or self.fills_cells
 
         def fading(self, wavelengths):

@@ -1,0 +1,122 @@
+"""The loop on a printed grid: pictures by stock Mitsuba's `volpath` and other meshes (optics.synthetic_grid), effects hidden in turn.
+
+A matt rod at three distances, lit by one panel after the other, 8 bits. Free are the powers of the panels; held out is one distance.
+"""
+
+import numpy as np
+import pytest
+
+from optics import captures as capture_files, loop, scene as scenes
+from optics.effect import registry
+from optics.synthetic_grid import GridMaker
+
+# the rod fills the view: at its edge a texel of the model's map of its light holds two surfaces
+SCENE = {"width": "32", "height": "24", "diameter": "13"}
+CHANCE = {"rays": "1024", "packets": "1000000"}  # the model's error is then a third of the camera's noise, which it adds to it
+DISTANCES = [3.0, 4.0, 5.0]  # nearer, the map is too coarse for the light on the rod: half a per cent at 2.5 mm
+HELD = ["distance-01"]
+BUILT = {"panel_left.power": 1.1, "panel_right.power": 0.9}
+FREE = ["panel_*.power"]
+
+# case: (strength, look-alikes, {variable: true value})
+HIDDEN = {
+    "volume scattering": (0.01, (), {"filling.scattering": 0.01}),
+    "rough walls": (0.05, (), {"filling.roughness": 0.05}),
+    "index mismatch": (0.01, (), {}),  # free are both indices: their ratio is what walls between them tell
+    "body absorption": (0.15, (), {"filling.absorption": 0.15}),
+    "unfilled cell": ((3, 2, 1), (), {"grid.unfilled": 1.0}),
+    "wall thickness": (0.02, (), {"grid.wall_error": 0.02}),
+}
+
+
+def study_of(folder, effects, seed=5):
+    maker = GridMaker(scenes.load("grid_bench", SCENE), BUILT, effects, seed=seed)
+    capture_files.write(maker.captures(DISTANCES), folder / "captures", bits=8)
+    assert max(maker.shares) < 0.3
+    defines = {"diameter": SCENE["diameter"], **CHANCE}
+    setup = loop.Setup(captures=str(folder / "captures"), defines=defines, free=FREE, per_group=[], held_out=HELD)
+    return (setup, *loop.begin(setup, folder / "study"))
+
+
+def small(effects=None, seed=1, spp=64):
+    return GridMaker(scenes.load("grid_bench", {"width": "12", "height": "9"}), BUILT, effects, seed=seed, spp=spp)
+
+
+def test_frames_are_lit_by_one_panel_each_and_as_noisy_as_they_say():
+    made = small().captures([2.5, 6.0])
+    assert [f.group for f in made.frames] == 3 * ["distance-00"] + 3 * ["distance-01"]
+    for frame in made.frames:
+        assert frame.image.shape == (9, 12, 1) and sum(v for k, v in frame.parameters.items() if k.endswith(".power")) == 1
+        assert frame.image.max() <= 255 and (frame.image == np.round(frame.image)).all()
+    again, other = small().captures([2.5]), small(seed=2).captures([2.5])
+    assert (again.frames[0].image == made.frames[0].image).all() and (other.frames[0].image != made.frames[0].image).any()
+    maker, rng = small(), np.random.default_rng(0)
+    stack = np.array([maker.photograph(np.full((9, 12), 0.01), np.zeros((9, 12)), rng) for _ in range(200)])
+    expected = 8 + 247 * 15 * 0.01
+    assert stack.mean() == pytest.approx(expected, abs=0.2)  # three standard errors
+    assert stack.std() == pytest.approx(made.noise.sd(expected), rel=0.02)
+    assert maker.shares == 200 * [0.0]
+
+
+def test_the_makers_error_falls_with_its_samples():
+    shares = []
+    for spp in (64, 1024):
+        maker = small(spp=spp)
+        radiance, error = maker.radiance(4.0, "panel_left")
+        maker.photograph(radiance, error, np.random.default_rng(0))
+        shares += maker.shares
+    assert shares[0] / shares[1] == pytest.approx(4, rel=0.25)  # errors of eight passes
+
+
+@pytest.mark.parametrize("effects, said", [
+    ({"fog": 1.0}, "no independent way to make fog"),
+    ({"unfilled cell": (8, 0, 0)}, r"unfilled cell = \(8, 0, 0\); allowed: \(column, row, layer\) below")])
+def test_what_the_maker_cannot_make_is_refused(effects, said):
+    with pytest.raises(ValueError, match=said):
+        small(effects)
+
+
+@pytest.mark.slow
+def test_the_maker_and_the_model_are_two_accounts_of_one_grid():
+    """At equal values, without a fit: half a per cent in the mean, and no more from pixel to pixel than both errors say."""
+    from optics.transport import Transport
+
+    scene = scenes.load("grid_bench", SCENE)
+    maker = GridMaker(scene, {}, {}, seed=2)
+    made = {name: maker.radiance(4.0, name) for name in maker.panels}
+    taken = Transport(scene).take(1024, 2_000_000)
+    for name, radiance, error in zip(taken.lights, taken.radiance[..., 0], taken.error[..., 0]):
+        stock, own = made[name]
+        assert radiance.mean() == pytest.approx(stock.mean(), rel=0.005)  # texels of the model's maps are shared by pixels
+        assert np.mean((radiance - stock) ** 2) < 1.3 * np.mean(error**2 + own**2)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", HIDDEN)
+def test_a_hidden_effect_is_found(case, tmp_path):
+    strength, alike, truth = HIDDEN[case]
+    setup, study, model, fit = study_of(tmp_path, {case: strength})
+    diagnosis = loop.examine(study, model, setup, fit)
+    if diagnosis.word == "AMBIGUOUS":
+        assert case in diagnosis.ambiguous and set(diagnosis.ambiguous) <= {case, *alike}, diagnosis.sentence
+    else:
+        assert diagnosis.word == "CLAIM" and diagnosis.missing == case, f"{diagnosis.word}: {diagnosis.sentence}"
+    before = study.steps[-1]["held_out"]["chi2_per_dof"]
+    start = diagnosis.fits[case].values if case in diagnosis.fits else None
+    fit = loop.extend(study, model, setup, fit, registry().find_effect(case), start)[0]
+    held = study.steps[-1]["held_out"]["chi2_per_dof"]
+    assert held < before and fit.chi2 / fit.dof < 1.1 and held < 1.1  # the noise floor; the maker's error adds two per cent
+    for variable, sd in zip(fit.variables, fit.sd):
+        if variable.name in truth:  # four standard deviations, and a twentieth: the model's error is not in sd
+            found = fit.values.get(variable, model.base)
+            assert abs(found - truth[variable.name]) < 4 * sd + 0.05 * truth[variable.name], f"{variable.name}: {found} +- {sd}"
+    if case == "unfilled cell":
+        place = [fit.values.common.get(f"grid.unfilled_{axis}", 0.0) for axis in ("column", "row", "layer")]
+        assert tuple(place) == strength
+
+
+@pytest.mark.slow
+def test_nothing_is_claimed_of_a_perfect_grid(tmp_path):
+    setup, study, model, fit = study_of(tmp_path, {})
+    assert loop.examine(study, model, setup, fit).word != "CLAIM"
+    assert fit.chi2 / fit.dof < 1.05
