@@ -59,14 +59,9 @@ def held(image: np.ndarray) -> np.ndarray:
     return np.clip(image * high, 0, 255)
 
 
-def main(picture_file: str = "renders/states.png") -> None:
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot as plt
-
-    made, rng = pictures(), np.random.default_rng(1)
-    exposure = MEAN / made[0][2].mean()
+def readings(made) -> tuple[dict, dict, list[float]]:
+    """Frames by camera; rows of the readers by camera, for bright cells and for dark walls; share of touched cells in the view."""
+    rng, exposure = np.random.default_rng(1), MEAN / made[0][2].mean()
     cameras = {"fixed": lambda image: np.clip(image * exposure, 0, 255), "holds its mean": held}
     frames, rows = {}, {}
     for name, camera in cameras.items():
@@ -74,8 +69,17 @@ def main(picture_file: str = "renders/states.png") -> None:
         frames[name] = [NOISE.expose(camera(image), rng) for _, _, image in made]
         rows[name] = [grid.read_sequence(frames[name], grid.references(still, dark=dark)) for dark in (False, True)]
     floor = np.maximum(made[0][2], 0.3 * made[0][2].mean())  # walls are dark
-    wide = [float(((image / floor).min(-1) > BRIGHT).mean()) for _, _, image in made]
+    return frames, rows, [float(((image / floor).min(-1) > BRIGHT).mean()) for _, _, image in made]
 
+
+def main(picture_file: str = "renders/states.png") -> None:
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    made = pictures()
+    frames, rows, wide = readings(made)
     print(f"thresholds {grid.BINARY:g} DN, E {grid.ENTROPY:g} bit, C {grid.CORRELATION:g}, S {grid.SIMILARITY:g}; still frame {MEAN:g} DN in the mean")
     print(f"{'':26}{'exposure fixed':^46}  {'the mean held':^28}")
     print("state       set to           E     C     S     bright  Algorithm 2  Algorithm 3  S     walls' S  Algorithm 3  published")
@@ -87,7 +91,7 @@ def main(picture_file: str = "renders/states.png") -> None:
 
     figure = plt.figure(figsize=(1.3 * len(made), 5.6))
     heights = figure.add_gridspec(3, len(made), height_ratios=(1, 1, 2.2), hspace=0.12, wspace=0.04, left=0.05, right=0.995, top=0.9, bottom=0.13)
-    for row, name in enumerate(cameras):
+    for row, name in enumerate(frames):
         for k, (state, what, _) in enumerate(made):
             axis = figure.add_subplot(heights[row, k])
             axis.imshow(frames[name][k].astype(np.uint8))

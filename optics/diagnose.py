@@ -196,7 +196,8 @@ class Table:
 
 def _rank(evidence: Evidence, candidates: list[Candidate], seed: int) -> Table:
     projected, first = evidence.projected, len(evidence.base)
-    visible = projected.survival > st.VISIBLE
+    # where noise of a derivative image is more than what survives of it, products of two such images are chance, and may be next to nothing
+    visible = (projected.survival > st.VISIBLE) & (np.diag(projected.information) > evidence.normal.noise[evidence.rest])
     for c in candidates:
         if c.broken:
             visible[[i - first for columns in c.forms.values() for i in columns]] = False

@@ -380,6 +380,22 @@ def test_noisy_derivatives_are_rendered_twice_with_seeds_of_their_own():
     assert len(seeds - {0}) == 2
 
 
+def test_an_effect_that_is_lost_in_the_noise_of_its_image_is_not_ranked():
+    """Products of two such images are chance, next to nothing as often as not, and falls of chi2 without bound."""
+    model, fit = calibrated({"vignetting": 0.1}, side=32)
+    plain = model.derivatives
+
+    def derivatives(values, variables, frames=None, secant=None, seed=0):
+        for index, (prediction, images) in zip(frames, plain(values, variables, frames, secant, seed)):
+            rng = np.random.default_rng([seed, index])
+            yield prediction, {name: 1e-3 * rng.standard_normal(image.shape).astype(image.dtype) if "glare" in name else image
+                               for name, image in images.items()}
+
+    model.derivatives = derivatives
+    d = judge(model, fit, library("vignetting", "glare"))
+    assert d.missing == "vignetting" and d.row("glare").fall == 0 and "nothing visible" in d.row("glare").flags
+
+
 def test_family_wise_alarms_on_the_images_of_the_mock():
     """R9: at most 2 % in 2000 nulls at nominal 1 %, for the very columns that a diagnosis uses."""
     model, fit = calibrated()
