@@ -46,6 +46,7 @@ TEXELS = 64  # of an irradiance map, each way
 SMOOTH = 1e-4  # roughness up to which a face is smooth: Mitsuba's distributions know no less
 ASTRAY = 5e-3  # faces per ray that rounding may lead a ray past, at edges: 2e-5 in a grid at rest, 1e-3 in a pressed one
 SPLIT = 2  # parts of a cell of the fluence map, each way
+WEAK = 1e-12  # birefringence that turns nothing
 AIR = "air"
 STREAM = 0xDA3E39CB94B95BDB  # of random numbers, as Dr.Jit begins
 
@@ -124,7 +125,7 @@ class Transport:
         # bands that go different ways are followed apart
         if reach == "maps":
             self._check_maps()
-        same = all(np.ptp(m.index) == 0 and m.birefringence == 0 for m in self.materials)
+        same = all(np.ptp(m.index) == 0 and abs(m.birefringence) < WEAK for m in self.materials)
         groups = [list(range(len(self.bands)))] if same else [[b] for b in range(len(self.bands))]
         kinds = len(self.materials) if slopes else 1
         images, followed, lost, astray = 0.0, 0, 0.0, 0.0
@@ -205,7 +206,7 @@ class Run:
         rough = [materials[s.inside].roughness if s.inside >= 0 else 0.0 for s in surfaces]
         self.roughness = table(mi.Float, rough) if any(rough) else None
         turns = [2e6 * np.pi * m.birefringence / transport.bands[group[0]] for m in materials]  # rad/mm
-        self.retardance = table(mi.Float, turns) if any(turns) else None
+        self.retardance = table(mi.Float, turns) if any(abs(m.birefringence) >= WEAK for m in materials) else None
         self.pointers = [mi.ShapePtr(s.shape) for s in surfaces]
         self.outside, self.inside, self.first, self.matt, self.grid, self.light = (table(mi.Int32, values) for values in (
             [s.outside for s in surfaces], [s.inside for s in surfaces], [s.first for s in surfaces], [s.matt for s in surfaces],
@@ -537,13 +538,13 @@ class Run:
 
     # -- from the camera ---------------------------------------------------------------------------------------------
 
-    def straight(self, light: int, si, rng, active):
-        """Irradiance that a light at power 1 sends to a surface with nothing in between, from one random point of the light: a panel's is
+    def straight(self, light: int, si, sample, active):
+        """Irradiance that a light at power 1 sends to a surface with nothing in between, from the point of the light that a sample names: a panel's is
         cos_l cos_s A/r^2, an LED's cos_l^mu cos_s/r^2."""
         import drjit as dr
         import mitsuba as mi
 
-        name, sample = self.of.lights[light], mi.Point2f(rng.next_float32(), rng.next_float32())
+        name = self.of.lights[light]
         part = self.scene.parts[name]
         if name in self.scene.sources:
             start = next(s.shape for s in self.of.surfaces if s.light == name).sample_position(mi.Float(0), sample)
@@ -635,7 +636,8 @@ class Run:
             tau = [t * reflectance[b] for b, t in zip(self.group, s["tau"])]
             read(self.irradiance, self.of.texels, self.texel(si, k, matt, shift), s["v"][0], tau, s["ways"], s, matt)
             in_air = matt & (s["medium"] == 0)
-            straight = [self.straight(number, si, s["rng"], in_air) for number in range(len(self.of.lights))]
+            sample = mi.Point2f(s["rng"].next_float32(), s["rng"].next_float32())
+            straight = [self.straight(number, si, sample, in_air) for number in range(len(self.of.lights))]
             for row, (light, band) in enumerate(self.rows):
                 value = s["v"][0] * tau[self.group.index(band)] * straight[light] * float(self.levels[light, band])
                 see(s, row, 0, value, in_air)
