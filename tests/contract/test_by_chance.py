@@ -24,6 +24,8 @@ KEYS = ["led_red.x", "led_red.z", "led_red.mu", "camera.x", "camera.x_fov", "obj
     for p in registry().parameters_of(kind) if p.name not in BENT and not p.name.startswith("unfilled")
     and f"{part}.{p.name}" != "walls.scattering")]
 
+QUICK = {"led_red.z", "camera.x", "filling.absorption", "filling.scattering", "grid.wall", "object.distance"}  # one of each way
+
 
 @pytest.fixture(scope="module")
 def bench(mitsuba):
@@ -59,7 +61,7 @@ def test_an_effect_at_neutral_is_not_there(key, bench):
     np.testing.assert_allclose(other, one, rtol=0, atol=1e-5 * one.max())  # atomic sums in float32, in another order
 
 
-@pytest.mark.parametrize("key", KEYS)
+@pytest.mark.parametrize("key", [k if k in QUICK else pytest.param(k, marks=pytest.mark.slow) for k in KEYS])
 def test_derivatives_against_differences(key, bench):
     """The renderer's own against differences over a plausible change, both as means over seeds with common random numbers."""
     scene, renderer, values = bench

@@ -141,7 +141,7 @@ def test_a_cell_that_was_not_filled(load):
         Transport(scene)
 
 
-@pytest.mark.parametrize("scattering", [0.0, 0.5])
+@pytest.mark.parametrize("scattering", [pytest.param(0.0, marks=pytest.mark.slow), 0.5])
 def test_a_pressed_grid_by_two_routes(load, scattering):
     """Maps against rays that find the lamp by themselves, in contact: the target's light and the cells' (z, and the mean)."""
     from optics.transport import Transport
