@@ -46,6 +46,7 @@ TEXELS = 64  # of an irradiance map, each way
 SMOOTH = 1e-4  # roughness up to which a face is smooth: Mitsuba's distributions know no less
 ASTRAY = 5e-3  # faces per ray that rounding may lead a ray past, at edges: 2e-5 in a grid at rest, 1e-3 in a pressed one
 SPLIT = 2  # parts of a cell of the fluence map, each way
+POINTS = 3  # of a light, each way, that a lit place looks at
 WEAK = 1e-12  # birefringence that turns nothing
 AIR = "air"
 STREAM = 0xDA3E39CB94B95BDB  # of random numbers, as Dr.Jit begins
@@ -636,8 +637,9 @@ class Run:
             tau = [t * reflectance[b] for b, t in zip(self.group, s["tau"])]
             read(self.irradiance, self.of.texels, self.texel(si, k, matt, shift), s["v"][0], tau, s["ways"], s, matt)
             in_air = matt & (s["medium"] == 0)
-            sample = mi.Point2f(s["rng"].next_float32(), s["rng"].next_float32())
-            straight = [self.straight(number, si, sample, in_air) for number in range(len(self.of.lights))]
+            x, y = s["rng"].next_float32(), s["rng"].next_float32()
+            points = [mi.Point2f((i + x) / POINTS, (j + y) / POINTS) for i in range(POINTS) for j in range(POINTS)]
+            straight = [sum(self.straight(number, si, point, in_air) for point in points) / len(points) for number in range(len(self.of.lights))]
             for row, (light, band) in enumerate(self.rows):
                 value = s["v"][0] * tau[self.group.index(band)] * straight[light] * float(self.levels[light, band])
                 see(s, row, 0, value, in_air)
