@@ -4,8 +4,8 @@
 
 Renders the shipped grid with a rod of 20 mm, as thick as a finger, that comes near and presses, and with light from before the skin; makes
 frames of 8 bits of them, with noise; and reads entropy, correlation of the channels and similarity of the grid with the published
-thresholds. Two cameras look: one keeps its exposure, the other the mean of its frames, as the camera of a DIGIT does unless it is told
-not to. Prints a table, with what MagicGripper's Figures 21 and 25 to 29 show, and draws the frames above the curves.
+thresholds. Two cameras look: one keeps its exposure, the other the mean of its frames, as automatic
+exposure does. Prints a table, with what MagicGripper's Figures 21 and 25 to 29 show, and draws the frames above the curves.
 
 What to see: the published drops of the similarity, under touch and under a flashlight, are a camera's that dims its picture. With a fixed
 exposure light only adds, and more of a picture stays above 35 DN.
