@@ -155,8 +155,7 @@ class Transport:
 
     def seen_through(self, rays: int, seed: int = 0) -> np.ndarray:
         """(cells, H, W): length (mm) in each cell of the camera's rays of each pixel, in the mean, by their weight in the first band."""
-        run = Run(self, [0], 1, seed)
-        return run.lengths(rays)
+        return Run(self, [0], 1, seed).lengths(rays)
 
     def _check_maps(self) -> None:
         """Refuse what the maps do not hold: scattering outside cells, polarized lights."""
@@ -215,7 +214,7 @@ class Run:
             [transport.lights.index(s.light) if s.light in transport.lights else -1 for s in surfaces]))
         boxes = [s.shape.bbox() for s in surfaces if s.inside >= 0]
         low, high = np.min([np.ravel(b.min) for b in boxes], 0), np.max([np.ravel(b.max) for b in boxes], 0)
-        self.aim, self.reach = [float(c) for c in (low + high) / 2], float(np.linalg.norm(high - low) / 2)
+        self.aim, self.radius = [float(c) for c in (low + high) / 2], float(np.linalg.norm(high - low) / 2)
         self.filled = None
         if transport.cells:
             origins, turns, volumes = (np.concatenate([getattr(c, n) for c in transport.cells]) for n in ("origins", "rows", "volumes"))
@@ -455,6 +454,17 @@ class Run:
 
     # -- from the lights ---------------------------------------------------------------------------------------------
 
+    def panel(self, name: str, sample):
+        """A point of a source's area, with its normal and density."""
+        import mitsuba as mi
+
+        return next(s.shape for s in self.of.surfaces if s.light == name).sample_position(mi.Float(0), sample)
+
+    @staticmethod
+    def chip(led, sample):
+        """A point of an LED."""
+        return led.point(sample) if led.number("area") > 0 else led.position()
+
     def _emitted(self, light: int, drawn: Sequence):
         """Where packets of a light start, which way they go, the power of all of them, and the weight of each, by five random numbers."""
         import drjit as dr
@@ -463,13 +473,12 @@ class Run:
         name, count = self.of.lights[light], dr.width(drawn[0])
         part, one, two = self.scene.parts[name], mi.Point2f(drawn[0], drawn[1]), mi.Point2f(drawn[2], drawn[3])
         if name in self.scene.sources:
-            shape = next(s.shape for s in self.of.surfaces if s.light == name)
-            start = shape.sample_position(mi.Float(0), one)
+            start = self.panel(name, one)
             # half of the packets by the cosine, half towards a ball around the clear bodies, which may be small and far away
             cosine = mi.Frame3f(start.n).to_world(mi.warp.square_to_cosine_hemisphere(two))
             to = mi.Point3f(*self.aim) - start.p
             distance = dr.norm(to)
-            edge = dr.safe_sqrt(1 - dr.square(dr.minimum(self.reach / distance, 1.0)))  # cosine of the ball's radius; 0 from within
+            edge = dr.safe_sqrt(1 - dr.square(dr.minimum(self.radius / distance, 1.0)))  # cosine of the ball's radius; 0 from within
             aimed = (edge > 0) & (drawn[4] < 0.5)
             cone = mi.Frame3f(to / distance).to_world(mi.warp.square_to_uniform_cone(two, edge))
             d = dr.select(aimed, cone, cosine)
@@ -481,8 +490,7 @@ class Run:
         z = dr.power(1 - two.x, 1 / (part.mu + 1))  # of cos(theta)^mu
         s, c = dr.sincos(2 * dr.pi * two.y)
         d = mi.Frame3f(part.axis()).to_world(mi.Vector3f(c, s, 0) * dr.safe_sqrt(1 - z * z) + mi.Vector3f(0, 0, 1) * z)
-        p = part.point(one) if part.number("area") > 0 else part.position()
-        return p + dr.zeros(mi.Point3f, count), d, 2 * dr.pi / (part.mu + 1) + dr.zeros(mi.Float, count), dr.full(mi.Float, 1.0, count)
+        return self.chip(part, one) + dr.zeros(mi.Point3f, count), d, 2 * dr.pi / (part.mu + 1) + dr.zeros(mi.Float, count), dr.full(mi.Float, 1.0, count)
 
     def _shine(self, packets: int, wanted: int, done: int) -> None:
         """Packets of all lights, into the maps."""
@@ -540,18 +548,18 @@ class Run:
     # -- from the camera ---------------------------------------------------------------------------------------------
 
     def straight(self, light: int, si, sample, active):
-        """Irradiance that a light at power 1 sends to a surface with nothing in between, from the point of the light that a sample names: a panel's is
-        cos_l cos_s A/r^2, an LED's cos_l^mu cos_s/r^2."""
+        """Irradiance that a light at power 1 sends to a surface with nothing in between, from the point of it that a sample names: a
+        panel's is cos_l cos_s A/r^2, an LED's cos_l^mu cos_s/r^2."""
         import drjit as dr
         import mitsuba as mi
 
         name = self.of.lights[light]
         part = self.scene.parts[name]
         if name in self.scene.sources:
-            start = next(s.shape for s in self.of.surfaces if s.light == name).sample_position(mi.Float(0), sample)
+            start = self.panel(name, sample)
             p, axis, mu, area = start.p, start.n, 1.0, 1 / start.pdf
         else:
-            p, axis, mu, area = part.point(sample) if part.number("area") > 0 else part.position(), part.axis(), part.mu, 1.0
+            p, axis, mu, area = self.chip(part, sample), part.axis(), part.mu, 1.0
         to = p - si.p
         square = dr.maximum(dr.squared_norm(to), 1e-12)
         d = to * dr.rsqrt(square)
@@ -603,6 +611,12 @@ class Run:
         def see(s, row, kind, value, active):
             dr.scatter_add(self.out, value, self.place(s, row, kind, pixels) + s["pixel"], active)
 
+        def see_light(s, row, value, active):
+            """Light that faded on the way of this ray alone, and its derivatives."""
+            see(s, row, 0, value, active)
+            for kind in range(1, self.kinds):
+                see(s, row, kind, -value * s["ways"][kind - 1], active)
+
         def read(where, size, place, worth, tau, ways, s, active):
             for row, (_, band) in enumerate(self.rows):
                 own = worth * tau[self.group.index(band)]
@@ -625,10 +639,7 @@ class Run:
             for row, (light, band) in enumerate(self.rows):
                 if self.of.lights[light] in self.scene.sources:
                     value = s["v"][0] * s["tau"][self.group.index(band)] * float(self.levels[light, band])
-                    shines = facing & (luminous == light)
-                    see(s, row, 0, value, shines)
-                    for kind in range(1, self.kinds):
-                        see(s, row, kind, -value * s["ways"][kind - 1], shines)
+                    see_light(s, row, value, facing & (luminous == light))
             if not self.maps or not self.of.texels:
                 return mi.Bool(False)
             matt = facing & (dr.gather(mi.Int32, self.matt, k) > 0)
@@ -642,9 +653,7 @@ class Run:
             straight = [sum(self.straight(number, si, point, in_air) for point in points) / len(points) for number in range(len(self.of.lights))]
             for row, (light, band) in enumerate(self.rows):
                 value = s["v"][0] * tau[self.group.index(band)] * straight[light] * float(self.levels[light, band])
-                see(s, row, 0, value, in_air)
-                for kind in range(1, self.kinds):
-                    see(s, row, kind, -value * s["ways"][kind - 1], in_air)
+                see_light(s, row, value, in_air)
             return matt
 
         self.fly(self._seen(rays, BATCHES, done), False, not self.maps, along, at)
