@@ -133,7 +133,7 @@ class Pictures:
         picture.header["provenance"] = {**self.record, "seed": seed, "parameters": now}
         pressed = None if self.scene.block is None else self.scene.block.press()
         if pressed is not None:
-            picture.header["provenance"]["press"] = {"force": [float(f) for f in pressed.force], "unit": "N", "seconds": pressed.seconds}
+            picture.header["provenance"]["press"] = {"force": [float(f) for f in pressed.force], "unit": "N"}
         return picture
 
     def _exact(self, now: Mapping, seed: int) -> Picture:
@@ -149,7 +149,8 @@ class Pictures:
             for light, image in alone.items():
                 channels.update(zip((f"{light}.{n}" for n in self._band_names()), np.moveaxis(image, -1, 0)))
         if renderer.by_chance:
-            scatter = exr.spectral_channels(self.bands, renderer.error(now) ** 2) if self.bands else {"Y": renderer.error(now)[..., 0] ** 2}
+            scatter = renderer.error(now) ** 2
+            scatter = exr.spectral_channels(self.bands, scatter) if self.bands else {"Y": scatter[..., 0]}
             channels.update({f"variance.{name}": image for name, image in scatter.items() if name in channels})
         header = exr.spectral_header(renderer.layered, UNITS) if self.bands else {}
         self.scene.set(now)  # the renderer leaves the LEDs at power 1
