@@ -37,6 +37,7 @@ from optics.effect import registry
 from optics.errors import BadScene
 from optics.mueller import diattenuator, fresnel, fresnel_reflection, retarder, rotation
 from optics.paths import part_values
+from optics.solid_angle import Rectangle
 
 DEPTH = 512  # faces that a ray may meet; of the scene magictac's, 6e-5 would meet more
 FAINT = 0.3  # below this share of its start, half of the packets go on with twice the weight
@@ -46,7 +47,7 @@ TEXELS = 64  # of an irradiance map, each way
 SMOOTH = 1e-4  # roughness up to which a face is smooth: Mitsuba's distributions know no less
 ASTRAY = 5e-3  # faces per ray that rounding may lead a ray past, at edges: 2e-5 in a grid at rest, 1e-3 in a pressed one
 SPLIT = 2  # parts of a cell of the fluence map, each way
-POINTS = 3  # of a light, each way, that a lit place looks at
+POINTS = 2  # of a light, each way, that a lit place looks at
 WEAK = 1e-12  # birefringence that turns nothing
 AIR = "air"
 STREAM = 0xDA3E39CB94B95BDB  # of random numbers, as Dr.Jit begins
@@ -284,6 +285,16 @@ class Run:
         column, row = (mi.UInt32(dr.clip(c * TEXELS + d, 0, TEXELS - 1e-3)) for c, d in zip(si.uv, shift))
         return mi.UInt32(dr.gather(mi.Int32, self.first, k, active)) + row * TEXELS + column
 
+    def number(self, si):
+        """Of the surface that was met."""
+        import drjit as dr
+        import mitsuba as mi
+
+        k = mi.UInt32(0)
+        for number, pointer in enumerate(self.pointers):
+            k = dr.select(si.shape == pointer, mi.UInt32(number), k)
+        return k
+
     def ways(self, s, length=None):
         """Length of the way in each material so far, and `length` further in the present one."""
         import drjit as dr
@@ -301,8 +312,9 @@ class Run:
 
     # -- flight ------------------------------------------------------------------------------------------------------
 
-    def fly(self, start: dict, forward: bool, drawn: bool, along: Callable, at: Callable) -> None:
-        """Follow rays through all faces until they end.
+    def fly(self, start: dict, forward: bool, drawn: bool, along: Callable, at: Callable) -> dict:
+        """Follow rays through all faces until they end; gives their last state, with `ended` where `at` says so: there p and d are those
+        of the last stretch.
 
         start    p, d, rng, x (axis across d that Stokes vectors refer to), tau (share of what each ray started with, per band of the
                  group), weight (what that is; 1), and numbers that stay: pixel, light, batch
@@ -321,9 +333,7 @@ class Run:
             active, rng, flight = s["active"], s["rng"], s["d"]
             si = self.scene.mitsuba.ray_intersect(mi.Ray3f(s["p"], flight, mi.Float(0), self.wavelengths), mi.RayFlags.All, False, active)
             hit = active & si.is_valid()
-            k = mi.UInt32(0)
-            for number, pointer in enumerate(self.pointers):
-                k = dr.select(si.shape == pointer, mi.UInt32(number), k)
+            k = self.number(si)
             sigma = dr.gather(mi.Float, self.scattering, s["medium"])
             length, scattered = dr.select(hit, si.t, 0.0), mi.Bool(False)
             if drawn:
@@ -380,20 +390,21 @@ class Run:
             weight = mi.unpolarized_spectrum(weight)
             s["tau"] = [dr.select(other, t * weight[b], t) for b, t in zip(self.group, s["tau"])]
             sphere = mi.warp.square_to_uniform_sphere(mi.Point2f(rng.next_float32(), rng.next_float32()))
-            s["d"] = dr.normalize(dr.select(other, si.to_world(bs.wo), dr.select(scattered, sphere, d)))
+            s["d"] = dr.select(ends, flight, dr.normalize(dr.select(other, si.to_world(bs.wo), dr.select(scattered, sphere, d))))
             mixed = other | scattered
             s["v"] = [v[0]] + [dr.select(mixed, 0.0, entry) for entry in v[1:]]
             s["x"] = dr.select(mixed, mi.Vector3f(mi.Frame3f(s["d"]).s), dr.select(face, axis, s["x"]))
 
             # of the faint, half go on with twice the weight
             brightest = reduce(dr.maximum, s["tau"])
-            faint = brightest < FAINT
+            faint = (brightest < FAINT) & ~ends
             on = (face | mixed) & (brightest > 0) & (~faint | (rng.next_float32() < 0.5))
             s["tau"] = [dr.select(faint, 2 * t, t) for t in s["tau"]]
             s["depth"] = s["depth"] + 1
             s["cut"] = on & (s["depth"] >= DEPTH)
             s["active"] = on & ~s["cut"]
-            s["p"] = dr.select(scattered, s["p"] + length * flight, dr.select(hit, si.spawn_ray(s["d"]).o, s["p"]))
+            s["ended"] = ends
+            s["p"] = dr.select(scattered, s["p"] + length * flight, dr.select(hit & ~ends, si.spawn_ray(s["d"]).o, s["p"]))
             s["rng"] = rng
             return (s,)
 
@@ -403,12 +414,14 @@ class Run:
             "p": mi.Point3f(start["p"]), "d": mi.Vector3f(start["d"]), "x": mi.Vector3f(start["x"]), "rng": start["rng"],
             "v": [zero + entry for entry in (start.get("weight", 1.0), 0.0, 0.0, 0.0)], "tau": [t + zero for t in start["tau"]],
             "ways": [zero + 0.0 for _ in self.of.materials[1:]], "astray": zero + 0.0,
-            "active": dr.full(mi.Bool, True, count), "cut": dr.full(mi.Bool, False, count),
+            "active": dr.full(mi.Bool, True, count), "cut": dr.full(mi.Bool, False, count), "ended": dr.full(mi.Bool, False, count),
         }
         end = dr.while_loop((state,), lambda s: s["active"], onward)[0]
+        dr.eval(end)  # all at once: what is asked for alone follows the rays anew
         self.followed += count
         self.lost += float(dr.count(end["cut"])[0])
         self.astray += float(dr.sum(end["astray"])[0])
+        return end
 
     def retarded(self, s, length, forward: bool) -> tuple:
         """Stokes vector or row, and its axis, after a stretch of a material that is birefringent along the world's x axis."""
@@ -454,11 +467,23 @@ class Run:
 
     # -- from the lights ---------------------------------------------------------------------------------------------
 
-    def panel(self, name: str, sample):
-        """A point of a source's area, with its normal and density."""
+    def panel(self, name: str) -> "Surface":
+        """What a source shines from."""
+        return next(s for s in self.of.surfaces if s.light == name)
+
+    def seen_panel(self, name: str, place, sample):
+        """A point of a source's area, its normal there, and cos_l / r^2 by its density: the solid angle that it stands for."""
+        import drjit as dr
         import mitsuba as mi
 
-        return next(s.shape for s in self.of.surfaces if s.light == name).sample_position(mi.Float(0), sample)
+        panel = self.panel(name)
+        if panel.rectangle is not None:
+            p, omega = panel.rectangle.seen(place, sample)
+            return p, panel.rectangle.normal, omega
+        start = panel.shape.sample_position(mi.Float(0), sample)
+        to = place - start.p
+        square = dr.maximum(dr.squared_norm(to), 1e-12)
+        return start.p, start.n, dr.maximum(dr.dot(to, start.n), 0.0) * dr.rsqrt(square) / square / start.pdf
 
     @staticmethod
     def chip(led, sample):
@@ -473,7 +498,7 @@ class Run:
         name, count = self.of.lights[light], dr.width(drawn[0])
         part, one, two = self.scene.parts[name], mi.Point2f(drawn[0], drawn[1]), mi.Point2f(drawn[2], drawn[3])
         if name in self.scene.sources:
-            start = self.panel(name, one)
+            start = self.panel(name).shape.sample_position(mi.Float(0), one)
             # half of the packets by the cosine, half towards a ball around the clear bodies, which may be small and far away
             cosine = mi.Frame3f(start.n).to_world(mi.warp.square_to_cosine_hemisphere(two))
             to = mi.Point3f(*self.aim) - start.p
@@ -549,24 +574,24 @@ class Run:
 
     def straight(self, light: int, si, sample, active):
         """Irradiance that a light at power 1 sends to a surface with nothing in between, from the point of it that a sample names: a
-        panel's is cos_l cos_s A/r^2, an LED's cos_l^mu cos_s/r^2."""
+        panel's is cos_s Omega (of its solid angle), an LED's cos_l^mu cos_s/r^2."""
         import drjit as dr
         import mitsuba as mi
 
         name = self.of.lights[light]
         part = self.scene.parts[name]
         if name in self.scene.sources:
-            start = self.panel(name, sample)
-            p, axis, mu, area = start.p, start.n, 1.0, 1 / start.pdf
+            p, axis, share = self.seen_panel(name, si.p, sample)
         else:
-            p, axis, mu, area = self.chip(part, sample), part.axis(), part.mu, 1.0
+            p, axis = self.chip(part, sample), part.axis()
+            to = si.p - p
+            square = dr.maximum(dr.squared_norm(to), 1e-12)
+            share = dr.power(dr.maximum(dr.dot(to, axis) * dr.rsqrt(square), 1e-9), part.mu) / square
         to = p - si.p
-        square = dr.maximum(dr.squared_norm(to), 1e-12)
-        d = to * dr.rsqrt(square)
-        cos_l, cos_s = dr.maximum(-dr.dot(d, axis), 0.0), dr.maximum(dr.dot(d, si.n), 0.0)
-        lit = active & (cos_l > 0) & (cos_s > 0)
+        cos = dr.dot(to, si.n) * dr.rsqrt(dr.maximum(dr.squared_norm(to), 1e-12))
+        lit = active & (dr.dot(to, axis) < 0) & (cos > 0)
         lit &= ~self.scene.mitsuba.ray_test(si.spawn_ray_to(p), lit)
-        return dr.select(lit, dr.power(dr.maximum(cos_l, 1e-9), mu) * cos_s * area / square, 0.0)
+        return dr.select(lit, cos * share, 0.0)
 
     def _seen(self, rays: int, batches: int, done: int) -> dict:
         """Where rays of the camera start, so many per pixel and batch."""
@@ -640,24 +665,33 @@ class Run:
                 if self.of.lights[light] in self.scene.sources:
                     value = s["v"][0] * s["tau"][self.group.index(band)] * float(self.levels[light, band])
                     see_light(s, row, value, facing & (luminous == light))
-            if not self.maps or not self.of.texels:
-                return mi.Bool(False)
-            matt = facing & (dr.gather(mi.Int32, self.matt, k) > 0)
-            reflectance = mi.unpolarized_spectrum(si.bsdf().eval(mi.BSDFContext(), si, mi.Vector3f(0, 0, 1), matt))  # rho/pi
-            shift = [s["rng"].next_float32() - 0.5 for _ in range(2)]  # in the mean, the map is read linearly between its texels
-            tau = [t * reflectance[b] for b, t in zip(self.group, s["tau"])]
-            read(self.irradiance, self.of.texels, self.texel(si, k, matt, shift), s["v"][0], tau, s["ways"], s, matt)
-            in_air = matt & (s["medium"] == 0)
-            x, y = s["rng"].next_float32(), s["rng"].next_float32()
-            points = [mi.Point2f((i + x) / POINTS, (j + y) / POINTS) for i in range(POINTS) for j in range(POINTS)]
-            straight = [sum(self.straight(number, si, point, in_air) for point in points) / len(points) for number in range(len(self.of.lights))]
-            for row, (light, band) in enumerate(self.rows):
-                value = s["v"][0] * tau[self.group.index(band)] * straight[light] * float(self.levels[light, band])
-                see_light(s, row, value, in_air)
-            return matt
+            return facing & (dr.gather(mi.Int32, self.matt, k) > 0) if self.maps else mi.Bool(False)
 
-        self.fly(self._seen(rays, BATCHES, done), False, not self.maps, along, at)
+        end = self.fly(self._seen(rays, BATCHES, done), False, not self.maps, along, at)
+        if self.maps and self.of.texels:
+            self._lit(end, read, see_light)
         dr.eval(self.out)
+
+    def _lit(self, s: dict, read: Callable, see_light: Callable) -> None:
+        """What rays that ended on matt surfaces find there: light of the map, and light that comes straight."""
+        import drjit as dr
+        import mitsuba as mi
+
+        matt = s["ended"]
+        si = self.scene.mitsuba.ray_intersect(mi.Ray3f(s["p"], s["d"], mi.Float(0), self.wavelengths), mi.RayFlags.All, False, matt)
+        matt &= si.is_valid()
+        k, rng = self.number(si), s["rng"]
+        reflectance = mi.unpolarized_spectrum(si.bsdf().eval(mi.BSDFContext(), si, mi.Vector3f(0, 0, 1), matt))  # rho/pi
+        tau = [t * reflectance[b] for b, t in zip(self.group, s["tau"])]
+        shift = [rng.next_float32() - 0.5 for _ in range(2)]  # in the mean, the map is read linearly between its texels
+        read(self.irradiance, self.of.texels, self.texel(si, k, matt, shift), s["v"][0], tau, s["ways"], s, matt)
+        in_air = matt & (s["medium"] == 0)
+        x, y = rng.next_float32(), rng.next_float32()
+        points = [mi.Point2f((i + x) / POINTS, (j + y) / POINTS) for i in range(POINTS) for j in range(POINTS)]
+        straight = [sum(self.straight(light, si, point, in_air) for point in points) / len(points) for light in range(len(self.of.lights))]
+        for row, (light, band) in enumerate(self.rows):
+            value = s["v"][0] * tau[self.group.index(band)] * straight[light] * float(self.levels[light, band])
+            see_light(s, row, value, in_air)
 
 
 # -- what a scene is made of --------------------------------------------------------------------------------------------
@@ -686,6 +720,7 @@ class Surface:
                 bsdf.flags(), mi.BSDFFlags.Delta | mi.BSDFFlags.Null):
             raise BadScene(f"{scene.path}: the surface '{shape.id()}' is neither clear nor matt; allowed among clear bodies: materials of the type "
                            "'clear', and matt ones (diffuse, membrane)")
+        self.rectangle = Rectangle.of(shape) if self.light else None
         self.cells = shape.cells(SPLIT) if getattr(shape, "kind", "") == "cells" else None
 
 

@@ -150,6 +150,7 @@ def test_a_pressed_grid_by_two_routes(load, scattering):
     quick, slow = t.take(rays=256, packets=150_000), t.take(rays=6000, reach="paths", seed=3)
     sd = np.hypot(quick.error, slow.error)[0]
     z = np.divide(quick.radiance[0] - slow.radiance[0], sd, out=np.zeros_like(sd), where=sd > 0)
-    assert np.mean(z**2) < 2.5  # Student's t, and the maps' resolution
+    # of Student's t with 7 to 14 degrees of freedom .49; the maps' resolution adds, and rare bright paths make the mean useless
+    assert np.median(z**2) < 0.9, np.median(z**2)
     off, error = quick.radiance.mean() / slow.radiance.mean() - 1, np.sqrt((sd**2).sum()) / sd.size / slow.radiance.mean()
     assert abs(off) < 0.01 + SIGMAS * error, (off, error)
