@@ -50,7 +50,6 @@ SPLIT = 2  # parts of a cell of the fluence map, each way
 POINTS = 2  # of a light, each way, that a lit place looks at
 WEAK = 1e-12  # birefringence that turns nothing
 AIR = "air"
-STREAM = 0xDA3E39CB94B95BDB  # of random numbers, as Dr.Jit begins
 
 
 @dataclass(frozen=True)
@@ -256,6 +255,16 @@ class Run:
         for row, (light, band) in enumerate(self.rows):
             image[:, :, light, ..., band] = found[:, row]
         return image / rays
+
+    def random(self, lane, kind: int, done: int):
+        """Random numbers of each lane. States and increments are hashed: generators that start beside one another are correlated, and
+        batches with them, whose spread then understates the error (measured: by 1.4 in variance)."""
+        import drjit as dr
+        import mitsuba as mi
+
+        key = dr.opaque(mi.UInt32, int(np.random.SeedSequence([self.seed, kind, done]).generate_state(1)[0]))
+        state, increment = mi.sample_tea_32(lane, key)
+        return mi.PCG32(1, mi.UInt64(state), mi.UInt64(increment))
 
     def place(self, s, row, kind: int, size: int):
         """Where a row of the state's batch begins in maps or images of a size."""
@@ -528,7 +537,7 @@ class Run:
         # a light has its own random numbers, whichever others are followed
         places = [list(self.scene.lights).index(n) for n in self.of.lights]
         lane = dr.gather(mi.UInt32, mi.UInt32(places), light) * (BATCHES * packets) + number % (BATCHES * packets)
-        rng = mi.PCG32(1, dr.opaque(mi.UInt64, (self.seed << 32) + 2 * done + 1) + lane, dr.opaque(mi.UInt64, STREAM) + lane)
+        rng = self.random(lane, 1, done)
         drawn = [rng.next_float32() for _ in range(5)]
         p, d, power, weight = self._emitted(0, drawn)
         for k in range(1, lights):
@@ -601,7 +610,7 @@ class Run:
         camera, height, width = self.scene.camera, self.of.height, self.of.width
         number = dr.arange(mi.UInt32, height * width * rays * batches)
         pixel, batch = (number // rays) % (height * width), number // (rays * height * width)
-        rng = mi.PCG32(size=dr.width(number), initstate=dr.opaque(mi.UInt64, (self.seed << 32) + 2 * done))
+        rng = self.random(number, 0, done)
         p, d = camera.ray(mi.Float(pixel % width) + rng.next_float32(), mi.Float(pixel // width) + rng.next_float32())
         x = dr.normalize(dr.cross(d, camera.turned(mi.Vector3f(0, -1, 0))))
         return {"p": p, "d": d, "x": x, "tau": [mi.Float(1.0) for _ in self.group], "rng": rng, "pixel": pixel, "batch": batch}
