@@ -234,7 +234,7 @@ def _intensity(light: np.ndarray) -> np.ndarray:
 def expected(truth: Truth, settings: Settings, noise: Noise) -> np.ndarray:
     """Mean reading (n, C) in DN, neither rounded nor clipped; errors as of `radiance`."""
     diode = truth.photodiode
-    m = (diode.gain * radiance(truth, settings)) ** diode.gamma
+    m = (diode.gain * np.maximum(radiance(truth, settings), 0.0)) ** diode.gamma  # crossed polarizers leave -1e-17 by rounding
     return noise.black_level + (noise.saturation - noise.black_level) * m + diode.offset
 
 

@@ -1,0 +1,122 @@
+"""One cell: captures made, the loop run blind on them, and the record of what it said.
+
+The loop sees the captures alone. It is what a user does: calibrate, diagnose; add what a CLAIM names, or the pair that a PARTIAL
+verdict has found to be complete, and diagnose again, while more than one effect may be hidden.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+from optics import loop
+from optics.compare import plain
+from optics.effect import registry
+from optics.evidence import value_of
+from optics.proof.cells import Cell
+from optics.verdict import CLEAR, MARGIN, Diagnosis
+
+STEPS = 3  # effects that the loop may add where two are hidden
+
+
+def run(rig, cell: Cell) -> dict:
+    """The record of a cell: the truth, every diagnosis in short, and the time. Errors that the program means to raise are records too."""
+    clock = time.perf_counter()
+    record = {"cell": cell.json(), "truth": {}, "steps": [], "failed": "", "unreachable": False,
+              "coordinates": list(rig.unknown.get(cell.hidden[0], ())) if cell.kind == "unknown" else []}
+    with tempfile.TemporaryDirectory() as folder:
+        captures, study_folder = Path(folder) / "captures", Path(folder) / "study"
+        record["truth"] = rig.make(captures, cell)
+        if cell.hidden and not record["truth"]:
+            return {**record, "unreachable": True}
+        record["made"] = time.perf_counter() - clock
+        try:
+            setup = rig.setup(captures, cell.seed)
+            study, model, fit = loop.begin(setup, study_folder)
+            for _ in range(STEPS if cell.kind == "pair" else 1):
+                diagnosis = loop.examine(study, model, setup, fit)
+                record["steps"].append(_step(rig, model, cell, diagnosis))
+                added = _to_add(diagnosis)
+                if cell.kind != "pair" or not added:
+                    break
+                record["steps"][-1]["added"] = added
+                for name in added:
+                    start = diagnosis.fits[name].values if name in diagnosis.fits and len(added) == 1 else None
+                    fit, _ = loop.extend(study, model, setup, fit, registry().find_effect(name), start)
+        except (ValueError, KeyError, ArithmeticError, np.linalg.LinAlgError) as error:
+            record["failed"] = f"{type(error).__name__}: {error}"
+    record["seconds"] = time.perf_counter() - clock
+    return plain(record)
+
+
+def _to_add(d: Diagnosis) -> list[str]:
+    if d.word == "CLAIM":
+        return [d.missing]
+    complete = [p for p in d.pairs if p.complete]
+    if d.word == "PARTIAL" and complete:
+        return list(max(complete, key=lambda p: p.fall).effects)
+    return []
+
+
+def _step(rig, model, cell: Cell, d: Diagnosis) -> dict:
+    refitted = sorted((r for r in d.rows if r.refit is not None), key=lambda r: -r.net_refit)
+    best = refitted[0].net_refit if refitted else 0.0
+    close = [r.name for r in refitted if best - r.net_refit < max(CLEAR, MARGIN * best)]
+    return {
+        "word": d.word, "claimed": d.claimed, "ambiguous": d.ambiguous, "sentence": d.sentence,
+        "p_best": min((r.p_family for r in d.rows), default=1.0),
+        "score": [r.name for r in d.rows[:5]], "refit": [r.name for r in refitted[:5]], "set": close,
+        "falls": {r.name: [r.fall, r.refit.fall] for r in refitted},
+        "noise": d.basis.noise, "excess_sd": d.basis.excess_sd, "phi": d.basis.phi,
+        "conditions": {c.name: [c.value, c.holds] for c in d.conditions},
+        "held_out": [level.chi2_held_out for level in d.levels], "misfit": [level.held_out for level in d.levels],
+        "complete": {r.name: r.refit.complete for r in refitted[:1]},
+        "coordinates": [f.coordinate for f in d.fingerprints[:4]],
+        "pairs": [[*p.effects] for p in d.pairs if p.complete],
+        "strength": _strengths(rig, model, cell, d),
+    }
+
+
+def _strengths(rig, model, cell: Cell, d: Diagnosis) -> dict[str, list[float]]:
+    """{claimed effect, where it is a hidden one: [strength found, from neutral; sd]}."""
+    if d.claimed not in cell.hidden or rig.parameters(d.claimed) is None or d.claimed not in d.fits:
+        return {}
+    weights, neutral = rig.parameters(d.claimed)
+    fit = d.fits[d.claimed]
+    names = [v.keys[0] for v in fit.variables]
+    if set(weights) - set(names):
+        return {}
+    w = np.array([weights.get(name, 0.0) for name in names])
+    value = sum(weight * value_of(model, fit.values, fit.variables[names.index(key)]) for key, weight in weights.items())
+    own = np.flatnonzero(w)
+    sd = math.sqrt(max(float(w[own] @ np.asarray(fit.covariance)[np.ix_(own, own)] @ w[own]), 0.0))
+    return {d.claimed: [value - neutral, sd]}
+
+
+def take_up(file: Path) -> dict | None:
+    """The record in a file; None where there is none, or it was cut off."""
+    try:
+        return json.loads(file.read_text(encoding="utf-8"))
+    except (FileNotFoundError, json.JSONDecodeError):
+        return None
+
+
+def keep(file: Path, record: dict) -> None:
+    """Write a record whole or not at all."""
+    temporary = file.with_suffix(".part")
+    temporary.write_text(json.dumps(_finite(record), indent=1, allow_nan=False), encoding="utf-8")
+    temporary.rename(file)
+
+
+def _finite(value):
+    """JSON knows no infinity."""
+    if isinstance(value, dict):
+        return {k: _finite(v) for k, v in value.items()}
+    if isinstance(value, list):
+        return [_finite(v) for v in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

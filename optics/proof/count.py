@@ -1,0 +1,222 @@
+"""Records to rates: each with its number of cells and its 95 % interval (Clopper & Pearson, 1934), against the targets.
+
+A target is reached when the near end of the interval reaches it: few cells reach nothing, whatever their rate.
+
+    top-1        the hidden effect has the largest fall of chi2 after refit; top-3: is among the three best by score
+    in the set   is among the effects that the refit cannot tell from the best
+    precision    of claims where a library effect, two, or none was hidden: share that name a hidden one
+    strength     of right claims by the library's own law: within 20 %; pulls: (found - true)/sd of those without clutter
+    fall         of chi2, brought by the refit over predicted by the score, of the right effects
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field
+
+import numpy as np
+
+CLEAN = 0.0
+
+
+@dataclass(frozen=True)
+class Rate:
+    """k of n, its 95 % interval, and the targets ('at least', or 'at most' where `low` is good)."""
+
+    name: str
+    k: int
+    n: int
+    first: float
+    ambitious: float
+    low: bool = False
+
+    @property
+    def value(self) -> float:
+        return self.k / self.n if self.n else float("nan")
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        from scipy.stats import binomtest
+
+        if not self.n:
+            return 0.0, 1.0
+        ci = binomtest(self.k, self.n).proportion_ci(0.95, method="exact")
+        return float(ci.low), float(ci.high)
+
+    def reached(self, target: float) -> bool:
+        return self.interval[1] <= target if self.low else self.interval[0] >= target
+
+    @property
+    def verdict(self) -> str:
+        if not self.n:
+            return "no cells"
+        if self.reached(self.ambitious):
+            return "ambitious"
+        if self.reached(self.first):
+            return "first release"
+        beyond = self.interval[0] > self.first if self.low else self.interval[1] < self.first
+        return "MISSED" if beyond else "open"  # open: the interval holds the target, more cells would tell
+
+
+@dataclass
+class Count:
+    """All that is counted; `rigs` holds the same for each sensor by itself."""
+
+    done: int
+    planned: int
+    unreachable: int
+    failed: list[str]
+    rates: list[Rate]
+    confusion: dict[str, dict[str, int]]
+    words: dict[str, dict[str, int]]
+    power: dict[str, dict[str, list[int]]]  # rig -> change -> [right claims, n], without clutter, own law
+    ties: tuple[int, int]
+    pulls: dict[str, list[float]]
+    falls: list[float]
+    null_p: list[float]
+    held_out: list[float]
+    seconds: float
+    rigs: dict[str, "Count"] = field(default_factory=dict)
+
+    def rate(self, name: str) -> Rate:
+        return next(r for r in self.rates if r.name == name)
+
+    @property
+    def holds(self) -> bool:
+        """Whether no target of the first release is missed for certain."""
+        return all(r.verdict != "MISSED" for r in self.rates)
+
+    def text(self) -> str:
+        """For a terminal."""
+        lines = [f"proof: {self.done} of {self.planned} cells ({self.unreachable} cannot be made that strong, {len(self.failed)} failed), "
+                 f"{self.seconds / max(self.done, 1):.0f} s each"]
+        for name, one in {"": self, **self.rigs}.items():
+            if name and len(self.rigs) < 2:
+                continue
+            lines += ["", f"{name or 'all'}:", f"  {'':<52}{'rate':>7}{'n':>6}   {'95 %':<13} {'first':>6} {'ambit.':>7}  reached"]
+            for r in one.rates:
+                lo, hi = r.interval
+                lines.append(f"  {r.name:<52}{r.value:>7.3f}{r.n:>6}   {lo:.3f}-{hi:.3f}   {r.first:>5g} {r.ambitious:>7g}  {r.verdict}")
+            lines += [f"  ties declared {one.ties[1]}, with the hidden effect among them {one.ties[0]}"]
+            for law, values in one.pulls.items():
+                if len(values) > 1:
+                    lines.append(f"  pulls of strengths ({law}): n {len(values)}, mean {np.mean(values):+.2f}, sd {np.std(values, ddof=1):.2f}")
+            if one.falls:
+                q = np.percentile(one.falls, [10, 50, 90])
+                lines.append(f"  fall of chi2 over its prediction: {q[1]:.2f} ({q[0]:.2f} to {q[2]:.2f}), n {len(one.falls)}")
+            if len(one.null_p) > 4:
+                from scipy.stats import kstest
+
+                lines.append(f"  family-wise p of {len(one.null_p)} clean null sets, uniform with p {kstest(one.null_p, 'uniform').pvalue:.2g} "
+                             "(Kolmogorov-Smirnov)")
+            if one.held_out:
+                lines.append(f"  held-out chi2 per value after a right claim: median {np.median(one.held_out):.3f}")
+        lines += [f"failed: {f}" for f in self.failed[:10]]
+        return "\n".join(lines) + "\n"
+
+    def json(self) -> dict:
+        return asdict(self)
+
+
+def _last(r: dict) -> dict:
+    return r["steps"][-1]
+
+
+def named(r: dict) -> set[str]:
+    """All effects that the loop added or claimed."""
+    found = set()
+    for step in r["steps"]:
+        found |= set(step.get("added", [])) | ({step["claimed"]} if step["claimed"] else set())
+    return found
+
+
+def count(records: Sequence[dict], planned: int, parts: bool = True) -> Count:
+    """Count records; `planned`: how many cells the plan has."""
+    made = [r for r in records if not r["unreachable"]]
+    failed = [f"{r['cell']['rig']} {'+'.join(r['cell']['hidden'])} s{r['cell']['seed']}: {r['failed']}" for r in made if r["failed"]]
+    good = [r for r in made if r["steps"] and not r["failed"]]
+
+    def some(kind: str, test: Callable[[dict], bool] = lambda c: True) -> list[dict]:
+        return [r for r in good if r["cell"]["kind"] == kind and test(r["cell"])]
+
+    def rate(name, of: Sequence[dict], test: Callable[[dict], bool], first, ambitious, low=False) -> Rate:
+        return Rate(name, sum(bool(test(r)) for r in of), len(of), first, ambitious, low)
+
+    def hidden(r):
+        return r["cell"]["hidden"]
+
+    own = some("library", lambda c: c["law"] == "same")
+    clean = [r for r in own if r["cell"]["clutter"] == CLEAN]
+    middle = [r for r in clean if r["cell"]["change"] == 0.005]
+    weak = [r for r in clean if r["cell"]["change"] == 0.002]
+    none, unknown, pair = some("none"), some("unknown"), some("pair")
+    calm = [r for r in none if r["cell"]["clutter"] == CLEAN]
+
+    def claims(of):
+        return [r for r in of if named(r)]
+
+    def right(r):
+        return named(r) <= set(hidden(r))
+
+    rates = [
+        rate("top-1 after refit, 0.5 %, no clutter", middle, lambda r: _last(r)["refit"][:1] == hidden(r), 0.95, 0.99),
+        rate("top-3 by score, 0.5 %, no clutter", middle, lambda r: hidden(r)[0] in _last(r)["score"][:3], 0.97, 0.99),
+        rate("in the set, 0.2 %, no clutter", weak, lambda r: hidden(r)[0] in _last(r)["set"], 0.97, 0.99),
+        rate("an effect stands out where none is hidden", calm, lambda r: _last(r)["p_best"] < 0.01, 0.03, 0.015, True),
+        rate("claims where none is hidden, any clutter", none, named, 0.03, 0.01, True),
+        rate("precision of claims, own law, any clutter", claims([*own, *pair, *none]), right, 0.95, 0.99),
+        rate("precision of claims, another law", claims(some("library", lambda c: c["law"] == "other")), right, 0.85, 0.95),
+    ]
+    for clutter, first, ambitious in ((0.0, 0.8, 0.9), (0.15, 0.7, 0.85), (0.5, 0.5, 0.65), (1.0, 0.3, 0.5)):
+        of = [r for r in own if r["cell"]["change"] == 0.02 and r["cell"]["clutter"] == clutter]
+        rates.append(rate(f"right claims, 2 %, clutter {clutter:g}", of, lambda r: named(r) == set(hidden(r)), first, ambitious))
+    judged = [r for r in own if _last(r)["strength"]]
+    rates += [
+        rate("unknown kinds falsely claimed", unknown, named, 0.10, 0.03, True),
+        rate("unknown kind's coordinate in the top two, no clutter", [r for r in unknown if r["cell"]["clutter"] == CLEAN],
+             lambda r: set(r["coordinates"]) & set(_last(r)["coordinates"][:2]), 0.75, 0.90),
+        rate("pairs named exactly, 1 % + 1 %, no clutter", pair, lambda r: named(r) == set(hidden(r)), 0.85, 0.95),
+        rate("strength within 20 % where claimed", judged, lambda r: abs(_ratio(r) - 1) < 0.2, 0.80, 0.95),
+    ]
+    ties = [r for r in [*own, *some("library", lambda c: c["law"] == "other")] if _last(r)["word"] == "AMBIGUOUS"]
+    confusion: dict[str, dict[str, int]] = {}
+    words: dict[str, dict[str, int]] = {}
+    for r in good:
+        c = r["cell"]
+        kind = {"library": hidden(r)[0] if hidden(r) else "", "none": "nothing", "pair": "two effects", "unknown": f"not in the library: "
+                f"{hidden(r)[0] if hidden(r) else ''}", "mistake": f"noise mistaken: {c['mistake']}"}[c["kind"]]
+        told = " + ".join(sorted(named(r))) if c["kind"] == "pair" and len(named(r)) == 1 else next(iter(named(r)), "")
+        told = ("both" if named(r) == set(hidden(r)) else "not both") if c["kind"] == "pair" and named(r) else told
+        told = told or _last(r)["word"]
+        confusion.setdefault(kind, {}).setdefault(told, 0)
+        confusion[kind][told] += 1
+        words.setdefault(c["kind"], {}).setdefault(_last(r)["word"], 0)
+        words[c["kind"]][_last(r)["word"]] += 1
+    power: dict[str, dict[str, list[int]]] = {}
+    for r in clean:
+        own_rig = power.setdefault(r["cell"]["rig"], {}).setdefault(f"{100 * r['cell']['change']:g}", [0, 0])
+        own_rig[0] += named(r) == set(hidden(r))
+        own_rig[1] += 1
+    pulls = {"no clutter": [_pull(r) for r in judged if r["cell"]["clutter"] == CLEAN and _pull(r) is not None],
+             "clutter": [_pull(r) for r in judged if r["cell"]["clutter"] > CLEAN and _pull(r) is not None]}
+    falls = [after / before for r in clean for name, (before, after) in _last(r)["falls"].items()
+             if name in hidden(r) and before > 10.8 and r["cell"]["change"] <= 0.005]
+    found = Count(
+        len(records), planned, len(records) - len(made), failed, rates, confusion, words, power,
+        (sum(hidden(r)[0] in _last(r)["ambiguous"] for r in ties), len(ties)), pulls, falls, [_last(r)["p_best"] for r in calm],
+        [_last(r)["held_out"][-1] for r in own if named(r) == set(hidden(r)) and _last(r)["held_out"][-1] is not None],
+        float(sum(r.get("seconds", 0.0) for r in records)))
+    if parts:
+        names = sorted({r["cell"]["rig"] for r in records})
+        found.rigs = {n: count([r for r in records if r["cell"]["rig"] == n], planned, parts=False) for n in names}
+    return found
+
+
+def _ratio(r: dict) -> float:
+    name, (found, _) = next(iter(_last(r)["strength"].items()))
+    return abs(found) / abs(r["truth"][name])  # of some, such as a stop between two lobes, the sign is not seen
+
+
+def _pull(r: dict) -> float | None:
+    name, (found, sd) = next(iter(_last(r)["strength"].items()))
+    return (found - r["truth"][name]) / sd if isinstance(sd, float) and sd > 0 else None
