@@ -138,7 +138,7 @@ class Evidence:
     def structure(self, whitened: Sequence[np.ndarray], base: Sequence[int]) -> st.Structure:
         precision = np.concatenate([self.precision, np.zeros(len(base) - len(self.precision))])
         gram = self.normal.gram[np.ix_(base, base)] + np.diag(precision)
-        return self.spectrum.test(whitened, base, st.inverse(gram, self.normal.truncation())[0])
+        return self.spectrum.test(whitened, base, st.inverse(gram, self.normal.truncation(base))[0])
 
     def variance(self, model, frame: int, prediction: np.ndarray, values: Values | None = None) -> np.ndarray:
         """Of a frame about its prediction, DN^2: where the model knows no error of its prediction, that between two seeds is added."""

@@ -76,9 +76,14 @@ class Normal:
         signal = np.maximum(np.diag(self.gram), 1e-300)
         return np.sqrt(self.noise / signal)
 
-    def truncation(self) -> float:
-        """Eigenvalues that noise of the images can make: kappa^2/sqrt(n), times 5, and never below TRUNCATION."""
-        kappa = self.kappa()[np.diag(self.gram) > 0]
+    def truncation(self, columns: Sequence[int]) -> float:
+        """Eigenvalues of these columns that their noise can make: kappa^2/sqrt(n), times 5, and never below TRUNCATION.
+
+        Only theirs: a candidate's noisy image says nothing about what the base can absorb, and a direction of the base that is left out
+        passes for a missing effect's (a sixth of a strength was found so, and an eighth of a fall of chi2).
+        """
+        columns = np.asarray(columns, int)
+        kappa = self.kappa()[columns][np.diag(self.gram)[columns] > 0]
         return max(TRUNCATION, 5 * float(kappa.max(initial=0.0)) ** 2 / np.sqrt(max(self.count, 1)))
 
 
@@ -128,7 +133,7 @@ def project(normal: Normal, base: Sequence[int], rest: Sequence[int], precision:
     b = normal.score[base] + pull
     across = normal.gram[np.ix_(base, rest)]
     raw = np.diag(normal.gram)[rest]
-    inv, rank = inverse(k, normal.truncation() if truncation is None else truncation)
+    inv, rank = inverse(k, normal.truncation(base) if truncation is None else truncation)
     x = inv @ across
     v = normal.gram[np.ix_(rest, rest)] - across.T @ x
     absorbed = float(b @ inv @ b)

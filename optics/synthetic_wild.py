@@ -22,6 +22,7 @@ from optics import captures as capture_files, jones
 from optics.noise import Noise
 from optics.synthetic import Maker
 
+CAMERA = Noise(system_gain=0.1, dark_noise=2.0, black_level=256.0, saturation=4095.0, prnu=0.0)  # 12 bits, 38 000 electrons
 PATTERN, MOTTLE, WRINKLE = 0.005, 0.01, 0.3  # rms: of a gain per pixel, of the coating, deg of the skin's slope; at clutter 1
 GRAIN = 0.4  # mm: of mottle and wrinkles
 
@@ -69,7 +70,7 @@ class Wild(Maker):
 
     def __init__(self, scene, values=None, effects=None, noise: Noise | None = None, seed: int = 0, spp: int = 256, *,
                  unknown: Mapping[str, float] | None = None, clutter: float = 0.0, other: bool = False, kept: dict | None = None):
-        super().__init__(scene, values, effects, noise or Noise(0.1, 1.0, 64.0, 1023.0, 0.0), seed, spp)
+        super().__init__(scene, values, effects, noise or CAMERA, seed, spp)
         if lacking := set(unknown or {}) - set(UNKNOWN):
             raise ValueError(f"no kind {', '.join(sorted(lacking))}; known: {', '.join(UNKNOWN)}")
         if other and (lacking := set(self.effects) - set(OTHER)):
