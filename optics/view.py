@@ -48,7 +48,7 @@ class Worker:
     before it has begun."""
 
     def __init__(self):
-        self._waiting: list[tuple[str, Callable, Future]] = []
+        self.waiting: list[tuple[str, Callable, Future]] = []
         self._ready, self._open = threading.Condition(), True
         self._thread = threading.Thread(target=self._run, name="model", daemon=True)
         self._thread.start()
@@ -59,10 +59,10 @@ class Worker:
         with self._ready:
             if not self._open:
                 raise Superseded("the page is closed")
-            for waiting in [w for w in self._waiting if slot and w[0] == slot]:
-                self._waiting.remove(waiting)
+            for waiting in [w for w in self.waiting if slot and w[0] == slot]:
+                self.waiting.remove(waiting)
                 waiting[2].set_exception(Superseded("a newer question took the place of this one"))
-            self._waiting.append((slot, job, future))
+            self.waiting.append((slot, job, future))
             self._ready.notify()
         return future.result()
 
@@ -70,19 +70,19 @@ class Worker:
         """Let the present job end, and do no other."""
         with self._ready:
             self._open = False
-            for _, _, future in self._waiting:
+            for _, _, future in self.waiting:
                 future.set_exception(Superseded("the page is closed"))
-            self._waiting.clear()
+            self.waiting.clear()
             self._ready.notify()
         self._thread.join()
 
     def _run(self) -> None:
         while True:
             with self._ready:
-                self._ready.wait_for(lambda: self._waiting or not self._open)
+                self._ready.wait_for(lambda: self.waiting or not self._open)
                 if not self._open:
                     return
-                _, job, future = self._waiting.pop(0)
+                _, job, future = self.waiting.pop(0)
             try:
                 future.set_result(job())
             except BaseException as error:  # noqa: BLE001 - whoever asked gets it
@@ -211,9 +211,9 @@ class View:
     # -- questions --------------------------------------------------------------------------------------------------------
 
     def frame(self, index) -> int:
-        """A frame's index, or UnknownKey."""
+        """A frame's index, or ValueError."""
         if not isinstance(index, int) or isinstance(index, bool) or not 0 <= index < len(self.model.frames):
-            raise UnknownKey(str(index), (), "frame", hint=f"; allowed: 0 to {len(self.model.frames) - 1}")
+            raise ValueError(f"no frame {index!r}; allowed: 0 to {len(self.model.frames) - 1}")
         return index
 
     def changes(self, given: Mapping) -> dict[str, float]:
@@ -229,7 +229,7 @@ class View:
         return dict(sorted(checked.items()))
 
     def _slider_of(self, name) -> Slider:
-        if name not in self.sliders:
+        if not isinstance(name, str) or name not in self.sliders:
             raise UnknownKey(str(name), self.sliders, "parameter of this page")
         return self.sliders[name]
 
@@ -331,9 +331,9 @@ class View:
 
     def best(self, names: Sequence[str], values: Mapping[str, float], there: Mapping[str, float]) -> dict:
         """Least squares of some sliders, within bounds and in one linear step about `there`, all others as they are; over the fitted
-        frames. Weights are held.
+        frames, with the priors of those that have one. Weights are held.
 
-        Returns values and standard deviations by name, and chi2 before and after, as the linear model has it.
+        Returns values and standard deviations by name, and chi2 (with the priors' share) before and after, as the linear model has it.
         """
         for name in names:
             self._slider_of(name)
@@ -347,7 +347,7 @@ class View:
         parameters = [self.sliders[n].variable.parameter for n in names]
         start = np.array([self.sliders[n].value for n in names])
         at, now = (np.array([p.coordinate(c.get(n, v)) for n, p, v in zip(names, parameters, start)]) for c in (there, values))
-        a, b, c, n = np.zeros((len(names), len(names))), np.zeros(len(names)), 0.0, 0
+        a, b, c, n, known = np.zeros((len(names), len(names))), np.zeros(len(names)), 0.0, 0, 0.0
         for index in self.fitted:
             row = self._rows(index, names, there)
             where = [names.index(name) for name in row["names"]]
@@ -355,8 +355,14 @@ class View:
             b[where] += row["chi2"]["b"]
             c, n = c + row["chi2"]["c"], n + row["n"]
 
+        for i, (slider, p) in enumerate(zip(sliders, parameters)):
+            prior, value = slider.variable.prior, there.get(names[i], slider.value)
+            if prior is not None and not (p.squared and value == 0):  # as a measured value, linear in u like the pictures
+                slope, gap = p.per_coordinate(value) / prior[1], (prior[0] - value) / prior[1]
+                a[i, i], b[i], known = a[i, i] + slope**2, b[i] + slope * gap, known + gap**2
+
         def chi2(x):
-            return float(c - 2 * b @ x + x @ a @ x)
+            return float(c + known - 2 * b @ x + x @ a @ x)
 
         k, x = len(sliders), now - at
         low, high = (np.array([p.coordinate(p.bounds[side]) for p in parameters[:k]]) for side in (0, 1))
@@ -499,10 +505,10 @@ class Handler(BaseHTTPRequestHandler):
         """Run a route, and turn what is wrong with the question into a status and a sentence."""
         try:
             size = int(self.headers.get("Content-Length") or 0)
-            text = self.rfile.read(min(size, BODY_MAX)) if size > 0 else b""
             if size > BODY_MAX:
-                self.close_connection = True
+                self.close_connection = True  # with what was not read
                 return self._error(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"a question of {size} bytes; allowed: {BODY_MAX}")
+            text = self.rfile.read(size) if size > 0 else b""
             # A page of another site may send its visitor's browser here under a name of its own, or post what needs no leave.
             if self.headers.get("Host") not in self.server.hosts:
                 return self._error(HTTPStatus.FORBIDDEN, f"this page is at {self.server.url} and nowhere else")
