@@ -172,7 +172,7 @@ class View:
             if e.key not in added and e.key not in self.clashes:
                 for v in loop.effect_variables(self.model, e):
                     self._slide(v, None, e.key)
-        self.added, self._sought = added, set()
+        self.added, self._sought = added, set(added)
         self.comparison = self.study.comparison(self.step["index"])
         self.usable: dict[int, np.ndarray] = {}
 
@@ -260,6 +260,7 @@ class View:
         key = ("predict", *self._here(index, changes))
         if (found := self.kept.get(key)) is not None:
             return found
+        self._seek(changes)
         values = self.moved(changes)
         prediction = self.model.predict(values, [index])[0]
         sd = np.sqrt(self.model.variance(values, index, prediction))
@@ -275,6 +276,12 @@ class View:
         if not dull and not (p.squared and value == 0):
             return None
         return p.plausible if value + p.plausible <= p.bounds[1] else -p.plausible
+
+    def _seek(self, names: Sequence[str]) -> None:
+        """Find where effects with a place would be, before they leave neutral for the first time: till then it does nothing."""
+        for effect in {e.key: e for e in map(self.effect_of, names) if e is not None and e.key not in self._sought}.values():
+            loop.seek(self.model, self.values, [effect], self.fitted)
+            self._sought.add(effect.key)
 
     def effect_of(self, name: str) -> Effect | None:
         key = self.sliders[name].effect
@@ -294,9 +301,7 @@ class View:
         missing = [n for n, item in found.items() if item is None]
         if not missing:
             return found
-        for effect in {e.key: e for e in map(self.effect_of, missing) if e is not None and e.key not in self._sought}.values():
-            loop.seek(self.model, self.values, [effect], self.fitted)  # puts what does nothing at neutral: pictures stay
-            self._sought.add(effect.key)
+        self._seek([*missing, *changes])
         values = self.moved(changes)
         steps = {n: self.secant(n, changes) for n in missing}
         _, images = next(self.model.derivatives(values, [self.sliders[n].variable for n in missing], [index],

@@ -526,6 +526,12 @@ def test_an_effect_is_switched_and_slid_by_keyboard(page, model, view):
     assert page.numbers("bothL", "bothXL", "bothR", "bothXR") == pytest.approx([*linear, *rendered], rel=SHOWN)
     assert np.allclose(page.run("Array.from(last.prediction)"), render.ravel(), rtol=SINGLE, atol=0)
 
+    page.tell("Input.dispatchKeyEvent", type="keyDown", key="o", text="o")
+    page.drawn()
+    assert page.text("state") == ["rendered: the study’s values"] and page.numbers("rms", "chi") == before
+    page.tell("Input.dispatchKeyEvent", type="keyUp", key="o")
+    page.drawn()
+    assert page.text("state") == ["rendered"]
     page.key("a")
     page.wait("at('which').textContent === 'All 6 frames rendered.'")
     page.key("r")
@@ -621,9 +627,51 @@ def test_everything_has_a_name_and_fits(page):
         || (e.labels && [...e.labels].some(l => l.textContent.trim())) || e.placeholder)).map(e => e.outerHTML)""")
     unreachable = page.run("[...document.querySelectorAll('input, button, select, [role=slider]')].filter(e => e.tabIndex < 0).map(e => e.outerHTML)")
     assert nameless == [] and unreachable == []
+    page.run("document.activeElement.blur()")
+    page.key("?")
+    assert page.run("at('keys').open")
+    page.key("Escape")
+    assert not page.run("at('keys').open")
     for width in (1280, 900, 400):
         page.size(width, 800)
         page.drawn()
         assert page.run("document.documentElement.scrollWidth") <= width
     page.size(1280, 800)
     page.idle()
+
+
+def test_point_readings_are_drawn_as_points(chromium, mitsuba, tmp_path):
+    """A bench with a leak: its linear prediction in the page is the server's, and the points move."""
+    from optics import jones
+
+    truth = jones.Truth(photodiode=jones.Photodiode(gain=2.2), p1=jones.Polarizer(leak=0.02), p2=jones.Polarizer(leak=0.02))
+    settings = [{"polarizer.angle": a, "analyzer.angle": 11.25 * i, "source.power": p, "source.time": i / 9}
+                for a in (0.0, 60.0) for p in (0.5, 1.0) for i in range(16)]
+    jones.write(tmp_path / "captures", truth, settings, Noise(0.05, 2.0, 64.0, 4095.0, 0.0), 3)
+    loop.begin(loop.Setup(captures=str(tmp_path / "captures")), tmp_path / "study")
+    found = Server()
+    found.view = View(tmp_path / "study")
+    thread = threading.Thread(target=found.serve_forever, kwargs={"poll_interval": 0.02})
+    thread.start()
+    chromium.errors.clear()
+    try:
+        chromium.open(found.url)
+        assert chromium.run("S.shape === null && canvas.width > 300") and chromium.text("state") == ["rendered: the study’s values"]
+        picture = "context.getImageData(0, 0, canvas.width, canvas.height).data.reduce((a, b) => (31 * a + b) % 1000003, 0)"
+        before = chromium.run(picture)
+        chromium.run("at('e-extinction-leak').click()")
+        chromium.key("b")
+        chromium.wait("at('message').textContent.startsWith('Best fit')")
+        chromium.idle()
+        (prediction, _) = found.view.predict(0, {"polarizer_film.leak": chromium.run("sliders.get('polarizer_film.leak').now")})
+        assert np.array_equal(chromium.run("Array.from(last.prediction)"), prediction.ravel()) and chromium.run(picture) != before
+        assert chromium.numbers("chi")[0] < 0.2 * chromium.numbers("chi0")[0]
+        for key in "12345":
+            chromium.key(key)
+            chromium.drawn()
+    finally:
+        found.shutdown()
+        thread.join()
+        found.server_close()
+        found.view.close()
+    assert chromium.errors == []
