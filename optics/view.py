@@ -113,7 +113,8 @@ class Kept:
 
 @dataclass(frozen=True)
 class Slider:
-    """A variable with what the study says of it: its value, its standard deviation (NaN: not calibrated), its effect's key."""
+    """A variable with what the study says of it: its value, its standard deviation (NaN: not calibrated, infinite:
+    undetermined), its effect's key."""
 
     variable: Variable
     value: float
@@ -205,8 +206,8 @@ class View:
         low, high = s.range()
         return {"name": name, "part": v.keys[0].rpartition(".")[0] if len(v.keys) == 1 else _part(v), "keys": list(v.keys),
                 "unit": "" if p.unit == "1" else p.unit, "doc": p.doc, "low": low, "high": high, "bounds": list(p.bounds),
-                "value": s.value, "sd": s.sd, "neutral": p.neutral, "plausible": p.plausible, "squared": p.squared,
-                "saturates": p.saturates, "frames": v.frames, "effect": s.effect}
+                "value": s.value, "sd": s.sd, "calibrated": not math.isnan(s.sd), "neutral": p.neutral,
+                "plausible": p.plausible, "squared": p.squared, "saturates": p.saturates, "frames": v.frames, "effect": s.effect}
 
     # -- questions --------------------------------------------------------------------------------------------------------
 
@@ -388,9 +389,10 @@ class View:
     def toml(self, changes: Mapping[str, float]) -> str:
         """Values as `optics compare --fit` reads them: [parameters] and [frames.NAME], key = value."""
         values = self.moved(changes)
+        unit = {n: "" if (u := self.sliders[n].variable.parameter.unit) in ("", "1") else f" {u}" for n in changes}
         begun = f"the step '{self.step['name']}' of {self.study.folder}"
         lines = [f"# Values chosen on the page of `optics view`, beginning from {begun}. Not calibrated; changed by hand:",
-                 *(f"#   {n}: {self.sliders[n].value:.6g} -> {v:.6g} {self.sliders[n].variable.parameter.unit}" for n, v in changes.items())]
+                 *(f"#   {n}: {self.sliders[n].value:.6g} -> {v:.6g}{unit[n]}" for n, v in changes.items())]
         if not changes:
             lines[0] = f"# Values of {begun}, unchanged."
 
