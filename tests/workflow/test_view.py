@@ -16,6 +16,7 @@ import sys
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -214,6 +215,17 @@ def test_best_is_least_squares_over_the_fitted_frames(ask, view):
         chi2.append(found["after"] / found["n"])
     assert abs(there[VIGNETTING] - HIDDEN) < 4 * found["sd"][VIGNETTING] < 0.1
     assert chi2[-1] == pytest.approx(1, abs=0.05)  # 20000 values: sd 0.01; and 8 bits
+
+
+def test_a_prior_is_one_more_measurement(ask, view, monkeypatch):
+    """Estimate and prior meet in the mean weighted by 1/sd^2, wherever the picture was linearised."""
+    question = {"names": [VIGNETTING], "values": {}, "there": {VIGNETTING: 0.1}}
+    free = json.loads(ask("/best", **question)[1])
+    slider, (value, sd) = view.sliders[VIGNETTING], (free[k][VIGNETTING] for k in ("values", "sd"))
+    monkeypatch.setitem(view.sliders, VIGNETTING, replace(slider, variable=slider.variable.with_prior(0.3, 0.5 * sd)))
+    found = json.loads(ask("/best", **question)[1])
+    assert found["values"][VIGNETTING] == pytest.approx(0.2 * value + 0.8 * 0.3, rel=1e-4)
+    assert found["sd"][VIGNETTING] == pytest.approx(sd / np.sqrt(5), rel=1e-4)
 
 
 def test_best_of_a_bounded_effect_stays_within(ask):
