@@ -764,6 +764,25 @@ def report(study: StudyFolder,
 
 
 @command
+def view(study: StudyFolder,
+         step: Annotated[int | None, typer.Option("--step", metavar="N", help="Begin from this step.", show_default="the last one")] = None,
+         port: Annotated[int, typer.Option("--port", min=0, max=65535, help="Of the page, on this machine alone.", show_default="any")] = 0,
+         browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the page in the browser.")] = True) -> None:
+    """Open a page to switch effects and slide parameters, while prediction, residual and misfit follow. Ctrl-C ends it."""
+    from optics import view as page
+
+    def ready(url: str) -> None:
+        print(url, flush=True)
+        terminal.note("Ctrl-C ends it")
+        if browser:
+            import webbrowser
+
+            webbrowser.open(url)
+
+    page.serve(study, port, step, ready)
+
+
+@command
 def demo(output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Where captures, study and report go.")] = Path("renders/demo"),
          seed: Annotated[int, typer.Option("--seed", min=0, help="Chooses the sensor and its hidden effect.")] = 1,
          effect: Annotated[str | None, typer.Option("--effect", help="Hide this effect instead.")] = None,

@@ -299,8 +299,8 @@ def take_up(folder: str | Path) -> tuple[Study, Model, Setup]:
     return study, open_model(setup), setup
 
 
-def restore(study: Study, model: Model, index: int = -1) -> calibrate.Fit:
-    """The fit of a step, from its folder: the same variables and values, with errors computed afresh."""
+def kept(study: Study, model: Model, index: int = -1) -> tuple[list[Variable], Values, list[int]]:
+    """What a step's folder has of its fit: the variables, the values, and the frames that were fitted."""
     setup = Setup(**study.record["facts"]["setup"])
     fitted, _ = split(model, setup)
     steps = study.steps[:len(study.steps) + index + 1] if index < 0 else study.steps[:index + 1]
@@ -312,7 +312,13 @@ def restore(study: Study, model: Model, index: int = -1) -> calibrate.Fit:
         if step["effect"]:
             variables += [v for v in effect_variables(model, registry().find_effect(step["effect"]))
                           if v.frames is None or set(v.frames) <= set(fitted)]
-    return calibrate.fit(model, variables, values, fitted, max_iterations=6 if steps[-1]["converged"] else 30)
+    return variables, values, fitted
+
+
+def restore(study: Study, model: Model, index: int = -1) -> calibrate.Fit:
+    """The fit of a step, from its folder: the same variables and values, with errors computed afresh."""
+    variables, values, fitted = kept(study, model, index)
+    return calibrate.fit(model, variables, values, fitted, max_iterations=6 if study.steps[index]["converged"] else 30)
 
 
 def candidates(model: Model, study: Study) -> list[Effect]:
