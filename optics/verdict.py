@@ -218,6 +218,48 @@ class Shift:
 
 
 @dataclass(frozen=True)
+class Apart:
+    """D, the expected chi2 by which the data would prefer `effect`, if true, over `rival`; and P(correct) = Phi(sqrt(D)/2)."""
+
+    effect: str
+    rival: str
+    before: float
+    after: float
+    correct_before: float
+    correct_after: float
+
+
+@dataclass(frozen=True)
+class Advice:
+    """A frame that could be taken, or several, simulated: what it would tell apart (optics.advise).
+
+    shot       in words; family: its kind, 'together' for the best few and 'more of the same' for as many others to compare with
+    settings   of each frame, by key: what differs from a frame that exists; press: name of a new press, '' for the same
+    frames     how many it takes
+    pairs      hardest first
+    nuisances  unknowns that it brings, which were projected off with what is known of them beforehand
+    """
+
+    shot: str
+    family: str
+    settings: list[dict[str, float]]
+    press: list[str]
+    frames: int
+    pairs: list[Apart]
+    nuisances: list[str]
+
+    @property
+    def hardest(self) -> Apart:
+        """The pair that is hardest to tell apart without it."""
+        return self.pairs[0]
+
+    @property
+    def least(self) -> float:
+        """The smallest D between any two with it."""
+        return min(p.after for p in self.pairs)
+
+
+@dataclass(frozen=True)
 class Basis:
     """What the verdict rests on: data, masks, noise, misfit. Misfit and noise in units of the mean signal.
 
@@ -272,7 +314,9 @@ class Diagnosis:
     warnings: list[str]
     claimed: str = ""
     pairs: list[Pair] = field(default_factory=list)  # of effects that were tried together (optics.pairs)
+    advice: list[Advice] = field(default_factory=list)  # what to measure next (optics.advise)
     fits: dict = field(default_factory=dict, repr=False, compare=False)  # effect -> Fit of the refit; not written
+    evidence: object = field(default=None, repr=False, compare=False)  # optics.evidence.Evidence, without pixels; not written
 
     def __post_init__(self):
         if self.word not in WORDS:
@@ -294,7 +338,7 @@ class Diagnosis:
         raise KeyError(f"no effect '{effect}' in the table; tested: {', '.join(r.name for r in self.rows)}")
 
     def to_dict(self) -> dict:
-        return plain({f.name: _record(getattr(self, f.name)) for f in fields(self) if f.name != "fits"})
+        return plain({f.name: _record(getattr(self, f.name)) for f in fields(self) if f.name not in ("fits", "evidence")})
 
     def to_json(self) -> str:
         return json.dumps(self.to_dict(), indent=1, allow_nan=False)
@@ -506,6 +550,13 @@ def moved_by(s: Shift) -> str:
     return f"{s.variable} by {abs(s.after - s.before):.2g}{unit}"
 
 
+def advice_text(a: Advice) -> str:
+    p = a.hardest
+    return (f"{'only for comparison: ' if a.family == 'more of the same' else ''}{a.shot}: tells {p.effect} from {p.rival} with D "
+            f"{p.before:.3g} -> {p.after:.3g}, P(correct) {p.correct_before:.2f} -> {p.correct_after:.2f}"
+            + (f"; the closest two then: D {a.least:.3g}" if len(a.pairs) > 2 and a.least < 0.9 * p.after else ""))
+
+
 def sentence(word: str, conditions: Sequence[Condition], f: Findings, rows: Sequence[Row], members: Sequence[Row],
              fingerprints: Sequence[Fingerprint], levels: Sequence[Level], shifts: Sequence[Shift], basis: Basis) -> str:
     """The verdict in words, with the numbers that decided it."""
@@ -614,6 +665,8 @@ def _text(d: Diagnosis) -> str:
     if d.shifts:
         lines += ["", "calibrated parameters had moved to hide it:"]
         lines += [f"  {s.variable:<24} {s.before:.5g} -> {s.after:.5g} {s.unit} ({s.in_sd:+.1f} sd)" for s in d.shifts[:6]]
+    lines += [f"next: {advice_text(a)}" for a in d.advice if a.family in ("together", "more of the same")]
+    lines += [f"next, by itself: {advice_text(a)}" for a in d.advice if a.family not in ("together", "more of the same")][:4]
     lines += [f"next: {hint}" for hint in d.hints]
     lines += [f"warning: {w}" for w in d.warnings]
     return "\n".join(lines) + "\n"
