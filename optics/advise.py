@@ -35,6 +35,7 @@ PLACES = 3  # other places that are tried: as many as a plan of "more presses" t
 TAKEN = 3  # shots of a plan
 SHOTS = 24  # that are simulated: each costs the derivative images of one frame
 ROWS = 300_000  # values that all shots together may keep: informations of thinned pixels, scaled up
+ENOUGH = 4 * CLEAR  # D at which the right one wins in 99.95 % of cases; more is not asked of a plan
 MEMBERS = 5  # effects that are told apart at once
 LIKELY = 6.0  # of chi2 below the best: 20 times less likely the cause in noise alone; a rival still, but not taken to be true
 CLOCKS = ("time", "approach")  # settings that tell when and from where, not what
@@ -73,7 +74,7 @@ def families(model, values: Values, frames: Sequence[int], most: int = SHOTS) ->
     like = _typical(model, values, frames)
     now = _now(model, values, like)
     found = [*_exposures(model, now, like), *_presses(model, values, frames, now, like), *_lights(model, values, frames, now, like),
-             Shot("repeat", f"{_same(model)} once more", like), *_films(model, now, like), *_distances(model, now, like),
+             Shot("repeat", f"{_same(model, like)} once more", like), *_films(model, now, like), *_distances(model, now, like),
              *_turned(model, frames, now, like)]
     found = [s for s in found if all(model.parameters[k].bounds[0] <= v <= model.parameters[k].bounds[1] for k, v in s.settings.items())]
     queues: dict[str, list[Shot]] = {}
@@ -104,9 +105,9 @@ def _press(model) -> tuple[str, str, str] | None:
     return tuple(depth[0].replace("press_depth", n) for n in ("press_x", "press_y", "press_depth")) if depth else None
 
 
-def _same(model) -> str:
-    if getattr(model.frames[0], "readings", None):
-        return "the same readings"
+def _same(model, like: int) -> str:
+    if getattr(model.frames[like], "readings", None):
+        return f"{len(model.frames[like].image)} of the same readings"
     return "the same press" if _press(model) else "the same frame"
 
 
@@ -128,8 +129,8 @@ def _exposures(model, now: Mapping, like: int) -> Iterator[Shot]:
         for factor in EXPOSURES:
             brighter = noise.black_level + factor * (image - noise.black_level)
             if factor < 1 or np.mean(brighter >= SATURATED * noise.saturation) < BRIGHT:
-                yield Shot("exposure", f"{_same(model)} at {factor:g} of the exposure" if factor < 1 else
-                           f"{_same(model)} at {factor:g} times the exposure", like, {key: factor * float(now[key])}, exposure=factor)
+                yield Shot("exposure", f"{_same(model, like)} at {factor:g} of the exposure" if factor < 1 else
+                           f"{_same(model, like)} at {factor:g} times the exposure", like, {key: factor * float(now[key])}, exposure=factor)
 
 
 def _presses(model, values: Values, frames: Sequence[int], now: Mapping, like: int) -> Iterator[Shot]:
@@ -185,7 +186,7 @@ def _lights(model, values: Values, frames: Sequence[int], now: Mapping, like: in
         return {k: float(k in on) for k in keys if driven is not None or k not in on}
 
     lit = lambda f: tuple(k for k in keys if _now(model, values, f)[k] != 0)  # noqa: E731
-    here, what = lit(like), _same(model)
+    here, what = lit(like), _same(model, like)
     seen = dict.fromkeys([here, *map(lit, frames)])
     wanted = [p for p in seen if p and p != here][:2 * len(keys)]
     wanted += [p for p in ([tuple(keys)] + [(k,) for k in keys]) if p != here and p not in wanted and len(keys) > 1]
@@ -201,7 +202,7 @@ def _lights(model, values: Values, frames: Sequence[int], now: Mapping, like: in
 
 def _films(model, now: Mapping, like: int) -> Iterator[Shot]:
     """Angles of polarizers and sheets, and films put in and taken out."""
-    what = _same(model)
+    what = _same(model, like)
     for key in _keys(model, "angle"):
         inserted = f"{key.rpartition('.')[0]}.inserted"
         if not now.get(inserted, 1.0):
@@ -243,7 +244,7 @@ def _turned(model, frames: Sequence[int], now: Mapping, like: int) -> Iterator[S
         for to in ((levels[gap] + levels[gap + 1]) / 2, beyond, max(levels[0] - (levels[-1] - levels[0]) / 2, low)):
             if to not in taken:
                 unit = model.parameters[key].unit
-                yield Shot(f"another {key}", f"{_same(model)} with {key} = {to:.4g}{'' if unit in ('', '1') else ' ' + unit}", like, {key: to})
+                yield Shot(f"another {key}", f"{_same(model, like)} with {key} = {to:.4g}{'' if unit in ('', '1') else ' ' + unit}", like, {key: to})
 
 
 # -- what shots would add ---------------------------------------------------------------------------------------------
@@ -326,22 +327,18 @@ class Outlook:
         """The smallest D between any two: what a choice of shots is judged by."""
         return float(self.gaps(chosen).min(initial=np.inf))
 
-    def choose(self, count: int, worth: Callable[[Sequence[int]], float] | None = None) -> list[int]:
-        """Up to `count` shots (one may be taken twice) of the greatest worth: one after the other, then exchanged while that helps."""
-        worth = worth or self.least
+    def choose(self, count: int, worth: Callable[[Sequence[int]], float], enough: float = math.inf) -> list[int]:
+        """Up to `count` shots (one may be taken twice) until they are worth enough: one after the other, each exchanged while that helps."""
         chosen: list[int] = []
-        for _ in range(count):
+        while len(chosen) < count and worth(chosen) < enough:
             chosen.append(max(range(len(self.shots)), key=lambda s: worth([*chosen, s])))
-        best = worth(chosen)
-        for _ in range(2):
-            before = best
-            for i in range(count):
-                trials = [[*chosen[:i], s, *chosen[i + 1:]] for s in range(len(self.shots)) if s != chosen[i]]
-                value, trial = max(((worth(t), t) for t in trials), key=lambda pair: pair[0], default=(best, chosen))
-                if value > best * (1 + 1e-9):
-                    best, chosen = value, trial
-            if best <= before * (1 + 1e-9):
-                break
+            best, before = worth(chosen), -math.inf
+            while best > before and len(chosen) > 1:
+                before = best
+                for i in range(len(chosen)):
+                    trial = max(([*chosen[:i], s, *chosen[i + 1:]] for s in range(len(self.shots))), key=worth)
+                    if worth(trial) > best * (1 + 1e-6):
+                        best, chosen = worth(trial), trial
         return chosen
 
 
@@ -477,10 +474,10 @@ def candidate(model, values: Values, effect, variables: Sequence[Variable]) -> C
 
 
 def next_measurement(model, values: Values, evidence: Evidence, members: Sequence[Candidate], variables_of: Callable, *,
-                     frames: Sequence[int] | None = None, shots: Sequence[Shot] | None = None, take: int = TAKEN, seed: int = 0,
-                     progress: Progress | None = None) -> list[Advice]:
-    """Shots that tell the members apart, the best of each family, best first; then the best `take` of them all together, and as
-    many more presses (or repeats, where nothing is pressed) for comparison.
+                     frames: Sequence[int] | None = None, shots: Sequence[Shot] | None = None, take: int = TAKEN, enough: float = ENOUGH,
+                     seed: int = 0, progress: Progress | None = None) -> list[Advice]:
+    """Shots that tell the members apart, the best of each family, best first; then the best up to `take` together, no more of them than
+    bring D to `enough`; and for comparison `take` more presses (or repeats, where nothing is pressed).
 
     Ranked by the smallest D between any two members, per frame. A member whose fall of chi2 is far below the best's counts as a rival
     and is not taken to be true. Nothing is returned for fewer than two members.
@@ -499,7 +496,7 @@ def next_measurement(model, values: Values, evidence: Evidence, members: Sequenc
     best = list({shots[s].family: s for s in reversed(order)}.values())
     best.sort(key=order.index)
     found = [_advice(seen, shots[s].words, shots[s].family, [shots[s]], before, singles[s], seen.nuisances[s]) for s in best]
-    plan = seen.choose(take)
+    plan = seen.choose(take, seen.least, enough)
     more = [s for s, shot in enumerate(shots) if shot.family == "another place"][:take]
     more = more or [s for s, shot in enumerate(shots) if shot.family == "repeat"] * take
     for family, chosen in (("together", plan), ("more of the same", more)):

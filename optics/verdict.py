@@ -36,6 +36,8 @@ SHARE = 0.05  # of the excess misfit that a claimed effect must explain ...
 EXCESS = 5.0  # ... where there is an excess of this many standard deviations at all
 UNEVEN = 0.1  # of the fall: what splitting the strength by channel, frame, ... may still gain
 MIMICS = ("place", "frame")
+PLANS = ("together", "more of the same")  # kinds of advice that are several shots
+TELLS = 0.02  # gain of P(correct) below which a shot is not worth a line
 WORDS = ("NOTHING", "CLAIM", "AMBIGUOUS", "PARTIAL", "UNKNOWN", "CANNOT_TELL")
 
 
@@ -552,9 +554,21 @@ def moved_by(s: Shift) -> str:
 
 def advice_text(a: Advice) -> str:
     p = a.hardest
-    return (f"{'only for comparison: ' if a.family == 'more of the same' else ''}{a.shot}: tells {p.effect} from {p.rival} with D "
-            f"{p.before:.3g} -> {p.after:.3g}, P(correct) {p.correct_before:.2f} -> {p.correct_after:.2f}"
-            + (f"; the closest two then: D {a.least:.3g}" if len(a.pairs) > 2 and a.least < 0.9 * p.after else ""))
+    return (f"{a.shot}: {'tells' if p.correct_after - p.correct_before > TELLS else 'hardly tells'} {p.effect} from {p.rival}, D {p.before:.3g} "
+            f"-> {p.after:.3g}, P(correct) {p.correct_before:.2f} -> {p.correct_after:.2f}"
+            + (f"; the closest two then have D {a.least:.3g}" if a.least < min(0.9 * p.after, 4 * CLEAR) else ""))
+
+
+def advice_lines(advice: Sequence[Advice]) -> list[str]:
+    """The best shots together, for comparison as many others, and the best of each kind by themselves where they tell anything."""
+    plans = {a.family: a for a in advice if a.family in PLANS}
+    singles = [a for a in advice if a.family not in PLANS]
+    lines = [f"next: {advice_text(plans['together'])}"] if "together" in plans else []
+    if "more of the same" in plans:
+        lines.append(f"      (more of the same instead: {advice_text(plans['more of the same'])})")
+    known = {a.shot for a in plans.values()}
+    return lines + [f"next, or by itself: {advice_text(a)}" for a in singles
+                    if a.shot not in known and a.hardest.correct_after - a.hardest.correct_before > TELLS][:4]
 
 
 def sentence(word: str, conditions: Sequence[Condition], f: Findings, rows: Sequence[Row], members: Sequence[Row],
@@ -665,8 +679,7 @@ def _text(d: Diagnosis) -> str:
     if d.shifts:
         lines += ["", "calibrated parameters had moved to hide it:"]
         lines += [f"  {s.variable:<24} {s.before:.5g} -> {s.after:.5g} {s.unit} ({s.in_sd:+.1f} sd)" for s in d.shifts[:6]]
-    lines += [f"next: {advice_text(a)}" for a in d.advice if a.family in ("together", "more of the same")]
-    lines += [f"next, by itself: {advice_text(a)}" for a in d.advice if a.family not in ("together", "more of the same")][:4]
+    lines += advice_lines(d.advice)
     lines += [f"next: {hint}" for hint in d.hints]
     lines += [f"warning: {w}" for w in d.warnings]
     return "\n".join(lines) + "\n"
