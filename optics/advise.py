@@ -31,6 +31,7 @@ DEPTHS = (1.5, 0.5, 2.0)  # of the present one
 DIMMED = 0.4  # of all lights' power
 BRIGHT = 0.5  # share of an image that may saturate before a longer exposure is not worth a frame
 DEEPEST = 0.4  # of the gel's thickness: beyond, no contact formula holds
+FAR, RIM = 3, 0.7  # places farther out that are tried; share of the pad's half width where they may lie
 PLACES = 3  # other places that are tried: as many as a plan of "more presses" takes
 TAKEN = 3  # shots of a plan
 SHOTS = 24  # that are simulated: each costs the derivative images of one frame
@@ -146,6 +147,11 @@ def _presses(model, values: Values, frames: Sequence[int], now: Mapping, like: i
                    dict(zip(keys, (x, y, depth))), press=f"place-{i + 1}")
     x, y, here = (float(now[k]) for k in keys)
     here = here or depth
+    deep = min(DEPTHS[0] * here, DEEPEST * thickness)
+    wide = _width(model, known, now, keys)
+    for i, (u, v) in enumerate(places(known[:, :2], wide, FAR)):
+        yield Shot("farther out", f"a press farther out, {deep:.2g} mm deep at x = {u:.2g} mm, y = {v:.2g} mm", like,
+                   dict(zip(keys, (u, v, deep))), press=f"far-{i + 1}")
     for factor in DEPTHS:
         to = min(factor * here, DEEPEST * thickness)
         if factor < 1 or to > 1.1 * here:
@@ -153,6 +159,15 @@ def _presses(model, values: Values, frames: Sequence[int], now: Mapping, like: i
             yield Shot(family, f"the same place pressed {to:.2g} mm deep", like, dict(zip(keys, (x, y, to))), press=f"depth-{to:.2g}")
     if here > 0:
         yield Shot("no press", "nothing pressed, the same light", like, {keys[2]: 0.0}, press="untouched")
+
+
+def _width(model, known: np.ndarray, now: Mapping, keys: Sequence[str]) -> np.ndarray:
+    """(2,) mm: how far from the middle a press still lies on the pad, as far as the scene says how large that is."""
+    found = []
+    for key, name, reach in zip(keys, ("width", "length"), np.abs(known[:, :2]).max(0)):
+        side = now.get(key.rpartition(".")[0] + f".{name}")
+        found.append(RIM * float(side) / 2 if side is not None else min(2 * max(reach, 0.5), 0.9 * model.parameters[key].bounds[1]))
+    return np.array(found)
 
 
 def _reach(model, known: np.ndarray, now: Mapping, keys: Sequence[str]) -> np.ndarray:
@@ -188,8 +203,10 @@ def _lights(model, values: Values, frames: Sequence[int], now: Mapping, like: in
     lit = lambda f: tuple(k for k in keys if _now(model, values, f)[k] != 0)  # noqa: E731
     here, what = lit(like), _same(model, like)
     seen = dict.fromkeys([here, *map(lit, frames)])
-    wanted = [p for p in seen if p and p != here][:2 * len(keys)]
-    wanted += [p for p in ([tuple(keys)] + [(k,) for k in keys]) if p != here and p not in wanted and len(keys) > 1]
+    wanted = [p for p in seen if p and p != here]
+    half = len(keys) // 2
+    subsets = [tuple(keys), *([tuple(keys[:half]), tuple(keys[half:])] if len(keys) > 3 else []), *((k,) for k in keys)]
+    wanted += [p for p in subsets if p != here and p not in wanted and len(keys) > 1]
     for on in wanted:
         names = [k.rpartition(".")[0] for k in on]
         words = "all lights on" if len(on) == len(keys) else f"{names[0]} alone" if len(on) == 1 else "only " + ", ".join(names) + " lit"
