@@ -203,6 +203,7 @@ def _sweeps(parameters: dict, base: dict, lights: Sequence[str], exposures: Sequ
     levels: dict[str, list[float]] = {k: [0.0, 20.0, 45.0, 90.0] for k in (*others, *(k for k in inserted if k not in films))}
     levels |= {k.rpartition(".")[0] + ".inserted": [0.0, 0.0, 1.0] for k, there in inserted.items() if not there}
     levels |= {k: [1.0, 0.4] for k in (*lights, *exposures)}
+    levels |= {k: [1.0, -1.0] for k in parameters if k == swept.replace(".angle", ".approach")}
     points = qmc.Sobol(len(levels), scramble=True, rng=np.random.default_rng(0)).random(64)[:SWEEPS]
     angles = {swept: np.arange(0.0, 180.0, STEP).tolist()}
     found = []
@@ -380,13 +381,12 @@ def _outlook(evidence: Evidence, members: Sequence[Candidate], share: float, see
     rng = np.random.default_rng([seed, 17])
     found = []
     for c in members:
-        squared = any(v.parameter.squared for v in c.variables)
-        c.form = "tangent" if "tangent" in c.forms and not squared else "secant" if "secant" in c.forms else "tangent"
+        c.form, power = _onset(c, np.diag(evidence.normal.gram))
         c.columns = c.forms[c.form]
-        change = share * c.plausible * np.where(np.array(c.sides) < 0, -1.0, 1.0)
-        if c.effect.scope == "frame":
-            change = change * np.where(np.array(c.sides) == 0, rng.choice([-1.0, 1.0], len(change)), 1.0)
-        strength = c.linear_of(change)
+        signs = np.where(np.array(c.sides) < 0, -1.0, 1.0)
+        if len(signs) > 1:  # parts and frames differ from each other: all alike is often what a calibration absorbs
+            signs = np.where(np.array(c.sides) == 0, rng.choice([-1.0, 1.0], len(signs)), signs)
+        strength = c.linear_of(share * c.plausible * signs) if power == 1 else share**2 * c.plausible * signs
         common = [j for j, v in enumerate(c.variables) if v.frames is None]
         member = advise.Member(c.effect.name, [c.columns[j] for j in common], [c.sides[j] for j in common], [float(strength[j]) for j in common])
         for j, v in enumerate(c.variables):
@@ -405,6 +405,19 @@ def _outlook(evidence: Evidence, members: Sequence[Candidate], share: float, see
     nested = {(i, j) for i, a in enumerate(members) for j, b in enumerate(members) if i != j and b.contains(a)}
     return advise.Outlook(np.zeros_like(evidence.normal.gram), grams, evidence.base, evidence.precision, found, [[] for _ in grams],
                           evidence.normal.truncation(), nested)
+
+
+def _onset(c: Candidate, squares: np.ndarray) -> tuple[str, int]:
+    """Which derivative images describe an effect at a small strength, and the power of the strength that they grow with.
+
+    Where both are at hand the tangent, unless it is nothing beside the finite step: then the onset is quadratic.
+    """
+    if len(c.forms) < 2:
+        return next(iter(c.forms)), 1
+    tangent, secant = (float(sum(squares[i] for i in c.forms[form])) for form in ("tangent", "secant"))
+    if tangent > 0.01 * secant:
+        return "tangent", 1
+    return "secant", 1 if any(v.parameter.squared for v in c.variables) else 2
 
 
 def _report(scene, frames, path, seen, chosen, members, share, noise, count, unseen) -> Plan:
