@@ -311,9 +311,9 @@ class Outlook:
         """What the present frames and the chosen shots would say of the effects, everything else projected off."""
         normal = st.Normal(len(self.present))
         normal.gram = self.present + sum((self.shots[s] for s in chosen), np.zeros_like(self.present))
-        rest = [i for m in self.members for i in m.at(chosen)[0]]
-        rest = list(dict.fromkeys(rest))
-        return st.project(normal, self.base, rest, self.precision, truncation=self.truncation), rest
+        rest = list(dict.fromkeys(i for m in self.members for i in m.at(chosen)[0]))
+        live = [i for i, column in enumerate(self.base) if normal.gram[column, column] > 0]  # not the unknowns of other shots
+        return st.project(normal, [self.base[i] for i in live], rest, self.precision[live], truncation=self.truncation), rest
 
     def gaps(self, chosen: Sequence[int] = ()) -> np.ndarray:
         """(n, n) D[a, b], a true as found; infinite where there is nothing to tell: a itself, what contains a, a not likely."""
@@ -337,7 +337,7 @@ class Outlook:
                     i = index[b][0]
                     u = score[i] if sides[0] == 0 else max(sides[0] * score[i], 0.0)
                     mimicked = u**2 / v[i, i] if v[i, i] > 0 else 0.0
-                found[a, b] = max(full - mimicked, 0.0)
+                found[a, b] = full - mimicked if full - mimicked > 1e-9 * full else 0.0  # below, it is rounding
         return found
 
     def least(self, chosen: Sequence[int] = ()) -> float:

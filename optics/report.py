@@ -1029,7 +1029,7 @@ def _advice(d: Mapping) -> list[dict]:
         kind = {"together": "best together", "more of the same": "more of the same, to compare"}.get(a["family"], a["family"])
         rows.append({"kind": kind, "shot": words(a["shot"]), "pair": f"{p['effect']} / {p['rival']}", "first": a["family"] != "together",
                      "before": number(_finite(p["before"]), 3), "after": number(_finite(p["after"]), 3),
-                     "correct": f"{percent(_finite(p['correct_before']), 2)} → {percent(_finite(p['correct_after']), 2)}",
+                     "correct": f"{_finite(p['correct_before']):.2f} → {_finite(p['correct_after']):.2f}",
                      "brings": ", ".join(words(n) for n in a.get("nuisances") or ())})
     return sorted(rows, key=lambda r: r["first"])
 
