@@ -742,6 +742,7 @@ def design(subject: Annotated[str, typer.Argument(metavar="SCENE|STUDY", help="A
            effects: Annotated[str | None, typer.Option("--effects", metavar="A,B,...", help="Which may be missing.",
                                                        show_default="all that the scene can express")] = None,
            strength: Annotated[float, typer.Option("--strength", metavar="X", help="Of every effect, in plausible sizes.")] = 0.1,
+           fixed_exposure: Annotated[bool, typer.Option("--fixed-exposure", help="Leave the exposure as the scene has it.")] = False,
            output: Annotated[Path | None, typer.Option("-o", "--output", metavar="DIR", help="Write a captures.toml to fill in.")] = None,
            defines: Defines = None, plugins: Plugins = None,
            system_gain: Annotated[float | None, typer.Option(help="DN per electron.", show_default="0.04")] = None,
@@ -757,7 +758,7 @@ def design(subject: Annotated[str, typer.Argument(metavar="SCENE|STUDY", help="A
         _check_new_folder(output)
     with terminal.progress() as progress:
         result = planning.session(subject, frames, [e.strip() for e in (effects or "").split(",") if e.strip()], pairs(defines, "-D"),
-                                  plugins, {k: v for k, v in given.items() if v is not None}, strength, progress)
+                                  plugins, {k: v for k, v in given.items() if v is not None}, strength, fixed_exposure, progress)
     if output is not None:
         terminal.note(f"to fill in: {planning.write(result, output) / 'captures.toml'}")
     show(result.json()) if as_json else print(result.text())

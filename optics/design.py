@@ -139,7 +139,7 @@ def _columns(rows: Sequence[Sequence[str]]) -> list[str]:
 # -- candidates ---------------------------------------------------------------------------------------------------------
 
 
-def candidates(parameters: dict[str, Parameter], base: dict, readings: bool) -> list[Choice]:
+def candidates(parameters: dict[str, Parameter], base: dict, readings: bool, fixed_exposure: bool = False) -> list[Choice]:
     """The frames to choose from: every place under several lights and exposures; of a camera of one pixel, sweeps.
 
     Exposures are factors here, 1 where a picture is as bright as it may be; `plan` turns them into settings.
@@ -147,7 +147,7 @@ def candidates(parameters: dict[str, Parameter], base: dict, readings: bool) -> 
     def keys(name):
         return [k for k in parameters if k.rpartition(".")[2] == name]
 
-    lights, exposures = keys("power"), keys("exposure")[:1]
+    lights, exposures = keys("power"), [] if fixed_exposure else keys("exposure")[:1]
     if readings:
         return _sweeps(parameters, base, lights, exposures)
     found = []
@@ -219,12 +219,13 @@ def _sweeps(parameters: dict, base: dict, lights: Sequence[str], exposures: Sequ
 
 
 def plan(scene, frames: int, effects: Sequence | None = None, *, noise: Noise = NOISE, values: Values | None = None, setup=None,
-         share: float = SHARE, seed: int = 0, progress: Progress | None = None) -> Plan:
+         share: float = SHARE, fixed_exposure: bool = False, seed: int = 0, progress: Progress | None = None) -> Plan:
     """Choose `frames` frames of a scene (optics.scene.Scene) that keep its effects apart.
 
     effects   that may be missing; None: all that the scene can express
     values    of a calibration, in place of the scene's own; setup: what it solves for (optics.loop.Setup)
     share     of the plausible strength, at which effects are told apart
+    fixed_exposure   leave the exposure as the scene has it
 
     Raises Underdetermined for too few frames or effects, BadScene for a scene without a camera or a light.
     """
@@ -251,7 +252,7 @@ def plan(scene, frames: int, effects: Sequence | None = None, *, noise: Noise = 
     setup = setup or loop.Setup(captures="")
     values = Values() if values is None else Values({k: v for k, v in values.common.items()})
     base = {**scene.values(), **values.common}
-    pool = candidates(scene.parameters, base, readings)
+    pool = candidates(scene.parameters, base, readings, fixed_exposure)
     channels = 1 if len(scene.integrator.bands or (0,)) == 1 else 3
     blank = np.zeros((height, width, channels), np.float32)
     first = Frame("first", blank, parameters=pool[0].readings[0], file="design")
@@ -296,7 +297,7 @@ def plan(scene, frames: int, effects: Sequence | None = None, *, noise: Noise = 
 
 
 def session(subject: str | Path, frames: int, effects: Sequence[str] = (), defines: dict | None = None, plugins: Path | None = None,
-            noise: dict | None = None, share: float = SHARE, progress: Progress | None = None) -> Plan:
+            noise: dict | None = None, share: float = SHARE, fixed_exposure: bool = False, progress: Progress | None = None) -> Plan:
     """Plan a session for a scene by its name, or for a study by its folder: with its values, its noise, and what it has added.
 
     Raises as `plan`, and UnknownKey for an effect that nobody knows.
@@ -316,17 +317,17 @@ def session(subject: str | Path, frames: int, effects: Sequence[str] = (), defin
         setup = replace(setup, free=[*(setup.free or loop.default_free(model)), *(k for e in done if e.scope == "common"
                                                                                 for keys in model.scene.keys_of(e).values() for k in keys)])
         scene = scenes.load(model.scene.path, {**model.scene.defines, **(defines or {})}, plugins=plugins)
-        return plan(scene, frames, chosen, noise=camera, values=values, setup=setup, share=share, progress=progress)
+        return plan(scene, frames, chosen, noise=camera, values=values, setup=setup, share=share, fixed_exposure=fixed_exposure, progress=progress)
     file = scenes.find(subject)
     text, defines = file.read_text(encoding="utf-8"), dict(defines or {})
     sizes = {n: re.search(rf'<default name="{n}" value="(\d+)"', text) for n in ("width", "height")}
-    if all(sizes.values()) and not {"width", "height"} & set(defines):
+    if all(sizes.values()) and "$width" in text and "$height" in text and not {"width", "height"} & set(defines):
         longest = max(int(m[1]) for m in sizes.values())
         if longest > LONG_SIDE:
             defines |= {n: str(max(round(int(m[1]) * LONG_SIDE / longest), 1)) for n, m in sizes.items()}
     scene = scenes.load(file, defines, plugins=plugins)
     chosen = [registry().find_effect(name) for name in effects]
-    return plan(scene, frames, chosen, noise=replace(NOISE, **(noise or {})), share=share, progress=progress)
+    return plan(scene, frames, chosen, noise=replace(NOISE, **(noise or {})), share=share, fixed_exposure=fixed_exposure, progress=progress)
 
 
 def seen_alone(seen: advise.Outlook, chosen: Sequence[int]) -> np.ndarray:
@@ -359,7 +360,7 @@ def _expose(model, values: Values, pool: list[Choice], base: dict, say: Progress
     for i, c in enumerate(pool):
         say("exposures", i, len(pool))
         own = dict(c.settings)
-        if key is not None:
+        if key in own:
             light = tuple(own.get(k, 1.0) for k in lights)
             factor = own[key]
             model.frames[i].parameters[key] = float(base[key])
@@ -371,7 +372,7 @@ def _expose(model, values: Values, pool: list[Choice], base: dict, say: Progress
             own[key] = model.frames[i].parameters[key] = factor * fitting.get(light, float(base[key]))
         prediction = model.predict(values, [i])[0]
         model.frames[i].image = np.minimum(prediction, model.noise.saturation).astype(np.float32)
-        found.append(replace(c, settings=own, words=c.words + (f", exposure {own[key]:g}" if key and model.captures.table is None else "")))
+        found.append(replace(c, settings=own, words=c.words + (f", exposure {own[key]:g}" if key in own and model.captures.table is None else "")))
     say("exposures", len(pool), len(pool))
     return found
 
