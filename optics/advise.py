@@ -27,14 +27,14 @@ from optics.parameter import Values, Variable
 from optics.verdict import CLEAR, MARGIN, Advice, Apart, Diagnosis
 
 EXPOSURES = (0.4, 0.15, 2.5)  # of the present one: far enough to bend a response, near enough to see something
-DEPTHS = (1.5, 0.5, 2.0)  # of the present one
+DEPTHS = (2.0, 0.5)  # of the present one: a new geometry costs ten times what another light costs, so few are tried
 DIMMED = 0.4  # of all lights' power
 BRIGHT = 0.5  # share of an image that may saturate before a longer exposure is not worth a frame
 DEEPEST = 0.4  # of the gel's thickness: beyond, no contact formula holds
-FAR, RIM = 3, 0.7  # places farther out that are tried; share of the pad's half width where they may lie
+FAR, RIM = 1, 0.7  # places farther out that are tried; share of the pad's half width where they may lie
 PLACES = 3  # other places that are tried: as many as a plan of "more presses" takes
 TAKEN = 3  # shots of a plan
-SHOTS = 24  # that are simulated: each costs the derivative images of one frame
+SHOTS = 20  # that are simulated: each costs the derivative images of one frame
 ROWS = 300_000  # values that all shots together may keep: informations of thinned pixels, scaled up
 ENOUGH = 4 * CLEAR  # D at which the right one wins in 99.95 % of cases; more is not asked of a plan
 MEMBERS = 5  # effects that are told apart at once
@@ -147,7 +147,7 @@ def _presses(model, values: Values, frames: Sequence[int], now: Mapping, like: i
                    dict(zip(keys, (x, y, depth))), press=f"place-{i + 1}")
     x, y, here = (float(now[k]) for k in keys)
     here = here or depth
-    deep = min(DEPTHS[0] * here, DEEPEST * thickness)
+    deep = min(1.5 * here, DEEPEST * thickness)
     wide = _width(model, known, now, keys)
     for i, (u, v) in enumerate(places(known[:, :2], wide, FAR)):
         yield Shot("farther out", f"a press farther out, {deep:.2g} mm deep at x = {u:.2g} mm, y = {v:.2g} mm", like,
@@ -317,17 +317,21 @@ class Outlook:
 
     def gaps(self, chosen: Sequence[int] = ()) -> np.ndarray:
         """(n, n) D[a, b], a true as found; infinite where there is nothing to tell: a itself, what contains a, a not likely."""
+        return self.falls(chosen)[0]
+
+    def falls(self, chosen: Sequence[int] = ()) -> tuple[np.ndarray, np.ndarray]:
+        """(gaps (n, n), full (n,)): D as in `gaps`, and s'Vs, the fall of chi2 by the true effect itself."""
         projected, rest = self.information(chosen)
         seen = projected.survival > st.VISIBLE
         v = projected.information * np.outer(seen, seen)
         place = {column: i for i, column in enumerate(rest)}
         own = [m.at(chosen) for m in self.members]
         index = [np.array([place[c] for c in columns], int) for columns, _, _ in own]
-        found = np.full((len(own), len(own)), np.inf)
+        found, full = np.full((len(own), len(own)), np.inf), np.zeros(len(own))
         cones = [st.Cone(v[np.ix_(i, i)], sides, draws=1) if len(i) > 1 else None for i, (_, sides, _) in zip(index, own)]
         for a, (_, _, strength) in enumerate(own):
             score = v[:, index[a]] @ strength
-            full = float(strength @ score[index[a]])
+            full[a] = max(float(strength @ score[index[a]]), 0.0)
             for b, (_, sides, _) in enumerate(own):
                 if a == b or (a, b) in self.nested or not self.members[a].likely:
                     continue
@@ -337,12 +341,18 @@ class Outlook:
                     i = index[b][0]
                     u = score[i] if sides[0] == 0 else max(sides[0] * score[i], 0.0)
                     mimicked = u**2 / v[i, i] if v[i, i] > 0 else 0.0
-                found[a, b] = full - mimicked if full - mimicked > 1e-9 * full else 0.0  # below, it is rounding
-        return found
+                found[a, b] = full[a] - mimicked if full[a] - mimicked > 1e-9 * full[a] else 0.0  # below, it is rounding
+        return found, full
 
     def least(self, chosen: Sequence[int] = ()) -> float:
-        """The smallest D between any two: what a choice of shots is judged by."""
+        """The smallest D between any two."""
         return float(self.gaps(chosen).min(initial=np.inf))
+
+    def worth(self, chosen: Sequence[int] = ()) -> float:
+        """The smallest D between any two, discounted where it is less than MARGIN of the fall itself: with misfit a verdict asks for both."""
+        gaps, full = self.falls(chosen)
+        share = gaps / np.where(full > 0, MARGIN * full, 1.0)[:, None]
+        return float((gaps * np.minimum(share, 1.0)).min(initial=np.inf))
 
     def choose(self, count: int, worth: Callable[[Sequence[int]], float], enough: float = math.inf) -> list[int]:
         """Up to `count` shots (one may be taken twice) until they are worth enough: one after the other, each exchanged while that helps."""
@@ -496,7 +506,7 @@ def next_measurement(model, values: Values, evidence: Evidence, members: Sequenc
     """Shots that tell the members apart, the best of each family, best first; then the best up to `take` together, no more of them than
     bring D to `enough`; and for comparison `take` more presses (or repeats, where nothing is pressed).
 
-    Ranked by the smallest D between any two members, per frame. A member whose fall of chi2 is far below the best's counts as a rival
+    Ranked by the smallest D between any two members, per frame; where no effect explains all, as `Outlook.worth` has it. A member whose fall of chi2 is far below the best's counts as a rival
     and is not taken to be true. Nothing is returned for fewer than two members.
     """
     if len(members) < 2:
@@ -509,11 +519,14 @@ def next_measurement(model, values: Values, evidence: Evidence, members: Sequenc
         member.likely = not max(net) - own > max(LIKELY, MARGIN * max(net))
     before = seen.gaps()
     singles = [seen.gaps([s]) for s in range(len(shots))]
-    order = sorted(range(len(shots)), key=lambda s: -singles[s].min() / shots[s].frames)
+    clean = any(c.row is not None and c.row.refit is not None and c.row.refit.complete for c in members)
+    judge = seen.least if clean else seen.worth
+    worth = [judge([s]) / shot.frames for s, shot in enumerate(shots)]
+    order = sorted(range(len(shots)), key=lambda s: -worth[s])
     best = list({shots[s].family: s for s in reversed(order)}.values())
     best.sort(key=order.index)
     found = [_advice(seen, shots[s].words, shots[s].family, [shots[s]], before, singles[s], seen.nuisances[s]) for s in best]
-    plan = seen.choose(take, seen.least, enough)
+    plan = seen.choose(take, judge, enough)
     more = [s for s, shot in enumerate(shots) if shot.family == "another place"][:take]
     more = more or [s for s, shot in enumerate(shots) if shot.family == "repeat"] * take
     for family, chosen in (("together", plan), ("more of the same", more)):

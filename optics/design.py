@@ -281,7 +281,7 @@ def plan(scene, frames: int, effects: Sequence | None = None, *, noise: Noise = 
 
     def worth(chosen: Sequence[int]) -> float:
         """Mean P(correct) over all ordered pairs that can differ, and of each against nothing."""
-        gaps, alone = seen.gaps(chosen), seen_alone(seen, chosen)
+        gaps, alone = seen.falls(chosen)
         every = np.concatenate([gaps[np.isfinite(gaps)], alone])
         return float(np.mean(ndtr(np.sqrt(np.maximum(every, 0.0)) / 2)))
 
@@ -328,19 +328,6 @@ def session(subject: str | Path, frames: int, effects: Sequence[str] = (), defin
     scene = scenes.load(file, defines, plugins=plugins)
     chosen = [registry().find_effect(name) for name in effects]
     return plan(scene, frames, chosen, noise=replace(NOISE, **(noise or {})), share=share, fixed_exposure=fixed_exposure, progress=progress)
-
-
-def seen_alone(seen: advise.Outlook, chosen: Sequence[int]) -> np.ndarray:
-    """(n,) D of each effect against none: s'Vs."""
-    projected, rest = seen.information(chosen)
-    v = projected.information * np.outer(projected.survival > st.VISIBLE, projected.survival > st.VISIBLE)
-    place = {c: i for i, c in enumerate(rest)}
-    found = []
-    for m in seen.members:
-        columns, _, strength = m.at(chosen)
-        own = [place[c] for c in columns]
-        found.append(max(float(strength @ v[np.ix_(own, own)] @ strength), 0.0))
-    return np.array(found)
 
 
 def _depths(scene) -> list[str]:
@@ -422,7 +409,7 @@ def _onset(c: Candidate, squares: np.ndarray) -> tuple[str, int]:
 
 
 def _report(scene, frames, path, seen, chosen, members, share, noise, count, unseen) -> Plan:
-    gaps, alone = seen.gaps(chosen), seen_alone(seen, chosen)
+    gaps, alone = seen.falls(chosen)
     projected, rest = seen.information(chosen)
     place = {c: i for i, c in enumerate(rest)}
     effects, confused = [], []
