@@ -107,7 +107,8 @@ class Plan:
 
     def text(self) -> str:
         lines = [f"design: {len(self.frames)} of {self.pool} candidate frames for {self.scene}, "
-                 + ("sweeps of readings, " if self.size == (1, 1) else f"pictures of {self.size[0]} x {self.size[1]} px, ") + f"every effect at {self.share:g} of its plausible strength", ""]
+                 + ("sweeps of readings, " if self.size == (1, 1) else f"pictures of {self.size[0]} x {self.size[1]} px, ")
+                 + f"every effect at {self.share:g} of its plausible strength", ""]
         rows = [("", "group", "frame", "mean P(correct)"), *((str(i + 1), f.group, f.words, f"{w:.3f}")
                                                               for i, (f, w) in enumerate(zip(self.frames, self.worth)))]
         lines += _columns(rows) + [""]
@@ -186,7 +187,8 @@ def _places(base: dict, keys: Callable) -> list[tuple[str, str, dict]]:
         return [(f"distance-{i}", f"object at {to:g} mm", {distance[0]: to}) for i, to in enumerate((here, here / 2, 2 * here, here / 8, 0.0))]
     angles = [k for k in keys("angle") if base.get(k.rpartition(".")[0] + ".inserted", 1.0)]
     if angles:
-        return [(f"angle-{to:g}", f"{angles[0]} = {to:g} deg", {angles[0]: float(base[angles[0]]) + to}) for to in (0.0, 30.0, 45.0, 60.0, 90.0, 135.0)]
+        return [(f"angle-{to:g}", f"{angles[0]} = {to:g} deg", {angles[0]: float(base[angles[0]]) + to})
+                for to in (0.0, 30.0, 45.0, 60.0, 90.0, 135.0)]
     return [("", "the scene", {})]
 
 
@@ -260,8 +262,8 @@ def plan(scene, frames: int, effects: Sequence | None = None, *, noise: Noise = 
     model = Model(scene, Captures(Path("."), str(scene.path), [first], noise=noise, table=table), noise)
     model.frames = []
     model = model.imagine([Frame(
-        f"candidate-{i}", np.repeat(blank, len(c.readings), 0) if c.swept else blank, group=c.group or None, parameters=dict(c.settings), file="design",
-        readings={k: np.array(v).reshape(-1, 1, 1) for k, v in c.swept.items()}) for i, c in enumerate(pool)])
+        f"candidate-{i}", np.repeat(blank, len(c.readings), 0) if c.swept else blank, group=c.group or None, parameters=dict(c.settings),
+        file="design", readings={k: np.array(v).reshape(-1, 1, 1) for k, v in c.swept.items()}) for i, c in enumerate(pool)])
     for key in model.driven:
         values.common.setdefault(key, float(base[key]))
     pool = _expose(model, values, pool, base, say)
@@ -410,14 +412,14 @@ def _onset(c: Candidate, squares: np.ndarray) -> tuple[str, int]:
 
 def _report(scene, frames, path, seen, chosen, members, share, noise, count, unseen) -> Plan:
     gaps, alone = seen.falls(chosen)
-    projected, rest = seen.information(chosen)
+    information, rest = seen.information(chosen)
     place = {c: i for i, c in enumerate(rest)}
     effects, confused = [], []
     names = [m.name for m in seen.members]
     for i, (m, c) in enumerate(zip(seen.members, members)):
         columns, sides, strength = m.at(chosen)
         own = [place[k] for k in columns]
-        cone = st.Cone(projected.information[np.ix_(own, own)], sides, draws=2000) if own else None
+        cone = st.Cone(information[np.ix_(own, own)], sides, draws=2000) if own else None
         power = cone.power(strength, cone.critical(LEVEL / len(names))) if cone is not None and len(cone.live) else 0.0
         j = int(np.argmin(gaps[i])) if len(names) > 1 else i
         finite = len(names) > 1 and math.isfinite(gaps[i, j])
@@ -425,18 +427,20 @@ def _report(scene, frames, path, seen, chosen, members, share, noise, count, uns
         cos = math.sqrt(max(1 - gap / alone[i], 0.0)) if finite and alone[i] > 0 else 0.0
         v = c.variables[0]
         unit = "" if v.parameter.unit in ("", "1") else f" {v.parameter.unit}"
-        effects.append(Power(m.name, f"{share * v.parameter.plausible:.2g}{unit}", float(alone[i]), float(power), names[j] if finite else "", gap, cos))
+        effects.append(Power(m.name, f"{share * v.parameter.plausible:.2g}{unit}", float(alone[i]), float(power),
+                             names[j] if finite else "", gap, cos))
         for k, name in enumerate(names):
             if k != i and math.isfinite(gaps[i, k]) and gaps[i, k] < CLEAR:
-                why = f"what a calibration leaves of them has cos {math.sqrt(max(1 - gaps[i, k] / alone[i], 0.0)) if alone[i] > 0 else 0:.3f}; D {alone[i]:.3g} against none"
+                alike = math.sqrt(max(1 - gaps[i, k] / alone[i], 0.0)) if alone[i] > 0 else 0.0
+                why = f"what a calibration leaves of them has cos {alike:.3f}; D {alone[i]:.3g} against none"
                 confused.append({"effect": m.name, "rival": name, "d": float(gaps[i, k]), "why": why, "weak": bool(alone[i] < CLEAR)})
     confused.sort(key=lambda c: (c["weak"], c["d"]))
     nested = [(names[a], names[b]) for a, b in sorted(seen.nested)]
     warnings = []
     groups = len({f.group for f in frames}) if any(f.group for f in frames) else len(frames)
     if groups < GROUPS:
-        warnings.append(f"{groups} presses or places: fewer than {GROUPS} groups are not held out by themselves, and without held-out frames there is "
-                        "no CLAIM; plan more frames, or name one with --hold-out")
+        warnings.append(f"{groups} presses or places: fewer than {GROUPS} groups are not held out by themselves, and without held-out frames "
+                        "there is no CLAIM; plan more frames, or name one with --hold-out")
     return Plan(str(scene.path.stem if scene.path.parent.name == "scenes" else scene.path), frames, path, effects, confused, share, noise, count,
                 tuple(scene.camera.resolution), nested, unseen, warnings)
 

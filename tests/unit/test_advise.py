@@ -231,7 +231,7 @@ def pairs_of(number):
     rows = []
     for a, b in itertools.combinations(range(len(members)), 2):
         both = replace(seen, members=[seen.members[a], seen.members[b]], nested=set())
-        gaps, alone = both.gaps(), [float(np.array(m.strength) @ replace(both, members=[m]).information(())[0].information @ m.strength)
+        gaps, alone = both.gaps(), [float(np.array(m.strength) @ replace(both, members=[m]).information(())[0] @ m.strength)
                                     for m in both.members]
         cos = max(math.sqrt(max(1 - gaps[i, 1 - i] / alone[i], 0)) for i in (0, 1))
         if cos < CONFUSED:

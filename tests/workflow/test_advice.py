@@ -26,7 +26,8 @@ def example():
     return module
 
 
-@pytest.mark.parametrize("hidden, family", [("depolarization", "film put in"), ("offset", "exposure")])
+@pytest.mark.parametrize("hidden, family", [
+    ("depolarization", "film put in"), pytest.param("offset", "exposure", marks=pytest.mark.slow)])
 def test_a_tie_is_resolved_by_what_is_advised(example, hidden, family, tmp_path):
     """The readings are those of optics.jones, which knows nothing of the model: AMBIGUOUS, the advice, and a claim of the right one."""
     effect, before, after = example.main(hidden, tmp_path)
