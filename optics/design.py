@@ -300,7 +300,8 @@ def plan(scene, frames: int, effects: Sequence | None = None, *, noise: Noise = 
 
 def session(subject: str | Path, frames: int, effects: Sequence[str] = (), defines: dict | None = None, plugins: Path | None = None,
             noise: dict | None = None, share: float = SHARE, fixed_exposure: bool = False, progress: Progress | None = None) -> Plan:
-    """Plan a session for a scene by its name, or for a study by its folder: with its values, its noise, and what it has added.
+    """Plan a session for a scene by its name, or for a study by its folder: with its values, its noise, and what it has added. The
+    frames that a study has are not counted: a session stands by itself.
 
     Raises as `plan`, and UnknownKey for an effect that nobody knows.
     """
@@ -310,7 +311,7 @@ def session(subject: str | Path, frames: int, effects: Sequence[str] = (), defin
     if frames < FEWEST:  # before anything is loaded
         raise Underdetermined(f"design: {frames} frames; allowed: {FEWEST} or more, as with one nothing can be held out and nothing compared")
     path = Path(subject)
-    if (path / "study.json").is_file():
+    if (path / "ladder.json").is_file():
         study, model, setup = loop.take_up(path)
         data = study.fit(len(study.steps) - 1)
         values, camera = Values(dict(data["parameters"])), replace(model.noise, **(noise or {}))

@@ -2,6 +2,7 @@
 
 import csv
 import importlib.util
+import json
 import tomllib
 from pathlib import Path
 
@@ -28,7 +29,7 @@ def example():
 
 @pytest.mark.parametrize("hidden, family", [
     ("depolarization", "film put in"), pytest.param("offset", "exposure", marks=pytest.mark.slow)])
-def test_a_tie_is_resolved_by_what_is_advised(example, hidden, family, tmp_path):
+def test_a_tie_is_resolved_by_what_is_advised(example, hidden, family, tmp_path, capsys):
     """The readings are those of optics.jones, which knows nothing of the model: AMBIGUOUS, the advice, and a claim of the right one."""
     effect, before, after = example.main(hidden, tmp_path)
     assert before.word == "AMBIGUOUS" and effect in before.ambiguous
@@ -43,6 +44,12 @@ def test_a_tie_is_resolved_by_what_is_advised(example, hidden, family, tmp_path)
 
     text = Path(report(tmp_path / "before" / "study", page)).read_text(encoding="utf-8")
     assert "best together" in text and "more of the same, to compare" in text
+    # a session planned with the study's values and noise keeps the two apart
+    capsys.readouterr()
+    assert main(["design", str(tmp_path / "before" / "study"), "--frames", "6", "--effects", ",".join(before.ambiguous), "--strength", "1",
+                 "--json", "--quiet"]) == 0
+    planned = json.loads(capsys.readouterr().out)
+    assert {e["effect"] for e in planned["effects"]} == set(before.ambiguous) and max(e["gap"] for e in planned["effects"]) > 10.8
 
 
 @pytest.mark.slow
