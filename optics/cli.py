@@ -737,6 +737,34 @@ def diagnose(study: StudyFolder, as_json: AsJson = False,
 
 
 @command
+def design(subject: Annotated[str, typer.Argument(metavar="SCENE|STUDY", help="A scene, or a study whose values and noise are taken.")],
+           frames: Annotated[int, typer.Option("--frames", "-n", metavar="N", help="How many frames to take.")] = 12,
+           effects: Annotated[str | None, typer.Option("--effects", metavar="A,B,...", help="Which may be missing.",
+                                                       show_default="all that the scene can express")] = None,
+           strength: Annotated[float, typer.Option("--strength", metavar="X", help="Of every effect, in plausible sizes.")] = 0.1,
+           fixed_exposure: Annotated[bool, typer.Option("--fixed-exposure", help="Leave the exposure as the scene has it.")] = False,
+           output: Annotated[Path | None, typer.Option("-o", "--output", metavar="DIR", help="Write a captures.toml to fill in.")] = None,
+           defines: Defines = None, plugins: Plugins = None,
+           system_gain: Annotated[float | None, typer.Option(help="DN per electron.", show_default="0.04")] = None,
+           dark_noise: Annotated[float | None, typer.Option(help="DN, rms.", show_default="0.8")] = None,
+           black_level: Annotated[float | None, typer.Option(help="DN.", show_default="8")] = None,
+           saturation: Annotated[float | None, typer.Option(help="DN.", show_default="255")] = None,
+           as_json: AsJson = False) -> None:
+    """Plan a capture session: the frames that keep a scene's effects apart, and the effects that no frames will."""
+    from optics import design as planning
+
+    given = {"system_gain": system_gain, "dark_noise": dark_noise, "black_level": black_level, "saturation": saturation}
+    if output is not None:
+        _check_new_folder(output)
+    with terminal.progress() as progress:
+        result = planning.session(subject, frames, [e.strip() for e in (effects or "").split(",") if e.strip()], pairs(defines, "-D"),
+                                  plugins, {k: v for k, v in given.items() if v is not None}, strength, fixed_exposure, progress)
+    if output is not None:
+        terminal.note(f"to fill in: {planning.write(result, output) / 'captures.toml'}")
+    show(result.json()) if as_json else print(result.text())
+
+
+@command
 def add(study: StudyFolder, effect: Annotated[str, typer.Argument(metavar="EFFECT", help="Its name (`optics effects`).")],
         as_json: AsJson = False) -> None:
     """Free an effect, calibrate everything again, and record it as the next step of the study."""

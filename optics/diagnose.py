@@ -36,6 +36,7 @@ HAIR = 0.01  # of the fall: a split that gains less says nothing about what the 
 NOT_A_COORDINATE = ("far",)  # regions that others make up
 NAMED_BINS = ("place", "frame", "channel", "LED")
 YES_NO = ("contact", "shadow", "rim")
+USUALLY = "the same press at 0.4 of the exposure, and one deeper press, often tell more than repeats"  # where no shot was simulated
 
 
 # -- the verb ---------------------------------------------------------------------------------------------------------
@@ -117,7 +118,8 @@ def diagnose(model, fit, effects: Sequence[Effect], variables_of: Callable[[Effe
         compared=names, gaps=gaps, correct=correct, splits=splits, levels=levels, fingerprints=fingerprints, shifts=shifts,
         hints=_hints(word, conditions, members, gaps, names), not_tested=not_tested,
         warnings=_warnings(model, fit, evidence, table, winner, shifts, dropped, structure, basis),
-        claimed=winner.effect.name if word == "CLAIM" else "", pairs=found, fits=fits)
+        claimed=winner.effect.name if word == "CLAIM" else "", pairs=found, fits=fits,
+        evidence=replace(evidence, blocks=[], sigma=[], whitened=[], use=[], candidates=table.order))
 
 
 # -- what must hold before any score ----------------------------------------------------------------------------------
@@ -861,7 +863,7 @@ def _hints(word: str, conditions, members: Sequence[Candidate], gaps, names) -> 
             if alone:
                 hints.append(f"only {one.effect.name} acts through {', '.join(alone)}: vary that and keep the rest")
         hints += [f"{c.effect.name} needs: {c.effect.needs}" for c in members if c.effect.needs]
-        hints.append("the same press at 0.4 of the exposure, and one deeper press, often tell more than repeats")
+        hints.append(USUALLY)
     if "held out" in failed and word != "NOTHING" and "held out" in {c.name for c in conditions}:
         hints.append("hold out frames that the fit has not seen (other presses or places), or find why they do not improve")
     if word == "UNKNOWN":

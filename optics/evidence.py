@@ -126,6 +126,7 @@ class Evidence:
     noise: float
     masked: float
     projected: st.Projected | None = None
+    candidates: list[Candidate] = field(default_factory=list)  # that were scored in it, best first
 
     @property
     def channels(self) -> int:

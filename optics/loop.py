@@ -337,7 +337,8 @@ def seek(model: Model, values: Values, effects: Sequence[Effect], frames: Sequen
 
 def examine(study: Study, model: Model, setup: Setup, found: calibrate.Fit, progress: Progress | None = None):
     """Diagnose the last step and write the diagnosis, with the best effects' fingerprints, into it."""
-    from optics.diagnose import diagnose
+    from optics.advise import advise
+    from optics.diagnose import USUALLY, diagnose
 
     fitted, held = split(model, setup)
     tested = candidates(model, study)
@@ -370,6 +371,9 @@ def examine(study: Study, model: Model, setup: Setup, found: calibrate.Fit, prog
 
     result = diagnose(model, found, tested, lambda e: effect_variables(model, e), held, fitted=fitted, refit=refit,
                       seed=setup.seed, progress=progress)
+    result.advice = advise(model, result, effect_variables, setup.seed, progress)
+    if result.advice:
+        result.hints = [hint for hint in result.hints if hint != USUALLY]
     worst = int(np.argmax(np.array(found.frame_chi2) / np.maximum(found.frame_n, 1)))
     study.put_diagnosis(len(study.steps) - 1, result, ladder.fingerprints_of(model, found, result, found.frames[worst]))
     return result

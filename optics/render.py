@@ -9,6 +9,7 @@ they are central differences with common samples (`Parameter.how`).
 
 from __future__ import annotations
 
+import copy
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -559,6 +560,15 @@ class Model:
                            "--flat-field none")
         if self.flat_field and background is not None:
             self.flat = np.maximum(np.asarray(background, float) - self.noise.black_level, 1e-3)
+
+    def imagine(self, frames: Sequence) -> "Model":
+        """The same model, with the same renderer, with further frames: what `optics.advise` could have somebody measure."""
+        twin = copy.copy(self)
+        twin.frames = [*self.frames, *frames]
+        twin.driven = self.driven | ({f"{n}.power" for n in self.scene.lights} & {k for f in frames for k in (*f.parameters, *f.readings)})
+        twin.base = {**self.base, **dict.fromkeys(twin.driven - self.driven, 1.0)}
+        twin.companions, twin._edges_kept = twin._companions(), dict(self._edges_kept)
+        return twin
 
     # -- values -------------------------------------------------------------------------------------------------------
 

@@ -920,7 +920,7 @@ def verdict(diagnosis: Mapping | None) -> dict | None:
         "not_tested": [f"{name} ({words(why)})" for name, why in (d.get("not_tested") or {}).items()],
         "splits": [_split(s) for s in d.get("splits") or ()], "levels": list(d.get("levels") or ()),
         "shifts": [s for s in d.get("shifts") or ()][:8], "curves": [_draft(f) for f in curves[:3]],
-        "pairs": _pairs(d),
+        "pairs": _pairs(d), "advice": _advice(d),
     }
 
 
@@ -1017,6 +1017,21 @@ def _pairs(d: Mapping) -> dict | None:
         return None
     return {"names": [names[i] for i in keep],
             "rows": [[percent(_finite(matrix[i][j]), 2) if i != j else "" for j in keep] for i in keep]}
+
+
+def _advice(d: Mapping) -> list[dict]:
+    """Shots that were simulated, the best few together first: what each would make of the pair that is hardest to tell apart."""
+    rows = []
+    for a in d.get("advice") or ():
+        if not a.get("pairs"):
+            continue
+        p = a["pairs"][0]
+        kind = {"together": "best together", "more of the same": "more of the same, to compare"}.get(a["family"], a["family"])
+        rows.append({"kind": kind, "shot": words(a["shot"]), "pair": f"{p['effect']} / {p['rival']}", "first": a["family"] != "together",
+                     "before": number(_finite(p["before"]), 3), "after": number(_finite(p["after"]), 3),
+                     "correct": f"{_finite(p['correct_before']):.2f} → {_finite(p['correct_after']):.2f}",
+                     "brings": ", ".join(words(n) for n in a.get("nuisances") or ())})
+    return sorted(rows, key=lambda r: r["first"])
 
 
 def words(text) -> str:

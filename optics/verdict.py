@@ -36,6 +36,8 @@ SHARE = 0.05  # of the excess misfit that a claimed effect must explain ...
 EXCESS = 5.0  # ... where there is an excess of this many standard deviations at all
 UNEVEN = 0.1  # of the fall: what splitting the strength by channel, frame, ... may still gain
 MIMICS = ("place", "frame")
+PLANS = ("together", "more of the same")  # kinds of advice that are several shots
+TELLS = 0.02  # gain of P(correct) below which a shot is not worth a line
 WORDS = ("NOTHING", "CLAIM", "AMBIGUOUS", "PARTIAL", "UNKNOWN", "CANNOT_TELL")
 
 
@@ -218,6 +220,48 @@ class Shift:
 
 
 @dataclass(frozen=True)
+class Apart:
+    """D, the expected chi2 by which the data would prefer `effect`, if true, over `rival`; and P(correct) = Phi(sqrt(D)/2)."""
+
+    effect: str
+    rival: str
+    before: float
+    after: float
+    correct_before: float
+    correct_after: float
+
+
+@dataclass(frozen=True)
+class Advice:
+    """A frame that could be taken, or several, simulated: what it would tell apart (optics.advise).
+
+    shot       in words; family: its kind, 'together' for the best few and 'more of the same' for as many others to compare with
+    settings   of each frame, by key: what differs from a frame that exists; press: name of a new press, '' for the same
+    frames     how many it takes
+    pairs      hardest first
+    nuisances  unknowns that it brings, which were projected off with what is known of them beforehand
+    """
+
+    shot: str
+    family: str
+    settings: list[dict[str, float]]
+    press: list[str]
+    frames: int
+    pairs: list[Apart]
+    nuisances: list[str]
+
+    @property
+    def hardest(self) -> Apart:
+        """The pair that is hardest to tell apart without it."""
+        return self.pairs[0]
+
+    @property
+    def least(self) -> float:
+        """The smallest D between any two with it."""
+        return min(p.after for p in self.pairs)
+
+
+@dataclass(frozen=True)
 class Basis:
     """What the verdict rests on: data, masks, noise, misfit. Misfit and noise in units of the mean signal.
 
@@ -272,7 +316,9 @@ class Diagnosis:
     warnings: list[str]
     claimed: str = ""
     pairs: list[Pair] = field(default_factory=list)  # of effects that were tried together (optics.pairs)
+    advice: list[Advice] = field(default_factory=list)  # what to measure next (optics.advise)
     fits: dict = field(default_factory=dict, repr=False, compare=False)  # effect -> Fit of the refit; not written
+    evidence: object = field(default=None, repr=False, compare=False)  # optics.evidence.Evidence, without pixels; not written
 
     def __post_init__(self):
         if self.word not in WORDS:
@@ -294,7 +340,7 @@ class Diagnosis:
         raise KeyError(f"no effect '{effect}' in the table; tested: {', '.join(r.name for r in self.rows)}")
 
     def to_dict(self) -> dict:
-        return plain({f.name: _record(getattr(self, f.name)) for f in fields(self) if f.name != "fits"})
+        return plain({f.name: _record(getattr(self, f.name)) for f in fields(self) if f.name not in ("fits", "evidence")})
 
     def to_json(self) -> str:
         return json.dumps(self.to_dict(), indent=1, allow_nan=False)
@@ -506,6 +552,25 @@ def moved_by(s: Shift) -> str:
     return f"{s.variable} by {abs(s.after - s.before):.2g}{unit}"
 
 
+def advice_text(a: Advice) -> str:
+    p = a.hardest
+    return (f"{a.shot}: {'tells' if p.correct_after - p.correct_before > TELLS else 'hardly tells'} {p.effect} from {p.rival}, D {p.before:.3g} "
+            f"-> {p.after:.3g}, P(correct) {p.correct_before:.2f} -> {p.correct_after:.2f}"
+            + (f"; the closest two then have D {a.least:.3g}" if a.least < min(0.9 * p.after, 4 * CLEAR) else ""))
+
+
+def advice_lines(advice: Sequence[Advice]) -> list[str]:
+    """The best shots together, for comparison as many others, and the best of each kind by themselves where they tell anything."""
+    plans = {a.family: a for a in advice if a.family in PLANS}
+    singles = [a for a in advice if a.family not in PLANS]
+    lines = [f"next: {advice_text(plans['together'])}"] if "together" in plans else []
+    if "more of the same" in plans:
+        lines.append(f"      (more of the same instead: {advice_text(plans['more of the same'])})")
+    known = {a.shot for a in plans.values()}
+    return lines + [f"next, or by itself: {advice_text(a)}" for a in singles
+                    if a.shot not in known and a.hardest.correct_after - a.hardest.correct_before > TELLS][:4]
+
+
 def sentence(word: str, conditions: Sequence[Condition], f: Findings, rows: Sequence[Row], members: Sequence[Row],
              fingerprints: Sequence[Fingerprint], levels: Sequence[Level], shifts: Sequence[Shift], basis: Basis) -> str:
     """The verdict in words, with the numbers that decided it."""
@@ -614,6 +679,7 @@ def _text(d: Diagnosis) -> str:
     if d.shifts:
         lines += ["", "calibrated parameters had moved to hide it:"]
         lines += [f"  {s.variable:<24} {s.before:.5g} -> {s.after:.5g} {s.unit} ({s.in_sd:+.1f} sd)" for s in d.shifts[:6]]
+    lines += advice_lines(d.advice)
     lines += [f"next: {hint}" for hint in d.hints]
     lines += [f"warning: {w}" for w in d.warnings]
     return "\n".join(lines) + "\n"

@@ -7,6 +7,7 @@ that no library holds (stain, banding, height gain, slope gain, drift of the red
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -70,6 +71,11 @@ class Exact:
     """A model whose predictions have no error of their own."""
 
     by_chance = False
+
+    def imagine(self, frames):
+        twin = copy(self)
+        twin.frames = [*self.frames, *frames]
+        return twin
 
     def variance(self, values, frame, prediction):
         return self.noise.variance(prediction)

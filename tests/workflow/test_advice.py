@@ -1,0 +1,154 @@
+"""Advice on a bench that two causes explain alike, followed with readings of another maker; and a session planned before any reading."""
+
+import csv
+import importlib.util
+import json
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from optics import design, loop, scene as scenes
+from optics.cli import main
+from optics.effect import registry
+from optics.errors import BadScene, OutputExists, Underdetermined
+from optics.noise import Noise
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "next_measurement.py"
+SMALL = {"width": "32", "height": "24"}
+NOISE = Noise(0.05, 2.0, 64.0, 4095.0, 0.0)
+
+
+@pytest.fixture(scope="module")
+def example():
+    spec = importlib.util.spec_from_file_location("next_measurement", EXAMPLE)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.parametrize("hidden, family", [
+    ("depolarization", "film put in"), pytest.param("offset", "exposure", marks=pytest.mark.slow)])
+def test_a_tie_is_resolved_by_what_is_advised(example, hidden, family, tmp_path, capsys):
+    """The readings are those of optics.jones, which knows nothing of the model: AMBIGUOUS, the advice, and a claim of the right one."""
+    effect, before, after = example.main(hidden, tmp_path)
+    assert before.word == "AMBIGUOUS" and effect in before.ambiguous
+    singles = [a for a in before.advice if a.family not in ("together", "more of the same")]
+    assert singles[0].family == family and len(singles) >= 6
+    assert all(a.hardest.before < 1e-6 < 10 < a.hardest.after for a in before.advice[:1])
+    more = next(a for a in before.advice if a.family == "more of the same")
+    assert more.least < 1e-6  # no number of such readings will do
+    assert after.missing == effect
+    page = (tmp_path / "before" / "study" / "report.html")
+    from optics.report import report
+
+    text = Path(report(tmp_path / "before" / "study", page)).read_text(encoding="utf-8")
+    assert "best together" in text and "more of the same, to compare" in text
+    # a session planned with the study's values and noise keeps the two apart
+    capsys.readouterr()
+    assert main(["design", str(tmp_path / "before" / "study"), "--frames", "6", "--effects", ",".join(before.ambiguous), "--strength", "1",
+                 "--json", "--quiet"]) == 0
+    planned = json.loads(capsys.readouterr().out)
+    assert {e["effect"] for e in planned["effects"]} == set(before.ambiguous) and max(e["gap"] for e in planned["effects"]) > 10.8
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("hidden", ["leak", "stray"])
+def test_the_other_cause_is_named_where_it_is_the_other(example, hidden, tmp_path):
+    effect, before, after = example.main(hidden, tmp_path)
+    assert before.word == "AMBIGUOUS" and after.missing == effect
+
+
+# -- a session --------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def bench():
+    """A plan for three effects of the bench, two of which only an exposure tells apart."""
+    effects = [registry().find_effect(n) for n in ("stray light", "dark offset", "extinction leak")]
+    return design.plan(scenes.load("polarizer_bench"), 6, effects, noise=NOISE, share=1.0)
+
+
+def test_a_planned_session_keeps_effects_apart(bench):
+    assert len(bench.frames) == len(bench.worth) == 6
+    assert all(b >= a - 1e-9 for a, b in zip(bench.worth, bench.worth[1:]))  # more frames never tell less
+    assert len({f.settings["camera.exposure"] for f in bench.frames}) > 1  # else stray light and an offset are the same
+    own = {e.effect: e for e in bench.effects}
+    assert own["stray light"].gap > 10.8 and own["stray light"].power > 0.99
+    assert {c["effect"] for c in bench.confused} == {e.effect for e in bench.effects if e.gap < 10.8}
+    assert "mean P(correct)" in bench.text() and bench.json()["effects"][0]["correct"] <= 1
+    assert any("held out" in w for w in bench.warnings) == (len(bench.frames) < 4)
+
+
+def test_what_a_single_exposure_cannot_tell_is_said():
+    """At one exposure nothing parts stray light from an offset: the plan says so."""
+    effects = [registry().find_effect(n) for n in ("stray light", "dark offset")]
+    found = design.plan(scenes.load("polarizer_bench"), 4, effects, noise=NOISE, share=1.0, fixed_exposure=True)
+    assert not any("camera.exposure" in f.settings for f in found.frames)
+    assert {(c["effect"], c["rival"]) for c in found.confused} == {("stray light", "dark offset"), ("dark offset", "stray light")}
+    assert all(c["d"] < 1e-6 for c in found.confused)
+
+
+def test_a_session_is_a_capture_set_to_fill_in(bench, tmp_path):
+    folder = design.write(bench, tmp_path / "set")
+    told = tomllib.loads((folder / "captures.toml").read_text())
+    assert told["scene"] == "polarizer_bench" and told["noise"]["saturation"] == 4095.0 and told["table"]["values"] == ["reading"]
+    rows = list(csv.DictReader((folder / "readings.csv").read_text().splitlines()))
+    assert len(rows) == 6 * 12 and all(row["reading"] == "" for row in rows)
+    known = scenes.load("polarizer_bench").parameters
+    assert set(rows[0]) - {"reading"} <= set(known)
+    with pytest.raises(OutputExists):
+        design.write(bench, folder)
+    # filled in, it is one that the program reads
+    lines = (folder / "readings.csv").read_text().splitlines()
+    (folder / "readings.csv").write_text("\n".join([lines[0], *(f"{line}{100 + i % 7}" for i, line in enumerate(lines[1:]))]))
+    assert len(loop.open_model(loop.Setup(captures=str(folder))).captures.frames) > 0
+
+
+@pytest.mark.slow
+def test_a_session_of_pictures(tmp_path, capsys):
+    """The command line on a sensor with a gel: presses, lights and exposures, four presses at least, pictures named one by one."""
+    code = main(["design", "gelsight", "--frames", "6", "--effects", "lens vignetting,camera gamma,veiling glare", "-o", str(tmp_path / "set"),
+                 "-D", "width=32", "-D", "height=24", "--quiet"])
+    out = capsys.readouterr().out
+    assert code == 0 and "6 of" in out and "lens vignetting" in out
+    told = tomllib.loads((tmp_path / "set" / "captures.toml").read_text())
+    assert len(told["frames"]) == 6 and len({f["group"] for f in told["frames"]}) >= 4
+    keys = scenes.load("gelsight", SMALL).parameters
+    for frame in told["frames"]:
+        assert frame["image"].startswith("frames/") and {f"led_{i}.power" for i in range(1, 7)} <= set(frame["parameters"])
+        assert all(keys[k].bounds[0] <= v <= keys[k].bounds[1] for k, v in frame["parameters"].items())
+
+
+# -- bad input --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("arguments, says", [
+    (["design", "gelsight", "--frames", "1"], "1 frames; allowed: 2 or more"),
+    (["design", "gelsight", "--effects", "lens vigneting"], "unknown effect 'lens vigneting'; did you mean 'lens-vignetting'"),
+    (["design", "gelsigt"], "unknown scene 'gelsigt'; did you mean 'gelsight'"),
+    (["design", "gelsight", "--effects", "unfilled cell"], "cannot express the effect 'unfilled cell'"),
+    (["design", "gelsight", "--strength", "0"], "strength of 0 plausible sizes; allowed: > 0"),
+    (["design", "gelsight", "--saturation", "5"], "saturation = 5 DN; allowed: > black_level = 8 DN"),
+])
+def test_a_session_that_cannot_be_planned_is_refused_in_one_line(arguments, says, capsys):
+    code = main(arguments)
+    out, err = capsys.readouterr()
+    assert code == 2 and out == "" and says in err and err.count("\n") == 1
+
+
+def test_a_scene_without_a_camera_is_refused(tmp_path, capsys):
+    text = scenes.find("gelsight").read_text(encoding="utf-8")
+    start, end = text.index("<sensor"), text.index("</sensor>") + len("</sensor>")
+    (tmp_path / "blind.xml").write_text(text[:start] + text[end:], encoding="utf-8")
+    code = main(["design", str(tmp_path / "blind.xml")])
+    out, err = capsys.readouterr()
+    assert code == 2 and out == "" and "no part of the type 'camera'" in err and err.count("\n") == 1
+
+
+def test_nothing_is_planned_for_effects_that_are_solved_for_already(tmp_path):
+    with pytest.raises(Underdetermined, match="solves for them already"):
+        design.plan(scenes.load("gelsight", SMALL), 4, [registry().find_effect("gain drift")],
+                    setup=loop.Setup(captures="", free=["camera.gain"]))
+    with pytest.raises(BadScene, match="cannot express"):
+        design.plan(scenes.load("gelsight", SMALL), 4, [registry().find_effect("extinction leak")])
