@@ -366,7 +366,7 @@ def _refit(model, fit, evidence: Evidence, table: Table, chosen: Sequence[Candid
         c.row.refit = Refit(fall, c.row.fall, ratio, before, after, strength,
                             [sd.get(v.name, math.nan) for v in c.variables], ended,
                             (after - dof) / math.sqrt(2 * dof), evidence.structure(images, [*evidence.base, *c.columns]).p,
-                            bool(found.converged), str(found.reason))
+                            bool(found.converged), str(found.reason), _clear(found, c, strength))
         if not 0.5 <= ratio <= 2 and c.row.fall > CLEAR:
             c.row.flags.append("nonlinear")
         if ended:
@@ -376,6 +376,18 @@ def _refit(model, fit, evidence: Evidence, table: Table, chosen: Sequence[Candid
             c.row.flags.append(f"{size.max():.2g} times the plausible strength")
     say("refit", len(chosen), len(chosen))
     return fits
+
+
+def _clear(found, c: Candidate, strength: Sequence[float]) -> float:
+    """sqrt(d' C^-1 d) of the strengths' change d and their covariance C; NaN where C is not known."""
+    names = [v.name for v in found.variables]
+    own = [names.index(v.name) for v in c.variables if v.name in names]
+    covariance = np.asarray(found.covariance, float)[np.ix_(own, own)]
+    if len(own) < len(c.variables) or not np.isfinite(covariance).all():
+        return math.nan
+    change = np.array(strength) - c.start
+    inverse, rank = st.inverse(covariance)
+    return math.sqrt(max(float(change @ inverse @ change), 0.0)) if rank else math.nan
 
 
 def _add_both(model, fit, evidence: Evidence, both: list[Candidate], refit: Callable, fitted: Sequence[int]):
@@ -730,7 +742,7 @@ def _findings(table, winner, done, members, fingerprints, splits, levels, basis,
             uneven=worst.h if worst else 0.0, uneven_by=f" by {worst.by} ({_extremes(worst)})" if worst else "",
             even=all(s.holds for s in mine),
             some_even=any(even.values()) if even else True,
-            held_out=levels[-1].fall if len(levels) > 1 else math.nan)
+            held_out=levels[-1].fall if len(levels) > 1 else math.nan, clear=winner.row.refit.clear)
     if not fingerprints:
         return own
     better = rivals(fingerprints, own.fall)

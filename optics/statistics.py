@@ -154,6 +154,7 @@ class Cone:
 
     T = max over allowed s of 2 s'u - s'Vs. Under the null hypothesis T follows a mixture of chi2 distributions whose
     weights (probability that j strengths come out off their bound) are exact for one strength and simulated for more.
+    Combinations of strengths of which the projection has left no more than rounding (VISIBLE) are known to nobody.
     """
 
     def __init__(self, information: np.ndarray, sides: Sequence[int], seed: int = 0, draws: int = 10_000):
@@ -165,10 +166,10 @@ class Cone:
         v = self.information[np.ix_(self.live, self.live)] * sign * sign[:, None]
         self.sign, self.free, self.bound = sign, np.flatnonzero(sides[self.live] == 0), np.flatnonzero(sides[self.live])
         across = v[np.ix_(self.bound, self.free)]
-        self.free_inverse, self.free_rank = inverse(v[np.ix_(self.free, self.free)])
+        self.free_inverse, self.free_rank = inverse(v[np.ix_(self.free, self.free)], VISIBLE)
         self.across = across @ self.free_inverse  # (bound, free)
         self.cone = v[np.ix_(self.bound, self.bound)] - self.across @ across.T
-        self.inverse, self.rank = inverse(self.information)
+        self.inverse, self.rank = inverse(self.information, VISIBLE)
         self.weights = self._weights(seed, draws)  # [j] = P(chi2 with j degrees of freedom)
 
     def _weights(self, seed: int, draws: int) -> np.ndarray:
@@ -208,7 +209,7 @@ class Cone:
         elif len(self.bound):
             scale = 1 / np.sqrt(np.diag(self.cone))
             values, vectors = np.linalg.eigh(self.cone * scale * scale[:, None])
-            keep = values > TRUNCATION * values[-1]
+            keep = values > VISIBLE * values[-1]
             root, vectors = np.sqrt(values[keep]), vectors[:, keep]
             x = scale * nnls((vectors * root).T, (vectors / root).T @ (bound * scale), maxiter=100 * len(x))[0]
         s = np.zeros(len(self.information))

@@ -35,6 +35,7 @@ RIVAL_CURVE = 1.25  # ... and a curve along one coordinate: with a true effect i
 SHARE = 0.05  # of the excess misfit that a claimed effect must explain ...
 EXCESS = 5.0  # ... where there is an excess of this many standard deviations at all
 UNEVEN = 0.1  # of the fall: what splitting the strength by channel, frame, ... may still gain
+STRENGTH = 2.0  # standard deviations that a claimed strength must differ from none by: a fall without it is another's
 MIMICS = ("place", "frame")
 PLANS = ("together", "more of the same")  # kinds of advice that are several shots
 TELLS = 0.02  # gain of P(correct) below which a shot is not worth a line
@@ -76,6 +77,7 @@ class Refit:
     structure_p: float
     converged: bool
     reason: str
+    clear: float = math.nan  # of its strength from where it started, in standard deviations of all its variables together
 
     @property
     def complete(self) -> bool:
@@ -419,6 +421,7 @@ class Findings:
     uneven       largest h of the winner, uneven_by: its split, in words; even: whether all splits hold; some_even: whether
                  those of any member of the ambiguous set do
     held_out     net fall on held-out frames, NaN where there are none
+    clear        of the winner's strength from none, in standard deviations; NaN where they are not known
     """
 
     p_family: float
@@ -438,6 +441,7 @@ class Findings:
     even: bool = True
     some_even: bool = True
     held_out: float = math.nan
+    clear: float = math.nan
 
 
 def is_structured(structure_p: float, excess_sd: float) -> bool:
@@ -475,6 +479,8 @@ def decide(f: Findings) -> tuple[str, list[Condition]]:
             Condition("share", f.share, SHARE, not weighed or f.share > SHARE,
                       f"{f.share:.0%} of the excess explained, {SHARE:.0%} needed" if weighed else
                       "the excess is within noise, no share is asked"),
+            Condition("strength", f.clear, STRENGTH, not f.clear < STRENGTH,
+                      "its error is not known" if math.isnan(f.clear) else f"{f.clear:.2g} sd from none, {STRENGTH:g} needed"),
             Condition("even", f.uneven, UNEVEN, f.even, f"splitting its strength{f.uneven_by} gains {f.uneven:.2f} of the "
                       f"fall, {UNEVEN:g} allowed"),
             Condition("held out", f.held_out, 0.0, f.held_out > 0,
