@@ -170,6 +170,7 @@ class Fingerprint:
     fall, dof   of chi2 with a gain and an offset per bin; net: fall less dof; ratio: net over the best effect's fall
     kind        'gain' (curve: relative change of the signal) or 'offset' (curve: DN), whichever explains more
     labels      names in place of centres for frame and channel; cells of 'place' run row by row
+    family      what the coordinate belongs to (optics.fingerprints); share: of the excess misfit, NaN within noise; unit: of the centres
     """
 
     coordinate: str
@@ -183,6 +184,23 @@ class Fingerprint:
     curve: list[float]
     sd: list[float]
     labels: list[str]
+    family: str = ""
+    share: float = math.nan
+    unit: str = ""
+
+
+@dataclass(frozen=True)
+class Family:
+    """The best curve of the coordinates that belong together: camera, light, geometry, time, or a setting.
+
+    share    of the excess misfit, NaN within noise; of_best: of the fall that the best family's curve has
+    """
+
+    family: str
+    coordinate: str
+    net: float
+    share: float
+    of_best: float
 
 
 @dataclass(frozen=True)
@@ -272,6 +290,7 @@ class Diagnosis:
     warnings: list[str]
     claimed: str = ""
     pairs: list[Pair] = field(default_factory=list)  # of effects that were tried together (optics.pairs)
+    families: list[Family] = field(default_factory=list)  # what the residual goes with, best first
     fits: dict = field(default_factory=dict, repr=False, compare=False)  # effect -> Fit of the refit; not written
 
     def __post_init__(self):
@@ -610,7 +629,11 @@ def _text(d: Diagnosis) -> str:
             lines.append("  (a falling held-out misfit verifies prediction; it does not prove the identity of the cause)")
     if d.fingerprints:
         lines += ["", "curves along coordinates (fall of chi2 less its number of bins; R = over the best effect)"]
-        lines += [f"  {f.coordinate:<18} {f.net:10.4g}  R {f.ratio:8.3g}  p {p_text(f.p)}" for f in d.fingerprints[:5]]
+        lines += [f"  {f.coordinate:<18} {f.net:10.4g}  R {f.ratio:8.3g}  p {p_text(f.p)}"
+                  + (f"  {f.family:<8}" if f.family else "") + (f"  {f.share:.0%} of the excess" if math.isfinite(f.share) else "")
+                  for f in d.fingerprints[:8]]
+        if d.families:
+            lines.append("  best of each family: " + ", ".join(f"{f.family} {f.coordinate} {f.of_best:.2f}" for f in d.families))
     if d.shifts:
         lines += ["", "calibrated parameters had moved to hide it:"]
         lines += [f"  {s.variable:<24} {s.before:.5g} -> {s.after:.5g} {s.unit} ({s.in_sd:+.1f} sd)" for s in d.shifts[:6]]
