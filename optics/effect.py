@@ -165,6 +165,8 @@ class Registry:
                 raise BadPlugin(f"{file}: a part of the kind '{item.kind}' exists already; choose another kind")
             self.parts[item.kind] = item
             return
+        if item.key == "new":
+            raise BadPlugin(f"{file}: an effect cannot be called 'new', which is the word for writing one; choose another name")
         if item.key in self.effects:
             raise BadPlugin(f"{file}: the effect '{item.name}' exists already ({self.effects[item.key].file})")
         for stage in item.stages:

@@ -93,7 +93,7 @@ def lit_geometry(model, values: Values, frame: int) -> dict[str, np.ndarray]:
     led_angle       deg, off the axis of the LED, as its lobe goes
     light_azimuth   deg, between the way down the slope and the way to the LED, seen along z; NaN where the surface is flat to 1 deg
     press_distance  mm, from the middle of the press along the skin; depth: mm, from the camera, where the scene has no gel
-    NAME.distance   mm, from the LED of this name, lit or not, in scenes of at most DISTANCES of them
+    NAME.distance   mm, from the LED of this name, in frames where it is lit, in scenes of at most DISTANCES of them
     """
     renderer = getattr(model, "renderer", None)
     if renderer is None or model.captures.table is not None:
@@ -124,7 +124,9 @@ def lit_geometry(model, values: Values, frame: int) -> dict[str, np.ndarray]:
     if scene.gel is not None and f"{scene.gel.name}.press_x" in now:
         found["press_distance"] = np.hypot(*(p[..., i] - float(now[f"{scene.gel.name}.press_{a}"]) for i, a in enumerate("xy")))
     if 1 < len(at) <= DISTANCES:
-        found.update({f"{led}.distance": np.where(hits.valid, np.linalg.norm(place - p, axis=-1), np.nan) for led, place in at.items()})
+        on = model.lit(now)
+        found.update({f"{led}.distance": np.where(hits.valid & (led in on), np.linalg.norm(place - p, axis=-1), np.nan)
+                      for led, place in at.items()})
     return found
 
 
@@ -177,7 +179,7 @@ def fingerprints(model, evidence: Evidence, found: list[dict], reference: float,
     """
     from scipy.special import chdtrc
 
-    k = evidence.thinning
+    k, black = evidence.thinning, float(model.noise.black_level)
     names = sorted(set.intersection(*[set(p) for p in found]) - {"quadrant"})
     plain_normal = evidence.thinned(extra=2 * max(SIDE * SIDE, st.BINS, len(evidence.frames), evidence.channels))
     middles = [block.middle for block in evidence.blocks]
@@ -193,7 +195,7 @@ def fingerprints(model, evidence: Evidence, found: list[dict], reference: float,
             continue
         count = len(edges) - 1
         normal = _with_bins(evidence, plain_normal, middles, found, name, edges,
-                            lambda block: (block.prediction / block.sigma, 1 / block.sigma))
+                            lambda block: ((block.prediction - black) / block.sigma, 1 / block.sigma))
         first = len(evidence.columns)
         rest = list(range(first, first + 2 * count))
         projected = evidence.project(normal, evidence.base, rest, k)
