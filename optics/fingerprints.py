@@ -24,6 +24,8 @@ SIDE = 4  # cells per side of the coordinate 'place': a finer map would fit any 
 NOT_A_COORDINATE = ("far",)  # regions that others make up
 NAMED_BINS = ("place", "frame", "channel", "LED")
 YES_NO = ("contact", "shadow", "rim")
+LINES = 64  # bins of 'row' and 'column': what a shutter or a read-out does goes by single rows
+SEEN = 0.01  # of a curve's direction that calibration must leave for it to be drawn: the rest (a level, a slope) nobody can know
 AS_GOOD = 0.8  # of the best family's fall: families nearer than that are not told apart
 DISTANCES = 8  # LEDs up to which the distance to each is a coordinate of its own
 
@@ -174,6 +176,9 @@ def settings(model, evidence: Evidence) -> dict[str, list[float]]:
 def fingerprints(model, evidence: Evidence, found: list[dict], reference: float, say: Progress) -> list[Fingerprint]:
     """The residual along every coordinate: bins of gain and offset, projected like effects; best first.
 
+    Falls of chi2 count every direction that is left; a curve is drawn (and drafted) without those of which calibration leaves less than
+    SEEN, such as a level, which powers of LEDs absorb: they would be large, and noise.
+
     found      what `places` returns
     reference  net fall of chi2 of the best effect, which the curves' ratios refer to
     """
@@ -181,7 +186,7 @@ def fingerprints(model, evidence: Evidence, found: list[dict], reference: float,
 
     k, black = evidence.thinning, float(model.noise.black_level)
     names = sorted(set.intersection(*[set(p) for p in found]) - {"quadrant"})
-    plain_normal = evidence.thinned(extra=2 * max(SIDE * SIDE, st.BINS, len(evidence.frames), evidence.channels))
+    plain_normal = evidence.thinned(extra=2 * max(SIDE * SIDE, LINES, len(evidence.frames), evidence.channels))
     middles = [block.middle for block in evidence.blocks]
     dof_all = max(evidence.normal.count - evidence.projected.rank, 1)
     excess = evidence.projected.chi2 - dof_all
@@ -190,7 +195,7 @@ def fingerprints(model, evidence: Evidence, found: list[dict], reference: float,
     for n, name in enumerate(names):
         say("fingerprints", n, len(names))
         x = np.concatenate([p[name] for p in found])
-        edges = st.bin_edges(x) if name not in NAMED_BINS else np.arange(x.min(), x.max() + 2) - 0.5
+        edges = st.bin_edges(x, LINES if name in ("row", "column") else st.BINS) if name not in NAMED_BINS else np.arange(x.min(), x.max() + 2) - 0.5
         if edges is None or len(edges) < 3:
             continue
         count = len(edges) - 1
@@ -203,12 +208,12 @@ def fingerprints(model, evidence: Evidence, found: list[dict], reference: float,
         fall, dof, _, _ = st.joint(projected, lengths)
         if dof == 0:
             continue
-        curves = {}
+        curves, drawn = {}, {}
         for kind, own in (("gain", slice(0, count)), ("offset", slice(count, 2 * count))):
             part = replace(projected, information=projected.information[own, own], score=projected.score[own])
-            curves[kind] = st.joint(part, lengths[own])
+            curves[kind], drawn[kind] = (st.joint(part, lengths[own], least) for least in (1e-6, SEEN))
         kind = max(curves, key=lambda name: curves[name][0] - curves[name][1])
-        _, _, curve, sd = curves[kind]
+        _, _, curve, sd = drawn[kind]
         net = (fall - dof) * k
         index = np.searchsorted(edges, x, side="right") - 1
         index = np.where(np.isfinite(x), index, -1)
