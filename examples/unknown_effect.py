@@ -94,9 +94,9 @@ def held_out(study: Path) -> list[float]:
 
 
 def phase_of(rows: np.ndarray, curve: np.ndarray, period: float) -> tuple[float, float]:
-    """(phase, amplitude) of the sine of a known period that fits a curve best, with a constant beside it."""
+    """(phase, amplitude) of the sine of a known period that fits a curve best, with the level and slopes that calibration absorbs."""
     turn = 2 * np.pi * rows / period
-    a, b, _ = np.linalg.lstsq(np.stack([np.sin(turn), np.cos(turn), np.ones_like(rows)], 1), curve, rcond=None)[0]
+    a, b, *_ = np.linalg.lstsq(np.stack([np.sin(turn), np.cos(turn), *(rows**k for k in range(4))], 1), curve, rcond=None)[0]
     return float(np.arctan2(b, a)), float(np.hypot(a, b))
 
 
@@ -156,7 +156,8 @@ def show_formula(file: Path, found: Diagnosis, phase: float, strength: tuple[flo
     figure = Figure(figsize=(7, 3.4), layout="constrained")
     axis = figure.subplots()
     axis.errorbar(rows, curve, 100 * np.array(best.sd), fmt="o", ms=3, label="curve of the first diagnosis")
-    axis.plot(rows, formula + (curve - formula).mean(), label=f"{100 * strength[0]:.2f} +- {100 * strength[1]:.2f} % sin(2 pi row/period + phase)")
+    absorbed = np.polyval(np.polyfit(rows, curve - formula, 3), rows)  # a level and slopes, which calibration keeps from a curve
+    axis.plot(rows, formula + absorbed, label=f"{100 * strength[0]:.2f} +- {100 * strength[1]:.2f} % sin(2 pi row/period + phase),\nand the slopes that calibration absorbs")
     axis.set(xlabel="row, px", ylabel="gain, %")
     axis.legend(fontsize=8)
     figure.savefig(file, dpi=110)
@@ -208,7 +209,7 @@ def main(output: Path) -> dict:
     print(f"with the curve as an effect ({drafted}): {with_draft:.3f}")
     optics("report", study)
     show_frame(output / "3-draft.png", Path(study), "Before, and with the curve as an effect")
-    page.append(("The curve as an effect", f"`optics effects new 'row curve' --from study` wrote the curve into {Path(drafted).name} as a "
+    page.append(("The curve as an effect", f"optics effects new 'row curve' --from study wrote the curve into {Path(drafted).name} as a "
                  f"table; added, the held-out chi2/dof falls from {base:.3f} to {with_draft:.3f}. The coordinate is right. A table of "
                  f"{len(best.curve)} numbers is no cause.", "3-draft.png"))
 
