@@ -157,7 +157,8 @@ def show_formula(file: Path, found: Diagnosis, phase: float, strength: tuple[flo
     axis = figure.subplots()
     axis.errorbar(rows, curve, 100 * np.array(best.sd), fmt="o", ms=3, label="curve of the first diagnosis")
     absorbed = np.polyval(np.polyfit(rows, curve - formula, 3), rows)  # a level and slopes, which calibration keeps from a curve
-    axis.plot(rows, formula + absorbed, label=f"{100 * strength[0]:.2f} +- {100 * strength[1]:.2f} % sin(2 pi row/period + phase),\nand the slopes that calibration absorbs")
+    axis.plot(rows, formula + absorbed, label=f"{100 * strength[0]:.2f} +- {100 * strength[1]:.2f} % sin(2 pi row/period + phase),\n"
+              "and the slopes that calibration absorbs")
     axis.set(xlabel="row, px", ylabel="gain, %")
     axis.legend(fontsize=8)
     figure.savefig(file, dpi=110)
@@ -235,10 +236,12 @@ def main(output: Path) -> dict:
     last = Study.open(answer).steps[-1]
     strength = next((v["value"], v["sd"]) for v in last["variables"] if v["keys"] == ["camera.shutter_ripple"])
     expected = RIPPLE * np.sinc(HERTZ * OPEN)
-    print(f"with the formula: chi2/dof {with_formula:.3f} on the held-out press; ripple {strength[0]:.2%} +- {strength[1]:.2%}, made with {expected:.2%}")
+    print(f"with the formula: chi2/dof {with_formula:.3f} on the held-out press; ripple {strength[0]:.2%} +- {strength[1]:.2%}, "
+          f"made with {expected:.2%}")
     show_formula(output / "4-formula.png", first, phase, strength)
-    page.append((f"The cause, and its formula: {second.word}", "The camera's rows open 0.1 ms apart and the supply ripples at 600 Hz: 16.67 rows, as the "
-                 f"curve has it. In a fresh study the diagnosis says: {second.sentence}", "4-formula.png"))
+    page.append((f"The cause, and its formula: {second.word}", f"The data sheets say that rows open {1e3 * LINE:g} ms apart and "
+                 f"that the supply ripples at {HERTZ:g} Hz: {period:.2f} rows, as the curve has it. In a fresh "
+                 f"study the diagnosis says: {second.sentence}", "4-formula.png"))
 
     final = told(Path(answer))
     optics("report", answer)

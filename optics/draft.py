@@ -261,8 +261,8 @@ def draft_effect(diagnosis: Diagnosis, along: str | None = None, *, name: str, b
     brightest = STAGES[stage] in ("gel", "led") and f.family == "light"
     return _file(
         word, stage, f"{_title(word)}: drafted from a curve along '{f.coordinate}', cause not known.", definition,
-        f"goes with {'the camera' if f.family == 'camera' else f.family}: a curve along '{f.coordinate}' lowered chi2 by {f.net:.4g}, {f.ratio:.3g} times as much "
-        f"as the best effect of the library.",
+        f"goes with {'the camera' if f.family == 'camera' else f.family}: a curve along '{f.coordinate}' lowered chi2 by {f.net:.4g}, "
+        f"{f.ratio:.3g} times as much as the best effect of the library.",
         "for the sensor, and within the range of the coordinate, that the captures had; beyond it the end of the table holds."
         + ("\n    The curve was found along the brightest LED of a frame; here every LED has it." if brightest else "") + remark,
         f"the diagnosis of {source or 'a study'}.",
@@ -270,7 +270,8 @@ def draft_effect(diagnosis: Diagnosis, along: str | None = None, *, name: str, b
               "    return np.asarray(CURVE)[np.asarray(x, int)]" if exact else "    return lookup(x, AT, CURVE)"],
         curve="curve(x)", acts=(f.coordinate, "dark") if dark else (f.coordinate,), needs=f"frames that cover the range of {f.coordinate}",
         plausible=float(f"{min(1.0, BENT / np.abs(values).max()):.2g}"), how="image" if STAGES[stage] == "camera" else "ad",
-        head=[*([] if exact else [_table("AT", at, "")]), _table("CURVE", [float(f"{v:.4g}") for v in values], f"+- {np.median(sd):.2g}, the median")],
+        head=[*([] if exact else [_table("AT", at, "")]),
+              _table("CURVE", [float(f"{v:.4g}") for v in values], f"+- {np.median(sd):.2g}, the median")],
         lines=carrier.lines, spread=spread, dark=dark, exact=exact)
 
 
@@ -303,7 +304,7 @@ def from_study(folder: str | Path, along: str | None, name: str, registry: Regis
 
 
 def _points(f: Fingerprint) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(at, values, sd) of the bins that hold data, in rising order, each place once; a value that noise alone gives counts as 0."""
+    """(at, values, sd) of the bins that hold data, in rising order, each place once."""
     at, values, sd = (np.array(v, float) for v in (f.centres, f.curve, f.sd))
     if f.coordinate in ("place", "channel"):
         return np.arange(len(values), dtype=float), np.nan_to_num(values), np.nan_to_num(sd)
@@ -367,8 +368,9 @@ def _wrapped(text: str) -> list[str]:
 def _check(word: str, stage: str, drafted: bool, exact: bool) -> tuple[str, list[str]]:
     """A closed form that the file must meet; the user puts the formula's own in its place."""
     if drafted and not exact:
-        return "meets_its_table", ["def meets_its_table():", '    """The curve passes its points, and holds beyond them. With a formula: a value '
-                                   'known by other means."""', "    assert abs(curve(AT[0]) - CURVE[0]) < 1e-9 and abs(curve(AT[-1] + 1e6) - CURVE[-1]) < 1e-9"]
+        return "meets_its_table", [
+            "def meets_its_table():", '    """The curve passes its ends, and holds beyond them. With a formula: a value known by other means."""',
+            "    assert abs(curve(AT[0]) - CURVE[0]) < 1e-9", "    assert abs(curve(AT[-1] + 1e6) - CURVE[-1]) < 1e-9"]
     if drafted:
         return "meets_its_table", ["def meets_its_table():", '    """Every cell has its value. With a formula: a value known by other means."""',
                                    "    assert list(curve(range(len(CURVE)))) == CURVE"]
