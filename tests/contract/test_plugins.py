@@ -985,7 +985,8 @@ BAD_LAYER = {
 
 @pytest.fixture
 def user_bench(tmp_path, load_bench, monkeypatch):
-    """Writes a plugin, or several by the names of their files, into a user's folder and loads a shipped scene with it as a bench, in a registry of its own."""
+    """Writes a plugin, or several by the names of their files, into a user's folder and loads a shipped scene with it as a bench, in a
+    registry of its own."""
     import optics.effect as declarations
 
     usual = declarations.registry()

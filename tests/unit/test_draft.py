@@ -176,7 +176,8 @@ def study(tmp_path):
               "facts": {"setup": {"captures": str(tmp_path / "captures"), "plugins": None}},
               "steps": []}
     told = {"word": "UNKNOWN", "sentence": "", "conditions": [], "rows": [], "ambiguous": [], "compared": [], "gaps": [], "correct": [],
-            "splits": [], "levels": [], "shifts": [], "hints": [], "not_tested": {}, "warnings": [], "basis": {f.name: [] if f.name.startswith("frame_") else 0 for f in fields(Basis)},
+            "splits": [], "levels": [], "shifts": [], "hints": [], "not_tested": {}, "warnings": [],
+            "basis": {f.name: [] if f.name.startswith("frame_") else 0 for f in fields(Basis)},
             # as written before coordinates had families
             "fingerprints": [{k: getattr(f, k) for k in ("coordinate", "fall", "dof", "p", "net", "ratio", "kind", "centres", "curve", "sd",
                                                          "labels")} for f in known]}
@@ -225,7 +226,8 @@ def test_effects_new_writes_a_stub(tmp_path, own_registry, optics):
     (("new", "a", "--stage", "lense"), "did you mean 'lens'"), (("new", "a", "--part", "sheet"), "unknown part"),
     (("new", "a", "--part", "gel", "--stage", "lens"), "belongs to the part 'camera'"), (("new", "a", "--along", "row"), "Add --from STUDY"),
     (("vignetting", "--stage", "lens"), "only with `optics effects new NAME`"), (("halo", "bright"), "only with"),
-    (("new", "a", "--from", "STUDY", "--along", "rows"), "did you mean 'row'"), (("new", "a", "--from", "STUDY", "--stage", "lens"), "leave them out"),
+    (("new", "a", "--from", "STUDY", "--along", "rows"), "did you mean 'row'"),
+    (("new", "a", "--from", "STUDY", "--stage", "lens"), "leave them out"),
 ])
 def test_errors_of_effects_new(words, error, study, tmp_path, own_registry, optics, monkeypatch):
     monkeypatch.chdir(tmp_path)

@@ -29,8 +29,22 @@ def test_the_tutorial_goes_from_a_puzzling_residual_to_the_noise_floor(mitsuba, 
         story["main"](tmp_path / "story")
 
 
+@pytest.fixture
+def own_registry(mitsuba, monkeypatch):
+    """A registry of its own, so that what a study's folder adds is gone afterwards."""
+    import optics.effect as declarations
+
+    usual, fresh = declarations.registry(), declarations.Registry()
+    fresh.scan(declarations.shipped("plugins"))
+    monkeypatch.setattr(declarations, "_registry", fresh)
+    yield
+    monkeypatch.undo()
+    usual.classes.clear()  # Mitsuba knows the study's classes by now: the usual ones are registered again
+    declarations.use_variant()
+
+
 @pytest.mark.slow
-def test_a_curve_along_geometry_becomes_an_effect_as_well(mitsuba, tmp_path, optics):
+def test_a_curve_along_geometry_becomes_an_effect_as_well(own_registry, tmp_path, optics):
     """A coating that shines the brighter the steeper it stands, by 0.6 % per degree, which no effect of the library does."""
     from optics import captures, demo, scene as scenes
     from optics.ladder import Study
