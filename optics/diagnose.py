@@ -751,5 +751,5 @@ def _hints(word: str, conditions, members: Sequence[Candidate], gaps, names) -> 
     if "held out" in failed and word != "NOTHING" and "held out" in {c.name for c in conditions}:
         hints.append("hold out frames that the fit has not seen (other presses or places), or find why they do not improve")
     if word == "UNKNOWN":
-        hints.append("draft an effect from the curve, add it, and diagnose again")
+        hints.append("draft an effect from the curve (optics effects new NAME --from STUDY), add it, and diagnose again")
     return hints

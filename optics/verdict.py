@@ -571,7 +571,7 @@ def sentence(word: str, conditions: Sequence[Condition], f: Findings, rows: Sequ
         return (f"{winner.name} explains {share:.0%} of the excess misfit, {1 - share:.0%} has another cause.")
     if word == "UNKNOWN":
         curve = next(c for c in fingerprints if c.coordinate == f.coordinate)
-        best = f"{f.ratio:.2g} times as much as the best effect" if f.winner else "what no effect does"
+        best = f"{f.ratio:.3g} times as much as the best effect" if f.winner else "what no effect does"
         i = int(np.argmax(np.abs(curve.curve)))
         size = percent(curve.curve[i]) if curve.kind == "gain" else f"{curve.curve[i]:.2g} DN"
         where = f" at {curve.labels[i] if curve.labels else f'{curve.centres[i]:.3g}'}"
