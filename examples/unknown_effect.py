@@ -100,6 +100,19 @@ def phase_of(rows: np.ndarray, curve: np.ndarray, period: float) -> tuple[float,
     return float(np.arctan2(b, a)), float(np.hypot(a, b))
 
 
+def filled_in(stub: str, phase: float) -> str:
+    """The stub of 'shutter ripple' with its formula and what it says of itself: what a user types."""
+    begin, end = stub.index("def formula("), stub.index("\n\ndef act(")
+    text = stub[:begin] + FORMULA.format(hertz=HERTZ, line=LINE, phase=phase) + stub[end:]
+    for stood, stands in (("what it is, in one sentence.", "rows of a rolling shutter see LEDs whose current ripples."),
+                          ("f = tan(theta)^2, theta the field angle", "f = sin(2 pi row/period + phase)"),
+                          ('acts=("radius",)', 'acts=("row",)'), ("what captures must vary for it to be seen", "any frames")):
+        if stood not in text:
+            raise ValueError(f"the stub has no '{stood}'")
+        text = text.replace(stood, stands)
+    return text
+
+
 # -- pictures ---------------------------------------------------------------------------------------------------------
 
 
@@ -220,14 +233,7 @@ def main(output: Path) -> dict:
           f"a period of {period:.2f} rows; the curve then has a phase of {phase:.2f} rad and an amplitude of {size:.2%}")
     Path(drafted).unlink()  # the formula takes its place
     stub = Path(optics("effects", "new", "shutter ripple", "--stage", "lens", "-o", f"{captures}/plugins").strip())
-    text = stub.read_text(encoding="utf-8")
-    begin, end = text.index("def formula("), text.index("\n\ndef act(")
-    text = text[:begin] + FORMULA.format(hertz=HERTZ, line=LINE, phase=phase) + text[end:]
-    for stood, stands in (("what it is, in one sentence.", "rows of a rolling shutter see LEDs whose current ripples."),
-                          ("f = tan(theta)^2, theta the field angle", "f = sin(2 pi row/period + phase)"),
-                          ('acts=("radius",)', 'acts=("row",)'), ("what captures must vary for it to be seen", "any frames")):
-        text = text.replace(stood, stands)
-    stub.write_text(text, encoding="utf-8")
+    stub.write_text(filled_in(stub.read_text(encoding="utf-8"), phase), encoding="utf-8")
 
     optics("calibrate", captures, "-o", answer, *FREE)
     second = told(Path(answer))

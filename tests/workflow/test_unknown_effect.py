@@ -3,11 +3,37 @@
 import json
 import runpy
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
+
+
+def test_the_formula_is_what_the_maker_does_to_rows(tmp_path):
+    """The ripple integrated over each row's exposure, by the maker, against the formula that the tutorial fills into the stub."""
+    from optics.draft import new_effect, write
+    from optics.effect import declared
+    from optics.noise import Noise
+
+    story = runpy.run_path(str(ROOT / "examples" / "unknown_effect.py"))
+    height, width = 48, 6
+    maker = object.__new__(story["RollingShutter"])
+    maker.values, maker.camera, maker.size = {"camera.x_fov": 40.0, "camera.exposure": 1.0}, "camera", (width, height)
+    maker.effects, maker.seed = {}, 0
+    maker.matrix, maker.noise = np.eye(3), Noise(1e-9, 0.0, 0.0, 1e9, 0.0)  # next to no noise and no rounding
+    rows = maker.photograph(np.full((height, width, 3), 0.5), np.random.default_rng(0), 0)[:, 0, 0] / 0.5e9 - 1
+    period = 1 / (story["HERTZ"] * story["LINE"])
+    phase, amplitude = story["phase_of"](np.arange(height), rows, period)
+    assert amplitude == pytest.approx(story["RIPPLE"] * np.sinc(story["HERTZ"] * story["OPEN"]), rel=1e-3)
+    file = write(story["filled_in"](new_effect("shutter ripple", "lens"), phase), tmp_path, "shutter ripple")
+    effect = next(declared(file))
+    for check in effect.checks:
+        check()
+    v, u = np.mgrid[:height, :width] + 0.5
+    camera = SimpleNamespace(v=v, u=u, width=width, height=height, shutter_ripple=amplitude)
+    assert effect.stages["lens"](np.ones((height, width, 3)), camera)[:, 0, 0] - 1 == pytest.approx(rows, abs=5e-5)  # phase to 3 digits
 
 
 @pytest.mark.slow
