@@ -715,7 +715,8 @@ def curve_chart(curve: Curve, channels: Sequence[Curve] = (), after: Curve | Non
     gap = 0.5 if curve.labels else gap
     x = _scale(x_low - gap, x_high + gap, left, width - right)
     parts = []
-    for tick in _ticks(low - pad, high + pad, 4):
+    marks = _ticks(low - pad, high + pad, 4)
+    for tick in marks if len(marks) > 2 else _ticks(low - pad, high + pad, 8):
         parts.append(f'<line class="grid" x1="{left}" x2="{width - right}" y1="{y(tick):.1f}" y2="{y(tick):.1f}"/>'
                      f'<text class="tick" x="{left - 6}" y="{y(tick) + 4:.1f}" text-anchor="end">{number(tick)}</text>')
     parts.append(f'<line class="zero" x1="{left}" x2="{width - right}" y1="{y(0):.1f}" y2="{y(0):.1f}"/>')
