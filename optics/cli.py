@@ -290,10 +290,47 @@ def _number(value: float | str) -> str:
     return value if isinstance(value, str) else f"{value:.6g}"
 
 
+def _new_effect(name: str | None, plugins: Path | None, **given) -> None:
+    """Write a plugin file, and say where and what comes next."""
+    from optics import draft
+    from optics.effect import STAGES
+
+    if not name:
+        raise ValueError("optics effects new: no name; allowed: optics effects new NAME, such as 'row banding'")
+    draft.identifier(name)
+    registry = scan(plugins)
+    if given["from"] is None:
+        if given["along"] is not None:
+            raise ValueError(f"--along {given['along']}: of which study? Add --from STUDY")
+        stage = draft.stage_of(given["part"], given["stage"])
+        draft.check_name(name, STAGES[stage], registry)
+        text, folder = draft.new_effect(name, stage), plugins or Path("plugins")
+    else:
+        if given["stage"] or given["part"]:
+            raise ValueError("--stage, --part: a draft acts where its coordinate is known; leave them out, or leave --from out")
+        text, folder = draft.from_study(given["from"], given["along"], name, registry)
+    file = draft.write(text, given["o"] or folder, name)
+    terminal.note(f"next: optics add {given['from']} '{name}', then put a formula in place of the table" if given["from"] else
+                  f"next: fill in the formula; a folder 'plugins' beside captures or scene is found, any other by --plugins {file.parent}")
+    print(file)
+
+
 @command
-def effects(name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="Show the page of this effect.")] = None,
+def effects(name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="Show the page of this effect; 'new': write one.")] = None,
+            new_name: Annotated[str | None, typer.Argument(metavar="[NEW]", help="Of `effects new NAME`: the new effect's name.")] = None,
+            stage: Annotated[str | None, typer.Option("--stage", help="new: where it acts (lens, sensor, response, emission, segment ...).")] = None,
+            part: Annotated[str | None, typer.Option("--part", help="new: on camera, led, gel or membrane.")] = None,
+            study: Annotated[Path | None, typer.Option("--from", metavar="STUDY", help="new: with a curve of this study's last diagnosis.")] = None,
+            along: Annotated[str | None, typer.Option("--along", metavar="COORDINATE", help="new: the coordinate of the curve.")] = None,
+            output: Annotated[Path | None, typer.Option("-o", "--output", metavar="DIR", help="new: folder of plugins.")] = None,
             plugins: Plugins = None, as_json: AsJson = False) -> None:
-    """List the physical effects that can be added to a model, or show one's page."""
+    """List the physical effects that can be added to a model, show one's page, or write a new one (`optics effects new NAME`)."""
+    options = {"--stage": stage, "--part": part, "--from": study, "--along": along, "-o": output}
+    if name == "new":
+        return _new_effect(new_name, plugins, **{k.strip("-"): v for k, v in options.items()})
+    given = [k for k, v in options.items() if v is not None] + ([new_name] if new_name else [])
+    if given:
+        raise ValueError(f"{' '.join(given)}: only with `optics effects new NAME`, which writes a new effect")
     found = scan(plugins)
     chosen = [found.find_effect(name)] if name else [found.effects[k] for k in sorted(found.effects)]
     records = [{

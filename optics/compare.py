@@ -24,6 +24,8 @@ SCOPES = (  # what the numbers are split by; regions may overlap, everything els
 UNITS = {
     "radius": "px", "row": "px", "column": "px", "height": "mm", "depth": "mm", "incidence": "deg", "emission": "deg",
     "led_distance": "mm", "contact_distance": "px", "gel_path": "mm", "slope": "deg", "intensity": "DN",
+    "half_angle": "deg", "led_angle": "deg", "light_azimuth": "deg", "press_distance": "mm", "signal": "DN",
+    "gradient": "DN/px", "laplacian": "DN/px^2",
 }
 FAR = ("far field", "far", "far_field")
 SIDE_MIN_SSIM = 3  # px; the smallest window that has a variance

@@ -13,15 +13,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from optics import pairs, statistics as st
+from optics import fingerprints as prints, pairs, statistics as st
 from optics.calibrate import for_frames
 from optics.compare import led_label
 from optics.effect import Effect
 from optics.errors import Underdetermined
-from optics.evidence import Block, Candidate, Evidence, Progress, at_bound, measure, value_of
+from optics.evidence import Candidate, Evidence, Progress, at_bound, measure, value_of
 from optics.parameter import Values, Variable
 from optics.verdict import (
-    CLEAR, EXCESS, LEVEL, MARGIN, UNEVEN, Basis, Diagnosis, Findings, Fingerprint, Level, Refit, Row, Shift, Split, decide,
+    CLEAR, EXCESS, LEVEL, MARGIN, UNEVEN, Basis, Diagnosis, Findings, Level, Refit, Row, Shift, Split, decide,
     moved_by, rivals, sentence,
 )
 
@@ -31,11 +31,7 @@ KAPPA = 0.1  # noise per pixel of derivative images over their signal, above whi
 IMPLAUSIBLE = 10.0  # times the plausible strength: worth a look
 MAX_REFITS = 10
 MAX_SPLIT = 4  # members of an ambiguous set that are tested for evenness
-SIDE = 4  # cells per side of the coordinate 'place': a finer map would fit any clutter and forbid every claim
 HAIR = 0.01  # of the fall: a split that gains less says nothing about what the effect is
-NOT_A_COORDINATE = ("far",)  # regions that others make up
-NAMED_BINS = ("place", "frame", "channel", "LED")
-YES_NO = ("contact", "shadow", "rim")
 USUALLY = "the same press at 0.4 of the exposure, and one deeper press, often tell more than repeats"  # where no shot was simulated
 
 
@@ -84,9 +80,10 @@ def diagnose(model, fit, effects: Sequence[Effect], variables_of: Callable[[Effe
     done = sorted((c for c in chosen if c.row.refit is not None), key=lambda c: -c.row.net_refit)
     winner = _simplest(done) if done and done[0].row.net_refit > 0 else None
     done = [c for c in done if not any(c.contains(d) and c.row.net_refit - d.row.net_refit < CLEAR for d in done)]
-    places = _places(model, fit.values, evidence)
+    places = prints.places(model, fit.values, evidence)
     reference = winner.row.net_refit if winner else max([c.row.net for c in table.order], default=0.0)
-    fingerprints = _fingerprints(model, evidence, places, max(reference, 1.0), say)
+    fingerprints = prints.fingerprints(model, evidence, places, max(reference, 1.0), say)
+    families = prints.families(fingerprints)
 
     if winner:
         done.sort(key=lambda c: c is not winner)
@@ -110,6 +107,9 @@ def diagnose(model, fit, effects: Sequence[Effect], variables_of: Callable[[Effe
     text = sentence(word, conditions, findings, rows, [c.row for c in members], fingerprints, levels, shifts, basis)
     if any(p.complete for p in found):
         text = pairs.words(found, {row.name: row.share for row in rows})
+    if word == "UNKNOWN":
+        excess = basis.chi2 - basis.dof if basis.excess_sd > EXCESS else 0.0
+        text = " ".join([text, *filter(None, (prints.unexplained(fingerprints, findings.fall, excess), prints.goes_with(families)))])
     names = [c.effect.name for c in chosen]
     gaps, correct = _gaps(evidence, chosen)
     return Diagnosis(
@@ -118,7 +118,7 @@ def diagnose(model, fit, effects: Sequence[Effect], variables_of: Callable[[Effe
         compared=names, gaps=gaps, correct=correct, splits=splits, levels=levels, fingerprints=fingerprints, shifts=shifts,
         hints=_hints(word, conditions, members, gaps, names), not_tested=not_tested,
         warnings=_warnings(model, fit, evidence, table, winner, shifts, dropped, structure, basis),
-        claimed=winner.effect.name if word == "CLAIM" else "", pairs=found, fits=fits,
+        claimed=winner.effect.name if word == "CLAIM" else "", pairs=found, families=families, fits=fits,
         evidence=replace(evidence, blocks=[], sigma=[], whitened=[], use=[], candidates=table.order))
 
 
@@ -442,121 +442,7 @@ def _prior_chi2(model, values: Values, variables: Sequence[Variable]) -> float:
     return sum(((value_of(model, values, v) - v.prior[0]) / v.prior[1]) ** 2 for v in variables if v.prior is not None)
 
 
-# -- fingerprints and splits ------------------------------------------------------------------------------------------
-
-
-def _places(model, values: Values, evidence: Evidence) -> list[dict[str, np.ndarray]]:
-    """Per block, the coordinates of every kept value (n,), those of the model and those that any image has."""
-    places = []
-    order = {frame: i for i, frame in enumerate(evidence.frames)}
-    settings = _settings(model, evidence)
-    lights = [led_label(model.frames[f].parameters) for f in evidence.frames]
-    kinds = sorted(set(lights))
-    for block in evidence.blocks:
-        shape = np.asarray(model.frames[block.frame].image).shape
-        row, column, channel = np.unravel_index(block.index, shape)
-        known = {}
-        for name, plane in model.coordinates(values, block.frame).items():
-            plane = np.asarray(plane)
-            if name in NOT_A_COORDINATE or plane.ndim not in (2, 3):
-                continue
-            plane = np.broadcast_to(plane if plane.ndim == 3 else plane[..., None], shape)
-            known[name] = plane.reshape(-1)[block.index].astype(np.float32)
-        known.update(row=row.astype(np.float32), column=column.astype(np.float32), channel=channel.astype(np.float32),
-                     frame=np.full(len(row), order[block.frame], np.float32))
-        known.update({key: np.full(len(row), values[order[block.frame]], np.float32) for key, values in settings.items()})
-        if len(kinds) > 1:
-            known["LED"] = np.full(len(row), kinds.index(lights[order[block.frame]]), np.float32)
-        if min(shape[:2]) >= 2 * SIDE:
-            known["place"] = (row * SIDE // shape[0] * SIDE + column * SIDE // shape[1]).astype(np.float32)
-        known["quadrant"] = (2 * (2 * row >= shape[0]) + (2 * column >= shape[1])).astype(np.float32)
-        places.append(known)
-    return places
-
-
-def _settings(model, evidence: Evidence) -> dict[str, list[float]]:
-    """key -> value per fitted frame of the numbers that the experimenter turned, other than which LED was on."""
-    turned: dict[str, list[float]] = {}
-    frames = [model.frames[f] for f in evidence.frames]
-    for key in sorted({key for f in frames for key in f.parameters if not key.endswith(".power")}):
-        values = [f.parameters.get(key, math.nan) for f in frames]
-        numbers = [float(v) if isinstance(v, (int, float)) else math.nan for v in values]
-        if len({v for v in numbers if math.isfinite(v)}) > 1:
-            turned[key] = numbers
-    return turned
-
-
-def _fingerprints(model, evidence: Evidence, places: list[dict], reference: float, say: Progress) -> list[Fingerprint]:
-    """The residual along every coordinate: bins of gain and offset, projected like effects; best first."""
-    from scipy.special import chdtrc
-
-    k = evidence.thinning
-    names = sorted(set.intersection(*[set(p) for p in places]) - {"quadrant"})
-    plain_normal = evidence.thinned(extra=2 * max(SIDE * SIDE, st.BINS, len(evidence.frames), evidence.channels))
-    middles = [block.middle for block in evidence.blocks]
-    found = []
-    for n, name in enumerate(names):
-        say("fingerprints", n, len(names))
-        x = np.concatenate([p[name] for p in places])
-        edges = st.bin_edges(x) if name not in NAMED_BINS else np.arange(x.min(), x.max() + 2) - 0.5
-        if edges is None or len(edges) < 3:
-            continue
-        count = len(edges) - 1
-        normal = _with_bins(evidence, plain_normal, middles, places, name, edges,
-                            lambda block: (block.prediction / block.sigma, 1 / block.sigma))
-        first = len(evidence.columns)
-        rest = list(range(first, first + 2 * count))
-        projected = evidence.project(normal, evidence.base, rest, k)
-        lengths = np.diag(normal.gram)[rest]
-        fall, dof, _, _ = st.joint(projected, lengths)
-        if dof == 0:
-            continue
-        curves = {}
-        for kind, own in (("gain", slice(0, count)), ("offset", slice(count, 2 * count))):
-            part = replace(projected, information=projected.information[own, own], score=projected.score[own])
-            curves[kind] = st.joint(part, lengths[own])
-        kind = max(curves, key=lambda name: curves[name][0] - curves[name][1])
-        _, _, curve, sd = curves[kind]
-        net = (fall - dof) * k
-        index = np.searchsorted(edges, x, side="right") - 1
-        index = np.where(np.isfinite(x), index, -1)
-        centres = [float(np.median(x[index == i])) if np.any(index == i) else math.nan for i in range(count)]
-        labels = _labels(evidence, model, name, centres)
-        found.append(Fingerprint(name, fall, dof, float(chdtrc(dof, fall)), net, net / reference, kind, centres,
-                                 curve.tolist(), sd.tolist(), labels))
-    say("fingerprints", len(names), len(names))
-    return sorted(found, key=lambda f: -f.net)
-
-
-def _labels(evidence: Evidence, model, name: str, centres: Sequence[float]) -> list[str]:
-    """Names of the bins of a coordinate that has no scale."""
-    if name == "frame":
-        return [str(getattr(model.frames[f], "name", f)) for f in evidence.frames]
-    if name == "LED":
-        return sorted({led_label(model.frames[f].parameters) for f in evidence.frames})
-    if name == "channel":
-        return _channels(evidence)
-    if name in YES_NO and len(centres) == 2:
-        return ["no", "yes"]
-    if name == "place":
-        return [f"row {i // SIDE + 1}, column {i % SIDE + 1} of {SIDE}" for i in range(len(centres))]
-    return []
-
-
-def _channels(evidence: Evidence) -> list[str]:
-    return ["R", "G", "B"] if evidence.channels == 3 else [str(i) for i in range(evidence.channels)]
-
-
-def _with_bins(evidence: Evidence, plain_normal: st.Normal, middles, places, name: str, edges: np.ndarray,
-               carriers: Callable[[Block], tuple]) -> st.Normal:
-    """A copy of the normal equations with bins of a coordinate after the columns of the evidence."""
-    first, count = len(evidence.columns), len(edges) - 1
-    normal = plain_normal.copy()
-    for block, middle, place in zip(evidence.blocks, middles, places):
-        x = place[name]
-        bins = np.where(np.isfinite(x), np.searchsorted(edges, x, side="right") - 1, -1)
-        st.add_bins(normal, block.where, middle, block.r, first, bins, count, carriers(block))
-    return normal
+# -- splits -----------------------------------------------------------------------------------------------------------
 
 
 def _split(model, evidence: Evidence, c: Candidate, found, places: list[dict], rows_max: int, seed: int,
@@ -622,13 +508,13 @@ def _parts(model, evidence: Evidence, places: list[dict]) -> dict[str, tuple[lis
         numbers = [kinds.index(label) for label in labels]
         if 2 <= len(kinds) and numbers not in seen:
             seen.append(numbers)
-            parts[by] = (kinds, [np.full(len(p["row"]), i) for i, p in zip(numbers, places)])
+            parts[by] = (kinds, [np.full(len(p["channel"]), i) for i, p in zip(numbers, places)])
 
-    of_coordinate("channel", "channel", _channels(evidence))
+    of_coordinate("channel", "channel", prints.channel_names(evidence))
     of_frame("frame", names)
     of_frame("LED", [led_label(f.parameters) for f in frames])
     of_frame("group", [getattr(f, "group", None) or name for f, name in zip(frames, names)])
-    for key, numbers in _settings(model, evidence).items():
+    for key, numbers in prints.settings(model, evidence).items():
         if len(set(numbers)) <= 8:
             of_frame(key, [f"{v:g}" for v in numbers])
     of_coordinate("contact", "contact", ["no contact", "contact"])
@@ -879,5 +765,5 @@ def _hints(word: str, conditions, members: Sequence[Candidate], gaps, names) -> 
     if "held out" in failed and word != "NOTHING" and "held out" in {c.name for c in conditions}:
         hints.append("hold out frames that the fit has not seen (other presses or places), or find why they do not improve")
     if word == "UNKNOWN":
-        hints.append("draft an effect from the curve, add it, and diagnose again")
+        hints.append("draft an effect from the curve (optics effects new NAME --from STUDY), add it, and diagnose again")
     return hints

@@ -165,6 +165,8 @@ class Registry:
                 raise BadPlugin(f"{file}: a part of the kind '{item.kind}' exists already; choose another kind")
             self.parts[item.kind] = item
             return
+        if item.key == "new":
+            raise BadPlugin(f"{file}: an effect cannot be called 'new', which is the word for writing one; choose another name")
         if item.key in self.effects:
             raise BadPlugin(f"{file}: the effect '{item.name}' exists already ({self.effects[item.key].file})")
         for stage in item.stages:
@@ -395,12 +397,13 @@ class Declared:
     def functions(self, stage: str) -> tuple[Callable, ...]:
         """The functions of effects at a stage, but for those that rest at neutral and carry no derivative.
 
-        Leaving them out saves time and changes nothing: the contract tests hold every effect to the identity at neutral.
+        Leaving them out saves time and changes nothing: the contract tests hold every effect to the identity at neutral. A part of
+        an earlier scene knows no effect that was scanned since.
         """
         import drjit as dr
 
         return tuple(e.stages[stage] for e in registry().at_stage(self.kind, stage)
-                     if any(self.held[n] != self.numbers[n].neutral or dr.grad_enabled(getattr(self, n))
+                     if any(n in self.held and (self.held[n] != self.numbers[n].neutral or dr.grad_enabled(getattr(self, n)))
                             for n in e.parameter_names))
 
 

@@ -177,6 +177,11 @@ class Study:
     def has(self, effect: str | None) -> bool:
         return any(step["effect"] == effect for step in self.steps)
 
+    def note_inputs(self, files: Sequence[str | Path]) -> None:
+        """Record files that the next steps depend on besides the inputs that the study began with."""
+        self.record["inputs"] = {**input_hashes(files), **self.record["inputs"]}
+        self._save()
+
     def changed_inputs(self) -> list[str]:
         """Input files that are gone or differ from the recorded hash."""
         return [path for path, digest in self.record["inputs"].items()

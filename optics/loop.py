@@ -397,5 +397,6 @@ def extend(study: Study, model: Model, setup: Setup, found: calibrate.Fit, effec
         start = off_neutral(model, found.values, extra)
     clock = time.perf_counter()
     best = calibrate.fit(model, variables, start, fitted, robust=setup.robust, progress=progress)
+    study.note_inputs([effect.file] if effect.file else [])  # a draft is written after the study began
     comparison = record(study, model, effect.name, effect, best, held, time.perf_counter() - clock)
     return best, comparison

@@ -71,6 +71,8 @@ def render(study: Study) -> str:
         raise ValueError(f"{study.folder}: the study has no step yet, so there is nothing to report; run the study first")
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
+    from optics import residual_maps
+
     environment = Environment(loader=FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=StrictUndefined,
                               trim_blocks=True, lstrip_blocks=True)
     environment.filters.update(number=number, fixed=fixed, figures=figures, measure=measure, percent=percent, pvalue=pvalue)
@@ -89,6 +91,8 @@ def render(study: Study) -> str:
         fingerprints=[[] if points else fingerprint_pictures(study.fingerprints(i)) for i in range(len(study.steps))],
         readings=[] if viewer["frames"] or points else reading_charts(comparisons),
         curves=residual_curves(comparisons, points), maps=map_pictures(comparisons, study.steps) if points is None else [],
+        pages=residual_maps.pages(comparisons, shown, study.steps) if points is None else [],
+        coordinates=[residual_maps.coordinates(told(study.diagnosis(i), points)) for i in range(len(study.steps))],
         facts=facts(study.record["facts"], points), numbers=number_tables(comparisons, nouns),
         nulls=null_table(study.metrics(len(study.steps) - 1)),
         background=study.metrics(len(study.steps) - 1).get("background") or {},
@@ -711,7 +715,8 @@ def curve_chart(curve: Curve, channels: Sequence[Curve] = (), after: Curve | Non
     gap = 0.5 if curve.labels else gap
     x = _scale(x_low - gap, x_high + gap, left, width - right)
     parts = []
-    for tick in _ticks(low - pad, high + pad, 4):
+    marks = _ticks(low - pad, high + pad, 4)
+    for tick in marks if len(marks) > 2 else _ticks(low - pad, high + pad, 8):
         parts.append(f'<line class="grid" x1="{left}" x2="{width - right}" y1="{y(tick):.1f}" y2="{y(tick):.1f}"/>'
                      f'<text class="tick" x="{left - 6}" y="{y(tick) + 4:.1f}" text-anchor="end">{number(tick)}</text>')
     parts.append(f'<line class="zero" x1="{left}" x2="{width - right}" y1="{y(0):.1f}" y2="{y(0):.1f}"/>')
@@ -919,7 +924,7 @@ def verdict(diagnosis: Mapping | None) -> dict | None:
         "limits": [f"{r['name']} {r['limit']}" for r in ranked if not r["evidence"] and r["limit"]],
         "not_tested": [f"{name} ({words(why)})" for name, why in (d.get("not_tested") or {}).items()],
         "splits": [_split(s) for s in d.get("splits") or ()], "levels": list(d.get("levels") or ()),
-        "shifts": [s for s in d.get("shifts") or ()][:8], "curves": [_draft(f) for f in curves[:3]],
+        "shifts": [s for s in d.get("shifts") or ()][:8], "curves": [_draft(f) for f in curves[:6]],
         "pairs": _pairs(d), "advice": _advice(d),
     }
 
@@ -1004,8 +1009,8 @@ def _draft(f: Mapping) -> dict:
     elif len(curve) == len(centres) == len(sd):
         one = np.ones(len(curve))
         labels = tuple(f.get("labels") or ()) or None
-        chart = curve_chart(Curve(name, UNITS.get(name, ""), "all", centres, curve, sd, one, one, labels))
-    return {"name": words(name), "what": what, "picture": picture, "svg": chart, "dof": f.get("dof"),
+        chart = curve_chart(Curve(name, f.get("unit") or UNITS.get(name, ""), "all", centres, curve, sd, one, one, labels))
+    return {"name": words(name), "family": str(f.get("family") or ""), "what": what, "picture": picture, "svg": chart, "dof": f.get("dof"),
             "ratio": number(_finite(f.get("ratio")), 2), "net": number(_finite(f.get("net")))}
 
 

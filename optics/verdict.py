@@ -174,6 +174,7 @@ class Fingerprint:
     fall, dof   of chi2 with a gain and an offset per bin; net: fall less dof; ratio: net over the best effect's fall
     kind        'gain' (curve: relative change of the signal) or 'offset' (curve: DN), whichever explains more
     labels      names in place of centres for frame and channel; cells of 'place' run row by row
+    family      what the coordinate belongs to (optics.fingerprints); share: of the excess misfit, NaN within noise; unit: of the centres
     """
 
     coordinate: str
@@ -187,6 +188,23 @@ class Fingerprint:
     curve: list[float]
     sd: list[float]
     labels: list[str]
+    family: str = ""
+    share: float = math.nan
+    unit: str = ""
+
+
+@dataclass(frozen=True)
+class Family:
+    """The best curve of the coordinates that belong together: camera, light, geometry, time, or a setting.
+
+    share    of the excess misfit, NaN within noise; of_best: of the fall that the best family's curve has
+    """
+
+    family: str
+    coordinate: str
+    net: float
+    share: float
+    of_best: float
 
 
 @dataclass(frozen=True)
@@ -319,6 +337,7 @@ class Diagnosis:
     claimed: str = ""
     pairs: list[Pair] = field(default_factory=list)  # of effects that were tried together (optics.pairs)
     advice: list[Advice] = field(default_factory=list)  # what to measure next (optics.advise)
+    families: list[Family] = field(default_factory=list)  # what the residual goes with, best first
     fits: dict = field(default_factory=dict, repr=False, compare=False)  # effect -> Fit of the refit; not written
     evidence: object = field(default=None, repr=False, compare=False)  # optics.evidence.Evidence, without pixels; not written
 
@@ -623,7 +642,7 @@ def sentence(word: str, conditions: Sequence[Condition], f: Findings, rows: Sequ
         return (f"{winner.name} explains {share:.0%} of the excess misfit, {1 - share:.0%} has another cause.")
     if word == "UNKNOWN":
         curve = next(c for c in fingerprints if c.coordinate == f.coordinate)
-        best = f"{f.ratio:.2g} times as much as the best effect" if f.winner else "what no effect does"
+        best = f"{f.ratio:.3g} times as much as the best effect" if f.winner else "what no effect does"
         i = int(np.argmax(np.abs(curve.curve)))
         size = percent(curve.curve[i]) if curve.kind == "gain" else f"{curve.curve[i]:.2g} DN"
         where = f" at {curve.labels[i] if curve.labels else f'{curve.centres[i]:.3g}'}"
@@ -681,7 +700,11 @@ def _text(d: Diagnosis) -> str:
             lines.append("  (a falling held-out misfit verifies prediction; it does not prove the identity of the cause)")
     if d.fingerprints:
         lines += ["", "curves along coordinates (fall of chi2 less its number of bins; R = over the best effect)"]
-        lines += [f"  {f.coordinate:<18} {f.net:10.4g}  R {f.ratio:8.3g}  p {p_text(f.p)}" for f in d.fingerprints[:5]]
+        lines += [f"  {f.coordinate:<18} {f.net:10.4g}  R {f.ratio:8.3g}  p {p_text(f.p)}"
+                  + (f"  {f.family:<8}" if f.family else "") + (f"  {f.share:.0%} of the excess" if math.isfinite(f.share) else "")
+                  for f in d.fingerprints[:8]]
+        if d.families:
+            lines.append("  best of each family: " + ", ".join(f"{f.family} {f.coordinate} {f.of_best:.2f}" for f in d.families))
     if d.shifts:
         lines += ["", "calibrated parameters had moved to hide it:"]
         lines += [f"  {s.variable:<24} {s.before:.5g} -> {s.after:.5g} {s.unit} ({s.in_sd:+.1f} sd)" for s in d.shifts[:6]]

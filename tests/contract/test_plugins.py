@@ -748,7 +748,7 @@ def test_all_layers_drawn_at_once_give_derivatives(kind, seed, bench_of):
 def test_no_light_no_image(key, bench_of):
     """With every light off all is black whatever the strength, but for effects that bring their own light.
 
-    A camera that adds to the signal does so at every pixel alike.
+    A camera that adds to the signal does so at every pixel alike, unless the effect says that it acts through the dark signal.
     """
     effect = registry().effects[key]
     bench = bench_of(effect)
@@ -757,7 +757,7 @@ def test_no_light_no_image(key, bench_of):
             **at(bench, effect, lambda p: inward(p, p.neutral, p.plausible))}
     image, shines = bench.image(dark), "ambient" in effect.stages
     assert (bench.model.radiance(dark).max() > 0) == shines
-    assert shines or np.ptp(image, axis=(0, 1)).max() == 0
+    assert shines or "dark" in effect.acts or np.ptp(image, axis=(0, 1)).max() == 0
     assert shines or effect.part == "camera" or np.abs(image).max() == 0
 
 
@@ -985,7 +985,8 @@ BAD_LAYER = {
 
 @pytest.fixture
 def user_bench(tmp_path, load_bench, monkeypatch):
-    """Writes a plugin into a user's folder and loads a shipped scene with it as a bench, in a registry of its own."""
+    """Writes a plugin, or several by the names of their files, into a user's folder and loads a shipped scene with it as a bench, in a
+    registry of its own."""
     import optics.effect as declarations
 
     usual = declarations.registry()
@@ -993,7 +994,8 @@ def user_bench(tmp_path, load_bench, monkeypatch):
     def load(text, name="gelsight", slot=None):
         folder = tmp_path / "plugins"
         folder.mkdir()
-        (folder / "own.py").write_text(text, encoding="utf-8")
+        for file, own in ({"own": text} if isinstance(text, str) else text).items():
+            (folder / f"{file}.py").write_text(own, encoding="utf-8")
         fresh = Registry()
         fresh.scan(shipped("plugins"))
         fresh.scan(folder)
@@ -1068,6 +1070,95 @@ def test_the_contract_notices_in_layers(fault, user_bench, mitsuba):
     }.get(check, (bench, effect))
     with pytest.raises((AssertionError, ValueError)):  # an array that is asked for its truth raises by itself
         check(*arguments)
+
+
+def test_stubs_of_new_effects_meet_the_contract(user_bench):
+    from optics import draft
+
+    bench = user_bench({f"my_{stage}": draft.new_effect(f"my {stage}", stage) for stage in draft.STUBS})
+    for stage in draft.STUBS:
+        effect = registry().find_effect(f"my {stage}")
+        check_documentation(effect)
+        check_effect_declaration(effect, registry())
+        check_declaration(registry().effect_parameters(effect)[0])
+        check_identity(bench, effect)
+        check_continuity(bench, effect)
+        check_onset(bench, effect)
+        if stage in IMAGE_STAGES:
+            check_image_function(effect, stage, bench)
+        for check in effect.checks:
+            check()
+
+
+RAMP = {"place": range(16), "channel": range(3)}  # cells; of other coordinates: a straight line from 0 to beyond any value
+STEEP = {"height", "gel_path", "press_distance", "led_distance"}  # mm
+
+
+def along(name):
+    """Gain of a strength of 1 per unit of a coordinate."""
+    return 0.1 if name in STEEP else 0.005
+
+
+@pytest.fixture
+def drafts(user_bench):
+    """A bench with a draft along every coordinate that one can follow, each a gain that is linear in it; LED 1 alone is lit."""
+    from optics import draft
+    from optics.verdict import Fingerprint
+
+    texts = {}
+    for name in draft.CARRIERS:
+        at = [float(x) for x in RAMP.get(name, (-1000, 1000))]
+        curve = Fingerprint(name, 9.0, 1, 0.0, 8.0, 2.0, "gain", at, [along(name) * x for x in at], [1e-5] * len(at), [], "geometry")
+        found = SimpleNamespace(fingerprints=[curve], families=[], basis=SimpleNamespace(signal=1.0))
+        texts[f"along_{name}"] = draft.draft_effect(found, name, name=f"along {name}", black_level=0.0, saturation=255.0)
+    bench = user_bench(texts)
+    bench.values.update({k: 0.0 for k in ("led_3.power", "led_5.power")})
+    return bench
+
+
+def draft_key(name):
+    effect = registry().find_effect(f"along {name}")
+    return f"{ {'gel': 'gel', 'led': 'led_1', 'camera': 'camera'}[effect.part]}.{effect.parameter_names[0]}"
+
+
+def test_drafts_act_along_the_coordinate_that_was_diagnosed(drafts):
+    """What a draft's stage computes is what the fingerprint was binned by, pixel by pixel, but at rims and where a press's edge bends."""
+    from optics import draft, fingerprints
+
+    bench = drafts
+    known = {**bench.model.coordinates(bench.at(), 0), **fingerprints.lit_geometry(bench.model, bench.at(), 0)}
+    height, width = bench.model.shape[:2]
+    v, u = np.mgrid[:height, :width]
+    known.update(row=v, column=u, place=v * 4 // height * 4 + u * 4 // width)
+    rest = bench.image()
+    lit = (rest.min(-1) > 1e-3) & ~known["rim"] & ~known["shadow"]
+    assert lit.mean() > 0.6
+    for name in draft.CARRIERS:
+        effect = registry().find_effect(f"along {name}")
+        check_documentation(effect)
+        check_effect_declaration(effect, registry())
+        strength = 0.3
+        gain = bench.image({draft_key(name): strength}) / np.maximum(rest, 1e-6) - 1
+        expected = {"channel": np.arange(3.0), "signal": rest * 255}.get(name)
+        expected = known[name][..., None] if expected is None else expected
+        off = np.abs(gain / (along(name) * strength) - expected)[lit]
+        assert np.isfinite(off).all()
+        # rounding of float32: 1e-6 of the image is 7e-4 deg; a degree near 0 is an arc cosine near 1, good to 0.02
+        assert np.quantile(off, 0.99) < 0.03 + 1e-3 * np.nanmax(np.abs(expected)), f"{name}: off by {np.quantile(off, 0.99):.3g}"
+
+
+@pytest.mark.parametrize("name, key, tolerance", [
+    ("incidence", "led_1.x", 2e-3), ("led_distance", "led_1.z", 2e-3), ("half_angle", "led_1.y", 2e-3),
+    ("led_angle", "led_1.tilt", 5e-3),  # an angle to an axis is a cone: within the step, 0.25 deg, pixels cross its tip
+    ("height", "gel.press_depth", 0.03),
+    ("slope", "gel.press_x", 0.12)])  # the slope bends at the edge of the contact, which the two steps cross by more or less
+def test_derivatives_go_through_a_draft(name, key, tolerance, drafts):
+    """Of what moves the coordinate itself, with the draft at a strength at which it matters; tolerances as without drafts."""
+    strong = {draft_key(name): 8.0}
+    before = drafts.derivative(key)
+    drafts.values.update(strong)
+    assert np.abs(drafts.derivative(key) - before).max() > 0.05 * np.abs(before).max()
+    assert check_model_derivative(drafts, key, tolerance) > 1e-4
 
 
 def test_a_layers_effect_of_what_is_no_layer_is_refused(user_bench):
