@@ -427,7 +427,7 @@ def outlook(model, values: Values, evidence: Evidence, members: Sequence[Candida
     precision = np.concatenate([evidence.precision[:p], [0.0 if v.prior is None else 1 / v.prior[1] ** 2 for v in fresh]])
     nuisances = [[_unknown(v) for v, s in zip(fresh, owners) if n in s] for n in range(len(shots))]
     nested = {(i, j) for i, a in enumerate(members) for j, b in enumerate(members) if i != j and b.contains(a)}
-    return Outlook(total, grams, [*range(p + q)], precision, joint, nuisances, evidence.normal.truncation(), nested)
+    return Outlook(total, grams, [*range(p + q)], precision, joint, nuisances, evidence.normal.truncation(evidence.base), nested)
 
 
 def imagined(model, values: Values, shots: Sequence[Shot]):
