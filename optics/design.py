@@ -395,7 +395,7 @@ def _outlook(evidence: Evidence, members: Sequence[Candidate], share: float, see
         grams.append(gram)
     nested = {(i, j) for i, a in enumerate(members) for j, b in enumerate(members) if i != j and b.contains(a)}
     return advise.Outlook(np.zeros_like(evidence.normal.gram), grams, evidence.base, evidence.precision, found, [[] for _ in grams],
-                          evidence.normal.truncation(), nested)
+                          evidence.normal.truncation(evidence.base), nested)
 
 
 def _onset(c: Candidate, squares: np.ndarray) -> tuple[str, int]:
