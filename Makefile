@@ -20,7 +20,7 @@ endif
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test bench lock clean
+.PHONY: help setup demo test bench proof lock clean
 
 help:  ## list these targets
 	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /  make \1\t/' | expand -t 16
@@ -45,6 +45,9 @@ test: setup  ## run the tests, but for the slow ones
 
 bench: setup  ## measure the speed
 	@$(BIN)/python -m optics.bench $(ARGS)
+
+proof: setup  ## hide effects, run the loop blind on each, count what it said (hours; can be stopped and taken up again; ARGS=--quick)
+	@$(BIN)/python -m optics.proof $(ARGS)
 
 lock:  ## resolve requirements.lock again from pyproject.toml (newest versions: make lock ARGS=--upgrade)
 	@command -v uv >/dev/null || { echo "make lock needs uv: pip install uv" >&2; exit 1; }

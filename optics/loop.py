@@ -335,8 +335,9 @@ def seek(model: Model, values: Values, effects: Sequence[Effect], frames: Sequen
             values.common.update(model.scene.check(effect.seek(model, values, frames), effect.name))
 
 
-def examine(study: Study, model: Model, setup: Setup, found: calibrate.Fit, progress: Progress | None = None):
-    """Diagnose the last step and write the diagnosis, with the best effects' fingerprints, into it."""
+def examine(study: Study, model: Model, setup: Setup, found: calibrate.Fit, progress: Progress | None = None, advised: bool = True):
+    """Diagnose the last step and write the diagnosis, with the best effects' fingerprints, into it; `advised`: where effects tie, also what
+    to measure next, which is rendered shot by shot."""
     from optics.advise import advise
     from optics.diagnose import USUALLY, diagnose
 
@@ -371,7 +372,7 @@ def examine(study: Study, model: Model, setup: Setup, found: calibrate.Fit, prog
 
     result = diagnose(model, found, tested, lambda e: effect_variables(model, e), held, fitted=fitted, refit=refit,
                       seed=setup.seed, progress=progress)
-    result.advice = advise(model, result, effect_variables, setup.seed, progress)
+    result.advice = advise(model, result, effect_variables, setup.seed, progress) if advised else []
     if result.advice:
         result.hints = [hint for hint in result.hints if hint != USUALLY]
     worst = int(np.argmax(np.array(found.frame_chi2) / np.maximum(found.frame_n, 1)))

@@ -27,7 +27,7 @@ from optics.noise import Noise
 from optics.parameter import Parameter, Values, Variable
 from optics.scene import Scene
 
-RIM_SAMPLES = 256  # per pixel at rims; a power of two. Of a picture 36 px wide, chi2 misses a path tracer by 10 to 60 with 64, by 5 to 10 with 256
+RIM_SAMPLES = 128  # per pixel at rims; a power of two. Of a picture 36 px wide, chi2 misses a path tracer by 10 to 60 with 64, by 5 to 20 with 128
 LAYERED_RIM_SAMPLES = 32  # in scenes with layers, whose matrices are multiplied for every sample
 BENT = 1e-3  # difference of a pixel's mean normal from that at its middle, above which finer samples are taken: a fifth of a grey level in 200
 CREASE = 25.0  # deg from pixel to pixel: what is no smooth surface

@@ -39,7 +39,7 @@ def run(rig, cell: Cell) -> dict:
             setup = rig.setup(captures, cell.seed)
             study, model, fit = loop.begin(setup, study_folder)
             for _ in range(STEPS if cell.kind == "pair" else 1):
-                diagnosis = loop.examine(study, model, setup, fit)
+                diagnosis = loop.examine(study, model, setup, fit, advised=False)
                 record["steps"].append(_step(rig, model, cell, diagnosis))
                 added = _to_add(diagnosis)
                 if cell.kind != "pair" or not added:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import sys
 import time
 from pathlib import Path
 from typing import Annotated
@@ -57,7 +58,8 @@ def _run(todo, folder: Path, jobs: int, minutes: float) -> None:
     if not total:
         return
     until = time.time() + 60 * minutes if minutes else float("inf")
-    with Progress(TextColumn("cells"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), TextColumn("{task.description}")) as bar:
+    with Progress(TextColumn("cells"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), TextColumn("{task.description}"),
+                  disable=not sys.stdout.isatty()) as bar:
         shown = bar.add_task("", total=total)
         if jobs == 1:
             for name, batch in todo:
