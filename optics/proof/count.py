@@ -16,6 +16,8 @@ from dataclasses import asdict, dataclass, field
 
 import numpy as np
 
+from optics.verdict import CLEAR
+
 CLEAN = 0.0
 
 
@@ -177,6 +179,8 @@ def count(records: Sequence[dict], planned: int, parts: bool = True) -> Count:
              lambda r: set(r["coordinates"]) & set(_last(r)["coordinates"][:2]), 0.75, 0.90),
         rate("pairs named exactly, 1 % + 1 %, no clutter", pair, lambda r: named(r) == set(hidden(r)), 0.85, 0.95),
         rate("strength within 20 % where claimed", judged, lambda r: abs(_ratio(r) - 1) < 0.2, 0.80, 0.95),
+        rate("fall of chi2 within 20 % of its prediction, to 0.5 %", (seen := [r for r in clean if r["cell"]["change"] <= 0.005 and _fall(r)]),
+             lambda r: abs(_fall(r) - 1) < 0.2, 0.90, 0.90),
     ]
     ties = [r for r in [*own, *some("library", lambda c: c["law"] == "other")] if _last(r)["word"] == "AMBIGUOUS"]
     confusion: dict[str, dict[str, int]] = {}
@@ -199,8 +203,7 @@ def count(records: Sequence[dict], planned: int, parts: bool = True) -> Count:
         own_rig[1] += 1
     pulls = {"no clutter": [_pull(r) for r in judged if r["cell"]["clutter"] == CLEAN and _pull(r) is not None],
              "clutter": [_pull(r) for r in judged if r["cell"]["clutter"] > CLEAN and _pull(r) is not None]}
-    falls = [after / before for r in clean for name, (before, after) in _last(r)["falls"].items()
-             if name in hidden(r) and before > 10.8 and r["cell"]["change"] <= 0.005]
+    falls = [_fall(r) for r in seen]
     found = Count(
         len(records), planned, len(records) - len(made), failed, rates, confusion, words, power,
         (sum(hidden(r)[0] in _last(r)["ambiguous"] for r in ties), len(ties)), pulls, falls, [_last(r)["p_best"] for r in calm],
@@ -215,6 +218,12 @@ def count(records: Sequence[dict], planned: int, parts: bool = True) -> Count:
 def _ratio(r: dict) -> float:
     name, (found, _) = next(iter(_last(r)["strength"].items()))
     return abs(found) / abs(r["truth"][name])  # of some, such as a stop between two lobes, the sign is not seen
+
+
+def _fall(r: dict) -> float | None:
+    """Fall of chi2 by the hidden effect over its prediction, where that says that there is something; None elsewhere."""
+    before, after = _last(r)["falls"].get(r["cell"]["hidden"][0], (0.0, 0.0))
+    return after / before if before > CLEAR else None
 
 
 def _pull(r: dict) -> float | None:

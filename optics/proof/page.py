@@ -103,7 +103,8 @@ def power(found: Count) -> str:
         ax.set_ylim(0, 1.03)
         ax.set_xlabel("change of the picture by the hidden effect, %")
         ax.set_ylabel("claimed rightly")
-        ax.legend(frameon=False)
+        if ax.get_legend_handles_labels()[0]:
+            ax.legend(frameon=False)
 
     return _svg(draw)
 
@@ -125,7 +126,8 @@ def falls(records: Sequence[dict]) -> str:
         ax.set_yscale("log")
         ax.set_xlabel("fall of chi2 predicted")
         ax.set_ylabel("fall that came")
-        ax.legend(frameon=False)
+        if ax.get_legend_handles_labels()[0]:
+            ax.legend(frameon=False)
 
     return _svg(draw)
 
