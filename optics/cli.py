@@ -774,6 +774,41 @@ def diagnose(study: StudyFolder, as_json: AsJson = False,
 
 
 @command
+def rehearse(study: StudyFolder,
+             change: Annotated[float, typer.Option(metavar="PERCENT", help="How much each hidden effect changes the pictures: rms over the mean "
+                                                                           "signal, before any calibration.")] = 0.5,
+             as_json: AsJson = False) -> None:
+    """Say which effects would be found in these captures, were they hidden in them, and what each would be taken for."""
+    from optics import loop
+    from optics.rehearse import rehearse as rehearsed
+
+    found, model, setup = loop.take_up(study)
+    fit = loop.restore(found, model)
+    fitted, _ = loop.split(model, setup)
+    with terminal.progress() as progress:
+        result = rehearsed(model, fit, loop.candidates(model, found), lambda e: loop.effect_variables(model, e), fitted, change=change / 100,
+                           seed=setup.seed, progress=progress)
+    print(result.to_json() if as_json else result.text(), end="")
+
+
+@command
+def imitate(study: StudyFolder,
+            output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="A new capture folder.")],
+            sets: Settings = None,
+            seed: Annotated[int, typer.Option(help="Of the noise.")] = 1) -> None:
+    """Write captures as the study's model would take them, with an effect put in: --set camera.vignetting=0.3 shows what that would look like."""
+    from optics import loop
+    from optics.rehearse import imitate as imitated
+
+    found, model, setup = loop.take_up(study)
+    fit = loop.restore(found, model)
+    _, held = loop.split(model, setup)
+    values, _ = loop.held_out_values(model, fit, held)
+    values.common.update(model.scene.check(settings(sets), "--set"))
+    print(f"{imitated(model, values, output, seed)}: optics calibrate {output} -o ANOTHER_STUDY")
+
+
+@command
 def design(subject: Annotated[str, typer.Argument(metavar="SCENE|STUDY", help="A scene, or a study whose values and noise are taken.")],
            frames: Annotated[int, typer.Option("--frames", "-n", metavar="N", help="How many frames to take.")] = 12,
            effects: Annotated[str | None, typer.Option("--effects", metavar="A,B,...", help="Which may be missing.",

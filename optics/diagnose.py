@@ -59,18 +59,11 @@ def diagnose(model, fit, effects: Sequence[Effect], variables_of: Callable[[Effe
         from optics.calibrate import fit as refit
     say = progress or (lambda what, done, total: None)
     fitted, held_out = [int(i) for i in fitted], [int(i) for i in held_out]
-    if not fitted:
-        raise ValueError("diagnose: no fitted frames given; name the frames that the base was calibrated on")
     both = sorted(set(fitted) & set(held_out))
     if both:
         raise ValueError(f"diagnose: frames {both} are fitted and held out at once; a frame is one or the other")
-    _require_noise(model)
-
-    base, dropped = _base_variables(model, fit, fitted)
-    candidates, not_tested = _candidates(model, fit, effects, variables_of, fitted)
-    evidence = measure(model, fit.values, base, candidates, fitted, rows_max, seed, say)
-    _require_convergence(evidence, fit)
-    table = _rank(evidence, candidates, seed)
+    scored = score(model, fit, effects, variables_of, fitted, rows_max=rows_max, seed=seed, progress=progress)
+    evidence, table, dropped, not_tested = scored.evidence, scored.table, scored.dropped, scored.not_tested
     structure = evidence.structure(evidence.whitened, evidence.base)
     basis = _basis(model, evidence, structure)
     chosen = _choose(table, top)
@@ -120,6 +113,30 @@ def diagnose(model, fit, effects: Sequence[Effect], variables_of: Callable[[Effe
         warnings=_warnings(model, fit, evidence, table, winner, shifts, dropped, structure, basis),
         claimed=winner.effect.name if word == "CLAIM" else "", pairs=found, families=families, fits=fits,
         evidence=replace(evidence, blocks=[], sigma=[], whitened=[], use=[], candidates=table.order))
+
+
+@dataclass
+class Scored:
+    """Every effect scored against a calibrated model; dropped: names of variables at a bound, not_tested: {effect: why}."""
+
+    evidence: Evidence
+    table: "Table"
+    dropped: list[str]
+    not_tested: dict[str, str]
+
+
+def score(model, fit, effects: Sequence[Effect], variables_of: Callable[[Effect], Sequence[Variable]], fitted: Sequence[int], *,
+          rows_max: int = 400_000, seed: int = 0, progress: Progress | None = None) -> Scored:
+    """The first part of a diagnosis: derivative images, projection and ranking, nothing added yet. Arguments and errors as of `diagnose`."""
+    fitted = [int(i) for i in fitted]
+    if not fitted:
+        raise ValueError("diagnose: no fitted frames given; name the frames that the base was calibrated on")
+    _require_noise(model)
+    base, dropped = _base_variables(model, fit, fitted)
+    candidates, not_tested = _candidates(model, fit, effects, variables_of, fitted)
+    evidence = measure(model, fit.values, base, candidates, fitted, rows_max, seed, progress or (lambda what, done, total: None))
+    _require_convergence(evidence, fit)
+    return Scored(evidence, _rank(evidence, candidates, seed), dropped, not_tested)
 
 
 # -- what must hold before any score ----------------------------------------------------------------------------------
@@ -190,6 +207,7 @@ class Table:
     """All candidates, best first, and the family-wise test that they share."""
 
     order: list[Candidate]
+    information: np.ndarray  # V of all columns, zero where nothing is visible
     family: st.Family
     p_best: float
     winner_uniform: str
@@ -228,6 +246,8 @@ def _rank(evidence: Evidence, candidates: list[Candidate], seed: int) -> Table:
         row.power = c.cone.power(c.linear_of(c.plausible * np.where(np.array(c.sides) < 0, -1, 1) / 10),
                                  c.cone.critical(critical))
         raw = uniform_gram.gram[np.ix_(c.columns, c.columns)]
+        usual = c.linear_of(c.plausible * np.where(np.array(c.sides) < 0, -1, 1))
+        c.raw = math.sqrt(max(usual @ raw @ usual, 0.0) / max(uniform_gram.count, 1)) / evidence.signal
         row.image = math.sqrt(max(c.linear @ raw @ c.linear, 0.0) / max(uniform_gram.count, 1)) / evidence.signal
         row.misfit_after = evidence.noise * math.sqrt(max(chi2 - row.fall, 0.0) / dof)
         excess = chi2 - dof
@@ -244,7 +264,7 @@ def _rank(evidence: Evidence, candidates: list[Candidate], seed: int) -> Table:
     p_best = min((c.row.p_family for c in candidates), default=1.0)
     uniform = _winner(evidence, uniform_gram, candidates)
     dilated = _winner(evidence, evidence.thinned(lambda block: block.inner.astype(float)), candidates)
-    return Table(order, family, p_best, uniform, dilated)
+    return Table(order, information, family, p_best, uniform, dilated)
 
 
 def _row(evidence: Evidence, c: Candidate, own: np.ndarray, fall: float) -> Row:

@@ -54,6 +54,7 @@ class Candidate:
     cone: st.Cone | None = None
     linear: np.ndarray | None = None  # coefficients of the columns; see `change_of`
     row: Row | None = None
+    raw: float = 0.0  # rms change of the image at the plausible strengths, over the mean signal, before any calibration
 
     def contains(self, other: "Candidate") -> bool:
         """Whether it frees all that another frees, and more: it fits as well by itself and rivals nothing."""

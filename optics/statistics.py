@@ -177,7 +177,7 @@ class Cone:
         if len(self.bound) < 2:
             active = np.array([1.0]) if not len(self.bound) else np.array([0.5, 0.5])
         else:
-            z = _gaussian(self.cone, draws, np.random.default_rng([seed, 11]))
+            z = gaussian(self.cone, draws, np.random.default_rng([seed, 11]))
             active = np.bincount((_descend(self.cone, z) > 0).sum(1), minlength=len(self.bound) + 1) / draws
         weights[self.free_rank:self.free_rank + len(active)] = active
         return weights
@@ -259,7 +259,7 @@ class Cone:
         return float(1 - chndtr(critical, dof, ncp)) if ncp < 1e4 else 1.0
 
 
-def _gaussian(covariance: np.ndarray, draws: int, rng: np.random.Generator) -> np.ndarray:
+def gaussian(covariance: np.ndarray, draws: int, rng: np.random.Generator) -> np.ndarray:
     """(draws, k) samples of N(0, covariance); the covariance may be singular."""
     length = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     scale = np.where(length > 0, length, 1.0)
@@ -295,7 +295,7 @@ class Family:
     def __init__(self, information: np.ndarray, candidates: Sequence[tuple[Sequence[int], Cone]], seed: int = 0,
                  draws: int = DRAWS):
         self.draws = draws
-        z = _gaussian(information, draws, np.random.default_rng([seed, 12]))
+        z = gaussian(information, draws, np.random.default_rng([seed, 12]))
         smallest = np.ones(draws)
         for columns, cone in candidates:
             np.minimum(smallest, cone.p(cone.fall(z[:, np.asarray(columns, int)])), out=smallest)
