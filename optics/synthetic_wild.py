@@ -357,7 +357,7 @@ IN_CAMERA = ("lens vignetting", "veiling glare", "lens blur", "colour crosstalk"
 
 # -- readings -----------------------------------------------------------------------------------------------------------
 
-READINGS_NOISE = Noise(0.05, 2.0, 64.0, 4095.0, 0.0)
+READINGS_NOISE = Noise(0.01, 1.0, 64.0, 4095.0, 0.0)  # 400 000 electrons: 0.3 % at the mean reading
 WANDER, JITTER = 0.003, 0.05  # of the lamp, rms relative, in some minutes; deg rms of the analyser; at clutter 1
 
 

@@ -16,7 +16,7 @@ from dataclasses import asdict, dataclass, field
 
 import numpy as np
 
-from optics.verdict import CLEAR
+from optics.verdict import CLEAR, LEVEL
 
 CLEAN = 0.0
 
@@ -164,7 +164,9 @@ def count(records: Sequence[dict], planned: int, parts: bool = True) -> Count:
         rate("top-1 after refit, 0.5 %, no clutter", middle, lambda r: _last(r)["refit"][:1] == hidden(r), 0.95, 0.99),
         rate("top-3 by score, 0.5 %, no clutter", middle, lambda r: hidden(r)[0] in _last(r)["score"][:3], 0.97, 0.99),
         rate("in the set, 0.2 %, no clutter", weak, lambda r: hidden(r)[0] in _last(r)["set"], 0.97, 0.99),
-        rate("an effect stands out where none is hidden", calm, lambda r: _last(r)["p_best"] < 0.01, 0.03, 0.015, True),
+        rate("in the set, 0.2 %, no clutter, where one stands out", [r for r in weak if _last(r)["p_best"] < LEVEL],
+             lambda r: hidden(r)[0] in _last(r)["set"], 0.97, 0.99),
+        rate("an effect stands out where none is hidden", calm, lambda r: _last(r)["p_best"] < LEVEL, 0.03, 0.015, True),
         rate("claims where none is hidden, any clutter", none, named, 0.03, 0.01, True),
         rate("precision of claims, own law, any clutter", claims([*own, *pair, *none]), right, 0.95, 0.99),
         rate("precision of claims, another law", claims(some("library", lambda c: c["law"] == "other")), right, 0.85, 0.95),

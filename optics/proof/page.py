@@ -56,7 +56,7 @@ def _svg(draw, width: float = 5.2, height: float = 3.4) -> str:
         try:
             draw(axes)
             out = io.StringIO()
-            figure.savefig(out, format="svg", metadata={"Date": None})
+            figure.savefig(out, format="svg", transparent=True, metadata={"Date": None})
         finally:
             plt.close(figure)
     text = out.getvalue()
