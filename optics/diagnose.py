@@ -21,7 +21,7 @@ from optics.errors import Underdetermined
 from optics.evidence import Candidate, Evidence, Progress, at_bound, measure, value_of
 from optics.parameter import Values, Variable
 from optics.verdict import (
-    CLEAR, EXCESS, LEVEL, MARGIN, UNEVEN, Basis, Diagnosis, Findings, Level, Refit, Row, Shift, Split, decide,
+    CLEAR, EXCESS, LEVEL, MARGIN, MIMICS, UNEVEN, Basis, Diagnosis, Findings, Level, Refit, Row, Shift, Split, decide,
     moved_by, rivals, sentence,
 )
 
@@ -31,6 +31,7 @@ KAPPA = 0.1  # noise per pixel of derivative images over their signal, above whi
 IMPLAUSIBLE = 10.0  # times the plausible strength: worth a look
 MAX_REFITS = 10
 MAX_SPLIT = 4  # members of an ambiguous set that are tested for evenness
+SAME_PLACE = 0.5  # of what an effect leaves: if its own strength, split, takes more than this, the rest is where the effect is, and it is not it
 HAIR = 0.01  # of the fall: a split that gains less says nothing about what the effect is
 USUALLY = "the same press at 0.4 of the exposure, and one deeper press, often tell more than repeats"  # where no shot was simulated
 
@@ -94,6 +95,10 @@ def diagnose(model, fit, effects: Sequence[Effect], variables_of: Callable[[Effe
     if winner and word not in ("NOTHING", "CLAIM") and not any(c.row.refit.complete for c in done):
         found = pairs.search(evidence, table.order, winner.row.net_refit,
                              lambda both: _add_both(model, fit, evidence, both, refit, fitted))
+        # what one curve explains as well as two effects together is rather one cause that the library lacks
+        curve = max([f.net for f in fingerprints if f.coordinate not in MIMICS], default=0.0)
+        chance = {row.name: row.expected for row in rows}
+        found = [p for p in found if not p.complete or p.fall - sum(chance[name] for name in p.effects) > curve + CLEAR]
         word = "PARTIAL" if any(p.complete for p in found) else word
     _write_limits(model, evidence, table, winner if word == "CLAIM" else None, fits, basis, rows_max, seed, say)
     _write_verdicts(table, word, winner, members, splits, levels)
@@ -509,7 +514,8 @@ def _split(model, evidence: Evidence, c: Candidate, found, places: list[dict], r
     chance = LEVEL / max(len(results), 1)
     if c.row.refit.complete:  # nothing but noise is left, so that p means what it says, but for a hair of the fall
         return [replace(s, holds=s.p >= chance or s.h < HAIR) for s in results]
-    return [replace(s, holds=s.h <= UNEVEN or s.p >= chance) for s in results]
+    left = c.row.refit.chi2_after - (evidence.normal.count - evidence.projected.rank)
+    return [replace(s, holds=s.p >= chance or s.h <= UNEVEN and s.fall - s.dof * own.thinning <= SAME_PLACE * left) for s in results]
 
 
 def _parts(model, evidence: Evidence, places: list[dict]) -> dict[str, tuple[list[str], list[np.ndarray]]]:
@@ -537,6 +543,11 @@ def _parts(model, evidence: Evidence, places: list[dict]) -> dict[str, tuple[lis
     for key, numbers in prints.settings(model, evidence).items():
         if len(set(numbers)) <= 8:
             of_frame(key, [f"{v:g}" for v in numbers])
+    for key in sorted(set.intersection(*[set(p) for p in places]) - set(parts)):  # what a sweep turns from reading to reading
+        if "." in key:
+            found = np.unique(np.concatenate([p[key] for p in places]))
+            if 2 <= len(found) <= 8 and np.isfinite(found).all():
+                parts[key] = ([f"{v:g}" for v in found], [np.searchsorted(found, p[key]) for p in places])
     of_coordinate("contact", "contact", ["no contact", "contact"])
     of_coordinate("quadrant", "quadrant", ["top left", "top right", "bottom left", "bottom right"])
     return {by: given for by, given in parts.items() if len(given[0]) > 1}

@@ -166,10 +166,12 @@ class Renderer:
         part = self.scene.leds[led]
         visible = self._visible(hits.si, part)
         rim = self._joint_rim(hits) if self.layered else self._rim(hits, visible)
-        index = np.flatnonzero(rim)
+        share = np.where(rim, 1.0, hits.bent)
+        index = np.flatnonzero(share)
         samples = self._rim_samples(hits, index)
         rim_visible = self._visible(samples.si, part) if len(index) else None
         image = LedImage(led, hits, rim, index, samples, visible, rim_visible, self._seen(visible).mean(0) > 0.5)
+        image.share = share.reshape(-1, 1)[index]
         image.raw = self._raw(image, lambda: self._shade(hits.sample, part, visible),
                               lambda: self._shade(samples, part, rim_visible))
         if not self.layered:
@@ -328,10 +330,10 @@ class Renderer:
         return self._bands(centre()).reshape(self.height * self.width, self.bands), fine
 
     def _mix(self, image: "LedImage", raw: tuple, weights: tuple = (1.0, 1.0)) -> np.ndarray:
-        """(H, W, B) from pixel centres and, where the rim is, from the mean of the finer samples."""
+        """(H, W, B) from pixel centres and, where the rim is, from the mean of the finer samples, by its share."""
         result = raw[0] * weights[0] if self.layered else raw[0].copy()
         if len(image.index):
-            result[image.index] = (raw[1] * weights[1]).mean(1)
+            result[image.index] += image.share * ((raw[1] * weights[1]).mean(1) - result[image.index])
         return result.reshape(-1, self.width, self.bands) if len(result) != self.height * self.width else result.reshape(
             self.height, self.width, self.bands)
 
@@ -477,8 +479,7 @@ class Hits:
             for met in (self.path.shape, *(step.part for step in self.path.steps)):
                 self.edges |= _edges(met.reshape(height, width))
             self.edges |= _creases(np.where(self.valid[..., None], self.normal, 0.0))
-        else:
-            self.edges |= _bent(np.where(self.valid[..., None], self.normal, 0.0))
+        self.bent = np.zeros((height, width)) if self.path is not None else _bent(np.where(self.valid[..., None], self.normal, 0.0))
 
     def image(self, values) -> np.ndarray:
         return np.array(values).reshape(self.shape)
@@ -498,6 +499,7 @@ class LedImage:
     def __init__(self, led, hits, rim, index, samples, visible, rim_visible, lit):
         self.led, self.hits, self.rim, self.index, self.samples = led, hits, rim, index, samples
         self.visible, self.rim_visible, self.lit = visible, rim_visible, lit
+        self.share: np.ndarray | float = 1.0  # (n, 1) of the finer samples in each of those pixels
         self.raw: tuple | None = None  # what the light makes before layers: at centres, at finer samples
         self.radiance: np.ndarray | None = None  # the image, in scenes without layers
 
@@ -948,15 +950,18 @@ def _creases(normal: np.ndarray) -> np.ndarray:
 
 
 def _bent(normal: np.ndarray) -> np.ndarray:
-    """Pixels whose middle does not stand for their area: the mean of what varies over a pixel is its middle and a twenty-fourth of its
-    second differences, which for the normals (H, W, 3) are above 24 BENT."""
-    found = np.zeros(normal.shape[:2], bool)
+    """(H, W) share, 0 to 1, by which finer samples stand for a pixel and not its middle.
+
+    The mean over a pixel of what varies is its middle and a twenty-fourth of its second differences. Where these are, for the normals
+    (H, W, 3), above 24 BENT, the share is 1, and it fades to 0 at half of that: a picture has no steps when a dent moves.
+    """
+    found = np.zeros(normal.shape[:2])
     for axis in (0, 1):
         if normal.shape[axis] < 3:
             continue
         inner = (slice(None),) * axis + (slice(1, -1),)
-        found[inner] |= np.linalg.norm(np.diff(normal, 2, axis=axis), axis=-1) > 24 * BENT
-    return found
+        found[inner] = np.maximum(found[inner], np.linalg.norm(np.diff(normal, 2, axis=axis), axis=-1) / 24)
+    return np.clip(2 * found / BENT - 1, 0.0, 1.0)
 
 
 def _edges(mask: np.ndarray) -> np.ndarray:

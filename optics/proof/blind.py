@@ -77,7 +77,7 @@ def _step(rig, model, cell: Cell, d: Diagnosis) -> dict:
         "held_out": [level.chi2_held_out for level in d.levels], "misfit": [level.held_out for level in d.levels],
         "complete": {r.name: r.refit.complete for r in refitted[:1]},
         "coordinates": [f.coordinate for f in d.fingerprints[:4]],
-        "pairs": [[*p.effects] for p in d.pairs if p.complete],
+        "pair": _to_add(d) if d.word == "PARTIAL" else [],
         "strength": _strengths(rig, model, cell, d),
     }
 

@@ -125,10 +125,10 @@ def _last(r: dict) -> dict:
 
 
 def named(r: dict) -> set[str]:
-    """All effects that the loop added or claimed."""
+    """All effects that the loop added, claimed, or named as two that together leave nothing."""
     found = set()
     for step in r["steps"]:
-        found |= set(step.get("added", [])) | ({step["claimed"]} if step["claimed"] else set())
+        found |= {*step.get("added", ()), *step.get("pair", ()), *filter(None, [step["claimed"]])}
     return found
 
 
