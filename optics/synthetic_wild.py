@@ -13,7 +13,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -361,15 +361,31 @@ READINGS_NOISE = Noise(0.01, 1.0, 64.0, 4095.0, 0.0)  # 400 000 electrons: 0.3 %
 WANDER, JITTER = 0.003, 0.05  # of the lamp, rms relative, in some minutes; deg rms of the analyser; at clutter 1
 
 
+def bench_light(truth: jones.Truth, settings: jones.Settings, noise: Noise = READINGS_NOISE, turned: np.ndarray | None = None) -> np.ndarray:
+    """(n, 1) mean of readings above black, DN, at settings in the model's keys: films that are out (`middle.inserted`, ...) and the
+    exposure too, which `jones` knows as parts of the bench. `turned`: deg by which the analyser is off its dial."""
+    turned = np.zeros(len(settings)) if turned is None else turned
+    light = np.zeros((len(settings), 1))
+    sets = [(s.get("middle.inserted", 0.0), s.get("camera.exposure", 1.0)) for s in settings]
+    for middle, exposure in sorted(set(sets)):
+        own = [i for i, s in enumerate(sets) if s == (middle, exposure)]
+        film = replace(truth.p1, offset=0.0, scale=1.0, backlash=0.0) if middle else None  # of the same roll
+        bench = replace(truth, pm=film, photodiode=replace(truth.photodiode, gain=truth.photodiode.gain * exposure))
+        dials = [{k: v for k, v in settings[i].items() if k in jones.DEFAULTS and (middle or not k.startswith("middle."))} for i in own]
+        for i, dial in zip(own, dials):
+            dial["analyzer.angle"] = dial["analyzer.angle"] + turned[i]
+        light[own] = jones.expected(bench, dials, noise) - noise.black_level
+    return light
+
+
 def sweep(truth: jones.Truth, settings: jones.Settings, seed: int, unknown: Mapping[str, float] | None = None, clutter: float = 0.0,
           noise: Noise = READINGS_NOISE, noted: Noise | None = None) -> capture_files.Captures:
-    """Readings of the bench as a capture set with a table; see the module for `unknown` and `clutter`."""
+    """Readings of the bench as a capture set with a table; see the module for `unknown` and `clutter`, `bench_light` for settings."""
     if lacking := set(unknown or {}) - set(UNKNOWN_READINGS):
         raise ValueError(f"no kind {', '.join(sorted(lacking))}; known: {', '.join(UNKNOWN_READINGS)}")
     rng = np.random.default_rng([seed, 19])
     count = len(settings)
-    true = [{**s, "analyzer.angle": s["analyzer.angle"] + clutter * JITTER * g} for s, g in zip(settings, rng.standard_normal(count))]
-    light = jones.expected(truth, true, noise) - noise.black_level
+    light = bench_light(truth, settings, noise, clutter * JITTER * rng.standard_normal(count))
     light = light * (1 + clutter * WANDER * smooth((count, 1), count / 40, rng))
     of = {key: np.array([s.get(key, jones.DEFAULTS[key]) for s in settings])[:, None] for key in jones.DEFAULTS}
     for kind, size in (unknown or {}).items():
@@ -379,8 +395,9 @@ def sweep(truth: jones.Truth, settings: jones.Settings, seed: int, unknown: Mapp
              "smeared film": lambda: -((of["polarizer.angle"] > 80) & (of["polarizer.angle"] < 120)).astype(float)}[kind]()
         light = light * (1 + size * p)
     values = noise.expose(noise.black_level + light, rng)
+    keys = list(dict.fromkeys(key for s in settings for key in s))
     frames = [capture_files.Frame(f"row {i}", value.astype(np.float32).reshape(1, 1, -1),
-                                  parameters={key: float(s.get(key, jones.DEFAULTS[key])) for key in jones.DEFAULTS if any(key in s for s in settings)})
+                                  parameters={key: float(s.get(key, jones.DEFAULTS.get(key, 0.0))) for key in keys})
               for i, (s, value) in enumerate(zip(settings, values))]
     return capture_files.Captures(Path("."), "polarizer_bench", frames, noise=noted or noise,
                                   table=capture_files.Table("readings.csv", ["reading"]))
