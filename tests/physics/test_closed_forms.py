@@ -386,7 +386,7 @@ def test_height_fall_off_and_light_of_no_led(bench):
     faded = bench.renderer.led({**values, "gel.height_loss": 0.5}, "led_1").radiance
     height = -hits.position[..., 2]
     assert height.max() > 0.7
-    lit = ~rim & (plain[..., 0] > 0)
+    lit = ~rim & (hits.bent == 0) & (plain[..., 0] > 0)
     close(faded[lit], plain[lit] * np.exp(-0.5 * height[lit])[:, None])
     rho = np.array([values[f"membrane.rho_{c}"] for c in "rgb"])
     close(bench.renderer.ambient({**values, "membrane.ambient": 0.3}), np.broadcast_to(rho * 0.3 / np.pi, plain.shape))
