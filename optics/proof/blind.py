@@ -66,6 +66,9 @@ def _to_add(d: Diagnosis) -> list[str]:
 def _step(rig, model, cell: Cell, d: Diagnosis) -> dict:
     refitted = sorted((r for r in d.rows if r.refit is not None), key=lambda r: -r.net_refit)
     best = refitted[0].net_refit if refitted else 0.0
+    # what frees less and does as well goes first, as in a diagnosis
+    first = next((r for r in refitted[1:] if set(r.variables) < set(refitted[0].variables) and best - r.net_refit < CLEAR), None)
+    refitted.sort(key=lambda r: r is not first)
     close = [r.name for r in refitted if best - r.net_refit < max(CLEAR, MARGIN * best)]
     return {
         "word": d.word, "claimed": d.claimed, "ambiguous": d.ambiguous, "sentence": d.sentence,
