@@ -7,7 +7,8 @@ the picture is nearly linear (`Parameter.coordinate`):
 
 `there` are the study's values, or later ones that the user chose. Derivative images are made when a slider is first touched; when it
 is let go, the true render takes the linear prediction's place. Everything asked of the model goes through one thread, as neither
-Mitsuba nor Dr.Jit may be used by several. The page is served on 127.0.0.1 alone and asks nothing of any other machine.
+Mitsuba nor Dr.Jit may be used by several; the page asks one thing at a time, so that of all that a slider passed only the last is
+rendered. The page is served on 127.0.0.1 alone and asks nothing of any other machine.
 """
 
 from __future__ import annotations
@@ -17,8 +18,8 @@ import math
 import shlex
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Future
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import CancelledError, ThreadPoolExecutor
 from dataclasses import dataclass
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -26,67 +27,17 @@ from pathlib import Path
 
 import numpy as np
 
-from optics import calibrate, loop
+from optics import calibrate, captures as capture_files, loop
 from optics.compare import led_label
-from optics.effect import Effect
 from optics.errors import UnknownKey
 from optics.parameter import Values, Variable
+from optics.report import DIVERGING, MASKED, SIGMA_RANGE, colour_bar, ramp
 
 HOST = "127.0.0.1"
 PAGE = Path(__file__).with_name("view.html")
 KEEP = 1 << 30  # bytes of pictures that are kept
 BODY_MAX = 1 << 20  # bytes of a question
 NEAR = 4.0  # plausible sizes to either side that a slider spans; its number may be anything within bounds
-
-
-class Superseded(RuntimeError):
-    """A render that nobody waits for any more: the same page has asked for a newer one."""
-
-
-class Worker:
-    """The one thread that works on a model. Jobs are done in order, but for one that a newer job of the same slot replaces
-    before it has begun."""
-
-    def __init__(self):
-        self.waiting: list[tuple[str, Callable, Future]] = []
-        self._ready, self._open = threading.Condition(), True
-        self._thread = threading.Thread(target=self._run, name="model", daemon=True)
-        self._thread.start()
-
-    def do(self, job: Callable, slot: str = ""):
-        """What `job()` returns or raises; Superseded where another job takes its place first."""
-        future: Future = Future()
-        with self._ready:
-            if not self._open:
-                raise Superseded("the page is closed")
-            for waiting in [w for w in self.waiting if slot and w[0] == slot]:
-                self.waiting.remove(waiting)
-                waiting[2].set_exception(Superseded("a newer question took the place of this one"))
-            self.waiting.append((slot, job, future))
-            self._ready.notify()
-        return future.result()
-
-    def close(self) -> None:
-        """Let the present job end, and do no other."""
-        with self._ready:
-            self._open = False
-            for _, _, future in self.waiting:
-                future.set_exception(Superseded("the page is closed"))
-            self.waiting.clear()
-            self._ready.notify()
-        self._thread.join()
-
-    def _run(self) -> None:
-        while True:
-            with self._ready:
-                self._ready.wait_for(lambda: self.waiting or not self._open)
-                if not self._open:
-                    return
-                _, job, future = self.waiting.pop(0)
-            try:
-                future.set_result(job())
-            except BaseException as error:  # noqa: BLE001 - whoever asked gets it
-                future.set_exception(error)
 
 
 class Kept:
@@ -129,22 +80,28 @@ class Slider:
 
 
 class View:
-    """A step of a study with its model, as a page asks for it. `model` may be used in the worker's thread only.
+    """A step of a study with its model, as a page asks for it.
 
+    worker    the one thread that may use the model
     sliders   by the name of their variable: what the step calibrated, the same for frames that were held out, and what
               every effect would free that the scene can express
     """
 
     def __init__(self, folder: str | Path, step: int | None = None):
-        self.worker, self.kept, self._lock = Worker(), Kept(), threading.Lock()
+        self.worker, self.kept = ThreadPoolExecutor(1, "model"), Kept()
         try:
-            self.worker.do(lambda: self._open(folder, step))
+            self._do(lambda: self._open(folder, step))
         except BaseException:
-            self.worker.close()
+            self.close()
             raise
 
     def close(self) -> None:
-        self.worker.close()
+        """Let the present job end, and do no other."""
+        self.worker.shutdown(cancel_futures=True)
+
+    def _do(self, job: Callable):
+        """What `job()` returns or raises in the model's thread; CancelledError where the view is closed before it begins."""
+        return self.worker.submit(job).result()
 
     def _open(self, folder: str | Path, step: int | None) -> None:
         self.study, self.model, self.setup = loop.take_up(folder)
@@ -157,25 +114,23 @@ class View:
         self.step = self.study.steps[count - 1 if step is None else step]
         variables, self.values, self.fitted = loop.kept(self.study, self.model, self.step["index"])
         self.held = sorted(set(range(len(self.model.frames))) - set(self.fitted))
-        self.names = {f.name: i for i, f in enumerate(self.model.frames)}
         sd = {v["name"]: v["sd"] for v in self.step["variables"]}
         added = [s["effect"] for s in self.study.steps[:self.step["index"] + 1] if s["effect"]]
-        self.effects = sorted({e.key: e for e in (*loop.candidates(self.model, self.study), *loop.effects_of(self.study))}.values(),
-                              key=lambda e: e.key)
-        own = {e.key: {k for keys in self.model.scene.keys_of(e).values() for k in keys} for e in self.effects}
+        known = (*loop.candidates(self.model, self.study), *loop.effects_of(self.study))
+        self.effects = {e.key: e for e in sorted(known, key=lambda e: e.key)}
+        own = {key: {k for keys in self.model.scene.keys_of(e).values() for k in keys} for key, e in self.effects.items()}
         self.sliders: dict[str, Slider] = {}
         for v in (*variables, *calibrate.for_frames(self.model, variables, self.held)):
             effect = next((key for key in added if set(v.keys) <= own[key]), "")
             self._slide(v, sd.get(v.name), effect)
         taken = {k for s in self.sliders.values() for k in s.variable.keys}
-        self.clashes = {e.key: sorted(own[e.key] & taken) for e in self.effects if e.key not in added and own[e.key] & taken}
-        for e in self.effects:
-            if e.key not in added and e.key not in self.clashes:
+        self.clashes = {key: sorted(keys & taken) for key, keys in own.items() if key not in added and keys & taken}
+        for key, e in self.effects.items():
+            if key not in added and key not in self.clashes:
                 for v in loop.effect_variables(self.model, e):
-                    self._slide(v, None, e.key)
+                    self._slide(v, None, key)
         self.added, self._sought = added, set(added)
         self.comparison = self.study.comparison(self.step["index"])
-        self.usable: dict[int, np.ndarray] = {}
 
     def _slide(self, variable: Variable, sd: float | None, effect: str) -> None:
         self.sliders[variable.name] = Slider(variable, calibrate.start_of(self.model, variable, self.values),
@@ -186,28 +141,27 @@ class View:
     def record(self) -> dict:
         """Everything but pictures: frames, sliders, effects, and how the study's own numbers stand."""
         rows = {row.scope["frame"]: row for row in self.comparison.by("frame")}
-        noise = self.model.noise
         return {
             "title": self.study.record["title"] or Path(self.study.folder).resolve().name, "folder": str(self.study.folder),
             "scene": Path(self.study.record["scene"]).stem, "step": self.step["index"],
             "steps": [s["name"] for s in self.study.steps], "shape": list(self.model.shape) if self.model.captures.table is None else None,
-            "channels": self.comparison.channels, "black": noise.black_level, "full": noise.saturation - noise.black_level,
-            "floor": self.study.record["noise_floor"],
-            "frames": [{"name": f.name, "led": led_label(f.parameters), "group": f.group or "", "held_out": i in self.held,
-                        "size": list(f.image.shape), **{k: getattr(rows[f.name], k) for k in ("n", "chi2", "rms", "noise")}}
+            "channels": self.comparison.channels, "black": self.model.noise.black_level,
+            "ramp": ramp(DIVERGING, 256), "bar": colour_bar(), "masked": ramp((MASKED,), 1)[0], "range": SIGMA_RANGE,
+            "frames": [{"name": f.name, "led": led_label(f.parameters), "held_out": i in self.held,
+                        **{k: getattr(rows[f.name], k) for k in ("n", "chi2", "rms", "noise")}}
                        for i, f in enumerate(self.model.frames)],
             "sliders": [self._slider(name, s) for name, s in self.sliders.items()],
             "effects": [{"key": e.key, "name": e.name, "part": e.part, "onset": e.onset, "doc": e.doc.strip(), "needs": e.needs,
-                         "added": e.key in self.added, "clash": self.clashes.get(e.key, [])} for e in self.effects],
+                         "added": e.key in self.added, "clash": self.clashes.get(e.key, [])} for e in self.effects.values()],
         }
 
     def _slider(self, name: str, s: Slider) -> dict:
         v, p = s.variable, s.variable.parameter
         low, high = s.range()
-        return {"name": name, "part": v.keys[0].rpartition(".")[0] if len(v.keys) == 1 else _part(v), "keys": list(v.keys),
+        return {"name": name, "part": (v.keys[0] if len(v.keys) == 1 else v.name).rpartition(".")[0], "keys": list(v.keys),
                 "unit": "" if p.unit == "1" else p.unit, "doc": p.doc, "low": low, "high": high, "bounds": list(p.bounds),
                 "value": s.value, "sd": s.sd, "calibrated": not math.isnan(s.sd), "neutral": p.neutral,
-                "plausible": p.plausible, "squared": p.squared, "saturates": p.saturates, "frames": v.frames, "effect": s.effect}
+                "squared": p.squared, "saturates": p.saturates, "frames": v.frames, "effect": s.effect}
 
     # -- questions --------------------------------------------------------------------------------------------------------
 
@@ -247,15 +201,15 @@ class View:
 
     def capture(self, index: int) -> tuple[np.ndarray, np.ndarray]:
         """(H, W, C) DN measured, and what is usable of it."""
-        return self.kept.get(("capture", index)) or self.worker.do(lambda: self._capture(index))
+        return self.kept.get(("capture", index)) or self._do(lambda: self._capture(index))
 
     def _capture(self, index: int) -> tuple:
         return self.kept.get(("capture", index)) or self.kept.put(
             ("capture", index), (np.asarray(self.model.frames[index].image, np.float32), self.model.usable(index)))
 
-    def predict(self, index: int, changes: Mapping[str, float], slot: str = "") -> tuple[np.ndarray, np.ndarray]:
+    def predict(self, index: int, changes: Mapping[str, float]) -> tuple[np.ndarray, np.ndarray]:
         """(H, W, C) DN, the true render and the standard deviation that the noise has about it."""
-        return self.kept.get(("predict", *self._here(index, changes))) or self.worker.do(lambda: self._predict(index, changes), slot)
+        return self.kept.get(("predict", *self._here(index, changes))) or self._do(lambda: self._predict(index, changes))
 
     def _predict(self, index: int, changes: Mapping[str, float]) -> tuple:
         key = ("predict", *self._here(index, changes))
@@ -272,21 +226,17 @@ class View:
         value of an effect with such an onset, and at 0 of what acts by its square. It turns round at a bound. None: the tangent."""
         slider = self.sliders[name]
         p, value = slider.variable.parameter, changes.get(name, slider.value)
-        effect = self.effect_of(name)
+        effect = self.effects.get(slider.effect)
         dull = effect is not None and effect.onset != "tangent" and value == p.neutral
         if not dull and not (p.squared and value == 0):
             return None
         return p.plausible if value + p.plausible <= p.bounds[1] else -p.plausible
 
-    def _seek(self, names: Sequence[str]) -> None:
+    def _seek(self, names: Iterable[str]) -> None:
         """Find where effects with a place would be, before they leave neutral for the first time: till then it does nothing."""
-        for effect in {e.key: e for e in map(self.effect_of, names) if e is not None and e.key not in self._sought}.values():
-            loop.seek(self.model, self.values, [effect], self.fitted)
-            self._sought.add(effect.key)
-
-    def effect_of(self, name: str) -> Effect | None:
-        key = self.sliders[name].effect
-        return next((e for e in self.effects if e.key == key), None) if key else None
+        for key in {self.sliders[n].effect for n in names} - {"", *self._sought}:
+            loop.seek(self.model, self.values, [self.effects[key]], self.fitted)
+            self._sought.add(key)
 
     def derivative(self, index: int, name: str, changes: Mapping[str, float]) -> tuple:
         """(image or None where it does nothing, step or None): d prediction / d u of a slider's coordinate u, (H, W, C), at the values
@@ -295,10 +245,11 @@ class View:
         if not slider.variable.holds_in(index):
             return None, None
         key = ("derivative", name, *self._here(index, changes))
-        return self.kept.get(key) or self.worker.do(lambda: self._derivatives(index, [name], changes)[name])
+        return self.kept.get(key) or self._do(lambda: self._derivatives(index, [name], changes)[name])
 
     def _derivatives(self, index: int, names: Sequence[str], changes: Mapping[str, float]) -> dict[str, tuple]:
-        found = {n: self.kept.get(("derivative", n, *self._here(index, changes))) for n in names}
+        here = self._here(index, changes)
+        found = {n: self.kept.get(("derivative", n, *here)) for n in names}
         missing = [n for n, item in found.items() if item is None]
         if not missing:
             return found
@@ -312,7 +263,7 @@ class View:
             if image is not None:  # per value -> per coordinate
                 image = image * np.float32(steps[n] / (p.coordinate(value + steps[n]) - p.coordinate(value))
                                            if steps[n] is not None else p.per_coordinate(value))
-            found[n] = self.kept.put(("derivative", n, *self._here(index, changes)), (image, steps[n]))
+            found[n] = self.kept.put(("derivative", n, *here), (image, steps[n]))
         return found
 
     def rows(self, index: int, names: Sequence[str], changes: Mapping[str, float]) -> dict:
@@ -320,7 +271,7 @@ class View:
         c - 2 b.x + x.A x, for chi2 (weights held) and for the sum of squares in DN^2; n values, noise: sum of variances."""
         for name in names:
             self._slider_of(name)
-        return self.worker.do(lambda: self._rows(index, names, changes))
+        return self._do(lambda: self._rows(index, names, changes))
 
     def _rows(self, index: int, names: Sequence[str], changes: Mapping[str, float]) -> dict:
         measured, use = self._capture(index)
@@ -345,7 +296,7 @@ class View:
             self._slider_of(name)
         if not names:
             raise ValueError("no effect is switched on: nothing to solve for; switch one on")
-        return self.worker.do(lambda: self._best(list(names), values, there))
+        return self._do(lambda: self._best(list(dict.fromkeys(names)), values, there))
 
     def _best(self, names: list[str], values: Mapping[str, float], there: Mapping[str, float]) -> dict:
         sliders = [self.sliders[n] for n in names]
@@ -353,7 +304,7 @@ class View:
         parameters = [self.sliders[n].variable.parameter for n in names]
         start = np.array([self.sliders[n].value for n in names])
         at, now = (np.array([p.coordinate(c.get(n, v)) for n, p, v in zip(names, parameters, start)]) for c in (there, values))
-        a, b, c, n, known = np.zeros((len(names), len(names))), np.zeros(len(names)), 0.0, 0, 0.0
+        a, b, c, n = np.zeros((len(names), len(names))), np.zeros(len(names)), 0.0, 0
         for index in self.fitted:
             row = self._rows(index, names, there)
             where = [names.index(name) for name in row["names"]]
@@ -361,16 +312,21 @@ class View:
             b[where] += row["chi2"]["b"]
             c, n = c + row["chi2"]["c"], n + row["n"]
 
-        for i, (slider, p) in enumerate(zip(sliders, parameters)):
-            prior, value = slider.variable.prior, there.get(names[i], slider.value)
-            if prior is not None and not (p.squared and value == 0):  # as a measured value, linear in u like the pictures
-                slope, gap = p.per_coordinate(value) / prior[1], (prior[0] - value) / prior[1]
-                a[i, i], b[i], known = a[i, i] + slope**2, b[i] + slope * gap, known + gap**2
+        def slopes(of):
+            """d value / d u of the sliders; infinite where the picture goes by the square of a value that is 0."""
+            return np.array([p.per_coordinate(v) if v or not p.squared else math.inf for p, v in zip(parameters, of)])
+
+        k = len(sliders)  # a prior is one more measured value, linear in u like the pictures
+        pull, curvature, prior = calibrate.prior_terms(self.model, [s.variable for s in sliders], self.moved(there))
+        slope = np.nan_to_num(slopes([there.get(name, s.value) for name, s in zip(names, sliders)]), posinf=0.0)
+        a[:k, :k] += np.diag(slope**2 * curvature)
+        b[:k] += slope * pull
+        c += prior
 
         def chi2(x):
-            return float(c + known - 2 * b @ x + x @ a @ x)
+            return float(c - 2 * b @ x + x @ a @ x)
 
-        k, x = len(sliders), now - at
+        x = now - at
         low, high = (np.array([p.coordinate(p.bounds[side]) for p in parameters[:k]]) for side in (0, 1))
         held = x.copy()
         held[:k] = 0
@@ -378,16 +334,16 @@ class View:
         found = held.copy()
         found[:k] = free
         estimate = [float(np.clip(p.at_coordinate(u), *p.bounds)) for p, u in zip(parameters, (at + found)[:k])]
-        sd_u = np.sqrt(np.maximum(np.diag(calibrate.covariance_of(a[:k, :k])), 0))
         with np.errstate(invalid="ignore"):
-            sd = [float(s * p.per_coordinate(v)) if not (p.squared and v == 0) else math.inf for s, p, v in zip(sd_u, parameters, estimate)]
-        return {"values": dict(zip(names[:k], estimate)), "sd": dict(zip(names[:k], sd)), "before": chi2(x), "after": chi2(found), "n": n,
+            sd = np.sqrt(np.maximum(np.diag(calibrate.covariance_of(a[:k, :k])), 0)) * slopes(estimate)
+        return {"values": dict(zip(names[:k], estimate)), "sd": dict(zip(names[:k], sd.tolist())), "before": chi2(x), "after": chi2(found), "n": n,
                 "frames": len(self.fitted)}
 
     # -- values to keep -----------------------------------------------------------------------------------------------------
 
-    def toml(self, changes: Mapping[str, float]) -> str:
+    def _toml(self, changes: Mapping[str, float]) -> str:
         """Values as `optics compare --fit` reads them: [parameters] and [frames.NAME], key = value."""
+        self._seek(changes)
         values = self.moved(changes)
         unit = {n: "" if (u := self.sliders[n].variable.parameter.unit) in ("", "1") else f" {u}" for n in changes}
         begun = f"the step '{self.step['name']}' of {self.study.folder}"
@@ -398,17 +354,17 @@ class View:
 
         def entry(key, value):
             unit = self.model.parameters[key].unit if key in self.model.parameters else ""
-            return f"{json.dumps(key)} = {json.dumps(value)}" + (f"  # {unit}" if unit not in ("", "1") else "")
+            return f"{quoted(key)} = {quoted(value)}" + (f"  # {unit}" if unit not in ("", "1") else "")
 
         lines += ["", "[parameters]", *(entry(k, v) for k, v in values.common.items())]
         for index, own in sorted(values.frame.items()):
             if own:
-                lines += ["", f"[frames.{json.dumps(self.model.frames[index].name)}]", *(entry(k, v) for k, v in own.items())]
+                lines += ["", f"[frames.{quoted(self.model.frames[index].name)}]", *(entry(k, v) for k, v in own.items())]
         return "\n".join(lines) + "\n"
 
     def write(self, changes: Mapping[str, float]) -> dict:
         """Write values into a new file of the study's folder; the file, its text, and the command that uses it."""
-        text, number = self.toml(changes), 1
+        text, number = self._do(lambda: self._toml(changes)), 1
         while True:
             file = Path(self.study.folder) / f"view-{number:02d}.toml"
             try:
@@ -417,15 +373,16 @@ class View:
                 break
             except FileExistsError:
                 number += 1
-        s = self.setup
+        s, groups = self.setup, [name for name, own in capture_files.groups(self.model.captures).items() if own[0] in self.held]
         words = ["optics", "compare", s.captures, "--fit", str(file), *(w for k, v in s.defines.items() for w in ("-D", f"{k}={v}")),
-                 *(["--flat-field", s.flat_field] if s.flat_field else []), *(["--plugins", s.plugins] if s.plugins else [])]
+                 *(w for g in groups for w in ("--hold-out", g)), *(["--flat-field", s.flat_field] if s.flat_field else []),
+                 *(["--plugins", s.plugins] if s.plugins else [])]
         return {"file": str(file), "text": text, "command": shlex.join(words)}
 
 
-def _part(variable: Variable) -> str:
-    """What a variable of several keys belongs to: the part of its name (`led` of `led.area`)."""
-    return variable.name.rpartition(".")[0]
+def quoted(value) -> str:
+    """A number or a string as TOML has it, which JSON's are, but for its pairs of escapes beyond 16 bits."""
+    return json.dumps(value, ensure_ascii=False)
 
 
 # -- the server -------------------------------------------------------------------------------------------------------------
@@ -501,7 +458,7 @@ class Handler(BaseHTTPRequestHandler):
 
         routes = {
             "/capture": capture, "/derivative": derivative,
-            "/predict": lambda: self._send(HTTPStatus.OK, floats(*view.predict(index(), changes(), str(body.get("page") or "")))),
+            "/predict": lambda: self._send(HTTPStatus.OK, floats(*view.predict(index(), changes()))),
             "/rows": lambda: self._json(view.rows(index(), names(), changes())),
             "/best": lambda: self._json(view.best(names(), changes(), changes("there"))),
             "/write": lambda: self._json(view.write(changes())),
@@ -512,10 +469,9 @@ class Handler(BaseHTTPRequestHandler):
         """Run a route, and turn what is wrong with the question into a status and a sentence."""
         try:
             size = int(self.headers.get("Content-Length") or 0)
-            if size > BODY_MAX:
-                self.close_connection = True  # with what was not read
+            if not 0 <= size <= BODY_MAX:
                 return self._error(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"a question of {size} bytes; allowed: {BODY_MAX}")
-            text = self.rfile.read(size) if size > 0 else b""
+            text = self.rfile.read(size)
             # A page of another site may send its visitor's browser here under a name of its own, or post what needs no leave.
             if self.headers.get("Host") not in self.server.hosts:
                 return self._error(HTTPStatus.FORBIDDEN, f"this page is at {self.server.url} and nowhere else")
@@ -530,12 +486,9 @@ class Handler(BaseHTTPRequestHandler):
                     raise ValueError("the question is not a JSON object")
                 body.update(given)
             routes[self.path]()
-        except Superseded as error:
-            self._error(HTTPStatus.CONFLICT, str(error))
-        except (ValueError, LookupError, TypeError, OSError, RuntimeError) as error:
-            if isinstance(error, ConnectionError):  # the page is gone
-                self.close_connection = True
-                return
+        except (ConnectionError, CancelledError):  # the page is gone, or the server ends
+            self.close_connection = True
+        except Exception as error:  # whoever asked is told, of a plugin's mistakes as well
             self._error(HTTPStatus.BAD_REQUEST, " ".join(str(error).split()) or type(error).__name__)
 
     def _page(self) -> None:
@@ -545,7 +498,8 @@ class Handler(BaseHTTPRequestHandler):
         self._send(HTTPStatus.OK, json.dumps(plain(value), allow_nan=False).encode(), "application/json")
 
     def _error(self, status: HTTPStatus, text: str) -> None:
-        self._send(status, json.dumps({"error": text}).encode(), "application/json")
+        """Refuse, and end the connection, with what was not read of the question."""
+        self._send(status, json.dumps({"error": text}).encode(), "application/json", Connection="close")
 
     def _send(self, status: HTTPStatus, data: bytes, kind: str = "application/octet-stream", **headers: str) -> None:
         self.send_response(status)

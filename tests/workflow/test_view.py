@@ -15,7 +15,7 @@ import subprocess
 import sys
 import threading
 import time
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import CancelledError, ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -27,16 +27,16 @@ from optics.ladder import Study, read_fit
 from optics.noise import Noise
 from optics.parameter import Values
 from optics.picture import Pictures
-from optics.view import Kept, Server, Superseded, View, Worker
+from optics.view import Kept, Server, View
 
 HIDDEN = 0.4  # camera.vignetting
-VIGNETTING, SIZE, POSE = "camera.vignetting", "led.area", "gel.press_x[press-0]"
+VIGNETTING, SIZE, POSE, ROUGHNESS = "camera.vignetting", "led.area", "gel.press_x[press-0]", "membrane.sigma"
 SINGLE = 2e-6  # float32, relative: pictures travel in it, and are added up in it
 
 
 @pytest.fixture(scope="module")
 def study(tmp_path_factory, mitsuba):
-    """A study of the base model: two powers, and where each press is."""
+    """A study of the base model: two powers, a roughness, in whose square the picture is linear, and where each press is."""
     folder = tmp_path_factory.mktemp("view")
     loaded = scene.load("gelsight", {"width": "48", "height": "36"})
     noise, rng, frames = Noise(0.05, 1.0, 8.0, 255.0, 0.0), np.random.default_rng(0), []
@@ -49,7 +49,7 @@ def study(tmp_path_factory, mitsuba):
                                               parameters=values))
     captures = capture_files.write(capture_files.Captures(Path("."), "gelsight", frames, {"camera.exposure": 150.0}, noise),
                                    folder / "captures", bits=8)
-    setup = loop.Setup(captures=str(captures), free=["led_[13].power"], per_group=["gel.press_x"], held_out=["press-2"],
+    setup = loop.Setup(captures=str(captures), free=["led_[13].power", "membrane.sigma"], per_group=["gel.press_x"], held_out=["press-2"],
                        priors={"gel.press_x*": (None, 0.05)})
     loop.begin(setup, folder / "study")
     return folder / "study"
@@ -113,14 +113,13 @@ def moved(model, view, **changes):
 def busy(view):
     """While the one thread of the model is at work on something else."""
     begun, end = threading.Event(), threading.Event()
-    with ThreadPoolExecutor(1) as pool:
-        job = pool.submit(view.worker.do, lambda: (begun.set(), end.wait(60)))
-        assert begun.wait(60)
-        try:
-            yield
-        finally:
-            end.set()
-            job.result(60)
+    job = view.worker.submit(lambda: (begun.set(), end.wait(60)))
+    assert begun.wait(60)
+    try:
+        yield
+    finally:
+        end.set()
+        job.result(60)
 
 
 # -- what the server answers ------------------------------------------------------------------------------------------------
@@ -217,15 +216,20 @@ def test_best_is_least_squares_over_the_fitted_frames(ask, view):
     assert chi2[-1] == pytest.approx(1, abs=0.05)  # 20000 values: sd 0.01; and 8 bits
 
 
-def test_a_prior_is_one_more_measurement(ask, view, monkeypatch):
-    """Estimate and prior meet in the mean weighted by 1/sd^2, wherever the picture was linearised."""
-    question = {"names": [VIGNETTING], "values": {}, "there": {VIGNETTING: 0.1}}
+@pytest.mark.parametrize("name, off, mean", [(VIGNETTING, 0.1, 0.2), (ROUGHNESS, 0.01, 0.005)])
+def test_a_prior_is_one_more_measurement(ask, view, monkeypatch, name, off, mean):
+    """Estimate and prior meet in the mean weighted by 1/sd^2, wherever the picture was linearised, in the parameter's coordinate u."""
+    slider, p = view.sliders[name], view.sliders[name].variable.parameter
+    there = slider.value + off
+    question, slope = {"names": [name], "values": {}, "there": {name: there}}, p.per_coordinate(there)
     free = json.loads(ask("/best", **question)[1])
-    slider, (value, sd) = view.sliders[VIGNETTING], (free[k][VIGNETTING] for k in ("values", "sd"))
-    monkeypatch.setitem(view.sliders, VIGNETTING, replace(slider, variable=slider.variable.with_prior(0.3, 0.5 * sd)))
+    value, sd = free["values"][name], free["sd"][name] / p.per_coordinate(free["values"][name])  # sd of u
+    monkeypatch.setitem(view.sliders, name, replace(slider, variable=slider.variable.with_prior(there + mean, 0.5 * sd * slope)))
     found = json.loads(ask("/best", **question)[1])
-    assert found["values"][VIGNETTING] == pytest.approx(0.2 * value + 0.8 * 0.3, rel=1e-4)
-    assert found["sd"][VIGNETTING] == pytest.approx(sd / np.sqrt(5), rel=1e-4)
+    prior = p.coordinate(there) + mean / slope
+    assert p.coordinate(found["values"][name]) == pytest.approx(0.2 * p.coordinate(value) + 0.8 * prior, rel=1e-4)
+    assert found["sd"][name] / p.per_coordinate(found["values"][name]) == pytest.approx(sd / np.sqrt(5), rel=1e-4)
+    assert found["before"] - free["before"] == pytest.approx(((prior - p.coordinate(slider.value)) / (0.5 * sd)) ** 2, rel=1e-6)
 
 
 def test_best_of_a_bounded_effect_stays_within(ask):
@@ -278,35 +282,26 @@ def test_only_this_machine_is_served(server):
             socket.create_connection(("127.0.0.2", server.server_address[1]), timeout=5).close()
 
 
-def test_of_two_renders_that_wait_the_newer_is_made(ask, view):
-    """One page asks three times while the model is busy, another once: the page's older questions are dropped, nothing else is."""
-    def slots():
-        return [slot for slot, *_ in view.worker.waiting]
-
-    with ThreadPoolExecutor(4) as pool:
+def test_a_closed_view_lets_the_present_job_end_and_does_no_other(study):
+    view = View(study)
+    with ThreadPoolExecutor(2) as pool:
         with busy(view):
-            questions, seen = [], (lambda: slots() == ["a"], lambda: questions[0].done(), lambda: slots() == ["a", "b"],
-                                   lambda: questions[1].done())
-            for (page, value), happened in zip((("a", 0.011), ("a", 0.012), ("b", 0.013), ("a", 0.014)), seen):
-                questions.append(pool.submit(ask, "/predict", frame=0, values={VIGNETTING: value}, page=page))
-                until = time.monotonic() + 30
-                while not happened():
-                    assert time.monotonic() < until, slots()
-                    time.sleep(0.005)
-        answers = [q.result(60) for q in questions]
-    assert [status for status, _, _ in answers] == [409, 409, 200, 200]
-    assert "newer question" in json.loads(answers[0][1])["error"]
-    assert not np.array_equal(floats(answers[2])[0], floats(answers[3])[0])
+            waiting, closing = pool.submit(view.predict, 0, {}), pool.submit(view.close)
+            with pytest.raises((CancelledError, RuntimeError)):
+                waiting.result(60)
+            assert not closing.done()
+        closing.result(60)
+    with pytest.raises(RuntimeError):
+        view.predict(0, {})
 
 
-def test_a_closed_worker_does_nothing_more():
-    worker = Worker()
-    assert worker.do(lambda: 2) == 2
-    with pytest.raises(ZeroDivisionError):
-        worker.do(lambda: 1 / 0)
-    worker.close()
-    with pytest.raises(Superseded, match="closed"):
-        worker.do(lambda: 2)
+def test_a_plugins_mistake_is_told(ask, view, monkeypatch):
+    def predict(values, frames):
+        return 1 / 0
+
+    monkeypatch.setattr(view.model, "predict", predict)
+    status, body, headers = ask("/predict", frame=0, values={VIGNETTING: 0.77})
+    assert (status, json.loads(body)["error"], headers["Connection"]) == (400, "division by zero", "close")
 
 
 def test_pictures_longest_unused_are_forgotten():
@@ -329,9 +324,28 @@ def test_written_values_are_read_by_compare(ask, optics, model, view, study):
     assert command[:2] == ["optics", "compare"] and Path(first["file"]).read_text() == first["text"]
     rows = json.loads(optics(*command[1:], "--json")[1])["rows"]
     found, values = moved(model, view, **changes)
-    chi2 = sum(np.sum(((f.image - p) ** 2 / found.variance(values, i, p))[found.usable(i)])
-               for i, (f, p) in enumerate(zip(found.frames, found.predict(values))))
-    assert rows[0]["chi2"] == pytest.approx(chi2, rel=1e-5)
+    chi2 = [np.sum(((f.image - p) ** 2 / found.variance(values, i, p))[found.usable(i)])
+            for i, (f, p) in enumerate(zip(found.frames, found.predict(values)))]
+    by_role = {row["scope"].get("role", ""): row["chi2"] for row in rows if row["scope"].keys() <= {"role"}}
+    assert by_role == pytest.approx({"": sum(chi2), "fitted": sum(chi2[:4]), "held out": sum(chi2[4:])}, rel=1e-5)
+
+
+def test_a_place_is_sought_once_before_its_effect_is_used(ask, view, monkeypatch):
+    sought = []
+    monkeypatch.setattr(loop, "seek", lambda model, values, effects, frames: sought.extend(e.key for e in effects))
+    monkeypatch.setattr(view, "_sought", set())
+    view._do(lambda: view._toml({SIZE: 0.3}))
+    assert sought == ["led-size"]
+    for _ in range(2):
+        assert ask("/derivative", frame=1, name=VIGNETTING, values={SIZE: 0.31})[0] == 200
+    assert sought == ["led-size", "lens-vignetting"]
+
+
+def test_a_frames_name_survives_in_the_file(view, monkeypatch, tmp_path):
+    names = ['dot. "quote" \\', "Größe \U0001f600", *"cdef"]
+    monkeypatch.setattr(view.model, "frames", [replace(f, name=n) for f, n in zip(view.model.frames, names)])
+    (tmp_path / "fit.toml").write_text(view._do(lambda: view._toml({POSE: -1.9})), encoding="utf-8")
+    assert list(read_fit(tmp_path / "fit.toml")["frames"])[:2] == names[:2]
 
 
 # -- the command ----------------------------------------------------------------------------------------------------------------
@@ -481,6 +495,7 @@ def page(chromium, server):
     """The page, freshly opened."""
     chromium.errors.clear()
     chromium.requests.clear()
+    chromium.server = server.url
     chromium.open(server.url)
     yield chromium
     assert chromium.errors == []
@@ -552,6 +567,74 @@ def test_an_effect_is_switched_and_slid_by_keyboard(page, model, view):
     assert page.run(VALUE) == 0 and page.numbers("rms", "chi") == before
 
 
+def test_of_all_that_a_slider_passed_only_the_last_is_rendered(page, view):
+    def renders():
+        return sum(url.endswith("/predict") for url in page.requests)
+
+    page.run("toggle('lens-vignetting', true)")
+    page.idle()
+    before = renders()
+    with busy(view):
+        page.run(f"set('{VIGNETTING}', 0.51, false)")
+        page.wait("busy === 'true render'")
+        page.run(f"for (const v of [0.52, 0.53, 0.54]) set('{VIGNETTING}', v, false)")
+        page.drawn()
+        assert page.text("state")[0].startswith("linear")
+    page.idle()
+    assert renders() == before + 2 and page.run(VALUE) == 0.54  # the one that was under way, and where the slider is
+
+
+def test_a_slider_steps_in_its_coordinate(page, model, view):
+    """In the page as in a fit: a roughness acts by its square, and levels off."""
+    value, p = view.sliders[ROUGHNESS].value, view.sliders[ROUGHNESS].variable.parameter
+    there = value + 0.02
+    found, values = model
+    base = found.predict(values, [0])[0]
+    slope = next(found.derivatives(values, [view.sliders[ROUGHNESS].variable], [0]))[1][ROUGHNESS]  # per value
+    page.run(f"touch('{ROUGHNESS}')")
+    page.wait("images.size === 1 && !pumping")
+    with busy(view):
+        page.run(f"set('{ROUGHNESS}', {there})")
+        page.drawn()
+        shown = np.array(page.run("Array.from(last.prediction)")).reshape(base.shape)
+    expected = (p.coordinate(there) - p.coordinate(value)) * p.per_coordinate(value) * slope
+    assert p.squared and p.saturates < 10
+    assert np.abs(expected).max() > 0.05 and np.allclose(shown - base, expected, rtol=0, atol=1e-4 + 255 * SINGLE)
+    page.idle()
+
+
+def test_frames_that_a_pose_leaves_alone_keep_the_studys_misfit(page, model, view):
+    page.run(f"set('{POSE}', -1.8, false)")
+    page.wait("at('which').textContent === '5 of 6 frames rendered, the rest linear.'")
+    page.key("a")
+    page.wait("at('which').textContent === 'All 6 frames rendered.'")
+    found, values = moved(model, view, **{POSE: -1.8})
+    chi2 = [misfit(model, i, p, np.sqrt(found.variance(values, i, p)))[1] for i, p in enumerate(found.predict(values))]
+    counts = [found.usable(i).sum() for i in range(6)]
+    assert page.numbers("chiAll", "chiHeld") == pytest.approx(
+        [np.average(chi2, weights=counts), np.average(chi2[4:], weights=counts[4:])], rel=SHOWN)
+
+
+def test_back_undoes_a_reset_and_a_fit(page, view):
+    page.run(f"toggle('lens-vignetting', true), set('{VIGNETTING}', 0.3, false)")
+    page.idle()
+    page.key("R", shift=True)
+    assert page.run(f"[{VALUE}, on.size]") == [0, 0]
+    page.run("history.back()")
+    page.wait(f"{VALUE} === 0.3 && on.has('lens-vignetting')")
+    page.key("b")
+    page.wait(f"at('message').textContent.startsWith('Best fit') && {VALUE} !== 0.3")
+    page.run("history.back()")
+    page.wait(f"{VALUE} === 0.3")
+    page.idle()
+    with busy(view):  # switched off while its fit is on the way: it stays off
+        page.key("b")
+        page.wait("busy === 'best fit'")
+        page.run("toggle('lens-vignetting', false)")
+    page.idle()
+    assert page.run(f"[{VALUE}, on.size]") == [0, 0]
+
+
 def test_pictures_follow_mode_wipe_channel_and_frame(page, model):
     found, values = model
     pixels = "Array.from(context.getImageData(0, 0, 48, 36).data)"
@@ -583,6 +666,8 @@ def test_pictures_follow_mode_wipe_channel_and_frame(page, model):
     z = np.where(found.usable(0).all(2), z.sum(2) / np.sqrt(3), 0)
     assert (whitened[z > 3][:, 0] > whitened[z > 3][:, 2]).all() and (whitened[z < -3][:, 2] > whitened[z < -3][:, 0]).all()
     assert (np.abs(z) > 3).sum() > 10
+    page.run("captures.get(0).use.fill(0, 0, 3), redraw()")  # the first pixel
+    assert len(set(seen()[0, 0])) == 1 and np.array_equal(seen()[1:], whitened[1:])
     page.key(".")
     page.idle()
     assert page.run("at('frame').value") == "1" and page.run("document.querySelector('.bars [aria-current=true]').textContent").startswith("p0-led_3")
@@ -605,6 +690,7 @@ def test_the_best_fit_is_the_servers_and_is_written(page, ask, study):
         page.idle()
         page.key("l")
         page.idle()
+        assert page.run("shifted(0).length") == 0 and page.run(f"there['{VIGNETTING}']") == page.run(VALUE)
     assert abs(page.run(VALUE) - HIDDEN) < 0.05 and page.numbers("chi")[0] == pytest.approx(1, abs=0.1)  # 5184 values: sd 0.02, and 8 bits
     assert page.numbers("chi")[0] < 0.9 * page.numbers("chi0")[0]
     page.key("w")
