@@ -79,7 +79,7 @@ def rounds(rig, count: int, first: int = 0) -> Iterator[list[Cell]]:
             cells.append(Cell(rig.name, "pair", tuple(both), PAIR_CHANGE, 0.0, "same", "", number))
         if rig.mistakes:
             cells.append(Cell(rig.name, "mistake", (), 0.0, 0.0, "same", rig.mistakes[number % len(rig.mistakes)], number))
-        yield cells
+        yield [cells[i] for i in rng.permutation(len(cells))]  # so that what is done when time is up is balanced
 
 
 def pairs_of(effects: Sequence[str], apart: int = 3) -> list[tuple[str, str]]:

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from optics import captures as capture_files, demo, loop, scene as scenes, synthetic_wild as wild
+from optics import captures as capture_files, demo, loop, scene as scenes
 from optics.cli import app
-from optics.proof.rigs import Bench
+from optics.proof.rigs import bench as readings, touch
 
 SIZE = {"width": "40", "height": "30"}
 
@@ -19,8 +19,8 @@ def study(tmp_path_factory, mitsuba):
     scene = scenes.load("digit", SIZE)
     built = {**demo.truth(scene, 1), "camera.exposure": 700.0}
     everything = dict.fromkeys(scene.leds, 1.0)
-    shots = [wild.Shot(f"press{k}", f"press-{k}", at, everything) for k, at in enumerate([(-1.5, 1.0, 0.5), (1.0, -1.5, 0.6), (0.5, 2.0, 0.7)])]
-    capture_files.write(wild.Wild(scene, built, spp=64).shoot(shots, "digit"), folder / "captures", bits=16)
+    shots = [touch.Shot(f"press{k}", f"press-{k}", at, everything) for k, at in enumerate([(-1.5, 1.0, 0.5), (1.0, -1.5, 0.6), (0.5, 2.0, 0.7)])]
+    capture_files.write(touch.Wild(scene, built, spp=64).shoot(shots, "digit"), folder / "captures", bits=16)
     setup = loop.Setup(captures=str(folder / "captures"), free=["led_*.power", "membrane.sigma"], per_group=[], held_out=["press-1"],
                        values={k: v for k, v in built.items() if k != "camera.exposure"})
     loop.begin(setup, folder / "study")
@@ -56,8 +56,8 @@ def test_a_rehearsal_from_the_command_line(study):
 
 
 def test_readings_are_not_imitated(tmp_path):
-    bench = Bench()
-    capture_files.write(wild.sweep(bench.bench({}), bench.settings()[:100], 1), tmp_path / "captures")
+    bench = readings.Bench()
+    capture_files.write(readings.sweep(bench.bench({}), bench.settings()[:100], 1), tmp_path / "captures")
     loop.begin(bench.setup(tmp_path / "captures", 1), tmp_path / "study")
     said = CliRunner().invoke(app, ["imitate", str(tmp_path / "study"), "-o", str(tmp_path / "out")])
     assert said.exit_code != 0 and "readings in a table are not imitated" in str(said.exception)

@@ -1,30 +1,30 @@
-"""Captures as they come from a workshop: clutter that nobody models, effects of another shape, effects that no library has.
+"""Sensors that see a pressed gel lit by LEDs: `digit` and `gelsight`, by stock Mitsuba's path tracer on meshes of its own.
 
-`Wild` is `optics.synthetic.Maker` (stock Mitsuba, its own meshes) with
+`Wild` is `optics.synthetic.Maker` as it comes from a workshop, with
 
     clutter    c = 1: fixed pattern of the sensor 0.5 % rms, mottle of the coating 1 % rms (0.4 mm), wrinkles of the skin of 0.3 deg rms,
                the same in every frame; of these no effect of the library knows (diagnosis laboratory, 3.4)
     shape      "other": effects with the same cause and size as the library's, but another law, as in OTHER
     unknown    what the library does not have, as in UNKNOWN
-
-`sweep` does the same for readings of the polarizer bench, on the means of `optics.jones`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from optics import captures as capture_files, jones
+from optics import captures as capture_files, demo, scene as scenes, synthetic
 from optics.noise import Noise
-from optics.synthetic import Maker
+from optics.proof.cells import Cell, pairs_of
+from optics.proof.rigs.base import PATTERNS, Mean, Pictures, Workshop, smooth
 
 CAMERA = Noise(system_gain=0.1, dark_noise=2.0, black_level=256.0, saturation=4095.0, prnu=0.0)  # 12 bits, 38 000 electrons
-PATTERN, MOTTLE, WRINKLE = 0.005, 0.01, 0.3  # rms: of a gain per pixel, of the coating, deg of the skin's slope; at clutter 1
+MOTTLE, WRINKLE = 0.01, 0.3  # rms: of the coating, deg of the skin's slope; at clutter 1
 GRAIN = 0.4  # mm: of mottle and wrinkles
+IN_CAMERA = ("lens vignetting", "veiling glare", "lens blur", "colour crosstalk", "residual response curve", "radial distortion", "gain drift")
 
 # effect -> how the other law differs; what is not here has one law only
 OTHER = {
@@ -47,42 +47,24 @@ UNKNOWN = {
     "stain": ("place",), "banding": ("row",), "tap": ("column",), "ring": ("radius",), "height gain": ("height", "gel_path"),
     "slope gain": ("slope",), "contact film": ("contact", "contact_distance"), "red drift": ("frame",),
 }
-# of the bench's readings
-UNKNOWN_READINGS = {"third harmonic": ("analyzer.angle",), "warm-up": ("source.time",), "lamp step": ("source.power",),
-                    "smeared film": ("polarizer.angle",)}
 
+class Wild(Workshop, synthetic.Maker):
+    """A maker of frames with clutter, laws of another shape, and kinds that the library lacks: see `Workshop.furnish`.
 
-def smooth(shape: tuple[int, int], sd: float, rng: np.random.Generator) -> np.ndarray:
-    """Gaussian noise of the correlation length sd (pixels), rms 1."""
-    from scipy.ndimage import gaussian_filter
-
-    found = gaussian_filter(rng.standard_normal(shape), sd, mode="wrap")
-    return found / found.std()
-
-
-class Wild(Maker):
-    """A maker of frames with clutter, laws of another shape, and kinds that the library lacks.
-
-    unknown   {kind of UNKNOWN: relative size}: the signal gains (1 + size p), p of order 1
-    clutter   1 is what a good sensor has
-    light     kept pictures of presses, by geometry: makers that share them make only what differs anew
+    kept   pictures of presses, by geometry: makers that share them make only what differs anew
     """
 
-    def __init__(self, scene, values=None, effects=None, noise: Noise | None = None, seed: int = 0, spp: int = 256, *,
-                 unknown: Mapping[str, float] | None = None, clutter: float = 0.0, other: bool = False, kept: dict | None = None):
-        super().__init__(scene, values, effects, noise or CAMERA, seed, spp)
-        if lacking := set(unknown or {}) - set(UNKNOWN):
-            raise ValueError(f"no kind {', '.join(sorted(lacking))}; known: {', '.join(UNKNOWN)}")
+    def __init__(self, scene, values=None, effects=None, noise: Noise | Mean = CAMERA, seed: int = 0, spp: int = 256, *,
+                 unknown: Mapping[str, float] | None = None, clutter: float = 0.0, other: bool = False, pattern: float | None = None,
+                 kept: dict | None = None):
+        super().__init__(scene, values, effects, noise, seed, spp)
         if other and (lacking := set(self.effects) - set(OTHER)):
             raise ValueError(f"{', '.join(sorted(lacking))}: one law only; allowed with another: {', '.join(OTHER)}")
-        self.unknown, self.clutter, self.other = dict(unknown or {}), float(clutter), other
+        self.furnish(unknown or {}, UNKNOWN, clutter, other, pattern)
         self.kept = {} if kept is None else kept
         width, height = self.size
-        rng = np.random.default_rng([seed, 17])
-        half = self._half()
-        grain = GRAIN / (2 * half / width)  # px
-        self.pattern = PATTERN * rng.standard_normal((height, width, 3))
-        self.mottle = MOTTLE * smooth((height, width), grain, rng)[..., None]
+        rng = np.random.default_rng([seed, 18])
+        self.mottle = self.clutter * MOTTLE * smooth((height, width), GRAIN / (2 * self._half() / width), rng)[..., None]
         self.wrinkle = smooth((256, 256), GRAIN / (24.0 / 256), rng)  # over 24 mm
 
     def _half(self) -> float:
@@ -204,30 +186,15 @@ class Wild(Maker):
 
     # -- camera ---------------------------------------------------------------------------------------------------------
 
-    def photograph(self, radiance, rng, frame, exposure: float = 1.0, press: Sequence[float] | None = None):
-        image = radiance
-        if self.clutter:
-            image = image * (1 + self.clutter * self.mottle)
-        if self.unknown:
-            image = image * self._unknown_gain(press, frame)
-        effects, noise, values = self.effects, self.noise, self.values
-        if self.other:
-            image = self._other_lens(image)
-            self.effects = {}
-        self.values = {**values, f"{self.camera}.exposure": values[f"{self.camera}.exposure"] * exposure}
-        self.noise = Mean(noise)
+    def photograph(self, radiance, rng, frame, press=None, exposure: float = 1.0):
+        values, key = self.values, f"{self.camera}.exposure"
+        self.values = {**values, key: values[key] * exposure}
         try:
-            mean = super().photograph(image, rng, frame)
+            return super().photograph(radiance * (1 + self.mottle), rng, frame, press)
         finally:
-            self.effects, self.noise, self.values = effects, noise, values
-        signal = (mean - noise.black_level) / (noise.saturation - noise.black_level)
-        if self.other:
-            signal = self._other_sensor(signal, frame)
-        if self.clutter:
-            signal = signal * (1 + self.clutter * self.pattern)
-        return noise.expose(noise.black_level + (noise.saturation - noise.black_level) * signal, rng)
+            self.values = values
 
-    def _other_lens(self, image):
+    def lens(self, image):
         from scipy.ndimage import convolve, gaussian_filter, map_coordinates
 
         e = self.effects
@@ -253,7 +220,7 @@ class Wild(Maker):
             image = image + e["veiling glare"] * (wide - image)
         return image
 
-    def _other_sensor(self, signal, frame: int):
+    def sensed(self, signal, frame: int):
         e = self.effects
         if "gain drift" in e:
             rng = np.random.default_rng([self.seed, frame, 5])
@@ -266,37 +233,19 @@ class Wild(Maker):
             signal = signal + e["residual response curve"] * signal * (1 - signal) * (1.6 - 1.2 * signal)
         return signal
 
-    def _unknown_gain(self, press, frame: int):
-        """(H, W, 1 or 3) gain by the kinds that the library lacks; each pattern is of order 1."""
+    def gain(self, kind: str, size: float, frame: int, press) -> np.ndarray:
         from optics.gel import contact
 
-        width, height = self.size
-        v, u = (np.mgrid[:height, :width] + 0.5) / np.array([height, width])[:, None, None]
-        x, y = self._tangents()
-        gain = np.ones((height, width, 1))
-        for kind, size in self.unknown.items():
-            if kind == "stain":
-                p = np.exp(-(((u - 0.7) / 0.12) ** 2 + ((v - 0.35) / 0.1) ** 2) / 2)
-            elif kind == "banding":
-                p = np.sin(2 * np.pi * 2.6 * v + 0.5)
-            elif kind == "tap":
-                p = np.where(u < 0.5, 1.0, 0.0)
-            elif kind == "ring":
-                r = np.sqrt(x**2 + y**2)
-                p = np.exp(-(((r / r.max()) - 0.55) / 0.1) ** 2)
-            elif kind == "red drift":
-                gain = gain * (1 + size * np.random.default_rng([self.seed, frame, 7]).standard_normal() * np.array([1.0, 0, 0]))
-                continue
-            else:
-                point = self.seen(press)[0]
-                if kind == "height gain":
-                    p = -point[..., 2] / 0.5
-                elif kind == "slope gain":
-                    p = sum(g**2 for g in np.gradient(point[..., 2], 2 * self._half() / width)) / 0.04
-                else:  # a film that the contact leaves
-                    p = -contact.surface(point[..., 0], point[..., 1], press[0], press[1], self._touch(press))
-            gain = gain * (1 + size * p[..., None])
-        return gain
+        if kind not in ("height gain", "slope gain", "contact film"):
+            return super().gain(kind, size, frame, press)
+        point = self.seen(press)[0]
+        if kind == "height gain":
+            p = -point[..., 2] / 0.5
+        elif kind == "slope gain":
+            p = sum(g**2 for g in np.gradient(point[..., 2], 2 * self._half() / self.size[0])) / 0.04
+        else:  # a film that the contact leaves
+            p = -contact.surface(point[..., 0], point[..., 1], press[0], press[1], self._touch(press))
+        return 1 + size * p[..., None]
 
     def _touch(self, press):
         from optics.gel import contact
@@ -305,8 +254,8 @@ class Wild(Maker):
         profile = contact.indenter_profile(v[f"{g}.indenter"], v[f"{g}.indenter_size"], (0.0, 0.0, 0.0), 3.0, 0.03)
         return contact.displacement(profile, press[2], v[f"{g}.thickness"], v[f"{g}.smoothing"], skirt=v.get(f"{g}.skirt", 0.0))[1]
 
-    def shoot(self, shots: Sequence["Shot"], scene_name: str, noted: Noise | None = None) -> capture_files.Captures:
-        """A capture set of these shots; `noted`: the noise that is written down (None: the true one)."""
+    def shoot(self, shots: Sequence["Shot"], scene_name: str) -> capture_files.Captures:
+        """A capture set of these shots."""
         rng = np.random.default_rng([self.seed, 3])
         frames = []
         for number, shot in enumerate(shots):
@@ -316,9 +265,9 @@ class Wild(Maker):
             settings = {f"{led}.power": float(shot.drive.get(led, 0.0)) for led in self.leds}
             settings |= {f"{self.gel}.press_{n}": float(v) for n, v in zip(("x", "y", "depth"), shot.press)}
             settings[f"{self.camera}.exposure"] = float(self.values[f"{self.camera}.exposure"] * shot.exposure)
-            image = self.photograph(radiance, rng, number, shot.exposure, shot.press).astype(np.float32)
+            image = self.photograph(radiance, rng, number, shot.press, shot.exposure).astype(np.float32)
             frames.append(capture_files.Frame(shot.name, image, None, shot.group, settings, [], f"frames/{shot.name}.png"))
-        return capture_files.Captures(Path("."), scene_name, frames, {}, noted or self.noise, None, None, "DN", None, [])
+        return capture_files.Captures(Path("."), scene_name, frames, {}, self.noise, None, None, "DN", None, [])
 
 
 @dataclass(frozen=True)
@@ -332,17 +281,6 @@ class Shot:
     exposure: float = 1.0
 
 
-class Mean:
-    """A camera without noise: `photograph` gives the mean."""
-
-    def __init__(self, noise: Noise):
-        self.black_level, self.saturation = noise.black_level, noise.saturation
-
-    @staticmethod
-    def expose(signal, rng):
-        return signal
-
-
 def _disc(radius: float) -> np.ndarray:
     """Kernel of an even disc (px), each cell by its share of 9 x 9 points; sum 1."""
     side = int(np.ceil(radius)) + 1
@@ -352,52 +290,72 @@ def _disc(radius: float) -> np.ndarray:
     return kernel / kernel.sum()
 
 
-IN_CAMERA = ("lens vignetting", "veiling glare", "lens blur", "colour crosstalk", "residual response curve", "radial distortion", "gain drift")
+# -- the sensors --------------------------------------------------------------------------------------------------------
 
 
-# -- readings -----------------------------------------------------------------------------------------------------------
+class Touch(Pictures):
+    """12 bits, 38 000 electrons: noise of 1 % at the mean signal of a bright frame."""
 
-READINGS_NOISE = Noise(0.01, 1.0, 64.0, 4095.0, 0.0)  # 400 000 electrons: 0.3 % at the mean reading
-WANDER, JITTER = 0.003, 0.05  # of the lamp, rms relative, in some minutes; deg rms of the analyser; at clutter 1
+    effects = ("lens vignetting", "veiling glare", "lens blur", "colour crosstalk", "residual response curve", "interreflection",
+               "ambient light", "LED size", "gel absorption", "radial distortion", "gain drift", "gel wedge", "gel bulge", "specular lobe",
+               "gel haze")
+    others = tuple(OTHER)
+    unknown = UNKNOWN
+    random = ("gain drift",)
+    width = height = 0
+    exposure = 0.0
+
+    def __init__(self):
+        super().__init__()
+        self.kept: dict = {}
+
+    def scene(self):
+        return scenes.load(self.name, {"width": str(self.width), "height": str(self.height)})
+
+    def built(self, scene, seed: int) -> dict[str, float]:
+        return {**demo.truth(scene, seed), f"{scene.camera.name}.exposure": self.exposure}
+
+    def shots(self, scene, seed: int) -> list[Shot]:
+        raise NotImplementedError
+
+    def captures(self, cell: Cell, truth, unknown, *, mean: bool = False) -> capture_files.Captures:
+        scene = self.scene()
+        maker = Wild(scene, self.built(scene, cell.seed), truth, Mean(CAMERA) if mean else CAMERA, 1000 + cell.seed, unknown=unknown,
+                     clutter=cell.clutter, other=cell.law == "other", pattern=PATTERNS.get(cell.mistake), kept=self.kept)
+        found = maker.shoot(self.shots(scene, cell.seed), self.name)
+        found.noise = CAMERA
+        return found
 
 
-def bench_light(truth: jones.Truth, settings: jones.Settings, noise: Noise = READINGS_NOISE, turned: np.ndarray | None = None) -> np.ndarray:
-    """(n, 1) mean of readings above black, DN, at settings in the model's keys: films that are out (`middle.inserted`, ...) and the
-    exposure too, which `jones` knows as parts of the bench. `turned`: deg by which the analyser is off its dial."""
-    turned = np.zeros(len(settings)) if turned is None else turned
-    light = np.zeros((len(settings), 1))
-    sets = [(s.get("middle.inserted", 0.0), s.get("camera.exposure", 1.0)) for s in settings]
-    for middle, exposure in sorted(set(sets)):
-        own = [i for i, s in enumerate(sets) if s == (middle, exposure)]
-        film = replace(truth.p1, offset=0.0, scale=1.0, backlash=0.0) if middle else None  # of the same roll
-        bench = replace(truth, pm=film, photodiode=replace(truth.photodiode, gain=truth.photodiode.gain * exposure))
-        dials = [{k: v for k, v in settings[i].items() if k in jones.DEFAULTS and (middle or not k.startswith("middle."))} for i in own]
-        for i, dial in zip(own, dials):
-            dial["analyzer.angle"] = dial["analyzer.angle"] + turned[i]
-        light[own] = jones.expected(bench, dials, noise) - noise.black_level
-    return light
+class Digit(Touch):
+    """Ten presses lit by red, green and blue LEDs at once, one of them at 0.4 of the exposure as well, and a dark frame; three of the
+    presses are held out."""
+
+    name = "digit"
+    pairs = pairs_of([e for e in Touch.effects if e not in ("interreflection", "gain drift")])
+    width, height, exposure = 36, 48, 700.0
+
+    def shots(self, scene, seed: int) -> list[Shot]:
+        everything = {led: 1.0 for led in scene.leds}
+        at = [tuple(float(v) for v in p) for p in synthetic.presses(10, seed)]
+        shots = [Shot(f"press{k:02d}", f"press-{k:02d}", p, everything) for k, p in enumerate(at)]
+        return [*shots, Shot("press00-short", "press-00", at[0], everything, 0.4), Shot("dark", "press-00", at[0], {})]
 
 
-def sweep(truth: jones.Truth, settings: jones.Settings, seed: int, unknown: Mapping[str, float] | None = None, clutter: float = 0.0,
-          noise: Noise = READINGS_NOISE, noted: Noise | None = None) -> capture_files.Captures:
-    """Readings of the bench as a capture set with a table; see the module for `unknown` and `clutter`, `bench_light` for settings."""
-    if lacking := set(unknown or {}) - set(UNKNOWN_READINGS):
-        raise ValueError(f"no kind {', '.join(sorted(lacking))}; known: {', '.join(UNKNOWN_READINGS)}")
-    rng = np.random.default_rng([seed, 19])
-    count = len(settings)
-    light = bench_light(truth, settings, noise, clutter * JITTER * rng.standard_normal(count))
-    light = light * (1 + clutter * WANDER * smooth((count, 1), count / 40, rng))
-    of = {key: np.array([s.get(key, jones.DEFAULTS[key]) for s in settings])[:, None] for key in jones.DEFAULTS}
-    for kind, size in (unknown or {}).items():
-        p = {"third harmonic": lambda: np.cos(3 * np.radians(of["analyzer.angle"])),
-             "warm-up": lambda: -np.exp(-of["source.time"] / 4.0),
-             "lamp step": lambda: (of["source.power"] < 0.75).astype(float),
-             "smeared film": lambda: -((of["polarizer.angle"] > 80) & (of["polarizer.angle"] < 120)).astype(float)}[kind]()
-        light = light * (1 + size * p)
-    values = noise.expose(noise.black_level + light, rng)
-    keys = list(dict.fromkeys(key for s in settings for key in s))
-    frames = [capture_files.Frame(f"row {i}", value.astype(np.float32).reshape(1, 1, -1),
-                                  parameters={key: float(s.get(key, jones.DEFAULTS.get(key, 0.0))) for key in keys})
-              for i, (s, value) in enumerate(zip(settings, values))]
-    return capture_files.Captures(Path("."), "polarizer_bench", frames, noise=noted or noise,
-                                  table=capture_files.Table("readings.csv", ["reading"]))
+class Gelsight(Touch):
+    """Eight presses under two of the six white LEDs each, one after the other; one of them at 0.4 of the exposure as well, and a dark
+    frame; two of the presses are held out. White light hardly shows crosstalk between colours."""
+
+    name = "gelsight"
+    effects = tuple(e for e in Touch.effects if e != "colour crosstalk")
+    pairs = pairs_of([e for e in effects if e not in ("interreflection", "gain drift")])
+    width, height, exposure = 40, 30, 200.0
+
+    def shots(self, scene, seed: int) -> list[Shot]:
+        leds, shots = list(scene.leds), []
+        at = [tuple(float(v) for v in p) for p in synthetic.presses(8, seed)]
+        for k, press in enumerate(at):
+            for step in (0, len(leds) // 2):
+                led = leds[(k + step) % len(leds)]
+                shots.append(Shot(f"press{k:02d}-{led}", f"press-{k:02d}", press, {led: 1.0}))
+        return [*shots, Shot("press00-short", "press-00", at[0], {leds[0]: 1.0}, 0.4), Shot("dark", "press-00", at[0], {})]

@@ -1,0 +1,16 @@
+"""Sensors and benches of the proof, a file each: what can be hidden, by which independent path captures are made, how a study begins.
+
+    base     what all of them are: strengths that make a change, the truth of a cell, captures with what is noted wrongly
+    touch    digit, gelsight: stock Mitsuba's `path` (optics.synthetic)
+    finger   vi2tap: stock films in the mono variant (optics.synthetic_finger)
+    grid     grid_bench: stock `volpath` (optics.synthetic_grid)
+    bench    polarizer_bench: coherency matrices (optics.jones)
+"""
+
+from optics.proof.rigs.base import Rig
+from optics.proof.rigs.bench import Bench
+from optics.proof.rigs.finger import Finger
+from optics.proof.rigs.grid import Grid
+from optics.proof.rigs.touch import Digit, Gelsight
+
+RIGS: dict[str, type[Rig]] = {rig.name: rig for rig in (Digit, Gelsight, Finger, Grid, Bench)}

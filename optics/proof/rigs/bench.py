@@ -1,0 +1,144 @@
+"""`polarizer_bench`: readings of a photodiode behind two or three films, by coherency matrices (optics.jones).
+
+    clutter    c = 1: the lamp wanders by 0.3 % rms in some minutes, the analyser is off its dial by 0.05 deg rms from reading to reading
+    unknown    what the library does not have, as in UNKNOWN
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from optics import captures as capture_files, jones
+from optics.noise import Noise
+from optics.proof.cells import Cell, pairs_of
+from optics.proof.rigs.base import Rig, smooth, strength_at
+
+PHOTODIODE = Noise(0.01, 1.0, 64.0, 4095.0, 0.0)  # 400 000 electrons: 0.3 % at the mean reading
+WANDER, JITTER = 0.003, 0.05  # of the lamp, rms relative; deg rms of the analyser; at clutter 1
+# kind -> coordinates by any of which it is rightly named
+UNKNOWN = {"third harmonic": ("analyzer.angle",), "warm-up": ("source.time",), "lamp step": ("source.power",),
+           "smeared film": ("polarizer.angle",)}
+
+
+def bench_light(truth: jones.Truth, settings: jones.Settings, noise: Noise = PHOTODIODE, turned: np.ndarray | None = None) -> np.ndarray:
+    """(n, 1) mean of readings above black, DN, at settings in the model's keys: films that are out (`middle.inserted`, ...) and the
+    exposure too, which `jones` knows as parts of the bench. `turned`: deg by which the analyser is off its dial."""
+    turned = np.zeros(len(settings)) if turned is None else turned
+    light = np.zeros((len(settings), 1))
+    sets = [(s.get("middle.inserted", 0.0), s.get("camera.exposure", 1.0)) for s in settings]
+    for middle, exposure in sorted(set(sets)):
+        own = [i for i, s in enumerate(sets) if s == (middle, exposure)]
+        film = replace(truth.p1, offset=0.0, scale=1.0, backlash=0.0) if middle else None  # of the same roll
+        bench = replace(truth, pm=film, photodiode=replace(truth.photodiode, gain=truth.photodiode.gain * exposure))
+        dials = [{k: v for k, v in settings[i].items() if k in jones.DEFAULTS and (middle or not k.startswith("middle."))} for i in own]
+        for i, dial in zip(own, dials):
+            dial["analyzer.angle"] = dial["analyzer.angle"] + turned[i]
+        light[own] = jones.expected(bench, dials, noise) - noise.black_level
+    return light
+
+
+def gain(kind: str, settings: jones.Settings) -> np.ndarray:
+    """(n, 1) relative gain of the readings, less 1, by a kind of UNKNOWN of size 1."""
+    analyzer, polarizer, time, power = (np.array([s.get(key, jones.DEFAULTS[key]) for s in settings])[:, None]
+                                        for key in ("analyzer.angle", "polarizer.angle", "source.time", "source.power"))
+    return {"third harmonic": lambda: np.cos(3 * np.radians(analyzer)),
+            "warm-up": lambda: -np.exp(-time / 4.0),
+            "lamp step": lambda: (power < 0.75).astype(float),
+            "smeared film": lambda: -((polarizer > 80) & (polarizer < 120)).astype(float)}[kind]()
+
+
+def sweep(truth: jones.Truth, settings: jones.Settings, seed: int, unknown: Mapping[str, float] | None = None, clutter: float = 0.0,
+          mean: bool = False) -> capture_files.Captures:
+    """Readings of the bench as a capture set with a table; see the module for `unknown` and `clutter`, `bench_light` for settings."""
+    rng = np.random.default_rng([seed, 19])
+    count = len(settings)
+    light = bench_light(truth, settings, turned=clutter * JITTER * rng.standard_normal(count))
+    light = light * (1 + clutter * WANDER * smooth((count, 1), count / 40, rng))
+    for kind, size in (unknown or {}).items():
+        light = light * (1 + size * gain(kind, settings))
+    values = PHOTODIODE.black_level + light
+    values = values if mean else PHOTODIODE.expose(values, rng)
+    keys = list(dict.fromkeys(key for s in settings for key in s))
+    frames = [capture_files.Frame(f"row {i}", value.astype(np.float32).reshape(1, 1, -1),
+                                  parameters={key: float(s.get(key, jones.DEFAULTS.get(key, 0.0))) for key in keys})
+              for i, (s, value) in enumerate(zip(settings, values))]
+    return capture_files.Captures(Path("."), "polarizer_bench", frames, noise=PHOTODIODE, table=capture_files.Table("readings.csv", ["reading"]))
+
+
+class Bench(Rig):
+    """600 readings: five angles of P1, the analyser round and back, two powers
+    of the lamp, two angles of the sample; a third of them with a film put in between, or at 0.15 of the exposure, as `optics diagnose`
+    advises: without, a leak looks like a hazy sample, and stray light like an offset."""
+
+    name = "polarizer_bench"
+    effects = ("polarizer misalignment", "servo scale", "servo backlash", "analyzer wobble", "retardance", "camera gamma", "polarized source",
+               "extinction leak", "depolarization", "dark offset", "stray light", "source drift")
+    unknown = UNKNOWN
+    mistakes = ("gain +20 %", "gain -20 %", "black level 0.5 DN")
+    # of the rest, the sum of two looks like another: leak and depolarization, offset and stray light
+    # and an angle too far on average, which is what a scale does: of opposite sign they leave nothing to be seen
+    pairs = [p for p in pairs_of([e for e in effects if e not in ("depolarization", "stray light")])
+             if set(p) != {"polarizer misalignment", "servo scale"}]
+    count = 600
+    most = {"polarizer misalignment": 20, "servo scale": 0.2, "servo backlash": 20, "analyzer wobble": 0.4, "retardance": 80, "camera gamma": 1,
+            "polarized source": 0.9, "extinction leak": 0.3, "depolarization": 0.9, "dark offset": 500, "stray light": 1.0, "source drift": 0.03}
+    # what of the effect's parameters the readings know: of two films' misalignments, the difference
+    seen: Mapping[str, tuple[dict[str, float], float]] = {
+        "polarizer misalignment": ({"analyzer.offset": 1.0, "polarizer.offset": -1.0}, 0.0), "servo scale": ({"analyzer.scale": 1.0}, 1.0),
+        "servo backlash": ({"analyzer.backlash": 1.0}, 0.0), "analyzer wobble": ({"analyzer.wobble_c": 1.0}, 0.0),
+        "camera gamma": ({"camera.gamma": 1.0}, 0.0), "depolarization": ({"sample.depolarization": 1.0}, 0.0),
+        "dark offset": ({"camera.offset": 1.0}, 0.0), "source drift": ({"source.drift": 1.0}, 0.0)}
+
+    def settings(self) -> list[dict[str, float]]:
+        found = jones.malus_sweep(self.count, polarizer_angles=(0.0, 60.0, 100.0, 190.0, 250.0))
+        for i, own in enumerate(found):
+            own.update({"source.power": (1.0, 0.5)[i % 2], "sample.angle": (0.0, 45.0)[i // 2 % 2], "middle.inserted": float(i // 4 % 6 == 0),
+                        "middle.angle": 20.0, "camera.exposure": 0.15 if i // 4 % 6 == 1 else 1.0})
+        return found
+
+    def bench(self, hidden: Mapping[str, float]) -> jones.Truth:
+        p1, p2, source, sample, diode, stray = jones.Polarizer(), jones.Polarizer(), jones.Source(), jones.Sample(), jones.Photodiode(gain=2.0), 0.0
+        for effect, s in hidden.items():
+            if effect == "polarizer misalignment":
+                p2 = replace(p2, offset=s)
+            elif effect == "servo scale":
+                p2 = replace(p2, scale=1 + s)
+            elif effect == "servo backlash":
+                p2 = replace(p2, backlash=s)
+            elif effect == "analyzer wobble":
+                p2 = replace(p2, wobble_c=s)
+            elif effect == "extinction leak":
+                p1, p2 = replace(p1, leak=s), replace(p2, leak=s)
+            elif effect == "retardance":
+                sample = replace(sample, retardance=s, axis=20.0)
+            elif effect == "depolarization":
+                sample = replace(sample, depolarization=s)
+            elif effect == "polarized source":
+                source = replace(source, dop=s, dop_angle=30.0)
+            elif effect == "source drift":
+                source = replace(source, drift=s)
+            elif effect == "camera gamma":
+                diode = replace(diode, gamma=1 + s)
+            elif effect == "dark offset":
+                diode = replace(diode, offset=s)
+            else:
+                stray = s
+        return jones.Truth(p1=p1, p2=p2, source=source, sample=sample, photodiode=diode, stray=stray)
+
+    def mean(self, hidden: Mapping[str, float]) -> np.ndarray:
+        return bench_light(self.bench(hidden), self.settings())
+
+    def strength_of(self, effect: str, change: float) -> float:
+        plain = self.mean({})
+        return strength_at(change, lambda s: float(np.sqrt(np.mean((self.mean({effect: s}) - plain) ** 2)) / plain.mean()),
+                           0.01 * self.most[effect], self.most[effect])
+
+    def captures(self, cell: Cell, truth, unknown, *, mean: bool = False) -> capture_files.Captures:
+        return sweep(self.bench(truth), self.settings(), 1000 + cell.seed, unknown, cell.clutter, mean)
+
+    def parameters(self, effect: str) -> tuple[dict[str, float], float] | None:
+        return self.seen.get(effect)
