@@ -4,8 +4,8 @@
 
 A polarizer bench (made by coherency matrices, optics.jones, which share no line with the model) hides one of four faint causes of light
 where there should be none. A Malus sweep cannot say which: a leak of the films looks like a hazy sample, stray light like an offset of
-the camera's zero. The diagnosis is AMBIGUOUS and says what to measure; the example does as it says, with 125 further readings, and
-diagnoses again.
+the camera's zero. The diagnosis is AMBIGUOUS and says what to measure; the example does as it says, with 125 further readings of
+each kind, and diagnoses again.
 """
 
 import sys
@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from optics import captures, jones, loop
+from optics.errors import UnknownKey
 from optics.jones import Photodiode, Polarizer, Sample, Truth
 from optics.noise import Noise
 
@@ -61,6 +62,8 @@ def diagnosed(folder, frames):
 
 def main(hidden="leak", folder=None):
     """(the effect hidden, the first diagnosis, the second one)."""
+    if hidden not in HIDDEN:
+        raise UnknownKey(hidden, HIDDEN, "cause")
     effect, truth = HIDDEN[hidden]
     folder = Path(folder or tempfile.mkdtemp())
     frames = measured(truth, sweep(1000), seed=1)

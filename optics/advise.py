@@ -15,16 +15,19 @@ the stage knows of them; every frame brings what the study solves for in each fr
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cache
+from itertools import chain, zip_longest
 
 import numpy as np
 
 from optics import statistics as st
 from optics.evidence import Candidate, Evidence, Progress, measure, value_of
 from optics.noise import SATURATED
-from optics.parameter import Values, Variable
-from optics.verdict import CLEAR, MARGIN, Advice, Apart, Diagnosis
+from optics.parameter import Parameter, Values, Variable
+from optics.verdict import CLEAR, MARGIN, Advice, Apart, Diagnosis, Row
 
 EXPOSURES = (0.4, 0.15, 2.5)  # of the present one: far enough to bend a response, near enough to see something
 DEPTHS = (2.0, 0.5)  # of the present one: a new geometry costs ten times what another light costs, so few are tried
@@ -40,6 +43,7 @@ ENOUGH = 4 * CLEAR  # D at which the right one wins in 99.95 % of cases; more is
 MEMBERS = 5  # effects that are told apart at once
 LIKELY = 6.0  # of chi2 below the best: 20 times less likely the cause in noise alone; a rival still, but not taken to be true
 CLOCKS = ("time", "approach")  # settings that tell when and from where, not what
+UNTOUCHED = "untouched"  # the press that is none: its place is not unknown
 
 
 @dataclass(frozen=True)
@@ -49,8 +53,6 @@ class Shot:
     family    what kind of change it is; words: what to do
     settings  key -> value that differs from the frame `like`
     press     name of the new press that it shows; '': the press of `like`, whose place is known as well as it is
-    exposure  factor on the exposure, in the settings already
-    frames    how many it costs
     """
 
     family: str
@@ -58,19 +60,17 @@ class Shot:
     like: int
     settings: dict[str, float] = field(default_factory=dict)
     press: str = ""
-    exposure: float = 1.0
-    frames: int = 1
 
 
 # -- which shots a scene admits ---------------------------------------------------------------------------------------
 
 
-def families(model, values: Values, frames: Sequence[int], most: int = SHOTS) -> list[Shot]:
-    """The shots to try, at most `most`, the families' first members first: found from the keys that the model has and frames turn.
+def families(model, values: Values, frames: Sequence[int]) -> list[Shot]:
+    """The shots to try, at most SHOTS, the families' first members first: found from the keys that the model has and frames turn.
 
     Places and depths where there is a press, exposure where there is a camera with one, single lights, darkness and dimmed light
     where there are lights, turned and removed films, an object nearer and farther, and for every other setting that the frames turned
-    a value between and one beyond.
+    a value between and one beyond either end.
     """
     like = _typical(model, values, frames)
     now = _now(model, values, like)
@@ -81,12 +81,7 @@ def families(model, values: Values, frames: Sequence[int], most: int = SHOTS) ->
     queues: dict[str, list[Shot]] = {}
     for shot in found:
         queues.setdefault(shot.family, []).append(shot)
-    return list(_in_turn(list(queues.values())))[:most]
-
-
-def _in_turn(queues: list[list[Shot]]) -> Iterator[Shot]:
-    for i in range(max(map(len, queues), default=0)):
-        yield from (queue[i] for queue in queues if i < len(queue))
+    return [shot for shot in chain(*zip_longest(*queues.values())) if shot is not None][:SHOTS]
 
 
 def _now(model, values: Values, frame: int) -> dict[str, float]:
@@ -96,13 +91,19 @@ def _now(model, values: Values, frame: int) -> dict[str, float]:
     return {**model.base, **values.common, **own.parameters, **swept, **values.frame.get(frame, {})}
 
 
-def _keys(model, name: str) -> list[str]:
-    return [k for k in model.parameters if k.rpartition(".")[2] == name]
+def keys_named(parameters: Iterable[str], name: str) -> list[str]:
+    """The keys of a parameter's name in all parts that have it."""
+    return [k for k in parameters if k.rpartition(".")[2] == name]
+
+
+def unit_of(parameter: Parameter) -> str:
+    """Its unit, to stand behind a number; nothing for a pure number."""
+    return "" if parameter.unit in ("", "1") else f" {parameter.unit}"
 
 
 def _press(model) -> tuple[str, str, str] | None:
     """Keys of place and depth of a press; None where nothing can be pressed."""
-    depth = _keys(model, "press_depth")
+    depth = keys_named(model.parameters, "press_depth")
     return tuple(depth[0].replace("press_depth", n) for n in ("press_x", "press_y", "press_depth")) if depth else None
 
 
@@ -125,13 +126,13 @@ def _typical(model, values: Values, frames: Sequence[int]) -> int:
 
 
 def _exposures(model, now: Mapping, like: int) -> Iterator[Shot]:
-    for key in _keys(model, "exposure")[:1]:
+    for key in keys_named(model.parameters, "exposure")[:1]:
         image, noise = np.asarray(model.frames[like].image, float), model.noise
         for factor in EXPOSURES:
             brighter = noise.black_level + factor * (image - noise.black_level)
             if factor < 1 or np.mean(brighter >= SATURATED * noise.saturation) < BRIGHT:
-                yield Shot("exposure", f"{_same(model, like)} at {factor:g} of the exposure" if factor < 1 else
-                           f"{_same(model, like)} at {factor:g} times the exposure", like, {key: factor * float(now[key])}, exposure=factor)
+                yield Shot("exposure", f"{_same(model, like)} at {factor:g} {'of' if factor < 1 else 'times'} the exposure", like,
+                           {key: factor * float(now[key])})
 
 
 def _presses(model, values: Values, frames: Sequence[int], now: Mapping, like: int) -> Iterator[Shot]:
@@ -141,41 +142,35 @@ def _presses(model, values: Values, frames: Sequence[int], now: Mapping, like: i
     known = np.array([[_now(model, values, f)[k] for k in keys] for f in frames])
     known = known[known[:, 2] > 0] if (known[:, 2] > 0).any() else known
     depth = float(np.median(known[:, 2])) or 0.5
-    thickness = float(now.get(keys[2].replace("press_depth", "thickness"), math.inf))
-    for i, (x, y) in enumerate(places(known[:, :2], _reach(model, known, now, keys), PLACES)):
+    deepest = DEEPEST * float(now.get(keys[2].replace("press_depth", "thickness"), math.inf))
+    near, far = _reaches(model, known, now, keys)
+    for i, (x, y) in enumerate(places(known[:, :2], near, PLACES)):
         yield Shot("another place", f"another press, {depth:.2g} mm deep at x = {x:.2g} mm, y = {y:.2g} mm", like,
                    dict(zip(keys, (x, y, depth))), press=f"place-{i + 1}")
-    x, y, here = (float(now[k]) for k in keys)
-    here = here or depth
-    deep = min(1.5 * here, DEEPEST * thickness)
-    wide = _width(model, known, now, keys)
-    for i, (u, v) in enumerate(places(known[:, :2], wide, FAR)):
+    x, y, pressed = (float(now[k]) for k in keys)
+    here = pressed or depth
+    deep = min(1.5 * here, deepest)
+    for i, (u, v) in enumerate(places(known[:, :2], far, FAR)):
         yield Shot("farther out", f"a press farther out, {deep:.2g} mm deep at x = {u:.2g} mm, y = {v:.2g} mm", like,
                    dict(zip(keys, (u, v, deep))), press=f"far-{i + 1}")
     for factor in DEPTHS:
-        to = min(factor * here, DEEPEST * thickness)
+        to = min(factor * here, deepest)
         if factor < 1 or to > 1.1 * here:
             family = "deeper press" if factor > 1 else "shallower press"
             yield Shot(family, f"the same place pressed {to:.2g} mm deep", like, dict(zip(keys, (x, y, to))), press=f"depth-{to:.2g}")
-    if here > 0:
-        yield Shot("no press", "nothing pressed, the same light", like, {keys[2]: 0.0}, press="untouched")
+    if pressed > 0:
+        yield Shot("no press", "nothing pressed, the same light", like, {keys[2]: 0.0}, press=UNTOUCHED)
 
 
-def _width(model, known: np.ndarray, now: Mapping, keys: Sequence[str]) -> np.ndarray:
-    """(2,) mm: how far from the middle a press still lies on the pad, as far as the scene says how large that is."""
-    found = []
-    for key, name, reach in zip(keys, ("width", "length"), np.abs(known[:, :2]).max(0)):
-        side = now.get(key.rpartition(".")[0] + f".{name}")
-        found.append(RIM * float(side) / 2 if side is not None else min(2 * max(reach, 0.5), 0.9 * model.parameters[key].bounds[1]))
-    return np.array(found)
-
-
-def _reach(model, known: np.ndarray, now: Mapping, keys: Sequence[str]) -> np.ndarray:
-    """(2,) how far from the middle presses may lie, mm: as far as they did, or a third of the gel's side where there were few."""
+def _reaches(model, known: np.ndarray, now: Mapping, keys: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
+    """(2,), (2,) mm: how far from the middle presses may lie (as far as they did, or 0.3 of the gel's side where those were few), and how
+    far out one still lies on the pad, as far as the scene says how large that is."""
     reach = np.abs(known[:, :2]).max(0)
-    sides = [now.get(keys[0].replace("press_x", name)) for name in ("width", "length")]
-    least = [0.3 * float(s) if s is not None else 1.0 for s in sides]
-    return np.where(reach > 0.3 * np.array(least), reach, least)
+    sides = [now.get(f"{key.rpartition('.')[0]}.{name}") for key, name in zip(keys, ("width", "length"))]
+    least = np.array([1.0 if side is None else 0.3 * float(side) for side in sides])
+    far = [min(2 * max(r, 0.5), 0.9 * model.parameters[key].bounds[1]) if side is None else RIM * float(side) / 2
+           for key, side, r in zip(keys, sides, reach)]
+    return np.where(reach > 0.3 * least, reach, least), np.array(far)
 
 
 def places(known: np.ndarray, reach: np.ndarray, count: int) -> list[tuple[float, float]]:
@@ -191,7 +186,7 @@ def places(known: np.ndarray, reach: np.ndarray, count: int) -> list[tuple[float
 
 
 def _lights(model, values: Values, frames: Sequence[int], now: Mapping, like: int) -> Iterator[Shot]:
-    keys = _keys(model, "power")
+    keys = keys_named(model.parameters, "power")
     driven = getattr(model, "driven", None)
     if not keys:
         return
@@ -200,10 +195,11 @@ def _lights(model, values: Values, frames: Sequence[int], now: Mapping, like: in
         """What a frame sets: drive levels; where levels are no setting of this model, only what is dark is said."""
         return {k: float(k in on) for k in keys if driven is not None or k not in on}
 
-    lit = lambda f: tuple(k for k in keys if _now(model, values, f)[k] != 0)  # noqa: E731
+    def lit(frame: int) -> tuple[str, ...]:
+        return tuple(k for k in keys if _now(model, values, frame)[k] != 0)
+
     here, what = lit(like), _same(model, like)
-    seen = dict.fromkeys([here, *map(lit, frames)])
-    wanted = [p for p in seen if p and p != here]
+    wanted = [p for p in dict.fromkeys(map(lit, frames)) if p and p != here]
     half = len(keys) // 2
     subsets = [tuple(keys), *([tuple(keys[:half]), tuple(keys[half:])] if len(keys) > 3 else []), *((k,) for k in keys)]
     wanted += [p for p in subsets if p != here and p not in wanted and len(keys) > 1]
@@ -220,7 +216,7 @@ def _lights(model, values: Values, frames: Sequence[int], now: Mapping, like: in
 def _films(model, now: Mapping, like: int) -> Iterator[Shot]:
     """Angles of polarizers and sheets, and films put in and taken out."""
     what = _same(model, like)
-    for key in _keys(model, "angle"):
+    for key in keys_named(model.parameters, "angle"):
         inserted = f"{key.rpartition('.')[0]}.inserted"
         if not now.get(inserted, 1.0):
             for turn in (45.0, 20.0):
@@ -235,7 +231,7 @@ def _films(model, now: Mapping, like: int) -> Iterator[Shot]:
 
 
 def _distances(model, now: Mapping, like: int) -> Iterator[Shot]:
-    for key in _keys(model, "distance"):
+    for key in keys_named(model.parameters, "distance"):
         for factor in (0.5, 2.0, 0.25):
             if now[key] > 0:
                 to = factor * float(now[key])
@@ -243,8 +239,9 @@ def _distances(model, now: Mapping, like: int) -> Iterator[Shot]:
 
 
 def _turned(model, frames: Sequence[int], now: Mapping, like: int) -> Iterator[Shot]:
-    """Settings that the frames turned and no family above knows: a value in the widest gap, and one beyond."""
-    special = {*(_press(model) or ()), *(k for n in ("power", "exposure", "angle", "inserted", "distance", *CLOCKS) for k in _keys(model, n))}
+    """Settings that the frames turned and no family above knows: a value in the widest gap, and one beyond either end."""
+    known = ("power", "exposure", "angle", "inserted", "distance", *CLOCKS)
+    special = {*(_press(model) or ()), *(k for name in known for k in keys_named(model.parameters, name))}
     turned: dict[str, set[float]] = {}
     for f in frames:
         own = model.frames[f]
@@ -260,8 +257,7 @@ def _turned(model, frames: Sequence[int], now: Mapping, like: int) -> Iterator[S
         beyond = min(levels[-1] + (levels[-1] - levels[0]) / 2, high)
         for to in ((levels[gap] + levels[gap + 1]) / 2, beyond, max(levels[0] - (levels[-1] - levels[0]) / 2, low)):
             if to not in taken:
-                unit = model.parameters[key].unit
-                yield Shot(f"another {key}", f"{_same(model, like)} with {key} = {to:.4g}{'' if unit in ('', '1') else ' ' + unit}", like, {key: to})
+                yield Shot(f"another {key}", f"{_same(model, like)} with {key} = {to:.4g}{unit_of(model.parameters[key])}", like, {key: to})
 
 
 # -- what shots would add ---------------------------------------------------------------------------------------------
@@ -281,6 +277,11 @@ class Member:
     strength: list[float]
     likely: bool = True
     more: dict[int, tuple[list[int], list[int], list[float]]] = field(default_factory=dict)
+
+    def bring(self, shot: int, column: int, side: int, strength: float) -> None:
+        """A strength that only this shot would show."""
+        for own, value in zip(self.more.setdefault(shot, ([], [], [])), (column, side, strength)):
+            own.append(value)
 
     def at(self, chosen: Sequence[int]) -> tuple[np.ndarray, list[int], np.ndarray]:
         parts = [(self.columns, self.sides, self.strength), *(self.more[s] for s in dict.fromkeys(chosen) if s in self.more)]
@@ -334,22 +335,21 @@ class Outlook:
         v, rest = self.information(chosen)
         place = {column: i for i, column in enumerate(rest)}
         own = [m.at(chosen) for m in self.members]
-        index = [np.array([place[c] for c in columns], int) for columns, _, _ in own]
-        found, full = np.full((len(own), len(own)), np.inf), np.zeros(len(own))
-        cones = [st.Cone(v[np.ix_(i, i)], sides, draws=1) if len(i) > 1 else None for i, (_, sides, _) in zip(index, own)]
-        for a, (_, _, strength) in enumerate(own):
-            score = v[:, index[a]] @ strength
-            full[a] = max(float(strength @ score[index[a]]), 0.0)
-            for b, (_, sides, _) in enumerate(own):
-                if a == b or (a, b) in self.nested or not self.members[a].likely:
-                    continue
-                if cones[b] is not None:
-                    mimicked = cones[b].solve(score[index[b]])[0]
-                else:
-                    i = index[b][0]
-                    u = score[i] if sides[0] == 0 else max(sides[0] * score[i], 0.0)
-                    mimicked = u**2 / v[i, i] if v[i, i] > 0 else 0.0
-                found[a, b] = full[a] - mimicked if full[a] - mimicked > 1e-9 * full[a] else 0.0  # below, it is rounding
+        index = [[place[c] for c in columns] for columns, _, _ in own]
+        scores = np.stack([v[:, i] @ strength for i, (_, _, strength) in zip(index, own)])  # (n, k): what each would leave, if true
+        full = np.array([max(float(strength @ score[i]), 0.0) for score, i, (_, _, strength) in zip(scores, index, own)])
+        found = np.full((len(own), len(own)), np.inf)
+        for b, (i, (_, sides, _)) in enumerate(zip(index, own)):
+            if len(i) == 1:  # `Cone.solve` of one strength, for all at once: a plan asks hundreds of times
+                u = scores[:, i[0]] if sides[0] == 0 else np.maximum(sides[0] * scores[:, i[0]], 0.0)
+                mimicked = u**2 / v[i[0], i[0]] if v[i[0], i[0]] > 0 else np.zeros(len(own))
+            else:
+                cone = st.Cone(v[np.ix_(i, i)], sides, draws=1)
+                mimicked = np.array([cone.solve(u)[0] for u in scores[:, i]])
+            d = full - mimicked
+            found[:, b] = np.where(d > 1e-9 * full, d, 0.0)  # below, it is rounding
+        for a, member in enumerate(self.members):
+            found[a, [b for b in range(len(own)) if a == b or (a, b) in self.nested or not member.likely]] = np.inf
         return found, full
 
     def least(self, chosen: Sequence[int] = ()) -> float:
@@ -364,16 +364,21 @@ class Outlook:
 
     def choose(self, count: int, worth: Callable[[Sequence[int]], float], enough: float = math.inf) -> list[int]:
         """Up to `count` shots (one may be taken twice) until they are worth enough: one after the other, each exchanged while that helps."""
+        known = cache(worth)  # exchanges come back to the same shots again and again
+
+        def of(shots: Sequence[int]) -> float:
+            return known(tuple(sorted(shots)))
+
         chosen: list[int] = []
-        while len(chosen) < count and worth(chosen) < enough:
-            chosen.append(max(range(len(self.shots)), key=lambda s: worth([*chosen, s])))
-            best, before = worth(chosen), -math.inf
-            while best > before and len(chosen) > 1:
-                before = best
+        while len(chosen) < count and of(chosen) < enough:
+            chosen.append(max(range(len(self.shots)), key=lambda s: of([*chosen, s])))
+            before = -math.inf
+            while of(chosen) > before and len(chosen) > 1:
+                before = of(chosen)
                 for i in range(len(chosen)):
-                    trial = max(([*chosen[:i], s, *chosen[i + 1:]] for s in range(len(self.shots))), key=worth)
-                    if worth(trial) > best * (1 + 1e-6):
-                        best, chosen = worth(trial), trial
+                    trial = max(([*chosen[:i], s, *chosen[i + 1:]] for s in range(len(self.shots))), key=of)
+                    if of(trial) > of(chosen) * (1 + 1e-6):
+                        chosen = trial
         return chosen
 
 
@@ -388,71 +393,74 @@ def outlook(model, values: Values, evidence: Evidence, members: Sequence[Candida
     say = progress or (lambda what, done, total: None)
     first = len(model.frames)
     twin, values = imagined(model, values, shots)
-    base, fresh, owners = _base_with_shots(twin, evidence, shots, first)
-    again = [_with_shots(twin, values, c, variables_of, first) for c in members]
+    base, fresh = _base_with_shots(twin, evidence, shots, first)
+    again = [Candidate.at(twin, values, c.effect, [v for v in variables_of(twin, c.effect) if v.frames is None or min(v.frames) >= first])
+             for c in members]
     pictured = measure(twin, values, [*base, *fresh], again, range(first, len(twin.frames)), ROWS, seed, say, "what other frames would show")
 
-    p, q = len(base), len(fresh)
-    present = evidence.base + [i for c in members for i in c.columns]
-    wide = p + q + sum(len(c.columns) for c in members)
-    at = {i: i for i in range(p + q)}  # columns of `pictured` -> of the joint matrix
-    joint, place, extra = [], p + q, wide
+    size = len(base) + len(fresh)
+    now, then = dict(zip(evidence.base, range(len(base)))), {i: i for i in range(size)}  # columns of `evidence`, `pictured` -> joint ones
+    joint = []
     for c, twin_c, strength in zip(members, again, strengths):
-        own = list(range(place, place + len(c.columns)))
-        place += len(own)
+        own = list(range(size, size + len(c.columns)))
+        size += len(own)
+        now.update(zip(c.columns, own))
         shared = {v.name: i for v, i in zip(c.variables, own)}
         member = Member(c.effect.name, own, list(c.sides), [float(s) for s in strength])
         rms = float(np.sqrt(np.mean(np.square(strength)))) if len(strength) else 0.0
         for v, side, column in zip(twin_c.variables, twin_c.sides, twin_c.forms[c.form]):
             if v.name not in shared:  # a strength of this frame alone, taken to be as large as the others are
-                shared[v.name], extra = extra, extra + 1
-                new, sides, sizes = member.more.setdefault(v.frames[0] - first, ([], [], []))
-                new.append(shared[v.name])
-                sides.append(side)
-                sizes.append(-rms if side < 0 else rms)
-            at[column] = shared[v.name]
+                shared[v.name], size = size, size + 1
+                member.bring(v.frames[0] - first, shared[v.name], side, -rms if side < 0 else rms)
+            then[column] = shared[v.name]
         joint.append(member)
-    total = np.zeros((extra, extra))
-    known = [*range(p), *range(p + q, wide)]
-    total[np.ix_(known, known)] = evidence.normal.gram[np.ix_(present, present)]
-    grams = []
-    for block in pictured.blocks:
-        b = block.a if block.b is None else block.b
-        product = block.a.T @ b * pictured.thinning
-        where = [at.get(int(i), -1) for i in block.where]
-        keep = [i for i, to in enumerate(where) if to >= 0]
-        gram = np.zeros((extra, extra))
-        np.add.at(gram, np.ix_([where[i] for i in keep], [where[i] for i in keep]), ((product + product.T) / 2)[np.ix_(keep, keep)])
-        grams.append(gram)
-    precision = np.concatenate([evidence.precision[:p], [0.0 if v.prior is None else 1 / v.prior[1] ** 2 for v in fresh]])
-    nuisances = [[_unknown(v) for v, s in zip(fresh, owners) if n in s] for n in range(len(shots))]
-    nested = {(i, j) for i, a in enumerate(members) for j, b in enumerate(members) if i != j and b.contains(a)}
-    return Outlook(total, grams, [*range(p + q)], precision, joint, nuisances, evidence.normal.truncation(evidence.base), nested)
+    precision = np.concatenate([evidence.precision, [0.0 if v.prior is None else 1 / v.prior[1] ** 2 for v in fresh]])
+    nuisances = [[_unknown(v) for v in fresh if v.holds_in(first + n)] for n in range(len(shots))]
+    return Outlook(_placed(evidence.normal.gram, now, size), [_placed(gram, then, size) for gram in informations(pictured)],
+                   list(range(len(base) + len(fresh))), precision, joint, nuisances, evidence.normal.truncation(evidence.base),
+                   nested_in(members))
+
+
+def informations(evidence: Evidence) -> list[np.ndarray]:
+    """(m, m) of each frame, on all columns: from the pixels that were kept, scaled up to those that there are."""
+    found = []
+    for block in evidence.blocks:
+        normal = st.Normal(len(evidence.columns))
+        normal.add(block.where, block.a, block.r, block.b)
+        found.append(evidence.thinning * normal.gram)
+    return found
+
+
+def _placed(gram: np.ndarray, to: Mapping[int, int], size: int) -> np.ndarray:
+    """(size, size) with the columns of a matrix at the places that they have there; those without one are left out."""
+    found = np.zeros((size, size))
+    found[np.ix_(list(to.values()), list(to.values()))] = gram[np.ix_(list(to), list(to))]
+    return found
+
+
+def nested_in(members: Sequence[Candidate]) -> set[tuple[int, int]]:
+    """Pairs (i, j) of which j can do all that i can."""
+    return {(i, j) for i, a in enumerate(members) for j, b in enumerate(members) if b.contains(a)}
 
 
 def imagined(model, values: Values, shots: Sequence[Shot]):
     """(model, values) with the shots as further frames, whose images are what the model predicts."""
     first = len(model.frames)
-    frames = [_frame(model, shot, n) for n, shot in enumerate(shots)]
-    twin, values = model.imagine(frames), values.copy()
+    twin, values = model.imagine([_frame(model, shot, n) for n, shot in enumerate(shots)]), values.copy()
     for key in getattr(twin, "driven", set()) - getattr(model, "driven", set()):
         values.common.setdefault(key, float(model.base[key]))  # what was the light's power is now its power at drive 1
-    for n, shot in enumerate(shots):
+    for n, shot in enumerate(shots, first):
         own = values.frame.get(shot.like, {})
-        values.frame[first + n] = {k: v for k, v in own.items() if k not in shot.settings and not (shot.press and is_place(model, k))}
-    for n in range(len(shots)):
-        prediction = np.asarray(twin.predict(values, [first + n])[0], float)
-        twin.frames[first + n].image = np.minimum(prediction, model.noise.saturation).astype(np.float32)
+        values.frame[n] = {k: v for k, v in own.items() if k not in shot.settings and not (shot.press and is_place(model, k))}
+        twin.frames[n].image = np.minimum(twin.predict(values, [n])[0], model.noise.saturation).astype(np.float32)
     return twin, values
 
 
 def _frame(model, shot: Shot, number: int):
     like = model.frames[shot.like]
-    group = getattr(like, "group", None)
-    more = {"group": shot.press or group} if shot.press else {}
-    if "readings" in {f.name for f in fields(like)}:
-        more["readings"] = {k: v for k, v in like.readings.items() if k not in shot.settings}
-    return replace(like, name=f"shot-{number + 1}", repeats=[], parameters={**like.parameters, **shot.settings}, **more)
+    readings = {k: v for k, v in getattr(like, "readings", {}).items() if k not in shot.settings}
+    return replace(like, name=f"shot-{number + 1}", repeats=[], parameters={**like.parameters, **shot.settings},
+                   group=shot.press or like.group, **({"readings": readings} if hasattr(like, "readings") else {}))
 
 
 def is_place(model, key: str) -> bool:
@@ -460,116 +468,88 @@ def is_place(model, key: str) -> bool:
     return key.rpartition(".")[2].startswith("press_") or model.parameters[key].how == "difference"
 
 
-def _base_with_shots(twin, evidence: Evidence, shots: Sequence[Shot], first: int) -> tuple[list[Variable], list[Variable], list[set[int]]]:
-    """The base's variables, which hold in the shots of their press as well; the unknowns that shots bring, and whose they are."""
-    known = [evidence.columns[i] for i in evidence.base]
-    base = []
-    for v in known:
-        shares = () if v.frames is None else tuple(
-            first + n for n, s in enumerate(shots) if not s.press and s.like in v.frames and is_place(twin, v.keys[0]))
-        base.append(v if v.frames is None else replace(v, frames=(*v.frames, *shares)))
-    fresh, owners = [], []
-    for keys in dict.fromkeys(v.keys for v in known if v.frames is not None):
-        alike = [v for v in known if v.keys == keys and v.frames is not None]
+def _base_with_shots(twin, evidence: Evidence, shots: Sequence[Shot], first: int) -> tuple[list[Variable], list[Variable]]:
+    """The base's variables, which hold in the shots of their press as well, and the unknowns that shots bring."""
+    base, fresh = [], []
+    kinds: dict[tuple, Variable] = {}  # the first of each kind that frames have for themselves
+    for v in (evidence.columns[i] for i in evidence.base):
+        if v.frames is not None:
+            kinds.setdefault(v.keys, v)
+            shares = [n for n, s in enumerate(shots, first) if not s.press and s.like in v.frames and is_place(twin, v.keys[0])]
+            v = replace(v, frames=(*v.frames, *shares))
+        base.append(v)
+    for keys, v in kinds.items():
         groups: dict[str, list[int]] = {}
-        for n, shot in enumerate(shots):
+        for n, shot in enumerate(shots, first):
             if is_place(twin, keys[0]):
-                if shot.press and shot.press != "untouched":
-                    groups.setdefault(shot.press, []).append(n)
-            elif keys[0] not in shot.settings:
-                groups.setdefault(twin.frames[first + n].name, []).append(n)
-        for name, own in groups.items():
-            mean = float(shots[own[0]].settings.get(keys[0], twin.base[keys[0]]))
-            prior = None if alike[0].prior is None else (mean, alike[0].prior[1])
-            fresh.append(Variable(f"{keys[0]}[{name}]", keys, alike[0].parameter, tuple(first + n for n in own), prior))
-            owners.append(set(own))
-    return base, fresh, owners
+                owner = "" if shot.press == UNTOUCHED else shot.press
+            else:
+                owner = "" if keys[0] in shot.settings else twin.frames[n].name
+            if owner:
+                groups.setdefault(owner, []).append(n)
+        # of a prior only the width counts: no data are needed
+        fresh += [replace(v, name=f"{keys[0]}[{owner}]", frames=tuple(own)) for owner, own in groups.items()]
+    return base, fresh
 
 
 def _unknown(v: Variable) -> str:
-    unit = "" if v.parameter.unit in ("", "1") else f" {v.parameter.unit}"
-    return v.keys[0] + ("" if v.prior is None else f" +- {v.prior[1]:g}{unit}")
-
-
-def _with_shots(twin, values: Values, c: Candidate, variables_of: Callable, first: int) -> Candidate:
-    """A member with its variables in the shots: those of all frames, and strengths of their own where it has one per frame."""
-    variables = [v for v in variables_of(twin, c.effect) if v.frames is None or min(v.frames) >= first]
-    return candidate(twin, values, c.effect, variables)
-
-
-def candidate(model, values: Values, effect, variables: Sequence[Variable]) -> Candidate:
-    """An effect under test at the values: where its strengths start, and to which side they may go."""
-    start = np.array([value_of(model, values, v) for v in variables])
-    near = [1e-6 * abs(v.parameter.plausible) for v in variables]
-    sides = [1 if x <= v.parameter.bounds[0] + e else -1 if x >= v.parameter.bounds[1] - e else 0 for v, x, e in zip(variables, start, near)]
-    return Candidate(effect, list(variables), start, sides, np.array([v.parameter.plausible for v in variables]))
+    return v.keys[0] + ("" if v.prior is None else f" +- {v.prior[1]:g}{unit_of(v.parameter)}")
 
 
 # -- advice -----------------------------------------------------------------------------------------------------------
 
 
 def next_measurement(model, values: Values, evidence: Evidence, members: Sequence[Candidate], variables_of: Callable, *,
-                     frames: Sequence[int] | None = None, shots: Sequence[Shot] | None = None, take: int = TAKEN, enough: float = ENOUGH,
-                     seed: int = 0, progress: Progress | None = None) -> list[Advice]:
-    """Shots that tell the members apart, the best of each family, best first; then the best up to `take` together, no more of them than
-    bring D to `enough`; and for comparison `take` more presses (or repeats, where nothing is pressed).
+                     enough: float = ENOUGH, seed: int = 0, progress: Progress | None = None) -> list[Advice]:
+    """Shots that tell the members apart, the best of each family, best first; then the best up to TAKEN together, no more of them than
+    bring D to `enough`; and for comparison TAKEN more presses (or repeats, where nothing is pressed).
 
-    Ranked by the smallest D between any two members, per frame; where no effect explains all, as `Outlook.worth` has it. A member
+    Ranked by the smallest D between any two members; where no effect explains all, as `Outlook.worth` has it. A member
     whose fall of chi2 is far below the best's counts as a rival and is not taken to be true. Nothing is returned for fewer than two
     members. Costs the derivative images of as many frames as there are shots, of the base and of the members; a new press is the dear part.
     """
     if len(members) < 2:
         return []
-    strengths = [strength_of(c) for c in members]
-    shots = families(model, values, evidence.frames if frames is None else frames) if shots is None else list(shots)
-    seen = outlook(model, values, evidence, members, strengths, shots, variables_of, seed, progress)
-    net = [-math.inf if c.row is None else c.row.net if c.row.refit is None else c.row.net_refit for c in members]
-    for member, own in zip(seen.members, net):
-        member.likely = not max(net) - own > max(LIKELY, MARGIN * max(net))
+    shots = families(model, values, evidence.frames)
+    seen = outlook(model, values, evidence, members, [strength_of(c) for c in members], shots, variables_of, seed, progress)
+    best = max(_net(c.row) for c in members)
+    for member, c in zip(seen.members, members):
+        member.likely = best - _net(c.row) <= max(LIKELY, MARGIN * best)
+    complete = any(c.row.refit is not None and c.row.refit.complete for c in members)
+    judge = seen.least if complete else seen.worth
+    worth = [judge([s]) for s in range(len(shots))]
+    leaders: dict[str, list[int]] = {}
+    for s in sorted(range(len(shots)), key=lambda s: -worth[s]):
+        leaders.setdefault(shots[s].family, [s])
+    more = [s for s, shot in enumerate(shots) if shot.family == "another place"][:TAKEN]
+    more = more or [s for s, shot in enumerate(shots) if shot.family == "repeat"] * TAKEN
+    plans = {"together": seen.choose(TAKEN, judge, enough), "more of the same": more}
     before = seen.gaps()
-    singles = [seen.gaps([s]) for s in range(len(shots))]
-    clean = any(c.row is not None and c.row.refit is not None and c.row.refit.complete for c in members)
-    judge = seen.least if clean else seen.worth
-    worth = [judge([s]) / shot.frames for s, shot in enumerate(shots)]
-    order = sorted(range(len(shots)), key=lambda s: -worth[s])
-    best = list({shots[s].family: s for s in reversed(order)}.values())
-    best.sort(key=order.index)
-    found = [_advice(seen, shots[s].words, shots[s].family, [shots[s]], before, singles[s], seen.nuisances[s]) for s in best]
-    plan = seen.choose(take, judge, enough)
-    more = [s for s, shot in enumerate(shots) if shot.family == "another place"][:take]
-    more = more or [s for s, shot in enumerate(shots) if shot.family == "repeat"] * take
-    for family, chosen in (("together", plan), ("more of the same", more)):
-        if chosen:
-            unknown = list(dict.fromkeys(u for s in chosen for u in seen.nuisances[s]))
-            found.append(_advice(seen, _joined([shots[s].words for s in chosen]), family, [shots[s] for s in chosen], before,
-                                 seen.gaps(chosen), unknown))
-    return found
+    return [_advice(seen, shots, family, chosen, before) for family, chosen in {**leaders, **plans}.items() if chosen]
 
 
-def _joined(words: Sequence[str]) -> str:
-    counted = {w: list(words).count(w) for w in words}
-    return "; ".join(w if n == 1 else f"{w} ({n} times)" for w, n in counted.items())
+def _net(row: Row) -> float:
+    """Fall beyond what chance gives, of the refit where there was one."""
+    return row.net if row.refit is None else row.net_refit
 
 
 def strength_of(c: Candidate) -> np.ndarray:
     """Coefficients at which a member is taken to be true: as the refit found it, else as the score expects it, else plausible."""
-    if c.row is not None and c.row.refit is not None:
+    if c.row.refit is not None:
         change = np.array(c.row.refit.strength) - c.start
         if np.isfinite(change).all() and change.any():
             return c.linear_of(change)
-    if c.linear is not None and c.linear.any():
-        return c.linear
-    return c.plausible * np.where(np.array(c.sides) < 0, -1.0, 1.0)
+    return c.direction
 
 
-def _advice(seen: Outlook, words: str, family: str, shots: Sequence[Shot], before: np.ndarray, after: np.ndarray,
-            nuisances: Sequence[str]) -> Advice:
-    names = [m.name for m in seen.members]
+def _advice(seen: Outlook, shots: Sequence[Shot], family: str, chosen: Sequence[int], before: np.ndarray) -> Advice:
+    names, after, taken = [m.name for m in seen.members], seen.gaps(chosen), [shots[s] for s in chosen]
     pairs = [Apart(names[i], names[j], float(before[i, j]), float(after[i, j]), st.probability_correct(before[i, j]),
-                   st.probability_correct(after[i, j]))
-             for i in range(len(names)) for j in range(len(names)) if np.isfinite(before[i, j])]
-    return Advice(words, family, [dict(s.settings) for s in shots], [s.press for s in shots], sum(s.frames for s in shots),
-                  sorted(pairs, key=lambda p: p.before), list(nuisances))
+                   st.probability_correct(after[i, j])) for i, j in np.argwhere(np.isfinite(before))]
+    counted = Counter(shot.words for shot in taken)
+    return Advice("; ".join(words if n == 1 else f"{words} ({n} times)" for words, n in counted.items()), family,
+                  [dict(s.settings) for s in taken], [s.press for s in taken], len(taken), sorted(pairs, key=lambda p: p.before),
+                  list(dict.fromkeys(u for s in chosen for u in seen.nuisances[s])))
 
 
 def asked_for(diagnosis: Diagnosis) -> list[str]:
@@ -579,7 +559,7 @@ def asked_for(diagnosis: Diagnosis) -> list[str]:
         return diagnosis.ambiguous[:MEMBERS]
     if diagnosis.word != "AMBIGUOUS" and not (diagnosis.word == "CANNOT_TELL" and failed & {"lead", "margin"}):
         return []
-    net = {row.name: row.net if row.refit is None else row.net_refit for row in diagnosis.rows}
+    net = {row.name: _net(row) for row in diagnosis.rows}
     best = max(net.values(), default=0.0)
     close = [name for name in sorted(net, key=net.get, reverse=True) if best > 0 and best - net[name] < max(CLEAR, MARGIN * best)]
     return close[:MEMBERS] if len(close) > 1 else []

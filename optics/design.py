@@ -16,14 +16,17 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from optics import advise, statistics as st
-from optics.captures import FILE, MARK, NOISE_KEYS, Captures, Frame, Table
+from optics import advise, readings, statistics as st
+from optics.advise import keys_named, unit_of
+from optics.captures import FILE, NOISE_KEYS, Captures, Frame, Table
+from optics.effect import shipped
 from optics.errors import BadScene, OutputExists, Underdetermined
 from optics.evidence import Candidate, Evidence, Progress, measure
 from optics.noise import UNITS, Noise
@@ -95,13 +98,13 @@ class Plan:
     pool: int
     size: tuple[int, int]
     nested: list[tuple[str, str]] = field(default_factory=list)
-    unseen: list[str] = field(default_factory=list)  # effects that no candidate frame shows at all
+    unseen: list[str] = field(default_factory=list)  # effects that no candidate frame shows, or with an image that is not finite
     warnings: list[str] = field(default_factory=list)
 
     def json(self) -> dict:
         return {"scene": self.scene, "frames": [{"words": f.words, "group": f.group, "parameters": f.settings, "swept": f.swept, "worth": w}
                                                 for f, w in zip(self.frames, self.worth)],
-                "effects": [{**e.__dict__, "correct": e.correct} for e in self.effects], "confused": self.confused,
+                "effects": [{**asdict(e), "correct": e.correct} for e in self.effects], "confused": self.confused,
                 "contained": [list(pair) for pair in self.nested], "unseen": self.unseen, "share_of_plausible": self.share, "candidates": self.pool,
                 "size": list(self.size), "warnings": self.warnings}
 
@@ -140,16 +143,13 @@ def _columns(rows: Sequence[Sequence[str]]) -> list[str]:
 # -- candidates ---------------------------------------------------------------------------------------------------------
 
 
-def candidates(parameters: dict[str, Parameter], base: dict, readings: bool, fixed_exposure: bool = False) -> list[Choice]:
+def candidates(parameters: dict[str, Parameter], base: dict, swept: bool, fixed_exposure: bool = False) -> list[Choice]:
     """The frames to choose from: every place under several lights and exposures; of a camera of one pixel, sweeps.
 
     Exposures are factors here, 1 where a picture is as bright as it may be; `plan` turns them into settings.
     """
-    def keys(name):
-        return [k for k in parameters if k.rpartition(".")[2] == name]
-
-    lights, exposures = keys("power"), [] if fixed_exposure else keys("exposure")[:1]
-    if readings:
+    lights, exposures = keys_named(parameters, "power"), [] if fixed_exposure else keys_named(parameters, "exposure")[:1]
+    if swept:
         return _sweeps(parameters, base, lights, exposures)
     found = []
     on = {"all lights": tuple(lights)}
@@ -157,7 +157,8 @@ def candidates(parameters: dict[str, Parameter], base: dict, readings: bool, fix
     if len(lights) > 3:
         on |= {"first half of the lights": tuple(lights[:half]), "other half of the lights": tuple(lights[half:])}
     single = [{f"{k.rpartition('.')[0]} alone": (k,)} for k in lights] if len(lights) > 1 else []
-    for n, (place, words, settings) in enumerate(_places(base, keys)):
+    places = _places(parameters, base)
+    for n, (place, words, settings) in enumerate(places):
         own = dict(on)
         for k in (2 * n, 2 * n + 1):  # two of the lights at each place, so that all are seen at some
             own |= single[k % len(single)] if single else {}
@@ -165,23 +166,23 @@ def candidates(parameters: dict[str, Parameter], base: dict, readings: bool, fix
             for factor in (1.0, *advise.EXPOSURES[:1]) if exposures and light == "all lights" else (1.0,):
                 found.append(Choice(f"{words}; {light}" + ("" if factor == 1 else f", {factor:g} of the exposure"), place,
                                     {**settings, **{k: float(k in lit) for k in lights}, **{k: factor for k in exposures}}))
-    first = _places(base, keys)[0][2]
-    return found + [Choice("all lights off", "dark", {**first, **dict.fromkeys(lights, 0.0), **dict.fromkeys(exposures, 1.0)})]
+    return found + [Choice("all lights off", "dark", {**places[0][2], **dict.fromkeys(lights, 0.0), **dict.fromkeys(exposures, 1.0)})]
 
 
-def _places(base: dict, keys: Callable) -> list[tuple[str, str, dict]]:
+def _places(parameters: dict[str, Parameter], base: dict) -> list[tuple[str, str, dict]]:
     """(group, words, settings) of the places of a press, distances of an object, angles of films; one place where nothing moves."""
+    keys = partial(keys_named, parameters)
     if depth := keys("press_depth"):
         gel = depth[0].rpartition(".")[0]
         wide = [0.3 * float(base.get(f"{gel}.{side}", 8.0)) for side in ("width", "length")]
         normal = 0.12 * float(base.get(f"{gel}.thickness", 4.0))
         spots = [(0.0, 0.0), *advise.places(np.zeros((1, 2)), np.array(wide), 5)]
-        found = [("untouched", "nothing pressed", {f"{gel}.press_x": 0.0, f"{gel}.press_y": 0.0, f"{gel}.press_depth": 0.0})]
+        found = []
         for i, (x, y) in enumerate(spots):
             for to in (normal, 2 * normal) if i < 3 else (normal,):
-                found.append((f"press-{len(found) - 1:02d}", f"press at x = {x:.2g}, y = {y:.2g} mm, {to:.2g} mm deep",
+                found.append((f"press-{len(found):02d}", f"press at x = {x:.2g}, y = {y:.2g} mm, {to:.2g} mm deep",
                               {f"{gel}.press_x": x, f"{gel}.press_y": y, f"{gel}.press_depth": round(to, 4)}))
-        return found[1:] + found[:1]
+        return [*found, ("untouched", "nothing pressed", dict.fromkeys((f"{gel}.press_x", f"{gel}.press_y", f"{gel}.press_depth"), 0.0))]
     if distance := keys("distance"):
         here = float(base[distance[0]]) or 1.0
         return [(f"distance-{i}", f"object at {to:g} mm", {distance[0]: to}) for i, to in enumerate((here, here / 2, 2 * here, here / 8, 0.0))]
@@ -196,7 +197,7 @@ def _sweeps(parameters: dict, base: dict, lights: Sequence[str], exposures: Sequ
     """Sweeps of the analyser, with everything else that a bench turns dealt out to SWEEPS points that cover each setting evenly."""
     from scipy.stats import qmc
 
-    inserted = {k: base.get(k.rpartition(".")[0] + ".inserted", 1.0) for k in parameters if k.endswith(".angle")}
+    inserted = {k: base.get(k.rpartition(".")[0] + ".inserted", 1.0) for k in keys_named(parameters, "angle")}
     films = [k for k, there in inserted.items() if there and k.rpartition(".")[0] + ".inserted" in base]
     if not films:
         raise Underdetermined("design: a camera of one pixel and no polarizer to turn: no two readings differ but in brightness; allowed: a scene "
@@ -221,11 +222,11 @@ def _sweeps(parameters: dict, base: dict, lights: Sequence[str], exposures: Sequ
 
 
 def plan(scene, frames: int, effects: Sequence | None = None, *, noise: Noise = NOISE, values: Values | None = None, setup=None,
-         share: float = SHARE, fixed_exposure: bool = False, seed: int = 0, progress: Progress | None = None) -> Plan:
+         added: Sequence = (), share: float = SHARE, fixed_exposure: bool = False, seed: int = 0, progress: Progress | None = None) -> Plan:
     """Choose `frames` frames of a scene (optics.scene.Scene) that keep its effects apart.
 
     effects   that may be missing; None: all that the scene can express
-    values    of a calibration, in place of the scene's own; setup: what it solves for (optics.loop.Setup)
+    values    of a calibration, in place of the scene's own; setup: what it solves for (optics.loop.Setup), added: effects that it has
     share     of the plausible strength, at which effects are told apart
     fixed_exposure   leave the exposure as the scene has it
 
@@ -238,27 +239,25 @@ def plan(scene, frames: int, effects: Sequence | None = None, *, noise: Noise = 
     from optics.render import Model
 
     say = progress or (lambda what, done, total: None)
-    if frames < FEWEST:
-        raise Underdetermined(f"design: {frames} frames; allowed: {FEWEST} or more, as with one nothing can be held out and nothing compared")
-    if scene.camera is None:
-        raise BadScene(f"{scene.path}: no part of the type 'camera'; a capture session needs one: add a <sensor type=\"camera\">")
-    if not share > 0:
-        raise ValueError(f"design: strength of {share:g} plausible sizes; allowed: > 0")
+    _require(frames, share)
+    for part, kind, tag in ((scene.camera, "camera", "sensor"), (scene.integrator, "tactile", "integrator")):
+        if part is None:
+            raise BadScene(f"{scene.path}: no part of the type '{kind}'; a capture session needs one: add a <{tag} type=\"{kind}\">")
     width, height = scene.camera.resolution
-    readings = width * height == 1
-    known = [e for _, e in sorted(registry().effects.items()) if scene.can_express(e) and not (readings and e.pictures)]
-    for e in effects or ():
+    swept = width * height == 1
+    known = [e for _, e in sorted(registry().effects.items()) if scene.can_express(e) and not (swept and e.pictures)]
+    effects = list({e.key: e for e in effects or ()}.values())  # an effect named twice would be its own rival
+    for e in effects:
         if e not in known:
             raise BadScene(f"{scene.path}: the scene cannot express the effect '{e.name}'; it can: {', '.join(k.key for k in known)}")
-    tested = list(effects or known)
     setup = setup or loop.Setup(captures="")
-    values = Values() if values is None else Values({k: v for k, v in values.common.items()})
+    values = Values() if values is None else Values(dict(values.common))
     base = {**scene.values(), **values.common}
-    pool = candidates(scene.parameters, base, readings, fixed_exposure)
+    pool = candidates(scene.parameters, base, swept, fixed_exposure)
     channels = 1 if len(scene.integrator.bands or (0,)) == 1 else 3
     blank = np.zeros((height, width, channels), np.float32)
     first = Frame("first", blank, parameters=pool[0].readings[0], file="design")
-    table = Table("readings.csv", ["reading"]) if readings else None
+    table = Table("readings.csv", ["reading"]) if swept else None
     model = Model(scene, Captures(Path("."), str(scene.path), [first], noise=noise, table=table), noise)
     model.frames = []
     model = model.imagine([Frame(
@@ -268,17 +267,22 @@ def plan(scene, frames: int, effects: Sequence | None = None, *, noise: Noise = 
         values.common.setdefault(key, float(base[key]))
     pool = _expose(model, values, pool, base, say)
     places = [c.group or str(i) for i, c in enumerate(pool)]
-    solved = [v for v in loop.variables_of_base(model, setup, range(len(pool))) if not (v.frames and all(
-        pool[i].settings.get(k) == 0 for i in v.frames for k in _depths(scene)))]
+    depths = keys_named(scene.parameters, "press_depth")
+    untouched = {i for i, c in enumerate(pool) if any(c.settings.get(k) == 0 for k in depths)}  # where nobody has to find a place
+    solved = [v for v in loop.variables_of_base(model, setup, range(len(pool)))
+              if v.frames is None or not (advise.is_place(model, v.keys[0]) and untouched.issuperset(v.frames))]
+    solved += [v for e in added for v in loop.effect_variables(model, e)]
     taken = {key for v in solved for key in v.keys}
-    members = [advise.candidate(model, values, e, loop.effect_variables(model, e)) for e in tested]
+    members = [Candidate.at(model, values, e, loop.effect_variables(model, e)) for e in effects or known]
     members = [c for c in members if not any(k in taken for v in c.variables for k in v.keys)]
     if not members:
         raise Underdetermined(f"{scene.path}: none of the effects asked for is free to be missing; the calibration solves for them already")
     evidence = measure(model, values, solved, members, range(len(pool)), ROWS, seed, say, "what candidate frames show")
     diagonal = np.diag(evidence.normal.gram)
-    unseen = [c.effect.name for c in members if not any(diagonal[i] > 0 for own in c.forms.values() for i in own)]
-    members = [c for c in members if c.effect.name not in unseen and not c.broken]
+    unseen = [c.effect.name for c in members if c.broken or not any(diagonal[i] > 0 for own in c.forms.values() for i in own)]
+    members = [c for c in members if c.effect.name not in unseen]
+    if not members:
+        raise Underdetermined(f"{scene.path}: none of {len(pool)} candidate frames shows {' or '.join(unseen)}")
     seen = _outlook(evidence, members, share, seed)
 
     def worth(chosen: Sequence[int]) -> float:
@@ -308,19 +312,16 @@ def session(subject: str | Path, frames: int, effects: Sequence[str] = (), defin
     from optics import loop, scene as scenes
     from optics.effect import registry
 
-    if frames < FEWEST:  # before anything is loaded
-        raise Underdetermined(f"design: {frames} frames; allowed: {FEWEST} or more, as with one nothing can be held out and nothing compared")
+    _require(frames, share)  # before anything is loaded
     path = Path(subject)
     if (path / "ladder.json").is_file():
         study, model, setup = loop.take_up(path)
-        data = study.fit(len(study.steps) - 1)
-        values, camera = Values(dict(data["parameters"])), replace(model.noise, **(noise or {}))
-        done = loop.effects_of(study)
         chosen = [registry().find_effect(name) for name in effects] or loop.candidates(model, study)
-        setup = replace(setup, free=[*(setup.free or loop.default_free(model)), *(k for e in done if e.scope == "common"
-                                                                                for keys in model.scene.keys_of(e).values() for k in keys)])
         scene = scenes.load(model.scene.path, {**model.scene.defines, **(defines or {})}, plugins=plugins)
-        return plan(scene, frames, chosen, noise=camera, values=values, setup=setup, share=share, fixed_exposure=fixed_exposure, progress=progress)
+        scene.set(model.captures.parameters)  # what was set in all frames stays so
+        return plan(scene, frames, chosen, noise=replace(model.noise, **(noise or {})), setup=setup, added=loop.effects_of(study),
+                    values=Values(dict(study.fit(len(study.steps) - 1)["parameters"])), share=share, fixed_exposure=fixed_exposure,
+                    progress=progress)
     file = scenes.find(subject)
     text, defines = file.read_text(encoding="utf-8"), dict(defines or {})
     sizes = {n: re.search(rf'<default name="{n}" value="(\d+)"', text) for n in ("width", "height")}
@@ -333,8 +334,11 @@ def session(subject: str | Path, frames: int, effects: Sequence[str] = (), defin
     return plan(scene, frames, chosen, noise=replace(NOISE, **(noise or {})), share=share, fixed_exposure=fixed_exposure, progress=progress)
 
 
-def _depths(scene) -> list[str]:
-    return [k for k in scene.parameters if k.endswith(".press_depth")]
+def _require(frames: int, share: float) -> None:
+    if frames < FEWEST:
+        raise Underdetermined(f"design: {frames} frames; allowed: {FEWEST} or more, as with one nothing can be held out and nothing compared")
+    if not 0 < share < math.inf:
+        raise ValueError(f"design: strength of {share:g} plausible sizes; allowed: > 0, finite")
 
 
 def _expose(model, values: Values, pool: list[Choice], base: dict, say: Progress) -> list[Choice]:
@@ -342,60 +346,57 @@ def _expose(model, values: Values, pool: list[Choice], base: dict, say: Progress
 
     One exposure per light, the same at all places: what a session can do.
     """
-    key = next((k for k in model.parameters if k.endswith(".exposure")), None)
-    full = model.noise.saturation - model.noise.black_level
-    lights = [k for k in model.parameters if k.endswith(".power")]
+    key = next(iter(keys_named(model.parameters, "exposure")), None)
+    lights = keys_named(model.parameters, "power")
+    pictures = model.captures.table is None
     fitting: dict[tuple, float] = {}
     found = []
     for i, c in enumerate(pool):
         say("exposures", i, len(pool))
-        own = dict(c.settings)
+        own, words = dict(c.settings), c.words
         if key in own:
-            light = tuple(own.get(k, 1.0) for k in lights)
-            factor = own[key]
-            model.frames[i].parameters[key] = float(base[key])
-            if light not in fitting and any(light):
-                signal = model.predict(values, [i])[0] - model.noise.black_level
-                bright = float(np.quantile(signal, 0.995))
-                ratio = FULL * full / bright if bright > 0 else 1.0
-                fitting[light] = float(f"{float(base[key]) * ratio:.3g}") if model.captures.table is None else float(base[key])
-            own[key] = model.frames[i].parameters[key] = factor * fitting.get(light, float(base[key]))
-        prediction = model.predict(values, [i])[0]
-        model.frames[i].image = np.minimum(prediction, model.noise.saturation).astype(np.float32)
-        found.append(replace(c, settings=own, words=c.words + (f", exposure {own[key]:g}" if key in own and model.captures.table is None else "")))
+            light, present = tuple(own.get(k, 1.0) for k in lights), float(base[key])
+            if light not in fitting:
+                model.frames[i].parameters[key] = present
+                fitting[light] = float(f"{present * _brighter(model, values, i):.3g}") if pictures and any(light) else present
+            own[key] = model.frames[i].parameters[key] = own[key] * fitting[light]
+            words += f", exposure {own[key]:g}" if pictures else ""
+        model.frames[i].image = np.minimum(model.predict(values, [i])[0], model.noise.saturation).astype(np.float32)
+        found.append(replace(c, settings=own, words=words))
     say("exposures", len(pool), len(pool))
     return found
 
 
+def _brighter(model, values: Values, frame: int) -> float:
+    """Factor on a frame's exposure at which its brightest half per cent stands at FULL of full scale; 1 in the dark."""
+    signal = model.predict(values, [frame])[0] - model.noise.black_level
+    bright = float(np.quantile(signal, 0.995))
+    return FULL * (model.noise.saturation - model.noise.black_level) / bright if bright > 0 else 1.0
+
+
 def _outlook(evidence: Evidence, members: Sequence[Candidate], share: float, seed: int) -> advise.Outlook:
     """Informations of all candidate frames, every effect at its share of the plausible strength; of one per frame, with random signs."""
-    rng = np.random.default_rng([seed, 17])
+    rng, squares = np.random.default_rng([seed, 17]), np.diag(evidence.normal.gram)
     found = []
     for c in members:
-        c.form, power = _onset(c, np.diag(evidence.normal.gram))
+        c.form, power = _onset(c, squares)
         c.columns = c.forms[c.form]
         signs = np.where(np.array(c.sides) < 0, -1.0, 1.0)
         if len(signs) > 1:  # parts and frames differ from each other: all alike is often what a calibration absorbs
             signs = np.where(np.array(c.sides) == 0, rng.choice([-1.0, 1.0], len(signs)), signs)
         strength = c.linear_of(share * c.plausible * signs) if power == 1 else share**2 * c.plausible * signs
-        common = [j for j, v in enumerate(c.variables) if v.frames is None]
-        member = advise.Member(c.effect.name, [c.columns[j] for j in common], [c.sides[j] for j in common], [float(strength[j]) for j in common])
-        for j, v in enumerate(c.variables):
-            if v.frames is not None:
-                columns, sides, sizes = member.more.setdefault(v.frames[0], ([], [], []))
-                columns.append(c.columns[j])
-                sides.append(c.sides[j])
-                sizes.append(float(strength[j]))
+        member = advise.Member(c.effect.name, [], [], [])
+        for v, column, side, size in zip(c.variables, c.columns, c.sides, strength.tolist()):
+            if v.frames is None:
+                member.columns.append(column)
+                member.sides.append(side)
+                member.strength.append(size)
+            else:
+                member.bring(v.frames[0], column, side, size)
         found.append(member)
-    grams = []
-    for block in evidence.blocks:
-        gram = np.zeros_like(evidence.normal.gram)
-        product = block.a.T @ (block.a if block.b is None else block.b) * evidence.thinning
-        gram[np.ix_(block.where, block.where)] = (product + product.T) / 2
-        grams.append(gram)
-    nested = {(i, j) for i, a in enumerate(members) for j, b in enumerate(members) if i != j and b.contains(a)}
+    grams = advise.informations(evidence)
     return advise.Outlook(np.zeros_like(evidence.normal.gram), grams, evidence.base, evidence.precision, found, [[] for _ in grams],
-                          evidence.normal.truncation(evidence.base), nested)
+                          evidence.normal.truncation(evidence.base), advise.nested_in(members))
 
 
 def _onset(c: Candidate, squares: np.ndarray) -> tuple[str, int]:
@@ -414,35 +415,32 @@ def _onset(c: Candidate, squares: np.ndarray) -> tuple[str, int]:
 def _report(scene, frames, path, seen, chosen, members, share, noise, count, unseen) -> Plan:
     gaps, alone = seen.falls(chosen)
     information, rest = seen.information(chosen)
-    place = {c: i for i, c in enumerate(rest)}
-    effects, confused = [], []
     names = [m.name for m in seen.members]
+    share_left = np.divide(gaps, alone[:, None], out=np.full_like(gaps, np.inf), where=alone[:, None] > 0)
+    cos = np.sqrt(np.maximum(1 - share_left, 0.0))  # of what a calibration leaves of both; 0 where there is nothing to compare
+    effects, confused = [], []
     for i, (m, c) in enumerate(zip(seen.members, members)):
         columns, sides, strength = m.at(chosen)
-        own = [place[k] for k in columns]
-        cone = st.Cone(information[np.ix_(own, own)], sides, draws=2000) if own else None
-        power = cone.power(strength, cone.critical(LEVEL / len(names))) if cone is not None and len(cone.live) else 0.0
-        j = int(np.argmin(gaps[i])) if len(names) > 1 else i
-        finite = len(names) > 1 and math.isfinite(gaps[i, j])
-        gap = float(gaps[i, j]) if finite else float(alone[i])
-        cos = math.sqrt(max(1 - gap / alone[i], 0.0)) if finite and alone[i] > 0 else 0.0
-        v = c.variables[0]
-        unit = "" if v.parameter.unit in ("", "1") else f" {v.parameter.unit}"
-        effects.append(Power(m.name, f"{share * v.parameter.plausible:.2g}{unit}", float(alone[i]), float(power),
-                             names[j] if finite else "", gap, cos))
-        for k, name in enumerate(names):
-            if k != i and math.isfinite(gaps[i, k]) and gaps[i, k] < CLEAR:
-                alike = math.sqrt(max(1 - gaps[i, k] / alone[i], 0.0)) if alone[i] > 0 else 0.0
-                why = f"what a calibration leaves of them has cos {alike:.3f}; D {alone[i]:.3g} against none"
-                confused.append({"effect": m.name, "rival": name, "d": float(gaps[i, k]), "why": why, "weak": bool(alone[i] < CLEAR)})
+        own = [rest.index(k) for k in columns]
+        cone = st.Cone(information[np.ix_(own, own)], sides, draws=2000)
+        power = cone.power(strength, cone.critical(LEVEL / len(names))) if len(cone.live) else 0.0
+        j = int(np.argmin(gaps[i]))
+        rival, gap = (names[j], gaps[i, j]) if math.isfinite(gaps[i, j]) else ("", alone[i])
+        parameter = c.variables[0].parameter
+        effects.append(Power(m.name, f"{share * parameter.plausible:.2g}{unit_of(parameter)}", float(alone[i]), float(power), rival,
+                             float(gap), float(cos[i, j])))
+        confused += [{"effect": m.name, "rival": names[k], "d": float(gaps[i, k]), "weak": bool(alone[i] < CLEAR),
+                      "why": f"what a calibration leaves of them has cos {cos[i, k]:.3f}; D {alone[i]:.3g} against none"}
+                     for k in np.flatnonzero(gaps[i] < CLEAR)]
     confused.sort(key=lambda c: (c["weak"], c["d"]))
     nested = [(names[a], names[b]) for a, b in sorted(seen.nested)]
     warnings = []
     groups = len({f.group for f in frames}) if any(f.group for f in frames) else len(frames)
-    if groups < GROUPS:
+    if groups < GROUPS and not frames[0].swept:  # readings are dealt out to sweeps, of which there are enough
         warnings.append(f"{groups} presses or places: fewer than {GROUPS} groups are not held out by themselves, and without held-out frames "
                         "there is no CLAIM; plan more frames, or name one with --hold-out")
-    return Plan(str(scene.path.stem if scene.path.parent.name == "scenes" else scene.path), frames, path, effects, confused, share, noise, count,
+    name = scene.path.stem if scene.path.parent == shipped("scenes") else str(scene.path)
+    return Plan(name, frames, path, effects, confused, share, noise, count,
                 tuple(scene.camera.resolution), nested, unseen, warnings)
 
 
@@ -457,7 +455,8 @@ def write(planned: Plan, folder: str | Path) -> Path:
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise OutputExists(f"{folder} exists and is not empty; choose another folder")
     document = tomlkit.document()
-    document.add(tomlkit.comment(f"{MARK[2:]}: a session to be taken. Put each picture where `image` says, correct what you set otherwise,"))
+    # not captures.MARK: once its pictures are in, the folder is a measured set, which no writing of captures may replace
+    document.add(tomlkit.comment("A session to be taken, planned by optics. Put each picture where `image` says, correct what you set otherwise,"))
     document.add(tomlkit.comment("and put your camera's numbers under [noise]."))
     document["scene"] = planned.scene
     document["noise"] = tomlkit.table()
@@ -476,10 +475,7 @@ def write(planned: Plan, folder: str | Path) -> Path:
             tables.append(table)
     folder.mkdir(parents=True, exist_ok=True)
     if planned.size == (1, 1):
-        taken = [own for f in planned.frames for own in f.readings]
-        keys = list(taken[0])
-        rows = [",".join([*keys, "reading"]), *(",".join([*(f"{own[k]:g}" for k in keys), ""]) for own in taken)]
-        (folder / "readings.csv").write_text("\n".join(rows) + "\n", encoding="utf-8")
+        readings.write(folder / "readings.csv", [(own, [""]) for f in planned.frames for own in f.readings], ["reading"])
     else:
         (folder / "frames").mkdir(exist_ok=True)
     (folder / FILE).write_text(tomlkit.dumps(document), encoding="utf-8")

@@ -177,13 +177,7 @@ def _candidates(model, fit, effects, variables_of, fitted) -> tuple[list[Candida
         if any(key in taken for v in variables for key in v.keys):
             not_tested[effect.name] = "in the model already"
             continue
-        start = np.array([value_of(model, fit.values, v) for v in variables])
-        sides = []
-        for v, value in zip(variables, start):
-            low, high = v.parameter.bounds
-            near = 1e-6 * abs(v.parameter.plausible)
-            sides.append(1 if value <= low + near else -1 if value >= high - near else 0)
-        found.append(Candidate(effect, variables, start, sides, np.array([v.parameter.plausible for v in variables])))
+        found.append(Candidate.at(model, fit.values, effect, variables))
     return found, not_tested
 
 
@@ -248,10 +242,9 @@ def _rank(evidence: Evidence, candidates: list[Candidate], seed: int) -> Table:
     for c in candidates:
         row = c.row
         row.p_family = family.p(row.p)
-        row.power = c.cone.power(c.linear_of(c.plausible * np.where(np.array(c.sides) < 0, -1, 1) / 10),
-                                 c.cone.critical(critical))
+        row.power = c.cone.power(c.linear_of(c.usual / 10), c.cone.critical(critical))
         raw = uniform_gram.gram[np.ix_(c.columns, c.columns)]
-        usual = c.linear_of(c.plausible * np.where(np.array(c.sides) < 0, -1, 1))
+        usual = c.linear_of(c.usual)
         c.raw = math.sqrt(max(usual @ raw @ usual, 0.0) / max(uniform_gram.count, 1)) / evidence.signal
         row.image = math.sqrt(max(c.linear @ raw @ c.linear, 0.0) / max(uniform_gram.count, 1)) / evidence.signal
         row.misfit_after = evidence.noise * math.sqrt(max(chi2 - row.fall, 0.0) / dof)
@@ -287,15 +280,10 @@ def _row(evidence: Evidence, c: Candidate, own: np.ndarray, fall: float) -> Row:
         upper=[math.nan] * len(c.variables))
 
 
-def _direction(c: Candidate) -> np.ndarray:
-    """Coefficients to compare effects at: as found, or the plausible ones where nothing was found."""
-    return c.linear if c.linear.any() else c.plausible * np.where(np.array(c.sides) < 0, -1.0, 1.0)
-
-
 def _confused(information: np.ndarray, c: Candidate, candidates: Sequence[Candidate], first: int) -> tuple[str, float]:
     """The effect that mimics this one best, and |cos| of the angle between what survives of both."""
     own = np.array(c.columns) - first
-    strength = _direction(c)
+    strength = c.direction
     full = float(strength @ information[np.ix_(own, own)] @ strength)
     best = ("", 0.0)
     for other in candidates:
@@ -346,7 +334,7 @@ def _choose(table: Table, top: int) -> list[Candidate]:
 def _gaps(evidence: Evidence, chosen: Sequence[Candidate]) -> tuple[list[list[float]], list[list[float]]]:
     """D[a][b], expected chi2 of a over b when a is true as found, and the probability to decide rightly."""
     first, information = len(evidence.base), evidence.projected.information
-    gaps = [[0.0 if a is b else st.gap(information, np.array(a.columns) - first, _direction(a),
+    gaps = [[0.0 if a is b else st.gap(information, np.array(a.columns) - first, a.direction,
                                        np.array(b.columns) - first, b.cone) for b in chosen] for a in chosen]
     return gaps, [[st.probability_correct(d) for d in line] for line in gaps]
 
@@ -374,23 +362,22 @@ def _refit(model, fit, evidence: Evidence, table: Table, chosen: Sequence[Candid
             except (ValueError, ArithmeticError, np.linalg.LinAlgError) as error:
                 c.row.flags.append(f"refit failed: {error}")
                 continue
-            after, images = _chi2(model, found.values, evidence)
+            after, expected, images = _chi2(model, found.values, evidence)
             after += _prior_chi2(model, found.values, fit.variables)
             if math.isfinite(after) and (best is None or before - after > best[0]):
-                best = (before - after, after, found, images)
+                best = (before - after, after, expected, found, images)
         if best is None:
             c.row.flags.append("refit without a result")
             continue
-        fall, after, found, images = best
+        fall, after, expected, found, images = best
         fits[c.effect.name] = found
         strength = [value_of(model, found.values, v) for v in c.variables]
         sd = {v.name: float(s) for v, s in zip(found.variables, found.sd)}
         ended = [v.name for v, s, at in zip(c.variables, strength, c.start) if at_bound(v, s) and abs(s - at) > 0]
         ratio = fall / c.row.fall if c.row.fall > 0 else math.nan
-        dof = max(evidence.normal.count - evidence.projected.rank - len(c.cone.live), 1)
         c.row.refit = Refit(fall, c.row.fall, ratio, before, after, strength,
                             [sd.get(v.name, math.nan) for v in c.variables], ended,
-                            (after - dof) / math.sqrt(2 * dof), evidence.structure(images, [*evidence.base, *c.columns]).p,
+                            _excess(evidence, after, expected, [c]), evidence.structure(images, [*evidence.base, *c.columns]).p,
                             bool(found.converged), str(found.reason), _clear(found, c, strength))
         if not 0.5 <= ratio <= 2 and c.row.fall > CLEAR:
             c.row.flags.append("nonlinear")
@@ -423,12 +410,11 @@ def _add_both(model, fit, evidence: Evidence, both: list[Candidate], refit: Call
         found = refit(model, [*base, *(v for c in both for v in c.variables)], start, frames=list(fitted))
     except (ValueError, ArithmeticError, np.linalg.LinAlgError):
         return None
-    after, images = _chi2(model, found.values, evidence)
+    after, expected, images = _chi2(model, found.values, evidence)
     after += _prior_chi2(model, found.values, fit.variables)
     fall = evidence.normal.square + _prior_chi2(model, fit.values, fit.variables) - after
-    dof = max(evidence.normal.count - evidence.projected.rank - sum(len(c.cone.live) for c in both), 1)
     columns = [*evidence.base, *(i for c in both for i in c.columns)]
-    return fall, (after - dof) / math.sqrt(2 * dof), evidence.structure(images, columns).p
+    return fall, _excess(evidence, after, expected, both), evidence.structure(images, columns).p
 
 
 def _start(model, fit, evidence: Evidence, effects: Sequence[Candidate], fraction: float) -> Values:
@@ -452,15 +438,26 @@ def _start(model, fit, evidence: Evidence, effects: Sequence[Candidate], fractio
     return values
 
 
-def _chi2(model, values: Values, evidence: Evidence) -> tuple[float, list[np.ndarray]]:
-    """chi2 of other values on the same pixels with the same weights, and the whitened residual images."""
-    total, images = 0.0, []
+def _chi2(model, values: Values, evidence: Evidence) -> tuple[float, float, list[np.ndarray]]:
+    """chi2 of other values on the same pixels with the same weights, what it would be were they true, and the whitened residual images.
+
+    Brighter pixels are noisier: by the base's weights chi2 of the truth is sum of variance/sigma^2, not the number of values.
+    """
+    total, expected, images = 0.0, 0.0, []
     predicted = model.predict(values, evidence.frames)
     for frame, prediction, sigma, use in zip(evidence.frames, predicted, evidence.sigma, evidence.use):
         image = np.where(use, (np.asarray(model.frames[frame].image, float) - prediction) / sigma, 0.0)
         total += float(np.sum(image**2))
+        variance = evidence.variance(model, frame, np.asarray(prediction, float), values)
+        expected += float(np.sum(np.where(use, variance, 0.0) / sigma.astype(float)**2))
         images.append(image)
-    return total, images
+    return total, expected, images
+
+
+def _excess(evidence: Evidence, after: float, expected: float, added: Sequence[Candidate]) -> float:
+    """Standard deviations by which chi2 with these effects is more than it would be were they all that is there."""
+    free = evidence.projected.rank + sum(len(c.cone.live) for c in added)
+    return (after - expected + free) / math.sqrt(2 * max(evidence.normal.count - free, 1))
 
 
 def _prior_chi2(model, values: Values, variables: Sequence[Variable]) -> float:
@@ -514,7 +511,7 @@ def _split(model, evidence: Evidence, c: Candidate, found, places: list[dict], r
     chance = LEVEL / max(len(results), 1)
     if c.row.refit.complete:  # nothing but noise is left, so that p means what it says, but for a hair of the fall
         return [replace(s, holds=s.p >= chance or s.h < HAIR) for s in results]
-    left = c.row.refit.chi2_after - (evidence.normal.count - evidence.projected.rank)
+    left = c.row.refit.excess_sd * math.sqrt(2 * max(evidence.normal.count - evidence.projected.rank, 1))
     return [replace(s, holds=s.p >= chance or s.h <= UNEVEN and s.fall - s.dof * own.thinning <= SAME_PLACE * left) for s in results]
 
 

@@ -16,22 +16,25 @@ from __future__ import annotations
 
 import json
 import keyword
-import os
 import re
+import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from optics import scene as scenes
-from optics.effect import STAGES, Registry
+from optics import loop, scene as scenes
+from optics.effect import STAGES, Declared, Registry
 from optics.errors import OutputExists, UnknownKey
-from optics.fingerprints import SIDE
+from optics.fingerprints import SIDE, family_of
 from optics.ladder import Study
 from optics.verdict import Diagnosis, Fingerprint
 
 BENT = 0.5  # the largest relative change that a strength of 1 is called plausible for
+CELLS = ("place", "channel")  # coordinates of cells, each with a value of its own: none lies between two of them
+VIEW = ("u", "v", "px", "py", "tan", "focal", "width", "height", "bands")  # what functions see as `camera` beside its parameters
+HELD = ("name", "numbers", "words", "held")  # what every part holds beside its parameters and the methods of Declared
 
 
 @dataclass(frozen=True)
@@ -124,26 +127,30 @@ def identifier(name: str) -> str:
 
 
 def check_name(name: str, part: str, registry: Registry) -> str:
-    """The name as an identifier, unless an effect, or a parameter of the part, has it already."""
+    """The name as an identifier, unless an effect, a parameter of the part, or what its functions see beside parameters has it already."""
     word = identifier(name)
     key = word.replace("_", "-")
     if key in registry.effects:
         raise ValueError(f"an effect '{registry.effects[key].name}' exists already ({registry.effects[key].file}); choose another name")
     if any(p.name == word for p in registry.parameters_of(part)):
         raise ValueError(f"the part '{part}' has a parameter '{word}' already; choose another name")
+    if word in HELD or hasattr(Declared, word) or (part == "camera" and word in VIEW):
+        raise ValueError(f"'{word}' means something else to functions of the part '{part}'; choose another name")
     return word
 
 
 def write(text: str, folder: Path, name: str) -> Path:
-    """Write a plugin file; an existing one is kept. Raises OutputExists."""
+    """Write a plugin file; an existing one is kept. Raises OutputExists, or what keeps the folder from being made."""
+    from optics.picture import check_folder
+
     file = Path(folder) / f"{identifier(name)}.py"
-    if file.exists():
-        raise OutputExists(f"{file} exists; choose another name, or change that file")
+    check_folder(file.parent)
     file.parent.mkdir(parents=True, exist_ok=True)
-    temporary = file.with_name(f".{file.name}.{os.getpid()}")
-    temporary.write_text(text, encoding="utf-8")
-    os.link(temporary, file)  # fails where another process was first
-    temporary.unlink()
+    try:
+        with file.open("x", encoding="utf-8") as out:  # fails as well where another process was first
+            out.write(text)
+    except FileExistsError as error:
+        raise OutputExists(f"{file} exists; choose another name, or change that file") from error
     return file
 
 
@@ -168,20 +175,27 @@ def stage_of(part: str | None, stage: str | None) -> str:
 def new_effect(name: str, stage: str = "lens") -> str:
     """The text of a plugin file with a formula to fill in; runnable as it stands."""
     word = identifier(name)
-    formula, definition, acts, plausible, how = STUBS[stage]
-    call = f"formula({', '.join(_arguments(stage))})"
+    formula, definition, acts, plausible, _ = STUBS[stage]
+    call = f"formula({VIEWS[stage][0]})"
     return _file(
         word, stage, f"{_title(word)}: what it is, in one sentence.", definition + "\nwith the strength s; 0 is no effect. REPLACE f by the "
         "physics, symbol by symbol.", "where it shows in an image, what it looks like, and what tells it from effects that look alike.",
         "what must hold for the formula to be right.", "author, title, equation; or where it was measured.",
-        body=[f"def formula({', '.join(_arguments(stage))}):", '    """f of the definition: what a strength of 1 does."""',
-              *_imports(formula), f"    return {formula}"],
-        curve=call, acts=tuple(a.strip() for a in acts.split(",")), needs="what captures must vary for it to be seen",
-        plausible=plausible, how=how, head=[])
+        body=[f"def {call}:", '    """f of the definition: what a strength of 1 does."""', *_imports(formula), f"    return {formula}"],
+        applied=VIEWS[stage][1].format(name=word, curve=call), check=_rests_at_0(word, stage), acts=acts.split(", "),
+        needs="what captures must vary for it to be seen", plausible=plausible)
 
 
-def _arguments(stage: str) -> list[str]:
-    return [a.strip() for a in VIEWS[stage][0].split(",")]
+def _rests_at_0(word: str, stage: str) -> list[str]:
+    """A closed form that the file must meet; the user puts the formula's own in its place."""
+    if STAGES[stage] != "camera":
+        return ["def rests_at_0():", '    """REPLACE by a value of the formula that is known by other means."""',
+                f'    assert effect.parameters[0].neutral == 0 and effect.parameters[0].name == "{word}"']
+    return [
+        "def rests_at_0():", '    """No effect at a strength of 0. Add a value of the formula that is known by other means."""',
+        "    from types import SimpleNamespace", "", "    v, u = np.mgrid[:3, :4] + 0.5",
+        f"    camera = SimpleNamespace(u=u, v=v, tan=0.1 * u, focal=10.0, width=4, height=3, {word}=0.0)",
+        "    image = np.full((3, 4, 3), 0.5)", "    assert (act(image, camera) == image).all()"]
 
 
 def _imports(code: str) -> list[str]:
@@ -189,8 +203,7 @@ def _imports(code: str) -> list[str]:
 
 
 def _title(word: str) -> str:
-    words = word.replace("_", " ")
-    return words[0].upper() + words[1:]
+    return word.replace("_", " ").capitalize()
 
 
 # -- a draft ----------------------------------------------------------------------------------------------------------
@@ -198,7 +211,7 @@ def _title(word: str) -> str:
 
 def drafted(diagnosis: Diagnosis) -> list[str]:
     """Coordinates of a diagnosis that a draft can carry, best first."""
-    return [f.coordinate for f in diagnosis.fingerprints if f.coordinate in CARRIERS or _camera_setting(f)]
+    return [f.coordinate for f in diagnosis.fingerprints if _carrier(f)]
 
 
 def fingerprint_of(diagnosis: Diagnosis, along: str | None) -> Fingerprint:
@@ -207,17 +220,22 @@ def fingerprint_of(diagnosis: Diagnosis, along: str | None) -> Fingerprint:
     if not known:
         raise ValueError("the diagnosis has no curves along coordinates; diagnose the study again")
     can = drafted(diagnosis)
+    offer = f"a draft can follow {', '.join(can) or 'none of these curves'}"
     along = along or (diagnosis.families[0].coordinate if diagnosis.families else diagnosis.fingerprints[0].coordinate)
     if along not in known:
-        raise UnknownKey(along, known, "coordinate", hint=f"(of this diagnosis; a draft can follow {', '.join(can)})")
+        raise UnknownKey(along, known, "coordinate", hint=f"(of this diagnosis; {offer})")
     if along not in can:
         why = ELSEWHERE.get(along, "no stage of a model sees it")
-        raise ValueError(f"no draft along '{along}': {why}; a draft can follow {', '.join(can) or 'none of these curves'}")
+        raise ValueError(f"no draft along '{along}': {why}; {offer}")
     return known[along]
 
 
-def _camera_setting(f: Fingerprint) -> bool:
-    return f.coordinate.startswith("camera.") and f.family == "camera"
+def _carrier(f: Fingerprint) -> Carrier | None:
+    """Where a curve can act: along a setting of the camera, whatever the scene calls it, or along a coordinate of CARRIERS."""
+    _, dot, setting = f.coordinate.rpartition(".")
+    if dot and f.family == "camera":
+        return Carrier("sensor", (f"x = camera.{setting} + 0 * camera.v",), f.coordinate)
+    return CARRIERS.get(f.coordinate)
 
 
 def draft_effect(diagnosis: Diagnosis, along: str | None = None, *, name: str, black_level: float, saturation: float,
@@ -231,48 +249,49 @@ def draft_effect(diagnosis: Diagnosis, along: str | None = None, *, name: str, b
     Raises ValueError or UnknownKey for a coordinate that no draft can carry.
     """
     f = fingerprint_of(diagnosis, along)
-    word = identifier(name)
-    setting = _camera_setting(f)
-    carrier = Carrier("sensor", (f"x = camera.{f.coordinate.partition('.')[2]} + 0 * camera.v",), f"{f.coordinate}") if setting else \
-        CARRIERS[f.coordinate]
+    word, carrier, family = identifier(name), _carrier(f), f.family or family_of(f.coordinate)
+    stage, part = carrier.stage, STAGES[carrier.stage]
+    dark, exact = f.kind == "offset" and part == "camera", f.coordinate in CELLS
     full = saturation - black_level
     at, values, sd = _points(f)
-    stage, what, remark = carrier.stage, "relative change of the light", ""
-    if f.kind == "offset" and STAGES[stage] == "camera":
+    what, remark, applied = "relative change of the light", "", VIEWS[stage][1]
+    if dark:
         stage, what = "response" if stage == "response" else "sensor", "change of the picture, 1 = full scale"
-        values, sd = values / full, sd / full
+        values, sd, applied = values / full, sd / full, "return image + camera.{name} * {curve}"
     elif f.kind == "offset":
         level = diagnosis.basis.signal
         values, sd = values / level, sd / level
-        remark = (f"\n    The curve was found as an offset in DN; here it is a gain, relative to the mean signal of {level:.4g} DN. Light that "
+        remark = (f"\nThe curve was found as an offset in DN; here it is a gain, relative to the mean signal of {level:.4g} DN. Light that "
                   "does not follow the LED is not this.")
     if f.coordinate == "signal":
         at = (at - black_level) / full
     if np.abs(values).max() == 0:
         raise ValueError(f"the curve along '{f.coordinate}' is 0 everywhere; there is nothing to draft")
-    dark = f.kind == "offset" and STAGES[stage] == "camera"
+    if part != "camera" and family == "light":
+        remark = "\nThe curve was found along the brightest LED of a frame; here every LED has it." + remark
     spread = "[..., None]" if stage == "sensor" and f.coordinate != "channel" else ""
-    exact = f.coordinate in ("place", "channel")  # a value per cell: none lies between two of them
-    definition = "\n".join((
-        f"I' = {'I + s g(x)' if dark else 'I (1 + s g(x))'}", f"x   {carrier.words}",
-        f"g   {what}: the table below, of a diagnosis, with straight lines between its points",
-        "s   the strength: 0 is no effect, 1 the curve as it was found",
-        "REPLACE the table by a formula g(x): it has fewer numbers, is smooth, and says what the cause is."))
-    brightest = STAGES[stage] in ("gel", "led") and f.family == "light"
     return _file(
-        word, stage, f"{_title(word)}: drafted from a curve along '{f.coordinate}', cause not known.", definition,
-        f"goes with {'the camera' if f.family == 'camera' else f.family}: a curve along '{f.coordinate}' lowered chi2 by {f.net:.4g}, "
-        f"{f.ratio:.3g} times as much as the best effect of the library.",
-        "for the sensor, and within the range of the coordinate, that the captures had; beyond it the end of the table holds."
-        + ("\n    The curve was found along the brightest LED of a frame; here every LED has it." if brightest else "") + remark,
+        word, stage, f"{_title(word)}: drafted from a curve along '{f.coordinate}', cause not known.", "\n".join((
+            f"I' = {'I + s g(x)' if dark else 'I (1 + s g(x))'}", f"x   {carrier.words}",
+            f"g   {what}: the table below, of a diagnosis, " + ("a value per cell" if exact else "with straight lines between its points"),
+            "s   the strength: 0 is no effect, 1 the curve as it was found",
+            "REPLACE the table by a formula g(x): it has fewer numbers, is smooth, and says what the cause is.")),
+        f"goes with {'the camera' if family == 'camera' else family}: a gain and an offset along '{f.coordinate}' together lowered "
+        f"chi2 by {f.net:.4g}, {f.ratio:.3g} times as much as the best effect of the library; here is the {f.kind}, which did more.",
+        "for the sensor, and within the range of the coordinate, that the captures had; beyond it the end of the table holds." + remark,
         f"the diagnosis of {source or 'a study'}.",
+        head=[*([] if exact else [_table("AT", at)]),
+              _table("CURVE", [float(f"{v:.4g}") for v in values], f"+- {np.median(sd):.2g}, the median")],
         body=["def curve(x):", f'    """g of the definition: {what}, of the {carrier.words}."""',
               "    return np.asarray(CURVE)[np.asarray(x, int)]" if exact else "    return lookup(x, AT, CURVE)"],
-        curve="curve(x)", acts=(f.coordinate, "dark") if dark else (f.coordinate,), needs=f"frames that cover the range of {f.coordinate}",
-        plausible=float(f"{min(1.0, BENT / np.abs(values).max()):.2g}"), how="image" if STAGES[stage] == "camera" else "ad",
-        head=[*([] if exact else [_table("AT", at, "")]),
-              _table("CURVE", [float(f"{v:.4g}") for v in values], f"+- {np.median(sd):.2g}, the median")],
-        lines=carrier.lines, spread=spread, dark=dark, exact=exact)
+        lines=carrier.lines, applied=applied.format(name=word, curve=f"curve(x){spread}"), check=[
+            "def meets_its_table():", *(
+                ['    """Every cell has its value. With a formula: a value known by other means."""',
+                 "    assert list(curve(range(len(CURVE)))) == CURVE"] if exact else
+                ['    """The curve passes its ends, and holds beyond them. With a formula: a value known by other means."""',
+                 "    assert abs(curve(AT[0]) - CURVE[0]) < 1e-9", "    assert abs(curve(AT[-1] + 1e6) - CURVE[-1]) < 1e-9"])],
+        acts=[f.coordinate, "dark"] if dark else [f.coordinate], needs=f"frames that cover the range of {f.coordinate}",
+        plausible=float(f"{min(1.0, BENT / np.abs(values).max()):.2g}"))
 
 
 def from_study(folder: str | Path, along: str | None, name: str, registry: Registry) -> tuple[str, Path]:
@@ -286,14 +305,13 @@ def from_study(folder: str | Path, along: str | None, name: str, registry: Regis
         raise ValueError(f"{folder}: no diagnosis to draft from; run `optics diagnose {folder}` first")
     diagnosis = Diagnosis.from_json(json.dumps(study.diagnosis(index)))
     f = fingerprint_of(diagnosis, along)
-    part = STAGES[CARRIERS[f.coordinate].stage] if f.coordinate in CARRIERS else "camera"
-    setup = study.record["facts"]["setup"]
-    plugins = Path(setup["plugins"]) if setup["plugins"] else Path(setup["captures"]) / "plugins"
+    part = STAGES[_carrier(f).stage]
+    plugins = loop.plugins_of(loop.Setup(**study.record["facts"]["setup"]))
     if plugins.is_dir():
         registry.scan(plugins)
     text = scenes.find(study.record["scene"]).read_text(encoding="utf-8")
     if part != "camera" and (f'type="{part}"' not in text or 'type="clear"' in text):
-        can = [c for c in drafted(diagnosis) if c not in CARRIERS or STAGES[CARRIERS[c].stage] == "camera"]
+        can = [g.coordinate for g in diagnosis.fingerprints if _carrier(g) and STAGES[_carrier(g).stage] == "camera"]
         raise ValueError(f"no draft along '{f.coordinate}': light in the scene {study.record['scene']} "
                          + ("is followed by chance, where effects do not act on its path" if 'type="clear"' in text else f"passes no {part}")
                          + f"; a draft can follow {', '.join(can) or 'none of these curves'}")
@@ -306,7 +324,7 @@ def from_study(folder: str | Path, along: str | None, name: str, registry: Regis
 def _points(f: Fingerprint) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(at, values, sd) of the bins that hold data, in rising order, each place once."""
     at, values, sd = (np.array(v, float) for v in (f.centres, f.curve, f.sd))
-    if f.coordinate in ("place", "channel"):
+    if f.coordinate in CELLS:
         return np.arange(len(values), dtype=float), np.nan_to_num(values), np.nan_to_num(sd)
     good = np.isfinite(at) & np.isfinite(values)
     order = np.argsort(at[good], kind="stable")
@@ -318,67 +336,33 @@ def _points(f: Fingerprint) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return at, values, sd
 
 
-def _table(name: str, values: Sequence[float], remark: str) -> str:
-    numbers, rows = [f"{v:.7g}" for v in values], []
-    for i in range(0, len(numbers), 8):
-        rows.append("    " + ", ".join(numbers[i:i + 8]) + ",")
-    return f"{name} = [{'  # ' + remark if remark else ''}\n" + "\n".join(rows) + "\n]"
+def _table(name: str, values: Sequence[float], remark: str = "") -> str:
+    numbers = [f"{v:.7g}," for v in values]
+    rows = ["    " + " ".join(numbers[i:i + 8]) for i in range(0, len(numbers), 8)]
+    return "\n".join([f"{name} = [{'  # ' + remark if remark else ''}", *rows, "]"])
 
 
 # -- the file ---------------------------------------------------------------------------------------------------------
 
 
 def _file(word: str, stage: str, title: str, definition: str, fingerprint: str, validity: str, references: str, *, body: Sequence[str],
-          curve: str, acts: Sequence[str], needs: str, plausible: float, how: str, head: Sequence[str], lines: Sequence[str] = (),
-          spread: str = "", dark: bool = False, exact: bool = False) -> str:
-    arguments, apply = VIEWS[stage]
-    part = STAGES[stage]
-    apply = "return image + camera.{name} * {curve}" if dark else apply
-    applied = apply.format(name=word, curve=f"{curve}{spread}")
-    function = [f"def act({arguments}):", '    """The stage\'s function: what the definition says, at the strength that the part has."""',
-                *_imports(" ".join([*lines, applied])), *(f"    {line}" for line in lines), f"    {applied}"]
-    check = _check(word, stage, bool(lines), exact)
-    uses = "\n".join([*body, *function, *check[1]])
-    head_imports = ["import numpy as np"] if re.search(r"\bnp\.", uses) else []
-    if "lookup(" in uses:
-        own = ["from optics.effect import Effect", "from optics.lookup import lookup", "from optics.parameter import Parameter"]
-    else:
-        own = ["from optics.effect import Effect", "from optics.parameter import Parameter"]
-    sections = (("Definition", definition), ("Fingerprint", fingerprint), ("Validity", validity), ("References", references))
-    doc = "\n".join([f'"""{title}', "", *(f"{s}\n" + "\n".join(f"    {line.strip()}" for line in _wrapped(text)) for s, text in sections), '"""'])
+          applied: str, check: Sequence[str], acts: Sequence[str], needs: str, plausible: float, head: Sequence[str] = (),
+          lines: Sequence[str] = ()) -> str:
+    """The text: docstring, imports, tables, the curve or formula, the stage's function with its last line `applied`, check, declaration."""
+    function = [f"def act({VIEWS[stage][0]}):", '    """The stage\'s function: what the definition says, at the strength that the part has."""',
+                *_imports(" ".join([*lines, applied])), *(f"    {line}" for line in [*lines, applied])]
+    code = "\n".join([*body, *function, *check])
+    imports = [*(["import numpy as np", ""] if re.search(r"\bnp\.", code) else []), "from optics.effect import Effect",
+               *(["from optics.lookup import lookup"] if "lookup(" in code else []), "from optics.parameter import Parameter"]
+    sections = {"Definition": definition, "Fingerprint": fingerprint, "Validity": validity, "References": references}
+    doc = [f'"""{title}', ""]
+    for name, text in sections.items():
+        doc += [name, *(f"    {line}" for piece in text.split("\n") for line in textwrap.wrap(piece, 125))]
     declaration = [
-        "effect = Effect(", f'    name="{word.replace("_", " ")}", part="{part}", stages={{"{stage}": act}},',
-        f'    parameters=(Parameter("{word}", "1", 0.0, (-10.0, 10.0), "strength s", neutral=0.0, plausible={plausible:g}, how="{how}"),),',
-        f"    acts={_tuple(acts)},", f'    needs="{needs}", checks=({check[0]},))']
-    pieces = [doc, "\n".join([*head_imports, *([""] if head_imports else []), *own]), *(["\n".join(head)] if head else []),
-              "\n" + "\n".join(body) + "\n", "\n".join(function) + "\n", "\n".join(check[1]) + "\n", "\n".join(declaration)]
-    return "\n\n".join(pieces) + "\n"
-
-
-def _tuple(words: Sequence[str]) -> str:
-    return "(" + ", ".join(f'"{w}"' for w in words) + ("," if len(words) == 1 else "") + ")"
-
-
-def _wrapped(text: str) -> list[str]:
-    import textwrap
-
-    return [line for piece in text.split("\n") for line in textwrap.wrap(piece.strip(), 125)]
-
-
-def _check(word: str, stage: str, drafted: bool, exact: bool) -> tuple[str, list[str]]:
-    """A closed form that the file must meet; the user puts the formula's own in its place."""
-    if drafted and not exact:
-        return "meets_its_table", [
-            "def meets_its_table():", '    """The curve passes its ends, and holds beyond them. With a formula: a value known by other means."""',
-            "    assert abs(curve(AT[0]) - CURVE[0]) < 1e-9", "    assert abs(curve(AT[-1] + 1e6) - CURVE[-1]) < 1e-9"]
-    if drafted:
-        return "meets_its_table", ["def meets_its_table():", '    """Every cell has its value. With a formula: a value known by other means."""',
-                                   "    assert list(curve(range(len(CURVE)))) == CURVE"]
-    if STAGES[stage] != "camera":
-        return "rests_at_0", ["def rests_at_0():", '    """REPLACE by a value of the formula that is known by other means."""',
-                              f'    assert effect.parameters[0].neutral == 0 and effect.parameters[0].name == "{word}"']
-    return "rests_at_0", [
-        "def rests_at_0():", '    """No effect at a strength of 0. Add a value of the formula that is known by other means."""',
-        "    from types import SimpleNamespace", "", "    v, u = np.mgrid[:3, :4] + 0.5",
-        f"    camera = SimpleNamespace(u=u, v=v, tan=0.1 * u, focal=10.0, width=4, height=3, {word}=0.0)",
-        "    image = np.full((3, 4, 3), 0.5)", "    assert (act(image, camera) == image).all()"]
+        "effect = Effect(", f'    name="{word.replace("_", " ")}", part="{STAGES[stage]}", stages={{"{stage}": act}},',
+        f'    parameters=(Parameter("{word}", "1", 0.0, (-10.0, 10.0), "strength s", neutral=0.0, plausible={plausible:g}, '
+        f'how="{STUBS[stage][4]}"),),', "    acts=(" + ", ".join(f'"{a}"' for a in acts) + ("," if len(acts) == 1 else "") + "),",
+        f'    needs="{needs}", checks=({check[0][4:-3]},))']
+    blocks = ["\n".join([*doc, '"""']), "\n".join(imports), *(["\n".join(head)] if head else [])]
+    functions = ["\n".join(block) for block in (body, function, check, declaration)]
+    return "\n\n".join(blocks) + "\n\n\n" + "\n\n\n".join(functions) + "\n"

@@ -61,6 +61,29 @@ class Candidate:
         mine, others = ({(key, v.frames) for v in c.variables for key in v.keys} for c in (self, other))
         return mine > others
 
+    @classmethod
+    def at(cls, model, values: Values, effect: Effect, variables: Sequence[Variable]) -> "Candidate":
+        """An effect under test at the values: where its strengths start, and to which side they may go."""
+        start = np.array([value_of(model, values, v) for v in variables])
+        sides = []
+        for v, value in zip(variables, start):
+            (low, high), near = v.parameter.bounds, 1e-6 * abs(v.parameter.plausible)
+            sides.append(1 if value <= low + near else -1 if value >= high - near else 0)
+        return cls(effect, list(variables), start, sides, np.array([v.parameter.plausible for v in variables]))
+
+    @property
+    def usual(self) -> np.ndarray:
+        """Changes of plausible size, to the side that is open; of a strength that every frame has for itself up and down in turn, as all
+        of them together would be one scale, which a calibration takes up."""
+        sides = np.array(self.sides)
+        turn = np.where([v.frames is not None and i % 2 == 1 for i, v in enumerate(self.variables)], -1.0, 1.0)
+        return self.plausible * np.where(sides == 0, turn, sides)
+
+    @property
+    def direction(self) -> np.ndarray:
+        """Coefficients to compare effects at: as found, or usual ones where nothing was found."""
+        return self.linear if self.linear.any() else self.linear_of(self.usual)
+
     def _squares(self) -> np.ndarray:
         """Variables whose effect grows with their square: a secant to the plausible size is linear in s^2/plausible."""
         own = [v.parameter.squared and abs(start) < 1e-3 * v.parameter.plausible for v, start in zip(self.variables, self.start)]
@@ -86,7 +109,10 @@ class Candidate:
 
 @dataclass
 class Block:
-    """Pixels of one frame that are kept: whitened columns a (n, k) in the places `where`, residual r (n,)."""
+    """Pixels of one frame that are kept: whitened columns a (n, k) in the places `where`, residual r (n,).
+
+    prediction   of the seed `Evidence.seed`, not the residual's: where pictures are Monte Carlo estimates, its error is not that of r
+    """
 
     frame: int
     where: np.ndarray
@@ -126,6 +152,7 @@ class Evidence:
     signal: float
     noise: float
     masked: float
+    seed: int = 0  # of pictures to bin or to scale residuals by: binned by a picture whose error is in them, residuals follow that error
     projected: st.Projected | None = None
     candidates: list[Candidate] = field(default_factory=list)  # that were scored in it, best first
 
@@ -212,7 +239,7 @@ def measure(model, values: Values, base: Sequence[Variable], candidates: Sequenc
     k = st.thinning(used, rows_max)
     normal, spectrum = st.Normal(len(columns)), st.Spectrum(len(columns))
     evidence = Evidence(columns, list(range(len(base))), list(range(len(base), len(columns))), values, normal, [],
-                        list(frames), [], [], [], spectrum, *_priors(model, values, base), k, 0, 0.0, 0.0, 0.0, 0.0)
+                        list(frames), [], [], [], spectrum, *_priors(model, values, base), k, 0, 0.0, 0.0, 0.0, 0.0, seeds[0])
     noisy: set[int] = set()
     signal = variance = 0.0
     for n, frame in enumerate(frames):
@@ -228,7 +255,8 @@ def measure(model, values: Values, base: Sequence[Variable], candidates: Sequenc
                 evidence.render_noise = float(np.mean(sample[np.isfinite(sample)]))
         elif noisy:
             _, second = images(frame, seeds[1], noisy)
-        _add_frame(evidence, model, frame, n, prediction, first, second if noisy else {}, noisy, candidates, len(base))
+        _add_frame(evidence, model, frame, n, prediction, prediction if own is None else own, first, second if noisy else {}, noisy,
+                   candidates, len(base))
         use, sigma = evidence.use[-1], evidence.sigma[-1]
         signal += float(prediction[use].sum())
         variance += float((sigma[use].astype(float) ** 2).sum())
@@ -255,7 +283,7 @@ def _priors(model, values: Values, base: Sequence[Variable]) -> tuple[np.ndarray
     return precision, pull
 
 
-def _add_frame(evidence: Evidence, model, frame: int, n: int, prediction, first: dict, second: dict, noisy: set,
+def _add_frame(evidence: Evidence, model, frame: int, n: int, prediction, other, first: dict, second: dict, noisy: set,
                candidates: Sequence[Candidate], p: int) -> None:
     image = np.asarray(model.frames[frame].image, float)
     variance = evidence.variance(model, frame, prediction)
@@ -289,7 +317,7 @@ def _add_frame(evidence: Evidence, model, frame: int, n: int, prediction, first:
     evidence.spectrum.add(good, where, a)
     keep = good & st.lattice(image.shape, evidence.thinning, n)
     evidence.blocks.append(Block(
-        frame, where, a[keep], None if b is None else b[keep], whitened[keep], 1 / weight[keep], prediction[keep],
+        frame, where, a[keep], None if b is None else b[keep], whitened[keep], 1 / weight[keep], np.asarray(other, float)[keep],
         np.flatnonzero(keep), _dilated(mask)[keep]))
     evidence.use.append(good)
     evidence.sigma.append(np.where(good, np.sqrt(variance), np.inf).astype(np.float32))

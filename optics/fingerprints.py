@@ -9,24 +9,22 @@ of chi2. `families` says whether the residual goes with the camera, with light, 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from optics import statistics as st
 from optics.compare import UNITS, led_label
-from optics.evidence import Block, Evidence, Progress
+from optics.evidence import Evidence, Progress
 from optics.parameter import Values
-from optics.verdict import EXCESS, MIMICS, Family, Fingerprint
+from optics.verdict import AS_GOOD, EXCESS, MIMICS, Family, Fingerprint, ordered
 
 SIDE = 4  # cells per side of the coordinate 'place': a finer map would fit any clutter and forbid every claim
-NOT_A_COORDINATE = ("far",)  # regions that others make up
-NAMED_BINS = ("place", "frame", "channel", "LED")
+NOT_A_COORDINATE = {"far", "quadrant"}  # regions that others make up
 YES_NO = ("contact", "shadow", "rim")
 LINES = 64  # bins of 'row' and 'column': what a shutter or a read-out does goes by single rows
 SEEN = 0.01  # of a curve's direction that calibration must leave for it to be drawn: the rest (a level, a slope) nobody can know
-AS_GOOD = 0.8  # of the best family's fall: families nearer than that are not told apart
 DISTANCES = 8  # LEDs up to which the distance to each is a coordinate of its own
 
 FAMILIES = {  # what a coordinate belongs to; a setting belongs to the family of the part that it is a setting of
@@ -45,8 +43,6 @@ def family_of(coordinate: str, kind: str = "") -> str:
     name, _, parameter = coordinate.rpartition(".")
     if parameter in TIMES:
         return "time"
-    if parameter == "distance":
-        return "light"
     found = next((family for family, names in FAMILIES.items() if coordinate in names), "")
     return found or PARTS.get(kind or name, "setting")
 
@@ -60,18 +56,18 @@ def places(model, values: Values, evidence: Evidence) -> list[dict[str, np.ndarr
     order = {frame: i for i, frame in enumerate(evidence.frames)}
     turned = settings(model, evidence)
     lights = [led_label(model.frames[f].parameters) for f in evidence.frames]
-    kinds = sorted(set(lights))
+    kinds = _lights(evidence, model)
     table = getattr(model.captures, "table", None) is not None
     for block in evidence.blocks:
         shape = np.asarray(model.frames[block.frame].image).shape
         row, column, channel = np.unravel_index(block.index, shape)
         known = {"signal": block.prediction.astype(np.float32)}
-        planes = {**model.coordinates(values, block.frame), **lit_geometry(model, values, block.frame)}
+        planes = {**model.coordinates(values, block.frame, evidence.seed), **lit_geometry(model, values, block.frame)}
         if min(shape[:2]) >= 2 * SIDE:
-            planes.update(_texture(np.asarray(model.predict(values, [block.frame])[0], float)))
+            planes.update(_texture(np.asarray(model.predict(values, [block.frame], evidence.seed)[0], float)))
         for name, plane in planes.items():
             plane = np.asarray(plane)
-            if name in NOT_A_COORDINATE or plane.ndim not in (2, 3):
+            if plane.ndim not in (2, 3):
                 continue
             plane = np.broadcast_to(plane if plane.ndim == 3 else plane[..., None], shape)
             known[name] = plane.reshape(-1)[block.index].astype(np.float32)
@@ -109,7 +105,8 @@ def lit_geometry(model, values: Values, frame: int) -> dict[str, np.ndarray]:
     found = {"depth": np.where(hits.valid, np.linalg.norm(eye, axis=-1), np.nan)} if scene.gel is None else {}
     best, toward, axis = np.full(hits.shape, -1.0), np.zeros(p.shape), np.zeros(p.shape)
     at = {led: np.array([float(now[f"{led}.{a}"]) for a in "xyz"]) for led in scene.leds}
-    for led, power in model.lit(now).items():
+    on = model.lit(now)
+    for led, power in on.items():
         if led not in at:
             continue
         strength = (power * renderer.image(now, led)).sum(-1)
@@ -118,15 +115,14 @@ def lit_geometry(model, values: Values, frame: int) -> dict[str, np.ndarray]:
         toward[brighter] = _unit(at[led] - p)[brighter]
         axis[brighter] = _axis(scene.leds[led], now[f"{led}.pan"], now[f"{led}.tilt"])
     lit = (best > 0) & hits.valid
-    if lit.any():
-        slope = np.degrees(np.arccos(np.clip(-n[..., 2], -1, 1)))
-        found["half_angle"] = np.where(lit, _angle(n, _unit(toward + to_camera)), np.nan)
-        found["led_angle"] = np.where(lit, _angle(-toward, axis), np.nan)
-        found["light_azimuth"] = np.where(lit & (slope > 1), _angle(_flat(n), _flat(toward)), np.nan)
+    slope = np.degrees(np.arccos(np.clip(-n[..., 2], -1, 1)))
+    # in a frame without light they are NaN, not left out: a coordinate that one frame lacks is no coordinate of the others either
+    found["half_angle"] = np.where(lit, _angle(n, _unit(toward + to_camera)), np.nan)
+    found["led_angle"] = np.where(lit, _angle(-toward, axis), np.nan)
+    found["light_azimuth"] = np.where(lit & (slope > 1), _angle(_flat(n), _flat(toward)), np.nan)
     if scene.gel is not None and f"{scene.gel.name}.press_x" in now:
         found["press_distance"] = np.hypot(*(p[..., i] - float(now[f"{scene.gel.name}.press_{a}"]) for i, a in enumerate("xy")))
     if 1 < len(at) <= DISTANCES:
-        on = model.lit(now)
         found.update({f"{led}.distance": np.where(hits.valid & (led in on), np.linalg.norm(place - p, axis=-1), np.nan)
                       for led, place in at.items()})
     return found
@@ -185,9 +181,14 @@ def fingerprints(model, evidence: Evidence, found: list[dict], reference: float,
     from scipy.special import chdtrc
 
     k, black = evidence.thinning, float(model.noise.black_level)
-    names = sorted(set.intersection(*[set(p) for p in found]) - {"quadrant"})
-    plain_normal = evidence.thinned(extra=2 * max(SIDE * SIDE, LINES, len(evidence.frames), evidence.channels))
+    names = sorted(set.intersection(*[set(p) for p in found]) - NOT_A_COORDINATE)
+    # bins that have names: one each, whether it holds data or not
+    named = {"place": SIDE * SIDE, "frame": len(evidence.frames), "channel": evidence.channels, "LED": len(_lights(evidence, model))}
+    plain_normal = evidence.thinned(extra=2 * max(LINES, *named.values()))
     middles = [block.middle for block in evidence.blocks]
+    carriers = [((block.prediction - black) / block.sigma, 1 / block.sigma) for block in evidence.blocks]
+    ends = np.cumsum([len(block.r) for block in evidence.blocks])[:-1]
+    first = len(evidence.columns)
     dof_all = max(evidence.normal.count - evidence.projected.rank, 1)
     excess = evidence.projected.chi2 - dof_all
     weighed = excess > EXCESS * math.sqrt(2 * dof_all)
@@ -195,13 +196,14 @@ def fingerprints(model, evidence: Evidence, found: list[dict], reference: float,
     for n, name in enumerate(names):
         say("fingerprints", n, len(names))
         x = np.concatenate([p[name] for p in found])
-        edges = st.bin_edges(x, LINES if name in ("row", "column") else st.BINS) if name not in NAMED_BINS else np.arange(x.min(), x.max() + 2) - 0.5
+        edges = np.arange(named[name] + 1) - 0.5 if name in named else st.bin_edges(x, LINES if name in ("row", "column") else st.BINS)
         if edges is None or len(edges) < 3:
             continue
         count = len(edges) - 1
-        normal = _with_bins(evidence, plain_normal, middles, found, name, edges,
-                            lambda block: ((block.prediction - black) / block.sigma, 1 / block.sigma))
-        first = len(evidence.columns)
+        index = np.where(np.isfinite(x), np.searchsorted(edges, x, side="right") - 1, -1)
+        normal = plain_normal.copy()
+        for block, middle, bins, carrier in zip(evidence.blocks, middles, np.split(index, ends), carriers):
+            st.add_bins(normal, block.where, middle, block.r, first, bins, count, carrier)
         rest = list(range(first, first + 2 * count))
         projected = evidence.project(normal, evidence.base, rest, k)
         lengths = np.diag(normal.gram)[rest]
@@ -215,8 +217,6 @@ def fingerprints(model, evidence: Evidence, found: list[dict], reference: float,
         kind = max(curves, key=lambda name: curves[name][0] - curves[name][1])
         _, _, curve, sd = drawn[kind]
         net = (fall - dof) * k
-        index = np.searchsorted(edges, x, side="right") - 1
-        index = np.where(np.isfinite(x), index, -1)
         centres = [float(np.median(x[index == i])) if np.any(index == i) else math.nan for i in range(count)]
         curves_of.append(Fingerprint(
             name, fall, dof, float(chdtrc(dof, fall)), net, net / reference, kind, centres, curve.tolist(), sd.tolist(),
@@ -243,7 +243,7 @@ def _labels(evidence: Evidence, model, name: str, centres: Sequence[float]) -> l
     if name == "frame":
         return [str(getattr(model.frames[f], "name", f)) for f in evidence.frames]
     if name == "LED":
-        return sorted({led_label(model.frames[f].parameters) for f in evidence.frames})
+        return _lights(evidence, model)
     if name == "channel":
         return [f"{c} ({nm:.0f} nm)" if nm else c for c, nm in zip(channel_names(evidence), _wavelengths(model, evidence.channels))]
     if name in YES_NO and len(centres) == 2:
@@ -251,6 +251,10 @@ def _labels(evidence: Evidence, model, name: str, centres: Sequence[float]) -> l
     if name == "place":
         return [f"row {i // SIDE + 1}, column {i % SIDE + 1} of {SIDE}" for i in range(len(centres))]
     return []
+
+
+def _lights(evidence: Evidence, model) -> list[str]:
+    return sorted({led_label(model.frames[f].parameters) for f in evidence.frames})
 
 
 def _wavelengths(model, channels: int) -> list[float]:
@@ -265,18 +269,6 @@ def channel_names(evidence: Evidence) -> list[str]:
     return ["R", "G", "B"] if evidence.channels == 3 else [str(i) for i in range(evidence.channels)]
 
 
-def _with_bins(evidence: Evidence, plain_normal: st.Normal, middles, found, name: str, edges: np.ndarray,
-               carriers: Callable[[Block], tuple]) -> st.Normal:
-    """A copy of the normal equations with bins of a coordinate after the columns of the evidence."""
-    first, count = len(evidence.columns), len(edges) - 1
-    normal = plain_normal.copy()
-    for block, middle, place in zip(evidence.blocks, middles, found):
-        x = place[name]
-        bins = np.where(np.isfinite(x), np.searchsorted(edges, x, side="right") - 1, -1)
-        st.add_bins(normal, block.where, middle, block.r, first, bins, count, carriers(block))
-    return normal
-
-
 # -- what it goes with ------------------------------------------------------------------------------------------------
 
 
@@ -286,15 +278,10 @@ def families(found: Sequence[Fingerprint]) -> list[Family]:
     A map of the sensor mimics every curve that does not move, and a number per frame every setting: either stands for its family,
     and its family comes first, only where no other curve is nearly as good.
     """
-    def ranked(curves):
-        reach = AS_GOOD * max((f.net for f in curves), default=0.0)
-        special = any(f.net > reach for f in curves if f.coordinate not in MIMICS)
-        return sorted(curves, key=lambda f: (special and f.coordinate in MIMICS, -f.net))
-
     own: dict[str, list[Fingerprint]] = {}
     for f in found:
         own.setdefault(f.family, []).append(f)
-    best = ranked([ranked(curves)[0] for curves in own.values()])
+    best = ordered([ordered(curves)[0] for curves in own.values()])
     return [Family(f.family, f.coordinate, f.net, f.share, f.net / best[0].net if best[0].net > 0 else 0.0) for f in best]
 
 

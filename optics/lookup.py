@@ -24,8 +24,8 @@ def lookup(x, at: Sequence[float], values: Sequence[float]):
         for begin, width, slope in zip(at, np.diff(at), slopes):
             result += float(slope) * dr.clip(x - float(begin), 0, float(width))
         return result
-    x = np.asarray(x)
     real = np.real(x)
-    k = np.clip(np.searchsorted(at, real, side="right") - 1, 0, len(slopes) - 1)
-    inside = (real > at[0]) & (real < at[-1])
-    return np.where(inside, values[k] + slopes[k] * (x - at[k]), np.where(real <= at[0], values[0], values[-1]))
+    result = np.interp(real, at, values)
+    if np.iscomplexobj(x):
+        result = result + 1j * np.imag(x) * np.array([0.0, *slopes, 0.0])[np.searchsorted(at, real, side="right")]
+    return result

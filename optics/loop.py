@@ -77,6 +77,11 @@ def setup_for(captures: str | Path, **given) -> Setup:
     return setup
 
 
+def plugins_of(setup: Setup) -> Path:
+    """The folder of plugins that belongs to a setup, whether it is there or not: the one that was named, or the one beside the captures."""
+    return Path(setup.plugins) if setup.plugins else Path(setup.captures) / "plugins"
+
+
 def open_model(setup: Setup, model_class: type = Model) -> Model:
     """Captures and scene of a setup as a model; raises before anything is rendered when they contradict each other."""
     found = capture_files.load(setup.captures)
@@ -87,10 +92,8 @@ def open_model(setup: Setup, model_class: type = Model) -> Model:
     for name, size in (("width", width), ("height", height)):
         if f'<default name="{name}"' in text:
             defines.setdefault(name, str(size))
-    plugins = Path(setup.plugins) if setup.plugins else None
-    if plugins is None and (Path(setup.captures) / "plugins").is_dir():
-        plugins = Path(setup.captures) / "plugins"
-    loaded = scenes.load(path, defines, plugins=plugins)
+    plugins = plugins_of(setup)
+    loaded = scenes.load(path, defines, plugins=plugins if setup.plugins or plugins.is_dir() else None)
     capture_files.check(found, loaded.parameters)
     noise = found.noise
     if noise is None:

@@ -77,7 +77,9 @@ class Parameter:
 
     def per_coordinate(self, value: float) -> float:
         """d value / d u; infinite at 0 of a squared parameter."""
-        return (1 + (value / self.saturates) ** 2) ** 2 / (2 * value) if self.squared else 1.0
+        if not self.squared:
+            return 1.0
+        return (1 + (value / self.saturates) ** 2) ** 2 / (2 * value) if value else math.inf
 
     def sides(self, value: float) -> tuple[float, float]:
         """The two values of a central difference, `step` to either side, within bounds."""

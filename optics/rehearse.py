@@ -91,7 +91,7 @@ def rehearse(model, fit, effects: Sequence, variables_of: Callable, fitted: Sequ
     levels = [c.cone.critical(critical) for c in live]
     rows = []
     for a, c in enumerate(live):
-        linear = c.linear_of(c.plausible * np.where(np.array(c.sides) < 0, -1, 1)) * change / c.raw
+        linear = c.linear_of(c.usual) * change / c.raw
         scores = noise + information[:, places[a]] @ linear
         falls = np.stack([other.cone.fall(scores[:, own]) for other, own in zip(live, places)])
         noticed = (falls > np.array(levels)[:, None]).any(0)

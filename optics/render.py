@@ -879,7 +879,7 @@ class Model:
         prediction = self.predict(Values(), [index])[0]
         return float(np.sqrt(np.mean(self._error(Values(), index) / self.noise.variance(prediction))))
 
-    def coordinates(self, values: Values, index: int) -> dict[str, np.ndarray]:
+    def coordinates(self, values: Values, index: int, seed: int = 0) -> dict[str, np.ndarray]:
         """What is known of every pixel of a frame; see `optics.compare` and `optics.diagnose` for their use."""
         from scipy.ndimage import distance_transform_edt
 
@@ -891,7 +891,7 @@ class Model:
         height, width = self.shape[:2]
         shadow = np.zeros((height, width), bool)
         rim = hits.edges.copy()
-        incidence, distance, best = np.full((height, width), 90.0), np.zeros((height, width)), np.full((height, width), -1.0)
+        incidence, distance, best = np.full((height, width), np.nan), np.full((height, width), np.nan), np.zeros((height, width))
         for led in lit:
             if led in self.scene.sources:
                 continue
@@ -912,7 +912,7 @@ class Model:
             np.linalg.norm(to_camera, axis=-1), 1e-9), -1, 1)))
         known = {
             "radius": view.tan * view.focal, "row": view.v, "column": view.u, "emission": emission,
-            "incidence": incidence, "led_distance": distance, "intensity": self.radiance(now).mean(-1),
+            "incidence": incidence, "led_distance": distance, "intensity": self.radiance(now, seed).mean(-1),
             "shadow": shadow, "rim": rim & hits.valid,
             "frame": np.full((height, width), float(index)),
         }

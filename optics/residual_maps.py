@@ -40,26 +40,25 @@ def pages(comparisons: Sequence[Comparison], shown: Sequence[Sequence[Shown]], s
     return out
 
 
-def _cells(image: np.ndarray, size: int) -> np.ndarray:
-    """(H, W) -> (h, w) means over blocks of `size` px, those at the far edges smaller; NaN where a block holds none."""
+def _cells(image: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
+    """(H, W) or (H, W, C) -> means and numbers of values, (h, w), of blocks of `size` px, those at the far edges smaller; NaN where none."""
     def summed(a):
         return np.add.reduceat(np.add.reduceat(a, np.arange(0, a.shape[0], size), 0), np.arange(0, a.shape[1], size), 1)
 
+    image = np.asarray(image, float).reshape(*image.shape[:2], -1)
     good = np.isfinite(image)
-    count = summed(good.astype(float))
-    return np.where(count > 0, summed(np.where(good, image, 0.0)) / np.maximum(count, 1), np.nan)
+    count = summed(good.sum(-1))
+    return np.where(count > 0, summed(np.where(good, image, 0.0).sum(-1)) / np.maximum(count, 1), np.nan), count
 
 
 def regions(c: Comparison) -> dict:
     """Mean and standard deviation of the residual in sigmas, over frames, channels and pixels of a cell."""
     size = max(1, math.ceil(max(c.mean_map.shape[:2]) / CELLS))
-    channels = range(c.mean_map.shape[2])
-    mean, square = (np.nanmean(np.stack([_cells(image[..., k], size) for k in channels]), 0) if len(channels) > 1 else
-                    _cells(image[..., 0], size) for image in (c.mean_map.astype(float), c.rms_map.astype(float) ** 2))
+    mean, square = (_cells(image, size)[0] for image in (c.mean_map, c.rms_map.astype(float) ** 2))
     sd = np.sqrt(np.maximum(square - mean**2, 0))
     top = max(float(np.nanmax(np.abs(mean), initial=0)), 0.05)
     return {"mean": coloured(mean, -top, top, DIVERGING), "mean_top": number(top, 2), "sd": coloured(sd, 0, 2, SEQUENTIAL),
-            "worst": number(float(np.nanmax(sd, initial=0)), 3), "cell": size, "columns": mean.shape[1], "rows": mean.shape[0],
+            "worst": number(float(np.nanmax(sd, initial=0)), 3), "cell": size,
             "width": c.mean_map.shape[1], "height": c.mean_map.shape[0]}
 
 
@@ -70,7 +69,7 @@ def colours(c: Comparison) -> str:
     from PIL import Image
 
     size = max(1, math.ceil(max(c.mean_map.shape[:2]) / COLOURED))
-    z = np.stack([_cells(c.mean_map[..., k].astype(float), size) for k in range(3)], -1) * size * math.sqrt(len(c.frames))
+    z = np.stack([mean * np.sqrt(count * len(c.frames)) for mean, count in (_cells(c.mean_map[..., k], size) for k in range(3))], -1)
     out = io.BytesIO()
     Image.fromarray((np.clip(np.nan_to_num(z) / 10 + 0.5, 0, 1) * 15 + 0.5).astype(np.uint8) * 17).save(out, "PNG", optimize=True)
     return "data:image/png;base64," + base64.b64encode(out.getvalue()).decode()
@@ -87,7 +86,7 @@ def components(shown: Sequence[Shown]) -> dict:
         return {"components": []}
     size = max(1, math.ceil(max(frames[0].measured.shape[:2]) / SIDE))
     # a mean over n pixels, times sqrt(n): noise keeps a standard deviation of 1
-    z = np.stack([np.nan_to_num(_cells(combined(f.residual), size) * size) for f in frames])
+    z = np.stack([np.nan_to_num(mean * np.sqrt(count)) for mean, count in (_cells(combined(f.residual), size) for f in frames)])
     shape = z.shape[1:]
     u, s, v = np.linalg.svd(z.reshape(len(frames), -1), full_matrices=False)
     total = float((s**2).sum()) or 1.0
@@ -106,5 +105,4 @@ def coordinates(diagnosis: Mapping | None) -> list[dict]:
     rows = [f for f in (diagnosis or {}).get("fingerprints") or () if (f.get("net") or 0) > 0]
     best = max([f["net"] for f in rows], default=1.0)
     return [{"name": f["coordinate"], "family": f.get("family") or "", "net": number(f["net"], 4), "bar": fixed(100 * f["net"] / best, 1),
-             "share": percent(f.get("share")) if f.get("share") is not None else "–", "ratio": number(f.get("ratio")), "kind": f.get("kind", ""),
-             "p": f.get("p")} for f in rows[:LISTED]]
+             "share": percent(f.get("share")), "ratio": number(f.get("ratio"))} for f in rows[:LISTED]]

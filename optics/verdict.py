@@ -37,6 +37,7 @@ EXCESS = 5.0  # ... where there is an excess of this many standard deviations at
 UNEVEN = 0.1  # of the fall: what splitting the strength by channel, frame, ... may still gain
 STRENGTH = 2.0  # standard deviations that a claimed strength must differ from none by: a fall without it is another's
 MIMICS = ("place", "frame")
+AS_GOOD = 0.8  # of the best curve's fall: what is nearer than that is not told apart from it
 PLANS = ("together", "more of the same")  # kinds of advice that are several shots
 TELLS = 0.02  # gain of P(correct) below which a shot is not worth a line
 WORDS = ("NOTHING", "CLAIM", "AMBIGUOUS", "PARTIAL", "UNKNOWN", "CANNOT_TELL")
@@ -531,10 +532,15 @@ def rivals(fingerprints: Sequence[Fingerprint], fall: float) -> list[Fingerprint
     """
     better = [f for f in fingerprints if f.ratio >= (RIVAL if f.coordinate == "place" else RIVAL_CURVE)
               and f.p < LEVEL / len(fingerprints)
-              and f.net - fall > 3 * math.sqrt(2 * f.dof)]  # beyond what the number of bins gives by chance
-    reach = max([f.net for f in better], default=0.0) * 0.8
-    special = any(f.net > reach for f in better if f.coordinate not in MIMICS)
-    return sorted(better, key=lambda f: (special and f.coordinate in MIMICS, -f.net))
+              and f.net - fall > 3 * math.sqrt(2 * f.dof) * f.net / (f.fall - f.dof)]  # beyond what the number of bins gives by chance
+    return ordered(better)
+
+
+def ordered(curves: Sequence[Fingerprint]) -> list[Fingerprint]:
+    """Best first, but those that mimic any other stand behind where one of the others is nearly as good."""
+    reach = AS_GOOD * max((f.net for f in curves), default=0.0)
+    special = any(f.net > reach for f in curves if f.coordinate not in MIMICS)
+    return sorted(curves, key=lambda f: (special and f.coordinate in MIMICS, -f.net))
 
 
 # -- words ------------------------------------------------------------------------------------------------------------

@@ -228,7 +228,7 @@ class MockModel(Exact):
         own = self.frames[frame].mask
         return mask if own is None else mask & own[..., None]
 
-    def coordinates(self, values: Values, frame: int) -> dict[str, np.ndarray]:
+    def coordinates(self, values: Values, frame: int, seed: int = 0) -> dict[str, np.ndarray]:
         now = self._at(values, frame)
         h, sx, sy = self.surface(now)
         distance = np.hypot(self.x - now["gel.press_x"], self.y - now["gel.press_y"])
@@ -292,7 +292,7 @@ class PointModel(Exact):
     def usable(self, frame):
         return np.ones(self.shape, bool)
 
-    def coordinates(self, values, frame):
+    def coordinates(self, values, frame, seed=0):
         return {}
 
     def variable(self, key):

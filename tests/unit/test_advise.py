@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from optics import advise
+from optics import advise, design, statistics
 from optics.diagnose import diagnose
-from optics.evidence import measure
+from optics.evidence import Candidate, measure
 from optics.parameter import Parameter, Values
-from optics.verdict import CLEAR, Advice, Apart, Diagnosis
+from optics.verdict import CLEAR, MARGIN, Advice, Apart, Diagnosis
 
 sys.path.insert(0, str(Path(__file__).parent))
 from mock_model import LEDS, LIBRARY, Frame, MockModel, mock_fit  # noqa: E402
@@ -82,7 +82,7 @@ def expose(model, true, frame, rng):
 
 def scored(model, values, variables, names=KINDS):
     """(evidence, candidates) of the present frames at the values, without any residual needed."""
-    members = [advise.candidate(model, values, e, model.variables_of(e)) for e in library(*names)]
+    members = [Candidate.at(model, values, e, model.variables_of(e)) for e in library(*names)]
     found = measure(model, values, variables, members, range(len(model.frames)), 10**6, 0, lambda *_: None)
     for c in members:
         c.form = next(iter(c.forms))
@@ -134,7 +134,7 @@ def test_more_frames_never_tell_less():
     model, true, _, _ = session(2, 2)
     found, members = scored(model, true, model.base_variables(range(2)))
     shots = advise.families(model, true, range(2))
-    seen = advise.outlook(model, true, found, members, [advise.strength_of(c) for c in members], shots, variables_of)
+    seen = advise.outlook(model, true, found, members, [c.plausible for c in members], shots, variables_of)
     before = seen.gaps()
     for s in range(len(shots)):
         after = seen.gaps([s])
@@ -158,6 +158,65 @@ def test_an_effect_per_frame_has_a_strength_of_its_own_in_a_shot():
     assert seen.gaps([0])[gamma, flicker] <= without.gaps([0])[gamma, flicker] * (1 + 1e-6)  # and may mimic more there
 
 
+def test_gaps_are_those_of_a_diagnosis():
+    """D and what is visible as optics.statistics has them: columns that the base has twice or absorbs, strengths with one side, several."""
+    rng = np.random.default_rng(8)
+    j = rng.standard_normal((200, 9))
+    j[:, 1] = j[:, 0]  # a direction that no calibration determines
+    j[:, 8] = j[:, 0] - 2 * j[:, 2] + 1e-5 * rng.standard_normal(200)  # an effect of which a calibration leaves nothing
+    j[:, 4] -= 0.8 * j[:, 3]
+    members = [advise.Member("free", [3], [0], [0.7]), advise.Member("one-sided", [4], [1], [0.4]),
+               advise.Member("several", [5, 6, 7], [0, 1, -1], [0.3, 0.2, -0.5]), advise.Member("absorbed", [8], [0], [1.0])]
+    normal = statistics.Normal(9)
+    normal.add(range(9), j, np.zeros(200))
+    seen = advise.Outlook(normal.gram, [], [0, 1, 2], np.zeros(3), members, [], statistics.TRUNCATION)
+    v = statistics.project(normal, [0, 1, 2], range(3, 9)).information
+    v[5], v[:, 5] = 0.0, 0.0
+    places = [np.array(m.columns) - 3 for m in members]
+    for a, m in enumerate(members):
+        for b, rival in enumerate(members):
+            d = statistics.gap(v, places[a], np.array(m.strength), places[b], statistics.Cone(v[np.ix_(places[b], places[b])], rival.sides))
+            assert seen.gaps()[a, b] == (math.inf if a == b else pytest.approx(d, rel=1e-6, abs=1e-9))  # 1e-6: a ridge of 1e-9 per column
+
+
+def two(cos, nested=frozenset()):
+    """Two effects that are worth 100 each, at an angle to each other."""
+    members = [advise.Member(name, [i], [0], [1.0]) for i, name in enumerate("ab")]
+    return advise.Outlook(100 * np.array([[1.0, cos], [cos, 1.0]]), [], [], np.zeros(0), members, [], statistics.TRUNCATION, nested)
+
+
+def test_what_can_do_all_that_an_effect_can_is_no_rival():
+    model, true, _, _ = session(2, 1)
+    _, (whole,) = scored(model, true, model.base_variables(range(2)), ("albedo gradient",))
+    half = replace(whole, variables=whole.variables[:1])
+    assert advise.nested_in([half, whole]) == {(0, 1)}
+    gaps = two(0.6, {(0, 1)}).gaps()
+    assert np.isinf(gaps[0, 1]) and gaps[1, 0] == pytest.approx(64.0)
+
+
+@pytest.mark.parametrize("cos", [0.2, 0.99])
+def test_a_gap_within_the_margin_is_worth_less(cos):
+    d = 100 * (1 - cos**2)
+    assert two(cos).least() == pytest.approx(d) and two(cos).worth() == pytest.approx(d * min(d / (MARGIN * 100), 1.0))
+
+
+def test_a_plan_exchanges_what_was_best_alone():
+    seen = advise.Outlook(np.zeros((0, 0)), [np.zeros((0, 0))] * 3, [], np.zeros(0), [], [], statistics.TRUNCATION)
+    worth = {(): 0.0, (0,): 3.0, (1,): 2.0, (2,): 2.0, (0, 1): 4.0, (0, 2): 4.0, (1, 2): 9.0}
+    assert sorted(seen.choose(2, lambda shots: worth.get(tuple(sorted(shots)), 0.0))) == [1, 2]
+    assert seen.choose(2, lambda shots: worth.get(tuple(sorted(shots)), 0.0), enough=3.0) == [0]
+
+
+def test_a_new_press_does_not_inherit_a_place():
+    model, true, _, _ = session(2, 1)
+    found, members = scored(model, true, model.base_variables(range(2)), ("gamma",))
+    shots = [advise.Shot("x", "x", 0, {PLACE[2]: 0.5}, press=press) for press in ("", "new", advise.UNTOUCHED)]
+    _, values = advise.imagined(model, true, shots)
+    assert [sorted(values.frame[2 + n]) for n in range(3)] == [sorted(PLACE[:2]), [], []]
+    seen = advise.outlook(model, true, found, members, [np.array([0.01])], shots, variables_of)
+    assert seen.nuisances == [[], list(PLACE), []]  # that nothing is pressed is known
+
+
 def test_a_member_that_is_not_likely_is_a_rival_only():
     model, true, _, _ = session(2, 1)
     found, members = scored(model, true, model.base_variables(range(2)), ("gamma", "LED lobe"))
@@ -175,6 +234,16 @@ def test_saturated_pixels_of_a_shot_do_not_count():
     assert np.abs(seen.shots[1]).max() < 1e-3 * np.abs(seen.shots[0]).max()
 
 
+def test_a_planned_effect_has_a_share_of_its_plausible_size():
+    """Frames have strengths that differ in sign; an onset that is quadratic has the square of the share."""
+    model, true, _, _ = session(6, 1)
+    found, members = scored(model, true, model.base_variables(range(6)), ("flicker", "vignetting", "defocus"))
+    own = {m.name: m for m in design._outlook(found, members, 0.1, 0).members}
+    assert own["vignetting"].strength == pytest.approx([0.1 * 0.3]) and own["defocus"].strength == pytest.approx([0.1**2 * 0.7])
+    drawn = [strength for _, _, (strength,) in own["flicker"].more.values()]
+    assert len(drawn) == 6 and {round(x, 9) for x in drawn} == {-0.002, 0.002} and not own["flicker"].columns
+
+
 # -- which shots ------------------------------------------------------------------------------------------------------
 
 
@@ -188,10 +257,10 @@ def test_families_come_from_what_the_model_has():
         for key, value in shot.settings.items():
             low, high = model.parameters[key].bounds
             assert low <= value <= high
-    assert not any(s.exposure > 1 for s in found)  # the frames are near full scale: more light would saturate most of them
+    assert max(s.settings.get("camera.exposure", 0.0) for s in found) < 1  # the frames are near full scale: more light would saturate most of them
     dim = Exposed(1)
     dim.frames[0].image = np.full(dim.shape, dim.noise.black_level + 50.0)
-    assert any(s.exposure > 1 for s in advise.families(dim, Values(), [0]))
+    assert any(s.settings.get("camera.exposure", 0.0) > 1 for s in advise.families(dim, Values(), [0]))
     plain = MockModel(2, SIDE)  # no exposure, and lights that cannot be switched off
     assert not {"exposure", "dark", "other light"} & {s.family for s in advise.families(plain, true, range(2))}
 
@@ -255,32 +324,6 @@ def test_three_advised_shots_are_worth_more_than_three_more_presses():
 def diagnosed(model, start, variables, held, names, fitted):
     fit = mock_fit(model, variables, start, fitted)
     return fit, diagnose(model, fit, library(*names), model.variables_of, held, fitted=fitted, refit=mock_fit)
-
-
-def follow(names, truth, seed, advised):
-    """(first verdict, second one): four presses, one held out; then the advised shots, or as many other presses, as frames 4 ..."""
-    model, true, start, rng = session(4, seed, truth)
-    variables = model.base_variables(range(3))
-    fit, first = diagnosed(model, start, variables, (3,), names, [0, 1, 2])
-    if first.word != "AMBIGUOUS":
-        return first, None
-    plan = next(a for a in advise.advise(model, first, variables_of) if a.family == ("together" if advised else "more of the same"))
-    steps = list(zip(plan.settings, plan.press)) if advised else [(None, "new")] * 3
-    for settings, press in steps:
-        number = len(model.frames)
-        own = dict(settings or {})
-        at = [own.pop(k) for k in PLACE] if settings and press else None
-        like = advise._typical(model, fit.values, [0, 1, 2])
-        model.frames.append(Frame(f"more-{number}", np.zeros(model.shape), parameters=own))
-        if press:
-            place(true, start, number, rng, at if at else (*rng.uniform(-1.8, 1.8, 2), rng.uniform(0.4, 1.0)))
-            variables += [model.variable(k, number) for k in PLACE]
-        else:
-            true.frame[number], start.frame[number] = dict(true.frame[like]), dict(start.frame[like])
-            variables = [replace(v, frames=(*v.frames, number)) if v.frames and like in v.frames else v for v in variables]
-        expose(model, true, number, rng)
-    _, second = diagnosed(model, start, variables, (3,), names, [0, 1, 2, *range(4, len(model.frames))])
-    return first, second
 
 
 TIES = (("gamma", "LED lobe"), ("glare", "gamma"), ("gamma", "glare"), ("LED lobe", "vignetting"), ("absorption", "interreflection"))
@@ -383,8 +426,33 @@ def test_only_verdicts_that_hang_on_a_tie_ask_for_advice():
         conditions = [replace(c, holds=True) for c in found.conditions]
         assert advise.asked_for(replace(found, word=word, ambiguous=[], conditions=conditions)) == []
     lost = [replace(c, holds=c.name != "lead") for c in found.conditions]
-    assert len(advise.asked_for(replace(found, word="CANNOT_TELL", ambiguous=[], conditions=lost))) == 2
+    lead = replace(found, word="CANNOT_TELL", ambiguous=[], conditions=lost)
+    assert len(advise.asked_for(lead)) == 2
+    assert advise.asked_for(replace(lead, rows=[found.rows[0], replace(found.rows[1], fall=-1e3, refit=None)])) == []  # far behind
     assert advise.advise(model, Diagnosis.from_json(found.to_json()), variables_of) == []  # read from a file: nothing to render from
+
+
+def test_a_member_is_taken_to_be_as_strong_as_its_refit_found_it():
+    _, found = tie()
+    c = found.evidence.candidates[0]
+    assert c.form == "tangent" and advise.strength_of(c) == pytest.approx(np.array(c.row.refit.strength) - c.start)
+    scored_only = replace(c, row=replace(c.row, refit=None))
+    assert advise.strength_of(scored_only) == pytest.approx(c.linear)
+    assert advise.strength_of(replace(scored_only, linear=0 * c.linear)) == pytest.approx(c.usual)
+
+
+@pytest.mark.parametrize("excess, judge", [(0.0, "least"), (100.0, "worth")])
+def test_misfit_that_is_left_asks_for_a_margin(excess, judge, monkeypatch):
+    """Where no effect explains all, shots are judged by `Outlook.worth`, else by the smallest D."""
+    model, found = tie()
+    first, *others = found.evidence.candidates
+    refit = replace(first.row.refit, excess_sd=excess, structure_p=1.0)
+    members = [replace(c, row=replace(c.row, refit=own)) for c, own in ((first, refit), *((c, None) for c in others))]
+    asked = []
+    for name in ("least", "worth"):
+        monkeypatch.setattr(advise.Outlook, name, lambda self, chosen=(), name=name: asked.append(name) or 0.0)
+    advise.next_measurement(model, found.evidence.values, found.evidence, members, variables_of)
+    assert set(asked) == {judge}
 
 
 def test_advice_that_does_not_help_says_so():

@@ -1,7 +1,10 @@
 """Fingerprints by family, and effects drafted from curves: the right family is named, a draft carries its curve, errors name what can be done."""
 
+import base64
+import io
 import json
 import sys
+from copy import copy
 from dataclasses import fields, replace
 from functools import cache
 from pathlib import Path
@@ -14,7 +17,7 @@ from optics import draft
 from optics.effect import Registry, declared, shipped
 from optics.errors import OutputExists, UnknownKey
 from optics.evidence import measure
-from optics.fingerprints import families, family_of, fingerprints, goes_with, places, unexplained
+from optics.fingerprints import families, family_of, fingerprints, goes_with, lit_geometry, places, unexplained
 from optics.lookup import lookup
 from optics.verdict import Basis, Family, Fingerprint
 
@@ -43,13 +46,66 @@ def test_an_unknown_effect_is_put_into_its_family(name, strength, family, coordi
     found = case(name, strength)[3]
     first = families(found)[0]
     assert first.family == family and first.coordinate in coordinates
+    assert "of the excess misfit a curve along it explains" in goes_with(families(found))
     assert first.of_best == 1 and all(f.of_best <= 1 / 0.8 for f in families(found))
     assert goes_with(families(found)).startswith(f"It goes with {'the ' if family == 'camera' else ''}{family} ({first.coordinate}")
+
+
+def test_the_numbers_of_a_curve_are_of_all_values_where_it_was_found_in_some():
+    model, fit, evidence, found = case("banding", 0.03)
+    whole = next(f for f in found if f.coordinate == "row")
+    some = measure(model, fit.values, fit.variables, [], FITTED, 2 * evidence.normal.count // 5, 0, lambda *a: None)
+    assert some.thinning == 3
+    row = next(f for f in fingerprints(model, some, places(model, fit.values, some), 50.0, lambda *a: None) if f.coordinate == "row")
+    # chi2 of a third of the values falls by net/3 with a variance of about 4 net/3 + 2 dof; 3 sd, tripled
+    assert abs(row.net - whole.net) < 9 * np.sqrt(4 * whole.net / 3 + 2 * whole.dof)
+    assert row.net == pytest.approx(3 * (row.fall - row.dof)) and row.ratio == pytest.approx(row.net / 50)
+    assert row.share == pytest.approx(row.net / (some.projected.chi2 - (some.normal.count - some.projected.rank)))
+    assert row.p < 1e-12
+
+
+def test_in_noise_no_curve_stands_out_and_none_has_a_share():
+    found = case("banding", 0.0)[3]
+    assert min(f.p for f in found) * len(found) > 0.01 and all(np.isnan(f.share) for f in found)
+    assert "how much of what the best curve does" in goes_with([Family("camera", "row", 9.0, np.nan, 1.0)])
+
+
+def test_directions_that_calibration_absorbs_are_not_drawn():
+    """A level is what powers of LEDs take up: a curve with it would be large, and noise."""
+    _, _, evidence, found = case("banding", 0.03)
+    channel, frame = (next(f for f in found if f.coordinate == name) for name in ("channel", "frame"))
+    assert channel.kind == frame.kind == "offset" and not any(channel.curve)
+    values = evidence.normal.count / len(FITTED)
+    assert max(frame.sd) < 2 * np.median(evidence.sigma) / np.sqrt(values)  # of a mean of noise; ten times that with the level
+
+
+def test_places_know_texture_and_settings():
+    model, fit, evidence, _ = case("banding", 0.03)
+    turned = copy(model)
+    turned.frames = [replace(f, parameters={**f.parameters, "room.heat": 10.0 * i, "led0.power": i}) for i, f in enumerate(model.frames)]
+    found = places(turned, fit.values, evidence)
+    assert [set(p["room.heat"]) for p in found] == [{0.0}, {10.0}, {20.0}, {30.0}] and "led0.power" not in found[0]
+    prediction = turned.predict(fit.values, [FITTED[0]])[0]
+    up, down, left, right, here = (prediction[i, j, 0] for i, j in ((7, 8), (9, 8), (8, 7), (8, 9), (8, 8)))
+    at = list(evidence.blocks[0].index).index((8 * 24 + 8) * 3)
+    assert found[0]["gradient"][at] == pytest.approx(np.hypot(down - up, right - left) / 2)
+    assert found[0]["laplacian"][at] == pytest.approx(up + down + left + right - 4 * here)
+
+
+def test_a_map_or_a_number_per_frame_comes_first_only_where_no_curve_is_nearly_as_good():
+    def curve(name, net):
+        return Fingerprint(name, net, 4, 0.0, net, 2.0, "gain", [], [], [], [], family_of(name))
+
+    assert [f.coordinate for f in families([curve("place", 100.0), curve("row", 90.0), curve("frame", 95.0)])] == ["row", "frame"]
+    assert [f.coordinate for f in families([curve("place", 100.0), curve("row", 70.0), curve("frame", 95.0)])] == ["place", "frame"]
+    one = Family("camera", "row", 100.0, 0.9, 1.0)
+    assert " or " not in goes_with([one, Family("time", "frame", 95.0, 0.85, 0.95)])
 
 
 def test_what_curve_effect_and_neither_explain_adds_up():
     found = case("banding", 0.03)[3]
     row = next(f for f in found if f.coordinate == "row")
+    assert "along 'row', explains 100%; 0% neither" in unexplained([replace(row, net=2000.0)], 100.0, 1000.0)  # chance makes it more
     assert 0.5 < row.share < 1.1 and row.unit == "px"
     assert "best effect explains 10%, so 90% is unexplained" in unexplained([replace(row, net=900.0)], 100.0, 1000.0)
     assert "along 'row', explains 90%; 10% neither" in unexplained([replace(row, net=900.0)], 100.0, 1000.0)
@@ -65,8 +121,44 @@ def test_families_that_explain_alike_are_not_told_apart():
 
 def test_a_setting_has_the_family_of_its_part():
     assert [family_of(*a) for a in (("camera.exposure", "camera"), ("source.time", "source"), ("analyzer.angle", "polarizer_film"),
-                                    ("led_3.distance", "led"), ("skin.press_depth", "gel"))] == [
-        "camera", "time", "setting", "light", "geometry"]
+                                    ("led_3.distance", "led"), ("skin.press_depth", "gel"), ("object.distance", "target"))] == [
+        "camera", "time", "setting", "light", "geometry", "geometry"]
+
+
+@pytest.mark.parametrize("name, count", [("place", 16), ("channel", 3), ("frame", len(FITTED))])
+def test_a_named_bin_without_data_keeps_its_number(name, count):
+    """Where a corner is masked throughout, or a channel saturated, the others must not take its name."""
+    model, fit, evidence, whole = case("banding", 0.03)
+    found = [{**p, name: np.maximum(p[name], 1)} for p in places(model, fit.values, evidence)]
+    one = next(f for f in fingerprints(model, evidence, found, 1.0, lambda *a: None) if f.coordinate == name)
+    assert len(one.curve) == len(one.labels) == count
+    assert one.centres[1:] == list(range(1, count)) and np.isnan(one.centres[0]) and one.curve[0] == 0
+    usual = next(f for f in whole if f.coordinate == name)
+    assert one.labels == usual.labels and one.dof < usual.dof
+
+
+def lit_point(powers):
+    """A camera at the origin that looks along z at one point 2 mm off its axis; two lamps that point along z. No Mitsuba."""
+    hits = SimpleNamespace(position=np.array([[[2.0, 0.0, 4.0]]]), normal=np.array([[[0.0, 0.0, -1.0]]]), origin=np.zeros(3),
+                           valid=np.ones((1, 1), bool), shape=(1, 1))
+    axes = tuple(tuple(np.array([float(i == j)]) for j in range(3)) for i in range(3))
+    now = {f"{led}.{n}": 0.0 for led in ("near", "above") for n in ("x", "y", "pan", "tilt")} | {"near.z": 2.0, "above.z": 0.0, "above.x": 2.0}
+    return SimpleNamespace(
+        renderer=SimpleNamespace(hits=lambda now: hits, image=lambda now, led: np.ones((1, 1, 3))), at=lambda values, frame: now,
+        captures=SimpleNamespace(table=None), lit=lambda now: powers,
+        scene=SimpleNamespace(gel=None, leds={led: SimpleNamespace(frame=axes) for led in ("near", "above")}))
+
+
+def test_how_the_brightest_led_stands_to_a_point_and_that_no_frame_loses_a_coordinate():
+    for powers in ({"near": 1.0, "above": 0.5}, {"above": 0.5, "near": 1.0}):
+        found = {k: float(v[0, 0]) for k, v in lit_geometry(lit_point(powers), None, 0).items()}
+        # to the lamp 45 deg off the normal, to the camera atan(2/4), both to the same side
+        assert found["half_angle"] == pytest.approx((45 + np.degrees(np.arctan(0.5))) / 2)
+        assert found["led_angle"] == pytest.approx(45) and found["depth"] == pytest.approx(np.hypot(2, 4))
+        assert found["near.distance"] == pytest.approx(np.hypot(2, 2)) and found["above.distance"] == pytest.approx(4)
+        assert np.isnan(found["light_azimuth"])  # a flat place has none
+    dark = lit_geometry(lit_point({}), None, 0)
+    assert set(dark) == set(found) and all(np.isnan(v).all() for k, v in dark.items() if k != "depth")
 
 
 def diagnosis(*found, named=None):
@@ -121,6 +213,9 @@ def test_an_offset_becomes_what_its_stage_can_do(tmp_path):
     out = effect.stages["sensor"](np.zeros((30, 2, 3)), SimpleNamespace(v=v, u=u, amp_glow=1.0))
     assert out[[0, 5, 10, 20, 29], 0, 0] * 200 == pytest.approx([1.0, -0.5, -2.0, 1.0, 1.0])  # DN
     assert "dark" in effect.acts
+    channel = replace(curve, coordinate="channel", centres=[0.0, 1.0, 2.0])
+    tint = load(draft.draft_effect(diagnosis(channel), name="tint", **options), tmp_path, "tint").stages["sensor"]
+    assert tint(np.zeros((2, 2, 3)), SimpleNamespace(tint=1.0))[1, 1] * 200 == pytest.approx([1.0, -2.0, 1.0])
     text = draft.draft_effect(diagnosis(replace(curve, coordinate="height", family="geometry")), "height", name="step", **options)
     assert "relative to the mean signal of 50 DN" in text and "0.02, -0.04, 0.02" in text
 
@@ -142,10 +237,46 @@ def test_signal_and_cells_are_read_where_they_are(tmp_path):
     assert out[..., 0] == pytest.approx(1 + 0.01 * (row * 4 // 10 * 4 + column * 4 // 14))
 
 
+def test_a_setting_of_the_camera_is_drafted_whatever_the_scene_calls_it(tmp_path):
+    curve = Fingerprint("eye.gain", 100.0, 4, 0.0, 96.0, 2.0, "gain", [1.0, 3.0], [0.0, 0.2], [0.01] * 2, [], "camera")
+    found = diagnosis(curve, replace(curve, coordinate="lamp.gain", family="light"))
+    assert draft.drafted(found) == ["eye.gain"]
+    act = load(draft.draft_effect(found, name="step", black_level=0.0, saturation=1.0), tmp_path, "step").stages["sensor"]
+    v, _ = np.mgrid[:3, :2] + 0.5
+    assert act(np.ones((3, 2, 3)), SimpleNamespace(v=v, gain=2.0, step=1.0)) == pytest.approx(np.full((3, 2, 3), 1.1))
+
+
+def test_a_table_has_each_place_once_and_a_strength_that_is_plausible():
+    options, nan = dict(name="x", black_level=0.0, saturation=1.0), np.nan
+    curve = Fingerprint("incidence", 9.0, 4, 0.0, 8.0, 2.0, "gain", [30.0, 10.0, nan, 10.0], [0.5, -2.0, 7.0, 8.0], [0.01] * 4, [], "light")
+    text = draft.draft_effect(diagnosis(curve), **options)
+    assert "AT = [\n    10, 30,\n]" in text and "    -2, 0.5,\n]" in text
+    assert "plausible=0.25," in text  # half of the light at most
+    assert "along the brightest LED" in text
+    assert "plausible=1," in draft.draft_effect(diagnosis(replace(curve, curve=[0.1, 0.2, nan, nan])), **options)
+    with pytest.raises(ValueError, match="has 1 points; a table needs two"):
+        draft.draft_effect(diagnosis(replace(curve, centres=[10.0, nan, nan, 10.0])), **options)
+    with pytest.raises(ValueError, match="0 everywhere"):
+        draft.draft_effect(diagnosis(replace(curve, curve=[0.0] * 4)), **options)
+
+
+def test_lookup_of_dr_jit_is_that_of_numpy_and_so_is_its_slope(mitsuba):
+    import drjit as dr
+
+    at, values, x = [0.0, 1.0, 3.0], [1.0, 2.0, -2.0], np.array([-5.0, 0.5, 2.0, 9.0])
+    there = mitsuba.Float(x)
+    dr.enable_grad(there)
+    dr.set_grad(there, 1.0)
+    found = lookup(there, at, values)
+    assert np.array(found) == pytest.approx(lookup(x, at, values), abs=1e-6)  # float32
+    assert np.array(dr.forward_to(found)) == pytest.approx([0.0, 1.0, -2.0, 0.0], abs=1e-6)
+
+
 def test_lookup():
     at, values = [0.0, 1.0, 3.0], [1.0, 2.0, -2.0]
     assert lookup(np.array([-5.0, 0.0, 0.5, 1.0, 2.0, 3.0, 9.0]), at, values) == pytest.approx([1.0, 1.0, 1.5, 2.0, 0.0, -2.0, -2.0])
-    assert np.imag(lookup(np.array([0.5, 2.0, 9.0]) + 1e-30j, at, values)) / 1e-30 == pytest.approx([1.0, -2.0, 0.0])
+    assert np.imag(lookup(np.array([-5.0, 0.5, 2.0, 9.0]) + 1e-30j, at, values)) / 1e-30 == pytest.approx([0.0, 1.0, -2.0, 0.0])
+    assert np.isnan(lookup(np.nan, at, values))
     for wrong in ([0.0, 0.0, 1.0], [0.0, 1.0]):
         with pytest.raises(ValueError, match="places rising"):
             lookup(0.5, wrong, values)
@@ -213,6 +344,21 @@ def test_effects_new_writes_a_draft_beside_the_captures_and_never_twice(study, o
     assert code == 0 and "REPLACE the table" in page and "row_bands.py" in page
 
 
+def test_a_draft_is_of_the_last_diagnosis_and_goes_where_the_study_looks(study, own_registry, optics):
+    record = json.loads((study / "ladder.json").read_text())
+    record["facts"]["setup"]["plugins"] = str(study.parent / "own")
+    (study / "ladder.json").write_text(json.dumps(record))
+    base = study / "steps" / "00-base"
+    later = base.with_name("01-more")
+    later.mkdir()
+    (later / "step.json").write_text(json.dumps({**json.loads((base / "step.json").read_text()), "index": 1, "name": "more", "folder": later.name}))
+    told = json.loads((base / "diagnosis.json").read_text())
+    (later / "diagnosis.json").write_text(json.dumps({**told, "fingerprints": [{**told["fingerprints"][0], "coordinate": "column"}]}))
+    code, said, _ = optics("effects", "new", "stripes", "--from", study)
+    assert code == 0 and Path(said.strip()) == study.parent / "own" / "stripes.py"
+    assert "along 'column'" in Path(said.strip()).read_text() and "step 'more'" in Path(said.strip()).read_text()
+
+
 def test_effects_new_writes_a_stub(tmp_path, own_registry, optics):
     code, said, _ = optics("effects", "new", "soft edge", "--part", "led", "-o", tmp_path / "mine")
     assert code == 0 and Path(said.strip()) == tmp_path / "mine" / "soft_edge.py"
@@ -222,7 +368,8 @@ def test_effects_new_writes_a_stub(tmp_path, own_registry, optics):
 
 @pytest.mark.parametrize("words, error", [
     (("new",), "no name"), (("new", "2 fast"), "the first a letter"), (("new", "new"), "not 'new'"), (("new", "class"), "not a word of Python"),
-    (("new", "lens vignetting"), "exists already"), (("new", "gain"), "has a parameter 'gain'"), (("new", "a", "--stage", "layer"), "copy a file"),
+    (("new", "lens vignetting"), "exists already"), (("new", "gain"), "has a parameter 'gain'"), (("new", "tan"), "means something else"), (("new", "number", "--part", "gel"), "choose another"),
+    (("new", "a", "-o", "file"), "is a file and no folder"), (("new", "a", "--stage", "layer"), "copy a file"),
     (("new", "a", "--stage", "lense"), "did you mean 'lens'"), (("new", "a", "--part", "sheet"), "unknown part"),
     (("new", "a", "--part", "gel", "--stage", "lens"), "belongs to the part 'camera'"), (("new", "a", "--along", "row"), "Add --from STUDY"),
     (("vignetting", "--stage", "lens"), "only with `optics effects new NAME`"), (("halo", "bright"), "only with"),
@@ -231,6 +378,7 @@ def test_effects_new_writes_a_stub(tmp_path, own_registry, optics):
 ])
 def test_errors_of_effects_new(words, error, study, tmp_path, own_registry, optics, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").touch()
     code, said, noted = optics("effects", *(study if w == "STUDY" else w for w in words))
     assert code == 2 and error in noted and not said
     assert not (tmp_path / "plugins").exists()
@@ -241,9 +389,21 @@ def test_a_study_without_a_diagnosis_or_without_a_gel(study, own_registry, optic
     (study / "ladder.json").write_text(json.dumps({**record, "scene": "polarizer_bench"}))
     code, _, error = optics("effects", "new", "a", "--from", study, "--along", "height")
     assert code == 2 and "passes no gel; a draft can follow row" in error
+    (study / "ladder.json").write_text(json.dumps({**record, "scene": "magictac"}))
+    code, _, error = optics("effects", "new", "a", "--from", study, "--along", "height")
+    assert code == 2 and "followed by chance" in error and "a draft can follow row" in error
     (study / "steps" / "00-base" / "diagnosis.json").unlink()
     code, _, error = optics("effects", "new", "a", "--from", study)
     assert code == 2 and "optics diagnose" in error
+
+
+def test_names_that_functions_of_a_camera_see_are_those_that_no_effect_may_take():
+    from optics.develop import Developer
+
+    own = {"x_fov": 40.0, "principal_x": 0.0, "principal_y": 0.0, "aspect": 1.0}
+    camera = SimpleNamespace(name="camera", resolution=(4, 3), sensitivity="identity", numbers={n: SimpleNamespace(neutral=None) for n in own})
+    view = Developer(camera, (450.0, 550.0, 650.0)).view({f"camera.{n}": value for n, value in own.items()})
+    assert set(vars(view)) - set(own) == set(draft.VIEW)
 
 
 def test_no_effect_is_called_new(tmp_path, own_registry):
@@ -271,6 +431,47 @@ def test_components_find_what_frames_have_in_common():
     # 9 w^2/2 sums to 4.5 of the pattern beside 6 of the noise, of which the first component has a sixth
     assert float(found["components"][0]["share"].split("\u202f")[0]) == pytest.approx(100 * (4.5 + 1) / 10.5, abs=8)
     assert components(frames[:2])["components"] == []
+    one = np.ones((192, 288, 1))
+    fine = [Shown(f"f{i}", rng.standard_normal(one.shape), 0 * one, one, one > 0) for i in range(6)]
+    of_noise = [float(s["score"].replace("−", "-")) for s in components(fine)["components"][0]["scores"]]
+    assert sum(s * s for s in of_noise) == pytest.approx(1, abs=0.15)  # means over 3 x 3 px, still in sigmas; the largest of six is above 1
+
+
+def test_pages_are_of_the_first_and_the_last_step():
+    from optics.compare import compare
+    from optics.residual_maps import coordinates, pages
+
+    rng = np.random.default_rng(4)
+    images, one = rng.standard_normal((6, 32, 48, 3)), np.ones((32, 48, 3))
+    c = compare(list(images), [0 * one] * 6, [one] * 6, [one > 0] * 6)
+    steps = [{"index": i, "name": name} for i, name in enumerate(("base", "a", "b"))]
+    assert [len(pages([c] * n, [[]] * n, steps[:n])) for n in (1, 3)] == [1, 2]
+    assert [p["step"] for p in pages([c] * 3, [[]] * 3, steps)] == ["base", "+ b"]
+    told = {"fingerprints": [{"coordinate": n, "net": net, "share": 0.5, "ratio": 2.0, "family": "camera"} for n, net in (("row", 8), ("x", -1))]}
+    assert [(r["name"], r["bar"]) for r in coordinates(told)] == [("row", "100.0")] and coordinates(None) == []
+
+
+def picture(uri):
+    from PIL import Image
+
+    return Image.open(io.BytesIO(base64.b64decode(uri.partition(",")[2])))
+
+
+def test_colours_of_noise_are_alike_in_a_picture_and_in_a_mosaic():
+    """In a mosaic a block holds a quarter of the pixels of a channel, and its mean scatters twice as much."""
+    from optics.compare import compare
+    from optics.residual_maps import colours, regions
+
+    rng = np.random.default_rng(2)
+    images, full = rng.standard_normal((8, 128, 128, 3)), np.ones((128, 128, 3), bool)
+    mosaic = np.zeros_like(full)
+    mosaic[::2, ::2, 0] = mosaic[1::2, ::2, 1] = mosaic[::2, 1::2, 1] = mosaic[1::2, 1::2, 2] = True
+    mosaic[:8, :8] = False  # a block that holds nothing
+    for usable in (full, mosaic):
+        c = compare(list(images), [np.zeros_like(images[0])] * 8, [np.ones_like(images[0])] * 8, [usable] * 8)
+        sd = np.asarray(picture(colours(c)), float).std((0, 1)) / 255 * 10  # of 4096 blocks: good to 1 %, and 4 % more of 16 levels
+        assert sd == pytest.approx(1.0, abs=0.08)
+        regions(c)
 
 
 def test_regions_tell_a_wrong_mean_from_a_wide_spread():
@@ -283,5 +484,8 @@ def test_regions_tell_a_wrong_mean_from_a_wide_spread():
     images[:, 16:, 24:] *= 1.6
     c = compare(list(images), [np.zeros((32, 48, 1))] * 12, [np.ones((32, 48, 1))] * 12, [np.ones((32, 48, 1), bool)] * 12)
     found = regions(c)
-    assert (found["columns"], found["rows"], found["cell"]) == (16, 11, 3)
+    assert picture(found["mean"]).size == picture(found["sd"]).size == (16, 11) and found["cell"] == 3
     assert 0.4 < float(found["mean_top"]) < 0.95 and 1.4 < float(found["worst"]) < 2.1
+    images = 5 + 0.1 * rng.standard_normal((12, 32, 48, 1))  # wrong, and steady
+    c = compare(list(images), [np.zeros((32, 48, 1))] * 12, [np.ones((32, 48, 1))] * 12, [np.ones((32, 48, 1), bool)] * 12)
+    assert float(regions(c)["worst"]) < 0.2

@@ -46,6 +46,12 @@ def test_strengths_make_the_change_that_is_hidden(model):
         assert np.sqrt(np.mean(change**2)) / signal == pytest.approx(0.004, rel=0.03)  # effects bend by so much at this size
 
 
+def test_what_every_frame_has_for_itself_is_not_hidden_as_one_scale(model):
+    """Frames up and down in turn: the same for all would be a scale, which calibration takes up (2 % were noticed)."""
+    row = next(r for r in rehearse(*model, LIBRARY, model[0].variables_of, FITTED, change=0.004, draws=200).rows if r.effect == "flicker")
+    assert row.noticed > 0.9 and row.first > 0.9  # 0.4 % in each of four frames of 1200 values with 1 % noise: 10 sd and more
+
+
 @pytest.mark.parametrize("change", [0.0005, 0.001, 0.002, 0.004])
 def test_who_comes_first_is_as_two_rivals_have_it(model, change):
     """Of two free strengths, scores over their sd are x ~ N(a, 1) and y ~ N(a c, 1) with the correlation c, and |x| > |y| where x - y and

@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from optics import statistics as st
-from optics.diagnose import diagnose
+from optics import fingerprints, statistics as st
+from optics.diagnose import diagnose, score
 from optics.effect import Effect
 from optics.errors import Underdetermined
 from optics.evidence import Candidate, measure
@@ -378,6 +378,48 @@ def test_noisy_derivatives_are_rendered_twice_with_seeds_of_their_own():
     assert row.kappa == pytest.approx(0.1, rel=0.1)
     assert row.change[0] == pytest.approx(clean.change[0], rel=0.05) and d.missing == "vignetting"
     assert len(seeds - {0}) == 2
+
+
+class ByChance(MockModel):
+    """The mock with pictures that are estimates: the same error in a picture and in what follows it (a lamp's power), by the seed."""
+
+    by_chance, relative = True, 0.002
+
+    def error(self, frame, seed):
+        return 1 + self.relative * np.random.default_rng([seed, frame]).standard_normal(self.shape)
+
+    def _estimate(self, image, frame, seed):
+        return self.noise.black_level + (image - self.noise.black_level) * self.error(frame, seed)
+
+    def predict(self, values, frames=None, seed=0):
+        frames = range(len(self.frames)) if frames is None else frames
+        return [self._estimate(image, f, seed) for f, image in zip(frames, super().predict(values, frames))]
+
+    def derivatives(self, values, variables, frames=None, secant=None, seed=0):
+        frames = range(len(self.frames)) if frames is None else frames
+        for f, (image, images) in zip(frames, super().derivatives(values, variables, frames, secant)):
+            yield self._estimate(image, f, seed), {name: own * self.error(f, seed) for name, own in images.items()}
+
+    def variance(self, values, frame, prediction):
+        return self.noise.variance(prediction) + (self.relative * (prediction - self.noise.black_level)) ** 2
+
+    def coordinates(self, values, frame, seed=0):
+        return {**super().coordinates(values, frame), "intensity": self.predict(values, [frame], seed)[0]}
+
+
+def test_no_curve_follows_the_error_of_a_picture_made_by_chance():
+    """The error of the prediction is in the residual: binned or scaled by that same picture, it would look like a curve (8 % of the
+    variance here, so hundreds of chi2 of 5 800 values)."""
+    exact, fit = calibrated(side=22)
+    model = ByChance(PRESSES, 22)
+    model.frames = exact.frames
+    share = np.mean([(model.variance(fit.values, f, p) / model.noise.variance(p)).mean() - 1 for f, p in enumerate(model.predict(fit.values))])
+    assert 0.05 < share < 0.2
+    scored = score(model, fit, library("glare"), model.variables_of, FITTED)
+    found = fingerprints.fingerprints(model, scored.evidence, fingerprints.places(model, fit.values, scored.evidence), 1.0, lambda *a: None)
+    assert {"intensity", "signal", "frame", "laplacian", "row"} <= {f.coordinate for f in found}
+    worst = max(found, key=lambda f: f.net / np.sqrt(2 * f.dof))
+    assert worst.net < 5 * np.sqrt(2 * worst.dof), f"{worst.coordinate}: {worst.net:.0f} of {worst.dof}"  # the largest of some twenty
 
 
 def test_an_effect_that_is_lost_in_the_noise_of_its_image_is_not_ranked():
