@@ -110,7 +110,7 @@ class Plan:
 
     def text(self) -> str:
         lines = [f"design: {len(self.frames)} of {self.pool} candidate frames for {self.scene}, "
-                 + ("sweeps of readings, " if self.size == (1, 1) else f"pictures of {self.size[0]} x {self.size[1]} px, ")
+                 + ("sweeps of readings, " if self.size == (1, 1) else f"pictures of {self.size[0]} x {self.size[1]} px (D grows with their number), ")
                  + f"every effect at {self.share:g} of its plausible strength", ""]
         rows = [("", "group", "frame", "mean P(correct)"), *((str(i + 1), f.group, f.words, f"{w:.3f}")
                                                               for i, (f, w) in enumerate(zip(self.frames, self.worth)))]
