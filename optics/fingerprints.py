@@ -23,7 +23,7 @@ from optics.verdict import AS_GOOD, EXCESS, MIMICS, Family, Fingerprint, ordered
 SIDE = 4  # cells per side of the coordinate 'place': a finer map would fit any clutter and forbid every claim
 NOT_A_COORDINATE = {"far", "quadrant"}  # regions that others make up
 YES_NO = ("contact", "shadow", "rim")
-LINES = 64  # bins of 'row' and 'column': what a shutter or a read-out does goes by single rows
+LINES = 64  # bins of 'row', 'column' and 'reading': what a shutter, a read-out or a restless lamp does goes by single rows
 SEEN = 0.01  # of a curve's direction that calibration must leave for it to be drawn: the rest (a level, a slope) nobody can know
 DISTANCES = 8  # LEDs up to which the distance to each is a coordinate of its own
 
@@ -196,7 +196,7 @@ def fingerprints(model, evidence: Evidence, found: list[dict], reference: float,
     for n, name in enumerate(names):
         say("fingerprints", n, len(names))
         x = np.concatenate([p[name] for p in found])
-        edges = np.arange(named[name] + 1) - 0.5 if name in named else st.bin_edges(x, LINES if name in ("row", "column") else st.BINS)
+        edges = np.arange(named[name] + 1) - 0.5 if name in named else st.bin_edges(x, LINES if name in ("row", "column", "reading") else st.BINS)
         if edges is None or len(edges) < 3:
             continue
         count = len(edges) - 1

@@ -30,13 +30,14 @@ from optics.errors import Underdetermined
 LEVEL = 0.01  # nominal level of the family-wise test and of the structure test
 CLEAR = 10.8  # chi2 between two effects at which the right one wins in 95 % of cases: Phi(sqrt(10.8)/2)
 MARGIN = 0.2  # of the best effect's fall: with real misfit, chi2 differences below it decide nothing
-RIVAL = 1.5  # a map of the sensor that explains this much more than the best effect says: not this effect ...
+RIVAL = 1.5  # a map of the sensor or of the session that explains this much more than the best effect says: not this effect ...
 RIVAL_CURVE = 1.12  # ... and a curve along one coordinate: with a true effect it gains only what clutter adds (measured: 1.02; 1.2 with a false one)
 SHARE = 0.05  # of the excess misfit that a claimed effect must explain ...
 EXCESS = 5.0  # ... where there is an excess of this many standard deviations at all
 UNEVEN = 0.1  # of the fall: what splitting the strength by channel, frame, ... may still gain
 STRENGTH = 2.0  # standard deviations that a claimed strength must differ from none by: a fall without it is another's
-MIMICS = ("place", "frame")
+MAPS = ("place", "reading")  # where, or when, whatever the cause: a fine map mimics every curve that does not move
+MIMICS = (*MAPS, "frame")
 AS_GOOD = 0.8  # of the best curve's fall: what is nearer than that is not told apart from it
 PLANS = ("together", "more of the same")  # kinds of advice that are several shots
 TELLS = 0.02  # gain of P(correct) below which a shot is not worth a line
@@ -493,7 +494,7 @@ def decide(f: Findings) -> tuple[str, list[Condition]]:
             Condition("margin", margin, MARGIN, margin > MARGIN or f.refuted, f"{margin:.0%} ahead of the next, "
                       + ("which leaves structure where the best leaves none" if f.refuted and margin <= MARGIN else
                          f"{MARGIN:.0%} needed")),
-            Condition("no better curve", f.ratio, RIVAL if f.coordinate == "place" else RIVAL_CURVE, not f.rival,
+            Condition("no better curve", f.ratio, RIVAL if f.coordinate in MAPS else RIVAL_CURVE, not f.rival,
                       f"the best curve ({f.coordinate or 'none'}) explains {f.ratio:.2f} of it, "
                       f"{RIVAL if f.coordinate == 'place' else RIVAL_CURVE:g} allowed"),
             Condition("share", f.share, SHARE, not weighed or f.share > SHARE,
@@ -527,10 +528,10 @@ def decide(f: Findings) -> tuple[str, list[Condition]]:
 def rivals(fingerprints: Sequence[Fingerprint], fall: float) -> list[Fingerprint]:
     """The curves that do better than an effect with this net fall; the one to name first.
 
-    'place', a map of the sensor, can mimic every curve that does not move, and 'frame' every setting: they are named
-    where no other curve is nearly as good.
+    'place', a map of the sensor, and 'reading', one of a session, can mimic every curve that does not move, and 'frame' every setting:
+    they are named where no other curve is nearly as good.
     """
-    better = [f for f in fingerprints if f.ratio >= (RIVAL if f.coordinate == "place" else RIVAL_CURVE)
+    better = [f for f in fingerprints if f.ratio >= (RIVAL if f.coordinate in MAPS else RIVAL_CURVE)
               and f.p < LEVEL / len(fingerprints)
               and f.net - fall > 3 * math.sqrt(2 * f.dof) * f.net / (f.fall - f.dof)]  # beyond what the number of bins gives by chance
     return ordered(better)

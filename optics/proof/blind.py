@@ -74,7 +74,7 @@ def _step(rig, model, cell: Cell, d: Diagnosis) -> dict:
         "word": d.word, "claimed": d.claimed, "ambiguous": d.ambiguous, "sentence": d.sentence,
         "p_best": min((r.p_family for r in d.rows), default=1.0),
         "score": [r.name for r in d.rows[:5]], "refit": [r.name for r in refitted[:5]], "set": close,
-        "falls": {r.name: [r.fall, r.refit.fall] for r in refitted},
+        "falls": {r.name: [r.refit.predicted, r.refit.fall] for r in refitted},
         "noise": d.basis.noise, "excess_sd": d.basis.excess_sd, "phi": d.basis.phi,
         "conditions": {c.name: [c.value, c.holds] for c in d.conditions},
         "held_out": [level.chi2_held_out for level in d.levels], "misfit": [level.held_out for level in d.levels],

@@ -6,7 +6,8 @@ A target is reached when the near end of the interval reaches it: few cells reac
     in the set   is among the effects that the refit cannot tell from the best
     precision    of claims where a library effect, two, or none was hidden: share that name a hidden one
     strength     of right claims by the library's own law: within 20 %; pulls: (found - true)/sd of those without clutter
-    fall         of chi2, brought by the refit over predicted by the score, of the right effects
+    fall         of chi2, brought by the refit over predicted before it (by the score; where the picture of a weak effect is not that of a
+                 strong one, by its picture at the strength that the score found), of the right effects
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@ Fingerprint
     one cell with bright and dark edges, as its walls reflect totally; the cells behind it are displaced.
 Validity
     one cell, and which is sought where the residual is, before u is fitted: `seek` weighs the misfit by the cells that each pixel is
-    seen through, and tries those that come first.
+    seen through, and tries those that come first, the best of them in all frames.
 References
     Fan, Li, Cong & Zhang, MagicGripper, III.A, prints cells that are all filled.
 """
@@ -16,7 +16,9 @@ import numpy as np
 from optics.effect import Effect
 
 TRIED = 12  # cells whose picture is made
+FINALS = 3  # of these, the ones that are weighed in all frames
 RAYS = 16  # per pixel, for what it is seen through
+SEED = 1001
 
 
 def seek(model, values, frames):
@@ -34,18 +36,30 @@ def seek(model, values, frames):
     seen = seen[:np.prod(grid.counts)].reshape(-1, excess.size)
     size = np.sqrt((seen**2).sum(1))
     score = seen @ (excess - np.median(excess)).ravel() / np.maximum(size, 0.05 * size.max())
-    # frames of one geometry: all lights are in one picture
+    # frames of one geometry first: all lights are in one picture
     geometry = model.renderer.geometry(model.at(values, frames[0]))
     alike = [k for k, i in enumerate(frames) if model.renderer.geometry(model.at(values, i)) == geometry]
-    best, place = 0.0, None
-    for cell in np.argsort(-score)[:TRIED]:
-        at = dict(zip((f"{name}.unfilled_{axis}" for axis in ("column", "row", "layer")), map(float, np.unravel_index(cell, grid.counts))))
-        trial = Values({**values.common, **at, f"{name}.unfilled": 1.0}, values.frame)
-        changes = [(p - predictions[k]) / sd[k] for k, p in zip(alike, model.predict(trial, [frames[k] for k in alike]))]
-        along, length = (sum(float((c * o).sum()) for c, o in zip(changes, others)) for others in ([residual[k] for k in alike], changes))
-        if length > 0 and along > 0 and along**2 / length > best:
-            best, place = along**2 / length, at
-    return place or {}
+    # the change is taken between pictures of another seed: the error of the predictions is in the residual, and would look like a change
+    plain: dict[int, np.ndarray] = {}
+
+    def worth(cell: int, used: list[int]) -> float:
+        """Fall of chi2 that the emptied cell's picture would bring in these frames, at its best strength."""
+        trial = Values({**values.common, **at[cell], f"{name}.unfilled": 1.0}, values.frame)
+        new = [k for k in used if k not in plain]
+        plain.update(zip(new, model.predict(values, [frames[k] for k in new], SEED)))
+        changes = [(p - plain[k]) / sd[k] for k, p in zip(used, model.predict(trial, [frames[k] for k in used], SEED))]
+        along, length = (sum(float((c * o).sum()) for c, o in zip(changes, others)) for others in ([residual[k] for k in used], changes))
+        return along**2 / length if length > 0 and along > 0 else 0.0
+
+    tried = [int(cell) for cell in np.argsort(-score)[:TRIED]]
+    at = {cell: dict(zip((f"{name}.unfilled_{axis}" for axis in ("column", "row", "layer")), map(float, np.unravel_index(cell, grid.counts))))
+          for cell in tried}
+    falls = {cell: worth(cell, alike) for cell in tried}
+    finals = sorted(tried, key=lambda cell: -falls[cell])[:FINALS]
+    if len(alike) < len(frames):
+        falls = {cell: worth(cell, list(range(len(frames)))) for cell in finals}
+    best = max(finals, key=lambda cell: falls[cell])
+    return at[best] if falls[best] > 0 else {}
 
 
 effect = Effect(name="unfilled cell", part="cells", parameters=("unfilled",), per="part", onset="secant", seek=seek,

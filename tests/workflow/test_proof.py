@@ -71,9 +71,10 @@ def test_a_target_is_reached_by_the_end_of_the_interval_and_not_by_the_rate():
 
 
 def test_the_bench_finds_what_is_hidden_and_predicts_what_comes(bench):
-    found = judged(bench)
-    assert found.rate("top-1 after refit, 0.5 %, no clutter").k == len(FOUND) and found.holds
-    assert found.rate("fall of chi2 within 20 % of its prediction, to 0.5 %").k == len(FOUND)
+    effects = (*FOUND, "extinction leak", "retardance")  # these two have other pictures when weak than when strong
+    found = judged(bench, effects)
+    assert found.rate("top-1 after refit, 0.5 %, no clutter").k == len(effects) and found.holds
+    assert found.rate("fall of chi2 within 20 % of its prediction, to 0.5 %").k == len(effects)
     assert all(abs(p) < 5 for p in found.pulls["no clutter"])
 
 
