@@ -21,7 +21,7 @@ from optics.errors import Underdetermined
 from optics.evidence import Candidate, Evidence, Progress, at_bound, measure, value_of
 from optics.parameter import Values, Variable
 from optics.verdict import (
-    CLEAR, EXCESS, LEVEL, MARGIN, MIMICS, UNEVEN, Basis, Diagnosis, Findings, Level, Refit, Row, Shift, Split, decide,
+    CLEAR, EXCESS, LEVEL, MAPS, MARGIN, MIMICS, UNEVEN, Basis, Diagnosis, Findings, Level, Refit, Row, Shift, Split, decide,
     moved_by, rivals, sentence,
 )
 
@@ -87,7 +87,9 @@ def diagnose(model, fit, effects: Sequence[Effect], variables_of: Callable[[Effe
     splits = []
     if winner:
         for c in members[:MAX_SPLIT]:
-            splits += _split(model, evidence, c, fits[c.effect.name], places, rows_max, seed, say)
+            own, chance = _split(model, evidence, c, fits[c.effect.name], places, rows_max, seed, say)
+            splits += own
+            c.row.refit = replace(c.row.refit, chance=chance if math.isnan(chance) else table.family.p(chance))
     levels = _held_out(model, fit, evidence, winner, fits, refit, held_out, variables_of, say)
     shifts = _shifts(model, fit, winner, fits) if winner else []
     findings = _findings(table, winner, done, members, fingerprints, splits, levels, basis, structure)
@@ -498,8 +500,8 @@ def _prior_chi2(model, values: Values, variables: Sequence[Variable]) -> float:
 
 
 def _split(model, evidence: Evidence, c: Candidate, found, places: list[dict], rows_max: int, seed: int,
-           say: Progress) -> list[Split]:
-    """Whether a fitted effect has the same strength in every part of the data.
+           say: Progress) -> tuple[list[Split], float]:
+    """Whether a fitted effect has the same strength in every part of the data, and `_chance` of its strength.
 
     With the effect in the base, its image e = sum_j s_j g_j is cut into parts e 1{part} and these are scored: a true
     effect gains nothing by being cut, a proxy does.
@@ -538,11 +540,47 @@ def _split(model, evidence: Evidence, c: Candidate, found, places: list[dict], r
         p = float(chdtrc(dof, fall))
         h = max(fall - dof, 0.0) * k / max(c.row.net_refit, 1e-9)
         results.append(Split(c.effect.name, by, labels, (1 + delta).tolist(), sd.tolist(), fall * k, dof, p, h, True))
-    chance = LEVEL / max(len(results), 1)
+    level, chance = LEVEL / max(len(results), 1), _chance(own, calibrated, effect, change, places)
     if c.row.refit.complete:  # nothing but noise is left, so that p means what it says, but for a hair of the fall
-        return [replace(s, holds=s.p >= chance or s.h < HAIR) for s in results]
+        return [replace(s, holds=s.p >= level or s.h < HAIR) for s in results], chance
     left = c.row.refit.excess_sd * math.sqrt(2 * max(evidence.normal.count - evidence.projected.rank, 1))
-    return [replace(s, holds=s.p >= chance or s.h <= UNEVEN and s.fall - s.dof * own.thinning <= SAME_PLACE * left) for s in results]
+    return [replace(s, holds=s.p >= level or s.h <= UNEVEN and s.fall - s.dof * own.thinning <= SAME_PLACE * left) for s in results], chance
+
+
+def _chance(own: Evidence, calibrated: Sequence[int], effect: Sequence[int], change: np.ndarray, places: list[dict]) -> float:
+    """p of a strength that asks for no independent noise: by its scatter between parts of the sensor or session, as neighbours share clutter.
+
+    With x the effect's images off the base, r what is left at the fit, u_g = sum of x r over the part g and B = sum of u_g u_g':
+    T2 = (V d)' B^-1 (V d), T2 (G - k)/(k (G - 1)) ~ F(k, G - k). NaN where there are too few parts.
+
+    Source: Liang & Zeger, Longitudinal data analysis using generalized linear models, Biometrika 73, 13 (1986), the robust variance.
+    """
+    from scipy.stats import f as fisher
+
+    projected, worst = own.project(own.thinned(), calibrated, effect, own.thinning), math.nan
+    for name in MAPS:
+        if name not in places[0]:
+            continue
+        x = np.concatenate([p[name] for p in places])
+        edges = st.bin_edges(x, prints.LINES)
+        if edges is None:
+            continue
+        sums = np.zeros((len(edges) - 1, len(effect)))
+        for block, place in zip(own.blocks, places):
+            position = {int(w): i for i, w in enumerate(block.where)}
+            images = np.zeros((len(block.r), len(effect)))
+            for weights, columns in ((np.eye(len(effect)), effect), (projected.response, calibrated)):
+                here = [(i, position[c]) for i, c in enumerate(columns) if c in position]
+                images += block.middle[:, [j for _, j in here]] @ weights[[i for i, _ in here]]
+            np.add.at(sums, np.searchsorted(edges, place[name], side="right") - 1, images * block.r[:, None])
+        inverse, k = st.inverse(sums.T @ sums)
+        parts = int((np.abs(sums).sum(1) > 0).sum())
+        if not 0 < k < parts - 1:
+            continue
+        score = projected.information @ change
+        p = float(fisher.sf(score @ inverse @ score * (parts - k) / (k * (parts - 1)), k, parts - k))
+        worst = p if math.isnan(worst) else max(p, worst)
+    return worst
 
 
 def _parts(model, evidence: Evidence, places: list[dict]) -> dict[str, tuple[list[str], list[np.ndarray]]]:
@@ -686,7 +724,8 @@ def _findings(table, winner, done, members, fingerprints, splits, levels, basis,
             uneven=worst.h if worst else 0.0, uneven_by=f" by {worst.by} ({_extremes(worst)})" if worst else "",
             even=all(s.holds for s in mine),
             some_even=any(even.values()) if even else True,
-            held_out=levels[-1].fall if len(levels) > 1 else math.nan, clear=winner.row.refit.clear)
+            held_out=levels[-1].fall if len(levels) > 1 else math.nan, clear=winner.row.refit.clear,
+            chance=winner.row.refit.chance)
     if not fingerprints:
         return own
     better = rivals(fingerprints, own.fall)

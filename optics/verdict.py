@@ -80,6 +80,7 @@ class Refit:
     converged: bool
     reason: str
     clear: float = math.nan  # of its strength from where it started, in standard deviations of all its variables together
+    chance: float = math.nan  # family-wise p of its strength by the scatter between parts of the sensor or session; NaN: not asked, or too few
 
     @property
     def complete(self) -> bool:
@@ -443,6 +444,7 @@ class Findings:
                  those of any member of the ambiguous set do
     held_out     net fall on held-out frames, NaN where there are none
     clear        of the winner's strength from none, in standard deviations; NaN where they are not known
+    chance       family-wise p of that strength by its scatter between parts of the sensor or session, NaN where these are too few
     """
 
     p_family: float
@@ -463,6 +465,7 @@ class Findings:
     some_even: bool = True
     held_out: float = math.nan
     clear: float = math.nan
+    chance: float = math.nan
 
 
 def is_structured(structure_p: float, excess_sd: float) -> bool:
@@ -496,12 +499,15 @@ def decide(f: Findings) -> tuple[str, list[Condition]]:
                          f"{MARGIN:.0%} needed")),
             Condition("no better curve", f.ratio, RIVAL if f.coordinate in MAPS else RIVAL_CURVE, not f.rival,
                       f"the best curve ({f.coordinate or 'none'}) explains {f.ratio:.2f} of it, "
-                      f"{RIVAL if f.coordinate == 'place' else RIVAL_CURVE:g} allowed"),
+                      f"{RIVAL if f.coordinate in MAPS else RIVAL_CURVE:g} allowed"),
             Condition("share", f.share, SHARE, not weighed or f.share > SHARE,
                       f"{f.share:.0%} of the excess explained, {SHARE:.0%} needed" if weighed else
                       "the excess is within noise, no share is asked"),
             Condition("strength", f.clear, STRENGTH, not f.clear < STRENGTH,
                       "its error is not known" if math.isnan(f.clear) else f"{f.clear:.2g} sd from none, {STRENGTH:g} needed"),
+            Condition("beyond clutter", f.chance, LEVEL, not f.chance >= LEVEL,
+                      "too few parts of the data to tell" if math.isnan(f.chance) else f"family-wise p {p_text(f.chance)} by the scatter between parts "
+                      f"of the data, against {LEVEL:g}"),
             Condition("even", f.uneven, UNEVEN, f.even, f"splitting its strength{f.uneven_by} gains {f.uneven:.2f} of the "
                       f"fall, {UNEVEN:g} allowed"),
             Condition("held out", f.held_out, 0.0, f.held_out > 0,
@@ -516,7 +522,7 @@ def decide(f: Findings) -> tuple[str, list[Condition]]:
             return "CLAIM", conditions
         if "significant" in failed and not structure and not weighed:
             return "NOTHING", conditions  # the linear score promised a fall that no refit brought, and nothing else is left
-        if failed & {"lead", "margin"} and not failed & {"significant", "no better curve", "share"} and f.some_even:
+        if failed & {"lead", "margin"} and not failed & {"significant", "no better curve", "share", "beyond clutter"} and f.some_even:
             return "AMBIGUOUS", conditions
         if failed <= {"share", "even"}:
             return "PARTIAL", conditions

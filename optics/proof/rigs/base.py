@@ -104,10 +104,12 @@ class Pictures(Rig):
     """A rig whose strengths the model's noise-free pictures tell: that sets how much is hidden, and takes no part in the making.
 
     several   {effect: keys} that a hidden strength moves together, where it is not the first parameter of the effect alone
+    most      {effect: strength} that the sensor can have, where that is less than the parameter's bounds
     frames    of a set that strengths are found from
     """
 
     several: Mapping[str, tuple[str, ...]] = {}
+    most: Mapping[str, float] = {}
     frames = 3
 
     def scene(self):
@@ -128,20 +130,21 @@ class Pictures(Rig):
         from optics.parameter import Values
         from optics.render import Model
 
-        scene = self.scene()
-        built, keys = self.built(scene, 0), self.keys(scene, effect)
         captures = self.captures(Cell(self.name, "none", (), 0.0, 0.0, "same", "", 0), {}, {}, mean=True)
         captures.frames = captures.frames[:self.frames]
+        scene = self.scene()  # after the captures, whose makers work in another variant
+        built, keys = self.built(scene, 0), self.keys(scene, effect)
+        start = {key: self.start(scene, key) for key in keys}  # a scene's values follow its predictions
         model = Model(scene, captures, captures.noise)
 
         def signal(s: float) -> np.ndarray:
-            values = {**built, **{key: self.start(scene, key) + s for key in keys}}
+            values = {**built, **{key: float(np.clip(start[key] + s, *scene.parameters[key].bounds)) for key in keys}}
             images = np.array(model.predict(Values(values)))
             return np.minimum(images, captures.noise.saturation) - captures.noise.black_level
 
         plain, first = signal(0.0), scene.parameters[keys[0]]
         return strength_at(change, lambda s: float(np.sqrt(np.mean((signal(s) - plain) ** 2)) / plain.mean()), 0.1 * first.plausible,
-                           first.bounds[1] - self.start(scene, keys[0]))
+                           self.most.get(effect, first.bounds[1] - start[keys[0]]))
 
     def parameters(self, effect: str) -> tuple[dict[str, float], float] | None:
         if effect in self.random:

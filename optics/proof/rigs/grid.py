@@ -23,6 +23,7 @@ class Grid(Pictures):
     defines = {"rays": "1024", "packets": "100000"}  # the model's error is then a quarter of the camera's noise, which it adds to it
     held_out = ("distance-01",)
     several = {"rough walls": ("filling.roughness",), "index mismatch": ("filling.index_offset",), "body absorption": ("filling.absorption",)}
+    most = {"wall thickness": 0.3}
     uncounted = ("index mismatch",)  # free are both indices
     distances = (2.5, 4.0, 6.0)
     width, height, spp = 32, 24, 8192
