@@ -354,11 +354,10 @@ def _refit(model, fit, evidence: Evidence, table: Table, chosen: Sequence[Candid
     for n, c in enumerate(chosen):
         say("refit", n, len(chosen))
         best, (predicted, linear) = None, _look_again(model, fit, evidence, c)
-        for fraction in (START, 0.1):
-            if fraction < START and best is not None and best[0] > 0.5 * predicted:
-                break  # the first attempt was as good as predicted
-            if fraction < START and predicted < CLEAR:
-                break  # nothing to win
+        # where a picture is not in proportion to its strength, between a weak effect and a strong one lie other minima
+        for fraction, enough in ((START, 0.0), *([(1.0, 0.8)] if c.form == "secant" else []), (0.1, 0.5)):
+            if enough and (predicted < CLEAR or best is not None and best[0] > enough * predicted):
+                break  # nothing to win, or an attempt before was as good as predicted
             start = _start(model, fit, evidence, [(c, linear)], fraction)
             try:
                 found = refit(model, [*base, *c.variables], start, frames=list(fitted))
@@ -503,8 +502,8 @@ def _split(model, evidence: Evidence, c: Candidate, found, places: list[dict], r
            say: Progress) -> tuple[list[Split], float]:
     """Whether a fitted effect has the same strength in every part of the data, and `_chance` of its strength.
 
-    With the effect in the base, its image e = sum_j s_j g_j is cut into parts e 1{part} and these are scored: a true
-    effect gains nothing by being cut, a proxy does.
+    With the effect in the base, e, by which its picture differs from the one without it, is cut into parts e 1{part} and these are
+    scored: a true effect gains nothing by being cut, a proxy does.
     """
     from scipy.special import chdtrc
 
@@ -515,12 +514,11 @@ def _split(model, evidence: Evidence, c: Candidate, found, places: list[dict], r
     effect = [i for i, v in enumerate(base) if v in c.variables]
     calibrated = [i for i in own.base if i not in effect]
     own.precision, own.pull = own.precision[calibrated], own.pull[calibrated]  # effect variables follow the base's
-    middles = [block.middle for block in own.blocks]
-    images = []
-    for block, middle in zip(own.blocks, middles):
-        position = {int(w): i for i, w in enumerate(block.where)}
-        images.append(sum((s * middle[:, position[i]] for i, s in zip(effect, change) if i in position),
-                          np.zeros(len(block.r))))
+    middles, without = [block.middle for block in own.blocks], found.values.copy()
+    for v, start in zip(c.variables, c.start):
+        without.put(v, float(start))
+    changes = zip(*(model.predict(values, own.frames, own.seed) for values in (found.values, without)))
+    images = [(np.asarray(new, float) - old).reshape(-1)[block.index] / block.sigma for block, (new, old) in zip(own.blocks, changes)]
     parts = _parts(model, own, places)
     plain_normal = own.thinned(extra=max([len(labels) for labels, _ in parts.values()], default=0))
     results = []

@@ -192,9 +192,10 @@ def count(records: Sequence[dict], planned: int, parts: bool = True) -> Count:
         c = r["cell"]
         kind = {"library": hidden(r)[0] if hidden(r) else "", "none": "nothing", "pair": "two effects", "unknown": f"not in the library: "
                 f"{hidden(r)[0] if hidden(r) else ''}", "mistake": f"noise mistaken: {c['mistake']}"}[c["kind"]]
-        told = " + ".join(sorted(named(r))) if c["kind"] == "pair" and len(named(r)) == 1 else next(iter(named(r)), "")
-        told = ("both" if named(r) == set(hidden(r)) else "not both") if c["kind"] == "pair" and named(r) else told
-        told = told or _last(r)["word"]
+        names, true = named(r), set(hidden(r))
+        told = next(iter(names), _last(r)["word"])
+        if c["kind"] == "pair" and names:
+            told = "both" if names == true else "one of two" if names < true else "another"
         confusion.setdefault(kind, {}).setdefault(told, 0)
         confusion[kind][told] += 1
         words.setdefault(c["kind"], {}).setdefault(_last(r)["word"], 0)

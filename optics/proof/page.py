@@ -66,7 +66,7 @@ def _svg(draw, width: float = 5.2, height: float = 3.4) -> str:
 def confusion(found: Count) -> str:
     """Rows: what was hidden; columns: what was claimed, or the verdict where nothing was."""
     rows = sorted(found.confusion, key=lambda k: (k.startswith("noise"), k.startswith("not in"), k in ("nothing", "two effects"), k))
-    words = ["both", "not both", "AMBIGUOUS", "PARTIAL", "UNKNOWN", "CANNOT_TELL", "NOTHING"]
+    words = ["both", "another", "one of two", "AMBIGUOUS", "PARTIAL", "UNKNOWN", "CANNOT_TELL", "NOTHING"]
     told = {t for row in found.confusion.values() for t in row}
     columns = [r for r in rows if r in told] + sorted(told - set(rows) - set(words)) + [w for w in words if w in told]
     table = np.array([[found.confusion[r].get(c, 0) for c in columns] for r in rows], float)

@@ -25,7 +25,7 @@ PARAMETERS = (
     Parameter("skin", "mm", 0.5, (0.0, 20.0), "from the touched face to the grid", plausible=0.05, how="difference", step=1.0),
     Parameter("wall_error", "mm", 0.0, (-5.0, 5.0), "by which walls are thicker than `wall`", neutral=0.0, plausible=0.02, how="difference",
               step=1.0),
-    Parameter("unfilled", "1", 0.0, (0.0, 1.0), "share of its filling that one cell lacks", neutral=0.0, plausible=0.5, how="difference"),
+    Parameter("unfilled", "1", 0.0, (0.0, 1.0), "share of its filling that one cell lacks", neutral=0.0, plausible=1.0, how="difference"),
     *(Parameter(f"unfilled_{axis}", "1", 0.0, (0.0, 9999.0), f"{axis} of that cell", how="difference") for axis in ("column", "row", "layer")),
 )
 
