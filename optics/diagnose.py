@@ -32,7 +32,7 @@ IMPLAUSIBLE = 10.0  # times the plausible strength: worth a look
 MAX_REFITS = 10
 MAX_SPLIT = 4  # members of an ambiguous set that are tested for evenness
 SAME_PLACE = 0.5  # of what an effect leaves: if its own strength, split, takes more than this, the rest is where the effect is, and it is not it
-LOOKS = 6  # at an effect's picture, to find the strength at which it was taken
+LOOKS = 3  # at an effect's picture, to find the strength at which it was taken
 HAIR = 0.01  # of the fall: a split that gains less says nothing about what the effect is
 USUALLY = "the same press at 0.4 of the exposure, and one deeper press, often tell more than repeats"  # where no shot was simulated
 
@@ -355,7 +355,7 @@ def _refit(model, fit, evidence: Evidence, table: Table, chosen: Sequence[Candid
         say("refit", n, len(chosen))
         best, (predicted, linear) = None, _look_again(model, fit, evidence, c)
         # where a picture is not in proportion to its strength, between a weak effect and a strong one lie other minima
-        for fraction, enough in ((START, 0.0), *([(1.0, 0.8)] if c.form == "secant" else []), (0.1, 0.5)):
+        for fraction, enough in ((START, 0.0), *([(1.0, 0.5)] if c.form == "secant" else []), (0.1, 0.5)):
             if enough and (predicted < CLEAR or best is not None and best[0] > enough * predicted):
                 break  # nothing to win, or an attempt before was as good as predicted
             start = _start(model, fit, evidence, [(c, linear)], fraction)
@@ -442,7 +442,7 @@ def _look_again(model, fit, evidence: Evidence, c: Candidate) -> tuple[float, np
         if not (math.isfinite(score) and projected.survival[0] > st.VISIBLE and score > 0):
             return c.row.fall, c.linear
         fall, times = k * score**2 / information, score / information
-        if abs(times - 1) < 0.1:
+        if abs(times - 1) < 0.25:
             break
         linear = linear * min(max(times, 0.1), 10.0)
     return float(fall), linear
