@@ -82,25 +82,13 @@ def make(folder: Path, seed: int, name: str | None = None, progress: Callable | 
 
 def make_bench(folder: Path, seed: int, effect: str, strength: float) -> None:
     """Readings of the polarizer bench with one effect: P1 at five angles, the analyser round and back, two powers of the lamp."""
-    from optics.jones import Photodiode, Polarizer, Sample, Source, Truth, malus_sweep, write
+    from optics.jones import malus_sweep, with_effects, write
     from optics.noise import Noise
 
-    film = {"polarizer misalignment": "offset", "servo scale": "scale", "servo backlash": "backlash", "analyzer wobble": "wobble_c"}
-    p1, p2, source, sample, gamma = Polarizer(), Polarizer(), Source(), Sample(), 1.0
-    if effect in film:
-        p2 = Polarizer(**{film[effect]: strength})
-    elif effect == "extinction leak":
-        p1 = p2 = Polarizer(leak=strength)
-    elif effect == "retardance":
-        sample = Sample(retardance=strength, axis=20.0)
-    elif effect == "polarized source":
-        source = Source(dop=strength, dop_angle=30.0)
-    else:
-        gamma += strength
     settings = malus_sweep(1000, polarizer_angles=(0.0, 60.0, 100.0, 190.0, 250.0))
     for i, own in enumerate(settings):
         own.update({"source.power": (1.0, 0.5)[i % 2], "sample.angle": (0.0, 45.0)[i // 2 % 2]})
-    truth = Truth(p1=p1, p2=p2, source=source, sample=sample, photodiode=Photodiode(gain=2.2, gamma=gamma))
+    truth = with_effects({effect: strength - (effect == "servo scale")}, gain=2.2)  # a scale is known by its value, 1 is none
     write(folder, truth, settings, Noise(0.05, 2.0, 64.0, 4095.0, 0.0), seed + 1000)
 
 

@@ -87,9 +87,9 @@ def diagnose(model, fit, effects: Sequence[Effect], variables_of: Callable[[Effe
     splits = []
     if winner:
         for c in members[:MAX_SPLIT]:
-            own, chance = _split(model, evidence, c, fits[c.effect.name], places, rows_max, seed, say)
+            own, p = _split(model, evidence, c, fits[c.effect.name], places, rows_max, seed, say)
             splits += own
-            c.row.refit = replace(c.row.refit, chance=chance if math.isnan(chance) else table.family.p(chance))
+            c.row.refit = replace(c.row.refit, chance=p if math.isnan(p) else table.family.p(p))
     levels = _held_out(model, fit, evidence, winner, fits, refit, held_out, variables_of, say)
     shifts = _shifts(model, fit, winner, fits) if winner else []
     findings = _findings(table, winner, done, members, fingerprints, splits, levels, basis, structure)

@@ -22,7 +22,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from numbers import Real
 from pathlib import Path
 
@@ -254,6 +254,39 @@ def readings(truth: Truth, settings: Settings, noise: Noise, seed: int, bits: in
     reading = noise.system_gain * rng.poisson(electrons) + np.minimum(mean, noise.black_level)
     reading += noise.dark_noise * rng.standard_normal(mean.shape)
     return np.clip(np.round(reading), 0.0, math.floor(noise.saturation))
+
+
+def with_effects(hidden: Mapping[str, float], gain: float) -> Truth:
+    """A bench with effects of the library in it, {name: strength from none}; films, a sheet and a diode of `gain` that are else ideal.
+
+    The misaligned, scaled, slack or wobbling film is the second; both leak. A sheet's fast axis is at 20 deg, a polarized lamp's at 30.
+    """
+    p1, p2, source, sample, diode, stray = Polarizer(), Polarizer(), Source(), Sample(), Photodiode(gain=gain), 0.0
+    film = {"polarizer misalignment": "offset", "servo backlash": "backlash", "analyzer wobble": "wobble_c"}
+    for effect, s in hidden.items():
+        if effect in film:
+            p2 = replace(p2, **{film[effect]: s})
+        elif effect == "servo scale":
+            p2 = replace(p2, scale=1 + s)
+        elif effect == "extinction leak":
+            p1, p2 = replace(p1, leak=s), replace(p2, leak=s)
+        elif effect == "retardance":
+            sample = replace(sample, retardance=s, axis=20.0)
+        elif effect == "depolarization":
+            sample = replace(sample, depolarization=s)
+        elif effect == "polarized source":
+            source = replace(source, dop=s, dop_angle=30.0)
+        elif effect == "source drift":
+            source = replace(source, drift=s)
+        elif effect == "camera gamma":
+            diode = replace(diode, gamma=1 + s)
+        elif effect == "dark offset":
+            diode = replace(diode, offset=s)
+        elif effect == "stray light":
+            stray = s
+        else:
+            raise ValueError(f"no independent way to make {effect} on the bench")
+    return Truth(p1=p1, p2=p2, source=source, sample=sample, photodiode=diode, stray=stray)
 
 
 def malus_sweep(count: int, polarizer_angles: Sequence[float] = (0.0,), turns: float = 1.0, minutes: float = 30.0,

@@ -497,9 +497,9 @@ def decide(f: Findings) -> tuple[str, list[Condition]]:
             Condition("margin", margin, MARGIN, margin > MARGIN or f.refuted, f"{margin:.0%} ahead of the next, "
                       + ("which leaves structure where the best leaves none" if f.refuted and margin <= MARGIN else
                          f"{MARGIN:.0%} needed")),
-            Condition("no better curve", f.ratio, RIVAL if f.coordinate in MAPS else RIVAL_CURVE, not f.rival,
+            Condition("no better curve", f.ratio, allowed(f.coordinate), not f.rival,
                       f"the best curve ({f.coordinate or 'none'}) explains {f.ratio:.2f} of it, "
-                      f"{RIVAL if f.coordinate in MAPS else RIVAL_CURVE:g} allowed"),
+                      f"{allowed(f.coordinate):g} allowed"),
             Condition("share", f.share, SHARE, not weighed or f.share > SHARE,
                       f"{f.share:.0%} of the excess explained, {SHARE:.0%} needed" if weighed else
                       "the excess is within noise, no share is asked"),
@@ -531,13 +531,18 @@ def decide(f: Findings) -> tuple[str, list[Condition]]:
     return "CANNOT_TELL", conditions
 
 
+def allowed(coordinate: str) -> float:
+    """How many times as much as the best effect a curve along it may explain."""
+    return RIVAL if coordinate in MAPS else RIVAL_CURVE
+
+
 def rivals(fingerprints: Sequence[Fingerprint], fall: float) -> list[Fingerprint]:
     """The curves that do better than an effect with this net fall; the one to name first.
 
     'place', a map of the sensor, and 'reading', one of a session, can mimic every curve that does not move, and 'frame' every setting:
     they are named where no other curve is nearly as good.
     """
-    better = [f for f in fingerprints if f.ratio >= (RIVAL if f.coordinate in MAPS else RIVAL_CURVE)
+    better = [f for f in fingerprints if f.ratio >= allowed(f.coordinate)
               and f.p < LEVEL / len(fingerprints)
               and f.net - fall > 3 * math.sqrt(2 * f.dof) * f.net / (f.fall - f.dof)]  # beyond what the number of bins gives by chance
     return ordered(better)

@@ -73,7 +73,7 @@ class Rig:
     def unknown_change(self, cell: Cell) -> float:
         """Rms change over the mean signal by an unknown kind of size 1, in the maker's own means."""
         plain, changed = (self._signal(self.captures(cell, {}, unknown, mean=True)) for unknown in ({}, {cell.hidden[0]: 0.01}))
-        return float(np.sqrt(np.mean((changed - plain) ** 2)) / plain.mean()) / 0.01
+        return change_of(changed, plain) / 0.01
 
     @staticmethod
     def _signal(captures: capture_files.Captures) -> np.ndarray:
@@ -143,7 +143,7 @@ class Pictures(Rig):
             return np.minimum(images, captures.noise.saturation) - captures.noise.black_level
 
         plain, first = signal(0.0), scene.parameters[keys[0]]
-        return strength_at(change, lambda s: float(np.sqrt(np.mean((signal(s) - plain) ** 2)) / plain.mean()), 0.1 * first.plausible,
+        return strength_at(change, lambda s: change_of(signal(s), plain), 0.1 * first.plausible,
                            self.most.get(effect, first.bounds[1] - start[keys[0]]))
 
     def parameters(self, effect: str) -> tuple[dict[str, float], float] | None:
@@ -154,16 +154,21 @@ class Pictures(Rig):
         return {key: 1.0}, self.start(scene, key)
 
 
-def strength_at(change: float, change_of: Callable[[float], float], start: float, most: float) -> float:
+def change_of(image: np.ndarray, plain: np.ndarray) -> float:
+    """Rms of what differs, over the mean of the plain signal."""
+    return float(np.sqrt(np.mean((image - plain) ** 2)) / plain.mean())
+
+
+def strength_at(change: float, changed_by: Callable[[float], float], start: float, most: float) -> float:
     """The strength whose change of the picture is so large, by secant steps in the logarithm; inf where `most` does not reach it."""
-    if change_of(most) < change:
+    if changed_by(most) < change:
         return math.inf
     trial = min(start, most)
     for _ in range(12):
-        now = change_of(trial)
+        now = changed_by(trial)
         if abs(now / change - 1) < 0.02:
             break
-        half = change_of(trial / 2)
+        half = changed_by(trial / 2)
         power = np.clip(math.log(max(now, 1e-15) / max(half, 1e-15)) / math.log(2), 0.3, 3.0)
         trial = min(trial * float(np.clip((change / max(now, 1e-15)) ** (1 / power), 0.05, 20)), most)
     return trial

@@ -15,7 +15,7 @@ import numpy as np
 from optics import captures as capture_files, jones
 from optics.noise import Noise
 from optics.proof.cells import Cell, pairs_of
-from optics.proof.rigs.base import Rig, smooth, strength_at
+from optics.proof.rigs.base import Rig, change_of, smooth, strength_at
 
 PHOTODIODE = Noise(0.01, 1.0, 64.0, 4095.0, 0.0)  # 400 000 electrons: 0.3 % at the mean reading
 WANDER, JITTER = 0.003, 0.05  # of the lamp, rms relative; deg rms of the analyser; at clutter 1
@@ -101,41 +101,14 @@ class Bench(Rig):
         return found
 
     def bench(self, hidden: Mapping[str, float]) -> jones.Truth:
-        p1, p2, source, sample, diode, stray = jones.Polarizer(), jones.Polarizer(), jones.Source(), jones.Sample(), jones.Photodiode(gain=2.0), 0.0
-        for effect, s in hidden.items():
-            if effect == "polarizer misalignment":
-                p2 = replace(p2, offset=s)
-            elif effect == "servo scale":
-                p2 = replace(p2, scale=1 + s)
-            elif effect == "servo backlash":
-                p2 = replace(p2, backlash=s)
-            elif effect == "analyzer wobble":
-                p2 = replace(p2, wobble_c=s)
-            elif effect == "extinction leak":
-                p1, p2 = replace(p1, leak=s), replace(p2, leak=s)
-            elif effect == "retardance":
-                sample = replace(sample, retardance=s, axis=20.0)
-            elif effect == "depolarization":
-                sample = replace(sample, depolarization=s)
-            elif effect == "polarized source":
-                source = replace(source, dop=s, dop_angle=30.0)
-            elif effect == "source drift":
-                source = replace(source, drift=s)
-            elif effect == "camera gamma":
-                diode = replace(diode, gamma=1 + s)
-            elif effect == "dark offset":
-                diode = replace(diode, offset=s)
-            else:
-                stray = s
-        return jones.Truth(p1=p1, p2=p2, source=source, sample=sample, photodiode=diode, stray=stray)
+        return jones.with_effects(hidden, gain=2.0)
 
     def mean(self, hidden: Mapping[str, float]) -> np.ndarray:
         return bench_light(self.bench(hidden), self.settings())
 
     def strength_of(self, effect: str, change: float) -> float:
         plain = self.mean({})
-        return strength_at(change, lambda s: float(np.sqrt(np.mean((self.mean({effect: s}) - plain) ** 2)) / plain.mean()),
-                           0.01 * self.most[effect], self.most[effect])
+        return strength_at(change, lambda s: change_of(self.mean({effect: s}), plain), 0.01 * self.most[effect], self.most[effect])
 
     def captures(self, cell: Cell, truth, unknown, *, mean: bool = False) -> capture_files.Captures:
         return sweep(self.bench(truth), self.settings(), 1000 + cell.seed, unknown, cell.clutter, mean)
