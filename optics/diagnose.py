@@ -32,6 +32,7 @@ IMPLAUSIBLE = 10.0  # times the plausible strength: worth a look
 MAX_REFITS = 10
 MAX_SPLIT = 4  # members of an ambiguous set that are tested for evenness
 SAME_PLACE = 0.5  # of what an effect leaves: if its own strength, split, takes more than this, the rest is where the effect is, and it is not it
+HIDDEN = 2.0  # standard deviations of excess misfit that may hide beside an effect which seems to leave none
 LOOKS = 3  # at an effect's picture, to find the strength at which it was taken
 HAIR = 0.01  # of the fall: a split that gains less says nothing about what the effect is
 USUALLY = "the same press at 0.4 of the exposure, and one deeper press, often tell more than repeats"  # where no shot was simulated
@@ -690,9 +691,9 @@ def _shifts(model, fit, winner: Candidate, fits: Mapping) -> list[Shift]:
 
 def _refuted(winner: Candidate, other: Candidate) -> bool:
     """Whether the winner leaves nothing to explain, and another, refitted, does: more than could hide beside the winner."""
-    left = other.row.refit
-    return other is not winner and winner.row.refit.complete and left is not None and left.converged and (
-        left.structure_p < LEVEL or left.excess_sd - winner.row.refit.excess_sd > EXCESS)
+    own, left = winner.row.refit, other.row.refit
+    return other is not winner and own.complete and left is not None and left.converged and (
+        left.structure_p < LEVEL or left.excess_sd - own.excess_sd > max(own.excess_sd, 0.0) + HIDDEN)
 
 
 def _simplest(done: Sequence[Candidate]) -> Candidate:

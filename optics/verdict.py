@@ -435,8 +435,8 @@ class Findings:
     p_family     of the best of all candidates; structure_p: of low-frequency structure (NaN: readings, or images too small to show any)
     winner       the effect with the largest fall after refit, '' if none; p_winner: family-wise, of that fall
     fall, runner_up   net falls of the winner and of the next one
-    refuted      with the winner nothing is left to explain, and every effect within the margin leaves structure, or an
-                 excess EXCESS sd above the winner's, behind: the misfit that makes small differences worthless is then not there
+    refuted      with the winner nothing is left to explain, and every effect within the margin leaves structure behind, or more
+                 than could hide beside the winner: the misfit that makes small differences worthless is then not there
     ratio        the best curve's net fall over the winner's
     rival        a curve does better by RIVAL (a map) or RIVAL_CURVE, significantly
     share        of the excess, where excess_sd > EXCESS
