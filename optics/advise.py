@@ -26,7 +26,7 @@ import numpy as np
 from optics import statistics as st
 from optics.evidence import Candidate, Evidence, Progress, measure, value_of
 from optics.noise import SATURATED
-from optics.parameter import Parameter, Values, Variable
+from optics.parameter import Values, Variable, spaced
 from optics.verdict import CLEAR, MARGIN, Advice, Apart, Diagnosis, Row
 
 EXPOSURES = (0.4, 0.15, 2.5)  # of the present one: far enough to bend a response, near enough to see something
@@ -94,11 +94,6 @@ def _now(model, values: Values, frame: int) -> dict[str, float]:
 def keys_named(parameters: Iterable[str], name: str) -> list[str]:
     """The keys of a parameter's name in all parts that have it."""
     return [k for k in parameters if k.rpartition(".")[2] == name]
-
-
-def unit_of(parameter: Parameter) -> str:
-    """Its unit, to stand behind a number; nothing for a pure number."""
-    return "" if parameter.unit in ("", "1") else f" {parameter.unit}"
 
 
 def _press(model) -> tuple[str, str, str] | None:
@@ -257,7 +252,7 @@ def _turned(model, frames: Sequence[int], now: Mapping, like: int) -> Iterator[S
         beyond = min(levels[-1] + (levels[-1] - levels[0]) / 2, high)
         for to in ((levels[gap] + levels[gap + 1]) / 2, beyond, max(levels[0] - (levels[-1] - levels[0]) / 2, low)):
             if to not in taken:
-                yield Shot(f"another {key}", f"{_same(model, like)} with {key} = {to:.4g}{unit_of(model.parameters[key])}", like, {key: to})
+                yield Shot(f"another {key}", f"{_same(model, like)} with {key} = {to:.4g}{spaced(model.parameters[key].unit)}", like, {key: to})
 
 
 # -- what shots would add ---------------------------------------------------------------------------------------------
@@ -493,7 +488,7 @@ def _base_with_shots(twin, evidence: Evidence, shots: Sequence[Shot], first: int
 
 
 def _unknown(v: Variable) -> str:
-    return v.keys[0] + ("" if v.prior is None else f" +- {v.prior[1]:g}{unit_of(v.parameter)}")
+    return v.keys[0] + ("" if v.prior is None else f" +- {v.prior[1]:g}{spaced(v.parameter.unit)}")
 
 
 # -- advice -----------------------------------------------------------------------------------------------------------

@@ -23,6 +23,7 @@ from typing import Annotated
 import typer
 
 from optics import __version__
+from optics.parameter import spaced
 
 app = typer.Typer(
     add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False,
@@ -596,7 +597,7 @@ def sweep(scene: SceneName,
 def _readings(found, rows) -> str:
     """The summary of a sweep as a table."""
     several, ideal, measured = (any(r.get(k) is not None for r in rows) for k in ("settings", "from_ideal", "from_measured"))
-    at_unit = "at" if found.unit in ("", "1") else f"at {found.unit}"
+    at_unit = f"at{spaced(found.unit)}"
     lines = [(*(["settings"] if several else []), "channel", "largest", at_unit, "smallest", at_unit,
               "extinction ratio" if found.turns else "ratio", "contrast", *(["from cos^2"] if ideal else []),
               *(["measured - predicted, rms"] if measured else []))]

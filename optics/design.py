@@ -24,13 +24,13 @@ from pathlib import Path
 import numpy as np
 
 from optics import advise, readings, statistics as st
-from optics.advise import keys_named, unit_of
+from optics.advise import keys_named
 from optics.captures import FILE, NOISE_KEYS, Captures, Frame, Table
 from optics.effect import shipped
 from optics.errors import BadScene, OutputExists, Underdetermined
 from optics.evidence import Candidate, Evidence, Progress, measure
 from optics.noise import UNITS, Noise
-from optics.parameter import Parameter, Values
+from optics.parameter import Parameter, Values, spaced
 from optics.verdict import CLEAR, LEVEL
 
 SHARE = 0.1  # of the plausible strength
@@ -427,7 +427,7 @@ def _report(scene, frames, path, seen, chosen, members, share, noise, count, uns
         j = int(np.argmin(gaps[i]))
         rival, gap = (names[j], gaps[i, j]) if math.isfinite(gaps[i, j]) else ("", alone[i])
         parameter = c.variables[0].parameter
-        effects.append(Power(m.name, f"{share * parameter.plausible:.2g}{unit_of(parameter)}", float(alone[i]), float(power), rival,
+        effects.append(Power(m.name, f"{share * parameter.plausible:.2g}{spaced(parameter.unit)}", float(alone[i]), float(power), rival,
                              float(gap), float(cos[i, j])))
         confused += [{"effect": m.name, "rival": names[k], "d": float(gaps[i, k]), "weak": bool(alone[i] < CLEAR),
                       "why": f"what a calibration leaves of them has cos {cos[i, k]:.3f}; D {alone[i]:.3g} against none"}

@@ -32,7 +32,8 @@ IMPLAUSIBLE = 10.0  # times the plausible strength: worth a look
 MAX_REFITS = 10
 MAX_SPLIT = 4  # members of an ambiguous set that are tested for evenness
 SAME_PLACE = 0.5  # of what an effect leaves: if its own strength, split, takes more than this, the rest is where the effect is, and it is not it
-HIDDEN = 2.0  # standard deviations of excess misfit that may hide beside an effect which seems to leave none
+HIDDEN = 2.0  # standard deviations of excess misfit that may hide beside an effect which seems to leave none ...
+ALONG = 0.05  # ... and what of it lies where two effects differ: on the polarizer bench .006 on average and .07 at most, on gelsight .002
 LOOKS = 3  # at an effect's picture, to find the strength at which it was taken
 HAIR = 0.01  # of the fall: a split that gains less says nothing about what the effect is
 USUALLY = "the same press at 0.4 of the exposure, and one deeper press, often tell more than repeats"  # where no shot was simulated
@@ -84,7 +85,7 @@ def diagnose(model, fit, effects: Sequence[Effect], variables_of: Callable[[Effe
     if winner:
         done.sort(key=lambda c: c is not winner)
     members = [c for c in done if c.row.net_refit > 0 and _close(winner.row.net_refit, c.row.net_refit)
-               and not _refuted(winner, c)] if winner else []
+               and not _refuted(winner, c, basis.dof)] if winner else []
     splits = []
     if winner:
         for c in members[:MAX_SPLIT]:
@@ -689,11 +690,17 @@ def _shifts(model, fit, winner: Candidate, fits: Mapping) -> list[Shift]:
 # -- findings, limits, warnings ---------------------------------------------------------------------------------------
 
 
-def _refuted(winner: Candidate, other: Candidate) -> bool:
-    """Whether the winner leaves nothing to explain, and another, refitted, does: more than could hide beside the winner."""
+def _refuted(winner: Candidate, other: Candidate, dof: int) -> bool:
+    """Whether the winner leaves nothing to explain, and another, refitted, does: more than misfit that hides beside the winner could fake.
+
+    For the wrong one of two to lead by L in chi2, what lies along the one direction in which their images differ must be sqrt(L) or more.
+    Noise has a variance of 1 there, and misfit of which H is hidden a share of it: L > CLEAR (1 + ALONG H).
+    """
     own, left = winner.row.refit, other.row.refit
-    return other is not winner and own.complete and left is not None and left.converged and (
-        left.structure_p < LEVEL or left.excess_sd - own.excess_sd > max(own.excess_sd, 0.0) + HIDDEN)
+    if other is winner or not own.complete or left is None or not left.converged:
+        return False
+    hidden = (abs(own.excess_sd) + HIDDEN) * math.sqrt(2 * dof)  # below none: the noise is overstated, by as much as that
+    return left.structure_p < LEVEL or winner.row.net_refit - other.row.net_refit > CLEAR * (1 + ALONG * hidden)
 
 
 def _simplest(done: Sequence[Candidate]) -> Candidate:
@@ -717,7 +724,7 @@ def _findings(table, winner, done, members, fingerprints, splits, levels, basis,
             table.family.p(float(winner.cone.p(winner.row.refit.fall))), winner.row.net_refit,
             max([c.row.net_refit for c in done[1:]] + [c.row.net for c in others if c not in done] + [0.0]),
             refuted=winner.row.refit.complete and all(
-                _refuted(winner, c) for c in others
+                _refuted(winner, c, basis.dof) for c in others
                 if _close(winner.row.net_refit, max(c.row.net_refit, 0.0 if c in done else c.row.net))),
             share=winner.row.net_refit / excess if excess > 0 else math.nan, excess_sd=basis.excess_sd,
             uneven=worst.h if worst else 0.0, uneven_by=f" by {worst.by} ({_extremes(worst)})" if worst else "",

@@ -25,7 +25,7 @@ from pathlib import Path
 import numpy as np
 
 from optics import loop, scene as scenes
-from optics.effect import STAGES, Declared, Registry
+from optics.effect import STAGES, Registry, is_taken
 from optics.errors import OutputExists, UnknownKey
 from optics.fingerprints import SIDE, family_of
 from optics.ladder import Study
@@ -34,7 +34,6 @@ from optics.verdict import Diagnosis, Fingerprint
 BENT = 0.5  # the largest relative change that a strength of 1 is called plausible for
 CELLS = ("place", "channel")  # coordinates of cells, each with a value of its own: none lies between two of them
 VIEW = ("u", "v", "px", "py", "tan", "focal", "width", "height", "bands")  # what functions see as `camera` beside its parameters
-HELD = ("name", "numbers", "words", "held")  # what every part holds beside its parameters and the methods of Declared
 
 
 @dataclass(frozen=True)
@@ -134,7 +133,7 @@ def check_name(name: str, part: str, registry: Registry) -> str:
         raise ValueError(f"an effect '{registry.effects[key].name}' exists already ({registry.effects[key].file}); choose another name")
     if any(p.name == word for p in registry.parameters_of(part)):
         raise ValueError(f"the part '{part}' has a parameter '{word}' already; choose another name")
-    if word in HELD or hasattr(Declared, word) or (part == "camera" and word in VIEW):
+    if is_taken(word) or (part == "camera" and word in VIEW):
         raise ValueError(f"'{word}' means something else to functions of the part '{part}'; choose another name")
     return word
 

@@ -286,11 +286,21 @@ def use_variant(variant: str = DEFAULT_VARIANT) -> None:
     reg = registry()
     if variant in reg.classes:
         return
-    reg.classes[variant] = {}
-    for kind, part in reg.parts.items():
-        cls = part.build()
-        reg.classes[variant][kind] = cls
-        getattr(mi, f"register_{part.category}")(kind, lambda props, cls=cls: cls(props))
+    classes = {kind: _built(reg, part) for kind, part in reg.parts.items()}
+    for kind, cls in classes.items():
+        getattr(mi, f"register_{reg.parts[kind].category}")(kind, lambda props, cls=cls: cls(props))
+    reg.classes[variant] = classes
+
+
+def _built(reg: Registry, part: Part) -> type:
+    """The Mitsuba class of a part, which parameters must not hide anything of."""
+    cls = part.build()
+    for p in reg.parameters_of(part.kind):
+        if is_taken(p.name, cls):
+            files = [e.file for e in reg.effects.values() if e.part == part.kind and p in (*e.parameters, *e.shape)]
+            raise BadPlugin(f"{files[0] if files else part.kind}: parameter '{p.name}' has the name of something else that the part "
+                            f"'{part.kind}' has; choose another name")
+    return cls
 
 
 _created: list | None = None  # parts made while a scene is being loaded
@@ -405,6 +415,14 @@ class Declared:
         return tuple(e.stages[stage] for e in registry().at_stage(self.kind, stage)
                      if any(n in self.held and (self.held[n] != self.numbers[n].neutral or dr.grad_enabled(getattr(self, n)))
                             for n in e.parameter_names))
+
+
+HELD = ("name", "numbers", "words", "held")  # what every part holds beside its parameters
+
+
+def is_taken(word: str, cls: type = Declared) -> bool:
+    """Whether a part has something of this name, which a parameter would hide."""
+    return word in HELD or hasattr(cls, word)
 
 
 def is_part(thing) -> bool:

@@ -21,6 +21,7 @@ import numpy as np
 from optics.compare import UNITS, Comparison, Curve
 from optics.errors import OutputExists
 from optics.ladder import Fingerprint, Shown, Study
+from optics.parameter import spaced
 
 BUDGET = 4_500_000  # bytes of embedded pictures; the page stays below 6 MB
 SIDE_MAX = 512  # px; larger frames are binned for display
@@ -479,9 +480,8 @@ class Readings:
         return cell.ravel(), [", ".join(self.words(k, self.settings[k][i]) for k in keys) for i in first]
 
     def words(self, key: str, value) -> str:
-        unit = self.units.get(key, "")
         text = number(value, 4) if isinstance(value, float) else str(value)
-        return f"{key} {text}" + (f" {unit}" if unit not in ("", "1") else "")
+        return f"{key} {text}{spaced(self.units.get(key, ''))}"
 
 
 def _column(f: Shown) -> bool:
@@ -506,7 +506,7 @@ def reading_plots(r: Readings, steps: Sequence[Mapping], channels: Sequence[str]
     values = np.concatenate([r.measured, *r.predicted])
     low, high = float(np.nanmin(values)), float(np.nanmax(values))
     scales = (float(r.settings[along].min()), float(r.settings[along].max())), (min(low, 0.0), high), top
-    axis = f"{_spoken(along)}, {r.units[along]}" if r.units.get(along, "1") not in ("", "1") else _spoken(along)
+    axis = ",".join(filter(None, (_spoken(along), spaced(r.units.get(along, "")))))
     out = []
     for i, step in enumerate(steps):
         for c in range(r.measured.shape[1]):
@@ -947,10 +947,9 @@ def told(diagnosis: Mapping | None, points: Readings | None) -> Mapping | None:
 def _candidate(r: Mapping) -> dict:
     """A row of the ranking, its cells as text."""
     refit = r.get("refit") or {}
-    units = r.get("units") or [""]
     strength = refit.get("strength") or [_finite(a) + _finite(c) for a, c in zip(r.get("start") or (), r.get("change") or ())]
     sd = refit.get("sd") or r.get("sd") or [None] * len(strength)
-    unit = f" {units[0]}" if units and units[0] not in ("", "1") else ""
+    unit = spaced((r.get("units") or [""])[0])
     values = [measure(_finite(v), None if s is None else float(s)) + unit for v, s in zip(strength, sd)]
     upper = [_finite(u) for u in r.get("upper") or () if math.isfinite(_finite(u))]
     limit = f"< {number(max(upper), 2)}{unit}" if upper else ""

@@ -26,6 +26,7 @@ import numpy as np
 
 from optics.compare import plain
 from optics.errors import Underdetermined
+from optics.parameter import spaced
 
 LEVEL = 0.01  # nominal level of the family-wise test and of the structure test
 CLEAR = 10.8  # chi2 between two effects at which the right one wins in 95 % of cases: Phi(sqrt(10.8)/2)
@@ -575,7 +576,7 @@ def with_sd(x: float, sd: float) -> str:
 
 
 def strength_text(values: Sequence[float], sds: Sequence[float], units: Sequence[str]) -> str:
-    unit = f" {units[0]}" if units and units[0] not in ("", "1") else ""
+    unit = spaced(units[0] if units else "")
     if len(values) == 1:
         return with_sd(values[0], sds[0]) + unit
     if len(values) <= 3:
@@ -586,13 +587,11 @@ def strength_text(values: Sequence[float], sds: Sequence[float], units: Sequence
 
 def limit_text(row: Row) -> str:
     limits = [u for u in row.upper if math.isfinite(u)]
-    unit = f" {row.units[0]}" if row.units[0] not in ("", "1") else ""
-    return f"{row.name} < {max(limits):.2g}{unit}" if limits else f"{row.name}: nothing visible"
+    return f"{row.name} < {max(limits):.2g}{spaced(row.units[0])}" if limits else f"{row.name}: nothing visible"
 
 
 def moved_by(s: Shift) -> str:
-    unit = f" {s.unit}" if s.unit not in ("", "1") else ""
-    return f"{s.variable} by {abs(s.after - s.before):.2g}{unit}"
+    return f"{s.variable} by {abs(s.after - s.before):.2g}{spaced(s.unit)}"
 
 
 def advice_text(a: Advice) -> str:

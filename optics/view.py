@@ -30,7 +30,7 @@ import numpy as np
 from optics import calibrate, captures as capture_files, loop
 from optics.compare import led_label
 from optics.errors import UnknownKey
-from optics.parameter import Values, Variable
+from optics.parameter import Values, Variable, spaced
 from optics.report import DIVERGING, MASKED, SIGMA_RANGE, colour_bar, ramp
 
 HOST = "127.0.0.1"
@@ -345,16 +345,15 @@ class View:
         """Values as `optics compare --fit` reads them: [parameters] and [frames.NAME], key = value."""
         self._seek(changes)
         values = self.moved(changes)
-        unit = {n: "" if (u := self.sliders[n].variable.parameter.unit) in ("", "1") else f" {u}" for n in changes}
         begun = f"the step '{self.step['name']}' of {self.study.folder}"
         lines = [f"# Values chosen on the page of `optics view`, beginning from {begun}. Not calibrated; changed by hand:",
-                 *(f"#   {n}: {self.sliders[n].value:.6g} -> {v:.6g}{unit[n]}" for n, v in changes.items())]
+                 *(f"#   {n}: {self.sliders[n].value:.6g} -> {v:.6g}{spaced(self.sliders[n].variable.parameter.unit)}" for n, v in changes.items())]
         if not changes:
             lines[0] = f"# Values of {begun}, unchanged."
 
         def entry(key, value):
-            unit = self.model.parameters[key].unit if key in self.model.parameters else ""
-            return f"{quoted(key)} = {quoted(value)}" + (f"  # {unit}" if unit not in ("", "1") else "")
+            unit = spaced(self.model.parameters[key].unit) if key in self.model.parameters else ""
+            return f"{quoted(key)} = {quoted(value)}" + (f"  #{unit}" if unit else "")
 
         lines += ["", "[parameters]", *(entry(k, v) for k, v in values.common.items())]
         for index, own in sorted(values.frame.items()):

@@ -414,6 +414,19 @@ def test_no_effect_is_called_new(tmp_path, own_registry):
         own_registry.scan(tmp_path)
 
 
+@pytest.mark.parametrize("word", ["takes", "held", "eval"])  # of every part, of an instance, of Mitsuba's own classes
+def test_no_parameter_hides_what_its_part_has(word, tmp_path, own_registry):
+    from optics.effect import use_variant
+    from optics.errors import BadPlugin
+
+    (tmp_path / "glint.py").write_text(
+        "from optics.effect import Effect\nfrom optics.parameter import Parameter\n\n"
+        f"GLINT = Effect(name='glint', part='membrane', parameters=(Parameter('{word}', '1', 0.0, neutral=0.0),))\n")
+    own_registry.scan(tmp_path)
+    with pytest.raises(BadPlugin, match=f"glint.py: parameter '{word}' has the name of something else"):
+        use_variant()
+
+
 # -- residuals in a report ----------------------------------------------------------------------------------------------
 
 
