@@ -24,10 +24,11 @@ from itertools import chain, zip_longest
 import numpy as np
 
 from optics import statistics as st
-from optics.evidence import Candidate, Evidence, Progress, measure, value_of
+from optics.evidence import Candidate, Evidence, Progress, measure
 from optics.noise import SATURATED
-from optics.parameter import Values, Variable, spaced
+from optics.parameter import Values, Variable
 from optics.verdict import CLEAR, MARGIN, Advice, Apart, Diagnosis, Row
+from optics.words import spaced
 
 EXPOSURES = (0.4, 0.15, 2.5)  # of the present one: far enough to bend a response, near enough to see something
 DEPTHS = (2.0, 0.5)  # of the present one: a new geometry costs ten times what another light costs, so few are tried

@@ -23,7 +23,7 @@ from typing import Annotated
 import typer
 
 from optics import __version__
-from optics.parameter import spaced
+from optics.words import spaced, table
 
 app = typer.Typer(
     add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False,
@@ -157,12 +157,6 @@ def show(result: object) -> None:
         return None if isinstance(value, float) and not math.isfinite(value) else value
 
     print(json.dumps(plain(result), indent=1, allow_nan=False, default=str))
-
-
-def table(rows: Sequence[Sequence[str]]) -> str:
-    """Aligned columns; the last one is as long as it likes."""
-    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]) - 1)]
-    return "\n".join("  ".join([*(cell.ljust(w) for cell, w in zip(row, widths)), row[-1]]).rstrip() for row in rows)
 
 
 def pairs(items: Sequence[str] | None, option: str) -> dict[str, str]:

@@ -16,6 +16,7 @@ from dataclasses import asdict, dataclass, field
 import numpy as np
 
 from optics.errors import Underdetermined
+from optics.words import table
 
 SCOPES = (  # what the numbers are split by; regions may overlap, everything else adds up to the whole
     (), ("role",), ("frame",), ("led",), ("group",), ("channel",), ("region",),
@@ -143,9 +144,8 @@ class Comparison:
             own_group = scope == ("group",) and len(rows) == len(self.frames)  # the block of frames says it
             if (rows and scope in ((), ("frame",))) or (len(rows) > 1 and not own_group):
                 blocks.append([("by " + " and ".join(scope) if scope else "", *head[1:])] + [_cells(r) for r in rows])
-        width = [max(len(line[k]) for block in blocks for line in block) for k in range(len(head))]
-        shown = ["\n".join("  ".join([line[0].ljust(width[0]), *(c.rjust(w) for c, w in zip(line[1:], width[1:]))])
-                           for line in block) for block in blocks]
+        lines = iter(table([line for block in blocks for line in block], left=(0,)).split("\n"))
+        shown = ["\n".join(next(lines) for _ in block) for block in blocks]
         s = self.similarity
         shown.append("over frames, mean and sd: " + ", ".join(
             f"{name} {s[key][0]:.{p}f} +- {s[key][1]:.{p}f}{unit}"

@@ -30,8 +30,9 @@ from optics.effect import shipped
 from optics.errors import BadScene, OutputExists, Underdetermined
 from optics.evidence import Candidate, Evidence, Progress, measure
 from optics.noise import UNITS, Noise
-from optics.parameter import Parameter, Values, spaced
+from optics.parameter import Parameter, Values
 from optics.verdict import CLEAR, LEVEL
+from optics.words import spaced, table
 
 SHARE = 0.1  # of the plausible strength
 FEWEST = 2  # frames: with one, nothing can be held out and nothing be compared
@@ -114,11 +115,11 @@ class Plan:
                  + f"every effect at {self.share:g} of its plausible strength", ""]
         rows = [("", "group", "frame", "mean P(correct)"), *((str(i + 1), f.group, f.words, f"{w:.3f}")
                                                               for i, (f, w) in enumerate(zip(self.frames, self.worth)))]
-        lines += _columns(rows) + [""]
+        lines += [table(rows), ""]
         rows = [("effect", "strength", "noticed", "hardest to tell from", "D", "P(correct)")]
         rows += [(e.effect, e.strength, f"{e.power:.0%}", f"{e.rival} (cos {e.cos:.2f})" if e.rival else "-", f"{e.gap:.3g}", f"{e.correct:.2f}")
                  for e in sorted(self.effects, key=lambda e: -e.correct)]
-        lines += _columns(rows)
+        lines.append(table(rows))
         alike = [c for c in self.confused if not c["weak"]]
         if alike:
             lines += ["", f"not told apart (D below {CLEAR:g}):"]
@@ -133,11 +134,6 @@ class Plan:
         if self.nested:
             lines.append("contained, and not compared: " + ", ".join(f"{a} in {b}" for a, b in self.nested))
         return "\n".join([*lines, *(f"warning: {w}" for w in self.warnings)]) + "\n"
-
-
-def _columns(rows: Sequence[Sequence[str]]) -> list[str]:
-    widths = [max(len(r[i]) for r in rows) for i in range(len(rows[0]))]
-    return ["  ".join(c.ljust(w) for c, w in zip(r, widths)).rstrip() for r in rows]
 
 
 # -- candidates ---------------------------------------------------------------------------------------------------------

@@ -33,7 +33,7 @@ from pathlib import Path
 
 import numpy as np
 
-from optics import __version__
+from optics import __version__, words
 from optics.compare import Comparison, Row, led_label, plain
 from optics.errors import BadCapture, OutputExists
 
@@ -337,11 +337,8 @@ class Study:
                 _format(held, "misfit", "{:.2%}"), _format(level, "noise", "{:.2%}"), str(len(step["variables"])),
                 "" if step["converged"] else f"not converged: {step['reason']}",
             ))
-        width = [max(len(line[k]) for line in lines) for k in range(len(lines[0]))]
-        text = ["  ".join([line[0].ljust(width[0]), *(c.rjust(w) for c, w in zip(line[1:6], width[1:])), line[6]]).rstrip()
-                for line in lines]
         floor = self.record["noise_floor"]
-        return "\n".join([*text, f"noise floor: chi2/dof {floor['chi2_per_dof']:.3f} ({floor['source']})"])
+        return "\n".join([words.table(lines, left=(0, 6)), f"noise floor: chi2/dof {floor['chi2_per_dof']:.3f} ({floor['source']})"])
 
 
 @contextlib.contextmanager

@@ -14,7 +14,6 @@ import numpy as np
 
 from optics import statistics as st
 from optics.evidence import Candidate, Evidence
-from optics.parameter import Values
 from optics.verdict import CLEAR, LEVEL, MARGIN, Pair
 
 CONSIDERED = 10  # effects, the best by themselves: 45 pairs

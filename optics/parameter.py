@@ -14,11 +14,6 @@ from optics.errors import OutOfBounds, UnknownKey
 HOW = ("ad", "difference", "image", "layer", "path")
 
 
-def spaced(unit: str) -> str:
-    """A unit to stand behind a number: ' mm', or nothing for a pure number."""
-    return "" if unit in ("", "1") else f" {unit}"
-
-
 @dataclass(frozen=True)
 class Parameter:
     """One physical quantity of a part: `led.power`, `membrane.sigma`, `camera.x_fov`.

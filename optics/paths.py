@@ -19,7 +19,7 @@ import numpy as np
 from optics.effect import registry
 from optics.errors import BadScene
 from optics.layers import Crossing, active_effects, evaluate
-from optics.mueller import Mueller, Slab, absorber, diattenuator, face, fresnel
+from optics.mueller import Mueller, Slab, diattenuator, face, fresnel
 
 STEPS = 24  # surfaces that a ray may pass
 GRAZE = 1e-4  # mm per mm of the coordinates: how far beyond a surface a ray goes on

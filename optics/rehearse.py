@@ -25,8 +25,9 @@ import numpy as np
 
 from optics import captures as capture_files, statistics as st
 from optics.errors import BadCapture
-from optics.parameter import Values, spaced
-from optics.verdict import CLEAR, LEVEL, MARGIN, percent
+from optics.parameter import Values
+from optics.verdict import CLEAR, LEVEL, MARGIN
+from optics.words import percent, spaced, table
 
 
 @dataclass(frozen=True)
@@ -53,12 +54,11 @@ class Rehearsal:
     unseen: list[str]
 
     def text(self) -> str:
-        width = max([len(r.effect) for r in self.rows], default=6)
         lines = [f"rehearsal: {self.frames} frames, every effect hidden in turn at a change of the pictures by {percent(self.change)}, in the "
-                 "camera's noise alone", f"{'effect':<{width}}  {'strength':>14}  noticed  first  named  most often taken for"]
-        for r in sorted(self.rows, key=lambda r: -r.named):
-            other = f"{r.mistaken_for} ({r.mistaken:.0%})" if r.mistaken_for else ""
-            lines.append(f"{r.effect:<{width}}  {f'{r.strength:.3g}{spaced(r.unit)}':>14}  {r.noticed:>6.0%}  {r.first:>5.0%}  {r.named:>5.0%}  {other}".rstrip())
+                 "camera's noise alone"]
+        lines.append(table([("effect", "strength", "noticed", "first", "named", "most often taken for")] + [
+            (r.effect, f"{r.strength:.3g}{spaced(r.unit)}", f"{r.noticed:.0%}", f"{r.first:.0%}", f"{r.named:.0%}",
+             f"{r.mistaken_for} ({r.mistaken:.0%})" if r.mistaken_for else "") for r in sorted(self.rows, key=lambda r: -r.named)], left=(0, 5)))
         if self.rows:
             lines.append(f"all: first in {np.mean([r.first for r in self.rows]):.0%}, named in {np.mean([r.named for r in self.rows]):.0%}; never "
                          f"named: {', '.join(r.effect for r in self.rows if r.named < 0.01) or 'none'}")

@@ -402,7 +402,6 @@ class Renderer:
         Light from all around varies slowly: it is gathered for every second pixel each way, over the area of the four,
         and interpolated linearly in between. The samples are the same for every geometry and LED of a seed.
         """
-        import drjit as dr
         import mitsuba as mi
         from scipy.ndimage import zoom
 

@@ -21,7 +21,7 @@ import numpy as np
 from optics.compare import UNITS, Comparison, Curve
 from optics.errors import OutputExists
 from optics.ladder import Fingerprint, Shown, Study
-from optics.parameter import spaced
+from optics.words import spaced
 
 BUDGET = 4_500_000  # bytes of embedded pictures; the page stays below 6 MB
 SIDE_MAX = 512  # px; larger frames are binned for display

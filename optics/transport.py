@@ -585,7 +585,6 @@ class Run:
         """Irradiance that a light at power 1 sends to a surface with nothing in between, from the point of it that a sample names: a
         panel's is cos_s Omega (of its solid angle), an LED's cos_l^mu cos_s/r^2."""
         import drjit as dr
-        import mitsuba as mi
 
         name = self.of.lights[light]
         part = self.scene.parts[name]
@@ -683,7 +682,6 @@ class Run:
 
     def _lit(self, s: dict, read: Callable, see_light: Callable) -> None:
         """What rays that ended on matt surfaces find there: light of the map, and light that comes straight."""
-        import drjit as dr
         import mitsuba as mi
 
         matt = s["ended"]

@@ -26,7 +26,7 @@ import numpy as np
 
 from optics.compare import plain
 from optics.errors import Underdetermined
-from optics.parameter import spaced
+from optics.words import p_text, percent, spaced, table, with_sd
 
 LEVEL = 0.01  # nominal level of the family-wise test and of the structure test
 CLEAR = 10.8  # chi2 between two effects at which the right one wins in 95 % of cases: Phi(sqrt(10.8)/2)
@@ -559,22 +559,6 @@ def ordered(curves: Sequence[Fingerprint]) -> list[Fingerprint]:
 # -- words ------------------------------------------------------------------------------------------------------------
 
 
-def p_text(p: float) -> str:
-    return "?" if math.isnan(p) else "<1e-9" if p < 1e-9 else f"{p:.1e}" if p < 1e-3 else f"{p:.2g}"
-
-
-def percent(x: float) -> str:
-    return "-" if x is None or not math.isfinite(x) else f"{100 * x:.3g} %"
-
-
-def with_sd(x: float, sd: float) -> str:
-    """0.3142, 0.0123 -> '0.314 +- 0.012': two digits of the standard deviation."""
-    if not (math.isfinite(sd) and sd > 0):
-        return f"{x:.3g}"
-    digits = max(0, 1 - math.floor(math.log10(sd)))
-    return f"{x:.{min(digits, 12)}f} +- {sd:.{min(digits, 12)}f}"
-
-
 def strength_text(values: Sequence[float], sds: Sequence[float], units: Sequence[str]) -> str:
     unit = spaced(units[0] if units else "")
     if len(values) == 1:
@@ -692,9 +676,7 @@ def _text(d: Diagnosis) -> str:
                      percent(r.survival), f"{r.refit.fall:.4g}" if r.refit else "-",
                      f"{r.confused_with} (.{min(int(100 * r.cos), 99):02d})" if r.confused_with else "-", note))
     if body:
-        widths = [max(len(line[i]) for line in [head, *body]) for i in range(len(head))]
-        lines += ["  ".join(cell.ljust(w) if i in (0, 3, 10, 11) else cell.rjust(w)
-                            for i, (cell, w) in enumerate(zip(line, widths))).rstrip() for line in [head, *body]]
+        lines.append(table([head, *body], left=(0, 3, 10, 11)))
     rest = [r for r in d.rows if r.p_family >= LEVEL]
     if rest:
         lines.append("no evidence; upper limits: " + ", ".join(limit_text(r) for r in rest))

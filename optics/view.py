@@ -30,8 +30,9 @@ import numpy as np
 from optics import calibrate, captures as capture_files, loop
 from optics.compare import led_label
 from optics.errors import UnknownKey
-from optics.parameter import Values, Variable, spaced
+from optics.parameter import Values, Variable
 from optics.report import DIVERGING, MASKED, SIGMA_RANGE, colour_bar, ramp
+from optics.words import spaced
 
 HOST = "127.0.0.1"
 PAGE = Path(__file__).with_name("view.html")

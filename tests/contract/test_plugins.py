@@ -6,7 +6,6 @@ the tests at the end can show that each of them notices what it is there for.
 
 from __future__ import annotations
 
-import fnmatch
 import math
 import re
 from dataclasses import replace

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from optics import captures as capture_files, cli, exr, mueller, scene
+from optics import captures as capture_files, exr, mueller, scene
 from optics.noise import Noise
 
 SMALL = ["-D", "width=48", "-D", "height=36"]

@@ -1,6 +1,5 @@
 """The tutorial of an effect that the library lacks, executed: puzzling residual, curve, table, formula, noise floor."""
 
-import json
 import runpy
 from pathlib import Path
 from types import SimpleNamespace

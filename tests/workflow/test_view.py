@@ -25,7 +25,6 @@ import pytest
 from optics import captures as capture_files, loop, scene
 from optics.ladder import Study, read_fit
 from optics.noise import Noise
-from optics.parameter import Values
 from optics.picture import Pictures
 from optics.view import Kept, Server, View
 
