@@ -89,9 +89,9 @@ def diagnose(model, fit, effects: Sequence[Effect], variables_of: Callable[[Effe
     splits = []
     if winner:
         for c in members[:MAX_SPLIT]:
-            own, p = _split(model, evidence, c, fits[c.effect.name], places, rows_max, seed, say)
+            own, p, clutter = _split(model, evidence, c, fits[c.effect.name], places, rows_max, seed, say)
             splits += own
-            c.row.refit = replace(c.row.refit, chance=p if math.isnan(p) else table.family.p(p))
+            c.row.refit = _scattered(c.row.refit, p if math.isnan(p) else table.family.p(p), clutter)
     levels = _held_out(model, fit, evidence, winner, fits, refit, held_out, variables_of, say)
     shifts = _shifts(model, fit, winner, fits) if winner else []
     findings = _findings(table, winner, done, members, fingerprints, splits, levels, basis, structure)
@@ -501,8 +501,8 @@ def _prior_chi2(model, values: Values, variables: Sequence[Variable]) -> float:
 
 
 def _split(model, evidence: Evidence, c: Candidate, found, places: list[dict], rows_max: int, seed: int,
-           say: Progress) -> tuple[list[Split], float]:
-    """Whether a fitted effect has the same strength in every part of the data, and `_chance` of its strength.
+           say: Progress) -> tuple[list[Split], float, np.ndarray]:
+    """Whether a fitted effect has the same strength in every part of the data, and `_scatter` of its strength.
 
     With the effect in the base, e, by which its picture differs from the one without it, is cut into parts e 1{part} and these are
     scored: a true effect gains nothing by being cut, a proxy does.
@@ -540,24 +540,35 @@ def _split(model, evidence: Evidence, c: Candidate, found, places: list[dict], r
         p = float(chdtrc(dof, fall))
         h = max(fall - dof, 0.0) * k / max(c.row.net_refit, 1e-9)
         results.append(Split(c.effect.name, by, labels, (1 + delta).tolist(), sd.tolist(), fall * k, dof, p, h, True))
-    level, chance = LEVEL / max(len(results), 1), _chance(own, calibrated, effect, change, places)
+    level, scatter = LEVEL / max(len(results), 1), _scatter(own, calibrated, effect, change, places)
     if c.row.refit.complete:  # nothing but noise is left, so that p means what it says, but for a hair of the fall
-        return [replace(s, holds=s.p >= level or s.h < HAIR) for s in results], chance
+        return [replace(s, holds=s.p >= level or s.h < HAIR) for s in results], *scatter
     left = c.row.refit.excess_sd * math.sqrt(2 * max(evidence.normal.count - evidence.projected.rank, 1))
-    return [replace(s, holds=s.p >= level or s.h <= UNEVEN and s.fall - s.dof * own.thinning <= SAME_PLACE * left) for s in results], chance
+    return [replace(s, holds=s.p >= level or s.h <= UNEVEN and s.fall - s.dof * own.thinning <= SAME_PLACE * left)
+            for s in results], *scatter
 
 
-def _chance(own: Evidence, calibrated: Sequence[int], effect: Sequence[int], change: np.ndarray, places: list[dict]) -> float:
-    """p of a strength that asks for no independent noise: by its scatter between parts of the sensor or session, as neighbours share clutter.
+def _scattered(refit: Refit, chance: float, clutter: np.ndarray) -> Refit:
+    """A refit with what the scatter of its strength says; where nothing is left but noise, its errors are those of noise."""
+    if refit.complete:
+        return replace(refit, chance=chance)
+    return replace(refit, chance=chance, clutter=clutter.tolist(),
+                   sd=np.sqrt(np.square(refit.sd) + np.maximum(np.diag(clutter), 0.0)).tolist())
 
-    With x the effect's images off the base, r what is left at the fit, u_g = sum of x r over the part g and B = sum of u_g u_g':
-    T2 = (V d)' B^-1 (V d), T2 (G - k)/(k (G - 1)) ~ F(k, G - k). NaN where there are too few parts.
+
+def _scatter(own: Evidence, calibrated: Sequence[int], effect: Sequence[int], change: np.ndarray, places: list[dict]) -> tuple[float, np.ndarray]:
+    """p of a strength that asks for no independent noise, by its scatter between parts of the sensor or session, as neighbours share
+    clutter; and the covariance that clutter adds to that of noise. The larger of what the maps say.
+
+    With x the effect's images off the base, V = x'x, r what is left at the fit, u_g = sum of x r over the part g and B = sum of u_g u_g':
+    T2 = (V d)' B^-1 (V d), T2 (G - k)/(k (G - 1)) ~ F(k, G - k), and V^-1 (B G/(G - 1) - V) V^-1. NaN and zero where there are too few parts.
 
     Source: Liang & Zeger, Longitudinal data analysis using generalized linear models, Biometrika 73, 13 (1986), the robust variance.
     """
     from scipy.stats import f as fisher
 
-    projected, worst = own.project(own.thinned(), calibrated, effect, own.thinning), math.nan
+    projected, worst, clutter = own.project(own.thinned(), calibrated, effect, own.thinning), math.nan, np.zeros((len(effect),) * 2)
+    covariance = st.inverse(projected.information)[0]
     for name in MAPS:
         if name not in places[0]:
             continue
@@ -580,7 +591,9 @@ def _chance(own: Evidence, calibrated: Sequence[int], effect: Sequence[int], cha
         score = projected.information @ change
         p = float(fisher.sf(score @ inverse @ score * (parts - k) / (k * (parts - 1)), k, parts - k))
         worst = p if math.isnan(worst) else max(p, worst)
-    return worst
+        more = covariance @ (parts / (parts - 1) * sums.T @ sums - projected.information) @ covariance
+        clutter = max(clutter, more, key=lambda c: float(np.trace(c @ projected.information)))
+    return worst, clutter
 
 
 def _parts(model, evidence: Evidence, places: list[dict]) -> dict[str, tuple[list[str], list[np.ndarray]]]:

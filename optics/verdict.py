@@ -64,7 +64,7 @@ class Refit:
     """An effect added in earnest, everything calibrated again.
 
     fall, predicted  of chi2, with the weights of the base model; ratio: fall / predicted
-    strength, sd     per variable, in its unit; at_bound: variables that ended at a bound
+    strength, sd     per variable, in its unit, with noise and `clutter`; at_bound: variables that ended at a bound
     excess_sd, structure_p   what is left with it: excess misfit, and the test of low-frequency structure
     """
 
@@ -82,6 +82,7 @@ class Refit:
     reason: str
     clear: float = math.nan  # of its strength from where it started, in standard deviations of all its variables together
     chance: float = math.nan  # family-wise p of its strength by the scatter between parts of the sensor or session; NaN: not asked, or too few
+    clutter: list[list[float]] = field(default_factory=list)  # covariance of the strengths by that scatter, beyond noise; it is in sd. Empty: none
 
     @property
     def complete(self) -> bool:

@@ -97,8 +97,13 @@ def _strengths(rig, model, cell: Cell, d: Diagnosis) -> dict[str, list[float]]:
     w = np.array([weights.get(name, 0.0) for name in names])
     value = sum(weight * value_of(model, fit.values, fit.variables[names.index(key)]) for key, weight in weights.items())
     own = np.flatnonzero(w)
-    sd = math.sqrt(max(float(w[own] @ np.asarray(fit.covariance)[np.ix_(own, own)] @ w[own]), 0.0))
-    return {d.claimed: [value - neutral, sd]}
+    variance = max(float(w[own] @ np.asarray(fit.covariance)[np.ix_(own, own)] @ w[own]), 0.0)
+    row = d.row(d.claimed)
+    if row.refit.clutter:
+        key = {v.name: v.keys[0] for v in fit.variables}
+        w = np.array([weights.get(key[name], 0.0) for name in row.variables])
+        variance += max(float(w @ np.array(row.refit.clutter) @ w), 0.0)
+    return {d.claimed: [value - neutral, math.sqrt(variance)]}
 
 
 def take_up(file: Path) -> dict | None:
