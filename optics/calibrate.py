@@ -432,8 +432,10 @@ def fit(model, variables: Sequence[Variable], start: Values | None = None, frame
     if descent.at is not descent.theta:  # the last steps moved on from where the derivative images were made
         normal = descent.linearise()
     theta, converged = descent.theta, reason.startswith("converged")
-    result = Fit(descent.values, variables, theta, covariance_of(normal.a), normal.chi2,
-                 sum(normal.frame_n) - len(variables) + sum(v.prior is not None for v in variables), frames,
+    covariance = covariance_of(normal.a)
+    # of variables with priors, the degrees of freedom that these and not the data hold: sum of c_ii/sd_i^2
+    held = sum(float(np.clip(c / v.prior[1] ** 2, 0.0, 1.0)) for v, c in zip(variables, np.diag(covariance)) if v.prior is not None)
+    result = Fit(descent.values, variables, theta, covariance, normal.chi2, round(sum(normal.frame_n) - len(variables) + held), frames,
                  normal.frame_chi2, normal.frame_n, converged, reason, history, start=first)
     result.at_bound = [v.name for v, t, lo, hi in zip(variables, theta, descent.low, descent.high) if t <= lo or t >= hi]
     result.warnings = warnings_of(result, normal.a)

@@ -45,6 +45,7 @@ class Frame:
     repeats: list[np.ndarray] = field(default_factory=list)  # same settings, same shape
     file: str = ""
     readings: dict[str, np.ndarray] = field(default_factory=dict)  # of a sweep: (N, 1, 1) settings of each reading, by key
+    rows: np.ndarray | None = None  # of a sweep: (N, 1, 1) row of the table that each reading stands in, as it was recorded
 
 
 @dataclass
@@ -269,7 +270,7 @@ def sweeps(captures: Captures, parameters: Mapping[str, Parameter], lights: Sequ
             image = np.concatenate([captures.frames[i].image for i in mine])
             name = f"readings {mine[0]} ... {mine[-1]}" if len(mine) > 1 else f"reading {mine[0]}"
             frames.append(Frame(name, image, None, None, {k: v for k, v in own.items() if k not in moving}, [],
-                                captures.frames[mine[0]].file, readings))
+                                captures.frames[mine[0]].file, readings, np.array(mine, float).reshape(-1, 1, 1)))
     return replace(captures, frames=frames, warnings=list(captures.warnings))
 
 

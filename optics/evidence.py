@@ -143,7 +143,7 @@ class Evidence:
     sigma: list[np.ndarray]
     whitened: list[np.ndarray]  # (H, W, C) float32, zero outside the mask
     use: list[np.ndarray]
-    spectrum: st.Spectrum
+    spectrum: st.Spectrum | st.Sweeps
     precision: np.ndarray
     pull: np.ndarray
     thinning: int
@@ -237,7 +237,8 @@ def measure(model, values: Values, base: Sequence[Variable], candidates: Sequenc
         mask = model.usable(frame)
         total, used = total + getattr(model, "size", mask.size), used + int(mask.sum())
     k = st.thinning(used, rows_max)
-    normal, spectrum = st.Normal(len(columns)), st.Spectrum(len(columns))
+    sweeps = all(getattr(model.frames[f], "readings", None) for f in frames)
+    normal, spectrum = st.Normal(len(columns)), st.Sweeps() if sweeps else st.Spectrum(len(columns))
     evidence = Evidence(columns, list(range(len(base))), list(range(len(base), len(columns))), values, normal, [],
                         list(frames), [], [], [], spectrum, *_priors(model, values, base), k, 0, 0.0, 0.0, 0.0, 0.0, seeds[0])
     noisy: set[int] = set()
@@ -314,7 +315,10 @@ def _add_frame(evidence: Evidence, model, frame: int, n: int, prediction, other,
     b = stack(second) if noisy else None
     whitened = np.where(good, (image - prediction) * weight, 0.0)
     evidence.normal.add(where, a[good], whitened[good], None if b is None else b[good])
-    evidence.spectrum.add(good, where, a)
+    if isinstance(evidence.spectrum, st.Sweeps):
+        evidence.spectrum.add(good, where, a, _swept(model.frames[frame], prediction))
+    else:
+        evidence.spectrum.add(good, where, a)
     keep = good & st.lattice(image.shape, evidence.thinning, n)
     evidence.blocks.append(Block(
         frame, where, a[keep], None if b is None else b[keep], whitened[keep], 1 / weight[keep], np.asarray(other, float)[keep],
@@ -322,6 +326,12 @@ def _add_frame(evidence: Evidence, model, frame: int, n: int, prediction, other,
     evidence.use.append(good)
     evidence.sigma.append(np.where(good, np.sqrt(variance), np.inf).astype(np.float32))
     evidence.whitened.append(whitened.astype(np.float32))
+
+
+def _swept(sweep, prediction: np.ndarray) -> dict[str, np.ndarray]:
+    """What tells the readings of a sweep apart: when, how bright, and what was set, which may be the same within one sweep."""
+    still = {k: np.full(1, v) for k, v in sweep.parameters.items() if isinstance(v, float)}
+    return {"reading": sweep.rows, "signal": prediction, **still, **sweep.readings}
 
 
 def _dilated(mask: np.ndarray) -> np.ndarray:

@@ -71,15 +71,15 @@ def places(model, values: Values, evidence: Evidence) -> list[dict[str, np.ndarr
                 continue
             plane = np.broadcast_to(plane if plane.ndim == 3 else plane[..., None], shape)
             known[name] = plane.reshape(-1)[block.index].astype(np.float32)
-        known.update({"reading": row.astype(np.float32)} if table else
-                     {"row": row.astype(np.float32), "column": column.astype(np.float32)})
+        if not table:
+            known.update(row=row.astype(np.float32), column=column.astype(np.float32),
+                         quadrant=(2 * (2 * row >= shape[0]) + (2 * column >= shape[1])).astype(np.float32))
         known.update(channel=channel.astype(np.float32), frame=np.full(len(row), order[block.frame], np.float32))
         known.update({key: np.full(len(row), numbers[order[block.frame]], np.float32) for key, numbers in turned.items()})
         if len(kinds) > 1:
             known["LED"] = np.full(len(row), kinds.index(lights[order[block.frame]]), np.float32)
         if min(shape[:2]) >= 2 * SIDE:
             known["place"] = (row * SIDE // shape[0] * SIDE + column * SIDE // shape[1]).astype(np.float32)
-        known["quadrant"] = (2 * (2 * row >= shape[0]) + (2 * column >= shape[1])).astype(np.float32)
         found.append(known)
     return found
 

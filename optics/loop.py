@@ -32,6 +32,7 @@ Progress = Callable[[str, int, int], None]
 POSE = ("press_x", "press_y", "press_depth")  # what is solved for per press, unless the user says otherwise
 POSE_SD = 0.05  # mm: how well a stage usually knows it
 CHANCE = 0.3  # of the noise: error of a prediction that is followed by chance, below which it adds less than 5 % to the noise
+GAUGE = 10.0  # plausible sizes: how far what no data hold may be from the scene's value
 
 
 @dataclass
@@ -167,7 +168,10 @@ def effects_of(study: Study) -> list[Effect]:
 
 
 def effect_variables(model: Model, effect: Effect) -> list[Variable]:
-    return model.scene.variables_of(effect, len(model.frames))
+    """What adding an effect frees. Of several strengths a common part may show nowhere, such as the gain of all frames: where no data
+    hold it, it stays where the scene has it, by a prior GAUGE times what is plausible, which data that do hold it outweigh."""
+    found = model.scene.variables_of(effect, len(model.frames))
+    return [v.with_prior(model.base[v.keys[0]], GAUGE * v.parameter.plausible) for v in found] if len(found) > 1 else found
 
 
 def fit_base(model: Model, variables: Sequence[Variable], fitted: Sequence[int], start: Values,

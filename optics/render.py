@@ -928,12 +928,12 @@ class Model:
                 "gel_path": np.array(gel.number("thickness") + p[..., 2]) / np.maximum(np.cos(np.radians(emission)), 1e-3),
             })
         known["far"] = ~(known.get("contact", shadow) | known["rim"] | shadow) & hits.valid
-        readings = self.frames[index].readings
         if self.captures.table is None:
             return known
-        count = self.frames[index].image.shape[0]  # of one place: only what is set tells readings apart
-        return {"intensity": np.broadcast_to(known["intensity"], (count, 1)), "far": np.ones((count, 1), bool),
-                "frame": np.full((count, 1), float(index)), **{k: v[..., 0] for k, v in readings.items()}}
+        frame = self.frames[index]
+        count = frame.image.shape[0]  # of one place: only what is set, and when it was read, tells readings apart
+        return {"intensity": np.broadcast_to(known["intensity"], (count, 1)), "far": np.ones((count, 1), bool), "reading": frame.rows[..., 0],
+                "frame": np.full((count, 1), float(index)), **{k: v[..., 0] for k, v in frame.readings.items()}}
 
 
 def _creases(normal: np.ndarray) -> np.ndarray:

@@ -20,7 +20,7 @@ Inference (2005); errors in variables: Fuller, Measurement Error Models (1987).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 
@@ -487,6 +487,59 @@ class Spectrum:
         mean_high = high / dof_high
         f = low / expected / max(mean_high, 1e-300)
         return Structure(f, float(fdtrc(dof_low, dof_high, f)), dof_low, dof_high, mean_high)
+
+
+class Sweeps:
+    """Of readings, as `Spectrum` of images: power of whitened residuals in the NARROW lowest cosines along what was swept, against the rest.
+
+    Along each coordinate in turn, by the ranks of its values; what a calibration takes is projected off, so that F is exactly F-distributed
+    in white noise of any size. p is that of the best coordinate times their number.
+    """
+
+    def __init__(self):
+        self.parts: list[tuple] = []
+
+    def add(self, use: np.ndarray, where: Sequence[int], columns: np.ndarray, along: Mapping[str, np.ndarray]) -> None:
+        """Add a sweep: as in `Spectrum`, and along: {coordinate: value of each reading, (N, 1, 1)}."""
+        self.parts.append((use, np.asarray(where, int), columns[use], {k: np.broadcast_to(x, use.shape)[use] for k, x in along.items()}))
+
+    def test(self, residuals: Sequence[np.ndarray], base: Sequence[int], inverse_gram: np.ndarray) -> Structure:
+        """As of `Spectrum`; `high` is NaN: neighbours among readings share nothing that pixels do."""
+        from scipy.special import fdtrc
+        from scipy.stats import rankdata
+
+        r = np.concatenate([residual[use] for residual, (use, *_) in zip(residuals, self.parts)]).astype(float)
+        calibrated = np.zeros((len(r), len(base)))
+        for (use, where, columns, _), end in zip(self.parts, np.cumsum([use.sum() for use, *_ in self.parts])):
+            here = [(i, int(np.flatnonzero(where == c)[0])) for i, c in enumerate(base) if c in where]
+            calibrated[end - use.sum():end, [i for i, _ in here]] = columns[:, [j for _, j in here]]
+        taken = _orthonormal(calibrated)
+        r -= taken @ (taken.T @ r)
+        found = []
+        for name in sorted(set.intersection(*[set(along) for *_, along in self.parts])):
+            x = np.concatenate([along[name] for *_, along in self.parts])
+            count = min(NARROW, len(np.unique(x)) - 1, len(x) // 4)
+            slow = _orthonormal(np.cos(np.pi * np.outer((rankdata(x) - 0.5) / len(x), np.arange(1, count + 1))))
+            left, s, _ = np.linalg.svd(slow - taken @ (taken.T @ slow), full_matrices=False)
+            basis = left[:, s**2 > VISIBLE]
+            low, free = basis.shape[1], len(r) - taken.shape[1] - basis.shape[1]
+            if low and free >= len(r) // 4:
+                power = float(np.sum((basis.T @ r) ** 2))
+                f = power / low / max((float(r @ r) - power) / free, 1e-300)
+                found.append((float(fdtrc(low, free, f)), f, low, free))
+        if not found:
+            return Structure(*[float("nan")] * 5)
+        p, f, low, free = min(found)
+        return Structure(f, min(1.0, p * len(found)), low, free, float("nan"))
+
+
+def _orthonormal(columns: np.ndarray) -> np.ndarray:
+    """A basis of what columns of any units span."""
+    length = np.linalg.norm(columns, axis=0)
+    if not length.any():
+        return np.zeros((len(columns), 0))
+    u, s, _ = np.linalg.svd(columns[:, length > 0] / length[length > 0], full_matrices=False)
+    return u[:, s > 1e-6 * s.max(initial=0.0)]
 
 
 # -- thinning ---------------------------------------------------------------------------------------------------------

@@ -310,6 +310,37 @@ def test_white_noise_has_no_structure_whatever_its_size_and_mask():
     assert high == pytest.approx(0.64, rel=0.2)
 
 
+def sweeps(rng, count=126, parts=6):
+    """Readings in turn in `parts` sweeps: a power and an offset are calibrated; an angle, a lamp of two powers, and time were swept."""
+    time, angle, power = np.arange(count) * 1.0, rng.permutation(np.repeat(np.arange(0, 180, 20.0), count // 9)), np.arange(count) % 2.0
+    columns = np.stack([np.cos(np.radians(angle)) ** 2 * (1 + power), np.ones(count)], -1)
+    found, of = st.Sweeps(), [np.arange(k, count, parts) for k in range(parts)]
+    for rows in of:
+        along = {name: x[rows].reshape(-1, 1, 1) for name, x in (("time", time), ("angle", angle), ("power", power))}
+        found.add(np.ones((len(rows), 1, 1), bool), [0, 1], columns[rows].reshape(-1, 1, 1, 2), along)
+    off = np.eye(count) - columns @ np.linalg.pinv(columns)
+    return lambda r: found.test([(off @ r)[rows].reshape(-1, 1, 1) for rows in of], [0, 1], np.zeros((2, 2))), time, angle
+
+
+def test_readings_without_structure_have_none_whatever_their_noise():
+    """Bonferroni over three coordinates: never more often than nominal (3 sd of 600), and not much less, as they hardly share anything."""
+    rng = np.random.default_rng(15)
+    test, _, _ = sweeps(rng)
+    p = np.array([test(3.0 * rng.standard_normal(126)).p for _ in range(600)])
+    assert 0.02 < np.mean(p < 0.05) < 0.077
+    assert np.mean(p < 0.01) < 0.022
+
+
+@pytest.mark.parametrize("shape", ["drift", "ripple", "tone"])
+def test_structure_of_readings_is_found_along_what_was_swept(shape):
+    """Of 0.7 of the noise: 62 in chi2, in 8 cosines, where noise gives 8."""
+    rng = np.random.default_rng(16)
+    test, time, angle = sweeps(rng)
+    image = {"drift": np.exp(-time / 30), "ripple": np.sin(time / 10), "tone": np.cos(np.radians(3 * angle))}[shape]
+    image = 0.7 * image / image.std()
+    assert np.mean([test(image + rng.standard_normal(126)).p < 0.01 for _ in range(100)]) > 0.9
+
+
 def test_smooth_structure_is_found_and_calibrated_columns_are_counted():
     rng = np.random.default_rng(13)
     use = np.ones((32, 32, 1), bool)
