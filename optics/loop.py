@@ -11,6 +11,7 @@ Every step is a folder of the study (optics.ladder), and each can be taken up ag
 from __future__ import annotations
 
 import json
+import re
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
@@ -20,18 +21,21 @@ from pathlib import Path
 import numpy as np
 
 from optics import calibrate, captures as capture_files, ladder, scene as scenes
-from optics.compare import Comparison, compare
+from optics.compare import Comparison, Row, compare
 from optics.effect import Effect, registry
 from optics.errors import BadCapture, Underdetermined, UnknownKey
 from optics.ladder import Study
 from optics.parameter import Values, Variable
 from optics.render import Model
+from optics.words import spaced
 
 Progress = Callable[[str, int, int], None]
 
 POSE = ("press_x", "press_y", "press_depth")  # what is solved for per press, unless the user says otherwise
 POSE_SD = 0.05  # mm: how well a stage usually knows it
 CHANCE = 0.3  # of the noise: error of a prediction that is followed by chance, below which it adds less than 5 % to the noise
+ASPECT = 0.02  # by which the sides of images may be in another ratio than the scene's
+FAR = 0.3  # misfit over mean signal: beyond what any effect of a sensor does
 GAUGE = 10.0  # plausible sizes: how far what no data hold may be from the scene's value
 
 
@@ -89,10 +93,14 @@ def open_model(setup: Setup, model_class: type = Model) -> Model:
     path = scenes.find(found.scene)
     defines = dict(setup.defines)
     height, width = found.frames[0].image.shape[:2]
-    text = path.read_text(encoding="utf-8")
+    usual = dict(re.findall(r'<default name="(width|height)" value="(\d+)"', path.read_text(encoding="utf-8")))
     for name, size in (("width", width), ("height", height)):
-        if f'<default name="{name}"' in text:
+        if name in usual:
             defines.setdefault(name, str(size))
+    if found.table is None and len(usual) == 2 and abs(width * int(usual["height"]) / (height * int(usual["width"])) - 1) > ASPECT:
+        found.warnings.append(f"the images are {width} x {height} px, the scene's own are {usual['width']} x {usual['height']}: cut or turned "
+                              "pictures show another part of the sensor than the scene's camera; give them whole, row 0 at the top, or "
+                              "write x_fov and principal point of what is left into the scene")
     plugins = plugins_of(setup)
     loaded = scenes.load(path, defines, plugins=plugins if setup.plugins or plugins.is_dir() else None)
     capture_files.check(found, loaded.parameters)
@@ -258,7 +266,7 @@ def _warnings(model: Model) -> list[str]:
     from optics.noise import warnings_of
     from optics.picture import veiled
 
-    texts = [*model.captures.warnings, *warnings_of(model.noise, model.captures)]
+    texts = [*model.captures.warnings, *warnings_of(model.noise, model.captures), *_unnamed(model)]
     if model.renderer.layered and model.captures.table is None and (what := veiled(model.renderer, model.at(Values(), 0))):
         texts.append(f"the model leaves out light that comes through layers: {what}")
     if model.by_chance and (share := model.chance()) > CHANCE:
@@ -268,11 +276,39 @@ def _warnings(model: Model) -> list[str]:
     return list(dict.fromkeys(texts))
 
 
+def _unnamed(model: Model) -> list[str]:
+    """Lights that some frames set and others leave to the scene, which has them on."""
+    own = [{*f.parameters, *f.readings} for f in model.frames]
+    left = {key: i for key in (f"{n}.power" for n in model.scene.lights) if model.base[key] and any(key in keys for keys in own)
+            for i, keys in enumerate(own) if key not in keys}
+    if not left:
+        return []
+    key, frame = next(iter(left.items()))
+    return [f"{', '.join(left)}: set in some frames and not in others, such as '{model.frames[frame].name}', where {key} is the scene's "
+            f"{model.base[key]:g}; write 0 where a light was off"]
+
+
+def _far(model: Model, found: calibrate.Fit, level: Row) -> list[str]:
+    """What no effect explains: a model that is nowhere near its images, or values far from what is known of them."""
+    texts, where = [], "units, LEDs that were off, black_level, and that pictures are whole with row 0 at the top"
+    if level.rms > FAR * level.signal:
+        texts.append(f"the model misses the images by {level.rms / max(level.signal, 1e-9):.0%} of its own mean, which is no matter of effects: check {where}")
+    moved = [(v, found.values.get(v, model.base)) for v in found.variables if v.prior is not None]
+    moved = [(v, value) for v, value in moved if abs(value - v.prior[0]) > 3 * v.prior[1]]
+    if moved:
+        v, value = max(moved, key=lambda t: abs(t[1] - t[0].prior[0]) / t[0].prior[1])
+        texts.append(f"{', '.join(v.name for v, _ in moved[:4])}{f' and {len(moved) - 4} more' if len(moved) > 4 else ''}: calibrated to more than "
+                     f"3 sd from what is known, most {v.name}: {value:.4g}{spaced(v.parameter.unit)} for {v.prior[0]:.4g} +- {v.prior[1]:g}; "
+                     f"check {where}")
+    return texts
+
+
 def record(study: Study, model: Model, name: str, effect: Effect | None, found: calibrate.Fit,
            held: Sequence[int], seconds: float) -> Comparison:
     """Write a calibrated model down as the next step of the study."""
     values, extra = held_out_values(model, found, held)
     comparison = comparison_of(model, values, held, len(found.variables), extra)
+    found.warnings += _far(model, found, comparison.fitted)
     everywhere = Values(dict(found.values.common), {**values.frame, **found.values.frame})
     kept = calibrate.Fit(**{**found.__dict__, "values": everywhere})
     study.add_step(name, effect.key if effect else None, kept, comparison,
