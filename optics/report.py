@@ -57,7 +57,7 @@ def report(study_folder: str | Path, out: str | Path, *, overwrite: bool = False
     out = Path(out)
     out = out / "report.html" if out.is_dir() or not out.suffix else out
     if out.exists() and not overwrite:
-        raise OutputExists(f"{out} exists; name another file or allow it to be replaced")
+        raise OutputExists(f"{out} exists; name another file, or --force to replace it")
     html = render(Study.open(study_folder))
     out.parent.mkdir(parents=True, exist_ok=True)
     temporary = out.with_name(f".{out.name}.{os.getpid()}")
@@ -216,7 +216,7 @@ def measure(value, sd) -> str:
     places = max(0, 1 - math.floor(math.log10(sd)))
     if places > 7 or sd >= 1e5:
         return f"{number(value, 4)} ± {number(sd, 2)}"
-    return f"{value:.{places}f} ± {sd:.{places}f}".replace("-", "−")
+    return f"{round(value, places) + 0.0:.{places}f} ± {sd:.{places}f}".replace("-", "−")
 
 
 def percent(value, digits: int = 3) -> str:
@@ -644,7 +644,7 @@ def ladder_chart(study: Study, width: int, height: int, nouns: Mapping[str, str]
                      f'<text class="tick" x="{left - 7}" y="{at + 4:.1f}" text-anchor="end">{number(tick)}</text>')
     dof = max([_value(s["held_out"] or s["fitted"], "dof") for s in steps[-1:]] + [1.0])
     spread = 2 * math.sqrt(2 / dof) if math.isfinite(dof) else 0.0
-    up, down = y(math.log(floor * (1 + spread))), y(math.log(floor * max(1 - spread, 1e-3)))
+    up, down = y(min(math.log(floor * (1 + spread)), math.log(high))), y(math.log(max(floor * (1 - spread), low)))
     at = y(math.log(floor))
     parts.append(f'<rect class="floorband" x="{left}" width="{width - left - right}" y="{up:.1f}" '
                  f'height="{max(down - up, 0.5):.1f}"/>'

@@ -20,7 +20,7 @@ from optics.errors import BadCapture, OutputExists
 from optics.ladder import Fingerprint, Shown, Study, read_fit
 from optics.nulls import PHYSICAL, NullTable, Score
 from optics.parameter import Parameter, Values, Variable
-from optics.report import number, report
+from optics.report import ladder_chart, number, report
 
 LEDS = {"led_red": (0.95, -0.31), "led_green": (-0.2, 0.98), "led_blue": (-0.75, -0.66)}
 TRUTH = {"camera.vignetting": 0.31, "gel.absorption": 0.06}
@@ -285,6 +285,13 @@ def test_ladder_falls_to_the_noise_floor(studied):
     assert "02 + gel absorption" in text and "noise floor: chi2/dof 1.000" in text
 
 
+def test_the_noise_band_of_few_readings_stays_within_its_chart():
+    steps = [{"name": "base", "effect": None, "fitted": {"chi2_per_dof": 2.0, "dof": 20}, "held_out": {"chi2_per_dof": 1.7, "dof": 6}}]
+    study = SimpleNamespace(steps=steps, record={"noise_floor": {"chi2_per_dof": 1.0}})
+    top, height = map(float, re.search(r'floorband".*? y="([\d.]+)" height="([\d.]+)"', ladder_chart(study, 900, 340)).groups())
+    assert 34 <= top and top + height <= 340 - 62 + 0.1  # chi2/dof of 6 readings scatters by 58 %, twice that goes below the axis
+
+
 def test_step_folder_can_be_read_without_this_program(studied):
     study, _ = studied
     step = study.folder / "steps" / "01-lens-vignetting"
@@ -313,7 +320,7 @@ def test_nothing_is_overwritten(studied, tmp_path):
     with pytest.raises(OutputExists, match="has a step already"):
         study.add_step("base", None, {}, study.comparison(0))
     (tmp_path / "taken.html").write_text("mine")
-    with pytest.raises(OutputExists, match="allow it to be replaced"):
+    with pytest.raises(OutputExists, match="or --force to replace it"):
         report(study.folder, tmp_path / "taken.html")
     assert (tmp_path / "taken.html").read_text() == "mine"
     (tmp_path / "notes").mkdir()
