@@ -21,7 +21,7 @@ import numpy as np
 from optics import checks, readings
 from optics.errors import BadCapture, OutputExists, UnknownKey
 from optics.images import SUFFIXES, read_image, read_mask, write_image
-from optics.noise import DEMOSAICED, UNITS, Noise, step_of
+from optics.noise import DEMOSAICED, SATURATED, UNITS, Noise, step_of
 from optics.parameter import Parameter
 
 FILE = "captures.toml"
@@ -202,6 +202,32 @@ def _check_levels(captures: Captures, where: str) -> None:
         if np.all(values >= top):
             raise BadCapture(f"{where}: {what}: all saturated, every value used is >= {top:g} DN; allowed: some values below; "
                              "remove it or expose it shorter")
+    if captures.noise is not None and not any(_lit(captures, f).any() for f in captures.frames):
+        raise BadCapture(f"{where}: {_unusable(captures)}")
+
+
+def _lit(captures: Captures, frame: Frame) -> np.ndarray:
+    """(H, W, C) values that say something of the light: not masked, not saturated, above black level."""
+    use = captures.noise.usable(frame.image) & (frame.image > captures.noise.black_level)
+    return use if frame.mask is None else use & frame.mask[..., None]
+
+
+def _unusable(captures: Captures) -> str:
+    """Why not one value of a set can be used, and what to do."""
+    noise, masked, bright, dark = captures.noise, 0, 0, 0
+    for f in captures.frames:
+        use = np.broadcast_to(True if f.mask is None else f.mask[..., None], f.image.shape)
+        masked += np.sum(~use)
+        bright += np.sum(use & (f.image > noise.black_level) & ~noise.usable(f.image))
+        dark += np.sum(use & (f.image <= noise.black_level))
+    low, high = min(f.image.min() for f in captures.frames), max(f.image.max() for f in captures.frames)
+    cut = "" if noise.pedestal else " or within 3 sigma of 0 (there is no pedestal)"
+    why = [f"{count} {what}" for count, what in (
+        (dark, f"not above black_level = {noise.black_level:g} DN"),
+        (bright, f"beside or above {SATURATED:.0%} of saturation = {noise.saturation:g} DN{cut}"), (masked, "masked")) if count]
+    files = list(dict.fromkeys(f.file for f in captures.frames))
+    return (f"none of the {dark + bright + masked} values of '{files[0]}'{' ...' if len(files) > 1 else ''} ({low:g} to {high:g}) is usable: "
+            f"{', '.join(why)}; allowed: raw DN (no volts, no 0 to 1) between these levels; correct [noise], the masks or the exposure")
 
 
 def _read_table(folder: Path, data: object, where: str) -> tuple[Table, list[Frame]]:
@@ -230,7 +256,9 @@ def check(captures: Captures, parameters: Mapping[str, Parameter]) -> None:
     for where, settings in places:
         for key, value in settings.items():
             if key not in parameters:
-                raise UnknownKey(key, parameters, "parameter", where, "; `optics params SCENE` lists them")
+                raise UnknownKey(key, parameters, "parameter", where, "`optics params SCENE` lists them" + (
+                    f"; rename = {{ \"{key}\" = \"KEY\" }} under [table] of {FILE} gives a column its key"
+                    if captures.table is not None and settings is not captures.parameters else ""))
             parameters[key].check(value, key, where)
 
 

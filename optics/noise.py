@@ -107,9 +107,10 @@ def estimate(captures: Captures, black_level: float | None = None, saturation: f
     black_level  DN; None: the mean of dark frames with repeats (every `*.power` or `*.exposure` that is set is 0)
     saturation   DN; None: full scale of the smallest converter (8, 10, 12, 14, 16 bit) that holds the values
     """
+    here = f"{captures.folder}/captures.toml"
     repeated = [frame for frame in captures.frames if frame.repeats]
     if not repeated:
-        raise Underdetermined("noise: no frame has repeats; add `repeats` at six exposures or more, or give [noise]")
+        raise Underdetermined(f"{here}: noise: no frame has repeats; add `repeats` at six exposures or more, or give [noise]")
     stacks = [np.stack([f.image, *f.repeats]).astype(float) for f in repeated]
     masks = [np.broadcast_to(True if f.mask is None else f.mask[..., None], f.image.shape) for f in repeated]
     lights = [[value for key, value in {**captures.parameters, **f.parameters}.items()
@@ -120,14 +121,14 @@ def estimate(captures: Captures, black_level: float | None = None, saturation: f
         top = max(float(image.max()) for f in captures.frames for image in (f.image, *f.repeats))
         saturation = next(((2**n - 1) * step for n in (8, 10, 12, 14, 16) if (2**n - 1) * step >= top), None)
         if not saturation:
-            raise Underdetermined(f"noise: values to {top:g} DN, step {step:g} DN, fit no converter; give saturation in DN")
+            raise Underdetermined(f"{here}: noise: values to {top:g} DN, step {step:g} DN, fit no converter; give saturation in DN")
     if black_level is None:
         if not any(dark):
-            raise Underdetermined("noise: lit frames cannot tell the black level from dark noise; add repeats of a dark "
+            raise Underdetermined(f"{here}: noise: lit frames cannot tell the black level from dark noise; add repeats of a dark "
                                   "frame (every power 0), or give the black level in DN")
         values = np.concatenate([stack[:, mask].ravel() for stack, mask, d in zip(stacks, masks, dark) if d])
         if np.mean(values <= 0) > 0.005:  # as from a pedestal below 2.6 sigma
-            raise Underdetermined(f"noise: {np.mean(values <= 0):.1%} of the dark values are clipped at 0 DN; set a pedestal "
+            raise Underdetermined(f"{here}: noise: {np.mean(values <= 0):.1%} of the dark values are clipped at 0 DN; set a pedestal "
                                   "in the camera, or give the black level in DN")
         black_level = float(values.mean())
     parts = [_levels(stack, mask & (stack.mean(0) < 0.9 * saturation)) for stack, mask in zip(stacks, masks)]
@@ -135,13 +136,13 @@ def estimate(captures: Captures, black_level: float | None = None, saturation: f
     keep = (variance > DITHERED * step**2) & (mean >= 3 * np.sqrt(variance))  # neither hidden by the step nor cut at 0
     few = "; add repeats at six exposures or more, from dark to 90 % of saturation"
     if keep.sum() < 3:
-        raise Underdetermined(f"noise: {keep.sum()} signal levels can be used, 3 are needed" + few)
+        raise Underdetermined(f"{here}: noise: {keep.sum()} signal levels can be used, 3 are needed" + few)
     (gain, floor), covariance = photon_transfer(mean[keep] - black_level, variance[keep], weight[keep])
     gain_sd, floor_sd = np.sqrt(np.diag(covariance))
     if gain < 10 * gain_sd:
-        raise Underdetermined(f"noise: system_gain {gain:.3g} +- {gain_sd:.2g} DN per electron; needed to 10 %" + few)
+        raise Underdetermined(f"{here}: noise: system_gain {gain:.3g} +- {gain_sd:.2g} DN per electron; needed to 10 %" + few)
     if floor - step**2 / 12 < -3 * floor_sd:
-        raise Underdetermined(f"noise: variance {floor:.3g} DN^2 at black level {black_level:g} DN: the black level is too low "
+        raise Underdetermined(f"{here}: noise: variance {floor:.3g} DN^2 at black level {black_level:g} DN: the black level is too low "
                               "or the response is bent; give the black level, and raw frames")
     noise = Noise(float(gain), math.sqrt(max(floor - step**2 / 12, 0.0)), black_level, saturation, 0.0, step)
     stride = 2 if captures.cfa else 1  # to the next pixel of the same colour

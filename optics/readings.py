@@ -25,15 +25,17 @@ def read(file: Path, values: Sequence[str], rename: Mapping[str, str], scale: Ma
     if len(rows) < 2:
         raise BadCapture(f"{file}: zero frames; allowed: a line of column names, then a row per frame, with commas")
     columns = [column.strip() for column in rows[0]]
+    if len(columns) == 1 and (found := next((mark for mark in ";\t" if mark in rows[0][0]), None)):
+        raise BadCapture(f"{file}: its cells are separated by {found!r}; allowed: commas, and points in decimal numbers; save it as such")
     for column in rename:
         if column not in columns:
-            raise UnknownKey(column, columns, "column", f"{where}: rename", f"in {file.name}")
+            raise UnknownKey(column, columns, "column", f"{where}: rename", f"the columns of {file}, before rename")
     columns = [rename.get(column, column) for column in columns]
     settings = [column for column in columns if column not in values]
     for what, wanted, known in (("values", values, columns), ("scale", scale, settings)):
         for column in wanted:
             if column not in known:
-                raise UnknownKey(column, known, "column", f"{where}: {what}", f"in {file.name} (after rename)")
+                raise UnknownKey(column, known, "column", f"{where}: {what}", f"the columns of {file}, after rename")
     if len(set(columns)) < len(columns) or len(set(values)) < len(values) or "" in columns:
         raise BadCapture(f"{file}: columns {columns}, values {list(values)}; allowed: each name once, none empty; rename one")
     found = []

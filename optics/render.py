@@ -550,8 +550,12 @@ class Model:
                 f"-D width={width} -D height={height}")
         self.developer = Developer(scene.camera, scene.integrator.bands or (0.0,), noise.black_level, noise.saturation)
         if self.developer.matrix.shape[0] != self.shape[2]:
-            raise BadScene(f"{captures.folder}: images have {self.shape[2]} channels, the scene's camera "
-                           f"{self.developer.matrix.shape[0]}")
+            channels, wanted, first = self.shape[2], self.developer.matrix.shape[0], captures.frames[0].file
+            raise BadScene(f"{captures.folder / 'captures.toml'}: '{first}' has channels: {channels}, the camera of the scene '{captures.scene}' has "
+                           f"{wanted}; allowed: {wanted}, " + (
+                               "a column of `values` for each" if captures.table is not None else
+                               "or one with cfa = \"RGGB\" (or its like) if it is a raw mosaic; or take a scene whose integrator names one band"
+                               if channels == 1 else "one for each band of the scene's integrator"))
         if flat_field not in (True, False, None, *FLAT_FIELDS):
             raise UnknownKey(str(flat_field), FLAT_FIELDS, "flat-field mode")
         self.flat_field = {True: FLAT_FIELDS[0], False: None, "none": None}.get(flat_field, flat_field)

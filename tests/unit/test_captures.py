@@ -253,7 +253,7 @@ def test_bad_input_is_refused_in_words(folder, kind):
 
 @pytest.mark.parametrize(("rows", "expected"), [
     ("a.b,reading\n0,dark\n", "frame 0: reading = 'dark' is no number"), ("a.b,reading\n0\n", r"1 cells \['0'\]; allowed: 2"),
-    ("a.b,reading\n", "zero frames"), ("a.b,reading\n,3\n", "a.b = '' is no number"), ("a.b;reading\n0;1\n", "unknown column"),
+    ("a.b,reading\n", "zero frames"), ("a.b,reading\n,3\n", "a.b = '' is no number"), ("a.b;reading\n0;1\n", "separated by .;."),
 ])
 def test_bad_rows_are_refused_in_words(folder, rows, expected):
     (folder / "malus.csv").write_text(rows)

@@ -87,6 +87,14 @@ JOBS = {
     "scene": JOB.replace("small.xml", "absent.xml"), "foreign": JOB.replace("{out}", "foreign"), "file": JOB.replace("{out}", "small.xml/x"),
 }
 
+BENCH = 'scene = "polarizer_bench"\n' + NOISE
+TABLE = '[table]\nfile = "{}.csv"\nvalues = ["reading"]\n'
+READINGS = {
+    "volts": "analyzer.angle,reading\n" + "".join(f"{a},{0.1 + a / 100}\n" for a in range(0, 180, 20)),
+    "column": "angle,reading\n" + "".join(f"{a},{20 + a}\n" for a in range(0, 180, 20)),
+    "semicolons": "analyzer.angle;reading\n0;12,5\n20;13,5\n",
+}
+
 
 def capture_sets(folder):
     """Name -> captures.toml; the images stand beside each."""
@@ -104,6 +112,9 @@ def capture_sets(folder):
         "size": head.replace("small.xml", "bench.xml") + NOISE + frames, "dark": head.replace("small.xml", "dark.xml") + NOISE + frames,
         "single": head + NOISE + frames.split("[[frames]]\nimage = \"b")[0], "black": head + NOISE.replace("8.0", "0.0") + frames.replace(
             "a.png", "black.png").replace("b.png", "black2.png"),
+        "gray": head + NOISE + frames.replace("a.png", "gray.png").split("[[frames]]\nimage = \"b")[0],
+        "volts": BENCH + TABLE.format("volts"), "column": BENCH + TABLE.format("column"), "semicolons": BENCH + TABLE.format("semicolons"),
+        "columns": BENCH + TABLE.format("column").replace('["reading"]', '["reading", "angle"]'),
     }
 
 
@@ -137,6 +148,9 @@ def place(tmp_path_factory):
         for image in ("black", "black2"):
             Image.fromarray(np.zeros((SIZE[1], SIZE[0], 3), np.uint8)).save(own / f"{image}.png")
         Image.fromarray(np.zeros((10, 10, 3), np.uint8)).save(own / "small.png")
+        Image.fromarray(np.full((SIZE[1], SIZE[0]), 60, np.uint8)).save(own / "gray.png")
+        for table, rows in READINGS.items():
+            (own / f"{table}.csv").write_text(rows)
         shutil.copy(own / "a.png", own / "b.jpg")
         np.save(own / "nan.npy", np.full((SIZE[1], SIZE[0], 3), np.nan, np.float32))
     (folder / "fit.toml").write_text('[parameters]\n"led_9.x" = 1.0\n')
@@ -276,13 +290,18 @@ CASES = [
     ("compare captures/mask", r"frame 1.*mask.*empty"),
     ("compare captures/setting", r"frame 1.*unknown parameter 'led_7\.power'; did you mean 'led_"),
     ("compare captures/beyond", r"frame 1.*gel\.press_depth = -1 mm is outside its bounds"),
-    ("compare captures/silent", r"noise: no frame has repeats; add `repeats`.* or give \[noise\]"),
+    ("compare captures/silent", r"silent/captures\.toml: noise: no frame has repeats; add `repeats`.* or give \[noise\]"),
     ("compare captures/half", r"\[noise\]: prnu .* missing; give all of"),
     ("compare captures/sceneless", r"captures\.toml: scene is missing"),
     ("compare captures/elsewhere", r"absent\.xml': no such file"),
     ("compare captures/size", r"images of 48 x 36 px, but the scene's camera has 20 x 20 px"),
     ("compare captures/dark", r"dark\.xml: the scene has no light"),
-    ("compare captures/black", r"no usable value in any frame"),
+    ("compare captures/black", r"captures\.toml: none of the 10368 values of 'black\.png' \.\.\. \(0 to 0\) is usable: 10368 not above black_level = 0 DN; allowed"),
+    ("compare captures/volts", r"none of the 9 values of 'volts\.csv' \(0\.1 to 1\.7\) is usable: 9 not above black_level = 8 DN; allowed: raw DN \(no volts"),
+    ("compare captures/column", r"frame 0 \('column\.csv'\): unknown parameter 'angle'.*rename = \{ \"angle\" = \"KEY\" \} under \[table\] of captures\.toml"),
+    ("compare captures/columns", r"'column\.csv' has channels: 2, .*'polarizer_bench' has 1; allowed: 1, a column of `values` for each"),
+    ("compare captures/semicolons", r"semicolons\.csv: its cells are separated by ';'; allowed: commas, and points"),
+    ("compare captures/gray", r"captures\.toml: 'gray\.png' has channels: 1, .*small\.xml' has 3; allowed: 3, or one with cfa = \"RGGB\""),
     ("compare captures/good --set led_7.x=1", r"unknown parameter 'led_7\.x'"),
     ("compare captures/good --fit absent.toml", r"absent\.toml: no such file"),
     ("compare captures/good --fit fit.toml", r"fit\.toml: \[parameters\]: unknown parameter 'led_9\.x'"),
@@ -300,8 +319,8 @@ CASES = [
     (CALIBRATE.format("good") + " --hold-out a --hold-out b", r"every group is held out; leave some"),
     (CALIBRATE.format("single") + " --hold-out a", r"every group is held out; leave some"),
     (CALIBRATE.format("good") + " --set led_1.x=left", r"led_1\.x = 'left' is not a number in mm"),
-    (CALIBRATE.format("good") + " --free led_1.fwhm --per-group none --hold-out none", r"none of the 1 free parameters changes any frame: led_1\.fwhm"),
-    (CALIBRATE.format("black"), r"no usable pixel"),
+    (CALIBRATE.format("good") + " --free led_1.fwhm --per-group none --hold-out none", r"none of the 1 free parameters changes any frame: at led_1\.fwhm = 30 nm; allowed"),
+    (CALIBRATE.format("black"), r"none of the 10368 values .* is usable"),
     (CALIBRATE.format("good").replace("study", "taken"), r"taken exists and holds no study; choose another"),
     (CALIBRATE.format("good").replace("study", "small.xml/study"), r"small\.xml' is a file and no folder"),
 ]
