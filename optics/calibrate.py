@@ -14,11 +14,14 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.optimize import lsq_linear
+from scipy.sparse.csgraph import connected_components
 
 from optics.errors import Underdetermined, UnknownKey
 from optics.parameter import Values, Variable
+from optics.words import spaced
 
 REACH = 4.0  # plausible sizes that one step may change what the image is not linear in
+ALIKE = 0.995  # correlation beyond which two variables are said to stand for each other
 TRUNCATION = 1e-12  # eigenvalues of the scaled normal matrix below this share of the largest count as undetermined
 
 
@@ -401,11 +404,14 @@ def fit(model, variables: Sequence[Variable], start: Values | None = None, frame
     for iteration in range(max_iterations):
         normal = descent.linearise(tick)
         if sum(normal.frame_n) == 0:
-            raise Underdetermined("no usable pixel: every pixel is saturated, at black, or masked; check [noise] "
-                                  "black_level and saturation in captures.toml, and the masks")
+            names = [str(getattr(model.frames[f], "name", f)) for f in frames]
+            raise Underdetermined(f"no usable value in the {len(frames)} frames to fit ({_some(names)}): all are saturated, at black, or "
+                                  "masked; check [noise] black_level and saturation in captures.toml, and the masks")
         silent = [v.name for i, v in enumerate(variables) if normal.a[i, i] == 0]
         if len(silent) == len(variables) and variables:
-            raise Underdetermined(f"none of the {len(variables)} free parameters changes any frame: {', '.join(silent[:6])}")
+            there = [f"{v.name} = {value:.4g}{spaced(v.parameter.unit)}" for v, value in zip(variables, descent.theta)]
+            raise Underdetermined(f"none of the {len(variables)} free parameters changes any frame: at {_some(there)}; allowed: what some "
+                                  "frame depends on; free others, or correct what the frames set")
         history.append(normal.total)
         promise = descent.promised
         if promise < accuracy:
@@ -492,13 +498,18 @@ def covariance_of(a: np.ndarray) -> np.ndarray:
     return inverse
 
 
+def _some(names: Sequence[str], most: int = 5) -> str:
+    """The first few names, and how many more there are."""
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
+
+
 def warnings_of(result: Fit, a: np.ndarray) -> list[str]:
     """Sentences about variables that cannot be told apart, that do nothing, or that stand at a bound."""
     texts = []
     names = [v.name for v in result.variables]
     silent = [n for n, d in zip(names, np.diag(a)) if d == 0]
     if silent:
-        texts.append(f"nothing in the frames depends on {', '.join(silent)}")
+        texts.append(f"nothing in the frames depends on {_some(silent, 8)}")
     if len(a):
         scale = np.sqrt(np.where(np.diag(a) > 0, np.diag(a), 1))
         eigen, vectors = np.linalg.eigh(a / np.outer(scale, scale))
@@ -508,11 +519,15 @@ def warnings_of(result: Fit, a: np.ndarray) -> list[str]:
                 if len(part) > 1:
                     texts.append(f"the captures cannot tell apart {', '.join(part[:8])}{' ...' if len(part) > 8 else ''}: only "
                                  "a combination is determined; hold one of them, or give it a prior")
-    correlation = result.correlation
-    for i in range(len(names)):
-        for j in range(i):
-            if np.isfinite(correlation[i, j]) and abs(correlation[i, j]) > 0.995:
-                texts.append(f"{names[j]} and {names[i]} are correlated to {correlation[i, j]:+.4f}")
+    correlation = np.nan_to_num(result.correlation, posinf=0.0, neginf=0.0) * (1 - np.eye(len(names)))
+    count, member = connected_components(np.abs(correlation) > ALIKE) if names else (0, None)
+    for one in (np.flatnonzero(member == k) for k in range(count)):
+        if len(one) == 2:
+            texts.append(f"{names[one[0]]} and {names[one[1]]} are correlated to {correlation[one[0], one[1]]:+.4f}")
+        elif len(one) > 2:
+            most = np.abs(correlation[np.ix_(one, one)]).max()
+            texts.append(f"{_some([names[i] for i in one])} are correlated among each other, to {most:.4f} at most: the captures know little "
+                         "more than one combination of them; hold one of them, or give it a prior")
     texts += [f"{n} ended at its bound" for n in result.at_bound]
     if not result.converged:
         texts.append(result.reason)

@@ -186,6 +186,7 @@ def fit_base(model: Model, variables: Sequence[Variable], fitted: Sequence[int],
              progress: Progress | None = None, tolerance: float = 0.05, robust: bool = False) -> calibrate.Fit:
     """Calibrate in three stages: what holds in all frames, then the poses, a press at a time, then everything together."""
     variables = list(variables)
+    begun = np.array([calibrate.start_of(model, v, start) for v in variables])  # where the first stage starts
     common = [v for v in variables if v.frames is None]
     if len(common) < len(variables):
         values = start
@@ -201,7 +202,9 @@ def fit_base(model: Model, variables: Sequence[Variable], fitted: Sequence[int],
             found = calibrate.fit(model, own, values, frames, max_iterations=6, tolerance=2.0, robust=robust, progress=progress)
             for index in frames:
                 start.frame.setdefault(index, {}).update(found.values.frame[index])
-    return calibrate.fit(model, variables, start, fitted, tolerance=tolerance, robust=robust, progress=progress)
+    found = calibrate.fit(model, variables, start, fitted, tolerance=tolerance, robust=robust, progress=progress)
+    found.start = begun
+    return found
 
 
 def off_neutral(model: Model, values: Values, variables: Sequence[Variable]) -> Values:

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from optics.calibrate import for_frames, solve
+from optics.calibrate import Fit, for_frames, solve, warnings_of
 from optics.parameter import Parameter, Variable
 
 
@@ -72,3 +72,14 @@ def test_priors_go_along_to_other_frames_where_they_say_something_about_them():
     assert for_frames(model, fitted((0.2, 0.1), (0.7, 0.1)), [4, 5])[0].prior is None
     each = [Variable(f"g[{i}]", ("camera.gain",), gain, (i,)) for i in range(4)]
     assert [v.frames for v in for_frames(model, each, [4, 5])] == [(4,), (5,)]
+
+
+def test_what_is_correlated_among_each_other_is_one_warning():
+    names = [*(f"led_{i}.power" for i in range(1, 7)), "rho", "x", "y", "alone"]
+    common = np.zeros((len(names), 3))
+    common[:7, 0], common[7, 1], common[8, 1] = 1, 1, -1
+    covariance = common @ common.T + 1e-3 * np.eye(len(names))
+    result = Fit(None, [SimpleNamespace(name=n) for n in names], np.zeros(len(names)), covariance, 1.0, 1, [], [], [], True, "")
+    every, pair = warnings_of(result, np.linalg.inv(covariance))
+    assert every.startswith("led_1.power, led_2.power, led_3.power, led_4.power, led_5.power and 2 more are correlated among each other")
+    assert every.endswith("hold one of them, or give it a prior") and pair == "x and y are correlated to -0.9990"
