@@ -655,7 +655,7 @@ def values_of(model, fit: Path | None, sets: Mapping[str, float | str]):
     own = {}
     for name, values in data["frames"].items():
         if name not in names:
-            raise UnknownKey(name, names, "frame", str(fit), "of the captures; the fit belongs to another set")
+            raise UnknownKey(name, names, "frame", str(fit), "the fit belongs to another set of captures")
         own[names[name]] = model.scene.check(values, f"{fit}: [frames.{name}]")
     return Values({**common, **model.scene.check(sets, "--set")}, own)
 
@@ -752,7 +752,10 @@ def import_(source: Annotated[Path, typer.Argument(metavar="SOURCE", help="An .n
 @command
 def diagnose(study: StudyFolder, as_json: AsJson = False,
              csv: Annotated[Path | None, typer.Option("--csv", metavar="FILE", help="Write the table of effects here.")] = None) -> None:
-    """Ask what the last step of a study lacks: every effect scored, the best ones added in earnest, one of six verdicts."""
+    """Ask what the last step of a study lacks: every effect scored, the best ones added in earnest, one of six verdicts.
+
+    The exit code is 1 where the verdict is UNKNOWN or CANNOT TELL, else 0.
+    """
     from optics import loop
     from optics.exr import replacing
 

@@ -21,7 +21,7 @@ class UnknownKey(KeyError):
         elif known and len(known) <= 12:
             text += f"; known: {', '.join(sorted(known))}"
         if hint:
-            text += f" {hint}"
+            text += f" {hint}" if near or hint.startswith("(") else f"; {hint}"
         super().__init__(text)
         self.key, self.nearest = key, near[0] if near else None
 

@@ -162,7 +162,7 @@ def _dials(truth: Truth, settings: Settings) -> dict[str, np.ndarray]:
     for index, reading in enumerate(settings):
         for key, value in reading.items():
             if key not in known:
-                hint = "; this part is not on the bench: give it in Truth" if key in DEFAULTS else ""
+                hint = "this part is not on the bench: give it in Truth" if key in DEFAULTS else ""
                 raise UnknownKey(key, known, "setting", f"reading {index}", hint)
             if not math.isfinite(value):
                 raise ValueError(f"reading {index}: {key} = {value}; allowed: finite; correct it")

@@ -111,7 +111,7 @@ class Study:
         hashes = input_hashes(inputs)
         if (folder / "ladder.json").exists():
             if not resume:
-                raise OutputExists(f"{folder} holds a study already; choose another folder, or resume it")
+                raise OutputExists(f"{folder} holds a study already; choose another folder, or go on with it (--resume)")
             study = cls.open(folder)
             old = study.record
             changed = [k for k, new in (("scene", scene), ("seed", seed)) if old[k] != new]

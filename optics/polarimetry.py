@@ -78,7 +78,7 @@ def stack(scene: Scene, values: Mapping, u: float, v: float, wavelengths: Sequen
     for name in parts or ():
         if name not in ray.names:
             passed = ", ".join(ray.names) or "none"
-            raise UnknownKey(name, ray.names, "layer", "", f"on the ray through {u:g},{v:g}, which passes {passed}")
+            raise UnknownKey(name, ray.names, "layer", "", f"the ray through {u:g},{v:g} passes {passed}")
     met = [(n, step) for n, step in zip(ray.names, ray.steps) if not parts or n in parts]
     chosen = [(n, paths.layer_matrix(scene, n, paths.crossing_at(step, [0], bands), values, ray.path.fields)) for n, step in met]
     names = [n for n, _ in chosen]

@@ -33,4 +33,5 @@ def with_sd(x: float, sd: float) -> str:
     if not (math.isfinite(sd) and sd > 0):
         return f"{x:.3g}"
     digits = max(0, 1 - math.floor(math.log10(sd)))
-    return f"{x:.{min(digits, 12)}f} +- {sd:.{min(digits, 12)}f}"
+    digits = min(digits, 12)
+    return f"{round(x, digits) + 0.0:.{digits}f} +- {sd:.{digits}f}"  # + 0.0: -0.0 reads 0.0

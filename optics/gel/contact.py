@@ -195,7 +195,7 @@ def indenter_profile(
     shape, stamp = str(shape), 0
     if shape not in SHAPES:
         if not shape.lower().endswith(MESH_FILES):
-            raise UnknownKey(shape, SHAPES, "indenter shape", hint=f"A mesh must end in {', '.join(MESH_FILES)}.")
+            raise UnknownKey(shape, SHAPES, "indenter shape", hint=f"a mesh must end in {', '.join(MESH_FILES)}")
         path = Path(shape).expanduser().resolve()
         if not path.is_file():
             raise FileNotFoundError(f"indenter mesh {path}: no such file; give its path or one of {', '.join(SHAPES)}")
