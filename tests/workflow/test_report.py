@@ -286,7 +286,7 @@ def test_ladder_falls_to_the_noise_floor(studied):
 
 
 def test_the_noise_band_of_few_readings_stays_within_its_chart():
-    steps = [{"name": "base", "effect": None, "fitted": {"chi2_per_dof": 2.0, "dof": 20}, "held_out": {"chi2_per_dof": 1.7, "dof": 6}}]
+    steps = [{"index": 0, "name": "base", "fitted": {"chi2_per_dof": 2.0, "dof": 20}, "held_out": {"chi2_per_dof": 1.7, "dof": 6}}]
     study = SimpleNamespace(steps=steps, record={"noise_floor": {"chi2_per_dof": 1.0}})
     top, height = map(float, re.search(r'floorband".*? y="([\d.]+)" height="([\d.]+)"', ladder_chart(study, 900, 340)).groups())
     assert 34 <= top and top + height <= 340 - 62 + 0.1  # chi2/dof of 6 readings scatters by 58 %, twice that goes below the axis
