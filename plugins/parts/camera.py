@@ -5,10 +5,13 @@ Definition
     distorted = undistorted (1 + k1 r^2 + k2 r^4 + k3 r^6) + tangential(p1, p2)      (OpenCV's order and signs)
     I_c = exposure gain gain_c sum_b M_cb L_b                    irradiance of channel c; 1 = full scale
     G_c(m) = m + a_c (m^2 - m) + b_c (m^3 - m),  m = G_c^-1(I)   response, inverse of a cubic (S1.1)
-    DN = black + (saturation - black) m + offset
-with f_x from the horizontal field of view, f_y = f_x aspect, principal point (c_x, c_y) given as an offset from the middle of
-the image, L_b the radiance in band b, and M the sensitivities of the channels in the bands (identity, or a measured
-camera of the colour-science library by its name). XML may give `fx`, `fy`, `cx`, `cy` (px) in place of the field of view.
+    DN = black_level + (saturation - black_level) m + offset
+so that with the default gains, response and offset DN = black_level + (saturation - black_level) exposure radiance: `exposure`
+is full scale per unit of radiance. black_level and saturation are those of [noise] in captures.toml (0 and 255 DN in `optics
+render`). Effects of the stage `lens` act on L_b, `sensor` on I_c, `response` on m.
+f_x comes from the horizontal field of view, f_y = f_x aspect, the principal point (c_x, c_y) is given as an offset from the middle
+of the image, L_b is the radiance in band b, and M the sensitivities of the channels in the bands (identity, or a measured camera
+of the colour-science library by its name). XML may give `fx`, `fy`, `cx`, `cy` (px) in place of the field of view.
 Frame: x right, y down, z forward (OpenCV); the transform `to_world` gives the nominal pose, `x` ... `roll` what departs from it.
 Fingerprint
     principal point and pose shift the image; distortion grows with the third power of the radius; exposure scales all.

@@ -2,11 +2,15 @@
 
 Definition
     z(x, y) = -D(x - press_x, y - press_y) + sum of `surface` effects          the coated face; flat at z = 0
-    D = contact depth clipped to [0, thickness], smoothed by a pyramid of Gaussians outside the contact (S1.6)
+    D0 = clip(press_depth - h, 0, thickness)                   h(x, y): height of the indenter over its lowest point
+    D <- max(D0, G_sd * D), from D = D0, sd = smoothing, smoothing/2, smoothing/4, smoothing/8                  (S1.6)
+    D <- G_sd * D once more, sd^2 = (smoothing/16)^2 + map_pitch^2                        without restoring the contact
+with G_sd * D the blur by a Gaussian of that standard deviation (mm); the maximum puts the skin back onto the indenter after each
+blur. Steep walls of h are cut to a slope, and the rim of D0 is rounded, within about a node of the map (optics.gel.contact).
 The gel fills -thickness < z < 0; the camera stands at z < -thickness. The face is a triangle mesh on a graded grid that
 is fine around the contact and moves with it, so that images vary smoothly with the press.
-With `skirt` > 0 the skin beside the contact falls off as exp(-distance / skirt) before the smoothing: D = max over touched
-points p of D0(p) exp(-|x - p| / skirt).
+With `skirt` > 0 the skin beside the contact falls off as exp(-distance / skirt) before the smoothing: in place of D0 stands the
+max over touched points p of D0(p) exp(-|x - p| / skirt).
 Indenters: sphere (`indenter_size` = radius), cylinder lying on its side (radius), cube face down (edge), or a mesh file
 (STL, OBJ, PLY; `indenter_size` = scale).
 Fingerprint

@@ -1,13 +1,16 @@
 """LED: a point (or small disc) source with an axially symmetric lobe.
 
 Definition
-    radiant intensity  I(s) = eta (-s.p)^mu w(lambda)            [W/sr, relative]
-    irradiance factor  kappa = eta (-s.p)^mu / |s|^2             (S2)
-with the unit vector s from the LED's position S to the lit point reversed (so that -s.p is the cosine to the axis p), the
-power eta, the lobe exponent mu (1 for a Lambertian chip, larger for a lens) and the relative spectrum w: a Gaussian of
-the given peak wavelength and full width at half maximum, or 1 in every band when `wavelength` is 0 (a white LED). In the first
-three bands w is multiplied by `power_r`, `power_g`, `power_b`: what an LED of unknown spectrum is calibrated by. They share a
-scale with `power` and, over all LEDs of a band, with the membrane's rho: hold one of them.
+    kappa = eta cos(a)^mu / d^2,  cos(a) = -s.p                  1/mm^2; 0 where cos(a) <= 0                     (S2)
+    kappa_b = kappa w_b power_b prod(`emission` effects)         in the band b: irradiance across the beam, relative
+    L_b = V T f_b(wi, s) cos(theta) kappa_b                      radiance that the lit point x sends to the camera (S5)
+with the distance d = |S - x| (mm) of the LED's position S from x, the unit vector s = (S - x)/d towards the LED, the axis p (so
+that a is the angle between axis and beam), the power eta = `power` and the lobe exponent mu (1 for a Lambertian chip, larger for
+a lens). V is 1 where the straight line to the LED is free and else 0, T what the gel's effects let pass, f the membrane's
+reflection, theta the angle between s and the skin's normal. w is the relative spectrum: a Gaussian of the given peak wavelength
+and full width at half maximum, or 1 in every band when `wavelength` is 0 (a white LED). power_b is `power_r`, `power_g`,
+`power_b` in the first three bands, 1 in a fourth: what an LED of unknown spectrum is calibrated by. They share a scale with
+`power` and, over all LEDs of a band, with the membrane's rho: hold one of them.
 With an emitting area A > 0 the source is a disc across the axis, of radius sqrt(A/pi): shadows get a penumbra.
 Fingerprint
     position and power shape the field of every frame in which the LED is lit; mu shows far from the axis.
