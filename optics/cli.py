@@ -275,7 +275,7 @@ def params(scene: SceneName,
            None: "-"}
     print(table([("key", "value", "unit", "bounds", "neutral", "derivative", "meaning"), *((
         r["key"], _number(r["value"]), r["unit"], "|".join(r["choices"]) if r["choices"] else
-        "any" if math.inf in r["bounds"] else " .. ".join(f"{b:g}" for b in r["bounds"]),
+        _span(r["bounds"]),
         "-" if r["neutral"] is None else f"{r['neutral']:g}",
         how[r["derivative"]] + (", linear" if r["linear"] else ", of its square" if r["squared"] else ""),
         r["meaning"] + (f" [effect: {r['effect']}]" if r["effect"] else "")) for r in rows)]))
@@ -283,6 +283,10 @@ def params(scene: SceneName,
 
 def _number(value: float | str) -> str:
     return value if isinstance(value, str) else f"{value:.6g}"
+
+
+def _span(bounds: Sequence[float]) -> str:
+    return "any" if math.inf in bounds else " .. ".join(f"{b:g}" for b in bounds)
 
 
 def _new_effect(name: str | None, plugins: Path | None, **given) -> None:
@@ -311,7 +315,8 @@ def _new_effect(name: str | None, plugins: Path | None, **given) -> None:
 
 
 @command
-def effects(name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="Show the page of this effect; 'new': write one.")] = None,
+def effects(name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="Show the page of this effect or part (led, gel, camera ...); 'new': "
+                                                                                "write an effect.")] = None,
             new_name: Annotated[str | None, typer.Argument(metavar="[NEW]", help="Of `effects new NAME`: the new effect's name.")] = None,
             stage: Annotated[str | None, typer.Option("--stage", help="new: where it acts (lens, sensor, response, emission, segment ...).")] = None,
             part: Annotated[str | None, typer.Option("--part", help="new: on camera, led, gel or membrane.")] = None,
@@ -319,7 +324,12 @@ def effects(name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="S
             along: Annotated[str | None, typer.Option("--along", metavar="COORDINATE", help="new: the coordinate of the curve.")] = None,
             output: Annotated[Path | None, typer.Option("-o", "--output", metavar="DIR", help="new: folder of plugins.")] = None,
             plugins: Plugins = None, as_json: AsJson = False) -> None:
-    """List the physical effects that can be added to a model, show one's page, or write a new one (`optics effects new NAME`)."""
+    """List the physical effects that can be added to a model, show one's page, or write a new one (`optics effects new NAME`).
+
+    Parts have pages too: `optics effects led` shows the LED's law, its parameters, and the effects that act on it.
+    """
+    from optics.errors import UnknownKey
+
     options = {"--stage": stage, "--part": part, "--from": study, "--along": along, "-o": output}
     if name == "new":
         return _new_effect(new_name, plugins, **{k.strip("-"): v for k, v in options.items()})
@@ -327,6 +337,11 @@ def effects(name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="S
     if given:
         raise ValueError(f"{' '.join(given)}: only with `optics effects new NAME`, which writes a new effect")
     found = scan(plugins)
+    key = re.sub(r"[^a-z0-9]+", "-", (name or "").lower()).strip("-")
+    if name and key not in found.effects:
+        if (kind := key.replace("-", "_")) in found.parts:
+            return _part_page(found, kind, as_json)
+        raise UnknownKey(name, [*found.effects, *found.parts], "effect or part", hint="`optics effects` lists them")
     chosen = [found.find_effect(name)] if name else [found.effects[k] for k in sorted(found.effects)]
     records = [{
         "key": e.key, "name": e.name, "part": e.part, "stages": list(e.stages), "onset": e.onset, "scope": e.scope, "per": e.per,
@@ -338,7 +353,8 @@ def effects(name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="S
         return show(records[0] if name else records)
     if not name:
         return print(table([("effect", "part", "parameters", "onset", "needs"), *(
-            (r["key"], r["part"], ", ".join(p["name"] for p in r["parameters"]), r["onset"], r["needs"] or "-") for r in records)]))
+            (r["key"], r["part"], ", ".join(p["name"] for p in r["parameters"]), r["onset"], r["needs"] or "-") for r in records)])
+            + f"\n\nparts, each with a page too: {', '.join(sorted(found.parts))}")
     r = records[0]
     print(f"{r['page'].strip()}\n\n{r['name']}: `{r['key']}`, {r['file']}")
     print(table([("part", f"{r['part']}, one value for {'each ' + r['part'] if r['per'] == 'part' else 'all of the kind'}"
@@ -348,6 +364,20 @@ def effects(name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="S
     print("\n" + table([("parameter", "unit", "neutral", "bounds", "meaning"), *(
         (p["name"], p["unit"], f"{p['neutral']:g}", f"{p['bounds'][0]:g} .. {p['bounds'][1]:g}", p["meaning"])
         for p in r["parameters"])]))
+
+
+def _part_page(found, kind: str, as_json: bool) -> None:
+    """Show a part: its page, its own parameters, and the effects that act on it."""
+    part = found.parts[kind]
+    acting = sorted(k for k, e in found.effects.items() if e.part == kind)
+    rows = [{"name": p.name, "unit": p.unit, "default": p.default, "neutral": p.neutral, "bounds": list(p.bounds) if p.is_number else None,
+             "choices": list(p.choices) or None, "meaning": p.doc} for p in part.parameters]
+    if as_json:
+        return show({"key": kind, "category": part.category, "file": part.file, "parameters": rows, "effects": acting, "page": part.doc})
+    print(f"{part.doc.strip()}\n\n{kind}: {part.category}, {part.file}\neffects that act on it: {', '.join(acting) or 'none'}\n")
+    print(table([("parameter", "unit", "default", "bounds", "neutral", "meaning"), *((
+        r["name"], r["unit"], _number(r["default"]), "|".join(r["choices"]) if r["choices"] else _span(r["bounds"]),
+        "-" if r["neutral"] is None else f"{r['neutral']:g}", r["meaning"]) for r in rows)]))
 
 
 @command

@@ -62,6 +62,7 @@ class Part:
     build: Callable[[], type]
     checks: tuple[Callable[[], None], ...] = ()
     doc: str = ""
+    file: str = ""
     mueller: Callable | None = None
     stokes: Callable | None = None
 
@@ -232,8 +233,7 @@ def declared(file: Path) -> Iterator[Part | Effect]:
         raise BadPlugin(f"{file}: declares neither a part nor an effect; files that only help begin with '_'")
     for item in found:
         object.__setattr__(item, "doc", module.__doc__ or "")
-        if isinstance(item, Effect):
-            object.__setattr__(item, "file", str(file))
+        object.__setattr__(item, "file", str(file))
         yield item
 
 

@@ -107,6 +107,20 @@ def test_effects_and_their_pages(optics):
         assert code == 0 and "cos^4" in page and "vignetting.py" in page and "References" in page
 
 
+def test_parts_have_pages_too(optics):
+    from optics.effect import registry
+
+    found, (_, text, _) = registry(), optics("effects")
+    assert not set(found.parts) & set(found.effects) and text.splitlines()[-1].endswith(", ".join(sorted(found.parts)))
+    for kind, part in found.parts.items():
+        code, page, _ = optics("effects", kind.replace("_", "-"))
+        assert code == 0 and part.doc.strip() in page and part.file in page
+        assert [line.split()[0] for line in page.splitlines()[-len(part.parameters):]] == [p.name for p in part.parameters]
+    record = json.loads(optics("effects", "led", "--json")[1])
+    assert record["key"] == "led" and "led-size" in record["effects"] and "cos(a)^mu / d^2" in record["page"]
+    assert {p["name"]: p["unit"] for p in record["parameters"]}["x"] == "mm"
+
+
 def test_a_users_plugin_is_listed_beside_the_shipped_ones(optics, tmp_path, monkeypatch):
     from optics import effect
 

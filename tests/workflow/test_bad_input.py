@@ -220,7 +220,7 @@ CASES = [
     (f"{RENDER} --sede=1", r"--sede.*--se"),
     ("render small.xml", r"Missing option '-o'.*--help"),
     ("rendr small.xml", r"No such command 'rendr'\. Did you mean 'render'"),
-    ("effects vignettign", r"unknown effect 'vignettign'; did you mean '.*vignetting'"),
+    ("effects vignettign", r"unknown effect or part 'vignettign'; did you mean '.*vignetting'"),
     # where a picture goes
     ("render small.xml -o old.exr", r"old\.exr exists; choose another name, or --force"),
     ("render small.xml -o other.exr", r"other\.json exists; choose another name, or --force"),
