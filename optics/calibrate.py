@@ -505,7 +505,7 @@ def _some(names: Sequence[str], most: int = 5) -> str:
 
 def warnings_of(result: Fit, a: np.ndarray) -> list[str]:
     """Sentences about variables that cannot be told apart, that do nothing, or that stand at a bound."""
-    texts = []
+    texts, told = [], [set()]
     names = [v.name for v in result.variables]
     silent = [n for n, d in zip(names, np.diag(a)) if d == 0]
     if silent:
@@ -517,14 +517,17 @@ def warnings_of(result: Fit, a: np.ndarray) -> list[str]:
             if value < 1e-7 * eigen.max():
                 part = [n for n, c in zip(names, vector) if abs(c) > 0.15 and n not in silent]
                 if len(part) > 1:
-                    texts.append(f"the captures cannot tell apart {', '.join(part[:8])}{' ...' if len(part) > 8 else ''}: only "
-                                 "a combination is determined; hold one of them, or give it a prior")
+                    told.append(set(part))
+                    texts.append(f"the captures cannot tell apart {_some(part, 8)}: only a combination is determined; hold one of "
+                                 "them, or give it a prior")
     correlation = np.nan_to_num(result.correlation, posinf=0.0, neginf=0.0) * (1 - np.eye(len(names)))
     count, member = connected_components(np.abs(correlation) > ALIKE) if names else (0, None)
     for one in (np.flatnonzero(member == k) for k in range(count)):
+        if len(one) < 2 or any({names[i] for i in one} <= part for part in told):
+            continue
         if len(one) == 2:
             texts.append(f"{names[one[0]]} and {names[one[1]]} are correlated to {correlation[one[0], one[1]]:+.4f}")
-        elif len(one) > 2:
+        else:
             most = np.abs(correlation[np.ix_(one, one)]).max()
             texts.append(f"{_some([names[i] for i in one])} are correlated among each other, to {most:.4f} at most: the captures know little "
                          "more than one combination of them; hold one of them, or give it a prior")

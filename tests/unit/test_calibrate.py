@@ -82,4 +82,9 @@ def test_what_is_correlated_among_each_other_is_one_warning():
     result = Fit(None, [SimpleNamespace(name=n) for n in names], np.zeros(len(names)), covariance, 1.0, 1, [], [], [], True, "")
     every, pair = warnings_of(result, np.linalg.inv(covariance))
     assert every.startswith("led_1.power, led_2.power, led_3.power, led_4.power, led_5.power and 2 more are correlated among each other")
-    assert every.endswith("hold one of them, or give it a prior") and pair == "x and y are correlated to -0.9990"
+    assert every.endswith("hold one of them, or give it a prior")
+    direction = np.r_[np.ones(7), np.zeros(3)] / np.sqrt(7)
+    flat = np.eye(10) - (1 - 1e-9) * np.outer(direction, direction)  # the same set, undetermined: said once
+    apart, *others = warnings_of(result, flat)
+    assert apart.startswith("the captures cannot tell apart led_1.power") and others == [pair]
+    assert pair == "x and y are correlated to -0.9990"
