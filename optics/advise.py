@@ -456,7 +456,7 @@ def _frame(model, shot: Shot, number: int):
     like = model.frames[shot.like]
     readings = {k: v for k, v in getattr(like, "readings", {}).items() if k not in shot.settings}
     return replace(like, name=f"shot-{number + 1}", repeats=[], parameters={**like.parameters, **shot.settings},
-                   group=shot.press or like.group, **({"readings": readings} if hasattr(like, "readings") else {}))
+                   group=shot.press or like.group, **({"readings": readings, "rows": None} if hasattr(like, "readings") else {}))
 
 
 def is_place(model, key: str) -> bool:

@@ -45,7 +45,7 @@ class Frame:
     repeats: list[np.ndarray] = field(default_factory=list)  # same settings, same shape
     file: str = ""
     readings: dict[str, np.ndarray] = field(default_factory=dict)  # of a sweep: (N, 1, 1) settings of each reading, by key
-    rows: np.ndarray | None = None  # of a sweep: (N, 1, 1) row of the table that each reading stands in, as it was recorded
+    rows: np.ndarray | None = None  # of a sweep: (N, 1, 1) row of the table that each reading stands in, as it was recorded; None: nowhere yet
 
 
 @dataclass

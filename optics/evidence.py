@@ -322,7 +322,7 @@ def _add_frame(evidence: Evidence, model, frame: int, n: int, prediction, other,
     keep = good & st.lattice(image.shape, evidence.thinning, n)
     evidence.blocks.append(Block(
         frame, where, a[keep], None if b is None else b[keep], whitened[keep], 1 / weight[keep], np.asarray(other, float)[keep],
-        np.flatnonzero(keep), _dilated(mask)[keep]))
+        np.flatnonzero(keep), (mask if isinstance(evidence.spectrum, st.Sweeps) else _dilated(mask))[keep]))
     evidence.use.append(good)
     evidence.sigma.append(np.where(good, np.sqrt(variance), np.inf).astype(np.float32))
     evidence.whitened.append(whitened.astype(np.float32))
@@ -331,7 +331,8 @@ def _add_frame(evidence: Evidence, model, frame: int, n: int, prediction, other,
 def _swept(sweep, prediction: np.ndarray) -> dict[str, np.ndarray]:
     """What tells the readings of a sweep apart: when, how bright, and what was set, which may be the same within one sweep."""
     still = {k: np.full(1, v) for k, v in sweep.parameters.items() if isinstance(v, float)}
-    return {"reading": sweep.rows, "signal": prediction, **still, **sweep.readings}
+    turned = {k: v for k, v in (("reading", sweep.rows), *sweep.readings.items()) if v is not None and len(v) == len(prediction)}
+    return {"signal": prediction, **still, **turned}  # one reading of a shot that is only thought of stands for all that are alike
 
 
 def _dilated(mask: np.ndarray) -> np.ndarray:

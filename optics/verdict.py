@@ -483,16 +483,19 @@ def decide(f: Findings) -> tuple[str, list[Condition]]:
         Condition("an effect stands out", f.p_family, LEVEL, significant,
                   f"family-wise p {p_text(f.p_family)} against {LEVEL:g}"),
         Condition("structure is left", f.structure_p, LEVEL, structure,
-                  f"readings, or images too small, show none; excess {f.excess_sd:.2g} sd against {EXCESS:g}" if math.isnan(f.structure_p)
+                  f"too few readings, or images too small, to show any; excess {f.excess_sd:.2g} sd against {EXCESS:g}" if math.isnan(f.structure_p)
                   else f"low-frequency test p {p_text(f.structure_p)} against {LEVEL:g}"),
     ]
     if not significant and not structure:
         return "NOTHING", conditions
-    failed = set()
-    if significant:
+    weighed = f.excess_sd > EXCESS
+    if significant and not f.winner:
+        conditions.append(Condition("significant", 1.0, LEVEL, False, "no effect that was added brought the fall that its score promised"))
+        if not structure and not weighed:
+            return "NOTHING", conditions
+    elif significant:
         lead = f.fall - f.runner_up
         margin = lead / f.fall if f.fall > 0 else 0.0
-        weighed = f.excess_sd > EXCESS
         rest = [
             Condition("significant", f.p_winner, LEVEL, f.p_winner < LEVEL, f"after refit, family-wise p {p_text(f.p_winner)}"),
             Condition("lead", lead, CLEAR, lead > CLEAR, f"chi2 falls by {lead:.3g} more than with the next, {CLEAR:g} needed"),
@@ -504,7 +507,7 @@ def decide(f: Findings) -> tuple[str, list[Condition]]:
                       f"{allowed(f.coordinate):g} allowed"),
             Condition("share", f.share, SHARE, not weighed or f.share > SHARE,
                       f"{f.share:.0%} of the excess explained, {SHARE:.0%} needed" if weighed else
-                      "the excess is within noise, no share is asked"),
+                      f"no share is asked of an excess of {f.excess_sd:.2g} sd, below {EXCESS:g}"),
             Condition("strength", f.clear, STRENGTH, not f.clear < STRENGTH,
                       "its error is not known" if math.isnan(f.clear) else f"{f.clear:.2g} sd from none, {STRENGTH:g} needed"),
             Condition("beyond clutter", f.chance, LEVEL, not f.chance >= LEVEL,
@@ -518,8 +521,6 @@ def decide(f: Findings) -> tuple[str, list[Condition]]:
         ]
         conditions += rest
         failed = {c.name for c in rest if not c.holds}
-        if not f.winner:
-            failed.add("significant")
         if not failed:
             return "CLAIM", conditions
         if "significant" in failed and not structure and not weighed:

@@ -126,6 +126,7 @@ def test_a_hidden_effect_is_found(name, tmp_path):
     # the error falls to the noise floor, on readings that were not fitted as well
     held = study.steps[-1]["held_out"]
     assert at_the_noise(fit.chi2 / fit.dof, fit.dof), fit.chi2 / fit.dof
+    assert np.isfinite(fit.sd).all()  # what no reading shows, such as where all angles count from, rests where it is
     assert at_the_noise(held["chi2_per_dof"], READINGS / 4), held
     for variable, sd in zip(fit.variables, fit.sd):
         if variable.name in case.strengths:  # within four standard deviations

@@ -1,0 +1,59 @@
+"""What is written down wrongly and yet can be rendered: a calibration says so, where no effect can explain it."""
+
+import csv
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from optics import captures as capture_files, jones, loop
+from optics.noise import Noise
+from optics.parameter import Parameter, Values, Variable
+
+NOISE = Noise(system_gain=0.05, dark_noise=2.0, black_level=64.0, saturation=4095.0, prnu=0.0)
+
+
+@pytest.mark.parametrize("wrong", [False, True])
+def test_angles_in_radians_are_no_matter_of_effects(wrong, tmp_path):
+    folder = jones.write(tmp_path / "captures", jones.Truth(photodiode=jones.Photodiode(gain=2.2)), jones.malus_sweep(120, (0.0, 60.0)), NOISE, 3)
+    if wrong:
+        file = next(folder.glob("*.csv"))
+        head, *rows = csv.reader(file.read_text().splitlines())
+        turned = [[f"{np.radians(float(x)):.6f}" if k.endswith(".angle") else x for k, x in zip(head, row)] for row in rows]
+        file.write_text("\n".join(",".join(row) for row in [head, *turned]) + "\n")
+    _, _, fit = loop.begin(loop.Setup(captures=str(folder)), tmp_path / "study")
+    assert any("no matter of effects: check units" in w for w in fit.warnings) == wrong
+
+
+def test_a_value_far_from_what_is_known_of_it_is_named():
+    depth = Parameter("press_depth", "mm", 0.2, (0.0, 1.0), plausible=0.1)
+    variables = [Variable(f"gel.press_depth[{i}]", ("gel.press_depth",), depth, (i,), (0.2, 0.05)) for i in range(3)]
+    model, near = SimpleNamespace(base={"gel.press_depth": 0.2}), SimpleNamespace(rms=1.0, signal=100.0)
+
+    def told(*depths):
+        fit = SimpleNamespace(variables=variables, values=Values(frame={i: {"gel.press_depth": d} for i, d in enumerate(depths)}))
+        return loop._far(model, fit, near)
+
+    assert told(0.2, 0.34, 0.06) == []
+    assert "gel.press_depth[1]: calibrated to more than 3 sd" in told(0.2, 0.36, 0.2)[0] and "0.36 mm for 0.2 +- 0.05" in told(0.2, 0.36, 0.2)[0]
+
+
+@pytest.mark.parametrize("frames, key", [
+    ([{"led_1.power": 1.0}, {"led_2.power": 1.0}], "led_1.power, led_2.power"), ([{"led_1.power": 1.0, "led_2.power": 0.0}, {"led_2.power": 1.0}],
+                                                                               "led_1.power"),
+    ([{"led_1.power": 1.0}, {"led_1.power": 0.5}], None), ([{}, {}], None)])
+def test_lights_named_in_some_frames_only(frames, key):
+    model = SimpleNamespace(frames=[SimpleNamespace(name=f"f{i}", parameters=p, readings={}) for i, p in enumerate(frames)],
+                            scene=SimpleNamespace(lights=["led_1", "led_2", "led_3"]), base={f"led_{k}.power": 1.0 for k in (1, 2, 3)})
+    texts = loop._unnamed(model)
+    assert (key is None) == (texts == [])
+    assert key is None or texts[0].startswith(f"{key}: set in some frames and not in others") and "write 0" in texts[0]
+
+
+@pytest.mark.parametrize("size, warned", [((30, 48), True), ((36, 48), False), ((48, 36), True)])
+def test_cut_and_turned_pictures_are_noticed(size, warned, tmp_path):
+    image = np.random.default_rng(1).uniform(50, 60, (*size, 3)).astype(np.float32)
+    frames = [capture_files.Frame("a", image, file="frames/a.png", parameters={"led_1.power": 1.0})]
+    folder = capture_files.write(capture_files.Captures(tmp_path, "gelsight", frames, noise=Noise(0.05, 1.0, 8.0, 255.0, 0.0)), tmp_path / "set")
+    model = loop.open_model(loop.Setup(captures=str(folder)))
+    assert any("the scene's own are 320 x 240" in w for w in loop._warnings(model)) == warned
