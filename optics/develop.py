@@ -60,14 +60,14 @@ class Developer:
         """What an image function sees as `camera`: every parameter of the camera, and the geometry of its pixels.
 
         u, v (H, W) px; x, y (H, W) normalised coordinates; tan (H, W) tangent of the field angle; focal (px);
-        width, height (px); bands (nm).
+        width, height (px); bands (nm); settings: all values by key, those of other parts too, (N, 1, 1) where readings were swept.
         """
         own = {n: values[f"{self.name}.{n}"] for n in self.names}
         focal = self.width / 2 / np.tan(np.deg2rad(np.real(own["x_fov"])) / 2)
         x = (self.u - self.width / 2 - np.real(own["principal_x"])) / focal
         y = (self.v - self.height / 2 - np.real(own["principal_y"])) / (focal * np.real(own["aspect"]))
         return SimpleNamespace(**own, u=self.u, v=self.v, px=x, py=y, tan=np.hypot(x, y), focal=focal, width=self.width,
-                               height=self.height, bands=np.array(self.bands))
+                               height=self.height, bands=np.array(self.bands), settings=values)
 
     def _stage(self, stage: str, image, view):
         for effect in self.effects[stage]:

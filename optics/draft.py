@@ -33,7 +33,7 @@ from optics.verdict import Diagnosis, Fingerprint
 
 BENT = 0.5  # the largest relative change that a strength of 1 is called plausible for
 CELLS = ("place", "channel")  # coordinates of cells, each with a value of its own: none lies between two of them
-VIEW = ("u", "v", "px", "py", "tan", "focal", "width", "height", "bands")  # what functions see as `camera` beside its parameters
+VIEW = ("u", "v", "px", "py", "tan", "focal", "width", "height", "bands", "settings")  # what functions see as `camera` beside its parameters
 
 
 @dataclass(frozen=True)
@@ -80,6 +80,7 @@ CARRIERS = {
 ELSEWHERE = {  # what carries no table, and what to do in its place
     "intensity": "a curve along the radiance before the camera bends it is no picture function; draft along 'signal'",
     "frame": "a number per frame says nothing of the next frame; 'gain drift' frees a gain per frame",
+    "reading": "the row of a table is no setting; write when each reading was taken into a column `source.time`, or what else changed into one",
     "LED": "an LED's own level is its power, which a calibration solves for; draft along 'led_distance' or 'led_angle'",
     "gradient": "a change that goes with edges mixes pixels: write it at the stage 'lens' (plugins/effects/blur.py)",
     "laplacian": "a change that goes with edges mixes pixels: write it at the stage 'lens' (plugins/effects/blur.py)",
@@ -230,11 +231,14 @@ def fingerprint_of(diagnosis: Diagnosis, along: str | None) -> Fingerprint:
 
 
 def _carrier(f: Fingerprint) -> Carrier | None:
-    """Where a curve can act: along a setting of the camera, whatever the scene calls it, or along a coordinate of CARRIERS."""
-    _, dot, setting = f.coordinate.rpartition(".")
-    if dot and f.family == "camera":
-        return Carrier("sensor", (f"x = camera.{setting} + 0 * camera.v",), f.coordinate)
+    """Where a curve can act: along a setting, as a gain of what the camera reads, or along a coordinate of CARRIERS."""
+    if _is_setting(f.coordinate):
+        return Carrier("sensor", (f'x = camera.settings["{f.coordinate}"]',), f.coordinate)
     return CARRIERS.get(f.coordinate)
+
+
+def _is_setting(coordinate: str) -> bool:
+    return "." in coordinate and not coordinate.endswith(".distance")
 
 
 def draft_effect(diagnosis: Diagnosis, along: str | None = None, *, name: str, black_level: float, saturation: float,
@@ -268,7 +272,7 @@ def draft_effect(diagnosis: Diagnosis, along: str | None = None, *, name: str, b
         raise ValueError(f"the curve along '{f.coordinate}' is 0 everywhere; there is nothing to draft")
     if part != "camera" and family == "light":
         remark = "\nThe curve was found along the brightest LED of a frame; here every LED has it." + remark
-    spread = "[..., None]" if stage == "sensor" and f.coordinate != "channel" else ""
+    spread = "[..., None]" if stage == "sensor" and f.coordinate != "channel" and not _is_setting(f.coordinate) else ""
     return _file(
         word, stage, f"{_title(word)}: drafted from a curve along '{f.coordinate}', cause not known.", "\n".join((
             f"I' = {'I + s g(x)' if dark else 'I (1 + s g(x))'}", f"x   {carrier.words}",

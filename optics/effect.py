@@ -20,6 +20,7 @@ Where an effect enters, in the order that light takes (`STAGES`):
     sensor      camera    I  = f(image, camera)       signal per channel, (H, W, C), 1 = full scale; numpy
     response    camera    m  = f(image, camera)       response per channel, 1 = full scale; numpy
 
+`camera` has the camera's parameters, the geometry of its pixels (optics.develop), and in `settings` all values by key, such as `source.time`.
 Functions of the stages `lens` and `sensor` are affine in the image, those of `response` act pixel by pixel. All three must
 be analytic (no abs, max or branches on their complex arguments): their derivatives are taken by complex step, exact to
 rounding (Squire & Trapp, SIAM Rev. 40, 110, 1998). An effect without functions frees parameters that its part has.

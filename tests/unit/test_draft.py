@@ -237,13 +237,15 @@ def test_signal_and_cells_are_read_where_they_are(tmp_path):
     assert out[..., 0] == pytest.approx(1 + 0.01 * (row * 4 // 10 * 4 + column * 4 // 14))
 
 
-def test_a_setting_of_the_camera_is_drafted_whatever_the_scene_calls_it(tmp_path):
+@pytest.mark.parametrize("x", [2.0, np.array([1.0, 2.0, 9.0]).reshape(3, 1, 1)])  # set in a frame; swept from reading to reading
+def test_a_setting_of_any_part_is_drafted_whatever_the_scene_calls_it(x, tmp_path):
     curve = Fingerprint("eye.gain", 100.0, 4, 0.0, 96.0, 2.0, "gain", [1.0, 3.0], [0.0, 0.2], [0.01] * 2, [], "camera")
-    found = diagnosis(curve, replace(curve, coordinate="lamp.gain", family="light"))
-    assert draft.drafted(found) == ["eye.gain"]
-    act = load(draft.draft_effect(found, name="step", black_level=0.0, saturation=1.0), tmp_path, "step").stages["sensor"]
-    v, _ = np.mgrid[:3, :2] + 0.5
-    assert act(np.ones((3, 2, 3)), SimpleNamespace(v=v, gain=2.0, step=1.0)) == pytest.approx(np.full((3, 2, 3), 1.1))
+    found = diagnosis(curve, replace(curve, coordinate="lamp.time", family="time"), replace(curve, coordinate="led_1.distance", family="geometry"))
+    assert draft.drafted(found) == ["eye.gain", "lamp.time"]
+    for along in draft.drafted(found):
+        act = load(draft.draft_effect(found, along, name="step", black_level=0.0, saturation=1.0), tmp_path / along, "step").stages["sensor"]
+        image = act(np.ones((3, 2, 3)), SimpleNamespace(settings={along: x}, step=1.0))
+        assert image == pytest.approx(np.broadcast_to(1.1 if np.ndim(x) == 0 else np.array([1.0, 1.1, 1.2]).reshape(3, 1, 1), (3, 2, 3)))
 
 
 def test_a_table_has_each_place_once_and_a_strength_that_is_plausible():

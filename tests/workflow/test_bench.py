@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
-from optics import jones, loop
+from optics import captures as capture_files, jones, loop
 from optics.effect import registry
 from optics.jones import Photodiode, Polarizer, Sample, Source, Truth
 from optics.noise import Noise
@@ -141,3 +141,36 @@ def test_a_perfect_bench_lacks_nothing(seed, tmp_path):
     assert loop.examine(study, model, setup, fit).word == "NOTHING"
     power = next(v for v in fit.variables if v.name == "source.power")
     assert abs(fit.values.get(power, model.base) - 2.2) < 4 * fit.sd[0]  # four standard deviations: the diode's gain
+
+
+def test_what_goes_with_a_setting_is_drafted_then_claimed_as_a_formula(tmp_path, monkeypatch):
+    """A lamp that warms up as exp(-t/4 min), which no effect has: the curve along its clock, as a table, then as a formula."""
+    import optics.effect as declarations
+    from optics import draft
+    from optics.proof.rigs.bench import Bench, sweep
+
+    fresh = declarations.Registry()
+    fresh.scan(declarations.shipped("plugins"))
+    monkeypatch.setattr(declarations, "_registry", fresh)
+    rig = Bench()
+    capture_files.write(sweep(rig.bench({}), rig.settings(), 5, {"warm-up": 0.1}), tmp_path / "captures")
+    setup = rig.setup(tmp_path / "captures", 5)
+    study, model, fit = loop.begin(setup, tmp_path / "study")
+    diagnosis = loop.examine(study, model, setup, fit, advised=False)
+    assert diagnosis.word == "UNKNOWN" and diagnosis.families[0].coordinate == "source.time", diagnosis.sentence
+    text, plugins = draft.from_study(study.folder, None, "warm up", fresh)
+    file = draft.write(text, plugins, "warm up")
+    study, model, setup = loop.take_up(study.folder)
+    table, _ = loop.extend(study, model, setup, loop.restore(study, model), fresh.find_effect("warm-up"))
+    assert table.chi2 - table.dof < 0.4 * (fit.chi2 - fit.dof)  # straight lines between few points, where the lamp is steepest
+
+    file.write_text("import numpy as np\n" + text.replace("lookup(x, AT, CURVE)", "-np.exp(-np.asarray(x) / 4.0)").replace("checks=(meets_its_table,)", ""))
+    fresh.effects.pop("warm-up")
+    fresh.folders.remove(plugins.resolve())
+    study, model, fit = loop.begin(setup, tmp_path / "formula")
+    diagnosis = loop.examine(study, model, setup, fit, advised=False)
+    assert diagnosis.missing == "warm up"
+    assert abs(diagnosis.row("warm up").refit.strength[0] - 0.1) < 4 * diagnosis.row("warm up").refit.sd[0]
+    fit, _ = loop.extend(study, model, setup, fit, fresh.find_effect("warm-up"), diagnosis.fits["warm up"].values)
+    assert at_the_noise(study.steps[-1]["held_out"]["chi2_per_dof"], 150)
+    assert loop.examine(study, model, setup, fit, advised=False).word == "NOTHING"
