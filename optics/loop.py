@@ -179,7 +179,7 @@ def effect_variables(model: Model, effect: Effect) -> list[Variable]:
     """What adding an effect frees. Of several strengths a common part may show nowhere, such as the gain of all frames: where no data
     hold it, it stays where the scene has it, by a prior GAUGE times what is plausible, which data that do hold it outweigh."""
     found = model.scene.variables_of(effect, len(model.frames))
-    return [v.with_prior(model.base[v.keys[0]], GAUGE * v.parameter.plausible) for v in found] if len(found) > 1 else found
+    return [_with_prior(model, v, "*", (None, GAUGE * v.parameter.plausible)) for v in found] if len(found) > 1 else found
 
 
 def fit_base(model: Model, variables: Sequence[Variable], fitted: Sequence[int], start: Values,

@@ -164,7 +164,7 @@ def test_a_sweep_beside_readings(optics, measured, tmp_path):
 
 WRONG = [
     (["mueller", "polarizer_bench", "--at", "3,1"], r"--at 3,1: outside the picture; allowed: .* to 1,1"),
-    (["mueller", "polarizer_bench", "--part", "analyser"], r"unknown layer 'analyser'; did you mean 'analyzer'\? on the ray"),
+    (["mueller", "polarizer_bench", "--part", "analyser"], r"unknown layer 'analyser'; did you mean 'analyzer'\? the ray through"),
     (["mueller", "polarizer_bench", "--set", "analyzer.angel=3"], r"--set: unknown parameter .* did you mean 'analyzer.angle'"),
     (["mueller", "polarizer_bench", "--wavelength", "5"], r"--wavelength 5: allowed: 100 to 10000 nm"),
     (["mueller", "polarizer_bench", "-D", "x_fov=90", "--at", "0,0.5"], r"passes no layer; the scene has analyzer, .*: give another place"),
