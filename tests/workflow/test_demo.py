@@ -33,7 +33,8 @@ def found(folder, name, sensor="gelsight"):
     return result, story
 
 
-def test_the_hidden_effect_is_named_added_and_the_noise_reached(mitsuba, tmp_path):
+def test_the_hidden_effect_is_named_added_and_the_noise_reached(mitsuba, tmp_path, monkeypatch):
+    monkeypatch.setitem(demo.SENSORS, "gelsight", ((80, 60), 200.0))  # px: a quarter of the pixels of `make demo`
     result, story = found(tmp_path, "veiling glare")
     assert result["verdict"] == "NOTHING" and result["right"], story
     with pytest.raises(OutputExists, match="seed 2"):
