@@ -18,7 +18,7 @@ from scipy.sparse.csgraph import connected_components
 
 from optics.errors import Underdetermined, UnknownKey
 from optics.parameter import Values, Variable
-from optics.words import spaced
+from optics.words import some, spaced
 
 REACH = 4.0  # plausible sizes that one step may change what the image is not linear in
 ALIKE = 0.995  # correlation beyond which two variables are said to stand for each other
@@ -405,12 +405,12 @@ def fit(model, variables: Sequence[Variable], start: Values | None = None, frame
         normal = descent.linearise(tick)
         if sum(normal.frame_n) == 0:
             names = [str(getattr(model.frames[f], "name", f)) for f in frames]
-            raise Underdetermined(f"no usable value in the {len(frames)} frames to fit ({_some(names)}): all are saturated, at black, or "
+            raise Underdetermined(f"no usable value in the {len(frames)} frames to fit ({some(names)}): all are saturated, at black, or "
                                   "masked; check [noise] black_level and saturation in captures.toml, and the masks")
         silent = [v.name for i, v in enumerate(variables) if normal.a[i, i] == 0]
         if len(silent) == len(variables) and variables:
             there = [f"{v.name} = {value:.4g}{spaced(v.parameter.unit)}" for v, value in zip(variables, descent.theta)]
-            raise Underdetermined(f"none of the {len(variables)} free parameters changes any frame: at {_some(there)}; allowed: what some "
+            raise Underdetermined(f"none of the {len(variables)} free parameters changes any frame: at {some(there)}; allowed: what some "
                                   "frame depends on; free others, or correct what the frames set")
         history.append(normal.total)
         promise = descent.promised
@@ -498,18 +498,13 @@ def covariance_of(a: np.ndarray) -> np.ndarray:
     return inverse
 
 
-def _some(names: Sequence[str], most: int = 5) -> str:
-    """The first few names, and how many more there are."""
-    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
-
-
 def warnings_of(result: Fit, a: np.ndarray) -> list[str]:
     """Sentences about variables that cannot be told apart, that do nothing, or that stand at a bound."""
     texts, told = [], [set()]
     names = [v.name for v in result.variables]
     silent = [n for n, d in zip(names, np.diag(a)) if d == 0]
     if silent:
-        texts.append(f"nothing in the frames depends on {_some(silent, 8)}")
+        texts.append(f"nothing in the frames depends on {some(silent, 8)}")
     if len(a):
         scale = np.sqrt(np.where(np.diag(a) > 0, np.diag(a), 1))
         eigen, vectors = np.linalg.eigh(a / np.outer(scale, scale))
@@ -518,7 +513,7 @@ def warnings_of(result: Fit, a: np.ndarray) -> list[str]:
                 part = [n for n, c in zip(names, vector) if abs(c) > 0.15 and n not in silent]
                 if len(part) > 1:
                     told.append(set(part))
-                    texts.append(f"the captures cannot tell apart {_some(part, 8)}: only a combination is determined; hold one of "
+                    texts.append(f"the captures cannot tell apart {some(part, 8)}: only a combination is determined; hold one of "
                                  "them, or give it a prior")
     correlation = np.nan_to_num(result.correlation, posinf=0.0, neginf=0.0) * (1 - np.eye(len(names)))
     count, member = connected_components(np.abs(correlation) > ALIKE) if names else (0, None)
@@ -529,7 +524,7 @@ def warnings_of(result: Fit, a: np.ndarray) -> list[str]:
             texts.append(f"{names[one[0]]} and {names[one[1]]} are correlated to {correlation[one[0], one[1]]:+.4f}")
         else:
             most = np.abs(correlation[np.ix_(one, one)]).max()
-            texts.append(f"{_some([names[i] for i in one])} are correlated among each other, to {most:.4f} at most: the captures know little "
+            texts.append(f"{some([names[i] for i in one])} are correlated among each other, to {most:.4f} at most: the captures know little "
                          "more than one combination of them; hold one of them, or give it a prior")
     texts += [f"{n} ended at its bound" for n in result.at_bound]
     if not result.converged:

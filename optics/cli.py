@@ -23,7 +23,7 @@ from typing import Annotated
 import typer
 
 from optics import __version__
-from optics.words import spaced, table
+from optics.words import key_of, spaced, table
 
 app = typer.Typer(
     add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False,
@@ -337,7 +337,7 @@ def effects(name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="S
     if given:
         raise ValueError(f"{' '.join(given)}: only with `optics effects new NAME`, which writes a new effect")
     found = scan(plugins)
-    key = re.sub(r"[^a-z0-9]+", "-", (name or "").lower()).strip("-")
+    key = key_of(name or "")
     if name and key not in found.effects:
         if (kind := key.replace("-", "_")) in found.parts:
             return _part_page(found, kind, as_json)

@@ -24,6 +24,7 @@ from optics.verdict import (
     CLEAR, EXCESS, LEVEL, MAPS, MARGIN, MIMICS, UNEVEN, Basis, Diagnosis, Findings, Level, Refit, Row, Shift, Split, decide,
     moved_by, rivals, sentence,
 )
+from optics.words import some
 
 START = 0.7  # of the expected change, to begin a refit from: the linear estimate overshoots more often than not
 SETTLED = 0.01  # of the excess of chi2: what a calibrated base may still absorb
@@ -852,8 +853,7 @@ def _warnings(model, fit, evidence, table, winner, shifts, dropped, structure, b
                 texts.append(f"fragile: {what} the best effect is {other}, not {winner.effect.name}")
     moved = [s for s in shifts if s.warn]
     if moved:
-        texts.append("adding it moves " + ", ".join(moved_by(s) for s in moved[:3])
-                     + (f" and {len(moved) - 3} more" if len(moved) > 3 else "") + " by more than 3 sd or out of its prior")
+        texts.append("adding it moves " + some([moved_by(s) for s in moved], 3) + " by more than 3 sd or out of its prior")
     return texts
 
 

@@ -38,6 +38,7 @@ from types import ModuleType
 
 from optics.errors import BadPlugin, UnknownKey
 from optics.parameter import Parameter
+from optics.words import key_of
 
 STAGES = {
     "surface": "gel", "emission": "led", "segment": "gel", "reflection": "membrane", "volume": "gel",
@@ -110,7 +111,7 @@ class Effect:
     @property
     def key(self) -> str:
         """The name as one word, for the command line: 'lens vignetting' -> 'lens-vignetting'."""
-        return re.sub(r"[^a-z0-9]+", "-", self.name.lower()).strip("-")
+        return key_of(self.name)
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
@@ -152,7 +153,7 @@ class Registry:
                      if self.effects[k].part == kind and stage in self.effects[k].stages)
 
     def find_effect(self, name: str) -> Effect:
-        key = re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-")
+        key = key_of(name)
         if key not in self.effects:
             raise UnknownKey(name, self.effects, "effect", hint="`optics effects` lists them")
         return self.effects[key]
@@ -299,7 +300,7 @@ def _built(reg: Registry, part: Part) -> type:
     for p in reg.parameters_of(part.kind):
         if is_taken(p.name, cls):
             files = [e.file for e in reg.effects.values() if e.part == part.kind and p in (*e.parameters, *e.shape)]
-            raise BadPlugin(f"{files[0] if files else part.kind}: parameter '{p.name}' has the name of something else that the part "
+            raise BadPlugin(f"{files[0] if files else part.file}: parameter '{p.name}' has the name of something else that the part "
                             f"'{part.kind}' has; choose another name")
     return cls
 

@@ -23,7 +23,6 @@ import json
 import math
 import os
 import platform
-import re
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -559,7 +558,7 @@ def _single(array) -> np.ndarray:
 
 
 def _slug(name: str) -> str:
-    return re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-") or "step"
+    return words.key_of(name) or "step"
 
 
 def _now() -> str:

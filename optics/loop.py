@@ -27,7 +27,7 @@ from optics.errors import BadCapture, Underdetermined, UnknownKey
 from optics.ladder import Study
 from optics.parameter import Values, Variable
 from optics.render import Model
-from optics.words import spaced
+from optics.words import some, spaced
 
 Progress = Callable[[str, int, int], None]
 
@@ -300,7 +300,7 @@ def _far(model: Model, found: calibrate.Fit, level: Row) -> list[str]:
     moved = [(v, value) for v, value in moved if abs(value - v.prior[0]) > 3 * v.prior[1]]
     if moved:
         v, value = max(moved, key=lambda t: abs(t[1] - t[0].prior[0]) / t[0].prior[1])
-        texts.append(f"{', '.join(v.name for v, _ in moved[:4])}{f' and {len(moved) - 4} more' if len(moved) > 4 else ''}: calibrated to more than "
+        texts.append(f"{some([v.name for v, _ in moved], 4)}: calibrated to more than "
                      f"3 sd from what is known, most {v.name}: {value:.4g}{spaced(v.parameter.unit)} for {v.prior[0]:.4g} +- {v.prior[1]:g}; "
                      f"check {where}")
     return texts

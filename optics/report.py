@@ -21,7 +21,7 @@ import numpy as np
 from optics.compare import UNITS, Comparison, Curve
 from optics.errors import OutputExists
 from optics.ladder import Fingerprint, Shown, Study
-from optics.words import spaced
+from optics.words import some, spaced
 
 BUDGET = 4_500_000  # bytes of embedded pictures; the page stays below 6 MB
 SIDE_MAX = 512  # px; larger frames are binned for display
@@ -956,7 +956,7 @@ def _candidate(r: Mapping) -> dict:
     confused = f"{r['confused_with']} ({number(_finite(r.get('cos')), 2)})" if r.get("confused_with") else ""
     cells = {
         "fall": number(_finite(r.get("fall")), 4), "actual": number(_finite(refit.get("fall")), 4),
-        "strength": "; ".join(values[:3]) + (f" and {len(values) - 3} more" if len(values) > 3 else ""),
+        "strength": some(values, 3, "; "),
         "plausible": number(_finite(r.get("of_plausible")), 2), "image": percent(_finite(r.get("image")), 2),
         "share": percent(_finite(r.get("share")), 2), "survival": percent(_finite(r.get("survival")), 2),
         "p": pvalue(_finite(r.get("p_family"))), "confused": confused, "flags": ", ".join(map(words, r.get("flags") or ())),

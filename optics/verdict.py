@@ -434,7 +434,7 @@ def _cell(value) -> str:
 class Findings:
     """The numbers that a verdict is made of.
 
-    p_family     of the best of all candidates; structure_p: of low-frequency structure (NaN: readings, or images too small to show any)
+    p_family     of the best of all candidates; structure_p: of low-frequency structure (NaN: too few readings, or images too small, to show any)
     winner       the effect with the largest fall after refit, '' if none; p_winner: family-wise, of that fall
     fall, runner_up   net falls of the winner and of the next one
     refuted      with the winner nothing is left to explain, and every effect within the margin leaves structure behind, or more
@@ -500,7 +500,7 @@ def decide(f: Findings) -> tuple[str, list[Condition]]:
             Condition("significant", f.p_winner, LEVEL, f.p_winner < LEVEL, f"after refit, family-wise p {p_text(f.p_winner)}"),
             Condition("lead", lead, CLEAR, lead > CLEAR, f"chi2 falls by {lead:.3g} more than with the next, {CLEAR:g} needed"),
             Condition("margin", margin, MARGIN, margin > MARGIN or f.refuted, f"{margin:.0%} ahead of the next, "
-                      + ("which leaves structure where the best leaves none" if f.refuted and margin <= MARGIN else
+                      + ("which leaves more than could hide beside the best" if f.refuted and margin <= MARGIN else
                          f"{MARGIN:.0%} needed")),
             Condition("no better curve", f.ratio, allowed(f.coordinate), not f.rival,
                       f"the best curve ({f.coordinate or 'none'}) explains {f.ratio:.2f} of it, "

@@ -1,8 +1,9 @@
-"""How numbers and tables read in a terminal."""
+"""How names, numbers and tables read in a terminal."""
 
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Collection, Sequence
 
 
@@ -11,6 +12,16 @@ def table(rows: Sequence[Sequence[str]], left: Collection[int] | None = None) ->
     widths = [max(len(cell) for cell in column) for column in zip(*rows)]
     return "\n".join("  ".join(cell.ljust(w) if left is None or i in left else cell.rjust(w)
                                 for i, (cell, w) in enumerate(zip(row, widths))).rstrip() for row in rows)
+
+
+def some(names: Sequence[str], most: int = 5, between: str = ", ") -> str:
+    """The first few names, and how many more there are."""
+    return between.join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
+
+
+def key_of(name: str) -> str:
+    """A name as one word, for the command line and for folders: 'lens vignetting' -> 'lens-vignetting'."""
+    return re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-")
 
 
 def spaced(unit: str) -> str:
