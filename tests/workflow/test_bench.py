@@ -153,7 +153,7 @@ def test_what_goes_with_a_setting_is_drafted_then_claimed_as_a_formula(tmp_path,
     fresh.scan(declarations.shipped("plugins"))
     monkeypatch.setattr(declarations, "_registry", fresh)
     rig = Bench()
-    capture_files.write(sweep(rig.bench({}), rig.settings(), 5, {"warm-up": 0.1}), tmp_path / "captures")
+    capture_files.write(sweep(rig.light({}), rig.settings(), 5, {"warm-up": 0.1}), tmp_path / "captures")
     setup = rig.setup(tmp_path / "captures", 5)
     study, model, fit = loop.begin(setup, tmp_path / "study")
     diagnosis = loop.examine(study, model, setup, fit, advised=False)

@@ -57,7 +57,7 @@ def test_a_rehearsal_from_the_command_line(study):
 
 def test_readings_are_not_imitated(tmp_path):
     bench = readings.Bench()
-    capture_files.write(readings.sweep(bench.bench({}), bench.settings()[:100], 1), tmp_path / "captures")
+    capture_files.write(readings.sweep(bench.light({}), bench.settings()[:100], 1), tmp_path / "captures")
     loop.begin(bench.setup(tmp_path / "captures", 1), tmp_path / "study")
     said = CliRunner().invoke(app, ["imitate", str(tmp_path / "study"), "-o", str(tmp_path / "out")])
     assert said.exit_code != 0 and "readings in a table are not imitated" in str(said.exception)

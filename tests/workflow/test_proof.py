@@ -8,7 +8,7 @@ import pytest
 
 from optics import statistics
 from optics.proof import blind, cells, command, count, page
-from optics.proof.rigs import RIGS, Bench
+from optics.proof.rigs import RIGS, Bench, bench as readings
 
 FOUND = ("servo backlash", "camera gamma", "polarized source", "analyzer wobble", "polarizer misalignment")
 
@@ -53,6 +53,19 @@ def test_strengths_make_the_change_that_is_asked_for(bench):
         image = bench.mean({effect: bench.strength(effect, 0.005)})
         assert np.sqrt(np.mean((image - plain) ** 2)) / plain.mean() == pytest.approx(0.005, rel=0.03)  # the search stops at 2 %
     assert bench.truth(strong("source drift", change=10.0)) == {}  # no lamp drifts so much
+
+
+def test_another_law_has_the_cause_and_size_of_the_librarys_but_not_its_shape(bench):
+    settings, plain = bench.settings(), bench.mean({})
+    assert set(bench.others) == set(readings.OTHER) <= set(bench.effects)
+    for effect in bench.others:
+        strength = bench.strength(effect, 0.005)
+        own, other = bench.mean({effect: strength}) - plain, readings.other_light(effect, strength, settings) - plain
+        assert np.abs(readings.other_light(effect, 0.0, settings) - plain).max() < 1e-9
+        assert 0.5 < np.linalg.norm(other) / np.linalg.norm(own) < 2
+        assert 0.8 < np.vdot(own, other) / np.linalg.norm(own) / np.linalg.norm(other) < 0.998
+    with pytest.raises(ValueError, match="one law only"):
+        readings.other_light("polarizer misalignment", 1.0, settings)
 
 
 # -- counting -----------------------------------------------------------------------------------------------------------
