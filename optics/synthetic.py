@@ -23,7 +23,7 @@ from optics.scene import Scene
 CAMERA = Noise(system_gain=0.04, dark_noise=0.8, black_level=8.0, saturation=255.0, prnu=0.0)
 MAKERS = ("lens vignetting", "veiling glare", "lens blur", "colour crosstalk", "residual response curve", "interreflection",
           "ambient light", "LED size", "gel absorption", "radial distortion", "gain drift", "gel wedge", "gel bulge",
-          "refraction at the window", "specular lobe", "gel haze")
+          "refraction at the window", "specular lobe", "gel haze", "dark offset")
 
 
 def presses(count: int, seed: int, width: float = 7.0, length: float = 5.0, depth: tuple[float, float] = (0.35, 0.8)):
@@ -277,7 +277,7 @@ class Maker:
         if "residual response curve" in e:
             signal = signal + e["residual response curve"] * signal * (1 - signal)
         n = self.noise
-        return n.expose(n.black_level + (n.saturation - n.black_level) * signal, rng)
+        return n.expose(n.black_level + (n.saturation - n.black_level) * signal + e.get("dark offset", 0.0), rng)
 
     def captures(self, at: np.ndarray, drives: Sequence[Mapping[str, float]] | None = None, known_to: float = 0.0,
                  cfa: str | None = None,

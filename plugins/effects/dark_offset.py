@@ -3,15 +3,15 @@
 Definition
     DN' = DN + offset
 Fingerprint
-    the same number at every pixel, whatever light there is and whatever the exposure.
+    the same number at every pixel, whatever light there is and whatever the exposure. Where it is claimed of an offset that was there
+    from the start, `black_level` of captures.toml is too low by as much. Half a DN looks like glare where there is no such effect.
 Validity
-    constant over a session; one number for all channels. Offered where polarizers are: there darkness is a measurement.
-    Elsewhere `black_level` of the captures says it.
+    constant over a session; one number for all channels.
 References
     EMVA 1288 release 4.0, 2.2 (dark signal).
 """
 
 from optics.effect import Effect
 
-effect = Effect(name="dark offset", part="camera", parameters=("offset",), requires=("polarizer_film",), acts=("intensity",),
+effect = Effect(name="dark offset", part="camera", parameters=("offset",), acts=("intensity",),
                 needs="dark frames, or readings at two exposures and two powers")

@@ -24,7 +24,8 @@ from optics.proof.rigs.base import PATTERNS, Mean, Pictures, Workshop, smooth
 CAMERA = Noise(system_gain=0.1, dark_noise=2.0, black_level=256.0, saturation=4095.0, prnu=0.0)  # 12 bits, 38 000 electrons
 MOTTLE, WRINKLE = 0.01, 0.3  # rms: of the coating, deg of the skin's slope; at clutter 1
 GRAIN = 0.4  # mm: of mottle and wrinkles
-IN_CAMERA = ("lens vignetting", "veiling glare", "lens blur", "colour crosstalk", "residual response curve", "radial distortion", "gain drift")
+IN_CAMERA = ("lens vignetting", "veiling glare", "lens blur", "colour crosstalk", "residual response curve", "radial distortion", "gain drift",
+             "dark offset")
 
 # effect -> how the other law differs; what is not here has one law only
 OTHER = {
@@ -298,7 +299,7 @@ class Touch(Pictures):
 
     effects = ("lens vignetting", "veiling glare", "lens blur", "colour crosstalk", "residual response curve", "interreflection",
                "ambient light", "LED size", "gel absorption", "radial distortion", "gain drift", "gel wedge", "gel bulge", "specular lobe",
-               "gel haze")
+               "gel haze", "dark offset")
     others = tuple(OTHER)
     unknown = UNKNOWN
     random = ("gain drift",)
