@@ -77,7 +77,7 @@ class Renderer:
                              and k not in self.ambient_keys]
         self.led_keys = {n: [k for k in led_keys if k.rsplit(".", 1)[0] == n and k.rsplit(".", 1)[1] not in POWERS]
                          for n in scene.lights}
-        self._fixed = set(self.geometry_keys)
+        self._fixed = {k for k in self.geometry_keys if self.kind(k)}  # of stock plugins, some shade and none is slow to set
         self._still = {k: scene.parameters[k].neutral for k in self.ambient_keys}
         self._tangents: OrderedDict = OrderedDict()
         self.together: set[str] = set()  # LEDs whose images are wanted of the same geometry
@@ -433,9 +433,13 @@ class Renderer:
         weight = self._weight(values, led, self.hits(values).path, component, ())
         return image * weight.reshape(-1, self.width, self.bands)
 
+    def glows(self, values: Mapping) -> bool:
+        """Whether there is light that no LED made."""
+        return any(values[k] != neutral for k, neutral in self._still.items())
+
     def ambient(self, values: Mapping, component: int = 0) -> np.ndarray:
         """(H, W, B): radiance of the membranes that no LED made."""
-        if all(values[k] == neutral for k, neutral in self._still.items()) or component and not self.layered:
+        if not self.glows(values) or component and not self.layered:
             return np.zeros((self.height, self.width, self.bands))
         hits = self.hits(values)
         self._apply(values, move=False)
@@ -771,12 +775,13 @@ class Model:
         kind = self.renderer.kind(key)
         lit = self.lit(now)
         tangent = self.renderer.led_tangent_at_rest if at_rest else self.renderer.led_tangent
-        if not lit and kind != "membrane" and self.parameters[key].how != "difference":
+        glows = self.renderer.glows(now)
+        if not lit and not glows and kind != "membrane" and self.parameters[key].how != "difference":
             return None  # a dark frame
-        if key == self.renderer.bounce_key:
-            return factor * sum(power * self.renderer.bounced(now, led, seed) for led, power in lit.items())
         if self.parameters[key].how == "layer":
             return factor * (np.imag(self.radiance({**now, key: now[key] + 1j * STEP}, seed)) / STEP)
+        if key == self.renderer.bounce_key:
+            return factor * sum(power * self.renderer.bounced(now, led, seed) for led, power in lit.items()) if lit else None
         if self._is_power(key):
             if np.all(factor == 0):
                 return None
@@ -800,8 +805,8 @@ class Model:
             image = (self._difference_led(now, name, key) if self.parameters[key].how == "difference"
                      else tangent(now, name, key))
             return factor * lit[name] * image
-        total = sum(power * tangent(now, led, key) for led, power in lit.items())
-        if kind == "membrane":
+        total = sum((power * tangent(now, led, key) for led, power in lit.items()), 0.0)
+        if glows or kind == "membrane":
             total = total + self._difference_ambient(now, key)
         return factor * total
 

@@ -568,6 +568,26 @@ def test_derivatives_behind_layers(key, bench_of):
     assert check(bench, key, *tolerance) > 1e-5
 
 
+@pytest.mark.parametrize("key", ("analyzer.angle", "film.offset", "film.leak", "object_paint.rho_g", "wall_paint.ambient",
+                                 "object.bsdf.reflectance.value"))
+def test_derivatives_of_light_that_no_lamp_made(key, bench_of, monkeypatch):
+    """With every lamp off, what the paints shine by themselves is still seen through the layers."""
+    bench = bench_of("fluorescent")
+    for light in bench.scene.lights:
+        monkeypatch.setitem(bench.values, f"{light}.power", 0.0)
+    layer = bench.scene.parameters[key].how == "layer"
+    assert (check_layer_step(bench, key) if layer else check_model_derivative(bench, key, 2e-3)) > 1e-5
+
+
+def test_a_picture_does_not_depend_on_those_before_it(bench):
+    """Values of stock plugins take hold whatever geometry is at hand, light of the room included."""
+    key, room = "membrane.reflectance.value", {"membrane.ambient": 0.01, **{f"{n}.power": 0.0 for n in bench.scene.leds}}
+    for light in (room, {}):
+        before = bench.image(light)
+        brighter = bench.image({**light, key: 1.1})
+        assert np.array_equal(bench.image(light), before) and np.abs(brighter - before).max() > 0.01 * before.max()
+
+
 def check_linear(bench, key):
     """linear: second differences vanish; squared: twice the value has four times the effect."""
     p = bench.scene.parameters[key]
