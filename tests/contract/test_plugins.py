@@ -568,7 +568,7 @@ def test_derivatives_behind_layers(key, bench_of):
     assert check(bench, key, *tolerance) > 1e-5
 
 
-@pytest.mark.parametrize("key", ("analyzer.angle", "film.offset", "film.leak", "object_paint.rho_g", "wall_paint.ambient",
+@pytest.mark.parametrize("key", ("analyzer.angle", "film.offset", "analyzer.transmittance", "object_paint.rho_g", "wall_paint.ambient",
                                  "object.bsdf.reflectance.value"))
 def test_derivatives_of_light_that_no_lamp_made(key, bench_of, monkeypatch):
     """With every lamp off, what the paints shine by themselves is still seen through the layers."""
