@@ -432,3 +432,18 @@ def test_stokes_vectors_turn_with_our_camera(mitsuba):
     assert behind_film(90.0) == pytest.approx([-1, 0], abs=0.01)
     assert behind_film(45.0) == pytest.approx(-behind_film(-45.0), abs=0.01)
     assert abs(behind_film(45.0)[1]) == pytest.approx(1, abs=0.01)
+
+
+def test_painted_edges_are_as_smooth_as_those_of_shapes(mitsuba):
+    """The chequers of the finger's wall against a picture eight times as fine: within what the samples of a rim resolve of a step of 0.4."""
+    from optics import scene as scenes
+    from optics.render import Renderer
+
+    def picture(width):
+        scene = scenes.load("vi2tap", {"width": str(width), "height": str(width * 3 // 4)})
+        values = {**scene.values(), **{f"{n}.power": 0.0 for n in scene.lights}, "analyzer.inserted": 0.0, "film.inserted": 0.0}
+        return Renderer(scene).radiance(values)[..., 0]
+
+    fine = picture(384).reshape(36, 8, 48, 8)
+    assert np.abs(picture(48) - fine.mean((1, 3))).max() < 0.05 * fine.max()
+    assert fine.std((1, 3)).max() > 0.1 * fine.max()  # there are edges
