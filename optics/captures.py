@@ -30,6 +30,7 @@ KEYS = ("scene", "values_are", "flat_field", "cfa", "noise", "parameters", "fram
 FRAME_KEYS = ("image", "mask", "repeats", "group", "parameters")
 TABLE_KEYS = ("file", "values", "rename", "scale")
 NOISE_KEYS = tuple(name for name in UNITS if name != "quantisation")  # the step is read off the images
+SUNK = 5.0  # sd of the dark noise that the median of a frame may lie below the black level
 CFA = ("RGGB", "BGGR", "GRBG", "GBRG")
 
 
@@ -202,6 +203,12 @@ def _check_levels(captures: Captures, where: str) -> None:
         if np.all(values >= top):
             raise BadCapture(f"{where}: {what}: all saturated, every value used is >= {top:g} DN; allowed: some values below; "
                              "remove it or expose it shorter")
+    if captures.noise is not None and captures.table is None:
+        least = captures.noise.black_level - SUNK * float(captures.noise.sd(captures.noise.black_level))
+        for what, values in used:
+            if values.size and (middle := float(np.median(values))) < least:
+                raise BadCapture(f"{where}: {what}: half of its values are {middle:g} DN or less, far below what it has without light, "
+                                 f"black_level = {captures.noise.black_level:g} DN; allowed: {least:.4g} DN or more; correct [noise] black_level")
     if captures.noise is not None and not any(_lit(captures, f).any() for f in captures.frames):
         raise BadCapture(f"{where}: {_unusable(captures)}")
 

@@ -828,6 +828,7 @@ def imitate(study: StudyFolder,
     from optics import loop
     from optics.rehearse import imitate as imitated
 
+    _check_new_folder(output)
     found, model, setup = loop.take_up(study)
     fit = loop.restore(found, model)
     _, held = loop.split(model, setup)

@@ -21,7 +21,7 @@ from optics.errors import Underdetermined
 from optics.evidence import Candidate, Evidence, Progress, at_bound, measure, value_of
 from optics.parameter import Values, Variable
 from optics.verdict import (
-    CLEAR, EXCESS, LEVEL, MAPS, MARGIN, MIMICS, UNEVEN, Basis, Diagnosis, Findings, Level, Refit, Row, Shift, Split, decide,
+    CLEAR, EXCESS, LEVEL, MAPS, MARGIN, MIMICS, NAMED, UNEVEN, Basis, Diagnosis, Findings, Level, Refit, Row, Shift, Split, decide,
     moved_by, rivals, sentence,
 )
 from optics.words import some
@@ -108,20 +108,25 @@ def diagnose(model, fit, effects: Sequence[Effect], variables_of: Callable[[Effe
         word = "PARTIAL" if any(p.complete for p in found) else word
     _write_limits(model, evidence, table, winner if word == "CLAIM" else None, fits, basis, rows_max, seed, say)
     _write_verdicts(table, word, winner, members, splits, levels)
+    names = [c.effect.name for c in chosen]
+    gaps, correct = _gaps(evidence, chosen)
+    hints = _hints(word, conditions, members, gaps, names)
     text = sentence(word, conditions, findings, rows, [c.row for c in members], fingerprints, levels, shifts, basis)
     if any(p.complete for p in found):
         text = pairs.words(found, {row.name: row.share for row in rows})
-    if word == "UNKNOWN":
+    if word in ("UNKNOWN", "CANNOT_TELL"):
         excess = basis.chi2 - basis.dof if basis.excess_sd > EXCESS else 0.0
-        text = " ".join([text, *filter(None, (prints.unexplained(fingerprints, findings.fall, excess), prints.goes_with(families)))])
-    names = [c.effect.name for c in chosen]
-    gaps, correct = _gaps(evidence, chosen)
+        fixed = prints.fixed_text(prints.fixed_pattern(model, evidence, excess), max([f.share for f in fingerprints], default=0.0))
+        unknown = [prints.unexplained(fingerprints, findings.fall, excess), "" if fixed else prints.goes_with(families)] if word == "UNKNOWN" else []
+        text = " ".join(filter(None, [fixed, text[0].upper() + text[1:] if fixed else text, *unknown]))
+        if fixed:
+            hints.insert(0, "divide the pattern out with a flat_field, mask what is dirt, or note the sensor's own as [noise] prnu")
     return Diagnosis(
         word=word, sentence=text, conditions=conditions, basis=basis, rows=rows,
         ambiguous=[c.effect.name for c in members] if word == "AMBIGUOUS" else [],
         compared=names, gaps=gaps, correct=correct, splits=splits, levels=levels, fingerprints=fingerprints, shifts=shifts,
-        hints=_hints(word, conditions, members, gaps, names), not_tested=not_tested,
-        warnings=_warnings(model, fit, evidence, table, winner, shifts, dropped, structure, basis),
+        hints=hints, not_tested=not_tested,
+        warnings=_warnings(model, fit, evidence, table, word, winner, shifts, dropped, structure, basis),
         claimed=winner.effect.name if word == "CLAIM" else "", pairs=found, families=families, fits=fits,
         evidence=replace(evidence, blocks=[], sigma=[], whitened=[], use=[], candidates=table.order))
 
@@ -741,6 +746,7 @@ def _findings(table, winner, done, members, fingerprints, splits, levels, basis,
                 _refuted(winner, c, basis.dof) for c in others
                 if _close(winner.row.net_refit, max(c.row.net_refit, 0.0 if c in done else c.row.net))),
             share=winner.row.net_refit / excess if excess > 0 else math.nan, excess_sd=basis.excess_sd,
+            left=basis.misfit * math.sqrt(max(1 - winner.row.refit.fall / basis.chi2, 0.0)),
             uneven=worst.h if worst else 0.0, uneven_by=f" by {worst.by} ({_extremes(worst)})" if worst else "",
             even=all(s.holds for s in mine),
             some_even=any(even.values()) if even else True,
@@ -750,7 +756,7 @@ def _findings(table, winner, done, members, fingerprints, splits, levels, basis,
         return own
     better = rivals(fingerprints, own.fall)
     best = better[0] if better else fingerprints[0]
-    return replace(own, ratio=best.ratio, rival=bool(better), coordinate=best.coordinate)
+    return replace(own, ratio=best.ratio, rival=bool(better), coordinate=best.coordinate, curve_share=best.share)
 
 
 def _extremes(split: Split) -> str:
@@ -822,7 +828,7 @@ def _write_verdicts(table: Table, word: str, winner, members, splits, levels) ->
             c.row.flags.append("fragile")
 
 
-def _warnings(model, fit, evidence, table, winner, shifts, dropped, structure, basis) -> list[str]:
+def _warnings(model, fit, evidence, table, word, winner, shifts, dropped, structure, basis) -> list[str]:
     """What weakens the verdict, in sentences."""
     texts = [] if getattr(fit, "converged", True) else [f"the base stopped before it converged: {fit.reason}"]
     captures = getattr(model, "captures", None)
@@ -852,8 +858,9 @@ def _warnings(model, fit, evidence, table, winner, shifts, dropped, structure, b
             if other and other != winner.effect.name:
                 texts.append(f"fragile: {what} the best effect is {other}, not {winner.effect.name}")
     moved = [s for s in shifts if s.warn]
-    if moved:
-        texts.append("adding it moves " + some([moved_by(s) for s in moved], 3) + " by more than 3 sd or out of its prior")
+    if moved and word in NAMED:
+        texts.append(f"with {winner.effect.name}, what had been calibrated moves by more than 3 sd or out of its prior: "
+                     + some([moved_by(s) for s in moved], 3))
     return texts
 
 
@@ -880,6 +887,10 @@ def _hints(word: str, conditions, members: Sequence[Candidate], gaps, names) -> 
         hints.append(USUALLY)
     if "held out" in failed and word != "NOTHING" and "held out" in {c.name for c in conditions}:
         hints.append("hold out frames that the fit has not seen (other presses or places), or find why they do not improve")
+    if "near" in failed:
+        hints.append("check units, LEDs that were off, black_level, and that pictures are linear and whole: no effect brings the model near them")
+    if "a curve explains it" in failed:
+        hints.append("check [noise]: repeats of one frame tell system_gain and dark_noise, a flat_field takes the sensor's own pattern out")
     if word == "UNKNOWN":
         hints.append("draft an effect from the curve (optics effects new NAME --from STUDY), add it, and diagnose again")
     return hints

@@ -8,6 +8,8 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable
 
+from optics.words import spaced
+
 
 class UnknownKey(KeyError):
     """A key that no part of the scene, file or registry has; the text names the nearest known one."""
@@ -34,8 +36,8 @@ class OutOfBounds(ValueError):
 
     def __init__(self, key: str, value: float, unit: str, bounds: tuple[float, float], where: str = ""):
         super().__init__(
-            f"{where + ': ' if where else ''}{key} = {value:g} {unit} is outside its bounds "
-            f"[{bounds[0]:g}, {bounds[1]:g}] {unit}; see `optics params SCENE`"
+            f"{where + ': ' if where else ''}{key} = {value:g}{spaced(unit)} is outside its bounds "
+            f"[{bounds[0]:g}, {bounds[1]:g}]{spaced(unit)}; see `optics params SCENE`"
         )
 
 

@@ -18,12 +18,13 @@ from optics import statistics as st
 from optics.compare import UNITS, led_label
 from optics.evidence import Evidence, Progress
 from optics.parameter import Values
-from optics.verdict import AS_GOOD, EXCESS, MIMICS, Family, Fingerprint, ordered
+from optics.verdict import AS_GOOD, EXCESS, MIMICS, SHARE, Family, Fingerprint, ordered
 
 SIDE = 4  # cells per side of the coordinate 'place': a finer map would fit any clutter and forbid every claim
 NOT_A_COORDINATE = {"far", "quadrant"}  # regions that others make up
 YES_NO = ("contact", "shadow", "rim")
 LINES = 64  # bins of 'row', 'column' and 'reading': what a shutter, a read-out or a restless lamp does goes by single rows
+REPEATED = 3  # frames that show a pixel, for a pattern to be called fixed
 SEEN = 0.01  # of a curve's direction that calibration must leave for it to be drawn: the rest (a level, a slope) nobody can know
 DISTANCES = 8  # LEDs up to which the distance to each is a coordinate of its own
 
@@ -290,18 +291,48 @@ def goes_with(found: Sequence[Family]) -> str:
     if not found or found[0].net <= 0:
         return ""
 
+    weighed = math.isfinite(found[0].share)
+
     def told(f: Family) -> str:
         name = "a setting" if f.family == "setting" else f"the {f.family}" if f.family == "camera" else f.family
-        return f"{name} ({f.coordinate} {max(f.share if math.isfinite(f.share) else f.of_best, 0.0):.0%})"
+        how = f" {max(f.share, 0.0):.0%}" if weighed else "" if f is found[0] else f", {max(f.of_best, 0.0):.2f} of it"
+        return f"{name} ({f.coordinate}{how})"
 
     near = [f for f in found[1:] if f.of_best > AS_GOOD and f.coordinate not in MIMICS]
     rest = [f for f in found[1:] if f not in near]
-    of = "the excess misfit" if math.isfinite(found[0].share) else "what the best curve does"
     text = f"It goes with {' or '.join(map(told, [found[0], *near]))}"
     text += ", which these captures do not separate" if near else ""
     if rest:
         text += (f"; less with {', '.join(map(told, rest))}" if near else f" rather than with {', '.join(map(told, rest))}")
-    return f"{text}; in brackets the best coordinate of each and how much of {of} a curve along it explains."
+    how = "of the excess misfit a curve along it explains" if weighed else "a curve along it explains of what the best curve does"
+    return f"{text}; in brackets the best coordinate of each and how much {how}."
+
+
+def fixed_pattern(model, evidence: Evidence, excess: float) -> float:
+    """Share of the excess misfit that one gain for each pixel explains, the same in all frames: dirt, scratches, a sensor's own pattern.
+
+    Of pixels that REPEATED frames or more show, beyond what as many gains explain by chance; NaN where there are none, or no excess.
+    excess   chi2 less its degrees of freedom
+    """
+    black, size = float(model.noise.black_level), max((int(b.index.max(initial=0)) for b in evidence.blocks), default=0) // evidence.channels + 1
+    shown, along, length = np.zeros(size), np.zeros(size), np.zeros(size)
+    for block in evidence.blocks:
+        pixel, g = block.index // evidence.channels, (block.prediction - black) / block.sigma
+        shown += np.bincount(np.unique(pixel), minlength=size)
+        along += np.bincount(pixel, g * block.r, size)
+        length += np.bincount(pixel, g * g, size)
+    use = (shown >= REPEATED) & (length > 0)
+    if not use.any() or not excess > 0:
+        return math.nan
+    return float(np.sum(along[use] ** 2 / length[use]) - use.sum()) * evidence.thinning / excess
+
+
+def fixed_text(share: float, best: float) -> str:
+    """One sentence where a fixed pattern explains much more than the best curve does; '' where not."""
+    if not share > max(SHARE, 2 * best):
+        return ""
+    return (f"one gain for each pixel, the same in every frame, explains {min(share, 1.0):.0%} of the excess: dirt, a scratch or the sensor's own "
+            "pattern lies fixed in the picture, whatever curve it leans to.")
 
 
 def unexplained(found: Sequence[Fingerprint], best_effect: float, excess: float) -> str:

@@ -111,7 +111,7 @@ class Study:
         if (folder / "ladder.json").exists():
             if not resume:
                 raise OutputExists(f"{folder} holds a study already; choose another folder, or go on with it (--resume)")
-            study = cls.open(folder)
+            study = cls.open(folder, empty=True)
             old = study.record
             changed = [k for k, new in (("scene", scene), ("seed", seed)) if old[k] != new]
             changed += sorted(k for k in hashes.keys() | old["inputs"].keys() if hashes.get(k) != old["inputs"].get(k))
@@ -135,15 +135,15 @@ class Study:
         return study
 
     @classmethod
-    def open(cls, folder: str | Path) -> "Study":
+    def open(cls, folder: str | Path, empty: bool = False) -> "Study":
         """Read a study; steps that were written whole but not yet listed are taken in.
 
-        Raises FileNotFoundError without a ladder.json, ValueError when it cannot be read.
+        Raises FileNotFoundError without a ladder.json, ValueError when it cannot be read, or has no step and may not be `empty`.
         """
         folder = Path(folder)
         file = folder / "ladder.json"
         if not file.is_file():
-            raise FileNotFoundError(f"{folder} is no study: it has no ladder.json; name the folder that a study wrote")
+            raise FileNotFoundError(f"{folder} is no study: it has no ladder.json; name the folder that `optics calibrate CAPTURES -o STUDY` wrote")
         try:
             record = json.loads(file.read_text(encoding="utf-8"))
             if record["format"] != FORMAT:
@@ -159,6 +159,9 @@ class Study:
             raise ValueError(f"{folder}/steps: steps are missing or double ({found}); restore them or start a new study")
         if record["steps"] and not record["shown"]:
             record["shown"] = [f["name"] for f in record["steps"][0]["frames"]]
+        if not record["steps"] and not empty:
+            raise ValueError(f"{folder}: the study has no step yet, its calibration was cut off; `optics calibrate {record['captures']} -o "
+                             f"{folder} --resume` finishes it")
         return cls(folder, record)
 
     def discard(self) -> None:

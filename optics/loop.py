@@ -11,6 +11,7 @@ Every step is a folder of the study (optics.ladder), and each can be taken up ag
 from __future__ import annotations
 
 import json
+import math
 import re
 import time
 from collections.abc import Callable, Sequence
@@ -27,6 +28,7 @@ from optics.errors import BadCapture, Underdetermined, UnknownKey
 from optics.ladder import Study
 from optics.parameter import Values, Variable
 from optics.render import Model
+from optics.verdict import FAR
 from optics.words import some, spaced
 
 Progress = Callable[[str, int, int], None]
@@ -35,7 +37,7 @@ POSE = ("press_x", "press_y", "press_depth")  # what is solved for per press, un
 POSE_SD = 0.05  # mm: how well a stage usually knows it
 CHANCE = 0.3  # of the noise: error of a prediction that is followed by chance, below which it adds less than 5 % to the noise
 ASPECT = 0.02  # by which the sides of images may be in another ratio than the scene's
-FAR = 0.3  # misfit over mean signal: beyond what any effect of a sensor does
+GROUPS = 4  # of frames, from which on one in so many is held out
 GAUGE = 10.0  # plausible sizes: how far what no data hold may be from the scene's value
 
 
@@ -119,7 +121,7 @@ def split(model: Model, setup: Setup) -> tuple[list[int], list[int]]:
     names = list(groups)
     held = setup.held_out
     if held is None:
-        held = names[1::4] if len(names) >= 4 else []
+        held = names[1::4] if len(names) >= GROUPS else []
     for name in held:
         if name not in groups:
             raise UnknownKey(name, names, "group of frames", setup.captures)
@@ -248,7 +250,7 @@ def begin(setup: Setup, folder: str | Path, *, title: str = "", command: Sequenc
     study = Study.create(
         folder, scene=str(model.captures.scene), captures=str(setup.captures),
         inputs=[setup.captures, model.scene.path, *registry().folders], seed=setup.seed, command=command, title=title,
-        noise=asdict(model.noise), warnings=_warnings(model), resume=resume,
+        noise=asdict(model.noise), warnings=[*_warnings(model), *_unverified(model, setup, held)], resume=resume,
         facts={"frames": len(model.frames), "fitted": len(fitted), "held_out": len(held),
                "image": list(model.shape), "masked": 1 - float(np.mean([u.sum() / model.size for u in usable])),
                "setup": asdict(setup)})
@@ -269,7 +271,7 @@ def _warnings(model: Model) -> list[str]:
     from optics.noise import warnings_of
     from optics.picture import veiled
 
-    texts = [*model.captures.warnings, *warnings_of(model.noise, model.captures), *_unnamed(model)]
+    texts = [*model.captures.warnings, *warnings_of(model.noise, model.captures), *_unnamed(model), *_astray(model)]
     if model.renderer.layered and model.captures.table is None and (what := veiled(model.renderer, model.at(Values(), 0))):
         texts.append(f"the model leaves out light that comes through layers: {what}")
     if model.by_chance and (share := model.chance()) > CHANCE:
@@ -277,6 +279,28 @@ def _warnings(model: Model) -> list[str]:
                      f"added to the noise, pixel by pixel, but is the same in frames of the same geometry: raise `rays` and `packets` of "
                      f"the scene's integrator until it is below {CHANCE:g}")
     return list(dict.fromkeys(texts))
+
+
+def _unverified(model: Model, setup: Setup, held: Sequence[int]) -> list[str]:
+    """Several frames, of which none is held out because there are too few groups."""
+    groups = len(capture_files.groups(model.captures))
+    if held or setup.held_out is not None or groups < 2:
+        return []
+    return [f"{groups} groups of frames: none is held out, so nothing verifies what is found; take {GROUPS} or more, or name one to hold out "
+            "(--hold-out)"]
+
+
+def _astray(model: Model) -> list[str]:
+    """Presses that lie beyond the gel."""
+    gel = model.scene.gel
+    if gel is None:
+        return []
+    for axis, side in (("press_x", "width"), ("press_y", "length")):
+        key, size = f"{gel.name}.{axis}", float(model.base[f"{gel.name}.{side}"])
+        for f in model.frames:
+            if abs(f.parameters.get(key, 0.0)) > size / 2:
+                return [f"frame '{f.name}': {key} = {f.parameters[key]:g} mm lies beyond the gel, which is {size:g} mm wide there: check units"]
+    return []
 
 
 def _unnamed(model: Model) -> list[str]:
@@ -293,7 +317,8 @@ def _unnamed(model: Model) -> list[str]:
 
 def _far(model: Model, found: calibrate.Fit, level: Row) -> list[str]:
     """What no effect explains: a model that is nowhere near its images, or values far from what is known of them."""
-    texts, where = [], "units, LEDs that were off, black_level, and that pictures are whole with row 0 at the top"
+    texts, where = [], ("units, LEDs that were off, black_level, and that pictures are linear (not encoded for viewing) and whole, with row 0 at "
+                        "the top")
     if level.rms > FAR * level.signal:
         texts.append(f"the model misses the images by {level.rms / max(level.signal, 1e-9):.0%} of its own mean, which is no matter of effects: check {where}")
     moved = [(v, found.values.get(v, model.base)) for v in found.variables if v.prior is not None]
@@ -446,4 +471,8 @@ def extend(study: Study, model: Model, setup: Setup, found: calibrate.Fit, effec
     best = calibrate.fit(model, variables, start, fitted, robust=setup.robust, progress=progress)
     study.note_inputs([effect.file] if effect.file else [])  # a draft is written after the study began
     comparison = record(study, model, effect.name, effect, best, held, time.perf_counter() - clock)
+    before, after = (step["held_out"]["chi2_per_dof"] if step["held_out"] else math.nan for step in study.steps[-2:])
+    if after > before:
+        best.warnings.append(f"held-out chi2/dof rises from {before:.4g} to {after:.4g} with {effect.name}: it does not predict what it was not "
+                             "fitted to, and is not the cause, or not by itself")
     return best, comparison

@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 from optics.errors import OutOfBounds, UnknownKey
+from optics.words import spaced
 
 HOW = ("ad", "difference", "image", "layer", "path")
 
@@ -96,9 +97,9 @@ class Parameter:
         try:
             number = float(value)
         except (TypeError, ValueError):
-            raise ValueError(f"{where + ': ' if where else ''}{key} = {value!r} is not a number in {self.unit}") from None
+            raise ValueError(f"{where + ': ' if where else ''}{key} = {value!r} is not a number{f' in {self.unit}' if spaced(self.unit) else ''}") from None
         if not math.isfinite(number):
-            raise ValueError(f"{where + ': ' if where else ''}{key} = {number} {self.unit} is not finite")
+            raise ValueError(f"{where + ': ' if where else ''}{key} = {number}{spaced(self.unit)} is not finite")
         if not self.bounds[0] <= number <= self.bounds[1]:
             raise OutOfBounds(key, number, self.unit, self.bounds, where)
         return number

@@ -79,7 +79,7 @@ def rehearse(model, fit, effects: Sequence, variables_of: Callable, fitted: Sequ
     from optics.diagnose import score
 
     if not change > 0:
-        raise ValueError(f"change = {change:g}; allowed: above 0, such as 0.005 for half a per cent of the mean signal")
+        raise ValueError(f"change = {100 * change:g} %; allowed: above 0 % of the mean signal, such as 0.5 %")
     scored = score(model, fit, effects, variables_of, fitted, seed=seed, progress=progress)
     evidence, table = scored.evidence, scored.table
     first, information = len(evidence.base), table.information

@@ -68,8 +68,6 @@ def report(study_folder: str | Path, out: str | Path, *, overwrite: bool = False
 
 def render(study: Study) -> str:
     """The page as text."""
-    if not study.steps:
-        raise ValueError(f"{study.folder}: the study has no step yet, so there is nothing to report; run the study first")
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
     from optics import residual_maps

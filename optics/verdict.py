@@ -39,9 +39,12 @@ UNEVEN = 0.1  # of the fall: what splitting the strength by channel, frame, ... 
 STRENGTH = 2.0  # standard deviations that a claimed strength must differ from none by: a fall without it is another's
 MAPS = ("place", "reading")  # where, or when, whatever the cause: a fine map mimics every curve that does not move
 MIMICS = (*MAPS, "frame")
+FAR = 0.3  # misfit over mean signal: beyond what effects of a sensor leave
+CLUTTERED = 0.005  # of the signal: misfit that mottle of a coating and a fixed pattern make in a good sensor
 AS_GOOD = 0.8  # of the best curve's fall: what is nearer than that is not told apart from it
 PLANS = ("together", "more of the same")  # kinds of advice that are several shots
 TELLS = 0.02  # gain of P(correct) below which a shot is not worth a line
+NAMED = ("CLAIM", "PARTIAL", "AMBIGUOUS")  # words that name effects
 WORDS = ("NOTHING", "CLAIM", "AMBIGUOUS", "PARTIAL", "UNKNOWN", "CANNOT_TELL")
 
 
@@ -441,7 +444,8 @@ class Findings:
                  than could hide beside the winner: the misfit that makes small differences worthless is then not there
     ratio        the best curve's net fall over the winner's
     rival        a curve does better by RIVAL (a map) or RIVAL_CURVE, significantly
-    share        of the excess, where excess_sd > EXCESS
+    share        of the excess, where excess_sd > EXCESS; curve_share: that of the best curve
+    left         misfit over mean signal with the winner
     uneven       largest h of the winner, uneven_by: its split, in words; even: whether all splits hold; some_even: whether
                  those of any member of the ambiguous set do
     held_out     net fall on held-out frames, NaN where there are none
@@ -460,6 +464,8 @@ class Findings:
     rival: bool = False
     coordinate: str = ""
     share: float = math.nan
+    curve_share: float = math.nan
+    left: float = math.nan
     excess_sd: float = 0.0
     uneven: float = 0.0
     uneven_by: str = ""
@@ -508,6 +514,8 @@ def decide(f: Findings) -> tuple[str, list[Condition]]:
             Condition("share", f.share, SHARE, not weighed or f.share > SHARE,
                       f"{f.share:.0%} of the excess explained, {SHARE:.0%} needed" if weighed else
                       f"no share is asked of an excess of {f.excess_sd:.2g} sd, below {EXCESS:g}"),
+            Condition("near", f.left, FAR, not f.left > FAR,
+                      f"with it the model still misses the images by {percent(f.left)} of their mean, {FAR:.0%} allowed"),
             Condition("strength", f.clear, STRENGTH, not f.clear < STRENGTH,
                       "its error is not known" if math.isnan(f.clear) else f"{f.clear:.2g} sd from none, {STRENGTH:g} needed"),
             Condition("beyond clutter", f.chance, LEVEL, not f.chance >= LEVEL,
@@ -525,12 +533,16 @@ def decide(f: Findings) -> tuple[str, list[Condition]]:
             return "CLAIM", conditions
         if "significant" in failed and not structure and not weighed:
             return "NOTHING", conditions  # the linear score promised a fall that no refit brought, and nothing else is left
-        if failed & {"lead", "margin"} and not failed & {"significant", "no better curve", "share", "beyond clutter"} and f.some_even:
+        if failed & {"lead", "margin"} and not failed & {"significant", "no better curve", "share", "beyond clutter", "near"} and f.some_even:
             return "AMBIGUOUS", conditions
         if failed <= {"share", "even"}:
             return "PARTIAL", conditions
     if f.rival and structure:
-        return "UNKNOWN", conditions
+        if not f.curve_share < SHARE:
+            return "UNKNOWN", conditions
+        conditions.append(Condition("a curve explains it", f.curve_share, SHARE, False,
+                                    f"the best one ({f.coordinate}) explains {f.curve_share:.1%} of the excess, {SHARE:.0%} needed: what is left "
+                                    "is spread evenly, as wrong noise spreads it"))
     return "CANNOT_TELL", conditions
 
 
@@ -648,10 +660,13 @@ def sentence(word: str, conditions: Sequence[Condition], f: Findings, rows: Sequ
         best = f"{f.ratio:.3g} times as much as the best effect" if f.winner else "what no effect does"
         i = int(np.argmax(np.abs(curve.curve)))
         size = percent(curve.curve[i]) if curve.kind == "gain" else f"{curve.curve[i]:.2g} DN"
-        where = f" at {curve.labels[i] if curve.labels else f'{curve.centres[i]:.3g}'}"
-        return (f"structure is left that depends on '{curve.coordinate}': a curve along it explains {best}. "
-                f"The largest step is {size}{where} as {'a gain' if curve.kind == 'gain' else 'an offset'}. "
-                "No effect of the library has this shape.")
+        where = curve.labels[i] if curve.labels else f"{curve.coordinate} {curve.centres[i]:.3g}{spaced(curve.unit)}"
+        text = (f"structure is left that depends on '{curve.coordinate}': a curve along it explains {best}. "
+                f"As {'a gain' if curve.kind == 'gain' else 'an offset'}, it is largest at {where}: {size}. No effect of the library has this shape.")
+        if (beyond := math.sqrt(max(basis.misfit**2 - basis.noise**2, 0.0))) < CLUTTERED:
+            text += (f" It is faint: misfit beyond noise is {percent(beyond)} of the signal, which mottle of a coating or a fixed pattern of the sensor "
+                     "makes as well.")
+        return text
     reasons = "; ".join(f"{c.name}: {c.text}" for c in failing) or "; ".join(c.text for c in conditions)
     return f"something is left, but no verdict holds ({reasons})."
 
@@ -706,7 +721,7 @@ def _text(d: Diagnosis) -> str:
                   for f in d.fingerprints[:8]]
         if d.families:
             lines.append("  best of each family: " + ", ".join(f"{f.family} {f.coordinate} {f.of_best:.2f}" for f in d.families))
-    if d.shifts:
+    if d.shifts and d.word in NAMED:
         lines += ["", "calibrated parameters had moved to hide it:"]
         lines += [f"  {s.variable:<24} {s.before:.5g} -> {s.after:.5g} {s.unit} ({s.in_sd:+.1f} sd)" for s in d.shifts[:6]]
     lines += advice_lines(d.advice)

@@ -107,8 +107,6 @@ class View:
     def _open(self, folder: str | Path, step: int | None) -> None:
         self.study, self.model, self.setup = loop.take_up(folder)
         count = len(self.study.steps)
-        if not count:
-            raise ValueError(f"{folder}: the study has no step yet; `optics calibrate` with --resume finishes the base model")
         if step is not None and not 0 <= step < count:
             steps = ", ".join(f"{s['index']} ({s['name']})" for s in self.study.steps)
             raise ValueError(f"--step {step}: no such step; {folder} has {steps}")

@@ -17,7 +17,7 @@ from optics import draft
 from optics.effect import Registry, declared, shipped
 from optics.errors import OutputExists, UnknownKey
 from optics.evidence import measure
-from optics.fingerprints import families, family_of, fingerprints, goes_with, lit_geometry, places, unexplained
+from optics.fingerprints import families, family_of, fingerprints, fixed_pattern, fixed_text, goes_with, lit_geometry, places, unexplained
 from optics.lookup import lookup
 from optics.verdict import Basis, Family, Fingerprint
 
@@ -64,10 +64,30 @@ def test_the_numbers_of_a_curve_are_of_all_values_where_it_was_found_in_some():
     assert row.p < 1e-12
 
 
+@pytest.mark.parametrize("pattern", ["scratch", "none", "banding"])
+def test_a_pattern_fixed_in_the_picture_is_told_from_a_curve(pattern):
+    """A scratch of one pixel's width across the picture, dark by 10 % in every frame: no curve along a coordinate is it."""
+    model = MockModel(len(FITTED), 24)
+    start = simulate(model, np.random.default_rng(3), {"banding": 0.03} if pattern == "banding" else None)
+    if pattern == "scratch":
+        for frame in model.frames:
+            frame.image[range(24), range(24)] = 8 + 0.9 * (frame.image[range(24), range(24)] - 8)
+    fit = mock_fit(model, model.base_variables(FITTED), start, FITTED)
+    evidence = measure(model, fit.values, fit.variables, [], FITTED, 400_000, 0, lambda *a: None)
+    found = fingerprints(model, evidence, places(model, fit.values, evidence), 1.0, lambda *a: None)
+    excess = evidence.projected.chi2 - (evidence.normal.count - evidence.projected.rank)
+    share, best = fixed_pattern(model, evidence, excess), max(f.share for f in found)
+    assert bool(fixed_text(share, best)) == (pattern == "scratch")
+    if pattern == "scratch":
+        assert share > 0.8
+    few = replace(evidence, blocks=evidence.blocks[:2])
+    assert np.isnan(fixed_pattern(model, few, excess)) and np.isnan(fixed_pattern(model, evidence, 0.0))
+
+
 def test_in_noise_no_curve_stands_out_and_none_has_a_share():
     found = case("banding", 0.0)[3]
     assert min(f.p for f in found) * len(found) > 0.01 and all(np.isnan(f.share) for f in found)
-    assert "how much of what the best curve does" in goes_with([Family("camera", "row", 9.0, np.nan, 1.0)])
+    assert "how much a curve along it explains of what the best curve does" in goes_with([Family("camera", "row", 9.0, np.nan, 1.0)])
 
 
 def test_directions_that_calibration_absorbs_are_not_drawn():

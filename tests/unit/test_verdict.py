@@ -215,6 +215,12 @@ GOOD = Findings(p_family=1e-6, structure_p=1e-6, winner="a", p_winner=1e-6, fall
     ({"chance": 0.02, "runner_up": 990.0}, "CANNOT_TELL"),
     ({"chance": 0.002}, "CLAIM"),
     ({"winner": ""}, "CANNOT_TELL"),
+    ({"left": 0.29}, "CLAIM"),
+    ({"left": 0.31}, "CANNOT_TELL"),
+    ({"left": 0.31, "runner_up": 990.0}, "CANNOT_TELL"),
+    ({"rival": True, "ratio": 2.0, "curve_share": 0.06}, "UNKNOWN"),
+    ({"rival": True, "ratio": 2.0, "curve_share": 0.04}, "CANNOT_TELL"),
+    ({"p_family": 0.02, "rival": True, "ratio": 3.0, "curve_share": 0.01}, "CANNOT_TELL"),
 ])
 def test_the_rule(changes, word):
     got, conditions = decide(replace(GOOD, **changes))

@@ -50,6 +50,42 @@ def test_lights_named_in_some_frames_only(frames, key):
     assert key is None or texts[0].startswith(f"{key}: set in some frames and not in others") and "write 0" in texts[0]
 
 
+@pytest.mark.parametrize("x, warned", [(9.3, False), (35.0, True), (-9.5, True)])
+def test_a_press_beyond_the_gel_is_named(x, warned):
+    gel = SimpleNamespace(name="gel")
+    model = SimpleNamespace(scene=SimpleNamespace(gel=gel), base={"gel.width": 18.8, "gel.length": 14.0},
+                            frames=[SimpleNamespace(name="a", parameters={}), SimpleNamespace(name="b", parameters={"gel.press_x": x})])
+    texts = loop._astray(model)
+    assert bool(texts) == warned
+    assert not warned or f"frame 'b': gel.press_x = {x:g} mm lies beyond the gel, which is 18.8 mm wide" in texts[0]
+
+
+@pytest.mark.parametrize("groups, held, asked, warned", [(3, [], None, True), (1, [], None, False), (4, [1], None, False), (3, [], [], False)])
+def test_a_set_of_which_nothing_is_held_out_says_so(groups, held, asked, warned):
+    frames = [SimpleNamespace(name=f"f{i}", group=f"g{i}") for i in range(groups)]
+    model = SimpleNamespace(captures=SimpleNamespace(frames=frames))
+    texts = loop._unverified(model, loop.Setup(captures="c", held_out=asked), held)
+    assert bool(texts) == warned and (not warned or texts[0].startswith("3 groups of frames: none is held out"))
+
+
+def test_an_effect_that_does_not_predict_is_said_to_be_no_cause(monkeypatch):
+    """Held-out frames that get worse with an effect, though the fitted ones get better."""
+    study = SimpleNamespace(steps=[{"held_out": {"chi2_per_dof": 1.5}}], note_inputs=lambda files: None)
+
+    def record(*_):
+        study.steps.append({"held_out": {"chi2_per_dof": 1.6}})
+
+    monkeypatch.setattr(loop, "split", lambda model, setup: ([0], [1]))
+    monkeypatch.setattr(loop, "effect_variables", lambda model, effect: [])
+    monkeypatch.setattr(loop, "record", record)
+    monkeypatch.setattr(loop.calibrate, "fit", lambda *_, **__: SimpleNamespace(warnings=[]))
+    model = SimpleNamespace(scene=SimpleNamespace(can_express=lambda effect: True))
+    effect = SimpleNamespace(name="row curve", file="")
+    found, _ = loop.extend(study, model, SimpleNamespace(robust=False), SimpleNamespace(variables=[]), effect, Values())
+    assert found.warnings == ["held-out chi2/dof rises from 1.5 to 1.6 with row curve: it does not predict what it was not fitted to, and is "
+                              "not the cause, or not by itself"]
+
+
 @pytest.mark.parametrize("size, warned", [((30, 48), True), ((36, 48), False), ((48, 36), True)])
 def test_cut_and_turned_pictures_are_noticed(size, warned, tmp_path):
     image = np.random.default_rng(1).uniform(50, 60, (*size, 3)).astype(np.float32)
