@@ -21,8 +21,8 @@ from optics.errors import Underdetermined
 from optics.evidence import Candidate, Evidence, Progress, at_bound, measure, value_of
 from optics.parameter import Values, Variable
 from optics.verdict import (
-    CLEAR, EXCESS, LEVEL, MAPS, MARGIN, MIMICS, NAMED, UNEVEN, Basis, Diagnosis, Findings, Level, Refit, Row, Shift, Split, decide,
-    moved_by, rivals, sentence,
+    AS_GOOD, CLEAR, CURVE, EXCESS, LEVEL, MAPS, MARGIN, MIMICS, NAMED, UNEVEN, Basis, Diagnosis, Findings, Fingerprint, Level, Refit, Row, Shift, Split,
+    decide, moved_by, rivals, sentence,
 )
 from optics.words import some
 
@@ -96,6 +96,9 @@ def diagnose(model, fit, effects: Sequence[Effect], variables_of: Callable[[Effe
     levels = _held_out(model, fit, evidence, winner, fits, refit, held_out, variables_of, say)
     shifts = _shifts(model, fit, winner, fits) if winner else []
     findings = _findings(table, winner, done, members, fingerprints, splits, levels, basis, structure)
+    followed = _followed(model, evidence, winner, fits[winner.effect.name], fingerprints) if winner and winner.effect.scope == "frame" else None
+    if followed:  # one number per frame mimics whatever goes with what was set in it
+        findings = replace(findings, ratio=followed.ratio, rival=True, coordinate=followed.coordinate, curve_share=followed.share)
     word, conditions = decide(findings)
     found = []
     if winner and word not in ("NOTHING", "CLAIM") and not any(c.row.refit.complete for c in done):
@@ -759,6 +762,20 @@ def _findings(table, winner, done, members, fingerprints, splits, levels, basis,
     return replace(own, ratio=best.ratio, rival=bool(better), coordinate=best.coordinate, curve_share=best.share)
 
 
+def _followed(model, evidence: Evidence, winner: Candidate, fit, fingerprints) -> Fingerprint | None:
+    """The curve along a setting, clocks aside, that an effect's numbers per frame follow and that explains as much as they do; None where
+    they go their own way, as a drift does."""
+    own = {v.frames[0]: value_of(model, fit.values, v) for v in fit.variables if v.name in winner.row.variables and v.frames}
+    turned, found = prints.settings(model, evidence), []
+    for curve in fingerprints:
+        if curve.coordinate in turned and curve.family != "time" and curve.net > AS_GOOD * winner.row.net_refit:
+            x = dict(zip(evidence.frames, turned[curve.coordinate]))
+            both = [(x[f], y) for f, y in own.items() if math.isfinite(x.get(f, math.nan))]
+            found.append((st.follows(*np.array(both).T) if len(both) > 1 else math.nan, curve))
+    p, curve = min(found, key=lambda t: (math.isnan(t[0]), t[0]), default=(math.nan, None))
+    return curve if p * len(found) < LEVEL else None
+
+
 def _extremes(split: Split) -> str:
     """'R 2.75, B 0.03': the parts of a split where the strength is largest and smallest."""
     order = np.argsort(split.strength)
@@ -889,7 +906,7 @@ def _hints(word: str, conditions, members: Sequence[Candidate], gaps, names) -> 
         hints.append("hold out frames that the fit has not seen (other presses or places), or find why they do not improve")
     if "near" in failed:
         hints.append("check units, LEDs that were off, black_level, and that pictures are linear and whole: no effect brings the model near them")
-    if "a curve explains it" in failed:
+    if CURVE in failed:
         hints.append("check [noise]: repeats of one frame tell system_gain and dark_noise, a flat_field takes the sensor's own pattern out")
     if word == "UNKNOWN":
         hints.append("draft an effect from the curve (optics effects new NAME --from STUDY), add it, and diagnose again")

@@ -533,6 +533,22 @@ class Sweeps:
         return Structure(f, min(1.0, p * len(found)), low, free, float("nan"))
 
 
+def follows(x: np.ndarray, y: np.ndarray) -> float:
+    """p of numbers y (n,) that do not depend on x (n,): F of their lowest cosines by the ranks of x, at most NARROW and n/4 of them; NaN where
+    these are too few. No error of y enters: what scatters about a curve is its own measure."""
+    from scipy.special import fdtrc
+    from scipy.stats import rankdata
+
+    n, y = len(y), y - np.mean(y)
+    low = min(NARROW, len(np.unique(x)) - 1, n // 4)
+    if low < 1 or not y.any():
+        return float("nan")
+    slow = np.cos(np.pi * np.outer((rankdata(x) - 0.5) / n, np.arange(1, low + 1)))
+    basis = _orthonormal(slow - slow.mean(0))
+    power, free = float(np.sum((basis.T @ y) ** 2)), n - 1 - basis.shape[1]
+    return float(fdtrc(basis.shape[1], free, power / basis.shape[1] / max((float(y @ y) - power) / free, 1e-300)))
+
+
 def _orthonormal(columns: np.ndarray) -> np.ndarray:
     """A basis of what columns of any units span."""
     length = np.linalg.norm(columns, axis=0)

@@ -44,6 +44,7 @@ CLUTTERED = 0.005  # of the signal: misfit that mottle of a coating and a fixed 
 AS_GOOD = 0.8  # of the best curve's fall: what is nearer than that is not told apart from it
 PLANS = ("together", "more of the same")  # kinds of advice that are several shots
 TELLS = 0.02  # gain of P(correct) below which a shot is not worth a line
+CURVE = "a curve explains it"
 NAMED = ("CLAIM", "PARTIAL", "AMBIGUOUS")  # words that name effects
 WORDS = ("NOTHING", "CLAIM", "AMBIGUOUS", "PARTIAL", "UNKNOWN", "CANNOT_TELL")
 
@@ -540,7 +541,7 @@ def decide(f: Findings) -> tuple[str, list[Condition]]:
     if f.rival and structure:
         if not f.curve_share < SHARE:
             return "UNKNOWN", conditions
-        conditions.append(Condition("a curve explains it", f.curve_share, SHARE, False,
+        conditions.append(Condition(CURVE, f.curve_share, SHARE, False,
                                     f"the best one ({f.coordinate}) explains {f.curve_share:.1%} of the excess, {SHARE:.0%} needed: what is left "
                                     "is spread evenly, as wrong noise spreads it"))
     return "CANNOT_TELL", conditions
@@ -667,7 +668,8 @@ def sentence(word: str, conditions: Sequence[Condition], f: Findings, rows: Sequ
             text += (f" It is faint: misfit beyond noise is {percent(beyond)} of the signal, which mottle of a coating or a fixed pattern of the sensor "
                      "makes as well.")
         return text
-    reasons = "; ".join(f"{c.name}: {c.text}" for c in failing) or "; ".join(c.text for c in conditions)
+    last = [c for c in failing if c.name == CURVE]  # says more than all others together
+    reasons = "; ".join(f"{c.name}: {c.text}" for c in last or failing) or "; ".join(c.text for c in conditions)
     return f"something is left, but no verdict holds ({reasons})."
 
 

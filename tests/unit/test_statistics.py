@@ -385,3 +385,12 @@ def test_thinning_is_odd_even_handed_and_enough():
         for i, j in itertools.product((0, 1), (0, 1)):  # every position of a colour mosaic
             assert keep[i::2, j::2, 1].mean() == pytest.approx(1 / k, rel=0.05)
     assert st.lattice((4, 4, 1), 1).all()
+
+
+def test_what_follows_a_setting_and_what_does_not():
+    rng = np.random.default_rng(7)
+    x = np.arange(13.0)
+    p = np.array([st.follows(rng.permutation(x), rng.standard_normal(13)) for _ in range(2000)])
+    assert abs(np.mean(p < 0.05) - 0.05) < 4 * np.sqrt(0.05 * 0.95 / 2000)  # exact in white noise
+    assert st.follows(x, np.cos(x / 3) + 0.05 * rng.standard_normal(13)) < 1e-4
+    assert np.isnan(st.follows(x[:3], x[:3])) and np.isnan(st.follows(0 * x, x)) and np.isnan(st.follows(x, 0 * x))

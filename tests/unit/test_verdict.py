@@ -108,6 +108,23 @@ def test_an_effect_with_a_strength_per_frame_is_claimed():
     assert found - found.mean() == pytest.approx(np.array([0.01, -0.02, 0.015, 0.0]) - 0.00125, abs=0.002)
 
 
+@pytest.mark.parametrize("follows", [True, False])
+def test_a_number_per_frame_that_follows_a_setting_is_no_drift(follows):
+    """A gain that goes with what was set in each frame is not named after the frames, as one that goes its own way is."""
+    count, fitted = 14, tuple(range(12))
+    angles = 15.0 * np.arange(count)
+    gains = 0.02 * np.cos(np.radians(3 * angles))
+    gains = gains if follows else np.random.default_rng(4).permutation(gains)
+    model = MockModel(count, 20)
+    start = simulate(model, np.random.default_rng(5), {"flicker": list(gains)})
+    for frame, angle in zip(model.frames, angles):
+        frame.parameters["sensor.angle"] = angle
+    fit = mock_fit(model, model.base_variables(fitted), start, fitted)
+    d = diagnose(model, fit, library("flicker", "gamma", "glare"), model.variables_of, (12, 13), fitted=fitted, refit=mock_fit, top=3)
+    assert d.word == ("UNKNOWN" if follows else "CLAIM"), d.sentence
+    assert ("depends on 'sensor.angle'" in d.sentence) == follows and (d.claimed == "flicker") == (not follows)
+
+
 def test_after_it_is_added_nothing_is_left():
     model, fit = calibrated({"vignetting": 0.3}, extra=("vignetting",))
     d = judge(model, fit, library("vignetting", "LED lobe", "gamma", "absorption", "glare"))
