@@ -55,7 +55,9 @@ class Finger(Pictures):
                "depolarization", "stray light", "dark offset", "camera gamma", "gain drift", "lens vignetting", "marker leak", "veiling glare")
     unknown = UNKNOWN
     random = ("gain drift",)
-    pairs = pairs_of([e for e in effects if e not in ("gain drift", "depolarization", "dark offset")])
+    # a coloured leak has a leak in it: the one name says both
+    pairs = [p for p in pairs_of([e for e in effects if e not in ("gain drift", "depolarization", "dark offset")])
+             if set(p) != {"extinction leak", "coloured leak"}]
     free = ("object_paint.rho_*", "wall_paint.rho_*", "pigment.yield")
     defines = {"wall_dark": "1"}  # an even wall: its chequers have edges that nobody measures
     several = {"extinction leak": ("analyzer.leak", "film.leak"), "coloured leak": ("analyzer.leak_tilt", "film.leak_tilt"),
