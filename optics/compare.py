@@ -516,6 +516,8 @@ def _binned(name, unit, channel, x, z, edges, labels=None) -> Curve:
 # -- views --------------------------------------------------------------------------------------------------------------
 
 def _cells(row: Row) -> tuple[str, ...]:
+    if not row.n:
+        return (row.label, "0", *["-"] * 8)
     return (row.label, str(row.n), f"{100 * row.share:.1f} %", f"{row.chi2_per_dof:.3f}", f"{row.bias:+.3f}",
             f"{row.rms:.3f}", f"{row.noise:.3f}", f"{row.l1:.4f}", f"{row.psnr:.2f}", f"{row.ssim:.4f}")
 

@@ -64,6 +64,8 @@ def read_array(file: Path, where: str) -> np.ndarray:
 def _png(file: Path, where: str) -> np.ndarray:
     from PIL import Image
 
+    if file.read_bytes()[:2] == b"\xff\xd8":
+        raise BadCapture(f"{where}: a JPEG by the name of .png; JPEG alters every pixel: record PNG or raw")
     with Image.open(file, formats=["PNG"]) as picture:
         depth, colour = file.read_bytes()[24:26]  # of the header chunk: bits per value, kind of colour
         if colour in (4, 6) or "transparency" in picture.info:

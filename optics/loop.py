@@ -160,9 +160,17 @@ def variables_of_base(model: Model, setup: Setup, frames: Sequence[int]) -> list
             per_group = [f"{model.scene.gel.name}.{n}" for n in POSE]
             priors = {**{f"{p}*": (None, POSE_SD) for p in per_group}, **priors}
     variables = calibrate.variables_from(model, free, per_group, None, frames)
+    if setup.per_group is None:
+        variables = [v for v in variables if v.frames is None or not _untouched(model, v.frames)]
     for pattern, prior in priors.items():
         variables = [_with_prior(model, v, pattern, prior) for v in variables]
     return variables
+
+
+def _untouched(model: Model, frames: Sequence[int]) -> bool:
+    """Whether frames say that nothing presses the gel: there is then no place of a press to solve for."""
+    key = f"{model.scene.gel.name}.press_depth"
+    return all(model.frames[i].parameters.get(key) == 0 for i in frames)
 
 
 def _with_prior(model, variable: Variable, pattern: str, prior) -> Variable:

@@ -105,10 +105,12 @@ def capture_sets(folder):
         "absent": head + NOISE + frames.replace("b.png", "c.png"), "sizes": head + NOISE + frames.replace("b.png", "small.png"),
         "nan": head + NOISE + frames.replace("a.png", "nan.npy"), "white": head + NOISE + frames.replace("b.png", "white.png"),
         "jpeg": head + NOISE + frames.replace("b.png", "b.jpg"), "mask": head + NOISE + frames + 'mask = "black.png"\n',
+        "photo": head + NOISE + frames.replace("b.png", "photo.png"),
         "setting": head + NOISE + frames + '[frames.parameters]\n"led_7.power" = 1.0\n',
         "beyond": head + NOISE + frames + '[frames.parameters]\n"gel.press_depth" = -1.0\n',
         "silent": head + frames, "half": head + NOISE.replace("prnu = 0.0\n", "") + frames,
-        "sunk": head + NOISE + frames.replace("b.png", "black.png"), "sceneless": NOISE + frames, "elsewhere": head.replace("small.xml", "absent.xml") + NOISE + frames,
+        "sunk": head + NOISE + frames.replace("b.png", "black.png"), "sceneless": NOISE + frames,
+        "elsewhere": head.replace("small.xml", "absent.xml") + NOISE + frames,
         "size": head.replace("small.xml", "bench.xml") + NOISE + frames, "dark": head.replace("small.xml", "dark.xml") + NOISE + frames,
         "single": head + NOISE + frames.split("[[frames]]\nimage = \"b")[0], "black": head + NOISE.replace("8.0", "0.0") + frames.replace(
             "a.png", "black.png").replace("b.png", "black2.png"),
@@ -148,6 +150,7 @@ def place(tmp_path_factory):
         for image in ("black", "black2"):
             Image.fromarray(np.zeros((SIZE[1], SIZE[0], 3), np.uint8)).save(own / f"{image}.png")
         Image.fromarray(np.zeros((10, 10, 3), np.uint8)).save(own / "small.png")
+        Image.fromarray(np.zeros((SIZE[1], SIZE[0], 3), np.uint8)).save(own / "photo.png", format="JPEG")
         Image.fromarray(np.full((SIZE[1], SIZE[0]), 60, np.uint8)).save(own / "gray.png")
         for table, rows in READINGS.items():
             (own / f"{table}.csv").write_text(rows)
@@ -288,6 +291,7 @@ CASES = [
     ("compare captures/white", r"frame 1.*all saturated"),
     ("compare captures/sunk", r"frame 1 \('black\.png'\): half of its values are 0 DN or less, far below .* black_level = 8 DN; allowed: 2\.796 DN"),
     ("compare captures/jpeg", r"frame 1.*'\.jpg' files are not read; allowed"),
+    ("compare captures/photo", r"frame 1.*a JPEG by the name of \.png"),
     ("compare captures/mask", r"frame 1.*mask.*empty"),
     ("compare captures/setting", r"frame 1.*unknown parameter 'led_7\.power'; did you mean 'led_"),
     ("compare captures/beyond", r"frame 1.*gel\.press_depth = -1 mm is outside its bounds"),

@@ -93,3 +93,13 @@ def test_cut_and_turned_pictures_are_noticed(size, warned, tmp_path):
     folder = capture_files.write(capture_files.Captures(tmp_path, "gelsight", frames, noise=Noise(0.05, 1.0, 8.0, 255.0, 0.0)), tmp_path / "set")
     model = loop.open_model(loop.Setup(captures=str(folder)))
     assert any("the scene's own are 320 x 240" in w for w in loop._warnings(model)) == warned
+
+
+def test_a_gel_that_nothing_presses_has_no_press_to_solve_for(tmp_path):
+    image = np.random.default_rng(1).uniform(50, 60, (240, 320, 3)).astype(np.float32)
+    frames = [capture_files.Frame(n, image, file=f"frames/{n}.png", group=n, parameters={"led_1.power": 1.0, "gel.press_depth": depth})
+              for n, depth in (("rest", 0.0), ("pressed", 0.4))]
+    folder = capture_files.write(capture_files.Captures(tmp_path, "gelsight", frames, noise=Noise(0.05, 1.0, 8.0, 255.0, 0.0)), tmp_path / "set")
+    setup = loop.Setup(captures=str(folder))
+    names = [v.name for v in loop.variables_of_base(loop.open_model(setup), setup, [0, 1])]
+    assert "gel.press_depth[pressed]" in names and not any("[rest]" in n for n in names)
