@@ -21,8 +21,8 @@ from optics.errors import Underdetermined
 from optics.evidence import Candidate, Evidence, Progress, at_bound, measure, value_of
 from optics.parameter import Values, Variable
 from optics.verdict import (
-    AS_GOOD, CLEAR, CURVE, EXCESS, LEVEL, MAPS, MARGIN, MIMICS, NAMED, UNEVEN, Basis, Diagnosis, Findings, Fingerprint, Level, Refit, Row, Shift, Split,
-    decide, moved_by, rivals, sentence,
+    AS_GOOD, AT_FAULT, CLEAR, CURVE, EXCESS, LEVEL, MAPS, MARGIN, MIMICS, NAMED, UNEVEN, Basis, Diagnosis, Findings, Fingerprint, Level, Refit, Row,
+    Shift, Split, decide, moved_by, rivals, sentence,
 )
 from optics.words import some
 
@@ -905,7 +905,7 @@ def _hints(word: str, conditions, members: Sequence[Candidate], gaps, names) -> 
     if "held out" in failed and word != "NOTHING" and "held out" in {c.name for c in conditions}:
         hints.append("hold out frames that the fit has not seen (other presses or places), or find why they do not improve")
     if "near" in failed:
-        hints.append("check units, LEDs that were off, black_level, and that pictures are linear and whole: no effect brings the model near them")
+        hints.append(f"no effect brings the model near its images: check {AT_FAULT}")
     if CURVE in failed:
         hints.append("check [noise]: repeats of one frame tell system_gain and dark_noise, a flat_field takes the sensor's own pattern out")
     if word == "UNKNOWN":

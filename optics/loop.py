@@ -28,7 +28,7 @@ from optics.errors import BadCapture, Underdetermined, UnknownKey
 from optics.ladder import Study
 from optics.parameter import Values, Variable
 from optics.render import Model
-from optics.verdict import FAR
+from optics.verdict import AT_FAULT, FAR
 from optics.words import some, spaced
 
 Progress = Callable[[str, int, int], None]
@@ -325,17 +325,16 @@ def _unnamed(model: Model) -> list[str]:
 
 def _far(model: Model, found: calibrate.Fit, level: Row) -> list[str]:
     """What no effect explains: a model that is nowhere near its images, or values far from what is known of them."""
-    texts, where = [], ("units, LEDs that were off, black_level, and that pictures are linear (not encoded for viewing) and whole, with row 0 at "
-                        "the top")
+    texts = []
     if level.rms > FAR * level.signal:
-        texts.append(f"the model misses the images by {level.rms / max(level.signal, 1e-9):.0%} of its own mean, which is no matter of effects: check {where}")
+        texts.append(f"the model misses the images by {level.rms / max(level.signal, 1e-9):.0%} of its own mean, which is no matter of effects: check {AT_FAULT}")
     moved = [(v, found.values.get(v, model.base)) for v in found.variables if v.prior is not None]
     moved = [(v, value) for v, value in moved if abs(value - v.prior[0]) > 3 * v.prior[1]]
     if moved:
         v, value = max(moved, key=lambda t: abs(t[1] - t[0].prior[0]) / t[0].prior[1])
         texts.append(f"{some([v.name for v, _ in moved], 4)}: calibrated to more than "
                      f"3 sd from what is known, most {v.name}: {value:.4g}{spaced(v.parameter.unit)} for {v.prior[0]:.4g} +- {v.prior[1]:g}; "
-                     f"check {where}")
+                     f"check {AT_FAULT}")
     return texts
 
 

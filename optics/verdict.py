@@ -39,6 +39,7 @@ UNEVEN = 0.1  # of the fall: what splitting the strength by channel, frame, ... 
 STRENGTH = 2.0  # standard deviations that a claimed strength must differ from none by: a fall without it is another's
 MAPS = ("place", "reading")  # where, or when, whatever the cause: a fine map mimics every curve that does not move
 MIMICS = (*MAPS, "frame")
+AT_FAULT = "units, LEDs that were off, black_level, and that pictures are linear (not encoded for viewing) and whole, with row 0 at the top"
 FAR = 0.3  # misfit over mean signal: beyond what effects of a sensor leave
 CLUTTERED = 0.005  # of the signal: misfit that mottle of a coating and a fixed pattern make in a good sensor
 AS_GOOD = 0.8  # of the best curve's fall: what is nearer than that is not told apart from it
