@@ -86,7 +86,7 @@ def test_what_it_promises_comes(model):
 
 
 def test_what_is_asked_for_must_be_something(model):
-    with pytest.raises(ValueError, match="change = 0; allowed: above 0"):
+    with pytest.raises(ValueError, match="change = 0 %; allowed: above 0 %"):
         rehearse(*model, LIBRARY, model[0].variables_of, FITTED, change=0.0)
 
 
