@@ -1,8 +1,9 @@
 """Ambient light: light that no LED made reaches the coated face from all sides.
 
 Definition
-    L' = L + rho_c E / pi
-with the irradiance E of the face, the same in every direction and band, and the reflectance rho_c.
+    L' = L + rho_c E / pi (A + B g(t)),    g(t) = (sin t (t - sin t cos t) + 2/3 tan t (1 - sin^3 t)) / pi
+with the irradiance E of the face, the same from every direction and in every band, the reflectance rho_c and what the face's roughness
+(A, B) makes of such light at the angle t of sight: the integral of its reflection over the hemisphere.
 Fingerprint
     an offset that does not follow the LEDs' powers, proportional to the reflectance. Veiling glare and a wrong black level look
     alike; frames of different power, or one with all LEDs off, separate them.
@@ -17,7 +18,13 @@ from optics.parameter import Parameter
 
 
 def leak(geometry, membrane):
-    return geometry.albedo * (membrane.ambient / 3.14159265358979)
+    import drjit as dr
+
+    a, b = membrane.rough()
+    cos = dr.clip(dr.abs(geometry.cos_view), 1e-3, 1.0)
+    t, sin = dr.acos(cos), dr.safe_sqrt(1 - cos * cos)
+    g = (sin * (t - sin * cos) + 2 / 3 * sin / cos * (1 - sin * sin * sin)) / dr.pi
+    return geometry.albedo * (membrane.ambient / dr.pi) * (a + b * g)
 
 
 effect = Effect(

@@ -48,12 +48,15 @@ def build():
             """rho_c times the texture, per band."""
             return self.rho() * self.reflectance.eval(si, active)
 
+        def rough(self):
+            """(A, B) of the facets' roughness."""
+            s2 = dr.square(self.sigma)
+            return 1 - 0.5 * s2 / (s2 + 0.33), 0.45 * s2 / (s2 + 0.09)
+
         def brdf(self, si, wo, active=True):
             """f(wi, wo) per band, 1/sr, without the cosine."""
             cos_v, cos_l = mi.Frame3f.cos_theta(si.wi), mi.Frame3f.cos_theta(wo)
-            s2 = dr.square(self.sigma)
-            a = 1 - 0.5 * s2 / (s2 + 0.33)
-            b = 0.45 * s2 / (s2 + 0.09)
+            a, b = self.rough()
             s = dr.dot(si.wi, wo) - cos_v * cos_l
             tilt = dr.select(s > 0, s / dr.maximum(dr.maximum(cos_v, cos_l), 1e-6), 0.0)
             albedo = self.albedo(si, active)

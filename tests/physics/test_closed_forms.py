@@ -378,6 +378,24 @@ def test_haze_is_the_single_scattering_integral(bench):
     close(found, expected)
 
 
+def test_light_from_everywhere_meets_the_facets_that_light_of_leds_meets(bench):
+    """Ambient light on a rough face: rho E/pi times the integral of Oren and Nayar's qualitative model over the hemisphere, by numbers."""
+    sigma, values = 0.4, {**bench.values, "membrane.sigma": 0.4, "membrane.ambient": 0.3, "gel.press_depth": 0.6}
+    hits = bench.renderer.hits(values)
+    eye = np.array(hits.origin).T - hits.position.reshape(-1, 3)
+    cos = np.sum(eye * hits.normal.reshape(-1, 3), -1) / np.linalg.norm(eye, axis=-1)
+    view = np.arccos(np.clip(cos, -1, 1)).reshape(hits.shape)
+    a, b = 1 - 0.5 * sigma**2 / (sigma**2 + 0.33), 0.45 * sigma**2 / (sigma**2 + 0.09)
+    light, turn = np.meshgrid((np.arange(900) + 0.5) / 900 * np.pi / 2, (np.arange(360) + 0.5) / 180 * np.pi, indexing="ij")
+    steps = np.pi / 2 / 900 * np.pi / 180
+    at = np.linspace(0, view.max(), 12)
+    share = [np.sum((a + b * np.maximum(0, np.cos(turn)) * np.sin(np.maximum(light, v)) * np.tan(np.minimum(light, v))) / np.pi
+                    * np.cos(light) * np.sin(light)) * steps for v in at]
+    found = bench.renderer.ambient(values)[..., 0] / (values["membrane.rho_r"] * 0.3 / np.pi)
+    assert 0.8 < found.min() and np.ptp(found) > 0.02
+    assert np.abs(found - np.interp(view, at, share)).max() < 2e-3  # straight lines between twelve angles
+
+
 def test_height_fall_off_and_light_of_no_led(bench):
     """exp(-c h) with the height of the face; rho E/pi everywhere; rho G/pi (1 - n_z)/2 with n_z towards the camera."""
     values = {**bench.values, "gel.press_depth": 0.8}
