@@ -95,10 +95,8 @@ def diagnose(model, fit, effects: Sequence[Effect], variables_of: Callable[[Effe
             c.row.refit = _scattered(c.row.refit, p if math.isnan(p) else table.family.p(p), clutter)
     levels = _held_out(model, fit, evidence, winner, fits, refit, held_out, variables_of, say)
     shifts = _shifts(model, fit, winner, fits) if winner else []
-    findings = _findings(table, winner, done, members, fingerprints, splits, levels, basis, structure)
-    followed = _followed(model, evidence, winner, fits[winner.effect.name], fingerprints) if winner and winner.effect.scope == "frame" else None
-    if followed:  # one number per frame mimics whatever goes with what was set in it
-        findings = replace(findings, ratio=followed.ratio, rival=True, coordinate=followed.coordinate, curve_share=followed.share)
+    followed = _followed(model, evidence, winner, fits, fingerprints)
+    findings = _findings(table, winner, done, members, fingerprints, splits, levels, basis, structure, followed)
     word, conditions = decide(findings)
     found = []
     if winner and word not in ("NOTHING", "CLAIM") and not any(c.row.refit.complete for c in done):
@@ -731,7 +729,7 @@ def _simplest(done: Sequence[Candidate]) -> Candidate:
     return next((c for c in done[1:] if best.contains(c) and best.row.net_refit - c.row.net_refit < CLEAR), best)
 
 
-def _findings(table, winner, done, members, fingerprints, splits, levels, basis, structure) -> Findings:
+def _findings(table, winner, done, members, fingerprints, splits, levels, basis, structure, followed) -> Findings:
     if winner is None:
         best = max((c.row.net for c in table.order), default=0.0)
         own = Findings(table.p_best, structure.p, fall=max(best, 0.0), excess_sd=basis.excess_sd)
@@ -757,14 +755,17 @@ def _findings(table, winner, done, members, fingerprints, splits, levels, basis,
             chance=winner.row.refit.chance)
     if not fingerprints:
         return own
-    better = rivals(fingerprints, own.fall)
+    better = [followed] if followed else rivals(fingerprints, own.fall)
     best = better[0] if better else fingerprints[0]
     return replace(own, ratio=best.ratio, rival=bool(better), coordinate=best.coordinate, curve_share=best.share)
 
 
-def _followed(model, evidence: Evidence, winner: Candidate, fit, fingerprints) -> Fingerprint | None:
-    """The curve along a setting, clocks aside, that an effect's numbers per frame follow and that explains as much as they do; None where
-    they go their own way, as a drift does."""
+def _followed(model, evidence: Evidence, winner: Candidate | None, fits, fingerprints) -> Fingerprint | None:
+    """The curve along a setting, clocks aside, that an effect's numbers per frame follow and that explains as much as they do: they mimic
+    whatever goes with what was set in each frame. None where they go their own way, as a drift does, and for other effects."""
+    if winner is None or winner.effect.scope != "frame":
+        return None
+    fit = fits[winner.effect.name]
     own = {v.frames[0]: value_of(model, fit.values, v) for v in fit.variables if v.name in winner.row.variables and v.frames}
     turned, found = prints.settings(model, evidence), []
     for curve in fingerprints:

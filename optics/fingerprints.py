@@ -311,9 +311,12 @@ def goes_with(found: Sequence[Family]) -> str:
 def fixed_pattern(model, evidence: Evidence, excess: float) -> float:
     """Share of the excess misfit that one gain for each pixel explains, the same in all frames: dirt, scratches, a sensor's own pattern.
 
-    Of pixels that REPEATED frames or more show, beyond what as many gains explain by chance; NaN where there are none, or no excess.
+    Of pixels that REPEATED frames or more show, beyond what as many gains explain by chance; NaN where there are none, no excess, or
+    readings of a table.
     excess   chi2 less its degrees of freedom
     """
+    if isinstance(evidence.spectrum, st.Sweeps):
+        return math.nan
     black, size = float(model.noise.black_level), max((int(b.index.max(initial=0)) for b in evidence.blocks), default=0) // evidence.channels + 1
     shown, along, length = np.zeros(size), np.zeros(size), np.zeros(size)
     for block in evidence.blocks:

@@ -64,10 +64,12 @@ def read_array(file: Path, where: str) -> np.ndarray:
 def _png(file: Path, where: str) -> np.ndarray:
     from PIL import Image
 
-    if file.read_bytes()[:2] == b"\xff\xd8":
+    with file.open("rb") as begin:
+        head = begin.read(26)
+    if head[:2] == b"\xff\xd8":
         raise BadCapture(f"{where}: a JPEG by the name of .png; JPEG alters every pixel: record PNG or raw")
     with Image.open(file, formats=["PNG"]) as picture:
-        depth, colour = file.read_bytes()[24:26]  # of the header chunk: bits per value, kind of colour
+        depth, colour = head[24:]  # of the header chunk: bits per value, kind of colour
         if colour in (4, 6) or "transparency" in picture.info:
             raise BadCapture(f"{where}: has an alpha channel; allowed: gray or RGB; remove it (a mask is a file of its own)")
         if colour == 3 or depth not in (1, 8, 16):

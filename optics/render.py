@@ -138,11 +138,14 @@ class Renderer:
 
         edges = np.zeros(hits.shape, bool)
         for m in self.scene.membranes.values():
+            if not m.reflectance.is_spatially_varying():
+                continue
             own = hits.si.is_valid() & (hits.si.bsdf() == mi.BSDFPtr(m))
             paint = dr.select(own, m.reflectance.eval(hits.si, own), 0.0)[0]
             own, paint = np.array(own).reshape(hits.shape), np.broadcast_to(np.array(paint), hits.valid.size).reshape(hits.shape)
             if own.any():
-                edges |= _step(np.where(own, paint, paint[own].mean())) > PAINTED * paint[own].max()
+                low, high = _around(np.where(own, paint, paint[own].mean()))
+                edges |= high - low > PAINTED * paint[own].max()
         return edges
 
     # -- one LED ------------------------------------------------------------------------------------------------------
@@ -798,7 +801,7 @@ class Model:
         lit = self.lit(now)
         tangent = self.renderer.led_tangent_at_rest if at_rest else self.renderer.led_tangent
         glows = self.renderer.glows(now)
-        if not lit and not glows and kind != "membrane" and self.parameters[key].how != "difference":
+        if not lit and not glows and key not in self.renderer.ambient_keys and self.parameters[key].how != "difference":
             return None  # a dark frame
         if self.parameters[key].how == "layer":
             return factor * (np.imag(self.radiance({**now, key: now[key] + 1j * STEP}, seed)) / STEP)
@@ -828,7 +831,7 @@ class Model:
                      else tangent(now, name, key))
             return factor * lit[name] * image
         total = sum((power * tangent(now, led, key) for led, power in lit.items()), 0.0)
-        if glows or kind == "membrane":
+        if glows:
             total = total + self._difference_ambient(now, key)
         return factor * total
 
@@ -996,11 +999,12 @@ def _bent(normal: np.ndarray) -> np.ndarray:
 
 def _edges(mask: np.ndarray) -> np.ndarray:
     """Pixels whose neighbourhood (3 x 3) is not all of one kind."""
-    return _step(mask.astype(float)) > 0
+    low, high = _around(mask)
+    return low != high
 
 
-def _step(plane: np.ndarray) -> np.ndarray:
-    """How much the neighbourhood (3 x 3) of each pixel differs."""
+def _around(plane: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Smallest and largest value in the neighbourhood (3 x 3) of each pixel."""
     from scipy.ndimage import maximum_filter, minimum_filter
 
-    return maximum_filter(plane, 3) - minimum_filter(plane, 3)
+    return minimum_filter(plane, 3), maximum_filter(plane, 3)

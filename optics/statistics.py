@@ -505,9 +505,6 @@ class Sweeps:
 
     def test(self, residuals: Sequence[np.ndarray], base: Sequence[int], inverse_gram: np.ndarray) -> Structure:
         """As of `Spectrum`; `high` is NaN: neighbours among readings share nothing that pixels do."""
-        from scipy.special import fdtrc
-        from scipy.stats import rankdata
-
         r = np.concatenate([residual[use] for residual, (use, *_) in zip(residuals, self.parts)]).astype(float)
         calibrated = np.zeros((len(r), len(base)))
         for (use, where, columns, _), end in zip(self.parts, np.cumsum([use.sum() for use, *_ in self.parts])):
@@ -515,18 +512,9 @@ class Sweeps:
             calibrated[end - use.sum():end, [i for i, _ in here]] = columns[:, [j for _, j in here]]
         taken = _orthonormal(calibrated)
         r -= taken @ (taken.T @ r)
-        found = []
-        for name in sorted(set.intersection(*[set(along) for *_, along in self.parts])):
-            x = np.concatenate([along[name] for *_, along in self.parts])
-            count = min(NARROW, len(np.unique(x)) - 1, len(x) // 4)
-            slow = _orthonormal(np.cos(np.pi * np.outer((rankdata(x) - 0.5) / len(x), np.arange(1, count + 1))))
-            left, s, _ = np.linalg.svd(slow - taken @ (taken.T @ slow), full_matrices=False)
-            basis = left[:, s**2 > VISIBLE]
-            low, free = basis.shape[1], len(r) - taken.shape[1] - basis.shape[1]
-            if low and free >= len(r) // 4:
-                power = float(np.sum((basis.T @ r) ** 2))
-                f = power / low / max((float(r @ r) - power) / free, 1e-300)
-                found.append((float(fdtrc(low, free, f)), f, low, free))
+        names = sorted(set.intersection(*[set(along) for *_, along in self.parts]))
+        tests = [_slow(np.concatenate([along[name] for *_, along in self.parts]), r, taken) for name in names]
+        found = [test for test in tests if test]
         if not found:
             return Structure(*[float("nan")] * 5)
         p, f, low, free = min(found)
@@ -534,19 +522,29 @@ class Sweeps:
 
 
 def follows(x: np.ndarray, y: np.ndarray) -> float:
-    """p of numbers y (n,) that do not depend on x (n,): F of their lowest cosines by the ranks of x, at most NARROW and n/4 of them; NaN where
-    these are too few. No error of y enters: what scatters about a curve is its own measure."""
+    """p of numbers y (n,) that do not depend on x (n,), by the test of `Sweeps` about their mean; NaN where they are too few, or all one. No
+    error of y enters: what scatters about a curve is its own measure."""
+    y = y - np.mean(y)
+    found = _slow(x, y, np.full((len(y), 1), len(y) ** -0.5)) if y.any() else None
+    return found[0] if found else float("nan")
+
+
+def _slow(x: np.ndarray, r: np.ndarray, taken: np.ndarray) -> tuple[float, float, int, int] | None:
+    """(p, F, low, free) of the lowest cosines of r (n,) by the ranks of x, at most NARROW and n/4 of them, against the rest; None where there
+    are too few. Columns of `taken`, orthonormal, are projected off r already."""
     from scipy.special import fdtrc
     from scipy.stats import rankdata
 
-    n, y = len(y), y - np.mean(y)
-    low = min(NARROW, len(np.unique(x)) - 1, n // 4)
-    if low < 1 or not y.any():
-        return float("nan")
-    slow = np.cos(np.pi * np.outer((rankdata(x) - 0.5) / n, np.arange(1, low + 1)))
-    basis = _orthonormal(slow - slow.mean(0))
-    power, free = float(np.sum((basis.T @ y) ** 2)), n - 1 - basis.shape[1]
-    return float(fdtrc(basis.shape[1], free, power / basis.shape[1] / max((float(y @ y) - power) / free, 1e-300)))
+    count = min(NARROW, len(np.unique(x)) - 1, len(x) // 4)
+    slow = _orthonormal(np.cos(np.pi * np.outer((rankdata(x) - 0.5) / len(x), np.arange(1, count + 1))))
+    left, s, _ = np.linalg.svd(slow - taken @ (taken.T @ slow), full_matrices=False)
+    basis = left[:, s**2 > VISIBLE]
+    low, free = basis.shape[1], len(r) - taken.shape[1] - basis.shape[1]
+    if not low or free < len(r) // 4:
+        return None
+    power = float(np.sum((basis.T @ r) ** 2))
+    f = power / low / max((float(r @ r) - power) / free, 1e-300)
+    return float(fdtrc(low, free, f)), f, low, free
 
 
 def _orthonormal(columns: np.ndarray) -> np.ndarray:

@@ -397,7 +397,7 @@ def test_light_from_everywhere_meets_the_facets_that_light_of_leds_meets(bench):
 
 
 def test_height_fall_off_and_light_of_no_led(bench):
-    """exp(-c h) with the height of the face; rho E/pi everywhere; rho G/pi (1 - n_z)/2 with n_z towards the camera."""
+    """exp(-c h) with the height of the face; rho E/pi everywhere on a smooth one; rho G/pi (1 - n_z)/2 with n_z towards the camera."""
     values = {**bench.values, "gel.press_depth": 0.8}
     hits, plain = bench.renderer.hits(values), bench.renderer.led(values, "led_1").radiance
     rim = bench.renderer.led(values, "led_1").rim  # sampled finely: the hit at the centre is not its height
@@ -407,7 +407,7 @@ def test_height_fall_off_and_light_of_no_led(bench):
     lit = ~rim & (hits.bent == 0) & (plain[..., 0] > 0)
     close(faded[lit], plain[lit] * np.exp(-0.5 * height[lit])[:, None])
     rho = np.array([values[f"membrane.rho_{c}"] for c in "rgb"])
-    close(bench.renderer.ambient({**values, "membrane.ambient": 0.3}), np.broadcast_to(rho * 0.3 / np.pi, plain.shape))
+    close(bench.renderer.ambient({**values, "membrane.ambient": 0.3, "membrane.sigma": 0}), np.broadcast_to(rho * 0.3 / np.pi, plain.shape))
     ground = np.array([0.2, 0.1, 0.4])
     found = bench.renderer.ambient({**values, **{f"membrane.ground_{c}": g for c, g in zip("rgb", ground)}})
     share = (1 + hits.normal[..., 2:]) / 2

@@ -19,6 +19,7 @@ from optics.errors import OutputExists, UnknownKey
 from optics.evidence import measure
 from optics.fingerprints import families, family_of, fingerprints, fixed_pattern, fixed_text, goes_with, lit_geometry, places, unexplained
 from optics.lookup import lookup
+from optics.statistics import Sweeps
 from optics.verdict import Basis, Family, Fingerprint
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -80,8 +81,8 @@ def test_a_pattern_fixed_in_the_picture_is_told_from_a_curve(pattern):
     assert bool(fixed_text(share, best)) == (pattern == "scratch")
     if pattern == "scratch":
         assert share > 0.8
-    few = replace(evidence, blocks=evidence.blocks[:2])
-    assert np.isnan(fixed_pattern(model, few, excess)) and np.isnan(fixed_pattern(model, evidence, 0.0))
+    few, swept = replace(evidence, blocks=evidence.blocks[:2]), replace(evidence, spectrum=Sweeps())  # a table has no picture
+    assert all(np.isnan(fixed_pattern(model, *given)) for given in ((few, excess), (swept, excess), (evidence, 0.0)))
 
 
 def test_in_noise_no_curve_stands_out_and_none_has_a_share():

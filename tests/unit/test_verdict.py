@@ -20,7 +20,7 @@ from optics.errors import Underdetermined
 from optics.evidence import Candidate, measure
 from optics.noise import Noise
 from optics.parameter import Parameter, Values, Variable
-from optics.verdict import CLEAR, MARGIN, WORDS, Diagnosis, Findings, decide
+from optics.verdict import CLEAR, CLUTTERED, MARGIN, WORDS, Diagnosis, Findings, decide
 
 sys.path.insert(0, str(Path(__file__).parent))
 from mock_model import LIBRARY, Exact, Frame, MockModel, PointModel, mock_fit, simulate  # noqa: E402
@@ -139,8 +139,16 @@ def test_what_the_library_lacks_is_unknown_and_named_by_its_coordinate(name, coo
     d = case(name)
     assert d.word == "UNKNOWN"
     assert re.search("depends on '(.*?)'", d.sentence)[1] in coordinates
+    assert d.shifts and "had moved" not in d.text()  # it names no effect that they could have hidden
     best = d.fingerprints[0]
     assert best.ratio > 1.25 and len(best.curve) == len(best.sd) == len(best.centres) and best.p < 1e-6
+
+
+@pytest.mark.parametrize("height_gain, faint", [(0.04, False), (0.025, True)])
+def test_what_a_good_sensors_own_mottle_makes_as_well_is_called_faint(height_gain, faint):
+    d = judge(*calibrated({"height_gain": height_gain}, seed=2), library("vignetting", "absorption", "crosstalk", "defocus"))
+    assert d.word == "UNKNOWN" and (d.basis.misfit**2 - d.basis.noise**2 < CLUTTERED**2) == faint
+    assert ("It is faint" in d.sentence) == faint
 
 
 def test_a_curve_is_the_shape_that_is_missing():

@@ -63,7 +63,7 @@ def test_another_law_has_the_cause_and_size_of_the_librarys_but_not_its_shape(be
         own, other = bench.mean({effect: strength}) - plain, readings.other_light(effect, strength, settings) - plain
         assert np.abs(readings.other_light(effect, 0.0, settings) - plain).max() < 1e-9
         assert 0.5 < np.linalg.norm(other) / np.linalg.norm(own) < 2
-        assert 0.8 < np.vdot(own, other) / np.linalg.norm(own) / np.linalg.norm(other) < 0.998
+        assert 0.8 < np.vdot(own, other) / np.linalg.norm(own) / np.linalg.norm(other) < 0.998  # alike, not the same: .87 to .994
     with pytest.raises(ValueError, match="one law only"):
         readings.other_light("polarizer misalignment", 1.0, settings)
 

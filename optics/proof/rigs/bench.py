@@ -60,7 +60,7 @@ def bench_light(truth: jones.Truth, settings: jones.Settings, noise: Noise = PHO
     return light
 
 
-def other_light(effect: str, s: float, settings: jones.Settings, noise: Noise = PHOTODIODE, turned: np.ndarray | None = None) -> np.ndarray:
+def other_light(effect: str, s: float, settings: jones.Settings, turned: np.ndarray | None = None) -> np.ndarray:
     """`bench_light` with one effect of strength s by its law of OTHER: by turned dials, and by mixtures of benches, as light adds up."""
     plain = jones.with_effects({}, GAIN)
     turned = np.zeros(len(settings)) if turned is None else turned
@@ -69,7 +69,7 @@ def other_light(effect: str, s: float, settings: jones.Settings, noise: Noise = 
     psi, warmed = np.radians(dial), 1 - np.exp(-time / 8.0)
 
     def lit(truth: jones.Truth = plain, off: np.ndarray | float = 0.0) -> np.ndarray:
-        return bench_light(truth, settings, noise, turned + np.ravel(off))
+        return bench_light(truth, settings, turned=turned + np.ravel(off))
 
     def mixed(truth: jones.Truth, share) -> np.ndarray:
         return (1 - share) * lit() + share * lit(truth)
@@ -85,7 +85,7 @@ def other_light(effect: str, s: float, settings: jones.Settings, noise: Noise = 
     if effect == "retardance":
         return lit(replace(plain, sample=jones.Sample(retardance=s / 2, axis=5.0, stress_retardance=s / 2, stress_axis=35.0)))
     if effect == "camera gamma":
-        swing = noise.saturation - noise.black_level
+        swing = PHOTODIODE.saturation - PHOTODIODE.black_level
         m = lit() / swing
         return swing * m ** (1 + s * (1.4 - 0.8 * m))
     if effect == "polarized source":

@@ -59,7 +59,7 @@ class Finger(Pictures):
     pairs = [p for p in pairs_of([e for e in effects if e not in ("gain drift", "depolarization", "dark offset")])
              if set(p) != {"extinction leak", "coloured leak"}]
     free = ("object_paint.rho_*", "wall_paint.rho_*", "pigment.yield")
-    defines = {"wall_dark": "1"}  # an even wall: its chequers have edges that nobody measures
+    defines = {"wall_dark": "1"}  # an even wall: edges of its chequers would be masked
     several = {"extinction leak": ("analyzer.leak", "film.leak"), "coloured leak": ("analyzer.leak_tilt", "film.leak_tilt"),
                "oblique leak": ("analyzer.leak_oblique", "film.leak_oblique"), "marker leak": ("inner_face.marker_leak",)}
     # what a fit finds is not the number that was hidden: films' offsets are known by their difference, exponentials are no lines
