@@ -318,7 +318,7 @@ class Descent:
         a, b = self.here.a * np.outer(self.slope, self.slope), self.here.b * self.slope
         step = solve(a, b, low - u, high - u, damping)
         fall = float(2 * b @ step - step @ a @ step)
-        moved = [v.parameter.at_coordinate(t) for v, t in zip(self.variables, u + step)]
+        moved = [v.parameter.moved(t, d) for v, t, d in zip(self.variables, self.theta, step)]
         return np.clip(moved, self.low, self.high), fall
 
     @property
@@ -420,6 +420,7 @@ def fit(model, variables: Sequence[Variable], start: Values | None = None, frame
         near = promise < 20 * len(variables)
         if near:
             tries += 1
+            descent.damping = 1e-9  # what is left lies along nearly flat valleys, where any damping forbids to go
             if promise < best[0]:
                 best = (promise, descent.theta, descent.values)
             stuck = len(history) > 1 and history[-2] - promise / 4 < history[-1]

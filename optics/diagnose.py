@@ -206,8 +206,17 @@ def _require_convergence(evidence: "Evidence", fit) -> None:
         how = "" if getattr(fit, "converged", True) else f" (it stopped: {fit.reason})"
         raise Underdetermined(
             f"diagnose: the base model is not calibrated to convergence{how}: moving its {rank} parameters "
-            f"would lower chi2 by {evidence.projected.absorbed:.3g}, {evidence.gradient:.3g} per parameter; allowed: below {allowed:.3g}; "
-            "calibrate again from this result, without robust weights, on the frames given as fitted")
+            f"would lower chi2 by {evidence.projected.absorbed:.3g}, {evidence.gradient:.3g} per parameter (most of all {some(_off(evidence))}); "
+            f"allowed: below {allowed:.3g}; calibrate again from there, without robust weights, or hold what the captures hardly tell apart: leave it "
+            "out of --free, or give it a --prior")
+
+
+def _off(evidence: "Evidence") -> list[str]:
+    """The variables of the base whose images change most in the step that would calibrate it."""
+    gram = evidence.normal.gram[np.ix_(evidence.base, evidence.base)] + np.diag(evidence.precision)
+    step = st.inverse(gram, evidence.normal.truncation(evidence.base))[0] @ (evidence.normal.score[evidence.base] + evidence.pull)
+    change = np.abs(step) * np.sqrt(np.maximum(np.diag(gram), 0))
+    return [evidence.columns[evidence.base[i]].name for i in np.argsort(-change)[:3] if change[i] > 0.3 * change.max()]
 
 
 # -- ranking ----------------------------------------------------------------------------------------------------------

@@ -68,6 +68,11 @@ class Parameter:
     def differentiable(self) -> bool:
         return self.is_number
 
+    @property
+    def factor(self) -> bool:
+        """Whether the image is proportional to it, or a part of the image is."""
+        return self.linear and self.neutral is None and self.bounds[0] == 0
+
     def coordinate(self, value: float) -> float:
         """u(value): what a fit steps in, so that the image is nearly linear in it."""
         return value**2 / (1 + (value / self.saturates) ** 2) if self.squared else value
@@ -75,6 +80,14 @@ class Parameter:
     def at_coordinate(self, u: float) -> float:
         """The inverse of `coordinate`; u below 0 counts as 0."""
         return math.sqrt(max(u, 0.0) / max(1 - u / self.saturates**2, 1e-12)) if self.squared else u
+
+    def moved(self, value: float, du: float) -> float:
+        """Where a step of du in the coordinate leads. A factor, such as a power, moves by its logarithm: what it multiplies may shrink by as
+        much (brightness and reflectance), and the image stays."""
+        if not self.factor or value <= 0:
+            return self.at_coordinate(self.coordinate(value) + du)
+        t = du / value
+        return value * (math.exp(t) if t < 1 else math.e * t)
 
     def per_coordinate(self, value: float) -> float:
         """d value / d u; infinite at 0 of a squared parameter."""

@@ -389,7 +389,7 @@ def test_units_change_nothing_and_one_seed_gives_one_table():
 def test_a_base_that_is_not_calibrated_is_refused():
     model, fit = calibrated()
     fit.values.common["led2.x"] += 0.05
-    with pytest.raises(Underdetermined, match="not calibrated"):
+    with pytest.raises(Underdetermined, match=r"not calibrated .*most of all (.*, )?led2\.x"):
         judge(model, fit, library("glare"))
 
 
