@@ -473,7 +473,7 @@ def extended(model, base: Fit, extra: Sequence[Variable], secant: Mapping[str, f
         cross = (j @ new.T).astype(float)
         a[np.ix_(where, there)] += cross
         a[np.ix_(there, where)] += cross.T
-        rows.append((np.array([*where, *there]), np.concatenate([j, new]), scale))
+        rows.append((np.array([*where, *there], int), np.concatenate([j, new]), scale))
         b[rows[-1][0]] += (rows[-1][1] @ whitened).astype(float)
     pull, curvature, prior = prior_terms(model, variables, values)
     a[first:, first:] += np.diag(curvature[first:])

@@ -8,8 +8,9 @@ Fingerprint
     every flank brightens alike, whichever way it faces, and with the square of its slope; flat parts stay. One bounce within
     the mesh (interreflection) is the same light with its true borders, and dearer to compute.
 Validity
-    convex dents, small against the lit face. Physics allows G_c up to the flat face's own reflected light, rho times its
-    irradiance; a larger estimate says that walls, window or gel send light from the side as well.
+    convex dents, small against the lit face, whose roughness is left out: G holds what it takes away. Physics allows G_c up to the
+    flat face's own reflected light, rho times its irradiance; a larger estimate says that walls, window or gel send light from the
+    side as well.
 References
     Howell et al., A Catalog of Radiation Heat Transfer Configuration Factors, A-3 (plate to inclined element).
 """

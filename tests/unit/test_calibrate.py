@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from optics.calibrate import Fit, fit, for_frames, solve, warnings_of
+from optics.calibrate import Fit, extended, fit, for_frames, solve, warnings_of
 from optics.noise import Noise
 from optics.parameter import Parameter, Values, Variable
 
@@ -92,6 +92,8 @@ class Twice:
 
     def _lit(self, now, f):
         rho = np.array([now[f"face.rho_{c}"] for c in range(3)])
+        if f == 3:
+            return np.zeros(self.shape)
         return 2500 * now[f"led_{f}.power"] * self.mixed[f] * (rho + 3e-3 * rho**2 * self.w) / (1 + ((self.at - now[f"led_{f}.x"]) / 5) ** 2)[:, None]
 
     def predict(self, values, frames=None, seed=0):
@@ -101,7 +103,7 @@ class Twice:
         now = {**self.base, **values.common}
         for f in frames:
             yield self._lit(now, f), {v.name: self._lit({**now, v.name: now[v.name] + 1e-30j}, f).imag / 1e-30 for v in variables
-                                      if v.name.startswith(("face", f"led_{f}"))}
+                                      if f < 3 and v.name.startswith(("face", f"led_{f}"))}
 
     def linear_in(self, variable):
         return variable.name.endswith("power")
@@ -123,6 +125,15 @@ def test_powers_and_reflectances_that_hardly_differ_are_found_from_anywhere(seed
     assert abs(one.chi2 - two.chi2) < len(variables)  # what `converged` promises
     for i in range(3):
         assert one.values.common[f"led_{i}.power"] * one.values.common[f"face.rho_{i}"] == pytest.approx(0.5 + 0.2 * i, rel=0.01)
+
+
+def test_an_effect_may_do_nothing_in_a_dark_frame():
+    model = Twice(np.random.default_rng(0))
+    model.frames.append(SimpleNamespace(name="dark", parameters={}, repeats=[], image=model.noise.sd(0.0) * np.ones(model.shape)))
+    power, x = [[Variable(f"led_{i}.{name}", (f"led_{i}.{name}",), model.parameters[f"led_{i}.{name}"]) for i in range(3)] for name in ("power", "x")]
+    base = fit(model, power, Values(model.true), frames=range(4))
+    more = extended(model, base, x)
+    assert [len(where) for where, *_ in base.normal.rows] == [1, 1, 1, 0] and more.converged and more.chi2 < base.chi2
 
 
 def test_priors_go_along_to_other_frames_where_they_say_something_about_them():
