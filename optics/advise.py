@@ -520,8 +520,8 @@ def next_measurement(model, values: Values, evidence: Evidence, members: Sequenc
     more = [s for s, shot in enumerate(shots) if shot.family == "another place"][:TAKEN]
     more = more or [s for s, shot in enumerate(shots) if shot.family == "repeat"] * TAKEN
     plans = {"together": seen.choose(TAKEN, judge, enough), "more of the same": more}
-    before = seen.gaps()
-    return [_advice(seen, shots, family, chosen, before) for family, chosen in {**leaders, **plans}.items() if chosen]
+    before = seen.falls()
+    return [_advice(seen, shots, family, chosen, before, complete) for family, chosen in {**leaders, **plans}.items() if chosen]
 
 
 def _net(row: Row) -> float:
@@ -538,10 +538,15 @@ def strength_of(c: Candidate) -> np.ndarray:
     return c.direction
 
 
-def _advice(seen: Outlook, shots: Sequence[Shot], family: str, chosen: Sequence[int], before: np.ndarray) -> Advice:
-    names, after, taken = [m.name for m in seen.members], seen.gaps(chosen), [shots[s] for s in chosen]
-    pairs = [Apart(names[i], names[j], float(before[i, j]), float(after[i, j]), st.probability_correct(before[i, j]),
-                   st.probability_correct(after[i, j])) for i, j in np.argwhere(np.isfinite(before))]
+def _advice(seen: Outlook, shots: Sequence[Shot], family: str, chosen: Sequence[int], before: tuple[np.ndarray, np.ndarray],
+            complete: bool) -> Advice:
+    names, taken, ((now, full_now), (then, full_then)) = [m.name for m in seen.members], [shots[s] for s in chosen], (before, seen.falls(chosen))
+
+    def share(d: np.ndarray, full: np.ndarray, i: int, j: int) -> float:
+        return math.nan if complete or not full[i] > 0 else float(d[i, j] / full[i])
+
+    pairs = [Apart(names[i], names[j], float(now[i, j]), float(then[i, j]), st.probability_correct(now[i, j]), st.probability_correct(then[i, j]),
+                   share(now, full_now, i, j), share(then, full_then, i, j)) for i, j in np.argwhere(np.isfinite(now))]
     counted = Counter(shot.words for shot in taken)
     return Advice("; ".join(words if n == 1 else f"{words} ({n} times)" for words, n in counted.items()), family,
                   [dict(s.settings) for s in taken], [s.press for s in taken], len(taken), sorted(pairs, key=lambda p: p.before),

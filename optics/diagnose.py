@@ -906,6 +906,9 @@ def _hints(word: str, conditions, members: Sequence[Candidate], gaps, names) -> 
                          "noise would allow a decision, but not the misfit that both leave" if d >= CLEAR else
                          f"{more} times as many frames of the same kind would decide in 95 % of cases" if 0 < more < 1000
                          else "more frames of the same kind will not decide"))
+        if d >= CLEAR:
+            hints.append("add each of them in a copy of the study, diagnose again, and keep the one after which the least is left: what else is "
+                         "missing hides which of them it is")
         for one, other in ((a, b), (b, a)):
             alone = [x for x in one.effect.acts if x not in other.effect.acts]
             if alone:

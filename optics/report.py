@@ -1032,6 +1032,8 @@ def _advice(d: Mapping) -> list[dict]:
         rows.append({"kind": kind, "shot": words(a["shot"]), "pair": f"{p['effect']} / {p['rival']}", "first": a["family"] != "together",
                      "before": number(_finite(p["before"]), 3), "after": number(_finite(p["after"]), 3),
                      "correct": f"{_finite(p['correct_before']):.2f} → {_finite(p['correct_after']):.2f}",
+                     "share": "" if math.isnan(after := _finite(p.get("share_after"))) else
+                     f"{percent(_finite(p['share_before']))} → {percent(after)}",
                      "brings": ", ".join(words(n) for n in a.get("nuisances") or ())})
     return sorted(rows, key=lambda r: r["first"])
 

@@ -251,7 +251,10 @@ class Shift:
 
 @dataclass(frozen=True)
 class Apart:
-    """D, the expected chi2 by which the data would prefer `effect`, if true, over `rival`; and P(correct) = Phi(sqrt(D)/2)."""
+    """D, the expected chi2 by which the data would prefer `effect`, if true, over `rival`; and P(correct) = Phi(sqrt(D)/2).
+
+    share_before, share_after   D over the fall by the effect itself, where misfit is left and a verdict asks for MARGIN of it; else NaN
+    """
 
     effect: str
     rival: str
@@ -259,6 +262,13 @@ class Apart:
     after: float
     correct_before: float
     correct_after: float
+    share_before: float = math.nan
+    share_after: float = math.nan
+
+    @property
+    def told(self) -> bool:
+        """Whether it makes a difference to what can be decided."""
+        return self.correct_after - self.correct_before > TELLS or self.share_before < MARGIN <= self.share_after
 
 
 @dataclass(frozen=True)
@@ -596,8 +606,10 @@ def moved_by(s: Shift) -> str:
 
 def advice_text(a: Advice) -> str:
     p = a.hardest
-    return (f"{a.shot}: {'tells' if p.correct_after - p.correct_before > TELLS else 'hardly tells'} {p.effect} from {p.rival}, D {p.before:.3g} "
+    return (f"{a.shot}: {'tells' if p.told else 'hardly tells'} {p.effect} from {p.rival}, D {p.before:.3g} "
             f"-> {p.after:.3g}, P(correct) {p.correct_before:.2f} -> {p.correct_after:.2f}"
+            + ("" if math.isnan(p.share_after) else f", D over the fall {percent(p.share_before)} -> {percent(p.share_after)} "
+               f"({percent(MARGIN)} needed while misfit is left)")
             + (f"; the closest two then have D {a.least:.3g}" if a.least < min(0.9 * p.after, 4 * CLEAR) else ""))
 
 
@@ -610,7 +622,7 @@ def advice_lines(advice: Sequence[Advice]) -> list[str]:
         lines.append(f"      (more of the same instead: {advice_text(plans['more of the same'])})")
     known = {a.shot for a in plans.values()}
     return lines + [f"next, or by itself: {advice_text(a)}" for a in singles
-                    if a.shot not in known and a.hardest.correct_after - a.hardest.correct_before > TELLS][:4]
+                    if a.shot not in known and a.hardest.told][:4]
 
 
 def sentence(word: str, conditions: Sequence[Condition], f: Findings, rows: Sequence[Row], members: Sequence[Row],

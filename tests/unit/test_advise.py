@@ -448,6 +448,8 @@ def test_misfit_that_is_left_asks_for_a_margin(excess, judge, monkeypatch):
     first, *others = found.evidence.candidates
     refit = replace(first.row.refit, excess_sd=excess, structure_p=1.0)
     members = [replace(c, row=replace(c.row, refit=own)) for c, own in ((first, refit), *((c, None) for c in others))]
+    shares = [p.share_after for a in advise.next_measurement(model, found.evidence.values, found.evidence, members, variables_of) for p in a.pairs]
+    assert shares and all(0 <= s <= 1 for s in shares) if excess else np.isnan(shares).all()
     asked = []
     for name in ("least", "worth"):
         monkeypatch.setattr(advise.Outlook, name, lambda self, chosen=(), name=name: asked.append(name) or 0.0)
@@ -459,6 +461,10 @@ def test_advice_that_does_not_help_says_so():
     _, found = tie()
     poor = Advice("the same press once more", "together", [{}], [""], 1, [Apart("a", "b", 0.0, 0.0, 0.5, 0.5)], [])
     assert "hardly tells a from b" in replace(found, advice=[poor]).text()
+    for after, verb in ((0.1, "hardly tells"), (0.3, ": tells")):  # noise had told them, but not the misfit that is left
+        pair = Apart("a", "b", 60.0, 3600.0, 1.0, 1.0, 0.01, after)
+        text = replace(found, advice=[replace(poor, pairs=[pair])]).text()
+        assert f"{verb} a from b" in text and f"D over the fall 1 % -> {100 * after:.0f} % (20 % needed while misfit is left)" in text
 
 
 def test_a_plan_ends_where_it_is_enough():
