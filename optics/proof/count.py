@@ -12,6 +12,7 @@ A target is reached when the near end of the interval reaches it: few cells reac
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 
@@ -74,6 +75,7 @@ class Count:
     words: dict[str, dict[str, int]]
     power: dict[str, dict[str, list[int]]]  # rig -> change -> [right claims, n], without clutter, own law
     ties: tuple[int, int]
+    set_size: float  # mean, at 0.2 %, where one stands out
     pulls: dict[str, list[float]]
     falls: list[float]
     null_p: list[float]
@@ -101,6 +103,8 @@ class Count:
                 lo, hi = r.interval
                 lines.append(f"  {r.name:<52}{r.value:>7.3f}{r.n:>6}   {lo:.3f}-{hi:.3f}   {r.first:>5g} {r.ambitious:>7g}  {r.verdict}")
             lines += [f"  ties declared {one.ties[1]}, with the hidden effect among them {one.ties[0]}"]
+            if math.isfinite(one.set_size):
+                lines += [f"  effects in the set at 0.2 %, where one stands out: {one.set_size:.2f} (to be: 2 at most)"]
             for law, values in one.pulls.items():
                 if len(values) > 1:
                     lines.append(f"  pulls of strengths ({law}): n {len(values)}, mean {np.mean(values):+.2f}, sd {np.std(values, ddof=1):.2f}")
@@ -152,6 +156,7 @@ def count(records: Sequence[dict], planned: int, parts: bool = True) -> Count:
     clean = [r for r in own if r["cell"]["clutter"] == CLEAN]
     middle = [r for r in clean if r["cell"]["change"] == 0.005]
     weak = [r for r in clean if r["cell"]["change"] == 0.002]
+    shown = [r for r in weak if _last(r)["p_best"] < LEVEL]
     none, unknown, pair = some("none"), some("unknown"), some("pair")
     calm = [r for r in none if r["cell"]["clutter"] == CLEAN]
 
@@ -165,7 +170,7 @@ def count(records: Sequence[dict], planned: int, parts: bool = True) -> Count:
         rate("top-1 after refit, 0.5 %, no clutter", middle, lambda r: [_last(r)["claimed"] or (_last(r)["refit"] or [""])[0]] == hidden(r), 0.95, 0.99),
         rate("top-3 by score, 0.5 %, no clutter", middle, lambda r: hidden(r)[0] in _last(r)["score"][:3], 0.97, 0.99),
         rate("in the set, 0.2 %, no clutter", weak, lambda r: hidden(r)[0] in _last(r)["set"], 0.97, 0.99),
-        rate("in the set, 0.2 %, no clutter, where one stands out", [r for r in weak if _last(r)["p_best"] < LEVEL],
+        rate("in the set, 0.2 %, no clutter, where one stands out", shown,
              lambda r: hidden(r)[0] in _last(r)["set"], 0.97, 0.99),
         rate("an effect stands out where none is hidden", calm, lambda r: _last(r)["p_best"] < LEVEL, 0.03, 0.015, True),
         rate("claims where none is hidden, any clutter", none, named, 0.03, 0.01, True),
@@ -210,7 +215,8 @@ def count(records: Sequence[dict], planned: int, parts: bool = True) -> Count:
     falls = [_fall(r) for r in seen]
     found = Count(
         len(records), planned, len(records) - len(made), failed, rates, confusion, words, power,
-        (sum(hidden(r)[0] in _last(r)["ambiguous"] for r in ties), len(ties)), pulls, falls, [_last(r)["p_best"] for r in calm],
+        (sum(hidden(r)[0] in _last(r)["ambiguous"] for r in ties), len(ties)),
+        float(np.mean([len(_last(r)["set"]) for r in shown])) if shown else math.nan, pulls, falls, [_last(r)["p_best"] for r in calm],
         [_last(r)["held_out"][-1] for r in own if named(r) == set(hidden(r)) and _last(r)["held_out"][-1] is not None],
         float(sum(r.get("seconds", 0.0) for r in records)))
     if parts:

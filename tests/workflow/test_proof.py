@@ -80,6 +80,19 @@ def test_a_target_is_reached_by_the_end_of_the_interval_and_not_by_the_rate():
     assert count.Rate("", 0, 400, 0, 0).interval[1] == pytest.approx(1 - 0.025 ** (1 / 400))  # Clopper & Pearson
 
 
+def test_the_size_of_the_set_is_counted_where_something_stands_out():
+    def weak(p, *close):
+        step = {"word": "AMBIGUOUS", "claimed": "", "ambiguous": list(close), "p_best": p, "score": ["a", "b", "c"], "refit": list(close), "set": list(close),
+                "falls": {}, "strength": {}, "held_out": [None]}
+        cell = {"rig": "r", "kind": "library", "hidden": ["a"], "change": 0.002, "clutter": 0.0, "law": "same", "mistake": "", "seed": 0}
+        return {"cell": cell, "truth": {"a": 1.0}, "steps": [step], "failed": "", "unreachable": False, "coordinates": []}
+
+    found = count.count([weak(1e-4, "a"), weak(1e-4, "b", "a", "c"), weak(0.3)], 3)
+    assert found.set_size == 2 and "2.00 (to be: 2 at most)" in found.text()
+    rates = [found.rate(f"in the set, 0.2 %, no clutter{where}") for where in ("", ", where one stands out")]
+    assert [(r.k, r.n) for r in rates] == [(2, 3), (2, 2)]
+
+
 # -- the loop, blind ----------------------------------------------------------------------------------------------------
 
 
