@@ -116,7 +116,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             return 0
         except Exception as error:
+            if _stopped(error):
+                print("interrupted", file=sys.stderr)
+                return 130
             return _report(error)
+
+
+def _stopped(error: BaseException | None) -> bool:
+    """Whether somebody pressed Ctrl-C below: Dr.Jit passes that on as an error of its own."""
+    return error is not None and (isinstance(error, KeyboardInterrupt) or _stopped(error.__cause__ or error.__context__))
 
 
 def _report(error: Exception) -> int:

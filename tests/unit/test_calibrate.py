@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from optics.calibrate import Fit, extended, fit, for_frames, solve, warnings_of
+from optics.calibrate import Descent, Fit, Normal, extended, fit, for_frames, solve, warnings_of
 from optics.noise import Noise
 from optics.parameter import Parameter, Values, Variable
 
@@ -69,6 +69,19 @@ def test_a_factor_moves_by_its_logarithm():
     assert power.moved(2.0, -9.0) > 0 and power.moved(0.0, 0.5) == 0.5  # a light that is off can be switched on
     for other in (Parameter("x", "mm", 1.0), Parameter("glare", "DN", 1.0, (0.0, 9.0), neutral=0.0, linear=True)):
         assert other.moved(1.0, 0.5) == 1.5
+
+
+@pytest.mark.parametrize("side", [-1, 1])
+def test_a_step_to_a_bound_ends_on_it(side):
+    """Not beside it by rounding: what stands at a bound is taken as known, and has no slope to be judged by."""
+    sigma = Variable("sigma", ("skin.sigma",), Parameter("sigma", "rad", 0.2, (0.0, 1.5), plausible=0.1, squared=True, saturates=0.3))
+    model = SimpleNamespace(parameters={"skin.sigma": sigma.parameter}, base={"skin.sigma": 0.2}, frames=[])
+    for start in np.linspace(0.01, 1.4, 40):
+        descent = Descent(model, [sigma], Values({"sigma": start}), [])
+        for push in (1e6, -1e-17):  # and stays there
+            descent.take(Normal(np.eye(1), np.array([side * push]), 0.0, 0.0, [], [], []))
+            descent.theta = descent._step(0.0)[0]
+            assert descent.theta == (descent.low if side < 0 else descent.high)
 
 
 class Twice:
