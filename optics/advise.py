@@ -540,7 +540,8 @@ def strength_of(c: Candidate) -> np.ndarray:
 
 def _advice(seen: Outlook, shots: Sequence[Shot], family: str, chosen: Sequence[int], before: tuple[np.ndarray, np.ndarray],
             complete: bool) -> Advice:
-    names, taken, ((now, full_now), (then, full_then)) = [m.name for m in seen.members], [shots[s] for s in chosen], (before, seen.falls(chosen))
+    names, taken = [m.name for m in seen.members], [shots[s] for s in chosen]
+    (now, full_now), (then, full_then) = before, seen.falls(chosen)
 
     def share(d: np.ndarray, full: np.ndarray, i: int, j: int) -> float:
         return math.nan if complete or not full[i] > 0 else float(d[i, j] / full[i])

@@ -284,7 +284,7 @@ class Descent:
         for i, v in enumerate(variables):
             if v.parameter.squared:
                 self.low[i] = max(self.low[i], 1e-3 * v.parameter.plausible)
-        self.near = np.array([1e-6 * v.parameter.plausible for v in variables])
+        self.near = np.array([v.parameter.near for v in variables])
         self.reach = np.array([np.inf if v.parameter.linear else REACH * v.parameter.plausible for v in variables])
         self.theta = np.clip([start_of(model, v, values) for v in variables], self.low, self.high)
         self.values, self.damping, self.here = self.moved(values, self.theta), damping, None
@@ -319,7 +319,7 @@ class Descent:
         a, b = self.here.a * np.outer(self.slope, self.slope), self.here.b * self.slope
         step = solve(a, b, low - u, high - u, damping)
         fall = float(2 * b @ step - step @ a @ step)
-        moved = np.array([v.parameter.moved(t, d) for v, t, d in zip(self.variables, self.theta, step)])
+        moved = np.array([v.parameter.stepped(t, d) for v, t, d in zip(self.variables, self.theta, step)])
         for end in (self.low, self.high):  # what stands at a bound is taken as known: not beside it by rounding
             moved = np.where(np.abs(moved - end) < self.near, end, moved)
         return np.clip(moved, self.low, self.high), fall

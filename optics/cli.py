@@ -25,6 +25,8 @@ import typer
 from optics import __version__
 from optics.words import key_of, spaced, table
 
+INTERRUPTED = 130  # 128 and the number of SIGINT, as shells count
+
 app = typer.Typer(
     add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110},
@@ -91,7 +93,17 @@ def command(function: Callable) -> Callable:
     @functools.wraps(function)
     def run(*args, quiet: bool = False, debug: bool = False, **options):
         terminal.quiet, terminal.debug = quiet, debug
-        return function(*args, **options)
+        try:
+            function(*args, **options)
+            sys.stdout.flush()
+        except BrokenPipeError:  # whoever read our output has seen enough
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        except (Exception, KeyboardInterrupt) as error:
+            stopped = _ctrl_c(error)  # in which typer would end without a word
+            if stopped is None:
+                raise
+            print(": ".join(["interrupted", *map(str, stopped.args)]), file=sys.stderr)
+            raise typer.Exit(INTERRUPTED) from None
 
     shared = [inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=False, annotation=kind)
               for name, kind in (("quiet", Quiet), ("debug", Debug))]
@@ -109,22 +121,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         warnings.showwarning = lambda text, *_: terminal.note(f"warning: {_one_line(text)}")
         try:
             return int(app(args=arguments, prog_name="optics", standalone_mode=False) or 0)
-        except KeyboardInterrupt:
-            print("interrupted", file=sys.stderr)
-            return 130
-        except BrokenPipeError:  # whoever read our output has seen enough
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-            return 0
         except Exception as error:
-            if _stopped(error):
-                print("interrupted", file=sys.stderr)
-                return 130
             return _report(error)
 
 
-def _stopped(error: BaseException | None) -> bool:
-    """Whether somebody pressed Ctrl-C below: Dr.Jit passes that on as an error of its own."""
-    return error is not None and (isinstance(error, KeyboardInterrupt) or _stopped(error.__cause__ or error.__context__))
+def _ctrl_c(error: BaseException | None) -> KeyboardInterrupt | None:
+    """The Ctrl-C behind an error: within a render, Dr.Jit puts an error of its own around it."""
+    return error if error is None or isinstance(error, KeyboardInterrupt) else _ctrl_c(error.__cause__ or error.__context__)
 
 
 def _report(error: Exception) -> int:
@@ -462,8 +465,7 @@ def batch(job: Annotated[Path, typer.Argument(metavar="JOB.toml", help="What to 
         with terminal.progress() as progress:
             result = work.run(job, part, workers, plugins, progress)
     except KeyboardInterrupt:
-        print("interrupted: what was made is kept, the same command goes on", file=sys.stderr)
-        raise typer.Exit(130) from None
+        raise KeyboardInterrupt("what was made is kept, the same command goes on") from None
     if as_json:
         return show({"folder": str(result.folder), "total": result.total, "own": result.own, "made": result.made,
                      "complete": result.complete})

@@ -213,9 +213,8 @@ def _require_convergence(evidence: "Evidence", fit) -> None:
 
 def _off(evidence: "Evidence") -> list[str]:
     """The variables of the base whose images change most in the step that would calibrate it."""
-    gram = evidence.normal.gram[np.ix_(evidence.base, evidence.base)] + np.diag(evidence.precision)
-    step = st.inverse(gram, evidence.normal.truncation(evidence.base))[0] @ (evidence.normal.score[evidence.base] + evidence.pull)
-    change = np.abs(step) * np.sqrt(np.maximum(np.diag(gram), 0))
+    step = evidence.inverse(evidence.base) @ (evidence.normal.score[evidence.base] + evidence.pull)
+    change = np.abs(step) * np.sqrt(np.maximum(np.diag(evidence.normal.gram)[evidence.base], 0))
     return [evidence.columns[evidence.base[i]].name for i in np.argsort(-change)[:3] if change[i] > 0.3 * change.max()]
 
 
@@ -901,14 +900,15 @@ def _hints(word: str, conditions, members: Sequence[Candidate], gaps, names) -> 
                  for i, a in enumerate(members) for b in members[i + 1:]]
         d, a, b = min(pairs, key=lambda pair: pair[0])
         more = math.ceil(CLEAR / d) if d > 0 else 0
-        hints.append(f"hardest pair: {a.effect.name} / {b.effect.name}, expected chi2 between them D = {d:.3g}, "
-                     f"P(correct) = {st.probability_correct(d):.2f} in noise alone; " + (
-                         "noise would allow a decision, but not the misfit that both leave" if d >= CLEAR else
-                         f"{more} times as many frames of the same kind would decide in 95 % of cases" if 0 < more < 1000
-                         else "more frames of the same kind will not decide"))
+        pair = (f"hardest pair: {a.effect.name} / {b.effect.name}, expected chi2 between them D = {d:.3g}, "
+                f"P(correct) = {st.probability_correct(d):.2f} in noise alone; ")
         if d >= CLEAR:
-            hints.append("add each of them in a copy of the study, diagnose again, and keep the one after which the least is left: what else is "
-                         "missing hides which of them it is")
+            hints += [pair + "noise would allow a decision, but not the misfit that both leave",
+                      "add each of them in a copy of the study, diagnose again, and keep the one after which the least is left: what else is "
+                      "missing hides which of them it is"]
+        else:
+            hints.append(pair + (f"{more} times as many frames of the same kind would decide in 95 % of cases" if 0 < more < 1000
+                                 else "more frames of the same kind will not decide"))
         for one, other in ((a, b), (b, a)):
             alone = [x for x in one.effect.acts if x not in other.effect.acts]
             if alone:

@@ -33,9 +33,7 @@ def value_of(model, values: Values, variable: Variable) -> float:
 
 
 def at_bound(variable: Variable, value: float) -> bool:
-    low, high = variable.parameter.bounds
-    near = 1e-6 * abs(variable.parameter.plausible)
-    return value <= low + near or value >= high - near
+    return variable.parameter.side(value) != 0
 
 
 @dataclass
@@ -65,10 +63,7 @@ class Candidate:
     def at(cls, model, values: Values, effect: Effect, variables: Sequence[Variable]) -> "Candidate":
         """An effect under test at the values: where its strengths start, and to which side they may go."""
         start = np.array([value_of(model, values, v) for v in variables])
-        sides = []
-        for v, value in zip(variables, start):
-            (low, high), near = v.parameter.bounds, 1e-6 * abs(v.parameter.plausible)
-            sides.append(1 if value <= low + near else -1 if value >= high - near else 0)
+        sides = [v.parameter.side(value) for v, value in zip(variables, start)]
         return cls(effect, list(variables), start, sides, np.array([v.parameter.plausible for v in variables]))
 
     @property
@@ -164,10 +159,13 @@ class Evidence:
     def gradient(self) -> float:
         return self.projected.absorbed / max(self.projected.rank, 1)
 
+    def inverse(self, base: Sequence[int]) -> np.ndarray:
+        """Of the Gram of base columns, with the priors of the first of them."""
+        gram = self.normal.gram[np.ix_(base, base)] + np.diag(_padded(self.precision, base))
+        return st.inverse(gram, self.normal.truncation(base))[0]
+
     def structure(self, whitened: Sequence[np.ndarray], base: Sequence[int]) -> st.Structure:
-        precision = np.concatenate([self.precision, np.zeros(len(base) - len(self.precision))])
-        gram = self.normal.gram[np.ix_(base, base)] + np.diag(precision)
-        return self.spectrum.test(whitened, base, st.inverse(gram, self.normal.truncation(base))[0])
+        return self.spectrum.test(whitened, base, self.inverse(base))
 
     def variance(self, model, frame: int, prediction: np.ndarray, values: Values | None = None) -> np.ndarray:
         """Of a frame about its prediction, DN^2: where the model knows no error of its prediction, that between two seeds is added."""
@@ -189,9 +187,12 @@ class Evidence:
     def project(self, normal: st.Normal, base: Sequence[int], rest: Sequence[int], thinning: int = 1,
                 settled: bool = False) -> st.Projected:
         """Project with the priors of the first base columns; thinned data meet thinned priors."""
-        pad = np.zeros(len(base) - len(self.precision))
-        return st.project(normal, base, rest, np.concatenate([self.precision, pad]) / thinning,
-                          np.concatenate([self.pull, pad]) / thinning, settled=settled)
+        return st.project(normal, base, rest, _padded(self.precision, base) / thinning, _padded(self.pull, base) / thinning, settled=settled)
+
+
+def _padded(known: np.ndarray, base: Sequence[int]) -> np.ndarray:
+    """Priors of the first base columns, none for those that follow."""
+    return np.concatenate([known, np.zeros(len(base) - len(known))])
 
 
 def measure(model, values: Values, base: Sequence[Variable], candidates: Sequence[Candidate], frames: Sequence[int],

@@ -81,9 +81,10 @@ class Parameter:
         """The inverse of `coordinate`; u below 0 counts as 0."""
         return math.sqrt(max(u, 0.0) / max(1 - u / self.saturates**2, 1e-12)) if self.squared else u
 
-    def moved(self, value: float, du: float) -> float:
+    def stepped(self, value: float, du: float) -> float:
         """Where a step of du in the coordinate leads. A factor, such as a power, moves by its logarithm: what it multiplies may shrink by as
-        much (brightness and reflectance), and the image stays."""
+        much (brightness and reflectance), and the image stays. Beyond e times the value it goes on straight, as a logarithm that overshoots
+        does so without measure."""
         if not self.factor or value <= 0:
             return self.at_coordinate(self.coordinate(value) + du)
         t = du / value
@@ -94,6 +95,16 @@ class Parameter:
         if not self.squared:
             return 1.0
         return (1 + (value / self.saturates) ** 2) ** 2 / (2 * value) if value else math.inf
+
+    @property
+    def near(self) -> float:
+        """What is nearer than this to a bound stands at it."""
+        return 1e-6 * self.plausible
+
+    def side(self, value: float) -> int:
+        """+1 at the lower bound, from which it may only rise; -1 at the upper; 0 between."""
+        low, high = self.bounds
+        return 1 if value <= low + self.near else -1 if value >= high - self.near else 0
 
     def sides(self, value: float) -> tuple[float, float]:
         """The two values of a central difference, `step` to either side, within bounds."""

@@ -62,13 +62,13 @@ def test_coordinates_return_and_have_the_slope_they_say(more):
 def test_a_factor_moves_by_its_logarithm():
     power = Parameter("power", "1", 1.0, (0.0, 1e6), linear=True)
     for value in (0.3, 2.0):
-        assert power.moved(value, 0.2) * power.moved(value, -0.2) == pytest.approx(value**2)
-        assert power.moved(value, 1e-6) == pytest.approx(value + 1e-6, rel=1e-10)
-        slow, fast = (power.moved(value, value * (1 + side * 1e-6)) for side in (-1, 1))
+        assert power.stepped(value, 0.2) * power.stepped(value, -0.2) == pytest.approx(value**2)
+        assert power.stepped(value, 1e-6) == pytest.approx(value + 1e-6, rel=1e-10)
+        slow, fast = (power.stepped(value, value * (1 + side * 1e-6)) for side in (-1, 1))
         assert 0 < fast - slow == pytest.approx(2e-6 * np.e * value, rel=1e-3)  # smooth where it goes on straight
-    assert power.moved(2.0, -9.0) > 0 and power.moved(0.0, 0.5) == 0.5  # a light that is off can be switched on
+    assert power.stepped(2.0, -9.0) > 0 and power.stepped(0.0, 0.5) == 0.5  # a light that is off can be switched on
     for other in (Parameter("x", "mm", 1.0), Parameter("glare", "DN", 1.0, (0.0, 9.0), neutral=0.0, linear=True)):
-        assert other.moved(1.0, 0.5) == 1.5
+        assert other.stepped(1.0, 0.5) == 1.5
 
 
 @pytest.mark.parametrize("side", [-1, 1])

@@ -163,6 +163,28 @@ def test_a_bug_shows_its_traceback(optics, monkeypatch):
     assert code == 2 and "Traceback" in err and "a bug" in err.splitlines()[-1]
 
 
+@pytest.mark.parametrize("inside", [False, True])
+def test_ctrl_c_is_said_in_one_line(optics, monkeypatch, inside):
+    """Python's own exception, and Dr.Jit's for a Ctrl-C within a render, which it puts around Python's."""
+    def stopped():
+        try:
+            raise KeyboardInterrupt
+        except KeyboardInterrupt as ctrl_c:
+            if inside:
+                raise RuntimeError("the evaluation was stopped") from ctrl_c
+            raise
+
+    monkeypatch.setattr(scene, "shipped_scenes", stopped)
+    assert optics("scenes") == (130, "", "interrupted\n")
+
+
+def test_a_reader_that_has_seen_enough_is_no_error():
+    run = "import sys; from optics import cli; sys.exit(cli.main(['scenes', '--json']))"
+    with subprocess.Popen([sys.executable, "-c", run], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as child:
+        child.stdout.close()
+        assert (child.stderr.read(), child.wait(60)) == ("", 0)
+
+
 def test_quiet_says_nothing_but_results(optics, tmp_path):
     assert optics("render", "gelsight", *SIZE, "-o", tmp_path / "a.exr")[2] != ""
     assert optics("render", "gelsight", *SIZE, "-o", tmp_path / "b.exr", "--quiet")[2] == ""
