@@ -10,6 +10,7 @@ import json
 import math
 import tempfile
 import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,7 @@ from optics.compare import plain
 from optics.effect import registry
 from optics.evidence import value_of
 from optics.proof.cells import Cell
-from optics.verdict import CLEAR, MARGIN, Diagnosis
+from optics.verdict import CLEAR, MARGIN, Diagnosis, Row
 
 STEPS = 3  # effects that the loop may add where two are hidden
 
@@ -69,11 +70,11 @@ def _step(rig, model, cell: Cell, d: Diagnosis) -> dict:
     # what frees less and does as well goes first, as in a diagnosis
     first = next((r for r in refitted[1:] if set(r.variables) < set(refitted[0].variables) and best - r.net_refit < CLEAR), None)
     refitted.sort(key=lambda r: r is not first)
-    close = [r.name for r in refitted if best - r.net_refit < max(CLEAR, MARGIN * best)]
     return {
         "word": d.word, "claimed": d.claimed, "ambiguous": d.ambiguous, "sentence": d.sentence,
         "p_best": min((r.p_family for r in d.rows), default=1.0),
-        "score": [r.name for r in d.rows[:5]], "refit": [r.name for r in refitted[:5]], "set": close,
+        "score": [r.name for r in d.rows[:5]], "refit": [r.name for r in refitted[:5]],
+        "set": _close(refitted, lambda r: r.net_refit) or _close(d.rows, lambda r: r.net),
         "falls": {r.name: [r.refit.predicted, r.refit.fall] for r in refitted},
         "noise": d.basis.noise, "excess_sd": d.basis.excess_sd, "phi": d.basis.phi,
         "conditions": {c.name: [c.value, c.holds] for c in d.conditions},
@@ -83,6 +84,13 @@ def _step(rig, model, cell: Cell, d: Diagnosis) -> dict:
         "pair": _to_add(d) if d.word == "PARTIAL" else [],
         "strength": _strengths(rig, model, cell, d),
     }
+
+
+def _close(rows: Sequence[Row], fall: Callable[[Row], float]) -> list[str]:
+    """What explains more than chance does and is not told from the best, of effects that were added in earnest; where none stands out enough
+    for that, by score."""
+    best = max(map(fall, rows), default=0.0)
+    return [r.name for r in rows if fall(r) > 0 and best - fall(r) < max(CLEAR, MARGIN * best)]
 
 
 def _strengths(rig, model, cell: Cell, d: Diagnosis) -> dict[str, list[float]]:

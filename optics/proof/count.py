@@ -74,7 +74,7 @@ class Count:
     words: dict[str, dict[str, int]]
     power: dict[str, dict[str, list[int]]]  # rig -> change -> [right claims, n], without clutter, own law
     ties: tuple[int, int]
-    set_size: float | None  # mean, at 0.2 %, where one stands out
+    set_size: float | None  # mean, at 0.2 %
     pulls: dict[str, list[float]]
     falls: list[float]
     null_p: list[float]
@@ -103,7 +103,7 @@ class Count:
                 lines.append(f"  {r.name:<52}{r.value:>7.3f}{r.n:>6}   {lo:.3f}-{hi:.3f}   {r.first:>5g} {r.ambitious:>7g}  {r.verdict}")
             lines += [f"  ties declared {one.ties[1]}, with the hidden effect among them {one.ties[0]}"]
             if one.set_size is not None:
-                lines += [f"  effects in the set at 0.2 %, where one stands out: {one.set_size:.2f} (to be: 2 at most)"]
+                lines += [f"  effects in the set at 0.2 %, on average: {one.set_size:.2f} (to be: 2 at most)"]
             for law, values in one.pulls.items():
                 if len(values) > 1:
                     lines.append(f"  pulls of strengths ({law}): n {len(values)}, mean {np.mean(values):+.2f}, sd {np.std(values, ddof=1):.2f}")
@@ -214,7 +214,7 @@ def count(records: Sequence[dict], planned: int, parts: bool = True) -> Count:
     found = Count(
         len(records), planned, len(records) - len(made), failed, rates, confusion, words, power,
         (sum(hidden(r)[0] in _last(r)["ambiguous"] for r in ties), len(ties)),
-        float(np.mean([len(_last(r)["set"]) for r in shown])) if shown else None, pulls, falls, [_last(r)["p_best"] for r in calm],
+        float(np.mean([len(_last(r)["set"]) for r in weak])) if weak else None, pulls, falls, [_last(r)["p_best"] for r in calm],
         [_last(r)["held_out"][-1] for r in own if named(r) == set(hidden(r)) and _last(r)["held_out"][-1] is not None],
         float(sum(r.get("seconds", 0.0) for r in records)))
     if parts:

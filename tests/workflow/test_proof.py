@@ -80,14 +80,14 @@ def test_a_target_is_reached_by_the_end_of_the_interval_and_not_by_the_rate():
     assert count.Rate("", 0, 400, 0, 0).interval[1] == pytest.approx(1 - 0.025 ** (1 / 400))  # Clopper & Pearson
 
 
-def test_the_size_of_the_set_is_counted_where_something_stands_out():
+def test_the_set_and_its_size_are_counted_whether_or_not_something_stands_out():
     def weak(p, *close):
         step = {"word": "AMBIGUOUS", "claimed": "", "ambiguous": list(close), "p_best": p, "score": ["a", "b", "c"], "refit": list(close), "set": list(close),
                 "falls": {}, "strength": {}, "held_out": [None]}
         cell = {"rig": "r", "kind": "library", "hidden": ["a"], "change": 0.002, "clutter": 0.0, "law": "same", "mistake": "", "seed": 0}
         return {"cell": cell, "truth": {"a": 1.0}, "steps": [step], "failed": "", "unreachable": False, "coordinates": []}
 
-    found = count.count([weak(1e-4, "a"), weak(1e-4, "b", "a", "c"), weak(0.3)], 3)
+    found = count.count([weak(1e-4, "a"), weak(1e-4, "b", "a", "c"), weak(0.3, "c", "b")], 3)
     assert found.set_size == 2 and "2.00 (to be: 2 at most)" in found.text()
     rates = [found.rate(f"in the set, 0.2 %, no clutter{where}") for where in ("", ", where one stands out")]
     assert [(r.k, r.n) for r in rates] == [(2, 3), (2, 2)]
@@ -102,6 +102,13 @@ def test_the_bench_finds_what_is_hidden_and_predicts_what_comes(bench):
     assert found.rate("top-1 after refit, 0.5 %, no clutter").k == len(effects) and found.holds
     assert found.rate("fall of chi2 within 20 % of its prediction, to 0.5 %").k == len(effects)
     assert all(abs(p) < 5 for p in found.pulls["no clutter"])
+
+
+def test_where_nothing_stands_out_the_set_is_that_of_the_scores(bench):
+    """A drift of 0.2 % by which noise hides it: the set is what explains more than chance would, the drift among it, and not the library."""
+    step = blind.run(bench, strong("source drift", change=0.002, seed=48))["steps"][-1]
+    assert step["word"] == "NOTHING" and not step["refit"] and "source drift" in step["set"]
+    assert 1 < len(step["set"]) < 12 and set(step["set"]) & set(step["score"]) >= {"source drift"}
 
 
 def test_ranked_by_chance_it_fails(bench, monkeypatch):
