@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -18,10 +19,10 @@ from optics.calibrate import for_frames
 from optics.compare import led_label
 from optics.effect import Effect
 from optics.errors import Underdetermined
-from optics.evidence import Candidate, Evidence, Progress, at_bound, measure, value_of
+from optics.evidence import Block, Candidate, Evidence, Progress, at_bound, measure, value_of
 from optics.parameter import Values, Variable
 from optics.verdict import (
-    AS_GOOD, AT_FAULT, CLEAR, CURVE, EXCESS, LEVEL, MAPS, MARGIN, MIMICS, NAMED, UNEVEN, Basis, Diagnosis, Findings, Fingerprint, Level, Refit, Row,
+    AS_GOOD, AT_FAULT, CLEAR, CURVE, EXCESS, HIDDEN, LEVEL, MAPS, MARGIN, NAMED, UNEVEN, Basis, Diagnosis, Findings, Fingerprint, Level, Pair, Refit, Row,
     Shift, Split, decide, moved_by, rivals, sentence,
 )
 from optics.words import some
@@ -31,10 +32,11 @@ SETTLED = 0.01  # of the excess of chi2: what a calibrated base may still absorb
 KAPPA = 0.1  # noise per pixel of derivative images over their signal, above which strengths are biased
 IMPLAUSIBLE = 10.0  # times the plausible strength: worth a look
 MAX_REFITS = 10
+EVEN = 0.05  # of the fall: what splitting may gain where clutter does not make it
 MAX_SPLIT = 4  # members of an ambiguous set that are tested for evenness
 SAME_PLACE = 0.5  # of what an effect leaves: if its own strength, split, takes more than this, the rest is where the effect is, and it is not it
-HIDDEN = 2.0  # standard deviations of excess misfit that may hide beside an effect which seems to leave none ...
-ALONG = 0.05  # ... and what of it lies where two effects differ: on the polarizer bench .006 on average and .07 at most, on gelsight .002
+ALONG = 0.05  # of misfit that hides: what lies where two effects differ: on the polarizer bench .006 on average and .07 at most, on gelsight .002
+PARTS = 16  # of the sensor or session, wider than what clutter shares: what a strength scatters between them, noise and clutter make
 LOOKS = 3  # at an effect's picture, to find the strength at which it was taken
 HAIR = 0.01  # of the fall: a split that gains less says nothing about what the effect is
 USUALLY = "the same press at 0.4 of the exposure, and one deeper press, often tell more than repeats"  # where no shot was simulated
@@ -87,10 +89,10 @@ def diagnose(model, fit, effects: Sequence[Effect], variables_of: Callable[[Effe
         done.sort(key=lambda c: c is not winner)
     members = [c for c in done if c.row.net_refit > 0 and _close(winner.row.net_refit, c.row.net_refit)
                and not _refuted(winner, c, basis.dof)] if winner else []
-    splits = []
+    splits, split = [], partial(_split, model, evidence, places, rows_max, seed, say)
     if winner:
         for c in members[:MAX_SPLIT]:
-            own, p, clutter = _split(model, evidence, c, fits[c.effect.name], places, rows_max, seed, say)
+            own, p, clutter = split(c, fits[c.effect.name], c.row.refit, c.row.net_refit)
             splits += own
             c.row.refit = _scattered(c.row.refit, p if math.isnan(p) else table.family.p(p), clutter)
     levels = _held_out(model, fit, evidence, winner, fits, refit, held_out, variables_of, say)
@@ -101,11 +103,8 @@ def diagnose(model, fit, effects: Sequence[Effect], variables_of: Callable[[Effe
     found = []
     if winner and word not in ("NOTHING", "CLAIM") and not any(c.row.refit.complete for c in done):
         found = pairs.search(evidence, table.order, winner.row.net_refit,
-                             lambda both: _add_both(model, fit, evidence, both, refit, fitted))
-        # what one curve explains as well as two effects together is rather one cause that the library lacks
-        curve = max([f.net for f in fingerprints if f.coordinate not in MIMICS], default=0.0)
-        chance = {row.name: row.expected for row in rows}
-        found = [p for p in found if not p.complete or p.fall - sum(chance[name] for name in p.effects) > curve + CLEAR]
+                             lambda both: _add_both(model, fit, evidence, both, refit, fitted, split, table.family))
+        found = pairs.beside_curves(found, fingerprints, {row.name: row.expected for row in rows})
         word = "PARTIAL" if any(p.complete for p in found) else word
     _write_limits(model, evidence, table, winner if word == "CLAIM" else None, fits, basis, rows_max, seed, say)
     _write_verdicts(table, word, winner, members, splits, levels)
@@ -115,6 +114,8 @@ def diagnose(model, fit, effects: Sequence[Effect], variables_of: Callable[[Effe
     text = sentence(word, conditions, findings, rows, [c.row for c in members], fingerprints, levels, shifts, basis)
     if any(p.complete for p in found):
         text = pairs.words(found, {row.name: row.share for row in rows})
+    elif word in ("PARTIAL", "UNKNOWN"):
+        text += pairs.doubt(found)
     if word in ("UNKNOWN", "CANNOT_TELL"):
         excess = basis.chi2 - basis.dof if basis.excess_sd > EXCESS else 0.0
         fixed = prints.fixed_text(prints.fixed_pattern(model, evidence, excess), max([f.share for f in fingerprints], default=0.0))
@@ -421,8 +422,9 @@ def _clear(found, c: Candidate, strength: Sequence[float]) -> float:
     return math.sqrt(max(float(change @ inverse @ change), 0.0)) if rank else math.nan
 
 
-def _add_both(model, fit, evidence: Evidence, both: list[Candidate], refit: Callable, fitted: Sequence[int]):
-    """Fall of chi2, excess and structure after two effects were added together; None where no refit succeeds."""
+def _add_both(model, fit, evidence: Evidence, both: list[Candidate], refit: Callable, fitted: Sequence[int], split: Callable,
+              family: st.Family) -> Pair | None:
+    """What comes of two effects that are added together; None where no refit succeeds. `split` is `_split`."""
     base = [v for v in fit.variables if v.frames is None or set(v.frames) & set(fitted)]
     start = _start(model, fit, evidence, [(c, c.linear) for c in both], START)
     try:
@@ -433,7 +435,15 @@ def _add_both(model, fit, evidence: Evidence, both: list[Candidate], refit: Call
     after += _prior_chi2(model, found.values, fit.variables)
     fall = evidence.normal.square + _prior_chi2(model, fit.values, fit.variables) - after
     columns = [*evidence.base, *(i for c in both for i in c.columns)]
-    return fall, _excess(evidence, after, expected, both), evidence.structure(images, columns).p
+    pair = Pair([c.effect.name for c in both], fall, _excess(evidence, after, expected, both), evidence.structure(images, columns).p)
+    for c, other in (both, both[::-1]) if pair.complete else ():  # a second effect may take up clutter, or what the first has wrong
+        strength = [value_of(model, found.values, v) for v in c.variables]
+        own, chance, _ = split(c, found, pair, _clear(found, c, strength) ** 2, other.variables)
+        uneven = [s.by for s in own if not s.holds]
+        if uneven or not math.isnan(chance) and family.p(chance) >= LEVEL:
+            return replace(pair, but=f"{c.effect.name}'s strength " + (
+                f"then differs by {uneven[0]}" if uneven else "is no more than its scatter between parts of the data"))
+    return pair
 
 
 def _look_again(model, fit, evidence: Evidence, c: Candidate) -> tuple[float, np.ndarray]:
@@ -515,23 +525,25 @@ def _prior_chi2(model, values: Values, variables: Sequence[Variable]) -> float:
 # -- splits -----------------------------------------------------------------------------------------------------------
 
 
-def _split(model, evidence: Evidence, c: Candidate, found, places: list[dict], rows_max: int, seed: int,
-           say: Progress) -> tuple[list[Split], float, np.ndarray]:
+def _split(model, evidence: Evidence, places: list[dict], rows_max: int, seed: int, say: Progress, c: Candidate, found, left: Refit | Pair,
+           net: float, beside: Sequence[Variable] = ()) -> tuple[list[Split], float, np.ndarray]:
     """Whether a fitted effect has the same strength in every part of the data, and `_scatter` of its strength.
 
     With the effect in the base, e, by which its picture differs from the one without it, is cut into parts e 1{part} and these are
     scored: a true effect gains nothing by being cut, a proxy does.
+
+    found   the fit with it;   left: what is left with that;   net: its fall;   beside: variables of what was added with it
     """
     from scipy.special import chdtrc
 
-    base = [v for v in [*(evidence.columns[i] for i in evidence.base), *c.variables]
+    base = [v for v in [*(evidence.columns[i] for i in evidence.base), *beside, *c.variables]
             if v in c.variables or not at_bound(v, value_of(model, found.values, v))]
     own = measure(model, found.values, base, [], evidence.frames, rows_max, seed, say, f"evenness of {c.effect.name}")
-    change = np.array(c.row.refit.strength) - c.start
+    change = np.array([value_of(model, found.values, v) for v in c.variables]) - c.start
     effect = [i for i, v in enumerate(base) if v in c.variables]
     calibrated = [i for i in own.base if i not in effect]
     own.precision, own.pull = own.precision[calibrated], own.pull[calibrated]  # effect variables follow the base's
-    middles, without = [block.middle for block in own.blocks], found.values.copy()
+    without = found.values.copy()
     for v, start in zip(c.variables, c.start):
         without.put(v, float(start))
     changes = zip(*(model.predict(values, own.frames, own.seed) for values in (found.values, without)))
@@ -542,25 +554,33 @@ def _split(model, evidence: Evidence, c: Candidate, found, places: list[dict], r
     for by, (labels, bins) in parts.items():
         count, first = len(labels), len(base)
         normal = plain_normal.copy()
-        for block, middle, image, index in zip(own.blocks, middles, images, bins):
-            st.add_bins(normal, block.where, middle, block.r, first, index, count, [image])
+        for block, image, index in zip(own.blocks, images, bins):
+            st.add_bins(normal, block.where, block.middle, block.r, first, index, count, [image])
         rest = list(range(first, first + count))
         lengths = np.diag(normal.gram)[rest]
         k = own.thinning
         projected = own.project(normal, calibrated + effect, rest, k)
-        fall, dof, _, _ = st.joint(projected, lengths)
+        fall, dof, more, _ = st.joint(projected, lengths)
         if dof == 0:
             continue
         _, _, delta, sd = st.joint(own.project(normal, calibrated, rest, k), lengths)
-        p = float(chdtrc(dof, fall))
-        h = max(fall - dof, 0.0) * k / max(c.row.net_refit, 1e-9)
-        results.append(Split(c.effect.name, by, labels, (1 + delta).tolist(), sd.tolist(), fall * k, dof, p, h, True))
-    level, scatter = LEVEL / max(len(results), 1), _scatter(own, calibrated, effect, change, places)
-    if c.row.refit.complete:  # nothing but noise is left, so that p means what it says, but for a hair of the fall
-        return [replace(s, holds=s.p >= level or s.h < HAIR) for s in results], *scatter
-    left = c.row.refit.excess_sd * math.sqrt(2 * max(evidence.normal.count - evidence.projected.rank, 1))
-    return [replace(s, holds=s.p >= level or s.h <= UNEVEN and s.fall - s.dof * own.thinning <= SAME_PLACE * left)
-            for s in results], *scatter
+        h = max(fall - dof, 0.0) * k / max(net, 1e-9)
+        cut = [image[:, None] * (index[:, None] == np.arange(count)) for image, index in zip(images, bins)]
+        cut = _off_base(own, cut, projected, calibrated + effect)
+        rest = [block.r - image @ more for block, image in zip(own.blocks, cut)]
+        results.append(Split(c.effect.name, by, labels, (1 + delta).tolist(), sd.tolist(), fall * k, dof, float(chdtrc(dof, fall)), h,
+                             _chance(projected.score, _scores(cut, rest, places)), UNEVEN, True))
+    level, excess = LEVEL / max(len(results), 1), left.excess_sd * math.sqrt(2 * max(evidence.normal.count - evidence.projected.rank, 1))
+
+    def most(s: Split) -> float:
+        if s.p >= level:
+            return max(s.h, UNEVEN)
+        if left.complete:  # nothing but noise is left, so that p means what it says
+            return HAIR
+        return min(EVEN if s.chance < LEVEL else UNEVEN, SAME_PLACE * excess / max(net, 1e-9))
+
+    results = [replace(s, limit=most(s), holds=s.h <= most(s)) for s in results]
+    return results, *_scatter(own, calibrated, effect, change, places)
 
 
 def _scattered(refit: Refit, chance: float, clutter: np.ndarray) -> Refit:
@@ -573,42 +593,73 @@ def _scattered(refit: Refit, chance: float, clutter: np.ndarray) -> Refit:
 
 def _scatter(own: Evidence, calibrated: Sequence[int], effect: Sequence[int], change: np.ndarray, places: list[dict]) -> tuple[float, np.ndarray]:
     """p of a strength that asks for no independent noise, by its scatter between parts of the sensor or session, as neighbours share
-    clutter; and the covariance that clutter adds to that of noise. The larger of what the maps say.
-
-    With x the effect's images off the base, V = x'x, r what is left at the fit, u_g = sum of x r over the part g and B = sum of u_g u_g':
-    T2 = (V d)' B^-1 (V d), T2 (G - k)/(k (G - 1)) ~ F(k, G - k), and V^-1 (B G/(G - 1) - V) V^-1. NaN and zero where there are too few parts.
-
-    Source: Liang & Zeger, Longitudinal data analysis using generalized linear models, Biometrika 73, 13 (1986), the robust variance.
-    """
-    from scipy.stats import f as fisher
-
-    projected, worst, clutter = own.project(own.thinned(), calibrated, effect, own.thinning), math.nan, np.zeros((len(effect),) * 2)
+    clutter (`_chance`); and the covariance V^-1 (B - V) V^-1 that clutter adds to that of noise, with V and B of `_scores` at the fit.
+    The larger of what the maps say; NaN and zero where there are too few parts."""
+    projected, clutter = own.project(own.thinned(), calibrated, effect, own.thinning), np.zeros((len(effect),) * 2)
     covariance = st.inverse(projected.information)[0]
+    images = _off_base(own, [_columns(block, effect) for block in own.blocks], projected, calibrated)
+    scores = _scores(images, [block.r for block in own.blocks], places)
+    for b, parts in scores:
+        if st.inverse(b)[1] < parts - 1:
+            clutter = max(clutter, covariance @ (b - projected.information) @ covariance, key=lambda c: float(np.trace(c @ projected.information)))
+    return _chance(projected.information @ change, scores), clutter
+
+
+def _columns(block: Block, columns: Sequence[int]) -> np.ndarray:
+    """(n, k) images of a block; 0 where it has none of a column."""
+    position = {int(w): i for i, w in enumerate(block.where)}
+    images = np.zeros((len(block.r), len(columns)))
+    there = [(i, position[c]) for i, c in enumerate(columns) if c in position]
+    images[:, [i for i, _ in there]] = block.middle[:, [j for _, j in there]]
+    return images
+
+
+def _off_base(own: Evidence, images: Sequence[np.ndarray], projected: st.Projected, base: Sequence[int]) -> list[np.ndarray]:
+    """Images of each block with what the base makes up for taken out."""
+    return [image + _columns(block, base) @ projected.response for block, image in zip(own.blocks, images)]
+
+
+def _scores(images: Sequence[np.ndarray], left: Sequence[np.ndarray], places: list[dict]) -> list[tuple[np.ndarray, int]]:
+    """(B, G) for each of MAPS that there is: the variance of the score x'r of images x, by its scatter between G parts.
+
+    B = (G - 1)/G sum of w w' with w = (1 - V_g/V)^-1 u_g, u_g = sum of x r over part g, V_g of x x': what part g says of strengths that
+    were fitted without it, where r is what is left at the fit.
+
+    Source: Liang & Zeger, Longitudinal data analysis using generalized linear models, Biometrika 73, 13 (1986), the robust variance;
+    Bell & McCaffrey, Bias reduction in standard errors for linear regression with multi-stage samples, Survey Methodology 28, 169 (2002),
+    the jackknife.
+    """
+    found, k = [], images[0].shape[1]
+    whole = st.inverse(sum(x.T @ x for x in images))[0]
     for name in MAPS:
-        if name not in places[0]:
-            continue
-        x = np.concatenate([p[name] for p in places])
-        edges = st.bin_edges(x, prints.LINES)
+        edges = st.bin_edges(np.concatenate([p[name] for p in places]), PARTS) if name in places[0] else None
         if edges is None:
             continue
-        sums = np.zeros((len(edges) - 1, len(effect)))
-        for block, place in zip(own.blocks, places):
-            position = {int(w): i for i, w in enumerate(block.where)}
-            images = np.zeros((len(block.r), len(effect)))
-            for weights, columns in ((np.eye(len(effect)), effect), (projected.response, calibrated)):
-                here = [(i, position[c]) for i, c in enumerate(columns) if c in position]
-                images += block.middle[:, [j for _, j in here]] @ weights[[i for i, _ in here]]
-            np.add.at(sums, np.searchsorted(edges, place[name], side="right") - 1, images * block.r[:, None])
-        inverse, k = st.inverse(sums.T @ sums)
-        parts = int((np.abs(sums).sum(1) > 0).sum())
-        if not 0 < k < parts - 1:
-            continue
-        score = projected.information @ change
-        p = float(fisher.sf(score @ inverse @ score * (parts - k) / (k * (parts - 1)), k, parts - k))
-        worst = p if math.isnan(worst) else max(p, worst)
-        more = covariance @ (parts / (parts - 1) * sums.T @ sums - projected.information) @ covariance
-        clutter = max(clutter, more, key=lambda c: float(np.trace(c @ projected.information)))
-    return worst, clutter
+        scores, grams = np.zeros((len(edges) - 1, k)), np.zeros((len(edges) - 1, k, k))
+        for place, x, r in zip(places, images, left):
+            part = np.searchsorted(edges, place[name], side="right") - 1
+            for g in range(len(scores)):
+                own = x[part == g]
+                scores[g] += own.T @ r[part == g]
+                grams[g] += own.T @ own
+        spoke = np.einsum("gii->g", grams) > 0
+        w = np.array([np.linalg.pinv(np.eye(k) - v @ whole, 1e-6) @ u for u, v in zip(scores[spoke], grams[spoke])]).reshape(-1, k)
+        found.append(((len(w) - 1) / max(len(w), 1) * w.T @ w, len(w)))
+    return found
+
+
+def _chance(score: np.ndarray, scores: Sequence[tuple[np.ndarray, int]]) -> float:
+    """p of a score u (k,) by its variance B between G parts: T2 = u' B^-1 u, T2 (G - k)/(k (G - 1)) ~ F(k, G - k). The larger of what the
+    maps say; NaN where there are too few parts."""
+    from scipy.stats import f as fisher
+
+    worst = math.nan
+    for b, parts in scores:
+        inverse, k = st.inverse(b)
+        if 0 < k < parts - 1:
+            p = float(fisher.sf(score @ inverse @ score * (parts - k) / (k * (parts - 1)), k, parts - k))
+            worst = p if math.isnan(worst) else max(p, worst)
+    return worst
 
 
 def _parts(model, evidence: Evidence, places: list[dict]) -> dict[str, tuple[list[str], list[np.ndarray]]]:
@@ -757,6 +808,7 @@ def _findings(table, winner, done, members, fingerprints, splits, levels, basis,
             share=winner.row.net_refit / excess if excess > 0 else math.nan, excess_sd=basis.excess_sd,
             left=basis.misfit * math.sqrt(max(1 - winner.row.refit.fall / basis.chi2, 0.0)),
             uneven=worst.h if worst else 0.0, uneven_by=f" by {worst.by} ({_extremes(worst)})" if worst else "",
+            uneven_limit=worst.limit if worst else UNEVEN,
             even=all(s.holds for s in mine),
             some_even=any(even.values()) if even else True,
             held_out=levels[-1].fall if len(levels) > 1 else math.nan, clear=winner.row.refit.clear,

@@ -7,17 +7,19 @@ everything else. Only a pair after which nothing is left counts: two more number
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
 
 from optics import statistics as st
 from optics.evidence import Candidate, Evidence
-from optics.verdict import CLEAR, LEVEL, MARGIN, Pair
+from optics.verdict import CLEAR, HIDDEN, LEVEL, MARGIN, MIMICS, Fingerprint, Pair
 
 CONSIDERED = 10  # effects, the best by themselves: 45 pairs
 REFITTED = 4  # pairs
+LEAD = MARGIN / 4  # of the fall, by which two effects must do better than one, and than one curve where they leave misfit
 
 
 def ranked(evidence: Evidence, candidates: Sequence[Candidate]) -> list[tuple[float, Candidate, Candidate, np.ndarray]]:
@@ -37,24 +39,41 @@ def ranked(evidence: Evidence, candidates: Sequence[Candidate]) -> list[tuple[fl
     return sorted(found, key=lambda t: -t[0])
 
 
-def search(evidence: Evidence, order: Sequence[Candidate], alone: float, add: Callable[[list[Candidate]], tuple]) -> list[Pair]:
+def search(evidence: Evidence, order: Sequence[Candidate], alone: float, add: Callable[[list[Candidate]], Pair | None]) -> list[Pair]:
     """The best pairs, refitted; `alone` is the best single effect's net fall.
 
-    add   (effects with their `linear` set) -> (fall, excess_sd, structure_p) after a refit, or None
+    add   effects with their `linear` set -> what comes of them after a refit, or None
     """
     live = [c for c in order if c.row.p_family < LEVEL and len(c.cone.live) and not c.broken][:CONSIDERED]
-    best = [t for t in ranked(evidence, live) if t[0] - alone > max(CLEAR, MARGIN / 4 * alone)]
+    best = [t for t in ranked(evidence, live) if t[0] - alone > max(CLEAR, LEAD * alone)]
     pairs = []
     for _, a, b, linear in best[:REFITTED]:
         kept = a.linear, b.linear
         a.linear, b.linear = linear[:len(a.columns)], linear[len(a.columns):]
         try:
-            result = add([a, b])
+            pair = add([a, b])
         finally:
             a.linear, b.linear = kept
-        if result is not None and math.isfinite(result[0]):
-            pairs.append(Pair([a.effect.name, b.effect.name], *result))
+        if pair is not None and math.isfinite(pair.fall):
+            pairs.append(pair)
     return sorted(pairs, key=lambda p: -p.fall)
+
+
+def beside_curves(pairs: Sequence[Pair], fingerprints: Sequence[Fingerprint], chance: Mapping[str, float]) -> list[Pair]:
+    """The pairs, less those that one curve does as well as: that is rather one cause, which the library lacks.
+
+    chance   effect -> fall that chance gives
+    """
+    curve = max((f for f in fingerprints if f.coordinate not in MIMICS), key=lambda f: f.net, default=None)
+
+    def judged(pair: Pair) -> Pair:
+        net = pair.fall - sum(chance[name] for name in pair.effects)
+        lead = LEAD * net if pair.excess_sd > HIDDEN else 0.0
+        if curve is None or not pair.complete or net > curve.net + max(CLEAR, lead):
+            return pair
+        return replace(pair, but=f"one curve, along '{curve.coordinate}', explains {curve.net / net:.0%} of what both do")
+
+    return [judged(pair) for pair in pairs]
 
 
 def words(pairs: Sequence[Pair], share: dict[str, float]) -> str:
@@ -69,3 +88,8 @@ def words(pairs: Sequence[Pair], share: dict[str, float]) -> str:
     part = f" {one} alone explains {share[one]:.0%}." if math.isfinite(share.get(one, math.nan)) else ""
     return (f"no one effect explains the residual, but {one} together with {' or with '.join(others)} leaves nothing.{part} "
             f"Add {one}, calibrate and diagnose again.")
+
+
+def doubt(pairs: Sequence[Pair]) -> str:
+    """Why two effects that would leave nothing are not named; empty where there are none."""
+    return next((f" {' with '.join(p.effects)} would leave nothing, but {p.but}." for p in pairs if p.but), "")

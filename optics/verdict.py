@@ -42,6 +42,7 @@ MIMICS = (*MAPS, "frame")
 AT_FAULT = "units, LEDs that were off, black_level, and that pictures are linear (not encoded for viewing) and whole, with row 0 at the top"
 FAR = 0.3  # misfit over mean signal: beyond what effects of a sensor leave
 CLUTTERED = 0.005  # of the signal: misfit as of the fixed pattern alone in a good sensor (optics.proof, clutter 1), whose coating adds 1 % of mottle
+HIDDEN = 2.0  # standard deviations of excess misfit that may hide beside an effect which seems to leave none
 AS_GOOD = 0.8  # of the best curve's fall: what is nearer than that is not told apart from it
 PLANS = ("together", "more of the same")  # kinds of advice that are several shots
 TELLS = 0.02  # gain of P(correct) below which a shot is not worth a line
@@ -97,13 +98,18 @@ class Refit:
 
 @dataclass
 class Pair:
-    """Two effects that were added together: fall of chi2, and what is left (as in Refit)."""
+    """Two effects that were added together: fall of chi2, and what is left (as in Refit); but: what speaks against one of them."""
 
     effects: list[str]
     fall: float
     excess_sd: float
     structure_p: float
-    complete = Refit.complete  # the same question
+    but: str = ""
+
+    @property
+    def complete(self) -> bool:
+        """Whether nothing is left to explain, nor speaks against either."""
+        return not self.but and Refit.complete.fget(self)
 
 
 @dataclass
@@ -161,8 +167,9 @@ class Row:
 class Split:
     """The strength of an effect in parts of the data, relative to its strength in all of it (1 everywhere if it is true).
 
-    h       fall of chi2 by splitting, less chance, over the effect's own fall; p under ideal noise
-    holds   h below the limit, or p as chance makes it; where the effect leaves no misfit behind, p alone decides
+    h       fall of chi2 by splitting, less chance, over the effect's own fall; p under ideal noise; chance: p by the scatter that clutter
+            makes between parts of the data, NaN where it is not known
+    limit   h that is allowed, by what noise and clutter make; holds: whether h is within it
     """
 
     effect: str
@@ -174,6 +181,8 @@ class Split:
     dof: int
     p: float
     h: float
+    chance: float
+    limit: float
     holds: bool
 
 
@@ -481,6 +490,7 @@ class Findings:
     excess_sd: float = 0.0
     uneven: float = 0.0
     uneven_by: str = ""
+    uneven_limit: float = UNEVEN
     even: bool = True
     some_even: bool = True
     held_out: float = math.nan
@@ -533,8 +543,8 @@ def decide(f: Findings) -> tuple[str, list[Condition]]:
             Condition("beyond clutter", f.chance, LEVEL, not f.chance >= LEVEL,
                       "too few parts of the data to tell" if math.isnan(f.chance) else f"family-wise p {p_text(f.chance)} by the scatter between parts "
                       f"of the data, against {LEVEL:g}"),
-            Condition("even", f.uneven, UNEVEN, f.even, f"splitting its strength{f.uneven_by} gains {f.uneven:.2f} of the "
-                      f"fall, {UNEVEN:g} allowed"),
+            Condition("even", f.uneven, f.uneven_limit, f.even, f"splitting its strength{f.uneven_by} gains {f.uneven:.2f} of the "
+                      f"fall, {f.uneven_limit:.2g} allowed"),
             Condition("held out", f.held_out, 0.0, f.held_out > 0,
                       "no frames were held out" if math.isnan(f.held_out) else
                       f"chi2 of held-out frames falls by {f.held_out:.3g}"),

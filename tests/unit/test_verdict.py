@@ -13,14 +13,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from optics import fingerprints, statistics as st
-from optics.diagnose import _refuted, _scatter, diagnose, score
+from optics import fingerprints, pairs, statistics as st
+from optics.diagnose import _chance, _refuted, _scatter, _scores, _split, diagnose, score
 from optics.effect import Effect
 from optics.errors import Underdetermined
 from optics.evidence import Candidate, measure
 from optics.noise import Noise
 from optics.parameter import Parameter, Values, Variable
-from optics.verdict import CLEAR, CLUTTERED, MARGIN, WORDS, Diagnosis, Findings, decide
+from optics.verdict import CLEAR, CLUTTERED, MARGIN, WORDS, Diagnosis, Findings, Pair, decide
 
 sys.path.insert(0, str(Path(__file__).parent))
 from mock_model import LIBRARY, Exact, Frame, MockModel, PointModel, mock_fit, simulate  # noqa: E402
@@ -308,6 +308,54 @@ def test_a_strength_is_held_against_what_neighbours_share():
     assert np.mean(naive) > 0.3
     assert abs(np.mean(np.array(ps) < 0.05) - 0.05) < 0.038 and np.mean(np.array(ps) < 0.01) < 0.028
     assert abs(np.mean(np.abs(pulls) < 2) - 0.92) < 0.047
+
+
+def test_a_lamp_that_wanders_does_not_pass_for_a_tone_of_the_session():
+    """600 readings, a wander that 50 neighbours share, as strong as noise, and a tone of 240 readings, as of a second dial. By noise most
+    sets would show it, by the scatter between 16 parts 4 % do at .01 (2000 sets), 6.5 % between 64. 1000 sets, to three sd."""
+    from scipy.ndimage import gaussian_filter1d
+
+    count = 600
+    rng, order, ps, noise = np.random.default_rng(9), np.arange(count, dtype=float), [], []
+    tone = np.cos(2 * np.pi * order / 240)[:, None]
+    tone -= tone.mean()
+    power = float(np.sum(tone**2))
+    for _ in range(1000):
+        wander = gaussian_filter1d(rng.standard_normal(count), 15, mode="wrap")
+        y = wander / wander.std() + rng.standard_normal(count)
+        y -= y.mean()
+        score = tone.T @ y
+        left = y - tone @ score / power
+        noise.append(score[0] ** 2 / power > 6.63)
+        ps.append(_chance(score, _scores([tone], [left], [{"reading": order}])))
+    assert np.mean(noise) > 0.6 and np.mean(np.array(ps) < 0.01) < 0.055
+
+
+@pytest.mark.parametrize("proxy", [False, True])
+def test_what_splits_a_strength_is_held_against_clutter_too(proxy):
+    """Patches of 8 x 8 px with 1 % of their own, and a slope of 6 %, which a proxy has in the upper half alone. Between quadrants, of four
+    patches each, noise would call all strengths uneven; their scatter calls a proxy's so, and of true ones 7 % at .01 (400 sets), as four
+    patches tell a scatter badly. 100 sets, to three sd."""
+    rng, effect, uneven, naive = np.random.default_rng(6), Effect("slope", "lamp", ("slope",)), [], []
+    side = np.arange(32)
+    place = np.add.outer(4 * (side // 8), side // 8).astype(float).ravel()
+    quadrant = np.add.outer(2 * (side // 16), side // 16).astype(float).ravel()
+    power, slope = (Variable(key, (key,), p) for key, p in Slope.parameters.items())
+    for _ in range(100):
+        truth = 1 + 0.01 * np.kron(rng.standard_normal((4, 4)), np.ones((8, 8)))[..., None]
+        model = Slope(np.zeros(Slope.shape))
+        strength = 0.06 * (np.where(side < 16, 2.0, 0.0)[:, None, None] if proxy else 1.0)
+        model.frames[0].image = Slope.noise.expose(64 + 400 * (truth + strength * model.across), rng)
+        fit = mock_fit(model, [power, slope], Values(), [0])
+        c = Candidate.at(model, Values(), effect, [slope])
+        base = measure(model, fit.values, [power], [c], [0], 10**6, 0, lambda *a: None)
+        left = SimpleNamespace(complete=False, excess_sd=100.0)
+        splits, _, _ = _split(model, base, [{"place": place, "quadrant": quadrant, "channel": np.zeros(1024)}], 10**6, 0, lambda *a: None, c, fit,
+                              left, (fit.values.common["lamp.slope"] / fit.sd[1]) ** 2)
+        own = next(s for s in splits if s.by == "quadrant")
+        uneven.append(own.chance < 0.01)
+        naive.append(own.p < 0.01)
+    assert np.mean(naive) > 0.9 and (np.mean(uneven) > 0.9 if proxy else np.mean(uneven) < 0.15), np.mean(uneven)
 
 
 def two_effects(apart, hidden, sets=4000, count=600):
@@ -604,3 +652,17 @@ def test_values_are_not_changed_by_a_diagnosis():
     before = Values(dict(fit.values.common), {k: dict(v) for k, v in fit.values.frame.items()})
     judge(model, fit, library("crosstalk", "glare"))
     assert fit.values == before
+
+
+# -- two at once --------------------------------------------------------------------------------------------------------
+
+
+def test_two_effects_are_not_named_for_what_one_curve_does():
+    curve = SimpleNamespace(coordinate="angle", net=990.0)
+    maps = SimpleNamespace(coordinate="place", net=1300.0)  # which mimics everything, and is no cause
+    one, two = Pair(["a", "b"], 1016.0, 3.0, 0.5), Pair(["a", "c"], 1300.0, 3.0, 0.5)  # 22 more than the curve, and 307
+    found = pairs.beside_curves([two, one], [maps, curve], {"a": 2.0, "b": 2.0, "c": 1.0})
+    assert [p.complete for p in found] == [True, False] and pairs.doubt(found[:1]) == ""
+    assert pairs.doubt(found) == " a with b would leave nothing, but one curve, along 'angle', explains 98% of what both do."
+    assert pairs.beside_curves([replace(one, excess_sd=0.0)], [curve], {"a": 2.0, "b": 2.0})[0].complete  # noise alone is left: it decides
+    assert pairs.beside_curves([one], [maps], {"a": 2.0, "b": 2.0}) == [one]

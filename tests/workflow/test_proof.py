@@ -111,6 +111,16 @@ def test_where_nothing_stands_out_the_set_is_that_of_the_scores(bench):
     assert 1 < len(step["set"]) < 12 and set(step["set"]) & set(step["score"]) >= {"source drift"}
 
 
+@pytest.mark.parametrize("seed, why", [(3, "'s strength is no more than its scatter"), (41, "one curve, along 'polarizer.angle', explains 99%")])
+def test_a_film_that_is_smeared_at_one_angle_is_no_polarized_source(bench, seed, why):
+    """Five angles of the polarizer, a lamp that wanders: a polarized source, whose light goes with that angle too, explains nearly all of it,
+    and with an analyser's wobble all."""
+    cell = cells.Cell("polarizer_bench", "unknown", ("smeared film",), 0.01, 0.5, "same", "", seed)
+    step = blind.run(bench, cell)["steps"][-1]
+    assert step["word"] in ("PARTIAL", "UNKNOWN") and not step["pair"] and step["refit"][0] == "polarized source"
+    assert not step["conditions"]["even"][1] and why in step["sentence"]
+
+
 def test_ranked_by_chance_it_fails(bench, monkeypatch):
     """Each candidate's scores stand under the name of another."""
     rng, solve = np.random.default_rng(1), statistics.Cone.solve
