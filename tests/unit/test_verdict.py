@@ -13,8 +13,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from optics import fingerprints, pairs, statistics as st
-from optics.diagnose import _chance, _refuted, _scatter, _scores, _split, diagnose, score
+from optics import evenness, fingerprints, pairs, statistics as st
+from optics.diagnose import _refuted, diagnose, score
 from optics.effect import Effect
 from optics.errors import Underdetermined
 from optics.evidence import Candidate, measure
@@ -301,7 +301,7 @@ def test_a_strength_is_held_against_what_neighbours_share():
         own = measure(model, fit.values, variables, [], [0], 10**6, 0, lambda *a: None)
         own.precision, own.pull = own.precision[:1], own.pull[:1]  # the slope stands behind the base
         slope = fit.values.common["lamp.slope"]
-        p, clutter = _scatter(own, [0], [1], np.array([slope]), [{"place": place}])
+        p, clutter = evenness.scatter(own, [0], [1], np.array([slope]), [{"place": place}])
         ps.append(p)
         pulls.append(slope / math.sqrt(fit.sd[1] ** 2 + max(clutter[0, 0], 0.0)))
         naive.append((slope / fit.sd[1]) ** 2 > 6.63)
@@ -327,7 +327,7 @@ def test_a_lamp_that_wanders_does_not_pass_for_a_tone_of_the_session():
         score = tone.T @ y
         left = y - tone @ score / power
         noise.append(score[0] ** 2 / power > 6.63)
-        ps.append(_chance(score, _scores([tone], [left], [{"reading": order}])))
+        ps.append(evenness.by_clutter(score, evenness.variances([tone], [left], [{"reading": order}])))
     assert np.mean(noise) > 0.6 and np.mean(np.array(ps) < 0.01) < 0.055
 
 
@@ -350,8 +350,9 @@ def test_what_splits_a_strength_is_held_against_clutter_too(proxy):
         c = Candidate.at(model, Values(), effect, [slope])
         base = measure(model, fit.values, [power], [c], [0], 10**6, 0, lambda *a: None)
         left = SimpleNamespace(complete=False, excess_sd=100.0)
-        splits, _, _ = _split(model, base, [{"place": place, "quadrant": quadrant, "channel": np.zeros(1024)}], 10**6, 0, lambda *a: None, c, fit,
-                              left, (fit.values.common["lamp.slope"] / fit.sd[1]) ** 2)
+        places = [{"place": place, "quadrant": quadrant, "channel": np.zeros(1024)}]
+        fall = (fit.values.common["lamp.slope"] / fit.sd[1]) ** 2
+        splits, _, _ = evenness.split(model, base, places, 10**6, 0, lambda *a: None, c, fit, left, fall)
         own = next(s for s in splits if s.by == "quadrant")
         uneven.append(own.chance < 0.01)
         naive.append(own.p < 0.01)
