@@ -21,6 +21,7 @@ from optics.parameter import Values, Variable
 from optics.words import some, spaced
 
 REACH = 4.0  # plausible sizes that one step may change what the image is not linear in
+SETTLED = 1e-3  # of the excess of chi2: a promise that is not worth another linearisation, a tenth of what a diagnosis allows
 ALIKE = 0.995  # correlation beyond which two variables are said to stand for each other
 TRUNCATION = 1e-12  # eigenvalues of the scaled normal matrix below this share of the largest count as undetermined
 
@@ -32,7 +33,8 @@ class Fit:
     values       start values with the estimates put in
     estimate     (p,) in the order of `variables`; covariance (p, p) from the noise model and the priors
     chi2, dof    of the data, without priors; per frame in frame_chi2, frame_n
-    converged    whether the fall of chi2 still predicted is below 1 per variable; `reason` says why it stopped
+    converged    whether the fall of chi2 still predicted is below 1 per variable, or a thousandth of what noise does not explain; `reason`
+                 says why it stopped
     warnings     sentences: combinations that the captures cannot tell apart, variables that do nothing or stand at a bound
     """
 
@@ -288,7 +290,7 @@ class Descent:
         self.reach = np.array([np.inf if v.parameter.linear else REACH * v.parameter.plausible for v in variables])
         self.theta = np.clip([start_of(model, v, values) for v in variables], self.low, self.high)
         self.values, self.damping, self.here = self.moved(values, self.theta), damping, None
-        self.trust = 1.0
+        self.trust, self.bent = 1.0, False
         linear = getattr(model, "linear_in", lambda variable: False)
         self.powers = [i for i, v in enumerate(self.variables) if linear(v)]
 
@@ -319,10 +321,15 @@ class Descent:
         a, b = self.here.a * np.outer(self.slope, self.slope), self.here.b * self.slope
         step = solve(a, b, low - u, high - u, damping)
         fall = float(2 * b @ step - step @ a @ step)
-        moved = np.array([v.parameter.stepped(t, d) for v, t, d in zip(self.variables, self.theta, step)])
+        moved = np.array([v.parameter.stepped(t, d, self.bent) for v, t, d in zip(self.variables, self.theta, step)])
         for end in (self.low, self.high):  # what stands at a bound is taken as known: not beside it by rounding
             moved = np.where(np.abs(moved - end) < self.near, end, moved)
         return np.clip(moved, self.low, self.high), fall
+
+    def creep(self) -> None:
+        """Go on along what is left near the best: nearly flat valleys, where any damping forbids to go, and which bend where one factor makes
+        up for another. Far from it, factors by which lights grow without measure as they turn away are no way down."""
+        self.damping, self.bent = 1e-9, True
 
     @property
     def promised(self) -> float:
@@ -384,8 +391,8 @@ def fit(model, variables: Sequence[Variable], start: Values | None = None, frame
         progress: Callable[[str, int, int], None] | None = None) -> Fit:
     """Levenberg-Marquardt within bounds.
 
-    Stops when the fall of chi2 that the linear model still predicts is below `tolerance` per variable, or when no damping
-    gives a lower chi2. Raises Underdetermined when no pixel is usable or no variable does anything.
+    Stops when the fall of chi2 that the linear model still predicts is below `tolerance` per variable or SETTLED of the excess, or when no
+    damping gives a lower chi2. Raises Underdetermined when no pixel is usable or no variable does anything.
     """
     variables = list(variables)
     frames = list(range(len(model.frames))) if frames is None else list(frames)
@@ -416,14 +423,14 @@ def fit(model, variables: Sequence[Variable], start: Values | None = None, frame
             raise Underdetermined(f"none of the {len(variables)} free parameters changes any frame: at {some(there)}; allowed: what some "
                                   "frame depends on; free others, or correct what the frames set")
         history.append(normal.total)
-        promise = descent.promised
-        if promise < accuracy:
+        promise, excess = descent.promised, max(normal.chi2 - sum(normal.frame_n) + len(variables), 0.0)
+        if promise < max(accuracy, SETTLED * excess):
             best, reason = (promise, descent.theta, descent.values), f"converged after {iteration} linearisations"
             break
         near = promise < 20 * len(variables)
         if near:
             tries += 1
-            descent.damping = 1e-9  # what is left lies along nearly flat valleys, where any damping forbids to go
+            descent.creep()
             if promise < best[0]:
                 best = (promise, descent.theta, descent.values)
             stuck = len(history) > 1 and history[-2] - promise / 4 < history[-1]

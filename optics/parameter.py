@@ -81,11 +81,11 @@ class Parameter:
         """The inverse of `coordinate`; u below 0 counts as 0."""
         return math.sqrt(max(u, 0.0) / max(1 - u / self.saturates**2, 1e-12)) if self.squared else u
 
-    def stepped(self, value: float, du: float) -> float:
-        """Where a step of du in the coordinate leads. A factor, such as a power, moves by its logarithm: what it multiplies may shrink by as
-        much (brightness and reflectance), and the image stays. Beyond e times the value it goes on straight, as a logarithm that overshoots
-        does so without measure."""
-        if not self.factor or value <= 0:
+    def stepped(self, value: float, du: float, bent: bool = True) -> float:
+        """Where a step of du in the coordinate leads. A factor, such as a power, moves by its logarithm if `bent`: what it multiplies may
+        shrink by as much (brightness and reflectance), and the image stays. Beyond e times the value it goes on straight, as a logarithm that
+        overshoots does so without measure."""
+        if not bent or not self.factor or value <= 0:
             return self.at_coordinate(self.coordinate(value) + du)
         t = du / value
         return value * (math.exp(t) if t < 1 else math.e * t)
