@@ -89,7 +89,7 @@ def diagnose(model, fit, effects: Sequence[Effect], variables_of: Callable[[Effe
         for c in members[:MAX_SPLIT]:
             own, p, clutter = split(c, fits[c.effect.name], c.row.refit, c.row.net_refit)
             splits += own
-            c.row.refit = evenness.scattered(c.row.refit, p if math.isnan(p) else table.family.p(p), clutter)
+            c.row.refit = evenness.scattered(c.row.refit, table.family.p(p), clutter)
     levels = _held_out(model, fit, evidence, winner, fits, refit, held_out, variables_of, say)
     shifts = _shifts(model, fit, winner, fits) if winner else []
     followed = _followed(model, evidence, winner, fits, fingerprints)
@@ -433,9 +433,10 @@ def _add_both(model, fit, evidence: Evidence, both: list[Candidate], refit: Call
     pair = Pair([c.effect.name for c in both], fall, _excess(evidence, after, expected, both), evidence.structure(images, columns).p)
     for c, other in (both, both[::-1]) if pair.complete else ():  # a second effect may take up clutter, or what the first has wrong
         strength = [value_of(model, found.values, v) for v in c.variables]
-        own, chance, _ = split(c, found, pair, _clear(found, c, strength) ** 2, other.variables)
+        alone = _clear(found, c, strength) ** 2
+        own, chance, _ = split(c, found, pair, fall if math.isnan(alone) else alone, other.variables)
         uneven = [s.by for s in own if not s.holds]
-        if uneven or not math.isnan(chance) and family.p(chance) >= LEVEL:
+        if uneven or family.p(chance) >= LEVEL:
             return replace(pair, but=f"{c.effect.name}'s strength " + (
                 f"then differs by {uneven[0]}" if uneven else "is no more than its scatter between parts of the data"))
     return pair

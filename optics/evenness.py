@@ -25,7 +25,7 @@ PARTS = 16  # of the sensor or session, wider than what clutter shares
 
 
 def split(model, evidence: Evidence, places: list[dict], rows_max: int, seed: int, say: Progress, c: Candidate, found, left: Refit | Pair,
-           net: float, beside: Sequence[Variable] = ()) -> tuple[list[Split], float, np.ndarray]:
+          net: float, beside: Sequence[Variable] = ()) -> tuple[list[Split], float, np.ndarray]:
     """Whether a fitted effect has the same strength in every part of the data, and `scatter` of its strength.
 
     With the effect in the base, e, by which its picture differs from the one without it, is cut into parts e 1{part} and these are
@@ -66,9 +66,9 @@ def split(model, evidence: Evidence, places: list[dict], rows_max: int, seed: in
         h = max(fall - dof, 0.0) * k / max(net, 1e-9)
         cut = [image[:, None] * (index[:, None] == np.arange(count)) for image, index in zip(images, bins)]
         cut = _off_base(own, cut, projected, calibrated + effect)
-        rest = [block.r - image @ more for block, image in zip(own.blocks, cut)]
+        after = [block.r - image @ more for block, image in zip(own.blocks, cut)]
         results.append(Split(c.effect.name, by, labels, (1 + delta).tolist(), sd.tolist(), fall * k, dof, float(chdtrc(dof, fall)), h,
-                             by_clutter(projected.score, variances(cut, rest, places)), UNEVEN, True))
+                             by_clutter(projected.score, variances(cut, after, places)), UNEVEN, True))
     level, excess = LEVEL / max(len(results), 1), left.excess_sd * math.sqrt(2 * max(evidence.normal.count - evidence.projected.rank, 1))
 
     def most(s: Split) -> float:

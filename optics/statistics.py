@@ -20,6 +20,7 @@ Inference (2005); errors in variables: Fuller, Measurement Error Models (1987).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -302,7 +303,9 @@ class Family:
         self.smallest = np.sort(smallest)
 
     def p(self, p: float) -> float:
-        """Family-wise probability of a smallest p as small as this one."""
+        """Family-wise probability of a smallest p as small as this one; NaN of NaN."""
+        if math.isnan(p):
+            return p
         tail = 200
         if self.draws >= 2 * tail and p < self.smallest[tail - 1]:
             return float(p / self.smallest[tail - 1] * tail / self.draws)
