@@ -553,8 +553,8 @@ def decide(f: Findings) -> tuple[str, list[Condition]]:
         failed = {c.name for c in rest if not c.holds}
         if not failed:
             return "CLAIM", conditions
-        if "significant" in failed and not structure and not weighed:
-            return "NOTHING", conditions  # the linear score promised a fall that no refit brought, and nothing else is left
+        if failed & {"significant", "strength"} and not structure and not weighed:
+            return "NOTHING", conditions  # no refit brought the fall that the score promised, or the base's calibration did; and nothing else is left
         if failed & {"lead", "margin"} and not failed & {"significant", "no better curve", "share", "beyond clutter", "near"} and f.some_even:
             return "AMBIGUOUS", conditions
         if failed <= {"share", "even"}:
@@ -643,8 +643,10 @@ def sentence(word: str, conditions: Sequence[Condition], f: Findings, rows: Sequ
     if word == "NOTHING":
         tail = ("no low-frequency structure is left" if not math.isnan(f.structure_p) else
                 f"no excess misfit is left ({f.excess_sd:.2g} sd)")
-        return (f"none of {len(rows)} effects stands out ({'after refit, ' if f.p_family < LEVEL else ''}family-wise p "
-                f"{p_text(f.p_winner if f.p_family < LEVEL else f.p_family)}) and {tail}"
+        how = (f"family-wise p {p_text(f.p_family)}" if not f.p_family < LEVEL else
+               f"after refit, family-wise p {p_text(f.p_winner)}" if not f.p_winner < LEVEL else
+               f"after refit, the best, {f.winner}, has a strength of {f.clear:.2g} sd")
+        return (f"none of {len(rows)} effects stands out ({how}) and {tail}"
                 f"{'' if math.isnan(f.structure_p) else f' (p {p_text(f.structure_p)})'}. "
                 "The upper limits say what can still hide.")
     if word == "CLAIM":
