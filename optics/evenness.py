@@ -121,30 +121,42 @@ def _off_base(own: Evidence, images: Sequence[np.ndarray], projected: st.Project
 def variances(images: Sequence[np.ndarray], left: Sequence[np.ndarray], places: list[dict]) -> list[tuple[np.ndarray, int]]:
     """(B, G) for each of MAPS that there is: the variance of the score x'r of images x, by its scatter between G parts.
 
-    B = (G - 1)/G sum of w w' with w = (1 - V_g/V)^-1 u_g, u_g = sum of x r over part g, V_g of x x': what part g says of strengths that
-    were fitted without it, where r is what is left at the fit.
+    B = sum of w w' with w = (1 - V_g/V)^(-1/2) u_g, u_g = sum of x r over part g, V_g of x x', where r is what is left at the fit, which
+    has taken a share V_g/V of part g along: without clutter the mean of B is V.
 
     Source: Liang & Zeger, Longitudinal data analysis using generalized linear models, Biometrika 73, 13 (1986), the robust variance;
     Bell & McCaffrey, Bias reduction in standard errors for linear regression with multi-stage samples, Survey Methodology 28, 169 (2002),
-    the jackknife.
+    eq. 11.
     """
     found, k = [], images[0].shape[1]
-    whole = st.inverse(sum(x.T @ x for x in images))[0]
+    root = _root(sum(x.T @ x for x in images))
+    back = np.linalg.pinv(root)
     for name in MAPS:
         edges = st.bin_edges(np.concatenate([p[name] for p in places]), PARTS) if name in places[0] else None
         if edges is None:
             continue
-        scores, grams = np.zeros((len(edges) - 1, k)), np.zeros((len(edges) - 1, k, k))
-        for place, x, r in zip(places, images, left):
-            part = np.searchsorted(edges, place[name], side="right") - 1
-            for g in range(len(scores)):
-                own = x[part == g]
-                scores[g] += own.T @ r[part == g]
-                grams[g] += own.T @ own
-        spoke = np.einsum("gii->g", grams) > 0
-        w = np.array([np.linalg.pinv(np.eye(k) - v @ whole, 1e-6) @ u for u, v in zip(scores[spoke], grams[spoke])]).reshape(-1, k)
-        found.append(((len(w) - 1) / max(len(w), 1) * w.T @ w, len(w)))
+        b, parts = np.zeros((k, k)), 0
+        bins = [np.searchsorted(edges, place[name], side="right") - 1 for place in places]
+        for g in range(len(edges) - 1):
+            own = np.concatenate([x[part == g] for x, part in zip(images, bins)])
+            if not own.any():
+                continue
+            score = own.T @ np.concatenate([r[part == g] for r, part in zip(left, bins)])
+            share, vectors = np.linalg.eigh(root @ (own.T @ own) @ root.T)
+            free = np.where(share < 1 - 1e-6, np.maximum(1 - share, 1e-6) ** -0.5, 0.0)  # what one part alone knows has no scatter
+            w = back @ (vectors * free) @ (vectors.T @ (root @ score))
+            b, parts = b + np.outer(w, w), parts + 1
+        found.append((b, parts))
     return found
+
+
+def _root(v: np.ndarray) -> np.ndarray:
+    """(rank, k) R with R V R' = 1 on what is determined."""
+    length = np.sqrt(np.maximum(np.diag(v), 0.0))
+    scale = np.where(length > 0, 1 / np.where(length > 0, length, 1.0), 0.0)
+    values, vectors = np.linalg.eigh(v * scale * scale[:, None])
+    keep = values > st.TRUNCATION * max(values[-1], 1e-300)
+    return (vectors[:, keep] / np.sqrt(values[keep])).T * scale
 
 
 def by_clutter(score: np.ndarray, variances: Sequence[tuple[np.ndarray, int]]) -> float:
