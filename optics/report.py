@@ -972,7 +972,8 @@ def _split(s: Mapping) -> dict:
     worst = max(range(len(strength)), key=lambda i: abs(np.nan_to_num(strength[i] - 1)), default=None)
     return {"effect": str(s.get("effect", "")), "by": words(s.get("by")), "svg": strip(strength, sd, labels),
             "worst": "" if worst is None else f"{labels[worst]}: {measure(strength[worst], sd[worst])}", "parts": len(labels),
-            "h": number(_finite(s.get("h")), 2), "p": pvalue(_finite(s.get("p"))), "holds": bool(s.get("holds", True))}
+            "h": number(_finite(s.get("h")), 2), "p": pvalue(_finite(s.get("p"))), "chance": pvalue(_finite(s.get("chance"))),
+            "holds": bool(s.get("holds", True))}
 
 
 def strip(values: Sequence[float], sds: Sequence[float], labels: Sequence[str], width: int = 200, height: int = 36) -> str:

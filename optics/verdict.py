@@ -728,10 +728,10 @@ def _text(d: Diagnosis) -> str:
         lines.append("not tested: " + ", ".join(f"{name} ({why})" for name, why in d.not_tested.items()))
     lines += ["", "decided by: " + "; ".join(f"{c.name} {'yes' if c.holds else 'no'} ({c.text})" for c in d.conditions)]
     if d.splits:
-        lines += ["", "evenness (strength relative to the whole; h = gain by splitting over the fall)"]
+        lines += ["", "evenness (strength relative to the whole; h = gain by splitting over the fall; p by noise / by the scatter between parts)"]
         for s in d.splits:
             parts = ", ".join(f"{label} {with_sd(x, sd)}" for label, x, sd in zip(s.labels[:8], s.strength, s.sd))
-            lines.append(f"  {s.effect} by {s.by}: h {s.h:.3f}, p {p_text(s.p)}{'' if s.holds else '  UNEVEN'}: {parts}")
+            lines.append(f"  {s.effect} by {s.by}: h {s.h:.3f}, p {p_text(s.p)} / {p_text(s.chance)}{'' if s.holds else '  UNEVEN'}: {parts}")
     if d.levels:
         lines += ["", f"misfit                 fitted   held out   (noise {percent(b.noise)}; only per-frame variables fitted "
                       "on held-out frames)"]
