@@ -186,7 +186,7 @@ def number(value, digits: int = 3) -> str:
     if size and (size >= 1e6 or size < 1e-4):
         mantissa, power = f"{value:.{max(digits - 2, 0)}e}".split("e")
         text = f"{mantissa}·10{str(int(power)).translate(str.maketrans('-0123456789', '⁻⁰¹²³⁴⁵⁶⁷⁸⁹'))}"
-    elif size >= 10**digits:
+    elif round(size) >= 10**digits:  # 99.7 in two digits is 100
         text = f"{value:,.0f}".replace(",", "\u202f")
     else:
         text = f"{value:.{digits}g}"
@@ -196,7 +196,7 @@ def number(value, digits: int = 3) -> str:
 def figures(value, digits: int = 4) -> str:
     """Like `number`, with closing zeros, so that a column lines up."""
     value = _finite(value)
-    if not math.isfinite(value) or abs(value) >= 10**digits or 0 < abs(value) < 1e-3:
+    if not math.isfinite(value) or round(abs(value)) >= 10**digits or 0 < abs(value) < 1e-3:
         return number(value, digits)
     return f"{value:#.{digits}g}".rstrip(".").replace("-", "−")
 

@@ -20,7 +20,7 @@ from optics.errors import BadCapture, OutputExists
 from optics.ladder import Fingerprint, Shown, Study, read_fit
 from optics.nulls import PHYSICAL, NullTable, Score
 from optics.parameter import Parameter, Values, Variable
-from optics.report import ladder_chart, number, report
+from optics.report import ladder_chart, number, percent, report
 
 LEDS = {"led_red": (0.95, -0.31), "led_green": (-0.2, 0.98), "led_blue": (-0.75, -0.66)}
 TRUTH = {"camera.vignetting": 0.31, "gel.absorption": 0.06}
@@ -562,9 +562,14 @@ def test_images_of_a_model_become_frames_and_fingerprints():
 
 
 @pytest.mark.parametrize("value, text", [(None, "–"), (float("nan"), "–"), ("inf", "∞"), (0, "0"), (-0.0123, "−0.0123"),
-                                         (12345.6, "12\u202f346"), (3.2e7, "3.2·10⁷"), (1.5e-6, "1.5·10⁻⁶")])
+                                         (12345.6, "12\u202f346"), (3.2e7, "3.2·10⁷"), (1.5e-6, "1.5·10⁻⁶"),
+                                         (999.7, "1\u202f000"), (-99.96, "−100")])
 def test_numbers_are_written_for_readers(value, text):
     assert number(value) == text
+
+
+def test_what_rounds_to_a_further_digit_is_no_power_of_ten():
+    assert percent(0.997, 2) == "100\u202f%" == percent(0.9998)
 
 
 if __name__ == "__main__":
