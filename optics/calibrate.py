@@ -21,7 +21,7 @@ from optics.parameter import Values, Variable
 from optics.words import some, spaced
 
 REACH = 4.0  # plausible sizes that one step may change what the image is not linear in
-SETTLED = 1e-3  # of the excess of chi2: a promise that is not worth another linearisation, a tenth of what a diagnosis allows
+NEGLIGIBLE = 1e-3  # of the excess of chi2: a promise that is not worth another linearisation, a tenth of what a diagnosis allows
 ALIKE = 0.995  # correlation beyond which two variables are said to stand for each other
 TRUNCATION = 1e-12  # eigenvalues of the scaled normal matrix below this share of the largest count as undetermined
 
@@ -391,7 +391,7 @@ def fit(model, variables: Sequence[Variable], start: Values | None = None, frame
         progress: Callable[[str, int, int], None] | None = None) -> Fit:
     """Levenberg-Marquardt within bounds.
 
-    Stops when the fall of chi2 that the linear model still predicts is below `tolerance` per variable or SETTLED of the excess, or when no
+    Stops when the fall of chi2 that the linear model still predicts is below `tolerance` per variable or NEGLIGIBLE beside the excess, or when no
     damping gives a lower chi2. Raises Underdetermined when no pixel is usable or no variable does anything.
     """
     variables = list(variables)
@@ -424,7 +424,7 @@ def fit(model, variables: Sequence[Variable], start: Values | None = None, frame
                                   "frame depends on; free others, or correct what the frames set")
         history.append(normal.total)
         promise, excess = descent.promised, max(normal.chi2 - sum(normal.frame_n) + len(variables), 0.0)
-        if promise < max(accuracy, SETTLED * excess):
+        if promise < max(accuracy, NEGLIGIBLE * excess):
             best, reason = (promise, descent.theta, descent.values), f"converged after {iteration} linearisations"
             break
         near = promise < 20 * len(variables)

@@ -21,8 +21,8 @@ from optics.errors import Underdetermined
 from optics.evidence import Candidate, Evidence, Progress, at_bound, measure, value_of
 from optics.parameter import Values, Variable
 from optics.verdict import (
-    AS_GOOD, AT_FAULT, CLEAR, CURVE, EXCESS, HIDDEN, LEVEL, MARGIN, NAMED, UNEVEN, Basis, Diagnosis, Findings, Fingerprint, Level, Pair, Refit, Row,
-    Shift, Split, decide, moved_by, rivals, sentence,
+    AS_GOOD, AT_FAULT, CLEAR, CURVE, EXCESS, HIDDEN, LEVEL, NAMED, UNEVEN, Basis, Diagnosis, Findings, Fingerprint, Level, Pair, Refit, Row,
+    Shift, Split, close, decide, moved_by, rivals, sentence,
 )
 from optics.words import some
 
@@ -82,7 +82,7 @@ def diagnose(model, fit, effects: Sequence[Effect], variables_of: Callable[[Effe
 
     if winner:
         done.sort(key=lambda c: c is not winner)
-    members = [c for c in done if c.row.net_refit > 0 and _close(winner.row.net_refit, c.row.net_refit)
+    members = [c for c in done if c.row.net_refit > 0 and close(winner.row.net_refit, c.row.net_refit)
                and not _refuted(winner, c, basis.dof)] if winner else []
     splits, split = [], partial(evenness.split, model, evidence, places, rows_max, seed, say)
     if winner:
@@ -330,18 +330,13 @@ def _winner(evidence: Evidence, normal: st.Normal, candidates: Sequence[Candidat
     return max(net, key=net.get, default="")
 
 
-def _close(best: float, other: float) -> bool:
-    """Whether two falls are too close to be told apart."""
-    return best - other < max(CLEAR, MARGIN * best)
-
-
 def _choose(table: Table, top: int) -> list[Candidate]:
     """The effects to add in earnest: the best ones, those that cannot be told from the best, winners of other weights.
 
     What chance explains is not added: a refit is as dear as a calibration.
     """
     live = [c for c in table.order if c.row.net > 0 and c.row.p_family < LEVEL]
-    chosen = live[:top] + [c for c in live[top:] if _close(live[0].row.net, c.row.net)]
+    chosen = live[:top] + [c for c in live[top:] if close(live[0].row.net, c.row.net)]
     chosen = chosen[:MAX_REFITS]
     others = {table.winner_uniform, table.winner_dilated} - {c.effect.name for c in chosen}
     return chosen + [c for c in live if c.effect.name in others]
@@ -625,7 +620,7 @@ def _findings(table, winner, done, members, fingerprints, splits, levels, basis,
             max([c.row.net_refit for c in done[1:]] + [c.row.net for c in others if c not in done] + [0.0]),
             refuted=winner.row.refit.complete and all(
                 _refuted(winner, c, basis.dof) for c in others
-                if _close(winner.row.net_refit, max(c.row.net_refit, 0.0 if c in done else c.row.net))),
+                if close(winner.row.net_refit, max(c.row.net_refit, 0.0 if c in done else c.row.net))),
             share=winner.row.net_refit / excess if excess > 0 else math.nan, excess_sd=basis.excess_sd,
             left=basis.misfit * math.sqrt(max(1 - winner.row.refit.fall / basis.chi2, 0.0)),
             uneven=worst.h if worst else 0.0, uneven_by=f" by {worst.by} ({_extremes(worst)})" if worst else "",

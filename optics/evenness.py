@@ -125,11 +125,10 @@ def variances(images: Sequence[np.ndarray], left: Sequence[np.ndarray], places: 
     has taken a share V_g/V of part g along: without clutter the mean of B is V.
 
     Source: Liang & Zeger, Longitudinal data analysis using generalized linear models, Biometrika 73, 13 (1986), the robust variance;
-    Bell & McCaffrey, Bias reduction in standard errors for linear regression with multi-stage samples, Survey Methodology 28, 169 (2002),
-    eq. 11.
+    Bell & McCaffrey, Bias reduction in standard errors for linear regression with multi-stage samples, Survey Methodology 28, 169 (2002).
     """
     found, k = [], images[0].shape[1]
-    root = _root(sum(x.T @ x for x in images))
+    root = st.root(sum(x.T @ x for x in images))
     back = np.linalg.pinv(root)
     for name in MAPS:
         edges = st.bin_edges(np.concatenate([p[name] for p in places]), PARTS) if name in places[0] else None
@@ -148,15 +147,6 @@ def variances(images: Sequence[np.ndarray], left: Sequence[np.ndarray], places: 
             b, parts = b + np.outer(w, w), parts + 1
         found.append((b, parts))
     return found
-
-
-def _root(v: np.ndarray) -> np.ndarray:
-    """(rank, k) R with R V R' = 1 on what is determined."""
-    length = np.sqrt(np.maximum(np.diag(v), 0.0))
-    scale = np.where(length > 0, 1 / np.where(length > 0, length, 1.0), 0.0)
-    values, vectors = np.linalg.eigh(v * scale * scale[:, None])
-    keep = values > st.TRUNCATION * max(values[-1], 1e-300)
-    return (vectors[:, keep] / np.sqrt(values[keep])).T * scale
 
 
 def by_clutter(score: np.ndarray, variances: Sequence[tuple[np.ndarray, int]]) -> float:

@@ -60,7 +60,7 @@ def search(evidence: Evidence, order: Sequence[Candidate], alone: float, add: Ca
 
 
 def beside_curves(pairs: Sequence[Pair], fingerprints: Sequence[Fingerprint], chance: Mapping[str, float]) -> list[Pair]:
-    """The pairs, less those that one curve does as well as: that is rather one cause, which the library lacks.
+    """The pairs, with a `but` where one curve does as well: that is rather one cause, which the library lacks.
 
     chance   effect -> fall that chance gives
     """

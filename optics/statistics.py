@@ -90,14 +90,19 @@ class Normal:
 
 def inverse(gram: np.ndarray, truncation: float = TRUNCATION) -> tuple[np.ndarray, int]:
     """Eigen-truncated inverse and rank of a symmetric matrix whose columns may have any units."""
+    r = root(gram, truncation)
+    return r.T @ r, len(r)
+
+
+def root(gram: np.ndarray, truncation: float = TRUNCATION) -> np.ndarray:
+    """(rank, k) R with R gram R' = 1, whose R'R is the `inverse`."""
     length = np.sqrt(np.maximum(np.diag(gram), 0.0))
     scale = np.where(length > 0, 1 / np.where(length > 0, length, 1.0), 0.0)
     if not len(gram) or not scale.any():
-        return np.zeros_like(gram), 0
+        return np.zeros((0, len(gram)))
     values, vectors = np.linalg.eigh(gram * scale * scale[:, None])
     keep = values > truncation * values[-1]
-    vectors = vectors[:, keep] * scale[:, None]
-    return (vectors / values[keep]) @ vectors.T, int(keep.sum())
+    return (vectors[:, keep] / np.sqrt(values[keep])).T * scale
 
 
 @dataclass(frozen=True)

@@ -568,6 +568,11 @@ def decide(f: Findings) -> tuple[str, list[Condition]]:
     return "CANNOT_TELL", conditions
 
 
+def close(best: float, other: float) -> bool:
+    """Whether two falls are too close to be told apart."""
+    return best - other < max(CLEAR, MARGIN * best)
+
+
 def allowed(coordinate: str) -> float:
     """How many times as much as the best effect a curve along it may explain."""
     return RIVAL if coordinate in MAPS else RIVAL_CURVE

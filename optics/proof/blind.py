@@ -20,7 +20,7 @@ from optics.compare import plain
 from optics.effect import registry
 from optics.evidence import value_of
 from optics.proof.cells import Cell
-from optics.verdict import CLEAR, MARGIN, Diagnosis, Row
+from optics.verdict import CLEAR, Diagnosis, Row, close
 
 STEPS = 3  # effects that the loop may add where two are hidden
 
@@ -90,7 +90,7 @@ def _close(rows: Sequence[Row], fall: Callable[[Row], float]) -> list[str]:
     """What explains more than chance does and is not told from the best, of effects that were added in earnest; where none stands out enough
     for that, by score."""
     best = max(map(fall, rows), default=0.0)
-    return [r.name for r in rows if fall(r) > 0 and best - fall(r) < max(CLEAR, MARGIN * best)]
+    return [r.name for r in rows if fall(r) > 0 and close(best, fall(r))]
 
 
 def _strengths(rig, model, cell: Cell, d: Diagnosis) -> dict[str, list[float]]:

@@ -147,7 +147,7 @@ def test_where_much_is_missing_the_last_of_chi2_is_not_waited_for(seed, monkeypa
     model = Twice(np.random.default_rng(seed), vignetting=0.1)
     variables = [Variable(key, (key,), p) for key, p in model.parameters.items()]
     soon = fit(model, variables, Values({f"led_{i}.power": 1.5 for i in range(3)}))
-    monkeypatch.setattr(calibrate, "SETTLED", 0.0)
+    monkeypatch.setattr(calibrate, "NEGLIGIBLE", 0.0)
     late = fit(model, variables, Values({f"led_{i}.power": 1.5 for i in range(3)}))
     excess = late.chi2 - late.dof
     assert soon.converged and len(soon.history) < len(late.history) and excess > 1e6  # without it two of these four do not converge

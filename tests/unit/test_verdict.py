@@ -315,7 +315,7 @@ def test_a_strength_is_held_against_what_neighbours_share():
 
 def test_a_lamp_that_wanders_does_not_pass_for_a_tone_of_the_session():
     """600 readings, a wander that 50 neighbours share, as strong as noise, and a tone of 240 readings, as of a second dial. By noise most
-    sets would show it, by the scatter between 16 parts 4 % do at .01 (2000 sets), 6.5 % between 64. 1000 sets, to three sd."""
+    sets would show it, by the scatter between 16 parts 4 % do at .01 (2000 sets), 7 % between 64. 1000 sets, to three sd."""
     from scipy.ndimage import gaussian_filter1d
 
     count = 600
@@ -337,7 +337,7 @@ def test_a_lamp_that_wanders_does_not_pass_for_a_tone_of_the_session():
 @pytest.mark.parametrize("proxy", [False, True])
 def test_what_splits_a_strength_is_held_against_clutter_too(proxy):
     """Patches of 8 x 8 px with 1 % of their own, and a slope of 6 %, which a proxy has in the upper half alone. Between quadrants, of four
-    patches each, noise would call all strengths uneven; their scatter calls a proxy's so, and of true ones 7 % at .01 (400 sets), as four
+    patches each, noise would call all strengths uneven; their scatter calls a proxy's so, and of true ones 8 % at .01 (300 sets), as four
     patches tell a scatter badly. 100 sets, to three sd."""
     rng, effect, uneven, naive = np.random.default_rng(6), Effect("slope", "lamp", ("slope",)), [], []
     side = np.arange(32)
