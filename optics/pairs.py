@@ -30,9 +30,11 @@ def ranked(evidence: Evidence, candidates: Sequence[Candidate]) -> list[tuple[fl
             continue  # its simpler part is tried
         if {key for v in a.variables for key in v.keys} & {key for v in b.variables for key in v.keys}:
             continue
-        own = np.array([*a.columns, *b.columns]) - first
-        inverse, rank = st.inverse(projected.information[np.ix_(own, own)], 1e-10)[:2]
-        linear = inverse @ projected.score[own]
+        own, live = np.array([*a.columns, *b.columns]) - first, np.array([*a.cone.live, *(len(a.columns) + b.cone.live)])
+        seen = own[live]  # of what the projection left no more than rounding, nothing is expected
+        inverse, rank = st.inverse(projected.information[np.ix_(seen, seen)], st.VISIBLE)
+        linear = np.zeros(len(own))
+        linear[live] = inverse @ projected.score[seen]
         signs = [s * x >= 0 for s, x in zip([*a.sides, *b.sides], linear) if s]
         if all(signs):  # no effect below its neutral value, where that is a bound
             found.append((float(projected.score[own] @ linear) - rank, a, b, linear))

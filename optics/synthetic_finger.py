@@ -4,8 +4,8 @@ Nothing of `optics.render`, `optics.paths`, `optics.mueller` or the `tactile` in
 two ideal ones, T1 along its axis and T2 across it: exact for light that enters unpolarized and is only weighed in the end. Four
 renders in the mono variant (each film along or across) hold every such pair; what is outside and what the markers send are rendered
 apart, for unit reflectance and unit excitation, and get their colours by quadrature over the spectra. Effects are made by
-mixing renders, by turning a film, by a stock retarder, or by numpy on the image; then photons, read noise and 8 bits. Shared
-with the model are the shape of a dent, the boundary's Snell and Fresnel and the LED's lobe, which tests hold to closed forms.
+mixing renders, by turning a film, or by numpy on the image; then photons, read noise and 8 bits. A retarder is a mixture of films too, as
+the stock one has a seam off the axis: it turns by the angle to its x axis, which is not across an oblique ray. Shared with the model are the shape of a dent, the boundary's Snell and Fresnel and the LED's lobe, which tests hold to closed forms.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from optics.scene import Scene
 from optics.synthetic import CAMERA
 
 VARIANT = "llvm_ad_mono_polarized"
+AXIS = 30.0  # deg: a retarder's fast axis
 MAKERS = ("extinction leak", "coloured leak", "oblique leak", "polarizer misalignment", "servo scale", "servo backlash",
           "analyzer wobble", "depolarization", "retardance", "stray light", "dark offset", "camera gamma", "gain drift",
           "lens vignetting", "marker leak", "veiling glare")
@@ -201,10 +202,6 @@ class FingerMaker:
             "object": self.cylinder(distance, paint("object")),
             "wall": self.rectangle(160, 1000, wall if what == "wall" else black),
         }
-        if self.effects.get("retardance") and what in ("object", "wall"):  # degrees at 540 nm, fast axis at 30 degrees
-            scene["retarder"] = self.rectangle(-15, 21, {
-                "type": "retarder", "theta": {"type": "uniform", "value": -30.0},
-                "delta": {"type": "uniform", "value": float(self.effects["retardance"])}})
         for name, sign, axis in (("left", 1, "x"), ("right", -1, "x"), ("top", -1, "y"), ("bottom", 1, "y")):
             x, y = (24.0, 21.5)
             turn = t().rotate([0, 1, 0], 90 * sign) if axis == "x" else t().rotate([1, 0, 0], 90 * sign)
@@ -231,13 +228,16 @@ class FingerMaker:
         return v["pigment.yield"] * photons * emission / self.bands
 
     def parts(self, geometry, analyzer: float) -> dict[str, np.ndarray]:
-        """{what: (2, 2, H, W)} behind ideal films: [analyser along | across][skin's film along | across]."""
+        """{what: (2, 2, H, W, 1 or B)} behind ideal films: [analyser along | across][skin's film along | across]; markers (2, 2, H, W)."""
         e, v = self.effects, self.values
         offset = e.get("polarizer misalignment", 0.0)
         film = v["film.angle"] + v["film.offset"]
         found = {}
         for what in ("object", "wall"):
-            found[what] = np.array([[self.render(geometry, analyzer + offset + a, film + f, what) for f in (0, 90)] for a in (0, 90)])
+            angles = [analyzer + offset, analyzer + offset + 90]
+            found[what] = np.array([[self.render(geometry, a, film + f, what) for f in (0, 90)] for a in angles])[..., None]
+            if "retardance" in e:
+                found[what] = found[what] - self.turned(geometry, angles, film, what)
         # markers are in front of the skin's film, and their light is unpolarized: one render serves all four
         one = self.kept("markers", lambda: self.render(geometry, 0.0, film, "markers"))
         found["markers"] = np.broadcast_to(one / 2, (2, 2, *one.shape))
@@ -251,6 +251,14 @@ class FingerMaker:
             mean = one.sum() / np.maximum(cover.sum() / 2, 1e-9)
             found["glow"] = e["marker leak"] * mean * (skin * (1 - np.clip(cover, 0, 1)))
         return found
+
+    def turned(self, geometry, analyzers: Sequence[float], film: float, what: str) -> np.ndarray:
+        """(2, 2, H, W, B) that a retarder behind the skin's film takes from its light: of light at f, the part polarized at 45 deg to the
+        fast axis psi, sin 2(f - psi), is left with cos Gamma of itself; Gamma = retardance x 540 nm/lambda, psi = AXIS."""
+        diagonal = [[self.render(geometry, a, AXIS + d, what) for d in (45, 135)] for a in analyzers]
+        lost = np.array([(plus - minus) / 2 for plus, minus in diagonal])[:, None, ..., None]
+        share = np.array([np.sin(np.radians(2 * (film + f - AXIS))) for f in (0, 90)])[:, None, None, None]
+        return share * lost * (1 - np.cos(np.radians(self.effects["retardance"] * 540 / self.bands)))
 
     def radiance(self, parts: Mapping[str, np.ndarray], dial: float) -> np.ndarray:
         """(H, W, B) of the frame, from the renders behind ideal films."""
@@ -271,9 +279,9 @@ class FingerMaker:
                 light = images[0, 0][..., None] * 2 * through
             else:
                 rho = np.array([v[f"{paints[what]}.rho_{c}"] for c in "rgb"])[:len(self.bands)]
-                light = sum(images[i, j][..., None] * weights[0][i] * weights[1][j] for i in (0, 1) for j in (0, 1)) * rho
+                light = sum(images[i, j] * weights[0][i] * weights[1][j] for i in (0, 1) for j in (0, 1)) * rho
                 if "depolarization" in e:  # a share comes through with its polarization mixed
-                    mixed = sum(images[i, j][..., None] * weights[1][j] for i in (0, 1) for j in (0, 1)) * (
+                    mixed = sum(images[i, j] * weights[1][j] for i in (0, 1) for j in (0, 1)) * (
                         (weights[0][0] + weights[0][1]) / 2) * rho
                     light = light + e["depolarization"] * (mixed - light)
             total = total + light
@@ -286,7 +294,7 @@ class FingerMaker:
             inside = sin2 / v["inner_face.index"] ** 2
             for what in ("object", "wall"):
                 rho = np.array([v[f"{paints[what]}.rho_{c}"] for c in "rgb"])[:len(self.bands)]
-                images = parts[what][..., None] * rho
+                images = parts[what] * rho
                 total = total + (sin2 * (images[1, 0] * weights[1][0] + images[1, 1] * weights[1][1])
                                  + inside * (images[0, 1] * weights[0][0] + images[1, 1] * weights[0][1]))
             total = total + sin2 * images_of_markers(parts, self.excitation())

@@ -680,6 +680,23 @@ def test_values_are_not_changed_by_a_diagnosis():
 # -- two at once --------------------------------------------------------------------------------------------------------
 
 
+def test_pairs_expect_nothing_of_what_the_projection_left_as_rounding():
+    """b has a second strength that shows nowhere, as of a film that no frame turns: its share of chi2 would be rounding over rounding."""
+    information, score = np.diag([4.0, 9.0, 1e-9]), np.array([8.0, 9.0, 1.0])  # falls of 16, 9, and 1e9
+    variables = [Variable(key, (key,), Slope.parameters["lamp.slope"]) for key in "abc"]
+
+    def candidate(name, columns):
+        own = [variables[i] for i in columns]
+        seen = np.array([i < 2 for i in columns], float)
+        cone = st.Cone(information[np.ix_(columns, columns)] * np.outer(seen, seen), [0] * len(own))
+        return Candidate(Effect(name, "lamp", ("slope",)), own, np.zeros(len(own)), [0] * len(own), np.ones(len(own)), columns=columns, cone=cone)
+
+    a, b = candidate("a", [0]), candidate("b", [1, 2])
+    evidence = SimpleNamespace(base=[], projected=SimpleNamespace(information=information, score=score))
+    (fall, *both, linear), = pairs.ranked(evidence, [a, b])
+    assert both == [a, b] and np.isclose(fall, 16 + 9 - 2) and np.allclose(linear, [2, 1, 0])
+
+
 def test_two_effects_are_not_named_for_what_one_curve_does():
     curve = SimpleNamespace(coordinate="angle", net=990.0)
     maps = SimpleNamespace(coordinate="place", net=1300.0)  # which mimics everything, and is no cause
