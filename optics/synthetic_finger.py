@@ -4,8 +4,9 @@ Nothing of `optics.render`, `optics.paths`, `optics.mueller` or the `tactile` in
 two ideal ones, T1 along its axis and T2 across it: exact for light that enters unpolarized and is only weighed in the end. Four
 renders in the mono variant (each film along or across) hold every such pair; what is outside and what the markers send are rendered
 apart, for unit reflectance and unit excitation, and get their colours by quadrature over the spectra. Effects are made by
-mixing renders, by turning a film, or by numpy on the image; then photons, read noise and 8 bits. A retarder is a mixture of films too, as
-the stock one has a seam off the axis: it turns by the angle to its x axis, which is not across an oblique ray. Shared with the model are the shape of a dent, the boundary's Snell and Fresnel and the LED's lobe, which tests hold to closed forms.
+mixing renders, by turning a film, or by numpy on the image; then photons, read noise and 8 bits. A retarder is a mixture of films
+too: the stock one turns by the angle to its x axis, which is not across an oblique ray, and has a seam there. Shared with the model
+are the shape of a dent, the boundary's Snell and Fresnel and the LED's lobe, which tests hold to closed forms.
 """
 
 from __future__ import annotations
@@ -237,7 +238,7 @@ class FingerMaker:
             angles = [analyzer + offset, analyzer + offset + 90]
             found[what] = np.array([[self.render(geometry, a, film + f, what) for f in (0, 90)] for a in angles])[..., None]
             if "retardance" in e:
-                found[what] = found[what] - self.turned(geometry, angles, film, what)
+                found[what] = found[what] - self.taken_by_retarder(geometry, angles, film, what)
         # markers are in front of the skin's film, and their light is unpolarized: one render serves all four
         one = self.kept("markers", lambda: self.render(geometry, 0.0, film, "markers"))
         found["markers"] = np.broadcast_to(one / 2, (2, 2, *one.shape))
@@ -252,7 +253,7 @@ class FingerMaker:
             found["glow"] = e["marker leak"] * mean * (skin * (1 - np.clip(cover, 0, 1)))
         return found
 
-    def turned(self, geometry, analyzers: Sequence[float], film: float, what: str) -> np.ndarray:
+    def taken_by_retarder(self, geometry, analyzers: Sequence[float], film: float, what: str) -> np.ndarray:
         """(2, 2, H, W, B) that a retarder behind the skin's film takes from its light: of light at f, the part polarized at 45 deg to the
         fast axis psi, sin 2(f - psi), is left with cos Gamma of itself; Gamma = retardance x 540 nm/lambda, psi = AXIS."""
         diagonal = [[self.render(geometry, a, AXIS + d, what) for d in (45, 135)] for a in analyzers]
