@@ -159,7 +159,7 @@ def by_clutter(score: np.ndarray, information: np.ndarray, variances: Sequence[t
     """
     from scipy.stats import f as fisher
 
-    worst, white = math.nan, st.root(information)
+    ps, white = [], st.root(information)
     for b, parts in variances:
         spread, vectors = np.linalg.eigh(white @ b @ white.T)
         known = spread > st.TRUNCATION * max(spread.max(initial=0.0), 1e-300)
@@ -167,12 +167,11 @@ def by_clutter(score: np.ndarray, information: np.ndarray, variances: Sequence[t
         if not k or parts < 3:
             continue
         if parts >= 2 * k:
-            p = float(fisher.sf(float(np.sum(z**2 / spread)) * (parts - k) / (k * (parts - 1)), k, parts - k))
+            ps.append(float(fisher.sf(np.sum(z**2 / spread) * (parts - k) / (k * (parts - 1)), k, parts - k)))
         else:
-            h = float(spread.sum() ** 2 / np.sum(spread**2))
-            p = float(fisher.sf(float(z @ z / spread.sum()), h, h * (parts - 1)))
-        worst = p if math.isnan(worst) else max(p, worst)
-    return worst
+            h = spread.sum() ** 2 / np.sum(spread**2)
+            ps.append(float(fisher.sf(z @ z / spread.sum(), h, h * (parts - 1))))
+    return max(ps, default=math.nan)
 
 
 def _parts(model, evidence: Evidence, places: list[dict]) -> dict[str, tuple[list[str], list[np.ndarray]]]:

@@ -1,6 +1,7 @@
 """A sensor with a secret, made by another path than the model: the loop names it, adds it, and reaches the noise.
 
-One secret of the polarizer bench runs always and one of a sensor, the others with the slow tests. White LEDs cannot show colour crosstalk: DIGIT's have to.
+One secret of the polarizer bench runs always and one of a sensor, the others with the slow tests. White LEDs cannot show colour
+crosstalk: DIGIT's have to.
 """
 
 import runpy
@@ -40,8 +41,10 @@ def test_the_hidden_effect_is_named_added_and_the_noise_reached(mitsuba, tmp_pat
         demo.run(tmp_path, seed=3)
 
 
-# what `make demo` shows is never left to the slow tests
-@pytest.mark.parametrize("name", [pytest.param(name, marks=() if name == "lens vignetting" else pytest.mark.slow) for name in sorted(demo.SECRETS)])
+SHOWN = "lens vignetting"  # by `make demo`: never left to the slow tests
+
+
+@pytest.mark.parametrize("name", [pytest.param(n, marks=() if n == SHOWN else pytest.mark.slow) for n in sorted(demo.SECRETS)])
 def test_every_secret_is_found(mitsuba, tmp_path, name):
     found(tmp_path, name)
 
