@@ -95,11 +95,12 @@ def scatter(own: Evidence, calibrated: Sequence[int], effect: Sequence[int], cha
     clutter (`by_clutter`); and the covariance V^-1 (B - V) V^-1 that clutter adds to that of noise, with B of `variances` at the fit.
     The larger of what the maps say; NaN and zero where there are too few parts."""
     projected, clutter = own.project(own.thinned(), calibrated, effect, own.thinning), np.zeros((len(effect),) * 2)
-    covariance = st.inverse(projected.information)[0]
+    white = st.root(projected.information, st.VISIBLE)
+    covariance = white.T @ white
     images = _off_base(own, [_columns(block, effect) for block in own.blocks], projected, calibrated)
     found = variances(images, [block.r for block in own.blocks], places)
     for b, parts in found:
-        if st.inverse(b)[1] < parts - 1:
+        if st.inverse(white @ b @ white.T)[1] < parts - 1:
             clutter = max(clutter, covariance @ (b - projected.information) @ covariance, key=lambda c: float(np.trace(c @ projected.information)))
     return by_clutter(projected.information @ change, projected.information, found), clutter
 
@@ -154,12 +155,13 @@ def by_clutter(score: np.ndarray, information: np.ndarray, variances: Sequence[t
 
     T2 = u' B^-1 u, T2 (G - k)/(k (G - 1)) ~ F(k, G - k), where G >= 2 k: fewer parts know too little of B's directions (15 strengths and 16
     parts would ask 1.4e6 of T2). They know its trace: with M = V^-1/2 B V^-1/2, F = u' V^-1 u / tr M ~ F(h, h (G - 1)), h = (tr M)^2 / tr M^2.
+    Combinations of strengths of which V holds no more than rounding (VISIBLE), as a gain common to all frames beside lights, have no part.
 
     Source: Brunner, Dette & Munk, Box-type approximations in nonparametric factorial designs, J. Am. Stat. Assoc. 92, 1494 (1997).
     """
     from scipy.stats import f as fisher
 
-    ps, white = [], st.root(information)
+    ps, white = [], st.root(information, st.VISIBLE)
     for b, parts in variances:
         spread, vectors = np.linalg.eigh(white @ b @ white.T)
         known = spread > st.TRUNCATION * max(spread.max(initial=0.0), 1e-300)

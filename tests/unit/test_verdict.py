@@ -353,6 +353,17 @@ def test_as_many_strengths_as_parts_are_held_against_clutter(count):
     assert np.mean(np.array(some) < 0.01) > 0.9
 
 
+def test_a_combination_that_nothing_tells_is_no_clutter():
+    """Gains of 12 frames beside a light that all frames share: their sum is left in V as rounding, 1e-7 of it, and scatters by the same
+    rounding, 1e4 times as much as V says. That says nothing of the others, which are 100 sd."""
+    rng, count = np.random.default_rng(3), 12
+    common = np.full((count, count), 1 / count)
+    others = np.eye(count) - common
+    parts = rng.standard_normal((16, count)) @ others
+    score = 100 * rng.standard_normal(count) @ others
+    assert evenness.by_clutter(score, others + 1e-7 * common, [(parts.T @ parts / 16 + 1e-3 * common, 16)]) < 1e-9
+
+
 @pytest.mark.parametrize("proxy", [False, True])
 def test_what_splits_a_strength_is_held_against_clutter_too(proxy):
     """Patches of 8 x 8 px with 1 % of their own, and a slope of 6 %, which a proxy has in the upper half alone. Between quadrants, of four
