@@ -7,7 +7,7 @@ that the scene's integrator names (`rays` per pixel, `packets` per light).
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 
@@ -66,7 +66,11 @@ class ClearRenderer(Renderer):
     def error(self, values: Mapping) -> np.ndarray:
         """(H, W, B) standard error of the picture."""
         found = self.picture(values)
-        return np.sqrt(sum((self.powers(values, n) * found.error[found.lights.index(n)]) ** 2 for n in self.lit(values)))
+        return np.sqrt(self._sum((self.powers(values, n) * found.error[found.lights.index(n)]) ** 2 for n in self.lit(values)))
+
+    def _sum(self, images: Iterable[np.ndarray]) -> np.ndarray:
+        """(H, W, B) of the lights that are on; black where none is."""
+        return sum(images, np.zeros((self.height, self.width, self.bands)))
 
     def led(self, values: Mapping, led: str) -> LedImage:
         """No shadow has a rim here."""
@@ -84,7 +88,7 @@ class ClearRenderer(Renderer):
             own = paths.part_values(self.scene, name, {**values, key: values[key] + 1j * STEP}, {})
             slope = np.imag(coefficient(own, "absorption", self.wavelengths)) / STEP  # of the coefficient, per band
             found = self.picture(values, seed, slopes=True)
-            return slope * sum(self.powers(values, n) * found.slopes[name][found.lights.index(n)] for n in self.lit(values))
+            return slope * self._sum(self.powers(values, n) * found.slopes[name][found.lights.index(n)] for n in self.lit(values))
         low, high = self.scene.parameters[key].sides(values[key])
         return (self.radiance({**values, key: high}, seed) - self.radiance({**values, key: low}, seed)) / (high - low)
 

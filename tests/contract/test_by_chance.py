@@ -206,7 +206,8 @@ def test_a_light_does_not_depend_on_the_others(bench):
 def test_no_light_no_picture(bench):
     scene, renderer, values = bench
     dark = {**values, **{f"{n}.power": 0.0 for n in scene.lights}}
-    assert renderer.radiance(dark).max() == 0
+    for image in (renderer.radiance(dark), renderer.error(dark), renderer.tangent(dark, "filling.absorption")):
+        assert image.shape == (scene.camera.resolution[1], scene.camera.resolution[0], 3) and not image.any()
 
 
 def test_the_model_differentiates_by_the_renderer(bench, tmp_path, monkeypatch):
