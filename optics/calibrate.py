@@ -21,6 +21,7 @@ from optics.parameter import Values, Variable
 from optics.words import some, spaced
 
 REACH = 4.0  # plausible sizes that one step may change what the image is not linear in
+POOR = 0.25  # of the gain that a linearisation promises: with less, it has been followed too far
 NEGLIGIBLE = 1e-3  # of the excess of chi2: a promise that is not worth another linearisation, a tenth of what a diagnosis allows
 ALIKE = 0.995  # correlation beyond which two variables are said to stand for each other
 TRUNCATION = 1e-12  # eigenvalues of the scaled normal matrix below this share of the largest count as undetermined
@@ -360,30 +361,47 @@ class Descent:
         part     share of the first promise, of which no step beyond the first is worth its prediction
         """
         gained = first = 0.0
-        for _ in range(steps):
+        while steps > 0:
             promised = self.promised
             first = first or promised
             if promised < enough or (gained and promised > part * first > 0):
                 break
             worst = -promised if promised < rough else 0.0
-            target, expected = self._step(self.damping)  # within reach, of which less may be expected
-            theta, values, there = self._at(target)
-            if self.powers and not self.here.total - there.total > max(worst, expected / 2):
-                theta, values, there = min((theta, values, there), self._settled(theta, values), key=lambda t: t[2].total)
-            gain = self.here.total - there.total
-            if np.isfinite(there.total) and gain > worst:
-                self.theta, self.values, self.here = theta, values, there
-                self.trust = min(2 * self.trust, 1e3) if gain > expected / 2 else max(self.trust / 2, 1.0)
-                gained += gain
-                self.damping = max(self.damping / 10, 1e-9)
-                if gain < enough or 10 * enough < gain < 0.25 * expected:
-                    break
-            else:
-                self.trust = max(self.trust / 2, 1.0)
-                self.damping = max(self.damping * 10, 1e-3)
-                if self.damping > 1e4:
-                    break
+            found, gain, expected, tried = self._search(steps, worst, promised < rough)
+            steps -= tried
+            if not gain > worst:
+                break
+            self.theta, self.values, self.here = found
+            self.trust = min(2 * self.trust, 1e3) if gain > expected / 2 else max(self.trust / 2, 1.0)
+            gained += gain
+            self.damping = max(self.damping / 10, 1e-9)
+            if gain < enough or 10 * enough < gain < POOR * expected:
+                break
         return gained
+
+    def _search(self, most: int, worst: float, rough: bool) -> tuple[tuple[np.ndarray, Values, Normal], float, float, int]:
+        """(where it leads, its gain, what was expected, predictions): the first step that brings its part of what was expected, under
+        ever more damping, or the best of `most`. A gain that is a poor part of what the same images promise is one that a shorter
+        step beats, and costs a prediction more; taking it for progress spends a linearisation on a hundredth of that.
+
+        worst, rough   where chi2 is rough, any gain above `worst` is the step's
+        """
+        best = None
+        for tried in range(1, most + 1):
+            target, expected = self._step(self.damping)  # within reach, of which less may be expected
+            found = self._at(target)
+            if self.powers and not self.here.total - found[2].total > max(worst, expected / 2):
+                found = min(found, self._settled(*found[:2]), key=lambda t: t[2].total)
+            gain = self.here.total - found[2].total
+            gain = gain if np.isfinite(gain) else -np.inf
+            if best is None or gain > best[1]:
+                best = found, gain, expected
+            elif best[1] > worst:  # more damping brings less
+                break
+            if gain > (worst if rough else max(worst, POOR * expected)) or self.damping > 1e4:
+                break
+            self.damping, self.trust = max(self.damping * 10, 1e-3), max(self.trust / 2, 1.0)
+        return *best, tried
 
 
 def fit(model, variables: Sequence[Variable], start: Values | None = None, frames: Sequence[int] | None = None, *,
