@@ -122,8 +122,9 @@ def _off_base(own: Evidence, images: Sequence[np.ndarray], projected: st.Project
 def variances(images: Sequence[np.ndarray], left: Sequence[np.ndarray], places: list[dict]) -> list[tuple[np.ndarray, int]]:
     """(B, G) for each of MAPS that there is: the variance of the score x'r of images x, by its scatter between G parts.
 
-    B = sum of w w' with w = (1 - V_g/V)^(-1/2) u_g, u_g = sum of x r over part g, V_g of x x', where r is what is left at the fit, which
-    has taken a share V_g/V of part g along: without clutter the mean of B is V.
+    B = sum of w w' with w = (1 - V_g/V)^(-1/2) u_g, u_g = sum of x r over part g, V_g of x x', where r is what is left at the optimum,
+    whose fit has taken a share V_g/V of part g along: without clutter the mean of B is V. What is `left` where a fit stopped short of it,
+    or followed other images than these, is brought there first: a part that knows nearly all would show that rest many times over.
 
     Source: Liang & Zeger, Longitudinal data analysis using generalized linear models, Biometrika 73, 13 (1986), the robust variance;
     Bell & McCaffrey, Bias reduction in standard errors for linear regression with multi-stage samples, Survey Methodology 28, 169 (2002).
@@ -131,6 +132,8 @@ def variances(images: Sequence[np.ndarray], left: Sequence[np.ndarray], places: 
     found, k = [], images[0].shape[1]
     root = st.root(sum(x.T @ x for x in images))
     back = np.linalg.pinv(root)
+    rest = root.T @ root @ sum(x.T @ r for x, r in zip(images, left))
+    left = [r - x @ rest for x, r in zip(images, left)]
     for name in MAPS:
         edges = st.bin_edges(np.concatenate([p[name] for p in places]), PARTS) if name in places[0] else None
         if edges is None:

@@ -364,6 +364,18 @@ def test_a_combination_that_nothing_tells_is_no_clutter():
     assert evenness.by_clutter(score, others + 1e-7 * common, [(parts.T @ parts / 16 + 1e-3 * common, 16)]) < 1e-9
 
 
+def test_a_fit_that_stopped_short_is_no_clutter():
+    """An effect of which one of 16 parts knows 99 %: two sd short of its optimum, or on it, its scatter is the same."""
+    rng = np.random.default_rng(4)
+    part = np.repeat(np.arange(16.0), 50)
+    image = np.where(part == 4, 1.0, 0.026)[:, None] * (1 + 0.1 * rng.standard_normal((800, 1)))
+    left = rng.standard_normal(800)
+    short = left + 2 * image[:, 0] / math.sqrt(np.sum(image**2))
+    (b, parts), (same, _) = (evenness.variances([image], [r], [{"place": part}])[0] for r in (left, short))
+    np.testing.assert_allclose(same, b, rtol=1e-9)
+    assert parts == 16
+
+
 @pytest.mark.parametrize("proxy", [False, True])
 def test_what_splits_a_strength_is_held_against_clutter_too(proxy):
     """Patches of 8 x 8 px with 1 % of their own, and a slope of 6 %, which a proxy has in the upper half alone. Between quadrants, of four
