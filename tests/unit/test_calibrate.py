@@ -154,6 +154,36 @@ def test_where_much_is_missing_the_last_of_chi2_is_not_waited_for(seed, monkeypa
     assert 0 < soon.chi2 - late.chi2 < 2e-3 * excess
 
 
+class Bend:
+    """One pixel, 100 arctan(x): from x = 1.39 a full step leads as far to the other side, and brings nothing of what it promises."""
+
+    shape, captures = (1, 1, 1), None
+    parameters = {"led.x": Parameter("x", "mm", 1.0, (-50.0, 50.0), plausible=1.0)}
+    base = {"led.x": 1.0}
+    frames = [SimpleNamespace(name="one", parameters={}, repeats=[], image=np.zeros((1, 1, 1)))]
+
+    def predict(self, values, frames=None, seed=0):
+        return [np.full(self.shape, 100 * np.arctan(values.common["led.x"]))]
+
+    def derivatives(self, values, variables, frames=None, secant=None, seed=0):
+        yield self.predict(values)[0], {"led.x": np.full(self.shape, 100 / (1 + values.common["led.x"] ** 2))}
+
+    def usable(self, frame):
+        return np.ones(self.shape, bool)
+
+    def variance(self, values, frame, prediction):
+        return np.ones(self.shape)
+
+
+@pytest.mark.parametrize("start", [1.3, 1.36, 1.38, 1.39, 1.4, -1.38])
+def test_a_step_that_brings_a_hundredth_of_its_promise_is_shortened(start):
+    """On the same derivative images, which are dear: three linearisations and the one that sees the end, where taking any gain for
+    progress needs five to eight."""
+    model = Bend()
+    found = fit(model, [Variable("led.x", ("led.x",), model.parameters["led.x"])], Values({"led.x": start}))
+    assert found.converged and len(found.history) <= 4 and found.chi2 < 0.05
+
+
 def test_far_from_the_best_a_factor_moves_straight():
     """By its logarithm a light that turns away would grow without measure."""
     power = Variable("power", ("led.power",), Parameter("power", "1", 1.0, (0.0, 1e6), linear=True))
