@@ -350,7 +350,7 @@ class Descent:
         return self._at(np.clip(theta, self.low, self.high))
 
     def chord(self, steps: int, enough: float, rough: float = 0.0, part: float = 0.0) -> float:
-        """Up to `steps` steps on the same derivative images, which cost many times what a prediction does; the total fall.
+        """Steps on the same derivative images, which cost many times what a prediction does, `steps` of them tried at most; the total fall.
 
         Lights that move or widen change their brightness by far more than their pattern: a long step ends on the wall of a
         narrow valley. There the powers are solved for once more, which costs about a prediction, before a step is given up.
