@@ -4,7 +4,7 @@
 
 TAXIM is the calibration pack of a GelSight sensor (Si & Yuan, Taxim, RA-L 7, 2361, 2022), DIGIT_FOLDER holds `images/` and
 `labels.csv` of a DIGIT (github.com/vocdex/digit-depth). Pictures are averaged over blocks of 2 x 2 and 4 x 4 px, as a ball's
-shading needs no more; either sensor takes ten minutes on two cores. OUTPUT gets the captures, the studies, and a report each.
+shading needs no more; calibrating either sensor takes about 13 minutes on two cores. OUTPUT gets the captures, the studies, and a report each.
 """
 
 import sys

@@ -367,7 +367,7 @@ class Descent:
             if promised < enough or (gained and promised > part * first > 0):
                 break
             worst = -promised if promised < rough else 0.0
-            found, gain, expected, tried = self._search(steps, worst, promised < rough)
+            found, gain, expected, tried = self._search(steps, worst)
             steps -= tried
             if not gain > worst:
                 break
@@ -379,12 +379,12 @@ class Descent:
                 break
         return gained
 
-    def _search(self, most: int, worst: float, rough: bool) -> tuple[tuple[np.ndarray, Values, Normal], float, float, int]:
+    def _search(self, most: int, worst: float) -> tuple[tuple[np.ndarray, Values, Normal], float, float, int]:
         """(where it leads, its gain, what was expected, predictions): the first step that brings its part of what was expected, under
         ever more damping, or the best of `most`. A gain that is a poor part of what the same images promise is one that a shorter
         step beats, and costs a prediction more; taking it for progress spends a linearisation on a hundredth of that.
 
-        worst, rough   where chi2 is rough, any gain above `worst` is the step's
+        worst   below it no gain is a step; negative where chi2 is rough, and there any above it is one
         """
         best = None
         for tried in range(1, most + 1):
@@ -398,7 +398,7 @@ class Descent:
                 best = found, gain, expected
             elif best[1] > worst:  # more damping brings less
                 break
-            if gain > (worst if rough else max(worst, POOR * expected)) or self.damping > 1e4:
+            if gain > (worst or POOR * expected) or self.damping > 1e4:
                 break
             self.damping, self.trust = max(self.damping * 10, 1e-3), max(self.trust / 2, 1.0)
         return *best, tried

@@ -47,7 +47,7 @@ def split(model, evidence: Evidence, places: list[dict], rows_max: int, seed: in
         without.put(v, float(start))
     changes = zip(*(model.predict(values, own.frames, own.seed) for values in (found.values, without)))
     images = [(np.asarray(new, float) - old).reshape(-1)[block.index] / block.sigma for block, (new, old) in zip(own.blocks, changes)]
-    parts = _parts(model, own, places)
+    parts, residuals = _parts(model, own, places), [block.r for block in own.blocks]
     plain_normal = own.thinned(extra=max([len(labels) for labels, _ in parts.values()], default=0))
     results = []
     for by, (labels, bins) in parts.items():
@@ -59,16 +59,15 @@ def split(model, evidence: Evidence, places: list[dict], rows_max: int, seed: in
         lengths = np.diag(normal.gram)[rest]
         k = own.thinning
         projected = own.project(normal, calibrated + effect, rest, k)
-        fall, dof, more, _ = st.joint(projected, lengths)
+        fall, dof, *_ = st.joint(projected, lengths)
         if dof == 0:
             continue
         _, _, delta, sd = st.joint(own.project(normal, calibrated, rest, k), lengths)
         h = max(fall - dof, 0.0) * k / max(net, 1e-9)
         cut = [image[:, None] * (index[:, None] == np.arange(count)) for image, index in zip(images, bins)]
         cut = _off_base(own, cut, projected, calibrated + effect)
-        after = [block.r - image @ more for block, image in zip(own.blocks, cut)]
         results.append(Split(c.effect.name, by, labels, (1 + delta).tolist(), sd.tolist(), fall * k, dof, float(chdtrc(dof, fall)), h,
-                             by_clutter(projected.score, projected.information, variances(cut, after, places)), UNEVEN, True))
+                             by_clutter(projected.score, projected.information, variances(cut, residuals, places)), UNEVEN, True))
     level, excess = LEVEL / max(len(results), 1), left.excess_sd * math.sqrt(2 * max(evidence.normal.count - evidence.projected.rank, 1))
 
     def most(s: Split) -> float:
@@ -92,7 +91,7 @@ def scattered(refit: Refit, chance: float, clutter: np.ndarray) -> Refit:
 
 def scatter(own: Evidence, calibrated: Sequence[int], effect: Sequence[int], change: np.ndarray, places: list[dict]) -> tuple[float, np.ndarray]:
     """p of a strength that asks for no independent noise, by its scatter between parts of the sensor or session, as neighbours share
-    clutter (`by_clutter`); and the covariance V^-1 (B - V) V^-1 that clutter adds to that of noise, with B of `variances` at the fit.
+    clutter (`by_clutter`); and the covariance V^-1 (B - V) V^-1 that clutter adds to that of noise, with B of `variances`.
     The larger of what the maps say; NaN and zero where there are too few parts."""
     projected, clutter = own.project(own.thinned(), calibrated, effect, own.thinning), np.zeros((len(effect),) * 2)
     white = st.root(projected.information, st.VISIBLE)
