@@ -44,7 +44,7 @@ test: setup  ## run the tests, but for the slow ones
 	@$(BIN)/pytest -q -m "not slow" $(ARGS)
 
 bench: setup  ## measure the speed
-	@$(BIN)/python -m optics.bench $(ARGS)
+	@$(BIN)/python -m optics.proof.speed $(ARGS)
 
 proof: setup  ## hide effects, run the loop blind on each, count what it said (hours; can be stopped and taken up again; ARGS=--quick)
 	@$(BIN)/python -m optics.proof $(ARGS)

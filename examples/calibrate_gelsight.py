@@ -7,8 +7,9 @@ CAPTURES is a folder with a captures.toml (see the README); `optics demo` makes 
 
 import sys
 
-from optics import calibrate, loop
-from optics.parameter import Values
+from optics.fit import calibrate
+from optics.scene.parameter import Values
+from optics.study import loop
 
 setup = loop.Setup(captures=sys.argv[1])
 model = loop.open_model(setup)  # scene and captures, checked against each other

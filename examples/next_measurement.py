@@ -2,7 +2,7 @@
 
     python examples/next_measurement.py [leak|depolarization|stray|offset] [FOLDER]
 
-A polarizer bench (made by coherency matrices, optics.jones, which share no line with the model) hides one of four faint causes of light
+A polarizer bench (made by coherency matrices, optics.proof.makers.bench, which share no line with the model) hides one of four faint causes of light
 where there should be none. A Malus sweep cannot say which: a leak of the films looks like a hazy sample, stray light like an offset of
 the camera's zero. The diagnosis is AMBIGUOUS and says what to measure; the example does as it says, with 125 further readings of
 each kind, and diagnoses again.
@@ -15,10 +15,12 @@ from pathlib import Path
 
 import numpy as np
 
-from optics import captures, jones, loop
+from optics.captures import capture_set as captures
+from optics.captures.noise import Noise
 from optics.errors import UnknownKey
-from optics.jones import Photodiode, Polarizer, Sample, Truth
-from optics.noise import Noise
+from optics.proof.makers import bench as jones
+from optics.proof.makers.bench import Photodiode, Polarizer, Sample, Truth
+from optics.study import loop
 
 NOISE = Noise(system_gain=0.05, dark_noise=2.0, black_level=64.0, saturation=4095.0, prnu=0.0)
 GAIN = 2.2

@@ -13,9 +13,9 @@ from pathlib import Path
 
 import numpy as np
 
-from optics import scene as scenes
+from optics.light.renderer import Renderer
 from optics.readers import proximity
-from optics.render import Renderer
+from optics.scene import loader as scenes
 
 DISTANCES = np.array([60.0, 50.0, 42.0, 35.0, 30.0, 25.0, 20.0, 15.0, 12.0, 10.0])  # mm
 NEARER = np.array([8.5, 7.0])  # mm: the reference's curve goes on, for objects that read as nearer than they are

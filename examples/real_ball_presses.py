@@ -11,10 +11,11 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from optics import importing, loop
-from optics.effect import registry
-from optics.nulls import NullTable
-from optics.report import report
+from optics.captures import importing
+from optics.fit.null_models import NullTable
+from optics.pages.report import report
+from optics.scene.registry import registry
+from optics.study import loop
 
 TAXIM = dict(bin=2, every=2, leds=6, camera_distance=40.0, skirt=0.88, contact_share=0.79)
 DIGIT = dict(bin=4, camera_distance=28.0, skirt=0.81, contact_share=0.85, gel_thickness=4.6, leds=6, ball_radius=3.0,

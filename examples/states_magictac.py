@@ -16,10 +16,10 @@ from pathlib import Path
 
 import numpy as np
 
-from optics import scene as scenes
-from optics.by_chance import ClearRenderer
-from optics.noise import Noise
+from optics.captures.noise import Noise
+from optics.light.monte_carlo import ClearRenderer
 from optics.readers import grid
+from optics.scene import loader as scenes
 
 FAR = 60.0  # mm: nothing near
 NEAR = (20.0, 10.0, 5.0, 2.0)  # mm before the skin

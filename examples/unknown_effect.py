@@ -4,7 +4,7 @@
 
 A GelSight-type sensor with a rolling shutter: its rows are read one after another, and the current of its LEDs ripples with the supply,
 locked to the camera's trigger. So rows are lit unevenly, by a few per cent and in every frame alike. No effect of the library does that.
-The captures are made by stock Mitsuba (`optics.synthetic`), with the ripple integrated over the time for which each row is exposed, then
+The captures are made by stock Mitsuba (`optics.proof.makers.touch`), with the ripple integrated over the time for which each row is exposed, then
 photons, read noise and 8 bits. Everything after that is what you would type with captures of your own:
 
     optics calibrate captures -o study ...                       the base model
@@ -26,10 +26,12 @@ from pathlib import Path
 
 import numpy as np
 
-from optics import captures as capture_files, demo, scene as scenes
-from optics.ladder import Study
-from optics.synthetic import Maker, presses
-from optics.verdict import Diagnosis
+from optics.captures import capture_set as capture_files
+from optics.diagnosis.verdict import Diagnosis
+from optics.proof import demo
+from optics.proof.makers.touch import Maker, presses
+from optics.scene import loader as scenes
+from optics.study.record import Study
 
 WIDTH, HEIGHT = 64, 48  # px
 EXPOSURE = 200.0  # one LED at a time is near full scale

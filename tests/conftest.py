@@ -25,7 +25,7 @@ def pytest_addoption(parser):
 def pytest_configure(config):
     folder = config.getoption("--plugin-folder", default=None)
     if folder:
-        from optics.effect import registry
+        from optics.scene.registry import registry
 
         registry().scan(Path(folder))
 
@@ -36,7 +36,7 @@ def mitsuba():
     from optics.doctor import require_llvm
 
     require_llvm()  # before drjit is imported: a bad LLVM ends the process
-    from optics.effect import use_variant
+    from optics.scene.mitsuba_parts import use_variant
 
     use_variant()
     import mitsuba
@@ -47,7 +47,7 @@ def mitsuba():
 @pytest.fixture
 def variant(mitsuba, request):
     """Another variant for one test: parametrise it indirectly; the default one comes back afterwards."""
-    from optics.effect import use_variant
+    from optics.scene.mitsuba_parts import use_variant
 
     use_variant(request.param)
     yield request.param
@@ -62,9 +62,9 @@ class Bench:
     """
 
     def __init__(self, scene, values, flat_field=None, mode=None):
-        from optics.captures import Captures, Frame
-        from optics.noise import Noise
-        from optics.render import Model
+        from optics.captures.capture_set import Captures, Frame
+        from optics.captures.noise import Noise
+        from optics.fit.model import Model
 
         self.scene = scene
         width, height = scene.camera.resolution
@@ -75,7 +75,7 @@ class Bench:
         self.values = {**scene.values(), **{k: v for k, v in values.items() if k in scene.parameters}}
 
     def at(self, values=None):
-        from optics.parameter import Values
+        from optics.scene.parameter import Values
 
         return Values(common={**self.values, **(values or {})})
 
@@ -84,7 +84,7 @@ class Bench:
 
     def derivative(self, key, values=None, keys=None):
         """d image / d value by the model's own means; zero where the model says that nothing depends on it."""
-        from optics.parameter import Variable
+        from optics.scene.parameter import Variable
 
         variable = Variable(key, tuple(keys or (key,)), self.scene.parameters[key])
         _, images = next(iter(self.model.derivatives(self.at(values), [variable])))
@@ -92,7 +92,7 @@ class Bench:
 
     def forget(self):
         """Drop every image that the renderer keeps."""
-        from optics.render import Renderer
+        from optics.light.renderer import Renderer
 
         self.model.renderer = self.renderer = Renderer(self.scene)
 
@@ -150,7 +150,7 @@ def load_bench(mitsuba, tmp_path_factory):
     slot     puts a material of this kind in the sample slot of the polarizer bench, as the part `sample`
     plugins  a further folder of plugins
     """
-    from optics import scene
+    from optics.scene import loader as scene
 
     def load(name="gelsight", slot=None, plugins=None):
         defines, values = POINTS.get(name, POINTS["gelsight"])

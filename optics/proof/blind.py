@@ -15,12 +15,12 @@ from pathlib import Path
 
 import numpy as np
 
-from optics import loop
-from optics.compare import plain
-from optics.effect import registry
-from optics.evidence import value_of
+from optics.diagnosis.evidence import value_of
+from optics.diagnosis.verdict import CLEAR, Diagnosis, Row, close
+from optics.fit.compare import plain
 from optics.proof.cells import Cell
-from optics.verdict import CLEAR, Diagnosis, Row, close
+from optics.scene.registry import registry
+from optics.study import loop
 
 STEPS = 3  # effects that the loop may add where two are hidden
 

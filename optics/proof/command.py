@@ -12,7 +12,8 @@ from typing import Annotated
 import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from optics.proof import blind, cells as plan
+from optics.proof import blind
+from optics.proof import cells as plan
 
 QUICK = {"polarizer_bench": 1}
 

@@ -17,7 +17,7 @@ from dataclasses import asdict, dataclass, field
 
 import numpy as np
 
-from optics.verdict import CLEAR, LEVEL
+from optics.diagnosis.verdict import CLEAR, LEVEL
 
 CLEAN = 0.0
 

@@ -12,8 +12,8 @@ References
     Bouguer-Lambert-Beer law, Born & Wolf, Principles of Optics, 14.1; printed-cell sensors use it as I exp(-alpha d).
 """
 
-from optics.effect import Effect
-from optics.parameter import Parameter
+from optics.scene.declare import Effect
+from optics.scene.parameter import Parameter
 
 
 def fade(path, gel):

@@ -10,9 +10,9 @@ References
     Fan, Li, Cong & Zhang, MagicGripper, supplementary VII-A, eq. (27), for one wavelength.
 """
 
-from optics.effect import Effect
-from optics.mueller import exp
-from optics.parameter import Parameter
+from optics.polarization.mueller import exp
+from optics.scene.declare import Effect
+from optics.scene.parameter import Parameter
 
 
 def fade(alpha, wavelengths, clear):

@@ -13,8 +13,8 @@ References
     F-TAC Hand supplementary information, S1.5 (neglected there: black cover).
 """
 
-from optics.effect import Effect
-from optics.parameter import Parameter
+from optics.scene.declare import Effect
+from optics.scene.parameter import Parameter
 
 
 def leak(geometry, membrane):

@@ -10,7 +10,7 @@ References
     Vi2TaP (RA-L 2025), II.B 2 (servo MG90S: dead band of a few microseconds, about 1 degree with its gears).
 """
 
-from optics.effect import Effect
+from optics.scene.declare import Effect
 
 effect = Effect(name="servo backlash", part="polarizer_film", parameters=("backlash",), acts=("analyzer.approach",),
                 needs="the same angles from both sides, with the setting `approach`")

@@ -16,8 +16,8 @@ References
 
 import numpy as np
 
-from optics.effect import Effect
-from optics.parameter import Parameter
+from optics.scene.declare import Effect
+from optics.scene.parameter import Parameter
 
 
 def smear(image, camera):

@@ -11,7 +11,7 @@ References
     Fan, Li, Cong & Zhang, MagicGripper, supplementary VII-A, eqs. (27)-(29).
 """
 
-from optics.effect import Effect
+from optics.scene.declare import Effect
 
 effect = Effect(name="body absorption", part="clear", parameters=("absorption",), per="part", acts=("led_distance", "height"),
                 needs="LEDs at different distances, one at a time")

@@ -12,12 +12,12 @@ References
     Johnson, Contact Mechanics, 3.4 and 5.8 (layers); F-TAC Hand supplementary information, S1.6 (neglected there).
 """
 
-from optics.effect import Effect
-from optics.parameter import Parameter
+from optics.scene.declare import Effect
+from optics.scene.parameter import Parameter
 
 
 def rise(x, y, gel):
-    from optics.gel import contact
+    from optics.skin import contact
 
     ring = contact.ring_bulge(gel.map, gel.touch, gel.number("thickness"))
     return gel.number("bulge") * contact.surface(x, y, gel.number("press_x"), gel.number("press_y"), ring)

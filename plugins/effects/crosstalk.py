@@ -12,8 +12,8 @@ References
     ISO 17321-1; Hirakawa, IEEE ICIP 2008 (cross-talk explained).
 """
 
-from optics.effect import Effect
-from optics.parameter import Parameter
+from optics.scene.declare import Effect
+from optics.scene.parameter import Parameter
 
 
 def mix(image, camera):

@@ -11,7 +11,7 @@ References
     EMVA 1288 release 4.0, 2.2 (dark signal).
 """
 
-from optics.effect import Effect
+from optics.scene.declare import Effect
 
 effect = Effect(name="dark offset", part="camera", parameters=("offset",), acts=("intensity",),
                 needs="dark frames, or readings at two exposures and two powers")

@@ -11,9 +11,9 @@ References
     Goldstein, Polarized Light, 3rd ed., ch. 6 (depolarizers); physics of hazy elastomers: forward scattering.
 """
 
-from optics.effect import Effect
-from optics.mueller import depolarizer
-from optics.parameter import Parameter
+from optics.polarization.mueller import depolarizer
+from optics.scene.declare import Effect
+from optics.scene.parameter import Parameter
 
 
 def mix(crossing, sheet):

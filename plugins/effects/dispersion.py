@@ -10,8 +10,8 @@ References
     Born & Wolf, Principles of Optics, 2.3.4.
 """
 
-from optics.effect import Effect
-from optics.parameter import Parameter
+from optics.scene.declare import Effect
+from optics.scene.parameter import Parameter
 
 
 def disperse(n, wavelengths, clear):

@@ -12,7 +12,7 @@ References
     Brown, Photogrammetric Engineering 32, 444 (1966).
 """
 
-from optics.effect import Effect
+from optics.scene.declare import Effect
 
 effect = Effect(name="radial distortion", part="camera", parameters=("k1",), acts=("radius", "gradient"),
                 needs="presses all over the field with known positions")

@@ -11,7 +11,7 @@ References
     EMVA 1288 release 4.0, sec. 2 (linear model: gain).
 """
 
-from optics.effect import Effect
+from optics.scene.declare import Effect
 
 effect = Effect(name="gain drift", part="camera", parameters=("gain",), scope="frame", acts=("frame",),
                 needs="repeated frames of the same press, in another order")

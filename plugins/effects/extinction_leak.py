@@ -13,7 +13,7 @@ References
     Vi2TaP (RA-L 2025), II.B; Goldstein, Polarized Light, 3rd ed., 5.2 and 26.2.
 """
 
-from optics.effect import Effect
+from optics.scene.declare import Effect
 
 effect = Effect(name="extinction leak", part="polarizer_film", parameters=("leak",), onset="both",
                 acts=("intensity", "analyzer.angle"), needs="crossed polarizers, and readings at another power of the source")

@@ -13,7 +13,7 @@ References
     van de Hulst, Multiple Light Scattering (1980), ch. 4; Born & Wolf, Principles of Optics, 1.5.2 (r = 0.04 at n = 1.5).
 """
 
-from optics.effect import Effect
+from optics.scene.declare import Effect
 
 effect = Effect(name="film reflections", part="polarizer_film", parameters=("face",), onset="secant",
                 acts=("analyzer.angle", "intensity"), needs="many angles, with little noise: the change is second order in r")

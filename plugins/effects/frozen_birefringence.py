@@ -12,8 +12,8 @@ References
     Born & Wolf, Principles of Optics, 15.3; Goldstein, Polarized Light, 3rd ed., 5.3.
 """
 
-from optics.effect import Effect
-from optics.parameter import Parameter
+from optics.scene.declare import Effect
+from optics.scene.parameter import Parameter
 
 effect = Effect(
     name="frozen birefringence", part="clear", per="part", onset="secant",

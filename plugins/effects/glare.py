@@ -13,8 +13,8 @@ References
     ISO 9358:1994, veiling glare of image forming systems.
 """
 
-from optics.effect import Effect
-from optics.parameter import Parameter
+from optics.scene.declare import Effect
+from optics.scene.parameter import Parameter
 
 
 def spread(image, camera):

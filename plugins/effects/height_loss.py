@@ -12,8 +12,8 @@ References
     none; see Validity.
 """
 
-from optics.effect import Effect
-from optics.parameter import Parameter
+from optics.scene.declare import Effect
+from optics.scene.parameter import Parameter
 
 
 def lose(path, gel):

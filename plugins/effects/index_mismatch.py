@@ -12,8 +12,8 @@ References
     Born & Wolf, Principles of Optics, 1.5.
 """
 
-from optics.effect import Effect
-from optics.parameter import Parameter
+from optics.scene.declare import Effect
+from optics.scene.parameter import Parameter
 
 
 def shift(n, wavelengths, clear):

@@ -12,7 +12,7 @@ References
     Forsyth & Zisserman, IEEE TPAMI 13, 671 (1991); F-TAC Hand supplementary information, S1.5 (neglected: black cover).
 """
 
-from optics.effect import Effect
+from optics.scene.declare import Effect
 
 effect = Effect(name="interreflection", part="tactile", requires=("membrane",), parameters=("interreflection",),
                 acts=("height", "slope", "shadow", "channel"), needs="deep presses with steep flanks")

@@ -11,7 +11,7 @@ References
     Goldstein, Polarized Light, 3rd ed., 26.2 (dichroic sheet polarizers).
 """
 
-from optics.effect import Effect
+from optics.scene.declare import Effect
 
 effect = Effect(name="coloured leak", part="polarizer_film", parameters=("leak", "leak_tilt"), onset="both",
                 acts=("channel", "intensity"), needs="crossed polarizers in two colours or more")

@@ -11,7 +11,7 @@ References
     Korger et al., Opt. Express 21, 27032 (2013); Vi2TaP (RA-L 2025), II.B (a field of 120 degrees).
 """
 
-from optics.effect import Effect
+from optics.scene.declare import Effect
 
 effect = Effect(name="oblique leak", part="polarizer_film", parameters=("leak_oblique",), onset="both", acts=("radius", "intensity"),
                 needs="crossed polarizers in a wide field")

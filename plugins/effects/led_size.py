@@ -14,7 +14,7 @@ References
     F-TAC Hand supplementary information, S1.3 (LEDs taken as points there).
 """
 
-from optics.effect import Effect
+from optics.scene.declare import Effect
 
 effect = Effect(name="LED size", part="led", parameters=("area",), onset="secant", acts=("rim", "led"),
                 needs="cast shadows: deep presses, LEDs at low elevation")

@@ -13,8 +13,8 @@ References
     Vi2TaP (RA-L 2025), II.B (markers cast into the skin); Born & Wolf, Principles of Optics, 1.5.4 (total reflection).
 """
 
-from optics.effect import Effect
-from optics.parameter import Parameter
+from optics.scene.declare import Effect
+from optics.scene.parameter import Parameter
 
 
 def shine(glow, interface):

@@ -11,7 +11,7 @@ References
     Vi2TaP (RA-L 2025), eq. (1).
 """
 
-from optics.effect import Effect
+from optics.scene.declare import Effect
 
 effect = Effect(name="polarizer misalignment", part="polarizer_film", parameters=("offset",), per="part",
                 acts=("analyzer.angle",), needs="the analyser on both flanks of Malus' curve")

@@ -12,7 +12,7 @@ References
     Goldstein, Polarized Light, 3rd ed., ch. 4.
 """
 
-from optics.effect import Effect
+from optics.scene.declare import Effect
 
 effect = Effect(
     name="polarized source", part="source", parameters=("dop_q", "dop_u"), acts=("polarizer.angle",),

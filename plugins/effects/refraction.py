@@ -12,7 +12,7 @@ References
     Born & Wolf, Principles of Optics, 1.5; Treibitz et al., IEEE TPAMI 34, 51 (2012) (flat ports).
 """
 
-from optics.effect import Effect
+from optics.scene.declare import Effect
 
 effect = Effect(name="refraction at the window", part="interface", parameters=("index",), onset="secant",
                 acts=("radius", "height"), needs="presses of known position all over the field, and of different depth")

@@ -12,8 +12,8 @@ References
     F-TAC Hand supplementary information, S1.1; Mitsunaga & Nayar, CVPR 1999.
 """
 
-from optics.effect import Effect
-from optics.parameter import Parameter
+from optics.scene.declare import Effect
+from optics.scene.parameter import Parameter
 
 
 def bend(image, camera):

@@ -3,7 +3,7 @@
 Definition
     delta(lambda) = delta_540 (540/lambda) (1 + retard_dispersion ((540/lambda)^2 - 1))
     delta_540 = sqrt(retard_0^2 + retard_45^2),  fast axis = atan2(retard_45, retard_0)/2 + angle of the sheet
-An oblique ray sees what of the in-plane birefringence lies across it, over a longer path (optics.layers.Crossing.retardance).
+An oblique ray sees what of the in-plane birefringence lies across it, over a longer path (optics.polarization.layers.Crossing.retardance).
 A wave plate is retard_0 = 90 (quarter) or 180 deg (half wave) and an `angle`; the two components, in place of retardance and axis,
 go through zero without a seam. Dispersion 0 is a birefringence that is the same at all wavelengths.
 Fingerprint
@@ -17,9 +17,9 @@ References
 
 import math
 
-from optics.effect import Effect
-from optics.mueller import cos, retarder, sin
-from optics.parameter import Parameter
+from optics.polarization.mueller import cos, retarder, sin
+from optics.scene.declare import Effect
+from optics.scene.parameter import Parameter
 
 
 def retard(crossing, sheet):

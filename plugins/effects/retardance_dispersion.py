@@ -11,7 +11,7 @@ References
     Born & Wolf, Principles of Optics, 2.3.4 and 15.4.
 """
 
-from optics.effect import Effect
+from optics.scene.declare import Effect
 
 effect = Effect(name="dispersive retardance", part="sheet", parameters=("retard_dispersion",), acts=("channel", "analyzer.angle"),
                 needs="a retardance, in two colours or more")

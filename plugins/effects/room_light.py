@@ -11,6 +11,6 @@ References
     Fan, Li, Cong & Zhang, MagicGripper, III.D and Fig. 26, for light that reaches all channels alike.
 """
 
-from optics.effect import Effect
+from optics.scene.declare import Effect
 
 effect = Effect(name="room light", part="room", parameters=("power",), per="part", acts=("intensity", "frame"), needs="a frame with all LEDs off")

@@ -15,8 +15,8 @@ References
     Walter, Marschner, Li & Torrance, EGSR 2007, eqs. (20)-(27); Heitz & d'Eon, CGF 33, 103 (2014), for facets that are seen.
 """
 
-from optics.effect import Effect
-from optics.parameter import Parameter
+from optics.scene.declare import Effect
+from optics.scene.parameter import Parameter
 
 effect = Effect(
     name="rough walls", part="clear", per="part", onset="secant",

@@ -10,8 +10,8 @@ References
     Chandrasekhar, Radiative Transfer (1960), 1.5.
 """
 
-from optics.effect import Effect
-from optics.parameter import Parameter
+from optics.scene.declare import Effect
+from optics.scene.parameter import Parameter
 
 effect = Effect(
     name="volume scattering", part="clear", per="part",

@@ -10,7 +10,7 @@ References
     Vi2TaP (RA-L 2025), II.B 2 (gear set with a ratio of 1:1, servo MG90S).
 """
 
-from optics.effect import Effect
+from optics.scene.declare import Effect
 
 effect = Effect(name="servo scale", part="polarizer_film", parameters=("scale",), per="part",
                 acts=("analyzer.angle",),

@@ -14,7 +14,7 @@ References
     Johnson, Contact Mechanics, 4.3 (elastic foundation) and 3.4 (half-space).
 """
 
-from optics.effect import Effect
+from optics.scene.declare import Effect
 
 effect = Effect(name="exponential skirt", part="gel", parameters=("skirt",), onset="secant",
                 acts=("contact_distance", "slope"), needs="presses of different depth, seen with their surroundings")

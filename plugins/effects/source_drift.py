@@ -10,7 +10,7 @@ References
     EMVA 1288 release 4.0, 6.4 (temporal stability of the light source).
 """
 
-from optics.effect import Effect
+from optics.scene.declare import Effect
 
 effect = Effect(name="source drift", part="source", parameters=("drift",), acts=("source.time",),
                 needs="the setting `time`, and the same angle early and late")

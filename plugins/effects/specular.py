@@ -12,8 +12,8 @@ References
     Blinn, SIGGRAPH 1977; Akenine-Moeller et al., Real-Time Rendering, 4th ed., 9.8.1 (normalisation).
 """
 
-from optics.effect import Effect
-from optics.parameter import Parameter
+from optics.scene.declare import Effect
+from optics.scene.parameter import Parameter
 
 
 def lobe(geometry, membrane):

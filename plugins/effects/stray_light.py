@@ -11,8 +11,8 @@ References
     Goldstein, Polarized Light, 3rd ed., ch. 14 (background of polarimeters).
 """
 
-from optics.effect import Effect
-from optics.parameter import Parameter
+from optics.scene.declare import Effect
+from optics.scene.parameter import Parameter
 
 
 def add(image, camera):

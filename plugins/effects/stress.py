@@ -21,9 +21,9 @@ References
 
 import math
 
-from optics.effect import Effect
-from optics.mueller import cos, real, retarder, sin, where
-from optics.parameter import Parameter
+from optics.polarization.mueller import cos, real, retarder, sin, where
+from optics.scene.declare import Effect
+from optics.scene.parameter import Parameter
 
 
 def strain(crossing, sheet):

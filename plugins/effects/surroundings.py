@@ -15,8 +15,8 @@ References
     Howell et al., A Catalog of Radiation Heat Transfer Configuration Factors, A-3 (plate to inclined element).
 """
 
-from optics.effect import Effect
-from optics.parameter import Parameter
+from optics.scene.declare import Effect
+from optics.scene.parameter import Parameter
 
 
 def from_the_side(geometry, membrane):

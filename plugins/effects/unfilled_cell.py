@@ -13,7 +13,7 @@ References
 
 import numpy as np
 
-from optics.effect import Effect
+from optics.scene.declare import Effect
 
 TRIED = 12  # cells whose picture is made
 FINALS = 3  # of these, the ones that are weighed in all frames
@@ -23,8 +23,8 @@ SEED = 1001
 
 def seek(model, values, frames):
     """The cell that explains the residual best: {key: value} of its column, row and layer."""
-    from optics.parameter import Values
-    from optics.transport import Transport
+    from optics.light.transport import Transport
+    from optics.scene.parameter import Values
 
     name, grid = next((n, p) for n, p in model.scene.parts.items() if p.kind == "cells")
     predictions = model.predict(values, frames)

@@ -14,8 +14,8 @@ References
     Born & Wolf, Principles of Optics, 4.8.1; Goldman, IEEE TPAMI 32, 2276 (2010).
 """
 
-from optics.effect import Effect
-from optics.parameter import Parameter
+from optics.scene.declare import Effect
+from optics.scene.parameter import Parameter
 
 
 def fall_off(image, camera):

@@ -10,7 +10,7 @@ References
     Fan, Li, Cong & Zhang, MagicGripper, III.A, for walls as drawn.
 """
 
-from optics.effect import Effect
+from optics.scene.declare import Effect
 
 effect = Effect(name="wall thickness", part="cells", parameters=("wall_error",), per="part", acts=("row", "column"),
                 needs="sharp pictures of the grid")

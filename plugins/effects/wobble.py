@@ -11,7 +11,7 @@ References
     Goldstein, Polarized Light, 3rd ed., ch. 14 (rotating-element polarimeters: beam wander).
 """
 
-from optics.effect import Effect
+from optics.scene.declare import Effect
 
 effect = Effect(name="analyzer wobble", part="polarizer_film", parameters=("wobble_c", "wobble_s"), per="part", acts=("analyzer.angle",),
                 needs="a whole turn of the analyser")

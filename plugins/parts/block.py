@@ -3,7 +3,7 @@
 Definition
     -thickness < z < 0, |x| < width/2, |y| < length/2 at rest; the face at z = -thickness is glued, the others are free.
 A `target` in the scene with distance < 0 is pressed -distance into the face at z = 0. How the body gives way is that of springs
-between the corners of cubes (D3Q14, optics.gel.lattice), between them a cubic spline; the cells of a grid are carried along. Where the
+between the corners of cubes (D3Q14, optics.skin.lattice), between them a cubic spline; the cells of a grid are carried along. Where the
 target touches, it is in optical contact: its surface lies inside the body, by 5 micrometres, so that light that would be
 totally reflected meets it instead.
 Fingerprint
@@ -16,8 +16,9 @@ References
     Fan, Li, Cong & Zhang, MagicGripper, supplementary VII-A, eqs. (4)-(17); physics of the contact: III.B and Fig. 4.
 """
 
-from optics.effect import Declared, Part
-from optics.parameter import Parameter
+from optics.scene.declare import Part
+from optics.scene.mitsuba_parts import Declared
+from optics.scene.parameter import Parameter
 
 PARAMETERS = (
     Parameter("width", "mm", 16.4, (0.1, 1000.0), "size along x", plausible=0.1, how="difference", step=1.0),
@@ -36,7 +37,7 @@ def build():
     import numpy as np
     from scipy.ndimage import map_coordinates, spline_filter
 
-    from optics.gel import lattice
+    from optics.skin import lattice
 
     class Block(Declared.on_mesh()):
         kind = "block"
@@ -88,7 +89,7 @@ def build():
         # -- the press ------------------------------------------------------------------------------------------------
 
         def press(self):
-            """The lattice under the present target (optics.gel.lattice.Deformed), or None where no corner is reached; kept."""
+            """The lattice under the present target (optics.skin.lattice.Deformed), or None where no corner is reached; kept."""
             target = self.target
             if target is None or target.number("distance") >= 0:
                 return None

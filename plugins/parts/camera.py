@@ -23,8 +23,9 @@ References
 
 import math
 
-from optics.effect import Declared, Part
-from optics.parameter import Parameter
+from optics.scene.declare import Part
+from optics.scene.mitsuba_parts import Declared
+from optics.scene.parameter import Parameter
 
 PARAMETERS = (
     Parameter("x_fov", "deg", 40.0, (1.0, 170.0), "horizontal field of view", plausible=0.5, how="difference", step=0.8),

@@ -2,7 +2,7 @@
 
 Definition
     (x, y, -depth) -> (x + u_x, y + u_y, -depth - u_z)       u: displacement of an incompressible half-space at that depth
-                                                             under the gel's dent D (optics.gel.halfspace)
+                                                             under the gel's dent D (optics.skin.halfspace)
 A rectangle `width` x `length` around the world's z axis, `depth` below the untouched face at z = 0; it lies flat while the gel is
 not pressed. Its texture coordinates are those of the place at rest, u = x/width + 1/2, v = y/length + 1/2: the first direction
 runs along x at rest and turns with the sheet. Its normals look at the camera, towards -z. A layer on it (a polarizer film, a
@@ -17,8 +17,9 @@ References
     Vi2TaP (RA-L 2025), II.B: a film embedded in a silicone skin of 5 mm. Johnson, Contact Mechanics (1985), 3.2.
 """
 
-from optics.effect import Declared, Part
-from optics.parameter import Parameter
+from optics.scene.declare import Part
+from optics.scene.mitsuba_parts import Declared
+from optics.scene.parameter import Parameter
 
 PARAMETERS = (
     Parameter("width", "mm", 48.0, (0.1, 1000.0), "size along x", plausible=0.1, how="difference", step=1.0),
@@ -32,7 +33,7 @@ def build():
     import mitsuba as mi
     import numpy as np
 
-    from optics.gel.halfspace import displaced
+    from optics.skin.halfspace import displaced
 
     class Carried(Declared.on_mesh()):
         kind = "carried"

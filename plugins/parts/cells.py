@@ -16,8 +16,9 @@ References
     Fan, Li, Cong & Zhang, MagicGripper, III.A: cells of 0.6 to 1 mm, skins from 0.3 mm on.
 """
 
-from optics.effect import Declared, Part
-from optics.parameter import Parameter
+from optics.scene.declare import Part
+from optics.scene.mitsuba_parts import Declared
+from optics.scene.parameter import Parameter
 
 PARAMETERS = (
     Parameter("pitch", "mm", 0.8, (0.05, 20.0), "from cell to cell", plausible=0.02, how="difference", step=1.0),

@@ -16,9 +16,9 @@ References
     Fan, Li, Cong & Zhang, MagicGripper, supplementary VII-A, eqs. (18)-(29); Born & Wolf, Principles of Optics, 1.5.
 """
 
-from optics.bsdf import passing
-from optics.effect import Part
-from optics.parameter import Parameter
+from optics.scene.declare import Part
+from optics.scene.parameter import Parameter
+from optics.scene.surfaces import passing
 
 PARAMETERS = (
     Parameter("index", "1", 1.5, (1.0, 2.5), "refractive index n at 540 nm", plausible=0.01, how="difference"),
@@ -31,8 +31,8 @@ def build():
     import drjit as dr
     import mitsuba as mi
 
-    from optics.mueller import diattenuator, fresnel, fresnel_reflection
-    from optics.transport import coefficient
+    from optics.light.transport import coefficient
+    from optics.polarization.mueller import diattenuator, fresnel, fresnel_reflection
 
     class Clear(passing(mi.BSDFFlags.DeltaTransmission)):
         kind = "clear"

@@ -18,9 +18,9 @@ References
 
 import math
 
-from optics.bsdf import matt
-from optics.effect import Part
-from optics.parameter import Parameter
+from optics.scene.declare import Part
+from optics.scene.parameter import Parameter
+from optics.scene.surfaces import matt
 
 PARAMETERS = (
     Parameter("yield", "1", 0.5, (0.0, 1.0), "photons out per photon absorbed", plausible=0.1, linear=True),

@@ -6,7 +6,7 @@ Definition
     D <- max(D0, G_sd * D), from D = D0, sd = smoothing, smoothing/2, smoothing/4, smoothing/8                  (S1.6)
     D <- G_sd * D once more, sd^2 = (smoothing/16)^2 + map_pitch^2                        without restoring the contact
 with G_sd * D the blur by a Gaussian of that standard deviation (mm); the maximum puts the skin back onto the indenter after each
-blur. Steep walls of h are cut to a slope, and the rim of D0 is rounded, within about a node of the map (optics.gel.contact).
+blur. Steep walls of h are cut to a slope, and the rim of D0 is rounded, within about a node of the map (optics.skin.contact).
 The gel fills -thickness < z < 0; the camera stands at z < -thickness. The face is a triangle mesh on a graded grid that
 is fine around the contact and moves with it, so that images vary smoothly with the press.
 With `skirt` > 0 the skin beside the contact falls off as exp(-distance / skirt) before the smoothing: in place of D0 stands the
@@ -21,8 +21,9 @@ References
     F-TAC Hand supplementary information, S1.2 and S1.6.
 """
 
-from optics.effect import Declared, Part
-from optics.parameter import Parameter
+from optics.scene.declare import Part
+from optics.scene.mitsuba_parts import Declared
+from optics.scene.parameter import Parameter
 
 PARAMETERS = (
     Parameter("width", "mm", 20.0, (0.1, 1000.0), "size along x", plausible=0.1, how="difference"),
@@ -53,7 +54,7 @@ def build():
     import mitsuba as mi
     import numpy as np
 
-    from optics.gel import contact
+    from optics.skin import contact
 
     class Gel(Declared.on_mesh()):
         kind = "gel"
@@ -77,7 +78,7 @@ def build():
             self.rebuild(params)
 
         def press(self):
-            """Displacement and contact maps on the indenter's own grid (optics.gel.contact)."""
+            """Displacement and contact maps on the indenter's own grid (optics.skin.contact)."""
             n = self.number
             profile = contact.indenter_profile(self.indenter, n("indenter_size"),
                                                (n("press_rx"), n("press_ry"), n("press_rz")), self.extent, self.map_pitch)

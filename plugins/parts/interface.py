@@ -15,9 +15,9 @@ References
     Born & Wolf, Principles of Optics, 1.5.2 (Fresnel's formulae).
 """
 
-from optics.bsdf import passing
-from optics.effect import Part
-from optics.parameter import Parameter
+from optics.scene.declare import Part
+from optics.scene.parameter import Parameter
+from optics.scene.surfaces import passing
 
 PARAMETERS = (
     Parameter("index", "1", 1.0, (0.4, 2.5), "n2/n1: index of the far side relative to the camera's side", neutral=1.0,

@@ -22,8 +22,9 @@ References
 
 import math
 
-from optics.effect import Declared, Part
-from optics.parameter import Parameter
+from optics.scene.declare import Part
+from optics.scene.mitsuba_parts import Declared
+from optics.scene.parameter import Parameter
 
 PARAMETERS = (
     Parameter("x", "mm", 0.0, doc="position S, to the right in the image", plausible=0.5, how="ad", step=0.2),

@@ -15,8 +15,9 @@ References
     Vi2TaP (RA-L 2025), II.B: 5 x 4 markers, 9.5 x 8.5 mm apart, cast in holes of 1.5 mm radius and 1 mm depth.
 """
 
-from optics.effect import Declared, Part
-from optics.parameter import Parameter
+from optics.scene.declare import Part
+from optics.scene.mitsuba_parts import Declared
+from optics.scene.parameter import Parameter
 
 PARAMETERS = (
     Parameter("pitch_x", "mm", 9.5, (0.0, 100.0), "distance of columns", plausible=0.05, how="difference", step=1.0),
@@ -33,7 +34,7 @@ def build():
     import mitsuba as mi
     import numpy as np
 
-    from optics.gel.halfspace import displaced
+    from optics.skin.halfspace import displaced
 
     class Markers(Declared.on_mesh()):
         kind = "markers"

@@ -16,9 +16,9 @@ References
     F-TAC Hand supplementary information, S1.4, eq. (S3); Oren & Nayar, IJCV 14, 227 (1995).
 """
 
-from optics.bsdf import matt
-from optics.effect import Part
-from optics.parameter import Parameter
+from optics.scene.declare import Part
+from optics.scene.parameter import Parameter
+from optics.scene.surfaces import matt
 
 PARAMETERS = (
     Parameter("rho_r", "1", 1.0, (0.0, 10.0), "reflectance rho in the first band (red)", plausible=0.1, linear=True),

@@ -23,9 +23,9 @@ References
 
 import math
 
-from optics.layers import layer
-from optics.mueller import absorber, cos, diattenuator, exp, real, sin, where
-from optics.parameter import Parameter
+from optics.polarization.mueller import absorber, cos, diattenuator, exp, real, sin, where
+from optics.scene.layer import layer
+from optics.scene.parameter import Parameter
 
 PARAMETERS = (
     Parameter("inserted", "1", 1.0, (0.0, 1.0), "1: the film stands in the light; 0: it was taken out", how="layer",

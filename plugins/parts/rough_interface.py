@@ -25,8 +25,9 @@ References
     sampling of visible facets; Born & Wolf, Principles of Optics, 1.5.2 and 1.5.4.
 """
 
-from optics.effect import Declared, Part
-from optics.parameter import Parameter
+from optics.scene.declare import Part
+from optics.scene.mitsuba_parts import Declared
+from optics.scene.parameter import Parameter
 
 SHARP = 1e-4  # a lobe narrower than this (rad) is one direction: float32 leaves 6e-8 of a direction, 6e-4 of such a lobe's width
 

@@ -15,9 +15,9 @@ References
     Born & Wolf, Principles of Optics, 1.5.2.
 """
 
-from optics.layers import layer
-from optics.mueller import diattenuator, exp, fresnel
-from optics.parameter import Parameter
+from optics.polarization.mueller import diattenuator, exp, fresnel
+from optics.scene.layer import layer
+from optics.scene.parameter import Parameter
 
 PARAMETERS = (
     Parameter("transmittance", "1", 1.0, (0.0, 1.0), "transmittance at 540 nm without the faces' losses", neutral=1.0,

@@ -18,9 +18,10 @@ References
 import math
 from dataclasses import replace
 
-from optics.effect import Declared, Part
-from optics.mueller import exp, real, where
-from optics.parameter import Parameter
+from optics.polarization.mueller import exp, real, where
+from optics.scene.declare import Part
+from optics.scene.mitsuba_parts import Declared
+from optics.scene.parameter import Parameter
 
 PARAMETERS = (
     Parameter("power", "1", 1.0, (0.0, 1e6), "radiance L, relative; 0 switches the source off", plausible=0.1, linear=True),
@@ -51,7 +52,7 @@ def build(kind_of="source"):
     import drjit as dr
     import mitsuba as mi
 
-    from optics.layers import crossing_of, numbers_of
+    from optics.scene.layer import crossing_of, numbers_of
 
     class Source(Declared.on(mi.Emitter)):
         kind = kind_of

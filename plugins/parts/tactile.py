@@ -20,8 +20,9 @@ References
 
 import math
 
-from optics.effect import Declared, Part
-from optics.parameter import Parameter
+from optics.scene.declare import Part
+from optics.scene.mitsuba_parts import Declared
+from optics.scene.parameter import Parameter
 
 PARAMETERS = (
     Parameter("interreflection", "1", 0.0, (0.0, 4.0), "scale of every bounce after the first; 1 is physics",
@@ -55,7 +56,7 @@ def build():
             self.stokes = props.get("stokes", False)
             self.max_depth = props.get("max_depth", 2)  # edges of a path between surfaces: 2 is direct light
             self.max_null = props.get("max_null", 8)
-            self.rays, self.packets = props.get("rays", 64), props.get("packets", 100_000)  # of optics.transport
+            self.rays, self.packets = props.get("rays", 64), props.get("packets", 100_000)  # of optics.light.transport
             text = str(props.get("bands", ""))
             self.bands = tuple(float(w) for w in text.replace(",", " ").split())
             self.lanes = dr.size_v(mi.UnpolarizedSpectrum)

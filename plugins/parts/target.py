@@ -15,8 +15,9 @@ References
     Vi2TaP (RA-L 2025), Fig. 5: cylinders of 20, 30 and 40 mm diameter, 60 to 10 mm before the skin.
 """
 
-from optics.effect import Declared, Part
-from optics.parameter import Parameter
+from optics.scene.declare import Part
+from optics.scene.mitsuba_parts import Declared
+from optics.scene.parameter import Parameter
 
 PARAMETERS = (
     Parameter("diameter", "mm", 20.0, (0.1, 1000.0), "of the cylinder or ball", plausible=0.1, how="difference", step=1.0),
@@ -39,7 +40,7 @@ def build():
     import mitsuba as mi
     import numpy as np
 
-    from optics.gel import lattice
+    from optics.skin import lattice
 
     class Target(Declared.on_mesh()):
         kind = "target"

@@ -7,7 +7,7 @@ own standard errors.
 import numpy as np
 import pytest
 
-from optics.effect import registry
+from optics.scene.registry import registry
 
 KINDS = ("clear", "cells", "block", "room")
 EFFECTS = sorted(k for k, e in registry().effects.items() if e.part in KINDS and e.part != "room")  # a light of its own
@@ -29,8 +29,8 @@ QUICK = {"led_red.z", "camera.x", "filling.absorption", "filling.scattering", "g
 
 @pytest.fixture(scope="module")
 def bench(mitsuba):
-    from optics import scene
-    from optics.by_chance import ClearRenderer
+    from optics.light.monte_carlo import ClearRenderer
+    from optics.scene import loader as scene
 
     loaded = scene.load("magictac", {k: str(v) for k, v in DEFINES.items()})
     loaded.set({**VALUES, **{f"led_{c}.{a}": v for c, a, v in (("red", "x", -2.0), ("green", "x", 2.0), ("blue", "y", 2.0))}})
@@ -106,8 +106,8 @@ SLAB = """<scene version="3.0.0">
                                          ("glass.dispersion", [(540 / w) ** 2 - 1 for w in (620, 540, 460)])])
 def test_derivatives_by_the_index(key, factor, mitsuba, tmp_path):
     """Of a slab's transmittance T = 2n/(n^2 + 1): dT/dn = 2 (1 - n^2)/(n^2 + 1)^2, in every band by its dispersion."""
-    from optics import scene
-    from optics.by_chance import ClearRenderer
+    from optics.light.monte_carlo import ClearRenderer
+    from optics.scene import loader as scene
 
     (tmp_path / "slab.xml").write_text(SLAB)
     loaded = scene.load(tmp_path / "slab.xml")
@@ -123,8 +123,8 @@ def test_the_effect_of_roughness_is_its_square(mitsuba, tmp_path):
     """Before the edge of a luminous half plane, a plate that hardly refracts turns rays by (n - 1) times the slope of a facet, twice: the
     edge x = 0 is seen as wide as s^2 = (alpha (n - 1))^2/2 (L^2 + (L + d/n)^2), L behind the plate of the thickness d, and the integral of
     x times the picture differs by -s^2/2, to second order in the slope (2 %); its derivative by the renderer's own difference."""
-    from optics import scene
-    from optics.by_chance import ClearRenderer
+    from optics.light.monte_carlo import ClearRenderer
+    from optics.scene import loader as scene
 
     n, fov, width = 1.05, 4, 24
     text = SLAB
@@ -168,10 +168,11 @@ def test_effects_are_offered_where_they_act(bench):
 
 def test_what_light_by_chance_does_not_pass_is_refused(bench, tmp_path):
     """A picture by mi.render, in which LEDs would be dark; a curve LED by LED; films and meshes without coordinates in between."""
-    from optics import cli, scene as scenes
-    from optics.by_chance import ClearRenderer
+    from optics import cli
     from optics.errors import BadScene
-    from optics.picture import Pictures, obstacle
+    from optics.light.monte_carlo import ClearRenderer
+    from optics.light.output import Pictures, obstacle
+    from optics.scene import loader as scenes
 
     scene, _, _ = bench
     for more in ({"spp": 4}, {"stokes": True}):
@@ -213,11 +214,11 @@ def test_no_light_no_picture(bench):
 def test_the_model_differentiates_by_the_renderer(bench, tmp_path, monkeypatch):
     """One derivative of each way, through development: absorption by the ways, index by differences, a power by linearity. Faint rays
     are not thinned, which a difference would draw anew."""
-    from optics import transport
-    from optics.captures import Captures, Frame
-    from optics.noise import Noise
-    from optics.parameter import Values, Variable
-    from optics.render import Model
+    from optics.captures.capture_set import Captures, Frame
+    from optics.captures.noise import Noise
+    from optics.fit.model import Model
+    from optics.light import transport
+    from optics.scene.parameter import Values, Variable
 
     monkeypatch.setattr(transport, "FAINT", 0.0)
     scene, _, values = bench
@@ -236,10 +237,10 @@ def test_the_model_differentiates_by_the_renderer(bench, tmp_path, monkeypatch):
 
 def test_a_study_is_told_of_the_error_of_its_predictions(bench, tmp_path):
     """Four times the rays and packets halve it."""
-    from optics import loop
-    from optics.captures import Captures, Frame
-    from optics.noise import Noise
-    from optics.render import Model
+    from optics.captures.capture_set import Captures, Frame
+    from optics.captures.noise import Noise
+    from optics.fit.model import Model
+    from optics.study import loop
 
     scene, _, values = bench
     frame = Frame("one", np.zeros((*scene.camera.resolution[::-1], 3), np.float32), parameters={**values, "camera.exposure": 4000.0})

@@ -14,9 +14,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from optics.effect import IMAGE_STAGES, Effect, Registry, registry, shipped
 from optics.errors import BadPlugin
-from optics.render import POWERS
+from optics.files.output import shipped
+from optics.light.renderer import POWERS
+from optics.scene.declare import IMAGE_STAGES, Effect
+from optics.scene.registry import Registry, registry
 
 PARTS = sorted(registry().parts)
 CHANCE = ("clear", "cells", "block", "room")  # parts that light is followed through by chance: their contract stands in test_by_chance.py
@@ -145,7 +147,7 @@ class Material:
     SIDE = 32  # of the grid
 
     def __init__(self, mi, kind):
-        from optics import scene
+        from optics.scene import loader as scene
 
         self.mi = mi
         self.bsdf = mi.load_dict({"type": kind, "id": "sample"})
@@ -192,7 +194,7 @@ class Material:
 @pytest.fixture
 def bench_of(benches, mitsuba):
     """The bench on which a kind of part, or an effect, is seen; its parameters are put back afterwards."""
-    from optics import scene
+    from optics.scene import loader as scene
 
     used = []
 
@@ -386,7 +388,7 @@ def test_an_effect_sets_in_linearly_or_says_that_it_does_not(key, bench_of):
 
 def without(folder, name, *shapes):
     """A file of a shipped scene without some of its shapes."""
-    from optics import scene
+    from optics.scene import loader as scene
 
     text = scene.find(name).read_text(encoding="utf-8")
     for shape in shapes:
@@ -399,8 +401,8 @@ def without(folder, name, *shapes):
 
 def test_a_window_of_index_1_is_not_there(bench, tmp_path):
     """An effect without functions, which is never left out: the scene with and without the window."""
-    from optics import scene
-    from optics.render import Renderer
+    from optics.light.renderer import Renderer
+    from optics.scene import loader as scene
 
     file = without(tmp_path, "gelsight", "front")
     width, height = bench.scene.camera.resolution
@@ -414,7 +416,7 @@ def test_a_window_of_index_1_is_not_there(bench, tmp_path):
 
 def test_a_sheet_at_rest_and_a_film_taken_out_are_not_there(benches, tmp_path):
     """A sheet whose parameters all rest, and a film that is not inserted: the bench with and without their plates."""
-    from optics import scene
+    from optics.scene import loader as scene
 
     bench = benches("polarizer_bench")
     file = without(tmp_path, "polarizer_bench", "middle_plate", "sample_plate")
@@ -427,8 +429,8 @@ def test_a_sheet_at_rest_and_a_film_taken_out_are_not_there(benches, tmp_path):
 
 def test_a_rough_boundary_of_index_1_is_not_there_in_a_render(benches, tmp_path):
     """mi.render with and without it in the sample slot, rough as it is."""
-    from optics import scene
-    from optics.picture import Pictures
+    from optics.light.output import Pictures
+    from optics.scene import loader as scene
 
     bench = benches("polarizer_bench", slot="rough_interface")
     bare = scene.load(without(tmp_path, "polarizer_bench", "sample_plate"), bench.scene.defines)
@@ -635,7 +637,7 @@ def test_derivatives_through_a_bent_response(bench):
 @pytest.mark.parametrize("mode", ["multiplicative", "additive"])
 def test_derivatives_with_a_flat_field(bench, mode):
     """The measured background and the prediction at rest take part in every derivative."""
-    from optics.render import FLAT_FIELDS
+    from optics.fit.model import FLAT_FIELDS
 
     assert mode in FLAT_FIELDS
     height, width = bench.model.shape[:2]
@@ -802,7 +804,7 @@ def test_bounds_are_kept(kind, name, bench_of):
 
 def crossings(rng, count, bands=(620.0, 540.0, 460.0), steepest=60.0):
     """Light that passes a layer from either side, anyhow, anywhere, in any axes; (count, 1) against the bands."""
-    from optics.layers import Crossing
+    from optics.polarization.layers import Crossing
 
     theta, phi, turn = np.radians([steepest, 360, 360])[:, None] * rng.uniform(0, 1, (3, count))
     k = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), rng.choice([-1, 1], count) * np.cos(theta)], -1)
@@ -814,7 +816,7 @@ def crossings(rng, count, bands=(620.0, 540.0, 460.0), steepest=60.0):
 
 def layer_of(bench, kind, values):
     """A part of a layered scene as its functions read it."""
-    from optics.paths import part_values
+    from optics.light.paths import part_values
 
     name = next(n for n, p in bench.scene.parts.items() if p.kind == kind)
     return part_values(bench.scene, name, values, {})
@@ -822,7 +824,7 @@ def layer_of(bench, kind, values):
 
 def check_realisable(bench, kind, seed):
     """Within a plausible change of the bench a layer's own matrix, and that of each of its effects, is one of something passive."""
-    from optics.mueller import gain, physical
+    from optics.polarization.mueller import gain, physical
 
     rng = np.random.default_rng(seed)
     effects = registry().at_stage(kind, "layer")
@@ -849,7 +851,7 @@ def check_emission(bench, kind, seed):
 
 def check_readings(bench, kind):
     """Settings of many readings at once, an array along the first axis, make what they make one by one."""
-    from optics import paths
+    from optics.light import paths
 
     scene, bands = bench.scene, bench.renderer.wavelengths
     u, v = (np.array([0.4 * n]) for n in scene.camera.resolution)
@@ -873,7 +875,8 @@ def check_readings(bench, kind):
 
 def check_both_arithmetics(mi, bench, kind):
     """What mi.render meets, in Dr.Jit, is what the prediction multiplies, in numpy."""
-    from optics.layers import Crossing, evaluate, numbers_of
+    from optics.polarization.layers import Crossing, evaluate
+    from optics.scene.layer import numbers_of
 
     part, bands = registry().parts[kind], (620.0, 540.0, 460.0)
     bench.scene.set(bench.values)
@@ -882,7 +885,7 @@ def check_both_arithmetics(mi, bench, kind):
                      *(mi.Float(c.ravel().astype("f")) for c in (here.u, here.v)),
                      mi.UnpolarizedSpectrum(*bands, *bands[-1:] * (len(mi.UnpolarizedSpectrum()) - len(bands))))
     own = next(p for p in bench.scene.parts.values() if p.kind == kind)
-    found, expected = ([e for row in evaluate(kind, part.mueller, c, layer).rows for e in row] if part.mueller is not None
+    found, expected = ([e for row in evaluate(part.mueller, c, layer, registry().at_stage(kind, "layer")).rows for e in row] if part.mueller is not None
                        else part.stokes(c, layer)
                        for c, layer in ((there, numbers_of(own)), (here, layer_of(bench, kind, bench.values))))
     for dr_entry, entry in zip(found, expected):
@@ -1006,7 +1009,7 @@ BAD_LAYER = {
 def user_bench(tmp_path, load_bench, monkeypatch):
     """Writes a plugin, or several by the names of their files, into a user's folder and loads a shipped scene with it as a bench, in a
     registry of its own."""
-    import optics.effect as declarations
+    import optics.scene.registry as declarations
 
     usual = declarations.registry()
 
@@ -1092,7 +1095,7 @@ def test_the_contract_notices_in_layers(fault, user_bench, mitsuba):
 
 
 def test_stubs_of_new_effects_meet_the_contract(user_bench):
-    from optics import draft
+    from optics.study import draft
 
     bench = user_bench({f"my_{stage}": draft.new_effect(f"my {stage}", stage) for stage in draft.STUBS})
     for stage in draft.STUBS:
@@ -1121,8 +1124,8 @@ def along(name):
 @pytest.fixture
 def drafts(user_bench):
     """A bench with a draft along every coordinate that one can follow, each a gain that is linear in it; LED 1 alone is lit."""
-    from optics import draft
-    from optics.verdict import Fingerprint
+    from optics.diagnosis.verdict import Fingerprint
+    from optics.study import draft
 
     texts = {}
     for name in draft.CARRIERS:
@@ -1142,7 +1145,8 @@ def draft_key(name):
 
 def test_drafts_act_along_the_coordinate_that_was_diagnosed(drafts):
     """What a draft's stage computes is what the fingerprint was binned by, pixel by pixel, but at rims and where a press's edge bends."""
-    from optics import draft, fingerprints
+    from optics.diagnosis import fingerprints
+    from optics.study import draft
 
     bench = drafts
     known = {**bench.model.coordinates(bench.at(), 0), **fingerprints.lit_geometry(bench.model, bench.at(), 0)}

@@ -160,7 +160,7 @@ def gelsight(tmp_path, variant, leds=None, window=True, size=(32, 24), stokes=Fa
     """The GelSight-type scene, pressed; with some LEDs only, without its window, without bands, or with Stokes channels."""
     import re
 
-    from optics import scene
+    from optics.scene import loader as scene
 
     text = scene.find("gelsight").read_text(encoding="utf-8")
     if leds is not None:
@@ -213,7 +213,7 @@ def test_interreflection_scales_the_second_bounce_alone(mitsuba):
 
 def test_led_by_led_is_what_the_integrator_renders(mitsuba, tmp_path):
     """Renderer.led at four times the resolution, averaged, against mi.render with `tactile`, per band."""
-    from optics.render import Renderer
+    from optics.light.renderer import Renderer
 
     fine = gelsight(tmp_path, SPECTRAL, leds=["led_2"], size=(160, 120))
     values = fine.values()
@@ -229,7 +229,7 @@ def test_led_by_led_is_what_the_integrator_renders(mitsuba, tmp_path):
 
 def test_all_leds_and_two_bounces_are_what_the_integrator_renders(mitsuba, tmp_path):
     """The prediction's linear image (six LEDs, powers, interreflection, absorption) against mi.render with `tactile`."""
-    from optics.render import Renderer
+    from optics.light.renderer import Renderer
 
     fine = gelsight(tmp_path, SPECTRAL, size=(160, 120))
     powers = {f"led_{k}.power": 0.4 + 0.1 * k for k in range(1, 7)}
@@ -263,7 +263,7 @@ EFFECTS = {"gel.absorption": 0.05, "gel.haze": 0.03, "gel.height_loss": 0.2, "me
 @pytest.mark.parametrize("key", EFFECTS)
 def test_effects_of_light_are_in_both_renders(mitsuba, tmp_path, key):
     """What an effect changes, LED by LED and by mi.render: the same in every pixel."""
-    from optics.render import Renderer
+    from optics.light.renderer import Renderer
 
     scene = gelsight(tmp_path, SPECTRAL, leds=["led_2"], stokes=True, size=(40, 30))
     assert key in scene.parameters
@@ -285,7 +285,7 @@ def test_effects_of_light_are_in_both_renders(mitsuba, tmp_path, key):
 
 def test_bands_are_the_monochrome_renders_of_stock_path(mitsuba, tmp_path):
     """One spectral render with bands is three mono renders by `path`, each with the band's reflectance."""
-    from optics.effect import use_variant
+    from optics.scene.mitsuba_parts import use_variant
 
     rho = (0.8, 0.5, 0.25)
     scene = gelsight(tmp_path, SPECTRAL, window=False, stokes=True)
@@ -304,9 +304,9 @@ def test_bands_are_the_monochrome_renders_of_stock_path(mitsuba, tmp_path):
 
 def test_a_mono_variant_refuses_three_bands(mitsuba, tmp_path):
     """It would render the first band three times."""
-    from optics.effect import use_variant
     from optics.errors import BadScene
-    from optics.render import Renderer
+    from optics.light.renderer import Renderer
+    from optics.scene.mitsuba_parts import use_variant
 
     try:
         with pytest.raises(BadScene, match="3 bands.*carries 1"):
@@ -436,8 +436,8 @@ def test_stokes_vectors_turn_with_our_camera(mitsuba):
 
 def test_painted_edges_are_as_smooth_as_those_of_shapes(mitsuba):
     """The chequers of the finger's wall against a picture eight times as fine: within what the samples of a rim resolve of a step of 0.4."""
-    from optics import scene as scenes
-    from optics.render import Renderer
+    from optics.light.renderer import Renderer
+    from optics.scene import loader as scenes
 
     def picture(width):
         scene = scenes.load("vi2tap", {"width": str(width), "height": str(width * 3 // 4)})

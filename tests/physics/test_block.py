@@ -38,7 +38,7 @@ SIGMAS = 5.0
 
 @pytest.fixture
 def load(tmp_path, mitsuba):
-    from optics import scene
+    from optics.scene import loader as scene
 
     (tmp_path / "scene.xml").write_text(SCENE)
     return lambda variant="llvm_ad_spectral_polarized", **defines: scene.load(
@@ -125,7 +125,7 @@ def volume_of(corner):
 def test_a_cell_that_was_not_filled(load):
     """Where it is the only one, as if the filling were air; half filled, half of what makes it differ; and the derivative by the filling's
     absorption, of what is left of it."""
-    from optics.transport import Transport
+    from optics.light.transport import Transport
 
     one = dict(columns=1, rows=1, layers=1, scattering=0.2)
     pictures = []
@@ -144,7 +144,7 @@ def test_a_cell_that_was_not_filled(load):
 @pytest.mark.parametrize("scattering", [pytest.param(0.0, marks=pytest.mark.slow), 0.5])
 def test_a_pressed_grid_by_two_routes(load, scattering):
     """Maps against rays that find the lamp by themselves, in contact: the target's light and the cells' (z, and the mean)."""
-    from optics.transport import Transport
+    from optics.light.transport import Transport
 
     t = Transport(load(distance=-0.5, scattering=scattering))
     quick, slow = t.take(rays=256, packets=150_000), t.take(rays=6000, reach="paths", seed=3)

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from optics.gel.contact import surface
-from optics.gel.halfspace import carried
+from optics.skin.contact import surface
+from optics.skin.halfspace import carried
 
 SCENE = """<scene version="3.0.0">
     <default name="depth" value="0"/>
@@ -28,7 +28,7 @@ ORIGIN = 2e-5  # mm: the same of a ray that comes from 60 mm away, some operatio
 
 @pytest.fixture
 def load(tmp_path, mitsuba):
-    from optics import scene
+    from optics.scene import loader as scene
 
     def load(text, depth=0, variant="llvm_ad_spectral_polarized"):
         file = tmp_path / "skin.xml"

@@ -447,8 +447,8 @@ def fresnel(n, c1):
 
 def test_two_media_window_bends_and_dims_as_by_hand(mitsuba, tmp_path):
     """Where each pixel's ray meets z = 0 through air, acrylic and gel, and the share of radiance that arrives."""
-    from optics import scene
-    from optics.render import Renderer
+    from optics.light.renderer import Renderer
+    from optics.scene import loader as scene
 
     file = tmp_path / "windowed.xml"
     file.write_text(WINDOWED)
@@ -589,7 +589,7 @@ def changed(view, **values):
 
 
 def test_response_is_the_inverse_of_its_cubic(mitsuba):
-    from optics.develop import STEP, inverse_cubic
+    from optics.light.development import STEP, inverse_cubic
 
     irradiance = np.concatenate([np.linspace(0, 1, 2001), RNG(10).uniform(0, 1, 500)])
     for a, b in ((0.3, 0.1), (-0.4, 0.2), (0.6, -0.3), (0.9, 0.0), (0.0, -0.4), (0.0, 0.0)):
@@ -621,7 +621,7 @@ def test_vignetting_is_cos_to_the_fourth(bench, view):
 
 
 def effects():
-    from optics.effect import registry
+    from optics.scene.registry import registry
 
     return registry().effects
 
@@ -654,7 +654,7 @@ def test_glare_and_crosstalk_keep_the_light(view):
 
 def test_bend_and_the_chain_to_digital_numbers(bench):
     """DN = black + (saturation - black) m, m = G^-1(exposure gain M L) + bend m (1 - m)."""
-    from optics.develop import Developer, inverse_cubic
+    from optics.light.development import Developer, inverse_cubic
 
     camera = bench.scene.camera
     developer = Developer(camera, bench.scene.integrator.bands, black=7.0, saturation=250.0)
@@ -725,8 +725,8 @@ def test_the_second_bounce_is_absorbed_on_its_last_way_too(mitsuba, tmp_path):
     """Same paths with and without absorption: each loses at least what the ways to the camera and from the LED take."""
     import re
 
-    from optics import scene
-    from optics.render import Renderer
+    from optics.light.renderer import Renderer
+    from optics.scene import loader as scene
 
     file = tmp_path / "open.xml"
     file.write_text(re.sub(r'<shape type="rectangle".*?</shape>', "", WINDOWED, flags=re.S))

@@ -1,4 +1,4 @@
-"""Closed forms and smoothness of a pressed skin: optics/gel/contact.py."""
+"""Closed forms and smoothness of a pressed skin: optics/skin/contact.py."""
 
 import math
 
@@ -6,8 +6,15 @@ import numpy as np
 import pytest
 
 from optics.errors import UnknownKey
-from optics.gel.contact import (
-    LocalMap, cone_envelope, displacement, gaussian_blur, graded_axis, grid_normals, indenter_profile, ring_bulge,
+from optics.skin.contact import (
+    LocalMap,
+    cone_envelope,
+    displacement,
+    gaussian_blur,
+    graded_axis,
+    grid_normals,
+    indenter_profile,
+    ring_bulge,
     surface,
 )
 

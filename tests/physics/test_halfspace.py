@@ -1,12 +1,12 @@
-"""A dent's reach into the skin against Boussinesq's and Hertz' closed forms, and against equilibrium: optics/gel/halfspace.py."""
+"""A dent's reach into the skin against Boussinesq's and Hertz' closed forms, and against equilibrium: optics/skin/halfspace.py."""
 
 import math
 
 import numpy as np
 import pytest
 
-from optics.gel.contact import LocalMap, displacement, indenter_profile, local_axis, surface
-from optics.gel.halfspace import carried, stress_integrals
+from optics.skin.contact import LocalMap, displacement, indenter_profile, local_axis, surface
+from optics.skin.halfspace import carried, stress_integrals
 
 # Three loads P_i s_i / (2 pi (r^2 + s_i^2)^1.5), point loads seen from s_i further away (mm, G = 1): chosen so that P and P s^2
 # sum to 0, and the dent with its tails in 1/r and 1/r^3 ends within the map

@@ -1,4 +1,4 @@
-"""Lattice springs of a grid skin: the continuum they stand for, finite elements, motion, contact: optics/gel/lattice.py."""
+"""Lattice springs of a grid skin: the continuum they stand for, finite elements, motion, contact: optics/skin/lattice.py."""
 
 import math
 from functools import lru_cache
@@ -7,9 +7,29 @@ from itertools import product
 import numpy as np
 import pytest
 
-from optics.gel.lattice import (
-    CHI, SPRINGS, CORNERS, WEIGHTS, Deformed, Lattice, Material, Push, Springs, balance, cells, equivalent, grid_material,
-    inverted, motion, nodes, plate, punch, settle, sphere, spring_constants, volume_ratio,
+from optics.skin.lattice import (
+    CHI,
+    CORNERS,
+    SPRINGS,
+    WEIGHTS,
+    Deformed,
+    Lattice,
+    Material,
+    Push,
+    Springs,
+    balance,
+    cells,
+    equivalent,
+    grid_material,
+    inverted,
+    motion,
+    nodes,
+    plate,
+    punch,
+    settle,
+    sphere,
+    spring_constants,
+    volume_ratio,
 )
 
 RATIOS = (0.0, 0.1, 0.25, 0.3, 0.47, 0.499)
@@ -180,7 +200,7 @@ def test_loaded_block_strains_by_young_and_poisson(poisson, stress):
 
 @pytest.mark.parametrize("poisson", (0.1, 0.3, 0.47))
 def test_forces_are_the_energys_slope_and_stiffness_that_of_forces(poisson):
-    from optics.gel.lattice import _assembled
+    from optics.skin.lattice import _assembled
 
     random = np.random.default_rng(1)
     skin = Lattice((3, 4, 3), 0.7, Material(1.0, poisson), factors=random.uniform(0.5, 2, (2, 3, 2)))
@@ -442,7 +462,7 @@ def test_energy_is_kept_to_second_order():
 
 
 def test_the_longest_step_is_safe_and_no_smaller_than_needed():
-    from optics.gel.lattice import _assembled
+    from optics.skin.lattice import _assembled
 
     skin = Lattice((4, 4, 4), 0.8, RUBBER, factors=np.random.default_rng(0).uniform(0.2, 3, (3, 3, 3)))
     stiffness = _assembled(skin, skin.positions.reshape(-1, 3))[0].toarray()

@@ -14,10 +14,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from optics import mueller, paths
-from optics.develop import STEP
-from optics.effect import registry
-from optics.layers import Crossing, evaluate
+from optics.light import paths
+from optics.light.development import STEP
+from optics.polarization import mueller
+from optics.polarization.layers import Crossing, evaluate
+from optics.scene.registry import registry
 
 RNG = np.random.default_rng  # every test seeds its own
 MONO, SPECTRAL = "llvm_ad_mono_polarized", "llvm_ad_spectral_polarized"
@@ -129,8 +130,8 @@ STACK = """<scene version="3.0.0">
 
 
 def loaded(file, variant, **defines):
-    from optics import scene
-    from optics.render import Renderer
+    from optics.light.renderer import Renderer
+    from optics.scene import loader as scene
 
     found = scene.load(file, {"bands": BANDS[variant], **defines}, variant)
     return found, Renderer(found)
@@ -151,7 +152,7 @@ def bench(variant, **defines):
 
 def centred(name, folder):
     """A shipped scene whose renders take one sample per pixel, in its middle."""
-    from optics import scene
+    from optics.scene import loader as scene
 
     text = scene.find(name).read_text(encoding="utf-8")
     start, end = text.index("<sampler"), text.index("</sampler>") + len("</sampler>")
@@ -811,7 +812,7 @@ def test_layers_are_physical_for_all_settings_and_directions(mitsuba, kind):
         if "stress_pattern" in own:
             own["stress_pattern"] = pattern
         own = {"name": kind, "field": None, **own}
-        found = evaluate(kind, registry().parts[kind].mueller, crossing, SimpleNamespace(**own)).numpy()
+        found = evaluate(registry().parts[kind].mueller, crossing, SimpleNamespace(**own), registry().at_stage(kind, "layer")).numpy()
         assert np.isfinite(found).all()
         dark = found[..., 0, 0] < 1e-12  # of a film that lets nothing through eigenvalues are rounding
         assert dark.mean() < 0.05
@@ -851,7 +852,8 @@ def test_slabs_with_reflecting_faces_keep_the_energy(mitsuba):
             faces = (1 - share) ** 2
             own.update(wobble_c=0.0, wobble_s=0.0, inserted=1.0, transmittance=own["transmittance"] * faces, leak_tilt=0.0,
                        leak=own["leak"] / 2 * faces, leak_oblique=own["leak_oblique"] * faces)
-        matrices = evaluate(kind, registry().parts[kind].mueller, crossing, SimpleNamespace(name=kind, field=None, **own))
+        matrices = evaluate(registry().parts[kind].mueller, crossing, SimpleNamespace(name=kind, field=None, **own),
+                                registry().at_stage(kind, "layer"))
         slab = mueller.Slab(matrices)
         if kind == "polarizer_film":
             slab = paths.slab("film", matrices, {"film.face": share.ravel(), "film.inserted": 1.0})

@@ -31,7 +31,7 @@ def test_the_solid_angle_and_even_directions(shape, place):
     import drjit as dr
     import mitsuba as mi
 
-    from optics.solid_angle import Rectangle
+    from optics.light.solid_angle import Rectangle
 
     side = 400
     u = (np.arange(side) + 0.5) / side
@@ -59,7 +59,7 @@ def test_the_solid_angle_and_even_directions(shape, place):
 
 def test_what_is_no_rectangle(mitsuba):
     mi = mitsuba
-    from optics.solid_angle import Rectangle
+    from optics.light.solid_angle import Rectangle
 
     sheared = mi.ScalarTransform4f([[1, 0.5, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
     assert Rectangle.of(mi.load_dict({"type": "rectangle", "to_world": sheared})) is None

@@ -49,8 +49,8 @@ def grid(cells, bsdf, pitch=0.8, wall=0.2, skin=0.5):
 
 
 def load(folder, bodies, fov=1.0, variant=SPECTRAL, bands="620, 540, 460", **defines):
-    from optics import scene
-    from optics.transport import Transport
+    from optics.light.transport import Transport
+    from optics.scene import loader as scene
 
     file = folder / "scene.xml"
     file.write_text(SCENE.replace("BANDS", bands).replace("FOV", str(fov)).replace("BODIES", "\n    ".join(bodies)))
@@ -126,7 +126,7 @@ def test_the_furnace_neither_gains_nor_loses(tmp_path, mitsuba):
 
 def test_light_goes_both_ways_alike(tmp_path, mitsuba):
     """Power from panel A on panel B through a grid, and from B on A: per radiance and area the same (reciprocity)."""
-    from optics.transport import BATCHES, Run
+    from optics.light.transport import BATCHES, Run
 
     power = []
     for lamp, target in ((-1, 1), (1, -1)):
@@ -244,7 +244,7 @@ def followed(t, p, d, steps, x=None, group=(0, 1, 2)):
     import drjit as dr
     import mitsuba as mi
 
-    from optics.transport import Run
+    from optics.light.transport import Run
 
     run, count, width = Run(t, list(group), 1, 5), len(p), 15
     log = dr.zeros(mi.Float, count * steps * width)
@@ -315,7 +315,7 @@ def test_one_cell_ray_by_ray(tmp_path, mitsuba):
 
 
 def stokes(a, b):
-    """Stokes vector of a field; circular as optics.mueller has it: a quarter-wave plate, fast at 45 degrees, makes S3 > 0 of x."""
+    """Stokes vector of a field; circular as optics.polarization.mueller has it: a quarter-wave plate, fast at 45 degrees, makes S3 > 0 of x."""
     return np.array([abs(a) ** 2 + abs(b) ** 2, abs(a) ** 2 - abs(b) ** 2, 2 * (a * np.conj(b)).real, 2 * (a * np.conj(b)).imag])
 
 
@@ -495,14 +495,14 @@ def test_stock_volpath_sees_the_same(tmp_path, mitsuba, roughness):
 
 def test_derivatives_by_absorption(tmp_path, mitsuba, monkeypatch):
     """Against central differences with common random numbers; faint rays are not thinned, which would draw anew."""
-    from optics import transport
+    from optics.light import transport
 
     monkeypatch.setattr(transport, "FAINT", 0.0)
 
     def at(wall, fill, slopes):
         t = load(tmp_path, little_grid(0.2), fov=9, size=4)
         t.scene.set({"walls.absorption": wall, "filling.absorption": fill})
-        from optics.transport import Transport
+        from optics.light.transport import Transport
 
         return Transport(t.scene).take(rays=512, packets=100_000, slopes=slopes)
 
@@ -526,8 +526,8 @@ def test_what_is_nested_wrongly_is_refused(tmp_path, mitsuba):
 def test_the_stated_error_is_that_between_seeds(mitsuba):
     """Variance of eight pictures, pixel by pixel, over the mean of the squares of their stated errors: 1, and .01 by chance (measured over
     six sets; pixels share maps). Generators that start beside one another gave 1.4."""
-    from optics import scene as scenes
-    from optics.transport import Transport
+    from optics.light.transport import Transport
+    from optics.scene import loader as scenes
 
     transport = Transport(scenes.load("grid_bench", {"width": "16", "height": "12"}))
     taken = [transport.take(256, 50_000, seed=seed) for seed in range(8)]

@@ -1,4 +1,4 @@
-"""A touch sensor in numpy that speaks the language of `optics.render.Model`, to judge `diagnose` on known truths in seconds.
+"""A touch sensor in numpy that speaks the language of `optics.fit.model.Model`, to judge `diagnose` on known truths in seconds.
 
 A plane that balls press into (smooth cap), six point LEDs (two per colour), a camera above. Ten effects, among them
 one-sided ones, one whose onset is quadratic (defocus width), one with a strength per frame (flicker); five more exist
@@ -12,11 +12,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from optics.effect import Effect
+from optics.captures.noise import Noise
+from optics.diagnosis.statistics import cosines
 from optics.errors import Underdetermined
-from optics.noise import Noise
-from optics.parameter import Parameter, Values, Variable
-from optics.statistics import cosines
+from optics.scene.declare import Effect
+from optics.scene.parameter import Parameter, Values, Variable
 
 STEP = 1e-30
 RADIUS, EDGE = 4.0, 0.05  # mm: ball, softness of the rim of the contact

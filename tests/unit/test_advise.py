@@ -11,11 +11,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from optics import advise, design, statistics
-from optics.diagnose import diagnose
-from optics.evidence import Candidate, measure
-from optics.parameter import Parameter, Values
-from optics.verdict import CLEAR, MARGIN, Advice, Apart, Diagnosis
+from optics.diagnosis import advice as advise
+from optics.diagnosis import statistics
+from optics.diagnosis.diagnose import diagnose
+from optics.diagnosis.evidence import Candidate, measure
+from optics.diagnosis.verdict import CLEAR, MARGIN, Advice, Apart, Diagnosis
+from optics.scene.parameter import Parameter, Values
+from optics.study import design
 
 sys.path.insert(0, str(Path(__file__).parent))
 from mock_model import LEDS, LIBRARY, Frame, MockModel, mock_fit  # noqa: E402
@@ -159,7 +161,7 @@ def test_an_effect_per_frame_has_a_strength_of_its_own_in_a_shot():
 
 
 def test_gaps_are_those_of_a_diagnosis():
-    """D and what is visible as optics.statistics has them: columns that the base has twice or absorbs, strengths with one side, several."""
+    """D and what is visible as optics.diagnosis.statistics has them: columns that the base has twice or absorbs, strengths with one side, several."""
     rng = np.random.default_rng(8)
     j = rng.standard_normal((200, 9))
     j[:, 1] = j[:, 0]  # a direction that no calibration determines

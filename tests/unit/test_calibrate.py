@@ -5,10 +5,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from optics import calibrate
-from optics.calibrate import Descent, Fit, Normal, extended, fit, for_frames, solve, warnings_of
-from optics.noise import Noise
-from optics.parameter import Parameter, Values, Variable
+from optics.captures.noise import Noise
+from optics.fit import calibrate
+from optics.fit.calibrate import Descent, Fit, Normal, extended, fit, for_frames, solve, warnings_of
+from optics.scene.parameter import Parameter, Values, Variable
 
 
 def problem(rng, n, flat=0):

@@ -8,11 +8,12 @@ import pytest
 import tifffile
 from PIL import Image
 
-from optics import captures, exr
+from optics.captures import capture_set as captures
+from optics.captures.noise import Noise
 from optics.errors import BadCapture, OutOfBounds, OutputExists, UnknownKey
-from optics.images import read_image
-from optics.noise import Noise
-from optics.parameter import Parameter
+from optics.files import exr
+from optics.files.images import read_image
+from optics.scene.parameter import Parameter
 
 NOISE = ("[noise]\nsystem_gain = 0.05\ndark_noise = 1.5\nblack_level = 8.0\nsaturation = 255.0\nprnu = 0.003\n")
 FRAME = '[[frames]]\nimage = "frames/000.png"\n'

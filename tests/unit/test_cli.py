@@ -9,10 +9,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from optics import captures as capture_files, cli, exr, scene
-from optics.noise import Noise
-from optics.parameter import Values
-from optics.picture import Pictures
+from optics import cli
+from optics.captures import capture_set as capture_files
+from optics.captures.noise import Noise
+from optics.files import exr
+from optics.light.output import Pictures
+from optics.scene import loader as scene
+from optics.scene.parameter import Values
 
 SIZE = ["-D", "width=64", "-D", "height=48"]
 HEAVY = ("mitsuba", "drjit", "numpy", "scipy", "matplotlib", "colour", "pydantic", "rich.console")
@@ -108,7 +111,7 @@ def test_effects_and_their_pages(optics):
 
 
 def test_parts_have_pages_too(optics):
-    from optics.effect import registry
+    from optics.scene.registry import registry
 
     found, (_, text, _) = registry(), optics("effects")
     assert not set(found.parts) & set(found.effects) and text.splitlines()[-1].endswith(", ".join(sorted(found.parts)))
@@ -122,10 +125,10 @@ def test_parts_have_pages_too(optics):
 
 
 def test_a_users_plugin_is_listed_beside_the_shipped_ones(optics, tmp_path, monkeypatch):
-    from optics import effect
+    from optics.scene import registry as effect
 
     monkeypatch.setattr(effect, "_registry", None)
-    (tmp_path / "rust.py").write_text('"""Rust: reddens."""\nfrom optics.effect import Effect\nfrom optics.parameter import '
+    (tmp_path / "rust.py").write_text('"""Rust: reddens."""\nfrom optics.scene.declare import Effect\nfrom optics.parameter import '
                                       'Parameter\neffect = Effect("rust", "membrane", (Parameter("rust", "1", 0.0, neutral=0.0),))\n')
     code, page, _ = optics("effects", "rust", "--plugins", tmp_path)
     assert code == 0 and "reddens" in page
@@ -321,7 +324,7 @@ def test_calibrate_writes_a_study_that_compare_can_use(optics, measured, tmp_pat
                             "led_1.power=+-1", "--hold-out", "press-2", "-o", study)
     assert code == 0, err
     assert out.splitlines()[-1] == str(study) and "warning: 8 bit" in err
-    from optics.ladder import Study
+    from optics.study.record import Study
 
     found = {v["name"]: v for v in Study.open(study).steps[0]["variables"]}
     for name in ("led_1.power", "led_3.power"):
@@ -336,7 +339,7 @@ def test_calibrate_writes_a_study_that_compare_can_use(optics, measured, tmp_pat
 
 
 def test_values_of_a_fit_hold_for_their_frames(measured, tmp_path):
-    from optics import loop
+    from optics.study import loop
 
     (tmp_path / "fit.toml").write_text('[parameters]\n"led_1.x" = 10.5\n[frames.p1-led_3]\n"gel.press_x" = 1.5\n')
     model = loop.open_model(loop.Setup(captures=str(measured)))

@@ -7,8 +7,8 @@ import json
 import numpy as np
 import pytest
 
-from optics.compare import Comparison, compare, led_label
 from optics.errors import Underdetermined
+from optics.fit.compare import Comparison, compare, led_label
 
 H, W, C = 24, 32, 3
 

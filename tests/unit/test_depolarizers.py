@@ -4,7 +4,7 @@ import warnings
 
 import pytest
 
-from optics import scene as scenes
+from optics.scene import loader as scenes
 
 WINDOW = """
     <shape type="rectangle" id="extra">

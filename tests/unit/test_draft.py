@@ -13,14 +13,25 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from optics import draft
-from optics.effect import Registry, declared, shipped
+from optics.diagnosis.evidence import measure
+from optics.diagnosis.fingerprints import (
+    families,
+    family_of,
+    fingerprints,
+    fixed_pattern,
+    fixed_text,
+    goes_with,
+    lit_geometry,
+    places,
+    unexplained,
+)
+from optics.diagnosis.statistics import Sweeps
+from optics.diagnosis.verdict import Basis, Family, Fingerprint
 from optics.errors import OutputExists, UnknownKey
-from optics.evidence import measure
-from optics.fingerprints import families, family_of, fingerprints, fixed_pattern, fixed_text, goes_with, lit_geometry, places, unexplained
+from optics.files.output import shipped
 from optics.lookup import lookup
-from optics.statistics import Sweeps
-from optics.verdict import Basis, Family, Fingerprint
+from optics.scene.registry import Registry, declared
+from optics.study import draft
 
 sys.path.insert(0, str(Path(__file__).parent))
 from mock_model import MockModel, mock_fit, simulate  # noqa: E402
@@ -346,7 +357,7 @@ def study(tmp_path):
 
 @pytest.fixture
 def own_registry(monkeypatch):
-    import optics.effect as declarations
+    import optics.scene.registry as declarations
 
     fresh = Registry()
     fresh.scan(shipped("plugins"))
@@ -421,7 +432,7 @@ def test_a_study_without_a_diagnosis_or_without_a_gel(study, own_registry, optic
 
 
 def test_names_that_functions_of_a_camera_see_are_those_that_no_effect_may_take():
-    from optics.develop import Developer
+    from optics.light.development import Developer
 
     own = {"x_fov": 40.0, "principal_x": 0.0, "principal_y": 0.0, "aspect": 1.0}
     camera = SimpleNamespace(name="camera", resolution=(4, 3), sensitivity="identity", numbers={n: SimpleNamespace(neutral=None) for n in own})
@@ -439,11 +450,11 @@ def test_no_effect_is_called_new(tmp_path, own_registry):
 
 @pytest.mark.parametrize("word", ["takes", "held", "eval"])  # of every part, of an instance, of Mitsuba's own classes
 def test_no_parameter_hides_what_its_part_has(word, tmp_path, own_registry):
-    from optics.effect import use_variant
     from optics.errors import BadPlugin
+    from optics.scene.mitsuba_parts import use_variant
 
     (tmp_path / "glint.py").write_text(
-        "from optics.effect import Effect\nfrom optics.parameter import Parameter\n\n"
+        "from optics.scene.declare import Effect\nfrom optics.scene.parameter import Parameter\n\n"
         f"GLINT = Effect(name='glint', part='membrane', parameters=(Parameter('{word}', '1', 0.0, neutral=0.0),))\n")
     own_registry.scan(tmp_path)
     with pytest.raises(BadPlugin, match=f"glint.py: parameter '{word}' has the name of something else"):
@@ -454,8 +465,8 @@ def test_no_parameter_hides_what_its_part_has(word, tmp_path, own_registry):
 
 
 def test_components_find_what_frames_have_in_common():
-    from optics.ladder import Shown
-    from optics.residual_maps import components
+    from optics.pages.residual_maps import components
+    from optics.study.record import Shown
 
     rng = np.random.default_rng(0)
     one, pattern = np.ones((20, 30, 1)), np.sin(np.arange(30) / 3)[None, :, None] * np.ones((20, 1, 1))
@@ -474,8 +485,8 @@ def test_components_find_what_frames_have_in_common():
 
 
 def test_pages_are_of_the_first_and_the_last_step():
-    from optics.compare import compare
-    from optics.residual_maps import coordinates, pages
+    from optics.fit.compare import compare
+    from optics.pages.residual_maps import coordinates, pages
 
     rng = np.random.default_rng(4)
     images, one = rng.standard_normal((6, 32, 48, 3)), np.ones((32, 48, 3))
@@ -495,8 +506,8 @@ def picture(uri):
 
 def test_colours_of_noise_are_alike_in_a_picture_and_in_a_mosaic():
     """In a mosaic a block holds a quarter of the pixels of a channel, and its mean scatters twice as much."""
-    from optics.compare import compare
-    from optics.residual_maps import colours, regions
+    from optics.fit.compare import compare
+    from optics.pages.residual_maps import colours, regions
 
     rng = np.random.default_rng(2)
     images, full = rng.standard_normal((8, 128, 128, 3)), np.ones((128, 128, 3), bool)
@@ -511,8 +522,8 @@ def test_colours_of_noise_are_alike_in_a_picture_and_in_a_mosaic():
 
 
 def test_regions_tell_a_wrong_mean_from_a_wide_spread():
-    from optics.compare import compare
-    from optics.residual_maps import regions
+    from optics.fit.compare import compare
+    from optics.pages.residual_maps import regions
 
     rng = np.random.default_rng(1)
     images = rng.standard_normal((12, 32, 48, 1))

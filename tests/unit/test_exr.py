@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from optics import exr
+from optics.files import exr
 
 
 @pytest.fixture

@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from optics.captures import Captures, Frame
+from optics.captures.capture_set import Captures, Frame
+from optics.captures.noise import Noise
 from optics.errors import UnknownKey
-from optics.noise import Noise
-from optics.parameter import Values, Variable
+from optics.scene.parameter import Values, Variable
 
 WIDTH, HEIGHT = 48, 36  # px
 PRESSED = {"gel.press_x": 1.0, "gel.press_y": -0.5, "gel.press_depth": 0.4}
@@ -18,8 +18,8 @@ KEYS = {"camera.gain": 1.03, "camera.gain_g": 0.98, "led_1.power": 1.2, "led_1.p
 
 @pytest.fixture(scope="module")
 def models(mitsuba):
-    from optics import scene
-    from optics.render import Model
+    from optics.fit.model import Model
+    from optics.scene import loader as scene
 
     loaded = scene.load("gelsight", {"width": WIDTH, "height": HEIGHT})
     frame = Frame("press", np.zeros((HEIGHT, WIDTH, 3), np.float32), parameters=dict(PRESSED))
@@ -29,7 +29,7 @@ def models(mitsuba):
 
 
 def test_modes_are_named_and_others_refused(models):
-    from optics.render import Model
+    from optics.fit.model import Model
 
     model = models["additive"]
     assert Model(model.scene, model.captures).flat_field == "multiplicative" and models[None].flat is None

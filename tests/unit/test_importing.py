@@ -5,7 +5,8 @@ import json
 import numpy as np
 import pytest
 
-from optics import captures, importing
+from optics.captures import capture_set as captures
+from optics.captures import importing
 from optics.errors import BadCapture, OutputExists
 
 H, W, R = 48, 64, 8  # px
@@ -68,7 +69,7 @@ def test_binning_averages_and_keeps_saturation():
 
 
 def test_depth_of_a_touched_radius_is_what_the_skin_does():
-    from optics.gel import contact
+    from optics.skin import contact
 
     depth = importing.depth_of(1.2, 2.5, 0.7)
     profile = contact.indenter_profile("sphere", 2.5, (0, 0, 0), 6.0, 0.05)

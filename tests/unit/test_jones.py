@@ -6,10 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from optics import captures, jones
+from optics.captures import capture_set as captures
+from optics.captures.noise import Noise
 from optics.errors import BadCapture, OutputExists, UnknownKey
-from optics.jones import Photodiode, Polarizer, Sample, Source, Truth
-from optics.noise import Noise
+from optics.proof.makers import bench as jones
+from optics.proof.makers.bench import Photodiode, Polarizer, Sample, Source, Truth
 
 DIODE = Noise(system_gain=0.5, dark_noise=1.5, black_level=100.0, saturation=4095.0, prnu=0.0)
 RGB = np.array([620.0, 540.0, 460.0])  # nm
@@ -330,8 +331,8 @@ def test_shares_no_optics_with_the_models():
     """What a fit is tried on must not come from the code that is fitted."""
     import subprocess
 
-    loaded = subprocess.run([sys.executable, "-c", "import sys, optics.jones; print(*sys.modules)"], text=True, capture_output=True,
+    loaded = subprocess.run([sys.executable, "-c", "import sys, optics.proof.makers.bench; print(*sys.modules)"], text=True, capture_output=True,
                             check=True).stdout.split()
-    models = ("optics.mueller", "optics.layers", "optics.render", "optics.scene", "optics.develop", "optics.effect", "plugins",
+    models = ("optics.polarization.mueller", "optics.polarization.layers", "optics.light.renderer", "optics.scene.loader", "optics.light.development", "optics.scene.registry", "plugins",
               "mitsuba", "drjit")
-    assert "optics.jones" in loaded and not [name for name in loaded if name.startswith(models)]
+    assert "optics.proof.makers.bench" in loaded and not [name for name in loaded if name.startswith(models)]

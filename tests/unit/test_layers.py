@@ -5,11 +5,11 @@ import shutil
 import numpy as np
 import pytest
 
-from optics import scene as scenes
-from optics.effect import registry
 from optics.errors import BadScene, UnknownKey
-from optics.layers import PatternImage
-from optics.render import Renderer
+from optics.light.renderer import Renderer
+from optics.scene import loader as scenes
+from optics.scene.layer import PatternImage
+from optics.scene.registry import registry
 
 CAMERA = {"width": "24", "height": "24", "x_fov": "6", "analyzer": "90"}
 

@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from optics import scene
-from optics.captures import Captures, Frame, cfa_channel
-from optics.noise import Noise
-from optics.parameter import Values, Variable
-from optics.render import Model
+from optics.captures.capture_set import Captures, Frame, cfa_channel
+from optics.captures.noise import Noise
+from optics.fit.model import Model
+from optics.scene import loader as scene
+from optics.scene.parameter import Values, Variable
 
 PATTERN = "GBRG"
 
@@ -44,7 +44,7 @@ def test_the_prediction_is_that_of_the_colour_camera_at_the_filters(models):
 
 
 def test_a_fit_finds_the_reflectance_of_each_channel(models):
-    from optics import calibrate
+    from optics.fit import calibrate
 
     _, mosaic, _ = models
     free = [Variable(f"membrane.rho_{c}", (f"membrane.rho_{c}",), mosaic.parameters[f"membrane.rho_{c}"]) for c in "rgb"]

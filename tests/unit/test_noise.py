@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from optics.captures import Captures, Frame
+from optics.captures.capture_set import Captures, Frame
+from optics.captures.noise import Noise, estimate, photon_transfer, step_of, warnings_of
 from optics.errors import Underdetermined
-from optics.noise import Noise, estimate, photon_transfer, step_of, warnings_of
 
 CAMERA = Noise(system_gain=0.05, dark_noise=1.5, black_level=8.0, saturation=255.0, prnu=0.003)
 EXPOSURES = (0.0, 0.1, 0.25, 0.4, 0.6, 0.85)  # of saturation; the first is dark

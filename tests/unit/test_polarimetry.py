@@ -3,10 +3,12 @@
 import numpy as np
 import pytest
 
-from optics import mueller, paths, polarimetry, scene
 from optics.errors import BadScene, UnknownKey
-from optics.polarimetry import decompose
-from optics.render import Renderer
+from optics.light import paths, polarimetry
+from optics.light.polarimetry import decompose
+from optics.light.renderer import Renderer
+from optics.polarization import mueller
+from optics.scene import loader as scene
 
 EXACT = 1e-12  # a few operations in double precision on numbers about 1
 RETARDANCE = 1e-7  # deg: of arc tangents of these
@@ -259,7 +261,7 @@ def test_other_parameters_and_their_ends(bench):
 def test_effects_that_mix_pixels_see_the_whole_picture(finger):
     values = {"camera.glare": 0.2, "camera.exposure": 3.0}
     found = polarimetry.sweep(finger, "analyzer.angle", [0.0, 90.0], (24, 18), values)
-    from optics.picture import Pictures
+    from optics.light.output import Pictures
 
     picture = Pictures(finger).take({**values, "analyzer.angle": 90.0})
     np.testing.assert_allclose(found.curves[0].y[1], picture.camera[18, 24], rtol=1e-5)

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from optics.diagnose import score
-from optics.rehearse import rehearse
+from optics.diagnosis.diagnose import score
+from optics.diagnosis.rehearse import rehearse
 
 sys.path.insert(0, str(Path(__file__).parent))
 from mock_model import LIBRARY, MockModel, mock_fit, simulate  # noqa: E402

@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from optics import statistics as st
+from optics.diagnosis import statistics as st
 
 
 def data(n=400, p=6, k=3, seed=0):

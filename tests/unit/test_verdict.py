@@ -13,14 +13,16 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from optics import evenness, fingerprints, pairs, statistics as st
-from optics.diagnose import _refuted, diagnose, score
-from optics.effect import Effect
+from optics.captures.noise import Noise
+from optics.diagnosis import fingerprints, pairs
+from optics.diagnosis import homogeneity as evenness
+from optics.diagnosis import statistics as st
+from optics.diagnosis.diagnose import _refuted, diagnose, score
+from optics.diagnosis.evidence import Candidate, measure
+from optics.diagnosis.verdict import CLEAR, CLUTTERED, MARGIN, WORDS, Diagnosis, Findings, Pair, decide
 from optics.errors import Underdetermined
-from optics.evidence import Candidate, measure
-from optics.noise import Noise
-from optics.parameter import Parameter, Values, Variable
-from optics.verdict import CLEAR, CLUTTERED, MARGIN, WORDS, Diagnosis, Findings, Pair, decide
+from optics.scene.declare import Effect
+from optics.scene.parameter import Parameter, Values, Variable
 
 sys.path.insert(0, str(Path(__file__).parent))
 from mock_model import LIBRARY, Exact, Frame, MockModel, PointModel, mock_fit, simulate  # noqa: E402

@@ -3,7 +3,7 @@
 import pytest
 
 from optics.errors import UnknownKey
-from optics.report import measure
+from optics.pages.report import measure
 from optics.words import with_sd
 
 

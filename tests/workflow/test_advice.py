@@ -3,16 +3,18 @@
 import csv
 import importlib.util
 import json
-import tomllib
 from pathlib import Path
 
 import pytest
+import tomllib
 
-from optics import captures, design, loop, scene as scenes
+from optics.captures import capture_set as captures
+from optics.captures.noise import Noise
 from optics.cli import main
-from optics.effect import registry
 from optics.errors import BadScene, OutputExists, Underdetermined
-from optics.noise import Noise
+from optics.scene import loader as scenes
+from optics.scene.registry import registry
+from optics.study import design, loop
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "next_measurement.py"
 SMALL = {"width": "32", "height": "24"}
@@ -30,7 +32,7 @@ def example():
 @pytest.mark.parametrize("hidden, family", [
     ("depolarization", "film put in"), pytest.param("offset", "exposure", marks=pytest.mark.slow)])
 def test_a_tie_is_resolved_by_what_is_advised(example, hidden, family, tmp_path, capsys):
-    """The readings are those of optics.jones, which knows nothing of the model: AMBIGUOUS, the advice, and a claim of the right one."""
+    """The readings are those of optics.proof.makers.bench, which knows nothing of the model: AMBIGUOUS, the advice, and a claim of the right one."""
     effect, before, after = example.main(hidden, tmp_path)
     assert before.word == "AMBIGUOUS" and effect in before.ambiguous
     singles = [a for a in before.advice if a.family not in ("together", "more of the same")]
@@ -40,7 +42,7 @@ def test_a_tie_is_resolved_by_what_is_advised(example, hidden, family, tmp_path,
     assert more.least < 1e-6  # no number of such readings will do
     assert after.missing == effect
     page = (tmp_path / "before" / "study" / "report.html")
-    from optics.report import report
+    from optics.pages.report import report
 
     text = Path(report(tmp_path / "before" / "study", page)).read_text(encoding="utf-8")
     assert "best together" in text and "more of the same, to compare" in text

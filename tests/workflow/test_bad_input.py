@@ -13,8 +13,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from optics import effect, scene
 from optics.cli import main
+from optics.scene import loader as scene
+from optics.scene import registry as effect
 
 NOISE = "[noise]\nsystem_gain = 0.05\ndark_noise = 1.0\nblack_level = 8.0\nsaturation = 255.0\nprnu = 0.0\n"
 JOB = 'scene = "small.xml"\nout = "{out}"\ncount = 2\n'
@@ -56,15 +57,15 @@ def broken_scenes(good):
 PLUGINS = {
     "syntax": ("bad.py", "effect = Effect(\n"), "nothing": ("bad.py", "x = 1\n"),
     "raises": ("bad.py", "import no_such_package\n"),
-    "kind": ("led.py", "from optics.effect import Part\npart = Part('led', 'emitter', (), lambda: None)\n"),
-    "category": ("lamp.py", "from optics.effect import Part\npart = Part('lamp', 'light', (), lambda: None)\n"),
-    "neutral": ("bad.py", "from optics.effect import Effect\nfrom optics.parameter import Parameter\n"
+    "kind": ("led.py", "from optics.scene.declare import Part\npart = Part('led', 'emitter', (), lambda: None)\n"),
+    "category": ("lamp.py", "from optics.scene.declare import Part\npart = Part('lamp', 'light', (), lambda: None)\n"),
+    "neutral": ("bad.py", "from optics.scene.declare import Effect\nfrom optics.scene.parameter import Parameter\n"
                 "effect = Effect('rust', 'camera', (Parameter('rust', '1', 0.0),))\n"),
-    "part": ("bad.py", "from optics.effect import Effect\nfrom optics.parameter import Parameter\n"
+    "part": ("bad.py", "from optics.scene.declare import Effect\nfrom optics.scene.parameter import Parameter\n"
              "effect = Effect('rust', 'hinge', (Parameter('rust', '1', 0.0, neutral=0.0),))\n"),
-    "stage": ("bad.py", "from optics.effect import Effect\nfrom optics.parameter import Parameter\n"
+    "stage": ("bad.py", "from optics.scene.declare import Effect\nfrom optics.scene.parameter import Parameter\n"
               "effect = Effect('rust', 'camera', (Parameter('rust', '1', 0.0, neutral=0.0),), {'emission': abs})\n"),
-    "twice": ("bad.py", "from optics.effect import Effect\nfrom optics.parameter import Parameter\n"
+    "twice": ("bad.py", "from optics.scene.declare import Effect\nfrom optics.scene.parameter import Parameter\n"
               "effect = Effect('rust', 'camera', (Parameter('k1', '1', 0.0, neutral=0.0),))\n"),
 }
 

@@ -15,10 +15,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from optics import batch, exr
 from optics.cli import main
 from optics.errors import OutputExists
-from optics.picture import Pictures
+from optics.files import exr
+from optics.light.output import Pictures
+from optics.study import batch
 
 JOB = """
 scene = "gelsight"
@@ -155,7 +156,7 @@ def test_each_light_alone(tmp_path):
     alone = [exr.read(result.folder / record["files"][f"led_{i}.exr"]["file"])[0] for i in range(1, 7)]
     assert set(alone[0]) == {"R", "G", "B", *(exr.spectral_name(b) for b in (610, 540, 460))}
     job = batch.read(tmp_path / "job.toml")
-    from optics import scene
+    from optics.scene import loader as scene
 
     together = Pictures(scene.load("gelsight", {"width": "32", "height": "24"})).take({**job.parameters, **job.values(0)})
     np.testing.assert_allclose(sum(c["S0.540,000000nm"] for c in alone), together.channels["S0.540,000000nm"], rtol=1e-5)
@@ -185,7 +186,7 @@ def command(job, *options):
 def started(job, *options):
     """A process at work, once it has made three samples; it heeds interrupts even where these tests run in the background."""
     process = subprocess.Popen(command(job, *options), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-                               env={**os.environ, "PYTHONPATH": str(Path(batch.__file__).parents[1])},
+                               env={**os.environ, "PYTHONPATH": str(Path(batch.__file__).parents[2])},
                                preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL))
     manifest = job.parent / "out" / "manifest.jsonl"
     deadline = time.monotonic() + 60
@@ -267,7 +268,7 @@ def test_another_job_is_refused(whole, tmp_path, old, new, changed):
 
 
 def test_a_changed_plugin_is_another_job(whole, tmp_path, monkeypatch):
-    from optics import picture
+    from optics.light import output as picture
 
     (tmp_path / "job.toml").write_text(JOB.replace('"out"', f'"{whole}"'))
     monkeypatch.setattr(batch, "Pictures", picture.Pictures)

@@ -1,4 +1,4 @@
-"""The loop on the polarizer bench: readings by coherency matrices (optics.jones), one effect hidden at a time, two together, none.
+"""The loop on the polarizer bench: readings by coherency matrices (optics.proof.makers.bench), one effect hidden at a time, two together, none.
 
 The base model is ideal: two polarizers without a leak, a clear slot, a lamp of unknown power. Data and model share no line; noise is
 that of a photodiode read with 12 bits.
@@ -9,10 +9,12 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
-from optics import captures as capture_files, jones, loop
-from optics.effect import registry
-from optics.jones import Photodiode, Polarizer, Sample, Source, Truth
-from optics.noise import Noise
+from optics.captures import capture_set as capture_files
+from optics.captures.noise import Noise
+from optics.proof.makers import bench as jones
+from optics.proof.makers.bench import Photodiode, Polarizer, Sample, Source, Truth
+from optics.scene.registry import registry
+from optics.study import loop
 
 NOISE = Noise(system_gain=0.05, dark_noise=2.0, black_level=64.0, saturation=4095.0, prnu=0.0)
 READINGS = 1000
@@ -145,9 +147,9 @@ def test_a_perfect_bench_lacks_nothing(seed, tmp_path):
 
 def test_what_goes_with_a_setting_is_drafted_then_claimed_as_a_formula(tmp_path, monkeypatch):
     """A lamp that warms up as exp(-t/4 min), which no effect has: the curve along its clock, as a table, then as a formula."""
-    import optics.effect as declarations
-    from optics import draft
+    import optics.scene.registry as declarations
     from optics.proof.rigs.bench import Bench, sweep
+    from optics.study import draft
 
     fresh = declarations.Registry()
     fresh.scan(declarations.shipped("plugins"))

@@ -5,10 +5,12 @@ import time
 import numpy as np
 import pytest
 
-from optics import calibrate, scene, synthetic
 from optics.errors import Underdetermined, UnknownKey
-from optics.parameter import Values
-from optics.render import Model
+from optics.fit import calibrate
+from optics.fit.model import Model
+from optics.proof.makers import touch as synthetic
+from optics.scene import loader as scene
+from optics.scene.parameter import Values
 
 FREE = ["led_*.[xyz]", "led_*.pan", "led_*.tilt", "led_*.mu", "led_[2-6].power", "membrane.rho_*", "membrane.sigma"]
 

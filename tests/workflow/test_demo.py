@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from optics import demo
 from optics.errors import OutputExists
+from optics.proof import demo
 
 ROOT = Path(__file__).resolve().parents[2]
 

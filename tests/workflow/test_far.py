@@ -6,9 +6,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from optics import captures as capture_files, jones, loop
-from optics.noise import Noise
-from optics.parameter import Parameter, Values, Variable
+from optics.captures import capture_set as capture_files
+from optics.captures.noise import Noise
+from optics.proof.makers import bench as jones
+from optics.scene.parameter import Parameter, Values, Variable
+from optics.study import loop
 
 NOISE = Noise(system_gain=0.05, dark_noise=2.0, black_level=64.0, saturation=4095.0, prnu=0.0)
 

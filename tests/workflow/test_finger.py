@@ -1,4 +1,4 @@
-"""The loop on the Vi2TaP finger: pictures by stock Mitsuba's `path` and finer meshes (optics.synthetic_finger), effects hidden in turn.
+"""The loop on the Vi2TaP finger: pictures by stock Mitsuba's `path` and finer meshes (optics.proof.makers.finger), effects hidden in turn.
 
 Four scenes (skin untouched and pressed, the object at four distances) at five angles of the analyser, 8 bits. Free are the
 paints and the pigment's yield; held out is one scene.
@@ -7,9 +7,11 @@ paints and the pigment's yield; held out is one scene.
 import numpy as np
 import pytest
 
-from optics import captures as capture_files, loop, scene as scenes
-from optics.effect import registry
-from optics.synthetic_finger import FingerMaker
+from optics.captures import capture_set as capture_files
+from optics.proof.makers.finger import FingerMaker
+from optics.scene import loader as scenes
+from optics.scene.registry import registry
+from optics.study import loop
 
 DEFINES = {"width": "64", "height": "48", "wall_dark": "1"}  # an even wall: its chequers have edges that nobody measures
 SCENES = [((0, 0, 0), 30.0), ((4, 3, 2.0), 15.0), ((-6, 2, 1.2), 45.0), ((2, -6, 1.6), 22.0)]
@@ -56,8 +58,8 @@ def study_of(folder, effects, seed=5, built=None, views=SCENES, **defines):
 
 def test_the_maker_and_the_model_are_two_accounts_of_one_finger():
     """At the true values, without a fit: what differs is noise, and two per cent of its variance for the edges."""
-    from optics.parameter import Values
-    from optics.render import Model
+    from optics.fit.model import Model
+    from optics.scene.parameter import Values
 
     maker = FingerMaker(scenes.load("vi2tap", DEFINES), BUILT, {}, spp=64, seed=2)
     captures = maker.captures(SCENES[1:2], [0.0, 90.0])

@@ -1,4 +1,4 @@
-"""The loop on a printed grid: pictures by stock Mitsuba's `volpath` and other meshes (optics.synthetic_grid), effects hidden in turn.
+"""The loop on a printed grid: pictures by stock Mitsuba's `volpath` and other meshes (optics.proof.makers.grid), effects hidden in turn.
 
 A matt rod at three distances, lit by one panel after the other, 8 bits. Free are the powers of the panels; held out is one distance.
 """
@@ -6,9 +6,11 @@ A matt rod at three distances, lit by one panel after the other, 8 bits. Free ar
 import numpy as np
 import pytest
 
-from optics import captures as capture_files, loop, scene as scenes
-from optics.effect import registry
-from optics.synthetic_grid import GridMaker
+from optics.captures import capture_set as capture_files
+from optics.proof.makers.grid import GridMaker
+from optics.scene import loader as scenes
+from optics.scene.registry import registry
+from optics.study import loop
 
 SCENE = {"width": "32", "height": "24"}
 CHANCE = {"rays": "1024", "packets": "100000"}  # the model's error is then a quarter of the camera's noise, which it adds to it
@@ -79,7 +81,7 @@ def test_what_the_maker_cannot_make_is_refused(effects, said):
 @pytest.mark.slow
 def test_the_maker_and_the_model_are_two_accounts_of_one_grid():
     """At equal values, without a fit: half a per cent in the mean, and no more from pixel to pixel than both errors say."""
-    from optics.transport import Transport
+    from optics.light.transport import Transport
 
     scene = scenes.load("grid_bench", SCENE)
     maker = GridMaker(scene, {}, {}, seed=2)

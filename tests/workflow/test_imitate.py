@@ -6,9 +6,13 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from optics import captures as capture_files, demo, loop, scene as scenes
+from optics.captures import capture_set as capture_files
 from optics.cli import app
-from optics.proof.rigs import bench as readings, touch
+from optics.proof import demo
+from optics.proof.rigs import bench as readings
+from optics.proof.rigs import touch
+from optics.scene import loader as scenes
+from optics.study import loop
 
 SIZE = {"width": "40", "height": "30"}
 

@@ -7,8 +7,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from optics import captures as capture_files, exr, mueller, scene
-from optics.noise import Noise
+from optics.captures import capture_set as capture_files
+from optics.captures.noise import Noise
+from optics.files import exr
+from optics.polarization import mueller
+from optics.scene import loader as scene
 
 SMALL = ["-D", "width=48", "-D", "height=36"]
 BENCH = ["-D", "width=24", "-D", "height=16", "-D", "x_fov=8", "-D", "bands=620, 540, 460"]

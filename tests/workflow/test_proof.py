@@ -6,9 +6,10 @@ import math
 import numpy as np
 import pytest
 
-from optics import statistics
+from optics.diagnosis import statistics
 from optics.proof import blind, cells, command, count, page
-from optics.proof.rigs import RIGS, Bench, bench as readings
+from optics.proof.rigs import RIGS, Bench
+from optics.proof.rigs import bench as readings
 
 FOUND = ("servo backlash", "camera gamma", "polarized source", "analyzer wobble", "polarizer misalignment")
 

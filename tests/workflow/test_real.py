@@ -9,7 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from optics import captures, importing, nulls
+from optics.captures import capture_set as captures
+from optics.captures import importing
+from optics.fit import null_models as nulls
 
 ROOT = Path(__file__).resolve().parents[2]
 DATA = ROOT.parent / "shared" / "data"

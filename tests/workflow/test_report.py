@@ -15,12 +15,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from optics.compare import compare
 from optics.errors import BadCapture, OutputExists
-from optics.ladder import Fingerprint, Shown, Study, read_fit
-from optics.nulls import PHYSICAL, NullTable, Score
-from optics.parameter import Parameter, Values, Variable
-from optics.report import ladder_chart, number, percent, report
+from optics.fit.compare import compare
+from optics.fit.null_models import PHYSICAL, NullTable, Score
+from optics.pages.report import ladder_chart, number, percent, report
+from optics.scene.parameter import Parameter, Values, Variable
+from optics.study.record import Fingerprint, Shown, Study, read_fit
 
 LEDS = {"led_red": (0.95, -0.31), "led_green": (-0.2, 0.98), "led_blue": (-0.75, -0.66)}
 TRUTH = {"camera.vignetting": 0.31, "gel.absorption": 0.06}
@@ -157,7 +157,7 @@ def demo(folder: Path, height=72, width=96, presses=4, seed=3, steps=3) -> Study
 
 
 def null_models() -> dict:
-    """Errors of a physical model that wins two channels, as optics.nulls writes them."""
+    """Errors of a physical model that wins two channels, as optics.fit.null_models writes them."""
     scores = [Score(name, split, "own", [near, near, near + worse], [1.5] * 3, [near] * 3, [1.0] * 3)
               for split in ("held out", "fitted")
               for name, near, worse in ((PHYSICAL, 4.25, 9.0), ("background", 28.5, 0.0), ("linear in the normal", 5.5, 0.0))]
@@ -165,7 +165,7 @@ def null_models() -> dict:
 
 
 def demo_diagnosis(rows, found, index, names) -> dict:
-    """What optics.diagnose would say at this step of the ladder: vignetting, then absorption, then nothing."""
+    """What optics.diagnosis.diagnose would say at this step of the ladder: vignetting, then absorption, then nothing."""
     claim = index < 2
     total, noise = found.total, found.total.noise / found.total.signal
     unit, plausible = {"lens vignetting": "1", "gel absorption": "1/mm"}, {"lens vignetting": 0.3, "gel absorption": 0.05}
@@ -399,9 +399,10 @@ def test_point_readings_are_drawn_against_their_setting(tmp_path):
 @pytest.fixture(scope="module")
 def swept(tmp_path_factory):
     """A study of 96 readings of a leaky polarizer bench, the leak found in a second step; and its page."""
-    from optics import jones, loop
-    from optics.effect import registry
-    from optics.noise import Noise
+    from optics.captures.noise import Noise
+    from optics.proof.makers import bench as jones
+    from optics.scene.registry import registry
+    from optics.study import loop
 
     folder = tmp_path_factory.mktemp("swept")
     truth = jones.Truth(photodiode=jones.Photodiode(gain=2.2), p1=jones.Polarizer(leak=0.02), p2=jones.Polarizer(leak=0.02))
@@ -482,7 +483,7 @@ def test_sweeps_recorded_without_settings_still_show(swept, tmp_path):
     ("source.power", "source.time", ("source.power", [], [])),  # time last where both take many
 ])
 def test_readings_are_drawn_along_the_setting_with_most_values(along, other, expected):
-    from optics.report import Readings
+    from optics.pages.report import Readings
 
     count = np.arange(40.0)
     settings = {other: count if other.endswith("time") else count % 2, along: count % 20}
@@ -492,9 +493,9 @@ def test_readings_are_drawn_along_the_setting_with_most_values(along, other, exp
 
 
 def test_large_frames_are_made_to_fit(tmp_path, monkeypatch):
-    import optics.report
+    import optics.pages.report
 
-    monkeypatch.setattr(optics.report, "BUDGET", 60_000)
+    monkeypatch.setattr(optics.pages.report, "BUDGET", 60_000)
     html = report(small(tmp_path / "study", 3, (96, 128), 6).folder, tmp_path / "r.html").read_text(encoding="utf-8")
     assert "recorded frames are left out" in html or re.search(r"blocks of \d+×\d+ pixels", html)
     assert sum(len(p) for p in re.findall(r"data:image/webp;base64,[^\"]+", html)) <= 60_000
@@ -515,7 +516,7 @@ def test_what_the_page_reads_is_what_a_diagnosis_writes():
     """The page reads dictionaries; this holds its keys against the declared ones."""
     import typing
 
-    from optics.diagnose import Diagnosis
+    from optics.diagnosis.diagnose import Diagnosis
 
     def keys(kind):
         return set(typing.get_type_hints(kind))
@@ -538,7 +539,7 @@ def test_what_the_page_reads_is_what_a_diagnosis_writes():
 
 def test_images_of_a_model_become_frames_and_fingerprints():
     """A refit that adds 2 DN shows as 2 sigmas beside a residual of 2 sigmas."""
-    from optics.ladder import fingerprints_of, shown_frames
+    from optics.study.record import fingerprints_of, shown_frames
 
     class Model:
         captures = SimpleNamespace(table=None)

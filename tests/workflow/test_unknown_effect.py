@@ -12,9 +12,9 @@ ROOT = Path(__file__).resolve().parents[2]
 
 def test_the_formula_is_what_the_maker_does_to_rows(tmp_path):
     """The ripple integrated over each row's exposure, by the maker, against the formula that the tutorial fills into the stub."""
-    from optics.draft import new_effect, write
-    from optics.effect import declared
-    from optics.noise import Noise
+    from optics.captures.noise import Noise
+    from optics.scene.registry import declared
+    from optics.study.draft import new_effect, write
 
     story = runpy.run_path(str(ROOT / "examples" / "unknown_effect.py"))
     height, width = 48, 6
@@ -57,7 +57,7 @@ def test_the_tutorial_goes_from_a_puzzling_residual_to_the_noise_floor(mitsuba, 
 @pytest.fixture
 def own_registry(mitsuba, monkeypatch):
     """A registry of its own, so that what a study's folder adds is gone afterwards."""
-    import optics.effect as declarations
+    import optics.scene.registry as declarations
 
     usual, fresh = declarations.registry(), declarations.Registry()
     fresh.scan(declarations.shipped("plugins"))
@@ -71,9 +71,11 @@ def own_registry(mitsuba, monkeypatch):
 @pytest.mark.slow
 def test_a_curve_along_geometry_becomes_an_effect_as_well(own_registry, tmp_path, optics):
     """A coating that shines the brighter the steeper it stands, by 0.6 % per degree, which no effect of the library does."""
-    from optics import captures, demo, scene as scenes
-    from optics.ladder import Study
-    from optics.synthetic import Maker, presses
+    from optics.captures import capture_set as captures
+    from optics.proof import demo
+    from optics.proof.makers.touch import Maker, presses
+    from optics.scene import loader as scenes
+    from optics.study.record import Study
 
     class Tilted(Maker):
         def light(self, press):

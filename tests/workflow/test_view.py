@@ -22,11 +22,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from optics import captures as capture_files, loop, scene
-from optics.ladder import Study, read_fit
-from optics.noise import Noise
-from optics.picture import Pictures
-from optics.view import Kept, Server, View
+from optics.captures import capture_set as capture_files
+from optics.captures.noise import Noise
+from optics.light.output import Pictures
+from optics.pages.view import Kept, Server, View
+from optics.scene import loader as scene
+from optics.study import loop
+from optics.study.record import Study, read_fit
 
 HIDDEN = 0.4  # camera.vignetting
 VIGNETTING, SIZE, POSE, ROUGHNESS = "camera.vignetting", "led.area", "gel.press_x[press-0]", "membrane.sigma"
@@ -740,7 +742,7 @@ def test_everything_has_a_name_and_fits(page):
 
 def test_point_readings_are_drawn_as_points(chromium, mitsuba, tmp_path):
     """A bench with a leak: its linear prediction in the page is the server's, and the points move."""
-    from optics import jones
+    from optics.proof.makers import bench as jones
 
     truth = jones.Truth(photodiode=jones.Photodiode(gain=2.2), p1=jones.Polarizer(leak=0.02), p2=jones.Polarizer(leak=0.02))
     settings = [{"polarizer.angle": a, "analyzer.angle": 11.25 * i, "source.power": p, "source.time": i / 9}

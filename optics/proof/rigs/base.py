@@ -9,10 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
-from optics import captures as capture_files, loop
-from optics.effect import registry
-from optics.noise import Noise
+from optics.captures import capture_set as capture_files
+from optics.captures.noise import Noise
 from optics.proof.cells import MISTAKES, Cell
+from optics.scene.registry import registry
+from optics.study import loop
 
 PATTERN = 0.005  # rms of a fixed gain per pixel of the sensor, at clutter 1
 PATTERNS = {"pattern 0.3 %": 0.003, "pattern 1 %": 0.01}  # rms of one that nobody noted
@@ -127,8 +128,8 @@ class Pictures(Rig):
         return float(self.built(scene, 0).get(key, scene.values()[key]))
 
     def strength_of(self, effect: str, change: float) -> float:
-        from optics.parameter import Values
-        from optics.render import Model
+        from optics.fit.model import Model
+        from optics.scene.parameter import Values
 
         captures = self.captures(Cell(self.name, "none", (), 0.0, 0.0, "same", "", 0), {}, {}, mean=True)
         captures.frames = captures.frames[:self.frames]

@@ -1,4 +1,4 @@
-"""`polarizer_bench`: readings of a photodiode behind two or three films, by coherency matrices (optics.jones).
+"""`polarizer_bench`: readings of a photodiode behind two or three films, by coherency matrices (optics.proof.makers.bench).
 
     clutter    c = 1: the lamp wanders by 0.3 % rms in some minutes, the analyser is off its dial by 0.05 deg rms from reading to reading
     law        "other": effects with the same cause and size as the library's, but another law, as in OTHER
@@ -15,9 +15,10 @@ from pathlib import Path
 
 import numpy as np
 
-from optics import captures as capture_files, jones
-from optics.noise import Noise
+from optics.captures import capture_set as capture_files
+from optics.captures.noise import Noise
 from optics.proof.cells import Cell, pairs_of
+from optics.proof.makers import bench as jones
 from optics.proof.rigs.base import Rig, change_of, smooth, strength_at
 
 PHOTODIODE = Noise(0.01, 1.0, 64.0, 4095.0, 0.0)  # 400 000 electrons: 0.3 % at the mean reading

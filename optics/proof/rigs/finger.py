@@ -1,4 +1,4 @@
-"""`vi2tap`: a skin between two polarizer films, an object and a wall behind it, by stock Mitsuba's films (optics.synthetic_finger)."""
+"""`vi2tap`: a skin between two polarizer films, an object and a wall behind it, by stock Mitsuba's films (optics.proof.makers.finger)."""
 
 from __future__ import annotations
 
@@ -6,11 +6,12 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from optics import captures as capture_files, scene as scenes
+from optics.captures import capture_set as capture_files
 from optics.proof.cells import Cell, pairs_of
+from optics.proof.makers.finger import FingerMaker
+from optics.proof.makers.touch import CAMERA
 from optics.proof.rigs.base import PATTERNS, Mean, Pictures, Workshop
-from optics.synthetic import CAMERA
-from optics.synthetic_finger import FingerMaker
+from optics.scene import loader as scenes
 
 # kind -> coordinates by any of which it is rightly named
 UNKNOWN = {"stain": ("place",), "banding": ("row",), "tap": ("column",), "red drift": ("frame",), "third harmonic": ("analyzer.angle",)}

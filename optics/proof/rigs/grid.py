@@ -1,13 +1,14 @@
-"""`grid_bench`: a small printed grid, a rod at three distances, by stock Mitsuba's `volpath` (optics.synthetic_grid)."""
+"""`grid_bench`: a small printed grid, a rod at three distances, by stock Mitsuba's `volpath` (optics.proof.makers.grid)."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from optics import captures as capture_files, scene as scenes
+from optics.captures import capture_set as capture_files
 from optics.proof.cells import Cell
+from optics.proof.makers.grid import CAMERA, GridMaker
 from optics.proof.rigs.base import Mean, Pictures
-from optics.synthetic_grid import CAMERA, GridMaker
+from optics.scene import loader as scenes
 
 
 class Grid(Pictures):

@@ -1,6 +1,6 @@
 """Sensors that see a pressed gel lit by LEDs: `digit` and `gelsight`, by stock Mitsuba's path tracer on meshes of its own.
 
-`Wild` is `optics.synthetic.Maker` as it comes from a workshop, with
+`Wild` is `optics.proof.makers.touch.Maker` as it comes from a workshop, with
 
     clutter    c = 1: fixed pattern of the sensor 0.5 % rms, mottle of the coating 1 % rms (0.4 mm), wrinkles of the skin of 0.3 deg rms,
                the same in every frame; of these no effect of the library knows (diagnosis laboratory, 3.4)
@@ -16,10 +16,13 @@ from pathlib import Path
 
 import numpy as np
 
-from optics import captures as capture_files, demo, scene as scenes, synthetic
-from optics.noise import Noise
+from optics.captures import capture_set as capture_files
+from optics.captures.noise import Noise
+from optics.proof import demo
 from optics.proof.cells import Cell, pairs_of
+from optics.proof.makers import touch as synthetic
 from optics.proof.rigs.base import PATTERNS, Mean, Pictures, Workshop, smooth
+from optics.scene import loader as scenes
 
 CAMERA = Noise(system_gain=0.1, dark_noise=2.0, black_level=256.0, saturation=4095.0, prnu=0.0)  # 12 bits, 38 000 electrons
 MOTTLE, WRINKLE = 0.01, 0.3  # rms: of the coating, deg of the skin's slope; at clutter 1
@@ -235,7 +238,7 @@ class Wild(Workshop, synthetic.Maker):
         return signal
 
     def gain(self, kind: str, size: float, frame: int, press) -> np.ndarray:
-        from optics.gel import contact
+        from optics.skin import contact
 
         if kind not in ("height gain", "slope gain", "contact film"):
             return super().gain(kind, size, frame, press)
@@ -249,7 +252,7 @@ class Wild(Workshop, synthetic.Maker):
         return 1 + size * p[..., None]
 
     def _touch(self, press):
-        from optics.gel import contact
+        from optics.skin import contact
 
         v, g = self.values, self.gel
         profile = contact.indenter_profile(v[f"{g}.indenter"], v[f"{g}.indenter_size"], (0.0, 0.0, 0.0), 3.0, 0.03)

@@ -1,0 +1,1 @@
+"""Captures: measurements on disk, their noise, and how other formats become captures."""

@@ -1,0 +1,348 @@
+"""What the data say: derivative images of a calibrated model and of candidate effects, whitened and summed, frame by frame.
+
+Masks come from data and noise, never from the size of a residual; weights from the prediction. Normal equations take
+every usable pixel; curves, splits and alternative weights use a thinned lattice of pixels that is kept in memory.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from optics.diagnosis import statistics as st
+from optics.diagnosis.verdict import Row
+from optics.errors import Underdetermined
+from optics.scene.declare import Effect
+from optics.scene.parameter import Values, Variable
+
+Progress = Callable[[str, int, int], None]
+
+
+def value_of(model, values: Values, variable: Variable) -> float:
+    """The present value of a variable: fitted in a frame <- set in it <- fitted in all <- the scene's."""
+    key = variable.keys[0]
+    if variable.frames is not None:
+        frame = variable.frames[0]
+        own = {**model.frames[frame].parameters, **values.frame.get(frame, {})}
+        if key in own:
+            return float(own[key])
+    return float(values.common.get(key, model.base[key]))
+
+
+def at_bound(variable: Variable, value: float) -> bool:
+    return variable.parameter.side(value) != 0
+
+
+@dataclass
+class Candidate:
+    """An effect under test: its variables, where they start, and what was found."""
+
+    effect: Effect
+    variables: list[Variable]
+    start: np.ndarray
+    sides: list[int]  # +1: may only rise, -1: may only fall, 0: either
+    plausible: np.ndarray
+    forms: dict[str, list[int]] = field(default_factory=dict)  # 'tangent' / 'secant' -> columns
+    broken: bool = False  # a derivative image was not finite
+    form: str = ""
+    columns: list[int] = field(default_factory=list)
+    cone: st.Cone | None = None
+    linear: np.ndarray | None = None  # coefficients of the columns; see `change_of`
+    row: Row | None = None
+    raw: float = 0.0  # rms change of the image at the plausible strengths, over the mean signal, before any calibration
+
+    def contains(self, other: "Candidate") -> bool:
+        """Whether it frees all that another frees, and more: it fits as well by itself and rivals nothing."""
+        mine, others = ({(key, v.frames) for v in c.variables for key in v.keys} for c in (self, other))
+        return mine > others
+
+    @classmethod
+    def at(cls, model, values: Values, effect: Effect, variables: Sequence[Variable]) -> "Candidate":
+        """An effect under test at the values: where its strengths start, and to which side they may go."""
+        start = np.array([value_of(model, values, v) for v in variables])
+        sides = [v.parameter.side(value) for v, value in zip(variables, start)]
+        return cls(effect, list(variables), start, sides, np.array([v.parameter.plausible for v in variables]))
+
+    @property
+    def usual(self) -> np.ndarray:
+        """Changes of plausible size, to the side that is open; of a strength that every frame has for itself up and down in turn, as all
+        of them together would be one scale, which a calibration takes up."""
+        sides = np.array(self.sides)
+        turn = np.where([v.frames is not None and i % 2 == 1 for i, v in enumerate(self.variables)], -1.0, 1.0)
+        return self.plausible * np.where(sides == 0, turn, sides)
+
+    @property
+    def direction(self) -> np.ndarray:
+        """Coefficients to compare effects at: as found, or usual ones where nothing was found."""
+        return self.linear if self.linear.any() else self.linear_of(self.usual)
+
+    def _squares(self) -> np.ndarray:
+        """Variables whose effect grows with their square: a secant to the plausible size is linear in s^2/plausible."""
+        own = [v.parameter.squared and abs(start) < 1e-3 * v.parameter.plausible for v, start in zip(self.variables, self.start)]
+        return np.array(own) & (self.form == "secant")
+
+    def change_of(self, linear: np.ndarray) -> np.ndarray:
+        """Change of each strength, in its unit, from the coefficients of the columns."""
+        return np.where(self._squares(), np.sign(linear) * np.sqrt(np.abs(linear) * self.plausible), linear)
+
+    def linear_of(self, change: np.ndarray) -> np.ndarray:
+        """Coefficients of the columns for a change of the strengths; the inverse of `change_of`."""
+        return np.where(self._squares(), np.sign(change) * change**2 / self.plausible, change)
+
+    def sd_of(self, sd: np.ndarray) -> np.ndarray:
+        """Standard deviation of each strength from those of the coefficients."""
+        change = np.abs(self.change_of(self.linear))
+        slope = np.maximum(2 * change / self.plausible, np.sqrt(sd / self.plausible))
+        return np.where(self._squares(), sd / np.where(slope > 0, slope, 1.0), sd)
+
+
+# -- measuring: one pass over the frames ------------------------------------------------------------------------------
+
+
+@dataclass
+class Block:
+    """Pixels of one frame that are kept: whitened columns a (n, k) in the places `where`, residual r (n,).
+
+    prediction   of the seed `Evidence.seed`, not the residual's: where pictures are Monte Carlo estimates, its error is not that of r
+    """
+
+    frame: int
+    where: np.ndarray
+    a: np.ndarray
+    b: np.ndarray | None
+    r: np.ndarray
+    sigma: np.ndarray
+    prediction: np.ndarray
+    index: np.ndarray  # (n,) into the flattened (H, W, C)
+    inner: np.ndarray  # (n,) bool: still used when the mask is dilated by one pixel
+
+    @property
+    def middle(self) -> np.ndarray:
+        return self.a if self.b is None else (self.a + self.b) / 2
+
+
+@dataclass
+class Evidence:
+    """Normal equations of all frames, the thinned pixels, and whitened residual images."""
+
+    columns: list[Variable]
+    base: list[int]
+    rest: list[int]
+    values: Values
+    normal: st.Normal
+    blocks: list[Block]
+    frames: list[int]
+    sigma: list[np.ndarray]
+    whitened: list[np.ndarray]  # (H, W, C) float32, zero outside the mask
+    use: list[np.ndarray]
+    spectrum: st.Spectrum | st.Sweeps
+    precision: np.ndarray
+    pull: np.ndarray
+    thinning: int
+    not_finite: int
+    render_noise: float
+    signal: float
+    noise: float
+    masked: float
+    seed: int = 0  # of pictures to bin or to scale residuals by: binned by a picture whose error is in them, residuals follow that error
+    projected: st.Projected | None = None
+    candidates: list[Candidate] = field(default_factory=list)  # that were scored in it, best first
+
+    @property
+    def channels(self) -> int:
+        return self.use[0].shape[2]
+
+    @property
+    def gradient(self) -> float:
+        return self.projected.absorbed / max(self.projected.rank, 1)
+
+    def inverse(self, base: Sequence[int]) -> np.ndarray:
+        """Of the Gram of base columns, with the priors of the first of them."""
+        gram = self.normal.gram[np.ix_(base, base)] + np.diag(_padded(self.precision, base))
+        return st.inverse(gram, self.normal.truncation(base))[0]
+
+    def structure(self, whitened: Sequence[np.ndarray], base: Sequence[int]) -> st.Structure:
+        return self.spectrum.test(whitened, base, self.inverse(base))
+
+    def variance(self, model, frame: int, prediction: np.ndarray, values: Values | None = None) -> np.ndarray:
+        """Of a frame about its prediction, DN^2: where the model knows no error of its prediction, that between two seeds is added."""
+        known = model.variance(values or self.values, frame, prediction)
+        return known if model.by_chance else known * (1 + self.render_noise)
+
+    def thinned(self, weight: Callable[[Block], np.ndarray] | None = None, extra: int = 0) -> st.Normal:
+        """Normal equations of the kept pixels alone; `weight` (n,) multiplies rows, `extra` columns are left empty."""
+        normal = st.Normal(len(self.columns) + extra)
+        for block in self.blocks:
+            if weight is None:
+                normal.add(block.where, block.a, block.r, block.b)
+                continue
+            w = weight(block)
+            b = None if block.b is None else block.b * w[:, None]
+            normal.add(block.where, block.a * w[:, None], block.r * w, b)
+        return normal
+
+    def project(self, normal: st.Normal, base: Sequence[int], rest: Sequence[int], thinning: int = 1,
+                settled: bool = False) -> st.Projected:
+        """Project with the priors of the first base columns; thinned data meet thinned priors."""
+        return st.project(normal, base, rest, _padded(self.precision, base) / thinning, _padded(self.pull, base) / thinning, settled=settled)
+
+
+def _padded(known: np.ndarray, base: Sequence[int]) -> np.ndarray:
+    """Priors of the first base columns, none for those that follow."""
+    return np.concatenate([known, np.zeros(len(base) - len(known))])
+
+
+def measure(model, values: Values, base: Sequence[Variable], candidates: Sequence[Candidate], frames: Sequence[int],
+             rows_max: int, seed: int, say: Progress, what: str = "derivative images") -> Evidence:
+    """One pass over the frames: derivative images of the base and of every candidate, whitened and summed.
+
+    The residual comes from `model.predict`; derivative images have seeds of their own. Where a second seed changes an
+    image of the first frame, that variable is rendered twice in every frame and products are taken across.
+    """
+    tangent, secant, steps = list(base), [], {}
+    for c in candidates:
+        if c.effect.onset in ("tangent", "both"):
+            c.forms["tangent"] = [len(tangent) + i for i in range(len(c.variables))]
+            tangent += c.variables
+    for c in candidates:
+        if c.effect.onset in ("secant", "both"):
+            c.forms["secant"] = [len(tangent) + len(secant) + i for i in range(len(c.variables))]
+            secant += c.variables
+            steps.update({v.name: v.parameter.plausible * (-1 if side < 0 else 1) for v, side in zip(c.variables, c.sides)})
+    columns = tangent + secant
+
+    def images(frame: int, seed: int, wanted: set[int] | None = None) -> tuple[np.ndarray | None, dict[int, np.ndarray]]:
+        found, prediction = {}, None
+        for first, variables, step in ((0, tangent, None), (len(tangent), secant, steps)):
+            here: dict[str, list[int]] = {}  # two effects may free the same variable
+            for i, v in enumerate(variables):
+                if v.holds_in(frame) and (wanted is None or first + i in wanted):
+                    here.setdefault(v.name, []).append(first + i)
+            if not here:
+                continue
+            asked = list({v.name: v for v in variables if v.name in here}.values())
+            if step is None:
+                result = model.derivatives(values, asked, [frame], seed=seed)
+            else:
+                result = model.derivatives(values, asked, [frame], secant={v.name: step[v.name] for v in asked}, seed=seed)
+            prediction, named = next(iter(result))
+            found.update({i: np.asarray(image) for name, image in named.items() for i in here.get(name, ())})
+        return prediction, found
+
+    seeds = (2 * seed + 1001, 2 * seed + 1002)
+    total, used = 0, 0
+    for frame in frames:
+        mask = model.usable(frame)
+        total, used = total + getattr(model, "size", mask.size), used + int(mask.sum())
+    k = st.thinning(used, rows_max)
+    sweeps = all(getattr(model.frames[f], "readings", None) for f in frames)
+    normal, spectrum = st.Normal(len(columns)), st.Sweeps() if sweeps else st.Spectrum(len(columns))
+    evidence = Evidence(columns, list(range(len(base))), list(range(len(base), len(columns))), values, normal, [],
+                        list(frames), [], [], [], spectrum, *_priors(model, values, base), k, 0, 0.0, 0.0, 0.0, 0.0, seeds[0])
+    noisy: set[int] = set()
+    signal = variance = 0.0
+    for n, frame in enumerate(frames):
+        say(what, n, len(frames))
+        prediction = np.asarray(model.predict(values, [frame])[0], float)
+        own, first = images(frame, seeds[0])
+        if n == 0:
+            other, second = images(frame, seeds[1])
+            noisy = {c for c in first if c not in second or not np.array_equal(first[c], second[c], equal_nan=True)}
+            if own is not None and not np.array_equal(own, other):
+                usable = model.usable(frame)
+                sample = (np.asarray(own, float) - other)[usable] ** 2 / 2 / model.noise.variance(prediction)[usable]
+                evidence.render_noise = float(np.mean(sample[np.isfinite(sample)]))
+        elif noisy:
+            _, second = images(frame, seeds[1], noisy)
+        _add_frame(evidence, model, frame, n, prediction, prediction if own is None else own, first, second if noisy else {}, noisy,
+                   candidates, len(base))
+        use, sigma = evidence.use[-1], evidence.sigma[-1]
+        signal += float(prediction[use].sum())
+        variance += float((sigma[use].astype(float) ** 2).sum())
+    say(what, len(frames), len(frames))
+    if normal.count == 0:
+        raise Underdetermined("diagnose: no usable value in the fitted frames; check masks, saturation and exposure")
+    if evidence.not_finite > 0.01 * normal.count:
+        raise ValueError(f"diagnose: prediction or derivative images of the base are not finite in {evidence.not_finite} of "
+                         f"{normal.count + evidence.not_finite} usable values; a parameter may have left its physical range")
+    evidence.signal = signal / normal.count - float(model.noise.black_level)
+    evidence.noise = math.sqrt(variance / normal.count) / evidence.signal
+    evidence.masked = 1 - (normal.count / total)
+    evidence.projected = evidence.project(normal, evidence.base, evidence.rest, settled=bool(noisy))
+    return evidence
+
+
+def _priors(model, values: Values, base: Sequence[Variable]) -> tuple[np.ndarray, np.ndarray]:
+    """(1/tau^2, (mean - value)/tau^2) of the base's priors, 0 where there is none."""
+    precision, pull = np.zeros(len(base)), np.zeros(len(base))
+    for i, v in enumerate(base):
+        if v.prior is not None:
+            precision[i] = 1 / v.prior[1] ** 2
+            pull[i] = (v.prior[0] - value_of(model, values, v)) * precision[i]
+    return precision, pull
+
+
+def _add_frame(evidence: Evidence, model, frame: int, n: int, prediction, other, first: dict, second: dict, noisy: set,
+               candidates: Sequence[Candidate], p: int) -> None:
+    image = np.asarray(model.frames[frame].image, float)
+    variance = evidence.variance(model, frame, prediction)
+    mask = np.asarray(model.usable(frame), bool)
+    good = mask & np.isfinite(prediction) & np.isfinite(image) & (variance > 0)
+    where = np.array(sorted(first), int)
+    broken = set()  # columns of candidates with a value that is not finite: they are left out as a whole
+    for c in where:
+        for images in (first, second):
+            if c in images and not np.isfinite(images[c][good]).all():
+                if c < p:
+                    good &= np.isfinite(images[c])
+                else:
+                    broken.add(c)
+                    for candidate in candidates:
+                        candidate.broken |= any(c in columns for columns in candidate.forms.values())
+    evidence.not_finite += int(mask.sum() - good.sum())
+    weight = np.where(good, 1 / np.sqrt(np.where(good, variance, 1.0)), 0.0)
+
+    def stack(images: dict) -> np.ndarray:
+        out = np.zeros((*image.shape, len(where)))
+        for i, c in enumerate(where):
+            if c not in broken:
+                np.multiply(np.where(good, images.get(c, first[c]), 0.0), weight, out=out[..., i])
+        return out
+
+    a = stack(first)
+    b = stack(second) if noisy else None
+    whitened = np.where(good, (image - prediction) * weight, 0.0)
+    evidence.normal.add(where, a[good], whitened[good], None if b is None else b[good])
+    if isinstance(evidence.spectrum, st.Sweeps):
+        evidence.spectrum.add(good, where, a, _swept(model.frames[frame], prediction))
+    else:
+        evidence.spectrum.add(good, where, a)
+    keep = good & st.lattice(image.shape, evidence.thinning, n)
+    evidence.blocks.append(Block(
+        frame, where, a[keep], None if b is None else b[keep], whitened[keep], 1 / weight[keep], np.asarray(other, float)[keep],
+        np.flatnonzero(keep), (mask if isinstance(evidence.spectrum, st.Sweeps) else _dilated(mask))[keep]))
+    evidence.use.append(good)
+    evidence.sigma.append(np.where(good, np.sqrt(variance), np.inf).astype(np.float32))
+    evidence.whitened.append(whitened.astype(np.float32))
+
+
+def _swept(sweep, prediction: np.ndarray) -> dict[str, np.ndarray]:
+    """What tells the readings of a sweep apart: when, how bright, and what was set, which may be the same within one sweep."""
+    still = {k: np.full(1, v) for k, v in sweep.parameters.items() if isinstance(v, float)}
+    turned = {k: v for k, v in (("reading", sweep.rows), *sweep.readings.items()) if v is not None and len(v) == len(prediction)}
+    return {"signal": prediction, **still, **turned}  # one reading of a shot that is only thought of stands for all that are alike
+
+
+def _dilated(mask: np.ndarray) -> np.ndarray:
+    """The mask with every unusable region grown by one pixel, within each plane of a mosaic."""
+    from scipy.ndimage import binary_erosion
+
+    out = np.zeros_like(mask)
+    for plane in st.planes_of(mask):
+        out[plane] = binary_erosion(mask[plane], np.ones((3, 3), bool), border_value=1)
+    return out
+
+

@@ -1,0 +1,214 @@
+"""Whether a strength is the same everywhere, and whether it is more than clutter makes.
+
+Noise is independent from pixel to pixel, clutter is not: mottle, a fixed pattern, a lamp that wanders are shared by neighbours. So what
+a strength scatters between parts of the sensor, or of a session, is held against it, beside the noise.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from optics.diagnosis import fingerprints as prints
+from optics.diagnosis import statistics as st
+from optics.diagnosis.evidence import Block, Candidate, Evidence, Progress, at_bound, measure, value_of
+from optics.diagnosis.verdict import LEVEL, MAPS, UNEVEN, Pair, Refit, Split
+from optics.fit.compare import led_label
+from optics.scene.parameter import Variable
+
+EVEN = 0.05  # of the fall: what splitting may gain where clutter does not make it
+SAME_PLACE = 0.5  # of what an effect leaves: if its own strength, split, takes more than this, the rest is where the effect is, and it is not it
+HAIR = 0.01  # of the fall: a split that gains less says nothing about what the effect is
+PARTS = 16  # of the sensor or session, wider than what clutter shares
+
+
+def split(model, evidence: Evidence, places: list[dict], rows_max: int, seed: int, say: Progress, c: Candidate, found, left: Refit | Pair,
+          net: float, beside: Sequence[Variable] = ()) -> tuple[list[Split], float, np.ndarray]:
+    """Whether a fitted effect has the same strength in every part of the data, and `scatter` of its strength.
+
+    With the effect in the base, e, by which its picture differs from the one without it, is cut into parts e 1{part} and these are
+    scored: a true effect gains nothing by being cut, a proxy does.
+
+    found   the fit with it;   left: what is left with that;   net: its fall;   beside: variables of what was added with it
+    """
+    from scipy.special import chdtrc
+
+    base = [v for v in [*(evidence.columns[i] for i in evidence.base), *beside, *c.variables]
+            if v in c.variables or not at_bound(v, value_of(model, found.values, v))]
+    own = measure(model, found.values, base, [], evidence.frames, rows_max, seed, say, f"evenness of {c.effect.name}")
+    change = np.array([value_of(model, found.values, v) for v in c.variables]) - c.start
+    effect = [i for i, v in enumerate(base) if v in c.variables]
+    calibrated = [i for i in own.base if i not in effect]
+    own.precision, own.pull = own.precision[calibrated], own.pull[calibrated]  # effect variables follow the base's
+    without = found.values.copy()
+    for v, start in zip(c.variables, c.start):
+        without.put(v, float(start))
+    changes = zip(*(model.predict(values, own.frames, own.seed) for values in (found.values, without)))
+    images = [(np.asarray(new, float) - old).reshape(-1)[block.index] / block.sigma for block, (new, old) in zip(own.blocks, changes)]
+    parts, residuals = _parts(model, own, places), [block.r for block in own.blocks]
+    plain_normal = own.thinned(extra=max([len(labels) for labels, _ in parts.values()], default=0))
+    results = []
+    for by, (labels, bins) in parts.items():
+        count, first = len(labels), len(base)
+        normal = plain_normal.copy()
+        for block, image, index in zip(own.blocks, images, bins):
+            st.add_bins(normal, block.where, block.middle, block.r, first, index, count, [image])
+        rest = list(range(first, first + count))
+        lengths = np.diag(normal.gram)[rest]
+        k = own.thinning
+        projected = own.project(normal, calibrated + effect, rest, k)
+        fall, dof, *_ = st.joint(projected, lengths)
+        if dof == 0:
+            continue
+        _, _, delta, sd = st.joint(own.project(normal, calibrated, rest, k), lengths)
+        h = max(fall - dof, 0.0) * k / max(net, 1e-9)
+        cut = [image[:, None] * (index[:, None] == np.arange(count)) for image, index in zip(images, bins)]
+        cut = _off_base(own, cut, projected, calibrated + effect)
+        results.append(Split(c.effect.name, by, labels, (1 + delta).tolist(), sd.tolist(), fall * k, dof, float(chdtrc(dof, fall)), h,
+                             by_clutter(projected.score, projected.information, variances(cut, residuals, places)), UNEVEN, True))
+    level, excess = LEVEL / max(len(results), 1), left.excess_sd * math.sqrt(2 * max(evidence.normal.count - evidence.projected.rank, 1))
+
+    def most(s: Split) -> float:
+        if s.p >= level:
+            return max(s.h, UNEVEN)
+        if left.complete:  # nothing but noise is left, so that p means what it says
+            return HAIR
+        return min(EVEN if s.chance < LEVEL else UNEVEN, SAME_PLACE * excess / max(net, 1e-9))
+
+    results = [replace(s, limit=most(s), holds=s.h <= most(s)) for s in results]
+    return results, *scatter(own, calibrated, effect, change, places)
+
+
+def scattered(refit: Refit, chance: float, clutter: np.ndarray) -> Refit:
+    """A refit with what the scatter of its strength says; where nothing is left but noise, its errors are those of noise."""
+    if refit.complete:
+        return replace(refit, chance=chance)
+    return replace(refit, chance=chance, clutter=clutter.tolist(),
+                   sd=np.sqrt(np.square(refit.sd) + np.maximum(np.diag(clutter), 0.0)).tolist())
+
+
+def scatter(own: Evidence, calibrated: Sequence[int], effect: Sequence[int], change: np.ndarray, places: list[dict]) -> tuple[float, np.ndarray]:
+    """p of a strength that asks for no independent noise, by its scatter between parts of the sensor or session, as neighbours share
+    clutter (`by_clutter`); and the covariance V^-1 (B - V) V^-1 that clutter adds to that of noise, with B of `variances`.
+    The larger of what the maps say; NaN and zero where there are too few parts."""
+    projected, clutter = own.project(own.thinned(), calibrated, effect, own.thinning), np.zeros((len(effect),) * 2)
+    white = st.root(projected.information, st.VISIBLE)
+    covariance = white.T @ white
+    images = _off_base(own, [_columns(block, effect) for block in own.blocks], projected, calibrated)
+    found = variances(images, [block.r for block in own.blocks], places)
+    for b, parts in found:
+        if st.inverse(white @ b @ white.T)[1] < parts - 1:
+            clutter = max(clutter, covariance @ (b - projected.information) @ covariance, key=lambda c: float(np.trace(c @ projected.information)))
+    return by_clutter(projected.information @ change, projected.information, found), clutter
+
+
+def _columns(block: Block, columns: Sequence[int]) -> np.ndarray:
+    """(n, k) images of a block; 0 where it has none of a column."""
+    position = {int(w): i for i, w in enumerate(block.where)}
+    images = np.zeros((len(block.r), len(columns)))
+    there = [(i, position[c]) for i, c in enumerate(columns) if c in position]
+    images[:, [i for i, _ in there]] = block.middle[:, [j for _, j in there]]
+    return images
+
+
+def _off_base(own: Evidence, images: Sequence[np.ndarray], projected: st.Projected, base: Sequence[int]) -> list[np.ndarray]:
+    """Images of each block with what the base makes up for taken out."""
+    return [image + _columns(block, base) @ projected.response for block, image in zip(own.blocks, images)]
+
+
+def variances(images: Sequence[np.ndarray], left: Sequence[np.ndarray], places: list[dict]) -> list[tuple[np.ndarray, int]]:
+    """(B, G) for each of MAPS that there is: the variance of the score x'r of images x, by its scatter between G parts.
+
+    B = sum of w w' with w = (1 - V_g/V)^(-1/2) u_g, u_g = sum of x r over part g, V_g of x x', where r is what is left at the optimum,
+    whose fit has taken a share V_g/V of part g along: without clutter the mean of B is V. What is `left` where a fit stopped short of it,
+    or followed other images than these, is brought there first: a part that knows nearly all would show that rest many times over.
+
+    Source: Liang & Zeger, Longitudinal data analysis using generalized linear models, Biometrika 73, 13 (1986), the robust variance;
+    Bell & McCaffrey, Bias reduction in standard errors for linear regression with multi-stage samples, Survey Methodology 28, 169 (2002).
+    """
+    found, k = [], images[0].shape[1]
+    root = st.root(sum(x.T @ x for x in images))
+    back = np.linalg.pinv(root)
+    rest = root.T @ root @ sum(x.T @ r for x, r in zip(images, left))
+    left = [r - x @ rest for x, r in zip(images, left)]
+    for name in MAPS:
+        edges = st.bin_edges(np.concatenate([p[name] for p in places]), PARTS) if name in places[0] else None
+        if edges is None:
+            continue
+        b, parts = np.zeros((k, k)), 0
+        bins = [np.searchsorted(edges, place[name], side="right") - 1 for place in places]
+        for g in range(len(edges) - 1):
+            own = np.concatenate([x[part == g] for x, part in zip(images, bins)])
+            if not own.any():
+                continue
+            score = own.T @ np.concatenate([r[part == g] for r, part in zip(left, bins)])
+            share, vectors = np.linalg.eigh(root @ (own.T @ own) @ root.T)
+            free = np.where(share < 1 - 1e-6, np.maximum(1 - share, 1e-6) ** -0.5, 0.0)  # what one part alone knows has no scatter
+            w = back @ (vectors * free) @ (vectors.T @ (root @ score))
+            b, parts = b + np.outer(w, w), parts + 1
+        found.append((b, parts))
+    return found
+
+
+def by_clutter(score: np.ndarray, information: np.ndarray, variances: Sequence[tuple[np.ndarray, int]]) -> float:
+    """p of a score u (k,) of information V by its variance B between G parts; the larger of what the maps say, NaN where these know none.
+
+    T2 = u' B^-1 u, T2 (G - k)/(k (G - 1)) ~ F(k, G - k), where G >= 2 k: fewer parts know too little of B's directions (15 strengths and 16
+    parts would ask 1.4e6 of T2). They know its trace: with M = V^-1/2 B V^-1/2, F = u' V^-1 u / tr M ~ F(h, h (G - 1)), h = (tr M)^2 / tr M^2.
+    Combinations of strengths of which V holds no more than rounding (VISIBLE), as a gain common to all frames beside lights, have no part.
+
+    Source: Brunner, Dette & Munk, Box-type approximations in nonparametric factorial designs, J. Am. Stat. Assoc. 92, 1494 (1997).
+    """
+    from scipy.stats import f as fisher
+
+    ps, white = [], st.root(information, st.VISIBLE)
+    for b, parts in variances:
+        spread, vectors = np.linalg.eigh(white @ b @ white.T)
+        known = spread > st.TRUNCATION * max(spread.max(initial=0.0), 1e-300)
+        spread, z, k = spread[known], vectors[:, known].T @ white @ score, int(known.sum())
+        if not k or parts < 3:
+            continue
+        if parts >= 2 * k:
+            ps.append(float(fisher.sf(np.sum(z**2 / spread) * (parts - k) / (k * (parts - 1)), k, parts - k)))
+        else:
+            h = spread.sum() ** 2 / np.sum(spread**2)
+            ps.append(float(fisher.sf(z @ z / spread.sum(), h, h * (parts - 1))))
+    return max(ps, default=math.nan)
+
+
+def _parts(model, evidence: Evidence, places: list[dict]) -> dict[str, tuple[list[str], list[np.ndarray]]]:
+    """name -> (labels, per block the part of each value): channel, frame, LED, group, settings, contact, quadrant."""
+    frames = [model.frames[f] for f in evidence.frames]
+    names = [getattr(f, "name", str(i)) for i, f in enumerate(frames)]
+    parts: dict[str, tuple[list[str], list[np.ndarray]]] = {}
+    seen: list[list[int]] = []
+
+    def of_coordinate(by, coordinate, labels):
+        if all(coordinate in p for p in places):
+            parts[by] = (labels, [np.nan_to_num(p[coordinate]).astype(int) for p in places])
+
+    def of_frame(by, labels):
+        kinds = list(dict.fromkeys(labels))  # by first occurrence, so that equal partitions have equal numbers
+        numbers = [kinds.index(label) for label in labels]
+        if 2 <= len(kinds) and numbers not in seen:
+            seen.append(numbers)
+            parts[by] = (kinds, [np.full(len(p["channel"]), i) for i, p in zip(numbers, places)])
+
+    of_coordinate("channel", "channel", prints.channel_names(evidence))
+    of_frame("frame", names)
+    of_frame("LED", [led_label(f.parameters) for f in frames])
+    of_frame("group", [getattr(f, "group", None) or name for f, name in zip(frames, names)])
+    for key, numbers in prints.settings(model, evidence).items():
+        if len(set(numbers)) <= 8:
+            of_frame(key, [f"{v:g}" for v in numbers])
+    for key in sorted(set.intersection(*[set(p) for p in places]) - set(parts)):  # what a sweep turns from reading to reading
+        if "." in key:
+            found = np.unique(np.concatenate([p[key] for p in places]))
+            if 2 <= len(found) <= 8 and np.isfinite(found).all():
+                parts[key] = ([f"{v:g}" for v in found], [np.searchsorted(found, p[key]) for p in places])
+    of_coordinate("contact", "contact", ["no contact", "contact"])
+    of_coordinate("quadrant", "quadrant", ["top left", "top right", "bottom left", "bottom right"])
+    return {by: given for by, given in parts.items() if len(given[0]) > 1}

@@ -1,0 +1,97 @@
+"""Two effects at once: where no single one explains a residual, the pairs that leave nothing of it.
+
+Pairs are ranked by the linear fall of chi2, T = u' V^-1 u over the columns of both, and the best are refitted together with
+everything else. Only a pair after which nothing is left counts: two more numbers cannot do that by luck.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+
+from optics.diagnosis import statistics as st
+from optics.diagnosis.evidence import Candidate, Evidence
+from optics.diagnosis.verdict import CLEAR, HIDDEN, LEVEL, MARGIN, MIMICS, Fingerprint, Pair
+
+CONSIDERED = 10  # effects, the best by themselves: 45 pairs
+REFITTED = 4  # pairs
+LEAD = MARGIN / 4  # of the fall, by which two effects must do better than one, and than one curve where they leave misfit
+
+
+def ranked(evidence: Evidence, candidates: Sequence[Candidate]) -> list[tuple[float, Candidate, Candidate, np.ndarray]]:
+    """(expected fall less its degrees of freedom, a, b, coefficients of both), best first."""
+    projected, first, found = evidence.projected, len(evidence.base), []
+    for a, b in combinations(candidates, 2):
+        if any(c.contains(d) for c in (a, b) for d in candidates):
+            continue  # its simpler part is tried
+        if {key for v in a.variables for key in v.keys} & {key for v in b.variables for key in v.keys}:
+            continue
+        own, live = np.array([*a.columns, *b.columns]) - first, np.array([*a.cone.live, *(len(a.columns) + b.cone.live)])
+        seen = own[live]  # of what the projection left no more than rounding, nothing is expected
+        inverse, rank = st.inverse(projected.information[np.ix_(seen, seen)], st.VISIBLE)
+        linear = np.zeros(len(own))
+        linear[live] = inverse @ projected.score[seen]
+        signs = [s * x >= 0 for s, x in zip([*a.sides, *b.sides], linear) if s]
+        if all(signs):  # no effect below its neutral value, where that is a bound
+            found.append((float(projected.score[own] @ linear) - rank, a, b, linear))
+    return sorted(found, key=lambda t: -t[0])
+
+
+def search(evidence: Evidence, order: Sequence[Candidate], alone: float, add: Callable[[list[Candidate]], Pair | None]) -> list[Pair]:
+    """The best pairs, refitted; `alone` is the best single effect's net fall.
+
+    add   effects with their `linear` set -> what comes of them after a refit, or None
+    """
+    live = [c for c in order if c.row.p_family < LEVEL and len(c.cone.live) and not c.broken][:CONSIDERED]
+    best = [t for t in ranked(evidence, live) if t[0] - alone > max(CLEAR, LEAD * alone)]
+    pairs = []
+    for _, a, b, linear in best[:REFITTED]:
+        kept = a.linear, b.linear
+        a.linear, b.linear = linear[:len(a.columns)], linear[len(a.columns):]
+        try:
+            pair = add([a, b])
+        finally:
+            a.linear, b.linear = kept
+        if pair is not None and math.isfinite(pair.fall):
+            pairs.append(pair)
+    return sorted(pairs, key=lambda p: -p.fall)
+
+
+def beside_curves(pairs: Sequence[Pair], fingerprints: Sequence[Fingerprint], chance: Mapping[str, float]) -> list[Pair]:
+    """The pairs, with a `but` where one curve does as well: that is rather one cause, which the library lacks.
+
+    chance   effect -> fall that chance gives
+    """
+    curve = max((f for f in fingerprints if f.coordinate not in MIMICS), key=lambda f: f.net, default=None)
+
+    def judged(pair: Pair) -> Pair:
+        net = pair.fall - sum(chance[name] for name in pair.effects)
+        lead = LEAD * net if pair.excess_sd > HIDDEN else 0.0
+        if curve is None or not pair.complete or net > curve.net + max(CLEAR, lead):
+            return pair
+        return replace(pair, but=f"one curve, along '{curve.coordinate}', explains {curve.net / net:.0%} of what both do")
+
+    return [judged(pair) for pair in pairs]
+
+
+def words(pairs: Sequence[Pair], share: dict[str, float]) -> str:
+    """The pairs that leave nothing, in a sentence; `share` of the excess that each effect explains alone."""
+    complete = [p for p in pairs if p.complete]
+    common = [n for n in complete[0].effects if all(n in p.effects for p in complete)]
+    if not common:
+        named = ", or ".join(" with ".join(p.effects) for p in complete)
+        return f"no one effect explains the residual, two do and leave nothing: {named}."
+    one = max(common, key=lambda n: share.get(n, 0.0))
+    others = [next(n for n in p.effects if n != one) for p in complete]
+    part = f" {one} alone explains {share[one]:.0%}." if math.isfinite(share.get(one, math.nan)) else ""
+    return (f"no one effect explains the residual, but {one} together with {' or with '.join(others)} leaves nothing.{part} "
+            f"Add {one}, calibrate and diagnose again.")
+
+
+def doubt(pairs: Sequence[Pair]) -> str:
+    """Why two effects that would leave nothing are not named; empty where there are none."""
+    return next((f" {' with '.join(p.effects)} would leave nothing, but {p.but}." for p in pairs if p.but), "")

@@ -1,0 +1,131 @@
+"""Rehearsal: were an effect hidden in these captures, would a diagnosis name it? From derivative images alone, before anybody hides one.
+
+Scores of a hidden effect with the strengths s are u = V s + z, z ~ N(0, V), with the information V that calibration leaves (as in
+`optics.diagnosis.statistics`); from thousands of such u the falls of chi2 of all candidates follow, and who comes first, by how much:
+
+    noticed   the best candidate is significant among all of them (family-wise, 1 %)
+    first     the hidden effect has the largest fall
+    named     it leads by what a claim asks for
+    as        who comes first most often where it does not
+
+Linear in the effect and in the base, with the camera's noise and nothing else: clutter, and effects that bend, do worse. For the whole
+loop on imitated captures see `imitate`.
+
+Source: diagnosis.md, section 2; mrcal, "make_perfect_observations", for the idea.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from optics.captures import capture_set as capture_files
+from optics.diagnosis import statistics as st
+from optics.diagnosis.verdict import CLEAR, LEVEL, MARGIN
+from optics.errors import BadCapture
+from optics.scene.parameter import Values
+from optics.words import percent, spaced, table
+
+
+@dataclass(frozen=True)
+class Rehearsed:
+    """One effect, hidden: its strengths (largest first in size), and shares of the draws. `change` is infinite where no image is left."""
+
+    effect: str
+    strength: float
+    unit: str
+    noticed: float
+    first: float
+    named: float
+    mistaken_for: str
+    mistaken: float
+
+
+@dataclass(frozen=True)
+class Rehearsal:
+    """All effects at one change of the pictures (rms over mean signal, before any calibration)."""
+
+    change: float
+    frames: int
+    rows: list[Rehearsed]
+    unseen: list[str]
+
+    def text(self) -> str:
+        lines = [f"rehearsal: {self.frames} frames, every effect hidden in turn at a change of the pictures by {percent(self.change)}, in the "
+                 "camera's noise alone"]
+        lines.append(table([("effect", "strength", "noticed", "first", "named", "most often taken for")] + [
+            (r.effect, f"{r.strength:.3g}{spaced(r.unit)}", f"{r.noticed:.0%}", f"{r.first:.0%}", f"{r.named:.0%}",
+             f"{r.mistaken_for} ({r.mistaken:.0%})" if r.mistaken_for else "") for r in sorted(self.rows, key=lambda r: -r.named)], left=(0, 5)))
+        if self.rows:
+            lines.append(f"all: first in {np.mean([r.first for r in self.rows]):.0%}, named in {np.mean([r.named for r in self.rows]):.0%}; never "
+                         f"named: {', '.join(r.effect for r in self.rows if r.named < 0.01) or 'none'}")
+        if self.unseen:
+            lines.append(f"leave nothing to be seen in these captures: {', '.join(self.unseen)}")
+        return "\n".join(lines) + "\n"
+
+    def to_json(self) -> str:
+        return json.dumps(asdict(self), indent=1)
+
+
+def rehearse(model, fit, effects: Sequence, variables_of: Callable, fitted: Sequence[int], *, change: float = 0.005, draws: int = 2000,
+             seed: int = 0, progress=None) -> Rehearsal:
+    """Hide every effect in turn; arguments as of `optics.diagnosis.diagnose.diagnose`, change as in `Rehearsal`.
+
+    Raises ValueError for a change that is not positive, Underdetermined as a diagnosis does.
+    """
+    from optics.diagnosis.diagnose import score
+
+    if not change > 0:
+        raise ValueError(f"change = {100 * change:g} %; allowed: above 0 % of the mean signal, such as 0.5 %")
+    scored = score(model, fit, effects, variables_of, fitted, seed=seed, progress=progress)
+    evidence, table = scored.evidence, scored.table
+    first, information = len(evidence.base), table.information
+    live = [c for c in table.order if len(c.cone.live) and c.raw > 0]
+    places = [np.array(c.columns) - first for c in live]
+    noise = st.gaussian(information, draws, np.random.default_rng([seed, 29]))
+    critical = table.family.critical(LEVEL)
+    levels = [c.cone.critical(critical) for c in live]
+    rows = []
+    for a, c in enumerate(live):
+        linear = c.linear_of(c.usual) * change / c.raw
+        scores = noise + information[:, places[a]] @ linear
+        falls = np.stack([other.cone.fall(scores[:, own]) for other, own in zip(live, places)])
+        noticed = (falls > np.array(levels)[:, None]).any(0)
+        net = falls - np.array([other.cone.expectation for other in live])[:, None]
+        # what contains the effect fits as well by itself, and rivals it only beyond what decides
+        net -= np.array([[CLEAR if other.contains(c) else 0.0] for other in live])
+        rivals = np.delete(net, a, 0)
+        lead = net[a] - rivals.max(0, initial=0.0)
+        best = net.argmax(0)
+        wrong = np.bincount(best[best != a], minlength=len(live)) / draws
+        strengths = c.change_of(linear)
+        biggest = int(np.argmax(np.abs(strengths / c.plausible)))
+        rows.append(Rehearsed(c.effect.name, float(strengths[biggest]), c.variables[biggest].parameter.unit, float(noticed.mean()),
+                              float((best == a).mean()), float((noticed & (best == a) & (lead > np.maximum(CLEAR, MARGIN * net[a]))).mean()),
+                              live[int(wrong.argmax())].effect.name if wrong.any() else "", float(wrong.max(initial=0.0))))
+    return Rehearsal(change, len(evidence.frames), rows, [c.effect.name for c in table.order if c not in live])
+
+
+def imitate(model, values: Values, folder: str | Path, seed: int = 0) -> Path:
+    """Captures as this model would take them at these values: its predictions, with noise of its camera, and the settings of its frames.
+
+    They show what a residual would look like, and what the loop says of it. They prove nothing about the model: both sides are the same.
+    Raises BadCapture for readings in a table, and as `optics.captures.capture_set.write`.
+    """
+    captures = model.captures
+    if captures.table is not None:
+        raise BadCapture(f"{captures.folder}: readings in a table are not imitated; allowed: pictures; `optics rehearse` works for both")
+    rng = np.random.default_rng([seed, 31])
+    frames = []
+    for frame, signal in zip(model.frames, model.predict(values)):
+        image = model.noise.expose(signal, rng).astype(np.float32)
+        if captures.cfa is not None:
+            image = np.take_along_axis(image, capture_files.cfa_channel(image.shape, captures.cfa)[..., None], axis=2)
+        frames.append(replace(frame, image=image, repeats=[]))
+    whole = model.noise.quantisation == 1 and float(model.noise.saturation).is_integer()
+    bits = None if not whole else 8 if model.noise.saturation <= 255 else 16
+    return capture_files.write(replace(captures, frames=frames, noise=model.noise, warnings=[]), folder, bits=bits)

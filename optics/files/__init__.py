@@ -1,0 +1,1 @@
+"""Files on disk: images, TOML, and output that is whole or absent."""

@@ -1,0 +1,321 @@
+"""Null models: what a physical model of a pressed gel must beat before it has said anything.
+
+    background           I = B
+    directional          I = B + l . (n - n0)   or   I = B max(0, n . l)/(n0 . l)      one light at infinity per channel;
+                         the form with the smaller error on the held-out frames stands in the table
+    linear in the normal I = B + sum over (n_x, n_y, n_z - 1) x (1, x, y, x^2, xy, y^2), 18 coefficients per channel
+
+with the background B (the flat field times the frame's gain), the normal n of the pressed face towards the camera, n0 the same
+at rest, and x, y the place on the face in units of half the picture's width. All see the frames, masks, gains and split of the
+physical model, and its geometry. Poses: those of the physical model, or poses refined for the null itself, by Gauss-Newton on
+fitted and held-out frames; of the two the one with the smaller held-out error counts, so that every doubt goes to the null.
+
+Errors are differences to the pictures in DN on usable pixels, predictions clipped to the camera's range: rms and L1, within
+`NEAR` labelled radii of the contact and in the whole picture.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field
+
+import numpy as np
+
+from optics.captures.importing import POSE, PRIORS
+from optics.scene.parameter import Values
+
+NEAR = 2.0  # labelled radii
+STEPS = (0.02, 0.02, 0.02)  # mm, of the differences by which normals follow a pose
+
+
+@dataclass
+class Score:
+    """Errors of one model on one split, per channel, DN."""
+
+    model: str
+    split: str  # 'fitted' or 'held out'
+    poses: str
+    rms_near: list[float]
+    rms_whole: list[float]
+    l1_near: list[float]
+    l1_whole: list[float]
+
+
+@dataclass
+class NullTable:
+    """Scores of the physical model and of the nulls on the same frames; noise: the camera's sd at the background, DN."""
+
+    scores: list[Score]
+    noise: list[float]
+    fitted: list[str] = field(default_factory=list)
+    held_out: list[str] = field(default_factory=list)
+
+    def of(self, model: str, split: str = "held out") -> Score:
+        return next(s for s in self.scores if s.model == model and s.split == split)
+
+    @property
+    def nulls(self) -> list[str]:
+        return [s.model for s in self.scores if s.split == "held out" and s.model != PHYSICAL]
+
+    def wins(self, measure: str = "rms_near") -> list[bool]:
+        """Per channel: whether the physical model beats every null on the held-out frames."""
+        own = np.array(getattr(self.of(PHYSICAL), measure))
+        return [bool(w) for w in own < np.min([getattr(self.of(n), measure) for n in self.nulls], axis=0)]
+
+    def text(self) -> str:
+        """A table of the errors per channel, held-out frames first."""
+        titles = [f"{what}, {where}" for what in ("rms", "L1") for where in (f"r < {NEAR:g} radii", "whole")]
+        lines = [f"{'':<30}{'poses':<10}" + "".join(f"{title:>24}" for title in titles)]
+        for split in ("held out", "fitted"):
+            names = self.held_out if split == "held out" else self.fitted
+            lines.append(f"{split}{f' ({len(names)} frames)' if names else ''}, DN, R / G / B")
+            for s in self.scores:
+                if s.split == split:
+                    cells = [" / ".join(f"{v:.2f}" for v in getattr(s, m)) for m in MEASURES]
+                    lines.append(f"  {s.model:<28}{s.poses:<10}" + "".join(f"{c:>24}" for c in cells))
+        lines.append(f"{'noise of the camera':<40}{' / '.join(f'{v:.2f}' for v in self.noise):>24}")
+        lines.append(f"the physical model beats every null on held-out frames in {self.won or 'no channel'} (rms near the contact)")
+        return "\n".join(lines)
+
+    @property
+    def channels(self) -> list[str]:
+        return list("RGB") if len(self.noise) == 3 else [str(c) for c in range(len(self.noise))]
+
+    @property
+    def won(self) -> str:
+        """The channels in which the physical model beats every null near the contact; '' for none."""
+        return ", ".join(c for c, w in zip(self.channels, self.wins()) if w)
+
+    @classmethod
+    def from_json(cls, data: dict) -> "NullTable":
+        return cls([Score(**score) for score in data["scores"]], data["noise"], data["fitted"], data["held_out"])
+
+    def json(self) -> dict:
+        return {"scores": [asdict(s) for s in self.scores], "noise": self.noise, "fitted": self.fitted,
+                "held_out": self.held_out, "wins": self.wins()}
+
+
+PHYSICAL = "physical"
+MEASURES = ("rms_near", "rms_whole", "l1_near", "l1_whole")
+
+
+def pooled(tables: Sequence[NullTable]) -> NullTable:
+    """One table of several folds: squares and sizes of errors averaged, each fold by its number of frames."""
+    scores = []
+    for first in tables[0].scores:
+        parts = [t.of(first.model, first.split) for t in tables]
+        weights = [len(t.held_out if first.split == "held out" else t.fitted) for t in tables]
+        mean = {m: np.average([np.array(getattr(p, m)) ** (2 if m.startswith("rms") else 1) for p in parts], axis=0,
+                              weights=weights) for m in MEASURES}
+        mean = {m: (np.sqrt(v) if m.startswith("rms") else v).tolist() for m, v in mean.items()}
+        poses = parts[0].poses if len({p.poses for p in parts}) == 1 else "either"
+        scores.append(Score(first.model, first.split, poses, **mean))
+    return NullTable(scores, np.mean([t.noise for t in tables], axis=0).tolist(),
+                     [n for t in tables for n in t.fitted], [n for t in tables for n in t.held_out])
+
+
+# -- The nulls ------------------------------------------------------------------------------------------------------------
+
+class Background:
+    """I = B."""
+
+    name = "background"
+
+    def fit(self, shapes, rows):
+        return self
+
+    def predict(self, shape):
+        return shape.background
+
+
+class Additive:
+    """I = B + l . (n - n0), per channel."""
+
+    name = "directional, additive"
+
+    def features(self, shape) -> np.ndarray:
+        """(H W, F), without the background's factor."""
+        return shape.tilt.reshape(-1, 3)
+
+    def fit(self, shapes, rows):
+        self.coefficients = []
+        for c in range(rows[0][0].shape[-1]):
+            a = b = 0
+            for shape, (image, weight) in zip(shapes, rows):
+                f, w = self.features(shape), weight[..., c].ravel()
+                a = a + (f.T * w) @ f
+                b = b + (f.T * w) @ (image - shape.background)[..., c].ravel()
+            self.coefficients.append(np.linalg.solve(a + 1e-9 * np.trace(a) / len(a) * np.eye(len(a)), b))
+        return self
+
+    def predict(self, shape):
+        steps = self.features(shape) @ np.array(self.coefficients).T
+        return shape.background + steps.reshape(shape.background.shape)
+
+
+class Linear(Additive):
+    """I = B + (n - n0) times a quadratic of the place, 18 coefficients per channel."""
+
+    name = "linear in the normal"
+
+    def features(self, shape):
+        x, y = shape.x, shape.y
+        place = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], -1)
+        return (shape.tilt[..., :, None] * place[..., None, :]).reshape(-1, 18)
+
+
+class Multiplicative:
+    """I = B max(0, n . l)/(n0 . l), per channel, with l = (a, b, 1) as n0 = (0, 0, 1); linear where it is lit."""
+
+    name = "directional, multiplicative"
+
+    def fit(self, shapes, rows):
+        self.coefficients = [np.zeros(2) for _ in range(rows[0][0].shape[-1])]
+        for c, start in enumerate(self.coefficients):
+            for _ in range(4):
+                a = b = 0
+                for shape, (image, weight) in zip(shapes, rows):
+                    n, flat = shape.tilt, shape.background[..., c]
+                    lit = 1 + n[..., 2] + n[..., :2] @ self.coefficients[c] > 0
+                    f = (n[..., :2] * flat[..., None] * lit[..., None]).reshape(-1, 2)
+                    left = np.where(lit, image[..., c] - flat * (1 + n[..., 2]), 0).ravel()
+                    w = weight[..., c].ravel()
+                    a, b = a + (f.T * w) @ f, b + (f.T * w) @ left
+                self.coefficients[c] = np.linalg.solve(a + 1e-9 * np.eye(2), b)
+        return self
+
+    def predict(self, shape):
+        n = shape.tilt
+        return shape.background * np.maximum(1 + n[..., 2:] + n[..., :2] @ np.array(self.coefficients).T, 0)
+
+
+@dataclass
+class Shape:
+    """What a null sees of a frame: background (H, W, C) DN, n - n0 (H, W, 3), place x, y (H, W)."""
+
+    background: np.ndarray
+    tilt: np.ndarray
+    x: np.ndarray
+    y: np.ndarray
+
+
+class Bench:
+    """The frames of a model with their shapes for any pose; shapes are kept, as all nulls start from the same poses."""
+
+    def __init__(self, model, values: Values, circles: np.ndarray):
+        self.model, self.circles = model, circles
+        self.base = values
+        self.kept: dict = {}
+        height, width = model.shape[:2]
+        v, u = np.mgrid[:height, :width] + 0.5
+        self.near = {i: np.hypot(u - x, v - y) < NEAR * r for i, (x, y, r) in enumerate(circles)}
+        self.x, self.y = (u - width / 2) / (width / 2), (v - height / 2) / (width / 2)
+        self.rows = {}
+
+    def pose(self, index: int) -> tuple[float, ...]:
+        now = self.model.at(self.base, index)
+        return tuple(float(now[key]) for key in POSE)
+
+    def row(self, index: int):
+        """(image, weight 1/variance of usable pixels)."""
+        if index not in self.rows:
+            image = self.model.frames[index].image.astype(float)
+            self.rows[index] = (image, self.model.usable(index) / self.model.noise.variance(image))
+        return self.rows[index]
+
+    def shape(self, index: int, pose: Sequence[float]) -> Shape:
+        pose = (*pose[:2], max(float(pose[2]), 1e-3))
+        if (index, pose) not in self.kept:
+            now = {**self.model.at(self.base, index), **dict(zip(POSE, pose))}
+            hits = self.model.renderer.hits(now)
+            normal = hits.normal * np.array([1, 1, -1])  # towards the camera, which stands at -z
+            tilt = np.where(hits.valid[..., None], normal - np.array([0, 0, 1]), 0)
+            self.kept[index, pose] = tilt.astype(np.float32)
+            self.model.renderer._hits.clear()
+        now = self.model.at(self.base, index)
+        flat = self.model.noise.black_level + self.model.flat * self.model._gains(now)
+        return Shape(flat, self.kept[index, pose].astype(float), self.x, self.y)
+
+    def misfit(self, null, index: int, pose) -> float:
+        image, weight = self.row(index)
+        gap = sum(((p - q) / s) ** 2 for p, q, s in zip(pose, self.start[index], PRIOR_SD))
+        return float((weight * (self.clip(null.predict(self.shape(index, pose))) - image) ** 2).sum()) + gap
+
+    def clip(self, image):
+        return np.clip(image, 0, self.model.noise.saturation)
+
+    def refined(self, null, index: int, pose) -> tuple[float, ...]:
+        """One Gauss-Newton step of the pose for a fitted null, halved until the misfit falls; else the pose as it was."""
+        image, weight = self.row(index)
+        sides = [[null.predict(self.shape(index, [p + sign * (k == j) * s for j, p in enumerate(pose)])) for sign in (1, -1)]
+                 for k, s in enumerate(STEPS)]
+        j = np.stack([((high - low) / (2 * s)).ravel() for (high, low), s in zip(sides, STEPS)])
+        w, left = weight.ravel(), (image - null.predict(self.shape(index, pose))).ravel()
+        sd = np.array(PRIOR_SD)
+        a, b = (j * w) @ j.T + np.diag(1 / sd**2), (j * w) @ left + (np.array(self.start[index]) - pose) / sd**2
+        step, before = np.clip(np.linalg.solve(a, b), -0.3, 0.3), self.misfit(null, index, pose)
+        for share in (1.0, 0.4):
+            moved = tuple(float(v) for v in np.array(pose) + share * step)
+            if moved[2] > 0.01 and self.misfit(null, index, moved) < before:
+                return moved
+        return tuple(pose)
+
+    def score(self, name: str, split: str, poses: str, indices, predictions) -> Score:
+        parts = {m: [] for m in MEASURES}
+        for index, prediction in zip(indices, predictions):
+            left = self.clip(prediction) - self.model.frames[index].image
+            usable = self.model.usable(index)
+            for place, mask in (("near", self.near[index][..., None] & usable), ("whole", usable)):
+                count = np.maximum(mask.sum((0, 1)), 1)
+                parts[f"rms_{place}"].append((mask * left**2).sum((0, 1)) / count)
+                parts[f"l1_{place}"].append((mask * np.abs(left)).sum((0, 1)) / count)
+        mean = {m: np.mean(v, 0) for m, v in parts.items()}
+        return Score(name, split, poses, **{m: (np.sqrt(v) if m.startswith("rms") else v).tolist() for m, v in mean.items()})
+
+
+PRIOR_SD = (PRIORS["gel.press_[xy]"], PRIORS["gel.press_[xy]"], PRIORS["gel.press_depth"])
+
+
+def compare(model, values: Values, fitted: Sequence[int], held_out: Sequence[int], circles: np.ndarray, *, rounds: int = 2,
+            progress: Callable[[str, int, int], None] | None = None) -> NullTable:
+    """Score a calibrated model against the nulls.
+
+    values    of the physical model, with its poses on fitted and on held-out frames;   circles (N, 3) px, see `importing`
+    rounds    Gauss-Newton steps by which a null's own poses are refined, on each split
+    Needs a model with a flat field. Raises ValueError when a frame is on both sides of the split.
+    """
+    if model.flat is None:
+        raise ValueError("nulls are departures from a background: the model needs a flat field")
+    if set(fitted) & set(held_out) or not fitted or not held_out:
+        raise ValueError(f"fitted frames {list(fitted)} and held-out frames {list(held_out)}: both sides need frames, none in common")
+    bench = Bench(model, values, circles)
+    splits = {"held out": list(held_out), "fitted": list(fitted)}
+    everything = [*fitted, *held_out]
+    same = bench.start = {i: bench.pose(i) for i in everything}
+    scores = [bench.score(PHYSICAL, split, "own", indices, model.predict(values, indices)) for split, indices in splits.items()]
+    rows = [bench.row(i) for i in fitted]
+    found = {}
+    for done, kind in enumerate((Background, Additive, Multiplicative, Linear)):
+        options = {"physical": (dict(same), kind().fit([bench.shape(i, same[i]) for i in fitted], rows))}
+        if kind is not Background and rounds:
+            null, poses = options["physical"][1], dict(same)
+            for _ in range(rounds):
+                poses.update({i: bench.refined(null, i, poses[i]) for i in fitted})
+                null = kind().fit([bench.shape(i, poses[i]) for i in fitted], rows)
+            for _ in range(rounds):
+                poses.update({i: bench.refined(null, i, poses[i]) for i in held_out})
+            options["own"] = (poses, null)
+        tried = []
+        for label, (poses, null) in options.items():
+            tried.append([bench.score(kind.name, split, label if kind is not Background else "-", indices,
+                                      [null.predict(bench.shape(i, poses[i])) for i in indices])
+                          for split, indices in splits.items()])
+        found[kind] = min(tried, key=lambda s: np.square(s[0].rms_near).sum())
+        if progress:
+            progress("nulls", done + 1, 4)
+    directional = min((found[Additive], found[Multiplicative]), key=lambda s: np.square(s[0].rms_near).sum())
+    for pair in (found[Background], directional, found[Linear]):
+        scores += pair
+    noise = [float(np.sqrt(np.mean(model.noise.variance(model.flat[..., c] + model.noise.black_level))))
+             for c in range(model.shape[2])]
+    return NullTable(scores, noise, [model.frames[i].name for i in fitted], [model.frames[i].name for i in held_out])

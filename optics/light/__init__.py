@@ -1,0 +1,1 @@
+"""Light: from a scene to what the camera makes of it."""

@@ -1,0 +1,163 @@
+"""What the camera makes of the light: bands to irradiance, channels, response, digital numbers.
+
+    I_b  = lens(L_b)                        effects of the stage `lens`
+    I_c  = exposure gain gain_c sum_b M_cb I_b     then effects of the stage `sensor`
+    m_c  = G_c^-1(I_c)                      then effects of the stage `response`
+    DN   = black + (saturation - black) m_c + offset
+
+All of it is numpy arithmetic, analytic in the image and in every camera parameter, so that derivatives come from a complex
+step: f'(x) v = Im f(x + i h v)/h with h = 1e-30, exact to rounding (Squire & Trapp, SIAM Rev. 40, 110, 1998).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import SimpleNamespace
+
+import numpy as np
+
+from optics.scene.declare import IMAGE_STAGES
+from optics.scene.registry import registry
+
+STEP = 1e-30  # of the complex step; far below rounding, far above underflow
+
+
+def sensitivities(name: str, bands: tuple[float, ...], channels: int = 3) -> np.ndarray:
+    """M (channels, bands): the identity, or a measured camera of colour-science at the bands, largest entry 1."""
+    if name == "identity":
+        return np.eye(channels, len(bands)) if len(bands) > 1 else np.ones((1, 1))
+    import colour
+
+    from optics.errors import UnknownKey
+
+    cameras = colour.MSDS_CAMERA_SENSITIVITIES
+    if name not in cameras:
+        raise UnknownKey(name, ["identity", *cameras], "camera sensitivity")
+    data = cameras[name]
+    matrix = np.stack([np.interp(bands, data.wavelengths, data.values[:, c]) for c in range(3)])
+    return matrix / matrix.max()
+
+
+class Developer:
+    """The camera of a scene as arithmetic on images of a fixed size.
+
+    camera     the scene's camera part
+    bands      wavelengths of the image's bands, nm
+    black, saturation    DN; (0, 1) for radiance
+    """
+
+    def __init__(self, camera, bands: tuple[float, ...], black: float = 0.0, saturation: float = 255.0):
+        self.name = camera.name
+        self.width, self.height = camera.resolution
+        self.bands = tuple(bands)
+        self.matrix = sensitivities(camera.sensitivity, self.bands)
+        self.black, self.saturation = float(black), float(saturation)
+        self.names = tuple(camera.numbers)
+        self.neutral = {n: p.neutral for n, p in camera.numbers.items()}
+        self.effects = {stage: registry().at_stage("camera", stage) for stage in IMAGE_STAGES}
+        self.v, self.u = np.mgrid[:self.height, :self.width] + 0.5
+
+    def view(self, values: Mapping[str, complex]) -> SimpleNamespace:
+        """What an image function sees as `camera`: every parameter of the camera, and the geometry of its pixels.
+
+        u, v (H, W) px; x, y (H, W) normalised coordinates; tan (H, W) tangent of the field angle; focal (px);
+        width, height (px); bands (nm); settings: all values by key, those of other parts too, (N, 1, 1) where readings were swept.
+        """
+        own = {n: values[f"{self.name}.{n}"] for n in self.names}
+        focal = self.width / 2 / np.tan(np.deg2rad(np.real(own["x_fov"])) / 2)
+        x = (self.u - self.width / 2 - np.real(own["principal_x"])) / focal
+        y = (self.v - self.height / 2 - np.real(own["principal_y"])) / (focal * np.real(own["aspect"]))
+        return SimpleNamespace(**own, u=self.u, v=self.v, px=x, py=y, tan=np.hypot(x, y), focal=focal, width=self.width,
+                               height=self.height, bands=np.array(self.bands), settings=values)
+
+    def _stage(self, stage: str, image, view):
+        for effect in self.effects[stage]:
+            if all(getattr(view, n) == self.neutral[n] for n in effect.parameter_names):
+                continue  # at neutral an effect is the identity; the contract tests hold every effect to that
+            image = effect.stages[stage](image, view)
+        return image
+
+    def channels(self, image, view):
+        """Irradiance per channel, 1 = full scale, of an image per band (H, W, B)."""
+        image = self._stage("lens", image, view)
+        image = image @ self.matrix.T
+        return self._stage("sensor", image * (view.exposure * self.gains(view)), view)
+
+    def gains(self, view) -> np.ndarray:
+        """(C,) gain of each channel."""
+        return view.gain * np.array([getattr(view, f"gain_{'rgb'[min(c, 2)]}") for c in range(len(self.matrix))])
+
+    def respond(self, irradiance, view):
+        """DN of an irradiance per channel."""
+        m = np.empty(irradiance.shape, np.result_type(irradiance, *(getattr(view, f"response{k}_{c}") for k in (2, 3)
+                                                                     for c in "rgb")))
+        for index in range(irradiance.shape[-1]):
+            c = "rgb"[min(index, 2)]
+            m[..., index] = inverse_cubic(irradiance[..., index], getattr(view, f"response2_{c}"),
+                                          getattr(view, f"response3_{c}"))
+        m = self._stage("response", m, view)
+        return self.black + (self.saturation - self.black) * m + view.offset
+
+    def develop(self, image: np.ndarray, values: Mapping[str, complex]) -> np.ndarray:
+        """DN (H, W, C), noise-free and not clipped, of radiance per band (H, W, B)."""
+        view = self.view(values)
+        return self.respond(self.channels(image, view), view)
+
+    def linearise(self, image: np.ndarray, values: Mapping[str, float]) -> "Linear":
+        """Prediction and derivatives about an image and camera values."""
+        return Linear(self, image, values)
+
+
+class Linear:
+    """The camera linearised about one image: `image` in DN, tangents of images and of camera parameters."""
+
+    def __init__(self, developer: Developer, bands: np.ndarray, values: Mapping[str, float]):
+        self.developer, self.bands, self.values = developer, np.asarray(bands, float), values
+        self.view = developer.view(values)
+        channels = developer.channels(self.bands, self.view)
+        stepped = developer.respond(channels + 1j * STEP, self.view)
+        self.image = stepped.real
+        self.slope = stepped.imag / STEP  # the response acts pixel by pixel
+        self.floor = developer.channels(np.zeros_like(self.bands), self.view)  # what the camera adds to darkness
+
+    def of_image(self, tangent: np.ndarray) -> np.ndarray:
+        """d DN for a change of the radiance per band; lens and sensor are affine in the image."""
+        return self.slope * (self.developer.channels(np.asarray(tangent, float), self.view) - self.floor)
+
+    def of_parameter(self, keys: tuple[str, ...]) -> np.ndarray:
+        """d DN / d value for camera parameters that share one value."""
+        stepped = dict(self.values)
+        for key in keys:
+            stepped[key] = stepped[key] + 1j * STEP
+        return self.developer.develop(self.bands.astype(complex), stepped).imag / STEP
+
+    def at(self, keys: tuple[str, ...], value: float) -> np.ndarray:
+        """DN at another value of camera parameters (for finite steps)."""
+        return self.developer.develop(self.bands, {**self.values, **{k: value for k in keys}})
+
+
+def inverse_cubic(irradiance, a, b):
+    """m with G(m) = m + a (m^2 - m) + b (m^3 - m) = irradiance, by Newton from m = irradiance; (S1.1).
+
+    Beyond full scale (m > 1) and below 0 the response goes on as a straight line, so that it stays invertible.
+    """
+    if np.all(a == 0) and np.all(b == 0):
+        return irradiance
+    x = np.asarray(irradiance)
+    m = np.clip(x.real, 0, 1)
+    ra, rb = np.real(a), np.real(b)
+    for _ in range(30):
+        slope = 1 + ra * (2 * m - 1) + rb * (3 * m * m - 1)
+        if np.any(slope <= 0):
+            raise ValueError(f"response with quadratic term {ra:g} and cubic term {rb:g} is not monotone on [0, 1]; "
+                             "its inverse needs 1 + a (2m - 1) + b (3m^2 - 1) > 0")
+        step = (m + ra * (m * m - m) + rb * (m**3 - m) - np.clip(x.real, 0, 1)) / slope
+        m = np.clip(m - step, 0, 1)
+        if np.abs(step).max() < 1e-13:
+            break
+    inside = (x.real >= 0) & (x.real <= 1)
+    # one complex Newton step carries the derivative along; outside, the end's slope does
+    slope = 1 + a * (2 * m - 1) + b * (3 * m * m - 1)
+    end = np.clip(x.real, 0, 1)
+    value = m - (m + a * (m * m - m) + b * (m**3 - m) - np.where(inside, x, end)) / slope
+    return value + np.where(inside, 0, (x - end) / slope)

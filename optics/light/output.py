@@ -1,0 +1,380 @@
+"""One picture of a scene with everything that is known of it: what `optics render` and `optics batch` write.
+
+A sensor of this program's parts is rendered LED by LED, without noise (optics.light.renderer), through polarizing layers as well. Every
+other Mitsuba scene, and a sensor beside stock lights or behind stock glass, goes through `mi.render`, with the variance of each
+mean. An EXR holds
+
+    R, G, B                      preview, linear sRGB; of a sensor times its exposure, so that 1 is full scale
+    S0.610,000000nm ...          radiance per band; S1 to S3 in scenes with layers, and where the integrator has `stokes`
+    depth.Z                      mm from the camera along its axis; infinite where a ray met nothing
+    normal.X, .Y, .Z             of the surface, in the scene's frame
+    contact.Y                    1 where the indenter touches what is seen
+    led_1.R, .G, .B ...          what one LED sends, in the first three bands; with the ambient light they add up to S0
+    variance.*                   variance of the mean of a Monte Carlo channel
+
+and its provenance: scene and plugins by hash, every parameter, versions, seed. It names no place and no time, so that on
+one thread (optics.study.batch) the same input gives the same bytes; with several, sums may differ in their last bit.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from optics.errors import BadScene
+from optics.files import exr
+from optics.files.output import file_hash, versions
+from optics.light import paths
+from optics.light.development import Developer
+from optics.light.monte_carlo import renderer_of
+from optics.light.renderer import POWERS, Hits, Renderer, Sample
+from optics.scene.loader import Scene
+from optics.scene.mitsuba_parts import is_part
+from optics.scene.registry import registry
+
+UNITS = "W.mm^-2.sr^-1"  # of S0, for LED powers in W/sr
+PASSES = 8  # of a Monte Carlo render: their scatter is its variance
+LAYERS = ("spectral", "aov", "leds")
+
+
+@dataclass
+class Picture:
+    """A rendered picture.
+
+    channels   EXR name -> (H, W)
+    header     EXR header
+    camera     (H, W, C) DN of the camera, free of noise and not clipped; None for scenes without a camera of this program's
+    """
+
+    channels: dict[str, np.ndarray]
+    header: dict[str, object] = field(default_factory=dict)
+    camera: np.ndarray | None = None
+
+    def stokes(self) -> tuple[np.ndarray, np.ndarray]:
+        """Bands in nm (B,) and Stokes vectors (H, W, B, 4); raises ValueError where the picture has none."""
+        bands, vectors = exr.spectral_image(self.channels)
+        if vectors.shape[3] != 4:
+            raise ValueError("the picture holds no Stokes vectors: S0 only; allowed: pictures with S0 to S3")
+        return bands, vectors
+
+    def write_exr(self, path: Path) -> Path:
+        return exr.write(path, self.channels, self.header)
+
+    def write_png(self, path: Path, saturation: float = 255.0) -> Path:
+        """The camera's DN as they are; without a camera, the preview as sRGB."""
+        if self.camera is not None:
+            return exr.write_png(path, self.camera, white=saturation, tone="linear")
+        names = [n for n in "RGB" if n in self.channels] or ["Y"]
+        return exr.write_png(path, np.nan_to_num(np.stack([self.channels[n] for n in names], -1)))
+
+
+class Pictures:
+    """Makes pictures of one scene, with other values each time.
+
+    black, saturation   DN, of the camera
+    spp                 samples per pixel: render by Monte Carlo, even where LED by LED is possible
+    stokes              S1 to S3 in every scene; without it, where there are layers or the integrator has `stokes`
+    method              "LED by LED", "from lights and camera" (clear bodies), or why the scene goes through `mi.render`
+    """
+
+    def __init__(self, scene: Scene, *, spp: int | None = None, black: float = 0.0, saturation: float = 255.0,
+                 layers: Sequence[str] = LAYERS, stokes: bool = False):
+        if spp is not None and spp < 1:
+            raise ValueError(f"spp = {spp}; allowed: whole numbers from 1 on (samples per pixel)")
+        self.scene, self.spp, self.layers = scene, spp, tuple(layers)
+        self.base = scene.values()
+        sensors = scene.mitsuba.sensors()
+        if len(sensors) != 1:
+            raise BadScene(f"{scene.path}: {len(sensors)} cameras; one is allowed: write one <sensor>")
+        if not scene.mitsuba.emitters():
+            raise BadScene(f"{scene.path}: no light; add an LED, <emitter type=\"led\" id=\"led_1\">, or another emitter")
+        if scene.mitsuba.integrator() is None:
+            raise BadScene(f"{scene.path}: no integrator; add <integrator type=\"tactile\" id=\"integrator\">, or another one")
+        if stokes and not (scene.integrator is not None and scene.integrator.bands and "polarized" in scene.variant):
+            raise BadScene(f"{scene.path}: no Stokes vectors from this integrator and the variant {scene.variant}; allowed: the "
+                           "integrator 'tactile' with `bands`, and a variant with 'polarized' in its name")
+        reason = "samples per pixel were asked for" if spp is not None else obstacle(scene, chance=True)
+        if not reason and stokes and (scene.by_chance or not paths.layered(scene)):
+            reason = "Stokes vectors were asked for of a scene without layers"
+        if reason and scene.by_chance and scene.leds:
+            raise BadScene(f"{scene.path}: {reason}, but mi.render brings no light of an LED, which is a point, through clear bodies; allowed: "
+                           "without --spp and --stokes, or luminous areas (emitters of the type 'source') in place of LEDs")
+        self.renderer = None if reason else renderer_of(scene, remember=2)
+        if self.renderer is not None and self.renderer.layered:
+            reason = veiled(self.renderer, self.base)
+            self.renderer = None if reason else self.renderer
+        self.stokes = stokes or paths.layered(scene) or (scene.integrator is not None and scene.integrator.stokes)
+        self.method = f"Monte Carlo: {reason}" if reason else "from lights and camera" if self.renderer.by_chance else "LED by LED"
+        self.developer = None
+        if scene.camera is not None and scene.integrator is not None:
+            self.bands = scene.integrator.bands
+            self.developer = Developer(scene.camera, self.bands or (0.0,), black, saturation)
+        self.record = {"scene": scene_record(scene), "plugins": plugins_record(), "variant": scene.variant,
+                       "method": self.method, "versions": versions()}
+
+    @property
+    def exact(self) -> bool:
+        """Whether pictures are made LED by LED."""
+        return self.renderer is not None
+
+    def take(self, values: Mapping[str, float | str] | None = None, seed: int = 0, lit: Sequence[str] | None = None,
+             progress: Callable[[str, int, int], None] | None = None) -> Picture:
+        """The picture for values that replace the scene's; lit: the lights that are on (None: all with power)."""
+        if self.exact and self.renderer.by_chance:
+            self.renderer.progress = progress
+        now = {**self.base, **self.scene.check(values or {})}
+        if lit is not None:
+            now.update({f"{led}.power": 0.0 for led in self.scene.lights if led not in lit})
+        picture = self._exact(now, seed) if self.renderer is not None else self._monte_carlo(now, seed)
+        picture.header["provenance"] = {**self.record, "seed": seed, "parameters": now}
+        pressed = None if self.scene.block is None else self.scene.block.press()
+        if pressed is not None:
+            picture.header["provenance"]["press"] = {"force": [float(f) for f in pressed.force], "unit": "N"}
+        return picture
+
+    def _exact(self, now: Mapping, seed: int) -> Picture:
+        renderer = self.renderer
+        alone = {light: renderer.light(now, light, seed) for light in renderer.lit(now)}
+        totals = [sum(alone.values(), renderer.ambient(now))]
+        if renderer.layered:
+            totals += [renderer.radiance(now, seed, component) for component in (1, 2, 3)]
+        channels = self._radiance_channels(np.stack(totals, -1), now)
+        if "aov" in self.layers:
+            channels.update(self._surface(renderer.hits(now), now))
+        if "leds" in self.layers:
+            for light, image in alone.items():
+                channels.update(zip((f"{light}.{n}" for n in self._band_names()), np.moveaxis(image, -1, 0)))
+        if renderer.by_chance:
+            scatter = renderer.error(now) ** 2
+            scatter = exr.spectral_channels(self.bands, scatter) if self.bands else {"Y": scatter[..., 0]}
+            channels.update({f"variance.{name}": image for name, image in scatter.items() if name in channels})
+        header = exr.spectral_header(renderer.layered, UNITS) if self.bands else {}
+        self.scene.set(now)  # the renderer leaves the LEDs at power 1
+        return Picture(channels, header, self.developer.develop(totals[0], now))
+
+    def _monte_carlo(self, now: Mapping, seed: int) -> Picture:
+        scene = self.scene
+        scene.set(now)
+        polarized, ours = "polarized" in scene.variant, scene.integrator is not None
+        asked = ours and scene.integrator.stokes
+        if ours:
+            scene.integrator.stokes = polarized  # its channels are the only way to the bands
+        try:
+            mean, variance, spp = self._passes(seed)
+        finally:
+            if ours:
+                scene.integrator.stokes = asked
+        radiance = None
+        if ours and polarized:
+            mean, variance = ({name: image for name, image in c.items() if "." in name} for c in (mean, variance))
+            lanes = self.bands or (0.0,)
+            pick = lambda c, s: np.stack([c[f"S{s}.{j}"] for j in range(len(lanes))], -1)  # noqa: E731
+            radiance = pick(mean, 0)
+            components = range(4) if self.stokes else range(1)
+            channels = self._radiance_channels(np.stack([pick(mean, s) for s in components], -1), now)
+            if self.bands:
+                scatter = exr.spectral_channels(self.bands, np.stack([pick(variance, s) for s in range(4)], -1))
+                variance = {n: image for n, image in scatter.items() if n in channels}
+        else:
+            channels = mean
+        channels.update({f"variance.{name}": image for name, image in variance.items() if name in channels})
+        if "aov" in self.layers:
+            channels.update(self._surface(self._hits(), now))
+        header = {**(exr.spectral_header(self.stokes, UNITS) if radiance is not None and self.bands else {}), "samplesPerPixel": spp}
+        camera = self.developer.develop(radiance, now) if radiance is not None else None
+        return Picture(channels, header, camera)
+
+    def _passes(self, seed: int) -> tuple[dict, dict, int]:
+        """Mean and variance of the mean of every channel by name, and the samples per pixel; passes of different seeds."""
+        import mitsuba as mi
+
+        sensor = self.scene.mitsuba.sensors()[0]
+        spp = self.spp or int(sensor.sampler().sample_count())
+        passes = min(PASSES, spp)
+        per_pass = spp // passes
+        seeds = np.random.SeedSequence(seed).generate_state(passes)
+        total, squares = 0.0, 0.0
+        for k in range(passes):
+            image = np.array(mi.render(self.scene.mitsuba, spp=per_pass, seed=int(seeds[k])), float)
+            total, squares = total + image, squares + image * image
+        names = [f.name for f in sensor.film().bitmap(raw=False).struct_()]
+        total = total.reshape(*total.shape[:2], -1)
+        mean = total / passes
+        if len(names) != mean.shape[2]:
+            names = [f"channel{i}" for i in range(mean.shape[2])]
+        variance = np.maximum(squares.reshape(mean.shape) / passes - mean**2, 0) / max(passes - 1, 1)
+        split = [{name: image[..., i] for i, name in enumerate(names)} for image in (mean, variance)]
+        return split[0], split[1] if passes > 1 else {}, per_pass * passes
+
+    def _band_names(self) -> list[str]:
+        return list("RGB") if len(self.bands) == 3 else [exr.spectral_name(b)[3:] for b in self.bands] or ["Y"]
+
+    def _radiance_channels(self, radiance: np.ndarray, now: Mapping) -> dict[str, np.ndarray]:
+        """Preview and spectral channels of (H, W, B), or of Stokes vectors (H, W, B, 4)."""
+        s0 = radiance if radiance.ndim == 3 else radiance[..., 0]
+        if not self.bands:
+            parts = radiance[..., 0, :] if radiance.ndim == 4 and radiance.shape[3] == 4 else ()
+            return {"Y": s0[..., 0], **{f"S{i}.Y": parts[..., i] for i in range(4) if len(parts)}}
+        channels = exr.preview_channels(self.bands, s0 * now[f"{self.scene.camera.name}.exposure"])
+        if "spectral" in self.layers:
+            parts = radiance[..., 0] if radiance.ndim == 4 and radiance.shape[3] == 1 else radiance
+            channels.update(exr.spectral_channels(self.bands, parts))
+        return channels
+
+    def _hits(self) -> Hits:
+        """What the rays through the pixels' centres meet."""
+        import drjit as dr
+        import mitsuba as mi
+
+        scene, sensor = self.scene.mitsuba, self.scene.mitsuba.sensors()[0]
+        width, height = (int(n) for n in sensor.film().crop_size())
+        v, u = (mi.Float((a.ravel() + 0.5).astype(np.float32)) for a in np.mgrid[:height, :width])
+        with dr.suspend_grad():
+            if self.developer is not None and paths.layered(self.scene):
+                path = paths.trace(self.scene, np.array(u), np.array(v))
+                return Hits(Sample(path.si, None, path.origin, path), height, width)
+            if self.developer is not None:
+                si, weight, origin = self.scene.integrator.hits(scene, self.scene.camera, u, v)
+            else:
+                ray, _ = sensor.sample_ray(mi.Float(0), mi.Float(0.5), mi.Point2f(u / width, v / height), mi.Point2f(0.5))
+                si, weight, origin = scene.ray_intersect(ray), None, ray.o
+        return Hits(Sample(si, weight, origin), height, width)
+
+    def _surface(self, hits: Hits, now: Mapping) -> dict[str, np.ndarray]:
+        """depth, normal and contact of what the pixels' centres see."""
+        import mitsuba as mi
+
+        origin, axis = self._view(now)
+        valid, position = hits.valid, hits.position
+        normal = np.where(valid[..., None], hits.normal, 0.0)
+        channels = {"depth.Z": np.where(valid, (position - origin) @ axis, np.inf)}
+        channels.update({f"normal.{name}": normal[..., i] for i, name in enumerate("XYZ")})
+        if self.scene.gel is not None:
+            x, y = (np.where(valid, position[..., i], 0.0) for i in (0, 1))
+            touched = self.scene.gel.contact_weight(x.ravel(), y.ravel()).reshape(valid.shape) > 0.5
+            if hits.path is not None:  # what lies behind a clear skin is not touched
+                touched &= hits.image(hits.si.shape == mi.ShapePtr(self.scene.gel)).astype(bool)
+            channels["contact.Y"] = (touched & valid).astype(np.float32)
+        return channels
+
+    def _view(self, now: Mapping) -> tuple[np.ndarray, np.ndarray]:
+        """Position and axis of the camera."""
+        import mitsuba as mi
+
+        camera = self.scene.camera
+        if camera is not None:
+            width, height = camera.resolution
+            o, d = camera.ray(mi.Float(width / 2 + now[f"{camera.name}.principal_x"]),
+                              mi.Float(height / 2 + now[f"{camera.name}.principal_y"]))
+        else:
+            pose = self.scene.mitsuba.sensors()[0].world_transform()
+            o, d = pose @ mi.Point3f(0), pose @ mi.Vector3f(0, 0, 1)
+        return tuple(np.array(a, float).reshape(3, -1)[:, 0] for a in (o, d))
+
+
+def obstacle(scene: Scene, chance: bool = False) -> str:
+    """Why a scene cannot be rendered LED by LED; empty where it can. chance: clear bodies are none, as light is followed by chance."""
+    import mitsuba as mi
+
+    if scene.camera is None or scene.integrator is None or not scene.lights:
+        return "the scene has no camera, LED and integrator of this program's"
+    others = [e for e in scene.mitsuba.emitters() if not is_part(e)]
+    if others:
+        return f"{len(others)} of its lights are no LED"
+    for shape in scene.mitsuba.shapes():
+        bsdf = shape.bsdf()
+        if shape.is_medium_transition():
+            return "it has a medium"
+        kind = getattr(bsdf, "kind", "")
+        if kind == "interface" or kind == "clear" and chance or kind and registry().parts[kind].mueller is not None:
+            continue
+        if mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta | mi.BSDFFlags.Null):
+            return "it has mirrors or clear surfaces that are no 'interface'"
+        if paths.layered(scene) and polarizes(bsdf):
+            return f"its surface '{shape.id()}' polarizes the light that it reflects"
+    if paths.layered(scene):
+        try:
+            paths.check(scene)
+        except BadScene as error:
+            return str(error)
+    return ""
+
+
+def polarizes(bsdf) -> bool:
+    """Whether a surface makes polarized light of unpolarized light, or keeps polarization; in unpolarized variants nothing does."""
+    import drjit as dr
+    import mitsuba as mi
+
+    if not mi.is_polarized:
+        return False
+    n = 64
+    rng = np.random.default_rng(0)
+    si = dr.zeros(mi.SurfaceInteraction3f, n)
+    si.t, si.n, si.sh_frame, si.uv = mi.Float(1), mi.Normal3f(0, 0, 1), mi.Frame3f(mi.Vector3f(0, 0, 1)), mi.Point2f(0.5)
+    if mi.is_spectral:
+        si.wavelengths = mi.UnpolarizedSpectrum(540.0)
+    si.wi, wo = (mi.warp.square_to_uniform_hemisphere(mi.Point2f(*rng.random((2, n)).astype(np.float32))) for _ in range(2))
+    matrix = bsdf.eval(mi.BSDFContext(), si, wo)
+    own = [np.abs(np.array(matrix[i, j])).max() for i in range(4) for j in range(4)]
+    return max(own[1:]) > 1e-5 * own[0]  # rounding leaves 1e-7
+
+
+def veiled(renderer: Renderer, values: Mapping) -> str:
+    """What LEDs light the picture through layers, by more than a thousandth of their light: LED by LED, a layer in the way of
+    their light is taken for a wall. Empty for none."""
+    import drjit as dr
+    import mitsuba as mi
+
+    hits, scene = renderer.hits(values), renderer.scene
+    scene.set({**values, **{f"{name}.{power}": 1.0 for name in scene.lights for power in POWERS}})
+    passing = int(mi.BSDFFlags.Null | mi.BSDFFlags.DeltaTransmission)
+    found = []
+    with dr.suspend_grad():
+        for name, led in scene.leds.items():
+            point = led.position()
+            seen = scene.integrator.visible(scene.mitsuba, hits.si, point, led)
+            ray, going, behind = hits.si.spawn_ray_to(point), hits.si.is_valid() & ~seen, mi.Bool(False)
+            for _ in range(paths.STEPS):
+                met = scene.mitsuba.ray_intersect(ray, going)
+                behind |= going & ~met.is_valid()
+                going &= met.is_valid() & ((met.bsdf().flags() & passing) != 0)
+                ray = dr.select(going, met.spawn_ray_to(point), ray)
+                dr.eval(ray, going, behind)
+                if not np.any(np.array(going)):
+                    break
+            if np.any(np.array(behind)):
+                light = [scene.integrator.direct(scene.mitsuba, hits.si, 1.0, hits.origin, led, way) for way in (seen, behind)]
+                direct, through = (np.array([float(np.array(a[i]).sum()) for i in range(renderer.bands)]) for a in light)
+                if np.any(through > 1e-3 * direct):
+                    found.append(name)
+    return f"the light of {' and '.join(found)} passes layers before it meets anything" if found else ""
+
+
+# -- provenance ---------------------------------------------------------------------------------------------------------
+
+def scene_record(scene: Scene) -> dict:
+    """Name and hash of the scene file, its definitions, and the hash of every file that it names."""
+    text = scene.path.read_text(encoding="utf-8")
+    named = re.findall(r'name="(?:filename|indenter)"\s+value="([^"$]+\.\w+)"', text)
+    named += [str(v) for v in scene.defines.values()] + [str(v) for v in scene.values().values() if isinstance(v, str)]
+    files = {}
+    for name in named:
+        for folder in (scene.path.parent, Path()):
+            if (folder / name).is_file():
+                files[Path(name).name] = file_hash(folder / name)
+                break
+    return {"name": scene.path.name, "hash": file_hash(scene.path), "files": dict(sorted(files.items())),
+            "defines": {k: str(v) for k, v in sorted(scene.defines.items())}}
+
+
+def plugins_record() -> dict[str, str]:
+    """Plugin file, relative to its folder, -> hash."""
+    return {file.relative_to(folder).as_posix(): file_hash(file) for folder in registry().folders
+            for file in sorted(folder.rglob("*.py")) if not file.name.startswith("_")}
+
+
+# -- files --------------------------------------------------------------------------------------------------------------

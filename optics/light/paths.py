@@ -1,0 +1,298 @@
+"""Paths: camera rays followed straight through layers and clear boundaries, and what light loses on its way back.
+
+A ray passes layers (optics.polarization.layers) unbent and boundaries (part `interface`) by Snell's law until it meets a surface that it
+cannot pass. The geometry is traced once by Mitsuba; the Mueller matrices of what was passed are multiplied in numpy, for any
+values of the layers' parameters: numbers, one per ray, or complex ones that carry a derivative.
+
+Stokes vectors at the camera refer to the image's horizontal axis x (right, across the ray and the vertical) and to y (up):
+optics.polarization.mueller's axes for light that travels towards the camera.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType, SimpleNamespace
+
+import numpy as np
+
+from optics.errors import BadScene
+from optics.polarization.layers import Crossing, evaluate
+from optics.polarization.mueller import Mueller, Slab, diattenuator, face, fresnel
+from optics.scene.layer import active_effects
+from optics.scene.registry import registry
+
+STEPS = 24  # surfaces that a ray may pass
+GRAZE = 1e-4  # mm per mm of the coordinates: how far beyond a surface a ray goes on
+
+
+@dataclass
+class Step:
+    """One surface that rays meet: `part` (N,) index into the scene's layers, -1 where a ray passes none; vectors (N, 3) in
+    the surface's own axes."""
+
+    part: np.ndarray
+    k: np.ndarray
+    x: np.ndarray
+    u: np.ndarray
+    v: np.ndarray
+
+
+@dataclass
+class Path:
+    """Rays that were followed: the steps, where they end (Dr.Jit: si, origin of the last stretch), and how they arrive."""
+
+    names: list[str]
+    steps: list[Step]
+    si: object
+    origin: object
+    end: Step
+    shape: np.ndarray  # (N,) index of the scene's shape that a path ends on, -1 for none
+    lost: np.ndarray  # (N,) bool: reflected totally, or after STEPS surfaces
+    fields: dict  # the layers' stress patterns when the rays were traced
+    matrices: dict = field(default_factory=dict)  # of layers at real values: a derivative by one layer leaves the others
+    groups: list = field(default_factory=list)
+
+    def sequences(self) -> list[tuple[tuple[int, ...], np.ndarray]]:
+        """Rays by the parts that they pass: (indices of the parts, from the camera on; which rays)."""
+        if not self.steps:
+            return [((), np.arange(len(self.lost)))]
+        if not self.groups:
+            table, code = np.stack([s.part for s in self.steps], -1), np.zeros(len(self.lost), np.int64)
+            for column in table.T:  # one number for each sequence met so far
+                code = np.unique(code * (len(self.names) + 1) + column + 1, return_inverse=True)[1]
+            firsts = np.unique(code, return_index=True)[1]
+            self.groups = [(tuple(int(i) for i in table[first]), np.flatnonzero(code == code[first])) for first in firsts]
+        return self.groups
+
+    def kept(self, group: int, place: int, name: str, scene, values: Mapping, make) -> Mueller:
+        """A layer's matrix for a group of rays; the last one made at real values is kept."""
+        own = tuple(values[f"{name}.{n}"] for n in (*scene.parts[name].numbers, *scene.parts[name].words))
+        if any(isinstance(v, (complex, np.ndarray)) for v in own):
+            return make()
+        known, matrix = self.matrices.get((group, place), (None, None))
+        if known != own:
+            matrix = make()
+            self.matrices[group, place] = own, matrix
+        return matrix
+
+
+def layered(scene) -> bool:
+    """Whether a scene has layers, or sources that may be polarized."""
+    return bool(scene.sources) or any(registry().parts[p.kind].mueller is not None for p in scene.parts.values())
+
+
+def passable(scene) -> list[str]:
+    """Names of the parts that a camera ray passes: layers and clear boundaries."""
+    parts = registry().parts
+    return [n for n, p in scene.parts.items() if parts[p.kind].mueller is not None or p.kind == "interface"]
+
+
+def trace(scene, u: np.ndarray, v: np.ndarray) -> Path:
+    """Follow the camera's rays through pixel positions (N,)."""
+    import drjit as dr
+    import mitsuba as mi
+
+    camera, names = scene.camera, passable(scene)
+    n = len(u)
+    o, d = camera.ray(mi.Float(u.astype(np.float32)), mi.Float(v.astype(np.float32)))
+    down = camera.turned(mi.Vector3f(0, 1, 0))
+    direction = np.array(d, float).T + np.zeros((n, 3))
+    x = np.cross(np.array(down, float).T, direction)  # across the image's vertical, as Mitsuba's `stokes` has it
+    x /= np.linalg.norm(x, axis=-1, keepdims=True)
+    origin = np.array(o, float).T + np.zeros((n, 3))
+    wavelengths = scene.integrator.wavelengths(n)
+    steps, lost = [], np.zeros(n, bool)
+    extents = {i: e for i, name in enumerate(names) if (e := getattr(scene.parts[name], "extent", lambda: None)())}
+    layers = [mi.BSDFPtr(scene.parts[name]) for name in names]
+    shapes = [mi.ShapePtr(shape) for shape in scene.mitsuba.shapes()]
+    for _ in range(STEPS + 1):
+        ray = mi.Ray3f(mi.Point3f(*origin.T.astype(np.float32)), mi.Vector3f(*direction.T.astype(np.float32)), mi.Float(0),
+                       wavelengths)
+        si = scene.mitsuba.ray_intersect(ray)
+        part, shape = (_which(met, pointers) for met, pointers in ((si.bsdf(), layers), (si.shape, shapes)))
+        dr.eval(si, part, shape)  # at once: piece by piece, every array would trace the rays anew
+        part, shape = np.where(lost, -1, np.array(part)), np.array(shape)
+        step, frame = _step(part, si, -direction, x, extents)
+        if not (part >= 0).any():
+            break
+        steps.append(step)
+        on = part >= 0
+        p = np.array(si.p, float).T
+        for index, name in enumerate(names):
+            if scene.parts[name].kind == "interface":
+                here = on & (part == index)
+                direction, x, total = _refract(here, direction, x, frame[2], scene.parts[name].number("index"))
+                lost |= total
+        ahead = p + direction * (GRAZE * (1 + np.abs(p).max(-1, keepdims=True)))
+        origin = np.where(on[:, None], ahead, origin)
+    else:
+        lost |= part >= 0
+    # the ray that reaches the end is straight; light that it brings to `origin` leaves the surface towards it
+    return Path(names, steps, si, mi.Point3f(*origin.T.astype(np.float32)), step, shape,
+                lost, {n: scene.parts[n].field for n in names if getattr(scene.parts[n], "field", None) is not None})
+
+
+def _which(met, pointers: list):
+    """Index of the pointer that each ray met, -1 for none of them (Dr.Jit)."""
+    import drjit as dr
+    import mitsuba as mi
+
+    found = mi.Int32(-1)
+    for index, pointer in enumerate(pointers):
+        found = dr.select(met == pointer, mi.Int32(index), found)
+    return found
+
+
+def across(axis: np.ndarray, k: np.ndarray) -> np.ndarray:
+    """The unit vector across k (N, 3) that is nearest to an axis (1 or N, 3)."""
+    x = axis - (axis * k).sum(-1, keepdims=True) * k
+    return x / np.linalg.norm(x, axis=-1, keepdims=True)
+
+
+def _step(part: np.ndarray, si, k: np.ndarray, x: np.ndarray, extents: Mapping) -> tuple[Step, tuple]:
+    """A surface in its own axes: z the normal, x the first direction of its coordinates; `extents` of parts that stretch."""
+    normal, du, dv, uv = (np.array(a, float).T for a in (si.sh_frame.n, si.dp_du, si.dp_dv, si.uv))
+    ok = np.linalg.norm(du, axis=-1) > 0
+    du = np.where(ok[:, None], du, (1.0, 0.0, 0.0))
+    normal = np.where(ok[:, None], normal, (0.0, 0.0, -1.0))
+    e1 = across(du, normal)
+    e2 = np.cross(normal, e1)
+    axes = np.stack([e1, e2, normal], -2)
+    local = [np.einsum("nij,nj->ni", axes, a) for a in (k, x)]
+    size_u, size_v = np.linalg.norm(du, axis=-1), np.linalg.norm(dv, axis=-1)
+    for index, (width, length) in extents.items():
+        size_u, size_v = np.where(part == index, width, size_u), np.where(part == index, length, size_v)
+    v = (uv[:, 1] - 0.5) * size_v * np.where((dv * e2).sum(-1) < 0, -1, 1)
+    return Step(part, *local, (uv[:, 0] - 0.5) * size_u, v), (e1, e2, normal)
+
+
+def _refract(here: np.ndarray, direction: np.ndarray, x: np.ndarray, normal: np.ndarray, index: float) -> tuple:
+    """Directions beyond a boundary, the axes x carried along (s stays s, p stays p), and where nothing passes."""
+    if index == 1 or not here.any():
+        return direction, x, np.zeros(len(here), bool)
+    cos1 = (-direction * normal).sum(-1)
+    front = cos1 >= 0
+    n = np.where(front, index, 1 / index)
+    facing = np.where(front[:, None], normal, -normal)
+    cos1 = np.abs(cos1)
+    square = 1 - (1 - cos1**2) / n**2
+    total = here & (square <= 0)
+    cos2 = np.sqrt(np.maximum(square, 0))
+    bent = direction / n[:, None] + (cos1 / n - cos2)[:, None] * facing
+    bent /= np.linalg.norm(bent, axis=-1, keepdims=True)
+    s = np.cross(direction, facing)
+    length = np.linalg.norm(s, axis=-1, keepdims=True)
+    s = np.where(length > 1e-9, s / np.maximum(length, 1e-12), x)
+    p, bent_p = np.cross(direction, s), np.cross(bent, s)
+    turned = (x * s).sum(-1, keepdims=True) * s + (x * p).sum(-1, keepdims=True) * bent_p
+    on = (here & ~total)[:, None]
+    return np.where(on, bent, direction), np.where(on, turned, x), total
+
+
+# -- what light loses -------------------------------------------------------------------------------------------------
+
+
+def part_values(scene, name: str, values: Mapping, fields: Mapping) -> SimpleNamespace:
+    """A part's parameters as its functions read them; arrays of readings stand along the first axis."""
+    part = scene.parts[name]
+
+    def shaped(value):
+        return np.reshape(value, (-1, 1)) if isinstance(value, np.ndarray) else value
+
+    return SimpleNamespace(name=name, **{n: shaped(values[f"{name}.{n}"]) for n in (*part.numbers, *part.words)},
+                           field=fields.get(name))
+
+
+def crossing_at(step: Step, rays, bands: np.ndarray) -> Crossing:
+    """How some of the rays pass the surface of a step; arrays (n, 1) against bands (B,)."""
+    k, x = (tuple(a[rays][:, i:i + 1] for i in range(3)) for a in (step.k, step.x))
+    return Crossing(k, x, step.u[rays][:, None], step.v[rays][:, None], bands)
+
+
+def layer_matrix(scene, name: str, crossing: Crossing, values: Mapping, fields: Mapping = MappingProxyType({})) -> Mueller:
+    """Mueller matrix of one part for light that crosses it towards the camera."""
+    part = scene.parts[name]
+    own = part_values(scene, name, values, fields)
+    if part.kind == "interface":
+        # the camera's side is the one that the normal points to: seen from there the relative index is `index`
+        front = crossing.k[2] > 0
+        n = np.where(front, own.index, 1 / own.index)
+        # cos of the ray beyond the boundary, from which the light comes; the same transmittance both ways
+        r_s, r_p, _ = fresnel(np.abs(crossing.k[2]), n)
+        return diattenuator(*crossing.plane(), 1 - r_s, 1 - r_p) * (1 / n**2)
+    active = active_effects(part.kind, {n: getattr(own, n) for n in part.numbers})
+    return evaluate(registry().parts[part.kind].mueller, crossing, own, active)
+
+
+def slab(name: str, matrix: Mueller, values: Mapping) -> Slab:
+    """A layer with the reflections of its faces, where it declares any (`face`); its matrix holds their losses already."""
+    share = values.get(f"{name}.face", 0.0) * values.get(f"{name}.inserted", 1.0)
+    if np.all(np.asarray(share) == 0):
+        return Slab(matrix)
+    share = np.reshape(share, (-1, 1)) if isinstance(share, np.ndarray) else share
+    side = face(share)
+    return side.after(Slab(matrix * (1 / ((1 - share) * (1 - share))))).after(side)
+
+
+def transmission(scene, path: Path, values: Mapping, bands: np.ndarray, component: int = 0, until: str = "") -> tuple:
+    """A row of the Mueller matrix from a path's end to the camera: how much of each of S0 ... S3 there becomes the
+    `component` here; 4 entries (N, B).
+
+    N is the number of rays, or of the readings that `values` holds arrays for (then one ray serves them all). Rays that are
+    lost transmit nothing. `until` a part: from that part, without it, to the camera; nothing where a ray does not meet it.
+    """
+    one = len(path.lost) == 1
+    count = max([len(path.lost), *(np.size(v) for v in values.values() if isinstance(v, np.ndarray))])
+    kind = complex if any(np.iscomplexobj(v) for v in values.values()) else float
+    out = [np.zeros((count, len(bands)), kind) for _ in range(4)]
+    for group, (parts, rays) in enumerate(path.sequences()):
+        names = [(path.names[index], step) for step, index in zip(path.steps, parts) if index >= 0]
+        if until:
+            met = [name for name, _ in names]
+            if until not in met:
+                continue
+            names = names[:met.index(until)]
+        matrices = [path.kept(group, place, name, scene, values,
+                              lambda: layer_matrix(scene, name, crossing_at(step, rays, bands), values, path.fields))
+                    for place, (name, step) in enumerate(names)]
+        row = tuple(1.0 if j == component else 0 for j in range(4))
+        if any(np.any(np.asarray(values.get(f"{name}.face", 0.0)) != 0) for name, _ in names):
+            stack = None
+            for (name, step), matrix in reversed(list(zip(names, matrices))):  # light meets the farthest first
+                if scene.parts[name].kind == "interface":  # a radiance grows by n^2 one way and shrinks by it the other
+                    index = values[f"{name}.index"]
+                    back = np.where(step.k[rays][:, 2:] > 0, index, 1 / index) ** 4
+                    own = Slab(matrix, t_back=matrix.reversed * back)
+                else:
+                    own = slab(name, matrix, values)
+                stack = own if stack is None else own.after(stack)
+            row = stack.t.after(row)
+        else:
+            for matrix in matrices:
+                row = matrix.after(row)
+        where = slice(None) if one else rays
+        for entry, new in zip(out, row):
+            entry[where] = new
+    keep = ~path.lost[:, None]
+    return tuple(entry * keep for entry in out) if path.lost.any() else tuple(out)
+
+
+def emitted(scene, name: str, path: Path, values: Mapping, bands: np.ndarray) -> tuple:
+    """Stokes vector (4 entries that broadcast to (N, B)) that a source of the scene sends along the paths, at power 1;
+    0 where a path does not end on it."""
+    import mitsuba as mi
+
+    source = scene.parts[name]
+    on = np.array(path.si.emitter(scene.mitsuba) == mi.EmitterPtr(source)) & (path.end.k[:, 2] > 0)
+    vector = registry().parts[source.kind].stokes(crossing_at(path.end, slice(None), bands), part_values(scene, name, values, {}))
+    return tuple(0 if isinstance(c, int) else c * on[:, None] for c in vector)
+
+
+def check(scene) -> None:
+    """Refuse layers on shapes whose first direction turns with the place."""
+    for shape in scene.mitsuba.shapes():
+        kind = getattr(shape.bsdf(), "kind", "")
+        if kind and registry().parts[kind].mueller is not None and str(shape).startswith("Disk"):
+            raise BadScene(f"{scene.path}: '{shape.bsdf().name}' stands on a disk, whose first direction runs outwards and would "
+                           "turn with the place; allowed: a rectangle or a mesh with texture coordinates")

@@ -1,0 +1,567 @@
+"""Prediction: what a scene says that a capture set should look like, frame by frame, and how that changes.
+
+Light is linear in every LED, so each LED is rendered once per geometry at power 1 and kept; powers, exposure, colour and
+response act on the kept images. One sample per pixel is exact away from edges: pixels at the rim of a shadow or of the
+gel are sampled 64 times. Derivative images come from Dr.Jit in forward mode through the shading,
+with the primary hits and shadows kept; at rims, where that misses the moving edge, and for everything that moves geometry
+they are central differences with common samples (`Parameter.how`).
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable, Iterator, Mapping
+from types import SimpleNamespace
+from typing import NamedTuple
+
+import numpy as np
+
+from optics.errors import BadScene
+from optics.light import paths
+from optics.scene.loader import Scene
+from optics.scene.mitsuba_parts import DEFAULT_VARIANT
+from optics.scene.registry import registry
+
+RIM_SAMPLES = 128  # per pixel at rims; a power of two. Of a picture 36 px wide, chi2 misses a path tracer by 10 to 60 with 64, by 5 to 20 with 128
+LAYERED_RIM_SAMPLES = 32  # in scenes with layers, whose matrices are multiplied for every sample
+PAINTED = 0.05  # of the largest reflectance of a texture: a step from pixel to pixel that needs finer samples
+BENT = 1e-3  # difference of a pixel's mean normal from that at its middle, above which finer samples are taken: a fifth of a grey level in 200
+CREASE = 25.0  # deg from pixel to pixel: what is no smooth surface
+POWERS = ("power", "power_r", "power_g", "power_b")  # images are kept per unit of each
+FLAT_FIELDS = ("multiplicative", "additive", "none")
+BOUNCE_SAMPLES = 32  # directions per cell for the second bounce
+BOUNCE_CELL = 2  # px each way of a cell
+
+
+class Renderer:
+    """Linear images of a scene, one LED at a time, with a memory for what was rendered before."""
+
+    by_chance = False  # whether pictures are Monte Carlo estimates
+
+    def __init__(self, scene: Scene, remember: int = 24):
+        if scene.camera is None or scene.integrator is None:
+            raise BadScene(f"{scene.path}: a prediction needs a part of the type 'camera' and the integrator 'tactile'")
+        if not scene.lights:
+            raise BadScene(f"{scene.path}: the scene has no light (an emitter of the type 'led' or 'source')")
+        paths.check(scene)
+        self.scene = scene
+        self.width, self.height = scene.camera.resolution
+        self.bands = len(scene.integrator.bands or (0,))
+        if self.bands > scene.integrator.lanes:
+            raise BadScene(f"{scene.path}: {self.bands} bands, but the variant {scene.variant} carries {scene.integrator.lanes}; "
+                           f"load the scene with variant='{DEFAULT_VARIANT}' or name one band")
+        self.layered = paths.layered(scene)
+        self.rim_samples = LAYERED_RIM_SAMPLES if self.layered else RIM_SAMPLES
+        self.wavelengths = np.array(scene.integrator.bands or (540.0,))
+        self.remember = remember
+        self._transmissions: OrderedDict = OrderedDict()
+        self._recent: list[paths.Path] = []
+        self._hits: OrderedDict = OrderedDict()
+        self._images: OrderedDict = OrderedDict()
+        image_keys = {k for k, p in scene.parameters.items() if p.how == "image"}
+        self.layer_keys = {k for k, p in scene.parameters.items() if p.how == "layer"}
+        words = {f"{n}.{w}" for n, p in scene.parts.items() if registry().parts[p.kind].mueller is not None for w in p.words}
+        self.layer_order = sorted(self.layer_keys | words)  # what the layers' matrices depend on
+        led_keys = {k for k in scene.parameters if k.rsplit(".", 1)[0] in scene.lights} - self.layer_keys
+        own = [k for k in scene.parameters if k not in image_keys and k not in led_keys and k not in self.layer_keys]
+        self.bounce_key = f"{scene.integrator.name}.interreflection"
+        self.geometry_keys = [k for k in own if self.kind(k) in ("camera", "interface", "", *scene.MOVED) or
+                              (self.kind(k) == "gel" and k.rsplit(".", 1)[1] in scene.shaping)]
+        ambient = {n for e in registry().at_stage("membrane", "ambient") for n in e.parameter_names}
+        self.ambient_keys = [k for k in own if self.kind(k) == "membrane" and k.rsplit(".", 1)[1] in ambient]
+        self.shading_keys = [k for k in own if k not in self.geometry_keys and k != self.bounce_key
+                             and k not in self.ambient_keys]
+        self.led_keys = {n: [k for k in led_keys if k.rsplit(".", 1)[0] == n and k.rsplit(".", 1)[1] not in POWERS]
+                         for n in scene.lights}
+        self._fixed = {k for k in self.geometry_keys if self.kind(k)}  # of stock plugins, some shade and none is slow to set
+        self._still = {k: scene.parameters[k].neutral for k in self.ambient_keys}
+        self._tangents: OrderedDict = OrderedDict()
+        self.together: set[str] = set()  # LEDs whose images are wanted of the same geometry
+
+    def kind(self, key: str) -> str:
+        part = self.scene.parts.get(key.rsplit(".", 1)[0])
+        return part.kind if part is not None else ""
+
+    # -- geometry -----------------------------------------------------------------------------------------------------
+
+    def geometry(self, values: Mapping) -> tuple:
+        return tuple(values[k] for k in self.geometry_keys)
+
+    def _apply(self, values: Mapping, move: bool = True) -> None:
+        """Set everything but the LEDs' powers, which stay at 1: images are kept per unit of power.
+
+        move = False leaves the geometry where it is (rebuilding the gel costs more than an image): enough for shading at
+        hits that are kept, but not for tracing or for shadows.
+        """
+        now = {k: v for k, v in values.items() if k in self.scene.parameters and k not in self.layer_keys
+               and not isinstance(v, np.ndarray) and (move or k not in self._fixed)}
+        now.update({f"{n}.{power}": 1.0 for n in self.scene.lights for power in POWERS})
+        self.scene.set(now)
+
+    def _trace(self, u: np.ndarray, v: np.ndarray) -> tuple:
+        import drjit as dr
+        import mitsuba as mi
+
+        with dr.suspend_grad():
+            if self.layered:
+                path = paths.trace(self.scene, u, v)
+                return Sample(path.si, mi.UnpolarizedSpectrum(1.0), path.origin, path)
+            si, weight, origin = self.scene.integrator.hits(
+                self.scene.mitsuba, self.scene.camera, mi.Float(u.astype(np.float32)), mi.Float(v.astype(np.float32)))
+            dr.eval(si, weight, origin)
+        return Sample(si, weight, origin)
+
+    def hits(self, values: Mapping) -> "Hits":
+        """Primary hits at pixel centres for a geometry; kept."""
+        key = self.geometry(values)
+        if key in self._hits:
+            self._hits.move_to_end(key)
+            return self._hits[key]
+        self._apply(values)
+        v, u = np.mgrid[:self.height, :self.width] + 0.5
+        hits = Hits(self._trace(u.ravel(), v.ravel()), self.height, self.width)
+        hits.edges |= self._painted(hits)
+        self._hits[key] = hits
+        while len(self._hits) > self.remember:
+            self._hits.popitem(last=False)
+        return hits
+
+    def _painted(self, hits: "Hits") -> np.ndarray:
+        """Pixels in whose neighbourhood the texture of a membrane's reflectance has an edge."""
+        import drjit as dr
+        import mitsuba as mi
+
+        edges = np.zeros(hits.shape, bool)
+        for m in self.scene.membranes.values():
+            if not m.reflectance.is_spatially_varying():
+                continue
+            own = hits.si.is_valid() & (hits.si.bsdf() == mi.BSDFPtr(m))
+            paint = dr.select(own, m.reflectance.eval(hits.si, own), 0.0)[0]
+            own, paint = np.array(own).reshape(hits.shape), np.broadcast_to(np.array(paint), hits.valid.size).reshape(hits.shape)
+            if own.any():
+                low, high = _around(np.where(own, paint, paint[own].mean()))
+                edges |= high - low > PAINTED * paint[own].max()
+        return edges
+
+    # -- one LED ------------------------------------------------------------------------------------------------------
+
+    def _led_key(self, values: Mapping, led: str) -> tuple:
+        return (led, self.geometry(values), tuple(values[k] for k in self.shading_keys),
+                tuple(values[k] for k in self.led_keys[led]))
+
+    def led(self, values: Mapping, led: str) -> "LedImage":
+        """The image that one LED makes at power 1 by direct light, kept with what its derivatives need."""
+        key = self._led_key(values, led)
+        if key in self._images:
+            self._images.move_to_end(key)
+            return self._images[key]
+        hits = self.hits(values)
+        self._apply(values)
+        image = self._keep(key, self._render_led(hits, led))
+        for other in self.together - {led}:  # moving the geometry costs more than an image: make what will be asked for next
+            key = self._led_key(values, other)
+            if key not in self._images:
+                self._keep(key, self._render_led(hits, other))
+        return image
+
+    def _keep(self, key: tuple, image: "LedImage") -> "LedImage":
+        self._images[key] = image
+        while len(self._images) > self.remember * len(self.scene.lights):
+            self._images.popitem(last=False)
+        return image
+
+    def _render_led(self, hits: "Hits", led: str) -> "LedImage":
+        if led in self.scene.sources:  # what it sends lies in the weights
+            rim = self._joint_rim(hits)
+            index = np.flatnonzero(rim)
+            image = LedImage(led, hits, rim, index, self._rim_samples(hits, index), None, None, hits.valid)
+            image.raw = (np.ones((1, self.bands)), np.ones((1, 1, self.bands)))
+            return image
+        part = self.scene.leds[led]
+        visible = self._visible(hits.si, part)
+        rim = self._joint_rim(hits) if self.layered else self._rim(hits, visible)
+        share = np.where(rim, 1.0, hits.bent)
+        index = np.flatnonzero(share)
+        samples = self._rim_samples(hits, index)
+        rim_visible = self._visible(samples.si, part) if len(index) else None
+        image = LedImage(led, hits, rim, index, samples, visible, rim_visible, self._seen(visible).mean(0) > 0.5)
+        image.share = share.reshape(-1, 1)[index]
+        image.raw = self._raw(image, lambda: self._shade(hits.sample, part, visible),
+                              lambda: self._shade(samples, part, rim_visible))
+        if not self.layered:
+            image.radiance = self._mix(image, image.raw)
+        return image
+
+    def _seen(self, visible) -> np.ndarray:
+        """(points of the source, H, W)"""
+        return np.array(visible).reshape(-1, self.height, self.width)
+
+    def _rim(self, hits: "Hits", visible) -> np.ndarray:
+        return np.logical_or.reduce([_edges(s & hits.valid) for s in self._seen(visible)]) | hits.edges
+
+    def _joint_rim(self, hits: "Hits") -> np.ndarray:
+        """Pixels at a rim for any light: in scenes with layers one set of finer samples serves all."""
+        if hits.joint is None:
+            rims = [self._rim(hits, self._visible(hits.si, part)) for part in self.scene.leds.values()]
+            hits.joint = np.logical_or.reduce([hits.edges, *rims])
+        return hits.joint
+
+    # -- what layers leave of it ----------------------------------------------------------------------------------------
+
+    def image(self, values: Mapping, light: str, component: int = 0) -> np.ndarray:
+        """(H, W, B) what one light makes at power 1, layers and all; (N, 1, B) where `values` hold arrays of readings.
+
+        component  of the Stokes vector in the camera's axes
+        """
+        image = self.led(values, light)
+        if not self.layered:
+            return image.radiance if component == 0 else np.zeros_like(image.radiance)
+        seen = [None if r is None or w is None else r * w for r, w in zip(image.raw, self.weights(values, image, component))]
+        for add in self._glows(values, image, component):
+            seen = [s if s is None else s + a for s, a in zip(seen, add)]
+        return self._mix(image, seen)
+
+    def _glows(self, values: Mapping, image: "LedImage", component: int) -> Iterator[tuple]:
+        """What boundaries send to the camera by themselves while one light is on (stage `glow`): at centres, at finer samples."""
+        effects = registry().at_stage("interface", "glow")
+        names = [n for n, p in self.scene.parts.items() if p.kind == "interface"] if image.led in self.scene.leds else []
+        for name in names:
+            own = paths.part_values(self.scene, name, values, {})
+            functions = [e.stages["glow"] for e in effects
+                         if any(getattr(own, n) != self.scene.parts[name].numbers[n].neutral for n in e.parameter_names)]
+            if not functions:
+                continue
+            shines = [i for i, s in enumerate(self.scene.mitsuba.shapes()) if getattr(s.bsdf(), "kind", "") == "fluorescent"]
+            marked = np.isin(image.hits.path.shape, shines)
+            glow = SimpleNamespace(markers=image.raw[0][marked].mean(0, dtype=float) if marked.any() else np.zeros(self.bands),
+                                   wavelengths=self.wavelengths)
+            light = sum(function(glow, own) for function in functions)
+            yield tuple(None if path is None else light * paths.transmission(
+                self.scene, path, values, self.wavelengths, component, name)[0].reshape(shape) for path, shape in (
+                (image.hits.path, (-1, self.bands)),
+                (image.samples.path if len(image.index) else None, (len(image.index), self.rim_samples, self.bands))))
+
+    def weights(self, values: Mapping, image: "LedImage", component: int = 0) -> tuple:
+        """What the layers leave of a light: (H W, B) at the pixels' centres, (n, S, B) at the finer samples of rims."""
+        centre = self._weight(values, image.led, image.hits.path, component, ())
+        fine = None
+        if len(image.index):
+            fine = self._weight(values, image.led, image.samples.path, component, (image.index.tobytes(),))
+            fine = fine.reshape(len(image.index), self.rim_samples, self.bands)
+        return centre, fine
+
+    def _weight(self, values: Mapping, light: str, path, component: int, where: tuple) -> np.ndarray:
+        key = (self.geometry(values), component, *where, *(v.tobytes() if isinstance(v, np.ndarray) else v for v in (
+            values[k] for k in self.layer_order)))
+        if key not in self._transmissions:
+            if all(path is not other for other in self._recent):  # matrices are large: those of the last two paths are kept
+                self._recent.append(path)
+                if len(self._recent) > 4:
+                    self._recent.pop(0).matrices.clear()
+            self._transmissions[key] = paths.transmission(self.scene, path, values, self.wavelengths, component)
+            while len(self._transmissions) > 2 * self.remember:
+                self._transmissions.popitem(last=False)
+        row = self._transmissions[key]
+        if light not in self.scene.sources:
+            return row[0]
+        sent = paths.emitted(self.scene, light, path, values, self.wavelengths)
+        return sum(r * s for r, s in zip(row, sent) if not isinstance(s, int))
+
+    # -- all lights ---------------------------------------------------------------------------------------------------
+
+    def lit(self, values: Mapping) -> list[str]:
+        """The lights that are on."""
+        return [n for n in self.scene.lights if np.any(values[f"{n}.power"] != 0)]
+
+    def light(self, values: Mapping, light: str, seed: int = 0, component: int = 0) -> np.ndarray:
+        """(H, W, B) what one light makes at its power, by one reflection and by two."""
+        image = self.image(values, light, component)
+        if values[self.bounce_key]:
+            image = image + values[self.bounce_key] * self.bounced(values, light, seed, component)
+        return self.powers(values, light) * image
+
+    def radiance(self, values: Mapping, seed: int = 0, component: int = 0) -> np.ndarray:
+        """(H, W, B): linear image; complex where `values` hold a complex step of a layer's parameter."""
+        lights = (self.light(values, n, seed, component) for n in self.lit(values))
+        return sum(lights, self.ambient(values, component))
+
+    def stokes(self, values: Mapping, seed: int = 0) -> np.ndarray:
+        """(4, H, W, B): Stokes vectors at the camera; (4, N, 1, B) where `values` hold arrays of readings."""
+        return np.stack([self.radiance(values, seed, component) for component in range(4)])
+
+    def _rim_samples(self, hits: "Hits", index: np.ndarray):
+        key = index.tobytes()
+        if key not in hits.rims:
+            # A Hammersley set, shifted from pixel to pixel: an edge in any direction crosses the samples one by one, and
+            # not in rows, so that a shadow that moves changes a pixel in small steps.
+            count = self.rim_samples
+            k = np.arange(count)
+            reversed_bits = sum(((k >> b) & 1) / 2 ** (b + 1) for b in range(count.bit_length() - 1))
+            shift = np.outer(index, (0.7548776662466927, 0.5698402909980532))  # the R2 sequence
+            u = (index % self.width)[:, None] + (k / count + shift[:, :1]) % 1.0
+            v = (index // self.width)[:, None] + (reversed_bits + shift[:, 1:]) % 1.0
+            hits.rims = {key: self._trace(u.ravel(), v.ravel()) if len(index) else None}  # only the latest is kept
+        return hits.rims[key]
+
+    def _discs(self, part) -> list:
+        """Sample positions on the emitting disc, as points of the unit square; [None] for a point source.
+
+        Four points stand for the inner quarter of the disc's area and twelve for the ring around it, each on the circle
+        that has its part's mean square radius, 1/8 and 5/8: the width of a penumbra is that of the whole disc.
+        """
+        if part.number("area") == 0:
+            return [None]
+        at = [0.5 + sign * (mean_square**0.5) / 2 for sign, mean_square in ((-1, 5 / 8), (-1, 1 / 8), (1, 1 / 8), (1, 5 / 8))]
+        return [(a, b) for a in at for b in at]
+
+    def _visible(self, si, part):
+        """Share of the LED that each hit sees; a Float (a mask for a point source)."""
+        import drjit as dr
+        import mitsuba as mi
+
+        integrator = self.scene.integrator
+        share = []
+        for place in self._discs(part):
+            point = part.position() if place is None else part.point(mi.Point2f(*place))
+            share.append(integrator.visible(self.scene.mitsuba, si, dr.detach(point), part))
+        dr.eval(share)
+        return share[0] if len(share) == 1 else share
+
+    def _shade(self, sample: Sample, part, visible):
+        """Direct radiance per band at hits, an UnpolarizedSpectrum attached to whatever carries gradients."""
+        import mitsuba as mi
+
+        integrator, scene = self.scene.integrator, self.scene.mitsuba
+        places = self._discs(part)
+        if len(places) == 1:
+            return integrator.direct(scene, *sample[:3], part, visible)
+        parts = [integrator.direct(scene, *sample[:3], part, seen, mi.Point2f(*place)) for place, seen in zip(places, visible)]
+        return sum(parts[1:], parts[0]) / len(parts)
+
+    def _raw(self, image: "LedImage", centre: Callable, rim: Callable) -> tuple:
+        """Shading at pixel centres (H W, B) and at the finer samples of rims (n, S, B), None without rims."""
+        fine = self._bands(rim()).reshape(len(image.index), self.rim_samples, self.bands) if len(image.index) else None
+        return self._bands(centre()).reshape(self.height * self.width, self.bands), fine
+
+    def _mix(self, image: "LedImage", raw: tuple, weights: tuple = (1.0, 1.0)) -> np.ndarray:
+        """(H, W, B) from pixel centres and, where the rim is, from the mean of the finer samples, by its share."""
+        result = raw[0] * weights[0] if self.layered else raw[0].copy()
+        if len(image.index):
+            result[image.index] += image.share * ((raw[1] * weights[1]).mean(1) - result[image.index])
+        return result.reshape(-1, self.width, self.bands) if len(result) != self.height * self.width else result.reshape(
+            self.height, self.width, self.bands)
+
+    def _bands(self, spectrum) -> np.ndarray:
+        import drjit as dr
+
+        dr.eval(spectrum)  # lane by lane: one array of all lanes would carry its size into the kernel
+        return np.stack([np.array(spectrum[i]) for i in range(self.bands)], -1)
+
+    def powers(self, values: Mapping, led: str) -> np.ndarray:
+        """(B,) power of an LED in each band, relative to its image."""
+        shares = [values[f"{led}.{name}"] for name in POWERS[1:]] + [1.0] * self.bands
+        return values[f"{led}.power"] * np.array(shares[:self.bands])
+
+    def led_tangent_at_rest(self, values: Mapping, led: str, key: str) -> np.ndarray:
+        """`led_tangent`, kept: all frames share the gel at rest."""
+        known = (key, *self._led_key(values, led), *(values[k] for k in self.layer_order))
+        if known not in self._tangents:
+            self._tangents[known] = self.led_tangent(values, led, key).astype(np.float32)
+            while len(self._tangents) > 8 * len(self.scene.lights):
+                self._tangents.popitem(last=False)
+        return self._tangents[known]
+
+    def led_tangent(self, values: Mapping, led: str, key: str) -> np.ndarray:
+        """d radiance / d parameter of one LED's image, forward mode; rims by central differences where the LED moves."""
+        import drjit as dr
+        import mitsuba as mi
+
+        image = self.led(values, led)
+        name, parameter = key.rsplit(".", 1)
+        part, lamp = self.scene.parts[name], self.scene.leds[led]
+        moves = part is lamp and parameter in ("x", "y", "z")
+        self._apply(values, move=moves and len(image.index) > 0)
+        value = getattr(part, parameter)
+
+        def tangent(sample, visible):
+            attached = mi.Float(dr.detach(value))
+            dr.enable_grad(attached)
+            setattr(part, parameter, attached)
+            try:
+                shaded = self._shade(sample, lamp, visible)
+                dr.set_grad(attached, 1.0)
+                return dr.forward_to(shaded, flags=dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
+            finally:
+                setattr(part, parameter, value)
+
+        def moved_rim():
+            step = part.numbers[parameter].step * part.numbers[parameter].plausible
+            sides = []
+            for sign in (1, -1):
+                setattr(part, parameter, dr.opaque(mi.Float, float(value[0]) + sign * step))
+                try:
+                    sides.append(self._shade(image.samples, lamp, self._visible(image.samples.si, lamp)))
+                finally:
+                    setattr(part, parameter, value)
+            return (sides[0] - sides[1]) / (2 * step)
+
+        raw = self._raw(image, lambda: tangent(image.hits.sample, image.visible),
+                        moved_rim if moves else lambda: tangent(image.samples, image.rim_visible))
+        return self._mix(image, raw, self.weights(values, image) if self.layered else (1.0, 1.0))
+
+    def bounced(self, values: Mapping, led: str, seed: int = 0, component: int = 0) -> np.ndarray:
+        """(H, W, B): light of one LED at power 1 after two reflections, unpolarized before any layers, as a component of the
+        Stokes vector; Monte Carlo over the second direction.
+
+        Light from all around varies slowly: it is gathered for every second pixel each way, over the area of the four,
+        and interpolated linearly in between. The samples are the same for every geometry and LED of a seed.
+        """
+        import mitsuba as mi
+        from scipy.ndimage import zoom
+
+        if led in self.scene.sources:  # it lights nothing
+            return np.zeros((1, 1, self.bands))
+        key = ("bounced", seed, *self._led_key(values, led))
+        if key in self._images:
+            self._images.move_to_end(key)
+            return self._bounced(values, led, self._images[key], component)
+        self._apply(values)
+        rows, columns = -(-self.height // BOUNCE_CELL), -(-self.width // BOUNCE_CELL)
+        v, u = np.mgrid[:rows, :columns]
+        rng = np.random.default_rng([seed, 77])
+        count = u.size * BOUNCE_SAMPLES
+        at = [np.repeat(a.ravel(), BOUNCE_SAMPLES) + rng.random(count) for a in (u, v)]
+        sample = self._trace(*(np.minimum(a * BOUNCE_CELL, size - 1e-3) for a, size in zip(at, (self.width, self.height))))
+        sampler = mi.load_dict({"type": "independent"})
+        sampler.seed(int(rng.integers(2**31)), count)
+        light = self.scene.integrator.bounced(self.scene.mitsuba, *sample[:3], self.scene.leds[led], 1, sampler)
+        coarse = self._bands(light).reshape(rows, columns, BOUNCE_SAMPLES, self.bands).mean(2)
+        image = zoom(coarse, (BOUNCE_CELL, BOUNCE_CELL, 1), order=1, mode="nearest", grid_mode=True)
+        self._images[key] = image[:self.height, :self.width].astype(float)
+        return self._bounced(values, led, self._images[key], component)
+
+    def _bounced(self, values: Mapping, led: str, image: np.ndarray, component: int) -> np.ndarray:
+        """A bounced image behind the layers."""
+        if not self.layered:
+            return image if component == 0 else np.zeros_like(image)
+        weight = self._weight(values, led, self.hits(values).path, component, ())
+        return image * weight.reshape(-1, self.width, self.bands)
+
+    def glows(self, values: Mapping) -> bool:
+        """Whether there is light that no LED made."""
+        return any(values[k] != neutral for k, neutral in self._still.items())
+
+    def ambient(self, values: Mapping, component: int = 0) -> np.ndarray:
+        """(H, W, B): radiance of the membranes that no LED made."""
+        if not self.glows(values) or component and not self.layered:
+            return np.zeros((self.height, self.width, self.bands))
+        if not self.layered:
+            return np.broadcast_to(self._shone(values, self.hits(values).sample), (self.height * self.width, self.bands)).reshape(
+                self.height, self.width, self.bands).astype(float)
+        image = self.glow(values)
+        return self._mix(image, image.raw, self.weights(values, image, component))
+
+    def glow(self, values: Mapping) -> "LedImage":
+        """The image of light that no LED made, in a scene with layers, before these."""
+        hits = self.hits(values)
+        rim = self._joint_rim(hits)
+        index = np.flatnonzero(rim)
+        image = LedImage("", hits, rim, index, self._rim_samples(hits, index), None, None, hits.valid)
+        image.raw = (self._shone(values, hits.sample),
+                     self._shone(values, image.samples).reshape(len(index), self.rim_samples, self.bands) if len(index) else None)
+        return image
+
+    def _shone(self, values: Mapping, sample: "Sample") -> np.ndarray:
+        """(N, B): radiance of the membranes that no LED made, at the ends of camera rays."""
+        self._apply(values, move=False)
+        return sum(self._bands(self.scene.integrator.ambient(self.scene.mitsuba, sample.si, sample.weight, m) + 0 * sample.si.t)
+                   for m in self.scene.membranes.values())
+
+
+class Sample(NamedTuple):
+    """Camera rays at their ends (Dr.Jit), and in a scene with layers the paths that they took."""
+
+    si: object
+    weight: object
+    origin: object
+    path: paths.Path | None = None
+
+
+class Hits:
+    """Primary hits of one geometry: si, weight, origin (Dr.Jit), and what they show as numpy images."""
+
+    def __init__(self, sample: Sample, height: int, width: int):
+        self.sample = sample
+        self.si, self.weight, self.origin, self.path = sample
+        self.shape = (height, width)
+        self.rims: dict = {}
+        self.joint: np.ndarray | None = None
+        self.valid = np.array(self.si.is_valid()).reshape(height, width)
+        self.edges = _edges(self.valid)
+        if self.path is not None:  # what is passed, and what is met, changes at an edge
+            for met in (self.path.shape, *(step.part for step in self.path.steps)):
+                self.edges |= _edges(met.reshape(height, width))
+            self.edges |= _creases(np.where(self.valid[..., None], self.normal, 0.0))
+        self.bent = np.zeros((height, width)) if self.path is not None else _bent(np.where(self.valid[..., None], self.normal, 0.0))
+
+    def image(self, values) -> np.ndarray:
+        return np.array(values).reshape(self.shape)
+
+    @property
+    def position(self) -> np.ndarray:
+        return np.array(self.si.p).T.reshape(*self.shape, 3)
+
+    @property
+    def normal(self) -> np.ndarray:
+        return np.array(self.si.sh_frame.n).T.reshape(*self.shape, 3)
+
+
+class LedImage:
+    """One LED's image with the hits, rim pixels and shadows that it was made from."""
+
+    def __init__(self, led, hits, rim, index, samples, visible, rim_visible, lit):
+        self.led, self.hits, self.rim, self.index, self.samples = led, hits, rim, index, samples
+        self.visible, self.rim_visible, self.lit = visible, rim_visible, lit
+        self.share: np.ndarray | float = 1.0  # (n, 1) of the finer samples in each of those pixels
+        self.raw: tuple | None = None  # what the light makes before layers: at centres, at finer samples
+        self.radiance: np.ndarray | None = None  # the image, in scenes without layers
+
+
+def _creases(normal: np.ndarray) -> np.ndarray:
+    """Pixels on either side of a sharp edge of a body: normals (H, W, 3) that turn by more than CREASE from one to the next."""
+    found = np.zeros(normal.shape[:2], bool)
+    for axis in (0, 1):
+        near, far = (np.take(normal, range(k, normal.shape[axis] - 1 + k), axis) for k in (0, 1))
+        turned = (near * far).sum(-1) < np.cos(np.radians(CREASE)) * np.linalg.norm(near, axis=-1) * np.linalg.norm(far, axis=-1)
+        first, second = ((slice(None),) * axis + (slice(k, normal.shape[axis] - 1 + k),) for k in (0, 1))
+        found[first] |= turned
+        found[second] |= turned
+    return found
+
+
+def _bent(normal: np.ndarray) -> np.ndarray:
+    """(H, W) share, 0 to 1, by which finer samples stand for a pixel and not its middle.
+
+    The mean over a pixel of what varies is its middle and a twenty-fourth of its second differences. Where these are, for the normals
+    (H, W, 3), above 24 BENT, the share is 1, and it fades to 0 at half of that: a picture has no steps when a dent moves.
+    """
+    found = np.zeros(normal.shape[:2])
+    for axis in (0, 1):
+        if normal.shape[axis] < 3:
+            continue
+        inner = (slice(None),) * axis + (slice(1, -1),)
+        found[inner] = np.maximum(found[inner], np.linalg.norm(np.diff(normal, 2, axis=axis), axis=-1) / 24)
+    return np.clip(2 * found / BENT - 1, 0.0, 1.0)
+
+
+def _edges(mask: np.ndarray) -> np.ndarray:
+    """Pixels whose neighbourhood (3 x 3) is not all of one kind."""
+    low, high = _around(mask)
+    return low != high
+
+
+def _around(plane: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Smallest and largest value in the neighbourhood (3 x 3) of each pixel."""
+    from scipy.ndimage import maximum_filter, minimum_filter
+
+    return minimum_filter(plane, 3), maximum_filter(plane, 3)

@@ -1,0 +1,1 @@
+"""Mueller calculus, and layers that change the polarization of light that passes."""

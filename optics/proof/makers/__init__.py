@@ -1,0 +1,1 @@
+"""Captures made by another path than the model that is fitted to them."""

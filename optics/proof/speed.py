@@ -1,0 +1,206 @@
+"""Speed, measured beside stock Mitsuba in one run: `make bench`. Prints ratios; judges nothing.
+
+    new press    geometry, hits, shadows and images of six LEDs, 320 x 240
+    derivatives  all derivative images of 30 parameters, in units of the primal
+    render       the same scene by `tactile` and by stock `path`: time x variance, which is time at equal noise
+    prediction   the images of six LEDs against `path` with as many samples as its noise needs to fall to their error
+    ranking      every effect scored on 16 frames of 160 x 120, presses solved for as well
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+import time
+from pathlib import Path
+from statistics import median
+
+import numpy as np
+
+
+def timed(function, repeats: int = 5) -> float:
+    """Median wall-clock seconds of a function, after one call that warms caches and kernels."""
+    function()
+    laps = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        function()
+        laps.append(time.perf_counter() - start)
+    return median(laps)
+
+
+def row(name: str, value: str, note: str = "") -> None:
+    print(f"{name:<44}{value:>16}   {note}", flush=True)
+
+
+GRID = """<scene version="3.0.0">
+    MEDIA
+    INTEGRATOR
+    <sensor type="camera" id="camera">
+        <film type="hdrfilm"><integer name="width" value="WIDTH"/><integer name="height" value="HEIGHT"/><rfilter type="box"/></film>
+        <float name="x_fov" value="41"/>
+        <transform name="to_world"><translate z="-22"/></transform>
+    </sensor>
+    <shape type="cube" id="block"><transform name="to_world"><scale x="8.2" y="8.2" z="2.75"/><translate z="-2.75"/></transform>WALLS</shape>
+    <shape type="cells" id="grid">
+        <integer name="columns" value="20"/><integer name="rows" value="20"/><integer name="layers" value="6"/>FILLING
+    </shape>
+    <shape type="rectangle" id="card">
+        <transform name="to_world"><rotate x="1" angle="180"/><scale x="12" y="12"/><translate z="0.5"/></transform>
+        <bsdf type="diffuse"><spectrum name="reflectance" value="0.6"/></bsdf>
+    </shape>
+    LAMPS
+</scene>"""
+SIDES = ((-8.7, 0.0), (8.7, 0.0), (0.0, 8.7))
+
+
+def lamps(emitter: str) -> str:
+    return "\n".join(
+        f'<shape type="rectangle" id="panel_{k}"><transform name="to_world"><scale x="6" y="2"/><lookat origin="{x}, {y}, -2.5" '
+        f'target="0, 0, -2.5" up="0, 0, 1"/></transform><bsdf type="diffuse"><spectrum name="reflectance" value="0"/></bsdf>'
+        f'{emitter.format(k)}</shape>' for k, (x, y) in enumerate(SIDES))
+
+
+def printed_grid() -> None:
+    """20 x 20 x 6 cells that absorb, lit by three panels: ours against stock `volpath`, and the time to 5 % noise."""
+    from optics.light.transport import Transport
+    from optics.scene import loader as scenes
+
+    ours = {"MEDIA": "", "INTEGRATOR": '<integrator type="tactile" id="integrator"><string name="bands" value="540"/></integrator>',
+            "WALLS": '<bsdf type="clear" id="walls"><float name="index" value="1.5"/><float name="absorption" value="0.05"/></bsdf>',
+            "FILLING": '<bsdf type="clear" id="filling"><string name="outside" value="walls"/><float name="index" value="1.4"/>'
+                       '<float name="absorption" value="0.1"/></bsdf>',
+            "LAMPS": lamps('<emitter type="source" id="lamp_{}"/>')}
+    medium = '<medium type="homogeneous" id="{}"><spectrum name="sigma_t" value="{}"/><spectrum name="albedo" value="0"/></medium>'
+    glass = '<bsdf type="dielectric"><float name="int_ior" value="{}"/><float name="ext_ior" value="{}"/></bsdf>'
+    stock = {"MEDIA": medium.format("resin", 0.05) + medium.format("support", 0.1),
+             "INTEGRATOR": '<integrator type="volpath"><integer name="max_depth" value="512"/><integer name="rr_depth" value="1000"/></integrator>',
+             "WALLS": glass.format(1.5, 1.0) + '<ref id="resin" name="interior"/>',
+             "FILLING": glass.format(1.4, 1.5) + '<ref id="support" name="interior"/><ref id="resin" name="exterior"/>',
+             "LAMPS": lamps('<emitter type="area"><spectrum name="radiance" value="1"/></emitter>')}
+
+    def text(slots, width, height):
+        found = GRID.replace("WIDTH", str(width)).replace("HEIGHT", str(height))
+        for slot, own in slots.items():
+            found = found.replace(slot, own)
+        return found
+
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "grid.xml"
+        file.write_text(text(ours, 80, 60))
+        transport = Transport(scenes.load(file, variant="llvm_ad_mono_polarized"))
+        import mitsuba as mi
+
+        seeds = iter(range(10**6))
+        start = time.perf_counter()
+        pictures = [transport.take(rays=256, packets=100_000, seed=next(seeds)) for _ in range(2)]
+        cost = (time.perf_counter() - start) / 2
+        level = pictures[0].radiance.sum(0).mean()
+        variance = float(np.mean([(p.error**2).sum(0).mean() for p in pictures]))
+        file.write_text(text(stock, 80, 60))
+        theirs = mi.load_file(str(file), optimize=False)
+        np.array(mi.render(theirs, spp=1, seed=0))
+        start = time.perf_counter()
+        images = [np.array(mi.render(theirs, spp=64, seed=next(seeds)))[..., 0] for _ in range(6)]
+        cost_stock = (time.perf_counter() - start) / 6
+        variance_stock = float(np.mean(np.var(images, 0, ddof=1)))
+        row("printed grid, stock volpath, 80x60, 64 samples", f"{cost_stock:.1f} s", f"noise {variance_stock**0.5 / np.mean(images):.0%} a pixel")
+        row("printed grid, ours, three lights apart", f"{cost:.1f} s", f"noise {variance**0.5 / level:.0%} a pixel")
+        row("ours / stock volpath at equal noise", f"{cost * variance / (cost_stock * variance_stock):.2g} x",
+            f"time x variance; target 0.1; means differ by {level / np.mean(images) - 1:+.1%}")
+
+        file.write_text(text(ours, 160, 120))
+        transport = Transport(scenes.load(file, variant="llvm_ad_mono_polarized"))
+        start = time.perf_counter()
+        picture = transport.take(rays=256, packets=1_500_000)
+        cost = time.perf_counter() - start
+        image, error = picture.radiance.sum(0), (picture.error**2).sum(0) ** 0.5
+        row("20x20x6 cells, 160x120", f"{cost:.0f} s", f"noise {np.median(error / np.maximum(image, 1e-12)):.1%} in the median pixel, "
+            f"{(error**2).mean() ** 0.5 / image.mean():.0%} rms; target 5 % below 60 s")
+    from optics.scene.mitsuba_parts import use_variant
+
+    use_variant("llvm_ad_spectral_polarized")
+
+
+def main() -> int:
+    from optics.light.renderer import Renderer
+    from optics.scene import loader as scenes
+    from optics.scene.mitsuba_parts import use_variant
+
+    scene = scenes.load("gelsight", {"width": "320", "height": "240", "depth": "0.6"})
+    renderer = Renderer(scene)
+    values = scene.values()
+    depth = iter(np.linspace(0.4, 0.8, 400))
+
+    def press():
+        now = {**values, "gel.press_depth": float(next(depth))}
+        renderer.together = set(scene.leds)
+        return sum(renderer.led(now, led).radiance for led in scene.leds)
+
+    ours = timed(press, 9)
+    row("new press, six LEDs, 320x240 (ours)", f"{ours * 1e3:.0f} ms", "target below 200 ms")
+
+    now = {**values, "gel.press_depth": 0.61}
+    keys = [f"{led}.{n}" for led in scene.leds for n in ("x", "y", "z", "mu", "pan")][:30]
+    lit = timed(press, 5)
+    [renderer.led(now, led) for led in scene.leds]
+    derivatives = timed(lambda: [renderer.led_tangent(now, k.split(".")[0], k) for k in keys], 3)
+    row("30 derivative images", f"{derivatives / lit:.1f} x primal", "target below 30 x")
+
+    stock = scenes.load("gelsight", {"width": "320", "height": "240", "depth": "0.61"}, variant="llvm_ad_mono_polarized")
+    import mitsuba as mi
+
+    bounces = {"max_depth": 3, "rr_depth": 100}  # `path` counts the window
+    cost, variance = {}, {}
+    for name, integrator in (("tactile", stock.mitsuba.integrator()), ("path", mi.load_dict({"type": "path", **bounces}))):
+        seeds = iter(range(10**6))
+        images = [np.array(mi.render(stock.mitsuba, integrator=integrator, spp=16, seed=next(seeds)))[..., 0] for _ in range(8)]
+        variance[name] = float(np.mean(np.var(images, 0, ddof=1)))
+        cost[name] = timed(lambda: np.array(mi.render(stock.mitsuba, integrator=integrator, spp=16, seed=next(seeds))))  # noqa: B023
+        row(f"{name}, 16 samples per pixel", f"{cost[name] * 1e3:.0f} ms", f"variance {variance[name]:.3g}")
+    ratio = cost["tactile"] * variance["tactile"] / (cost["path"] * variance["path"])
+    row("tactile / stock path at equal noise", f"{ratio:.2g} x", "time x variance; below 1 is faster; target 1")
+
+    # Our error: against many samples of `tactile`, less their own noise.
+    use_variant("llvm_ad_spectral_polarized")
+    level = scene.values()["membrane.rho_r"] / stock.values()["membrane.rho_r"]
+    ours_image = sum(renderer.led(now, led).radiance for led in scene.leds)[..., 0] / level
+    use_variant("llvm_ad_mono_polarized")
+    many = [np.array(mi.render(stock.mitsuba, integrator=stock.mitsuba.integrator(), spp=512, seed=10**6 + k))[..., 0]
+            for k in range(4)]
+    own = float(np.mean(np.var(many, 0, ddof=1))) / len(many)
+    error = max(float(np.mean((ours_image - np.mean(many, 0)) ** 2)) - own, own)
+    needed = 16 * variance["path"] / error
+    row("ours / stock path at equal error", f"{ours / (cost['path'] * needed / 16):.2g} x",
+        f"path needs {needed:.3g} samples for our rms error of {error**0.5:.1e}; its time extrapolated from 16")
+    use_variant("llvm_ad_spectral_polarized")
+    printed_grid()
+
+    from optics.captures import capture_set as files
+    from optics.diagnosis import diagnose as diagnosis
+    from optics.proof import demo
+    from optics.proof.makers import touch as synthetic
+    from optics.scene.parameter import Values
+    from optics.study import loop
+
+    with tempfile.TemporaryDirectory() as folder:
+        small = scenes.load("gelsight", {"width": "160", "height": "120"})
+        made = synthetic.Maker(small, demo.truth(small, 1), {}, seed=1).captures(
+            synthetic.presses(4, 1), drives=[{led: 1.0} for led in list(small.leds)[:4]])
+        files.write(made, Path(folder) / "captures", bits=8)
+        setup = loop.Setup(captures=str(Path(folder) / "captures"), held_out=[])
+        model = loop.open_model(setup)
+        fit = loop.fit_base(model, loop.variables_of_base(model, setup, range(16)), list(range(16)),
+                            Values(demo.truth(small, 1)))
+        from optics.scene.registry import registry
+
+        effects = [e for e in registry().effects.values() if model.scene.can_express(e)]
+        start = time.perf_counter()
+        diagnosis.diagnose(model, fit, effects, lambda e: loop.effect_variables(model, e), fitted=list(range(16)), top=0)
+        row(f"ranking {len(effects)} effects, 16 frames 160x120", f"{time.perf_counter() - start:.0f} s",
+            f"{len(fit.variables)} parameters in the base; target below 60 s")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,111 @@
+"""Declarations: a part of a sensor, an effect of a part, and the folder they are found in.
+
+A plugin is one file. It holds a module-level `part` (a Mitsuba plugin with its parameters) or an `effect` (one or a few
+parameters of a part that rest at their neutral value, and the function that brings them in). Files are found by
+scanning folders, never imported by name, so that what ships has no privilege over what a user writes.
+
+Where an effect enters, in the order that light takes (`STAGES`):
+
+    surface     gel       dz = f(x, y, gel)           mm, added to the gel surface; numpy, (N,) arrays
+    emission    led       k  = f(beam, led)           factor on the radiance that an LED sends to a point; Dr.Jit
+    segment     gel       k  = f(path, gel)           factor on the light along its path in the gel; Dr.Jit
+    reflection  membrane  fr = f(geometry, membrane)  added to the BRDF, 1/sr; Dr.Jit
+    volume      gel       L  = f(path, gel)           radiance added by the gel itself, per LED; Dr.Jit
+    ambient     membrane  L  = f(geometry, membrane)  radiance added that no LED made; Dr.Jit
+    glow        interface L  = f(glow, interface)     (B,) radiance that a boundary sends to the camera, per light; numpy
+    index       clear     n  = f(n, wavelengths, clear)  refractive index per band; arithmetic of optics.polarization.mueller
+    absorption  clear     a  = f(a, wavelengths, clear)  absorption coefficient per band, 1/mm; arithmetic of optics.polarization.mueller
+    layer       a layer   M  = f(crossing, layer)     Mueller matrix that light passes after the layer's own (optics.polarization.layers)
+    lens        camera    I  = f(image, camera)       irradiance per band, (H, W, B); numpy
+    sensor      camera    I  = f(image, camera)       signal per channel, (H, W, C), 1 = full scale; numpy
+    response    camera    m  = f(image, camera)       response per channel, 1 = full scale; numpy
+
+`camera` has the camera's parameters, the geometry of its pixels (optics.light.development), and in `settings` all values by key, such as `source.time`.
+Functions of the stages `lens` and `sensor` are affine in the image, those of `response` act pixel by pixel. All three must
+be analytic (no abs, max or branches on their complex arguments): their derivatives are taken by complex step, exact to
+rounding (Squire & Trapp, SIAM Rev. 40, 110, 1998). An effect without functions frees parameters that its part has.
+"""
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+from optics.scene.parameter import Parameter
+from optics.words import key_of
+
+STAGES = {
+    "surface": "gel", "emission": "led", "segment": "gel", "reflection": "membrane", "volume": "gel",
+    "ambient": "membrane", "glow": "interface", "index": "clear", "absorption": "clear", "layer": "", "lens": "camera",
+    "sensor": "camera", "response": "camera",
+}
+IMAGE_STAGES = ("lens", "sensor", "response")
+CATEGORIES = ("bsdf", "emitter", "sensor", "shape", "integrator")
+
+
+@dataclass(frozen=True)
+class Part:
+    """A part of a sensor: the name of its Mitsuba plugin, its category, its parameters and its class.
+
+    build   called once per Mitsuba variant, returns the plugin class (a subclass of mi.BSDF, mi.Emitter, ...)
+    checks  functions without arguments that raise AssertionError: the closed forms that the part must meet
+    mueller of a layer: its Mueller matrix (optics.polarization.layers);   stokes   of a source: the Stokes vector that it sends
+    """
+
+    kind: str
+    category: str
+    parameters: tuple[Parameter, ...]
+    build: Callable[[], type]
+    checks: tuple[Callable[[], None], ...] = ()
+    doc: str = ""
+    file: str = ""
+    mueller: Callable | None = None
+    stokes: Callable | None = None
+
+
+@dataclass(frozen=True)
+class Effect:
+    """A physical effect: parameters that rest at neutral until somebody adds them.
+
+    name        words, as in a sentence: "lens vignetting"
+    part        kind of the part that carries it
+    parameters  new ones (declared here) or names of parameters that the part already has
+    stages      stage -> function: where the physics enters, see the module's text; empty: the part itself does it
+    shape       further parameters that the functions use and that stay as they are (a width, an exponent)
+    onset       'tangent' (linear at neutral), 'secant' (the derivative at neutral says nothing: a finite step to
+                `plausible` is used) or 'both'
+    scope       'common' (one value in all frames) or 'frame' (a value per frame)
+    per         'kind' (one value shared by all parts of the kind, such as all LEDs) or 'part' (each its own)
+    requires    kinds of further parts that a scene must have for the effect to make sense in it
+    pictures    True where it mixes the pixels of a picture: point readings cannot have it
+    acts        coordinates that it acts through: radius, height, slope, led, channel, frame, intensity ...
+    needs       what a capture set must vary for it to be seen, in words
+    seek        where an effect has a place that no derivative leads to: f(model, values, frames) -> {key: value} of further parameters
+                that do nothing at neutral, found from the residual before the effect is scored or added
+    checks      closed forms, as in Part
+    """
+
+    name: str
+    part: str
+    parameters: tuple[Parameter | str, ...]
+    stages: Mapping[str, Callable] = field(default_factory=dict)
+    shape: tuple[Parameter, ...] = ()
+    onset: str = "tangent"
+    scope: str = "common"
+    per: str = "kind"
+    requires: tuple[str, ...] = ()
+    pictures: bool = False
+    acts: tuple[str, ...] = ()
+    needs: str = ""
+    seek: Callable | None = None
+    checks: tuple[Callable[[], None], ...] = ()
+    doc: str = ""
+    file: str = ""
+
+    @property
+    def key(self) -> str:
+        """The name as one word, for the command line: 'lens vignetting' -> 'lens-vignetting'."""
+        return key_of(self.name)
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        return tuple(p if isinstance(p, str) else p.name for p in self.parameters)

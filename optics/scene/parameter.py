@@ -1,0 +1,184 @@
+"""The one vocabulary: a parameter of a part of the scene, with its key, unit, bounds and neutral value.
+
+Settings, free parameters and effects are roles that a parameter plays; see `optics.scene.registry` for the declarations.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+from optics.errors import OutOfBounds, UnknownKey
+from optics.words import spaced
+
+HOW = ("ad", "difference", "image", "layer", "path")
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One physical quantity of a part: `led.power`, `membrane.sigma`, `camera.x_fov`.
+
+    name        as written in XML, unique within its part
+    unit        mm, deg, nm, 1/mm, DN, px, 1 ...
+    default     value when the XML does not give one
+    bounds      (low, high), closed
+    doc         what it means, in one sentence, with its symbol in the source
+    neutral     value at which its effect vanishes; None where it has none (a position has no neutral value)
+    plausible   the size of a change that a real sensor shows; sets steps and scales, > 0
+    step        half width of a central difference, in plausible sizes: narrow where the image bends, wide where an edge that
+                moves changes a rim's pixel by jumps of one sample
+    how         how its derivative image is made: 'ad' (forward mode through the render), 'difference' (central, common
+                random numbers: it moves shadows or geometry), 'image' (arithmetic on the linear images), 'layer' (complex step
+                through the Mueller matrices of the layers and the Stokes vectors of sources), 'path' (by the lengths of the ways
+                that light took through clear bodies)
+    squared     True where the image depends on the square of it (a roughness): a fit steps in the square, whose onset is
+                linear, and stays above a thousandth of `plausible`
+    saturates   of a squared parameter s: the value v beyond which its effect levels off; a fit steps in s^2/(1 + s^2/v^2)
+    linear      True where the image is exactly linear in it (one render serves every value)
+    choices     the allowed words, for a parameter that is a choice and not a number; files: endings of files that serve as well
+    """
+
+    name: str
+    unit: str
+    default: float | str
+    bounds: tuple[float, float] = (-math.inf, math.inf)
+    doc: str = ""
+    neutral: float | None = None
+    plausible: float = 1.0
+    how: str = "ad"
+    step: float = 0.1
+    linear: bool = False
+    squared: bool = False
+    saturates: float = math.inf
+    choices: tuple[str, ...] = ()
+    files: tuple[str, ...] = ()
+
+    def __post_init__(self):
+        if self.how not in HOW:
+            raise ValueError(f"parameter {self.name}: how = {self.how!r} is none of {', '.join(HOW)}")
+        if not self.choices and not self.bounds[0] <= float(self.default) <= self.bounds[1]:
+            raise OutOfBounds(self.name, float(self.default), self.unit, self.bounds, "declaration")
+
+    @property
+    def is_number(self) -> bool:
+        return not self.choices
+
+    @property
+    def differentiable(self) -> bool:
+        return self.is_number
+
+    @property
+    def factor(self) -> bool:
+        """Whether the image is proportional to it, or a part of the image is."""
+        return self.linear and self.neutral is None and self.bounds[0] == 0
+
+    def coordinate(self, value: float) -> float:
+        """u(value): what a fit steps in, so that the image is nearly linear in it."""
+        return value**2 / (1 + (value / self.saturates) ** 2) if self.squared else value
+
+    def at_coordinate(self, u: float) -> float:
+        """The inverse of `coordinate`; u below 0 counts as 0."""
+        return math.sqrt(max(u, 0.0) / max(1 - u / self.saturates**2, 1e-12)) if self.squared else u
+
+    def stepped(self, value: float, du: float, bent: bool = True) -> float:
+        """Where a step of du in the coordinate leads. A factor, such as a power, moves by its logarithm if `bent`: what it multiplies may
+        shrink by as much (brightness and reflectance), and the image stays. Beyond e times the value it goes on straight, as a logarithm that
+        overshoots does so without measure."""
+        if not bent or not self.factor or value <= 0:
+            return self.at_coordinate(self.coordinate(value) + du)
+        t = du / value
+        return value * (math.exp(t) if t < 1 else math.e * t)
+
+    def per_coordinate(self, value: float) -> float:
+        """d value / d u; infinite at 0 of a squared parameter."""
+        if not self.squared:
+            return 1.0
+        return (1 + (value / self.saturates) ** 2) ** 2 / (2 * value) if value else math.inf
+
+    @property
+    def near(self) -> float:
+        """What is nearer than this to a bound stands at it."""
+        return 1e-6 * self.plausible
+
+    def side(self, value: float) -> int:
+        """+1 at the lower bound, from which it may only rise; -1 at the upper; 0 between."""
+        low, high = self.bounds
+        return 1 if value <= low + self.near else -1 if value >= high - self.near else 0
+
+    def sides(self, value: float) -> tuple[float, float]:
+        """The two values of a central difference, `step` to either side, within bounds."""
+        step = self.step * self.plausible
+        return max(value - step, self.bounds[0]), min(value + step, self.bounds[1])
+
+    def check(self, value, key: str, where: str = ""):
+        """Return the value in its own type, or raise: not a number, not finite, out of bounds, not a choice."""
+        if self.choices:
+            if value not in self.choices and not (self.files and str(value).endswith(self.files)):
+                raise UnknownKey(str(value), self.choices, f"choice for {key}", where,
+                                 f"or a file ({', '.join(self.files)})" if self.files else "")
+            return str(value)
+        try:
+            number = float(value)
+        except (TypeError, ValueError):
+            raise ValueError(f"{where + ': ' if where else ''}{key} = {value!r} is not a number{f' in {self.unit}' if spaced(self.unit) else ''}") from None
+        if not math.isfinite(number):
+            raise ValueError(f"{where + ': ' if where else ''}{key} = {number}{spaced(self.unit)} is not finite")
+        if not self.bounds[0] <= number <= self.bounds[1]:
+            raise OutOfBounds(key, number, self.unit, self.bounds, where)
+        return number
+
+
+@dataclass(frozen=True)
+class Variable:
+    """What a calibration solves for: one number that sets one or several parameters, in all frames or in some.
+
+    name      shown to the user; the key itself, or `led.size` for a value shared by all parts of a kind,
+              or `gel.press_x[press-03]` for a value of some frames
+    keys      the scene parameters that take the value
+    frames    indices of the frames that it holds in; None: all
+    parameter the declaration (unit, bounds, plausible size)
+    prior     (mean, standard deviation) or None
+    """
+
+    name: str
+    keys: tuple[str, ...]
+    parameter: Parameter
+    frames: tuple[int, ...] | None = None
+    prior: tuple[float, float] | None = None
+
+    def holds_in(self, frame: int) -> bool:
+        return self.frames is None or frame in self.frames
+
+    def with_prior(self, mean: float, sd: float) -> "Variable":
+        return replace(self, prior=(float(mean), float(sd)))
+
+
+@dataclass
+class Values:
+    """Values of parameters by key, for all frames and, above those, for single frames."""
+
+    common: dict[str, float] = field(default_factory=dict)
+    frame: dict[int, dict[str, float]] = field(default_factory=dict)
+
+    def at(self, frame: int, base: Mapping[str, float] | None = None) -> dict[str, float]:
+        """base <- common <- this frame's own."""
+        return {**(base or {}), **self.common, **self.frame.get(frame, {})}
+
+    def get(self, variable: Variable, base: Mapping[str, float]) -> float:
+        if variable.frames is not None:
+            own = self.frame.get(variable.frames[0], {})
+            if variable.keys[0] in own:
+                return float(own[variable.keys[0]])
+        return float(self.common.get(variable.keys[0], base[variable.keys[0]]))
+
+    def put(self, variable: Variable, value: float) -> None:
+        if variable.frames is None:
+            for key in variable.keys:
+                self.common[key] = float(value)
+        else:
+            for index in variable.frames:
+                self.frame.setdefault(index, {}).update({key: float(value) for key in variable.keys})
+
+    def copy(self) -> "Values":
+        return Values(dict(self.common), {index: dict(own) for index, own in self.frame.items()})

@@ -1,0 +1,101 @@
+"""Surfaces: what matt surfaces, and surfaces that send light one way only, have in common as Mitsuba BSDFs.
+
+Classes belong to the Mitsuba variant that is set when they are made, so these functions are called where a part is built.
+"""
+
+from __future__ import annotations
+
+from optics.scene.mitsuba_parts import Declared
+
+
+def matt() -> type:
+    """A base for surfaces that reflect into all directions and depolarize: `brdf(si, wo, active)` is f(wi, wo) per band, 1/sr.
+
+    Directions are sampled by their cosine; light comes from the side that the normal points to.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    class Matt(Declared.on(mi.BSDF)):
+        def __init__(self, props):
+            mi.BSDF.__init__(self, props)
+            self.declare(props)
+            self.m_components = [mi.BSDFFlags.DiffuseReflection | mi.BSDFFlags.FrontSide]
+            self.m_flags = self.m_components[0]
+
+        def rho(self):
+            """Reflectance in each band: rho_r, rho_g, rho_b, 1."""
+            rho = (self.rho_r, self.rho_g, self.rho_b, mi.Float(1.0))
+            return mi.UnpolarizedSpectrum(*rho[:dr.size_v(mi.UnpolarizedSpectrum)])
+
+        def sample(self, ctx, si, sample1, sample2, active=True):
+            bs = dr.zeros(mi.BSDFSample3f)
+            bs.wo = mi.warp.square_to_cosine_hemisphere(sample2)
+            bs.pdf = mi.warp.square_to_cosine_hemisphere_pdf(bs.wo)
+            bs.eta = mi.Float(1.0)
+            bs.sampled_type = mi.UInt32(+mi.BSDFFlags.DiffuseReflection)
+            bs.sampled_component = mi.UInt32(0)
+            lit = active & (mi.Frame3f.cos_theta(si.wi) > 0) & (bs.pdf > 0)
+            return bs, dr.select(lit, unpolarized(self.brdf(si, bs.wo, active) * dr.pi), mi.Spectrum(0.0))
+
+        def eval(self, ctx, si, wo, active=True):
+            cos_v, cos_l = mi.Frame3f.cos_theta(si.wi), mi.Frame3f.cos_theta(wo)
+            return unpolarized(dr.select(active & (cos_v > 0) & (cos_l > 0), self.brdf(si, wo, active) * cos_l, 0.0))
+
+        def pdf(self, ctx, si, wo, active=True):
+            lit = active & (mi.Frame3f.cos_theta(si.wi) > 0) & (mi.Frame3f.cos_theta(wo) > 0)
+            return dr.select(lit, mi.warp.square_to_cosine_hemisphere_pdf(wo), 0.0)
+
+        def eval_pdf(self, ctx, si, wo, active=True):
+            return self.eval(ctx, si, wo, active), self.pdf(ctx, si, wo, active)
+
+        def to_string(self):
+            return f"{type(self).__name__}[{self.name}]"
+
+    return Matt
+
+
+def unpolarized(value):
+    """A weight per band that leaves no polarization, as a Spectrum of the present variant."""
+    import mitsuba as mi
+
+    return mi.mueller.depolarizer(value) if mi.is_polarized else mi.Spectrum(value)
+
+
+def passing(flags: int) -> type:
+    """A base for surfaces that send light on in one direction and scatter none: `sample` and `eval_null_transmission` are theirs.
+
+    flags  what passing counts as, of mi.BSDFFlags
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    class Passing(Declared.on(mi.BSDF)):
+        def __init__(self, props):
+            mi.BSDF.__init__(self, props)
+            self.declare(props)
+            self.m_components = [flags | mi.BSDFFlags.FrontSide | mi.BSDFFlags.BackSide]
+            self.m_flags = self.m_components[0]
+
+        def passed(self, wo, eta, kind):
+            """The sample of a ray that goes on along wo."""
+            bs = dr.zeros(mi.BSDFSample3f)
+            bs.wo, bs.eta = wo, mi.Float(eta)
+            bs.pdf = mi.Float(1.0)
+            bs.sampled_type = mi.UInt32(kind)
+            bs.sampled_component = mi.UInt32(0)
+            return bs
+
+        def eval(self, ctx, si, wo, active=True):
+            return mi.Spectrum(0.0)
+
+        def pdf(self, ctx, si, wo, active=True):
+            return mi.Float(0.0)
+
+        def eval_pdf(self, ctx, si, wo, active=True):
+            return mi.Spectrum(0.0), mi.Float(0.0)
+
+        def to_string(self):
+            return f"{type(self).__name__}[{self.kind}, {self.name}]"
+
+    return Passing

@@ -1,0 +1,1 @@
+"""A study: the base model, the effects added to it step by step, and the record of each."""
