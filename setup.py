@@ -1,8 +1,7 @@
 """Puts the folders `plugins/` and `scenes/` into the wheel, as `optics/_data/plugins` and `optics/_data/scenes`.
 
 Everything else is declared in pyproject.toml. A source checkout, and with it the editable install, uses the top-level
-folders directly and has no `optics/_data`.
-"""
+folders directly and has no `optics/_data`."""
 
 import os
 import shutil

@@ -2,11 +2,10 @@
 
     python examples/next_measurement.py [leak|depolarization|stray|offset] [FOLDER]
 
-A polarizer bench (made by coherency matrices, optics.proof.makers.bench, which share no line with the model) hides one of four faint causes of light
-where there should be none. A Malus sweep cannot say which: a leak of the films looks like a hazy sample, stray light like an offset of
-the camera's zero. The diagnosis is AMBIGUOUS and says what to measure; the example does as it says, with 125 further readings of
-each kind, and diagnoses again.
-"""
+A polarizer bench (made by coherency matrices, optics.proof.makers.bench, which share no line with the model) hides one
+of four faint causes of light where there should be none. A Malus sweep cannot say which: a leak of the films looks like
+a hazy sample, stray light like an offset of the camera's zero. The diagnosis is AMBIGUOUS and says what to measure; the
+example does as it says, with 125 further readings of each kind, and diagnoses again."""
 
 import sys
 import tempfile
@@ -31,7 +30,13 @@ HIDDEN = {
     "stray": ("stray light", Truth(stray=0.004, photodiode=DIODE)),
     "offset": ("dark offset", Truth(photodiode=Photodiode(gain=GAIN, offset=10.0))),
 }
-BASE = {"camera.exposure": 1.0, "middle.inserted": 0.0, "middle.angle": 0.0, "analyzer.inserted": 1.0, "polarizer.inserted": 1.0}
+BASE = {
+    "camera.exposure": 1.0,
+    "middle.inserted": 0.0,
+    "middle.angle": 0.0,
+    "analyzer.inserted": 1.0,
+    "polarizer.inserted": 1.0,
+}
 
 
 def sweep(count, **more):
@@ -44,13 +49,24 @@ def measured(truth, settings, seed):
     """What the photodiode reads at each setting; all of them have the same films in and the same exposure."""
     first = settings[0]
     film = Polarizer(leak=truth.p1.leak) if first["middle.inserted"] else None  # of the same roll as the others
-    bench = replace(truth, pm=film, p1=truth.p1 if first["polarizer.inserted"] else None, p2=truth.p2 if first["analyzer.inserted"] else None,
-                    photodiode=replace(truth.photodiode, gain=truth.photodiode.gain * first["camera.exposure"]))
-    out = tuple(f"{part}." for part, there in (("polarizer", bench.p1), ("middle", film), ("analyzer", bench.p2)) if there is None)
+    bench = replace(
+        truth,
+        pm=film,
+        p1=truth.p1 if first["polarizer.inserted"] else None,
+        p2=truth.p2 if first["analyzer.inserted"] else None,
+        photodiode=replace(truth.photodiode, gain=truth.photodiode.gain * first["camera.exposure"]),
+    )
+    out = tuple(
+        f"{part}."
+        for part, there in (("polarizer", bench.p1), ("middle", film), ("analyzer", bench.p2))
+        if there is None
+    )
     dials = [{k: v for k, v in own.items() if k in jones.DEFAULTS and not k.startswith(out)} for own in settings]
     readings = jones.readings(bench, dials, NOISE, seed)
-    return [captures.Frame(f"row {seed}-{i}", reading.astype(np.float32).reshape(1, 1, -1), parameters=own)
-            for i, (own, reading) in enumerate(zip(settings, readings))]
+    return [
+        captures.Frame(f"row {seed}-{i}", reading.astype(np.float32).reshape(1, 1, -1), parameters=own)
+        for i, (own, reading) in enumerate(zip(settings, readings))
+    ]
 
 
 def diagnosed(folder, frames):

@@ -1,12 +1,13 @@
-"""Proximity with the Vi2TaP finger: three cylinders approach, the metric r of eq. (9) reads the distance; and where it fails.
+"""Proximity with the Vi2TaP finger: three cylinders approach, the metric r of eq. (9) reads the distance; and where it
+fails.
 
-    python examples/proximity_vi2tap.py [picture.png]
+    python examples/proximity_vi2tap.py [image.png]
 
-Follows the camera's rays through analyser, skin and film of the shipped finger to cylinders of 20, 30 and 40 mm diameter, 60 to
-10 mm before the skin, lying across the view and standing on end. The depth map that the rays give stands for the paper's
-monocular depth network, without its errors. The 20 mm cylinder is the reference: its curve turns r of the others into a distance.
-Prints the curves, how far they agree, and what is read at 10 mm; the paper reads 11.51 (30 mm) and 12.58 mm (40 mm).
-"""
+Follows the camera's rays through analyser, skin and film of the shipped finger to cylinders of 20, 30 and 40 mm
+diameter, 60 to 10 mm before the skin, lying across the view and standing on end. The depth map that the rays give
+stands for the paper's monocular depth network, without its errors. The 20 mm cylinder is the reference: its curve turns
+r of the others into a distance. Prints the curves, how far they agree, and what is read at 10 mm; the paper reads 11.51
+(30 mm) and 12.58 mm (40 mm)."""
 
 import sys
 from pathlib import Path
@@ -51,11 +52,13 @@ def curves(stance: str = "lying") -> tuple[dict[float, np.ndarray], np.ndarray]:
     first = {d: float(np.interp(FIRST, DISTANCES[::-1], a[::-1])) for d, a in areas.items()}
     near = np.array([area(DIAMETERS[0], z) for z in NEARER])
     one = first[DIAMETERS[0]]
-    return ({d: proximity.metric(a, first[d], one, SIZE[0] * SIZE[1]) for d, a in areas.items()},
-            proximity.metric(near, one, one, SIZE[0] * SIZE[1]))
+    return (
+        {d: proximity.metric(a, first[d], one, SIZE[0] * SIZE[1]) for d, a in areas.items()},
+        proximity.metric(near, one, one, SIZE[0] * SIZE[1]),
+    )
 
 
-def main(picture_file: str = "renders/proximity.png") -> None:
+def main(image_file: str = "renders/proximity.png") -> None:
     import matplotlib
 
     matplotlib.use("Agg")
@@ -71,9 +74,12 @@ def main(picture_file: str = "renders/proximity.png") -> None:
         rising = all(np.all(np.diff(curve) > 0) for curve in r.values())
         agree = proximity.reliable_range(DISTANCES, {f"D{d:g}": curve for d, curve in r.items()}, 0.15)
         read = {d: float(proximity.distance(r[d][-1], reference, at)) for d in DIAMETERS[1:]}
-        print(f"r rises at every step: {'yes' if rising else 'no'}; curves agree within 15 % up to {agree:.0f} mm; where the "
-              f"cylinders stand at {DISTANCES[-1]:g} mm the reference's curve reads " + ", ".join(
-                  f"{v:.2f} mm for D{d:g}" for d, v in read.items()) + "\n")
+        print(
+            f"r rises at every step: {'yes' if rising else 'no'}; curves agree within 15 % up to {agree:.0f} mm; where the "
+            f"cylinders stand at {DISTANCES[-1]:g} mm the reference's curve reads "
+            + ", ".join(f"{v:.2f} mm for D{d:g}" for d, v in read.items())
+            + "\n"
+        )
         for d, curve in r.items():
             axis.plot(DISTANCES, curve, "o-", ms=3, label=f"D{d:g}")
         axis.set_xlabel("distance (mm)")
@@ -81,8 +87,8 @@ def main(picture_file: str = "renders/proximity.png") -> None:
     axes[0].set_ylabel("r")
     axes[0].legend()
     figure.tight_layout()
-    Path(picture_file).parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(picture_file, dpi=110)
+    Path(image_file).parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(image_file, dpi=110)
 
 
 if __name__ == "__main__":

@@ -2,7 +2,6 @@
 
 A scene (Mitsuba XML) and captures (images with their settings) go in; a model that explains the captures comes out,
 with the record of which physical effects it took. Importing this package sets no Mitsuba variant and loads nothing
-heavy: each verb imports what it needs.
-"""
+heavy: each verb imports what it needs."""
 
 __version__ = "0.1.0"

@@ -2,9 +2,8 @@
 
 The processor variants of Mitsuba compile their kernels with the system's LLVM library. Dr.Jit 1.5 accepts LLVM 15 and
 16 and then aborts the whole process in the first `dr.minimum`, so a library is tried in a process of its own before it
-is used; the verdict is kept on disk. This file needs nothing but Python 3.8, so that it can also run before anything
-is installed: `python3 -I optics/doctor.py --help`.
-"""
+is used; the verdict is kept on disk. This file needs nothing but Python 3.8, so that it can also run before anything is
+installed: `python3 -I optics/doctor.py --help`."""
 
 from __future__ import annotations
 

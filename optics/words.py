@@ -8,10 +8,16 @@ from collections.abc import Collection, Sequence
 
 
 def table(rows: Sequence[Sequence[str]], left: Collection[int] | None = None) -> str:
-    """Aligned columns, two spaces apart; `left`: those that begin at the left (None: all), the others end at the right."""
+    """Aligned columns, two spaces apart; `left`: those that begin at the left (None: all), the others end at the
+    right."""
     widths = [max(len(cell) for cell in column) for column in zip(*rows)]
-    return "\n".join("  ".join(cell.ljust(w) if left is None or i in left else cell.rjust(w)
-                                for i, (cell, w) in enumerate(zip(row, widths))).rstrip() for row in rows)
+    return "\n".join(
+        "  ".join(
+            cell.ljust(w) if left is None or i in left else cell.rjust(w)
+            for i, (cell, w) in enumerate(zip(row, widths))
+        ).rstrip()
+        for row in rows
+    )
 
 
 def some(names: Sequence[str], most: int = 5, between: str = ", ") -> str:

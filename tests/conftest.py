@@ -1,8 +1,7 @@
 """What several test files share: Mitsuba set up once, a small sensor that shows every effect, and a few measures.
 
-Tests cannot import one another's modules, so everything shared is a fixture. `pytest --plugin-folder DIR` adds a user's folder of
-plugins, which then has to meet the same contract as those that ship.
-"""
+Tests cannot import one another's modules, so everything shared is a fixture. `pytest --plugin-folder DIR` adds a user's
+folder of plugins, which then has to meet the same contract as those that ship."""
 
 from __future__ import annotations
 
@@ -70,7 +69,9 @@ class Bench:
         width, height = scene.camera.resolution
         frame = Frame("bench", np.zeros((height, width, 3), np.float32))
         noise = Noise(system_gain=0.1, dark_noise=1.0, black_level=0.0, saturation=FULL_SCALE, prnu=0.0)
-        self.model = Model(scene, Captures(Path("."), str(scene.path), [frame], noise=noise, flat_field=flat_field), flat_field=mode)
+        self.model = Model(
+            scene, Captures(Path("."), str(scene.path), [frame], noise=noise, flat_field=flat_field), flat_field=mode
+        )
         self.renderer = self.model.renderer
         self.values = {**scene.values(), **{k: v for k, v in values.items() if k in scene.parameters}}
 
@@ -97,47 +98,108 @@ class Bench:
         self.model.renderer = self.renderer = Renderer(self.scene)
 
 
-# A dent off the middle, a coloured membrane, three LEDs of unequal power, one of them coloured: nothing is symmetric, so that no
-# derivative vanishes by chance. The other LEDs are off to save time. Highlights reach half of full scale.
+# A dent off the middle, a coloured membrane, three LEDs of unequal power, one of them coloured: nothing is symmetric,
+# so that no derivative vanishes by Monte Carlo. The other LEDs are off to save time. Highlights reach half of full
+# scale.
 WORKING_POINT = {
-    "gel.press_x": 1.5, "gel.press_y": -0.8, "gel.press_depth": 0.5,
-    "membrane.rho_r": 0.7, "membrane.rho_g": 0.55, "membrane.rho_b": 0.4, "membrane.sigma": 0.3,
-    "led_1.wavelength": 560.0, "led_1.fwhm": 150.0, "led_1.pan": 4.0, "led_1.tilt": -3.0,
-    "led_1.power": 0.9, "led_1.power_g": 0.7,
-    "led_2.power": 0.0, "led_3.power": 0.6, "led_4.power": 0.0, "led_5.power": 0.8, "led_6.power": 0.0,
+    "gel.press_x": 1.5,
+    "gel.press_y": -0.8,
+    "gel.press_depth": 0.5,
+    "membrane.rho_r": 0.7,
+    "membrane.rho_g": 0.55,
+    "membrane.rho_b": 0.4,
+    "membrane.sigma": 0.3,
+    "led_1.wavelength": 560.0,
+    "led_1.fwhm": 150.0,
+    "led_1.pan": 4.0,
+    "led_1.tilt": -3.0,
+    "led_1.power": 0.9,
+    "led_1.power_g": 0.7,
+    "led_2.power": 0.0,
+    "led_3.power": 0.6,
+    "led_4.power": 0.0,
+    "led_5.power": 0.8,
+    "led_6.power": 0.0,
     "camera.exposure": 150.0,
 }
 
 
-# Light comes in aslant (13 to 23 deg), passes three films and a sheet that does all that a sheet can, and no two axes agree.
-# Nothing rests at neutral that an effect needs to be seen: a retardance for its dispersion, a leak for its slope, a clock for a drift.
+# Light comes in aslant (13 to 23 deg), passes three films and a sheet that does all that a sheet can, and no two axes
+# agree. Nothing rests at neutral that an effect needs to be seen: a retardance for its dispersion, a leak for its
+# slope, a clock for a drift.
 FILMS = ("analyzer", "middle", "polarizer")
 POLARIZER_POINT = {
-    "camera.x": -40.0, "camera.y": -50.0, "camera.pan": 11.0, "camera.tilt": -14.0, "camera.exposure": 5.0,
-    "analyzer.angle": 35.0, "middle.angle": 75.0, "polarizer.angle": -20.0, "analyzer.offset": 2.0, "polarizer.scale": 1.01,
-    **{f"{film}.{name}": value for film in FILMS for name, value in (("leak", 0.01), ("approach", 0.7), ("backlash", 1.5))},
-    "sample.transmittance": 0.8, "sample.transmittance_slope": 0.05, "sample.index": 1.3, "sample.angle": 20.0,
-    "sample.retard_0": 40.0, "sample.retard_45": -25.0, "sample.retard_dispersion": 0.1,
-    "sample.stress": 4.0, "sample.stress_size": 60.0, "sample.depolarization": 0.05, "sample.alpha": 0.2,
-    "source.power": 0.8, "source.power_r": 0.9, "source.power_g": 1.1, "source.power_b": 0.7,
-    "source.dop_q": 0.1, "source.dop_u": -0.05, "source.drift": 0.02, "source.time": 3.0,
-    "source.wavelength": 560.0, "source.fwhm": 150.0,
+    "camera.x": -40.0,
+    "camera.y": -50.0,
+    "camera.pan": 11.0,
+    "camera.tilt": -14.0,
+    "camera.exposure": 5.0,
+    "analyzer.angle": 35.0,
+    "middle.angle": 75.0,
+    "polarizer.angle": -20.0,
+    "analyzer.offset": 2.0,
+    "polarizer.scale": 1.01,
+    **{
+        f"{film}.{name}": value
+        for film in FILMS
+        for name, value in (("leak", 0.01), ("approach", 0.7), ("backlash", 1.5))
+    },
+    "sample.transmittance": 0.8,
+    "sample.transmittance_slope": 0.05,
+    "sample.index": 1.3,
+    "sample.angle": 20.0,
+    "sample.retard_0": 40.0,
+    "sample.retard_45": -25.0,
+    "sample.retard_dispersion": 0.1,
+    "sample.stress": 4.0,
+    "sample.stress_size": 60.0,
+    "sample.depolarization": 0.05,
+    "sample.alpha": 0.2,
+    "source.power": 0.8,
+    "source.power_r": 0.9,
+    "source.power_g": 1.1,
+    "source.power_b": 0.7,
+    "source.dop_q": 0.1,
+    "source.dop_u": -0.05,
+    "source.drift": 0.02,
+    "source.time": 3.0,
+    "source.wavelength": 560.0,
+    "source.fwhm": 150.0,
 }
 
-# A press beside the middle, under stress; the film and the object end within the view. One of the LEDs in the body is blue, so that
-# the markers both glow and reflect.
+# A press beside the middle, under stress; the film and the object end within the view. One of the LEDs in the body is
+# blue, so that the markers both glow and reflect.
 FINGER_POINT = {
-    "camera.exposure": 8.0, "analyzer.angle": 50.0, "film.angle": 10.0, "silicone.stress": 0.0133, "silicone.index": 1.2,
-    "skin.press_x": 3.0, "skin.press_y": -2.0, "film_sheet.width": 15.0, "film_sheet.length": 12.0,
-    "uv_left.wavelength": 440.0, "uv_left.fwhm": 120.0, "uv_left.power": 500.0, "uv_left.power_g": 0.8,
-    "pigment.absorptance": 0.6, "object.x": 2.0, "object.y": -6.0, "object.length": 14.0,
-    "uv_right.power": 0.0, "room_right.power": 0.0, "wall_paint.ambient": 0.3, "markers.pitch_x": 6.0, "markers.pitch_y": 6.0,
+    "camera.exposure": 8.0,
+    "analyzer.angle": 50.0,
+    "film.angle": 10.0,
+    "silicone.stress": 0.0133,
+    "silicone.index": 1.2,
+    "skin.press_x": 3.0,
+    "skin.press_y": -2.0,
+    "film_sheet.width": 15.0,
+    "film_sheet.length": 12.0,
+    "uv_left.wavelength": 440.0,
+    "uv_left.fwhm": 120.0,
+    "uv_left.power": 500.0,
+    "uv_left.power_g": 0.8,
+    "pigment.absorptance": 0.6,
+    "object.x": 2.0,
+    "object.y": -6.0,
+    "object.length": 14.0,
+    "uv_right.power": 0.0,
+    "room_right.power": 0.0,
+    "wall_paint.ambient": 0.3,
+    "markers.pitch_x": 6.0,
+    "markers.pitch_y": 6.0,
 }
 
 POINTS = {  # scene: (what replaces its <default>s, values)
     "gelsight": ({"width": WIDTH, "height": HEIGHT, "depth": 0.5}, WORKING_POINT),
-    "polarizer_bench": ({"width": 8, "height": 6, "x_fov": 7, "bands": "620, 540, 460", "middle": 1, "pattern": "disc"},
-                        POLARIZER_POINT),
+    "polarizer_bench": (
+        {"width": 8, "height": 6, "x_fov": 7, "bands": "620, 540, 460", "middle": 1, "pattern": "disc"},
+        POLARIZER_POINT,
+    ),
     "vi2tap": ({"width": 32, "height": 24, "x_fov": 45, "depth": 1, "wall_dark": 1}, FINGER_POINT),
 }
 SLOT = r'<bsdf type="sheet" id="sample">.*?</bsdf>'

@@ -2,8 +2,7 @@
 
 Everything a file gets wrong is refused here, before any rendering, with the file, the frame, the key, the value, its
 unit, what is allowed and the next step. Images become (H, W, C) float32 in DN, row 0 on top; a row of a table of point
-readings becomes a frame of 1 x 1 pixel.
-"""
+readings becomes a frame of 1 x 1 pixel."""
 
 from __future__ import annotations
 
@@ -46,8 +45,13 @@ class Frame:
     parameters: dict[str, float | str] = field(default_factory=dict)  # by scene parameter key
     repeats: list[np.ndarray] = field(default_factory=list)  # same settings, same shape
     file: str = ""
-    readings: dict[str, np.ndarray] = field(default_factory=dict)  # of a sweep: (N, 1, 1) settings of each reading, by key
-    rows: np.ndarray | None = None  # of a sweep: (N, 1, 1) row of the table that each reading stands in, as it was recorded; None: nowhere yet
+    readings: dict[str, np.ndarray] = field(
+        default_factory=dict
+    )  # of a sweep: (N, 1, 1) settings of each reading, by key
+    rows: np.ndarray | None = (
+        # of a sweep: (N, 1, 1) row of the table that each reading stands in, as it was recorded; None: nowhere yet
+        None
+    )
 
 
 @dataclass
@@ -77,7 +81,9 @@ class Captures:
     bits: int | None = None
 
 
-# -- Loading ------------------------------------------------------------------------------------------------------------
+# -- Loading
+# ------------------------------------------------------------------------------------------------------------
+
 
 def load(path: str | Path) -> Captures:
     """Read and check a capture set, given its folder or its `captures.toml`.
@@ -101,8 +107,10 @@ def load(path: str | Path) -> Captures:
     noise = _noise(data["noise"], f"{where}: [noise]") if "noise" in data else None
     common = checks.settings(data.get("parameters", {}), f"{where}: [parameters]")
     if ("frames" in data) == ("table" in data):
-        raise BadCapture(f"{where}: {'both [[frames]] and [table] stand' if 'frames' in data else 'zero frames'}; allowed: "
-                         "one [[frames]] or more, or one [table] of point readings")
+        raise BadCapture(
+            f"{where}: {'both [[frames]] and [table] stand' if 'frames' in data else 'zero frames'}; allowed: "
+            "one [[frames]] or more, or one [table] of point readings"
+        )
     captures = Captures(folder, scene, [], common, noise, None, cfa, values_are)
     if "table" in data:
         for key in ("cfa", "flat_field"):
@@ -115,15 +123,19 @@ def load(path: str | Path) -> Captures:
             captures.warnings.append(DEMOSAICED)
         if "flat_field" in data:
             here = f"{where}: flat_field"
-            captures.flat_field, _ = read_image(checks.existing(folder, checks.text(data, "flat_field", where), here), here)
+            captures.flat_field, _ = read_image(
+                checks.existing(folder, checks.text(data, "flat_field", where), here), here
+            )
             _same_size(captures.flat_field, captures, here)
     images = [image for f in captures.frames for image in (f.image, *f.repeats)]
     if noise is not None:
         captures.noise = replace(noise, quantisation=step_of(images))
     _check_levels(captures, where)
     if noise is None and len(images) == len(captures.frames):
-        captures.warnings.append("neither [noise] nor repeats: nothing says how large a residual may be; give the EMVA 1288 "
-                                 f"numbers ({', '.join(NOISE_KEYS)}) or repeated frames")
+        captures.warnings.append(
+            "neither [noise] nor repeats: nothing says how large a residual may be; give the EMVA 1288 "
+            f"numbers ({', '.join(NOISE_KEYS)}) or repeated frames"
+        )
     return captures
 
 
@@ -131,8 +143,10 @@ def _noise(table: object, where: str) -> Noise:
     checks.keys(table, NOISE_KEYS, where)
     missing = [f"{key} ({UNITS[key]})" for key in NOISE_KEYS if key not in table]
     if missing:
-        raise BadCapture(f"{where}: {', '.join(missing)} missing; give all of {', '.join(NOISE_KEYS)}, or leave [noise] out "
-                         "to have it estimated from repeats")
+        raise BadCapture(
+            f"{where}: {', '.join(missing)} missing; give all of {', '.join(NOISE_KEYS)}, or leave [noise] out "
+            "to have it estimated from repeats"
+        )
     numbers = {key: checks.number(table[key], key, UNITS[key], where) for key in NOISE_KEYS}
     try:
         return Noise(**numbers)
@@ -142,7 +156,9 @@ def _noise(table: object, where: str) -> Noise:
 
 def _read_frames(captures: Captures, tables: object, where: str) -> None:
     if not isinstance(tables, list) or not tables:
-        raise BadCapture(f"{where}: frames = {tables!r}: zero frames; allowed: one [[frames]] or more, each with an image")
+        raise BadCapture(
+            f"{where}: frames = {tables!r}: zero frames; allowed: one [[frames]] or more, each with an image"
+        )
     specs, seen = [], {}
     for index, table in enumerate(tables):  # all texts first, then the images: a typing error costs no reading
         here = f"{where}: frame {index}"
@@ -152,11 +168,15 @@ def _read_frames(captures: Captures, tables: object, where: str) -> None:
             raise BadCapture(f"{here}: image is missing; give the path of a {', '.join(SUFFIXES)} file")
         here += f" ('{image}')"
         files = [checks.existing(captures.folder, image, f"{here}: image")]
-        files += [checks.existing(captures.folder, name, f"{here}: repeats") for name in checks.texts(table, "repeats", here)]
+        files += [
+            checks.existing(captures.folder, name, f"{here}: repeats") for name in checks.texts(table, "repeats", here)
+        ]
         for file in files:
             if (same := file.resolve()) in seen:
-                raise BadCapture(f"{here}: '{file.name}' is used twice (first by frame {seen[same]}); allowed: each image "
-                                 "once, as it is one reading; remove one of them")
+                raise BadCapture(
+                    f"{here}: '{file.name}' is used twice (first by frame {seen[same]}); allowed: each image "
+                    "once, as it is one reading; remove one of them"
+                )
             seen[same] = index
         mask = checks.text(table, "mask", here)
         mask = checks.existing(captures.folder, mask, f"{here}: mask") if mask else None
@@ -178,38 +198,53 @@ def _read_frames(captures: Captures, tables: object, where: str) -> None:
         if mask is not None:
             frame.mask = read_mask(mask, frame.image.shape, f"{here}: mask '{mask.name}'")
     if len(depths) > 1:
-        raise BadCapture(f"{where}: files of different depth ({', '.join(f'{n}: {b or 32} bit' for b, n in depths.items())}): "
-                         "their DN differ; write all in one depth")
+        raise BadCapture(
+            f"{where}: files of different depth ({', '.join(f'{n}: {b or 32} bit' for b, n in depths.items())}): "
+            "their DN differ; write all in one depth"
+        )
     captures.bits = next(iter(depths))
 
 
 def _same_size(image: np.ndarray, captures: Captures, where: str) -> None:
     shape = captures.frames[0].image.shape
     if image.shape != shape:
-        raise BadCapture(f"{where}: (H, W, C) = {image.shape} pixels; allowed: {shape}, as '{captures.frames[0].file}'; "
-                         "one camera, one size: split the set or crop the images")
+        raise BadCapture(
+            f"{where}: (H, W, C) = {image.shape} pixels; allowed: {shape}, as '{captures.frames[0].file}'; "
+            "one camera, one size: split the set or crop the images"
+        )
     if captures.cfa and shape[2] != 1:
-        raise BadCapture(f"{where}: cfa = '{captures.cfa}' but the image has {shape[2]} channels; allowed: the raw mosaic (one "
-                         "value per pixel); remove cfa if the image is demosaiced")
+        raise BadCapture(
+            f"{where}: cfa = '{captures.cfa}' but the image has {shape[2]} channels; allowed: the raw mosaic (one "
+            "value per pixel); remove cfa if the image is demosaiced"
+        )
 
 
 def _check_levels(captures: Captures, where: str) -> None:
     full = 2**captures.bits - 1 if captures.bits else math.inf
     top = captures.noise.saturation if captures.noise else full
     if top > full:
-        raise BadCapture(f"{where}: [noise]: saturation = {top:g} DN; allowed: <= {full:g} DN, the end of {captures.bits} bit "
-                         "files; above it nothing would be masked")
-    used = [(f"frame {i} ('{f.file}')", f.image if f.mask is None else f.image[f.mask]) for i, f in enumerate(captures.frames)]
+        raise BadCapture(
+            f"{where}: [noise]: saturation = {top:g} DN; allowed: <= {full:g} DN, the end of {captures.bits} bit "
+            "files; above it nothing would be masked"
+        )
+    used = [
+        (f"frame {i} ('{f.file}')", f.image if f.mask is None else f.image[f.mask])
+        for i, f in enumerate(captures.frames)
+    ]
     for what, values in used + [("flat_field", captures.flat_field)] * (captures.flat_field is not None):
         if np.all(values >= top):
-            raise BadCapture(f"{where}: {what}: all saturated, every value used is >= {top:g} DN; allowed: some values below; "
-                             "remove it or expose it shorter")
+            raise BadCapture(
+                f"{where}: {what}: all saturated, every value used is >= {top:g} DN; allowed: some values below; "
+                "remove it or expose it shorter"
+            )
     if captures.noise is not None and captures.table is None:
         least = captures.noise.black_level - SUNK * float(captures.noise.sd(captures.noise.black_level))
         for what, values in used:
             if values.size and (middle := float(np.median(values))) < least:
-                raise BadCapture(f"{where}: {what}: half of its values are {middle:g} DN or less, far below what it has without light, "
-                                 f"black_level = {captures.noise.black_level:g} DN; allowed: {least:.4g} DN or more; correct [noise] black_level")
+                raise BadCapture(
+                    f"{where}: {what}: half of its values are {middle:g} DN or less, far below what it has without light, "
+                    f"black_level = {captures.noise.black_level:g} DN; allowed: {least:.4g} DN or more; correct [noise] black_level"
+                )
     if captures.noise is not None and not any(_lit(captures, f).any() for f in captures.frames):
         raise BadCapture(f"{where}: {_unusable(captures)}")
 
@@ -230,31 +265,44 @@ def _unusable(captures: Captures) -> str:
         dark += np.sum(use & (f.image <= noise.black_level))
     low, high = min(f.image.min() for f in captures.frames), max(f.image.max() for f in captures.frames)
     cut = "" if noise.pedestal else " or within 3 sigma of 0 (there is no pedestal)"
-    why = [f"{count} {what}" for count, what in (
-        (dark, f"not above black_level = {noise.black_level:g} DN"),
-        (bright, f"beside or above {SATURATED:.0%} of saturation = {noise.saturation:g} DN{cut}"), (masked, "masked")) if count]
+    why = [
+        f"{count} {what}"
+        for count, what in (
+            (dark, f"not above black_level = {noise.black_level:g} DN"),
+            (bright, f"beside or above {SATURATED:.0%} of saturation = {noise.saturation:g} DN{cut}"),
+            (masked, "masked"),
+        )
+        if count
+    ]
     files = list(dict.fromkeys(f.file for f in captures.frames))
-    return (f"none of the {dark + bright + masked} values of '{files[0]}'{' ...' if len(files) > 1 else ''} ({low:g} to {high:g}) is usable: "
-            f"{', '.join(why)}; allowed: raw DN (no volts, no 0 to 1) between these levels; correct [noise], the masks or the exposure")
+    return (
+        f"none of the {dark + bright + masked} values of '{files[0]}'{' ...' if len(files) > 1 else ''} ({low:g} to {high:g}) is usable: "
+        f"{', '.join(why)}; allowed: raw DN (no volts, no 0 to 1) between these levels; correct [noise], the masks or the exposure"
+    )
 
 
 def _read_table(folder: Path, data: object, where: str) -> tuple[Table, list[Frame]]:
     checks.keys(data, TABLE_KEYS, where)
     name, values = checks.text(data, "file", where), checks.texts(data, "values", where)
     if name is None or not values:
-        raise BadCapture(f"{where}: file = {name!r}, values = {values}; allowed: the path of a CSV file, one column or more")
+        raise BadCapture(
+            f"{where}: file = {name!r}, values = {values}; allowed: the path of a CSV file, one column or more"
+        )
     rename, scale = data.get("rename", {}), data.get("scale", {})
     checks.keys(rename, (), f"{where}: rename")
     checks.keys(scale, (), f"{where}: scale")
     rename = {column: checks.text(rename, column, f"{where}: rename") for column in rename}
     scale = {key: checks.number(factor, f'"{key}"', "", f"{where}: scale") for key, factor in scale.items()}
     rows = readings.read(checks.existing(folder, name, f"{where}: file"), values, rename, scale, where)
-    frames = [Frame(f"row {index}", np.array(reading, np.float32).reshape(1, 1, -1), parameters=settings, file=name)
-              for index, (settings, reading) in enumerate(rows)]
+    frames = [
+        Frame(f"row {index}", np.array(reading, np.float32).reshape(1, 1, -1), parameters=settings, file=name)
+        for index, (settings, reading) in enumerate(rows)
+    ]
     return Table(name, values, rename, scale), frames
 
 
 # -- Using --------------------------------------------------------------------------------------------------------------
+
 
 def check(captures: Captures, parameters: Mapping[str, Parameter]) -> None:
     """Hold every setting against the scene's parameters by key; raises UnknownKey, OutOfBounds or ValueError."""
@@ -264,9 +312,18 @@ def check(captures: Captures, parameters: Mapping[str, Parameter]) -> None:
     for where, settings in places:
         for key, value in settings.items():
             if key not in parameters:
-                raise UnknownKey(key, parameters, "parameter", where, "`optics params SCENE` lists them" + (
-                    f"; rename = {{ \"{key}\" = \"KEY\" }} under [table] of {FILE} gives a column its key"
-                    if captures.table is not None and settings is not captures.parameters else ""))
+                raise UnknownKey(
+                    key,
+                    parameters,
+                    "parameter",
+                    where,
+                    "`optics params SCENE` lists them"
+                    + (
+                        f'; rename = {{ "{key}" = "KEY" }} under [table] of {FILE} gives a column its key'
+                        if captures.table is not None and settings is not captures.parameters
+                        else ""
+                    ),
+                )
             parameters[key].check(value, key, where)
 
 
@@ -282,9 +339,9 @@ def subset(captures: Captures, frames: Sequence[int]) -> Captures:
 def sweeps(captures: Captures, parameters: Mapping[str, Parameter], lights: Sequence[str]) -> Captures:
     """The rows of a table as a few frames of many readings, (N, 1, C), which are predicted at once.
 
-    Readings are ordered by the setting that takes the most values and dealt out to 8 sweeps (4 of fewer than 32 readings, 1 of
-    fewer than 8), so that each covers the whole range. Settings that move the scene's geometry keep sweeps of their own.
-    """
+    Readings are ordered by the setting that takes the most values and dealt out to 8 sweeps (4 of fewer than 32
+    readings, 1 of fewer than 8), so that each covers the whole range. Settings that move the scene's geometry keep
+    sweeps of their own."""
     settings = [f.parameters for f in captures.frames]
     keys = sorted({k for own in settings for k in own})
     powers = {f"{name}.power" for name in lights}
@@ -305,8 +362,19 @@ def sweeps(captures: Captures, parameters: Mapping[str, Parameter], lights: Sequ
             readings = {k: np.array([settings[i][k] for i in mine], float).reshape(-1, 1, 1) for k in moving}
             image = np.concatenate([captures.frames[i].image for i in mine])
             name = f"readings {mine[0]} ... {mine[-1]}" if len(mine) > 1 else f"reading {mine[0]}"
-            frames.append(Frame(name, image, None, None, {k: v for k, v in own.items() if k not in moving}, [],
-                                captures.frames[mine[0]].file, readings, np.array(mine, float).reshape(-1, 1, 1)))
+            frames.append(
+                Frame(
+                    name,
+                    image,
+                    None,
+                    None,
+                    {k: v for k, v in own.items() if k not in moving},
+                    [],
+                    captures.frames[mine[0]].file,
+                    readings,
+                    np.array(mine, float).reshape(-1, 1, 1),
+                )
+            )
     return replace(captures, frames=frames, warnings=list(captures.warnings))
 
 
@@ -328,7 +396,9 @@ def cfa_channel(shape: Sequence[int], pattern: str) -> np.ndarray:
     return cell[np.ix_(np.arange(shape[0]) % 2, np.arange(shape[1]) % 2)]
 
 
-# -- Writing ------------------------------------------------------------------------------------------------------------
+# -- Writing
+# ------------------------------------------------------------------------------------------------------------
+
 
 def write(captures: Captures, folder: str | Path, *, overwrite: bool = False, bits: int | None = None) -> Path:
     """Write a capture set that `load` reads back; the folder appears whole or not at all. Returns the folder.
@@ -345,10 +415,15 @@ def write(captures: Captures, folder: str | Path, *, overwrite: bool = False, bi
         if not overwrite:
             raise OutputExists(f"{folder} exists and is not empty; choose another folder, or allow to overwrite it")
         names = {p.name if p.stem != "flat_field" else "flat_field" for p in folder.glob("*")}
-        if FILE not in names or names - {FILE, "frames", "readings.csv", "flat_field"} or not (
-                (folder / FILE).read_text(encoding="utf-8").startswith(MARK)):
-            raise OutputExists(f"{folder} holds more than a capture set written by this program and is never replaced; "
-                               "choose another folder")
+        if (
+            FILE not in names
+            or names - {FILE, "frames", "readings.csv", "flat_field"}
+            or not ((folder / FILE).read_text(encoding="utf-8").startswith(MARK))
+        ):
+            raise OutputExists(
+                f"{folder} holds more than a capture set written by this program and is never replaced; "
+                "choose another folder"
+            )
     temporary = folder.parent / f".{folder.name}.{uuid.uuid4().hex}"
     try:
         temporary.mkdir(parents=True)
@@ -393,7 +468,9 @@ def _fill(captures: Captures, folder: Path, final: Path, bits: int | None) -> No
         rows = [(_plain(f.parameters), [float(value) for value in f.image.ravel()]) for f in captures.frames]
         readings.write(folder / "readings.csv", rows, captures.table.values)
     else:
-        names = [re.sub(r"[^\w.+-]+", "_", f.name) or "frame" for f in captures.frames]  # "~" is left for what belongs to one
+        names = [
+            re.sub(r"[^\w.+-]+", "_", f.name) or "frame" for f in captures.frames
+        ]  # "~" is left for what belongs to one
         if len(set(names)) < len(names):
             raise BadCapture(f"{final}: two frames are called '{max(names, key=names.count)}'; allowed: each name once")
         (folder / "frames").mkdir()

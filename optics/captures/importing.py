@@ -3,21 +3,21 @@
     import_taxim("dataPack.npz", "captures/taxim", ball_radius=2.0, mm_per_pixel=0.1245)
     import_circles("images", "labels.csv", "captures/digit", ball_radius=3.0, mm_per_pixel=1 / 17.15)
 
-What comes in: pictures of one ball pressed at many places, and circles drawn around the contacts by hand. What goes out is a
-folder of `captures` with, beside it, `scene.xml` (from the template `scenes/templates/ball_presses.xml`), `import.json`
-(everything that was derived) and `README.txt` (the same in sentences, contradictions first).
+What comes in: images of one ball pressed at many places, and circles drawn around the contacts by hand. What goes out
+is a folder of `captures` with, beside it, `scene.xml` (from the template `scenes/templates/ball_presses.xml`),
+`import.json` (everything that was derived) and `README.txt` (the same in sentences, contradictions first).
 
 Derived, not measured, and said so in these files:
     press      x, y = (circle's centre + 0.5 - half the image) mm_per_pixel;   labels count pixel centres from 0
-    depth      from a touched radius a = contact_share times the circle's radius: skirt a/sqrt(R^2 - a^2) + R - sqrt(R^2 - a^2)
+    depth      from a touched radius a = contact_share times the circle's radius: skirt a/sqrt(R^2 - a^2) + R - sqrt(R^2
+               - a^2)
     gain       of every frame and channel: median of frame over background, beyond three circle radii
-    background per-pixel median of all presses, or a given picture
+    background per-pixel median of all presses, or a given image
     noise      variance against signal of half the squared differences of successive frames beyond three circle radii
     lights     per channel the direction l of the least-squares fit I - B = l.(n - n0) on the labelled balls, at 16 mm
-A circle drawn by eye is a start: what to solve for from there stands in import.json under `setup`, and `optics calibrate`
-follows it: the lights, the skirt, and every press's position and depth, with priors about the imported values; the ball's
-radius too, where circles are drawn larger than the ball.
-"""
+A circle drawn by eye is a start: what to solve for from there stands in import.json under `setup`, and `optics
+calibrate` follows it: the lights, the skirt, and every press's position and depth, with priors about the imported
+values; the ball's radius too, where circles are drawn larger than the ball."""
 
 from __future__ import annotations
 
@@ -41,22 +41,31 @@ from optics.files.images import SUFFIXES, read_image
 from optics.files.output import shipped
 
 COLUMNS = ("file", "center_x_px", "center_y_px", "contact_radius_px")
-FAR = 3.0  # circle radii beyond which a press leaves the picture alone, but for a skirt of a few per mille
+FAR = 3.0  # circle radii beyond which a press leaves the image alone, but for a skirt of a few per mille
 LED_DISTANCE = 16.0  # mm from the middle of the face, where no better is known
 POSE = ("gel.press_x", "gel.press_y", "gel.press_depth")
 LIGHTS = ("led_*.[xyz]", "led_*.pan", "led_*.tilt", "led_*.mu")
-PRIORS = {"led_*.[xy]": 8.0, "led_*.z": 3.0, "led_*.pan": 20.0, "led_*.tilt": 20.0, "led_*.mu": 4.0, "gel.skirt": 0.15,
-          "gel.indenter_size": 0.15, "gel.press_[xy]": 0.4, "gel.press_depth": 0.5}  # sd about the imported value, in the parameter's unit
+PRIORS = {
+    "led_*.[xy]": 8.0,
+    "led_*.z": 3.0,
+    "led_*.pan": 20.0,
+    "led_*.tilt": 20.0,
+    "led_*.mu": 4.0,
+    "gel.skirt": 0.15,
+    "gel.indenter_size": 0.15,
+    "gel.press_[xy]": 0.4,
+    "gel.press_depth": 0.5,
+}  # sd about the imported value, in the parameter's unit
 EXTRAS = ("scene.xml", "import.json", "README.txt")
 BACKGROUNDS = ("median", "given")
 
 
 @dataclass
 class Presses:
-    """Pictures of ball presses with their circles.
+    """Images of ball presses with their circles.
 
     images   (N, H, W, 3) DN;   circles (N, 3): centre x, y and radius in px, pixel centres count from 0
-    given    (H, W, 3) DN, a picture of the untouched sensor, or None
+    given    (H, W, 3) DN, an image of the untouched sensor, or None
     """
 
     source: str
@@ -75,22 +84,45 @@ class Imported:
     facts: dict = field(default_factory=dict)
 
 
-def import_taxim(pack: str | Path, folder: str | Path, *, ball_radius: float = 2.0, mm_per_pixel: float = 0.1245,
-                 mm_per_pixel_check: float | None = 0.12, background: str = "median", **options) -> Imported:
+def import_taxim(
+    pack: str | Path,
+    folder: str | Path,
+    *,
+    ball_radius: float = 2.0,
+    mm_per_pixel: float = 0.1245,
+    mm_per_pixel_check: float | None = 0.12,
+    background: str = "median",
+    **options,
+) -> Imported:
     """Import the calibration pack of Taxim (an .npz with imgs, touch_center, touch_radius and f0; never unpickled).
 
-    Defaults are the numbers of its authors: ball of 4 mm diameter, 0.1245 mm/px, and 4 x 0.03 mm/px as a second route to the
-    same scale. Options as in `import_presses`. Raises BadCapture.
-    """
-    return import_presses(read_taxim(pack), folder, ball_radius=ball_radius, mm_per_pixel=mm_per_pixel,
-                          mm_per_pixel_check=mm_per_pixel_check, background=background, **options)
+    Defaults are the numbers of its authors: ball of 4 mm diameter, 0.1245 mm/px, and 4 x 0.03 mm/px as a second route
+    to the same scale. Options as in `import_presses`. Raises BadCapture."""
+    return import_presses(
+        read_taxim(pack),
+        folder,
+        ball_radius=ball_radius,
+        mm_per_pixel=mm_per_pixel,
+        mm_per_pixel_check=mm_per_pixel_check,
+        background=background,
+        **options,
+    )
 
 
-def import_circles(images: str | Path, circles: str | Path, folder: str | Path, *, ball_radius: float, mm_per_pixel: float,
-                   untouched: str | Path | None = None, **options) -> Imported:
-    """Import a folder of pictures and a CSV file of circles with the columns file, center_x_px, center_y_px, contact_radius_px.
+def import_circles(
+    images: str | Path,
+    circles: str | Path,
+    folder: str | Path,
+    *,
+    ball_radius: float,
+    mm_per_pixel: float,
+    untouched: str | Path | None = None,
+    **options,
+) -> Imported:
+    """Import a folder of images and a CSV file of circles with the columns file, center_x_px, center_y_px,
+    contact_radius_px.
 
-    untouched  a picture of the sensor without contact; None: the per-pixel median of the presses is the background
+    untouched  an image of the sensor without contact; None: the per-pixel median of the presses is the background
     Options as in `import_presses`. Raises BadCapture.
     """
     presses = read_circles(images, circles)
@@ -100,7 +132,9 @@ def import_circles(images: str | Path, circles: str | Path, folder: str | Path, 
     return import_presses(presses, folder, ball_radius=ball_radius, mm_per_pixel=mm_per_pixel, **options)
 
 
-# -- Reading --------------------------------------------------------------------------------------------------------------
+# -- Reading
+# --------------------------------------------------------------------------------------------------------------
+
 
 def read_taxim(pack: str | Path) -> Presses:
     """Presses of a Taxim calibration pack; raises BadCapture with the array, its shape and what is allowed."""
@@ -112,21 +146,27 @@ def read_taxim(pack: str | Path) -> Presses:
         with np.load(path, allow_pickle=False) as data:
             missing = [key for key in wanted if key not in data.files]
             if missing:
-                raise BadCapture(f"{path}: {', '.join(missing)} missing (it has {', '.join(data.files) or 'nothing'}); needed: "
-                                 f"{', '.join(wanted)}, and f0 where there is a picture of the untouched gel")
+                raise BadCapture(
+                    f"{path}: {', '.join(missing)} missing (it has {', '.join(data.files) or 'nothing'}); needed: "
+                    f"{', '.join(wanted)}, and f0 where there is an image of the untouched gel"
+                )
             arrays = {key: data[key] for key in (*wanted, "f0", "names") if key in data.files}
     except BadCapture:
         raise
     except Exception as error:  # zipfile, zlib and numpy raise whatever they find
-        raise BadCapture(f"{path}: cannot be read as .npz without pickles ({type(error).__name__}: {error}); save its arrays "
-                         "with numpy.savez and numeric types") from error
+        raise BadCapture(
+            f"{path}: cannot be read as .npz without pickles ({type(error).__name__}: {error}); save its arrays "
+            "with numpy.savez and numeric types"
+        ) from error
     images, centres, radii = (arrays[key] for key in wanted)
     where = str(path)
     if images.ndim != 4 or images.shape[-1] != 3 or not len(images):
         raise BadCapture(f"{where}: imgs has the shape {images.shape}; allowed: (N, H, W, 3) with N >= 1")
     for key, shape in (("touch_center", (len(images), 2)), ("touch_radius", (len(images),))):
         if arrays[key].shape != shape:
-            raise BadCapture(f"{where}: {key} has the shape {arrays[key].shape}; allowed: {shape}, one row per image of imgs")
+            raise BadCapture(
+                f"{where}: {key} has the shape {arrays[key].shape}; allowed: {shape}, one row per image of imgs"
+            )
     if "f0" in arrays and arrays["f0"].shape != images.shape[1:]:
         raise BadCapture(f"{where}: f0 has the shape {arrays['f0'].shape}; allowed: {images.shape[1:]}, as the images")
     for key in ("imgs", "f0"):
@@ -140,10 +180,10 @@ def read_taxim(pack: str | Path) -> Presses:
 
 
 def read_circles(images: str | Path, circles: str | Path) -> Presses:
-    """Presses of a folder of pictures and a CSV of circles; raises BadCapture with file, row, column and value."""
+    """Presses of a folder of images and a CSV of circles; raises BadCapture with file, row, column and value."""
     folder, table = Path(images), Path(circles)
     if not folder.is_dir():
-        raise BadCapture(f"{folder}: no such folder of pictures")
+        raise BadCapture(f"{folder}: no such folder of images")
     if not table.is_file():
         raise BadCapture(f"{table}: no such file; give a CSV with the columns {', '.join(COLUMNS)}")
     try:
@@ -158,13 +198,13 @@ def read_circles(images: str | Path, circles: str | Path) -> Presses:
         if column not in known:
             raise BadCapture(str(UnknownKey(column, known, "column", str(table), f"needed: {', '.join(COLUMNS)}")))
     if not rows:
-        raise BadCapture(f"{table}: zero rows; needed: one per picture")
+        raise BadCapture(f"{table}: zero rows; needed: one per image")
     names, pictures, found, seen = [], [], [], {}
     for line, row in enumerate(rows, 2):
         where = f"{table}: line {line}"
         name = (row["file"] or "").strip()
         if name in seen:
-            raise BadCapture(f"{where}: '{name}' was given in line {seen[name]} already; one circle per picture")
+            raise BadCapture(f"{where}: '{name}' was given in line {seen[name]} already; one circle per image")
         seen[name] = line
         numbers = []
         for column in COLUMNS[1:]:
@@ -174,7 +214,9 @@ def read_circles(images: str | Path, circles: str | Path) -> Presses:
                 raise BadCapture(f"{where}: {column} = {row[column]!r} is not a number in px") from None
         file = folder / name
         if not name or not file.is_file():
-            raise BadCapture(f"{where}: no picture '{name}' in {folder}; allowed: {', '.join(SUFFIXES)} files of that folder")
+            raise BadCapture(
+                f"{where}: no image '{name}' in {folder}; allowed: {', '.join(SUFFIXES)} files of that folder"
+            )
         pictures.append(_picture(file, f"{where}: {name}", pictures[0].shape if pictures else None))
         names.append(Path(name).stem)
         found.append(numbers)
@@ -182,48 +224,77 @@ def read_circles(images: str | Path, circles: str | Path) -> Presses:
 
 
 def _picture(file: Path, where: str, shape: tuple | None) -> np.ndarray:
-    picture, _ = read_image(file, where)
-    if picture.shape[-1] != 3 or (shape is not None and picture.shape != shape):
-        raise BadCapture(f"{where}: (H, W, C) = {picture.shape}; allowed: {shape or '(H, W, 3)'}, one camera, one size, colour")
-    return picture.astype(np.float64)
+    image, _ = read_image(file, where)
+    if image.shape[-1] != 3 or (shape is not None and image.shape != shape):
+        raise BadCapture(
+            f"{where}: (H, W, C) = {image.shape}; allowed: {shape or '(H, W, 3)'}, one camera, one size, colour"
+        )
+    return image.astype(np.float64)
 
 
-# -- Importing ------------------------------------------------------------------------------------------------------------
+# -- Importing
+# ------------------------------------------------------------------------------------------------------------
 
-def import_presses(presses: Presses, folder: str | Path, *, ball_radius: float, mm_per_pixel: float,
-                   mm_per_pixel_check: float | None = None, camera_distance: float = 30.0, gel_thickness: float = 4.0,
-                   skirt: float = 0.8, contact_share: float = 0.85, background: str = "median", leds: int = 3, bin: int = 1,
-                   every: int = 1, saturation: float = 255.0, overwrite: bool = False,
-                   progress: Callable[[str, int, int], None] | None = None) -> Imported:
+
+def import_presses(
+    presses: Presses,
+    folder: str | Path,
+    *,
+    ball_radius: float,
+    mm_per_pixel: float,
+    mm_per_pixel_check: float | None = None,
+    camera_distance: float = 30.0,
+    gel_thickness: float = 4.0,
+    skirt: float = 0.8,
+    contact_share: float = 0.85,
+    background: str = "median",
+    leds: int = 3,
+    bin: int = 1,
+    every: int = 1,
+    saturation: float = 255.0,
+    overwrite: bool = False,
+    progress: Callable[[str, int, int], None] | None = None,
+) -> Imported:
     """Write presses as a capture set with its scene; see the module's text for what is derived.
 
-    ball_radius         mm;   mm_per_pixel of the full picture on the untouched face
+    ball_radius         mm;   mm_per_pixel of the full image on the untouched face
     mm_per_pixel_check  mm/px by a second route, or None; a disagreement above 1 % is a warning
     camera_distance     mm from the face to the camera's centre of projection
     skirt               mm, start of `gel.skirt`;   contact_share  start of touched over labelled radius
-    background          'median' of the presses or 'given' (the picture of the untouched sensor)
+    background          'median' of the presses or 'given' (the image of the untouched sensor)
     leds                3: one per channel; 6: shared by the channels, each with a power per channel
     bin                 pixels per side that are averaged into one; a block with a saturated pixel stays saturated
     every               take every n-th press; background and noise come from all of them
     Raises BadCapture, OutputExists.
     """
-    for name, value in {"ball_radius": ball_radius, "mm_per_pixel": mm_per_pixel, "camera_distance": camera_distance,
-                        "gel_thickness": gel_thickness, "contact_share": contact_share, "saturation": saturation}.items():
+    for name, value in {
+        "ball_radius": ball_radius,
+        "mm_per_pixel": mm_per_pixel,
+        "camera_distance": camera_distance,
+        "gel_thickness": gel_thickness,
+        "contact_share": contact_share,
+        "saturation": saturation,
+    }.items():
         if not (math.isfinite(value) and value > 0):
             raise BadCapture(f"{presses.source}: {name} = {value:g}; allowed: above 0")
     if background not in BACKGROUNDS:
         raise UnknownKey(background, BACKGROUNDS, "background")
     if background == "given" and presses.given is None:
-        raise BadCapture(f"{presses.source}: background = 'given', but there is no picture of the untouched sensor; take "
-                         "'median'")
+        raise BadCapture(
+            f"{presses.source}: background = 'given', but there is no image of the untouched sensor; take 'median'"
+        )
     if not 1 <= every <= len(presses.images):
-        raise BadCapture(f"{presses.source}: every = {every}; allowed: 1 to {len(presses.images)}, the number of presses")
+        raise BadCapture(
+            f"{presses.source}: every = {every}; allowed: 1 to {len(presses.images)}, the number of presses"
+        )
     if leds not in (3, 6):
         raise BadCapture(f"{presses.source}: leds = {leds}; allowed: 3 (one per channel) or 6 (shared)")
     _check(presses, bin)
     if background == "median" and len(presses.images) < 5:
-        raise BadCapture(f"{presses.source}: {len(presses.images)} presses; a per-pixel median needs 5 or more, else give a "
-                         "picture of the untouched sensor")
+        raise BadCapture(
+            f"{presses.source}: {len(presses.images)} presses; a per-pixel median needs 5 or more, else give a "
+            "image of the untouched sensor"
+        )
     tick = progress or (lambda *_: None)
     tick("import", 0, 4)
     scale = mm_per_pixel * bin
@@ -245,38 +316,76 @@ def import_presses(presses: Presses, folder: str | Path, *, ball_radius: float, 
     taken = slice(None, None, every)
     for name, image, circle, gain, a in zip(*(v[taken] for v in (presses.names, images, circles, gains, touched))):
         x, y = (circle[:2] - middle) * scale
-        settings = {"gel.press_x": x, "gel.press_y": y, "gel.press_depth": depth_of(a, ball_radius, skirt),
-                    **{f"camera.gain_{c}": g for c, g in zip("rgb", gain)}}
+        settings = {
+            "gel.press_x": x,
+            "gel.press_y": y,
+            "gel.press_depth": depth_of(a, ball_radius, skirt),
+            **{f"camera.gain_{c}": g for c, g in zip("rgb", gain)},
+        }
         settings = {key: round(float(value), 6) for key, value in settings.items()}
         frames.append(Frame(name, image.astype(np.float32), None, name, settings))
     free = ["led_*.power_?" if leds > 3 else "led_*.power", *LIGHTS, "gel.skirt"]
-    if np.any(circles[taken, 2] * scale > ball_radius):  # ball, scale or labels are wrong: the pictures decide
+    if np.any(circles[taken, 2] * scale > ball_radius):  # ball, scale or labels are wrong: the images decide
         free.append("gel.indenter_size")
     directions = light_directions(images, flat * gains[:, None, None], circles, ball_radius / scale)
     facts = {
-        "source": presses.source, "presses": len(frames), "every": every, "size_px": [height, width], "bin": bin,
-        "ball_radius_mm": ball_radius, "mm_per_pixel": mm_per_pixel, "mm_per_pixel_after_binning": scale,
-        "camera_distance_mm": camera_distance, "x_fov_deg": fov, "skirt_mm": skirt, "contact_share": contact_share,
-        "background": background, "labelled_radius_mm": _span(circles[:, 2] * scale),
+        "source": presses.source,
+        "presses": len(frames),
+        "every": every,
+        "size_px": [height, width],
+        "bin": bin,
+        "ball_radius_mm": ball_radius,
+        "mm_per_pixel": mm_per_pixel,
+        "mm_per_pixel_after_binning": scale,
+        "camera_distance_mm": camera_distance,
+        "x_fov_deg": fov,
+        "skirt_mm": skirt,
+        "contact_share": contact_share,
+        "background": background,
+        "labelled_radius_mm": _span(circles[:, 2] * scale),
         "circles_px": circles[taken].round(4).tolist(),
-        "frame_gain_sd": gains.std(0).tolist(), "frame_gain": gains.round(5).tolist(),
-        "noise": {"system_gain": noise.system_gain, "dark_noise": noise.dark_noise, "levels": levels,
-                  "how": "half the squared differences of successive frames beyond three circle radii, after their gains: "
-                         "temporal noise, banding and drift together"},
+        "frame_gain_sd": gains.std(0).tolist(),
+        "frame_gain": gains.round(5).tolist(),
+        "noise": {
+            "system_gain": noise.system_gain,
+            "dark_noise": noise.dark_noise,
+            "levels": levels,
+            "how": "half the squared differences of successive frames beyond three circle radii, after their gains: "
+            "temporal noise, banding and drift together",
+        },
         "light_directions": {c: d for c, d in zip("rgb", directions)},
-        "setup": {"free": free, "per_group": list(POSE), "flat_field": "additive", "priors": {
-            pattern: [None, sd] for pattern, sd in PRIORS.items() if pattern in free or pattern != "gel.indenter_size"}},
+        "setup": {
+            "free": free,
+            "per_group": list(POSE),
+            "flat_field": "additive",
+            "priors": {
+                pattern: [None, sd]
+                for pattern, sd in PRIORS.items()
+                if pattern in free or pattern != "gel.indenter_size"
+            },
+        },
     }
     warnings = contradictions(presses, facts, images, median, given, far, gains, noise, saturation, mm_per_pixel_check)
     facts["warnings"] = warnings
     tick("import", 3, 4)
     template = (shipped("scenes") / "templates" / "ball_presses.xml").read_text(encoding="utf-8")
     xml = template.format(
-        source=_comment(presses.source), width=width, height=height, x_fov=f"{fov:.5g}", distance=f"{camera_distance:g}",
-        ball=f"{ball_radius:g}", scale=f"{scale:.6g}", skirt=f"{skirt:g}", thickness=f"{gel_thickness:g}",
-        gel_width=f"{1.15 * width * scale:.4g}", gel_length=f"{1.15 * height * scale:.4g}",
-        extent=f"{touched.max() + 5 * skirt:.3g}", leds=led_elements(directions, leds, flat.mean((0, 1))),
-        circle_low=f"{facts['labelled_radius_mm'][0]:.3g}", circle_high=f"{facts['labelled_radius_mm'][1]:.3g}")
+        source=_comment(presses.source),
+        width=width,
+        height=height,
+        x_fov=f"{fov:.5g}",
+        distance=f"{camera_distance:g}",
+        ball=f"{ball_radius:g}",
+        scale=f"{scale:.6g}",
+        skirt=f"{skirt:g}",
+        thickness=f"{gel_thickness:g}",
+        gel_width=f"{1.15 * width * scale:.4g}",
+        gel_length=f"{1.15 * height * scale:.4g}",
+        extent=f"{touched.max() + 5 * skirt:.3g}",
+        leds=led_elements(directions, leds, flat.mean((0, 1))),
+        circle_low=f"{facts['labelled_radius_mm'][0]:.3g}",
+        circle_high=f"{facts['labelled_radius_mm'][1]:.3g}",
+    )
     path = _write(Path(folder), frames, noise, flat, xml, facts, bits=8 if bin == 1 else None, overwrite=overwrite)
     tick("import", 4, 4)
     return Imported(path, warnings, facts)
@@ -287,17 +396,20 @@ def _check(presses: Presses, bin: int) -> None:
     if not 1 <= int(bin) == bin <= min(height, width) // 8:
         raise BadCapture(f"{presses.source}: bin = {bin}; allowed: whole numbers from 1 to {min(height, width) // 8}")
     if height % bin or width % bin:
-        raise BadCapture(f"{presses.source}: pictures of {width} x {height} px do not divide into blocks of {bin} px")
+        raise BadCapture(f"{presses.source}: images of {width} x {height} px do not divide into blocks of {bin} px")
     if not np.isfinite(presses.images).all():
-        raise BadCapture(f"{presses.source}: the pictures hold values that are not finite")
+        raise BadCapture(f"{presses.source}: the images hold values that are not finite")
     for name, (x, y, r) in zip(presses.names, presses.circles):
         if not (np.isfinite([x, y, r]).all() and r > 0 and 0 <= x < width and 0 <= y < height):
-            raise BadCapture(f"{presses.source}: {name}: circle at ({x:g}, {y:g}) px with radius {r:g} px; allowed: a centre "
-                             f"inside the {width} x {height} px picture and a radius above 0")
+            raise BadCapture(
+                f"{presses.source}: {name}: circle at ({x:g}, {y:g}) px with radius {r:g} px; allowed: a centre "
+                f"inside the {width} x {height} px image and a radius above 0"
+            )
 
 
 def binned(image: np.ndarray, bin: int, saturation: float = 255.0) -> np.ndarray:
-    """Means of blocks of bin x bin pixels; a block with a saturated value keeps its largest, so that it stays masked."""
+    """Means of blocks of bin x bin pixels; a block with a saturated value keeps its largest, so that it stays
+    masked."""
     if bin == 1:
         return np.asarray(image, np.float64)
     height, width, channels = image.shape
@@ -314,7 +426,7 @@ def depth_of(touched: float, ball_radius: float, skirt: float) -> float:
 
 def _distances(shape: tuple[int, int], circles: np.ndarray) -> np.ndarray:
     """(N, H, W) distance of every pixel's centre from each circle's centre, in circle radii."""
-    v, u = np.mgrid[:shape[0], :shape[1]] + 0.5
+    v, u = np.mgrid[: shape[0], : shape[1]] + 0.5
     x, y, r = (circles[:, i, None, None] for i in range(3))
     return np.hypot(u - x, v - y) / r
 
@@ -324,10 +436,11 @@ def _gain(image: np.ndarray, flat: np.ndarray, beyond: np.ndarray) -> np.ndarray
 
 
 def far_noise(images: np.ndarray, far: np.ndarray, saturation: float) -> tuple[Noise, list[dict]]:
-    """Noise from successive frames where neither is pressed: half the squared difference against the mean, 12 levels each.
+    """Noise from successive frames where neither is pressed: half the squared difference against the mean, 12 levels
+    each.
 
-    Nothing is filtered out, so banding counts as noise; neighbouring pixels share it, which chi2 per degree of freedom hides.
-    """
+    Nothing is filtered out, so banding counts as noise; neighbouring pixels share it, which chi2 per degree of freedom
+    hides."""
     means, squares, channel = [], [], []
     for i in range(len(images) - 1):
         use = far[i] & far[i + 1]
@@ -337,20 +450,27 @@ def far_noise(images: np.ndarray, far: np.ndarray, saturation: float) -> tuple[N
         means.append((a + b) / 2)
         squares.append((a - b) ** 2 / 2)
     if not means:
-        raise BadCapture("no two successive presses leave an untouched part of the picture in common: the noise cannot be "
-                         "estimated; give pictures of more presses")
+        raise BadCapture(
+            "no two successive presses leave an untouched part of the image in common: the noise cannot be "
+            "estimated; give images of more presses"
+        )
     mean, square = np.concatenate(means), np.concatenate(squares)
     levels = []
     for c in range(mean.shape[1]):
         for group in np.array_split(np.argsort(mean[:, c], kind="stable"), 12):
             if mean[group, c].mean() < 0.9 * saturation:
                 levels.append((mean[group, c].mean(), square[group, c].mean(), len(group)))
-        channel.append({"channel": "rgb"[c], "signal": float(mean[:, c].mean()), "sd": float(np.sqrt(square[:, c].mean()))})
+        channel.append(
+            {"channel": "rgb"[c], "signal": float(mean[:, c].mean()), "sd": float(np.sqrt(square[:, c].mean()))}
+        )
     light, variance, weight = (np.array(v, float) for v in zip(*levels))
     (gain, floor), _ = photon_transfer(light, variance, weight)
     if gain <= 0 or floor < 0:  # no photon transfer in these data: banding and drift rule
-        gain, floor = (1e-3, float(np.average(variance, weights=weight))) if gain <= 0 else (
-            float(np.average(variance / light, weights=weight)), 0.0)
+        gain, floor = (
+            (1e-3, float(np.average(variance, weights=weight)))
+            if gain <= 0
+            else (float(np.average(variance / light, weights=weight)), 0.0)
+        )
     return Noise(float(gain), math.sqrt(max(floor, 0.0)), 0.0, saturation, 0.0, 1.0), channel
 
 
@@ -360,7 +480,7 @@ def light_directions(images, backgrounds, circles, radius: float) -> list[list[f
     Its direction is where the channel's light comes from, but for light that comes from all sides.
     """
     normals, steps = [], []
-    v, u = np.mgrid[:images.shape[1], :images.shape[2]] + 0.5
+    v, u = np.mgrid[: images.shape[1], : images.shape[2]] + 0.5
     for image, flat, (x, y, r) in zip(images, backgrounds, circles):
         inside = np.hypot(u - x, v - y) < 0.8 * min(r, radius)
         nx, ny = ((u - x) / radius)[inside], ((v - y) / radius)[inside]
@@ -371,7 +491,8 @@ def light_directions(images, backgrounds, circles, radius: float) -> list[list[f
 
 
 def led_elements(directions: Sequence[Sequence[float]], leds: int, level: np.ndarray) -> str:
-    """XML of the lights: at LED_DISTANCE from the middle, in the directions that the contacts show; a start, not a finding."""
+    """XML of the lights: at LED_DISTANCE from the middle, in the directions that the contacts show; a start, not a
+    finding."""
     texts = []
     for k in range(leds):
         nx, ny, _ = directions[k % 3]
@@ -383,12 +504,16 @@ def led_elements(directions: Sequence[Sequence[float]], leds: int, level: np.nda
         weight = 1.0 if k < 3 else 0.2
         name = ("led_red", "led_green", "led_blue")[k] if leds == 3 else f"led_{k + 1}"
         power = math.pi * LED_DISTANCE**2 * float(level[k % 3]) / 255.0 * weight
-        texts.append(f'''    <emitter type="led" id="{name}">
+        texts.append(
+            f'''    <emitter type="led" id="{name}">
         <point name="position" x="{x:.4g}" y="{y:.4g}" z="{-LED_DISTANCE * math.sin(elevation):.4g}"/>
         <point name="target" x="{-3 * math.cos(azimuth):.4g}" y="{-3 * math.sin(azimuth):.4g}" z="0"/>
         <float name="mu" value="2"/>
         <float name="power" value="{power:.4g}"/>
-''' + "".join(f'        <float name="power_{c}" value="{share:g}"/>\n' for c, share in zip("rgb", shares)) + "    </emitter>")
+'''
+            + "".join(f'        <float name="power_{c}" value="{share:g}"/>\n' for c, share in zip("rgb", shares))
+            + "    </emitter>"
+        )
     return "\n".join(texts)
 
 
@@ -396,41 +521,60 @@ def _span(values: np.ndarray) -> list[float]:
     return [float(values.min()), float(values.max())]
 
 
-def contradictions(presses: Presses, facts: dict, images, median, given, far, gains, noise, saturation,
-                   second: float | None) -> list[str]:
-    """What the labels, the scale and the pictures say against each other, in sentences with numbers."""
+def contradictions(
+    presses: Presses, facts: dict, images, median, given, far, gains, noise, saturation, second: float | None
+) -> list[str]:
+    """What the labels, the scale and the images say against each other, in sentences with numbers."""
     texts, ball = [], facts["ball_radius_mm"]
     low, high = facts["labelled_radius_mm"]
     count = int((presses.circles[:, 2] * facts["mm_per_pixel"] > ball).sum())
     if count:
-        texts.append(f"{count} of {len(presses.circles)} labelled circles are larger than the ball itself: radius up to "
-                     f"{presses.circles[:, 2].max():g} px = {high:.2f} mm, ball radius {ball:.2f} mm; the scale, the ball or the "
-                     "labels are wrong, or the circle is drawn around the skirt of the dent: free gel.press_depth per press, "
-                     "and gel.indenter_size")
+        texts.append(
+            f"{count} of {len(presses.circles)} labelled circles are larger than the ball itself: radius up to "
+            f"{presses.circles[:, 2].max():g} px = {high:.2f} mm, ball radius {ball:.2f} mm; the scale, the ball or the "
+            "labels are wrong, or the circle is drawn around the skirt of the dent: free gel.press_depth per press, "
+            "and gel.indenter_size"
+        )
     elif high > 0.95 * ball:
-        texts.append(f"labelled circles up to {high:.2f} mm reach {high / ball:.0%} of the ball radius ({ball:.2f} mm): flanks "
-                     "would be steeper than 72 deg there")
+        texts.append(
+            f"labelled circles up to {high:.2f} mm reach {high / ball:.0%} of the ball radius ({ball:.2f} mm): flanks "
+            "would be steeper than 72 deg there"
+        )
     if second is not None and abs(second / facts["mm_per_pixel"] - 1) > 0.01:
-        texts.append(f"the scale disagrees by two routes: {facts['mm_per_pixel']:.4g} mm/px and {second:.4g} mm/px, "
-                     f"{second / facts['mm_per_pixel'] - 1:+.1%}; lengths are known no better")
+        texts.append(
+            f"the scale disagrees by two routes: {facts['mm_per_pixel']:.4g} mm/px and {second:.4g} mm/px, "
+            f"{second / facts['mm_per_pixel'] - 1:+.1%}; lengths are known no better"
+        )
     scatter = np.sqrt([noise.variance(median[..., c].mean()) for c in range(median.shape[-1])])
     if given is not None:
         rms = np.sqrt(np.mean((given - median) ** 2, (0, 1)))
         shift = (median - given).mean((0, 1))
         facts["given_against_median_rms"] = rms.tolist()
         if np.any(rms > scatter):
-            texts.append("the given picture of the untouched sensor is not the background of these presses: rms difference to "
-                         f"their median {_rgb(rms)} DN (mean {_rgb(shift, True)}), noise {_rgb(scatter)} DN; "
-                         f"background in use: {facts['background']}")
+            texts.append(
+                "the given image of the untouched sensor is not the background of these presses: rms difference to "
+                f"their median {_rgb(rms)} DN (mean {_rgb(shift, True)}), noise {_rgb(scatter)} DN; "
+                f"background in use: {facts['background']}"
+            )
     if np.abs(gains - 1).max() > 0.01:
-        texts.append(f"frames differ in gain: sd {_rgb(100 * gains.std(0))} %, largest departure {np.abs(gains - 1).max():.1%}; "
-                     "set as camera.gain_r, gain_g, gain_b in every frame")
+        texts.append(
+            f"frames differ in gain: sd {_rgb(100 * gains.std(0))} %, largest departure {np.abs(gains - 1).max():.1%}; "
+            "set as camera.gain_r, gain_g, gain_b in every frame"
+        )
     if facts["background"] == "median":
-        covered = np.mean(_distances(images.shape[1:3], np.column_stack(
-            [(presses.circles[:, :2] + 0.5) / facts["bin"], presses.circles[:, 2] / facts["bin"]])) < 1.5, 0)
+        covered = np.mean(
+            _distances(
+                images.shape[1:3],
+                np.column_stack([(presses.circles[:, :2] + 0.5) / facts["bin"], presses.circles[:, 2] / facts["bin"]]),
+            )
+            < 1.5,
+            0,
+        )
         if covered.max() > 0.4:
-            texts.append(f"the median background is biased where presses crowd: up to {covered.max():.0%} of the presses lie "
-                         f"over one pixel ({np.mean(covered > 0.4):.1%} of the picture above 40 %)")
+            texts.append(
+                f"the median background is biased where presses crowd: up to {covered.max():.0%} of the presses lie "
+                f"over one pixel ({np.mean(covered > 0.4):.1%} of the image above 40 %)"
+            )
     share = np.mean(images >= SATURATED * saturation, (0, 1, 2))
     if share.max() > 1e-3:
         texts.append(f"saturated values (masked): {_rgb(100 * share)} %")
@@ -457,8 +601,10 @@ def _write(folder: Path, frames, noise, flat, xml: str, facts: dict, bits: int |
         names = [p.name for p in folder.glob("*")] if folder.is_dir() else []
         extra = [name for name in names if name not in ours and not name.startswith("flat_field.")]
         if not overwrite or extra or not (folder / "import.json").is_file():
-            raise OutputExists(f"{folder} exists and is not empty; choose another folder"
-                               + ("" if extra or overwrite else ", or allow to overwrite what an import left there"))
+            raise OutputExists(
+                f"{folder} exists and is not empty; choose another folder"
+                + ("" if extra or overwrite else ", or allow to overwrite what an import left there")
+            )
     temporary = folder.parent / f".{folder.name}.{uuid.uuid4().hex}"
     try:
         flat = np.asarray(flat, np.float32)
@@ -481,21 +627,29 @@ def readme(facts: dict) -> str:
     levels = facts["noise"]["levels"]
     lines = [f"{facts['presses']} ball presses from {facts['source']}", "", "Contradictions"]
     lines += [f"- {text}" for text in facts["warnings"]] or ["- none found"]
-    lines += ["", "Given", f"- ball radius {facts['ball_radius_mm']:g} mm, {facts['mm_per_pixel']:.5g} mm/px, camera at "
-              f"{facts['camera_distance_mm']:g} mm", "", "Derived",
-              f"- pictures of {width} x {height} px" + (f", means of blocks of {facts['bin']} px" if facts["bin"] > 1 else ""),
-              f"- labelled radii {facts['labelled_radius_mm'][0]:.2f} to {facts['labelled_radius_mm'][1]:.2f} mm; the touched radius "
-              f"starts at {facts['contact_share']:g} of that",
-              f"- background: {facts['background']}" + (" of the presses, per pixel" if facts["background"] == "median" else ""),
-              f"- gain of frames: sd {_rgb(100 * np.array(facts['frame_gain_sd']))} %",
-              f"- noise (sd, R / G / B): {_rgb([level['sd'] for level in levels])} DN at "
-              f"{_rgb([level['signal'] for level in levels])} DN; {facts['noise']['how']}",
-              "- lights in scene.xml: directions from the contacts' shading, distance assumed; calibrate them", ""]
+    lines += [
+        "",
+        "Given",
+        f"- ball radius {facts['ball_radius_mm']:g} mm, {facts['mm_per_pixel']:.5g} mm/px, camera at "
+        f"{facts['camera_distance_mm']:g} mm",
+        "",
+        "Derived",
+        f"- images of {width} x {height} px" + (f", means of blocks of {facts['bin']} px" if facts["bin"] > 1 else ""),
+        f"- labelled radii {facts['labelled_radius_mm'][0]:.2f} to {facts['labelled_radius_mm'][1]:.2f} mm; the touched radius "
+        f"starts at {facts['contact_share']:g} of that",
+        f"- background: {facts['background']}"
+        + (" of the presses, per pixel" if facts["background"] == "median" else ""),
+        f"- gain of frames: sd {_rgb(100 * np.array(facts['frame_gain_sd']))} %",
+        f"- noise (sd, R / G / B): {_rgb([level['sd'] for level in levels])} DN at "
+        f"{_rgb([level['signal'] for level in levels])} DN; {facts['noise']['how']}",
+        "- lights in scene.xml: directions from the contacts' shading, distance assumed; calibrate them",
+        "",
+    ]
     return "\n".join(lines)
 
 
 def circles_of(captures: Captures) -> np.ndarray:
-    """(N, 3) labelled circles of an imported set: centre x, y and radius in px of its pictures, pixel centres at +0.5."""
+    """(N, 3) labelled circles of an imported set: centre x, y and radius in px of its images, pixel centres at +0.5."""
     path = captures.folder / "import.json"
     if not path.is_file():
         raise BadCapture(f"{path}: no such file; labelled circles are known for imported sets only")

@@ -21,12 +21,24 @@ from optics.errors import Underdetermined
 if TYPE_CHECKING:
     from optics.captures.capture_set import Captures
 
-SATURATED = 0.96  # of saturation: above, response bends before it clips (top-1 of a diagnosis fell from 99 to 17 % unmasked)
-DITHERED = 0.25  # temporal variance per step^2 from which the step acts as noise q^2/12 to 2.5 % (at 0.09: only to 45 %)
-UNITS = {"system_gain": "DN per electron", "dark_noise": "DN, rms", "black_level": "DN", "saturation": "DN",
-         "prnu": "(relative, rms)", "quantisation": "DN"}
-DEMOSAICED = ("3 channels and no cfa: if these are demosaiced, neighbouring pixels share their noise and a diagnosis raises "
-              "false alarms (85 % of sets at a perfect chi2); supply raw frames and cfa")
+SATURATED = (
+    0.96  # of saturation: above, response bends before it clips (top-1 of a diagnosis fell from 99 to 17 % unmasked)
+)
+DITHERED = (
+    0.25  # temporal variance per step^2 from which the step acts as noise q^2/12 to 2.5 % (at 0.09: only to 45 %)
+)
+UNITS = {
+    "system_gain": "DN per electron",
+    "dark_noise": "DN, rms",
+    "black_level": "DN",
+    "saturation": "DN",
+    "prnu": "(relative, rms)",
+    "quantisation": "DN",
+}
+DEMOSAICED = (
+    "3 channels and no cfa: if these are demosaiced, neighbouring pixels share their noise and a diagnosis raises "
+    "false alarms (85 % of sets at a perfect chi2); supply raw frames and cfa"
+)
 
 
 @dataclass(frozen=True)
@@ -49,7 +61,8 @@ class Noise:
             raise ValueError(f"saturation = {self.saturation:g} DN; allowed: > black_level = {self.black_level:g} DN")
 
     def variance(self, signal: np.ndarray, frames_averaged: int = 1) -> np.ndarray:
-        """Variance in DN^2 of a noise-free signal in DN (any shape), recorded as the mean of `frames_averaged` frames."""
+        """Variance in DN^2 of a noise-free signal in DN (any shape), recorded as the mean of `frames_averaged`
+        frames."""
         light = np.maximum(np.asarray(signal, float) - self.black_level, 0.0)
         temporal = self.system_gain * light + self.dark_noise**2
         step = self.quantisation**2 / 12
@@ -65,7 +78,9 @@ class Noise:
         """A gain per pixel, relative, of rms `prnu`; make it once per camera and hand it to every `expose`."""
         return self.prnu * rng.standard_normal(shape)
 
-    def expose(self, signal: np.ndarray, rng: np.random.Generator, fixed_pattern: np.ndarray | None = None) -> np.ndarray:
+    def expose(
+        self, signal: np.ndarray, rng: np.random.Generator, fixed_pattern: np.ndarray | None = None
+    ) -> np.ndarray:
         """One frame in DN of a noise-free signal in DN; fixed_pattern: relative gain per pixel, None: all alike."""
         light = np.maximum(np.asarray(signal, float) - self.black_level, 0.0)
         if fixed_pattern is not None:
@@ -93,11 +108,16 @@ class Noise:
 
 
 def step_of(images: Sequence[np.ndarray]) -> float:
-    """The step of the quantisation in DN: the common divisor of whole numbers (16 for 12 bit in 16), 0 for fractions."""
-    levels = np.unique(np.concatenate([image.ravel()[:: 1 + image.size // 20000] for image in images]))  # a sample will do
+    """The step of the quantisation in DN: the common divisor of whole numbers (16 for 12 bit in 16), 0 for
+    fractions."""
+    levels = np.unique(
+        np.concatenate([image.ravel()[:: 1 + image.size // 20000] for image in images])
+    )  # a sample will do
     if np.any(levels != np.round(levels)):
         return 0.0
-    return float(np.gcd.reduce(levels.astype(np.int64))) if len(levels) >= 32 else 1.0  # few levels share one by chance
+    return (
+        float(np.gcd.reduce(levels.astype(np.int64))) if len(levels) >= 32 else 1.0
+    )  # few levels share one by Monte Carlo
 
 
 def estimate(captures: Captures, black_level: float | None = None, saturation: float | None = None) -> Noise:
@@ -110,26 +130,40 @@ def estimate(captures: Captures, black_level: float | None = None, saturation: f
     here = f"{captures.folder}/captures.toml"
     repeated = [frame for frame in captures.frames if frame.repeats]
     if not repeated:
-        raise Underdetermined(f"{here}: noise: no frame has repeats; add `repeats` at six exposures or more, or give [noise]")
+        raise Underdetermined(
+            f"{here}: noise: no frame has repeats; add `repeats` at six exposures or more, or give [noise]"
+        )
     stacks = [np.stack([f.image, *f.repeats]).astype(float) for f in repeated]
     masks = [np.broadcast_to(True if f.mask is None else f.mask[..., None], f.image.shape) for f in repeated]
-    lights = [[value for key, value in {**captures.parameters, **f.parameters}.items()
-               if key.endswith((".power", ".exposure"))] for f in repeated]
+    lights = [
+        [
+            value
+            for key, value in {**captures.parameters, **f.parameters}.items()
+            if key.endswith((".power", ".exposure"))
+        ]
+        for f in repeated
+    ]
     dark = [bool(values) and not any(values) for values in lights]
     step = step_of(stacks)
     if saturation is None:
         top = max(float(image.max()) for f in captures.frames for image in (f.image, *f.repeats))
         saturation = next(((2**n - 1) * step for n in (8, 10, 12, 14, 16) if (2**n - 1) * step >= top), None)
         if not saturation:
-            raise Underdetermined(f"{here}: noise: values to {top:g} DN, step {step:g} DN, fit no converter; give saturation in DN")
+            raise Underdetermined(
+                f"{here}: noise: values to {top:g} DN, step {step:g} DN, fit no converter; give saturation in DN"
+            )
     if black_level is None:
         if not any(dark):
-            raise Underdetermined(f"{here}: noise: lit frames cannot tell the black level from dark noise; add repeats of a dark "
-                                  "frame (every power 0), or give the black level in DN")
+            raise Underdetermined(
+                f"{here}: noise: lit frames cannot tell the black level from dark noise; add repeats of a dark "
+                "frame (every power 0), or give the black level in DN"
+            )
         values = np.concatenate([stack[:, mask].ravel() for stack, mask, d in zip(stacks, masks, dark) if d])
         if np.mean(values <= 0) > 0.005:  # as from a pedestal below 2.6 sigma
-            raise Underdetermined(f"{here}: noise: {np.mean(values <= 0):.1%} of the dark values are clipped at 0 DN; set a pedestal "
-                                  "in the camera, or give the black level in DN")
+            raise Underdetermined(
+                f"{here}: noise: {np.mean(values <= 0):.1%} of the dark values are clipped at 0 DN; set a pedestal "
+                "in the camera, or give the black level in DN"
+            )
         black_level = float(values.mean())
     parts = [_levels(stack, mask & (stack.mean(0) < 0.9 * saturation)) for stack, mask in zip(stacks, masks)]
     mean, variance, weight = (np.concatenate(part) for part in zip(*parts))
@@ -140,10 +174,14 @@ def estimate(captures: Captures, black_level: float | None = None, saturation: f
     (gain, floor), covariance = photon_transfer(mean[keep] - black_level, variance[keep], weight[keep])
     gain_sd, floor_sd = np.sqrt(np.diag(covariance))
     if gain < 10 * gain_sd:
-        raise Underdetermined(f"{here}: noise: system_gain {gain:.3g} +- {gain_sd:.2g} DN per electron; needed to 10 %" + few)
+        raise Underdetermined(
+            f"{here}: noise: system_gain {gain:.3g} +- {gain_sd:.2g} DN per electron; needed to 10 %" + few
+        )
     if floor - step**2 / 12 < -3 * floor_sd:
-        raise Underdetermined(f"{here}: noise: variance {floor:.3g} DN^2 at black level {black_level:g} DN: the black level is too low "
-                              "or the response is bent; give the black level, and raw frames")
+        raise Underdetermined(
+            f"{here}: noise: variance {floor:.3g} DN^2 at black level {black_level:g} DN: the black level is too low "
+            "or the response is bent; give the black level, and raw frames"
+        )
     noise = Noise(float(gain), math.sqrt(max(floor - step**2 / 12, 0.0)), black_level, saturation, 0.0, step)
     stride = 2 if captures.cfa else 1  # to the next pixel of the same colour
     lit = [(stack, mask) for stack, mask, d in zip(stacks, masks, dark) if not d and stack.shape[2] > 2 * stride]
@@ -193,14 +231,26 @@ def _prnu(lit: Sequence[tuple[np.ndarray, np.ndarray]], noise: Noise, stride: in
 def warnings_of(noise: Noise, captures: Captures) -> list[str]:
     """What about the camera and the frames weakens a verdict, in sentences."""
     found = [
-        (captures.values_are == "DN" and not noise.pedestal,
-         f"no pedestal: black level {noise.black_level:g} DN is below 3 sigma of the dark noise; dim pixels are cut at 0 and "
-         "masked, and half a DN of black level looks like glare: raise the camera's offset"),
-        (captures.values_are == "DN" and captures.cfa is None and captures.table is None
-         and captures.frames[0].image.shape[2] == 3, DEMOSAICED),
+        (
+            captures.values_are == "DN" and not noise.pedestal,
+            f"no pedestal: black level {noise.black_level:g} DN is below 3 sigma of the dark noise; dim pixels are cut at 0 and "
+            "masked, and half a DN of black level looks like glare: raise the camera's offset",
+        ),
+        (
+            captures.values_are == "DN"
+            and captures.cfa is None
+            and captures.table is None
+            and captures.frames[0].image.shape[2] == 3,
+            DEMOSAICED,
+        ),
         (captures.bits == 8, "8 bit: a step of 1 DN hides what is weaker than it; record 10 bit or more"),
-        (len(captures.frames) == 1, "one frame only: nothing can be held out, so no verdict can be verified; add frames"),
-        (noise.prnu > 0.003 and captures.flat_field is None,
-         f"PRNU {noise.prnu:.2%} is above 0.3 % and does not average down over frames: record a flat_field to divide it out"),
+        (
+            len(captures.frames) == 1,
+            "one frame only: nothing can be held out, so no verdict can be verified; add frames",
+        ),
+        (
+            noise.prnu > 0.003 and captures.flat_field is None,
+            f"PRNU {noise.prnu:.2%} is above 0.3 % and does not average down over frames: record a flat_field to divide it out",
+        ),
     ]
     return [text for holds, text in found if holds]

@@ -1,8 +1,8 @@
 """The command line: thin. Each command reads its arguments, calls one verb of the library and shows what came of it.
 
-Results go to stdout (`--json` for programs); progress and remarks to stderr, progress only on a terminal. Exit codes: 0 done,
-1 done with a negative finding, 2 an error of the input, said in one line. Heavy imports stand inside the commands.
-"""
+Results go to stdout (`--json` for programs); progress and remarks to stderr, progress only on a terminal. Exit codes: 0
+done, 1 done with a negative finding, 2 an error of the input, said in one line. Heavy imports stand inside the
+commands."""
 
 import functools
 import inspect
@@ -28,12 +28,17 @@ from optics.words import key_of, spaced, table
 INTERRUPTED = 130  # 128 and the number of SIGINT, as shells count
 
 app = typer.Typer(
-    add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False,
+    add_completion=False,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110},
-    help="Optical models of camera-based touch sensors that can be held against a measurement.")
+    help="Optical models of camera-based touch sensors that can be held against a measurement.",
+)
 
 
-# -- what every command shares --------------------------------------------------------------------------------------------
+# -- what every command shares
+# --------------------------------------------------------------------------------------------
+
 
 class Terminal:
     """Where a command speaks: `note` for remarks, `progress` for long work. Results are printed."""
@@ -54,8 +59,14 @@ class Terminal:
         from rich.console import Console
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-        bars = Progress(TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
-                        console=Console(stderr=True), transient=True)
+        bars = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeRemainingColumn(),
+            console=Console(stderr=True),
+            transient=True,
+        )
         tasks: dict[str, int] = {}
 
         def show(what: str, done: int, total: int) -> None:
@@ -72,24 +83,42 @@ terminal = Terminal()
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no remarks.")]
 Debug = Annotated[bool, typer.Option("--debug", help="Show where in the program an error came from.")]
 AsJson = Annotated[bool, typer.Option("--json", help="The result for programs.")]
-SceneName = Annotated[str, typer.Argument(metavar="SCENE", help="A shipped scene's name (`optics scenes`) or an XML file.")]
+SceneName = Annotated[
+    str, typer.Argument(metavar="SCENE", help="A shipped scene's name (`optics scenes`) or an XML file.")
+]
 CaptureSet = Annotated[str, typer.Argument(metavar="CAPTURES", help="Folder with captures.toml.")]
 StudyFolder = Annotated[Path, typer.Argument(metavar="STUDY", help="Folder that `optics calibrate` made.")]
-Defines = Annotated[list[str] | None, typer.Option(
-    "-D", "--define", metavar="NAME=VALUE", help="Replace a <default> of the scene's XML. Repeatable.")]
-Settings = Annotated[list[str] | None, typer.Option(
-    "--set", metavar="KEY=VALUE", help="Set a parameter (`optics params SCENE` lists them). Repeatable.")]
+Defines = Annotated[
+    list[str] | None,
+    typer.Option("-D", "--define", metavar="NAME=VALUE", help="Replace a <default> of the scene's XML. Repeatable."),
+]
+Settings = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="KEY=VALUE", help="Set a parameter (`optics params SCENE` lists them). Repeatable."),
+]
 Plugins = Annotated[Path | None, typer.Option("--plugins", metavar="DIR", help="A further folder of plugins.")]
 Variant = Annotated[str | None, typer.Option("--variant", help="Mitsuba variant.", show_default=False)]
 Force = Annotated[bool, typer.Option("--force", help="Replace existing files.")]
-At = Annotated[str | None, typer.Option(
-    "--at", metavar="U,V", help="Pixel position, u right and v down from the top left.", show_default="the picture's centre")]
-FlatField = Annotated[str | None, typer.Option(
-    "--flat-field", metavar="MODE", help="How a background image enters: multiplicative, additive or none.")]
+At = Annotated[
+    str | None,
+    typer.Option(
+        "--at",
+        metavar="U,V",
+        help="Pixel position, u right and v down from the top left.",
+        show_default="the image's centre",
+    ),
+]
+FlatField = Annotated[
+    str | None,
+    typer.Option(
+        "--flat-field", metavar="MODE", help="How a background image enters: multiplicative, additive or none."
+    ),
+]
 
 
 def command(function: Callable) -> Callable:
     """Register a command, and give it the options that every command has."""
+
     @functools.wraps(function)
     def run(*args, quiet: bool = False, debug: bool = False, **options):
         terminal.quiet, terminal.debug = quiet, debug
@@ -105,8 +134,10 @@ def command(function: Callable) -> Callable:
             print(": ".join(["interrupted", *map(str, stopped.args)]), file=sys.stderr)
             raise typer.Exit(INTERRUPTED) from None
 
-    shared = [inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=False, annotation=kind)
-              for name, kind in (("quiet", Quiet), ("debug", Debug))]
+    shared = [
+        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=False, annotation=kind)
+        for name, kind in (("quiet", Quiet), ("debug", Debug))
+    ]
     signature = inspect.signature(function)
     run.__signature__ = signature.replace(parameters=[*signature.parameters.values(), *shared])
     run.__annotations__ = {**function.__annotations__, "quiet": Quiet, "debug": Debug}
@@ -127,7 +158,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _ctrl_c(error: BaseException | None) -> KeyboardInterrupt | None:
     """The Ctrl-C behind an error: within a render, Dr.Jit puts an error of its own around it."""
-    return error if error is None or isinstance(error, KeyboardInterrupt) else _ctrl_c(error.__cause__ or error.__context__)
+    return (
+        error
+        if error is None or isinstance(error, KeyboardInterrupt)
+        else _ctrl_c(error.__cause__ or error.__context__)
+    )
 
 
 def _report(error: Exception) -> int:
@@ -136,7 +171,10 @@ def _report(error: Exception) -> int:
     if terminal.debug or not expected:
         traceback.print_exception(error, file=sys.stderr)
     text = _usage(error) if hasattr(error, "format_message") else _text(error)
-    print(f"error: {_one_line(text)}" + ("" if expected else " (a bug: please report it with the lines above)"), file=sys.stderr)
+    print(
+        f"error: {_one_line(text)}" + ("" if expected else " (a bug: please report it with the lines above)"),
+        file=sys.stderr,
+    )
     return 2
 
 
@@ -160,6 +198,7 @@ def _one_line(text: object) -> str:
 
 def show(result: object) -> None:
     """Print a result for programs."""
+
     def plain(value):
         if isinstance(value, Mapping):
             return {str(k): plain(v) for k, v in value.items()}
@@ -183,6 +222,7 @@ def pairs(items: Sequence[str] | None, option: str) -> dict[str, str]:
 
 def settings(items: Sequence[str] | None) -> dict[str, float | str]:
     """{key: number or word} of --set arguments."""
+
     def value(text):
         try:
             return float(text)
@@ -199,8 +239,10 @@ def priors(items: Sequence[str] | None) -> dict[str, tuple[float | None, float]]
         number = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
         match = re.fullmatch(rf"({number})?\s*(?:\+-|\+/-|±)\s*({number})", text)
         if match is None or not float(match[2]) > 0:
-            raise ValueError(f"--prior {pattern}={text}: allowed: PATTERN=MEAN+-SD with SD above 0, such as "
-                             "'led_*.x=11+-0.5', or PATTERN=+-SD about the present value")
+            raise ValueError(
+                f"--prior {pattern}={text}: allowed: PATTERN=MEAN+-SD with SD above 0, such as "
+                "'led_*.x=11+-0.5', or PATTERN=+-SD about the present value"
+            )
         found[pattern] = (float(match[1]) if match[1] else None, float(match[2]))
     return found
 
@@ -217,8 +259,13 @@ def setup_of(captures: str, defines: Sequence[str] | None, plugins: Path | None,
     """What a study starts from (optics.study.loop.Setup); places are absolute, so that any folder can go on with it."""
     from optics.study import loop
 
-    return loop.setup_for(os.path.abspath(captures), defines=pairs(defines, "-D"), values=settings(values),
-                          plugins=os.path.abspath(plugins) if plugins else None, **more)
+    return loop.setup_for(
+        os.path.abspath(captures),
+        defines=pairs(defines, "-D"),
+        values=settings(values),
+        plugins=os.path.abspath(plugins) if plugins else None,
+        **more,
+    )
 
 
 def scan(plugins: Path | None):
@@ -232,13 +279,17 @@ def scan(plugins: Path | None):
 
 
 @app.callback(invoke_without_command=True)
-def optics(version: Annotated[bool, typer.Option("--version", help="Print the version.", is_eager=True)] = False) -> None:
+def optics(
+    version: Annotated[bool, typer.Option("--version", help="Print the version.", is_eager=True)] = False,
+) -> None:
     if version:
         print(f"optics {__version__}")
         raise typer.Exit()
 
 
-# -- looking around -------------------------------------------------------------------------------------------------------
+# -- looking around
+# -------------------------------------------------------------------------------------------------------
+
 
 @command
 def scenes(as_json: AsJson = False) -> None:
@@ -255,9 +306,16 @@ def scenes(as_json: AsJson = False) -> None:
 
 
 @command
-def params(scene: SceneName,
-           patterns: Annotated[list[str] | None, typer.Argument(metavar="[PATTERN]...", help="Keys to show: 'led_*', '*.x'.")] = None,
-           define: Defines = None, plugins: Plugins = None, variant: Variant = None, as_json: AsJson = False) -> None:
+def params(
+    scene: SceneName,
+    patterns: Annotated[
+        list[str] | None, typer.Argument(metavar="[PATTERN]...", help="Keys to show: 'led_*', '*.x'.")
+    ] = None,
+    define: Defines = None,
+    plugins: Plugins = None,
+    variant: Variant = None,
+    as_json: AsJson = False,
+) -> None:
     """List the parameters of a scene: value, unit, bounds, neutral value, derivative, meaning."""
     from optics.errors import UnknownKey
     from optics.scene.registry import registry
@@ -275,21 +333,53 @@ def params(scene: SceneName,
             continue
         p = loaded.parameters[key]
         part = loaded.parts.get(key.rsplit(".", 1)[0])
-        rows.append({
-            "key": key, "value": values[key], "unit": p.unit, "bounds": list(p.bounds) if p.is_number else None,
-            "choices": list(p.choices) or None, "neutral": p.neutral, "plausible": p.plausible if p.is_number else None,
-            "differentiable": p.differentiable, "derivative": p.how if p.differentiable else None, "linear": p.linear,
-            "squared": p.squared, "effect": brought.get((part.kind, p.name)) if part is not None else None, "meaning": p.doc})
+        rows.append(
+            {
+                "key": key,
+                "value": values[key],
+                "unit": p.unit,
+                "bounds": list(p.bounds) if p.is_number else None,
+                "choices": list(p.choices) or None,
+                "neutral": p.neutral,
+                "plausible": p.plausible if p.is_number else None,
+                "differentiable": p.differentiable,
+                "derivative": p.how if p.differentiable else None,
+                "linear": p.linear,
+                "squared": p.squared,
+                "effect": brought.get((part.kind, p.name)) if part is not None else None,
+                "meaning": p.doc,
+            }
+        )
     if as_json:
         return show(rows)
-    how = {"ad": "forward mode", "difference": "differences", "image": "complex step", "layer": "complex step", "path": "lengths of ways",
-           None: "-"}
-    print(table([("key", "value", "unit", "bounds", "neutral", "derivative", "meaning"), *((
-        r["key"], _number(r["value"]), r["unit"], "|".join(r["choices"]) if r["choices"] else
-        _span(r["bounds"]),
-        "-" if r["neutral"] is None else f"{r['neutral']:g}",
-        how[r["derivative"]] + (", linear" if r["linear"] else ", of its square" if r["squared"] else ""),
-        r["meaning"] + (f" [effect: {r['effect']}]" if r["effect"] else "")) for r in rows)]))
+    how = {
+        "ad": "forward mode",
+        "difference": "differences",
+        "image": "complex step",
+        "layer": "complex step",
+        "path": "lengths of ways",
+        None: "-",
+    }
+    print(
+        table(
+            [
+                ("key", "value", "unit", "bounds", "neutral", "derivative", "meaning"),
+                *(
+                    (
+                        r["key"],
+                        _number(r["value"]),
+                        r["unit"],
+                        "|".join(r["choices"]) if r["choices"] else _span(r["bounds"]),
+                        "-" if r["neutral"] is None else f"{r['neutral']:g}",
+                        how[r["derivative"]]
+                        + (", linear" if r["linear"] else ", of its square" if r["squared"] else ""),
+                        r["meaning"] + (f" [effect: {r['effect']}]" if r["effect"] else ""),
+                    )
+                    for r in rows
+                ),
+            ]
+        )
+    )
 
 
 def _number(value: float | str) -> str:
@@ -317,25 +407,49 @@ def _new_effect(name: str | None, plugins: Path | None, **given) -> None:
         text, folder = draft.new_effect(name, stage), plugins or Path("plugins")
     else:
         if given["stage"] or given["part"]:
-            raise ValueError("--stage, --part: a draft acts where its coordinate is known; leave them out, or leave --from out")
+            raise ValueError(
+                "--stage, --part: a draft acts where its coordinate is known; leave them out, or leave --from out"
+            )
         text, folder = draft.from_study(given["from"], given["along"], name, registry)
     file = draft.write(text, given["o"] or folder, name)
-    terminal.note(f"next: optics add {given['from']} '{name}', then put a formula in place of the table" if given["from"] else
-                  f"next: fill in the formula; a folder 'plugins' beside captures or scene is found, any other by --plugins {file.parent}")
+    terminal.note(
+        f"next: optics add {given['from']} '{name}', then put a formula in place of the table"
+        if given["from"]
+        else f"next: fill in the formula; a folder 'plugins' beside captures or scene is found, any other by --plugins {file.parent}"
+    )
     print(file)
 
 
 @command
-def effects(name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="Show the page of this effect or part (led, gel, camera ...); 'new': "
-                                                                                "write an effect.")] = None,
-            new_name: Annotated[str | None, typer.Argument(metavar="[NEW]", help="Of `effects new NAME`: the new effect's name.")] = None,
-            stage: Annotated[str | None, typer.Option("--stage", help="new: where it acts (lens, sensor, response, emission, segment ...).")] = None,
-            part: Annotated[str | None, typer.Option("--part", help="new: on camera, led, gel or membrane.")] = None,
-            study: Annotated[Path | None, typer.Option("--from", metavar="STUDY", help="new: with a curve of this study's last diagnosis.")] = None,
-            along: Annotated[str | None, typer.Option("--along", metavar="COORDINATE", help="new: the coordinate of the curve.")] = None,
-            output: Annotated[Path | None, typer.Option("-o", "--output", metavar="DIR", help="new: folder of plugins.")] = None,
-            plugins: Plugins = None, as_json: AsJson = False) -> None:
-    """List the physical effects that can be added to a model, show one's page, or write a new one (`optics effects new NAME`).
+def effects(
+    name: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="[NAME]",
+            help="Show the page of this effect or part (led, gel, camera ...); 'new': write an effect.",
+        ),
+    ] = None,
+    new_name: Annotated[
+        str | None, typer.Argument(metavar="[NEW]", help="Of `effects new NAME`: the new effect's name.")
+    ] = None,
+    stage: Annotated[
+        str | None, typer.Option("--stage", help="new: where it acts (lens, sensor, response, emission, segment ...).")
+    ] = None,
+    part: Annotated[str | None, typer.Option("--part", help="new: on camera, led, gel or membrane.")] = None,
+    study: Annotated[
+        Path | None, typer.Option("--from", metavar="STUDY", help="new: with a curve of this study's last diagnosis.")
+    ] = None,
+    along: Annotated[
+        str | None, typer.Option("--along", metavar="COORDINATE", help="new: the coordinate of the curve.")
+    ] = None,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", metavar="DIR", help="new: folder of plugins.")
+    ] = None,
+    plugins: Plugins = None,
+    as_json: AsJson = False,
+) -> None:
+    """List the physical effects that can be added to a model, show one's page, or write a new one (`optics effects new
+    NAME`).
 
     Parts have pages too: `optics effects led` shows the LED's law, its parameters, and the effects that act on it.
     """
@@ -354,41 +468,139 @@ def effects(name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="S
             return _part_page(found, kind, as_json)
         raise UnknownKey(name, [*found.effects, *found.parts], "effect or part", hint="`optics effects` lists them")
     chosen = [found.find_effect(name)] if name else [found.effects[k] for k in sorted(found.effects)]
-    records = [{
-        "key": e.key, "name": e.name, "part": e.part, "stages": list(e.stages), "onset": e.onset, "scope": e.scope, "per": e.per,
-        "acts": list(e.acts), "needs": e.needs, "file": e.file, "parameters": [
-            {"name": p.name, "unit": p.unit, "neutral": p.neutral, "bounds": list(p.bounds), "plausible": p.plausible,
-             "meaning": p.doc} for p in found.effect_parameters(e)],
-        **({"page": e.doc} if name else {})} for e in chosen]
+    records = [
+        {
+            "key": e.key,
+            "name": e.name,
+            "part": e.part,
+            "stages": list(e.stages),
+            "onset": e.onset,
+            "scope": e.scope,
+            "per": e.per,
+            "acts": list(e.acts),
+            "needs": e.needs,
+            "file": e.file,
+            "parameters": [
+                {
+                    "name": p.name,
+                    "unit": p.unit,
+                    "neutral": p.neutral,
+                    "bounds": list(p.bounds),
+                    "plausible": p.plausible,
+                    "meaning": p.doc,
+                }
+                for p in found.effect_parameters(e)
+            ],
+            **({"page": e.doc} if name else {}),
+        }
+        for e in chosen
+    ]
     if as_json:
         return show(records[0] if name else records)
     if not name:
-        return print(table([("effect", "part", "parameters", "onset", "needs"), *(
-            (r["key"], r["part"], ", ".join(p["name"] for p in r["parameters"]), r["onset"], r["needs"] or "-") for r in records)])
-            + f"\n\nparts, each with a page too: {', '.join(sorted(found.parts))}")
+        return print(
+            table(
+                [
+                    ("effect", "part", "parameters", "onset", "needs"),
+                    *(
+                        (
+                            r["key"],
+                            r["part"],
+                            ", ".join(p["name"] for p in r["parameters"]),
+                            r["onset"],
+                            r["needs"] or "-",
+                        )
+                        for r in records
+                    ),
+                ]
+            )
+            + f"\n\nparts, each with a page too: {', '.join(sorted(found.parts))}"
+        )
     r = records[0]
     print(f"{r['page'].strip()}\n\n{r['name']}: `{r['key']}`, {r['file']}")
-    print(table([("part", f"{r['part']}, one value for {'each ' + r['part'] if r['per'] == 'part' else 'all of the kind'}"
-                          f"{', in each frame' if r['scope'] == 'frame' else ''}"),
-                 ("enters at", ", ".join(r["stages"]) or "the part itself"), ("onset", r["onset"]),
-                 ("acts through", ", ".join(r["acts"]) or "-"), ("needs", r["needs"] or "-")]))
-    print("\n" + table([("parameter", "unit", "neutral", "bounds", "meaning"), *(
-        (p["name"], p["unit"], f"{p['neutral']:g}", f"{p['bounds'][0]:g} .. {p['bounds'][1]:g}", p["meaning"])
-        for p in r["parameters"])]))
+    print(
+        table(
+            [
+                (
+                    "part",
+                    f"{r['part']}, one value for {'each ' + r['part'] if r['per'] == 'part' else 'all of the kind'}"
+                    f"{', in each frame' if r['scope'] == 'frame' else ''}",
+                ),
+                ("enters at", ", ".join(r["stages"]) or "the part itself"),
+                ("onset", r["onset"]),
+                ("acts through", ", ".join(r["acts"]) or "-"),
+                ("needs", r["needs"] or "-"),
+            ]
+        )
+    )
+    print(
+        "\n"
+        + table(
+            [
+                ("parameter", "unit", "neutral", "bounds", "meaning"),
+                *(
+                    (
+                        p["name"],
+                        p["unit"],
+                        f"{p['neutral']:g}",
+                        f"{p['bounds'][0]:g} .. {p['bounds'][1]:g}",
+                        p["meaning"],
+                    )
+                    for p in r["parameters"]
+                ),
+            ]
+        )
+    )
 
 
 def _part_page(found, kind: str, as_json: bool) -> None:
     """Show a part: its page, its own parameters, and the effects that act on it."""
     part = found.parts[kind]
     acting = sorted(k for k, e in found.effects.items() if e.part == kind)
-    rows = [{"name": p.name, "unit": p.unit, "default": p.default, "neutral": p.neutral, "bounds": list(p.bounds) if p.is_number else None,
-             "choices": list(p.choices) or None, "meaning": p.doc} for p in part.parameters]
+    rows = [
+        {
+            "name": p.name,
+            "unit": p.unit,
+            "default": p.default,
+            "neutral": p.neutral,
+            "bounds": list(p.bounds) if p.is_number else None,
+            "choices": list(p.choices) or None,
+            "meaning": p.doc,
+        }
+        for p in part.parameters
+    ]
     if as_json:
-        return show({"key": kind, "category": part.category, "file": part.file, "parameters": rows, "effects": acting, "page": part.doc})
-    print(f"{part.doc.strip()}\n\n{kind}: {part.category}, {part.file}\neffects that act on it: {', '.join(acting) or 'none'}\n")
-    print(table([("parameter", "unit", "default", "bounds", "neutral", "meaning"), *((
-        r["name"], r["unit"], _number(r["default"]), "|".join(r["choices"]) if r["choices"] else _span(r["bounds"]),
-        "-" if r["neutral"] is None else f"{r['neutral']:g}", r["meaning"]) for r in rows)]))
+        return show(
+            {
+                "key": kind,
+                "category": part.category,
+                "file": part.file,
+                "parameters": rows,
+                "effects": acting,
+                "page": part.doc,
+            }
+        )
+    print(
+        f"{part.doc.strip()}\n\n{kind}: {part.category}, {part.file}\neffects that act on it: {', '.join(acting) or 'none'}\n"
+    )
+    print(
+        table(
+            [
+                ("parameter", "unit", "default", "bounds", "neutral", "meaning"),
+                *(
+                    (
+                        r["name"],
+                        r["unit"],
+                        _number(r["default"]),
+                        "|".join(r["choices"]) if r["choices"] else _span(r["bounds"]),
+                        "-" if r["neutral"] is None else f"{r['neutral']:g}",
+                        r["meaning"],
+                    )
+                    for r in rows
+                ),
+            ]
+        )
+    )
 
 
 @command
@@ -402,30 +614,51 @@ def doctor(as_json: AsJson = False) -> None:
         raise typer.Exit(1)
 
 
-# -- pictures -------------------------------------------------------------------------------------------------------------
+# -- images -------------------------------------------------------------------------------------------------------------
+
 
 @command
-def render(scene: SceneName,
-           output: Annotated[Path, typer.Option("-o", "--output", metavar="FILE.exr", help="Where the picture goes.")],
-           define: Defines = None, sets: Settings = None, png: Annotated[bool, typer.Option(
-               "--png", help="Also FILE.png: the camera's digital numbers, free of noise.")] = False,
-           stokes: Annotated[bool, typer.Option(
-               "--stokes", help="Also FILE.dolp.png and FILE.aolp.png: degree and angle of linear polarization per band; S0 to S3 in "
-                                "the EXR, which scenes with layers have anyway.")] = False,
-           spp: Annotated[int | None, typer.Option("--spp", help="Monte Carlo with so many samples per pixel, and variances; "
-                                                   "without it a sensor is rendered LED by LED, free of noise.")] = None,
-           seed: Annotated[int, typer.Option("--seed", min=0, help="Of everything random.")] = 0, plugins: Plugins = None,
-           variant: Variant = None, force: Force = False, as_json: AsJson = False) -> None:
-    """Render one picture: an EXR with all that is known of it, and its provenance.
+def render(
+    scene: SceneName,
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="FILE.exr", help="Where the image goes.")],
+    define: Defines = None,
+    sets: Settings = None,
+    png: Annotated[
+        bool, typer.Option("--png", help="Also FILE.png: the camera's digital numbers, free of noise.")
+    ] = False,
+    stokes: Annotated[
+        bool,
+        typer.Option(
+            "--stokes",
+            help="Also FILE.dolp.png and FILE.aolp.png: degree and angle of linear polarization per band; S0 to S3 in "
+            "the EXR, which scenes with layers have anyway.",
+        ),
+    ] = False,
+    spp: Annotated[
+        int | None,
+        typer.Option(
+            "--spp",
+            help="Monte Carlo with so many samples per pixel, and variances; "
+            "without it a sensor is rendered LED by LED, free of noise.",
+        ),
+    ] = None,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Of everything random.")] = 0,
+    plugins: Plugins = None,
+    variant: Variant = None,
+    force: Force = False,
+    as_json: AsJson = False,
+) -> None:
+    """Render one image: an EXR with all that is known of it, and its provenance.
 
-    The channels are radiance (with layers: Stokes vectors) per band, depth, normals, contact, one image per LED, variances;
-    optics.light.output lists them.
-    """
+    The channels are radiance (with layers: Stokes vectors) per band, depth, normals, contact, one image per LED,
+    variances; optics.light.rendering lists them."""
     from optics.files.output import claim, write_json
-    from optics.light.output import Pictures
+    from optics.light.rendering import RenderJob
 
     if output.suffix.lower() != ".exr":
-        raise ValueError(f"-o {output}: '{output.suffix}' is no picture format of this command; allowed: a name ending in .exr")
+        raise ValueError(
+            f"-o {output}: '{output.suffix}' is no image format of this command; allowed: a name ending in .exr"
+        )
     record, preview = output.with_suffix(".json"), output.with_suffix(".png")
     maps = tuple(output.with_suffix(f".{name}.png") for name in ("dolp", "aolp"))
     files = [output, record, *([preview] if png else []), *(maps if stokes else ())]
@@ -433,32 +666,45 @@ def render(scene: SceneName,
     loaded = load_scene(scene, define, plugins, variant)
     values = loaded.check(settings(sets), "--set")
     clock = time.perf_counter()
-    pictures = Pictures(loaded, spp=spp, stokes=stokes)
+    images = RenderJob(loaded, spp=spp, stokes=stokes)
     with terminal.progress() as progress:
-        picture = pictures.take(values, seed, progress=progress)
+        image = images.take(values, seed, progress=progress)
     seconds = time.perf_counter() - clock
     if png:
-        picture.write_png(preview)
+        image.write_png(preview)
     if stokes:
         from optics.light.polarimetry import write_maps
 
-        write_maps(maps, *picture.stokes())
-    write_json(record, {**picture.header["provenance"], "command": ["optics", *sys.argv[1:]]})
-    picture.write_exr(output)
+        write_maps(maps, *image.stokes())
+    write_json(record, {**image.header["provenance"], "command": ["optics", *sys.argv[1:]]})
+    image.write_exr(output)
     if as_json:
-        return show({"files": [str(f) for f in files], "method": pictures.method, "seconds": seconds,
-                     "channels": list(picture.channels)})
+        return show(
+            {
+                "files": [str(f) for f in files],
+                "method": images.method,
+                "seconds": seconds,
+                "channels": list(image.channels),
+            }
+        )
     for file in files:
         print(file)
-    terminal.note(f"{pictures.method}, {seconds:.1f} s")
+    terminal.note(f"{images.method}, {seconds:.1f} s")
 
 
 @command
-def batch(job: Annotated[Path, typer.Argument(metavar="JOB.toml", help="What to make; optics.study.batch describes the file.")],
-          shard: Annotated[str, typer.Option("--shard", metavar="K/N", help="Make only every N-th sample, from the K-th on.")] = "1/1",
-          workers: Annotated[int | None, typer.Option("--workers", help="Processes.", show_default="one per core")] = None,
-          plugins: Plugins = None, as_json: AsJson = False) -> None:
-    """Make many pictures from a job file. May be stopped at any moment; the same command goes on."""
+def batch(
+    job: Annotated[
+        Path, typer.Argument(metavar="JOB.toml", help="What to make; optics.study.batch describes the file.")
+    ],
+    shard: Annotated[
+        str, typer.Option("--shard", metavar="K/N", help="Make only every N-th sample, from the K-th on.")
+    ] = "1/1",
+    workers: Annotated[int | None, typer.Option("--workers", help="Processes.", show_default="one per core")] = None,
+    plugins: Plugins = None,
+    as_json: AsJson = False,
+) -> None:
+    """Make many images from a job file. May be stopped at any moment; the same command goes on."""
     from optics.study import batch as work
 
     part = work.parse_shard(shard)
@@ -468,26 +714,47 @@ def batch(job: Annotated[Path, typer.Argument(metavar="JOB.toml", help="What to 
     except KeyboardInterrupt:
         raise KeyboardInterrupt("what was made is kept, the same command goes on") from None
     if as_json:
-        return show({"folder": str(result.folder), "total": result.total, "own": result.own, "made": result.made,
-                     "complete": result.complete})
-    print(f"{result.folder}: {result.own} of {result.total} samples, {result.made} of them made now"
-          + (", all complete: manifest.csv" if result.complete else ", other shards are still to come"))
+        return show(
+            {
+                "folder": str(result.folder),
+                "total": result.total,
+                "own": result.own,
+                "made": result.made,
+                "complete": result.complete,
+            }
+        )
+    print(
+        f"{result.folder}: {result.own} of {result.total} samples, {result.made} of them made now"
+        + (", all complete: manifest.csv" if result.complete else ", other shards are still to come")
+    )
 
 
-# -- polarized light -------------------------------------------------------------------------------------------------------
+# -- polarized light
+# -------------------------------------------------------------------------------------------------------
+
 
 @command
-def mueller(scene: SceneName, at: At = None, sets: Settings = None,
-            wavelength: Annotated[list[float] | None, typer.Option(
-                "--wavelength", metavar="NM", help="Repeatable.", show_default="the scene's bands")] = None,
-            part: Annotated[list[str] | None, typer.Option(
-                "--part", metavar="NAME", help="Only these layers, and their product. Repeatable.")] = None,
-            define: Defines = None, plugins: Plugins = None, variant: Variant = None, as_json: AsJson = False) -> None:
+def mueller(
+    scene: SceneName,
+    at: At = None,
+    sets: Settings = None,
+    wavelength: Annotated[
+        list[float] | None,
+        typer.Option("--wavelength", metavar="NM", help="Repeatable.", show_default="the scene's bands"),
+    ] = None,
+    part: Annotated[
+        list[str] | None,
+        typer.Option("--part", metavar="NAME", help="Only these layers, and their product. Repeatable."),
+    ] = None,
+    define: Defines = None,
+    plugins: Plugins = None,
+    variant: Variant = None,
+    as_json: AsJson = False,
+) -> None:
     """Show what the layers on a camera ray do to polarization.
 
-    The Mueller matrix of each layer, their product, and what it means. Axes: x right, y up in the image, angles from x to y.
-    Layers are named from the camera on: the last one is the first that light meets.
-    """
+    The Mueller matrix of each layer, their product, and what it means. Axes: x right, y up in the image, angles from x
+    to y. Layers are named from the camera on: the last one is the first that light meets."""
     from optics.light import paths, polarimetry
 
     loaded = load_scene(scene, define, plugins, variant)
@@ -499,25 +766,41 @@ def mueller(scene: SceneName, at: At = None, sets: Settings = None,
     ray = polarimetry.follow(loaded, values, u, v)
     if not ray.names:
         there = paths.passable(loaded)
-        raise ValueError(f"{loaded.path}: the ray through {u:g},{v:g} passes no layer; " + (
-            f"the scene has {', '.join(there)}: give another place with --at U,V" if there else "the scene has none"))
+        raise ValueError(
+            f"{loaded.path}: the ray through {u:g},{v:g} passes no layer; "
+            + (f"the scene has {', '.join(there)}: give another place with --at U,V" if there else "the scene has none")
+        )
     names, matrices, whole = polarimetry.stack(loaded, values, u, v, bands, part, ray)
     shown = [*zip(names, matrices), *([("product", whole)] if len(names) > 1 else [])]
     if as_json:
+
         def record(own):
             return {"matrix": own.tolist(), "bands": [polarimetry.decompose(m).numbers() for m in own]}
 
         layers = [{"name": n, "kind": loaded.parts[n].kind, **record(own)} for n, own in zip(names, matrices)]
-        return show({"scene": str(loaded.path), "at": [u, v], "wavelengths": bands, "ends_on": ray.end, "lost": ray.lost,
-                     "layers": layers, "product": record(whole)})
-    print(f"the ray through {u:g},{v:g} passes, from the camera on: {', '.join(ray.names)}; "
-          + (f"it ends on {ray.end}" if ray.end else "it meets nothing"))
+        return show(
+            {
+                "scene": str(loaded.path),
+                "at": [u, v],
+                "wavelengths": bands,
+                "ends_on": ray.end,
+                "lost": ray.lost,
+                "layers": layers,
+                "product": record(whole),
+            }
+        )
+    print(
+        f"the ray through {u:g},{v:g} passes, from the camera on: {', '.join(ray.names)}; "
+        + (f"it ends on {ray.end}" if ray.end else "it meets nothing")
+    )
     for name, own in shown:
         title = name if name != "product" else f"product: {' '.join(names)}"
         print(f"\n{title}\n" + _matrices(own, bands))
     print("\n" + _meanings(shown, bands))
     if any(loaded.parts[n].kind == "interface" for n in names):
-        terminal.note("the transmittance of an interface is of radiance, which grows with n^2; at the way out it falls again")
+        terminal.note(
+            "the transmittance of an interface is of radiance, which grows with n^2; at the way out it falls again"
+        )
     if ray.lost:
         terminal.note("this ray is reflected totally on its way: nothing of what stands here arrives at the camera")
 
@@ -533,12 +816,17 @@ def _alike(own, bands) -> list[tuple[str, object]]:
 
 def _matrices(own, bands) -> str:
     """Matrices (B, 4, 4) side by side, with their bands above."""
+
     def entry(value):
         return f"{value:9.5f}" if abs(value) >= 5e-7 else f"{'0':>9}"
 
     found = _alike(own, bands)
-    return "\n".join(["    ".join(f"{band:<38}" for band, _ in found).rstrip(),
-                      *("    ".join(f"[{''.join(map(entry, m[i]))}]" for _, m in found) for i in range(4))])
+    return "\n".join(
+        [
+            "    ".join(f"{band:<38}" for band, _ in found).rstrip(),
+            *("    ".join(f"[{''.join(map(entry, m[i]))}]" for _, m in found) for i in range(4)),
+        ]
+    )
 
 
 def _meanings(shown, bands) -> str:
@@ -549,36 +837,85 @@ def _meanings(shown, bands) -> str:
         return "-" if math.isnan(value) else f"{0 if abs(value) < small else value:.{digits}g}"
 
     def axis(angle, ellipticity):
-        return cell(angle, 4, 1e-4) + ("" if math.isnan(ellipticity) or abs(ellipticity) < 0.05 else f" ({ellipticity:+.1f})")
+        return cell(angle, 4, 1e-4) + (
+            "" if math.isnan(ellipticity) or abs(ellipticity) < 0.05 else f" ({ellipticity:+.1f})"
+        )
 
-    lines = [("", "", "T", "T max", "T min", "diattenuation", "axis", "retardance", "fast axis", "depolarization", "index",
-              "physical")]
+    lines = [
+        (
+            "",
+            "",
+            "T",
+            "T max",
+            "T min",
+            "diattenuation",
+            "axis",
+            "retardance",
+            "fast axis",
+            "depolarization",
+            "index",
+            "physical",
+        )
+    ]
     for name, own in shown:
         for band, matrix in _alike(own, bands):
             d = decompose(matrix)
-            lines.append((name, band, cell(d.transmittance), cell(d.largest), cell(d.smallest), cell(d.diattenuation, 5),
-                          axis(d.axis, d.axis_ellipticity), cell(d.retardance, 4, 1e-4), axis(d.fast_axis, d.fast_ellipticity),
-                          cell(d.depolarization), cell(d.depolarization_index, 5), "no" if d.realisable < -1e-9 else "yes"))
-    return (table(lines) + "\nT: transmittance of unpolarized light. Axes and retardance in deg, an ellipticity (+-45: circular) in "
-            "brackets. Depolarization: 0 none;\nindex: 1 none. '-': no meaning here, such as the retardance of a perfect polarizer.")
+            lines.append(
+                (
+                    name,
+                    band,
+                    cell(d.transmittance),
+                    cell(d.largest),
+                    cell(d.smallest),
+                    cell(d.diattenuation, 5),
+                    axis(d.axis, d.axis_ellipticity),
+                    cell(d.retardance, 4, 1e-4),
+                    axis(d.fast_axis, d.fast_ellipticity),
+                    cell(d.depolarization),
+                    cell(d.depolarization_index, 5),
+                    "no" if d.realisable < -1e-9 else "yes",
+                )
+            )
+    return (
+        table(lines)
+        + "\nT: transmittance of unpolarized light. Axes and retardance in deg, an ellipticity (+-45: circular) in "
+        "brackets. Depolarization: 0 none;\nindex: 1 none. '-': no meaning here, such as the retardance of a perfect polarizer."
+    )
 
 
 @command
-def sweep(scene: SceneName,
-          key: Annotated[str, typer.Option("--key", metavar="KEY", help="What is turned or changed.")] = "analyzer.angle",
-          first: Annotated[float | None, typer.Option(
-              "--from", metavar="VALUE", help="First value.", show_default="0 of an angle")] = None,
-          last: Annotated[float | None, typer.Option(
-              "--to", metavar="VALUE", help="Last value.", show_default="180 of an angle")] = None,
-          steps: Annotated[int, typer.Option("--steps", min=2, max=10000, help="Values, both ends included.")] = 37, at: At = None,
-          output: Annotated[Path | None, typer.Option("-o", "--output", metavar="FILE.png", help="Plot the curve.")] = None,
-          csv: Annotated[Path | None, typer.Option("--csv", metavar="FILE", help="Write the curve as a table.")] = None,
-          captures: Annotated[Path | None, typer.Option(
-              "--captures", metavar="CAPTURES", help="Measured readings to hold beside it: a folder with captures.toml.")] = None,
-          fit: Annotated[Path | None, typer.Option("--fit", metavar="FIT.toml", help="Calibrated values, from a study.")] = None,
-          radiance: Annotated[bool, typer.Option("--radiance", help="Radiance per band in place of the camera's DN.")] = False,
-          define: Defines = None, sets: Settings = None, plugins: Plugins = None, variant: Variant = None, force: Force = False,
-          as_json: AsJson = False) -> None:
+def sweep(
+    scene: SceneName,
+    key: Annotated[str, typer.Option("--key", metavar="KEY", help="What is turned or changed.")] = "analyzer.angle",
+    first: Annotated[
+        float | None, typer.Option("--from", metavar="VALUE", help="First value.", show_default="0 of an angle")
+    ] = None,
+    last: Annotated[
+        float | None, typer.Option("--to", metavar="VALUE", help="Last value.", show_default="180 of an angle")
+    ] = None,
+    steps: Annotated[int, typer.Option("--steps", min=2, max=10000, help="Values, both ends included.")] = 37,
+    at: At = None,
+    output: Annotated[Path | None, typer.Option("-o", "--output", metavar="FILE.png", help="Plot the curve.")] = None,
+    csv: Annotated[Path | None, typer.Option("--csv", metavar="FILE", help="Write the curve as a table.")] = None,
+    captures: Annotated[
+        Path | None,
+        typer.Option(
+            "--captures", metavar="CAPTURES", help="Measured readings to hold beside it: a folder with captures.toml."
+        ),
+    ] = None,
+    fit: Annotated[
+        Path | None, typer.Option("--fit", metavar="FIT.toml", help="Calibrated values, from a study.")
+    ] = None,
+    radiance: Annotated[
+        bool, typer.Option("--radiance", help="Radiance per band in place of the camera's DN.")
+    ] = False,
+    define: Defines = None,
+    sets: Settings = None,
+    plugins: Plugins = None,
+    variant: Variant = None,
+    force: Force = False,
+    as_json: AsJson = False,
+) -> None:
     """Predict a reading against an angle, or any parameter.
 
     What a pixel or a photodiode reads, its extinction ratio, how far it is from Malus' cos^2; -o draws the curves.
@@ -587,18 +924,19 @@ def sweep(scene: SceneName,
 
     from optics.captures import capture_set as capture_files
     from optics.files.output import claim, replacing
-    from optics.light import output as picture
-    from optics.light import polarimetry
+    from optics.light import polarimetry, rendering
     from optics.study import record as ladder
 
     if output is not None and output.suffix.lower() not in (".png", ".pdf", ".svg"):
-        raise ValueError(f"-o {output}: '{output.suffix}' is no format of a plot; allowed: a name ending in .png, .pdf or .svg")
+        raise ValueError(
+            f"-o {output}: '{output.suffix}' is no format of a plot; allowed: a name ending in .png, .pdf or .svg"
+        )
     claim([f for f in (output, csv) if f is not None], force)
     if radiance and captures is not None:
         raise ValueError("--radiance and --captures: readings are DN; leave out one of them")
     loaded = load_scene(scene, define, plugins, variant)
     place = polarimetry.pixel(loaded, at)
-    if reason := picture.obstacle(loaded):
+    if reason := rendering.obstacle(loaded):
         raise ValueError(f"{loaded.path}: no prediction light by light: {reason}; `optics render` goes through Mitsuba")
     values = {}
     if fit is not None:
@@ -609,8 +947,17 @@ def sweep(scene: SceneName,
     first, last = polarimetry.span(loaded, key, first, last)
     readings = capture_files.load(captures) if captures is not None else None
     with terminal.progress() as progress:
-        found = polarimetry.sweep(loaded, key, np.linspace(first, last, steps), place, {**values, **chosen}, radiance=radiance,
-                                  captures=readings, only=chosen, progress=progress)
+        found = polarimetry.sweep(
+            loaded,
+            key,
+            np.linspace(first, last, steps),
+            place,
+            {**values, **chosen},
+            radiance=radiance,
+            captures=readings,
+            only=chosen,
+            progress=progress,
+        )
     if csv is not None:
         with replacing(csv) as temporary:
             temporary.write_text(found.to_csv(), encoding="utf-8")
@@ -621,11 +968,24 @@ def sweep(scene: SceneName,
     rows = found.summary()
     if as_json:
         curves = [{"settings": c.settings, "values": c.x.tolist(), "readings": c.y.tolist()} for c in found.curves]
-        return show({"scene": str(loaded.path), "key": key, "unit": found.unit, "at": list(place), "black": found.black,
-                     "quantity": "radiance" if radiance else "DN", "channels": found.channels, "summary": rows, "curves": curves,
-                     "files": [str(f) for f in (output, csv) if f]})
-    print(f"{key} from {first:g} to {last:g} {found.unit}, {'radiance per band' if radiance else 'DN'} at pixel "
-          f"{place[0]:g},{place[1]:g}" + (f", black {found.black:g}" if found.black else ""))
+        return show(
+            {
+                "scene": str(loaded.path),
+                "key": key,
+                "unit": found.unit,
+                "at": list(place),
+                "black": found.black,
+                "quantity": "radiance" if radiance else "DN",
+                "channels": found.channels,
+                "summary": rows,
+                "curves": curves,
+                "files": [str(f) for f in (output, csv) if f],
+            }
+        )
+    print(
+        f"{key} from {first:g} to {last:g} {found.unit}, {'radiance per band' if radiance else 'DN'} at pixel "
+        f"{place[0]:g},{place[1]:g}" + (f", black {found.black:g}" if found.black else "")
+    )
     print(_readings(found, rows))
     for file in (output, csv):
         if file is not None:
@@ -634,30 +994,67 @@ def sweep(scene: SceneName,
 
 def _readings(found, rows) -> str:
     """The summary of a sweep as a table."""
-    several, ideal, measured = (any(r.get(k) is not None for r in rows) for k in ("settings", "from_ideal", "from_measured"))
+    several, ideal, measured = (
+        any(r.get(k) is not None for r in rows) for k in ("settings", "from_ideal", "from_measured")
+    )
     at_unit = f"at{spaced(found.unit)}"
-    lines = [(*(["settings"] if several else []), "channel", "largest", at_unit, "smallest", at_unit,
-              "extinction ratio" if found.turns else "ratio", "contrast", *(["from cos^2"] if ideal else []),
-              *(["measured - predicted, rms"] if measured else []))]
+    lines = [
+        (
+            *(["settings"] if several else []),
+            "channel",
+            "largest",
+            at_unit,
+            "smallest",
+            at_unit,
+            "extinction ratio" if found.turns else "ratio",
+            "contrast",
+            *(["from cos^2"] if ideal else []),
+            *(["measured - predicted, rms"] if measured else []),
+        )
+    ]
     for r in rows:
         own = ", ".join(f"{k} = {_number(v)}" for k, v in r.get("settings", {}).items())
         numbers = [f"{r[k]:.5g}" for k in ("largest", "at", "smallest", "dark_at", "extinction_ratio", "contrast")]
         departure = "-" if r["from_ideal"] is None else f"{r['from_ideal']:.2%}"
-        lines.append((*([own] if several else []), r["channel"], *numbers, *([departure] if ideal else []),
-                      *([f"{r['from_measured']:.4g}"] if measured else [])))
+        lines.append(
+            (
+                *([own] if several else []),
+                r["channel"],
+                *numbers,
+                *([departure] if ideal else []),
+                *([f"{r['from_measured']:.4g}"] if measured else []),
+            )
+        )
     return table(lines)
 
 
-# -- models and measurements ----------------------------------------------------------------------------------------------
+# -- models and measurements
+# ----------------------------------------------------------------------------------------------
+
 
 @command
-def compare(captures: CaptureSet,
-            fit: Annotated[Path | None, typer.Option("--fit", metavar="FIT.toml", help="Calibrated values, from a study.")] = None,
-            output: Annotated[Path | None, typer.Option("-o", "--output", metavar="DIR", help="Write numbers and images here.")] = None,
-            hold_out: Annotated[list[str] | None, typer.Option(
-                "--hold-out", metavar="GROUP", help="Groups of frames that the fit has not seen, to be told apart. Repeatable.")] = None,
-            define: Defines = None, sets: Settings = None, flat_field: FlatField = None, plugins: Plugins = None,
-            as_json: AsJson = False) -> None:
+def compare(
+    captures: CaptureSet,
+    fit: Annotated[
+        Path | None, typer.Option("--fit", metavar="FIT.toml", help="Calibrated values, from a study.")
+    ] = None,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", metavar="DIR", help="Write numbers and images here.")
+    ] = None,
+    hold_out: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--hold-out",
+            metavar="GROUP",
+            help="Groups of frames that the fit has not seen, to be told apart. Repeatable.",
+        ),
+    ] = None,
+    define: Defines = None,
+    sets: Settings = None,
+    flat_field: FlatField = None,
+    plugins: Plugins = None,
+    as_json: AsJson = False,
+) -> None:
     """Hold a scene against captures: misfit by frame, LED, region and channel."""
     from optics.study import loop
     from optics.study import record as ladder
@@ -671,7 +1068,7 @@ def compare(captures: CaptureSet,
     values = values_of(model, fit, setup.values)
     comparison = loop.comparison_of(model, values, loop.split(model, setup)[1], 0, 0)
     if output is not None:
-        worst = comparison.worst()[:ladder.SHOWN_MAX]
+        worst = comparison.worst()[: ladder.SHOWN_MAX]
         with _new_folder(output) as folder:
             (folder / "comparison.txt").write_text(comparison.text() + "\n", encoding="utf-8")
             (folder / "comparison.csv").write_text(comparison.to_csv(), encoding="utf-8")
@@ -706,46 +1103,86 @@ def values_of(model, fit: Path | None, sets: Mapping[str, float | str]):
 
 
 @command
-def calibrate(captures: CaptureSet,
-              output: Annotated[Path, typer.Option("-o", "--output", metavar="STUDY", help="Folder of the new study.")],
-              free: Annotated[list[str] | None, typer.Option(
-                  "--free", metavar="PATTERN", help="Parameters to solve for, such as 'led_*.x'. Repeatable. Without it: every "
-                  "LED's position, axis, lobe and power, every membrane's reflectance and roughness.")] = None,
-              per_group: Annotated[list[str] | None, typer.Option(
-                  "--per-group", metavar="PATTERN", help="Parameters with a value per group of frames. Without it: where and how "
-                  "deep each press is. 'none': none.")] = None,
-              prior: Annotated[list[str] | None, typer.Option(
-                  "--prior", metavar="PATTERN=MEAN+-SD", help="What is known beforehand. Repeatable.")] = None,
-              hold_out: Annotated[list[str] | None, typer.Option(
-                  "--hold-out", metavar="GROUP", help="Groups of frames to test on and not to fit. Repeatable. Without it: one in "
-                  "four. 'none': none.")] = None,
-              define: Defines = None, sets: Settings = None, flat_field: FlatField = None, plugins: Plugins = None,
-              robust: Annotated[bool, typer.Option("--robust", help="Let residuals beyond three sigmas count less (Huber).")] = False,
-              seed: Annotated[int, typer.Option("--seed", min=0, help="Of everything random.")] = 0,
-              title: Annotated[str, typer.Option("--title", help="Of the study's report.")] = "",
-              resume: Annotated[bool, typer.Option("--resume", help="Go on with this study.")] = False,
-              as_json: AsJson = False) -> None:
+def calibrate(
+    captures: CaptureSet,
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="STUDY", help="Folder of the new study.")],
+    free: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--free",
+            metavar="PATTERN",
+            help="Parameters to solve for, such as 'led_*.x'. Repeatable. Without it: every "
+            "LED's position, axis, lobe and power, every membrane's reflectance and roughness.",
+        ),
+    ] = None,
+    per_group: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--per-group",
+            metavar="PATTERN",
+            help="Parameters with a value per group of frames. Without it: where and how "
+            "deep each press is. 'none': none.",
+        ),
+    ] = None,
+    prior: Annotated[
+        list[str] | None,
+        typer.Option("--prior", metavar="PATTERN=MEAN+-SD", help="What is known beforehand. Repeatable."),
+    ] = None,
+    hold_out: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--hold-out",
+            metavar="GROUP",
+            help="Groups of frames to test on and not to fit. Repeatable. Without it: one in four. 'none': none.",
+        ),
+    ] = None,
+    define: Defines = None,
+    sets: Settings = None,
+    flat_field: FlatField = None,
+    plugins: Plugins = None,
+    robust: Annotated[
+        bool, typer.Option("--robust", help="Let residuals beyond three sigmas count less (Huber).")
+    ] = False,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Of everything random.")] = 0,
+    title: Annotated[str, typer.Option("--title", help="Of the study's report.")] = "",
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with this study.")] = False,
+    as_json: AsJson = False,
+) -> None:
     """Start a study: solve for the free parameters of the base model, and test it on frames that were held out."""
     from optics.files.output import check_folder
     from optics.study import loop
 
     check_folder(output)
     none = lambda names: [] if names == ["none"] else names  # noqa: E731
-    setup = setup_of(captures, define, plugins, sets, free=free or [], per_group=none(per_group), priors=priors(prior),
-                     held_out=none(hold_out), flat_field=flat_field, robust=robust, seed=seed)
+    setup = setup_of(
+        captures,
+        define,
+        plugins,
+        sets,
+        free=free or [],
+        per_group=none(per_group),
+        priors=priors(prior),
+        held_out=none(hold_out),
+        flat_field=flat_field,
+        robust=robust,
+        seed=seed,
+    )
     with terminal.progress() as progress:
-        study, model, fit = loop.begin(setup, output, title=title, command=["optics", *sys.argv[1:]], resume=resume,
-                                       progress=progress)
+        study, model, fit = loop.begin(
+            setup, output, title=title, command=["optics", *sys.argv[1:]], resume=resume, progress=progress
+        )
     for text in study.record["warnings"]:
         terminal.note(f"warning: {_one_line(text)}")
     show({"study": str(study.folder), **study.steps[0]}) if as_json else print(
-        f"{fit.table()}\n\n{study.table()}\n{null_text(study)}{study.folder}")
+        f"{fit.table()}\n\n{study.table()}\n{null_text(study)}{study.folder}"
+    )
     if not fit.converged:
         raise typer.Exit(1)
 
 
 def null_text(study) -> str:
-    """The last step beside models without physics, and the share of the background that the scene explains; '' without either."""
+    """The last step beside models without physics, and the share of the background that the scene explains; '' without
+    either."""
     from optics.fit.null_models import NullTable
 
     metrics, text = study.metrics(len(study.steps) - 1), ""
@@ -757,20 +1194,39 @@ def null_text(study) -> str:
     return text
 
 
-@app.command("import", help="Read a measured data set of ball presses into a capture folder, with a scene to start from.")
-def import_(source: Annotated[Path, typer.Argument(metavar="SOURCE", help="An .npz calibration pack, or a folder of pictures.")],
-            output: Annotated[Path, typer.Option("-o", "--output", metavar="CAPTURES", help="Folder of the new capture set.")],
-            circles: Annotated[Path | None, typer.Option("--circles", metavar="CSV", help="For a folder: file, center_x_px, "
-                                                         "center_y_px, contact_radius_px.")] = None,
-            ball_radius: Annotated[float | None, typer.Option("--ball-radius", help="mm")] = None,
-            mm_per_pixel: Annotated[float | None, typer.Option("--mm-per-pixel", help="Scale of the pictures as they are.")] = None,
-            untouched: Annotated[Path | None, typer.Option("--untouched", metavar="IMAGE", help="For a folder: the sensor without "
-                                                           "contact; without it the median of the presses.")] = None,
-            leds: Annotated[int, typer.Option("--leds", help="LEDs of the scene to start from: 3 or 6.")] = 3,
-            bin: Annotated[int, typer.Option("--bin", min=1, help="Average this many pixels each way.")] = 1,
-            every: Annotated[int, typer.Option("--every", min=1, help="Take every n-th press.")] = 1,
-            force: Force = False, quiet: Quiet = False, debug: Debug = False) -> None:
-    """Read presses, check labels and scale against each other, write captures.toml, a scene and what contradicts itself."""
+@app.command(
+    "import", help="Read a measured data set of ball presses into a capture folder, with a scene to start from."
+)
+def import_(
+    source: Annotated[Path, typer.Argument(metavar="SOURCE", help="An .npz calibration pack, or a folder of images.")],
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="CAPTURES", help="Folder of the new capture set.")],
+    circles: Annotated[
+        Path | None,
+        typer.Option(
+            "--circles", metavar="CSV", help="For a folder: file, center_x_px, center_y_px, contact_radius_px."
+        ),
+    ] = None,
+    ball_radius: Annotated[float | None, typer.Option("--ball-radius", help="mm")] = None,
+    mm_per_pixel: Annotated[
+        float | None, typer.Option("--mm-per-pixel", help="Scale of the images as they are.")
+    ] = None,
+    untouched: Annotated[
+        Path | None,
+        typer.Option(
+            "--untouched",
+            metavar="IMAGE",
+            help="For a folder: the sensor without contact; without it the median of the presses.",
+        ),
+    ] = None,
+    leds: Annotated[int, typer.Option("--leds", help="LEDs of the scene to start from: 3 or 6.")] = 3,
+    bin: Annotated[int, typer.Option("--bin", min=1, help="Average this many pixels each way.")] = 1,
+    every: Annotated[int, typer.Option("--every", min=1, help="Take every n-th press.")] = 1,
+    force: Force = False,
+    quiet: Quiet = False,
+    debug: Debug = False,
+) -> None:
+    """Read presses, check labels and scale against each other, write captures.toml, a scene and what contradicts
+    itself."""
     from optics.captures import importing
 
     terminal.quiet, terminal.debug = quiet, debug
@@ -783,11 +1239,15 @@ def import_(source: Annotated[Path, typer.Argument(metavar="SOURCE", help="An .n
         found = importing.import_taxim(source, output, **options)
     else:
         if circles is None:
-            raise ValueError(f"{source}: a folder of pictures needs --circles CSV with the columns file, center_x_px, center_y_px, "
-                             "contact_radius_px")
+            raise ValueError(
+                f"{source}: a folder of images needs --circles CSV with the columns file, center_x_px, center_y_px, "
+                "contact_radius_px"
+            )
         missing = [n for n, v in (("--ball-radius", ball_radius), ("--mm-per-pixel", mm_per_pixel)) if v is None]
         if missing:
-            raise ValueError(f"{source}: {' and '.join(missing)} missing: the size of the ball and of a pixel cannot be read off circles")
+            raise ValueError(
+                f"{source}: {' and '.join(missing)} missing: the size of the ball and of a pixel cannot be read off circles"
+            )
         found = importing.import_circles(source, circles, output, untouched=untouched, **options)
     for text in found.warnings:
         terminal.note(f"warning: {_one_line(text)}")
@@ -795,9 +1255,13 @@ def import_(source: Annotated[Path, typer.Argument(metavar="SOURCE", help="An .n
 
 
 @command
-def diagnose(study: StudyFolder, as_json: AsJson = False,
-             csv: Annotated[Path | None, typer.Option("--csv", metavar="FILE", help="Write the table of effects here.")] = None) -> None:
-    """Ask what the last step of a study lacks: every effect scored, the best ones added in earnest, one of six verdicts.
+def diagnose(
+    study: StudyFolder,
+    as_json: AsJson = False,
+    csv: Annotated[Path | None, typer.Option("--csv", metavar="FILE", help="Write the table of effects here.")] = None,
+) -> None:
+    """Ask what the last step of a study lacks: every effect scored, the best ones added and refitted, one of six
+    verdicts.
 
     The exit code is 1 where the verdict is UNKNOWN or CANNOT TELL, else 0.
     """
@@ -817,11 +1281,19 @@ def diagnose(study: StudyFolder, as_json: AsJson = False,
 
 
 @command
-def rehearse(study: StudyFolder,
-             change: Annotated[float, typer.Option(metavar="PERCENT", help="How much each hidden effect changes the pictures: rms over the mean "
-                                                                           "signal, before any calibration.")] = 0.5,
-             as_json: AsJson = False) -> None:
-    """Say which effects would be found in these captures, were they hidden in them, and what each would be taken for."""
+def rehearse(
+    study: StudyFolder,
+    change: Annotated[
+        float,
+        typer.Option(
+            metavar="PERCENT",
+            help="How much each hidden effect changes the images: rms over the mean signal, before any calibration.",
+        ),
+    ] = 0.5,
+    as_json: AsJson = False,
+) -> None:
+    """Say which effects would be found in these captures, were they hidden in them, and what each would be taken
+    for."""
     from optics.diagnosis.rehearse import rehearse as rehearsed
     from optics.study import loop
 
@@ -829,17 +1301,28 @@ def rehearse(study: StudyFolder,
     fit = loop.restore(found, model)
     fitted, _ = loop.split(model, setup)
     with terminal.progress() as progress:
-        result = rehearsed(model, fit, loop.candidates(model, found), lambda e: loop.effect_variables(model, e), fitted, change=change / 100,
-                           seed=setup.seed, progress=progress)
+        result = rehearsed(
+            model,
+            fit,
+            loop.candidates(model, found),
+            lambda e: loop.effect_variables(model, e),
+            fitted,
+            change=change / 100,
+            seed=setup.seed,
+            progress=progress,
+        )
     print(result.to_json() if as_json else result.text(), end="")
 
 
 @command
-def imitate(study: StudyFolder,
-            output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="A new capture folder.")],
-            sets: Settings = None,
-            seed: Annotated[int, typer.Option(help="Of the noise.")] = 1) -> None:
-    """Write captures as the study's model would take them, with an effect put in: --set camera.vignetting=0.3 shows what that would look like."""
+def imitate(
+    study: StudyFolder,
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="A new capture folder.")],
+    sets: Settings = None,
+    seed: Annotated[int, typer.Option(help="Of the noise.")] = 1,
+) -> None:
+    """Write captures as the study's model would take them, with an effect put in: --set camera.vignetting=0.3 shows
+    what that would look like."""
     from optics.diagnosis.rehearse import imitate as imitated
     from optics.study import loop
 
@@ -853,19 +1336,34 @@ def imitate(study: StudyFolder,
 
 
 @command
-def design(subject: Annotated[str, typer.Argument(metavar="SCENE|STUDY", help="A scene, or a study whose values and noise are taken.")],
-           frames: Annotated[int, typer.Option("--frames", "-n", metavar="N", help="How many frames to take.")] = 12,
-           effects: Annotated[str | None, typer.Option("--effects", metavar="A,B,...", help="Which may be missing.",
-                                                       show_default="all that the scene can express")] = None,
-           strength: Annotated[float, typer.Option("--strength", metavar="X", help="Of every effect, in plausible sizes.")] = 0.1,
-           fixed_exposure: Annotated[bool, typer.Option("--fixed-exposure", help="Leave the exposure as the scene has it.")] = False,
-           output: Annotated[Path | None, typer.Option("-o", "--output", metavar="DIR", help="Write a captures.toml to fill in.")] = None,
-           defines: Defines = None, plugins: Plugins = None,
-           system_gain: Annotated[float | None, typer.Option(help="DN per electron.", show_default="0.04")] = None,
-           dark_noise: Annotated[float | None, typer.Option(help="DN, rms.", show_default="0.8")] = None,
-           black_level: Annotated[float | None, typer.Option(help="DN.", show_default="8")] = None,
-           saturation: Annotated[float | None, typer.Option(help="DN.", show_default="255")] = None,
-           as_json: AsJson = False) -> None:
+def design(
+    subject: Annotated[
+        str, typer.Argument(metavar="SCENE|STUDY", help="A scene, or a study whose values and noise are taken.")
+    ],
+    frames: Annotated[int, typer.Option("--frames", "-n", metavar="N", help="How many frames to take.")] = 12,
+    effects: Annotated[
+        str | None,
+        typer.Option(
+            "--effects", metavar="A,B,...", help="Which may be missing.", show_default="all that the scene can express"
+        ),
+    ] = None,
+    strength: Annotated[
+        float, typer.Option("--strength", metavar="X", help="Of every effect, in plausible sizes.")
+    ] = 0.1,
+    fixed_exposure: Annotated[
+        bool, typer.Option("--fixed-exposure", help="Leave the exposure as the scene has it.")
+    ] = False,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", metavar="DIR", help="Write a captures.toml to fill in.")
+    ] = None,
+    defines: Defines = None,
+    plugins: Plugins = None,
+    system_gain: Annotated[float | None, typer.Option(help="DN per electron.", show_default="0.04")] = None,
+    dark_noise: Annotated[float | None, typer.Option(help="DN, rms.", show_default="0.8")] = None,
+    black_level: Annotated[float | None, typer.Option(help="DN.", show_default="8")] = None,
+    saturation: Annotated[float | None, typer.Option(help="DN.", show_default="255")] = None,
+    as_json: AsJson = False,
+) -> None:
     """Plan a capture session: the frames that keep a scene's effects apart, and the effects that no frames will."""
     from optics.study import design as planning
 
@@ -873,16 +1371,28 @@ def design(subject: Annotated[str, typer.Argument(metavar="SCENE|STUDY", help="A
     if output is not None:
         _check_new_folder(output)
     with terminal.progress() as progress:
-        result = planning.session(subject, frames, [e.strip() for e in (effects or "").split(",") if e.strip()], pairs(defines, "-D"),
-                                  plugins, {k: v for k, v in given.items() if v is not None}, strength, fixed_exposure, progress)
+        result = planning.session(
+            subject,
+            frames,
+            [e.strip() for e in (effects or "").split(",") if e.strip()],
+            pairs(defines, "-D"),
+            plugins,
+            {k: v for k, v in given.items() if v is not None},
+            strength,
+            fixed_exposure,
+            progress,
+        )
     if output is not None:
         terminal.note(f"to fill in: {planning.write(result, output) / 'captures.toml'}")
     show(result.json()) if as_json else print(result.text())
 
 
 @command
-def add(study: StudyFolder, effect: Annotated[str, typer.Argument(metavar="EFFECT", help="Its name (`optics effects`).")],
-        as_json: AsJson = False) -> None:
+def add(
+    study: StudyFolder,
+    effect: Annotated[str, typer.Argument(metavar="EFFECT", help="Its name (`optics effects`).")],
+    as_json: AsJson = False,
+) -> None:
     """Free an effect, calibrate everything again, and record it as the next step of the study."""
     from optics.scene.registry import registry
     from optics.study import loop
@@ -890,7 +1400,9 @@ def add(study: StudyFolder, effect: Annotated[str, typer.Argument(metavar="EFFEC
     found, model, setup = loop.take_up(study)
     chosen = registry().find_effect(effect)
     if found.has(chosen.key):
-        raise ValueError(f"{study}: '{chosen.name}' is part of the study already; `optics diagnose {study}` asks what else is missing")
+        raise ValueError(
+            f"{study}: '{chosen.name}' is part of the study already; `optics diagnose {study}` asks what else is missing"
+        )
     fit = loop.restore(found, model)
     with terminal.progress() as progress:
         fit, _ = loop.extend(found, model, setup, fit, chosen, progress=progress)
@@ -898,21 +1410,32 @@ def add(study: StudyFolder, effect: Annotated[str, typer.Argument(metavar="EFFEC
 
 
 @command
-def report(study: StudyFolder,
-           output: Annotated[Path | None, typer.Option("-o", "--output", metavar="PAGE.html", help="Default: STUDY/report.html.")] = None,
-           force: Force = False) -> None:
-    """Write a study as one HTML page: pictures, ranking, ladder."""
+def report(
+    study: StudyFolder,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", metavar="PAGE.html", help="Default: STUDY/report.html.")
+    ] = None,
+    force: Force = False,
+) -> None:
+    """Write a study as one HTML page: images, ranking, ladder."""
     from optics.pages.report import report as write
 
     print(write(study, output or study / "report.html", overwrite=force))
 
 
 @command
-def view(study: StudyFolder,
-         step: Annotated[int | None, typer.Option("--step", metavar="N", help="Begin from this step.", show_default="the last one")] = None,
-         port: Annotated[int, typer.Option("--port", min=0, max=65535, help="Of the page, on this machine alone.", show_default="any")] = 0,
-         browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the page in the browser.")] = True) -> None:
-    """Open a page to switch effects and slide parameters, while prediction, residual and misfit follow. Ctrl-C ends it."""
+def view(
+    study: StudyFolder,
+    step: Annotated[
+        int | None, typer.Option("--step", metavar="N", help="Begin from this step.", show_default="the last one")
+    ] = None,
+    port: Annotated[
+        int, typer.Option("--port", min=0, max=65535, help="Of the page, on this machine alone.", show_default="any")
+    ] = 0,
+    browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the page in the browser.")] = True,
+) -> None:
+    """Open a page to switch effects and slide parameters, while prediction, residual and misfit follow. Ctrl-C ends
+    it."""
     from optics.pages import view as page
 
     def ready(url: str) -> None:
@@ -927,10 +1450,16 @@ def view(study: StudyFolder,
 
 
 @command
-def demo(output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Where captures, study and report go.")] = Path("renders/demo"),
-         seed: Annotated[int, typer.Option("--seed", min=0, help="Chooses the sensor and its hidden effect.")] = 1,
-         effect: Annotated[str | None, typer.Option("--effect", help="Hide this effect instead.")] = None,
-         sensor: Annotated[str, typer.Option("--sensor", help="gelsight (six white LEDs), digit (red, green, blue) or polarizer_bench.")] = "gelsight") -> None:
+def demo(
+    output: Annotated[
+        Path, typer.Option("-o", "--output", metavar="DIR", help="Where captures, study and report go.")
+    ] = Path("renders/demo"),
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Chooses the sensor and its hidden effect.")] = 1,
+    effect: Annotated[str | None, typer.Option("--effect", help="Hide this effect instead.")] = None,
+    sensor: Annotated[
+        str, typer.Option("--sensor", help="gelsight (six white LEDs), digit (red, green, blue) or polarizer_bench.")
+    ] = "gelsight",
+) -> None:
     """Make a sensor with a secret, by another path than the model, and find what is missing."""
     from optics.errors import UnknownKey
     from optics.proof import demo as story
@@ -942,16 +1471,22 @@ def demo(output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", h
         found = story.run(output, seed, effect, sensor, progress, lambda text: print(text + "\n", flush=True))
     hidden = found["hidden"]
     strengths = [f"{name} = {value:.4g} +- {sd:.2g}" for name, (value, sd) in found["strengths"].items()]
-    print(f"hidden: {hidden['effect']}, strength {hidden['strength']:g}; named: {', '.join(found['claimed']) or 'nothing'}"
-          f"{' (' + ', '.join(strengths[:3]) + (' ...' if len(strengths) > 3 else '') + ')' if strengths else ''}; "
-          f"last verdict: {found['verdict']}")
-    print(f"held-out chi2 per degree of freedom: {found['first']:.3f} before, {found['held_out']:.3f} after; "
-          f"{time.monotonic() - clock:.0f} s; {found['report']}")
+    print(
+        f"hidden: {hidden['effect']}, strength {hidden['strength']:g}; named: {', '.join(found['claimed']) or 'nothing'}"
+        f"{' (' + ', '.join(strengths[:3]) + (' ...' if len(strengths) > 3 else '') + ')' if strengths else ''}; "
+        f"last verdict: {found['verdict']}"
+    )
+    print(
+        f"held-out chi2 per degree of freedom: {found['first']:.3f} before, {found['held_out']:.3f} after; "
+        f"{time.monotonic() - clock:.0f} s; {found['report']}"
+    )
     if not found["right"]:
         raise typer.Exit(1)
 
 
-# -- folders --------------------------------------------------------------------------------------------------------------
+# -- folders
+# --------------------------------------------------------------------------------------------------------------
+
 
 def _check_new_folder(folder: Path) -> None:
     from optics.errors import OutputExists

@@ -1,16 +1,18 @@
-"""The next measurement: which frame would tell effects apart that the present frames cannot, by how much, before it is taken.
+"""The next measurement: which frame would tell effects apart that the present frames cannot, by how much, before it is
+taken.
 
-A shot is rendered at the study's values with hypothetical settings (another exposure, a deeper press, other lights, a turned polarizer);
-its derivative images say what it would add. With G_A, G_B what is left of two effects' images, in units of the noise, after everything
-that a calibration solves for is projected off, and effect A true with the strength s that was found for it,
+A shot is rendered at the study's values with hypothetical settings (another exposure, a deeper press, other lights, a
+turned polarizer); its derivative images say what it would add. With G_A, G_B what is left of two effects' images, in
+units of the noise, after everything that a calibration solves for is projected off, and effect A true with the strength
+s that was found for it,
 
     D_AB = s^2 (|G_A|^2 - (G_A.G_B)^2/|G_B|^2)         expected chi2 by which the data prefer A over B at its best
     P(A beats B) = Phi(sqrt(D_AB)/2)
 
-(T-optimality: Atkinson & Fedorov, Biometrika 62, 57 (1975); several and one-sided strengths: `optics.diagnosis.statistics.gap`). Informations of
-frames add up, so that a choice among shots costs algebra only. A new press brings unknowns of its own, its place and depth with what
-the stage knows of them; every frame brings what the study solves for in each frame. Saturated pixels of a shot do not count.
-"""
+(T-optimality: Atkinson & Fedorov, Biometrika 62, 57 (1975); several and one-sided strengths:
+`optics.diagnosis.statistics.gap`). Informations of frames add up, so that a choice among shots costs algebra only. A
+new press brings unknowns of its own, its place and depth with what the stage knows of them; every frame brings what the
+study solves for in each frame. Saturated pixels of a shot do not count."""
 
 from __future__ import annotations
 
@@ -42,7 +44,8 @@ SHOTS = 20  # that are simulated: each costs the derivative images of one frame
 ROWS = 300_000  # values that all shots together may keep: informations of thinned pixels, scaled up
 ENOUGH = 4 * CLEAR  # D at which the right one wins in 99.95 % of cases; more is not asked of a plan
 MEMBERS = 5  # effects that are told apart at once
-LIKELY = 6.0  # of chi2 below the best: 20 times less likely the cause in noise alone; a rival still, but not taken to be true
+# of chi2 below the best: 20 times less likely the cause in noise alone; a rival still, but not taken to be true
+LIKELY = 6.0
 CLOCKS = ("time", "approach")  # settings that tell when and from where, not what
 UNTOUCHED = "untouched"  # the press that is none: its place is not unknown
 
@@ -67,18 +70,28 @@ class Shot:
 
 
 def families(model, values: Values, frames: Sequence[int]) -> list[Shot]:
-    """The shots to try, at most SHOTS, the families' first members first: found from the keys that the model has and frames turn.
+    """The shots to try, at most SHOTS, the families' first members first: found from the keys that the model has and
+    frames turn.
 
-    Places and depths where there is a press, exposure where there is a camera with one, single lights, darkness and dimmed light
-    where there are lights, turned and removed films, an object nearer and farther, and for every other setting that the frames turned
-    a value between and one beyond either end.
-    """
+    Places and depths where there is a press, exposure where there is a camera with one, single lights, darkness and
+    dimmed light where there are lights, turned and removed films, an object nearer and farther, and for every other
+    setting that the frames turned a value between and one beyond either end."""
     like = _typical(model, values, frames)
     now = _now(model, values, like)
-    found = [*_exposures(model, now, like), *_presses(model, values, frames, now, like), *_lights(model, values, frames, now, like),
-             Shot("repeat", f"{_same(model, like)} once more", like), *_films(model, now, like), *_distances(model, now, like),
-             *_turned(model, frames, now, like)]
-    found = [s for s in found if all(model.parameters[k].bounds[0] <= v <= model.parameters[k].bounds[1] for k, v in s.settings.items())]
+    found = [
+        *_exposures(model, now, like),
+        *_presses(model, values, frames, now, like),
+        *_lights(model, values, frames, now, like),
+        Shot("repeat", f"{_same(model, like)} once more", like),
+        *_films(model, now, like),
+        *_distances(model, now, like),
+        *_turned(model, frames, now, like),
+    ]
+    found = [
+        s
+        for s in found
+        if all(model.parameters[k].bounds[0] <= v <= model.parameters[k].bounds[1] for k, v in s.settings.items())
+    ]
     queues: dict[str, list[Shot]] = {}
     for shot in found:
         queues.setdefault(shot.family, []).append(shot)
@@ -86,7 +99,8 @@ def families(model, values: Values, frames: Sequence[int]) -> list[Shot]:
 
 
 def _now(model, values: Values, frame: int) -> dict[str, float]:
-    """Numbers that hold in a frame, by key; of a sweep of readings what they share, and the middle of what they do not."""
+    """Numbers that hold in a frame, by key; of a sweep of readings what they share, and the middle of what they do
+    not."""
     own = model.frames[frame]
     swept = {k: float(np.median(v)) for k, v in getattr(own, "readings", {}).items()}
     return {**model.base, **values.common, **own.parameters, **swept, **values.frame.get(frame, {})}
@@ -127,8 +141,12 @@ def _exposures(model, now: Mapping, like: int) -> Iterator[Shot]:
         for factor in EXPOSURES:
             brighter = noise.black_level + factor * (image - noise.black_level)
             if factor < 1 or np.mean(brighter >= SATURATED * noise.saturation) < BRIGHT:
-                yield Shot("exposure", f"{_same(model, like)} at {factor:g} {'of' if factor < 1 else 'times'} the exposure", like,
-                           {key: factor * float(now[key])})
+                yield Shot(
+                    "exposure",
+                    f"{_same(model, like)} at {factor:g} {'of' if factor < 1 else 'times'} the exposure",
+                    like,
+                    {key: factor * float(now[key])},
+                )
 
 
 def _presses(model, values: Values, frames: Sequence[int], now: Mapping, like: int) -> Iterator[Shot]:
@@ -141,31 +159,49 @@ def _presses(model, values: Values, frames: Sequence[int], now: Mapping, like: i
     deepest = DEEPEST * float(now.get(keys[2].replace("press_depth", "thickness"), math.inf))
     near, far = _reaches(model, known, now, keys)
     for i, (x, y) in enumerate(places(known[:, :2], near, PLACES)):
-        yield Shot("another place", f"another press, {depth:.2g} mm deep at x = {x:.2g} mm, y = {y:.2g} mm", like,
-                   dict(zip(keys, (x, y, depth))), press=f"place-{i + 1}")
+        yield Shot(
+            "another place",
+            f"another press, {depth:.2g} mm deep at x = {x:.2g} mm, y = {y:.2g} mm",
+            like,
+            dict(zip(keys, (x, y, depth))),
+            press=f"place-{i + 1}",
+        )
     x, y, pressed = (float(now[k]) for k in keys)
     here = pressed or depth
     deep = min(1.5 * here, deepest)
     for i, (u, v) in enumerate(places(known[:, :2], far, FAR)):
-        yield Shot("farther out", f"a press farther out, {deep:.2g} mm deep at x = {u:.2g} mm, y = {v:.2g} mm", like,
-                   dict(zip(keys, (u, v, deep))), press=f"far-{i + 1}")
+        yield Shot(
+            "farther out",
+            f"a press farther out, {deep:.2g} mm deep at x = {u:.2g} mm, y = {v:.2g} mm",
+            like,
+            dict(zip(keys, (u, v, deep))),
+            press=f"far-{i + 1}",
+        )
     for factor in DEPTHS:
         to = min(factor * here, deepest)
         if factor < 1 or to > 1.1 * here:
             family = "deeper press" if factor > 1 else "shallower press"
-            yield Shot(family, f"the same place pressed {to:.2g} mm deep", like, dict(zip(keys, (x, y, to))), press=f"depth-{to:.2g}")
+            yield Shot(
+                family,
+                f"the same place pressed {to:.2g} mm deep",
+                like,
+                dict(zip(keys, (x, y, to))),
+                press=f"depth-{to:.2g}",
+            )
     if pressed > 0:
         yield Shot("no press", "nothing pressed, the same light", like, {keys[2]: 0.0}, press=UNTOUCHED)
 
 
 def _reaches(model, known: np.ndarray, now: Mapping, keys: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
-    """(2,), (2,) mm: how far from the middle presses may lie (as far as they did, or 0.3 of the gel's side where those were few), and how
-    far out one still lies on the pad, as far as the scene says how large that is."""
+    """(2,), (2,) mm: how far from the middle presses may lie (as far as they did, or 0.3 of the gel's side where those
+    were few), and how far out one still lies on the pad, as far as the scene says how large that is."""
     reach = np.abs(known[:, :2]).max(0)
     sides = [now.get(f"{key.rpartition('.')[0]}.{name}") for key, name in zip(keys, ("width", "length"))]
     least = np.array([1.0 if side is None else 0.3 * float(side) for side in sides])
-    far = [min(2 * max(r, 0.5), 0.9 * model.parameters[key].bounds[1]) if side is None else RIM * float(side) / 2
-           for key, side, r in zip(keys, sides, reach)]
+    far = [
+        min(2 * max(r, 0.5), 0.9 * model.parameters[key].bounds[1]) if side is None else RIM * float(side) / 2
+        for key, side, r in zip(keys, sides, reach)
+    ]
     return np.where(reach > 0.3 * least, reach, least), np.array(far)
 
 
@@ -175,7 +211,9 @@ def places(known: np.ndarray, reach: np.ndarray, count: int) -> list[tuple[float
     taken = list(np.asarray(known, float).reshape(-1, 2))
     found = []
     for _ in range(count):
-        distance = np.min([np.hypot(*((grid - t) / reach).T) for t in taken], 0) if taken else -np.hypot(*(grid / reach).T)
+        distance = (
+            np.min([np.hypot(*((grid - t) / reach).T) for t in taken], 0) if taken else -np.hypot(*(grid / reach).T)
+        )
         taken.append(grid[int(np.argmax(np.round(distance, 9)))])
         found.append((float(taken[-1][0]), float(taken[-1][1])))
     return found
@@ -201,7 +239,13 @@ def _lights(model, values: Values, frames: Sequence[int], now: Mapping, like: in
     wanted += [p for p in subsets if p != here and p not in wanted and len(keys) > 1]
     for on in wanted:
         names = [k.rpartition(".")[0] for k in on]
-        words = "all lights on" if len(on) == len(keys) else f"{names[0]} alone" if len(on) == 1 else "only " + ", ".join(names) + " lit"
+        words = (
+            "all lights on"
+            if len(on) == len(keys)
+            else f"{names[0]} alone"
+            if len(on) == 1
+            else "only " + ", ".join(names) + " lit"
+        )
         yield Shot("other light", f"{what}, {words}", like, pattern(on))
     yield Shot("dark", "all lights off", like, dict.fromkeys(keys, 0.0))
     if driven is not None and here:
@@ -216,8 +260,12 @@ def _films(model, now: Mapping, like: int) -> Iterator[Shot]:
         inserted = f"{key.rpartition('.')[0]}.inserted"
         if not now.get(inserted, 1.0):
             for turn in (45.0, 20.0):
-                yield Shot("film put in", f"{what}, {key.rpartition('.')[0]} put in at {now[key] + turn:g} deg", like,
-                           {inserted: 1.0, key: float(now[key]) + turn})
+                yield Shot(
+                    "film put in",
+                    f"{what}, {key.rpartition('.')[0]} put in at {now[key] + turn:g} deg",
+                    like,
+                    {inserted: 1.0, key: float(now[key]) + turn},
+                )
             continue
         for turn in (45.0, 90.0, 20.0):
             to = (float(now[key]) + turn) % 180.0
@@ -235,7 +283,8 @@ def _distances(model, now: Mapping, like: int) -> Iterator[Shot]:
 
 
 def _turned(model, frames: Sequence[int], now: Mapping, like: int) -> Iterator[Shot]:
-    """Settings that the frames turned and no family above knows: a value in the widest gap, and one beyond either end."""
+    """Settings that the frames turned and no family above knows: a value in the widest gap, and one beyond either
+    end."""
     known = ("power", "exposure", "angle", "inserted", "distance", *CLOCKS)
     special = {*(_press(model) or ()), *(k for name in known for k in keys_named(model.parameters, name))}
     turned: dict[str, set[float]] = {}
@@ -253,7 +302,12 @@ def _turned(model, frames: Sequence[int], now: Mapping, like: int) -> Iterator[S
         beyond = min(levels[-1] + (levels[-1] - levels[0]) / 2, high)
         for to in ((levels[gap] + levels[gap + 1]) / 2, beyond, max(levels[0] - (levels[-1] - levels[0]) / 2, low)):
             if to not in taken:
-                yield Shot(f"another {key}", f"{_same(model, like)} with {key} = {to:.4g}{spaced(model.parameters[key].unit)}", like, {key: to})
+                yield Shot(
+                    f"another {key}",
+                    f"{_same(model, like)} with {key} = {to:.4g}{spaced(model.parameters[key].unit)}",
+                    like,
+                    {key: to},
+                )
 
 
 # -- what shots would add ---------------------------------------------------------------------------------------------
@@ -280,14 +334,18 @@ class Member:
             own.append(value)
 
     def at(self, chosen: Sequence[int]) -> tuple[np.ndarray, list[int], np.ndarray]:
-        parts = [(self.columns, self.sides, self.strength), *(self.more[s] for s in dict.fromkeys(chosen) if s in self.more)]
+        parts = [
+            (self.columns, self.sides, self.strength),
+            *(self.more[s] for s in dict.fromkeys(chosen) if s in self.more),
+        ]
         columns, sides, strength = ([x for part in parts for x in part[i]] for i in range(3))
         return np.array(columns, int), sides, np.array(strength, float)
 
 
 @dataclass
 class Outlook:
-    """Informations of the present frames and of each shot, on the same columns: the base, unknowns of the shots, the effects.
+    """Informations of the present frames and of each shot, on the same columns: the base, unknowns of the shots, the
+    effects.
 
     present     (m, m);   shots: [(m, m)]
     base        columns that a calibration solves for, with 1/sd^2 of their priors in `precision`
@@ -305,11 +363,12 @@ class Outlook:
     nested: set[tuple[int, int]] = field(default_factory=set)
 
     def information(self, chosen: Sequence[int]) -> tuple[np.ndarray, list[int]]:
-        """(V, columns): what the present frames and the chosen shots would say of the effects, everything else projected off.
+        """(V, columns): what the present frames and the chosen shots would say of the effects, everything else
+        projected off.
 
-        As `optics.diagnosis.statistics.project`, with a ridge of the size of its truncation in place of eigenvectors: a choice takes hundreds of
-        these, and threads that wait for each other make an eigenvector problem of this size fifty times as slow as a solution.
-        """
+        As `optics.diagnosis.statistics.project`, with a ridge of the size of its truncation in place of eigenvectors: a
+        choice takes hundreds of these, and threads that wait for each other make an eigenvector problem of this size
+        fifty times as slow as a solution."""
         gram = sum((self.shots[s] for s in chosen), self.present)
         rest = list(dict.fromkeys(i for m in self.members for i in m.at(chosen)[0]))
         raw = np.diag(gram)
@@ -323,7 +382,8 @@ class Outlook:
         return (v + v.T) / 2 * np.outer(seen, seen), rest
 
     def gaps(self, chosen: Sequence[int] = ()) -> np.ndarray:
-        """(n, n) D[a, b], a true as found; infinite where there is nothing to tell: a itself, what contains a, a not likely."""
+        """(n, n) D[a, b], a true as found; infinite where there is nothing to tell: a itself, what contains a, a not
+        likely."""
         return self.falls(chosen)[0]
 
     def falls(self, chosen: Sequence[int] = ()) -> tuple[np.ndarray, np.ndarray]:
@@ -332,8 +392,12 @@ class Outlook:
         place = {column: i for i, column in enumerate(rest)}
         own = [m.at(chosen) for m in self.members]
         index = [[place[c] for c in columns] for columns, _, _ in own]
-        scores = np.stack([v[:, i] @ strength for i, (_, _, strength) in zip(index, own)])  # (n, k): what each would leave, if true
-        full = np.array([max(float(strength @ score[i]), 0.0) for score, i, (_, _, strength) in zip(scores, index, own)])
+        scores = np.stack(
+            [v[:, i] @ strength for i, (_, _, strength) in zip(index, own)]
+        )  # (n, k): what each would leave, if true
+        full = np.array(
+            [max(float(strength @ score[i]), 0.0) for score, i, (_, _, strength) in zip(scores, index, own)]
+        )
         found = np.full((len(own), len(own)), np.inf)
         for b, (i, (_, sides, _)) in enumerate(zip(index, own)):
             if len(i) == 1:  # `Cone.solve` of one strength, for all at once: a plan asks hundreds of times
@@ -353,13 +417,15 @@ class Outlook:
         return float(self.gaps(chosen).min(initial=np.inf))
 
     def worth(self, chosen: Sequence[int] = ()) -> float:
-        """The smallest D between any two, discounted where it is less than MARGIN of the fall itself: with misfit a verdict asks for both."""
+        """The smallest D between any two, discounted where it is less than MARGIN of the fall itself: with misfit a
+        verdict asks for both."""
         gaps, full = self.falls(chosen)
         share = gaps / np.where(full > 0, MARGIN * full, 1.0)[:, None]
         return float((gaps * np.minimum(share, 1.0)).min(initial=np.inf))
 
     def choose(self, count: int, worth: Callable[[Sequence[int]], float], enough: float = math.inf) -> list[int]:
-        """Up to `count` shots (one may be taken twice) until they are worth enough: one after the other, each exchanged while that helps."""
+        """Up to `count` shots (one may be taken twice) until they are worth enough: one after the other, each exchanged
+        while that helps."""
         known = cache(worth)  # exchanges come back to the same shots again and again
 
         def of(shots: Sequence[int]) -> float:
@@ -372,14 +438,23 @@ class Outlook:
             while of(chosen) > before and len(chosen) > 1:
                 before = of(chosen)
                 for i in range(len(chosen)):
-                    trial = max(([*chosen[:i], s, *chosen[i + 1:]] for s in range(len(self.shots))), key=of)
+                    trial = max(([*chosen[:i], s, *chosen[i + 1 :]] for s in range(len(self.shots))), key=of)
                     if of(trial) > of(chosen) * (1 + 1e-6):
                         chosen = trial
         return chosen
 
 
-def outlook(model, values: Values, evidence: Evidence, members: Sequence[Candidate], strengths: Sequence[np.ndarray],
-            shots: Sequence[Shot], variables_of: Callable, seed: int = 0, progress: Progress | None = None) -> Outlook:
+def outlook(
+    model,
+    values: Values,
+    evidence: Evidence,
+    members: Sequence[Candidate],
+    strengths: Sequence[np.ndarray],
+    shots: Sequence[Shot],
+    variables_of: Callable,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> Outlook:
     """Render every shot once at the values, and sum up what it would say; no data are needed.
 
     evidence   of the present frames, in which the members were scored (`columns`, `form`)
@@ -390,12 +465,32 @@ def outlook(model, values: Values, evidence: Evidence, members: Sequence[Candida
     first = len(model.frames)
     twin, values = imagined(model, values, shots)
     base, fresh = _base_with_shots(twin, evidence, shots, first)
-    again = [Candidate.at(twin, values, c.effect, [v for v in variables_of(twin, c.effect) if v.frames is None or min(v.frames) >= first])
-             for c in members]
-    pictured = measure(twin, values, [*base, *fresh], again, range(first, len(twin.frames)), ROWS, seed, say, "what other frames would show")
+    again = [
+        Candidate.at(
+            twin,
+            values,
+            c.effect,
+            [v for v in variables_of(twin, c.effect) if v.frames is None or min(v.frames) >= first],
+        )
+        for c in members
+    ]
+    imaged = measure(
+        twin,
+        values,
+        [*base, *fresh],
+        again,
+        range(first, len(twin.frames)),
+        ROWS,
+        seed,
+        say,
+        "what other frames would show",
+    )
 
     size = len(base) + len(fresh)
-    now, then = dict(zip(evidence.base, range(len(base)))), {i: i for i in range(size)}  # columns of `evidence`, `pictured` -> joint ones
+    now, then = (
+        dict(zip(evidence.base, range(len(base)))),
+        {i: i for i in range(size)},
+    )  # columns of `evidence`, `imaged` -> joint ones
     joint = []
     for c, twin_c, strength in zip(members, again, strengths):
         own = list(range(size, size + len(c.columns)))
@@ -412,9 +507,16 @@ def outlook(model, values: Values, evidence: Evidence, members: Sequence[Candida
         joint.append(member)
     precision = np.concatenate([evidence.precision, [0.0 if v.prior is None else 1 / v.prior[1] ** 2 for v in fresh]])
     nuisances = [[_unknown(v) for v in fresh if v.holds_in(first + n)] for n in range(len(shots))]
-    return Outlook(_placed(evidence.normal.gram, now, size), [_placed(gram, then, size) for gram in informations(pictured)],
-                   list(range(len(base) + len(fresh))), precision, joint, nuisances, evidence.normal.truncation(evidence.base),
-                   nested_in(members))
+    return Outlook(
+        _placed(evidence.normal.gram, now, size),
+        [_placed(gram, then, size) for gram in informations(imaged)],
+        list(range(len(base) + len(fresh))),
+        precision,
+        joint,
+        nuisances,
+        evidence.normal.truncation(evidence.base),
+        nested_in(members),
+    )
 
 
 def informations(evidence: Evidence) -> list[np.ndarray]:
@@ -447,7 +549,9 @@ def imagined(model, values: Values, shots: Sequence[Shot]):
         values.common.setdefault(key, float(model.base[key]))  # what was the light's power is now its power at drive 1
     for n, shot in enumerate(shots, first):
         own = values.frame.get(shot.like, {})
-        values.frame[n] = {k: v for k, v in own.items() if k not in shot.settings and not (shot.press and is_place(model, k))}
+        values.frame[n] = {
+            k: v for k, v in own.items() if k not in shot.settings and not (shot.press and is_place(model, k))
+        }
         twin.frames[n].image = np.minimum(twin.predict(values, [n])[0], model.noise.saturation).astype(np.float32)
     return twin, values
 
@@ -455,8 +559,14 @@ def imagined(model, values: Values, shots: Sequence[Shot]):
 def _frame(model, shot: Shot, number: int):
     like = model.frames[shot.like]
     readings = {k: v for k, v in getattr(like, "readings", {}).items() if k not in shot.settings}
-    return replace(like, name=f"shot-{number + 1}", repeats=[], parameters={**like.parameters, **shot.settings},
-                   group=shot.press or like.group, **({"readings": readings, "rows": None} if hasattr(like, "readings") else {}))
+    return replace(
+        like,
+        name=f"shot-{number + 1}",
+        repeats=[],
+        parameters={**like.parameters, **shot.settings},
+        group=shot.press or like.group,
+        **({"readings": readings, "rows": None} if hasattr(like, "readings") else {}),
+    )
 
 
 def is_place(model, key: str) -> bool:
@@ -464,14 +574,20 @@ def is_place(model, key: str) -> bool:
     return key.rpartition(".")[2].startswith("press_") or model.parameters[key].how == "difference"
 
 
-def _base_with_shots(twin, evidence: Evidence, shots: Sequence[Shot], first: int) -> tuple[list[Variable], list[Variable]]:
+def _base_with_shots(
+    twin, evidence: Evidence, shots: Sequence[Shot], first: int
+) -> tuple[list[Variable], list[Variable]]:
     """The base's variables, which hold in the shots of their press as well, and the unknowns that shots bring."""
     base, fresh = [], []
     kinds: dict[tuple, Variable] = {}  # the first of each kind that frames have for themselves
     for v in (evidence.columns[i] for i in evidence.base):
         if v.frames is not None:
             kinds.setdefault(v.keys, v)
-            shares = [n for n, s in enumerate(shots, first) if not s.press and s.like in v.frames and is_place(twin, v.keys[0])]
+            shares = [
+                n
+                for n, s in enumerate(shots, first)
+                if not s.press and s.like in v.frames and is_place(twin, v.keys[0])
+            ]
             v = replace(v, frames=(*v.frames, *shares))
         base.append(v)
     for keys, v in kinds.items():
@@ -495,19 +611,30 @@ def _unknown(v: Variable) -> str:
 # -- advice -----------------------------------------------------------------------------------------------------------
 
 
-def next_measurement(model, values: Values, evidence: Evidence, members: Sequence[Candidate], variables_of: Callable, *,
-                     enough: float = ENOUGH, seed: int = 0, progress: Progress | None = None) -> list[Advice]:
-    """Shots that tell the members apart, the best of each family, best first; then the best up to TAKEN together, no more of them than
-    bring D to `enough`; and for comparison TAKEN more presses (or repeats, where nothing is pressed).
+def next_measurement(
+    model,
+    values: Values,
+    evidence: Evidence,
+    members: Sequence[Candidate],
+    variables_of: Callable,
+    *,
+    enough: float = ENOUGH,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> list[Advice]:
+    """Shots that tell the members apart, the best of each family, best first; then the best up to TAKEN together, no
+    more of them than bring D to `enough`; and for comparison TAKEN more presses (or repeats, where nothing is pressed).
 
     Ranked by the smallest D between any two members; where no effect explains all, as `Outlook.worth` has it. A member
-    whose fall of chi2 is far below the best's counts as a rival and is not taken to be true. Nothing is returned for fewer than two
-    members. Costs the derivative images of as many frames as there are shots, of the base and of the members; a new press is the dear part.
-    """
+    whose fall of chi2 is far below the best's counts as a rival and is not taken to be true. Nothing is returned for
+    fewer than two members. Costs the derivative images of as many frames as there are shots, of the base and of the
+    members; a new press is the dear part."""
     if len(members) < 2:
         return []
     shots = families(model, values, evidence.frames)
-    seen = outlook(model, values, evidence, members, [strength_of(c) for c in members], shots, variables_of, seed, progress)
+    seen = outlook(
+        model, values, evidence, members, [strength_of(c) for c in members], shots, variables_of, seed, progress
+    )
     best = max(_net(c.row) for c in members)
     for member, c in zip(seen.members, members):
         member.likely = best - _net(c.row) <= max(LIKELY, MARGIN * best)
@@ -521,7 +648,11 @@ def next_measurement(model, values: Values, evidence: Evidence, members: Sequenc
     more = more or [s for s, shot in enumerate(shots) if shot.family == "repeat"] * TAKEN
     plans = {"together": seen.choose(TAKEN, judge, enough), "more of the same": more}
     before = seen.falls()
-    return [_advice(seen, shots, family, chosen, before, complete) for family, chosen in {**leaders, **plans}.items() if chosen]
+    return [
+        _advice(seen, shots, family, chosen, before, complete)
+        for family, chosen in {**leaders, **plans}.items()
+        if chosen
+    ]
 
 
 def _net(row: Row) -> float:
@@ -530,7 +661,8 @@ def _net(row: Row) -> float:
 
 
 def strength_of(c: Candidate) -> np.ndarray:
-    """Coefficients at which a member is taken to be true: as the refit found it, else as the score expects it, else plausible."""
+    """Coefficients at which a member is taken to be true: as the refit found it, else as the score expects it, else
+    plausible."""
     if c.row.refit is not None:
         change = np.array(c.row.refit.strength) - c.start
         if np.isfinite(change).all() and change.any():
@@ -538,20 +670,43 @@ def strength_of(c: Candidate) -> np.ndarray:
     return c.direction
 
 
-def _advice(seen: Outlook, shots: Sequence[Shot], family: str, chosen: Sequence[int], before: tuple[np.ndarray, np.ndarray],
-            complete: bool) -> Advice:
+def _advice(
+    seen: Outlook,
+    shots: Sequence[Shot],
+    family: str,
+    chosen: Sequence[int],
+    before: tuple[np.ndarray, np.ndarray],
+    complete: bool,
+) -> Advice:
     names, taken = [m.name for m in seen.members], [shots[s] for s in chosen]
     (now, full_now), (then, full_then) = before, seen.falls(chosen)
 
     def share(d: np.ndarray, full: np.ndarray, i: int, j: int) -> float:
         return math.nan if complete or not full[i] > 0 else float(d[i, j] / full[i])
 
-    pairs = [Apart(names[i], names[j], float(now[i, j]), float(then[i, j]), st.probability_correct(now[i, j]), st.probability_correct(then[i, j]),
-                   share(now, full_now, i, j), share(then, full_then, i, j)) for i, j in np.argwhere(np.isfinite(now))]
+    pairs = [
+        Apart(
+            names[i],
+            names[j],
+            float(now[i, j]),
+            float(then[i, j]),
+            st.probability_correct(now[i, j]),
+            st.probability_correct(then[i, j]),
+            share(now, full_now, i, j),
+            share(then, full_then, i, j),
+        )
+        for i, j in np.argwhere(np.isfinite(now))
+    ]
     counted = Counter(shot.words for shot in taken)
-    return Advice("; ".join(words if n == 1 else f"{words} ({n} times)" for words, n in counted.items()), family,
-                  [dict(s.settings) for s in taken], [s.press for s in taken], len(taken), sorted(pairs, key=lambda p: p.before),
-                  list(dict.fromkeys(u for s in chosen for u in seen.nuisances[s])))
+    return Advice(
+        "; ".join(words if n == 1 else f"{words} ({n} times)" for words, n in counted.items()),
+        family,
+        [dict(s.settings) for s in taken],
+        [s.press for s in taken],
+        len(taken),
+        sorted(pairs, key=lambda p: p.before),
+        list(dict.fromkeys(u for s in chosen for u in seen.nuisances[s])),
+    )
 
 
 def asked_for(diagnosis: Diagnosis) -> list[str]:
@@ -563,12 +718,19 @@ def asked_for(diagnosis: Diagnosis) -> list[str]:
         return []
     net = {row.name: _net(row) for row in diagnosis.rows}
     best = max(net.values(), default=0.0)
-    close = [name for name in sorted(net, key=net.get, reverse=True) if best > 0 and best - net[name] < max(CLEAR, MARGIN * best)]
+    close = [
+        name
+        for name in sorted(net, key=net.get, reverse=True)
+        if best > 0 and best - net[name] < max(CLEAR, MARGIN * best)
+    ]
     return close[:MEMBERS] if len(close) > 1 else []
 
 
-def advise(model, diagnosis: Diagnosis, variables_of: Callable, seed: int = 0, progress: Progress | None = None) -> list[Advice]:
-    """The next measurement after a diagnosis of this process; nothing where it does not hang on two effects that look alike."""
+def advise(
+    model, diagnosis: Diagnosis, variables_of: Callable, seed: int = 0, progress: Progress | None = None
+) -> list[Advice]:
+    """The next measurement after a diagnosis of this process; nothing where it does not hang on two effects that look
+    alike."""
     evidence, names = diagnosis.evidence, asked_for(diagnosis)
     if evidence is None or len(names) < 2:
         return []

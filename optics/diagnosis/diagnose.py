@@ -1,9 +1,9 @@
 """From residual to verdict: which missing effect would explain what a calibrated model leaves over, if any does.
 
-`diagnose` scores every effect against the calibrated model, adds the best ones in earnest, tests the winner for
-evenness, on frames that were not fitted and against curves along every coordinate, and answers with one of six words
-(`optics.diagnosis.verdict`). Masks and sums are in `optics.diagnosis.evidence`, the algebra is in `optics.diagnosis.statistics`.
-"""
+`diagnose` scores every effect against the calibrated model, adds the best ones by a refit, tests the winner for
+homogeneity, on frames that were not fitted and against curves along every coordinate, and answers with one of six words
+(`optics.diagnosis.verdict`). Masks and sums are in `optics.diagnosis.evidence`, the algebra is in
+`optics.diagnosis.statistics`."""
 
 from __future__ import annotations
 
@@ -56,21 +56,36 @@ SETTLED = 0.01  # of the excess of chi2: what a calibrated base may still absorb
 KAPPA = 0.1  # noise per pixel of derivative images over their signal, above which strengths are biased
 IMPLAUSIBLE = 10.0  # times the plausible strength: worth a look
 MAX_REFITS = 10
-MAX_SPLIT = 4  # members of an ambiguous set that are tested for evenness
-ALONG = 0.05  # of misfit that hides: what lies where two effects differ: on the polarizer bench .006 on average and .07 at most, on gelsight .002
-LOOKS = 3  # at an effect's picture, to find the strength at which it was taken
-USUALLY = "the same press at 0.4 of the exposure, and one deeper press, often tell more than repeats"  # where no shot was simulated
+MAX_SPLIT = 4  # members of an ambiguous set that are tested for homogeneity
+# of misfit that hides: what lies where two effects differ: on the polarizer bench .006 on average and .07 at most, on
+# gelsight .002
+ALONG = 0.05
+LOOKS = 3  # at an effect's image, to find the strength at which it was taken
+# where no shot was simulated
+USUALLY = "the same press at 0.4 of the exposure, and one deeper press, often tell more than repeats"
 
 
 # -- the verb ---------------------------------------------------------------------------------------------------------
 
 
-def diagnose(model, fit, effects: Sequence[Effect], variables_of: Callable[[Effect], Sequence[Variable]],
-             held_out: Sequence[int] = (), *, fitted: Sequence[int], refit: Callable | None = None,
-             rows_max: int = 400_000, seed: int = 0, top: int = 5, progress: Progress | None = None) -> Diagnosis:
+def diagnose(
+    model,
+    fit,
+    effects: Sequence[Effect],
+    variables_of: Callable[[Effect], Sequence[Variable]],
+    held_out: Sequence[int] = (),
+    *,
+    fitted: Sequence[int],
+    refit: Callable | None = None,
+    rows_max: int = 400_000,
+    seed: int = 0,
+    top: int = 5,
+    progress: Progress | None = None,
+) -> Diagnosis:
     """Score, refit and judge: what a calibrated model lacks.
 
-    model         optics.fit.model.Model, or anything with its predict, derivatives, usable, coordinates, frames, noise, base
+    model         optics.fit.model.Model, or anything with its predict, derivatives, usable, coordinates, frames, noise,
+                  base
     fit           optics.fit.calibrate.Fit of the base on the frames `fitted`, converged
     effects       candidates; those that the base has already are passed over
     variables_of  the variables that an effect frees; one per frame for the scope 'frame'
@@ -78,7 +93,7 @@ def diagnose(model, fit, effects: Sequence[Effect], variables_of: Callable[[Effe
     refit         optics.fit.calibrate.fit, or a function with its arguments
     rows_max      values (pixel x channel) that curves, splits and alternative weights may use
     seed          of the simulations and of derivative images; the same seed gives the same table
-    top           how many of the best effects are added in earnest, besides those that cannot be told from the best
+    top           how many of the best effects are added and refitted, besides those that cannot be told from the best
 
     Raises Underdetermined when the base is not calibrated to convergence, or black level or saturation are not known.
     """
@@ -107,8 +122,17 @@ def diagnose(model, fit, effects: Sequence[Effect], variables_of: Callable[[Effe
 
     if winner:
         done.sort(key=lambda c: c is not winner)
-    members = [c for c in done if c.row.net_refit > 0 and close(winner.row.net_refit, c.row.net_refit)
-               and not _refuted(winner, c, basis.dof)] if winner else []
+    members = (
+        [
+            c
+            for c in done
+            if c.row.net_refit > 0
+            and close(winner.row.net_refit, c.row.net_refit)
+            and not _refuted(winner, c, basis.dof)
+        ]
+        if winner
+        else []
+    )
     splits, split = [], partial(evenness.split, model, evidence, places, rows_max, seed, say)
     if winner:
         for c in members[:MAX_SPLIT]:
@@ -122,8 +146,12 @@ def diagnose(model, fit, effects: Sequence[Effect], variables_of: Callable[[Effe
     word, conditions = decide(findings)
     found = []
     if winner and word not in ("NOTHING", "CLAIM") and not any(c.row.refit.complete for c in done):
-        found = pairs.search(evidence, table.order, winner.row.net_refit,
-                             lambda both: _add_both(model, fit, evidence, both, refit, fitted, split, table.family))
+        found = pairs.search(
+            evidence,
+            table.order,
+            winner.row.net_refit,
+            lambda both: _add_both(model, fit, evidence, both, refit, fitted, split, table.family),
+        )
         found = pairs.beside_curves(found, fingerprints, {row.name: row.expected for row in rows})
         word = "PARTIAL" if any(p.complete for p in found) else word
     _write_limits(model, evidence, table, winner if word == "CLAIM" else None, fits, basis, rows_max, seed, say)
@@ -138,41 +166,78 @@ def diagnose(model, fit, effects: Sequence[Effect], variables_of: Callable[[Effe
         text += pairs.doubt(found)
     if word in ("UNKNOWN", "CANNOT_TELL"):
         excess = basis.chi2 - basis.dof if basis.excess_sd > EXCESS else 0.0
-        fixed = prints.fixed_text(prints.fixed_pattern(model, evidence, excess), max([f.share for f in fingerprints], default=0.0))
-        unknown = [prints.unexplained(fingerprints, findings.fall, excess), "" if fixed else prints.goes_with(families)] if word == "UNKNOWN" else []
+        fixed = prints.fixed_text(
+            prints.fixed_pattern(model, evidence, excess), max([f.share for f in fingerprints], default=0.0)
+        )
+        unknown = (
+            [prints.unexplained(fingerprints, findings.fall, excess), "" if fixed else prints.goes_with(families)]
+            if word == "UNKNOWN"
+            else []
+        )
         text = " ".join(filter(None, [fixed, text[0].upper() + text[1:] if fixed else text, *unknown]))
         if fixed:
-            hints.insert(0, "divide the pattern out with a flat_field, mask what is dirt, or note the sensor's own as [noise] prnu")
+            hints.insert(
+                0,
+                "divide the pattern out with a flat_field, mask what is dirt, or note the sensor's own as [noise] prnu",
+            )
     return Diagnosis(
-        word=word, sentence=text, conditions=conditions, basis=basis, rows=rows,
+        word=word,
+        sentence=text,
+        conditions=conditions,
+        basis=basis,
+        rows=rows,
         ambiguous=[c.effect.name for c in members] if word == "AMBIGUOUS" else [],
-        compared=names, gaps=gaps, correct=correct, splits=splits, levels=levels, fingerprints=fingerprints, shifts=shifts,
-        hints=hints, not_tested=not_tested,
+        compared=names,
+        gaps=gaps,
+        correct=correct,
+        splits=splits,
+        levels=levels,
+        fingerprints=fingerprints,
+        shifts=shifts,
+        hints=hints,
+        not_tested=not_tested,
         warnings=_warnings(model, fit, evidence, table, word, winner, shifts, dropped, structure, basis),
-        claimed=winner.effect.name if word == "CLAIM" else "", pairs=found, families=families, fits=fits,
-        evidence=replace(evidence, blocks=[], sigma=[], whitened=[], use=[], candidates=table.order))
+        claimed=winner.effect.name if word == "CLAIM" else "",
+        pairs=found,
+        families=families,
+        fits=fits,
+        evidence=replace(evidence, blocks=[], sigma=[], whitened=[], use=[], candidates=table.order),
+    )
 
 
 @dataclass
 class Scored:
-    """Every effect scored against a calibrated model; dropped: names of variables at a bound, not_tested: {effect: why}."""
+    """Every effect scored against a calibrated model; dropped: names of variables at a bound, not_tested: {effect:
+    why}."""
 
     evidence: Evidence
-    table: "Table"
+    table: Table
     dropped: list[str]
     not_tested: dict[str, str]
 
 
-def score(model, fit, effects: Sequence[Effect], variables_of: Callable[[Effect], Sequence[Variable]], fitted: Sequence[int], *,
-          rows_max: int = 400_000, seed: int = 0, progress: Progress | None = None) -> Scored:
-    """The first part of a diagnosis: derivative images, projection and ranking, nothing added yet. Arguments and errors as of `diagnose`."""
+def score(
+    model,
+    fit,
+    effects: Sequence[Effect],
+    variables_of: Callable[[Effect], Sequence[Variable]],
+    fitted: Sequence[int],
+    *,
+    rows_max: int = 400_000,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> Scored:
+    """The first part of a diagnosis: derivative images, projection and ranking, nothing added yet. Arguments and errors
+    as of `diagnose`."""
     fitted = [int(i) for i in fitted]
     if not fitted:
         raise ValueError("diagnose: no fitted frames given; name the frames that the base was calibrated on")
     _require_noise(model)
     base, dropped = _base_variables(model, fit, fitted)
     candidates, not_tested = _candidates(model, fit, effects, variables_of, fitted)
-    evidence = measure(model, fit.values, base, candidates, fitted, rows_max, seed, progress or (lambda what, done, total: None))
+    evidence = measure(
+        model, fit.values, base, candidates, fitted, rows_max, seed, progress or (lambda what, done, total: None)
+    )
     _require_convergence(evidence, fit)
     return Scored(evidence, _rank(evidence, candidates, seed), dropped, not_tested)
 
@@ -183,12 +248,16 @@ def score(model, fit, effects: Sequence[Effect], variables_of: Callable[[Effect]
 def _require_noise(model) -> None:
     """Refuse to judge images whose saturation or black level nobody knows: both fake effects at any significance."""
     noise = getattr(model, "noise", None)
-    for name, cost in (("saturation", "unmasked saturation makes the right effect lose in four of five cases"),
-                       ("black_level", "half a DN of black level looks like glare")):
+    for name, cost in (
+        ("saturation", "unmasked saturation makes the right effect lose in four of five cases"),
+        ("black_level", "half a DN of black level looks like glare"),
+    ):
         value = getattr(noise, name, None)
         if value is None or not math.isfinite(value):
-            raise Underdetermined(f"diagnose: the camera's {name} is not known, and {cost}; give it under [noise] in "
-                                  "captures.toml, or estimate the noise from dark and repeated frames")
+            raise Underdetermined(
+                f"diagnose: the camera's {name} is not known, and {cost}; give it under [noise] in "
+                "captures.toml, or estimate the noise from dark and repeated frames"
+            )
 
 
 def _base_variables(model, fit, fitted: Sequence[int]) -> tuple[list[Variable], list[str]]:
@@ -214,12 +283,12 @@ def _candidates(model, fit, effects, variables_of, fitted) -> tuple[list[Candida
     return found, not_tested
 
 
-def _require_convergence(evidence: "Evidence", fit) -> None:
+def _require_convergence(evidence: Evidence, fit) -> None:
     """Refuse a base that is not calibrated: |Q'r|^2 would be chi2 of a parameter, not of a missing effect.
 
-    Allowed is 1 per parameter or, where the model misses the data by more than noise, a percent of that excess: derivative
-    images of moving edges are finite samples, which no calibration can make orthogonal to a residual with structure.
-    """
+    Allowed is 1 per parameter or, where the model misses the data by more than noise, a percent of that excess:
+    derivative images of moving edges are finite samples, which no calibration can make orthogonal to a residual with
+    structure."""
     rank = max(evidence.projected.rank, 1)
     excess = max(evidence.projected.chi2 - (evidence.normal.count - rank), 0.0)
     allowed = max(1.0, SETTLED * excess / rank)
@@ -229,10 +298,11 @@ def _require_convergence(evidence: "Evidence", fit) -> None:
             f"diagnose: the base model is not calibrated to convergence{how}: moving its {rank} parameters "
             f"would lower chi2 by {evidence.projected.absorbed:.3g}, {evidence.gradient:.3g} per parameter (most of all {some(_off(evidence))}); "
             f"allowed: below {allowed:.3g}; calibrate again from there, without robust weights, or hold what the captures hardly tell apart: leave it "
-            "out of --free, or give it a --prior")
+            "out of --free, or give it a --prior"
+        )
 
 
-def _off(evidence: "Evidence") -> list[str]:
+def _off(evidence: Evidence) -> list[str]:
     """The variables of the base whose images change most in the step that would calibrate it."""
     step = evidence.inverse(evidence.base) @ (evidence.normal.score[evidence.base] + evidence.pull)
     change = np.abs(step) * np.sqrt(np.maximum(np.diag(evidence.normal.gram)[evidence.base], 0))
@@ -256,8 +326,11 @@ class Table:
 
 def _rank(evidence: Evidence, candidates: list[Candidate], seed: int) -> Table:
     projected, first = evidence.projected, len(evidence.base)
-    # where noise of a derivative image is more than what survives of it, products of two such images are chance, and may be next to nothing
-    visible = (projected.survival > st.VISIBLE) & (np.diag(projected.information) > evidence.normal.noise[evidence.rest])
+    # where noise of a derivative image is more than what survives of it, products of two such images are chance, and
+    # may be next to nothing
+    visible = (projected.survival > st.VISIBLE) & (
+        np.diag(projected.information) > evidence.normal.noise[evidence.rest]
+    )
     for c in candidates:
         if c.broken:
             visible[[i - first for columns in c.forms.values() for i in columns]] = False
@@ -296,8 +369,10 @@ def _rank(evidence: Evidence, candidates: list[Candidate], seed: int) -> Table:
             row.flags.append("a derivative image is not finite" if c.broken else "nothing visible")
         if row.kappa > KAPPA:
             row.flags.append("noisy derivative")
-        if any(v.parameter.neutral is not None and abs(value - v.parameter.neutral) > 1e-9 * abs(v.parameter.plausible)
-               for v, value in zip(c.variables, c.start)):
+        if any(
+            v.parameter.neutral is not None and abs(value - v.parameter.neutral) > 1e-9 * abs(v.parameter.plausible)
+            for v, value in zip(c.variables, c.start)
+        ):
             row.flags.append("not at neutral: tests a change of the value assumed")
     order = sorted(candidates, key=lambda c: (not len(c.cone.live), -c.row.net, c.effect.name))
     p_best = min((c.row.p_family for c in candidates), default=1.0)
@@ -313,12 +388,28 @@ def _row(evidence: Evidence, c: Candidate, own: np.ndarray, fall: float) -> Row:
     seen = c.cone.live
     change = c.change_of(c.linear)
     return Row(
-        name=c.effect.name, variables=[v.name for v in c.variables], units=[v.parameter.unit for v in c.variables],
-        form=c.form, fall=fall, expected=c.cone.expectation, p=float(c.cone.p(fall)), p_family=1.0,
-        start=c.start.tolist(), change=change.tolist(), sd=c.sd_of(c.cone.sd).tolist(),
-        of_plausible=float(np.max(np.abs(change) / c.plausible)), image=math.nan, misfit_after=math.nan, share=math.nan,
-        survival=survival, power=0.0, kappa=float(kappa[seen].max(initial=0.0)), confused_with="", cos=0.0,
-        upper=[math.nan] * len(c.variables))
+        name=c.effect.name,
+        variables=[v.name for v in c.variables],
+        units=[v.parameter.unit for v in c.variables],
+        form=c.form,
+        fall=fall,
+        expected=c.cone.expectation,
+        p=float(c.cone.p(fall)),
+        p_family=1.0,
+        start=c.start.tolist(),
+        change=change.tolist(),
+        sd=c.sd_of(c.cone.sd).tolist(),
+        of_plausible=float(np.max(np.abs(change) / c.plausible)),
+        image=math.nan,
+        misfit_after=math.nan,
+        share=math.nan,
+        survival=survival,
+        power=0.0,
+        kappa=float(kappa[seen].max(initial=0.0)),
+        confused_with="",
+        cos=0.0,
+        upper=[math.nan] * len(c.variables),
+    )
 
 
 def _confused(information: np.ndarray, c: Candidate, candidates: Sequence[Candidate], first: int) -> tuple[str, float]:
@@ -356,7 +447,7 @@ def _winner(evidence: Evidence, normal: st.Normal, candidates: Sequence[Candidat
 
 
 def _choose(table: Table, top: int) -> list[Candidate]:
-    """The effects to add in earnest: the best ones, those that cannot be told from the best, winners of other weights.
+    """The effects to add and refit: the best ones, those that cannot be told from the best, winners of other weights.
 
     What chance explains is not added: a refit is as dear as a calibration.
     """
@@ -370,16 +461,31 @@ def _choose(table: Table, top: int) -> list[Candidate]:
 def _gaps(evidence: Evidence, chosen: Sequence[Candidate]) -> tuple[list[list[float]], list[list[float]]]:
     """D[a][b], expected chi2 of a over b when a is true as found, and the probability to decide rightly."""
     first, information = len(evidence.base), evidence.projected.information
-    gaps = [[0.0 if a is b else st.gap(information, np.array(a.columns) - first, a.direction,
-                                       np.array(b.columns) - first, b.cone) for b in chosen] for a in chosen]
+    gaps = [
+        [
+            0.0
+            if a is b
+            else st.gap(information, np.array(a.columns) - first, a.direction, np.array(b.columns) - first, b.cone)
+            for b in chosen
+        ]
+        for a in chosen
+    ]
     return gaps, [[st.probability_correct(d) for d in line] for line in gaps]
 
 
 # -- refit ------------------------------------------------------------------------------------------------------------
 
 
-def _refit(model, fit, evidence: Evidence, table: Table, chosen: Sequence[Candidate], refit: Callable,
-           fitted: Sequence[int], say: Progress) -> dict:
+def _refit(
+    model,
+    fit,
+    evidence: Evidence,
+    table: Table,
+    chosen: Sequence[Candidate],
+    refit: Callable,
+    fitted: Sequence[int],
+    say: Progress,
+) -> dict:
     """Add each chosen effect, calibrate everything again, and write what came of it into its row."""
     before = evidence.normal.square + _prior_chi2(model, fit.values, fit.variables)
     base = [v for v in fit.variables if v.frames is None or set(v.frames) & set(fitted)]
@@ -387,7 +493,7 @@ def _refit(model, fit, evidence: Evidence, table: Table, chosen: Sequence[Candid
     for n, c in enumerate(chosen):
         say("refit", n, len(chosen))
         best, (predicted, linear) = None, _look_again(model, fit, evidence, c)
-        # where a picture is not in proportion to its strength, between a weak effect and a strong one lie other minima
+        # where an image is not in proportion to its strength, between a weak effect and a strong one lie other minima
         for fraction, enough in ((START, 0.0), *([(1.0, 0.5)] if c.form == "secant" else []), (0.1, 0.5)):
             if enough and (predicted < CLEAR or best is not None and best[0] > enough * predicted):
                 break  # nothing to win, or an attempt before was as good as predicted
@@ -410,10 +516,21 @@ def _refit(model, fit, evidence: Evidence, table: Table, chosen: Sequence[Candid
         sd = {v.name: float(s) for v, s in zip(found.variables, found.sd)}
         ended = [v.name for v, s, at in zip(c.variables, strength, c.start) if at_bound(v, s) and abs(s - at) > 0]
         ratio = fall / predicted if predicted > 0 else math.nan
-        c.row.refit = Refit(fall, predicted, ratio, before, after, strength,
-                            [sd.get(v.name, math.nan) for v in c.variables], ended,
-                            _excess(evidence, after, expected, [c]), evidence.structure(images, [*evidence.base, *c.columns]).p,
-                            bool(found.converged), str(found.reason), _clear(found, c, strength))
+        c.row.refit = Refit(
+            fall,
+            predicted,
+            ratio,
+            before,
+            after,
+            strength,
+            [sd.get(v.name, math.nan) for v in c.variables],
+            ended,
+            _excess(evidence, after, expected, [c]),
+            evidence.structure(images, [*evidence.base, *c.columns]).p,
+            bool(found.converged),
+            str(found.reason),
+            _clear(found, c, strength),
+        )
         if not 0.5 <= ratio <= 2 and predicted > CLEAR:
             c.row.flags.append("nonlinear")
         if ended:
@@ -437,9 +554,18 @@ def _clear(found, c: Candidate, strength: Sequence[float]) -> float:
     return math.sqrt(max(float(change @ inverse @ change), 0.0)) if rank else math.nan
 
 
-def _add_both(model, fit, evidence: Evidence, both: list[Candidate], refit: Callable, fitted: Sequence[int], split: Callable,
-              family: st.Family) -> Pair | None:
-    """What comes of two effects that are added together; None where no refit succeeds. `split` is `evenness.split`."""
+def _add_both(
+    model,
+    fit,
+    evidence: Evidence,
+    both: list[Candidate],
+    refit: Callable,
+    fitted: Sequence[int],
+    split: Callable,
+    family: st.Family,
+) -> Pair | None:
+    """What comes of two effects that are added together; None where no refit succeeds. `split` is
+    `homogeneity.split`."""
     base = [v for v in fit.variables if v.frames is None or set(v.frames) & set(fitted)]
     start = _start(model, fit, evidence, [(c, c.linear) for c in both], START)
     try:
@@ -450,24 +576,38 @@ def _add_both(model, fit, evidence: Evidence, both: list[Candidate], refit: Call
     after += _prior_chi2(model, found.values, fit.variables)
     fall = evidence.normal.square + _prior_chi2(model, fit.values, fit.variables) - after
     columns = [*evidence.base, *(i for c in both for i in c.columns)]
-    pair = Pair([c.effect.name for c in both], fall, _excess(evidence, after, expected, both), evidence.structure(images, columns).p)
-    for c, other in (both, both[::-1]) if pair.complete else ():  # a second effect may take up clutter, or what the first has wrong
+    pair = Pair(
+        [c.effect.name for c in both],
+        fall,
+        _excess(evidence, after, expected, both),
+        evidence.structure(images, columns).p,
+    )
+    for c, other in (
+        (both, both[::-1]) if pair.complete else ()
+    ):  # a second effect may take up clutter, or what the first has wrong
         strength = [value_of(model, found.values, v) for v in c.variables]
         alone = _clear(found, c, strength) ** 2
         own, chance, _ = split(c, found, pair, fall if math.isnan(alone) else alone, other.variables)
         uneven = [s.by for s in own if not s.holds]
         if uneven or family.p(chance) >= LEVEL:
-            return replace(pair, but=f"{c.effect.name}'s strength " + (
-                f"then differs by {uneven[0]}" if uneven else "is no more than its scatter between parts of the data"))
+            return replace(
+                pair,
+                but=f"{c.effect.name}'s strength "
+                + (
+                    f"then differs by {uneven[0]}"
+                    if uneven
+                    else "is no more than its scatter between parts of the data"
+                ),
+            )
     return pair
 
 
 def _look_again(model, fit, evidence: Evidence, c: Candidate) -> tuple[float, np.ndarray]:
-    """(fall of chi2 that a refit will bring, coefficients) of an effect by its picture at the strength that was found, not at the plausible.
+    """(fall of chi2 that a refit will bring, coefficients) of an effect by its image at the strength that was found,
+    not at the plausible.
 
-    A secant to the plausible strength is the wrong picture where a weak effect has another shape than a strong one: leaks that add in
-    amplitude, two components of one retardance. Scores and tests stay what they were.
-    """
+    A secant to the plausible strength is the wrong image where a weak effect has another shape than a strong one: leaks
+    that add in amplitude, two components of one retardance. Scores and tests stay what they were."""
     fall, linear, first = c.row.fall, c.linear, len(evidence.columns)
     if c.form != "secant" or not linear.any():
         return fall, linear
@@ -498,8 +638,16 @@ def _start(model, fit, evidence: Evidence, effects: Sequence[tuple[Candidate, np
         linear = linear * fraction
         for v, start, step in zip(c.variables, c.start, c.change_of(linear)):
             low, high = v.parameter.bounds
-            values.put(v, float(np.clip(start + step, start + 0.9 * (low - start) if math.isfinite(low) else -math.inf,
-                                        start + 0.9 * (high - start) if math.isfinite(high) else math.inf)))
+            values.put(
+                v,
+                float(
+                    np.clip(
+                        start + step,
+                        start + 0.9 * (low - start) if math.isfinite(low) else -math.inf,
+                        start + 0.9 * (high - start) if math.isfinite(high) else math.inf,
+                    )
+                ),
+            )
         moves = moves + evidence.projected.response[:, np.array(c.columns) - first] @ linear
     for i, move in zip(evidence.base, moves):
         v = evidence.columns[i]
@@ -507,23 +655,32 @@ def _start(model, fit, evidence: Evidence, effects: Sequence[tuple[Candidate, np
         here = value_of(model, fit.values, v)
         limit = 3 * abs(v.parameter.plausible)  # beyond, the linear guess is no guide
         to = here + float(np.clip(move, -limit, limit))
-        values.put(v, float(np.clip(to, low + 0.1 * (here - low) if math.isfinite(low) else to,
-                                    high - 0.1 * (high - here) if math.isfinite(high) else to)))
+        values.put(
+            v,
+            float(
+                np.clip(
+                    to,
+                    low + 0.1 * (here - low) if math.isfinite(low) else to,
+                    high - 0.1 * (high - here) if math.isfinite(high) else to,
+                )
+            ),
+        )
     return values
 
 
 def _chi2(model, values: Values, evidence: Evidence) -> tuple[float, float, list[np.ndarray]]:
-    """chi2 of other values on the same pixels with the same weights, what it would be were they true, and the whitened residual images.
+    """chi2 of other values on the same pixels with the same weights, what it would be were they true, and the whitened
+    residual images.
 
-    Brighter pixels are noisier: by the base's weights chi2 of the truth is sum of variance/sigma^2, not the number of values.
-    """
+    Brighter pixels are noisier: by the base's weights chi2 of the truth is sum of variance/sigma^2, not the number of
+    values."""
     total, expected, images = 0.0, 0.0, []
     predicted = model.predict(values, evidence.frames)
     for frame, prediction, sigma, use in zip(evidence.frames, predicted, evidence.sigma, evidence.use):
         image = np.where(use, (np.asarray(model.frames[frame].image, float) - prediction) / sigma, 0.0)
         total += float(np.sum(image**2))
         variance = evidence.variance(model, frame, np.asarray(prediction, float), values)
-        expected += float(np.sum(np.where(use, variance, 0.0) / sigma.astype(float)**2))
+        expected += float(np.sum(np.where(use, variance, 0.0) / sigma.astype(float) ** 2))
         images.append(image)
     return total, expected, images
 
@@ -541,16 +698,35 @@ def _prior_chi2(model, values: Values, variables: Sequence[Variable]) -> float:
 # -- held-out frames, shifts ------------------------------------------------------------------------------------------
 
 
-def _held_out(model, fit, evidence: Evidence, winner: Candidate | None, fits: Mapping, refit: Callable,
-              held_out: Sequence[int], variables_of, say: Progress) -> list[Level]:
-    """Base and winner on frames that were not fitted: globals frozen, only what is per frame solved for, alike for both."""
+def _held_out(
+    model,
+    fit,
+    evidence: Evidence,
+    winner: Candidate | None,
+    fits: Mapping,
+    refit: Callable,
+    held_out: Sequence[int],
+    variables_of,
+    say: Progress,
+) -> list[Level]:
+    """Base and winner on frames that were not fitted: globals frozen, only what is per frame solved for, alike for
+    both."""
     n = evidence.normal.count
     after = _chi2(model, fits[winner.effect.name].values, evidence)[0] if winner else math.nan
 
     def level(name, chi2, held, count, fall=math.nan, better=0):
-        return Level(name, evidence.noise * math.sqrt(chi2 / n),
-                     evidence.noise * math.sqrt(held / count) if count else math.nan,
-                     chi2 / n, held / count if count else math.nan, n, count, fall, better, len(held_out))
+        return Level(
+            name,
+            evidence.noise * math.sqrt(chi2 / n),
+            evidence.noise * math.sqrt(held / count) if count else math.nan,
+            chi2 / n,
+            held / count if count else math.nan,
+            n,
+            count,
+            fall,
+            better,
+            len(held_out),
+        )
 
     if not held_out:
         levels = [level("base", evidence.normal.square, math.nan, 0)]
@@ -577,8 +753,10 @@ def _held_out(model, fit, evidence: Evidence, winner: Candidate | None, fits: Ma
     values = fits[winner.effect.name].values.copy()
     if pose or own:
         values = refit(model, [*pose, *own], values, frames=list(held_out)).values
-    with_effect = [_square(model, f, np.asarray(model.predict(values, [f])[0], float), use, sd)
-                   for f, use, sd in zip(held_out, masks, sds)]
+    with_effect = [
+        _square(model, f, np.asarray(model.predict(values, [f])[0], float), use, sd)
+        for f, use, sd in zip(held_out, masks, sds)
+    ]
     fall = sum(base) - sum(with_effect) - len(own)
     better = int(sum(b > w for b, w in zip(base, with_effect)))
     say("held-out frames", 2, 2)
@@ -603,7 +781,9 @@ def _shifts(model, fit, winner: Candidate, fits: Mapping) -> list[Shift]:
         own = sd.get(v.name, math.nan)
         in_sd = (after - before) / own if own > 0 else math.nan
         out = v.prior is not None and abs(after - v.prior[0]) > 3 * v.prior[1]
-        shifts.append(Shift(winner.effect.name, v.name, v.parameter.unit, before, after, in_sd, bool(abs(in_sd) > 3 or out)))
+        shifts.append(
+            Shift(winner.effect.name, v.name, v.parameter.unit, before, after, in_sd, bool(abs(in_sd) > 3 or out))
+        )
     return sorted(shifts, key=lambda s: -abs(s.in_sd) if math.isfinite(s.in_sd) else 0.0)
 
 
@@ -611,15 +791,18 @@ def _shifts(model, fit, winner: Candidate, fits: Mapping) -> list[Shift]:
 
 
 def _refuted(winner: Candidate, other: Candidate, dof: int) -> bool:
-    """Whether the winner leaves nothing to explain, and another, refitted, does: more than misfit that hides beside the winner could fake.
+    """Whether the winner leaves nothing to explain, and another, refitted, does: more than misfit that hides beside the
+    winner could fake.
 
-    For the wrong one of two to lead by L in chi2, what lies along the one direction in which their images differ must be sqrt(L) or more.
-    Noise has a variance of 1 there, and misfit of which H is hidden a share of it: L > CLEAR (1 + ALONG H).
-    """
+    For the wrong one of two to lead by L in chi2, what lies along the one direction in which their images differ must
+    be sqrt(L) or more. Noise has a variance of 1 there, and misfit of which H is hidden a share of it: L > CLEAR (1 +
+    ALONG H)."""
     own, left = winner.row.refit, other.row.refit
     if other is winner or not own.complete or left is None or not left.converged:
         return False
-    hidden = (abs(own.excess_sd) + HIDDEN) * math.sqrt(2 * dof)  # below none: the noise is overstated, by as much as that
+    hidden = (abs(own.excess_sd) + HIDDEN) * math.sqrt(
+        2 * dof
+    )  # below none: the noise is overstated, by as much as that
     return left.structure_p < LEVEL or winner.row.net_refit - other.row.net_refit > CLEAR * (1 + ALONG * hidden)
 
 
@@ -640,20 +823,30 @@ def _findings(table, winner, done, members, fingerprints, splits, levels, basis,
         worst = max(mine, key=lambda s: (not s.holds, s.h), default=None)
         excess = basis.chi2 - basis.dof
         own = Findings(
-            table.p_best, structure.p, winner.effect.name,
-            table.family.p(float(winner.cone.p(winner.row.refit.fall))), winner.row.net_refit,
+            table.p_best,
+            structure.p,
+            winner.effect.name,
+            table.family.p(float(winner.cone.p(winner.row.refit.fall))),
+            winner.row.net_refit,
             max([c.row.net_refit for c in done[1:]] + [c.row.net for c in others if c not in done] + [0.0]),
-            refuted=winner.row.refit.complete and all(
-                _refuted(winner, c, basis.dof) for c in others
-                if close(winner.row.net_refit, max(c.row.net_refit, 0.0 if c in done else c.row.net))),
-            share=winner.row.net_refit / excess if excess > 0 else math.nan, excess_sd=basis.excess_sd,
+            refuted=winner.row.refit.complete
+            and all(
+                _refuted(winner, c, basis.dof)
+                for c in others
+                if close(winner.row.net_refit, max(c.row.net_refit, 0.0 if c in done else c.row.net))
+            ),
+            share=winner.row.net_refit / excess if excess > 0 else math.nan,
+            excess_sd=basis.excess_sd,
             left=basis.misfit * math.sqrt(max(1 - winner.row.refit.fall / basis.chi2, 0.0)),
-            uneven=worst.h if worst else 0.0, uneven_by=f" by {worst.by} ({_extremes(worst)})" if worst else "",
+            uneven=worst.h if worst else 0.0,
+            uneven_by=f" by {worst.by} ({_extremes(worst)})" if worst else "",
             uneven_limit=worst.limit if worst else UNEVEN,
             even=all(s.holds for s in mine),
             some_even=any(even.values()) if even else True,
-            held_out=levels[-1].fall if len(levels) > 1 else math.nan, clear=winner.row.refit.clear,
-            chance=winner.row.refit.chance)
+            held_out=levels[-1].fall if len(levels) > 1 else math.nan,
+            clear=winner.row.refit.clear,
+            chance=winner.row.refit.chance,
+        )
     if not fingerprints:
         return own
     better = [followed] if followed else rivals(fingerprints, own.fall)
@@ -662,12 +855,17 @@ def _findings(table, winner, done, members, fingerprints, splits, levels, basis,
 
 
 def _followed(model, evidence: Evidence, winner: Candidate | None, fits, fingerprints) -> Fingerprint | None:
-    """The curve along a setting, clocks aside, that an effect's numbers per frame follow and that explains as much as they do: they mimic
-    whatever goes with what was set in each frame. None where they go their own way, as a drift does, and for other effects."""
+    """The curve along a setting, clocks aside, that an effect's numbers per frame follow and that explains as much as
+    they do: they mimic whatever goes with what was set in each frame. None where they go their own way, as a drift
+    does, and for other effects."""
     if winner is None or winner.effect.scope != "frame":
         return None
     fit = fits[winner.effect.name]
-    own = {v.frames[0]: value_of(model, fit.values, v) for v in fit.variables if v.name in winner.row.variables and v.frames}
+    own = {
+        v.frames[0]: value_of(model, fit.values, v)
+        for v in fit.variables
+        if v.name in winner.row.variables and v.frames
+    }
     turned, found = prints.settings(model, evidence), []
     for curve in fingerprints:
         if curve.coordinate in turned and curve.family != "time" and curve.net > AS_GOOD * winner.row.net_refit:
@@ -691,24 +889,50 @@ def _basis(model, evidence: Evidence, structure: st.Structure) -> Basis:
     frame_n = [max(int(u.sum()), 1) for u in evidence.use]
     frame_chi2 = [float(np.sum(w.astype(float) ** 2)) for w in evidence.whitened]
     return Basis(
-        frames=len(evidence.frames), values=n, masked=evidence.masked, not_finite=evidence.not_finite,
-        thinning=evidence.thinning, signal=evidence.signal, noise=evidence.noise,
-        misfit=evidence.noise * math.sqrt(chi2 / dof), chi2=chi2, dof=dof, rank=rank, phi=chi2 / dof,
-        excess_sd=(chi2 - dof) / math.sqrt(2 * dof), gradient=evidence.gradient,
-        structure_f=structure.f, structure_p=structure.p, high_frequency=structure.high,
+        frames=len(evidence.frames),
+        values=n,
+        masked=evidence.masked,
+        not_finite=evidence.not_finite,
+        thinning=evidence.thinning,
+        signal=evidence.signal,
+        noise=evidence.noise,
+        misfit=evidence.noise * math.sqrt(chi2 / dof),
+        chi2=chi2,
+        dof=dof,
+        rank=rank,
+        phi=chi2 / dof,
+        excess_sd=(chi2 - dof) / math.sqrt(2 * dof),
+        gradient=evidence.gradient,
+        structure_f=structure.f,
+        structure_p=structure.p,
+        high_frequency=structure.high,
         render_noise=evidence.render_noise,
         frame_names=[str(getattr(model.frames[f], "name", f)) for f in evidence.frames],
-        frame_phi=[c / m for c, m in zip(frame_chi2, frame_n)])
+        frame_phi=[c / m for c, m in zip(frame_chi2, frame_n)],
+    )
 
 
-def _write_limits(model, evidence: Evidence, table: Table, claimed: Candidate | None, fits: Mapping, basis: Basis,
-                  rows_max: int, seed: int, say: Progress) -> None:
-    """Upper limits of every effect; after a claim, at the values with the claimed effect, where it can mislead no more."""
+def _write_limits(
+    model,
+    evidence: Evidence,
+    table: Table,
+    claimed: Candidate | None,
+    fits: Mapping,
+    basis: Basis,
+    rows_max: int,
+    seed: int,
+    say: Progress,
+) -> None:
+    """Upper limits of every effect; after a claim, at the values with the claimed effect, where it can mislead no
+    more."""
     others, widen = table.order, math.sqrt(max(basis.phi, 1.0))
     if claimed is not None:
         values, refit = fits[claimed.effect.name].values, claimed.row.refit
-        base = [v for v in [*(evidence.columns[i] for i in evidence.base), *claimed.variables]
-                if not at_bound(v, value_of(model, values, v))]
+        base = [
+            v
+            for v in [*(evidence.columns[i] for i in evidence.base), *claimed.variables]
+            if not at_bound(v, value_of(model, values, v))
+        ]
         others = [replace(c, forms={}, broken=False) for c in table.order if c is not claimed]
         evidence = measure(model, values, base, others, evidence.frames, rows_max, seed, say, "upper limits")
         widen = math.sqrt(max(1 + refit.excess_sd * math.sqrt(2 / basis.dof), 1.0))
@@ -760,26 +984,38 @@ def _warnings(model, fit, evidence, table, word, winner, shifts, dropped, struct
     if evidence.not_finite:
         texts.append(f"{evidence.not_finite} values left out because prediction or derivative is not finite")
     if evidence.render_noise > 0.01:
-        texts.append(f"Monte Carlo noise of the prediction adds {evidence.render_noise:.1%} to the variance; render with more "
-                     "samples")
+        texts.append(
+            f"Monte Carlo noise of the prediction adds {evidence.render_noise:.1%} to the variance; render with more "
+            "samples"
+        )
     noisy = [c.effect.name for c in table.order if c.row.kappa > KAPPA]
     if noisy:
-        texts.append(f"derivative images are noisy (kappa above {KAPPA:g}): {', '.join(noisy)}; render with more samples")
+        texts.append(
+            f"derivative images are noisy (kappa above {KAPPA:g}): {', '.join(noisy)}; render with more samples"
+        )
     if structure.high < 0.7:
-        texts.append(f"fine detail of the residual has {structure.high:.2f} of the noise expected: the images look interpolated "
-                     "or filtered, or the noise is overstated; neighbouring pixels then share their noise and p is too small")
+        texts.append(
+            f"fine detail of the residual has {structure.high:.2f} of the noise expected: the images look interpolated "
+            "or filtered, or the noise is overstated; neighbouring pixels then share their noise and p is too small"
+        )
     if abs(basis.excess_sd) > EXCESS and structure.p >= LEVEL:
-        texts.append(f"chi2 is {basis.phi:.3g} per degree of freedom without structure: rather the noise model (gain, PRNU) is off "
-                     "than the physics")
+        texts.append(
+            f"chi2 is {basis.phi:.3g} per degree of freedom without structure: rather the noise model (gain, PRNU) is off "
+            "than the physics"
+        )
     if winner is not None and table.p_best < LEVEL:
-        for other, what in ((table.winner_uniform, "with uniform weights"),
-                            (table.winner_dilated, "with masks one pixel wider")):
+        for other, what in (
+            (table.winner_uniform, "with uniform weights"),
+            (table.winner_dilated, "with masks one pixel wider"),
+        ):
             if other and other != winner.effect.name:
                 texts.append(f"fragile: {what} the best effect is {other}, not {winner.effect.name}")
     moved = [s for s in shifts if s.warn]
     if moved and word in NAMED:
-        texts.append(f"with {winner.effect.name}, what had been calibrated moves by more than 3 sd or out of its prior: "
-                     + some([moved_by(s) for s in moved], 3))
+        texts.append(
+            f"with {winner.effect.name}, what had been calibrated moves by more than 3 sd or out of its prior: "
+            + some([moved_by(s) for s in moved], 3)
+        )
     return texts
 
 
@@ -788,20 +1024,39 @@ def _hints(word: str, conditions, members: Sequence[Candidate], gaps, names) -> 
     failed = {c.name for c in conditions if not c.holds}
     hints = []
     if word == "AMBIGUOUS" and len(members) > 1:
-        pairs = [(min(gaps[names.index(a.effect.name)][names.index(b.effect.name)],
-                      gaps[names.index(b.effect.name)][names.index(a.effect.name)]), a, b)
-                 for i, a in enumerate(members) for b in members[i + 1:]]
+        pairs = [
+            (
+                min(
+                    gaps[names.index(a.effect.name)][names.index(b.effect.name)],
+                    gaps[names.index(b.effect.name)][names.index(a.effect.name)],
+                ),
+                a,
+                b,
+            )
+            for i, a in enumerate(members)
+            for b in members[i + 1 :]
+        ]
         d, a, b = min(pairs, key=lambda pair: pair[0])
         more = math.ceil(CLEAR / d) if d > 0 else 0
-        pair = (f"hardest pair: {a.effect.name} / {b.effect.name}, expected chi2 between them D = {d:.3g}, "
-                f"P(correct) = {st.probability_correct(d):.2f} in noise alone; ")
+        pair = (
+            f"hardest pair: {a.effect.name} / {b.effect.name}, expected chi2 between them D = {d:.3g}, "
+            f"P(correct) = {st.probability_correct(d):.2f} in noise alone; "
+        )
         if d >= CLEAR:
-            hints += [pair + "noise would allow a decision, but not the misfit that both leave",
-                      "add each of them in a copy of the study, diagnose again, and keep the one after which the least is left: what else is "
-                      "missing hides which of them it is"]
+            hints += [
+                pair + "noise would allow a decision, but not the misfit that both leave",
+                "add each of them in a copy of the study, diagnose again, and keep the one after which the least is left: what else is "
+                "missing hides which of them it is",
+            ]
         else:
-            hints.append(pair + (f"{more} times as many frames of the same kind would decide in 95 % of cases" if 0 < more < 1000
-                                 else "more frames of the same kind will not decide"))
+            hints.append(
+                pair
+                + (
+                    f"{more} times as many frames of the same kind would decide in 95 % of cases"
+                    if 0 < more < 1000
+                    else "more frames of the same kind will not decide"
+                )
+            )
         for one, other in ((a, b), (b, a)):
             alone = [x for x in one.effect.acts if x not in other.effect.acts]
             if alone:
@@ -809,11 +1064,17 @@ def _hints(word: str, conditions, members: Sequence[Candidate], gaps, names) -> 
         hints += [f"{c.effect.name} needs: {c.effect.needs}" for c in members if c.effect.needs]
         hints.append(USUALLY)
     if "held out" in failed and word != "NOTHING" and "held out" in {c.name for c in conditions}:
-        hints.append("hold out frames that the fit has not seen (other presses or places), or find why they do not improve")
+        hints.append(
+            "hold out frames that the fit has not seen (other presses or places), or find why they do not improve"
+        )
     if "near" in failed:
         hints.append(f"no effect brings the model near its images: check {AT_FAULT}")
     if CURVE in failed:
-        hints.append("check [noise]: repeats of one frame tell system_gain and dark_noise, a flat_field takes the sensor's own pattern out")
+        hints.append(
+            "check [noise]: repeats of one frame tell system_gain and dark_noise, a flat_field takes the sensor's own pattern out"
+        )
     if word == "UNKNOWN":
-        hints.append("draft an effect from the curve (optics effects new NAME --from STUDY), add it, and diagnose again")
+        hints.append(
+            "draft an effect from the curve (optics effects new NAME --from STUDY), add it, and diagnose again"
+        )
     return hints

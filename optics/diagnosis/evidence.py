@@ -1,4 +1,5 @@
-"""What the data say: derivative images of a calibrated model and of candidate effects, whitened and summed, frame by frame.
+"""What the data say: derivative images of a calibrated model and of candidate effects, whitened and summed, frame by
+frame.
 
 Masks come from data and noise, never from the size of a residual; weights from the prediction. Normal equations take
 every usable pixel; curves, splits and alternative weights use a thinned lattice of pixels that is kept in memory.
@@ -54,13 +55,13 @@ class Candidate:
     row: Row | None = None
     raw: float = 0.0  # rms change of the image at the plausible strengths, over the mean signal, before any calibration
 
-    def contains(self, other: "Candidate") -> bool:
+    def contains(self, other: Candidate) -> bool:
         """Whether it frees all that another frees, and more: it fits as well by itself and rivals nothing."""
         mine, others = ({(key, v.frames) for v in c.variables for key in v.keys} for c in (self, other))
         return mine > others
 
     @classmethod
-    def at(cls, model, values: Values, effect: Effect, variables: Sequence[Variable]) -> "Candidate":
+    def at(cls, model, values: Values, effect: Effect, variables: Sequence[Variable]) -> Candidate:
         """An effect under test at the values: where its strengths start, and to which side they may go."""
         start = np.array([value_of(model, values, v) for v in variables])
         sides = [v.parameter.side(value) for v, value in zip(variables, start)]
@@ -68,8 +69,8 @@ class Candidate:
 
     @property
     def usual(self) -> np.ndarray:
-        """Changes of plausible size, to the side that is open; of a strength that every frame has for itself up and down in turn, as all
-        of them together would be one scale, which a calibration takes up."""
+        """Changes of plausible size, to the side that is open; of a strength that every frame has for itself up and
+        down in turn, as all of them together would be one scale, which a calibration takes up."""
         sides = np.array(self.sides)
         turn = np.where([v.frames is not None and i % 2 == 1 for i, v in enumerate(self.variables)], -1.0, 1.0)
         return self.plausible * np.where(sides == 0, turn, sides)
@@ -81,7 +82,10 @@ class Candidate:
 
     def _squares(self) -> np.ndarray:
         """Variables whose effect grows with their square: a secant to the plausible size is linear in s^2/plausible."""
-        own = [v.parameter.squared and abs(start) < 1e-3 * v.parameter.plausible for v, start in zip(self.variables, self.start)]
+        own = [
+            v.parameter.squared and abs(start) < 1e-3 * v.parameter.plausible
+            for v, start in zip(self.variables, self.start)
+        ]
         return np.array(own) & (self.form == "secant")
 
     def change_of(self, linear: np.ndarray) -> np.ndarray:
@@ -106,7 +110,8 @@ class Candidate:
 class Block:
     """Pixels of one frame that are kept: whitened columns a (n, k) in the places `where`, residual r (n,).
 
-    prediction   of the seed `Evidence.seed`, not the residual's: where pictures are Monte Carlo estimates, its error is not that of r
+    prediction   of the seed `Evidence.seed`, not the residual's: where images are Monte Carlo estimates, its error is
+                 not that of r
     """
 
     frame: int
@@ -147,7 +152,8 @@ class Evidence:
     signal: float
     noise: float
     masked: float
-    seed: int = 0  # of pictures to bin or to scale residuals by: binned by a picture whose error is in them, residuals follow that error
+    # of images to bin or to scale residuals by: binned by an image whose error is in them, residuals follow that error
+    seed: int = 0
     projected: st.Projected | None = None
     candidates: list[Candidate] = field(default_factory=list)  # that were scored in it, best first
 
@@ -168,9 +174,10 @@ class Evidence:
         return self.spectrum.test(whitened, base, self.inverse(base))
 
     def variance(self, model, frame: int, prediction: np.ndarray, values: Values | None = None) -> np.ndarray:
-        """Of a frame about its prediction, DN^2: where the model knows no error of its prediction, that between two seeds is added."""
+        """Of a frame about its prediction, DN^2: where the model knows no error of its prediction, that between two
+        seeds is added."""
         known = model.variance(values or self.values, frame, prediction)
-        return known if model.by_chance else known * (1 + self.render_noise)
+        return known if model.monte_carlo else known * (1 + self.render_noise)
 
     def thinned(self, weight: Callable[[Block], np.ndarray] | None = None, extra: int = 0) -> st.Normal:
         """Normal equations of the kept pixels alone; `weight` (n,) multiplies rows, `extra` columns are left empty."""
@@ -184,10 +191,18 @@ class Evidence:
             normal.add(block.where, block.a * w[:, None], block.r * w, b)
         return normal
 
-    def project(self, normal: st.Normal, base: Sequence[int], rest: Sequence[int], thinning: int = 1,
-                settled: bool = False) -> st.Projected:
+    def project(
+        self, normal: st.Normal, base: Sequence[int], rest: Sequence[int], thinning: int = 1, settled: bool = False
+    ) -> st.Projected:
         """Project with the priors of the first base columns; thinned data meet thinned priors."""
-        return st.project(normal, base, rest, _padded(self.precision, base) / thinning, _padded(self.pull, base) / thinning, settled=settled)
+        return st.project(
+            normal,
+            base,
+            rest,
+            _padded(self.precision, base) / thinning,
+            _padded(self.pull, base) / thinning,
+            settled=settled,
+        )
 
 
 def _padded(known: np.ndarray, base: Sequence[int]) -> np.ndarray:
@@ -195,8 +210,17 @@ def _padded(known: np.ndarray, base: Sequence[int]) -> np.ndarray:
     return np.concatenate([known, np.zeros(len(base) - len(known))])
 
 
-def measure(model, values: Values, base: Sequence[Variable], candidates: Sequence[Candidate], frames: Sequence[int],
-             rows_max: int, seed: int, say: Progress, what: str = "derivative images") -> Evidence:
+def measure(
+    model,
+    values: Values,
+    base: Sequence[Variable],
+    candidates: Sequence[Candidate],
+    frames: Sequence[int],
+    rows_max: int,
+    seed: int,
+    say: Progress,
+    what: str = "derivative images",
+) -> Evidence:
     """One pass over the frames: derivative images of the base and of every candidate, whitened and summed.
 
     The residual comes from `model.predict`; derivative images have seeds of their own. Where a second seed changes an
@@ -211,10 +235,14 @@ def measure(model, values: Values, base: Sequence[Variable], candidates: Sequenc
         if c.effect.onset in ("secant", "both"):
             c.forms["secant"] = [len(tangent) + len(secant) + i for i in range(len(c.variables))]
             secant += c.variables
-            steps.update({v.name: v.parameter.plausible * (-1 if side < 0 else 1) for v, side in zip(c.variables, c.sides)})
+            steps.update(
+                {v.name: v.parameter.plausible * (-1 if side < 0 else 1) for v, side in zip(c.variables, c.sides)}
+            )
     columns = tangent + secant
 
-    def images(frame: int, seed: int, wanted: set[int] | None = None) -> tuple[np.ndarray | None, dict[int, np.ndarray]]:
+    def images(
+        frame: int, seed: int, wanted: set[int] | None = None
+    ) -> tuple[np.ndarray | None, dict[int, np.ndarray]]:
         found, prediction = {}, None
         for first, variables, step in ((0, tangent, None), (len(tangent), secant, steps)):
             here: dict[str, list[int]] = {}  # two effects may free the same variable
@@ -227,7 +255,9 @@ def measure(model, values: Values, base: Sequence[Variable], candidates: Sequenc
             if step is None:
                 result = model.derivatives(values, asked, [frame], seed=seed)
             else:
-                result = model.derivatives(values, asked, [frame], secant={v.name: step[v.name] for v in asked}, seed=seed)
+                result = model.derivatives(
+                    values, asked, [frame], secant={v.name: step[v.name] for v in asked}, seed=seed
+                )
             prediction, named = next(iter(result))
             found.update({i: np.asarray(image) for name, image in named.items() for i in here.get(name, ())})
         return prediction, found
@@ -240,8 +270,27 @@ def measure(model, values: Values, base: Sequence[Variable], candidates: Sequenc
     k = st.thinning(used, rows_max)
     sweeps = all(getattr(model.frames[f], "readings", None) for f in frames)
     normal, spectrum = st.Normal(len(columns)), st.Sweeps() if sweeps else st.Spectrum(len(columns))
-    evidence = Evidence(columns, list(range(len(base))), list(range(len(base), len(columns))), values, normal, [],
-                        list(frames), [], [], [], spectrum, *_priors(model, values, base), k, 0, 0.0, 0.0, 0.0, 0.0, seeds[0])
+    evidence = Evidence(
+        columns,
+        list(range(len(base))),
+        list(range(len(base), len(columns))),
+        values,
+        normal,
+        [],
+        list(frames),
+        [],
+        [],
+        [],
+        spectrum,
+        *_priors(model, values, base),
+        k,
+        0,
+        0.0,
+        0.0,
+        0.0,
+        0.0,
+        seeds[0],
+    )
     noisy: set[int] = set()
     signal = variance = 0.0
     for n, frame in enumerate(frames):
@@ -257,8 +306,19 @@ def measure(model, values: Values, base: Sequence[Variable], candidates: Sequenc
                 evidence.render_noise = float(np.mean(sample[np.isfinite(sample)]))
         elif noisy:
             _, second = images(frame, seeds[1], noisy)
-        _add_frame(evidence, model, frame, n, prediction, prediction if own is None else own, first, second if noisy else {}, noisy,
-                   candidates, len(base))
+        _add_frame(
+            evidence,
+            model,
+            frame,
+            n,
+            prediction,
+            prediction if own is None else own,
+            first,
+            second if noisy else {},
+            noisy,
+            candidates,
+            len(base),
+        )
         use, sigma = evidence.use[-1], evidence.sigma[-1]
         signal += float(prediction[use].sum())
         variance += float((sigma[use].astype(float) ** 2).sum())
@@ -266,8 +326,10 @@ def measure(model, values: Values, base: Sequence[Variable], candidates: Sequenc
     if normal.count == 0:
         raise Underdetermined("diagnose: no usable value in the fitted frames; check masks, saturation and exposure")
     if evidence.not_finite > 0.01 * normal.count:
-        raise ValueError(f"diagnose: prediction or derivative images of the base are not finite in {evidence.not_finite} of "
-                         f"{normal.count + evidence.not_finite} usable values; a parameter may have left its physical range")
+        raise ValueError(
+            f"diagnose: prediction or derivative images of the base are not finite in {evidence.not_finite} of "
+            f"{normal.count + evidence.not_finite} usable values; a parameter may have left its physical range"
+        )
     evidence.signal = signal / normal.count - float(model.noise.black_level)
     evidence.noise = math.sqrt(variance / normal.count) / evidence.signal
     evidence.masked = 1 - (normal.count / total)
@@ -285,8 +347,19 @@ def _priors(model, values: Values, base: Sequence[Variable]) -> tuple[np.ndarray
     return precision, pull
 
 
-def _add_frame(evidence: Evidence, model, frame: int, n: int, prediction, other, first: dict, second: dict, noisy: set,
-               candidates: Sequence[Candidate], p: int) -> None:
+def _add_frame(
+    evidence: Evidence,
+    model,
+    frame: int,
+    n: int,
+    prediction,
+    other,
+    first: dict,
+    second: dict,
+    noisy: set,
+    candidates: Sequence[Candidate],
+    p: int,
+) -> None:
     image = np.asarray(model.frames[frame].image, float)
     variance = evidence.variance(model, frame, prediction)
     mask = np.asarray(model.usable(frame), bool)
@@ -321,19 +394,38 @@ def _add_frame(evidence: Evidence, model, frame: int, n: int, prediction, other,
     else:
         evidence.spectrum.add(good, where, a)
     keep = good & st.lattice(image.shape, evidence.thinning, n)
-    evidence.blocks.append(Block(
-        frame, where, a[keep], None if b is None else b[keep], whitened[keep], 1 / weight[keep], np.asarray(other, float)[keep],
-        np.flatnonzero(keep), (mask if isinstance(evidence.spectrum, st.Sweeps) else _dilated(mask))[keep]))
+    evidence.blocks.append(
+        Block(
+            frame,
+            where,
+            a[keep],
+            None if b is None else b[keep],
+            whitened[keep],
+            1 / weight[keep],
+            np.asarray(other, float)[keep],
+            np.flatnonzero(keep),
+            (mask if isinstance(evidence.spectrum, st.Sweeps) else _dilated(mask))[keep],
+        )
+    )
     evidence.use.append(good)
     evidence.sigma.append(np.where(good, np.sqrt(variance), np.inf).astype(np.float32))
     evidence.whitened.append(whitened.astype(np.float32))
 
 
 def _swept(sweep, prediction: np.ndarray) -> dict[str, np.ndarray]:
-    """What tells the readings of a sweep apart: when, how bright, and what was set, which may be the same within one sweep."""
+    """What tells the readings of a sweep apart: when, how bright, and what was set, which may be the same within one
+    sweep."""
     still = {k: np.full(1, v) for k, v in sweep.parameters.items() if isinstance(v, float)}
-    turned = {k: v for k, v in (("reading", sweep.rows), *sweep.readings.items()) if v is not None and len(v) == len(prediction)}
-    return {"signal": prediction, **still, **turned}  # one reading of a shot that is only thought of stands for all that are alike
+    turned = {
+        k: v
+        for k, v in (("reading", sweep.rows), *sweep.readings.items())
+        if v is not None and len(v) == len(prediction)
+    }
+    return {
+        "signal": prediction,
+        **still,
+        **turned,
+    }  # one reading of a shot that is only thought of stands for all that are alike
 
 
 def _dilated(mask: np.ndarray) -> np.ndarray:
@@ -344,5 +436,3 @@ def _dilated(mask: np.ndarray) -> np.ndarray:
     for plane in st.planes_of(mask):
         out[plane] = binary_erosion(mask[plane], np.ones((3, 3), bool), border_value=1)
     return out
-
-

@@ -1,10 +1,11 @@
-"""Fingerprints: a residual that no effect explains, along everything that the scene knows of a pixel, and what that leads to.
+"""Fingerprints: a residual that no effect explains, along everything that the scene knows of a pixel, and what that
+leads to.
 
-`places` gathers the covariates of every kept value: those of the model (`optics.fit.model.Model.coordinates`), those that any picture has
-(row, column, channel, frame, a map of cells), those of the prediction (signal, its gradient, its Laplacian) and the settings that the
-experimenter turned. `fingerprints` fits a gain and an offset per bin of each, what calibration absorbs taken out, and ranks them by the fall
-of chi2. `families` says whether the residual goes with the camera, with light, with geometry or with time.
-"""
+`places` gathers the covariates of every kept value: those of the model (`optics.fit.model.Model.coordinates`), those
+that any image has (row, column, channel, frame, a map of cells), those of the prediction (signal, its gradient, its
+Laplacian) and the settings that the experimenter turned. `fingerprints` fits a gain and an offset per bin of each, what
+calibration absorbs taken out, and ranks them by the fall of chi2. `families` says whether the residual goes with the
+camera, with light, with geometry or with time."""
 
 from __future__ import annotations
 
@@ -23,19 +24,43 @@ from optics.scene.parameter import Values
 SIDE = 4  # cells per side of the coordinate 'place': a finer map would fit any clutter and forbid every claim
 NOT_A_COORDINATE = {"far", "quadrant"}  # regions that others make up
 YES_NO = ("contact", "shadow", "rim")
-LINES = 64  # bins of 'row', 'column' and 'reading': what a shutter, a read-out or a restless lamp does goes by single rows
+LINES = (
+    64  # bins of 'row', 'column' and 'reading': what a shutter, a read-out or a restless lamp does goes by single rows
+)
 REPEATED = 3  # frames that show a pixel, for a pattern to be called fixed
-SEEN = 0.01  # of a curve's direction that calibration must leave for it to be drawn: the rest (a level, a slope) nobody can know
+# of a curve's direction that calibration must leave for it to be drawn: the rest (a level, a slope) nobody can know
+SEEN = 0.01
 DISTANCES = 8  # LEDs up to which the distance to each is a coordinate of its own
 
 FAMILIES = {  # what a coordinate belongs to; a setting belongs to the family of the part that it is a setting of
     "camera": ("radius", "row", "column", "place", "channel", "signal", "gradient", "laplacian"),
     "light": ("incidence", "half_angle", "led_distance", "led_angle", "light_azimuth", "intensity", "shadow", "LED"),
-    "geometry": ("height", "depth", "slope", "curvature", "emission", "contact", "contact_distance", "press_distance", "gel_path", "rim"),
+    "geometry": (
+        "height",
+        "depth",
+        "slope",
+        "curvature",
+        "emission",
+        "contact",
+        "contact_distance",
+        "press_distance",
+        "gel_path",
+        "rim",
+    ),
     "time": ("frame", "reading"),
 }
-PARTS = {"camera": "camera", "led": "light", "source": "light", "room": "light", "gel": "geometry", "block": "geometry",
-         "target": "geometry", "cells": "geometry", "carried": "geometry", "markers": "geometry"}
+PARTS = {
+    "camera": "camera",
+    "led": "light",
+    "source": "light",
+    "room": "light",
+    "gel": "geometry",
+    "block": "geometry",
+    "target": "geometry",
+    "cells": "geometry",
+    "carried": "geometry",
+    "markers": "geometry",
+}
 TIMES = ("time", "frame_time", "timestamp")
 
 
@@ -52,7 +77,8 @@ def family_of(coordinate: str, kind: str = "") -> str:
 
 
 def places(model, values: Values, evidence: Evidence) -> list[dict[str, np.ndarray]]:
-    """Per block, the covariates of every kept value (n,): those of the model, of the prediction, of any picture, and the settings."""
+    """Per block, the covariates of every kept value (n,): those of the model, of the prediction, of any image, and the
+    settings."""
     found = []
     order = {frame: i for i, frame in enumerate(evidence.frames)}
     turned = settings(model, evidence)
@@ -73,10 +99,15 @@ def places(model, values: Values, evidence: Evidence) -> list[dict[str, np.ndarr
             plane = np.broadcast_to(plane if plane.ndim == 3 else plane[..., None], shape)
             known[name] = plane.reshape(-1)[block.index].astype(np.float32)
         if not table:
-            known.update(row=row.astype(np.float32), column=column.astype(np.float32),
-                         quadrant=(2 * (2 * row >= shape[0]) + (2 * column >= shape[1])).astype(np.float32))
+            known.update(
+                row=row.astype(np.float32),
+                column=column.astype(np.float32),
+                quadrant=(2 * (2 * row >= shape[0]) + (2 * column >= shape[1])).astype(np.float32),
+            )
         known.update(channel=channel.astype(np.float32), frame=np.full(len(row), order[block.frame], np.float32))
-        known.update({key: np.full(len(row), numbers[order[block.frame]], np.float32) for key, numbers in turned.items()})
+        known.update(
+            {key: np.full(len(row), numbers[order[block.frame]], np.float32) for key, numbers in turned.items()}
+        )
         if len(kinds) > 1:
             known["LED"] = np.full(len(row), kinds.index(lights[order[block.frame]]), np.float32)
         if min(shape[:2]) >= 2 * SIDE:
@@ -86,12 +117,15 @@ def places(model, values: Values, evidence: Evidence) -> list[dict[str, np.ndarr
 
 
 def lit_geometry(model, values: Values, frame: int) -> dict[str, np.ndarray]:
-    """(H, W) more of what a scene knows of its pixels: how the brightest LED stands to the surface, and how far each LED is.
+    """(H, W) more of what a scene knows of its pixels: how the brightest LED stands to the surface, and how far each
+    LED is.
 
     half_angle      deg, of the normal to the bisector of the ways to LED and camera: 0 where a mirror would glint
     led_angle       deg, off the axis of the LED, as its lobe goes
-    light_azimuth   deg, between the way down the slope and the way to the LED, seen along z; NaN where the surface is flat to 1 deg
-    press_distance  mm, from the middle of the press along the skin; depth: mm, from the camera, where the scene has no gel
+    light_azimuth   deg, between the way down the slope and the way to the LED, seen along z; NaN where the surface is
+                    flat to 1 deg
+    press_distance  mm, from the middle of the press along the skin; depth: mm, from the camera, where the scene has no
+                    gel
     NAME.distance   mm, from the LED of this name, in frames where it is lit, in scenes of at most DISTANCES of them
     """
     renderer = getattr(model, "renderer", None)
@@ -117,15 +151,22 @@ def lit_geometry(model, values: Values, frame: int) -> dict[str, np.ndarray]:
         axis[brighter] = _axis(scene.leds[led], now[f"{led}.pan"], now[f"{led}.tilt"])
     lit = (best > 0) & hits.valid
     slope = np.degrees(np.arccos(np.clip(-n[..., 2], -1, 1)))
-    # in a frame without light they are NaN, not left out: a coordinate that one frame lacks is no coordinate of the others either
+    # in a frame without light they are NaN, not left out: a coordinate that one frame lacks is no coordinate of the
+    # others either
     found["half_angle"] = np.where(lit, _angle(n, _unit(toward + to_camera)), np.nan)
     found["led_angle"] = np.where(lit, _angle(-toward, axis), np.nan)
     found["light_azimuth"] = np.where(lit & (slope > 1), _angle(_flat(n), _flat(toward)), np.nan)
     if scene.gel is not None and f"{scene.gel.name}.press_x" in now:
-        found["press_distance"] = np.hypot(*(p[..., i] - float(now[f"{scene.gel.name}.press_{a}"]) for i, a in enumerate("xy")))
+        found["press_distance"] = np.hypot(
+            *(p[..., i] - float(now[f"{scene.gel.name}.press_{a}"]) for i, a in enumerate("xy"))
+        )
     if 1 < len(at) <= DISTANCES:
-        found.update({f"{led}.distance": np.where(hits.valid & (led in on), np.linalg.norm(place - p, axis=-1), np.nan)
-                      for led, place in at.items()})
+        found.update(
+            {
+                f"{led}.distance": np.where(hits.valid & (led in on), np.linalg.norm(place - p, axis=-1), np.nan)
+                for led, place in at.items()
+            }
+        )
     return found
 
 
@@ -148,11 +189,15 @@ def _angle(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def _texture(prediction: np.ndarray) -> dict[str, np.ndarray]:
-    """(H, W, C) DN/px and DN/px^2: how steep and how bent a predicted picture is; what a blur takes from, and a sharpening adds to."""
+    """(H, W, C) DN/px and DN/px^2: how steep and how bent a predicted image is; what a blur takes from, and a
+    sharpening adds to."""
     from scipy.ndimage import laplace
 
     steep = np.hypot(*np.gradient(prediction, axis=(0, 1)))
-    return {"gradient": steep, "laplacian": np.stack([laplace(prediction[..., c], mode="nearest") for c in range(prediction.shape[2])], -1)}
+    return {
+        "gradient": steep,
+        "laplacian": np.stack([laplace(prediction[..., c], mode="nearest") for c in range(prediction.shape[2])], -1),
+    }
 
 
 def settings(model, evidence: Evidence) -> dict[str, list[float]]:
@@ -173,8 +218,8 @@ def settings(model, evidence: Evidence) -> dict[str, list[float]]:
 def fingerprints(model, evidence: Evidence, found: list[dict], reference: float, say: Progress) -> list[Fingerprint]:
     """The residual along every coordinate: bins of gain and offset, projected like effects; best first.
 
-    Falls of chi2 count every direction that is left; a curve is drawn (and drafted) without those of which calibration leaves less than
-    SEEN, such as a level, which powers of LEDs absorb: they would be large, and noise.
+    Falls of chi2 count every direction that is left; a curve is drawn (and drafted) without those of which calibration
+    leaves less than SEEN, such as a level, which powers of LEDs absorb: they would be large, and noise.
 
     found      what `places` returns
     reference  net fall of chi2 of the best effect, which the curves' ratios refer to
@@ -184,7 +229,12 @@ def fingerprints(model, evidence: Evidence, found: list[dict], reference: float,
     k, black = evidence.thinning, float(model.noise.black_level)
     names = sorted(set.intersection(*[set(p) for p in found]) - NOT_A_COORDINATE)
     # bins that have names: one each, whether it holds data or not
-    named = {"place": SIDE * SIDE, "frame": len(evidence.frames), "channel": evidence.channels, "LED": len(_lights(evidence, model))}
+    named = {
+        "place": SIDE * SIDE,
+        "frame": len(evidence.frames),
+        "channel": evidence.channels,
+        "LED": len(_lights(evidence, model)),
+    }
     plain_normal = evidence.thinned(extra=2 * max(LINES, *named.values()))
     middles = [block.middle for block in evidence.blocks]
     carriers = [((block.prediction - black) / block.sigma, 1 / block.sigma) for block in evidence.blocks]
@@ -197,7 +247,11 @@ def fingerprints(model, evidence: Evidence, found: list[dict], reference: float,
     for n, name in enumerate(names):
         say("fingerprints", n, len(names))
         x = np.concatenate([p[name] for p in found])
-        edges = np.arange(named[name] + 1) - 0.5 if name in named else st.bin_edges(x, LINES if name in ("row", "column", "reading") else st.BINS)
+        edges = (
+            np.arange(named[name] + 1) - 0.5
+            if name in named
+            else st.bin_edges(x, LINES if name in ("row", "column", "reading") else st.BINS)
+        )
         if edges is None or len(edges) < 3:
             continue
         count = len(edges) - 1
@@ -219,10 +273,24 @@ def fingerprints(model, evidence: Evidence, found: list[dict], reference: float,
         _, _, curve, sd = drawn[kind]
         net = (fall - dof) * k
         centres = [float(np.median(x[index == i])) if np.any(index == i) else math.nan for i in range(count)]
-        curves_of.append(Fingerprint(
-            name, fall, dof, float(chdtrc(dof, fall)), net, net / reference, kind, centres, curve.tolist(), sd.tolist(),
-            _labels(evidence, model, name, centres), family_of(name, _kind(model, name)),
-            net / excess if weighed else math.nan, _unit_of(model, name)))
+        curves_of.append(
+            Fingerprint(
+                name,
+                fall,
+                dof,
+                float(chdtrc(dof, fall)),
+                net,
+                net / reference,
+                kind,
+                centres,
+                curve.tolist(),
+                sd.tolist(),
+                _labels(evidence, model, name, centres),
+                family_of(name, _kind(model, name)),
+                net / excess if weighed else math.nan,
+                _unit_of(model, name),
+            )
+        )
     say("fingerprints", len(names), len(names))
     return sorted(curves_of, key=lambda f: -f.net)
 
@@ -246,7 +314,10 @@ def _labels(evidence: Evidence, model, name: str, centres: Sequence[float]) -> l
     if name == "LED":
         return _lights(evidence, model)
     if name == "channel":
-        return [f"{c} ({nm:.0f} nm)" if nm else c for c, nm in zip(channel_names(evidence), _wavelengths(model, evidence.channels))]
+        return [
+            f"{c} ({nm:.0f} nm)" if nm else c
+            for c, nm in zip(channel_names(evidence), _wavelengths(model, evidence.channels))
+        ]
     if name in YES_NO and len(centres) == 2:
         return ["no", "yes"]
     if name == "place":
@@ -276,18 +347,20 @@ def channel_names(evidence: Evidence) -> list[str]:
 def families(found: Sequence[Fingerprint]) -> list[Family]:
     """The best curve of each family, the family that the residual goes with first.
 
-    A map of the sensor mimics every curve that does not move, and a number per frame every setting: either stands for its family,
-    and its family comes first, only where no other curve is nearly as good.
-    """
+    A map of the sensor mimics every curve that does not move, and a number per frame every setting: either stands for
+    its family, and its family comes first, only where no other curve is nearly as good."""
     own: dict[str, list[Fingerprint]] = {}
     for f in found:
         own.setdefault(f.family, []).append(f)
     best = ordered([ordered(curves)[0] for curves in own.values()])
-    return [Family(f.family, f.coordinate, f.net, f.share, f.net / best[0].net if best[0].net > 0 else 0.0) for f in best]
+    return [
+        Family(f.family, f.coordinate, f.net, f.share, f.net / best[0].net if best[0].net > 0 else 0.0) for f in best
+    ]
 
 
 def goes_with(found: Sequence[Family]) -> str:
-    """One sentence: with what the residual goes, and what it goes with less; '' without a curve that explains anything."""
+    """One sentence: with what the residual goes, and what it goes with less; '' without a curve that explains
+    anything."""
     if not found or found[0].net <= 0:
         return ""
 
@@ -303,21 +376,31 @@ def goes_with(found: Sequence[Family]) -> str:
     text = f"It goes with {' or '.join(map(told, [found[0], *near]))}"
     text += ", which these captures do not separate" if near else ""
     if rest:
-        text += (f"; less with {', '.join(map(told, rest))}" if near else f" rather than with {', '.join(map(told, rest))}")
-    how = "of the excess misfit a curve along it explains" if weighed else "a curve along it explains of what the best curve does"
+        text += (
+            f"; less with {', '.join(map(told, rest))}" if near else f" rather than with {', '.join(map(told, rest))}"
+        )
+    how = (
+        "of the excess misfit a curve along it explains"
+        if weighed
+        else "a curve along it explains of what the best curve does"
+    )
     return f"{text}; in brackets the best coordinate of each and how much {how}."
 
 
 def fixed_pattern(model, evidence: Evidence, excess: float) -> float:
-    """Share of the excess misfit that one gain for each pixel explains, the same in all frames: dirt, scratches, a sensor's own pattern.
+    """Share of the excess misfit that one gain for each pixel explains, the same in all frames: dirt, scratches, a
+    sensor's own pattern.
 
-    Of pixels that REPEATED frames or more show, beyond what as many gains explain by chance; NaN where there are none, no excess, or
-    readings of a table.
+    Of pixels that REPEATED frames or more show, beyond what as many gains explain by Monte Carlo; NaN where there are
+    none, no excess, or readings of a table.
     excess   chi2 less its degrees of freedom
     """
     if isinstance(evidence.spectrum, st.Sweeps):
         return math.nan
-    black, size = float(model.noise.black_level), max((int(b.index.max(initial=0)) for b in evidence.blocks), default=0) // evidence.channels + 1
+    black, size = (
+        float(model.noise.black_level),
+        max((int(b.index.max(initial=0)) for b in evidence.blocks), default=0) // evidence.channels + 1,
+    )
     shown, along, length = np.zeros(size), np.zeros(size), np.zeros(size)
     for block in evidence.blocks:
         pixel, g = block.index // evidence.channels, (block.prediction - black) / block.sigma
@@ -334,8 +417,10 @@ def fixed_text(share: float, best: float) -> str:
     """One sentence where a fixed pattern explains much more than the best curve does; '' where not."""
     if not share > max(SHARE, 2 * best):
         return ""
-    return (f"one gain for each pixel, the same in every frame, explains {min(share, 1.0):.0%} of the excess: dirt, a scratch or the sensor's own "
-            "pattern lies fixed in the picture, whatever curve it leans to.")
+    return (
+        f"one gain for each pixel, the same in every frame, explains {min(share, 1.0):.0%} of the excess: dirt, a scratch or the sensor's own "
+        "pattern lies fixed in the image, whatever curve it leans to."
+    )
 
 
 def unexplained(found: Sequence[Fingerprint], best_effect: float, excess: float) -> str:
@@ -346,5 +431,7 @@ def unexplained(found: Sequence[Fingerprint], best_effect: float, excess: float)
     if not excess > 0 or not found:
         return ""
     effect, curve = (min(max(x / excess, 0.0), 1.0) for x in (best_effect, found[0].net))
-    return (f"Of the excess misfit the best effect explains {effect:.0%}, so {1 - effect:.0%} is unexplained by the library; the best curve, "
-            f"along '{found[0].coordinate}', explains {curve:.0%}; {1 - max(effect, curve):.0%} neither does.")
+    return (
+        f"Of the excess misfit the best effect explains {effect:.0%}, so {1 - effect:.0%} is unexplained by the library; the best curve, "
+        f"along '{found[0].coordinate}', explains {curve:.0%}; {1 - max(effect, curve):.0%} neither does."
+    )

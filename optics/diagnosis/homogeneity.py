@@ -1,8 +1,8 @@
 """Whether a strength is the same everywhere, and whether it is more than clutter makes.
 
-Noise is independent from pixel to pixel, clutter is not: mottle, a fixed pattern, a lamp that wanders are shared by neighbours. So what
-a strength scatters between parts of the sensor, or of a session, is held against it, beside the noise.
-"""
+Noise is independent from pixel to pixel, clutter is not: mottle, a fixed pattern, a lamp that wanders are shared by
+neighbours. So what a strength scatters between parts of the sensor, or of a session, is held against it, beside the
+noise."""
 
 from __future__ import annotations
 
@@ -20,25 +20,44 @@ from optics.fit.compare import led_label
 from optics.scene.parameter import Variable
 
 EVEN = 0.05  # of the fall: what splitting may gain where clutter does not make it
-SAME_PLACE = 0.5  # of what an effect leaves: if its own strength, split, takes more than this, the rest is where the effect is, and it is not it
+# of what an effect leaves: if its own strength, split, takes more than this, the rest is where the effect is, and it is
+# not it
+SAME_PLACE = 0.5
 HAIR = 0.01  # of the fall: a split that gains less says nothing about what the effect is
 PARTS = 16  # of the sensor or session, wider than what clutter shares
 
 
-def split(model, evidence: Evidence, places: list[dict], rows_max: int, seed: int, say: Progress, c: Candidate, found, left: Refit | Pair,
-          net: float, beside: Sequence[Variable] = ()) -> tuple[list[Split], float, np.ndarray]:
+def split(
+    model,
+    evidence: Evidence,
+    places: list[dict],
+    rows_max: int,
+    seed: int,
+    say: Progress,
+    c: Candidate,
+    found,
+    left: Refit | Pair,
+    net: float,
+    beside: Sequence[Variable] = (),
+) -> tuple[list[Split], float, np.ndarray]:
     """Whether a fitted effect has the same strength in every part of the data, and `scatter` of its strength.
 
-    With the effect in the base, e, by which its picture differs from the one without it, is cut into parts e 1{part} and these are
-    scored: a true effect gains nothing by being cut, a proxy does.
+    With the effect in the base, e, by which its image differs from the one without it, is cut into parts e 1{part} and
+    these are scored: a true effect gains nothing by being cut, a proxy does.
 
-    found   the fit with it;   left: what is left with that;   net: its fall;   beside: variables of what was added with it
+    found   the fit with it;   left: what is left with that;   net: its fall;   beside: variables of what was added with
+            it
     """
     from scipy.special import chdtrc
 
-    base = [v for v in [*(evidence.columns[i] for i in evidence.base), *beside, *c.variables]
-            if v in c.variables or not at_bound(v, value_of(model, found.values, v))]
-    own = measure(model, found.values, base, [], evidence.frames, rows_max, seed, say, f"evenness of {c.effect.name}")
+    base = [
+        v
+        for v in [*(evidence.columns[i] for i in evidence.base), *beside, *c.variables]
+        if v in c.variables or not at_bound(v, value_of(model, found.values, v))
+    ]
+    own = measure(
+        model, found.values, base, [], evidence.frames, rows_max, seed, say, f"homogeneity of {c.effect.name}"
+    )
     change = np.array([value_of(model, found.values, v) for v in c.variables]) - c.start
     effect = [i for i, v in enumerate(base) if v in c.variables]
     calibrated = [i for i in own.base if i not in effect]
@@ -47,7 +66,10 @@ def split(model, evidence: Evidence, places: list[dict], rows_max: int, seed: in
     for v, start in zip(c.variables, c.start):
         without.put(v, float(start))
     changes = zip(*(model.predict(values, own.frames, own.seed) for values in (found.values, without)))
-    images = [(np.asarray(new, float) - old).reshape(-1)[block.index] / block.sigma for block, (new, old) in zip(own.blocks, changes)]
+    images = [
+        (np.asarray(new, float) - old).reshape(-1)[block.index] / block.sigma
+        for block, (new, old) in zip(own.blocks, changes)
+    ]
     parts, residuals = _parts(model, own, places), [block.r for block in own.blocks]
     plain_normal = own.thinned(extra=max([len(labels) for labels, _ in parts.values()], default=0))
     results = []
@@ -67,9 +89,26 @@ def split(model, evidence: Evidence, places: list[dict], rows_max: int, seed: in
         h = max(fall - dof, 0.0) * k / max(net, 1e-9)
         cut = [image[:, None] * (index[:, None] == np.arange(count)) for image, index in zip(images, bins)]
         cut = _off_base(own, cut, projected, calibrated + effect)
-        results.append(Split(c.effect.name, by, labels, (1 + delta).tolist(), sd.tolist(), fall * k, dof, float(chdtrc(dof, fall)), h,
-                             by_clutter(projected.score, projected.information, variances(cut, residuals, places)), UNEVEN, True))
-    level, excess = LEVEL / max(len(results), 1), left.excess_sd * math.sqrt(2 * max(evidence.normal.count - evidence.projected.rank, 1))
+        results.append(
+            Split(
+                c.effect.name,
+                by,
+                labels,
+                (1 + delta).tolist(),
+                sd.tolist(),
+                fall * k,
+                dof,
+                float(chdtrc(dof, fall)),
+                h,
+                by_clutter(projected.score, projected.information, variances(cut, residuals, places)),
+                UNEVEN,
+                True,
+            )
+        )
+    level, excess = (
+        LEVEL / max(len(results), 1),
+        left.excess_sd * math.sqrt(2 * max(evidence.normal.count - evidence.projected.rank, 1)),
+    )
 
     def most(s: Split) -> float:
         if s.p >= level:
@@ -83,17 +122,24 @@ def split(model, evidence: Evidence, places: list[dict], rows_max: int, seed: in
 
 
 def scattered(refit: Refit, chance: float, clutter: np.ndarray) -> Refit:
-    """A refit with what the scatter of its strength says; where nothing is left but noise, its errors are those of noise."""
+    """A refit with what the scatter of its strength says; where nothing is left but noise, its errors are those of
+    noise."""
     if refit.complete:
         return replace(refit, chance=chance)
-    return replace(refit, chance=chance, clutter=clutter.tolist(),
-                   sd=np.sqrt(np.square(refit.sd) + np.maximum(np.diag(clutter), 0.0)).tolist())
+    return replace(
+        refit,
+        chance=chance,
+        clutter=clutter.tolist(),
+        sd=np.sqrt(np.square(refit.sd) + np.maximum(np.diag(clutter), 0.0)).tolist(),
+    )
 
 
-def scatter(own: Evidence, calibrated: Sequence[int], effect: Sequence[int], change: np.ndarray, places: list[dict]) -> tuple[float, np.ndarray]:
-    """p of a strength that asks for no independent noise, by its scatter between parts of the sensor or session, as neighbours share
-    clutter (`by_clutter`); and the covariance V^-1 (B - V) V^-1 that clutter adds to that of noise, with B of `variances`.
-    The larger of what the maps say; NaN and zero where there are too few parts."""
+def scatter(
+    own: Evidence, calibrated: Sequence[int], effect: Sequence[int], change: np.ndarray, places: list[dict]
+) -> tuple[float, np.ndarray]:
+    """p of a strength that asks for no independent noise, by its scatter between parts of the sensor or session, as
+    neighbours share clutter (`by_clutter`); and the covariance V^-1 (B - V) V^-1 that clutter adds to that of noise,
+    with B of `variances`. The larger of what the maps say; NaN and zero where there are too few parts."""
     projected, clutter = own.project(own.thinned(), calibrated, effect, own.thinning), np.zeros((len(effect),) * 2)
     white = st.root(projected.information, st.VISIBLE)
     covariance = white.T @ white
@@ -101,7 +147,11 @@ def scatter(own: Evidence, calibrated: Sequence[int], effect: Sequence[int], cha
     found = variances(images, [block.r for block in own.blocks], places)
     for b, parts in found:
         if st.inverse(white @ b @ white.T)[1] < parts - 1:
-            clutter = max(clutter, covariance @ (b - projected.information) @ covariance, key=lambda c: float(np.trace(c @ projected.information)))
+            clutter = max(
+                clutter,
+                covariance @ (b - projected.information) @ covariance,
+                key=lambda c: float(np.trace(c @ projected.information)),
+            )
     return by_clutter(projected.information @ change, projected.information, found), clutter
 
 
@@ -114,21 +164,26 @@ def _columns(block: Block, columns: Sequence[int]) -> np.ndarray:
     return images
 
 
-def _off_base(own: Evidence, images: Sequence[np.ndarray], projected: st.Projected, base: Sequence[int]) -> list[np.ndarray]:
+def _off_base(
+    own: Evidence, images: Sequence[np.ndarray], projected: st.Projected, base: Sequence[int]
+) -> list[np.ndarray]:
     """Images of each block with what the base makes up for taken out."""
     return [image + _columns(block, base) @ projected.response for block, image in zip(own.blocks, images)]
 
 
-def variances(images: Sequence[np.ndarray], left: Sequence[np.ndarray], places: list[dict]) -> list[tuple[np.ndarray, int]]:
+def variances(
+    images: Sequence[np.ndarray], left: Sequence[np.ndarray], places: list[dict]
+) -> list[tuple[np.ndarray, int]]:
     """(B, G) for each of MAPS that there is: the variance of the score x'r of images x, by its scatter between G parts.
 
-    B = sum of w w' with w = (1 - V_g/V)^(-1/2) u_g, u_g = sum of x r over part g, V_g of x x', where r is what is left at the optimum,
-    whose fit has taken a share V_g/V of part g along: without clutter the mean of B is V. What is `left` where a fit stopped short of it,
-    or followed other images than these, is brought there first: a part that knows nearly all would show that rest many times over.
+    B = sum of w w' with w = (1 - V_g/V)^(-1/2) u_g, u_g = sum of x r over part g, V_g of x x', where r is what is left
+    at the optimum, whose fit has taken a share V_g/V of part g along: without clutter the mean of B is V. What is
+    `left` where a fit stopped short of it, or followed other images than these, is brought there first: a part that
+    knows nearly all would show that rest many times over.
 
-    Source: Liang & Zeger, Longitudinal data analysis using generalized linear models, Biometrika 73, 13 (1986), the robust variance;
-    Bell & McCaffrey, Bias reduction in standard errors for linear regression with multi-stage samples, Survey Methodology 28, 169 (2002).
-    """
+    Source: Liang & Zeger, Longitudinal data analysis using generalized linear models, Biometrika 73, 13 (1986), the
+    robust variance; Bell & McCaffrey, Bias reduction in standard errors for linear regression with multi-stage samples,
+    Survey Methodology 28, 169 (2002)."""
     found, k = [], images[0].shape[1]
     root = st.root(sum(x.T @ x for x in images))
     back = np.linalg.pinv(root)
@@ -146,7 +201,9 @@ def variances(images: Sequence[np.ndarray], left: Sequence[np.ndarray], places: 
                 continue
             score = own.T @ np.concatenate([r[part == g] for r, part in zip(left, bins)])
             share, vectors = np.linalg.eigh(root @ (own.T @ own) @ root.T)
-            free = np.where(share < 1 - 1e-6, np.maximum(1 - share, 1e-6) ** -0.5, 0.0)  # what one part alone knows has no scatter
+            free = np.where(
+                share < 1 - 1e-6, np.maximum(1 - share, 1e-6) ** -0.5, 0.0
+            )  # what one part alone knows has no scatter
             w = back @ (vectors * free) @ (vectors.T @ (root @ score))
             b, parts = b + np.outer(w, w), parts + 1
         found.append((b, parts))
@@ -154,14 +211,16 @@ def variances(images: Sequence[np.ndarray], left: Sequence[np.ndarray], places: 
 
 
 def by_clutter(score: np.ndarray, information: np.ndarray, variances: Sequence[tuple[np.ndarray, int]]) -> float:
-    """p of a score u (k,) of information V by its variance B between G parts; the larger of what the maps say, NaN where these know none.
+    """p of a score u (k,) of information V by its variance B between G parts; the larger of what the maps say, NaN
+    where these know none.
 
-    T2 = u' B^-1 u, T2 (G - k)/(k (G - 1)) ~ F(k, G - k), where G >= 2 k: fewer parts know too little of B's directions (15 strengths and 16
-    parts would ask 1.4e6 of T2). They know its trace: with M = V^-1/2 B V^-1/2, F = u' V^-1 u / tr M ~ F(h, h (G - 1)), h = (tr M)^2 / tr M^2.
-    Combinations of strengths of which V holds no more than rounding (VISIBLE), as a gain common to all frames beside lights, have no part.
+    T2 = u' B^-1 u, T2 (G - k)/(k (G - 1)) ~ F(k, G - k), where G >= 2 k: fewer parts know too little of B's directions
+    (15 strengths and 16 parts would ask 1.4e6 of T2). They know its trace: with M = V^-1/2 B V^-1/2, F = u' V^-1 u / tr
+    M ~ F(h, h (G - 1)), h = (tr M)^2 / tr M^2. Combinations of strengths of which V holds no more than rounding
+    (VISIBLE), as a gain common to all frames beside lights, have no part.
 
-    Source: Brunner, Dette & Munk, Box-type approximations in nonparametric factorial designs, J. Am. Stat. Assoc. 92, 1494 (1997).
-    """
+    Source: Brunner, Dette & Munk, Box-type approximations in nonparametric factorial designs, J. Am. Stat. Assoc. 92,
+    1494 (1997)."""
     from scipy.stats import f as fisher
 
     ps, white = [], st.root(information, st.VISIBLE)
@@ -193,7 +252,7 @@ def _parts(model, evidence: Evidence, places: list[dict]) -> dict[str, tuple[lis
     def of_frame(by, labels):
         kinds = list(dict.fromkeys(labels))  # by first occurrence, so that equal partitions have equal numbers
         numbers = [kinds.index(label) for label in labels]
-        if 2 <= len(kinds) and numbers not in seen:
+        if len(kinds) >= 2 and numbers not in seen:
             seen.append(numbers)
             parts[by] = (kinds, [np.full(len(p["channel"]), i) for i, p in zip(numbers, places)])
 
@@ -204,7 +263,9 @@ def _parts(model, evidence: Evidence, places: list[dict]) -> dict[str, tuple[lis
     for key, numbers in prints.settings(model, evidence).items():
         if len(set(numbers)) <= 8:
             of_frame(key, [f"{v:g}" for v in numbers])
-    for key in sorted(set.intersection(*[set(p) for p in places]) - set(parts)):  # what a sweep turns from reading to reading
+    for key in sorted(
+        set.intersection(*[set(p) for p in places]) - set(parts)
+    ):  # what a sweep turns from reading to reading
         if "." in key:
             found = np.unique(np.concatenate([p[key] for p in places]))
             if 2 <= len(found) <= 8 and np.isfinite(found).all():

@@ -1,8 +1,7 @@
 """Two effects at once: where no single one explains a residual, the pairs that leave nothing of it.
 
-Pairs are ranked by the linear fall of chi2, T = u' V^-1 u over the columns of both, and the best are refitted together with
-everything else. Only a pair after which nothing is left counts: two more numbers cannot do that by luck.
-"""
+Pairs are ranked by the linear fall of chi2, T = u' V^-1 u over the columns of both, and the best are refitted together
+with everything else. Only a pair after which nothing is left counts: two more numbers cannot do that by luck."""
 
 from __future__ import annotations
 
@@ -19,7 +18,9 @@ from optics.diagnosis.verdict import CLEAR, HIDDEN, LEVEL, MARGIN, MIMICS, Finge
 
 CONSIDERED = 10  # effects, the best by themselves: 45 pairs
 REFITTED = 4  # pairs
-LEAD = MARGIN / 4  # of the fall, by which two effects must do better than one, and than one curve where they leave misfit
+LEAD = (
+    MARGIN / 4
+)  # of the fall, by which two effects must do better than one, and than one curve where they leave misfit
 
 
 def ranked(evidence: Evidence, candidates: Sequence[Candidate]) -> list[tuple[float, Candidate, Candidate, np.ndarray]]:
@@ -30,7 +31,10 @@ def ranked(evidence: Evidence, candidates: Sequence[Candidate]) -> list[tuple[fl
             continue  # its simpler part is tried
         if {key for v in a.variables for key in v.keys} & {key for v in b.variables for key in v.keys}:
             continue
-        own, live = np.array([*a.columns, *b.columns]) - first, np.array([*a.cone.live, *(len(a.columns) + b.cone.live)])
+        own, live = (
+            np.array([*a.columns, *b.columns]) - first,
+            np.array([*a.cone.live, *(len(a.columns) + b.cone.live)]),
+        )
         seen = own[live]  # of what the projection left no more than rounding, nothing is expected
         inverse, rank = st.inverse(projected.information[np.ix_(seen, seen)], st.VISIBLE)
         linear = np.zeros(len(own))
@@ -41,7 +45,9 @@ def ranked(evidence: Evidence, candidates: Sequence[Candidate]) -> list[tuple[fl
     return sorted(found, key=lambda t: -t[0])
 
 
-def search(evidence: Evidence, order: Sequence[Candidate], alone: float, add: Callable[[list[Candidate]], Pair | None]) -> list[Pair]:
+def search(
+    evidence: Evidence, order: Sequence[Candidate], alone: float, add: Callable[[list[Candidate]], Pair | None]
+) -> list[Pair]:
     """The best pairs, refitted; `alone` is the best single effect's net fall.
 
     add   effects with their `linear` set -> what comes of them after a refit, or None
@@ -51,7 +57,7 @@ def search(evidence: Evidence, order: Sequence[Candidate], alone: float, add: Ca
     pairs = []
     for _, a, b, linear in best[:REFITTED]:
         kept = a.linear, b.linear
-        a.linear, b.linear = linear[:len(a.columns)], linear[len(a.columns):]
+        a.linear, b.linear = linear[: len(a.columns)], linear[len(a.columns) :]
         try:
             pair = add([a, b])
         finally:
@@ -61,7 +67,9 @@ def search(evidence: Evidence, order: Sequence[Candidate], alone: float, add: Ca
     return sorted(pairs, key=lambda p: -p.fall)
 
 
-def beside_curves(pairs: Sequence[Pair], fingerprints: Sequence[Fingerprint], chance: Mapping[str, float]) -> list[Pair]:
+def beside_curves(
+    pairs: Sequence[Pair], fingerprints: Sequence[Fingerprint], chance: Mapping[str, float]
+) -> list[Pair]:
     """The pairs, with a `but` where one curve does as well: that is rather one cause, which the library lacks.
 
     chance   effect -> fall that chance gives
@@ -73,7 +81,9 @@ def beside_curves(pairs: Sequence[Pair], fingerprints: Sequence[Fingerprint], ch
         lead = LEAD * net if pair.excess_sd > HIDDEN else 0.0
         if curve is None or not pair.complete or net > curve.net + max(CLEAR, lead):
             return pair
-        return replace(pair, but=f"one curve, along '{curve.coordinate}', explains {curve.net / net:.0%} of what both do")
+        return replace(
+            pair, but=f"one curve, along '{curve.coordinate}', explains {curve.net / net:.0%} of what both do"
+        )
 
     return [judged(pair) for pair in pairs]
 
@@ -88,8 +98,10 @@ def words(pairs: Sequence[Pair], share: dict[str, float]) -> str:
     one = max(common, key=lambda n: share.get(n, 0.0))
     others = [next(n for n in p.effects if n != one) for p in complete]
     part = f" {one} alone explains {share[one]:.0%}." if math.isfinite(share.get(one, math.nan)) else ""
-    return (f"no one effect explains the residual, but {one} together with {' or with '.join(others)} leaves nothing.{part} "
-            f"Add {one}, calibrate and diagnose again.")
+    return (
+        f"no one effect explains the residual, but {one} together with {' or with '.join(others)} leaves nothing.{part} "
+        f"Add {one}, calibrate and diagnose again."
+    )
 
 
 def doubt(pairs: Sequence[Pair]) -> str:

@@ -1,15 +1,17 @@
-"""Rehearsal: were an effect hidden in these captures, would a diagnosis name it? From derivative images alone, before anybody hides one.
+"""Rehearsal: were an effect hidden in these captures, would a diagnosis name it? From derivative images alone, before
+anybody hides one.
 
-Scores of a hidden effect with the strengths s are u = V s + z, z ~ N(0, V), with the information V that calibration leaves (as in
-`optics.diagnosis.statistics`); from thousands of such u the falls of chi2 of all candidates follow, and who comes first, by how much:
+Scores of a hidden effect with the strengths s are u = V s + z, z ~ N(0, V), with the information V that calibration
+leaves (as in `optics.diagnosis.statistics`); from thousands of such u the falls of chi2 of all candidates follow, and
+who comes first, by how much:
 
     noticed   the best candidate is significant among all of them (family-wise, 1 %)
     first     the hidden effect has the largest fall
     named     it leads by what a claim asks for
     as        who comes first most often where it does not
 
-Linear in the effect and in the base, with the camera's noise and nothing else: clutter, and effects that bend, do worse. For the whole
-loop on imitated captures see `imitate`.
+Linear in the effect and in the base, with the camera's noise and nothing else: clutter, and effects that bend, do
+worse. For the whole loop on imitated captures see `imitate`.
 
 Source: diagnosis.md, section 2; mrcal, "make_perfect_observations", for the idea.
 """
@@ -33,7 +35,8 @@ from optics.words import percent, spaced, table
 
 @dataclass(frozen=True)
 class Rehearsed:
-    """One effect, hidden: its strengths (largest first in size), and shares of the draws. `change` is infinite where no image is left."""
+    """One effect, hidden: its strengths (largest first in size), and shares of the draws. `change` is infinite where no
+    image is left."""
 
     effect: str
     strength: float
@@ -47,7 +50,7 @@ class Rehearsed:
 
 @dataclass(frozen=True)
 class Rehearsal:
-    """All effects at one change of the pictures (rms over mean signal, before any calibration)."""
+    """All effects at one change of the images (rms over mean signal, before any calibration)."""
 
     change: float
     frames: int
@@ -55,14 +58,32 @@ class Rehearsal:
     unseen: list[str]
 
     def text(self) -> str:
-        lines = [f"rehearsal: {self.frames} frames, every effect hidden in turn at a change of the pictures by {percent(self.change)}, in the "
-                 "camera's noise alone"]
-        lines.append(table([("effect", "strength", "noticed", "first", "named", "most often taken for")] + [
-            (r.effect, f"{r.strength:.3g}{spaced(r.unit)}", f"{r.noticed:.0%}", f"{r.first:.0%}", f"{r.named:.0%}",
-             f"{r.mistaken_for} ({r.mistaken:.0%})" if r.mistaken_for else "") for r in sorted(self.rows, key=lambda r: -r.named)], left=(0, 5)))
+        lines = [
+            f"rehearsal: {self.frames} frames, every effect hidden in turn at a change of the images by {percent(self.change)}, in the "
+            "camera's noise alone"
+        ]
+        lines.append(
+            table(
+                [("effect", "strength", "noticed", "first", "named", "most often taken for")]
+                + [
+                    (
+                        r.effect,
+                        f"{r.strength:.3g}{spaced(r.unit)}",
+                        f"{r.noticed:.0%}",
+                        f"{r.first:.0%}",
+                        f"{r.named:.0%}",
+                        f"{r.mistaken_for} ({r.mistaken:.0%})" if r.mistaken_for else "",
+                    )
+                    for r in sorted(self.rows, key=lambda r: -r.named)
+                ],
+                left=(0, 5),
+            )
+        )
         if self.rows:
-            lines.append(f"all: first in {np.mean([r.first for r in self.rows]):.0%}, named in {np.mean([r.named for r in self.rows]):.0%}; never "
-                         f"named: {', '.join(r.effect for r in self.rows if r.named < 0.01) or 'none'}")
+            lines.append(
+                f"all: first in {np.mean([r.first for r in self.rows]):.0%}, named in {np.mean([r.named for r in self.rows]):.0%}; never "
+                f"named: {', '.join(r.effect for r in self.rows if r.named < 0.01) or 'none'}"
+            )
         if self.unseen:
             lines.append(f"leave nothing to be seen in these captures: {', '.join(self.unseen)}")
         return "\n".join(lines) + "\n"
@@ -71,8 +92,18 @@ class Rehearsal:
         return json.dumps(asdict(self), indent=1)
 
 
-def rehearse(model, fit, effects: Sequence, variables_of: Callable, fitted: Sequence[int], *, change: float = 0.005, draws: int = 2000,
-             seed: int = 0, progress=None) -> Rehearsal:
+def rehearse(
+    model,
+    fit,
+    effects: Sequence,
+    variables_of: Callable,
+    fitted: Sequence[int],
+    *,
+    change: float = 0.005,
+    draws: int = 2000,
+    seed: int = 0,
+    progress=None,
+) -> Rehearsal:
     """Hide every effect in turn; arguments as of `optics.diagnosis.diagnose.diagnose`, change as in `Rehearsal`.
 
     Raises ValueError for a change that is not positive, Underdetermined as a diagnosis does.
@@ -104,21 +135,32 @@ def rehearse(model, fit, effects: Sequence, variables_of: Callable, fitted: Sequ
         wrong = np.bincount(best[best != a], minlength=len(live)) / draws
         strengths = c.change_of(linear)
         biggest = int(np.argmax(np.abs(strengths / c.plausible)))
-        rows.append(Rehearsed(c.effect.name, float(strengths[biggest]), c.variables[biggest].parameter.unit, float(noticed.mean()),
-                              float((best == a).mean()), float((noticed & (best == a) & (lead > np.maximum(CLEAR, MARGIN * net[a]))).mean()),
-                              live[int(wrong.argmax())].effect.name if wrong.any() else "", float(wrong.max(initial=0.0))))
+        rows.append(
+            Rehearsed(
+                c.effect.name,
+                float(strengths[biggest]),
+                c.variables[biggest].parameter.unit,
+                float(noticed.mean()),
+                float((best == a).mean()),
+                float((noticed & (best == a) & (lead > np.maximum(CLEAR, MARGIN * net[a]))).mean()),
+                live[int(wrong.argmax())].effect.name if wrong.any() else "",
+                float(wrong.max(initial=0.0)),
+            )
+        )
     return Rehearsal(change, len(evidence.frames), rows, [c.effect.name for c in table.order if c not in live])
 
 
 def imitate(model, values: Values, folder: str | Path, seed: int = 0) -> Path:
-    """Captures as this model would take them at these values: its predictions, with noise of its camera, and the settings of its frames.
+    """Captures as this model would take them at these values: its predictions, with noise of its camera, and the
+    settings of its frames.
 
-    They show what a residual would look like, and what the loop says of it. They prove nothing about the model: both sides are the same.
-    Raises BadCapture for readings in a table, and as `optics.captures.capture_set.write`.
-    """
+    They show what a residual would look like, and what the loop says of it. They prove nothing about the model: both
+    sides are the same. Raises BadCapture for readings in a table, and as `optics.captures.capture_set.write`."""
     captures = model.captures
     if captures.table is not None:
-        raise BadCapture(f"{captures.folder}: readings in a table are not imitated; allowed: pictures; `optics rehearse` works for both")
+        raise BadCapture(
+            f"{captures.folder}: readings in a table are not imitated; allowed: images; `optics rehearse` works for both"
+        )
     rng = np.random.default_rng([seed, 31])
     frames = []
     for frame, signal in zip(model.frames, model.predict(values)):

@@ -27,7 +27,9 @@ from functools import cache
 
 import numpy as np
 
-TRUNCATION = 1e-9  # of the largest eigenvalue of unit-length columns: below, a direction is not calibrated but undetermined
+TRUNCATION = (
+    1e-9  # of the largest eigenvalue of unit-length columns: below, a direction is not calibrated but undetermined
+)
 VISIBLE = 1e-6  # survival below which normal equations in double precision cannot tell what is left from rounding
 DRAWS = 40_000  # of the simulated maximum: 1 % of them are 400, known to 5 %
 BINS = 16  # of a curve along a coordinate
@@ -80,9 +82,9 @@ class Normal:
     def truncation(self, columns: Sequence[int]) -> float:
         """Eigenvalues of these columns that their noise can make: kappa^2/sqrt(n), times 5, and never below TRUNCATION.
 
-        Only theirs: a candidate's noisy image says nothing about what the base can absorb, and a direction of the base that is left out
-        passes for a missing effect's (a sixth of a strength was found so, and an eighth of a fall of chi2).
-        """
+        Only theirs: a candidate's noisy image says nothing about what the base can absorb, and a direction of the base
+        that is left out passes for a missing effect's (a sixth of a strength was found so, and an eighth of a fall of
+        chi2)."""
         columns = np.asarray(columns, int)
         kappa = self.kappa()[columns][np.diag(self.gram)[columns] > 0]
         return max(TRUNCATION, 5 * float(kappa.max(initial=0.0)) ** 2 / np.sqrt(max(self.count, 1)))
@@ -124,12 +126,20 @@ class Projected:
     chi2: float
 
 
-def project(normal: Normal, base: Sequence[int], rest: Sequence[int], precision: np.ndarray | None = None,
-            pull: np.ndarray | None = None, truncation: float | None = None, settled: bool = False) -> Projected:
+def project(
+    normal: Normal,
+    base: Sequence[int],
+    rest: Sequence[int],
+    precision: np.ndarray | None = None,
+    pull: np.ndarray | None = None,
+    truncation: float | None = None,
+    settled: bool = False,
+) -> Projected:
     """Project the columns `base` off the columns `rest` and the residual.
 
     precision, pull   (p,) 1/tau^2 and (mean - value)/tau^2 of priors on the base: rows that a calibration sees as well
-    settled           the base is known to be at its optimum, where J'r = 0: what noise of the images makes of J'r is left
+    settled           the base is known to be at its optimum, where J'r = 0: what noise of the images makes of J'r is
+                      left
                       out of the scores, and its expectation out of `absorbed`
     """
     base, rest = np.asarray(base, int), np.asarray(rest, int)
@@ -144,12 +154,15 @@ def project(normal: Normal, base: Sequence[int], rest: Sequence[int], precision:
     v = normal.gram[np.ix_(rest, rest)] - across.T @ x
     absorbed = float(b @ inv @ b)
     if settled:
-        absorbed = max(absorbed - float(np.diag(inv) @ normal.noise[base]) * normal.square / max(normal.count, 1) / 2, 0.0)
+        absorbed = max(
+            absorbed - float(np.diag(inv) @ normal.noise[base]) * normal.square / max(normal.count, 1) / 2, 0.0
+        )
         b = np.zeros_like(b)
     prior = float(np.sum(pull**2 / np.where(precision > 0, precision, 1.0)))
     survival = np.clip(np.divide(np.diag(v), raw, out=np.zeros(len(rest)), where=raw > 0), 0.0, 1.0)
-    return Projected((v + v.T) / 2, normal.score[rest] - x.T @ b, survival, -x, rank, absorbed,
-                     normal.square + prior - absorbed)
+    return Projected(
+        (v + v.T) / 2, normal.score[rest] - x.T @ b, survival, -x, rank, absorbed, normal.square + prior - absorbed
+    )
 
 
 # -- one effect -------------------------------------------------------------------------------------------------------
@@ -185,7 +198,7 @@ class Cone:
         else:
             z = gaussian(self.cone, draws, np.random.default_rng([seed, 11]))
             active = np.bincount((_descend(self.cone, z) > 0).sum(1), minlength=len(self.bound) + 1) / draws
-        weights[self.free_rank:self.free_rank + len(active)] = active
+        weights[self.free_rank : self.free_rank + len(active)] = active
         return weights
 
     def _split(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -292,14 +305,19 @@ def _descend(v: np.ndarray, u: np.ndarray, sweeps: int = 100, tolerance: float =
 
 
 class Family:
-    """Probability that the best of all candidates looks as good as p by chance: the simulated maximum.
+    """Probability that the best of all candidates looks as good as p by Monte Carlo: the simulated maximum.
 
     Scores are drawn from N(0, V) with the V of all candidates together, so that look-alikes count once.
     Below the reach of the simulation the number of effectively independent candidates found there is kept.
     """
 
-    def __init__(self, information: np.ndarray, candidates: Sequence[tuple[Sequence[int], Cone]], seed: int = 0,
-                 draws: int = DRAWS):
+    def __init__(
+        self,
+        information: np.ndarray,
+        candidates: Sequence[tuple[Sequence[int], Cone]],
+        seed: int = 0,
+        draws: int = DRAWS,
+    ):
         self.draws = draws
         z = gaussian(information, draws, np.random.default_rng([seed, 12]))
         smallest = np.ones(draws)
@@ -340,8 +358,9 @@ def probability_correct(d: float) -> float:
 
 
 def bin_edges(x: np.ndarray, bins: int = BINS) -> np.ndarray | None:
-    """Edges of at most `bins` bins: half of them hold equal counts, half are equally wide, so that neither a flat region
-    nor a long tail takes them all. One bin per value where there are few values; None where there is only one."""
+    """Edges of at most `bins` bins: half of them hold equal counts, half are equally wide, so that neither a flat
+    region nor a long tail takes them all. One bin per value where there are few values; None where there is only
+    one."""
     x = x[np.isfinite(x)]
     if not len(x):
         return None
@@ -352,8 +371,9 @@ def bin_edges(x: np.ndarray, bins: int = BINS) -> np.ndarray | None:
     if len(values) <= bins:
         return np.concatenate([[-np.inf], (values[1:] + values[:-1]) / 2, [np.inf]])
     low, high = np.quantile(sample, [0.005, 0.995])
-    inner = np.concatenate([np.quantile(sample, np.linspace(0, 1, bins // 2 + 1))[1:-1],
-                            np.linspace(low, high, bins // 2 + 2)[1:-1]])
+    inner = np.concatenate(
+        [np.quantile(sample, np.linspace(0, 1, bins // 2 + 1))[1:-1], np.linspace(low, high, bins // 2 + 2)[1:-1]]
+    )
     edges = np.unique(inner)
     keep, floor = [], max(20, len(sample) // 2000)
     last = 0
@@ -365,8 +385,16 @@ def bin_edges(x: np.ndarray, bins: int = BINS) -> np.ndarray | None:
     return np.concatenate([[-np.inf], keep, [np.inf]]) if keep else None
 
 
-def add_bins(normal: Normal, where: Sequence[int], a: np.ndarray, r: np.ndarray, first: int, bins: np.ndarray, count: int,
-             carriers: Sequence[np.ndarray]) -> None:
+def add_bins(
+    normal: Normal,
+    where: Sequence[int],
+    a: np.ndarray,
+    r: np.ndarray,
+    first: int,
+    bins: np.ndarray,
+    count: int,
+    carriers: Sequence[np.ndarray],
+) -> None:
     """Add columns 1{bin} * carrier, starting at column `first`: bins (n,) in 0..count-1 or -1 for none.
 
     Only products with the new columns are added; those of `a` (n, k) among themselves are there already.
@@ -387,7 +415,9 @@ def add_bins(normal: Normal, where: Sequence[int], a: np.ndarray, r: np.ndarray,
     normal.score[new] += b @ r
 
 
-def joint(projected: Projected, scale: np.ndarray, truncation: float = 1e-6) -> tuple[float, int, np.ndarray, np.ndarray]:
+def joint(
+    projected: Projected, scale: np.ndarray, truncation: float = 1e-6
+) -> tuple[float, int, np.ndarray, np.ndarray]:
     """(T, dof, s, sd) of columns that may be dependent among themselves or absorbed by the base.
 
     scale  (k,) squared lengths of the columns before projection: what survives of them below `truncation` is no column
@@ -437,7 +467,9 @@ def planes_of(use: np.ndarray) -> list[tuple]:
     for c in range(use.shape[2]):
         cells = [(slice(i, None, 2), slice(j, None, 2), c) for i in (0, 1) for j in (0, 1)]
         filled = [use[cell].any() for cell in cells]
-        planes += [(slice(None), slice(None), c)] if all(filled) else [cell for cell, full in zip(cells, filled) if full]
+        planes += (
+            [(slice(None), slice(None), c)] if all(filled) else [cell for cell, full in zip(cells, filled) if full]
+        )
     return planes
 
 
@@ -471,10 +503,11 @@ class Spectrum:
 
     @staticmethod
     def _low(shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-        return tuple(cosines(n)[:min(NARROW, n // 4)] for n in shape)
+        return tuple(cosines(n)[: min(NARROW, n // 4)] for n in shape)
 
     def test(self, residuals: Sequence[np.ndarray], base: Sequence[int], inverse_gram: np.ndarray) -> Structure:
-        """F test of whitened residuals (H, W, C), zero outside the masks; base and (J'J)^-1 name what was calibrated."""
+        """F test of whitened residuals (H, W, C), zero outside the masks; base and (J'J)^-1 name what was
+        calibrated."""
         from scipy.fft import dctn
         from scipy.special import fdtrc
 
@@ -485,8 +518,8 @@ class Spectrum:
             for plane in planes:
                 power = dctn(residual[plane], norm="ortho") ** 2
                 h, w = power.shape
-                low += float(power[:min(NARROW, h // 4), :min(NARROW, w // 4)].sum())
-                high += float(power[h - h // 2:, w - w // 2:].sum())
+                low += float(power[: min(NARROW, h // 4), : min(NARROW, w // 4)].sum())
+                high += float(power[h - h // 2 :, w - w // 2 :].sum())
         base = np.asarray(base, int)
         taken = float(np.sum(inverse_gram * self.low_gram[np.ix_(base, base)]))
         expected = max(self.trace - taken, 1e-9)
@@ -498,18 +531,25 @@ class Spectrum:
 
 
 class Sweeps:
-    """Of readings, as `Spectrum` of images: power of whitened residuals in the NARROW lowest cosines along what was swept, against the rest.
+    """Of readings, as `Spectrum` of images: power of whitened residuals in the NARROW lowest cosines along what was
+    swept, against the rest.
 
-    Along each coordinate in turn, by the ranks of its values; what a calibration takes is projected off, so that F is exactly F-distributed
-    in white noise of any size. p is that of the best coordinate times their number.
-    """
+    Along each coordinate in turn, by the ranks of its values; what a calibration takes is projected off, so that F is
+    exactly F-distributed in white noise of any size. p is that of the best coordinate times their number."""
 
     def __init__(self):
         self.parts: list[tuple] = []
 
     def add(self, use: np.ndarray, where: Sequence[int], columns: np.ndarray, along: Mapping[str, np.ndarray]) -> None:
         """Add a sweep: as in `Spectrum`, and along: {coordinate: value of each reading, (N, 1, 1)}."""
-        self.parts.append((use, np.asarray(where, int), columns[use], {k: np.broadcast_to(x, use.shape)[use] for k, x in along.items()}))
+        self.parts.append(
+            (
+                use,
+                np.asarray(where, int),
+                columns[use],
+                {k: np.broadcast_to(x, use.shape)[use] for k, x in along.items()},
+            )
+        )
 
     def test(self, residuals: Sequence[np.ndarray], base: Sequence[int], inverse_gram: np.ndarray) -> Structure:
         """As of `Spectrum`; `high` is NaN: neighbours among readings share nothing that pixels do."""
@@ -517,7 +557,7 @@ class Sweeps:
         calibrated = np.zeros((len(r), len(base)))
         for (use, where, columns, _), end in zip(self.parts, np.cumsum([use.sum() for use, *_ in self.parts])):
             here = [(i, int(np.flatnonzero(where == c)[0])) for i, c in enumerate(base) if c in where]
-            calibrated[end - use.sum():end, [i for i, _ in here]] = columns[:, [j for _, j in here]]
+            calibrated[end - use.sum() : end, [i for i, _ in here]] = columns[:, [j for _, j in here]]
         taken = _orthonormal(calibrated)
         r -= taken @ (taken.T @ r)
         names = sorted(set.intersection(*[set(along) for *_, along in self.parts]))
@@ -530,16 +570,16 @@ class Sweeps:
 
 
 def follows(x: np.ndarray, y: np.ndarray) -> float:
-    """p of numbers y (n,) that do not depend on x (n,), by the test of `Sweeps` about their mean; NaN where they are too few, or all one. No
-    error of y enters: what scatters about a curve is its own measure."""
+    """p of numbers y (n,) that do not depend on x (n,), by the test of `Sweeps` about their mean; NaN where they are
+    too few, or all one. No error of y enters: what scatters about a curve is its own measure."""
     y = y - np.mean(y)
     found = _slow(x, y, np.full((len(y), 1), len(y) ** -0.5)) if y.any() else None
     return found[0] if found else float("nan")
 
 
 def _slow(x: np.ndarray, r: np.ndarray, taken: np.ndarray) -> tuple[float, float, int, int] | None:
-    """(p, F, low, free) of the lowest cosines of r (n,) by the ranks of x, at most NARROW and n/4 of them, against the rest; None where there
-    are too few. Columns of `taken`, orthonormal, are projected off r already."""
+    """(p, F, low, free) of the lowest cosines of r (n,) by the ranks of x, at most NARROW and n/4 of them, against the
+    rest; None where there are too few. Columns of `taken`, orthonormal, are projected off r already."""
     from scipy.special import fdtrc
     from scipy.stats import rankdata
 
@@ -568,7 +608,8 @@ def _orthonormal(columns: np.ndarray) -> np.ndarray:
 
 
 def thinning(values: int, limit: int) -> int:
-    """Smallest odd k so that every k-th of `values` pixels are at most `limit`; odd, so that a mosaic is thinned evenly."""
+    """Smallest odd k so that every k-th of `values` pixels are at most `limit`; odd, so that a mosaic is thinned
+    evenly."""
     k = max(1, -(-values // max(limit, 1)))
     return k + 1 - k % 2
 
@@ -585,5 +626,5 @@ def lattice(shape: tuple[int, int, int], k: int, shift: int = 0) -> np.ndarray:
         return (column**2 + row**2)[hit].min()
 
     s = max(range(1, k), key=distance)
-    row, column, channel = np.ogrid[:shape[0], :shape[1], :shape[2]]
+    row, column, channel = np.ogrid[: shape[0], : shape[1], : shape[2]]
     return (column + s * row + channel + shift) % k == 0

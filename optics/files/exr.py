@@ -1,9 +1,8 @@
 """Images on disk: float32 EXR with spectral and Stokes channels, and 8-bit PNG previews.
 
-Channels by name: `R`, `G`, `B` (preview, linear sRGB), `S0.525,000000nm` ... `S3.525,000000nm` (spectral radiance and the
-other Stokes components per band; Fichet, Pacanowski & Wilkie, JCGT 10(3), 2021), and others such as `depth.Z`,
-`normal.X`, `variance.R`. Images are (H, W), row 0 on top. Every file appears whole or not at all.
-"""
+Channels by name: `R`, `G`, `B` (preview, linear sRGB), `S0.525,000000nm` ... `S3.525,000000nm` (spectral radiance and
+the other Stokes components per band; Fichet, Pacanowski & Wilkie, JCGT 10(3), 2021), and others such as `depth.Z`,
+`normal.X`, `variance.R`. Images are (H, W), row 0 on top. Every file appears whole or not at all."""
 
 from __future__ import annotations
 
@@ -16,15 +15,33 @@ import numpy as np
 
 from optics.files.output import replacing
 
-RESERVED = ("channels", "chunkCount", "compression", "dataWindow", "displayWindow", "lineOrder", "name",
-            "pixelAspectRatio", "screenWindowCenter", "screenWindowWidth", "tiles", "type", "version")
+RESERVED = (
+    "channels",
+    "chunkCount",
+    "compression",
+    "dataWindow",
+    "displayWindow",
+    "lineOrder",
+    "name",
+    "pixelAspectRatio",
+    "screenWindowCenter",
+    "screenWindowWidth",
+    "tiles",
+    "type",
+    "version",
+)
 SPECTRAL_NAME = re.compile(r"S([0-3])\.(\d+(?:,\d+)?)nm")
 
 
 # -- EXR ----------------------------------------------------------------------------------------------------------------
 
-def write(path: str | Path, channels: Mapping[str, np.ndarray], header: Mapping[str, object] | None = None,
-          half: Sequence[str] = ()) -> Path:
+
+def write(
+    path: str | Path,
+    channels: Mapping[str, np.ndarray],
+    header: Mapping[str, object] | None = None,
+    half: Sequence[str] = (),
+) -> Path:
     """Write channels, each (H, W), as float32 (those named in `half`: float16), ZIP-compressed without loss.
 
     header  text, numbers (kept as float32 by the format) or mappings (kept as JSON text: `provenance`, `units`)
@@ -44,16 +61,21 @@ def write(path: str | Path, channels: Mapping[str, np.ndarray], header: Mapping[
     for name, values in channels.items():
         values = np.asarray(values)
         if not name or values.ndim != 2 or 0 in values.shape or values.dtype.kind not in "fiub":
-            raise ValueError(f"{path}: channel '{name}' is {values.dtype} of shape {values.shape}; allowed: a name and "
-                             "real values of shape (H, W); split other arrays into one channel each")
+            raise ValueError(
+                f"{path}: channel '{name}' is {values.dtype} of shape {values.shape}; allowed: a name and "
+                "real values of shape (H, W); split other arrays into one channel each"
+            )
         shape, first = (shape, first) if shape else (values.shape, name)
         if values.shape != shape:
-            raise ValueError(f"{path}: channel '{name}' has {values.shape} pixels, '{first}' {shape}; one file, one size")
+            raise ValueError(
+                f"{path}: channel '{name}' has {values.shape} pixels, '{first}' {shape}; one file, one size"
+            )
         pixels[name] = _narrowed(values, np.float16 if name in half else np.float32, f"{path}: channel '{name}'")
     attributes = {key: _attribute(path, key, value) for key, value in (header or {}).items()}
     with replacing(path) as file:
-        OpenEXR.File({"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **attributes},
-                     pixels).write(str(file))
+        OpenEXR.File(
+            {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **attributes}, pixels
+        ).write(str(file))
     return path
 
 
@@ -76,8 +98,11 @@ def read(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, str | float
             raise ValueError(f"it has {len(file.parts)} parts; allowed: 1; split it")
     except (RuntimeError, ValueError, TypeError) as error:
         raise ValueError(f"{path}: unreadable as EXR ({error})") from error
-    header = {key: float(str(np.float32(value))) if isinstance(value, float) else value
-              for key, value in file.header().items() if key not in RESERVED and isinstance(value, (str, int, float))}
+    header = {
+        key: float(str(np.float32(value))) if isinstance(value, float) else value
+        for key, value in file.header().items()
+        if key not in RESERVED and isinstance(value, (str, int, float))
+    }
     return channels, header
 
 
@@ -85,8 +110,10 @@ def _narrowed(values: np.ndarray, dtype: type, where: str) -> np.ndarray:
     with np.errstate(over="ignore"):
         narrow = np.ascontiguousarray(values, dtype)
     if np.any(np.isinf(narrow) & np.isfinite(values)):
-        raise ValueError(f"{where}: values up to {np.nanmax(np.abs(values)):g} do not fit {np.dtype(dtype).name} "
-                         f"(at most {np.finfo(dtype).max:g}); take it out of `half` or scale it")
+        raise ValueError(
+            f"{where}: values up to {np.nanmax(np.abs(values)):g} do not fit {np.dtype(dtype).name} "
+            f"(at most {np.finfo(dtype).max:g}); take it out of `half` or scale it"
+        )
     return narrow
 
 
@@ -100,7 +127,9 @@ def _attribute(path: Path, key: str, value: object) -> str | int | float:
     return value.item() if isinstance(value, np.generic) else value
 
 
-# -- Spectra ------------------------------------------------------------------------------------------------------------
+# -- Spectra
+# ------------------------------------------------------------------------------------------------------------
+
 
 def spectral_name(band_nm: float, stokes: int = 0) -> str:
     """525 -> 'S0.525,000000nm' (the comma because EXR splits layer names at dots)."""
@@ -111,7 +140,9 @@ def spectral_channels(bands_nm: Sequence[float], stokes: np.ndarray) -> dict[str
     """Channels of (H, W, B) radiance or (H, W, B, 4) Stokes vectors; bands in nm, one per entry of axis 2."""
     stokes = np.asarray(stokes)
     if stokes.ndim not in (3, 4) or stokes.shape[2] != len(bands_nm) or (stokes.ndim == 4 and stokes.shape[3] != 4):
-        raise ValueError(f"spectral image of shape {stokes.shape}; allowed: (H, W, B) or (H, W, B, 4), B = {len(bands_nm)}")
+        raise ValueError(
+            f"spectral image of shape {stokes.shape}; allowed: (H, W, B) or (H, W, B, 4), B = {len(bands_nm)}"
+        )
     if len({spectral_name(band) for band in bands_nm}) != len(bands_nm):
         raise ValueError(f"bands {list(bands_nm)} nm: two of them are the same to 1e-6 nm; join them")
     parts = stokes[..., None] if stokes.ndim == 3 else stokes
@@ -120,13 +151,18 @@ def spectral_channels(bands_nm: Sequence[float], stokes: np.ndarray) -> dict[str
 
 def spectral_image(channels: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """The inverse: (bands in nm (B,), (H, W, B, 1 or 4)) of the spectral channels, others passed over."""
-    found = {(int(m[1]), float(m[2].replace(",", "."))): values for name, values in channels.items()
-             if (m := SPECTRAL_NAME.fullmatch(name))}
+    found = {
+        (int(m[1]), float(m[2].replace(",", "."))): values
+        for name, values in channels.items()
+        if (m := SPECTRAL_NAME.fullmatch(name))
+    }
     bands = sorted({band for _, band in found})
     count = 1 + max((s for s, _ in found), default=-1)
     if count not in (1, 4) or len(found) != count * len(bands):
-        raise ValueError(f"{len(found)} spectral channels: {len(bands)} bands, Stokes components up to S{count - 1}; "
-                         "allowed: the same bands in S0, or in S0 to S3")
+        raise ValueError(
+            f"{len(found)} spectral channels: {len(bands)} bands, Stokes components up to S{count - 1}; "
+            "allowed: the same bands in S0, or in S0 to S3"
+        )
     return np.array(bands), np.stack([np.stack([found[s, band] for s in range(count)], -1) for band in bands], 2)
 
 
@@ -141,6 +177,7 @@ def preview_channels(bands_nm: Sequence[float], radiance: np.ndarray) -> dict[st
 
     Colour matching functions: Wyman, Sloan & Shirley, JCGT 2(2), 2013, multi-lobe fit; a preview, no colorimetry.
     """
+
     def lobe(mean, low, high):  # nm
         return np.exp(-0.5 * ((bands - mean) / np.where(bands < mean, low, high)) ** 2)
 
@@ -154,6 +191,7 @@ def preview_channels(bands_nm: Sequence[float], radiance: np.ndarray) -> dict[st
 
 
 # -- PNG ----------------------------------------------------------------------------------------------------------------
+
 
 def srgb(linear: np.ndarray) -> np.ndarray:
     """The display value of a linear one, both 0..1 (IEC 61966-2-1)."""

@@ -1,8 +1,7 @@
 """Camera images on disk, digital number for digital number: PNG and TIFF (8, 16 bit), EXR, NPY.
 
 What alters or hides a DN is refused: JPEG, palettes, alpha channels, several pages, channels in front. Raises
-BadCapture with the place, what is allowed and the next step.
-"""
+BadCapture with the place, what is allowed and the next step."""
 
 from __future__ import annotations
 
@@ -21,16 +20,22 @@ def read_image(file: Path, where: str) -> tuple[np.ndarray, int | None]:
     """(image (H, W, C) float32, bits: 8 or 16, None for floats and other integers); (H, W) becomes (H, W, 1)."""
     values = read_array(file, where)
     if values.dtype.kind not in "uif":
-        raise BadCapture(f"{where}: values of type {values.dtype}; allowed: whole or real numbers; save DN as 8 or 16 bit")
+        raise BadCapture(
+            f"{where}: values of type {values.dtype}; allowed: whole or real numbers; save DN as 8 or 16 bit"
+        )
     values = values[..., None] if values.ndim == 2 else values
     if values.ndim != 3 or 0 in values.shape or values.shape[2] > CHANNELS_MOST:
-        raise BadCapture(f"{where}: shape {values.shape}; allowed: (H, W) or (H, W, C), C <= {CHANNELS_MOST}, channels last")
+        raise BadCapture(
+            f"{where}: shape {values.shape}; allowed: (H, W) or (H, W, C), C <= {CHANNELS_MOST}, channels last"
+        )
     with np.errstate(over="ignore"):  # what is beyond float32 becomes infinite and is refused as such
         image = np.ascontiguousarray(values, np.float32)
     if not np.isfinite(image).all():
         row, column, channel = np.argwhere(~np.isfinite(image))[0]
-        raise BadCapture(f"{where}: {np.sum(~np.isfinite(image))} values are NaN or infinite, the first in row {row}, column "
-                         f"{column}, channel {channel}; allowed: finite DN; leave bad pixels out by a mask, not by NaN")
+        raise BadCapture(
+            f"{where}: {np.sum(~np.isfinite(image))} values are NaN or infinite, the first in row {row}, column "
+            f"{column}, channel {channel}; allowed: finite DN; leave bad pixels out by a mask, not by NaN"
+        )
     return image, 8 * values.dtype.itemsize if values.dtype in (np.uint8, np.uint16) else None
 
 
@@ -43,7 +48,9 @@ def read_mask(file: Path, shape: tuple[int, ...], where: str) -> np.ndarray:
     if values.dtype.kind not in "biuf" or not np.isfinite(values).all():
         raise BadCapture(f"{where}: values of type {values.dtype}, or not finite; allowed: 0 = leave out, else = use")
     if not values.any():
-        raise BadCapture(f"{where}: empty, all is 0 and no pixel is used; allowed: non-zero = use; remove the mask to use all")
+        raise BadCapture(
+            f"{where}: empty, all is 0 and no pixel is used; allowed: non-zero = use; remove the mask to use all"
+        )
     return values != 0
 
 
@@ -58,7 +65,9 @@ def read_array(file: Path, where: str) -> np.ndarray:
     except BadCapture:
         raise
     except Exception as error:  # decoders raise whatever they like on a damaged file
-        raise BadCapture(f"{where}: unreadable as {file.suffix} ({type(error).__name__}: {error}); write it again") from error
+        raise BadCapture(
+            f"{where}: unreadable as {file.suffix} ({type(error).__name__}: {error}); write it again"
+        ) from error
 
 
 def _png(file: Path, where: str) -> np.ndarray:
@@ -68,15 +77,19 @@ def _png(file: Path, where: str) -> np.ndarray:
         head = begin.read(26)
     if head[:2] == b"\xff\xd8":
         raise BadCapture(f"{where}: a JPEG by the name of .png; JPEG alters every pixel: record PNG or raw")
-    with Image.open(file, formats=["PNG"]) as picture:
+    with Image.open(file, formats=["PNG"]) as image:
         depth, colour = head[24:]  # of the header chunk: bits per value, kind of colour
-        if colour in (4, 6) or "transparency" in picture.info:
-            raise BadCapture(f"{where}: has an alpha channel; allowed: gray or RGB; remove it (a mask is a file of its own)")
+        if colour in (4, 6) or "transparency" in image.info:
+            raise BadCapture(
+                f"{where}: has an alpha channel; allowed: gray or RGB; remove it (a mask is a file of its own)"
+            )
         if colour == 3 or depth not in (1, 8, 16):
-            raise BadCapture(f"{where}: has a palette or {depth} bit; allowed: 8 or 16 bit gray or RGB; save it as such")
+            raise BadCapture(
+                f"{where}: has a palette or {depth} bit; allowed: 8 or 16 bit gray or RGB; save it as such"
+            )
         if (depth, colour) != (16, 2):
-            picture.load()
-            return np.asarray(picture).astype({1: bool, 8: np.uint8, 16: np.uint16}[depth])
+            image.load()
+            return np.asarray(image).astype({1: bool, 8: np.uint8, 16: np.uint16}[depth])
     import mitsuba as mi  # Pillow would cut 16 bit colour to 8 without a word
 
     return np.array(mi.Bitmap(str(file)))
@@ -89,19 +102,25 @@ def _tiff(file: Path, where: str) -> np.ndarray:
     with tifffile.TiffFile(file) as tiff:
         page = tiff.pages[0]
         if len(tiff.pages) != 1 or page.axes not in ("YX", "YXS", "SYX"):
-            raise BadCapture(f"{where}: {len(tiff.pages)} pages of axes {page.axes}; allowed: one page; one file per reading")
+            raise BadCapture(
+                f"{where}: {len(tiff.pages)} pages of axes {page.axes}; allowed: one page; one file per reading"
+            )
         if page.extrasamples:
             raise BadCapture(f"{where}: has an alpha or extra channel; allowed: gray or RGB; remove it")
         if page.photometric not in (1, 2):  # min-is-black, RGB
-            raise BadCapture(f"{where}: colours are {page.photometric.name}; allowed: MINISBLACK or RGB; save it as such")
+            raise BadCapture(
+                f"{where}: colours are {page.photometric.name}; allowed: MINISBLACK or RGB; save it as such"
+            )
         try:
             values = page.asarray()
         except ValueError:  # a compression that tifffile leaves to a package of its own, such as LZW
-            with Image.open(file, formats=["TIFF"]) as picture:
-                values = np.asarray(picture)
+            with Image.open(file, formats=["TIFF"]) as image:
+                values = np.asarray(image)
             if values.shape != page.shape or values.dtype != page.dtype:
-                raise BadCapture(f"{where}: {page.compression.name} compression of {page.dtype} is not read; allowed: "
-                                 "none or DEFLATE; save it again") from None
+                raise BadCapture(
+                    f"{where}: {page.compression.name} compression of {page.dtype} is not read; allowed: "
+                    "none or DEFLATE; save it again"
+                ) from None
         return np.moveaxis(values, 0, -1) if page.axes == "SYX" else values
 
 
@@ -111,7 +130,9 @@ def _exr(file: Path, where: str) -> np.ndarray:
         raise BadCapture(f"{where}: has an alpha channel; allowed: one channel, or R, G, B; remove it")
     names = list(channels) if len(channels) == 1 else ["R", "G", "B"]
     if set(names) != set(channels):
-        raise BadCapture(f"{where}: channels {', '.join(channels)}; allowed: one channel, or R, G, B; use NPY for others")
+        raise BadCapture(
+            f"{where}: channels {', '.join(channels)}; allowed: one channel, or R, G, B; use NPY for others"
+        )
     return np.stack([channels[name] for name in names], -1)
 
 
@@ -128,8 +149,10 @@ def write_image(stem: Path, image: np.ndarray, bits: int | None) -> Path:
         values, suffix = image.astype(np.float32), ".exr"
     else:
         if np.any(image != np.round(image)) or image.min() < 0 or image.max() > 2**bits - 1:
-            raise BadCapture(f"{stem.name}: values {image.min():g} to {image.max():g} DN do not fit {bits} bit; allowed: whole "
-                             f"numbers 0 to {2**bits - 1}; use bits=None, or expose with a quantisation of 1 DN")
+            raise BadCapture(
+                f"{stem.name}: values {image.min():g} to {image.max():g} DN do not fit {bits} bit; allowed: whole "
+                f"numbers 0 to {2**bits - 1}; use bits=None, or expose with a quantisation of 1 DN"
+            )
         values, suffix = image.astype({8: np.uint8, 16: np.uint16}[bits]), ".png"
     count = image.shape[2]
     file = stem.parent / (stem.name + (suffix if count in (1, 3) else ".npy"))

@@ -1,4 +1,5 @@
-"""Files that are written whole or not at all, checks before any work that they can be, and what identifies them later."""
+"""Files that are written whole or not at all, checks before any work that they can be, and what identifies them
+later."""
 
 from __future__ import annotations
 
@@ -32,10 +33,13 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def claim(paths: Sequence[Path], force: bool = False) -> None:
-    """Make sure, before any work, that files can be written: none exists (unless `force`), every folder can take them."""
+    """Make sure, before any work, that files can be written: none exists (unless `force`), every folder can take
+    them."""
     for path in map(Path, paths):
         if path.is_dir() or (path.exists() and not force):
-            raise OutputExists(f"{path} exists; choose another name" + ("" if path.is_dir() else ", or --force to replace it"))
+            raise OutputExists(
+                f"{path} exists; choose another name" + ("" if path.is_dir() else ", or --force to replace it")
+            )
         check_folder(path.parent)
 
 
@@ -65,7 +69,11 @@ def shipped(folder: str) -> Path:
 
 
 def versions() -> dict[str, str]:
-    found = {"optics": __version__, "python": platform.python_version(), "system": f"{platform.system()} {platform.machine()}"}
+    found = {
+        "optics": __version__,
+        "python": platform.python_version(),
+        "system": f"{platform.system()} {platform.machine()}",
+    }
     for package in PACKAGES:
         try:
             found[package] = metadata.version(package)

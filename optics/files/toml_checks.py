@@ -1,4 +1,5 @@
-"""A TOML file's values, checked one by one: what is refused names the file, the place, the value and what is allowed."""
+"""A TOML file's values, checked one by one: what is refused names the file, the place, the value and what is
+allowed."""
 
 from __future__ import annotations
 
@@ -27,7 +28,9 @@ def parse(file: Path) -> dict:
 def keys(table: object, known: Sequence[str], where: str) -> None:
     """A table with no other keys than these (none named: any)."""
     if not isinstance(table, Mapping):
-        raise BadCapture(f"{where} = {table!r} is no table; allowed: a table" + (f" with {', '.join(known)}" if known else ""))
+        raise BadCapture(
+            f"{where} = {table!r} is no table; allowed: a table" + (f" with {', '.join(known)}" if known else "")
+        )
     for key in table:
         if known and key not in known:
             raise UnknownKey(key, known, "key", where, f"(allowed: {', '.join(known)})")
@@ -45,13 +48,15 @@ def texts(table: Mapping, key: str, where: str) -> list[str]:
     """The list of texts under a key; empty where the key is absent."""
     value = table.get(key, [])
     if not isinstance(value, list) or not all(isinstance(v, str) and v for v in value):
-        raise BadCapture(f"{where}: {key} = {value!r}; allowed: a list of texts, such as [\"one\", \"two\"]")
+        raise BadCapture(f'{where}: {key} = {value!r}; allowed: a list of texts, such as ["one", "two"]')
     return value
 
 
 def number(value: object, key: str, unit: str, where: str) -> float:
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-        raise BadCapture(f"{where}: {key} = {value!r}{' ' + unit if unit else ''}; allowed: a finite number, without quotes")
+        raise BadCapture(
+            f"{where}: {key} = {value!r}{' ' + unit if unit else ''}; allowed: a finite number, without quotes"
+        )
     return float(value)
 
 
@@ -60,8 +65,12 @@ def settings(table: object, where: str) -> dict[str, float | str]:
     keys(table, (), where)
     for key, value in table.items():
         if isinstance(value, Mapping):
-            raise BadCapture(f"{where}: {key} is a table; a key with a dot stands in quotes: \"{key}.{next(iter(value), '')}\"")
-    return {key: value if isinstance(value, str) else number(value, f'"{key}"', "", where) for key, value in table.items()}
+            raise BadCapture(
+                f'{where}: {key} is a table; a key with a dot stands in quotes: "{key}.{next(iter(value), "")}"'
+            )
+    return {
+        key: value if isinstance(value, str) else number(value, f'"{key}"', "", where) for key, value in table.items()
+    }
 
 
 def existing(folder: Path, name: str, where: str) -> Path:
@@ -70,6 +79,8 @@ def existing(folder: Path, name: str, where: str) -> Path:
     if not file.is_file():
         there = [Path(name).with_name(p.name).as_posix() for p in (folder / Path(name).parent).glob("*")]
         near = difflib.get_close_matches(name, there, n=1)
-        raise BadCapture(f"{where} = '{name}': no such file in {folder}; allowed: a path relative to {folder.name}"
-                         + (f"; did you mean '{near[0]}'?" if near else "; correct the path or add the file"))
+        raise BadCapture(
+            f"{where} = '{name}': no such file in {folder}; allowed: a path relative to {folder.name}"
+            + (f"; did you mean '{near[0]}'?" if near else "; correct the path or add the file")
+        )
     return file

@@ -22,7 +22,9 @@ from optics.words import some, spaced
 
 REACH = 4.0  # plausible sizes that one step may change what the image is not linear in
 POOR = 0.25  # of the gain that a linearisation promises: with less, it has been followed too far
-NEGLIGIBLE = 1e-3  # of the excess of chi2: a promise that is not worth another linearisation, a tenth of what a diagnosis allows
+NEGLIGIBLE = (
+    1e-3  # of the excess of chi2: a promise that is not worth another linearisation, a tenth of what a diagnosis allows
+)
 ALIKE = 0.995  # correlation beyond which two variables are said to stand for each other
 TRUNCATION = 1e-12  # eigenvalues of the scaled normal matrix below this share of the largest count as undetermined
 
@@ -34,9 +36,11 @@ class Fit:
     values       start values with the estimates put in
     estimate     (p,) in the order of `variables`; covariance (p, p) from the noise model and the priors
     chi2, dof    of the data, without priors; per frame in frame_chi2, frame_n
-    converged    whether the fall of chi2 still predicted is below 1 per variable, or a thousandth of what noise does not explain; `reason`
+    converged    whether the fall of chi2 still predicted is below 1 per variable, or a thousandth of what noise does
+                 not explain; `reason`
                  says why it stopped
-    warnings     sentences: combinations that the captures cannot tell apart, variables that do nothing or stand at a bound
+    warnings     sentences: combinations that the captures cannot tell apart, variables that do nothing or stand at a
+                 bound
     """
 
     values: Values
@@ -54,7 +58,7 @@ class Fit:
     warnings: list[str] = field(default_factory=list)
     start: np.ndarray | None = None
     at_bound: list[str] = field(default_factory=list)
-    normal: "Normal | None" = None  # the last linearisation, for `extended`
+    normal: Normal | None = None  # the last linearisation, for `extended`
 
     @property
     def sd(self) -> np.ndarray:
@@ -78,9 +82,13 @@ class Fit:
             other = f"{self.correlation[i, j]:+.2f} {self.variables[j].name}" if j != i else ""
             start = "" if self.start is None else f"{self.start[i]:11.5g}"
             bound = "  at its bound" if variable.name in self.at_bound else ""
-            lines.append(f"{variable.name:<28}{self.estimate[i]:12.5g}{self.sd[i]:11.2g}  {variable.parameter.unit:<6}"
-                         f"{start}   {other}{bound}")
-        lines.append(f"chi2 per degree of freedom {self.chi2_per_dof:.4f} ({self.dof} degrees of freedom); {self.reason}")
+            lines.append(
+                f"{variable.name:<28}{self.estimate[i]:12.5g}{self.sd[i]:11.2g}  {variable.parameter.unit:<6}"
+                f"{start}   {other}{bound}"
+            )
+        lines.append(
+            f"chi2 per degree of freedom {self.chi2_per_dof:.4f} ({self.dof} degrees of freedom); {self.reason}"
+        )
         return "\n".join([*lines, *(f"warning: {w}" for w in self.warnings)])
 
 
@@ -88,7 +96,8 @@ class Fit:
 class Normal:
     """Normal equations at one point: A = J'WJ + priors, b = J'Wr + priors, chi2 of data and of priors.
 
-    rows   per frame: which variables act in it, their whitened derivative images (k, n), sqrt(weight), residual whitened
+    rows   per frame: which variables act in it, their whitened derivative images (k, n), sqrt(weight), residual
+           whitened
     """
 
     a: np.ndarray
@@ -104,8 +113,13 @@ class Normal:
         return self.chi2 + self.prior
 
 
-def variables_from(model, free: Sequence[str], per_group: Sequence[str] = (), priors: Mapping[str, tuple] | None = None,
-                   frames: Sequence[int] | None = None) -> list[Variable]:
+def variables_from(
+    model,
+    free: Sequence[str],
+    per_group: Sequence[str] = (),
+    priors: Mapping[str, tuple] | None = None,
+    frames: Sequence[int] | None = None,
+) -> list[Variable]:
     """Variables for key patterns: `free` in all frames (`led_*.x`), `per_group` with a value per group of frames.
 
     priors: pattern -> (mean or None for the present value, standard deviation).
@@ -121,8 +135,9 @@ def variables_from(model, free: Sequence[str], per_group: Sequence[str] = (), pr
         return found
 
     for pattern in free:
-        variables += [Variable(k, (k,), model.parameters[k]) for k in matching(pattern)
-                      if all(k != v.name for v in variables)]
+        variables += [
+            Variable(k, (k,), model.parameters[k]) for k in matching(pattern) if all(k != v.name for v in variables)
+        ]
     groups: dict[str, list[int]] = {}
     for index in range(len(model.frames)) if frames is None else frames:
         frame = model.frames[index]
@@ -146,6 +161,7 @@ def for_frames(model, variables: Sequence[Variable], frames: Sequence[int]) -> l
 
     A prior goes along when it is the same for all, or stands about what every frame sets.
     """
+
     def group(f: int) -> str:
         frame = model.frames[f]
         return getattr(frame, "group", None) or getattr(frame, "name", str(f))
@@ -171,8 +187,10 @@ def for_frames(model, variables: Sequence[Variable], frames: Sequence[int]) -> l
         shared: dict[str, list[int]] = {}
         for f in frames:
             shared.setdefault(getattr(model.frames[f], "name", str(f)) if single else group(f), []).append(f)
-        found += [Variable(f"{keys[0]}[{name}]", keys, alike[0].parameter, tuple(own), prior_in(alike, own[0]))
-                  for name, own in shared.items()]
+        found += [
+            Variable(f"{keys[0]}[{name}]", keys, alike[0].parameter, tuple(own), prior_in(alike, own[0]))
+            for name, own in shared.items()
+        ]
     return found
 
 
@@ -196,8 +214,14 @@ def huber(whitened: np.ndarray, limit: float = 3.0) -> np.ndarray:
     return np.minimum(1.0, limit / np.maximum(np.abs(whitened), 1e-12))
 
 
-def normal_equations(model, variables: Sequence[Variable], values: Values, frames: Sequence[int], robust: bool = False,
-                     tick: Callable[[], None] | None = None) -> Normal:
+def normal_equations(
+    model,
+    variables: Sequence[Variable],
+    values: Values,
+    frames: Sequence[int],
+    robust: bool = False,
+    tick: Callable[[], None] | None = None,
+) -> Normal:
     """J'WJ, J'Wr and chi2 of the frames at the values, with the priors' rows."""
     p = len(variables)
     a, b = np.zeros((p, p)), np.zeros(p)
@@ -209,8 +233,11 @@ def normal_equations(model, variables: Sequence[Variable], values: Values, frame
         if robust:
             scale *= np.sqrt(huber((model.frames[frame].image - prediction) * scale)).astype(np.float32)
         whitened = whiten(model, frame, prediction, scale)
-        j = (np.stack([(image * scale).ravel() for image in images.values()]) if images
-             else np.zeros((0, whitened.size), np.float32))
+        j = (
+            np.stack([(image * scale).ravel() for image in images.values()])
+            if images
+            else np.zeros((0, whitened.size), np.float32)
+        )
         where = [index_of[n] for n in images]
         a[np.ix_(where, where)] += (j @ j.T).astype(float)
         b[where] += (j @ whitened).astype(float)
@@ -241,7 +268,8 @@ def prior_terms(model, variables: Sequence[Variable], values: Values) -> tuple[n
 
 
 def again(model, variables: Sequence[Variable], values: Values, frames: Sequence[int], normal: Normal) -> Normal:
-    """The normal equations at other values with the derivative images and weights of `normal`: one prediction, no derivative."""
+    """The normal equations at other values with the derivative images and weights of `normal`: one prediction, no
+    derivative."""
     b, frame_chi2 = np.zeros(len(variables)), []
     for frame, prediction, (where, j, scale) in zip(frames, model.predict(values, frames), normal.rows):
         whitened = whiten(model, frame, prediction, scale)
@@ -254,9 +282,8 @@ def again(model, variables: Sequence[Variable], values: Values, frames: Sequence
 def solve(a: np.ndarray, b: np.ndarray, low: np.ndarray, high: np.ndarray, damping: float = 0.0) -> np.ndarray:
     """The x in [low, high] that minimises x'(A + damping diag A)x/2 - b'x.
 
-    In the eigenbasis of the scaled matrix; directions below TRUNCATION stay put. Bounds are kept by an active-set method
-    (Stark & Parker's bounded-variable least squares), so that what is free makes up for what is held.
-    """
+    In the eigenbasis of the scaled matrix; directions below TRUNCATION stay put. Bounds are kept by an active-set
+    method (Stark & Parker's bounded-variable least squares), so that what is free makes up for what is held."""
     scale = np.sqrt(np.where(np.diag(a) > 0, np.diag(a), 1.0))
     low, high = np.where(np.diag(a) > 0, low, 0.0), np.where(np.diag(a) > 0, high, 0.0)
     eigen, vectors = np.linalg.eigh(a / np.outer(scale, scale))
@@ -267,7 +294,9 @@ def solve(a: np.ndarray, b: np.ndarray, low: np.ndarray, high: np.ndarray, dampi
     if np.all((low <= step) & (step <= high)):
         return step
     open_ = high > low
-    bounded = lsq_linear((root[:, None] * basis)[:, open_], target, ((low * scale)[open_], (high * scale)[open_]), method="bvls")
+    bounded = lsq_linear(
+        (root[:, None] * basis)[:, open_], target, ((low * scale)[open_], (high * scale)[open_]), method="bvls"
+    )
     step = np.zeros(len(b))
     step[open_] = bounded.x / scale[open_]
     return np.clip(step, low, high)
@@ -276,12 +305,18 @@ def solve(a: np.ndarray, b: np.ndarray, low: np.ndarray, high: np.ndarray, dampi
 class Descent:
     """Damped steps down chi2 + priors, with the derivative images of one linearisation at a time.
 
-    Steps are taken in `Parameter.coordinate`. State: theta, values, `here` (the normal equations at theta, on the images of
-    the last `linearise`), damping.
-    """
+    Steps are taken in `Parameter.coordinate`. State: theta, values, `here` (the normal equations at theta, on the
+    images of the last `linearise`), damping."""
 
-    def __init__(self, model, variables: Sequence[Variable], values: Values, frames: Sequence[int], robust: bool = False,
-                 damping: float = 1e-3):
+    def __init__(
+        self,
+        model,
+        variables: Sequence[Variable],
+        values: Values,
+        frames: Sequence[int],
+        robust: bool = False,
+        damping: float = 1e-3,
+    ):
         self.model, self.variables, self.frames, self.robust = model, list(variables), list(frames), robust
         self.low, self.high = (np.array([v.parameter.bounds[k] for v in variables], float) for k in (0, 1))
         for i, v in enumerate(variables):
@@ -313,9 +348,8 @@ class Descent:
     def _step(self, damping: float) -> tuple[np.ndarray, float]:
         """Where a damped step leads, and the fall of the misfit that the linear model expects of it.
 
-        A damped step keeps within REACH, in which a linearisation may be trusted at all (a light that is sent round the sensor does
-        not come back), or further where steps have brought what they promised.
-        """
+        A damped step keeps within REACH, in which a linearisation may be trusted at all (a light that is sent round the
+        sensor does not come back), or further where steps have brought what they promised."""
         reach = self.trust * self.reach if damping else np.inf
         box = (self.theta, np.maximum(self.low, self.theta - reach), np.minimum(self.high, self.theta + reach))
         u, low, high = (np.array([v.parameter.coordinate(t) for v, t in zip(self.variables, values)]) for values in box)
@@ -328,8 +362,9 @@ class Descent:
         return np.clip(moved, self.low, self.high), fall
 
     def creep(self) -> None:
-        """Go on along what is left near the best: nearly flat valleys, where any damping forbids to go, and which bend where one factor makes
-        up for another. Far from it, factors by which lights grow without measure as they turn away are no way down."""
+        """Go on along what is left near the best: nearly flat valleys, where any damping forbids to go, and which bend
+        where one factor makes up for another. Far from it, factors by which lights grow without measure as they turn
+        away are no way down."""
         self.damping, self.bent = 1e-9, True
 
     @property
@@ -350,13 +385,16 @@ class Descent:
         return self._at(np.clip(theta, self.low, self.high))
 
     def chord(self, steps: int, enough: float, rough: float = 0.0, part: float = 0.0) -> float:
-        """Steps on the same derivative images, which cost many times what a prediction does, `steps` of them tried at most; the total fall.
+        """Steps on the same derivative images, which cost many times what a prediction does, `steps` of them tried at
+        most; the total fall.
 
-        Lights that move or widen change their brightness by far more than their pattern: a long step ends on the wall of a
-        narrow valley. There the powers are solved for once more, which costs about a prediction, before a step is given up.
+        Lights that move or widen change their brightness by far more than their pattern: a long step ends on the wall
+        of a narrow valley. There the powers are solved for once more, which costs about a prediction, before a step is
+        given up.
 
         enough   a promised fall, or a gain, not worth another step
-        rough    chi2 may rise by a promise below this: close to the best, where chi2 is rough as shadow rims cross pixels,
+        rough    chi2 may rise by a promise below this: close to the best, where chi2 is rough as shadow rims cross
+                 pixels,
                  the root of J'Wr is followed, not chi2
         part     share of the first promise, of which no step beyond the first is worth its prediction
         """
@@ -380,9 +418,10 @@ class Descent:
         return gained
 
     def _search(self, most: int, worst: float) -> tuple[tuple[np.ndarray, Values, Normal], float, float, int]:
-        """(where it leads, its gain, what was expected, predictions): the first step that brings its part of what was expected, under
-        ever more damping, or the best of `most`. A gain that is a poor part of what the same images promise is one that a shorter
-        step beats, and costs a prediction more; taking it for progress spends a linearisation on a hundredth of that.
+        """(where it leads, its gain, what was expected, predictions): the first step that brings its part of what was
+        expected, under ever more damping, or the best of `most`. A gain that is a poor part of what the same images
+        promise is one that a shorter step beats, and costs a prediction more; taking it for progress spends a
+        linearisation on a hundredth of that.
 
         worst   below it no gain is a step; negative where chi2 is rough, and there any above it is one
         """
@@ -404,14 +443,22 @@ class Descent:
         return *best, tried
 
 
-def fit(model, variables: Sequence[Variable], start: Values | None = None, frames: Sequence[int] | None = None, *,
-        max_iterations: int = 40, robust: bool = False, tolerance: float = 0.05,
-        progress: Callable[[str, int, int], None] | None = None) -> Fit:
+def fit(
+    model,
+    variables: Sequence[Variable],
+    start: Values | None = None,
+    frames: Sequence[int] | None = None,
+    *,
+    max_iterations: int = 40,
+    robust: bool = False,
+    tolerance: float = 0.05,
+    progress: Callable[[str, int, int], None] | None = None,
+) -> Fit:
     """Levenberg-Marquardt within bounds.
 
-    Stops when the fall of chi2 that the linear model still predicts is below `tolerance` per variable or NEGLIGIBLE beside the excess, or when no
-    damping gives a lower chi2. Raises Underdetermined when no pixel is usable or no variable does anything.
-    """
+    Stops when the fall of chi2 that the linear model still predicts is below `tolerance` per variable or NEGLIGIBLE
+    beside the excess, or when no damping gives a lower chi2. Raises Underdetermined when no pixel is usable or no
+    variable does anything."""
     variables = list(variables)
     frames = list(range(len(model.frames))) if frames is None else list(frames)
     filled = with_start(model, variables, start or Values())
@@ -433,13 +480,17 @@ def fit(model, variables: Sequence[Variable], start: Values | None = None, frame
         normal = descent.linearise(tick)
         if sum(normal.frame_n) == 0:
             names = [str(getattr(model.frames[f], "name", f)) for f in frames]
-            raise Underdetermined(f"no usable value in the {len(frames)} frames to fit ({some(names)}): all are saturated, at black, or "
-                                  "masked; check [noise] black_level and saturation in captures.toml, and the masks")
+            raise Underdetermined(
+                f"no usable value in the {len(frames)} frames to fit ({some(names)}): all are saturated, at black, or "
+                "masked; check [noise] black_level and saturation in captures.toml, and the masks"
+            )
         silent = [v.name for i, v in enumerate(variables) if normal.a[i, i] == 0]
         if len(silent) == len(variables) and variables:
             there = [f"{v.name} = {value:.4g}{spaced(v.parameter.unit)}" for v, value in zip(variables, descent.theta)]
-            raise Underdetermined(f"none of the {len(variables)} free parameters changes any frame: at {some(there)}; allowed: what some "
-                                  "frame depends on; free others, or correct what the frames set")
+            raise Underdetermined(
+                f"none of the {len(variables)} free parameters changes any frame: at {some(there)}; allowed: what some "
+                "frame depends on; free others, or correct what the frames set"
+            )
         history.append(normal.total)
         promise, excess = descent.promised, max(normal.chi2 - sum(normal.frame_n) + len(variables), 0.0)
         if promise < max(accuracy, NEGLIGIBLE * excess):
@@ -461,31 +512,55 @@ def fit(model, variables: Sequence[Variable], start: Values | None = None, frame
     else:
         reason = f"stopped after {max_iterations} linearisations without converging; allow more or start nearer"
     if not reason:
-        reason = (f"converged after {iteration + 1} linearisations" if best[0] < len(variables) else
-                  f"the linear model still promised a fall of {best[0]:.3g}, which no step brought")
+        reason = (
+            f"converged after {iteration + 1} linearisations"
+            if best[0] < len(variables)
+            else f"the linear model still promised a fall of {best[0]:.3g}, which no step brought"
+        )
         descent.theta, descent.values = best[1:]
     if descent.at is not descent.theta:  # the last steps moved on from where the derivative images were made
         normal = descent.linearise()
     theta, converged = descent.theta, reason.startswith("converged")
     covariance = covariance_of(normal.a)
     # of variables with priors, the degrees of freedom that these and not the data hold: sum of c_ii/sd_i^2
-    held = sum(float(np.clip(c / v.prior[1] ** 2, 0.0, 1.0)) for v, c in zip(variables, np.diag(covariance)) if v.prior is not None)
-    result = Fit(descent.values, variables, theta, covariance, normal.chi2, round(sum(normal.frame_n) - len(variables) + held), frames,
-                 normal.frame_chi2, normal.frame_n, converged, reason, history, start=first)
-    result.at_bound = [v.name for v, t, lo, hi in zip(variables, theta, descent.low, descent.high) if t <= lo or t >= hi]
+    held = sum(
+        float(np.clip(c / v.prior[1] ** 2, 0.0, 1.0))
+        for v, c in zip(variables, np.diag(covariance))
+        if v.prior is not None
+    )
+    result = Fit(
+        descent.values,
+        variables,
+        theta,
+        covariance,
+        normal.chi2,
+        round(sum(normal.frame_n) - len(variables) + held),
+        frames,
+        normal.frame_chi2,
+        normal.frame_n,
+        converged,
+        reason,
+        history,
+        start=first,
+    )
+    result.at_bound = [
+        v.name for v, t, lo, hi in zip(variables, theta, descent.low, descent.high) if t <= lo or t >= hi
+    ]
     result.warnings = warnings_of(result, normal.a)
     result.normal = normal
     return result
 
 
-def extended(model, base: Fit, extra: Sequence[Variable], secant: Mapping[str, float] | None = None, steps: int = 10) -> Fit:
-    """Free further variables and calibrate everything again, by chord steps on the derivative images of a fit that has converged.
+def extended(
+    model, base: Fit, extra: Sequence[Variable], secant: Mapping[str, float] | None = None, steps: int = 10
+) -> Fit:
+    """Free further variables and calibrate everything again, by chord steps on the derivative images of a fit that has
+    converged.
 
-    Each step costs one prediction, where `fit` would make all derivative images afresh: what ranks many effects. The extra
-    variables' images are tangents at the base's values, or secants of the sizes in `secant`. The steps follow the true
-    prediction, so that the result is a true minimum along them; only its last digits, and the errors, are those of the base's
-    linearisation. `converged` says whether the fall that it still predicts is below 1 per variable.
-    """
+    Each step costs one prediction, where `fit` would make all derivative images afresh: what ranks many effects. The
+    extra variables' images are tangents at the base's values, or secants of the sizes in `secant`. The steps follow the
+    true prediction, so that the result is a true minimum along them; only its last digits, and the errors, are those of
+    the base's linearisation. `converged` says whether the fall that it still predicts is below 1 per variable."""
     variables = [*base.variables, *extra]
     p, first = len(variables), len(base.variables)
     index_of = {v.name: i for i, v in enumerate(variables)}
@@ -494,7 +569,11 @@ def extended(model, base: Fit, extra: Sequence[Variable], secant: Mapping[str, f
     a[:first, :first] = base.normal.a
     derivatives = model.derivatives(values, list(extra), base.frames, secant=secant or {})
     for frame, (where, j, scale), (prediction, images) in zip(base.frames, base.normal.rows, derivatives):
-        new = np.stack([(i * scale).ravel() for i in images.values()]) if images else np.zeros((0, j.shape[1]), np.float32)
+        new = (
+            np.stack([(i * scale).ravel() for i in images.values()])
+            if images
+            else np.zeros((0, j.shape[1]), np.float32)
+        )
         there = [index_of[n] for n in images]
         whitened = whiten(model, frame, prediction, scale)
         a[np.ix_(there, there)] += (new @ new.T).astype(float)
@@ -510,8 +589,20 @@ def extended(model, base: Fit, extra: Sequence[Variable], secant: Mapping[str, f
     before = descent.here.total
     descent.chord(steps, 0.1 * p)
     here = descent.here
-    return Fit(descent.values, variables, descent.theta, covariance_of(here.a), here.chi2, base.dof - len(extra), base.frames,
-               here.frame_chi2, here.frame_n, descent.promised < p, "chord steps", [before, here.total])
+    return Fit(
+        descent.values,
+        variables,
+        descent.theta,
+        covariance_of(here.a),
+        here.chi2,
+        base.dof - len(extra),
+        base.frames,
+        here.frame_chi2,
+        here.frame_n,
+        descent.promised < p,
+        "chord steps",
+        [before, here.total],
+    )
 
 
 def covariance_of(a: np.ndarray) -> np.ndarray:
@@ -542,8 +633,10 @@ def warnings_of(result: Fit, a: np.ndarray) -> list[str]:
                 part = [n for n, c in zip(names, vector) if abs(c) > 0.15 and n not in silent]
                 if len(part) > 1:
                     told.append(set(part))
-                    texts.append(f"the captures cannot tell apart {some(part, 8)}: only a combination is determined; hold one of "
-                                 "them, or give it a prior")
+                    texts.append(
+                        f"the captures cannot tell apart {some(part, 8)}: only a combination is determined; hold one of "
+                        "them, or give it a prior"
+                    )
     correlation = np.nan_to_num(result.correlation, posinf=0.0, neginf=0.0) * (1 - np.eye(len(names)))
     count, member = connected_components(np.abs(correlation) > ALIKE) if names else (0, None)
     for one in (np.flatnonzero(member == k) for k in range(count)):
@@ -553,8 +646,10 @@ def warnings_of(result: Fit, a: np.ndarray) -> list[str]:
             texts.append(f"{names[one[0]]} and {names[one[1]]} are correlated to {correlation[one[0], one[1]]:+.4f}")
         else:
             most = np.abs(correlation[np.ix_(one, one)]).max()
-            texts.append(f"{some([names[i] for i in one])} are correlated among each other, to {most:.4f} at most: the captures know little "
-                         "more than one combination of them; hold one of them, or give it a prior")
+            texts.append(
+                f"{some([names[i] for i in one])} are correlated among each other, to {most:.4f} at most: the captures know little "
+                "more than one combination of them; hold one of them, or give it a prior"
+            )
     texts += [f"{n} ended at its bound" for n in result.at_bound]
     if not result.converged:
         texts.append(result.reason)

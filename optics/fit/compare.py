@@ -19,14 +19,38 @@ from optics.errors import Underdetermined
 from optics.words import table
 
 SCOPES = (  # what the numbers are split by; regions may overlap, everything else adds up to the whole
-    (), ("role",), ("frame",), ("led",), ("group",), ("channel",), ("region",),
-    ("frame", "channel"), ("frame", "region"), ("led", "channel"), ("led", "region"),
+    (),
+    ("role",),
+    ("frame",),
+    ("led",),
+    ("group",),
+    ("channel",),
+    ("region",),
+    ("frame", "channel"),
+    ("frame", "region"),
+    ("led", "channel"),
+    ("led", "region"),
 )
 UNITS = {
-    "radius": "px", "row": "px", "column": "px", "height": "mm", "depth": "mm", "incidence": "deg", "emission": "deg",
-    "led_distance": "mm", "contact_distance": "px", "gel_path": "mm", "slope": "deg", "intensity": "DN",
-    "half_angle": "deg", "led_angle": "deg", "light_azimuth": "deg", "press_distance": "mm", "signal": "DN",
-    "gradient": "DN/px", "laplacian": "DN/px^2",
+    "radius": "px",
+    "row": "px",
+    "column": "px",
+    "height": "mm",
+    "depth": "mm",
+    "incidence": "deg",
+    "emission": "deg",
+    "led_distance": "mm",
+    "contact_distance": "px",
+    "gel_path": "mm",
+    "slope": "deg",
+    "intensity": "DN",
+    "half_angle": "deg",
+    "led_angle": "deg",
+    "light_azimuth": "deg",
+    "press_distance": "mm",
+    "signal": "DN",
+    "gradient": "DN/px",
+    "laplacian": "DN/px^2",
 }
 FAR = ("far field", "far", "far_field")
 SIDE_MIN_SSIM = 3  # px; the smallest window that has a variance
@@ -147,9 +171,13 @@ class Comparison:
         lines = iter(table([line for block in blocks for line in block], left=(0,)).split("\n"))
         shown = ["\n".join(next(lines) for _ in block) for block in blocks]
         s = self.similarity
-        shown.append("over frames, mean and sd: " + ", ".join(
-            f"{name} {s[key][0]:.{p}f} +- {s[key][1]:.{p}f}{unit}"
-            for key, name, p, unit in (("l1", "L1", 4, ""), ("ssim", "SSIM", 4, ""), ("psnr", "PSNR", 2, " dB"))))
+        shown.append(
+            "over frames, mean and sd: "
+            + ", ".join(
+                f"{name} {s[key][0]:.{p}f} +- {s[key][1]:.{p}f}{unit}"
+                for key, name, p, unit in (("l1", "L1", 4, ""), ("ssim", "SSIM", 4, ""), ("psnr", "PSNR", 2, " dB"))
+            )
+        )
         return "\n\n".join(shown)
 
     def to_csv(self) -> str:
@@ -165,38 +193,76 @@ class Comparison:
 
     def to_dict(self) -> dict:
         """Plain data without the maps. NaN becomes None and infinity 'inf', so that any JSON reader takes it."""
-        return plain({
-            "rows": [asdict(r) for r in self.rows], "curves": [asdict(c) for c in self.curves], "frames": self.frames,
-            "channels": self.channels, "similarity": self.similarity, "full_scale": self.full_scale,
-        })
+        return plain(
+            {
+                "rows": [asdict(r) for r in self.rows],
+                "curves": [asdict(c) for c in self.curves],
+                "frames": self.frames,
+                "channels": self.channels,
+                "similarity": self.similarity,
+                "full_scale": self.full_scale,
+            }
+        )
 
     def to_json(self) -> str:
         return json.dumps(self.to_dict(), indent=1, allow_nan=False)
 
     @classmethod
-    def from_dict(cls, data: Mapping, rms_map=None, mean_map=None) -> "Comparison":
-        rows = [Row(**{k: v if k == "scope" else (int(v) if k == "n" else _number(v)) for k, v in r.items()})
-                for r in data["rows"]]
-        curves = [Curve(**{k: np.array([_number(x) for x in v], int if k == "n" else float)
-                           if k in ("centre", "mean", "se", "rms", "n")
-                           else tuple(v) if k == "labels" and v is not None else v for k, v in c.items()})
-                  for c in data["curves"]]
+    def from_dict(cls, data: Mapping, rms_map=None, mean_map=None) -> Comparison:
+        rows = [
+            Row(**{k: v if k == "scope" else (int(v) if k == "n" else _number(v)) for k, v in r.items()})
+            for r in data["rows"]
+        ]
+        curves = [
+            Curve(
+                **{
+                    k: np.array([_number(x) for x in v], int if k == "n" else float)
+                    if k in ("centre", "mean", "se", "rms", "n")
+                    else tuple(v)
+                    if k == "labels" and v is not None
+                    else v
+                    for k, v in c.items()
+                }
+            )
+            for c in data["curves"]
+        ]
         similarity = {k: (_number(v[0]), _number(v[1])) for k, v in data["similarity"].items()}
-        return cls(rows, curves, list(data["frames"]), list(data["channels"]), similarity, float(data["full_scale"]),
-                   rms_map, mean_map)
+        return cls(
+            rows,
+            curves,
+            list(data["frames"]),
+            list(data["channels"]),
+            similarity,
+            float(data["full_scale"]),
+            rms_map,
+            mean_map,
+        )
 
     @classmethod
-    def from_json(cls, text: str) -> "Comparison":
+    def from_json(cls, text: str) -> Comparison:
         return cls.from_dict(json.loads(text))
 
 
-def compare(measured: Sequence[np.ndarray], predicted: Sequence[np.ndarray], sd: Sequence[np.ndarray],
-            usable: Sequence[np.ndarray], coordinates: Sequence[Mapping[str, np.ndarray]] | None = None,
-            settings: Sequence[Mapping] | None = None, groups: Sequence[str] | Mapping[str, Sequence[int]] | None = None,
-            *, names: Sequence[str] | None = None, leds: Sequence[str] | None = None,
-            channels: Sequence[str] | None = None, full_scale: float = 255.0, held_out: Sequence[int] = (),
-            parameters: int = 0, held_out_parameters: int = 0, bins: int = 16,
-            black_level: float = 0.0, units: Mapping[str, str] | None = None) -> Comparison:
+def compare(
+    measured: Sequence[np.ndarray],
+    predicted: Sequence[np.ndarray],
+    sd: Sequence[np.ndarray],
+    usable: Sequence[np.ndarray],
+    coordinates: Sequence[Mapping[str, np.ndarray]] | None = None,
+    settings: Sequence[Mapping] | None = None,
+    groups: Sequence[str] | Mapping[str, Sequence[int]] | None = None,
+    *,
+    names: Sequence[str] | None = None,
+    leds: Sequence[str] | None = None,
+    channels: Sequence[str] | None = None,
+    full_scale: float = 255.0,
+    held_out: Sequence[int] = (),
+    parameters: int = 0,
+    held_out_parameters: int = 0,
+    bins: int = 16,
+    black_level: float = 0.0,
+    units: Mapping[str, str] | None = None,
+) -> Comparison:
     """Compare frames (H, W) or (H, W, C) in DN with their predictions; all lists have one entry per frame.
 
     sd           standard deviation of each measured value, DN
@@ -213,19 +279,31 @@ def compare(measured: Sequence[np.ndarray], predicted: Sequence[np.ndarray], sd:
     Raises ValueError when lists or shapes disagree, Underdetermined when no value is usable.
     """
     frames = len(measured)
-    _same_length(frames, predicted=predicted, sd=sd, usable=usable, coordinates=coordinates, settings=settings,
-                 names=names, leds=leds)
+    _same_length(
+        frames,
+        predicted=predicted,
+        sd=sd,
+        usable=usable,
+        coordinates=coordinates,
+        settings=settings,
+        names=names,
+        leds=leds,
+    )
     if not full_scale > 0:
         raise ValueError(f"full_scale = {full_scale} DN is not above 0")
     data = [_frame(i, *arrays) for i, arrays in enumerate(zip(measured, predicted, sd, usable))]
     if not any(use.any() for *_, use in data):
-        raise Underdetermined("no usable value in any frame: everything is masked, saturated or not finite; "
-                              "check the masks and the noise model's saturation")
+        raise Underdetermined(
+            "no usable value in any frame: everything is masked, saturated or not finite; "
+            "check the masks and the noise model's saturation"
+        )
     shape = data[0][0].shape
     channels = list(channels or {1: ["L"], 3: ["R", "G", "B"]}.get(shape[2], [f"c{k}" for k in range(shape[2])]))
     varied = _varied(settings or [{}] * frames)
-    coordinates = [_planes({**c, **v}, d[0].shape, i)
-                   for i, (c, v, d) in enumerate(zip(coordinates or [{}] * frames, varied, data))]
+    coordinates = [
+        _planes({**c, **v}, d[0].shape, i)
+        for i, (c, v, d) in enumerate(zip(coordinates or [{}] * frames, varied, data))
+    ]
     info = {
         "frame": list(names or [f"{i:03d}" for i in range(frames)]),
         "led": list(leds or [led_label(s) for s in settings or [{}] * frames]),
@@ -236,8 +314,11 @@ def compare(measured: Sequence[np.ndarray], predicted: Sequence[np.ndarray], sd:
     regions = _region_names(coordinates)
     sums = _sums(data, coordinates, regions, full_scale, black_level)
     per_value = _parameters_per_value(sums["n"][:, 0].sum(1), info["role"], parameters, held_out_parameters)
-    rows = [_row(scope, sums, keep, per_value, full_scale)
-            for names_of_scope in SCOPES for scope, keep in _parts(names_of_scope, info, regions, channels)]
+    rows = [
+        _row(scope, sums, keep, per_value, full_scale)
+        for names_of_scope in SCOPES
+        for scope, keep in _parts(names_of_scope, info, regions, channels)
+    ]
     per_frame = [row for row in rows if tuple(row.scope) == ("frame",) and row.n]
     similarity = {key: _mean_sd([getattr(row, key) for row in per_frame]) for key in ("l1", "ssim", "psnr")}
 
@@ -249,7 +330,8 @@ def compare(measured: Sequence[np.ndarray], predicted: Sequence[np.ndarray], sd:
 
 
 def led_label(settings: Mapping) -> str:
-    """The parts whose `.power` is above 0, joined by ' + '; 'all' where none is set, or three or more and all of them."""
+    """The parts whose `.power` is above 0, joined by ' + '; 'all' where none is set, or three or more and all of
+    them."""
     power = {k.rsplit(".", 1)[0]: float(v) for k, v in settings.items() if k.endswith(".power")}
     on = [name for name, value in power.items() if value > 0]
     if not power or (len(on) == len(power) and len(on) > 2):
@@ -261,22 +343,24 @@ def structural_similarity_map(measured: np.ndarray, predicted: np.ndarray, usabl
     """SSIM of two (H, W) planes with range 0..1: (H, W) map, (H, W) bool where it counts.
 
     Masked pixels take the predicted value in both planes, so that what a window sees of them is no difference. The
-    border of half a window does not count, as in scikit-image's mean.
-    """
+    border of half a window does not count, as in scikit-image's mean."""
     from skimage.metrics import structural_similarity
 
     side = min(7, min(measured.shape) - 1 + min(measured.shape) % 2)  # 7 px unless the plane is smaller; odd
     if side < SIDE_MIN_SSIM or not usable.any():
         return np.full(measured.shape, np.nan), np.zeros(measured.shape, bool)
     filled = np.where(np.isfinite(predicted), predicted, 0.0)
-    _, local = structural_similarity(np.where(usable, measured, filled), filled, data_range=1.0, win_size=side, full=True)
+    _, local = structural_similarity(
+        np.where(usable, measured, filled), filled, data_range=1.0, win_size=side, full=True
+    )
     inner = np.zeros(measured.shape, bool)
     pad = side // 2
-    inner[pad:measured.shape[0] - pad, pad:measured.shape[1] - pad] = True
+    inner[pad : measured.shape[0] - pad, pad : measured.shape[1] - pad] = True
     return local, inner & usable
 
 
 # -- input --------------------------------------------------------------------------------------------------------------
+
 
 def _same_length(frames: int, **lists) -> None:
     if not frames:
@@ -337,7 +421,9 @@ def _group_names(groups, frames: int) -> list[str]:
     return [f"{i:03d}" if g is None else str(g) for i, g in enumerate(groups)]
 
 
-# -- numbers ------------------------------------------------------------------------------------------------------------
+# -- numbers
+# ------------------------------------------------------------------------------------------------------------
+
 
 def _region_names(coordinates: list[dict]) -> list[str]:
     """'all' first, then every boolean coordinate, then the far field where nothing else is given."""
@@ -345,20 +431,27 @@ def _region_names(coordinates: list[dict]) -> list[str]:
     return ["all", *(n for n in found if n != FAR[0]), *FAR[: len(found) > 0]]
 
 
-def _sums(data: list[tuple], coordinates: list[dict], regions: list[str], full_scale: float,
-          black_level: float) -> dict[str, np.ndarray]:
+def _sums(
+    data: list[tuple], coordinates: list[dict], regions: list[str], full_scale: float, black_level: float
+) -> dict[str, np.ndarray]:
     """Sums over pixels per (frame, region, channel); every row is made from these, so marginals agree exactly."""
     keys = ("total", "n", "difference", "absolute", "square", "chi2", "variance", "signal", "ssim", "ssim_n")
     sums = {key: np.zeros((len(data), len(regions), data[0][0].shape[2])) for key in keys}
     for i, (y, f, s, use) in enumerate(data):
         d = np.where(use, y - f, 0.0)
         terms = {
-            "n": use, "difference": d, "absolute": np.abs(d), "square": d * d,
-            "chi2": (d / np.where(use, s, 1.0)) ** 2, "variance": np.where(use, s, 0.0) ** 2,
+            "n": use,
+            "difference": d,
+            "absolute": np.abs(d),
+            "square": d * d,
+            "chi2": (d / np.where(use, s, 1.0)) ** 2,
+            "variance": np.where(use, s, 0.0) ** 2,
             "signal": np.where(use, f - black_level, 0.0),
         }
-        similar = [structural_similarity_map(y[..., c] / full_scale, f[..., c] / full_scale, use[..., c])
-                   for c in range(y.shape[2])]
+        similar = [
+            structural_similarity_map(y[..., c] / full_scale, f[..., c] / full_scale, use[..., c])
+            for c in range(y.shape[2])
+        ]
         counts = np.stack([m for _, m in similar], -1)
         terms["ssim"] = np.where(counts, np.stack([v for v, _ in similar], -1), 0.0)
         terms["ssim_n"] = counts
@@ -376,7 +469,8 @@ def _sums(data: list[tuple], coordinates: list[dict], regions: list[str], full_s
 
 
 def _parameters_per_value(n: np.ndarray, roles: list[str], parameters: int, held_out_parameters: int) -> np.ndarray:
-    """Fitted parameters per value of each frame: they are shared out evenly over the values that they were fitted to."""
+    """Fitted parameters per value of each frame: they are shared out evenly over the values that they were fitted
+    to."""
     held = np.array([role == "held out" for role in roles])
     out = np.zeros(len(n))
     for mask, count in ((~held, parameters), (held, held_out_parameters)):
@@ -390,7 +484,9 @@ def _parts(scope: tuple[str, ...], info: dict, regions: list[str], channels: lis
     every = np.arange(len(info["frame"]))
     choices = []
     for name in scope:
-        choices.append({"region": regions[1:], "channel": channels}.get(name) or list(dict.fromkeys(info.get(name, []))))
+        choices.append(
+            {"region": regions[1:], "channel": channels}.get(name) or list(dict.fromkeys(info.get(name, [])))
+        )
     if scope and (not all(choices) or (scope[-1] in ("region", "channel") and len(scope) > 1 and len(choices[-1]) < 2)):
         return
     for labels in _product(choices):
@@ -421,10 +517,20 @@ def _row(scope: dict, sums: dict, keep: tuple, per_value: np.ndarray, full_scale
     if not n:
         return Row(scope, 0, 0.0, *[math.nan] * 9)
     mse = s["square"] / n / full_scale**2
-    return Row(scope, int(n), n / s["total"], s["chi2"], dof, s["difference"] / n, math.sqrt(s["square"] / n),
-               math.sqrt(s["variance"] / n), s["signal"] / n, s["absolute"] / n / full_scale,
-               -10 * math.log10(mse) if mse > 0 else math.inf,
-               s["ssim"] / s["ssim_n"] if s["ssim_n"] else math.nan)
+    return Row(
+        scope,
+        int(n),
+        n / s["total"],
+        s["chi2"],
+        dof,
+        s["difference"] / n,
+        math.sqrt(s["square"] / n),
+        math.sqrt(s["variance"] / n),
+        s["signal"] / n,
+        s["absolute"] / n / full_scale,
+        -10 * math.log10(mse) if mse > 0 else math.inf,
+        s["ssim"] / s["ssim_n"] if s["ssim_n"] else math.nan,
+    )
 
 
 def _mean_sd(values: list[float]) -> tuple[float, float]:
@@ -435,7 +541,9 @@ def _mean_sd(values: list[float]) -> tuple[float, float]:
     return float(values.mean()), float(values.std(ddof=1)) if len(values) > 1 else math.nan
 
 
-# -- maps and curves ----------------------------------------------------------------------------------------------------
+# -- maps and curves
+# ----------------------------------------------------------------------------------------------------
+
 
 def _maps(whitened: list[np.ndarray]) -> tuple[np.ndarray | None, np.ndarray | None]:
     """Root mean square and mean over frames per pixel; None where frames differ in size."""
@@ -454,12 +562,22 @@ def _maps(whitened: list[np.ndarray]) -> tuple[np.ndarray | None, np.ndarray | N
 def _curves(whitened, data, coordinates, names, channels, bins, units) -> list[Curve]:
     """Residual in sigmas against every number-valued coordinate, and against intensity, channel and frame."""
     z = np.concatenate([w.reshape(-1, w.shape[2]) for w in whitened])
-    given = list(dict.fromkeys(n for planes in coordinates for n, v in planes.items()
-                               if v.dtype != bool and n not in ("intensity", "channel", "frame")))
+    given = list(
+        dict.fromkeys(
+            n
+            for planes in coordinates
+            for n, v in planes.items()
+            if v.dtype != bool and n not in ("intensity", "channel", "frame")
+        )
+    )
     curves = []
     for name in given + ["intensity"]:
-        x = np.concatenate([np.broadcast_to(_plane(name, planes, d), w.shape).reshape(-1, w.shape[2])
-                            for planes, d, w in zip(coordinates, data, whitened)])
+        x = np.concatenate(
+            [
+                np.broadcast_to(_plane(name, planes, d), w.shape).reshape(-1, w.shape[2])
+                for planes, d, w in zip(coordinates, data, whitened)
+            ]
+        )
         edges = _edges(x[np.isfinite(z) & np.isfinite(x)], bins)
         if edges is None:
             continue
@@ -468,8 +586,10 @@ def _curves(whitened, data, coordinates, names, channels, bins, units) -> list[C
         if len(channels) > 1:
             curves += [_binned(name, unit, label, x[:, c], z[:, c], edges) for c, label in enumerate(channels)]
     frame = np.concatenate([np.full(w.shape[0] * w.shape[1], i) for i, w in enumerate(whitened)])
-    for name, index, labels in (("channel", np.broadcast_to(np.arange(len(channels)), z.shape), channels),
-                                ("frame", np.broadcast_to(frame[:, None], z.shape), names)):
+    for name, index, labels in (
+        ("channel", np.broadcast_to(np.arange(len(channels)), z.shape), channels),
+        ("frame", np.broadcast_to(frame[:, None], z.shape), names),
+    ):
         if len(labels) > 1:
             edges = np.arange(len(labels) + 1) - 0.5
             curves.append(_binned(name, "", "all", index.ravel(), z.ravel(), edges, tuple(labels)))
@@ -515,11 +635,22 @@ def _binned(name, unit, channel, x, z, edges, labels=None) -> Curve:
 
 # -- views --------------------------------------------------------------------------------------------------------------
 
+
 def _cells(row: Row) -> tuple[str, ...]:
     if not row.n:
         return (row.label, "0", *["-"] * 8)
-    return (row.label, str(row.n), f"{100 * row.share:.1f} %", f"{row.chi2_per_dof:.3f}", f"{row.bias:+.3f}",
-            f"{row.rms:.3f}", f"{row.noise:.3f}", f"{row.l1:.4f}", f"{row.psnr:.2f}", f"{row.ssim:.4f}")
+    return (
+        row.label,
+        str(row.n),
+        f"{100 * row.share:.1f} %",
+        f"{row.chi2_per_dof:.3f}",
+        f"{row.bias:+.3f}",
+        f"{row.rms:.3f}",
+        f"{row.noise:.3f}",
+        f"{row.l1:.4f}",
+        f"{row.psnr:.2f}",
+        f"{row.ssim:.4f}",
+    )
 
 
 def plain(value):

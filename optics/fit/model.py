@@ -1,4 +1,5 @@
-"""The model: a scene held against a capture set. Predictions, derivative images, masks and coordinates, frame by frame."""
+"""The model: a scene held against a capture set. Predictions, derivative images, masks and coordinates, frame by
+frame."""
 
 from __future__ import annotations
 
@@ -30,13 +31,16 @@ class Model:
                  does not know of the background is a gain; "additive", it is light that a press leaves as it is; None
     """
 
-    def __init__(self, scene: Scene, captures: Captures, noise: Noise | None = None,
-                 flat_field: bool | str | None = True):
+    def __init__(
+        self, scene: Scene, captures: Captures, noise: Noise | None = None, flat_field: bool | str | None = True
+    ):
         from optics.light.monte_carlo import renderer_of
 
         noise = noise or captures.noise
         if noise is None:
-            raise BadScene(f"{captures.folder}: no noise model; give [noise] in captures.toml or repeats to estimate it from")
+            raise BadScene(
+                f"{captures.folder}: no noise model; give [noise] in captures.toml or repeats to estimate it from"
+            )
         if captures.table is not None:
             captures = sweeps(captures, scene.parameters, scene.lights)
         self.scene, self.captures, self.noise = scene, captures, noise
@@ -47,46 +51,65 @@ class Model:
             self.frames = [replace(f, image=np.repeat(f.image, 3, axis=2)) for f in captures.frames]
             background = None if background is None else np.repeat(background, 3, axis=2)
         self.renderer = renderer_of(scene)
-        self.by_chance = self.renderer.by_chance  # whether predictions are Monte Carlo estimates, whose error `variance` holds
+        self.monte_carlo = (
+            self.renderer.monte_carlo
+        )  # whether predictions are Monte Carlo estimates, whose error `variance` holds
         self._edges_kept: dict[int, np.ndarray] = {}
         self.parameters: dict[str, Parameter] = scene.parameters
-        self.base = {**scene.values(), **scene.check(captures.parameters, f"{captures.folder}/captures.toml [parameters]")}
+        self.base = {
+            **scene.values(),
+            **scene.check(captures.parameters, f"{captures.folder}/captures.toml [parameters]"),
+        }
         for frame in self.frames:
             scene.check(frame.parameters, f"{frame.file or captures.folder}: frame {frame.name}")
         self.companions = self._companions()
         # A power that frames set is a drive level: what a calibration finds is the LED's power at drive 1.
-        self.driven = {f"{n}.power" for n in scene.lights} & {k for f in self.frames for k in (*f.parameters, *f.readings)}
-        self.base.update({k: 1.0 for k in self.driven})
+        self.driven = {f"{n}.power" for n in scene.lights} & {
+            k for f in self.frames for k in (*f.parameters, *f.readings)
+        }
+        self.base.update(dict.fromkeys(self.driven, 1.0))
         self.shape = self.frames[0].image.shape
         height, width = self.shape[:2] if captures.table is None else (1, 1)
         if (width, height) != scene.camera.resolution:
             raise BadScene(
                 f"{captures.folder}: images of {width} x {height} px, but the scene's camera has "
                 f"{scene.camera.resolution[0]} x {scene.camera.resolution[1]} px; load the scene with "
-                f"-D width={width} -D height={height}")
+                f"-D width={width} -D height={height}"
+            )
         self.developer = Developer(scene.camera, scene.integrator.bands or (0.0,), noise.black_level, noise.saturation)
         if self.developer.matrix.shape[0] != self.shape[2]:
             channels, wanted, first = self.shape[2], self.developer.matrix.shape[0], captures.frames[0].file
-            raise BadScene(f"{captures.folder / 'captures.toml'}: '{first}' has channels: {channels}, the camera of the scene '{captures.scene}' has "
-                           f"{wanted}; allowed: {wanted}, " + (
-                               "a column of `values` for each" if captures.table is not None else
-                               "or one with cfa = \"RGGB\" (or its like) if it is a raw mosaic; or take a scene whose integrator names one band"
-                               if channels == 1 else "one for each band of the scene's integrator"))
+            raise BadScene(
+                f"{captures.folder / 'captures.toml'}: '{first}' has channels: {channels}, the camera of the scene '{captures.scene}' has "
+                f"{wanted}; allowed: {wanted}, "
+                + (
+                    "a column of `values` for each"
+                    if captures.table is not None
+                    else 'or one with cfa = "RGGB" (or its like) if it is a raw mosaic; or take a scene whose integrator names one band'
+                    if channels == 1
+                    else "one for each band of the scene's integrator"
+                )
+            )
         if flat_field not in (True, False, None, *FLAT_FIELDS):
             raise UnknownKey(str(flat_field), FLAT_FIELDS, "flat-field mode")
         self.flat_field = {True: FLAT_FIELDS[0], False: None, "none": None}.get(flat_field, flat_field)
         self.flat = None  # the measured background above black, a declared nuisance; see `predict`
         if self.flat_field and background is not None and scene.gel is None:
-            raise BadScene(f"{captures.folder}: the set has a background, and the scene no gel that could be at rest in it; allowed: "
-                           "--flat-field none")
+            raise BadScene(
+                f"{captures.folder}: the set has a background, and the scene no gel that could be at rest in it; allowed: "
+                "--flat-field none"
+            )
         if self.flat_field and background is not None:
             self.flat = np.maximum(np.asarray(background, float) - self.noise.black_level, 1e-3)
 
-    def imagine(self, frames: Sequence) -> "Model":
-        """The same model, with the same renderer, with further frames: what `optics.diagnosis.advice` could have somebody measure."""
+    def imagine(self, frames: Sequence) -> Model:
+        """The same model, with the same renderer, with further frames: what `optics.diagnosis.advice` could have
+        somebody measure."""
         twin = copy.copy(self)
         twin.frames = [*self.frames, *frames]
-        twin.driven = self.driven | ({f"{n}.power" for n in self.scene.lights} & {k for f in frames for k in (*f.parameters, *f.readings)})
+        twin.driven = self.driven | (
+            {f"{n}.power" for n in self.scene.lights} & {k for f in frames for k in (*f.parameters, *f.readings)}
+        )
         twin.base = {**self.base, **dict.fromkeys(twin.driven - self.driven, 1.0)}
         twin.companions, twin._edges_kept = twin._companions(), dict(self._edges_kept)
         return twin
@@ -94,7 +117,8 @@ class Model:
     # -- values -------------------------------------------------------------------------------------------------------
 
     def at(self, values: Values, index: int) -> dict:
-        """Every parameter's value in a frame: base <- fitted in all frames <- set in this frame <- fitted in this frame.
+        """Every parameter's value in a frame: base <- fitted in all frames <- set in this frame <- fitted in this
+        frame.
 
         The power of an LED that frames set is the product of the setting and of the fitted power.
         """
@@ -124,7 +148,8 @@ class Model:
         return [presses[key] for key in keys]
 
     def linear_in(self, variable: Variable) -> bool:
-        """Whether predictions are linear in a variable together with all others of which this holds: the LEDs' powers."""
+        """Whether predictions are linear in a variable together with all others of which this holds: the LEDs'
+        powers."""
         return all(self._is_power(k) for k in variable.keys)
 
     def _is_power(self, key: str) -> bool:
@@ -160,8 +185,8 @@ class Model:
     def predict(self, values: Values, frames: Sequence[int] | None = None, seed: int = 0) -> list[np.ndarray]:
         """Noise-free DN (H, W, C) of each frame.
 
-        With a flat field B (the measured background of the untouched sensor), P0 the prediction for the gel at rest in the
-        same frame, and the frame's gain g per channel:
+        With a flat field B (the measured background of the untouched sensor), P0 the prediction for the gel at rest in
+        the same frame, and the frame's gain g per channel:
             multiplicative   black + g (B - black) (P - black)/(P0 - black)
             additive         black + g (B - black) + P - P0             (light adds up: exact for a linear response)
         """
@@ -192,7 +217,8 @@ class Model:
 
     def background_share(self, values: Values | None = None, index: int = 0) -> list[dict[str, float]]:
         """How much of the flat field the scene explains by itself, per channel: rms of the flat field's structure about
-        its mean, rms of what is left of it after the predicted background, both in DN, and the share 1 - (left/structure)^2.
+        its mean, rms of what is left of it after the predicted background, both in DN, and the share 1 -
+        (left/structure)^2.
 
         A multiplicative flat field divides what is left out, an additive one adds it; either way it is not explained.
         """
@@ -202,26 +228,33 @@ class Model:
         found = []
         for c in range(self.shape[2]):
             structure, left = np.std(self.flat[..., c]), np.sqrt(np.mean((self.flat - rest)[..., c] ** 2))
-            found.append({"structure": float(structure), "left": float(left), "share": float(1 - (left / structure) ** 2)})
+            found.append(
+                {"structure": float(structure), "left": float(left), "share": float(1 - (left / structure) ** 2)}
+            )
         return found
 
     def _indices(self, frames) -> list[int]:
         return list(range(len(self.frames))) if frames is None else list(frames)
 
-    def derivatives(self, values: Values, variables: Sequence[Variable], frames: Sequence[int] | None = None,
-                    secant: Mapping[str, float] | None = None, seed: int = 0,
-                    ) -> Iterator[tuple[np.ndarray, dict[str, np.ndarray]]]:
+    def derivatives(
+        self,
+        values: Values,
+        variables: Sequence[Variable],
+        frames: Sequence[int] | None = None,
+        secant: Mapping[str, float] | None = None,
+        seed: int = 0,
+    ) -> Iterator[tuple[np.ndarray, dict[str, np.ndarray]]]:
         """Per frame: prediction (H, W, C) in DN and {variable's name: d prediction / d value}, float32.
 
         `secant` gives, by name, a finite step to take from the present value in place of the tangent. Variables that do
-        nothing in a frame are left out of its dictionary.
-        """
+        nothing in a frame are left out of its dictionary."""
         self.check_variables(variables)
         for index in self._indices(frames):
             yield self._differentiate(values, [v for v in variables if v.holds_in(index)], secant or {}, seed, index)
 
-    def _differentiate(self, values: Values, variables: Sequence[Variable], secant: Mapping[str, float], seed: int,
-                       index: int):
+    def _differentiate(
+        self, values: Values, variables: Sequence[Variable], secant: Mapping[str, float], seed: int, index: int
+    ):
         now = self._turn_to(values, index)
         black = self.noise.black_level
         linear = self.developer.linearise(self.radiance(now, seed), now)
@@ -246,7 +279,9 @@ class Model:
             else:
                 image = self._tangent(linear, now, acts, seed)
                 if self.flat is not None:
-                    still = self._tangent(rest, at_rest, {k: f for k, f in acts.items() if not self._rests(k)}, seed, True)
+                    still = self._tangent(
+                        rest, at_rest, {k: f for k, f in acts.items() if not self._rests(k)}, seed, True
+                    )
                     if image is not None or still is not None:
                         image = scale * ((0 if image is None else image) - share * (0 if still is None else still))
                         if any(self.parameters[k].how == "image" for k in acts):
@@ -265,8 +300,9 @@ class Model:
         moved.put(variable, value + step)
         return (self._predict(self.at(moved, index), seed) - prediction) / step
 
-    def _tangent(self, linear, now: Mapping, acts: Mapping[str, float], seed: int,
-                 at_rest: bool = False) -> np.ndarray | None:
+    def _tangent(
+        self, linear, now: Mapping, acts: Mapping[str, float], seed: int, at_rest: bool = False
+    ) -> np.ndarray | None:
         """d DN / d value in a frame for keys that share one value; None where nothing depends on them."""
         camera = tuple(k for k in acts if self.parameters[k].how == "image")
         light = None
@@ -293,7 +329,11 @@ class Model:
         if self.parameters[key].how == "layer":
             return factor * (np.imag(self.radiance({**now, key: now[key] + 1j * STEP}, seed)) / STEP)
         if key == self.renderer.bounce_key:
-            return factor * sum(power * self.renderer.bounced(now, led, seed) for led, power in lit.items()) if lit else None
+            return (
+                factor * sum(power * self.renderer.bounced(now, led, seed) for led, power in lit.items())
+                if lit
+                else None
+            )
         if self._is_power(key):
             if np.all(factor == 0):
                 return None
@@ -307,15 +347,18 @@ class Model:
             return factor * self.renderer.light({**now, **{f"{name}.{p}": 1.0 for p in POWERS}}, name, seed)
         if kind == "led" and name not in lit:
             return None
-        if self.renderer.by_chance:
+        if self.renderer.monte_carlo:
             return factor * self.renderer.tangent(now, key, seed)
         if key in self.renderer.ambient_keys:
             return factor * self._difference_ambient(now, key)
         if self.parameters[key].how == "difference" and kind != "led":
             return factor * self._difference(now, key, seed)
         if kind == "led":
-            image = (self._difference_led(now, name, key) if self.parameters[key].how == "difference"
-                     else tangent(now, name, key))
+            image = (
+                self._difference_led(now, name, key)
+                if self.parameters[key].how == "difference"
+                else tangent(now, name, key)
+            )
             return factor * lit[name] * image
         total = sum((power * tangent(now, led, key) for led, power in lit.items()), 0.0)
         if glows:
@@ -329,16 +372,20 @@ class Model:
 
     def _difference_led(self, now: Mapping, led: str, key: str) -> np.ndarray:
         low, high = self.parameters[key].sides(now[key])
-        return (self.renderer.image({**now, key: high}, led) - self.renderer.image({**now, key: low}, led)) / (high - low)
+        return (self.renderer.image({**now, key: high}, led) - self.renderer.image({**now, key: low}, led)) / (
+            high - low
+        )
 
     def _difference_ambient(self, now: Mapping, key: str) -> np.ndarray:
         low, high = self.parameters[key].sides(now[key])
         return (self.renderer.ambient({**now, key: high}) - self.renderer.ambient({**now, key: low})) / (high - low)
 
-    # -- what a fit and a diagnosis need of the data --------------------------------------------------------------------
+    # -- what a fit and a diagnosis need of the data
+    # --------------------------------------------------------------------
 
     def usable(self, index: int) -> np.ndarray:
-        """(H, W, C) pixels to use: not saturated, not clipped at black, not masked by the user, of a mosaic's own channel."""
+        """(H, W, C) pixels to use: not saturated, not clipped at black, not masked by the user, of a mosaic's own
+        channel."""
         frame = self.frames[index]
         mask = self.noise.usable(frame.image)
         mask = np.broadcast_to(mask if mask.ndim == 3 else mask[..., None], frame.image.shape).copy()
@@ -351,8 +398,9 @@ class Model:
         return mask
 
     def _resolved(self, index: int) -> np.ndarray:
-        """(H, W, C) False at sharp edges that the finer samples resolve worse than the noise: where the step across a pixel,
-        over the number of samples, is more than a sixth of the noise. At the base's values, so that a fit cannot move it."""
+        """(H, W, C) False at sharp edges that the finer samples resolve worse than the noise: where the step across a
+        pixel, over the number of samples, is more than a sixth of the noise. At the base's values, so that a fit cannot
+        move it."""
         if index not in self._edges_kept:
             now = self.at(Values(), index)
             low = high = 0.0
@@ -366,9 +414,13 @@ class Model:
             if np.ndim(high):
                 view = self.developer.view(now)
                 full = self.noise.saturation - self.noise.black_level
-                step = ((high - low) @ self.developer.matrix.T) * np.abs(view.exposure * self.developer.gains(view)) * full
+                step = (
+                    ((high - low) @ self.developer.matrix.T) * np.abs(view.exposure * self.developer.gains(view)) * full
+                )
                 level = self.predict(Values(), [index])[0].reshape(-1, self.shape[2])[image.index]
-                known.reshape(-1, self.shape[2])[image.index] = step / self.renderer.rim_samples < self.noise.sd(level) / 6
+                known.reshape(-1, self.shape[2])[image.index] = (
+                    step / self.renderer.rim_samples < self.noise.sd(level) / 6
+                )
             self._edges_kept[index] = known
         return self._edges_kept[index]
 
@@ -378,10 +430,10 @@ class Model:
         return float(np.mean([f.image.size for f in self.frames])) / (3 if self.mosaic is not None else 1)
 
     def variance(self, values: Values, index: int, prediction: np.ndarray) -> np.ndarray:
-        """(H, W, C) in DN^2, of a frame about its prediction: the camera's noise, and the prediction's own error where pictures are
-        Monte Carlo estimates, averaged over 3 x 3 pixels (the error itself is known to a quarter)."""
+        """(H, W, C) in DN^2, of a frame about its prediction: the camera's noise, and the prediction's own error where
+        images are Monte Carlo estimates, averaged over 3 x 3 pixels (the error itself is known to a quarter)."""
         noise = self.noise.variance(prediction)
-        return noise + self._error(values, index) if self.by_chance else noise
+        return noise + self._error(values, index) if self.monte_carlo else noise
 
     def _error(self, values: Values, index: int) -> np.ndarray:
         """(H, W, C) variance of a Monte Carlo prediction, DN^2."""
@@ -390,17 +442,20 @@ class Model:
         now = self.at(values, index)
         view = self.developer.view(now)
         full = (self.noise.saturation - self.noise.black_level) * np.abs(view.exposure * self.developer.gains(view))
-        return uniform_filter((self.renderer.error(now) ** 2 @ (self.developer.matrix**2).T) * full**2, (3, 3, 0), mode="nearest")
+        return uniform_filter(
+            (self.renderer.error(now) ** 2 @ (self.developer.matrix**2).T) * full**2, (3, 3, 0), mode="nearest"
+        )
 
     def chance(self, index: int = 0) -> float:
-        """Error of the prediction itself over the camera's noise in a frame, rms; 0 where pictures are exact."""
-        if not self.by_chance:
+        """Error of the prediction itself over the camera's noise in a frame, rms; 0 where images are exact."""
+        if not self.monte_carlo:
             return 0.0
         prediction = self.predict(Values(), [index])[0]
         return float(np.sqrt(np.mean(self._error(Values(), index) / self.noise.variance(prediction))))
 
     def coordinates(self, values: Values, index: int, seed: int = 0) -> dict[str, np.ndarray]:
-        """What is known of every pixel of a frame; see `optics.fit.compare` and `optics.diagnosis.diagnose` for their use."""
+        """What is known of every pixel of a frame; see `optics.fit.compare` and `optics.diagnosis.diagnose` for their
+        use."""
         from scipy.ndimage import distance_transform_edt
 
         now = self.at(values, index)
@@ -411,7 +466,11 @@ class Model:
         height, width = self.shape[:2]
         shadow = np.zeros((height, width), bool)
         rim = hits.edges.copy()
-        incidence, distance, best = np.full((height, width), np.nan), np.full((height, width), np.nan), np.zeros((height, width))
+        incidence, distance, best = (
+            np.full((height, width), np.nan),
+            np.full((height, width), np.nan),
+            np.zeros((height, width)),
+        )
         for led in lit:
             if led in self.scene.sources:
                 continue
@@ -426,14 +485,23 @@ class Model:
             best = np.where(brightest, strength, best)
             incidence = np.where(brightest, np.degrees(np.arccos(cos)), incidence)
             distance = np.where(brightest, length, distance)
-        origin = np.array(hits.origin).T.reshape(p.shape) if np.array(hits.origin).size == p.size else np.array(hits.origin)
+        origin = (
+            np.array(hits.origin).T.reshape(p.shape) if np.array(hits.origin).size == p.size else np.array(hits.origin)
+        )
         to_camera = origin - p
-        emission = np.degrees(np.arccos(np.clip((to_camera * n).sum(-1) / np.maximum(
-            np.linalg.norm(to_camera, axis=-1), 1e-9), -1, 1)))
+        emission = np.degrees(
+            np.arccos(np.clip((to_camera * n).sum(-1) / np.maximum(np.linalg.norm(to_camera, axis=-1), 1e-9), -1, 1))
+        )
         known = {
-            "radius": view.tan * view.focal, "row": view.v, "column": view.u, "emission": emission,
-            "incidence": incidence, "led_distance": distance, "intensity": self.radiance(now, seed).mean(-1),
-            "shadow": shadow, "rim": rim & hits.valid,
+            "radius": view.tan * view.focal,
+            "row": view.v,
+            "column": view.u,
+            "emission": emission,
+            "incidence": incidence,
+            "led_distance": distance,
+            "intensity": self.radiance(now, seed).mean(-1),
+            "shadow": shadow,
+            "rim": rim & hits.valid,
             "frame": np.full((height, width), float(index)),
         }
         if self.scene.gel is not None:
@@ -442,16 +510,28 @@ class Model:
             x, y = np.where(hits.valid, p[..., 0], 0), np.where(hits.valid, p[..., 1], 0)
             touch = gel.contact_weight(x.ravel(), y.ravel()).reshape(height, width) > 0.5
             slope = np.degrees(np.arccos(np.clip(-n[..., 2], -1, 1)))
-            known.update({
-                "height": np.where(hits.valid, -p[..., 2], 0), "slope": slope, "contact": touch & hits.valid,
-                "curvature": np.gradient(n[..., 0], axis=1) + np.gradient(n[..., 1], axis=0),
-                "contact_distance": distance_transform_edt(~touch) if touch.any() else np.full((height, width), np.nan),
-                "gel_path": np.array(gel.number("thickness") + p[..., 2]) / np.maximum(np.cos(np.radians(emission)), 1e-3),
-            })
+            known.update(
+                {
+                    "height": np.where(hits.valid, -p[..., 2], 0),
+                    "slope": slope,
+                    "contact": touch & hits.valid,
+                    "curvature": np.gradient(n[..., 0], axis=1) + np.gradient(n[..., 1], axis=0),
+                    "contact_distance": distance_transform_edt(~touch)
+                    if touch.any()
+                    else np.full((height, width), np.nan),
+                    "gel_path": np.array(gel.number("thickness") + p[..., 2])
+                    / np.maximum(np.cos(np.radians(emission)), 1e-3),
+                }
+            )
         known["far"] = ~(known.get("contact", shadow) | known["rim"] | shadow) & hits.valid
         if self.captures.table is None:
             return known
         frame = self.frames[index]
         count = frame.image.shape[0]  # of one place: only what is set, and when it was read, tells readings apart
-        return {"intensity": np.broadcast_to(known["intensity"], (count, 1)), "far": np.ones((count, 1), bool), "reading": frame.rows[..., 0],
-                "frame": np.full((count, 1), float(index)), **{k: v[..., 0] for k, v in frame.readings.items()}}
+        return {
+            "intensity": np.broadcast_to(known["intensity"], (count, 1)),
+            "far": np.ones((count, 1), bool),
+            "reading": frame.rows[..., 0],
+            "frame": np.full((count, 1), float(index)),
+            **{k: v[..., 0] for k, v in frame.readings.items()},
+        }

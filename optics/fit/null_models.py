@@ -1,18 +1,19 @@
 """Null models: what a physical model of a pressed gel must beat before it has said anything.
 
     background           I = B
-    directional          I = B + l . (n - n0)   or   I = B max(0, n . l)/(n0 . l)      one light at infinity per channel;
+    directional          I = B + l . (n - n0)   or   I = B max(0, n . l)/(n0 . l)      one light at infinity per
+                         channel;
                          the form with the smaller error on the held-out frames stands in the table
     linear in the normal I = B + sum over (n_x, n_y, n_z - 1) x (1, x, y, x^2, xy, y^2), 18 coefficients per channel
 
-with the background B (the flat field times the frame's gain), the normal n of the pressed face towards the camera, n0 the same
-at rest, and x, y the place on the face in units of half the picture's width. All see the frames, masks, gains and split of the
-physical model, and its geometry. Poses: those of the physical model, or poses refined for the null itself, by Gauss-Newton on
-fitted and held-out frames; of the two the one with the smaller held-out error counts, so that every doubt goes to the null.
+with the background B (the flat field times the frame's gain), the normal n of the pressed face towards the camera, n0
+the same at rest, and x, y the place on the face in units of half the image's width. All see the frames, masks, gains
+and split of the physical model, and its geometry. Poses: those of the physical model, or poses refined for the null
+itself, by Gauss-Newton on fitted and held-out frames; of the two the one with the smaller held-out error counts, so
+that every doubt goes to the null.
 
-Errors are differences to the pictures in DN on usable pixels, predictions clipped to the camera's range: rms and L1, within
-`NEAR` labelled radii of the contact and in the whole picture.
-"""
+Errors are differences to the images in DN on usable pixels, predictions clipped to the camera's range: rms and L1,
+within `NEAR` labelled radii of the contact and in the whole image."""
 
 from __future__ import annotations
 
@@ -43,7 +44,8 @@ class Score:
 
 @dataclass
 class NullTable:
-    """Scores of the physical model and of the nulls on the same frames; noise: the camera's sd at the background, DN."""
+    """Scores of the physical model and of the nulls on the same frames; noise: the camera's sd at the background,
+    DN."""
 
     scores: list[Score]
     noise: list[float]
@@ -74,7 +76,9 @@ class NullTable:
                     cells = [" / ".join(f"{v:.2f}" for v in getattr(s, m)) for m in MEASURES]
                     lines.append(f"  {s.model:<28}{s.poses:<10}" + "".join(f"{c:>24}" for c in cells))
         lines.append(f"{'noise of the camera':<40}{' / '.join(f'{v:.2f}' for v in self.noise):>24}")
-        lines.append(f"the physical model beats every null on held-out frames in {self.won or 'no channel'} (rms near the contact)")
+        lines.append(
+            f"the physical model beats every null on held-out frames in {self.won or 'no channel'} (rms near the contact)"
+        )
         return "\n".join(lines)
 
     @property
@@ -87,12 +91,17 @@ class NullTable:
         return ", ".join(c for c, w in zip(self.channels, self.wins()) if w)
 
     @classmethod
-    def from_json(cls, data: dict) -> "NullTable":
+    def from_json(cls, data: dict) -> NullTable:
         return cls([Score(**score) for score in data["scores"]], data["noise"], data["fitted"], data["held_out"])
 
     def json(self) -> dict:
-        return {"scores": [asdict(s) for s in self.scores], "noise": self.noise, "fitted": self.fitted,
-                "held_out": self.held_out, "wins": self.wins()}
+        return {
+            "scores": [asdict(s) for s in self.scores],
+            "noise": self.noise,
+            "fitted": self.fitted,
+            "held_out": self.held_out,
+            "wins": self.wins(),
+        }
 
 
 PHYSICAL = "physical"
@@ -105,16 +114,26 @@ def pooled(tables: Sequence[NullTable]) -> NullTable:
     for first in tables[0].scores:
         parts = [t.of(first.model, first.split) for t in tables]
         weights = [len(t.held_out if first.split == "held out" else t.fitted) for t in tables]
-        mean = {m: np.average([np.array(getattr(p, m)) ** (2 if m.startswith("rms") else 1) for p in parts], axis=0,
-                              weights=weights) for m in MEASURES}
+        mean = {
+            m: np.average(
+                [np.array(getattr(p, m)) ** (2 if m.startswith("rms") else 1) for p in parts], axis=0, weights=weights
+            )
+            for m in MEASURES
+        }
         mean = {m: (np.sqrt(v) if m.startswith("rms") else v).tolist() for m, v in mean.items()}
         poses = parts[0].poses if len({p.poses for p in parts}) == 1 else "either"
         scores.append(Score(first.model, first.split, poses, **mean))
-    return NullTable(scores, np.mean([t.noise for t in tables], axis=0).tolist(),
-                     [n for t in tables for n in t.fitted], [n for t in tables for n in t.held_out])
+    return NullTable(
+        scores,
+        np.mean([t.noise for t in tables], axis=0).tolist(),
+        [n for t in tables for n in t.fitted],
+        [n for t in tables for n in t.held_out],
+    )
 
 
-# -- The nulls ------------------------------------------------------------------------------------------------------------
+# -- The nulls
+# ------------------------------------------------------------------------------------------------------------
+
 
 class Background:
     """I = B."""
@@ -245,10 +264,13 @@ class Bench:
         return np.clip(image, 0, self.model.noise.saturation)
 
     def refined(self, null, index: int, pose) -> tuple[float, ...]:
-        """One Gauss-Newton step of the pose for a fitted null, halved until the misfit falls; else the pose as it was."""
+        """One Gauss-Newton step of the pose for a fitted null, halved until the misfit falls; else the pose as it
+        was."""
         image, weight = self.row(index)
-        sides = [[null.predict(self.shape(index, [p + sign * (k == j) * s for j, p in enumerate(pose)])) for sign in (1, -1)]
-                 for k, s in enumerate(STEPS)]
+        sides = [
+            [null.predict(self.shape(index, [p + sign * (k == j) * s for j, p in enumerate(pose)])) for sign in (1, -1)]
+            for k, s in enumerate(STEPS)
+        ]
         j = np.stack([((high - low) / (2 * s)).ravel() for (high, low), s in zip(sides, STEPS)])
         w, left = weight.ravel(), (image - null.predict(self.shape(index, pose))).ravel()
         sd = np.array(PRIOR_SD)
@@ -270,29 +292,45 @@ class Bench:
                 parts[f"rms_{place}"].append((mask * left**2).sum((0, 1)) / count)
                 parts[f"l1_{place}"].append((mask * np.abs(left)).sum((0, 1)) / count)
         mean = {m: np.mean(v, 0) for m, v in parts.items()}
-        return Score(name, split, poses, **{m: (np.sqrt(v) if m.startswith("rms") else v).tolist() for m, v in mean.items()})
+        return Score(
+            name, split, poses, **{m: (np.sqrt(v) if m.startswith("rms") else v).tolist() for m, v in mean.items()}
+        )
 
 
 PRIOR_SD = (PRIORS["gel.press_[xy]"], PRIORS["gel.press_[xy]"], PRIORS["gel.press_depth"])
 
 
-def compare(model, values: Values, fitted: Sequence[int], held_out: Sequence[int], circles: np.ndarray, *, rounds: int = 2,
-            progress: Callable[[str, int, int], None] | None = None) -> NullTable:
+def compare(
+    model,
+    values: Values,
+    fitted: Sequence[int],
+    held_out: Sequence[int],
+    circles: np.ndarray,
+    *,
+    rounds: int = 2,
+    progress: Callable[[str, int, int], None] | None = None,
+) -> NullTable:
     """Score a calibrated model against the nulls.
 
-    values    of the physical model, with its poses on fitted and on held-out frames;   circles (N, 3) px, see `importing`
+    values    of the physical model, with its poses on fitted and on held-out frames;   circles (N, 3) px, see
+              `importing`
     rounds    Gauss-Newton steps by which a null's own poses are refined, on each split
     Needs a model with a flat field. Raises ValueError when a frame is on both sides of the split.
     """
     if model.flat is None:
         raise ValueError("nulls are departures from a background: the model needs a flat field")
     if set(fitted) & set(held_out) or not fitted or not held_out:
-        raise ValueError(f"fitted frames {list(fitted)} and held-out frames {list(held_out)}: both sides need frames, none in common")
+        raise ValueError(
+            f"fitted frames {list(fitted)} and held-out frames {list(held_out)}: both sides need frames, none in common"
+        )
     bench = Bench(model, values, circles)
     splits = {"held out": list(held_out), "fitted": list(fitted)}
     everything = [*fitted, *held_out]
     same = bench.start = {i: bench.pose(i) for i in everything}
-    scores = [bench.score(PHYSICAL, split, "own", indices, model.predict(values, indices)) for split, indices in splits.items()]
+    scores = [
+        bench.score(PHYSICAL, split, "own", indices, model.predict(values, indices))
+        for split, indices in splits.items()
+    ]
     rows = [bench.row(i) for i in fitted]
     found = {}
     for done, kind in enumerate((Background, Additive, Multiplicative, Linear)):
@@ -307,15 +345,26 @@ def compare(model, values: Values, fitted: Sequence[int], held_out: Sequence[int
             options["own"] = (poses, null)
         tried = []
         for label, (poses, null) in options.items():
-            tried.append([bench.score(kind.name, split, label if kind is not Background else "-", indices,
-                                      [null.predict(bench.shape(i, poses[i])) for i in indices])
-                          for split, indices in splits.items()])
+            tried.append(
+                [
+                    bench.score(
+                        kind.name,
+                        split,
+                        label if kind is not Background else "-",
+                        indices,
+                        [null.predict(bench.shape(i, poses[i])) for i in indices],
+                    )
+                    for split, indices in splits.items()
+                ]
+            )
         found[kind] = min(tried, key=lambda s: np.square(s[0].rms_near).sum())
         if progress:
             progress("nulls", done + 1, 4)
     directional = min((found[Additive], found[Multiplicative]), key=lambda s: np.square(s[0].rms_near).sum())
     for pair in (found[Background], directional, found[Linear]):
         scores += pair
-    noise = [float(np.sqrt(np.mean(model.noise.variance(model.flat[..., c] + model.noise.black_level))))
-             for c in range(model.shape[2])]
+    noise = [
+        float(np.sqrt(np.mean(model.noise.variance(model.flat[..., c] + model.noise.black_level))))
+        for c in range(model.shape[2])
+    ]
     return NullTable(scores, noise, [model.frames[i].name for i in fitted], [model.frames[i].name for i in held_out])

@@ -5,8 +5,8 @@
     m_c  = G_c^-1(I_c)                      then effects of the stage `response`
     DN   = black + (saturation - black) m_c + offset
 
-All of it is numpy arithmetic, analytic in the image and in every camera parameter, so that derivatives come from a complex
-step: f'(x) v = Im f(x + i h v)/h with h = 1e-30, exact to rounding (Squire & Trapp, SIAM Rev. 40, 110, 1998).
+All of it is numpy arithmetic, analytic in the image and in every camera parameter, so that derivatives come from a
+complex step: f'(x) v = Im f(x + i h v)/h with h = 1e-30, exact to rounding (Squire & Trapp, SIAM Rev. 40, 110, 1998).
 """
 
 from __future__ import annotations
@@ -55,20 +55,31 @@ class Developer:
         self.names = tuple(camera.numbers)
         self.neutral = {n: p.neutral for n, p in camera.numbers.items()}
         self.effects = {stage: registry().at_stage("camera", stage) for stage in IMAGE_STAGES}
-        self.v, self.u = np.mgrid[:self.height, :self.width] + 0.5
+        self.v, self.u = np.mgrid[: self.height, : self.width] + 0.5
 
     def view(self, values: Mapping[str, complex]) -> SimpleNamespace:
         """What an image function sees as `camera`: every parameter of the camera, and the geometry of its pixels.
 
-        u, v (H, W) px; x, y (H, W) normalised coordinates; tan (H, W) tangent of the field angle; focal (px);
-        width, height (px); bands (nm); settings: all values by key, those of other parts too, (N, 1, 1) where readings were swept.
-        """
+        u, v (H, W) px; x, y (H, W) normalised coordinates; tan (H, W) tangent of the field angle; focal (px); width,
+        height (px); bands (nm); settings: all values by key, those of other parts too, (N, 1, 1) where readings were
+        swept."""
         own = {n: values[f"{self.name}.{n}"] for n in self.names}
         focal = self.width / 2 / np.tan(np.deg2rad(np.real(own["x_fov"])) / 2)
         x = (self.u - self.width / 2 - np.real(own["principal_x"])) / focal
         y = (self.v - self.height / 2 - np.real(own["principal_y"])) / (focal * np.real(own["aspect"]))
-        return SimpleNamespace(**own, u=self.u, v=self.v, px=x, py=y, tan=np.hypot(x, y), focal=focal, width=self.width,
-                               height=self.height, bands=np.array(self.bands), settings=values)
+        return SimpleNamespace(
+            **own,
+            u=self.u,
+            v=self.v,
+            px=x,
+            py=y,
+            tan=np.hypot(x, y),
+            focal=focal,
+            width=self.width,
+            height=self.height,
+            bands=np.array(self.bands),
+            settings=values,
+        )
 
     def _stage(self, stage: str, image, view):
         for effect in self.effects[stage]:
@@ -89,12 +100,15 @@ class Developer:
 
     def respond(self, irradiance, view):
         """DN of an irradiance per channel."""
-        m = np.empty(irradiance.shape, np.result_type(irradiance, *(getattr(view, f"response{k}_{c}") for k in (2, 3)
-                                                                     for c in "rgb")))
+        m = np.empty(
+            irradiance.shape,
+            np.result_type(irradiance, *(getattr(view, f"response{k}_{c}") for k in (2, 3) for c in "rgb")),
+        )
         for index in range(irradiance.shape[-1]):
             c = "rgb"[min(index, 2)]
-            m[..., index] = inverse_cubic(irradiance[..., index], getattr(view, f"response2_{c}"),
-                                          getattr(view, f"response3_{c}"))
+            m[..., index] = inverse_cubic(
+                irradiance[..., index], getattr(view, f"response2_{c}"), getattr(view, f"response3_{c}")
+            )
         m = self._stage("response", m, view)
         return self.black + (self.saturation - self.black) * m + view.offset
 
@@ -103,7 +117,7 @@ class Developer:
         view = self.view(values)
         return self.respond(self.channels(image, view), view)
 
-    def linearise(self, image: np.ndarray, values: Mapping[str, float]) -> "Linear":
+    def linearise(self, image: np.ndarray, values: Mapping[str, float]) -> Linear:
         """Prediction and derivatives about an image and camera values."""
         return Linear(self, image, values)
 
@@ -133,7 +147,7 @@ class Linear:
 
     def at(self, keys: tuple[str, ...], value: float) -> np.ndarray:
         """DN at another value of camera parameters (for finite steps)."""
-        return self.developer.develop(self.bands, {**self.values, **{k: value for k in keys}})
+        return self.developer.develop(self.bands, {**self.values, **dict.fromkeys(keys, value)})
 
 
 def inverse_cubic(irradiance, a, b):
@@ -149,8 +163,10 @@ def inverse_cubic(irradiance, a, b):
     for _ in range(30):
         slope = 1 + ra * (2 * m - 1) + rb * (3 * m * m - 1)
         if np.any(slope <= 0):
-            raise ValueError(f"response with quadratic term {ra:g} and cubic term {rb:g} is not monotone on [0, 1]; "
-                             "its inverse needs 1 + a (2m - 1) + b (3m^2 - 1) > 0")
+            raise ValueError(
+                f"response with quadratic term {ra:g} and cubic term {rb:g} is not monotone on [0, 1]; "
+                "its inverse needs 1 + a (2m - 1) + b (3m^2 - 1) > 0"
+            )
         step = (m + ra * (m * m - m) + rb * (m**3 - m) - np.clip(x.real, 0, 1)) / slope
         m = np.clip(m - step, 0, 1)
         if np.abs(step).max() < 1e-13:

@@ -1,12 +1,12 @@
 """Paths: camera rays followed straight through layers and clear boundaries, and what light loses on its way back.
 
-A ray passes layers (optics.polarization.layers) unbent and boundaries (part `interface`) by Snell's law until it meets a surface that it
-cannot pass. The geometry is traced once by Mitsuba; the Mueller matrices of what was passed are multiplied in numpy, for any
-values of the layers' parameters: numbers, one per ray, or complex ones that carry a derivative.
+A ray passes layers (optics.polarization.layers) unbent and boundaries (part `interface`) by Snell's law until it meets
+a surface that it cannot pass. The geometry is traced once by Mitsuba; the Mueller matrices of what was passed are
+multiplied in numpy, for any values of the layers' parameters: numbers, one per ray, or complex ones that carry a
+derivative.
 
-Stokes vectors at the camera refer to the image's horizontal axis x (right, across the ray and the vertical) and to y (up):
-optics.polarization.mueller's axes for light that travels towards the camera.
-"""
+Stokes vectors at the camera refer to the image's horizontal axis x (right, across the ray and the vertical) and to y
+(up): optics.polarization.mueller's axes for light that travels towards the camera."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ GRAZE = 1e-4  # mm per mm of the coordinates: how far beyond a surface a ray goe
 
 @dataclass
 class Step:
-    """One surface that rays meet: `part` (N,) index into the scene's layers, -1 where a ray passes none; vectors (N, 3) in
-    the surface's own axes."""
+    """One surface that rays meet: `part` (N,) index into the scene's layers, -1 where a ray passes none; vectors (N, 3)
+    in the surface's own axes."""
 
     part: np.ndarray
     k: np.ndarray
@@ -40,7 +40,8 @@ class Step:
 
 @dataclass
 class Path:
-    """Rays that were followed: the steps, where they end (Dr.Jit: si, origin of the last stretch), and how they arrive."""
+    """Rays that were followed: the steps, where they end (Dr.Jit: si, origin of the last stretch), and how they
+    arrive."""
 
     names: list[str]
     steps: list[Step]
@@ -50,7 +51,9 @@ class Path:
     shape: np.ndarray  # (N,) index of the scene's shape that a path ends on, -1 for none
     lost: np.ndarray  # (N,) bool: reflected totally, or after STEPS surfaces
     fields: dict  # the layers' stress patterns when the rays were traced
-    matrices: dict = field(default_factory=dict)  # of layers at real values: a derivative by one layer leaves the others
+    matrices: dict = field(
+        default_factory=dict
+    )  # of layers at real values: a derivative by one layer leaves the others
     groups: list = field(default_factory=list)
 
     def sequences(self) -> list[tuple[tuple[int, ...], np.ndarray]]:
@@ -62,7 +65,9 @@ class Path:
             for column in table.T:  # one number for each sequence met so far
                 code = np.unique(code * (len(self.names) + 1) + column + 1, return_inverse=True)[1]
             firsts = np.unique(code, return_index=True)[1]
-            self.groups = [(tuple(int(i) for i in table[first]), np.flatnonzero(code == code[first])) for first in firsts]
+            self.groups = [
+                (tuple(int(i) for i in table[first]), np.flatnonzero(code == code[first])) for first in firsts
+            ]
         return self.groups
 
     def kept(self, group: int, place: int, name: str, scene, values: Mapping, make) -> Mueller:
@@ -107,8 +112,12 @@ def trace(scene, u: np.ndarray, v: np.ndarray) -> Path:
     layers = [mi.BSDFPtr(scene.parts[name]) for name in names]
     shapes = [mi.ShapePtr(shape) for shape in scene.mitsuba.shapes()]
     for _ in range(STEPS + 1):
-        ray = mi.Ray3f(mi.Point3f(*origin.T.astype(np.float32)), mi.Vector3f(*direction.T.astype(np.float32)), mi.Float(0),
-                       wavelengths)
+        ray = mi.Ray3f(
+            mi.Point3f(*origin.T.astype(np.float32)),
+            mi.Vector3f(*direction.T.astype(np.float32)),
+            mi.Float(0),
+            wavelengths,
+        )
         si = scene.mitsuba.ray_intersect(ray)
         part, shape = (_which(met, pointers) for met, pointers in ((si.bsdf(), layers), (si.shape, shapes)))
         dr.eval(si, part, shape)  # at once: piece by piece, every array would trace the rays anew
@@ -129,8 +138,16 @@ def trace(scene, u: np.ndarray, v: np.ndarray) -> Path:
     else:
         lost |= part >= 0
     # the ray that reaches the end is straight; light that it brings to `origin` leaves the surface towards it
-    return Path(names, steps, si, mi.Point3f(*origin.T.astype(np.float32)), step, shape,
-                lost, {n: scene.parts[n].field for n in names if getattr(scene.parts[n], "field", None) is not None})
+    return Path(
+        names,
+        steps,
+        si,
+        mi.Point3f(*origin.T.astype(np.float32)),
+        step,
+        shape,
+        lost,
+        {n: scene.parts[n].field for n in names if getattr(scene.parts[n], "field", None) is not None},
+    )
 
 
 def _which(met, pointers: list):
@@ -151,7 +168,8 @@ def across(axis: np.ndarray, k: np.ndarray) -> np.ndarray:
 
 
 def _step(part: np.ndarray, si, k: np.ndarray, x: np.ndarray, extents: Mapping) -> tuple[Step, tuple]:
-    """A surface in its own axes: z the normal, x the first direction of its coordinates; `extents` of parts that stretch."""
+    """A surface in its own axes: z the normal, x the first direction of its coordinates; `extents` of parts that
+    stretch."""
     normal, du, dv, uv = (np.array(a, float).T for a in (si.sh_frame.n, si.dp_du, si.dp_dv, si.uv))
     ok = np.linalg.norm(du, axis=-1) > 0
     du = np.where(ok[:, None], du, (1.0, 0.0, 0.0))
@@ -200,17 +218,20 @@ def part_values(scene, name: str, values: Mapping, fields: Mapping) -> SimpleNam
     def shaped(value):
         return np.reshape(value, (-1, 1)) if isinstance(value, np.ndarray) else value
 
-    return SimpleNamespace(name=name, **{n: shaped(values[f"{name}.{n}"]) for n in (*part.numbers, *part.words)},
-                           field=fields.get(name))
+    return SimpleNamespace(
+        name=name, **{n: shaped(values[f"{name}.{n}"]) for n in (*part.numbers, *part.words)}, field=fields.get(name)
+    )
 
 
 def crossing_at(step: Step, rays, bands: np.ndarray) -> Crossing:
     """How some of the rays pass the surface of a step; arrays (n, 1) against bands (B,)."""
-    k, x = (tuple(a[rays][:, i:i + 1] for i in range(3)) for a in (step.k, step.x))
+    k, x = (tuple(a[rays][:, i : i + 1] for i in range(3)) for a in (step.k, step.x))
     return Crossing(k, x, step.u[rays][:, None], step.v[rays][:, None], bands)
 
 
-def layer_matrix(scene, name: str, crossing: Crossing, values: Mapping, fields: Mapping = MappingProxyType({})) -> Mueller:
+def layer_matrix(
+    scene, name: str, crossing: Crossing, values: Mapping, fields: Mapping = MappingProxyType({})
+) -> Mueller:
     """Mueller matrix of one part for light that crosses it towards the camera."""
     part = scene.parts[name]
     own = part_values(scene, name, values, fields)
@@ -226,7 +247,8 @@ def layer_matrix(scene, name: str, crossing: Crossing, values: Mapping, fields: 
 
 
 def slab(name: str, matrix: Mueller, values: Mapping) -> Slab:
-    """A layer with the reflections of its faces, where it declares any (`face`); its matrix holds their losses already."""
+    """A layer with the reflections of its faces, where it declares any (`face`); its matrix holds their losses
+    already."""
     share = values.get(f"{name}.face", 0.0) * values.get(f"{name}.inserted", 1.0)
     if np.all(np.asarray(share) == 0):
         return Slab(matrix)
@@ -239,9 +261,9 @@ def transmission(scene, path: Path, values: Mapping, bands: np.ndarray, componen
     """A row of the Mueller matrix from a path's end to the camera: how much of each of S0 ... S3 there becomes the
     `component` here; 4 entries (N, B).
 
-    N is the number of rays, or of the readings that `values` holds arrays for (then one ray serves them all). Rays that are
-    lost transmit nothing. `until` a part: from that part, without it, to the camera; nothing where a ray does not meet it.
-    """
+    N is the number of rays, or of the readings that `values` holds arrays for (then one ray serves them all). Rays that
+    are lost transmit nothing. `until` a part: from that part, without it, to the camera; nothing where a ray does not
+    meet it."""
     one = len(path.lost) == 1
     count = max([len(path.lost), *(np.size(v) for v in values.values() if isinstance(v, np.ndarray))])
     kind = complex if any(np.iscomplexobj(v) for v in values.values()) else float
@@ -252,10 +274,18 @@ def transmission(scene, path: Path, values: Mapping, bands: np.ndarray, componen
             met = [name for name, _ in names]
             if until not in met:
                 continue
-            names = names[:met.index(until)]
-        matrices = [path.kept(group, place, name, scene, values,
-                              lambda: layer_matrix(scene, name, crossing_at(step, rays, bands), values, path.fields))
-                    for place, (name, step) in enumerate(names)]
+            names = names[: met.index(until)]
+        matrices = [
+            path.kept(
+                group,
+                place,
+                name,
+                scene,
+                values,
+                lambda: layer_matrix(scene, name, crossing_at(step, rays, bands), values, path.fields),
+            )
+            for place, (name, step) in enumerate(names)
+        ]
         row = tuple(1.0 if j == component else 0 for j in range(4))
         if any(np.any(np.asarray(values.get(f"{name}.face", 0.0)) != 0) for name, _ in names):
             stack = None
@@ -285,7 +315,11 @@ def emitted(scene, name: str, path: Path, values: Mapping, bands: np.ndarray) ->
 
     source = scene.parts[name]
     on = np.array(path.si.emitter(scene.mitsuba) == mi.EmitterPtr(source)) & (path.end.k[:, 2] > 0)
-    vector = registry().parts[source.kind].stokes(crossing_at(path.end, slice(None), bands), part_values(scene, name, values, {}))
+    vector = (
+        registry()
+        .parts[source.kind]
+        .stokes(crossing_at(path.end, slice(None), bands), part_values(scene, name, values, {}))
+    )
     return tuple(0 if isinstance(c, int) else c * on[:, None] for c in vector)
 
 
@@ -294,5 +328,7 @@ def check(scene) -> None:
     for shape in scene.mitsuba.shapes():
         kind = getattr(shape.bsdf(), "kind", "")
         if kind and registry().parts[kind].mueller is not None and str(shape).startswith("Disk"):
-            raise BadScene(f"{scene.path}: '{shape.bsdf().name}' stands on a disk, whose first direction runs outwards and would "
-                           "turn with the place; allowed: a rectangle or a mesh with texture coordinates")
+            raise BadScene(
+                f"{scene.path}: '{shape.bsdf().name}' stands on a disk, whose first direction runs outwards and would "
+                "turn with the place; allowed: a rectangle or a mesh with texture coordinates"
+            )

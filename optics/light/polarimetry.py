@@ -1,11 +1,11 @@
 """Polarimetry: what the layers on a ray do to polarization, in the words of a laboratory, and how it looks.
 
-`stack` gives the Mueller matrices of what a camera ray passes, `decompose` the transmittances, diattenuation, retardance and
-depolarization of a matrix, `sweep` a reading against any parameter, `write_maps` pictures of degree and angle of polarization.
+`stack` gives the Mueller matrices of what a camera ray passes, `decompose` the transmittances, diattenuation,
+retardance and depolarization of a matrix, `sweep` a reading against any parameter, `write_maps` images of degree and
+angle of polarization.
 
-Axes: x right and y up in the image, for light that travels towards the camera; angles count from x to y, deg. A product M1 M2 M3
-names the layers from the camera on: the light meets the last one first.
-"""
+Axes: x right and y up in the image, for light that travels towards the camera; angles count from x to y, deg. A product
+M1 M2 M3 names the layers from the camera on: the light meets the last one first."""
 
 from __future__ import annotations
 
@@ -31,26 +31,30 @@ from optics.scene.loader import Scene
 
 
 def pixel(scene: Scene, text: str | None) -> tuple[float, float]:
-    """Position (u, v) in px of "U,V", u to the right and v down, centre of the first pixel at 0.5; the image's centre for None."""
+    """Position (u, v) in px of "U,V", u to the right and v down, centre of the first pixel at 0.5; the image's centre
+    for None."""
     if scene.camera is None or scene.integrator is None:
-        raise BadScene(f"{scene.path}: no camera ray to follow; a scene needs a part of the type 'camera' and the integrator "
-                       "'tactile'")
+        raise BadScene(
+            f"{scene.path}: no camera ray to follow; a scene needs a part of the type 'camera' and the integrator "
+            "'tactile'"
+        )
     width, height = scene.camera.resolution
     if text is None:
         return width / 2, height / 2
-    allowed = f"allowed: U,V in px within the picture, 0,0 (top left) to {width},{height}"
+    allowed = f"allowed: U,V in px within the image, 0,0 (top left) to {width},{height}"
     try:
         u, v = (float(part) for part in text.split(","))
     except ValueError:
         raise ValueError(f"--at {text}: no pair of numbers; {allowed}") from None
     if not (0 <= u <= width and 0 <= v <= height):
-        raise ValueError(f"--at {text}: outside the picture; {allowed}")
+        raise ValueError(f"--at {text}: outside the image; {allowed}")
     return u, v
 
 
 @dataclass
 class Ray:
-    """A camera ray: the layers and clear boundaries that it passes, from the camera on, and the shape that it ends on."""
+    """A camera ray: the layers and clear boundaries that it passes, from the camera on, and the shape that it ends
+    on."""
 
     path: paths.Path
     names: list[str]
@@ -69,9 +73,17 @@ def follow(scene: Scene, values: Mapping, u: float, v: float) -> Ray:
     return Ray(path, [path.names[step.part[0]] for step in steps], steps, end, bool(path.lost[0]))
 
 
-def stack(scene: Scene, values: Mapping, u: float, v: float, wavelengths: Sequence[float], parts: Sequence[str] | None = None,
-          ray: Ray | None = None) -> tuple[list[str], np.ndarray, np.ndarray]:
-    """Names of what the ray through (u, v) passes, from the camera on, the matrix of each (L, B, 4, 4), and the whole (B, 4, 4).
+def stack(
+    scene: Scene,
+    values: Mapping,
+    u: float,
+    v: float,
+    wavelengths: Sequence[float],
+    parts: Sequence[str] | None = None,
+    ray: Ray | None = None,
+) -> tuple[list[str], np.ndarray, np.ndarray]:
+    """Names of what the ray through (u, v) passes, from the camera on, the matrix of each (L, B, 4, 4), and the whole
+    (B, 4, 4).
 
     parts   only these of them;   ray   as `follow` found it
     A layer's own matrix holds the reflections between its own faces; the whole adds those between layers.
@@ -83,7 +95,10 @@ def stack(scene: Scene, values: Mapping, u: float, v: float, wavelengths: Sequen
             passed = ", ".join(ray.names) or "none"
             raise UnknownKey(name, ray.names, "layer", "", f"the ray through {u:g},{v:g} passes {passed}")
     met = [(n, step) for n, step in zip(ray.names, ray.steps) if not parts or n in parts]
-    chosen = [(n, paths.layer_matrix(scene, n, paths.crossing_at(step, [0], bands), values, ray.path.fields)) for n, step in met]
+    chosen = [
+        (n, paths.layer_matrix(scene, n, paths.crossing_at(step, [0], bands), values, ray.path.fields))
+        for n, step in met
+    ]
     names = [n for n, _ in chosen]
 
     def numbers(matrix: Mueller) -> np.ndarray:
@@ -94,7 +109,8 @@ def stack(scene: Scene, values: Mapping, u: float, v: float, wavelengths: Sequen
 
 
 def _combined(names: Sequence[str], matrices: Sequence[Mueller], values: Mapping) -> Mueller:
-    """The product of matrices, from the camera on; where faces reflect, with the light that goes to and fro between them."""
+    """The product of matrices, from the camera on; where faces reflect, with the light that goes to and fro between
+    them."""
     if not names:
         return mueller.identity()
     if any(values.get(f"{n}.face", 0.0) != 0 for n in names):
@@ -117,9 +133,11 @@ class Decomposition:
 
     transmittance                of unpolarized light, m00
     largest, smallest            transmittance over all states of polarization, m00 (1 +- D)
-    diattenuation, axis, axis_ellipticity      D = 0 ... 1 (a polarizer) and the state that passes best; deg, +-45 is circular
+    diattenuation, axis, axis_ellipticity      D = 0 ... 1 (a polarizer) and the state that passes best; deg, +-45 is
+                                               circular
     polarizance, polarizance_axis              degree and angle of polarization of unpolarized light behind it
-    retardance, fast_axis, fast_ellipticity    deg: 0 ... 180, the state that runs ahead; of a half wave fast and slow are one.
+    retardance, fast_axis, fast_ellipticity    deg: 0 ... 180, the state that runs ahead; of a half wave fast and slow
+                                               are one.
                                                No retardance for D = 1: no second polarization is left to be late
     depolarization               power of depolarization 1 - |tr(m)|/3 of the depolarizer: 0 none, 1 all
     depolarization_index         sqrt((sum m_ij^2 - m00^2)/(3 m00^2)): 1 none, 0 all (Gil & Bernabeu)
@@ -156,9 +174,8 @@ SINGULAR = 1e-9  # of 1 - D: beyond it a second polarization is lost in rounding
 def decompose(matrix: np.ndarray) -> Decomposition:
     """Polar decomposition of M (4, 4); Lu & Chipman, J. Opt. Soc. Am. A 13, 1106 (1996), sec. 6.
 
-    Of a perfect polarizer (D = 1) the retarder is the one that turns least (ibid., sec. 4), and so wherever depolarization leaves
-    one axis only.
-    """
+    Of a perfect polarizer (D = 1) the retarder is the one that turns least (ibid., sec. 4), and so wherever
+    depolarization leaves one axis only."""
     m = np.asarray(matrix, float)
     if m.shape != (4, 4) or not np.isfinite(m).all():
         what = f"of shape {m.shape}" if m.shape != (4, 4) else "that is not finite"
@@ -194,9 +211,22 @@ def decompose(matrix: np.ndarray) -> Decomposition:
     depolarizer, retarder = np.eye(4), np.eye(4)
     depolarizer[1:, 0], depolarizer[1:, 1:], retarder[1:, 1:] = polarizance, small, turn
     return Decomposition(
-        float(t), float(t * (1 + dichroism)), float(t * (1 - dichroism)), dichroism, *_state(d), float(np.linalg.norm(p)),
-        _state(p)[0], delay, *_state(fast), float(1 - abs(np.trace(small)) / 3), float(np.sqrt(max((m**2).sum() - 1, 0) / 3)),
-        float(mueller.physical(m)), depolarizer, retarder, first)
+        float(t),
+        float(t * (1 + dichroism)),
+        float(t * (1 - dichroism)),
+        dichroism,
+        *_state(d),
+        float(np.linalg.norm(p)),
+        _state(p)[0],
+        delay,
+        *_state(fast),
+        float(1 - abs(np.trace(small)) / 3),
+        float(np.sqrt(max((m**2).sum() - 1, 0) / 3)),
+        float(mueller.physical(m)),
+        depolarizer,
+        retarder,
+        first,
+    )
 
 
 def _diattenuator(d: np.ndarray) -> np.ndarray:
@@ -225,7 +255,8 @@ def _turn(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def _rotation(turn: np.ndarray) -> tuple[float, np.ndarray | None]:
-    """Retardance (deg) of a rotation of the Poincare sphere, and the vector of its fast axis; None without retardance."""
+    """Retardance (deg) of a rotation of the Poincare sphere, and the vector of its fast axis; None without
+    retardance."""
     odd = np.array([turn[1, 2] - turn[2, 1], turn[2, 0] - turn[0, 2], turn[0, 1] - turn[1, 0]]) / 2
     sine, cosine = float(np.linalg.norm(odd)), (float(np.trace(turn)) - 1) / 2
     angle = float(np.degrees(np.arctan2(sine, cosine)))
@@ -239,7 +270,8 @@ def _rotation(turn: np.ndarray) -> tuple[float, np.ndarray | None]:
 
 
 def _state(vector: np.ndarray | None) -> tuple[float, float]:
-    """Angle in [0, 180) and ellipticity in [-45, 45] of a polarization (S1, S2, S3), deg; NaN for none, no angle of a circle."""
+    """Angle in [0, 180) and ellipticity in [-45, 45] of a polarization (S1, S2, S3), deg; NaN for none, no angle of a
+    circle."""
     length = 0.0 if vector is None else float(np.linalg.norm(vector))
     if length < 1e-9:
         return float("nan"), float("nan")
@@ -249,27 +281,45 @@ def _state(vector: np.ndarray | None) -> tuple[float, float]:
     return angle if linear > 1e-9 * length else float("nan"), float(np.degrees(np.arctan2(vector[2], linear))) / 2
 
 
-# -- pictures ---------------------------------------------------------------------------------------------------------
+# -- images ---------------------------------------------------------------------------------------------------------
 
 DARK = 2e-3  # of the brightest: nothing is said of pixels below
 
 
 def wheel(angle: np.ndarray) -> np.ndarray:
-    """(..., 3) sRGB colours of angles of polarization (deg): a circle of one lightness, closed after 180 deg; 0 is red, 45 olive,
-    90 turquoise, 135 violet.
+    """(..., 3) sRGB colours of angles of polarization (deg): a circle of one lightness, closed after 180 deg; 0 is red,
+    45 olive, 90 turquoise, 135 violet.
 
     Hue in OKLCh at lightness 0.75, chroma 0.12 (Ottosson, 2020).
     """
     hue = np.radians(2 * np.asarray(angle, float) + 20)
     a, b = 0.12 * np.cos(hue), 0.12 * np.sin(hue)
-    lms = np.stack([0.75 + 0.3963377774 * a + 0.2158037573 * b, 0.75 - 0.1055613458 * a - 0.0638541728 * b,
-                    0.75 - 0.0894841775 * a - 1.2914855480 * b], -1) ** 3
-    return exr.srgb(lms @ np.array([[4.0767416621, -3.3077115913, 0.2309699292], [-1.2684380046, 2.6097574011, -0.3413193965],
-                                    [-0.0041960863, -0.7034186147, 1.7076147010]]).T)
+    lms = (
+        np.stack(
+            [
+                0.75 + 0.3963377774 * a + 0.2158037573 * b,
+                0.75 - 0.1055613458 * a - 0.0638541728 * b,
+                0.75 - 0.0894841775 * a - 1.2914855480 * b,
+            ],
+            -1,
+        )
+        ** 3
+    )
+    return exr.srgb(
+        lms
+        @ np.array(
+            [
+                [4.0767416621, -3.3077115913, 0.2309699292],
+                [-1.2684380046, 2.6097574011, -0.3413193965],
+                [-0.0041960863, -0.7034186147, 1.7076147010],
+            ]
+        ).T
+    )
 
 
 def map_colours(stokes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """sRGB (H, W, B, 3) of the degree (viridis, 0 to 1) and of the angle (`wheel`) of linear polarization; stokes (H, W, B, 4).
+    """sRGB (H, W, B, 3) of the degree (viridis, 0 to 1) and of the angle (`wheel`) of linear polarization; stokes (H,
+    W, B, 4).
 
     Black where a band is dark; angles fade out below a degree of 5 %, where they mean little.
     """
@@ -283,7 +333,8 @@ def map_colours(stokes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def write_maps(files: tuple[Path, Path], bands: Sequence[float], stokes: np.ndarray) -> None:
-    """Write degree and angle of linear polarization of (H, W, B, 4) as two PNG, a panel per band, each with its colour bar."""
+    """Write degree and angle of linear polarization of (H, W, B, 4) as two PNG, a panel per band, each with its colour
+    bar."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import ListedColormap, Normalize
     from matplotlib.figure import Figure
@@ -292,9 +343,15 @@ def write_maps(files: tuple[Path, Path], bands: Sequence[float], stokes: np.ndar
     columns = count if count <= 3 else int(np.ceil(np.sqrt(count)))
     rows = -(-count // columns)
     circle = ListedColormap(wheel(np.linspace(0, 180, 256)))
-    legends = (("degree of linear polarization (black: dark)", "viridis", 1, np.linspace(0, 1, 6)),
-               ("angle of linear polarization, deg: 0 right, 90 up\n(black: dark or unpolarized)", circle, 180,
-                np.arange(0, 181, 45)))
+    legends = (
+        ("degree of linear polarization (black: dark)", "viridis", 1, np.linspace(0, 1, 6)),
+        (
+            "angle of linear polarization, deg: 0 right, 90 up\n(black: dark or unpolarized)",
+            circle,
+            180,
+            np.arange(0, 181, 45),
+        ),
+    )
     for file, images, (label, colours, top, ticks) in zip(files, map_colours(stokes), legends):
         size = 4.2 * columns + 1.2, max((4.2 * height / width + 0.35) * rows, 3.6)  # inches
         figure = Figure(figsize=size, layout="constrained", dpi=110)
@@ -318,7 +375,7 @@ def save(figure, file: Path) -> None:
 
 
 class Spot(Renderer):
-    """One pixel of a scene's picture, by its own light: the pixels about it say whether it lies at a rim."""
+    """One pixel of a scene's image, by its own light: the pixels about it say whether it lies at a rim."""
 
     def __init__(self, scene: Scene, column: int, row: int, whole: bool = False):
         super().__init__(scene, remember=4)
@@ -326,7 +383,9 @@ class Spot(Renderer):
         self.corner = (0, 0) if whole else (max(column - 1, 0), max(row - 1, 0))
         self.at = (row - self.corner[1], column - self.corner[0])
         if not whole:
-            self.width, self.height = (min(place + 2, size) - start for place, size, start in zip((column, row), full, self.corner))
+            self.width, self.height = (
+                min(place + 2, size) - start for place, size, start in zip((column, row), full, self.corner)
+            )
 
     def _trace(self, u: np.ndarray, v: np.ndarray):
         return super()._trace(u + self.corner[0], v + self.corner[1])
@@ -334,7 +393,8 @@ class Spot(Renderer):
 
 @dataclass
 class Curve:
-    """Readings (N, C) against a parameter (N,); what else captures set, their own readings (M, C), and what these should be."""
+    """Readings (N, C) against a parameter (N,); what else captures set, their own readings (M, C), and what these
+    should be."""
 
     x: np.ndarray
     y: np.ndarray
@@ -346,7 +406,8 @@ class Curve:
 
 @dataclass
 class Sweep:
-    """What a pixel reads against a parameter; `black`: the reading without light; `turns`: the parameter turns a layer."""
+    """What a pixel reads against a parameter; `black`: the reading without light; `turns`: the parameter turns a
+    layer."""
 
     key: str
     unit: str
@@ -360,22 +421,25 @@ class Sweep:
     notes: list[str]
 
     def ideal(self, curve: Curve, x: np.ndarray | None = None) -> np.ndarray | None:
-        """Malus' cos^2 (N, C) at the curve's values or at others: of the same maximum, about the angle of the readings' own second
-        harmonic. None where nothing turns, or by less than 90 deg."""
+        """Malus' cos^2 (N, C) at the curve's values or at others: of the same maximum, about the angle of the readings'
+        own second harmonic. None where nothing turns, or by less than 90 deg."""
         if not self.turns or len(curve.x) < 4 or np.ptp(curve.x) < 90:
             return None
         turn = np.radians(2 * curve.x)
         signal = curve.y - self.black
         _, c, s = np.linalg.lstsq(np.stack([np.ones_like(turn), np.cos(turn), np.sin(turn)], -1), signal, rcond=None)[0]
-        return self.black + signal.max(0) * np.cos(np.radians(curve.x if x is None else x)[:, None] - np.arctan2(s, c) / 2) ** 2
+        return (
+            self.black
+            + signal.max(0) * np.cos(np.radians(curve.x if x is None else x)[:, None] - np.arctan2(s, c) / 2) ** 2
+        )
 
     def apart(self, curve: Curve) -> dict[str, float | str]:
         """The settings of a curve in which the curves differ."""
         return {k: v for k, v in curve.settings.items() if any(c.settings.get(k) != v for c in self.curves)}
 
     def summary(self) -> list[dict]:
-        """Per curve and channel: largest and smallest reading and where, their ratio and contrast above black, the departure from
-        cos^2 (rms, of the maximum), and of measured readings from the predicted ones (rms)."""
+        """Per curve and channel: largest and smallest reading and where, their ratio and contrast above black, the
+        departure from cos^2 (rms, of the maximum), and of measured readings from the predicted ones (rms)."""
         rows = []
         for curve in self.curves:
             ideal = self.ideal(curve)
@@ -384,15 +448,22 @@ class Sweep:
                 top, low = float(y.max()), float(y.min())
                 low = 0.0 if abs(low) < 1e-12 * top else low  # rounding of an exact zero
                 off = None if ideal is None or top <= 0 else float(np.sqrt(np.mean((curve.y - ideal)[:, c] ** 2)) / top)
-                rows.append({
-                    **({"settings": self.apart(curve)} if len(self.curves) > 1 else {}), "channel": name,
-                    "largest": float(curve.y[:, c].max()), "at": float(curve.x[y.argmax()]),
-                    "smallest": float(curve.y[:, c].min()), "dark_at": float(curve.x[y.argmin()]),
-                    "extinction_ratio": top / low if low > 0 else float("inf") if top > 0 else float("nan"),
-                    "contrast": (top - low) / (top + low) if top + low > 0 else float("nan"),
-                    "from_ideal": off,
-                    "from_measured": None if curve.measured is None else float(
-                        np.sqrt(np.mean((curve.measured - curve.predicted)[:, c] ** 2)))})
+                rows.append(
+                    {
+                        **({"settings": self.apart(curve)} if len(self.curves) > 1 else {}),
+                        "channel": name,
+                        "largest": float(curve.y[:, c].max()),
+                        "at": float(curve.x[y.argmax()]),
+                        "smallest": float(curve.y[:, c].min()),
+                        "dark_at": float(curve.x[y.argmin()]),
+                        "extinction_ratio": top / low if low > 0 else float("inf") if top > 0 else float("nan"),
+                        "contrast": (top - low) / (top + low) if top + low > 0 else float("nan"),
+                        "from_ideal": off,
+                        "from_measured": None
+                        if curve.measured is None
+                        else float(np.sqrt(np.mean((curve.measured - curve.predicted)[:, c] ** 2))),
+                    }
+                )
         return rows
 
     def to_csv(self) -> str:
@@ -404,11 +475,13 @@ class Sweep:
         writer = csv.writer(out, lineterminator="\n")
         writer.writerow([*keys, self.key, *self.channels])
         for curve in self.curves:
-            writer.writerows([*curve.settings.values(), f"{x:.10g}", *(f"{v:.10g}" for v in y)] for x, y in zip(curve.x, curve.y))
+            writer.writerows(
+                [*curve.settings.values(), f"{x:.10g}", *(f"{v:.10g}" for v in y)] for x, y in zip(curve.x, curve.y)
+            )
         return out.getvalue()
 
     def plot(self, file: Path) -> None:
-        """Write the curves as a picture, below once more with a logarithmic axis, which shows the dark end."""
+        """Write the curves as an image, below once more with a logarithmic axis, which shows the dark end."""
         from matplotlib.figure import Figure
 
         figure = Figure(figsize=(max(6.4, 3.6 * len(self.curves)), 6.4), layout="constrained", dpi=110)
@@ -423,10 +496,22 @@ class Sweep:
                     if ideal is not None:
                         ax.plot(fine, ideal[:, c] - black, color=colour, lw=1, ls=":", label="_")
                     if curve.measured is not None:
-                        ax.plot(curve.measured_x, curve.measured[:, c] - black, ".", color=colour, ms=5, alpha=0.7, label="_")
+                        ax.plot(
+                            curve.measured_x,
+                            curve.measured[:, c] - black,
+                            ".",
+                            color=colour,
+                            ms=5,
+                            alpha=0.7,
+                            label="_",
+                        )
                 ax.grid(alpha=0.3)
-            column[0].set_title("\n".join(f"{k} = {v:g}" if not isinstance(v, str) else f"{k} = {v}"
-                                          for k, v in self.apart(curve).items()), fontsize=9)
+            column[0].set_title(
+                "\n".join(
+                    f"{k} = {v:g}" if not isinstance(v, str) else f"{k} = {v}" for k, v in self.apart(curve).items()
+                ),
+                fontsize=9,
+            )
             column[0].set_ylim(bottom=min(0.0, float(curve.y.min())))
             column[1].set_yscale("log")
             column[1].set_xlabel(f"{self.key} ({self.unit})")
@@ -442,7 +527,10 @@ class Sweep:
         from matplotlib.lines import Line2D
 
         if any(self.ideal(c) is not None for c in self.curves):
-            handles, labels = [*handles, Line2D([], [], color="0.4", lw=1, ls=":")], [*labels, "cos\u00b2, same maximum"]
+            handles, labels = (
+                [*handles, Line2D([], [], color="0.4", lw=1, ls=":")],
+                [*labels, "cos\u00b2, same maximum"],
+            )
         if any(c.measured is not None for c in self.curves):
             handles, labels = [*handles, Line2D([], [], color="0.4", marker=".", ls="")], [*labels, "measured"]
         axes[0, 0].legend(handles, labels, fontsize=9)
@@ -483,15 +571,27 @@ def _number(scene: Scene, key: str):
 CURVES = 6  # settings of captures that are told apart
 
 
-def sweep(scene: Scene, key: str, x: Sequence[float], at: tuple[float, float], values: Mapping | None = None, *,
-          radiance: bool = False, captures: Captures | None = None, only: Mapping = MappingProxyType({}),
-          progress: Callable[[str, int, int], None] | None = None) -> Sweep:
+def sweep(
+    scene: Scene,
+    key: str,
+    x: Sequence[float],
+    at: tuple[float, float],
+    values: Mapping | None = None,
+    *,
+    radiance: bool = False,
+    captures: Captures | None = None,
+    only: Mapping = MappingProxyType({}),
+    progress: Callable[[str, int, int], None] | None = None,
+) -> Sweep:
     """What the pixel that holds the position `at` reads as a parameter takes the values x.
 
     values     replace the scene's
-    radiance   per band; without it DN per channel, by the captures' black level and saturation (0 and 255 without captures)
-    captures   readings to hold beside it, of a table or of the pixel: a curve for each combination of their other settings
-    only       of the captures those with these settings; of a light's power, which captures set as a drive level, it is the unit
+    radiance   per band; without it DN per channel, by the captures' black level and saturation (0 and 255 without
+               captures)
+    captures   readings to hold beside it, of a table or of the pixel: a curve for each combination of their other
+               settings
+    only       of the captures those with these settings; of a light's power, which captures set as a drive level, it is
+               the unit
     """
     parameter = _number(scene, key)
     x = np.array([parameter.check(float(v), key) for v in x])
@@ -505,9 +605,13 @@ def sweep(scene: Scene, key: str, x: Sequence[float], at: tuple[float, float], v
     groups, notes = [({}, [], None)], []
     if captures is not None:
         groups, notes = _groups(captures, scene, key, base, values or {}, only, row, column)
-    camera = {f"{developer.name}.{n}" for effects in developer.effects.values() for e in effects for n in e.parameter_names}
+    camera = {
+        f"{developer.name}.{n}" for effects in developer.effects.values() for e in effects for n in e.parameter_names
+    }
     mixes = {k for settings, *_ in groups for k in settings} | {key}
-    whole = bool(camera & mixes) or any(base[k] != scene.parameters[k].neutral for k in camera)  # effects that mix pixels need all
+    whole = bool(camera & mixes) or any(
+        base[k] != scene.parameters[k].neutral for k in camera
+    )  # effects that mix pixels need all
     spot = Spot(scene, column, row, whole)
     total, done = sum(len(x) + len(own) for _, own, _ in groups), 0
     drives = _powers(scene) if captures is not None else set()
@@ -529,8 +633,10 @@ def sweep(scene: Scene, key: str, x: Sequence[float], at: tuple[float, float], v
     curves = []
     for settings, own, measured in groups:
         if measured is not None and measured.shape[1] != channels:
-            raise BadCapture(f"{captures.folder}: readings of {measured.shape[1]} channels, the scene's camera has {channels}; "
-                             "load the scene with other bands (-D bands=...)")
+            raise BadCapture(
+                f"{captures.folder}: readings of {measured.shape[1]} channels, the scene's camera has {channels}; "
+                "load the scene with other bands (-D bands=...)"
+            )
         curve = Curve(x, read([{**settings, key: float(v)} for v in x]), settings)
         if measured is not None:
             curve.measured_x, curve.measured, curve.predicted = np.array([s[key] for s in own]), measured, read(own)
@@ -539,8 +645,18 @@ def sweep(scene: Scene, key: str, x: Sequence[float], at: tuple[float, float], v
     names = [f"{b:g} nm" for b in bands] if radiance else ["reading"] if channels == 1 else ["R", "G", "B"]
     quantity = "radiance (W mm$^{-2}$ sr$^{-1}$)" if radiance else "DN"
     turns = parameter.unit == "deg" and parameter.how == "layer"
-    return Sweep(key, parameter.unit, quantity, names, _colours(bands, channels, radiance), curves, 0.0 if radiance else black,
-                 turns, f"{scene.path.stem}, pixel {column}, {row}", notes)
+    return Sweep(
+        key,
+        parameter.unit,
+        quantity,
+        names,
+        _colours(bands, channels, radiance),
+        curves,
+        0.0 if radiance else black,
+        turns,
+        f"{scene.path.stem}, pixel {column}, {row}",
+        notes,
+    )
 
 
 def _powers(scene: Scene) -> set[str]:
@@ -559,13 +675,13 @@ def _colours(bands: Sequence[float], channels: int, radiance: bool) -> list:
     return [tuple(c) for c in exr.srgb(colours + 0.02)]
 
 
-def _groups(captures: Captures, scene: Scene, key: str, base: dict, values: Mapping, only: Mapping, row: int,
-            column: int) -> tuple[list, list[str]]:
+def _groups(
+    captures: Captures, scene: Scene, key: str, base: dict, values: Mapping, only: Mapping, row: int, column: int
+) -> tuple[list, list[str]]:
     """[(other settings, settings of each reading, readings (M, C))] of captures that agree with `only`, and remarks.
 
-    `base` becomes what holds in all of them. A curve has settings with more values than can be told apart, such as a clock,
-    at their mean.
-    """
+    `base` becomes what holds in all of them. A curve has settings with more values than can be told apart, such as a
+    clock, at their mean."""
     where = str(captures.folder)
     check(captures, scene.parameters)
     powers = _powers(scene)
@@ -574,37 +690,52 @@ def _groups(captures: Captures, scene: Scene, key: str, base: dict, values: Mapp
     rows = [f for f in captures.frames if key in f.parameters]
     if not rows:
         known = sorted({k for f in captures.frames for k in f.parameters})
-        raise BadCapture(f"{where}: no reading sets '{key}'; they set {', '.join(known) or 'nothing'}: choose one with --key")
+        raise BadCapture(
+            f"{where}: no reading sets '{key}'; they set {', '.join(known) or 'nothing'}: choose one with --key"
+        )
 
     def agrees(frame) -> bool:
-        return all(k in powers or v == only[k] or not isinstance(v, str) and np.isclose(v, only[k])
-                   for k, v in frame.parameters.items() if k in only and k != key)
+        return all(
+            k in powers or v == only[k] or not isinstance(v, str) and np.isclose(v, only[k])
+            for k, v in frame.parameters.items()
+            if k in only and k != key
+        )
 
     rows, count = [f for f in rows if agrees(f)], len(rows)
     if not rows:
-        raise BadCapture(f"{where}: none of {count} readings agrees with --set {', '.join(only)}; leave out what they set")
+        raise BadCapture(
+            f"{where}: none of {count} readings agrees with --set {', '.join(only)}; leave out what they set"
+        )
     settings = [{k: v for k, v in f.parameters.items() if k != key} for f in rows]
     notes = []
     for name in sorted({k for s in settings for k in s}):
         found = {s[name] for s in settings if name in s}
         if len(found) > CURVES and not any(isinstance(v, str) for v in found):
             mean = float(np.mean([s[name] for s in settings if name in s]))
-            notes.append(f"{name} takes {len(found)} values, {min(found):g} to {max(found):g}; the curve is for their mean, {mean:g}")
+            notes.append(
+                f"{name} takes {len(found)} values, {min(found):g} to {max(found):g}; the curve is for their mean, {mean:g}"
+            )
             settings = [{**s, name: mean} if name in s else s for s in settings]
     groups: dict[tuple, list[int]] = {}
     for index, own in enumerate(settings):
         groups.setdefault(tuple(sorted(own.items())), []).append(index)
     if len(groups) > CURVES:
         vary = sorted({k for s in settings for k in s if len({t.get(k) for t in settings}) > 1})
-        raise BadCapture(f"{where}: {len(groups)} combinations of {', '.join(vary)}; allowed: up to {CURVES}; choose some, such as "
-                         f"with --set {vary[0]}={settings[0].get(vary[0])}")
+        raise BadCapture(
+            f"{where}: {len(groups)} combinations of {', '.join(vary)}; allowed: up to {CURVES}; choose some, such as "
+            f"with --set {vary[0]}={settings[0].get(vary[0])}"
+        )
     found = []
     for own, members in groups.items():
         images = [rows[i].image for i in members]
         if captures.table is None and images[0].shape[:2] != scene.camera.resolution[::-1]:
             height, width = images[0].shape[:2]
-            raise BadCapture(f"{where}: images of {width} x {height} px, the scene's camera has {scene.camera.resolution[0]} x "
-                             f"{scene.camera.resolution[1]} px; load the scene with -D width={width} -D height={height}")
+            raise BadCapture(
+                f"{where}: images of {width} x {height} px, the scene's camera has {scene.camera.resolution[0]} x "
+                f"{scene.camera.resolution[1]} px; load the scene with -D width={width} -D height={height}"
+            )
         place = (0, 0) if captures.table is not None else (row, column)
-        found.append((dict(own), [rows[i].parameters for i in members], np.array([image[place] for image in images], float)))
+        found.append(
+            (dict(own), [rows[i].parameters for i in members], np.array([image[place] for image in images], float))
+        )
     return found, notes

@@ -1,11 +1,10 @@
 """Prediction: what a scene says that a capture set should look like, frame by frame, and how that changes.
 
-Light is linear in every LED, so each LED is rendered once per geometry at power 1 and kept; powers, exposure, colour and
-response act on the kept images. One sample per pixel is exact away from edges: pixels at the rim of a shadow or of the
-gel are sampled 64 times. Derivative images come from Dr.Jit in forward mode through the shading,
-with the primary hits and shadows kept; at rims, where that misses the moving edge, and for everything that moves geometry
-they are central differences with common samples (`Parameter.how`).
-"""
+Light is linear in every LED, so each LED is rendered once per geometry at power 1 and kept; powers, exposure, colour
+and response act on the kept images. One sample per pixel is exact away from edges: pixels at the rim of a shadow or of
+the gel are sampled 64 times. Derivative images come from Dr.Jit in forward mode through the shading, with the primary
+hits and shadows kept; at rims, where that misses the moving edge, and for everything that moves geometry they are
+central differences with common samples (`Parameter.how`)."""
 
 from __future__ import annotations
 
@@ -22,10 +21,14 @@ from optics.scene.loader import Scene
 from optics.scene.mitsuba_parts import DEFAULT_VARIANT
 from optics.scene.registry import registry
 
-RIM_SAMPLES = 128  # per pixel at rims; a power of two. Of a picture 36 px wide, chi2 misses a path tracer by 10 to 60 with 64, by 5 to 20 with 128
+# per pixel at rims; a power of two. Of an image 36 px wide, chi2 misses a path tracer by 10 to 60 with 64, by 5 to 20
+# with 128
+RIM_SAMPLES = 128
 LAYERED_RIM_SAMPLES = 32  # in scenes with layers, whose matrices are multiplied for every sample
 PAINTED = 0.05  # of the largest reflectance of a texture: a step from pixel to pixel that needs finer samples
-BENT = 1e-3  # difference of a pixel's mean normal from that at its middle, above which finer samples are taken: a fifth of a grey level in 200
+# difference of a pixel's mean normal from that at its middle, above which finer samples are taken: a fifth of a grey
+# level in 200
+BENT = 1e-3
 CREASE = 25.0  # deg from pixel to pixel: what is no smooth surface
 POWERS = ("power", "power_r", "power_g", "power_b")  # images are kept per unit of each
 FLAT_FIELDS = ("multiplicative", "additive", "none")
@@ -36,7 +39,7 @@ BOUNCE_CELL = 2  # px each way of a cell
 class Renderer:
     """Linear images of a scene, one LED at a time, with a memory for what was rendered before."""
 
-    by_chance = False  # whether pictures are Monte Carlo estimates
+    monte_carlo = False  # whether images are Monte Carlo estimates
 
     def __init__(self, scene: Scene, remember: int = 24):
         if scene.camera is None or scene.integrator is None:
@@ -48,8 +51,10 @@ class Renderer:
         self.width, self.height = scene.camera.resolution
         self.bands = len(scene.integrator.bands or (0,))
         if self.bands > scene.integrator.lanes:
-            raise BadScene(f"{scene.path}: {self.bands} bands, but the variant {scene.variant} carries {scene.integrator.lanes}; "
-                           f"load the scene with variant='{DEFAULT_VARIANT}' or name one band")
+            raise BadScene(
+                f"{scene.path}: {self.bands} bands, but the variant {scene.variant} carries {scene.integrator.lanes}; "
+                f"load the scene with variant='{DEFAULT_VARIANT}' or name one band"
+            )
         self.layered = paths.layered(scene)
         self.rim_samples = LAYERED_RIM_SAMPLES if self.layered else RIM_SAMPLES
         self.wavelengths = np.array(scene.integrator.bands or (540.0,))
@@ -60,20 +65,31 @@ class Renderer:
         self._images: OrderedDict = OrderedDict()
         image_keys = {k for k, p in scene.parameters.items() if p.how == "image"}
         self.layer_keys = {k for k, p in scene.parameters.items() if p.how == "layer"}
-        words = {f"{n}.{w}" for n, p in scene.parts.items() if registry().parts[p.kind].mueller is not None for w in p.words}
+        words = {
+            f"{n}.{w}" for n, p in scene.parts.items() if registry().parts[p.kind].mueller is not None for w in p.words
+        }
         self.layer_order = sorted(self.layer_keys | words)  # what the layers' matrices depend on
         led_keys = {k for k in scene.parameters if k.rsplit(".", 1)[0] in scene.lights} - self.layer_keys
         own = [k for k in scene.parameters if k not in image_keys and k not in led_keys and k not in self.layer_keys]
         self.bounce_key = f"{scene.integrator.name}.interreflection"
-        self.geometry_keys = [k for k in own if self.kind(k) in ("camera", "interface", "", *scene.MOVED) or
-                              (self.kind(k) == "gel" and k.rsplit(".", 1)[1] in scene.shaping)]
+        self.geometry_keys = [
+            k
+            for k in own
+            if self.kind(k) in ("camera", "interface", "", *scene.MOVED)
+            or (self.kind(k) == "gel" and k.rsplit(".", 1)[1] in scene.shaping)
+        ]
         ambient = {n for e in registry().at_stage("membrane", "ambient") for n in e.parameter_names}
         self.ambient_keys = [k for k in own if self.kind(k) == "membrane" and k.rsplit(".", 1)[1] in ambient]
-        self.shading_keys = [k for k in own if k not in self.geometry_keys and k != self.bounce_key
-                             and k not in self.ambient_keys]
-        self.led_keys = {n: [k for k in led_keys if k.rsplit(".", 1)[0] == n and k.rsplit(".", 1)[1] not in POWERS]
-                         for n in scene.lights}
-        self._fixed = {k for k in self.geometry_keys if self.kind(k)}  # of stock plugins, some shade and none is slow to set
+        self.shading_keys = [
+            k for k in own if k not in self.geometry_keys and k != self.bounce_key and k not in self.ambient_keys
+        ]
+        self.led_keys = {
+            n: [k for k in led_keys if k.rsplit(".", 1)[0] == n and k.rsplit(".", 1)[1] not in POWERS]
+            for n in scene.lights
+        }
+        self._fixed = {
+            k for k in self.geometry_keys if self.kind(k)
+        }  # of stock plugins, some shade and none is slow to set
         self._still = {k: scene.parameters[k].neutral for k in self.ambient_keys}
         self._tangents: OrderedDict = OrderedDict()
         self.together: set[str] = set()  # LEDs whose images are wanted of the same geometry
@@ -90,11 +106,16 @@ class Renderer:
     def _apply(self, values: Mapping, move: bool = True) -> None:
         """Set everything but the LEDs' powers, which stay at 1: images are kept per unit of power.
 
-        move = False leaves the geometry where it is (rebuilding the gel costs more than an image): enough for shading at
-        hits that are kept, but not for tracing or for shadows.
-        """
-        now = {k: v for k, v in values.items() if k in self.scene.parameters and k not in self.layer_keys
-               and not isinstance(v, np.ndarray) and (move or k not in self._fixed)}
+        move = False leaves the geometry where it is (rebuilding the gel costs more than an image): enough for shading
+        at hits that are kept, but not for tracing or for shadows."""
+        now = {
+            k: v
+            for k, v in values.items()
+            if k in self.scene.parameters
+            and k not in self.layer_keys
+            and not isinstance(v, np.ndarray)
+            and (move or k not in self._fixed)
+        }
         now.update({f"{n}.{power}": 1.0 for n in self.scene.lights for power in POWERS})
         self.scene.set(now)
 
@@ -107,18 +128,19 @@ class Renderer:
                 path = paths.trace(self.scene, u, v)
                 return Sample(path.si, mi.UnpolarizedSpectrum(1.0), path.origin, path)
             si, weight, origin = self.scene.integrator.hits(
-                self.scene.mitsuba, self.scene.camera, mi.Float(u.astype(np.float32)), mi.Float(v.astype(np.float32)))
+                self.scene.mitsuba, self.scene.camera, mi.Float(u.astype(np.float32)), mi.Float(v.astype(np.float32))
+            )
             dr.eval(si, weight, origin)
         return Sample(si, weight, origin)
 
-    def hits(self, values: Mapping) -> "Hits":
+    def hits(self, values: Mapping) -> Hits:
         """Primary hits at pixel centres for a geometry; kept."""
         key = self.geometry(values)
         if key in self._hits:
             self._hits.move_to_end(key)
             return self._hits[key]
         self._apply(values)
-        v, u = np.mgrid[:self.height, :self.width] + 0.5
+        v, u = np.mgrid[: self.height, : self.width] + 0.5
         hits = Hits(self._trace(u.ravel(), v.ravel()), self.height, self.width)
         hits.edges |= self._painted(hits)
         self._hits[key] = hits
@@ -126,7 +148,7 @@ class Renderer:
             self._hits.popitem(last=False)
         return hits
 
-    def _painted(self, hits: "Hits") -> np.ndarray:
+    def _painted(self, hits: Hits) -> np.ndarray:
         """Pixels in whose neighbourhood the texture of a membrane's reflectance has an edge."""
         import drjit as dr
         import mitsuba as mi
@@ -137,7 +159,10 @@ class Renderer:
                 continue
             own = hits.si.is_valid() & (hits.si.bsdf() == mi.BSDFPtr(m))
             paint = dr.select(own, m.reflectance.eval(hits.si, own), 0.0)[0]
-            own, paint = np.array(own).reshape(hits.shape), np.broadcast_to(np.array(paint), hits.valid.size).reshape(hits.shape)
+            own, paint = (
+                np.array(own).reshape(hits.shape),
+                np.broadcast_to(np.array(paint), hits.valid.size).reshape(hits.shape),
+            )
             if own.any():
                 low, high = _around(np.where(own, paint, paint[own].mean()))
                 edges |= high - low > PAINTED * paint[own].max()
@@ -146,10 +171,14 @@ class Renderer:
     # -- one LED ------------------------------------------------------------------------------------------------------
 
     def _led_key(self, values: Mapping, led: str) -> tuple:
-        return (led, self.geometry(values), tuple(values[k] for k in self.shading_keys),
-                tuple(values[k] for k in self.led_keys[led]))
+        return (
+            led,
+            self.geometry(values),
+            tuple(values[k] for k in self.shading_keys),
+            tuple(values[k] for k in self.led_keys[led]),
+        )
 
-    def led(self, values: Mapping, led: str) -> "LedImage":
+    def led(self, values: Mapping, led: str) -> LedImage:
         """The image that one LED makes at power 1 by direct light, kept with what its derivatives need."""
         key = self._led_key(values, led)
         if key in self._images:
@@ -158,19 +187,21 @@ class Renderer:
         hits = self.hits(values)
         self._apply(values)
         image = self._keep(key, self._render_led(hits, led))
-        for other in self.together - {led}:  # moving the geometry costs more than an image: make what will be asked for next
+        for other in self.together - {
+            led
+        }:  # moving the geometry costs more than an image: make what will be asked for next
             key = self._led_key(values, other)
             if key not in self._images:
                 self._keep(key, self._render_led(hits, other))
         return image
 
-    def _keep(self, key: tuple, image: "LedImage") -> "LedImage":
+    def _keep(self, key: tuple, image: LedImage) -> LedImage:
         self._images[key] = image
         while len(self._images) > self.remember * len(self.scene.lights):
             self._images.popitem(last=False)
         return image
 
-    def _render_led(self, hits: "Hits", led: str) -> "LedImage":
+    def _render_led(self, hits: Hits, led: str) -> LedImage:
         if led in self.scene.sources:  # what it sends lies in the weights
             rim = self._joint_rim(hits)
             index = np.flatnonzero(rim)
@@ -186,8 +217,9 @@ class Renderer:
         rim_visible = self._visible(samples.si, part) if len(index) else None
         image = LedImage(led, hits, rim, index, samples, visible, rim_visible, self._seen(visible).mean(0) > 0.5)
         image.share = share.reshape(-1, 1)[index]
-        image.raw = self._raw(image, lambda: self._shade(hits.sample, part, visible),
-                              lambda: self._shade(samples, part, rim_visible))
+        image.raw = self._raw(
+            image, lambda: self._shade(hits.sample, part, visible), lambda: self._shade(samples, part, rim_visible)
+        )
         if not self.layered:
             image.radiance = self._mix(image, image.raw)
         return image
@@ -196,17 +228,18 @@ class Renderer:
         """(points of the source, H, W)"""
         return np.array(visible).reshape(-1, self.height, self.width)
 
-    def _rim(self, hits: "Hits", visible) -> np.ndarray:
+    def _rim(self, hits: Hits, visible) -> np.ndarray:
         return np.logical_or.reduce([_edges(s & hits.valid) for s in self._seen(visible)]) | hits.edges
 
-    def _joint_rim(self, hits: "Hits") -> np.ndarray:
+    def _joint_rim(self, hits: Hits) -> np.ndarray:
         """Pixels at a rim for any light: in scenes with layers one set of finer samples serves all."""
         if hits.joint is None:
             rims = [self._rim(hits, self._visible(hits.si, part)) for part in self.scene.leds.values()]
             hits.joint = np.logical_or.reduce([hits.edges, *rims])
         return hits.joint
 
-    # -- what layers leave of it ----------------------------------------------------------------------------------------
+    # -- what layers leave of it
+    # ----------------------------------------------------------------------------------------
 
     def image(self, values: Mapping, light: str, component: int = 0) -> np.ndarray:
         """(H, W, B) what one light makes at power 1, layers and all; (N, 1, B) where `values` hold arrays of readings.
@@ -216,32 +249,53 @@ class Renderer:
         image = self.led(values, light)
         if not self.layered:
             return image.radiance if component == 0 else np.zeros_like(image.radiance)
-        seen = [None if r is None or w is None else r * w for r, w in zip(image.raw, self.weights(values, image, component))]
+        seen = [
+            None if r is None or w is None else r * w for r, w in zip(image.raw, self.weights(values, image, component))
+        ]
         for add in self._glows(values, image, component):
             seen = [s if s is None else s + a for s, a in zip(seen, add)]
         return self._mix(image, seen)
 
-    def _glows(self, values: Mapping, image: "LedImage", component: int) -> Iterator[tuple]:
-        """What boundaries send to the camera by themselves while one light is on (stage `glow`): at centres, at finer samples."""
+    def _glows(self, values: Mapping, image: LedImage, component: int) -> Iterator[tuple]:
+        """What boundaries send to the camera by themselves while one light is on (stage `glow`): at centres, at finer
+        samples."""
         effects = registry().at_stage("interface", "glow")
-        names = [n for n, p in self.scene.parts.items() if p.kind == "interface"] if image.led in self.scene.leds else []
+        names = (
+            [n for n, p in self.scene.parts.items() if p.kind == "interface"] if image.led in self.scene.leds else []
+        )
         for name in names:
             own = paths.part_values(self.scene, name, values, {})
-            functions = [e.stages["glow"] for e in effects
-                         if any(getattr(own, n) != self.scene.parts[name].numbers[n].neutral for n in e.parameter_names)]
+            functions = [
+                e.stages["glow"]
+                for e in effects
+                if any(getattr(own, n) != self.scene.parts[name].numbers[n].neutral for n in e.parameter_names)
+            ]
             if not functions:
                 continue
-            shines = [i for i, s in enumerate(self.scene.mitsuba.shapes()) if getattr(s.bsdf(), "kind", "") == "fluorescent"]
+            shines = [
+                i for i, s in enumerate(self.scene.mitsuba.shapes()) if getattr(s.bsdf(), "kind", "") == "fluorescent"
+            ]
             marked = np.isin(image.hits.path.shape, shines)
-            glow = SimpleNamespace(markers=image.raw[0][marked].mean(0, dtype=float) if marked.any() else np.zeros(self.bands),
-                                   wavelengths=self.wavelengths)
+            glow = SimpleNamespace(
+                markers=image.raw[0][marked].mean(0, dtype=float) if marked.any() else np.zeros(self.bands),
+                wavelengths=self.wavelengths,
+            )
             light = sum(function(glow, own) for function in functions)
-            yield tuple(None if path is None else light * paths.transmission(
-                self.scene, path, values, self.wavelengths, component, name)[0].reshape(shape) for path, shape in (
-                (image.hits.path, (-1, self.bands)),
-                (image.samples.path if len(image.index) else None, (len(image.index), self.rim_samples, self.bands))))
+            yield tuple(
+                None
+                if path is None
+                else light
+                * paths.transmission(self.scene, path, values, self.wavelengths, component, name)[0].reshape(shape)
+                for path, shape in (
+                    (image.hits.path, (-1, self.bands)),
+                    (
+                        image.samples.path if len(image.index) else None,
+                        (len(image.index), self.rim_samples, self.bands),
+                    ),
+                )
+            )
 
-    def weights(self, values: Mapping, image: "LedImage", component: int = 0) -> tuple:
+    def weights(self, values: Mapping, image: LedImage, component: int = 0) -> tuple:
         """What the layers leave of a light: (H W, B) at the pixels' centres, (n, S, B) at the finer samples of rims."""
         centre = self._weight(values, image.led, image.hits.path, component, ())
         fine = None
@@ -251,10 +305,16 @@ class Renderer:
         return centre, fine
 
     def _weight(self, values: Mapping, light: str, path, component: int, where: tuple) -> np.ndarray:
-        key = (self.geometry(values), component, *where, *(v.tobytes() if isinstance(v, np.ndarray) else v for v in (
-            values[k] for k in self.layer_order)))
+        key = (
+            self.geometry(values),
+            component,
+            *where,
+            *(v.tobytes() if isinstance(v, np.ndarray) else v for v in (values[k] for k in self.layer_order)),
+        )
         if key not in self._transmissions:
-            if all(path is not other for other in self._recent):  # matrices are large: those of the last two paths are kept
+            if all(
+                path is not other for other in self._recent
+            ):  # matrices are large: those of the last two paths are kept
                 self._recent.append(path)
                 if len(self._recent) > 4:
                     self._recent.pop(0).matrices.clear()
@@ -289,11 +349,11 @@ class Renderer:
         """(4, H, W, B): Stokes vectors at the camera; (4, N, 1, B) where `values` hold arrays of readings."""
         return np.stack([self.radiance(values, seed, component) for component in range(4)])
 
-    def _rim_samples(self, hits: "Hits", index: np.ndarray):
+    def _rim_samples(self, hits: Hits, index: np.ndarray):
         key = index.tobytes()
         if key not in hits.rims:
-            # A Hammersley set, shifted from pixel to pixel: an edge in any direction crosses the samples one by one, and
-            # not in rows, so that a shadow that moves changes a pixel in small steps.
+            # A Hammersley set, shifted from pixel to pixel: an edge in any direction crosses the samples one by one,
+            # and not in rows, so that a shadow that moves changes a pixel in small steps.
             count = self.rim_samples
             k = np.arange(count)
             reversed_bits = sum(((k >> b) & 1) / 2 ** (b + 1) for b in range(count.bit_length() - 1))
@@ -311,7 +371,10 @@ class Renderer:
         """
         if part.number("area") == 0:
             return [None]
-        at = [0.5 + sign * (mean_square**0.5) / 2 for sign, mean_square in ((-1, 5 / 8), (-1, 1 / 8), (1, 1 / 8), (1, 5 / 8))]
+        at = [
+            0.5 + sign * (mean_square**0.5) / 2
+            for sign, mean_square in ((-1, 5 / 8), (-1, 1 / 8), (1, 1 / 8), (1, 5 / 8))
+        ]
         return [(a, b) for a in at for b in at]
 
     def _visible(self, si, part):
@@ -335,21 +398,27 @@ class Renderer:
         places = self._discs(part)
         if len(places) == 1:
             return integrator.direct(scene, *sample[:3], part, visible)
-        parts = [integrator.direct(scene, *sample[:3], part, seen, mi.Point2f(*place)) for place, seen in zip(places, visible)]
+        parts = [
+            integrator.direct(scene, *sample[:3], part, seen, mi.Point2f(*place))
+            for place, seen in zip(places, visible)
+        ]
         return sum(parts[1:], parts[0]) / len(parts)
 
-    def _raw(self, image: "LedImage", centre: Callable, rim: Callable) -> tuple:
+    def _raw(self, image: LedImage, centre: Callable, rim: Callable) -> tuple:
         """Shading at pixel centres (H W, B) and at the finer samples of rims (n, S, B), None without rims."""
         fine = self._bands(rim()).reshape(len(image.index), self.rim_samples, self.bands) if len(image.index) else None
         return self._bands(centre()).reshape(self.height * self.width, self.bands), fine
 
-    def _mix(self, image: "LedImage", raw: tuple, weights: tuple = (1.0, 1.0)) -> np.ndarray:
+    def _mix(self, image: LedImage, raw: tuple, weights: tuple = (1.0, 1.0)) -> np.ndarray:
         """(H, W, B) from pixel centres and, where the rim is, from the mean of the finer samples, by its share."""
         result = raw[0] * weights[0] if self.layered else raw[0].copy()
         if len(image.index):
             result[image.index] += image.share * ((raw[1] * weights[1]).mean(1) - result[image.index])
-        return result.reshape(-1, self.width, self.bands) if len(result) != self.height * self.width else result.reshape(
-            self.height, self.width, self.bands)
+        return (
+            result.reshape(-1, self.width, self.bands)
+            if len(result) != self.height * self.width
+            else result.reshape(self.height, self.width, self.bands)
+        )
 
     def _bands(self, spectrum) -> np.ndarray:
         import drjit as dr
@@ -360,7 +429,7 @@ class Renderer:
     def powers(self, values: Mapping, led: str) -> np.ndarray:
         """(B,) power of an LED in each band, relative to its image."""
         shares = [values[f"{led}.{name}"] for name in POWERS[1:]] + [1.0] * self.bands
-        return values[f"{led}.power"] * np.array(shares[:self.bands])
+        return values[f"{led}.power"] * np.array(shares[: self.bands])
 
     def led_tangent_at_rest(self, values: Mapping, led: str, key: str) -> np.ndarray:
         """`led_tangent`, kept: all frames share the gel at rest."""
@@ -372,7 +441,8 @@ class Renderer:
         return self._tangents[known]
 
     def led_tangent(self, values: Mapping, led: str, key: str) -> np.ndarray:
-        """d radiance / d parameter of one LED's image, forward mode; rims by central differences where the LED moves."""
+        """d radiance / d parameter of one LED's image, forward mode; rims by central differences where the LED
+        moves."""
         import drjit as dr
         import mitsuba as mi
 
@@ -405,13 +475,16 @@ class Renderer:
                     setattr(part, parameter, value)
             return (sides[0] - sides[1]) / (2 * step)
 
-        raw = self._raw(image, lambda: tangent(image.hits.sample, image.visible),
-                        moved_rim if moves else lambda: tangent(image.samples, image.rim_visible))
+        raw = self._raw(
+            image,
+            lambda: tangent(image.hits.sample, image.visible),
+            moved_rim if moves else lambda: tangent(image.samples, image.rim_visible),
+        )
         return self._mix(image, raw, self.weights(values, image) if self.layered else (1.0, 1.0))
 
     def bounced(self, values: Mapping, led: str, seed: int = 0, component: int = 0) -> np.ndarray:
-        """(H, W, B): light of one LED at power 1 after two reflections, unpolarized before any layers, as a component of the
-        Stokes vector; Monte Carlo over the second direction.
+        """(H, W, B): light of one LED at power 1 after two reflections, unpolarized before any layers, as a component
+        of the Stokes vector; Monte Carlo over the second direction.
 
         Light from all around varies slowly: it is gathered for every second pixel each way, over the area of the four,
         and interpolated linearly in between. The samples are the same for every geometry and LED of a seed.
@@ -431,13 +504,15 @@ class Renderer:
         rng = np.random.default_rng([seed, 77])
         count = u.size * BOUNCE_SAMPLES
         at = [np.repeat(a.ravel(), BOUNCE_SAMPLES) + rng.random(count) for a in (u, v)]
-        sample = self._trace(*(np.minimum(a * BOUNCE_CELL, size - 1e-3) for a, size in zip(at, (self.width, self.height))))
+        sample = self._trace(
+            *(np.minimum(a * BOUNCE_CELL, size - 1e-3) for a, size in zip(at, (self.width, self.height)))
+        )
         sampler = mi.load_dict({"type": "independent"})
         sampler.seed(int(rng.integers(2**31)), count)
         light = self.scene.integrator.bounced(self.scene.mitsuba, *sample[:3], self.scene.leds[led], 1, sampler)
         coarse = self._bands(light).reshape(rows, columns, BOUNCE_SAMPLES, self.bands).mean(2)
         image = zoom(coarse, (BOUNCE_CELL, BOUNCE_CELL, 1), order=1, mode="nearest", grid_mode=True)
-        self._images[key] = image[:self.height, :self.width].astype(float)
+        self._images[key] = image[: self.height, : self.width].astype(float)
         return self._bounced(values, led, self._images[key], component)
 
     def _bounced(self, values: Mapping, led: str, image: np.ndarray, component: int) -> np.ndarray:
@@ -456,26 +531,37 @@ class Renderer:
         if not self.glows(values) or component and not self.layered:
             return np.zeros((self.height, self.width, self.bands))
         if not self.layered:
-            return np.broadcast_to(self._shone(values, self.hits(values).sample), (self.height * self.width, self.bands)).reshape(
-                self.height, self.width, self.bands).astype(float)
+            return (
+                np.broadcast_to(self._shone(values, self.hits(values).sample), (self.height * self.width, self.bands))
+                .reshape(self.height, self.width, self.bands)
+                .astype(float)
+            )
         image = self.glow(values)
         return self._mix(image, image.raw, self.weights(values, image, component))
 
-    def glow(self, values: Mapping) -> "LedImage":
+    def glow(self, values: Mapping) -> LedImage:
         """The image of light that no LED made, in a scene with layers, before these."""
         hits = self.hits(values)
         rim = self._joint_rim(hits)
         index = np.flatnonzero(rim)
         image = LedImage("", hits, rim, index, self._rim_samples(hits, index), None, None, hits.valid)
-        image.raw = (self._shone(values, hits.sample),
-                     self._shone(values, image.samples).reshape(len(index), self.rim_samples, self.bands) if len(index) else None)
+        image.raw = (
+            self._shone(values, hits.sample),
+            self._shone(values, image.samples).reshape(len(index), self.rim_samples, self.bands)
+            if len(index)
+            else None,
+        )
         return image
 
-    def _shone(self, values: Mapping, sample: "Sample") -> np.ndarray:
+    def _shone(self, values: Mapping, sample: Sample) -> np.ndarray:
         """(N, B): radiance of the membranes that no LED made, at the ends of camera rays."""
         self._apply(values, move=False)
-        return sum(self._bands(self.scene.integrator.ambient(self.scene.mitsuba, sample.si, sample.weight, m) + 0 * sample.si.t)
-                   for m in self.scene.membranes.values())
+        return sum(
+            self._bands(
+                self.scene.integrator.ambient(self.scene.mitsuba, sample.si, sample.weight, m) + 0 * sample.si.t
+            )
+            for m in self.scene.membranes.values()
+        )
 
 
 class Sample(NamedTuple):
@@ -502,7 +588,11 @@ class Hits:
             for met in (self.path.shape, *(step.part for step in self.path.steps)):
                 self.edges |= _edges(met.reshape(height, width))
             self.edges |= _creases(np.where(self.valid[..., None], self.normal, 0.0))
-        self.bent = np.zeros((height, width)) if self.path is not None else _bent(np.where(self.valid[..., None], self.normal, 0.0))
+        self.bent = (
+            np.zeros((height, width))
+            if self.path is not None
+            else _bent(np.where(self.valid[..., None], self.normal, 0.0))
+        )
 
     def image(self, values) -> np.ndarray:
         return np.array(values).reshape(self.shape)
@@ -528,11 +618,14 @@ class LedImage:
 
 
 def _creases(normal: np.ndarray) -> np.ndarray:
-    """Pixels on either side of a sharp edge of a body: normals (H, W, 3) that turn by more than CREASE from one to the next."""
+    """Pixels on either side of a sharp edge of a body: normals (H, W, 3) that turn by more than CREASE from one to the
+    next."""
     found = np.zeros(normal.shape[:2], bool)
     for axis in (0, 1):
         near, far = (np.take(normal, range(k, normal.shape[axis] - 1 + k), axis) for k in (0, 1))
-        turned = (near * far).sum(-1) < np.cos(np.radians(CREASE)) * np.linalg.norm(near, axis=-1) * np.linalg.norm(far, axis=-1)
+        turned = (near * far).sum(-1) < np.cos(np.radians(CREASE)) * np.linalg.norm(near, axis=-1) * np.linalg.norm(
+            far, axis=-1
+        )
         first, second = ((slice(None),) * axis + (slice(k, normal.shape[axis] - 1 + k),) for k in (0, 1))
         found[first] |= turned
         found[second] |= turned
@@ -542,9 +635,9 @@ def _creases(normal: np.ndarray) -> np.ndarray:
 def _bent(normal: np.ndarray) -> np.ndarray:
     """(H, W) share, 0 to 1, by which finer samples stand for a pixel and not its middle.
 
-    The mean over a pixel of what varies is its middle and a twenty-fourth of its second differences. Where these are, for the normals
-    (H, W, 3), above 24 BENT, the share is 1, and it fades to 0 at half of that: a picture has no steps when a dent moves.
-    """
+    The mean over a pixel of what varies is its middle and a twenty-fourth of its second differences. Where these are,
+    for the normals (H, W, 3), above 24 BENT, the share is 1, and it fades to 0 at half of that: an image has no steps
+    when a dent moves."""
     found = np.zeros(normal.shape[:2])
     for axis in (0, 1):
         if normal.shape[axis] < 3:

@@ -1,29 +1,32 @@
-"""Transport: light in clear bodies that reflect and refract it many times, from lights to the camera, by chance and by maps.
+"""Transport: light in dielectric bodies that reflect and refract it many times, from lights to the camera, by Monte
+Carlo and by maps.
 
-In a printed grid a ray meets some hundred faces, and a pinhole camera never meets the small LEDs at the grid's sides. So light is
-followed from both ends to where it is scattered:
+In a printed grid a ray meets some hundred faces, and a pinhole camera never meets the small LEDs at the grid's sides.
+So light is followed from both ends to where it is scattered:
 
-    from the lights    packets of light fly through all faces, are absorbed along every stretch (exp(-alpha d)), scattered by the
-                       bodies and by matt surfaces, and leave what they are worth in two maps: the fluence in every cell of a
-                       grid (track length by volume, 1/mm^2 per unit of power), and the irradiance on matt surfaces
-    from the camera    rays fly through all faces the same way; each ends on a matt surface, where it reads the irradiance, and
+    from the lights    packets of light fly through all faces, are absorbed along every stretch (exp(-alpha d)),
+                       scattered by the bodies and by matt surfaces, and leave what they are worth in two maps: the
+                       fluence in every cell of a grid (track length by volume, 1/mm^2 per unit of power), and the
+                       irradiance on matt surfaces
+    from the camera    rays fly through all faces the same way; each ends on a matt surface, where it reads the
+                       irradiance, and
                        gathers on its way what the bodies scatter towards it, sigma_s/(4 pi) of the fluence
 
-At every face the way is drawn by Fresnel's reflectance; absorption is weighed, never drawn, so that derivatives by absorption
-are exact: every contribution times the length of its way (d/d alpha exp(-alpha l) = -l exp(-alpha l)). Polarization is followed
-as the row (from the camera) or column (from a light) of the Mueller matrix of everything met so far, in axes that travel along.
-On a rough face the ray meets a facet, drawn as often as it is seen (Beckmann's slopes), and all that a face does is done about the
-facet's normal m; the way on is weighed by Smith's G1(wo, m), and what leaves on the wrong side of the face is lost.
+At every face the way is drawn by Fresnel's reflectance; absorption is weighed, never drawn, so that derivatives by
+absorption are exact: every contribution times the length of its way (d/d alpha exp(-alpha l) = -l exp(-alpha l)).
+Polarization is followed as the row (from the camera) or column (from a light) of the Mueller matrix of everything met
+so far, in axes that travel along. On a rough face the ray meets a facet, drawn as often as it is seen (Beckmann's
+slopes), and all that a face does is done about the facet's normal m; the way on is weighed by Smith's G1(wo, m), and
+what leaves on the wrong side of the face is lost.
 
-The maps know cells and matt surfaces with coordinates on them (u, v); matt surfaces are taken as Lambertian.
-Light that comes straight to a matt surface, through air, is left to the camera's rays, which look from there to every light.
-Without maps (`reach="paths"`) rays of the camera go on until they meet a luminous area: without the maps' resolution, and slower
-the smaller the area. It is what the maps are tested against, beside stock Mitsuba.
+The maps know cells and matt surfaces with coordinates on them (u, v); matt surfaces are taken as Lambertian. Light that
+comes straight to a matt surface, through air, is left to the camera's rays, which look from there to every light.
+Without maps (`reach="paths"`) rays of the camera go on until they meet a luminous area: without the maps' resolution,
+and slower the smaller the area. It is what the maps are tested against, beside stock Mitsuba.
 
-Source: Fan, Li, Cong & Zhang, MagicGripper, supplementary VII-A, eqs. (18)-(29); Veach, thesis (1997), 5.2, for radiance across
-a boundary (1/n^2) against power (1); Jensen, Realistic Image Synthesis Using Photon Mapping (2001), for maps of light; Walter,
-Marschner, Li & Torrance, EGSR 2007, and Heitz & d'Eon, CGF 33, 103 (2014), for rough faces.
-"""
+Source: Fan, Li, Cong & Zhang, MagicGripper, supplementary VII-A, eqs. (18)-(29); Veach, thesis (1997), 5.2, for
+radiance across a boundary (1/n^2) against power (1); Jensen, Realistic Image Synthesis Using Photon Mapping (2001), for
+maps of light; Walter, Marschner, Li & Torrance, EGSR 2007, and Heitz & d'Eon, CGF 33, 103 (2014), for rough faces."""
 
 from __future__ import annotations
 
@@ -45,7 +48,9 @@ BATCHES = 8  # independent parts of an image, maps and all, for its standard err
 AT_ONCE = 4_000_000  # rays that are followed together
 TEXELS = 64  # of an irradiance map, each way
 SMOOTH = 1e-4  # roughness up to which a face is smooth: Mitsuba's distributions know no less
-ASTRAY = 5e-3  # faces per ray that rounding may lead a ray past, at edges: 2e-5 in a grid at rest, 1e-3 in a pressed one
+ASTRAY = (
+    5e-3  # faces per ray that rounding may lead a ray past, at edges: 2e-5 in a grid at rest, 1e-3 in a pressed one
+)
 SPLIT = 2  # parts of a cell of the fluence map, each way
 POINTS = 2  # of a light, each way, that a lit place looks at
 WEAK = 1e-12  # birefringence that turns nothing
@@ -54,8 +59,8 @@ AIR = "air"
 
 @dataclass(frozen=True)
 class Material:
-    """What a body is made of, per band: refractive index, absorption and scattering coefficients in 1/mm; roughness of its faces;
-    birefringence along x."""
+    """What a body is made of, per band: refractive index, absorption and scattering coefficients in 1/mm; roughness of
+    its faces; birefringence along x."""
 
     name: str
     index: np.ndarray
@@ -68,7 +73,7 @@ class Material:
 
 
 @dataclass
-class Picture:
+class Estimate:
     """Linear images of every light at power 1.
 
     radiance   (L, H, W, B);   error   its standard error, from batches
@@ -84,12 +89,13 @@ class Picture:
 
 
 class Transport:
-    """A scene of clear bodies, matt surfaces and lights, ready to be photographed at the scene's present values."""
+    """A scene of dielectric bodies, matt surfaces and lights, ready to be photographed at the scene's present
+    values."""
 
     def __init__(self, scene, lights: Sequence[str] | None = None):
-        """lights: those to follow; None: all. A light's picture does not depend on the others."""
+        """lights: those to follow; None: all. A light's image does not depend on the others."""
         if scene.camera is None or scene.integrator is None:
-            raise BadScene(f"{scene.path}: a picture needs a part of the type 'camera' and the integrator 'tactile'")
+            raise BadScene(f"{scene.path}: an image needs a part of the type 'camera' and the integrator 'tactile'")
         if not scene.lights:
             raise BadScene(f"{scene.path}: the scene has no light (an emitter of the type 'led' or 'source')")
         self.scene = scene
@@ -110,9 +116,16 @@ class Transport:
                 s.first, matt = matt * TEXELS**2, matt + 1
         self.voxels, self.texels = cells * SPLIT**3, matt * TEXELS**2
 
-    def take(self, rays: int = 64, packets: int = 400_000, seed: int = 0, slopes: bool = False, reach: str = "maps",
-             progress: Callable[[str, int, int], None] | None = None) -> Picture:
-        """The picture of every light.
+    def take(
+        self,
+        rays: int = 64,
+        packets: int = 400_000,
+        seed: int = 0,
+        slopes: bool = False,
+        reach: str = "maps",
+        progress: Callable[[str, int, int], None] | None = None,
+    ) -> Estimate:
+        """The image of every light.
 
         rays     from the camera, per pixel;   packets   from each light, for the maps
         slopes   also the derivative by each material's absorption
@@ -121,8 +134,10 @@ class Transport:
         if reach not in ("maps", "paths"):
             raise ValueError(f"reach = {reach!r}; allowed: maps, paths")
         if reach == "paths" and self.scene.leds:
-            raise BadScene(f"{self.scene.path}: rays of the camera never meet an LED, which is a point; allowed with reach = 'paths': "
-                           "luminous areas (emitters of the type 'source')")
+            raise BadScene(
+                f"{self.scene.path}: rays of the camera never meet an LED, which is a point; allowed with reach = 'paths': "
+                "luminous areas (emitters of the type 'source')"
+            )
         # bands that go different ways are followed apart
         if reach == "maps":
             self._check_maps()
@@ -130,31 +145,44 @@ class Transport:
         groups = [list(range(len(self.bands)))] if same else [[b] for b in range(len(self.bands))]
         kinds = len(self.materials) if slopes else 1
         images, followed, lost, astray = 0.0, 0, 0.0, 0.0
-        for group in groups:  # with the same random numbers: equal indices would give equal pictures
+        for group in groups:  # with the same random numbers: equal indices would give equal images
             run = Run(self, group, kinds, seed, progress)
             images = images + run.images(max(rays // BATCHES, 1), max(packets // BATCHES, 1), reach == "maps")
             followed, lost, astray = followed + run.followed, lost + run.lost, astray + run.astray
         if astray > ASTRAY * followed:
-            raise BadScene(f"{self.scene.path}: {astray / followed:.2g} times per ray a face of a clear body is met from a material that is not "
-                           "its neighbour: bodies overlap, a normal points inwards, or `outside` names the wrong material")
+            raise BadScene(
+                f"{self.scene.path}: {astray / followed:.2g} times per ray a face of a dielectric body is met from a material that is not "
+                "its neighbour: bodies overlap, a normal points inwards, or `outside` names the wrong material"
+            )
         mean, error = images.mean(0), images.std(0, ddof=1) / np.sqrt(BATCHES)
         by = {}
         for m, slope in zip(self.materials[1:], mean[1:]):
             by[m.of or m.name] = by.get(m.of or m.name, 0.0) + m.share * slope
-        return Picture(self.lights, mean[0], error[0], by, lost / followed)
+        return Estimate(self.lights, mean[0], error[0], by, lost / followed)
 
-    def _fill(self, grid: "Surface") -> None:
+    def _fill(self, grid: Surface) -> None:
         """Say what is in each cell, with a material of its own for one that lacks filling."""
         cell, share = grid.shape.lacking()
         grid.fillings = np.full(len(grid.cells.rows), grid.inside)
         if share > 0 and grid.inside >= 0:
             m = self.materials[grid.inside]
             grid.fillings[cell] = len(self.materials)
-            self.materials.append(Material(f"{m.name}, unfilled", 1 + (m.index - 1) * (1 - share), m.absorption * (1 - share),
-                                           m.scattering * (1 - share), m.roughness, m.birefringence * (1 - share), m.name, 1 - share))
+            self.materials.append(
+                Material(
+                    f"{m.name}, unfilled",
+                    1 + (m.index - 1) * (1 - share),
+                    m.absorption * (1 - share),
+                    m.scattering * (1 - share),
+                    m.roughness,
+                    m.birefringence * (1 - share),
+                    m.name,
+                    1 - share,
+                )
+            )
 
     def seen_through(self, rays: int, seed: int = 0) -> np.ndarray:
-        """(cells, H, W): length (mm) in each cell of the camera's rays of each pixel, in the mean, by their weight in the first band."""
+        """(cells, H, W): length (mm) in each cell of the camera's rays of each pixel, in the mean, by their weight in
+        the first band."""
         return Run(self, [0], 1, seed).lengths(rays)
 
     def _check_maps(self) -> None:
@@ -162,29 +190,36 @@ class Transport:
         filling = {number for s in self.surfaces if s.cells is not None for number in (s.inside, *s.fillings)}
         for number, m in enumerate(self.materials):
             if number not in filling and m.scattering.max() > 1e-12:
-                raise BadScene(f"{self.scene.path}: {m.name}.scattering = {m.scattering.max():g} 1/mm; allowed: 0 in a material that fills no "
-                               "`cells`, as light is mapped in cells only")
+                raise BadScene(
+                    f"{self.scene.path}: {m.name}.scattering = {m.scattering.max():g} 1/mm; allowed: 0 in a material that fills no "
+                    "`cells`, as light is mapped in cells only"
+                )
         for name, part in self.scene.sources.items():
             if part.number("dop_q") or part.number("dop_u"):
-                raise BadScene(f"{self.scene.path}: '{name}' sends polarized light; allowed among clear bodies: dop_q = dop_u = 0")
+                raise BadScene(
+                    f"{self.scene.path}: '{name}' sends polarized light; allowed among dielectric bodies: dop_q = dop_u = 0"
+                )
 
 
 class Run:
     """Packets and rays for bands that go the same way.
 
-    group      numbers of the bands;   kinds  1, or one more for each material: images and maps, then their derivatives by absorption
+    group      numbers of the bands;   kinds  1, or one more for each material: images and maps, then their derivatives
+               by absorption
     rows       (light, band) of the images and maps that are kept: what a light does not send needs none
     followed   rays so far;   lost   cut off;   astray   met a face from the wrong side
     """
 
-    def __init__(self, transport: Transport, group: Sequence[int], kinds: int, seed: int, progress: Callable | None = None):
+    def __init__(
+        self, transport: Transport, group: Sequence[int], kinds: int, seed: int, progress: Callable | None = None
+    ):
         import drjit as dr
         import mitsuba as mi
 
         self.of, self.group, self.kinds, self.seed = transport, list(group), kinds, seed
         self.scene, self.progress = transport.scene, progress or (lambda what, done, total: None)
         self.followed, self.lost, self.astray = 0, 0.0, 0.0
-        bands = (*transport.bands, *[transport.bands[-1]] * 4)[:dr.size_v(mi.UnpolarizedSpectrum)]
+        bands = (*transport.bands, *[transport.bands[-1]] * 4)[: dr.size_v(mi.UnpolarizedSpectrum)]
         self.wavelengths = mi.UnpolarizedSpectrum(*[float(b) for b in bands]) if mi.is_spectral else mi.Color0f()
         levels = np.array([self._level(n) for n in transport.lights])  # (L, B)
         self.rows = [(light, b) for light, own in enumerate(levels) for b in self.group if own[b] > 1e-6 * own.max()]
@@ -208,16 +243,25 @@ class Run:
         turns = [2e6 * np.pi * m.birefringence / transport.bands[group[0]] for m in materials]  # rad/mm
         self.retardance = table(mi.Float, turns) if any(abs(m.birefringence) >= WEAK for m in materials) else None
         self.pointers = [mi.ShapePtr(s.shape) for s in surfaces]
-        self.outside, self.inside, self.first, self.matt, self.grid, self.light = (table(mi.Int32, values) for values in (
-            [s.outside for s in surfaces], [s.inside for s in surfaces], [s.first for s in surfaces], [s.matt for s in surfaces],
-            [s.cells is not None for s in surfaces],
-            [transport.lights.index(s.light) if s.light in transport.lights else -1 for s in surfaces]))
+        self.outside, self.inside, self.first, self.matt, self.grid, self.light = (
+            table(mi.Int32, values)
+            for values in (
+                [s.outside for s in surfaces],
+                [s.inside for s in surfaces],
+                [s.first for s in surfaces],
+                [s.matt for s in surfaces],
+                [s.cells is not None for s in surfaces],
+                [transport.lights.index(s.light) if s.light in transport.lights else -1 for s in surfaces],
+            )
+        )
         boxes = [s.shape.bbox() for s in surfaces if s.inside >= 0]
         low, high = np.min([np.ravel(b.min) for b in boxes], 0), np.max([np.ravel(b.max) for b in boxes], 0)
         self.aim, self.radius = [float(c) for c in (low + high) / 2], float(np.linalg.norm(high - low) / 2)
         self.filled = None
         if transport.cells:
-            origins, turns, volumes = (np.concatenate([getattr(c, n) for c in transport.cells]) for n in ("origins", "rows", "volumes"))
+            origins, turns, volumes = (
+                np.concatenate([getattr(c, n) for c in transport.cells]) for n in ("origins", "rows", "volumes")
+            )
             self.origin = [table(mi.Float, origins[:, i]) for i in range(3)]
             self.turn = [[table(mi.Float, turns[:, i, j]) for j in range(3)] for i in range(3)]
             self.volume = table(mi.Float, volumes.ravel())
@@ -229,7 +273,10 @@ class Run:
         """What a light at power 1 sends in each band, relative."""
         import mitsuba as mi
 
-        part, wavelengths = self.scene.parts[light], self.wavelengths if mi.is_spectral else mi.UnpolarizedSpectrum(float(self.of.bands[0]))
+        part, wavelengths = (
+            self.scene.parts[light],
+            self.wavelengths if mi.is_spectral else mi.UnpolarizedSpectrum(float(self.of.bands[0])),
+        )
         level = part.level(wavelengths) if light in self.scene.sources else part.spectrum(wavelengths)
         return [float(np.ravel(np.array(level[b]))[0]) for b in range(len(self.of.bands))]
 
@@ -243,7 +290,10 @@ class Run:
         self.maps = maps
         self.fluence, self.irradiance = (dr.zeros(mi.Float, max(rows * size, 1)) for size in (of.voxels, of.texels))
         self.out = dr.zeros(mi.Float, rows * pixels)
-        for name, follow, wanted, each in (("packets", self._shine, packets if maps else 0, lights), ("rays", self._look, rays, pixels)):
+        for name, follow, wanted, each in (
+            ("packets", self._shine, packets if maps else 0, lights),
+            ("rays", self._look, rays, pixels),
+        ):
             most, done = max(AT_ONCE // (BATCHES * each), 1), 0
             while done < wanted:
                 count = min(most, wanted - done)
@@ -257,8 +307,8 @@ class Run:
         return image / rays
 
     def random(self, lane, kind: int, done: int):
-        """Random numbers of each lane. States and increments are hashed: generators that start beside one another are correlated, and
-        batches with them, whose spread then understates the error (measured: by 1.4 in variance)."""
+        """Random numbers of each lane. States and increments are hashed: generators that start beside one another are
+        correlated, and batches with them, whose spread then understates the error (measured: by 1.4 in variance)."""
         import drjit as dr
         import mitsuba as mi
 
@@ -317,18 +367,22 @@ class Run:
         import drjit as dr
         import mitsuba as mi
 
-        return [t * dr.exp(-(dr.gather(mi.Float, a, s["medium"]) + further) * length) for t, a in zip(s["tau"], self.absorption)]
+        return [
+            t * dr.exp(-(dr.gather(mi.Float, a, s["medium"]) + further) * length)
+            for t, a in zip(s["tau"], self.absorption)
+        ]
 
     # -- flight ------------------------------------------------------------------------------------------------------
 
     def fly(self, start: dict, forward: bool, drawn: bool, along: Callable, at: Callable) -> dict:
-        """Follow rays through all faces until they end; gives their last state, with `ended` where `at` says so: there p and d are those
-        of the last stretch.
+        """Follow rays through all faces until they end; gives their last state, with `ended` where `at` says so: there
+        p and d are those of the last stretch.
 
-        start    p, d, rng, x (axis across d that Stokes vectors refer to), tau (share of what each ray started with, per band of the
+        start    p, d, rng, x (axis across d that Stokes vectors refer to), tau (share of what each ray started with,
+                 per band of the
                  group), weight (what that is; 1), and numbers that stay: pixel, light, batch
         forward  from a light: the Stokes vector is carried along; else from the camera: what it is sensitive to
-        drawn    scattering is drawn by chance; else it only weakens, and `along` gathers it
+        drawn    scattering is drawn by Monte Carlo; else it only weakens, and `along` gathers it
         along    f(s, length, sigma, active): what is left or found on a straight stretch of the state s
         at       f(s, si, k, hit) -> mask: what is left or found on surface number k, and where the ray ends there
         """
@@ -340,7 +394,9 @@ class Run:
         def onward(s):
             s = dict(s)
             active, rng, flight = s["active"], s["rng"], s["d"]
-            si = self.scene.mitsuba.ray_intersect(mi.Ray3f(s["p"], flight, mi.Float(0), self.wavelengths), mi.RayFlags.All, False, active)
+            si = self.scene.mitsuba.ray_intersect(
+                mi.Ray3f(s["p"], flight, mi.Float(0), self.wavelengths), mi.RayFlags.All, False, active
+            )
             hit = active & si.is_valid()
             k = self.number(si)
             sigma = dr.gather(mi.Float, self.scattering, s["medium"])
@@ -357,7 +413,7 @@ class Run:
             hit &= ~scattered
             ends = at(s, si, k, hit)
 
-            # at a face of a clear body: reflected or refracted
+            # at a face of a dielectric body: reflected or refracted
             outside, inside = (dr.gather(mi.Int32, a, k) for a in (self.outside, self.inside))
             cell = mi.UInt32(dr.gather(mi.Int32, self.first, k)) + si.prim_index // 12  # where it is one
             if self.filled is not None:
@@ -367,7 +423,9 @@ class Run:
             front = dr.dot(flight, si.n) < 0
             normal = mi.Vector3f(dr.select(front, si.n, -si.n))
             here, there = mi.UInt32(dr.select(front, outside, inside)), mi.UInt32(dr.select(front, inside, outside))
-            n = dr.gather(mi.Float, self.index, there, face) / dr.select(face, dr.gather(mi.Float, self.index, here, face), 1.0)
+            n = dr.gather(mi.Float, self.index, there, face) / dr.select(
+                face, dr.gather(mi.Float, self.index, here, face), 1.0
+            )
             n = dr.select(face, n, 1.0)
             if self.roughness is not None:
                 normal, seen = self.facet(flight, normal, dr.gather(mi.Float, self.roughness, k, face), rng)
@@ -383,9 +441,13 @@ class Run:
             axis = dr.select(level, s["x"], dr.normalize(across))
             turned = self.turned(s["v"], s["x"], axis, flight, forward)
             act = (lambda m: m @ tuple(turned)) if forward else (lambda m: m.after(tuple(turned)))
-            v = [dr.select(face, dr.select(back, a / bounced, b / passed), c) for a, b, c in zip(
-                act(fresnel_reflection(cos, n)), act(diattenuator(1.0, 0, 1 - r_s, 1 - r_p)), s["v"])]
-            d = dr.select(face, dr.select(back, flight + 2 * cos * normal, flight / n + (cos / n - cos2) * normal), flight)
+            v = [
+                dr.select(face, dr.select(back, a / bounced, b / passed), c)
+                for a, b, c in zip(act(fresnel_reflection(cos, n)), act(diattenuator(1.0, 0, 1 - r_s, 1 - r_p)), s["v"])
+            ]
+            d = dr.select(
+                face, dr.select(back, flight + 2 * cos * normal, flight / n + (cos / n - cos2) * normal), flight
+            )
             if self.roughness is not None:
                 s["tau"] = [dr.select(face, t * seen(d), t) for t in s["tau"]]
             s["astray"] = s["astray"] + dr.select(face & (here != s["medium"]), 1.0, 0.0)
@@ -395,11 +457,15 @@ class Run:
 
             # at another surface, or within a body: into all directions, unpolarized
             other = hit & ~face & ~ends
-            bs, weight = si.bsdf().sample(context, si, rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32()), other)
+            bs, weight = si.bsdf().sample(
+                context, si, rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32()), other
+            )
             weight = mi.unpolarized_spectrum(weight)
             s["tau"] = [dr.select(other, t * weight[b], t) for b, t in zip(self.group, s["tau"])]
             sphere = mi.warp.square_to_uniform_sphere(mi.Point2f(rng.next_float32(), rng.next_float32()))
-            s["d"] = dr.select(ends, flight, dr.normalize(dr.select(other, si.to_world(bs.wo), dr.select(scattered, sphere, d))))
+            s["d"] = dr.select(
+                ends, flight, dr.normalize(dr.select(other, si.to_world(bs.wo), dr.select(scattered, sphere, d)))
+            )
             mixed = other | scattered
             s["v"] = [v[0]] + [dr.select(mixed, 0.0, entry) for entry in v[1:]]
             s["x"] = dr.select(mixed, mi.Vector3f(mi.Frame3f(s["d"]).s), dr.select(face, axis, s["x"]))
@@ -413,17 +479,29 @@ class Run:
             s["cut"] = on & (s["depth"] >= DEPTH)
             s["active"] = on & ~s["cut"]
             s["ended"] = ends
-            s["p"] = dr.select(scattered, s["p"] + length * flight, dr.select(hit & ~ends, si.spawn_ray(s["d"]).o, s["p"]))
+            s["p"] = dr.select(
+                scattered, s["p"] + length * flight, dr.select(hit & ~ends, si.spawn_ray(s["d"]).o, s["p"])
+            )
             s["rng"] = rng
             return (s,)
 
         zero = dr.zeros(mi.Float, count)
         state = {
-            **{name: mi.UInt32(start.get(name, 0)) + dr.zeros(mi.UInt32, count) for name in ("pixel", "light", "batch", "medium", "cell", "depth")},
-            "p": mi.Point3f(start["p"]), "d": mi.Vector3f(start["d"]), "x": mi.Vector3f(start["x"]), "rng": start["rng"],
-            "v": [zero + entry for entry in (start.get("weight", 1.0), 0.0, 0.0, 0.0)], "tau": [t + zero for t in start["tau"]],
-            "ways": [zero + 0.0 for _ in self.of.materials[1:]], "astray": zero + 0.0,
-            "active": dr.full(mi.Bool, True, count), "cut": dr.full(mi.Bool, False, count), "ended": dr.full(mi.Bool, False, count),
+            **{
+                name: mi.UInt32(start.get(name, 0)) + dr.zeros(mi.UInt32, count)
+                for name in ("pixel", "light", "batch", "medium", "cell", "depth")
+            },
+            "p": mi.Point3f(start["p"]),
+            "d": mi.Vector3f(start["d"]),
+            "x": mi.Vector3f(start["x"]),
+            "rng": start["rng"],
+            "v": [zero + entry for entry in (start.get("weight", 1.0), 0.0, 0.0, 0.0)],
+            "tau": [t + zero for t in start["tau"]],
+            "ways": [zero + 0.0 for _ in self.of.materials[1:]],
+            "astray": zero + 0.0,
+            "active": dr.full(mi.Bool, True, count),
+            "cut": dr.full(mi.Bool, False, count),
+            "ended": dr.full(mi.Bool, False, count),
         }
         end = dr.while_loop((state,), lambda s: s["active"], onward)[0]
         dr.eval(end)  # all at once: what is asked for alone follows the rays anew
@@ -433,7 +511,8 @@ class Run:
         return end
 
     def retarded(self, s, length, forward: bool) -> tuple:
-        """Stokes vector or row, and its axis, after a stretch of a material that is birefringent along the world's x axis."""
+        """Stokes vector or row, and its axis, after a stretch of a material that is birefringent along the world's x
+        axis."""
         import drjit as dr
         import mitsuba as mi
 
@@ -448,11 +527,11 @@ class Run:
 
     @staticmethod
     def facet(flight, normal, roughness, rng) -> tuple:
-        """The normal m of the facet that a ray meets on a face, and G1(d, m): the share of what leaves the facet along d that others let by,
-        0 on the wrong side of the face.
+        """The normal m of the facet that a ray meets on a face, and G1(d, m): the share of what leaves the facet along
+        d that others let by, 0 on the wrong side of the face.
 
-        m is drawn by a hash of the generator's state: the same numbers at every roughness > 0, and all others those of a smooth face.
-        """
+        m is drawn by a hash of the generator's state: the same numbers at every roughness > 0, and all others those of
+        a smooth face."""
         import drjit as dr
         import mitsuba as mi
 
@@ -460,8 +539,10 @@ class Run:
         facets = mi.MicrofacetDistribution(mi.MicrofacetType.Beckmann, roughness)
         hidden = mi.sample_tea_32(mi.UInt32(rng.state), mi.UInt32(rng.state >> 32))
         m, _ = facets.sample(frame.to_local(-flight), mi.Point2f(*[mi.Float(h >> 8) * 2.0**-24 for h in hidden]))
-        return (dr.select(smooth, normal, frame.to_world(mi.Vector3f(m))),
-                lambda d: dr.select(smooth, 1.0, facets.smith_g1(frame.to_local(d), mi.Vector3f(m))))
+        return (
+            dr.select(smooth, normal, frame.to_world(mi.Vector3f(m))),
+            lambda d: dr.select(smooth, 1.0, facets.smith_g1(frame.to_local(d), mi.Vector3f(m))),
+        )
 
     @staticmethod
     def turned(v, x, axis, flight, forward: bool):
@@ -476,12 +557,13 @@ class Run:
 
     # -- from the lights ---------------------------------------------------------------------------------------------
 
-    def panel(self, name: str) -> "Surface":
+    def panel(self, name: str) -> Surface:
         """What a source shines from."""
         return next(s for s in self.of.surfaces if s.light == name)
 
     def seen_panel(self, name: str, place, sample):
-        """A point of a source's area, its normal there, and cos_l / r^2 by its density: the solid angle that it stands for."""
+        """A point of a source's area, its normal there, and cos_l / r^2 by its density: the solid angle that it stands
+        for."""
         import drjit as dr
         import mitsuba as mi
 
@@ -500,7 +582,8 @@ class Run:
         return led.point(sample) if led.number("area") > 0 else led.position()
 
     def _emitted(self, light: int, drawn: Sequence):
-        """Where packets of a light start, which way they go, the power of all of them, and the weight of each, by five random numbers."""
+        """Where packets of a light start, which way they go, the power of all of them, and the weight of each, by five
+        random numbers."""
         import drjit as dr
         import mitsuba as mi
 
@@ -508,23 +591,33 @@ class Run:
         part, one, two = self.scene.parts[name], mi.Point2f(drawn[0], drawn[1]), mi.Point2f(drawn[2], drawn[3])
         if name in self.scene.sources:
             start = self.panel(name).shape.sample_position(mi.Float(0), one)
-            # half of the packets by the cosine, half towards a ball around the clear bodies, which may be small and far away
+            # half of the packets by the cosine, half towards a ball around the dielectric bodies, which may be small
+            # and far away
             cosine = mi.Frame3f(start.n).to_world(mi.warp.square_to_cosine_hemisphere(two))
             to = mi.Point3f(*self.aim) - start.p
             distance = dr.norm(to)
-            edge = dr.safe_sqrt(1 - dr.square(dr.minimum(self.radius / distance, 1.0)))  # cosine of the ball's radius; 0 from within
+            edge = dr.safe_sqrt(
+                1 - dr.square(dr.minimum(self.radius / distance, 1.0))
+            )  # cosine of the ball's radius; 0 from within
             aimed = (edge > 0) & (drawn[4] < 0.5)
             cone = mi.Frame3f(to / distance).to_world(mi.warp.square_to_uniform_cone(two, edge))
             d = dr.select(aimed, cone, cosine)
             cos = dr.maximum(dr.dot(d, start.n), 0.0)
             inside = (edge > 0) & (dr.dot(d, to) > edge * distance)
-            chance = dr.select(edge > 0, cos / (2 * dr.pi), cos / dr.pi) + dr.select(inside, 1 / (4 * dr.pi * dr.maximum(1 - edge, 1e-9)), 0.0)
+            chance = dr.select(edge > 0, cos / (2 * dr.pi), cos / dr.pi) + dr.select(
+                inside, 1 / (4 * dr.pi * dr.maximum(1 - edge, 1e-9)), 0.0
+            )
             weight = cos / dr.pi / dr.maximum(chance, 1e-12)
             return start.p + 1e-4 * (1 + dr.max(dr.abs(start.p))) * start.n, d, dr.pi / start.pdf, weight
         z = dr.power(1 - two.x, 1 / (part.mu + 1))  # of cos(theta)^mu
         s, c = dr.sincos(2 * dr.pi * two.y)
         d = mi.Frame3f(part.axis()).to_world(mi.Vector3f(c, s, 0) * dr.safe_sqrt(1 - z * z) + mi.Vector3f(0, 0, 1) * z)
-        return self.chip(part, one) + dr.zeros(mi.Point3f, count), d, 2 * dr.pi / (part.mu + 1) + dr.zeros(mi.Float, count), dr.full(mi.Float, 1.0, count)
+        return (
+            self.chip(part, one) + dr.zeros(mi.Point3f, count),
+            d,
+            2 * dr.pi / (part.mu + 1) + dr.zeros(mi.Float, count),
+            dr.full(mi.Float, 1.0, count),
+        )
 
     def _shine(self, packets: int, wanted: int, done: int) -> None:
         """Packets of all lights, into the maps."""
@@ -542,7 +635,9 @@ class Run:
         p, d, power, weight = self._emitted(0, drawn)
         for k in range(1, lights):
             own = light == k
-            p, d, power, weight = (dr.select(own, new, old) for new, old in zip(self._emitted(k, drawn), (p, d, power, weight)))
+            p, d, power, weight = (
+                dr.select(own, new, old) for new, old in zip(self._emitted(k, drawn), (p, d, power, weight))
+            )
         share = power / wanted
 
         def leave(where, size, place, worth, tau, ways, s, active):
@@ -565,25 +660,49 @@ class Run:
         def at(s, si, k, hit):
             if self.of.texels:
                 # what comes straight from a light, the camera's rays find by themselves
-                matt = hit & (dr.gather(mi.Int32, self.matt, k) > 0) & (mi.Frame3f.cos_theta(si.wi) > 0) & (s["depth"] > 0)
+                matt = (
+                    hit & (dr.gather(mi.Int32, self.matt, k) > 0) & (mi.Frame3f.cos_theta(si.wi) > 0) & (s["depth"] > 0)
+                )
                 area = dr.select(matt, dr.norm(dr.cross(si.dp_du, si.dp_dv)) / TEXELS**2, 1.0)
-                leave(self.irradiance, self.of.texels, self.texel(si, k, matt), s["v"][0] * dr.gather(mi.Float, shares, s["light"]) / area,
-                      s["tau"], s["ways"], s, matt)
+                leave(
+                    self.irradiance,
+                    self.of.texels,
+                    self.texel(si, k, matt),
+                    s["v"][0] * dr.gather(mi.Float, shares, s["light"]) / area,
+                    s["tau"],
+                    s["ways"],
+                    s,
+                    matt,
+                )
             return mi.Bool(False)
 
         # the power of a light is the same for all of its packets
         shares = dr.gather(mi.Float, share, dr.arange(mi.UInt32, lights) * (BATCHES * packets))
         dr.eval(p, d, shares, weight, rng)
         tau = [dr.gather(mi.Float, level, light) for level in self.level]
-        self.fly({"p": p, "d": d, "x": mi.Frame3f(d).s, "tau": tau, "rng": rng, "light": light, "batch": batch, "weight": weight},
-                 True, True, along, at)
+        self.fly(
+            {
+                "p": p,
+                "d": d,
+                "x": mi.Frame3f(d).s,
+                "tau": tau,
+                "rng": rng,
+                "light": light,
+                "batch": batch,
+                "weight": weight,
+            },
+            True,
+            True,
+            along,
+            at,
+        )
         dr.eval(self.fluence, self.irradiance)
 
     # -- from the camera ---------------------------------------------------------------------------------------------
 
     def straight(self, light: int, si, sample, active):
-        """Irradiance that a light at power 1 sends to a surface with nothing in between, from the point of it that a sample names: a
-        panel's is cos_s Omega (of its solid angle), an LED's cos_l^mu cos_s/r^2."""
+        """Irradiance that a light at power 1 sends to a surface with nothing in between, from the point of it that a
+        sample names: a panel's is cos_s Omega (of its solid angle), an LED's cos_l^mu cos_s/r^2."""
         import drjit as dr
 
         name = self.of.lights[light]
@@ -612,7 +731,15 @@ class Run:
         rng = self.random(number, 0, done)
         p, d = camera.ray(mi.Float(pixel % width) + rng.next_float32(), mi.Float(pixel // width) + rng.next_float32())
         x = dr.normalize(dr.cross(d, camera.turned(mi.Vector3f(0, -1, 0))))
-        return {"p": p, "d": d, "x": x, "tau": [mi.Float(1.0) for _ in self.group], "rng": rng, "pixel": pixel, "batch": batch}
+        return {
+            "p": p,
+            "d": d,
+            "x": x,
+            "tau": [mi.Float(1.0) for _ in self.group],
+            "rng": rng,
+            "pixel": pixel,
+            "batch": batch,
+        }
 
     def lengths(self, rays: int) -> np.ndarray:
         """(cells, H, W): length in each cell of the camera's rays, so many per pixel, by their weight."""
@@ -653,7 +780,10 @@ class Run:
         def read(where, size, place, worth, tau, ways, s, active):
             for row, (_, band) in enumerate(self.rows):
                 own = worth * tau[self.group.index(band)]
-                held = [dr.gather(mi.Float, where, self.place(s, row, kind, size) + place, active) for kind in range(self.kinds)]
+                held = [
+                    dr.gather(mi.Float, where, self.place(s, row, kind, size) + place, active)
+                    for kind in range(self.kinds)
+                ]
                 see(s, row, 0, own * held[0], active)
                 for kind in range(1, self.kinds):
                     see(s, row, kind, own * (held[kind] - ways[kind - 1] * held[0]), active)
@@ -663,8 +793,16 @@ class Run:
             if self.maps and self.of.voxels:
                 active = hit & (sigma > 0)
                 u = s["rng"].next_float32() * length
-                read(self.fluence, self.of.voxels, self.voxel(s["cell"], s["p"] + u * s["d"], active),
-                     s["v"][0] * length * sigma / (4 * dr.pi), self.faded(s, u, sigma), self.ways(s, u), s, active)
+                read(
+                    self.fluence,
+                    self.of.voxels,
+                    self.voxel(s["cell"], s["p"] + u * s["d"], active),
+                    s["v"][0] * length * sigma / (4 * dr.pi),
+                    self.faded(s, u, sigma),
+                    self.ways(s, u),
+                    s,
+                    active,
+                )
 
         def at(s, si, k, hit):
             facing = hit & (mi.Frame3f.cos_theta(si.wi) > 0)
@@ -685,28 +823,37 @@ class Run:
         import mitsuba as mi
 
         matt = s["ended"]
-        si = self.scene.mitsuba.ray_intersect(mi.Ray3f(s["p"], s["d"], mi.Float(0), self.wavelengths), mi.RayFlags.All, False, matt)
+        si = self.scene.mitsuba.ray_intersect(
+            mi.Ray3f(s["p"], s["d"], mi.Float(0), self.wavelengths), mi.RayFlags.All, False, matt
+        )
         matt &= si.is_valid()
         k, rng = self.number(si), s["rng"]
-        reflectance = mi.unpolarized_spectrum(si.bsdf().eval(mi.BSDFContext(), si, mi.Vector3f(0, 0, 1), matt))  # rho/pi
+        reflectance = mi.unpolarized_spectrum(
+            si.bsdf().eval(mi.BSDFContext(), si, mi.Vector3f(0, 0, 1), matt)
+        )  # rho/pi
         tau = [t * reflectance[b] for b, t in zip(self.group, s["tau"])]
         shift = [rng.next_float32() - 0.5 for _ in range(2)]  # in the mean, the map is read linearly between its texels
         read(self.irradiance, self.of.texels, self.texel(si, k, matt, shift), s["v"][0], tau, s["ways"], s, matt)
         in_air = matt & (s["medium"] == 0)
         x, y = rng.next_float32(), rng.next_float32()
         points = [mi.Point2f((i + x) / POINTS, (j + y) / POINTS) for i in range(POINTS) for j in range(POINTS)]
-        straight = [sum(self.straight(light, si, point, in_air) for point in points) / len(points) for light in range(len(self.of.lights))]
+        straight = [
+            sum(self.straight(light, si, point, in_air) for point in points) / len(points)
+            for light in range(len(self.of.lights))
+        ]
         for row, (light, band) in enumerate(self.rows):
             value = s["v"][0] * tau[self.group.index(band)] * straight[light] * float(self.levels[light, band])
             see_light(s, row, value, in_air)
 
 
-# -- what a scene is made of --------------------------------------------------------------------------------------------
+# -- what a scene is made of
+# --------------------------------------------------------------------------------------------
 
 
 class Surface:
-    """A shape as rays know it: `outside`, `inside` numbers of the materials that it parts (-1: it is no face of a clear body),
-    `light` the name of the source that it is, `matt` whether it keeps a map of its irradiance, `cells` of a grid."""
+    """A shape as rays know it: `outside`, `inside` numbers of the materials that it parts (-1: it is no face of a
+    dielectric body), `light` the name of the source that it is, `matt` whether it keeps a map of its irradiance,
+    `cells` of a grid."""
 
     def __init__(self, scene, shape, known: Sequence[Material]):
         import mitsuba as mi
@@ -721,12 +868,20 @@ class Surface:
         diffuse = bsdf is not None and not clear and mi.has_flag(bsdf.flags(), mi.BSDFFlags.DiffuseReflection)
         self.matt = diffuse and not self.light
         if self.matt and shape.is_mesh() and not shape.has_vertex_texcoords():
-            raise BadScene(f"{scene.path}: '{shape.id()}' is matt, and no map of its light can be kept on a mesh without texture coordinates; "
-                           "allowed among clear bodies: rectangles, cubes, spheres, meshes with coordinates")
-        if not (clear or diffuse or self.light) or mi.has_flag(bsdf.flags(), mi.BSDFFlags.Glossy) or not clear and mi.has_flag(
-                bsdf.flags(), mi.BSDFFlags.Delta | mi.BSDFFlags.Null):
-            raise BadScene(f"{scene.path}: the surface '{shape.id()}' is neither clear nor matt; allowed among clear bodies: materials of the type "
-                           "'clear', and matt ones (diffuse, membrane)")
+            raise BadScene(
+                f"{scene.path}: '{shape.id()}' is matt, and no map of its light can be kept on a mesh without texture coordinates; "
+                "allowed among dielectric bodies: rectangles, cubes, spheres, meshes with coordinates"
+            )
+        if (
+            not (clear or diffuse or self.light)
+            or mi.has_flag(bsdf.flags(), mi.BSDFFlags.Glossy)
+            or not clear
+            and mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta | mi.BSDFFlags.Null)
+        ):
+            raise BadScene(
+                f"{scene.path}: the surface '{shape.id()}' is neither clear nor matt; allowed among dielectric bodies: materials of the type "
+                "'clear', and matt ones (diffuse, membrane)"
+            )
         self.rectangle = Rectangle.of(shape) if self.light else None
         self.cells = shape.cells(SPLIT) if getattr(shape, "kind", "") == "cells" else None
 
@@ -737,14 +892,22 @@ def materials(scene, bands: np.ndarray) -> list[Material]:
     for name, part in scene.parts.items():
         if part.kind == "clear":
             own = part_values(scene, name, values, {})
-            found.append(Material(name, coefficient(own, "index", bands), coefficient(own, "absorption", bands),
-                                  np.full(len(bands), own.scattering), own.roughness, own.birefringence))
+            found.append(
+                Material(
+                    name,
+                    coefficient(own, "index", bands),
+                    coefficient(own, "absorption", bands),
+                    np.full(len(bands), own.scattering),
+                    own.roughness,
+                    own.birefringence,
+                )
+            )
     return found
 
 
 def coefficient(clear, stage: str, wavelengths, functions: Sequence[Callable] | None = None):
-    """`index` or `absorption` (1/mm) of a clear material per band, with what effects of that stage make of it (`functions`: those that
-    act; None: all); for numpy, complex numbers among them, and for Dr.Jit."""
+    """`index` or `absorption` (1/mm) of a clear material per band, with what effects of that stage make of it
+    (`functions`: those that act; None: all); for numpy, complex numbers among them, and for Dr.Jit."""
     value = getattr(clear, stage) + 0 * wavelengths
     for function in registry().functions("clear", stage) if functions is None else functions:
         value = function(value, wavelengths, clear)

@@ -1,4 +1,4 @@
-"""One self-contained HTML page from a study: pictures first, then the numbers behind them.
+"""One self-contained HTML page from a study: images first, then the numbers behind them.
 
 Everything is inside the file: images as data URIs, charts as SVG drawn here, a page of script without libraries. What a
 study lacks (a diagnosis, held-out frames, null models) is left out of the page. The layout is in `report.html.j2`.
@@ -23,12 +23,12 @@ from optics.fit.compare import UNITS, Comparison, Curve
 from optics.study.record import Fingerprint, Shown, Study
 from optics.words import some, spaced
 
-BUDGET = 4_500_000  # bytes of embedded pictures; the page stays below 6 MB
+BUDGET = 4_500_000  # bytes of embedded images; the page stays below 6 MB
 SIDE_MAX = 512  # px; larger frames are binned for display
 SIDE_MIN = 8  # px; smaller frames are readings, shown as points over the settings
 FRAMES_MIN = 4  # frames that stay when the budget is short; below that, pixels are binned
 SIGMA_RANGE = 5.0  # the residual colour bar is symmetric, +- this
-CODES_PER_SIGMA = 4  # residual pictures carry quarters of a sigma, so that the page can colour and read them
+CODES_PER_SIGMA = 4  # residual images carry quarters of a sigma, so that the page can colour and read them
 FINGERPRINTS_SHOWN = 4
 FINGERPRINT_SIDE = 128  # px
 FEW = 8  # values of a setting that colours or panels can tell apart
@@ -43,7 +43,7 @@ MOVED_SHOWN = 3.0  # standard deviations; beyond, a parameter's move is marked
 DIVERGING = ("#08306b", "#1d5fa6", "#6aa5d8", "#bcd6ea", "#f5f3ef", "#f3c3a8", "#dd7c5c", "#b22f33", "#650a1c")
 SEQUENTIAL = ("#f5f3ef", "#e6d9c0", "#d9b36c", "#b9762f", "#7a3d1a", "#33160b")
 MASKED = "#8a8a8a"
-NO_PICTURES = {"frames": [], "steps": [], "channels": [], "note": ""}
+NO_IMAGES = {"frames": [], "steps": [], "channels": [], "note": ""}
 FRAMES = {"frame": "frame", "frames": "frames", "data": "frames"}  # what the page calls the parts of the data
 SWEEPS = {"frame": "sweep", "frames": "sweeps", "data": "readings"}
 CHANNEL_STYLE = {"R": "red", "G": "green", "B": "blue"}
@@ -72,34 +72,54 @@ def render(study: Study) -> str:
 
     from optics.pages import residual_maps
 
-    environment = Environment(loader=FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=StrictUndefined,
-                              trim_blocks=True, lstrip_blocks=True)
-    environment.filters.update(number=number, fixed=fixed, figures=figures, measure=measure, percent=percent, pvalue=pvalue)
+    environment = Environment(
+        loader=FileSystemLoader(Path(__file__).parent),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters.update(
+        number=number, fixed=fixed, figures=figures, measure=measure, percent=percent, pvalue=pvalue
+    )
     environment.globals.update(measure=measure)
     comparisons = [study.comparison(i) for i in range(len(study.steps))]
     shown = [study.frames(i) for i in range(len(study.steps))]
     points = Readings.of(shown)
-    viewer = pictures(study, shown) if points is None else NO_PICTURES
+    viewer = pictures(study, shown) if points is None else NO_IMAGES
     nouns = FRAMES if points is None else SWEEPS
     verdicts = [verdict(told(study.diagnosis(i), points)) for i in range(len(study.steps))]
     return environment.get_template("report.html.j2").render(
-        study=study.record, steps=study.steps, headline=headline(study, verdicts, nouns), verdicts=verdicts,
-        tiles=tiles(study.steps), viewer=viewer, payload=_script(viewer), colour_bar=colour_bar(),
-        nouns=nouns, points=points, plots=reading_plots(points, study.steps, comparisons[0].channels) if points else {},
-        ladder_wide=ladder_chart(study, 920, 330, nouns), ladder_narrow=ladder_chart(study, 360, 300, nouns),
-        fingerprints=[[] if points else fingerprint_pictures(study.fingerprints(i)) for i in range(len(study.steps))],
+        study=study.record,
+        steps=study.steps,
+        headline=headline(study, verdicts, nouns),
+        verdicts=verdicts,
+        tiles=tiles(study.steps),
+        viewer=viewer,
+        payload=_script(viewer),
+        colour_bar=colour_bar(),
+        nouns=nouns,
+        points=points,
+        plots=reading_plots(points, study.steps, comparisons[0].channels) if points else {},
+        ladder_wide=ladder_chart(study, 920, 330, nouns),
+        ladder_narrow=ladder_chart(study, 360, 300, nouns),
+        fingerprints=[[] if points else fingerprint_images(study.fingerprints(i)) for i in range(len(study.steps))],
         readings=[] if viewer["frames"] or points else reading_charts(comparisons),
-        curves=residual_curves(comparisons, points), maps=map_pictures(comparisons, study.steps) if points is None else [],
+        curves=residual_curves(comparisons, points),
+        maps=map_images(comparisons, study.steps) if points is None else [],
         pages=residual_maps.pages(comparisons, shown, study.steps) if points is None else [],
         coordinates=[residual_maps.coordinates(told(study.diagnosis(i), points)) for i in range(len(study.steps))],
-        facts=facts(study.record["facts"], points), numbers=number_tables(comparisons, nouns),
+        facts=facts(study.record["facts"], points),
+        numbers=number_tables(comparisons, nouns),
         nulls=null_table(study.metrics(len(study.steps) - 1)),
         background=study.metrics(len(study.steps) - 1).get("background") or {},
-        parameters=parameter_tables(study.steps), comparisons=comparisons,
+        parameters=parameter_tables(study.steps),
+        comparisons=comparisons,
     )
 
 
 # -- words --------------------------------------------------------------------------------------------------------------
+
 
 def headline(study: Study, verdicts: list, nouns: Mapping[str, str]) -> dict:
     """One sentence with the numbers that matter, and the last verdict."""
@@ -111,27 +131,45 @@ def headline(study: Study, verdicts: list, nouns: Mapping[str, str]) -> dict:
     at_floor = last["chi2_per_dof"] <= floor * (1 + max(0.02, 4 * math.sqrt(2 / max(last["dof"], 1))))
     if added:
         fell = last["misfit"] < first["misfit"]
-        text = (f"Adding {added} {'lowers' if fell else 'does not lower'} the misfit {where} from "
-                f"{percent(first['misfit'])} to {now}.")
+        text = (
+            f"Adding {added} {'lowers' if fell else 'does not lower'} the misfit {where} from "
+            f"{percent(first['misfit'])} to {now}."
+        )
     else:
         text = f"The base model misses the measurement by {now} ({where})."
-    rest = "What is left is noise." if at_floor else (
-        f"What is left is {math.sqrt(max(last['chi2_per_dof'] / floor, 0)):.2f} times the noise.")
-    return {"text": text, "rest": rest, "verdict": verdicts[-1], "title": study.record["title"] or study.record["scene"]}
+    rest = (
+        "What is left is noise."
+        if at_floor
+        else (f"What is left is {math.sqrt(max(last['chi2_per_dof'] / floor, 0)):.2f} times the noise.")
+    )
+    return {
+        "text": text,
+        "rest": rest,
+        "verdict": verdicts[-1],
+        "title": study.record["title"] or study.record["scene"],
+    }
 
 
 def tiles(steps: Sequence[Mapping]) -> list[dict]:
     """Before and after, of the numbers that people compare."""
     first, last = _level(steps[0]), _level(steps[-1])
     which = "held out" if steps[-1]["held_out"] else "fitted"
-    rows = (("chi2_per_dof", "χ²/dof", "{:#.3g}"), ("l1", "L1 of full scale", "{:.4f}"), ("psnr", "PSNR, dB", "{:.1f}"),
-            ("ssim", "SSIM", "{:.4f}"))
-    return [{"label": f"{label}, {which}", "before": _text(first[key], form), "after": _text(last[key], form)}
-            for key, label, form in rows if math.isfinite(last[key])]
+    rows = (
+        ("chi2_per_dof", "χ²/dof", "{:#.3g}"),
+        ("l1", "L1 of full scale", "{:.4f}"),
+        ("psnr", "PSNR, dB", "{:.1f}"),
+        ("ssim", "SSIM", "{:.4f}"),
+    )
+    return [
+        {"label": f"{label}, {which}", "before": _text(first[key], form), "after": _text(last[key], form)}
+        for key, label, form in rows
+        if math.isfinite(last[key])
+    ]
 
 
 def facts(record: Mapping, points: Readings | None = None) -> dict[str, list[tuple[str, str]]]:
     """What a study notes about its data, as text: plain values to list, and tables of settings to fold away."""
+
     def text(key: str, value) -> str:
         if isinstance(value, float):
             return percent(value) if key == "masked" else number(value, 4)
@@ -141,10 +179,22 @@ def facts(record: Mapping, points: Readings | None = None) -> dict[str, list[tup
 
     plain = [(k.replace("_", " "), text(k, v)) for k, v in record.items() if not isinstance(v, Mapping)]
     if points is not None:
-        plain = [("readings", f"{len(points.measured)} in {points.sweeps} sweeps"), ("channels", str(points.measured.shape[1])),
-                 *((f"{k} sweeps" if k in ("fitted", "held out") else k, v) for k, v in plain if k not in ("frames", "image"))]
-    folded = [(k.replace("_", " "), text(k, v)) for table in record.values() if isinstance(table, Mapping)
-              for k, v in table.items() if v not in (None, "", [], {})]
+        plain = [
+            ("readings", f"{len(points.measured)} in {points.sweeps} sweeps"),
+            ("channels", str(points.measured.shape[1])),
+            *(
+                (f"{k} sweeps" if k in ("fitted", "held out") else k, v)
+                for k, v in plain
+                if k not in ("frames", "image")
+            ),
+        ]
+    folded = [
+        (k.replace("_", " "), text(k, v))
+        for table in record.values()
+        if isinstance(table, Mapping)
+        for k, v in table.items()
+        if v not in (None, "", [], {})
+    ]
     return {"plain": plain, "folded": folded}
 
 
@@ -155,11 +205,28 @@ def null_table(metrics: Mapping) -> dict:
     from optics.fit import null_models as nulls
 
     table = nulls.NullTable.from_json(metrics["nulls"])
-    tables = [{"title": f"{split}, {len(names)} frames", "rows": [
-        {"name": "this model" if s.model == nulls.PHYSICAL else s.model, "own": s.model == nulls.PHYSICAL,
-         "errors": [*s.rms_near, *s.rms_whole]} for s in table.scores if s.split == split]}
-        for split, names in (("held out", table.held_out), ("fitted", table.fitted))]
-    return {"tables": tables, "noise": table.noise, "channels": table.channels, "near": f"{nulls.NEAR:g}", "won": table.won}
+    tables = [
+        {
+            "title": f"{split}, {len(names)} frames",
+            "rows": [
+                {
+                    "name": "this model" if s.model == nulls.PHYSICAL else s.model,
+                    "own": s.model == nulls.PHYSICAL,
+                    "errors": [*s.rms_near, *s.rms_whole],
+                }
+                for s in table.scores
+                if s.split == split
+            ],
+        }
+        for split, names in (("held out", table.held_out), ("fitted", table.fitted))
+    ]
+    return {
+        "tables": tables,
+        "noise": table.noise,
+        "channels": table.channels,
+        "near": f"{nulls.NEAR:g}",
+        "won": table.won,
+    }
 
 
 def _level(step: Mapping) -> dict:
@@ -226,7 +293,8 @@ def pvalue(value) -> str:
     return "< 10⁻⁹" if value < 1e-9 else number(value, 2)
 
 
-# -- pictures -----------------------------------------------------------------------------------------------------------
+# -- images -----------------------------------------------------------------------------------------------------------
+
 
 def pictures(study: Study, steps: list[list[Shown]]) -> dict:
     """What the viewer shows: measured once per frame, predicted and residual per frame and step.
@@ -235,11 +303,11 @@ def pictures(study: Study, steps: list[list[Shown]]) -> dict:
     """
     names = [n for n in study.record["shown"] if all(any(f.name == n for f in frames) for frames in steps)]
     if not names or max(steps[0][0].measured.shape[:2]) < SIDE_MIN:
-        return NO_PICTURES
+        return NO_IMAGES
     table = [{f.name: f for f in frames} for frames in steps]
     held = next((n for n in names if table[0][n].held_out), None)
     if held in names[FRAMES_MIN:]:  # stays when frames are left out
-        names = [*(rest := [n for n in names if n != held])[:FRAMES_MIN - 1], held, *rest[FRAMES_MIN - 1:]]
+        names = [*(rest := [n for n in names if n != held])[: FRAMES_MIN - 1], held, *rest[FRAMES_MIN - 1 :]]
     rows = [{r.scope["frame"]: r for r in study.comparison(i).by("frame")} for i in range(len(table))]
     bins = max(math.ceil(max(table[0][n].measured.shape[:2]) / SIDE_MAX) for n in names)
     while True:
@@ -257,12 +325,17 @@ def pictures(study: Study, steps: list[list[Shown]]) -> dict:
     if len(bundles) < len(names):
         notes.append(f"{len(names) - len(bundles)} of {len(names)} recorded frames are left out to keep the page small")
     if bins > 1:
-        notes.append(f"shown in blocks of {bins}×{bins} pixels; residuals are summed over a block and divided by the root "
-                     "of its pixel count, so that noise keeps a standard deviation of 1")
+        notes.append(
+            f"shown in blocks of {bins}×{bins} pixels; residuals are summed over a block and divided by the root "
+            "of its pixel count, so that noise keeps a standard deviation of 1"
+        )
     count = table[0][names[0]].measured.shape[2]
     return {
-        "frames": [b["frame"] for b in bundles], "channels": {1: ["L"], 3: ["R", "G", "B"]}.get(count, ["all"]),
-        "steps": [{"name": step["name"], "frames": [b["steps"][i] for b in bundles]} for i, step in enumerate(study.steps)],
+        "frames": [b["frame"] for b in bundles],
+        "channels": {1: ["L"], 3: ["R", "G", "B"]}.get(count, ["all"]),
+        "steps": [
+            {"name": step["name"], "frames": [b["steps"][i] for b in bundles]} for i, step in enumerate(study.steps)
+        ],
         "note": "; ".join(notes),
     }
 
@@ -271,14 +344,27 @@ def _encode(name: str, table: list[dict[str, Shown]], rows: list[dict], bins: in
     """One frame: what was measured, and what each step predicts and leaves over, as data URIs."""
     f = table[0][name]
     y, white = _block(f.measured, bins), _white(f)
-    frame = {"name": name, "led": f.led, "group": f.group, "heldOut": f.held_out, "height": y.shape[0], "width": y.shape[1],
-             "white": white, "measured": webp(_eight_bit(y, white)), "grey": y.shape[2] not in (1, 3)}
+    frame = {
+        "name": name,
+        "led": f.led,
+        "group": f.group,
+        "heldOut": f.held_out,
+        "height": y.shape[0],
+        "width": y.shape[1],
+        "white": white,
+        "measured": webp(_eight_bit(y, white)),
+        "grey": y.shape[2] not in (1, 3),
+    }
     steps = []
     for shown, row in zip(table, rows):
         f = shown[name]
-        steps.append({"predicted": webp(_eight_bit(_block(f.predicted, bins), white)),
-                      "residual": webp(codes(_planes(_block_sigma(f.residual, bins)))),
-                      "chi2": figures(row[name].chi2_per_dof, 3) if name in row else "–"})
+        steps.append(
+            {
+                "predicted": webp(_eight_bit(_block(f.predicted, bins), white)),
+                "residual": webp(codes(_planes(_block_sigma(f.residual, bins)))),
+                "chi2": figures(row[name].chi2_per_dof, 3) if name in row else "–",
+            }
+        )
     size = len(frame["measured"]) + sum(len(s["predicted"]) + len(s["residual"]) for s in steps)
     return {"frame": frame, "steps": steps, "bytes": size}
 
@@ -301,14 +387,17 @@ def _planes(z: np.ndarray) -> np.ndarray:
 
 
 def combined(z: np.ndarray) -> np.ndarray:
-    """Sum over channels / sqrt(number of usable channels): noise keeps a standard deviation of 1. (H, W), NaN if none."""
+    """Sum over channels / sqrt(number of usable channels): noise keeps a standard deviation of 1. (H, W), NaN if
+    none."""
     n = np.isfinite(z).sum(2)
     return np.where(n > 0, np.nansum(z, 2) / np.sqrt(np.maximum(n, 1)), np.nan)
 
 
 def codes(z: np.ndarray) -> np.ndarray:
     """Residuals in sigmas as bytes: 128 + 4 z, clipped to 1..255; 0 is masked."""
-    return np.where(np.isfinite(z), np.clip(np.round(np.nan_to_num(z) * CODES_PER_SIGMA) + 128, 1, 255), 0).astype(np.uint8)
+    return np.where(np.isfinite(z), np.clip(np.round(np.nan_to_num(z) * CODES_PER_SIGMA) + 128, 1, 255), 0).astype(
+        np.uint8
+    )
 
 
 def _blocks(image: np.ndarray, bins: int) -> np.ndarray:
@@ -331,7 +420,7 @@ def _block_sigma(z: np.ndarray, bins: int) -> np.ndarray:
 
 
 def webp(image: np.ndarray) -> str:
-    """Lossless picture as a data URI. image: (H, W, 1 or 3) uint8."""
+    """Lossless image as a data URI. image: (H, W, 1 or 3) uint8."""
     from PIL import Image
 
     picture = Image.fromarray(image[..., 0] if image.shape[2] == 1 else image).convert("RGB")
@@ -346,30 +435,32 @@ def coloured(plane: np.ndarray, low: float, high: float, colours: Sequence[str])
 
     levels = 41
     index = np.clip(np.round((np.nan_to_num(plane) - low) / (high - low) * (levels - 1)), 0, levels - 1)
-    picture = Image.fromarray(np.where(np.isfinite(plane), index, levels).astype(np.uint8))
-    picture.putpalette([v for colour in (*ramp(colours, levels), _rgb(MASKED)) for v in colour])
+    image = Image.fromarray(np.where(np.isfinite(plane), index, levels).astype(np.uint8))
+    image.putpalette([v for colour in (*ramp(colours, levels), _rgb(MASKED)) for v in colour])
     out = io.BytesIO()
-    picture.save(out, "PNG", optimize=True)
+    image.save(out, "PNG", optimize=True)
     return "data:image/png;base64," + base64.b64encode(out.getvalue()).decode()
 
 
 def _rgb(colour: str) -> tuple[int, int, int]:
-    return tuple(int(colour[i:i + 2], 16) for i in (1, 3, 5))
+    return tuple(int(colour[i : i + 2], 16) for i in (1, 3, 5))
 
 
 def ramp(colours: Sequence[str], count: int) -> list[tuple[int, int, int]]:
     """`count` colours between equally spaced ones."""
     anchors = np.array([_rgb(c) for c in colours], float)
     at = np.linspace(0, len(colours) - 1, count)
-    return [tuple(int(round(v)) for v in c)
-            for c in np.stack([np.interp(at, np.arange(len(colours)), anchors[:, k]) for k in range(3)], 1)]
+    return [
+        tuple(int(round(v)) for v in c)
+        for c in np.stack([np.interp(at, np.arange(len(colours)), anchors[:, k]) for k in range(3)], 1)
+    ]
 
 
 def colour_bar() -> str:
     return "linear-gradient(to right," + ",".join(DIVERGING) + ")"
 
 
-def fingerprint_pictures(fingerprints: Sequence[Fingerprint]) -> list[dict]:
+def fingerprint_images(fingerprints: Sequence[Fingerprint]) -> list[dict]:
     """Per effect: what it would add, beside the residual that it is to explain, on one scale."""
     out = []
     for f in fingerprints[:FINGERPRINTS_SHOWN]:
@@ -380,13 +471,23 @@ def fingerprint_pictures(fingerprints: Sequence[Fingerprint]) -> list[dict]:
         top = float(np.nanpercentile(np.abs(image), 99.5)) if np.isfinite(image).any() else 0.0
         noise = 1 / bins
         scale = _round_up(max(top, 2 * noise))
-        out.append({"effect": f.effect, "key": _key(f.effect), "frame": f.frame, "strength": f.strength, "scale": number(scale),
-                    "image": coloured(image, -scale, scale, DIVERGING), "width": image.shape[1], "height": image.shape[0],
-                    "residual": coloured(residual, -scale, scale, DIVERGING)})
+        out.append(
+            {
+                "effect": f.effect,
+                "key": _key(f.effect),
+                "frame": f.frame,
+                "strength": f.strength,
+                "scale": number(scale),
+                "image": coloured(image, -scale, scale, DIVERGING),
+                "width": image.shape[1],
+                "height": image.shape[0],
+                "residual": coloured(residual, -scale, scale, DIVERGING),
+            }
+        )
     return out
 
 
-def map_pictures(comparisons: list[Comparison], steps: Sequence[Mapping]) -> list[dict]:
+def map_images(comparisons: list[Comparison], steps: Sequence[Mapping]) -> list[dict]:
     """Of the first and the last step: mean residual over all frames, and its root mean square, per pixel."""
     out = []
     for i in dict.fromkeys((0, len(comparisons) - 1)):
@@ -399,8 +500,15 @@ def map_pictures(comparisons: list[Comparison], steps: Sequence[Mapping]) -> lis
         count = np.isfinite(square).sum(2)
         rms = np.sqrt(np.where(count > 0, np.nansum(square, 2) / np.maximum(count, 1), np.nan))
         rms = _block_sigma(rms[..., None], bins)[..., 0] / bins
-        out.append({"step": step_name(steps[i]), "mean": coloured(mean, -SIGMA_RANGE, SIGMA_RANGE, DIVERGING),
-                    "rms": coloured(rms, 0, SIGMA_RANGE, SEQUENTIAL), "width": mean.shape[1], "height": mean.shape[0]})
+        out.append(
+            {
+                "step": step_name(steps[i]),
+                "mean": coloured(mean, -SIGMA_RANGE, SIGMA_RANGE, DIVERGING),
+                "rms": coloured(rms, 0, SIGMA_RANGE, SEQUENTIAL),
+                "width": mean.shape[1],
+                "height": mean.shape[0],
+            }
+        )
     return out
 
 
@@ -411,15 +519,24 @@ def _round_up(value: float) -> float:
 
 def _script(viewer: dict) -> str:
     """The viewer's data for a script element; '<' is written so that no text can end the element."""
-    data = {**viewer, "ramp": ramp(DIVERGING, 81), "masked": _rgb(MASKED), "range": SIGMA_RANGE, "perSigma": CODES_PER_SIGMA}
+    data = {
+        **viewer,
+        "ramp": ramp(DIVERGING, 81),
+        "masked": _rgb(MASKED),
+        "range": SIGMA_RANGE,
+        "perSigma": CODES_PER_SIGMA,
+    }
     return json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")
 
 
-# -- readings -----------------------------------------------------------------------------------------------------------
+# -- readings
+# -----------------------------------------------------------------------------------------------------------
+
 
 @dataclass(frozen=True)
 class Readings:
-    """All point readings of a study: (M,) settings by key, (M, C) DN measured, and of each step (M, C) predicted and residual.
+    """All point readings of a study: (M,) settings by key, (M, C) DN measured, and of each step (M, C) predicted and
+    residual.
 
     residual  measured minus predicted in sigmas, NaN where not usable
     """
@@ -434,10 +551,15 @@ class Readings:
 
     @classmethod
     def of(cls, steps: Sequence[Sequence[Shown]]) -> Readings | None:
-        """The readings of a study's frames, step by step; None where they are pictures or single readings without settings."""
+        """The readings of a study's frames, step by step; None where they are images or single readings without
+        settings."""
         shown = steps[0]
         names = [f.name for f in shown]
-        if not shown or not all(f.settings or _column(f) for f in shown) or any([f.name for f in s] != names for s in steps):
+        if (
+            not shown
+            or not all(f.settings or _column(f) for f in shown)
+            or any([f.name for f in s] != names for s in steps)
+        ):
             return None
         own = [f.settings or {PLACE: np.arange(len(f.measured))} for f in shown]
         settings = {k: np.concatenate([o[k] for o in own]) for k in own[0] if all(k in o for o in own)}
@@ -446,9 +568,15 @@ class Readings:
         def joined(values) -> np.ndarray:
             return np.concatenate([np.reshape(v, (len(v), -1)) for v in values])
 
-        return cls(settings, shown[0].units, np.concatenate([np.full(len(f.measured), f.held_out) for f in shown]),
-                   joined(f.measured for f in shown), [joined(f.predicted for f in s) for s in steps],
-                   [joined(f.residual for f in s) for s in steps], len(shown))
+        return cls(
+            settings,
+            shown[0].units,
+            np.concatenate([np.full(len(f.measured), f.held_out) for f in shown]),
+            joined(f.measured for f in shown),
+            [joined(f.predicted for f in s) for s in steps],
+            [joined(f.residual for f in s) for s in steps],
+            len(shown),
+        )
 
     def folds(self) -> tuple[str, list[str], list[str]]:
         """The setting to draw along, the one told apart by colour (or none), and those told apart by panels.
@@ -510,17 +638,42 @@ def reading_plots(r: Readings, steps: Sequence[Mapping], channels: Sequence[str]
         for c in range(r.measured.shape[1]):
             z = r.residual[i][:, c]
             beyond = float(np.mean(np.abs(z[np.isfinite(z)]) > 3)) if np.isfinite(z).any() else math.nan
-            out.append({"step": i, "channel": c, "beyond": percent(beyond, 2), "panels": [
-                reading_panel(r, i, c, along, axis, (panel == p) & drawn, panel == p, hue, line, scales, title)
-                for p, title in enumerate(titles)]})
-    return {"plots": out, "channels": list(channels), "along": _spoken(along), "hues": hues,
-            "panels": len(titles), "merged": [k for k in lines if k not in (*colour, *panel_keys)
-                                              and len(np.unique(r.settings[k])) > 1],
-            "note": f"one reading in {stride} is drawn" if stride > 1 else ""}
+            out.append(
+                {
+                    "step": i,
+                    "channel": c,
+                    "beyond": percent(beyond, 2),
+                    "panels": [
+                        reading_panel(r, i, c, along, axis, (panel == p) & drawn, panel == p, hue, line, scales, title)
+                        for p, title in enumerate(titles)
+                    ],
+                }
+            )
+    return {
+        "plots": out,
+        "channels": list(channels),
+        "along": _spoken(along),
+        "hues": hues,
+        "panels": len(titles),
+        "merged": [k for k in lines if k not in (*colour, *panel_keys) and len(np.unique(r.settings[k])) > 1],
+        "note": f"one reading in {stride} is drawn" if stride > 1 else "",
+    }
 
 
-def reading_panel(r: Readings, step: int, channel: int, along: str, axis: str, drawn: np.ndarray, mine: np.ndarray,
-                  hue: np.ndarray, line: np.ndarray, scales: tuple, title: str, width: int = 460) -> str:
+def reading_panel(
+    r: Readings,
+    step: int,
+    channel: int,
+    along: str,
+    axis: str,
+    drawn: np.ndarray,
+    mine: np.ndarray,
+    hue: np.ndarray,
+    line: np.ndarray,
+    scales: tuple,
+    title: str,
+    width: int = 460,
+) -> str:
     """SVG: readings as points (held out: rings) on the predicted curves, and below them the residual in sigmas.
 
     The residual's axis is linear to about 3 sigmas and logarithmic beyond where some step leaves more than 15.
@@ -541,23 +694,37 @@ def reading_panel(r: Readings, step: int, channel: int, along: str, axis: str, d
     z_at = _scale(-reach, reach, bottom, split)
 
     def grid(at: float, text: str, style: str = "grid") -> str:
-        return (f'<line class="{style}" x1="{left}" x2="{width - right}" y1="{at:.1f}" y2="{at:.1f}"/>'
-                f'<text class="tick" x="{left - 6}" y="{at + 4:.1f}" text-anchor="end">{text}</text>')
+        return (
+            f'<line class="{style}" x1="{left}" x2="{width - right}" y1="{at:.1f}" y2="{at:.1f}"/>'
+            f'<text class="tick" x="{left - 6}" y="{at + 4:.1f}" text-anchor="end">{text}</text>'
+        )
 
     parts = [f'<text class="title" x="{left}" y="14">{_escape(title)}</text>'] if title else []
     parts += [grid(y(t), number(t, 4)) for t in _ticks(y_low, y_high, 4)]
     for sigmas in (3, 1):
-        parts.append(f'<rect class="sigmas" x="{left}" width="{width - left - right}" y="{z(sigmas):.1f}" '
-                     f'height="{z(-sigmas) - z(sigmas):.1f}"/>')
-    marks = [t for t in (3, 10, 30, 100, 300, 1000, 3000, 10000) if t <= z_top] if bent else [3, *([10] if z_top > 10 else [])]
+        parts.append(
+            f'<rect class="sigmas" x="{left}" width="{width - left - right}" y="{z(sigmas):.1f}" '
+            f'height="{z(-sigmas) - z(sigmas):.1f}"/>'
+        )
+    marks = (
+        [t for t in (3, 10, 30, 100, 300, 1000, 3000, 10000) if t <= z_top]
+        if bent
+        else [3, *([10] if z_top > 10 else [])]
+    )
     parts += [grid(float(z(s * t)), ("+" if s > 0 else "−") + number(t, 5)) for t in marks for s in (1, -1)]
     parts.append(grid(float(z(0)), "0 σ", "zero"))
-    parts += [f'<text class="tick" x="{x(t):.1f}" y="{bottom + 16}" text-anchor="middle">{number(t, 4)}</text>'
-              for t in _angles(x_low, x_high, r.units.get(along, ""))]
-    parts.append(f'<text class="axis" x="{(left + width - right) / 2:.0f}" y="{floor - 6}" text-anchor="middle">'
-                 f'{_escape(axis)}</text>')
-    at, predicted, measured, sigma = (v[..., channel] if v.ndim > 1 else v for v in (
-        r.settings[along], r.predicted[step], r.measured, r.residual[step]))
+    parts += [
+        f'<text class="tick" x="{x(t):.1f}" y="{bottom + 16}" text-anchor="middle">{number(t, 4)}</text>'
+        for t in _angles(x_low, x_high, r.units.get(along, ""))
+    ]
+    parts.append(
+        f'<text class="axis" x="{(left + width - right) / 2:.0f}" y="{floor - 6}" text-anchor="middle">'
+        f"{_escape(axis)}</text>"
+    )
+    at, predicted, measured, sigma = (
+        v[..., channel] if v.ndim > 1 else v
+        for v in (r.settings[along], r.predicted[step], r.measured, r.residual[step])
+    )
     for h in np.unique(hue[mine]):
         own = mine & (hue == h)
         parts.append(_predictions(at[own], predicted[own], line[own], x, y, f"k{h}", 0.05 * (y_high - y_low)))
@@ -569,11 +736,18 @@ def reading_panel(r: Readings, step: int, channel: int, along: str, axis: str, d
             for held in (False, True):
                 own = good & (hue == h) & (r.held_out == held)
                 where = x(at[own]), scale(values[own])
-                parts.append(_dots(f"mark k{h}{' held' if held else ''}", *where) + (_dots("hole", *where) if held else ""))
+                parts.append(
+                    _dots(f"mark k{h}{' held' if held else ''}", *where) + (_dots("hole", *where) if held else "")
+                )
     used = sigma[mine & np.isfinite(sigma)]
     rms = number(math.sqrt(np.mean(used**2))) if len(used) else "–"
-    return _svg(width, floor, parts, f"Readings and predictions against {along}{', ' if title else ''}{title}, residual below: "
-                                     f"{mine.sum()} readings, rms residual {rms} sigmas")
+    return _svg(
+        width,
+        floor,
+        parts,
+        f"Readings and predictions against {along}{', ' if title else ''}{title}, residual below: "
+        f"{mine.sum()} readings, rms residual {rms} sigmas",
+    )
 
 
 def _dots(style: str, xs: np.ndarray, ys: np.ndarray) -> str:
@@ -582,12 +756,15 @@ def _dots(style: str, xs: np.ndarray, ys: np.ndarray) -> str:
 
 
 def _predictions(at: np.ndarray, predicted: np.ndarray, line: np.ndarray, x, y, style: str, tolerance: float) -> str:
-    """Curves through the predictions of each line, or of all where lines are too short; a dash each where none is smooth."""
+    """Curves through the predictions of each line, or of all where lines are too short; a dash each where none is
+    smooth."""
     for group in (line, np.zeros_like(line)):
         curves = [_averaged(at[group == g], predicted[group == g]) for g in np.unique(group)]
         if all(_smooth(*curve, tolerance) for curve in curves):
             return "".join(f'<path class="curve {style}" d="{_bezier(x(a), y(b))}"/>' for a, b, _ in curves)
-    return f'<path class="curve {style}" d="{"".join(f"M{a - 4:.1f} {b:.1f}h8" for a, b in zip(x(at), y(predicted)))}"/>'
+    return (
+        f'<path class="curve {style}" d="{"".join(f"M{a - 4:.1f} {b:.1f}h8" for a, b in zip(x(at), y(predicted)))}"/>'
+    )
 
 
 def _averaged(at: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
@@ -602,16 +779,20 @@ def _smooth(at: np.ndarray, values: np.ndarray, spread: float, tolerance: float)
     if len(at) < 6 or not spread <= tolerance:
         return False
     near = (-2, -1, 1, 2)
-    a = [at[2 + j:len(at) - 2 + j] for j in near]
-    cubic = sum(values[2 + j:len(at) - 2 + j] * math.prod((at[2:-2] - a[m]) / (a[n] - a[m]) for m in range(4) if m != n)
-                for n, j in enumerate(near))
+    a = [at[2 + j : len(at) - 2 + j] for j in near]
+    cubic = sum(
+        values[2 + j : len(at) - 2 + j] * math.prod((at[2:-2] - a[m]) / (a[n] - a[m]) for m in range(4) if m != n)
+        for n, j in enumerate(near)
+    )
     return bool(np.all(np.abs(cubic - values[2:-2]) <= tolerance))
 
 
 def _bezier(x: np.ndarray, y: np.ndarray) -> str:
     """A path through the points with continuous slopes."""
     slope, third = np.gradient(y, x), np.diff(x) / 3
-    segments = np.stack([x[:-1] + third, y[:-1] + third * slope[:-1], x[1:] - third, y[1:] - third * slope[1:], x[1:], y[1:]], 1)
+    segments = np.stack(
+        [x[:-1] + third, y[:-1] + third * slope[:-1], x[1:] - third, y[1:] - third * slope[1:], x[1:], y[1:]], 1
+    )
     return f"M{x[0]:.1f} {y[0]:.1f}" + "".join("C" + " ".join(f"{v:.1f}" for v in row) for row in segments)
 
 
@@ -624,6 +805,7 @@ def _angles(low: float, high: float, unit: str) -> list[float]:
 
 
 # -- charts -------------------------------------------------------------------------------------------------------------
+
 
 def ladder_chart(study: Study, width: int, height: int, nouns: Mapping[str, str] = FRAMES) -> str:
     """SVG: chi2/dof of every step, held out and fitted, over the noise floor, on a logarithmic scale."""
@@ -638,41 +820,56 @@ def ladder_chart(study: Study, width: int, height: int, nouns: Mapping[str, str]
     parts = []
     for tick in _log_ticks(low, high):
         at = y(math.log(tick))
-        parts.append(f'<line class="grid" x1="{left}" x2="{width - right}" y1="{at:.1f}" y2="{at:.1f}"/>'
-                     f'<text class="tick" x="{left - 7}" y="{at + 4:.1f}" text-anchor="end">{number(tick)}</text>')
+        parts.append(
+            f'<line class="grid" x1="{left}" x2="{width - right}" y1="{at:.1f}" y2="{at:.1f}"/>'
+            f'<text class="tick" x="{left - 7}" y="{at + 4:.1f}" text-anchor="end">{number(tick)}</text>'
+        )
     dof = max([_value(s["held_out"] or s["fitted"], "dof") for s in steps[-1:]] + [1.0])
     spread = 2 * math.sqrt(2 / dof) if math.isfinite(dof) else 0.0
     up, down = y(min(math.log(floor * (1 + spread)), math.log(high))), y(math.log(max(floor * (1 - spread), low)))
     at = y(math.log(floor))
-    parts.append(f'<rect class="floorband" x="{left}" width="{width - left - right}" y="{up:.1f}" '
-                 f'height="{max(down - up, 0.5):.1f}"/>'
-                 f'<line class="floor" x1="{left}" x2="{width - right}" y1="{at:.1f}" y2="{at:.1f}"/>'
-                 f'<text class="floorlabel" x="{width - right}" y="{at + 15:.1f}" text-anchor="end">'
-                 f'noise floor {figures(floor, 3)}</text>')
+    parts.append(
+        f'<rect class="floorband" x="{left}" width="{width - left - right}" y="{up:.1f}" '
+        f'height="{max(down - up, 0.5):.1f}"/>'
+        f'<line class="floor" x1="{left}" x2="{width - right}" y1="{at:.1f}" y2="{at:.1f}"/>'
+        f'<text class="floorlabel" x="{width - right}" y="{at + 15:.1f}" text-anchor="end">'
+        f"noise floor {figures(floor, 3)}</text>"
+    )
     for key, line in lines:
         points = [(x(i), y(math.log(v)), v) for i, v in enumerate(line) if math.isfinite(v) and v > 0]
         if not points:
             continue
         path = " ".join(f"{px:.1f},{py:.1f}" for px, py, _ in points)
         parts.append(f'<polyline class="line {key}" points="{path}"/>')
-        parts += [f'<circle class="dot {key}" cx="{px:.1f}" cy="{py:.1f}" r="5"><title>{number(v)}</title></circle>'
-                  for px, py, v in points]
+        parts += [
+            f'<circle class="dot {key}" cx="{px:.1f}" cy="{py:.1f}" r="5"><title>{number(v)}</title></circle>'
+            for px, py, v in points
+        ]
         if key == "held_out" or not any(math.isfinite(v) for v in lines[1][1]):
-            parts += [f'<text class="value" x="{px + 9:.1f}" y="{py - 9:.1f}">{figures(v, 3)}</text>' for px, py, v in points]
+            parts += [
+                f'<text class="value" x="{px + 9:.1f}" y="{py - 9:.1f}">{figures(v, 3)}</text>' for px, py, v in points
+            ]
     slot = (width - left - right) / max(len(steps), 1)
     for i, step in enumerate(steps):
         for k, words in enumerate(_wrap(("+ " if i else "") + step["name"], max(8, int(slot / 6.6)))[:3]):
-            parts.append(f'<text class="step" x="{x(i):.1f}" y="{height - bottom + 22 + 15 * k}" text-anchor="middle">'
-                         f'{_escape(words)}</text>')
+            parts.append(
+                f'<text class="step" x="{x(i):.1f}" y="{height - bottom + 22 + 15 * k}" text-anchor="middle">'
+                f"{_escape(words)}</text>"
+            )
     parts.append(f'<text class="tick" x="{left}" y="14">χ²/dof</text>')
     legend = width - right
     for key, words, wide in (("fitted", f"fitted {nouns['data']}", 92), ("held_out", f"held-out {nouns['data']}", 122)):
         if any(math.isfinite(v) for v in dict(lines)[key]):
             legend -= wide
-            parts.append(f'<circle class="dot {key}" cx="{legend:.0f}" cy="10" r="5"/>'
-                         f'<text class="tick" x="{legend + 10:.0f}" y="14">{words}</text>')
-    said = "; ".join(f"{step_name(s)}: held out {number(_value(s['held_out'], 'chi2_per_dof'))}, "
-                     f"fitted {number(_value(s['fitted'], 'chi2_per_dof'))}" for s in steps)
+            parts.append(
+                f'<circle class="dot {key}" cx="{legend:.0f}" cy="10" r="5"/>'
+                f'<text class="tick" x="{legend + 10:.0f}" y="14">{words}</text>'
+            )
+    said = "; ".join(
+        f"{step_name(s)}: held out {number(_value(s['held_out'], 'chi2_per_dof'))}, "
+        f"fitted {number(_value(s['fitted'], 'chi2_per_dof'))}"
+        for s in steps
+    )
     return _svg(width, height, parts, f"Chi-squared per degree of freedom. {said}. Noise floor {number(floor)}.")
 
 
@@ -680,20 +877,32 @@ def residual_curves(comparisons: list[Comparison], points: Readings | None = Non
     """One small chart per coordinate: the first step's curve, in colour channels too, and the last step's."""
     first, final = comparisons[0].curves, comparisons[-1].curves
     if points is not None:
-        first, final = ([replace(c, coordinate="sweep" if c.coordinate == "frame" else c.coordinate,
-                                 unit=points.units.get(c.coordinate, c.unit)) for c in curves] for curves in (first, final))
+        first, final = (
+            [
+                replace(
+                    c,
+                    coordinate="sweep" if c.coordinate == "frame" else c.coordinate,
+                    unit=points.units.get(c.coordinate, c.unit),
+                )
+                for c in curves
+            ]
+            for curves in (first, final)
+        )
     last = {c.coordinate: c for c in final if c.channel == "all"}
     out = []
     for curve in (c for c in first if c.channel == "all"):
         channels = [c for c in first if c.coordinate == curve.coordinate and c.channel in CHANNEL_STYLE]
         after = last.get(curve.coordinate) if len(comparisons) > 1 else None
         own = [c for c in final if c.coordinate == curve.coordinate and c.channel in CHANNEL_STYLE]
-        out.append({"svg": curve_chart(curve, channels, after), "alone": curve_chart(after, own) if after is not None else ""})
+        out.append(
+            {"svg": curve_chart(curve, channels, after), "alone": curve_chart(after, own) if after is not None else ""}
+        )
     return out
 
 
-def curve_chart(curve: Curve, channels: Sequence[Curve] = (), after: Curve | None = None, width: int = 340,
-                height: int = 210) -> str:
+def curve_chart(
+    curve: Curve, channels: Sequence[Curve] = (), after: Curve | None = None, width: int = 340, height: int = 210
+) -> str:
     """SVG: mean residual in sigmas +- standard error against a coordinate."""
     left, right, top, bottom = 42, 12, 12, 38
     drawn = [c for c in (curve, after, *channels) if c is not None]
@@ -715,19 +924,25 @@ def curve_chart(curve: Curve, channels: Sequence[Curve] = (), after: Curve | Non
     parts = []
     marks = _ticks(low - pad, high + pad, 4)
     for tick in marks if len(marks) > 2 else _ticks(low - pad, high + pad, 8):
-        parts.append(f'<line class="grid" x1="{left}" x2="{width - right}" y1="{y(tick):.1f}" y2="{y(tick):.1f}"/>'
-                     f'<text class="tick" x="{left - 6}" y="{y(tick) + 4:.1f}" text-anchor="end">{number(tick)}</text>')
+        parts.append(
+            f'<line class="grid" x1="{left}" x2="{width - right}" y1="{y(tick):.1f}" y2="{y(tick):.1f}"/>'
+            f'<text class="tick" x="{left - 6}" y="{y(tick) + 4:.1f}" text-anchor="end">{number(tick)}</text>'
+        )
     parts.append(f'<line class="zero" x1="{left}" x2="{width - right}" y1="{y(0):.1f}" y2="{y(0):.1f}"/>')
     if curve.labels and len(curve.labels) <= 4:
         ticks = [(i, _escape(label)) for i, label in enumerate(curve.labels)]
     else:
         ticks = [(t, number(t, 4)) for t in _ticks(x_low, x_high, 5)]
-    parts += [f'<text class="tick" x="{x(t):.1f}" y="{height - bottom + 16}" text-anchor="middle">{label}</text>'
-              for t, label in ticks]
+    parts += [
+        f'<text class="tick" x="{x(t):.1f}" y="{height - bottom + 16}" text-anchor="middle">{label}</text>'
+        for t, label in ticks
+    ]
     unit = f", {curve.unit}" if curve.unit and curve.unit != "1" else ""
     number_of = " number" if curve.coordinate in ("frame", "sweep") else ""
-    parts.append(f'<text class="axis" x="{(left + width - right) / 2:.0f}" y="{height - 4}" text-anchor="middle">'
-                 f'{_escape(_spoken(curve.coordinate))}{number_of}{unit}</text>')
+    parts.append(
+        f'<text class="axis" x="{(left + width - right) / 2:.0f}" y="{height - 4}" text-anchor="middle">'
+        f"{_escape(_spoken(curve.coordinate))}{number_of}{unit}</text>"
+    )
     for c in channels:
         good = np.isfinite(c.centre) & np.isfinite(c.mean)
         points = " ".join(f"{x(a):.1f},{y(b):.1f}" for a, b in zip(c.centre[good], c.mean[good]))
@@ -741,11 +956,18 @@ def curve_chart(curve: Curve, channels: Sequence[Curve] = (), after: Curve | Non
         if not c.labels:
             parts.append(f'<polyline class="{style}" points="{points}"/>')
         for a, b, e in zip(c.centre[good], c.mean[good], np.nan_to_num(c.se[good])):
-            parts.append(f'<line class="bar {style}" x1="{x(a):.1f}" x2="{x(a):.1f}" y1="{y(b - e):.1f}" y2="{y(b + e):.1f}"/>'
-                         f'<circle class="point {style}" cx="{x(a):.1f}" cy="{y(b):.1f}" r="2.4"/>')
+            parts.append(
+                f'<line class="bar {style}" x1="{x(a):.1f}" x2="{x(a):.1f}" y1="{y(b - e):.1f}" y2="{y(b + e):.1f}"/>'
+                f'<circle class="point {style}" cx="{x(a):.1f}" cy="{y(b):.1f}" r="2.4"/>'
+            )
     largest = float(np.nanmax(np.abs(curve.mean))) if np.isfinite(curve.mean).any() else math.nan
-    return _svg(width, height, parts, f"Mean residual in sigmas against {curve.coordinate}; largest at first {number(largest)}"
-                + (f", at last {number(float(np.nanmax(np.abs(after.mean))))}" if after is not None else ""))
+    return _svg(
+        width,
+        height,
+        parts,
+        f"Mean residual in sigmas against {curve.coordinate}; largest at first {number(largest)}"
+        + (f", at last {number(float(np.nanmax(np.abs(after.mean))))}" if after is not None else ""),
+    )
 
 
 def _spoken(key: str) -> str:
@@ -769,7 +991,9 @@ def reading_charts(comparisons: list[Comparison]) -> list[str]:
             return Curve(key, last_unit, "all", x[order], np.array(values), np.array(se), one, one)
 
         last_unit = next((c.unit for c in last.curves if c.coordinate == key), "")
-        measured = curve([rows[i].signal + rows[i].bias for i in order], [rows[i].noise / math.sqrt(rows[i].n) for i in order])
+        measured = curve(
+            [rows[i].signal + rows[i].bias for i in order], [rows[i].noise / math.sqrt(rows[i].n) for i in order]
+        )
         lines = [("after", curve([rows[i].signal for i in order], 0 * one))]
         if len(comparisons) > 1:
             lines.insert(0, ("before", curve([before[i].signal for i in order], 0 * one)))
@@ -784,26 +1008,38 @@ def _reading_chart(measured: Curve, lines: Sequence[tuple[str, Curve]], width: i
     x = _scale(float(measured.centre.min()), float(measured.centre.max()), left + 6, width - right - 6)
     low, high = float(values.min()) - 0.06 * span, float(values.max()) + 0.06 * span
     y = _scale(low, high, height - bottom, top)
-    parts = [f'<line class="grid" x1="{left}" x2="{width - right}" y1="{y(t):.1f}" y2="{y(t):.1f}"/>'
-             f'<text class="tick" x="{left - 6}" y="{y(t) + 4:.1f}" text-anchor="end">{number(t, 4)}</text>'
-             for t in _ticks(low, high, 5)]
-    parts += [f'<text class="tick" x="{x(t):.1f}" y="{height - bottom + 16}" text-anchor="middle">{number(t, 4)}</text>'
-              for t in _ticks(float(measured.centre.min()), float(measured.centre.max()), 6)]
+    parts = [
+        f'<line class="grid" x1="{left}" x2="{width - right}" y1="{y(t):.1f}" y2="{y(t):.1f}"/>'
+        f'<text class="tick" x="{left - 6}" y="{y(t) + 4:.1f}" text-anchor="end">{number(t, 4)}</text>'
+        for t in _ticks(low, high, 5)
+    ]
+    parts += [
+        f'<text class="tick" x="{x(t):.1f}" y="{height - bottom + 16}" text-anchor="middle">{number(t, 4)}</text>'
+        for t in _ticks(float(measured.centre.min()), float(measured.centre.max()), 6)
+    ]
     unit = f", {measured.unit}" if measured.unit else ""
-    parts.append(f'<text class="axis" x="{(left + width - right) / 2:.0f}" y="{height - 4}" text-anchor="middle">'
-                 f'{_escape(_spoken(measured.coordinate))}{unit}</text>')
+    parts.append(
+        f'<text class="axis" x="{(left + width - right) / 2:.0f}" y="{height - 4}" text-anchor="middle">'
+        f"{_escape(_spoken(measured.coordinate))}{unit}</text>"
+    )
     for style, c in lines:
         points = " ".join(f"{x(a):.1f},{y(b):.1f}" for a, b in zip(c.centre, c.mean))
         parts.append(f'<polyline class="{style}" points="{points}"/>')
     for a, b, e in zip(measured.centre, measured.mean, measured.se):
-        parts.append(f'<line class="bar ink" x1="{x(a):.1f}" x2="{x(a):.1f}" y1="{y(b - e):.1f}" y2="{y(b + e):.1f}"/>'
-                     f'<circle class="point ink" cx="{x(a):.1f}" cy="{y(b):.1f}" r="3"/>')
+        parts.append(
+            f'<line class="bar ink" x1="{x(a):.1f}" x2="{x(a):.1f}" y1="{y(b - e):.1f}" y2="{y(b + e):.1f}"/>'
+            f'<circle class="point ink" cx="{x(a):.1f}" cy="{y(b):.1f}" r="3"/>'
+        )
     return _svg(width, height, parts, f"Readings and predictions against {measured.coordinate}")
 
 
 def _svg(width: int, height: int, parts: Sequence[str], words: str, fixed: bool = False) -> str:
     size = f' style="width:{width}px;height:{height}px"' if fixed else ""
-    return (f'<svg viewBox="0 0 {width} {height}"{size} role="img" aria-label="{_escape(words)}">' + "".join(parts) + "</svg>")
+    return (
+        f'<svg viewBox="0 0 {width} {height}"{size} role="img" aria-label="{_escape(words)}">'
+        + "".join(parts)
+        + "</svg>"
+    )
 
 
 def _scale(low: float, high: float, start: float, end: float):
@@ -822,9 +1058,19 @@ def _ticks(low: float, high: float, count: int) -> list[float]:
 
 
 def _log_ticks(low: float, high: float) -> list[float]:
-    for marks in ((1,), (1, 3), (1, 2, 5), (1, 1.2, 1.5, 2, 3, 5, 7), (1, 1.05, 1.1, 1.2, 1.3, 1.5, 2, 3, 4, 5, 6, 7, 8, 9)):
-        found = [m * 10.0**k for k in range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1) for m in marks
-                 if low <= m * 10.0**k <= high]
+    for marks in (
+        (1,),
+        (1, 3),
+        (1, 2, 5),
+        (1, 1.2, 1.5, 2, 3, 5, 7),
+        (1, 1.05, 1.1, 1.2, 1.3, 1.5, 2, 3, 4, 5, 6, 7, 8, 9),
+    ):
+        found = [
+            m * 10.0**k
+            for k in range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
+            for m in marks
+            if low <= m * 10.0**k <= high
+        ]
         if len(found) >= 4:
             return found
     return found
@@ -849,6 +1095,7 @@ def _value(level: Mapping | None, key: str) -> float:
 
 # -- tables -------------------------------------------------------------------------------------------------------------
 
+
 def step_name(step: Mapping) -> str:
     return ("+ " if step["index"] else "") + step["name"]
 
@@ -858,8 +1105,14 @@ def number_tables(comparisons: list[Comparison], nouns: Mapping[str, str] = FRAM
     first, last = comparisons[0], comparisons[-1]
     out = []
     data, frames = nouns["data"].capitalize(), nouns["frames"].capitalize()
-    for scope, title in (("role", f"{data} fitted and held out"), ("frame", frames), ("led", "LEDs"), ("group", "Presses"),
-                         ("channel", "Channels"), ("region", "Regions")):
+    for scope, title in (
+        ("role", f"{data} fitted and held out"),
+        ("frame", frames),
+        ("led", "LEDs"),
+        ("group", "Presses"),
+        ("channel", "Channels"),
+        ("region", "Regions"),
+    ):
         before = {r.label: r.chi2_per_dof for r in first.by(scope)}
         rows = [{"label": r.label, "before": before.get(r.label, math.nan), "row": r} for r in last.by(scope)]
         if scope == "group" and len(rows) == len(last.frames):
@@ -885,20 +1138,36 @@ def parameter_tables(steps: Sequence[Mapping]) -> dict:
         moved, sd = math.nan, _finite(first.get("sd"))
         if len(present) > 1 and sd > 0:  # not where nothing determined it: infinite
             moved = (last["value"] - first["value"]) / sd
-        row = {"name": name, "unit": last.get("unit", ""), "values": values, "pull": last.get("pull"), "moved": moved,
-               "shift": last["value"] - first["value"] if len(present) > 1 else math.nan,
-               "added": values[0] is None, "at_bound": bool(last.get("at_bound")), "far": abs(moved) > MOVED_SHOWN}
+        row = {
+            "name": name,
+            "unit": last.get("unit", ""),
+            "values": values,
+            "pull": last.get("pull"),
+            "moved": moved,
+            "shift": last["value"] - first["value"] if len(present) > 1 else math.nan,
+            "added": values[0] is None,
+            "at_bound": bool(last.get("at_bound")),
+            "far": abs(moved) > MOVED_SHOWN,
+        }
         (own if last.get("frames") else common).append(row)
     return {"common": common, "frames": own}
 
 
-# -- diagnoses ----------------------------------------------------------------------------------------------------------
+# -- diagnoses
+# ----------------------------------------------------------------------------------------------------------
 
 NAMED = 0.01  # family-wise p at or above which an effect only gets an upper limit
 COLUMNS = (  # of the ranking: key, title, whether it is text
-    ("verdict", "verdict", True), ("fall", "χ² fall predicted", False), ("actual", "after refit", False),
-    ("strength", "strength", False), ("plausible", "of plausible", False), ("image", "image change", False),
-    ("share", "explains", False), ("survival", "visible", False), ("p", "p, family", False), ("confused", "confused with", True),
+    ("verdict", "verdict", True),
+    ("fall", "χ² fall predicted", False),
+    ("actual", "after refit", False),
+    ("strength", "strength", False),
+    ("plausible", "of plausible", False),
+    ("image", "image change", False),
+    ("share", "explains", False),
+    ("survival", "visible", False),
+    ("p", "p, family", False),
+    ("confused", "confused with", True),
     ("flags", "notes", True),
 )
 
@@ -910,25 +1179,37 @@ def verdict(diagnosis: Mapping | None) -> dict | None:
     d = diagnosis
     ranked = [_candidate(r) for r in d.get("rows") or ()]
     shown = [r for r in ranked if r["evidence"]]
-    columns = [{"key": key, "title": title, "left": left} for key, title, left in COLUMNS
-               if any(r["cells"][key] not in ("", "–") for r in shown)]
+    columns = [
+        {"key": key, "title": title, "left": left}
+        for key, title, left in COLUMNS
+        if any(r["cells"][key] not in ("", "–") for r in shown)
+    ]
     curves = [f for f in d.get("fingerprints") or () if _finite(f.get("net")) > 0 and f.get("curve")]
     return {
-        "word": str(d["word"]).replace("_", " "), "sentence": (text := words(d.get("sentence")))[:1].upper() + text[1:],
-        "conditions": [{"name": words(c.get("name")), "holds": bool(c.get("holds")), "text": words(c.get("text"))}
-                       for c in d.get("conditions") or ()],
-        "warnings": [words(w) for w in d.get("warnings") or ()], "hints": [words(h) for h in d.get("hints") or ()],
-        "ranking": shown, "columns": columns, "by_key": {_key(r["name"]): r for r in ranked},
+        "word": str(d["word"]).replace("_", " "),
+        "sentence": (text := words(d.get("sentence")))[:1].upper() + text[1:],
+        "conditions": [
+            {"name": words(c.get("name")), "holds": bool(c.get("holds")), "text": words(c.get("text"))}
+            for c in d.get("conditions") or ()
+        ],
+        "warnings": [words(w) for w in d.get("warnings") or ()],
+        "hints": [words(h) for h in d.get("hints") or ()],
+        "ranking": shown,
+        "columns": columns,
+        "by_key": {_key(r["name"]): r for r in ranked},
         "limits": [f"{r['name']} {r['limit']}" for r in ranked if not r["evidence"] and r["limit"]],
         "not_tested": [f"{name} ({words(why)})" for name, why in (d.get("not_tested") or {}).items()],
-        "splits": [_split(s) for s in d.get("splits") or ()], "levels": list(d.get("levels") or ()),
-        "shifts": [s for s in d.get("shifts") or ()][:8], "curves": [_draft(f) for f in curves[:6]],
-        "pairs": _pairs(d), "advice": _advice(d),
+        "splits": [_split(s) for s in d.get("splits") or ()],
+        "levels": list(d.get("levels") or ()),
+        "shifts": [s for s in d.get("shifts") or ()][:8],
+        "curves": [_draft(f) for f in curves[:6]],
+        "pairs": _pairs(d),
+        "advice": _advice(d),
     }
 
 
 def told(diagnosis: Mapping | None, points: Readings | None) -> Mapping | None:
-    """A diagnosis in the words of readings: frames are sweeps, and a split by their place in a picture is left out."""
+    """A diagnosis in the words of readings: frames are sweeps, and a split by their place in an image is left out."""
     if not diagnosis or points is None:
         return diagnosis
 
@@ -945,7 +1226,9 @@ def told(diagnosis: Mapping | None, points: Readings | None) -> Mapping | None:
 def _candidate(r: Mapping) -> dict:
     """A row of the ranking, its cells as text."""
     refit = r.get("refit") or {}
-    strength = refit.get("strength") or [_finite(a) + _finite(c) for a, c in zip(r.get("start") or (), r.get("change") or ())]
+    strength = refit.get("strength") or [
+        _finite(a) + _finite(c) for a, c in zip(r.get("start") or (), r.get("change") or ())
+    ]
     sd = refit.get("sd") or r.get("sd") or [None] * len(strength)
     unit = spaced((r.get("units") or [""])[0])
     values = [measure(_finite(v), None if s is None else float(s)) + unit for v, s in zip(strength, sd)]
@@ -953,30 +1236,51 @@ def _candidate(r: Mapping) -> dict:
     limit = f"< {number(max(upper), 2)}{unit}" if upper else ""
     confused = f"{r['confused_with']} ({number(_finite(r.get('cos')), 2)})" if r.get("confused_with") else ""
     cells = {
-        "fall": number(_finite(r.get("fall")), 4), "actual": number(_finite(refit.get("fall")), 4),
+        "fall": number(_finite(r.get("fall")), 4),
+        "actual": number(_finite(refit.get("fall")), 4),
         "strength": some(values, 3, "; "),
-        "plausible": number(_finite(r.get("of_plausible")), 2), "image": percent(_finite(r.get("image")), 2),
-        "share": percent(_finite(r.get("share")), 2), "survival": percent(_finite(r.get("survival")), 2),
-        "p": pvalue(_finite(r.get("p_family"))), "confused": confused, "flags": ", ".join(map(words, r.get("flags") or ())),
+        "plausible": number(_finite(r.get("of_plausible")), 2),
+        "image": percent(_finite(r.get("image")), 2),
+        "share": percent(_finite(r.get("share")), 2),
+        "survival": percent(_finite(r.get("survival")), 2),
+        "p": pvalue(_finite(r.get("p_family"))),
+        "confused": confused,
+        "flags": ", ".join(map(words, r.get("flags") or ())),
         "verdict": words(r.get("verdict")),
     }
-    return {"name": str(r.get("name", "")), "cells": cells, "limit": limit, "fall": cells["fall"], "actual": cells["actual"],
-            "strength": cells["strength"], "verdict": cells["verdict"],
-            "evidence": bool(refit) or not _finite(r.get("p_family")) >= NAMED}
+    return {
+        "name": str(r.get("name", "")),
+        "cells": cells,
+        "limit": limit,
+        "fall": cells["fall"],
+        "actual": cells["actual"],
+        "strength": cells["strength"],
+        "verdict": cells["verdict"],
+        "evidence": bool(refit) or not _finite(r.get("p_family")) >= NAMED,
+    }
 
 
 def _split(s: Mapping) -> dict:
-    """One test of evenness: its parts as a strip of points with error bars about 1."""
+    """One test of homogeneity: its parts as a strip of points with error bars about 1."""
     strength, sd = [_finite(v) for v in s.get("strength") or ()], [_finite(v) for v in s.get("sd") or ()]
     labels = [str(label) for label in s.get("labels") or ()]
     worst = max(range(len(strength)), key=lambda i: abs(np.nan_to_num(strength[i] - 1)), default=None)
-    return {"effect": str(s.get("effect", "")), "by": words(s.get("by")), "svg": strip(strength, sd, labels),
-            "worst": "" if worst is None else f"{labels[worst]}: {measure(strength[worst], sd[worst])}", "parts": len(labels),
-            "h": number(_finite(s.get("h")), 2), "p": pvalue(_finite(s.get("p"))), "chance": pvalue(_finite(s.get("chance"))),
-            "holds": bool(s.get("holds", True))}
+    return {
+        "effect": str(s.get("effect", "")),
+        "by": words(s.get("by")),
+        "svg": strip(strength, sd, labels),
+        "worst": "" if worst is None else f"{labels[worst]}: {measure(strength[worst], sd[worst])}",
+        "parts": len(labels),
+        "h": number(_finite(s.get("h")), 2),
+        "p": pvalue(_finite(s.get("p"))),
+        "chance": pvalue(_finite(s.get("chance"))),
+        "holds": bool(s.get("holds", True)),
+    }
 
 
-def strip(values: Sequence[float], sds: Sequence[float], labels: Sequence[str], width: int = 200, height: int = 36) -> str:
+def strip(
+    values: Sequence[float], sds: Sequence[float], labels: Sequence[str], width: int = 200, height: int = 36
+) -> str:
     """SVG: one point with its error bar per part, and the line at 1."""
     good = [(v, s if math.isfinite(s) else 0.0) for v, s in zip(values, sds) if math.isfinite(v)]
     if not good:
@@ -987,9 +1291,11 @@ def strip(values: Sequence[float], sds: Sequence[float], labels: Sequence[str], 
     for i, (v, s, label) in enumerate(zip(values, sds, labels)):
         if math.isfinite(v):
             s = s if math.isfinite(s) else 0.0
-            parts.append(f'<line class="bar after" x1="{x(i):.1f}" x2="{x(i):.1f}" y1="{y(v - s):.1f}" y2="{y(v + s):.1f}"/>'
-                         f'<circle class="point after" cx="{x(i):.1f}" cy="{y(v):.1f}" r="3"><title>{_escape(label)}: '
-                         f'{measure(v, s)}</title></circle>')
+            parts.append(
+                f'<line class="bar after" x1="{x(i):.1f}" x2="{x(i):.1f}" y1="{y(v - s):.1f}" y2="{y(v + s):.1f}"/>'
+                f'<circle class="point after" cx="{x(i):.1f}" cy="{y(v):.1f}" r="3"><title>{_escape(label)}: '
+                f"{measure(v, s)}</title></circle>"
+            )
     said = ", ".join(f"{label} {measure(v, s)}" for label, v, s in zip(labels, values, sds))
     return _svg(width, height, parts, f"Strength relative to the whole: {said}", fixed=True)
 
@@ -999,17 +1305,27 @@ def _draft(f: Mapping) -> dict:
     name, gain = str(f.get("coordinate", "")), f.get("kind") == "gain"
     centres, curve, sd = (np.array([_finite(v) for v in f.get(key) or ()]) for key in ("centres", "curve", "sd"))
     curve, sd = (100 * curve, 100 * sd) if gain else (curve, sd)
-    what, picture, chart = "relative gain, %" if gain else "offset, DN", "", ""
+    what, image, chart = "relative gain, %" if gain else "offset, DN", "", ""
     side = math.isqrt(len(curve))
     if name == "place" and side * side == len(curve):
         top = _round_up(float(np.nanmax(np.abs(curve), initial=1e-9)))
-        picture, what = coloured(curve.reshape(side, side), -top, top, DIVERGING), f"{what}, colours ±{number(top)}"
+        image, what = coloured(curve.reshape(side, side), -top, top, DIVERGING), f"{what}, colours ±{number(top)}"
     elif len(curve) == len(centres) == len(sd):
         one = np.ones(len(curve))
         labels = tuple(f.get("labels") or ()) or None
-        chart = curve_chart(Curve(name, f.get("unit") or UNITS.get(name, ""), "all", centres, curve, sd, one, one, labels))
-    return {"name": words(name), "family": str(f.get("family") or ""), "what": what, "picture": picture, "svg": chart, "dof": f.get("dof"),
-            "ratio": number(_finite(f.get("ratio")), 2), "net": number(_finite(f.get("net")))}
+        chart = curve_chart(
+            Curve(name, f.get("unit") or UNITS.get(name, ""), "all", centres, curve, sd, one, one, labels)
+        )
+    return {
+        "name": words(name),
+        "family": str(f.get("family") or ""),
+        "what": what,
+        "image": image,
+        "svg": chart,
+        "dof": f.get("dof"),
+        "ratio": number(_finite(f.get("ratio")), 2),
+        "net": number(_finite(f.get("net"))),
+    }
 
 
 def _pairs(d: Mapping) -> dict | None:
@@ -1018,24 +1334,38 @@ def _pairs(d: Mapping) -> dict | None:
     keep = [i for i, n in enumerate(names) if n in (d.get("ambiguous") or [])]
     if len(keep) < 2 or len(matrix) != len(names):
         return None
-    return {"names": [names[i] for i in keep],
-            "rows": [[percent(_finite(matrix[i][j]), 2) if i != j else "" for j in keep] for i in keep]}
+    return {
+        "names": [names[i] for i in keep],
+        "rows": [[percent(_finite(matrix[i][j]), 2) if i != j else "" for j in keep] for i in keep],
+    }
 
 
 def _advice(d: Mapping) -> list[dict]:
-    """Shots that were simulated, the best few together first: what each would make of the pair that is hardest to tell apart."""
+    """Shots that were simulated, the best few together first: what each would make of the pair that is hardest to tell
+    apart."""
     rows = []
     for a in d.get("advice") or ():
         if not a.get("pairs"):
             continue
         p = a["pairs"][0]
-        kind = {"together": "best together", "more of the same": "more of the same, to compare"}.get(a["family"], a["family"])
-        rows.append({"kind": kind, "shot": words(a["shot"]), "pair": f"{p['effect']} / {p['rival']}", "first": a["family"] != "together",
-                     "before": number(_finite(p["before"]), 3), "after": number(_finite(p["after"]), 3),
-                     "correct": f"{_finite(p['correct_before']):.2f} → {_finite(p['correct_after']):.2f}",
-                     "share": "" if math.isnan(after := _finite(p.get("share_after"))) else
-                     f"{percent(_finite(p['share_before']))} → {percent(after)}",
-                     "brings": ", ".join(words(n) for n in a.get("nuisances") or ())})
+        kind = {"together": "best together", "more of the same": "more of the same, to compare"}.get(
+            a["family"], a["family"]
+        )
+        rows.append(
+            {
+                "kind": kind,
+                "shot": words(a["shot"]),
+                "pair": f"{p['effect']} / {p['rival']}",
+                "first": a["family"] != "together",
+                "before": number(_finite(p["before"]), 3),
+                "after": number(_finite(p["after"]), 3),
+                "correct": f"{_finite(p['correct_before']):.2f} → {_finite(p['correct_after']):.2f}",
+                "share": ""
+                if math.isnan(after := _finite(p.get("share_after")))
+                else f"{percent(_finite(p['share_before']))} → {percent(after)}",
+                "brings": ", ".join(words(n) for n in a.get("nuisances") or ()),
+            }
+        )
     return sorted(rows, key=lambda r: r["first"])
 
 

@@ -1,11 +1,14 @@
 """What a report shows of residuals beyond a mean per pixel: by region, by colour, and what many frames have in common.
 
-    regions      mean and standard deviation of the residual in cells of the sensor: a mean off 0 is a wrong model, a standard
-                 deviation above 1 something that changes from frame to frame or from pixel to pixel
-    colours      the mean residual of the three channels as a colour: grey where all agree, a hue where some channels miss more
-    components   singular vectors of the residual frames: what the frames have in common, and how much of it each frame has; noise
-                 alone gives every component the same share
-    coordinates  how much of the excess a curve along each coordinate explains, by family
+regions      mean and standard deviation of the residual in cells of the sensor: a mean off 0 is a wrong model, a
+             standard
+             deviation above 1 something that changes from frame to frame or from pixel to pixel
+colours      the mean residual of the three channels as a colour: grey where all agree, a hue where some channels miss
+             more
+components   singular vectors of the residual frames: what the frames have in common, and how much of it each frame has;
+             noise
+             alone gives every component the same share
+coordinates  how much of the excess a curve along each coordinate explains, by family
 """
 
 from __future__ import annotations
@@ -23,14 +26,15 @@ from optics.study.record import Shown
 
 CELLS = 16  # of a regional map along the longer side
 COMPONENTS = 3
-SIDE = 96  # px; components of larger pictures are taken of means over blocks
-COLOURED = 64  # px of the picture of colours
+SIDE = 96  # px; components of larger images are taken of means over blocks
+COLOURED = 64  # px of the image of colours
 LISTED = 14  # coordinates
 FRAMES_MIN = 3
 
 
 def pages(comparisons: Sequence[Comparison], shown: Sequence[Sequence[Shown]], steps: Sequence[Mapping]) -> list[dict]:
-    """Of the first and the last step: the pictures of regions and colours, and the components; what is missing is left out."""
+    """Of the first and the last step: the images of regions and colours, and the components; what is missing is left
+    out."""
     out = []
     for i in dict.fromkeys((0, len(steps) - 1)):
         c = comparisons[i]
@@ -41,7 +45,9 @@ def pages(comparisons: Sequence[Comparison], shown: Sequence[Sequence[Shown]], s
 
 
 def _cells(image: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """(H, W) or (H, W, C) -> means and numbers of values, (h, w), of blocks of `size` px, those at the far edges smaller; NaN where none."""
+    """(H, W) or (H, W, C) -> means and numbers of values, (h, w), of blocks of `size` px, those at the far edges
+    smaller; NaN where none."""
+
     def summed(a):
         return np.add.reduceat(np.add.reduceat(a, np.arange(0, a.shape[0], size), 0), np.arange(0, a.shape[1], size), 1)
 
@@ -57,21 +63,33 @@ def regions(c: Comparison) -> dict:
     mean, square = (_cells(image, size)[0] for image in (c.mean_map, c.rms_map.astype(float) ** 2))
     sd = np.sqrt(np.maximum(square - mean**2, 0))
     top = max(float(np.nanmax(np.abs(mean), initial=0)), 0.05)
-    return {"mean": coloured(mean, -top, top, DIVERGING), "mean_top": number(top, 2), "sd": coloured(sd, 0, 2, SEQUENTIAL),
-            "worst": number(float(np.nanmax(sd, initial=0)), 3), "cell": size,
-            "width": c.mean_map.shape[1], "height": c.mean_map.shape[0]}
+    return {
+        "mean": coloured(mean, -top, top, DIVERGING),
+        "mean_top": number(top, 2),
+        "sd": coloured(sd, 0, 2, SEQUENTIAL),
+        "worst": number(float(np.nanmax(sd, initial=0)), 3),
+        "cell": size,
+        "width": c.mean_map.shape[1],
+        "height": c.mean_map.shape[0],
+    }
 
 
 def colours(c: Comparison) -> str:
-    """The mean residual of blocks, in its own standard deviations: grey is 0, red, green and blue their channels, +-5; '' without colours."""
+    """The mean residual of blocks, in its own standard deviations: grey is 0, red, green and blue their channels, +-5;
+    '' without colours."""
     if c.mean_map.shape[2] != 3:
         return ""
     from PIL import Image
 
     size = max(1, math.ceil(max(c.mean_map.shape[:2]) / COLOURED))
-    z = np.stack([mean * np.sqrt(count * len(c.frames)) for mean, count in (_cells(c.mean_map[..., k], size) for k in range(3))], -1)
+    z = np.stack(
+        [mean * np.sqrt(count * len(c.frames)) for mean, count in (_cells(c.mean_map[..., k], size) for k in range(3))],
+        -1,
+    )
     out = io.BytesIO()
-    Image.fromarray((np.clip(np.nan_to_num(z) / 10 + 0.5, 0, 1) * 15 + 0.5).astype(np.uint8) * 17).save(out, "PNG", optimize=True)
+    Image.fromarray((np.clip(np.nan_to_num(z) / 10 + 0.5, 0, 1) * 15 + 0.5).astype(np.uint8) * 17).save(
+        out, "PNG", optimize=True
+    )
     return "data:image/png;base64," + base64.b64encode(out.getvalue()).decode()
 
 
@@ -86,23 +104,40 @@ def components(shown: Sequence[Shown]) -> dict:
         return {"components": []}
     size = max(1, math.ceil(max(frames[0].measured.shape[:2]) / SIDE))
     # a mean over n pixels, times sqrt(n): noise keeps a standard deviation of 1
-    z = np.stack([np.nan_to_num(mean * np.sqrt(count)) for mean, count in (_cells(combined(f.residual), size) for f in frames)])
+    z = np.stack(
+        [np.nan_to_num(mean * np.sqrt(count)) for mean, count in (_cells(combined(f.residual), size) for f in frames)]
+    )
     shape = z.shape[1:]
     u, s, v = np.linalg.svd(z.reshape(len(frames), -1), full_matrices=False)
     total = float((s**2).sum()) or 1.0
     found = []
     for k in range(min(COMPONENTS, len(frames))):
         sign = 1.0 if u[:, k].sum() >= 0 else -1.0
-        picture = sign * v[k].reshape(shape) * math.sqrt(v.shape[1])  # rms 1
+        image = sign * v[k].reshape(shape) * math.sqrt(v.shape[1])  # rms 1
         scores = sign * u[:, k] * s[k] / math.sqrt(v.shape[1])
-        found.append({"image": coloured(picture, -3, 3, DIVERGING), "share": percent(s[k] ** 2 / total, 2),
-                      "scores": [{"frame": f.name, "score": fixed(x, 2)} for f, x in zip(frames, scores)]})
+        found.append(
+            {
+                "image": coloured(image, -3, 3, DIVERGING),
+                "share": percent(s[k] ** 2 / total, 2),
+                "scores": [{"frame": f.name, "score": fixed(x, 2)} for f, x in zip(frames, scores)],
+            }
+        )
     return {"components": found, "noise": percent(1 / len(frames), 2), "count": len(frames)}
 
 
 def coordinates(diagnosis: Mapping | None) -> list[dict]:
-    """Rows of the table of coordinates, best first: family, fall of chi2, share of the excess, and over the best effect's fall."""
+    """Rows of the table of coordinates, best first: family, fall of chi2, share of the excess, and over the best
+    effect's fall."""
     rows = [f for f in (diagnosis or {}).get("fingerprints") or () if (f.get("net") or 0) > 0]
     best = max([f["net"] for f in rows], default=1.0)
-    return [{"name": f["coordinate"], "family": f.get("family") or "", "net": number(f["net"], 4), "bar": fixed(100 * f["net"] / best, 1),
-             "share": percent(f.get("share")), "ratio": number(f.get("ratio"))} for f in rows[:LISTED]]
+    return [
+        {
+            "name": f["coordinate"],
+            "family": f.get("family") or "",
+            "net": number(f["net"], 4),
+            "bar": fixed(100 * f["net"] / best, 1),
+            "share": percent(f.get("share")),
+            "ratio": number(f.get("ratio")),
+        }
+        for f in rows[:LISTED]
+    ]

@@ -1,15 +1,15 @@
 """A local page on which effects and parameters are switched and slid while prediction, residual and misfit follow.
 
-The browser has the pictures as numbers and computes the linear prediction itself, in the coordinate u of every parameter in which
-the picture is nearly linear (`Parameter.coordinate`):
+The browser has the images as numbers and computes the linear prediction itself, in the coordinate u of every parameter
+in which the image is nearly linear (`Parameter.coordinate`):
 
     prediction(values) = prediction(there) + sum_j [u_j(value_j) - u_j(there_j)] d prediction / d u_j
 
-`there` are the study's values, or later ones that the user chose. Derivative images are made when a slider is first touched; when it
-is let go, the true render takes the linear prediction's place. Everything asked of the model goes through one thread, as neither
-Mitsuba nor Dr.Jit may be used by several; the page asks one thing at a time, so that of all that a slider passed only the last is
-rendered. The page is served on 127.0.0.1 alone and asks nothing of any other machine.
-"""
+`there` are the study's values, or later ones that the user chose. Derivative images are made when a slider is first
+touched; when it is let go, the true render takes the linear prediction's place. Everything asked of the model goes
+through one thread, as neither Mitsuba nor Dr.Jit may be used by several; the page asks one thing at a time, so that of
+all that a slider passed only the last is rendered. The page is served on 127.0.0.1 alone and asks nothing of any other
+machine."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ from optics.words import spaced
 
 HOST = "127.0.0.1"
 PAGE = Path(__file__).with_name("view.html")
-KEEP = 1 << 30  # bytes of pictures that are kept
+KEEP = 1 << 30  # bytes of images that are kept
 BODY_MAX = 1 << 20  # bytes of a question
 NEAR = 4.0  # plausible sizes to either side that a slider spans; its number may be anything within bounds
 
 
 class Kept:
-    """Pictures by what they show; of more than `size` bytes the ones longest unused are forgotten."""
+    """Images by what they show; of more than `size` bytes the ones longest unused are forgotten."""
 
     def __init__(self, size: int = KEEP):
         self.size, self._items, self._lock = size, OrderedDict(), threading.Lock()
@@ -76,10 +76,14 @@ class Slider:
     effect: str = ""
 
     def range(self) -> tuple[float, float]:
-        """What the slider spans: the value, or for an effect its neutral value too, and some plausible sizes about it, in bounds."""
+        """What the slider spans: the value, or for an effect its neutral value too, and some plausible sizes about it,
+        in bounds."""
         p = self.variable.parameter
         centres = [self.value, *([p.neutral] if self.effect and p.neutral is not None else [])]
-        return (float(max(p.bounds[0], min(centres) - NEAR * p.plausible)), float(min(p.bounds[1], max(centres) + NEAR * p.plausible)))
+        return (
+            float(max(p.bounds[0], min(centres) - NEAR * p.plausible)),
+            float(min(p.bounds[1], max(centres) + NEAR * p.plausible)),
+        )
 
 
 class View:
@@ -103,7 +107,8 @@ class View:
         self.worker.shutdown(cancel_futures=True)
 
     def _do(self, job: Callable):
-        """What `job()` returns or raises in the model's thread; CancelledError where the view is closed before it begins."""
+        """What `job()` returns or raises in the model's thread; CancelledError where the view is closed before it
+        begins."""
         return self.worker.submit(job).result()
 
     def _open(self, folder: str | Path, step: int | None) -> None:
@@ -116,10 +121,12 @@ class View:
         variables, self.values, self.fitted = loop.kept(self.study, self.model, self.step["index"])
         self.held = sorted(set(range(len(self.model.frames))) - set(self.fitted))
         sd = {v["name"]: v["sd"] for v in self.step["variables"]}
-        added = [s["effect"] for s in self.study.steps[:self.step["index"] + 1] if s["effect"]]
+        added = [s["effect"] for s in self.study.steps[: self.step["index"] + 1] if s["effect"]]
         known = (*loop.candidates(self.model, self.study), *loop.effects_of(self.study))
         self.effects = {e.key: e for e in sorted(known, key=lambda e: e.key)}
-        own = {key: {k for keys in self.model.scene.keys_of(e).values() for k in keys} for key, e in self.effects.items()}
+        own = {
+            key: {k for keys in self.model.scene.keys_of(e).values() for k in keys} for key, e in self.effects.items()
+        }
         self.sliders: dict[str, Slider] = {}
         for v in (*variables, *calibrate.for_frames(self.model, variables, self.held)):
             effect = next((key for key in added if set(v.keys) <= own[key]), "")
@@ -134,37 +141,81 @@ class View:
         self.comparison = self.study.comparison(self.step["index"])
 
     def _slide(self, variable: Variable, sd: float | None, effect: str) -> None:
-        self.sliders[variable.name] = Slider(variable, calibrate.start_of(self.model, variable, self.values),
-                                             math.nan if sd is None else float(sd), effect)
+        self.sliders[variable.name] = Slider(
+            variable,
+            calibrate.start_of(self.model, variable, self.values),
+            math.nan if sd is None else float(sd),
+            effect,
+        )
 
-    # -- what a page needs to know first ------------------------------------------------------------------------------------
+    # -- what a page needs to know first
+    # ------------------------------------------------------------------------------------
 
     def record(self) -> dict:
-        """Everything but pictures: frames, sliders, effects, and how the study's own numbers stand."""
+        """Everything but images: frames, sliders, effects, and how the study's own numbers stand."""
         rows = {row.scope["frame"]: row for row in self.comparison.by("frame")}
         return {
-            "title": self.study.record["title"] or Path(self.study.folder).resolve().name, "folder": str(self.study.folder),
-            "scene": Path(self.study.record["scene"]).stem, "step": self.step["index"],
-            "steps": [s["name"] for s in self.study.steps], "shape": list(self.model.shape) if self.model.captures.table is None else None,
-            "channels": self.comparison.channels, "black": self.model.noise.black_level,
-            "ramp": ramp(DIVERGING, 256), "bar": colour_bar(), "masked": ramp((MASKED,), 1)[0], "range": SIGMA_RANGE,
-            "frames": [{"name": f.name, "led": led_label(f.parameters), "held_out": i in self.held,
-                        **{k: getattr(rows[f.name], k) for k in ("n", "chi2", "rms", "noise")}}
-                       for i, f in enumerate(self.model.frames)],
+            "title": self.study.record["title"] or Path(self.study.folder).resolve().name,
+            "folder": str(self.study.folder),
+            "scene": Path(self.study.record["scene"]).stem,
+            "step": self.step["index"],
+            "steps": [s["name"] for s in self.study.steps],
+            "shape": list(self.model.shape) if self.model.captures.table is None else None,
+            "channels": self.comparison.channels,
+            "black": self.model.noise.black_level,
+            "ramp": ramp(DIVERGING, 256),
+            "bar": colour_bar(),
+            "masked": ramp((MASKED,), 1)[0],
+            "range": SIGMA_RANGE,
+            "frames": [
+                {
+                    "name": f.name,
+                    "led": led_label(f.parameters),
+                    "held_out": i in self.held,
+                    **{k: getattr(rows[f.name], k) for k in ("n", "chi2", "rms", "noise")},
+                }
+                for i, f in enumerate(self.model.frames)
+            ],
             "sliders": [self._slider(name, s) for name, s in self.sliders.items()],
-            "effects": [{"key": e.key, "name": e.name, "part": e.part, "onset": e.onset, "doc": e.doc.strip(), "needs": e.needs,
-                         "added": e.key in self.added, "clash": self.clashes.get(e.key, [])} for e in self.effects.values()],
+            "effects": [
+                {
+                    "key": e.key,
+                    "name": e.name,
+                    "part": e.part,
+                    "onset": e.onset,
+                    "doc": e.doc.strip(),
+                    "needs": e.needs,
+                    "added": e.key in self.added,
+                    "clash": self.clashes.get(e.key, []),
+                }
+                for e in self.effects.values()
+            ],
         }
 
     def _slider(self, name: str, s: Slider) -> dict:
         v, p = s.variable, s.variable.parameter
         low, high = s.range()
-        return {"name": name, "part": (v.keys[0] if len(v.keys) == 1 else v.name).rpartition(".")[0], "keys": list(v.keys),
-                "unit": "" if p.unit == "1" else p.unit, "doc": p.doc, "low": low, "high": high, "bounds": list(p.bounds),
-                "value": s.value, "sd": s.sd, "calibrated": not math.isnan(s.sd), "neutral": p.neutral,
-                "squared": p.squared, "saturates": p.saturates, "frames": v.frames, "effect": s.effect}
+        return {
+            "name": name,
+            "part": (v.keys[0] if len(v.keys) == 1 else v.name).rpartition(".")[0],
+            "keys": list(v.keys),
+            "unit": "" if p.unit == "1" else p.unit,
+            "doc": p.doc,
+            "low": low,
+            "high": high,
+            "bounds": list(p.bounds),
+            "value": s.value,
+            "sd": s.sd,
+            "calibrated": not math.isnan(s.sd),
+            "neutral": p.neutral,
+            "squared": p.squared,
+            "saturates": p.saturates,
+            "frames": v.frames,
+            "effect": s.effect,
+        }
 
-    # -- questions --------------------------------------------------------------------------------------------------------
+    # -- questions
+    # --------------------------------------------------------------------------------------------------------
 
     def frame(self, index) -> int:
         """A frame's index, or ValueError."""
@@ -197,7 +248,7 @@ class View:
         return values
 
     def _here(self, index: int, changes: Mapping[str, float]) -> tuple:
-        """What of the changes holds in a frame: the key of its pictures."""
+        """What of the changes holds in a frame: the key of its images."""
         return (index, *((n, v) for n, v in changes.items() if self.sliders[n].variable.holds_in(index)))
 
     def capture(self, index: int) -> tuple[np.ndarray, np.ndarray]:
@@ -206,11 +257,14 @@ class View:
 
     def _capture(self, index: int) -> tuple:
         return self.kept.get(("capture", index)) or self.kept.put(
-            ("capture", index), (np.asarray(self.model.frames[index].image, np.float32), self.model.usable(index)))
+            ("capture", index), (np.asarray(self.model.frames[index].image, np.float32), self.model.usable(index))
+        )
 
     def predict(self, index: int, changes: Mapping[str, float]) -> tuple[np.ndarray, np.ndarray]:
         """(H, W, C) DN, the true render and the standard deviation that the noise has about it."""
-        return self.kept.get(("predict", *self._here(index, changes))) or self._do(lambda: self._predict(index, changes))
+        return self.kept.get(("predict", *self._here(index, changes))) or self._do(
+            lambda: self._predict(index, changes)
+        )
 
     def _predict(self, index: int, changes: Mapping[str, float]) -> tuple:
         key = ("predict", *self._here(index, changes))
@@ -220,11 +274,14 @@ class View:
         values = self.moved(changes)
         prediction = self.model.predict(values, [index])[0]
         sd = np.sqrt(self.model.variance(values, index, prediction))
-        return self.kept.put(key, (prediction.astype(np.float32), np.broadcast_to(sd, prediction.shape).astype(np.float32)))
+        return self.kept.put(
+            key, (prediction.astype(np.float32), np.broadcast_to(sd, prediction.shape).astype(np.float32))
+        )
 
     def secant(self, name: str, changes: Mapping[str, float]) -> float | None:
-        """The finite step that a derivative image is taken with, where the tangent at the present value says nothing: at the neutral
-        value of an effect with such an onset, and at 0 of what acts by its square. It turns round at a bound. None: the tangent."""
+        """The finite step that a derivative image is taken with, where the tangent at the present value says nothing:
+        at the neutral value of an effect with such an onset, and at 0 of what acts by its square. It turns round at a
+        bound. None: the tangent."""
         slider = self.sliders[name]
         p, value = slider.variable.parameter, changes.get(name, slider.value)
         effect = self.effects.get(slider.effect)
@@ -234,14 +291,15 @@ class View:
         return p.plausible if value + p.plausible <= p.bounds[1] else -p.plausible
 
     def _seek(self, names: Iterable[str]) -> None:
-        """Find where effects with a place would be, before they leave neutral for the first time: till then it does nothing."""
+        """Find where effects with a place would be, before they leave neutral for the first time: till then it does
+        nothing."""
         for key in {self.sliders[n].effect for n in names} - {"", *self._sought}:
             loop.seek(self.model, self.values, [self.effects[key]], self.fitted)
             self._sought.add(key)
 
     def derivative(self, index: int, name: str, changes: Mapping[str, float]) -> tuple:
-        """(image or None where it does nothing, step or None): d prediction / d u of a slider's coordinate u, (H, W, C), at the values
-        with the changes."""
+        """(image or None where it does nothing, step or None): d prediction / d u of a slider's coordinate u, (H, W,
+        C), at the values with the changes."""
         slider = self._slider_of(name)
         if not slider.variable.holds_in(index):
             return None, None
@@ -257,19 +315,29 @@ class View:
         self._seek([*missing, *changes])
         values = self.moved(changes)
         steps = {n: self.secant(n, changes) for n in missing}
-        _, images = next(self.model.derivatives(values, [self.sliders[n].variable for n in missing], [index],
-                                                secant={n: s for n, s in steps.items() if s is not None}))
+        _, images = next(
+            self.model.derivatives(
+                values,
+                [self.sliders[n].variable for n in missing],
+                [index],
+                secant={n: s for n, s in steps.items() if s is not None},
+            )
+        )
         for n in missing:
             image, p, value = images.get(n), self.sliders[n].variable.parameter, changes.get(n, self.sliders[n].value)
             if image is not None:  # per value -> per coordinate
-                image = image * np.float32(steps[n] / (p.coordinate(value + steps[n]) - p.coordinate(value))
-                                           if steps[n] is not None else p.per_coordinate(value))
+                image = image * np.float32(
+                    steps[n] / (p.coordinate(value + steps[n]) - p.coordinate(value))
+                    if steps[n] is not None
+                    else p.per_coordinate(value)
+                )
             found[n] = self.kept.put(("derivative", n, *here), (image, steps[n]))
         return found
 
     def rows(self, index: int, names: Sequence[str], changes: Mapping[str, float]) -> dict:
         """A frame's misfit as a quadratic form in the coordinates of sliders, about the values with the changes:
-        c - 2 b.x + x.A x, for chi2 (weights held) and for the sum of squares in DN^2; n values, noise: sum of variances."""
+        c - 2 b.x + x.A x, for chi2 (weights held) and for the sum of squares in DN^2; n values, noise: sum of
+        variances."""
         for name in names:
             self._slider_of(name)
         return self._do(lambda: self._rows(index, names, changes))
@@ -284,15 +352,19 @@ class View:
         stack = np.stack([i[use] for i in images.values()]) if images else np.zeros((0, residual.size), np.float32)
         found = {"names": list(images), "n": int(use.sum()), "noise": float(np.sum(sd[use].astype(float) ** 2))}
         for what, j, r in (("chi2", stack / sd[use], residual / sd[use]), ("square", stack, residual)):
-            found[what] = {"a": (j @ j.T).astype(float).tolist(), "b": (j @ r).astype(float).tolist(), "c": float(np.sum(r.astype(float) ** 2))}
+            found[what] = {
+                "a": (j @ j.T).astype(float).tolist(),
+                "b": (j @ r).astype(float).tolist(),
+                "c": float(np.sum(r.astype(float) ** 2)),
+            }
         return found
 
     def best(self, names: Sequence[str], values: Mapping[str, float], there: Mapping[str, float]) -> dict:
-        """Least squares of some sliders, within bounds and in one linear step about `there`, all others as they are; over the fitted
-        frames, with the priors of those that have one. Weights are held.
+        """Least squares of some sliders, within bounds and in one linear step about `there`, all others as they are;
+        over the fitted frames, with the priors of those that have one. Weights are held.
 
-        Returns values and standard deviations by name, and chi2 (with the priors' share) before and after, as the linear model has it.
-        """
+        Returns values and standard deviations by name, and chi2 (with the priors' share) before and after, as the
+        linear model has it."""
         for name in names:
             self._slider_of(name)
         if not names:
@@ -304,7 +376,9 @@ class View:
         names += [n for n in dict.fromkeys((*values, *there)) if n not in names]  # what is held, but was moved
         parameters = [self.sliders[n].variable.parameter for n in names]
         start = np.array([self.sliders[n].value for n in names])
-        at, now = (np.array([p.coordinate(c.get(n, v)) for n, p, v in zip(names, parameters, start)]) for c in (there, values))
+        at, now = (
+            np.array([p.coordinate(c.get(n, v)) for n, p, v in zip(names, parameters, start)]) for c in (there, values)
+        )
         a, b, c, n = np.zeros((len(names), len(names))), np.zeros(len(names)), 0.0, 0
         for index in self.fitted:
             row = self._rows(index, names, there)
@@ -314,10 +388,10 @@ class View:
             c, n = c + row["chi2"]["c"], n + row["n"]
 
         def slopes(of):
-            """d value / d u of the sliders; infinite where the picture goes by the square of a value that is 0."""
+            """d value / d u of the sliders; infinite where the image goes by the square of a value that is 0."""
             return np.array([p.per_coordinate(v) if v or not p.squared else math.inf for p, v in zip(parameters, of)])
 
-        k = len(sliders)  # a prior is one more measured value, linear in u like the pictures
+        k = len(sliders)  # a prior is one more measured value, linear in u like the images
         pull, curvature, prior = calibrate.prior_terms(self.model, [s.variable for s in sliders], self.moved(there))
         slope = np.nan_to_num(slopes([there.get(name, s.value) for name, s in zip(names, sliders)]), posinf=0.0)
         a[:k, :k] += np.diag(slope**2 * curvature)
@@ -337,18 +411,30 @@ class View:
         estimate = [float(np.clip(p.at_coordinate(u), *p.bounds)) for p, u in zip(parameters, (at + found)[:k])]
         with np.errstate(invalid="ignore"):
             sd = np.sqrt(np.maximum(np.diag(calibrate.covariance_of(a[:k, :k])), 0)) * slopes(estimate)
-        return {"values": dict(zip(names[:k], estimate)), "sd": dict(zip(names[:k], sd.tolist())), "before": chi2(x), "after": chi2(found), "n": n,
-                "frames": len(self.fitted)}
+        return {
+            "values": dict(zip(names[:k], estimate)),
+            "sd": dict(zip(names[:k], sd.tolist())),
+            "before": chi2(x),
+            "after": chi2(found),
+            "n": n,
+            "frames": len(self.fitted),
+        }
 
-    # -- values to keep -----------------------------------------------------------------------------------------------------
+    # -- values to keep
+    # -----------------------------------------------------------------------------------------------------
 
     def _toml(self, changes: Mapping[str, float]) -> str:
         """Values as `optics compare --fit` reads them: [parameters] and [frames.NAME], key = value."""
         self._seek(changes)
         values = self.moved(changes)
         begun = f"the step '{self.step['name']}' of {self.study.folder}"
-        lines = [f"# Values chosen on the page of `optics view`, beginning from {begun}. Not calibrated; changed by hand:",
-                 *(f"#   {n}: {self.sliders[n].value:.6g} -> {v:.6g}{spaced(self.sliders[n].variable.parameter.unit)}" for n, v in changes.items())]
+        lines = [
+            f"# Values chosen on the page of `optics view`, beginning from {begun}. Not calibrated; changed by hand:",
+            *(
+                f"#   {n}: {self.sliders[n].value:.6g} -> {v:.6g}{spaced(self.sliders[n].variable.parameter.unit)}"
+                for n, v in changes.items()
+            ),
+        ]
         if not changes:
             lines[0] = f"# Values of {begun}, unchanged."
 
@@ -359,7 +445,11 @@ class View:
         lines += ["", "[parameters]", *(entry(k, v) for k, v in values.common.items())]
         for index, own in sorted(values.frame.items()):
             if own:
-                lines += ["", f"[frames.{quoted(self.model.frames[index].name)}]", *(entry(k, v) for k, v in own.items())]
+                lines += [
+                    "",
+                    f"[frames.{quoted(self.model.frames[index].name)}]",
+                    *(entry(k, v) for k, v in own.items()),
+                ]
         return "\n".join(lines) + "\n"
 
     def write(self, changes: Mapping[str, float]) -> dict:
@@ -373,10 +463,21 @@ class View:
                 break
             except FileExistsError:
                 number += 1
-        s, groups = self.setup, [name for name, own in capture_files.groups(self.model.captures).items() if own[0] in self.held]
-        words = ["optics", "compare", s.captures, "--fit", str(file), *(w for k, v in s.defines.items() for w in ("-D", f"{k}={v}")),
-                 *(w for g in groups for w in ("--hold-out", g)), *(["--flat-field", s.flat_field] if s.flat_field else []),
-                 *(["--plugins", s.plugins] if s.plugins else [])]
+        s, groups = (
+            self.setup,
+            [name for name, own in capture_files.groups(self.model.captures).items() if own[0] in self.held],
+        )
+        words = [
+            "optics",
+            "compare",
+            s.captures,
+            "--fit",
+            str(file),
+            *(w for k, v in s.defines.items() for w in ("-D", f"{k}={v}")),
+            *(w for g in groups for w in ("--hold-out", g)),
+            *(["--flat-field", s.flat_field] if s.flat_field else []),
+            *(["--plugins", s.plugins] if s.plugins else []),
+        ]
         return {"file": str(file), "text": text, "command": shlex.join(words)}
 
 
@@ -385,7 +486,9 @@ def quoted(value) -> str:
     return json.dumps(value, ensure_ascii=False)
 
 
-# -- the server -------------------------------------------------------------------------------------------------------------
+# -- the server
+# -------------------------------------------------------------------------------------------------------------
+
 
 def floats(*arrays: np.ndarray) -> bytes:
     """Arrays one after the other, little-endian float32."""
@@ -412,8 +515,10 @@ class Server(ThreadingHTTPServer):
         try:
             super().__init__((HOST, port), Handler)
         except (OSError, OverflowError) as error:
-            raise OSError(f"--port {port}: {getattr(error, 'strerror', None) or error}; give another one, or none to take any that is "
-                          "free") from error
+            raise OSError(
+                f"--port {port}: {getattr(error, 'strerror', None) or error}; give another one, or none to take any that is "
+                "free"
+            ) from error
         self.hosts = {f"{name}:{self.server_address[1]}" for name in (HOST, "localhost")}
 
     @property
@@ -422,7 +527,8 @@ class Server(ThreadingHTTPServer):
 
 
 class Handler(BaseHTTPRequestHandler):
-    """GET / and /study; POST questions as JSON, answered by float32 or JSON. There are no other places, and no files are served."""
+    """GET / and /study; POST questions as JSON, answered by float32 or JSON. There are no other places, and no files
+    are served."""
 
     protocol_version = "HTTP/1.1"
     server: Server
@@ -457,7 +563,8 @@ class Handler(BaseHTTPRequestHandler):
             self._send(HTTPStatus.OK, floats(image, np.broadcast_to(use, image.shape)))
 
         routes = {
-            "/capture": capture, "/derivative": derivative,
+            "/capture": capture,
+            "/derivative": derivative,
             "/predict": lambda: self._send(HTTPStatus.OK, floats(*view.predict(index(), changes()))),
             "/rows": lambda: self._json(view.rows(index(), names(), changes())),
             "/best": lambda: self._json(view.best(names(), changes(), changes("there"))),
@@ -470,16 +577,23 @@ class Handler(BaseHTTPRequestHandler):
         try:
             size = int(self.headers.get("Content-Length") or 0)
             if not 0 <= size <= BODY_MAX:
-                return self._error(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"a question of {size} bytes; allowed: {BODY_MAX}")
+                return self._error(
+                    HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"a question of {size} bytes; allowed: {BODY_MAX}"
+                )
             text = self.rfile.read(size)
-            # A page of another site may send its visitor's browser here under a name of its own, or post what needs no leave.
+            # A page of another site may send its visitor's browser here under a name of its own, or post what needs no
+            # leave.
             if self.headers.get("Host") not in self.server.hosts:
                 return self._error(HTTPStatus.FORBIDDEN, f"this page is at {self.server.url} and nowhere else")
             if self.path not in routes:
                 return self._error(HTTPStatus.NOT_FOUND, f"nothing is at this place; the page is at {self.server.url}")
             if body is not None:
                 origin = self.headers.get("Origin")
-                if self.headers.get_content_type() != "application/json" or origin and origin.removeprefix("http://") not in self.server.hosts:
+                if (
+                    self.headers.get_content_type() != "application/json"
+                    or origin
+                    and origin.removeprefix("http://") not in self.server.hosts
+                ):
                     return self._error(HTTPStatus.FORBIDDEN, "questions come as application/json, from this page alone")
                 given = json.loads(text or b"{}")
                 if not isinstance(given, dict):
@@ -508,8 +622,11 @@ class Handler(BaseHTTPRequestHandler):
             self.send_header("Content-Length", str(len(data)))
         self.send_header("Cache-Control", "no-store")
         self.send_header("X-Content-Type-Options", "nosniff")
-        self.send_header("Content-Security-Policy", "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; "
-                                                    "connect-src 'self'; img-src data:; base-uri 'none'; frame-ancestors 'none'")
+        self.send_header(
+            "Content-Security-Policy",
+            "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; "
+            "connect-src 'self'; img-src data:; base-uri 'none'; frame-ancestors 'none'",
+        )
         for name, value in headers.items():
             self.send_header(name, value)
         self.end_headers()
@@ -519,11 +636,13 @@ class Handler(BaseHTTPRequestHandler):
         """Say nothing: the terminal belongs to the command."""
 
 
-def serve(folder: str | Path, port: int = 0, step: int | None = None, ready: Callable[[str], None] = lambda url: None) -> None:
+def serve(
+    folder: str | Path, port: int = 0, step: int | None = None, ready: Callable[[str], None] = lambda url: None
+) -> None:
     """Serve the page of a study until Ctrl-C; `ready` is told its address.
 
-    Raises what `optics.study.loop.take_up` raises, ValueError for a study or a step that is not there, OSError for a port in use.
-    """
+    Raises what `optics.study.loop.take_up` raises, ValueError for a study or a step that is not there, OSError for a
+    port in use."""
     if not PAGE.is_file():
         raise FileNotFoundError(f"{PAGE}: the page is missing from this installation; install the package again")
     server = Server(port)

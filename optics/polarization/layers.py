@@ -2,12 +2,12 @@
 
 A layer is a part of the category `bsdf` on a flat or curved surface. Its physics is one function of what a ray meets:
 
-    mueller(crossing, layer) -> Mueller          crossing: how the light passes (`Crossing`); layer: the part's parameters
+    mueller(crossing, layer) -> Mueller          crossing: how the light passes (`Crossing`); layer: the part's
+                                                 parameters
 
-in arithmetic that numpy arrays and Dr.Jit share (optics.polarization.mueller). The prediction follows each camera ray through the layers
-(optics.light.paths) and multiplies these matrices in numpy; mi.render meets the same function inside a null BSDF (`bsdf`).
-Effects add to it at the stage `layer`, with a function of the same form.
-"""
+in arithmetic that numpy arrays and Dr.Jit share (optics.polarization.mueller). The prediction follows each camera ray
+through the layers (optics.light.paths) and multiplies these matrices in numpy; mi.render meets the same function inside
+a null BSDF (`bsdf`). Effects add to it at the stage `layer`, with a function of the same form."""
 
 from __future__ import annotations
 
@@ -26,7 +26,8 @@ def cross(a, b):
 
 
 class Crossing:
-    """How light passes a layer, in the layer's own axes: z the normal (towards the viewer), x the layer's zero direction.
+    """How light passes a layer, in the layer's own axes: z the normal (towards the viewer), x the layer's zero
+    direction.
 
     k            unit vector of the light's direction, (kx, ky, kz)
     x, y         the axes that the Stokes vectors refer to, unit vectors with k = x cross y
@@ -67,15 +68,17 @@ class Crossing:
     def plane(self) -> tuple:
         """(q, u) of the s direction, across the plane of incidence; that of the layer's x axis at normal incidence."""
         level = 1 - self.k[2] * self.k[2] < 1e-12
-        return self._doubled((where(level, 0.0 * self.k[1] + 1, -self.k[1]), where(level, 0.0, self.k[0]), 0 * self.k[2]))
+        return self._doubled(
+            (where(level, 0.0 * self.k[1] + 1, -self.k[1]), where(level, 0.0, self.k[0]), 0 * self.k[2])
+        )
 
     def retardance(self, a, b, index) -> tuple:
-        """Components against the axes x, y of a retardance that is (a, b) against the sheet's own axes at normal incidence.
+        """Components against the axes x, y of a retardance that is (a, b) against the sheet's own axes at normal
+        incidence.
 
-        The sheet's birefringence is the tensor [[a, b], [b, -a]]/2 in its plane (a along x less along y, b along the diagonals),
-        without part along its normal; a ray sees what of it lies across the ray inside the sheet, over a path longer by 1/cos.
-        Small birefringence: Yeh & Gu, Optics of Liquid Crystal Displays, 2nd ed., 3.2.
-        """
+        The sheet's birefringence is the tensor [[a, b], [b, -a]]/2 in its plane (a along x less along y, b along the
+        diagonals), without part along its normal; a ray sees what of it lies across the ray inside the sheet, over a
+        path longer by 1/cos. Small birefringence: Yeh & Gu, Optics of Liquid Crystal Displays, 2nd ed., 3.2."""
         inner = sqrt(1 - (1 - self.k[2] * self.k[2]) / (index * index))
         bent = (self.k[0] / index, self.k[1] / index, where(self.k[2] < 0, -inner, inner))
         middle = tuple(p + q for p, q in zip(self.k, bent))
@@ -97,8 +100,8 @@ def evaluate(own: Callable, crossing: Crossing, layer, effects=()) -> Mueller:
 
 
 class Texture:
-    """An image (H, W, C) for Dr.Jit: f(s, t) -> C values at s along the columns and t along the rows, both from 0 to 1 over
-    the whole pixels, linear between their centres and constant beyond."""
+    """An image (H, W, C) for Dr.Jit: f(s, t) -> C values at s along the columns and t along the rows, both from 0 to 1
+    over the whole pixels, linear between their centres and constant beyond."""
 
     def __init__(self, values):
         self.values, self.made = values, {}
@@ -108,5 +111,7 @@ class Texture:
         import mitsuba as mi
 
         if mi.variant() not in self.made:
-            self.made[mi.variant()] = mi.Texture2f(mi.TensorXf(self.values.astype("float32")), wrap_mode=dr.WrapMode.Clamp)
+            self.made[mi.variant()] = mi.Texture2f(
+                mi.TensorXf(self.values.astype("float32")), wrap_mode=dr.WrapMode.Clamp
+            )
         return self.made[mi.variant()].eval(mi.Point2f(s, t))

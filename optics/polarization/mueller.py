@@ -1,15 +1,16 @@
 """Mueller calculus: how a layer changes the polarization of light, for numpy arrays and for Dr.Jit alike.
 
-Stokes vectors S = (S0, S1, S2, S3) refer to two axes x, y across the direction k in which the light travels, k = x cross y:
-an observer whom the light reaches sees x to the right and y up. S1 > 0 is light polarized along x, S2 > 0 along x + y, an angle is
-counted from x to y. An axis that lies at the angle phi enters a matrix as q = cos(2 phi), u = sin(2 phi).
+Stokes vectors S = (S0, S1, S2, S3) refer to two axes x, y across the direction k in which the light travels, k = x
+cross y: an observer whom the light reaches sees x to the right and y up. S1 > 0 is light polarized along x, S2 > 0
+along x + y, an angle is counted from x to y. An axis that lies at the angle phi enters a matrix as q = cos(2 phi), u =
+sin(2 phi).
 
-A `Mueller` holds 4 x 4 entries; each is a plain 0 (nothing there, never multiplied), a number, or an array of any shape that
-broadcasts. All formulas are analytic in their arguments, so that numpy's complex numbers carry derivatives (optics.light.development).
+A `Mueller` holds 4 x 4 entries; each is a plain 0 (nothing there, never multiplied), a number, or an array of any shape
+that broadcasts. All formulas are analytic in their arguments, so that numpy's complex numbers carry derivatives
+(optics.light.development).
 
-Sources: Goldstein, Polarized Light, 3rd ed. (2011), chs. 5, 6, 9; Born & Wolf, Principles of Optics, 1.5; for what a matrix
-must meet to be physical, Cloude, Proc. SPIE 1166, 177 (1989).
-"""
+Sources: Goldstein, Polarized Light, 3rd ed. (2011), chs. 5, 6, 9; Born & Wolf, Principles of Optics, 1.5; for what a
+matrix must meet to be physical, Cloude, Proc. SPIE 1166, 177 (1989)."""
 
 from __future__ import annotations
 
@@ -28,7 +29,9 @@ def _library(*values):
 
 def _apply(name: str, x):
     value = getattr(_library(x), name)(x)
-    return float(value) if isinstance(x, (int, float)) else value  # a numpy scalar would swallow a Dr.Jit array beside it
+    return (
+        float(value) if isinstance(x, (int, float)) else value
+    )  # a numpy scalar would swallow a Dr.Jit array beside it
 
 
 def cos(x):
@@ -105,26 +108,37 @@ class Mueller:
         """row times the matrix: what a detector (a row vector) is sensitive to before the layer."""
         return tuple(_dot(row, column) for column in zip(*self.rows))
 
-    def __mul__(self, factor) -> "Mueller":
+    def __mul__(self, factor) -> Mueller:
         return Mueller([[0 if _nothing(e) else e * factor for e in row] for row in self.rows])
 
     __rmul__ = __mul__
 
-    def __add__(self, other: "Mueller") -> "Mueller":
-        return Mueller([[b if _nothing(a) else a if _nothing(b) else a + b for a, b in zip(*rows)]
-                        for rows in zip(self.rows, other.rows)])
+    def __add__(self, other: Mueller) -> Mueller:
+        return Mueller(
+            [
+                [b if _nothing(a) else a if _nothing(b) else a + b for a, b in zip(*rows)]
+                for rows in zip(self.rows, other.rows)
+            ]
+        )
 
     @property
-    def reversed(self) -> "Mueller":
-        """The same layer met from behind, in axes (-x, y) that look back: O M^T O, O = diag(1, 1, -1, 1) (reciprocity)."""
+    def reversed(self) -> Mueller:
+        """The same layer met from behind, in axes (-x, y) that look back: O M^T O, O = diag(1, 1, -1, 1)
+        (reciprocity)."""
         sign = (1, 1, -1, 1)
-        return Mueller([[0 if _nothing(self.rows[j][i]) else self.rows[j][i] * (sign[i] * sign[j]) for j in range(4)]
-                        for i in range(4)])
+        return Mueller(
+            [
+                [0 if _nothing(self.rows[j][i]) else self.rows[j][i] * (sign[i] * sign[j]) for j in range(4)]
+                for i in range(4)
+            ]
+        )
 
     def numpy(self) -> np.ndarray:
         """(..., 4, 4) of numpy entries."""
         shape = np.broadcast_shapes(*(np.shape(e) for row in self.rows for e in row))
-        return np.stack([np.stack([np.broadcast_to(np.asarray(e) * 1.0, shape) for e in row], -1) for row in self.rows], -2)
+        return np.stack(
+            [np.stack([np.broadcast_to(np.asarray(e) * 1.0, shape) for e in row], -1) for row in self.rows], -2
+        )
 
     def mitsuba(self):
         """As Mitsuba's Spectrum of the polarized variants."""
@@ -133,7 +147,7 @@ class Mueller:
         return mi.Spectrum(*[mi.UnpolarizedSpectrum(e) for row in self.rows for e in row])
 
     @classmethod
-    def of(cls, array: np.ndarray) -> "Mueller":
+    def of(cls, array: np.ndarray) -> Mueller:
         """From an array (..., 4, 4)."""
         return cls([[array[..., i, j] for j in range(4)] for i in range(4)])
 
@@ -163,8 +177,14 @@ def diattenuator(q, u, t1, t2) -> Mueller:
     dark = real(product) <= 1e-14
     c = where(dark, 0.0 * product, sqrt(where(dark, 1.0, product)))
     cross = (a - c) * (q * u)
-    return Mueller([[a, b * q, b * u, 0], [b * q, a * (q * q) + c * (u * u), cross, 0],
-                    [b * u, cross, a * (u * u) + c * (q * q), 0], [0, 0, 0, c]])
+    return Mueller(
+        [
+            [a, b * q, b * u, 0],
+            [b * q, a * (q * q) + c * (u * u), cross, 0],
+            [b * u, cross, a * (u * u) + c * (q * q), 0],
+            [0, 0, 0, c],
+        ]
+    )
 
 
 def retarder(a, b) -> Mueller:
@@ -172,15 +192,19 @@ def retarder(a, b) -> Mueller:
     b = delta sin(2 phi); analytic through delta = 0, where phi has no meaning.
 
         M = [[1, 0, 0, 0], [0, 1 - g b^2, g a b, -s b], [0, g a b, 1 - g a^2, s a], [0, s b, -s a, cos(delta)]]
-    with s = sin(delta)/delta and g = (1 - cos(delta))/delta^2. Light at 0 degrees becomes S3 > 0 in a quarter-wave plate with
-    its fast axis at +45 degrees, as by Mitsuba's `retarder`.
-    Goldstein (2011), sec. 5.3.
-    """
+    with s = sin(delta)/delta and g = (1 - cos(delta))/delta^2. Light at 0 degrees becomes S3 > 0 in a quarter-wave
+    plate with its fast axis at +45 degrees, as by Mitsuba's `retarder`. Goldstein (2011), sec. 5.3."""
     square = a * a + b * b
     s, g = sinc(square), cosc(square)
     sa, sb = s * a, s * b
-    return Mueller([[1.0, 0, 0, 0], [0, 1 - g * (b * b), g * (a * b), -sb], [0, g * (a * b), 1 - g * (a * a), sa],
-                    [0, sb, -sa, 1 - g * square]])
+    return Mueller(
+        [
+            [1.0, 0, 0, 0],
+            [0, 1 - g * (b * b), g * (a * b), -sb],
+            [0, g * (a * b), 1 - g * (a * a), sa],
+            [0, sb, -sa, 1 - g * square],
+        ]
+    )
 
 
 def depolarizer(keep_linear, keep_circular=None) -> Mueller:
@@ -190,7 +214,8 @@ def depolarizer(keep_linear, keep_circular=None) -> Mueller:
 
 
 def mirrored(r) -> Mueller:
-    """Reflection at normal incidence with reflectance r, seen in the axes (-x, y) that look back: r diag(1, 1, -1, -1)."""
+    """Reflection at normal incidence with reflectance r, seen in the axes (-x, y) that look back: r diag(1, 1, -1,
+    -1)."""
     return Mueller([[r, 0, 0, 0], [0, r, 0, 0], [0, 0, -r, 0], [0, 0, 0, -r]])
 
 
@@ -200,9 +225,8 @@ def mirrored(r) -> Mueller:
 def fresnel(cos1, n) -> tuple:
     """Power reflectances R_s, R_p of a boundary with relative index n = n2/n1, and cos of the refracted angle.
 
-    cos1 > 0 on the side of medium 1; beyond the critical angle both are 1. Transmittances are 1 - R (power over the projected
-    area; a radiance changes by a further 1/n^2). Born & Wolf, 1.5.2.
-    """
+    cos1 > 0 on the side of medium 1; beyond the critical angle both are 1. Transmittances are 1 - R (power over the
+    projected area; a radiance changes by a further 1/n^2). Born & Wolf, 1.5.2."""
     square = 1 - (1 - cos1 * cos1) / (n * n)
     total = real(square) <= 0
     cos2 = where(total, 0.0 * square, sqrt(where(total, 1.0, square)))
@@ -227,9 +251,8 @@ def total_reflection_phase(cos1, n):
 def fresnel_reflection(cos1, n) -> Mueller:
     """Reflection in axes (s, p) before and (s, p) after; beyond the critical angle with the phase of total reflection.
 
-    Axes: s = k cross (surface normal), p = k cross s for the incident as for the reflected k. Below Brewster's angle r_s and r_p
-    have opposite signs in these axes.
-    """
+    Axes: s = k cross (surface normal), p = k cross s for the incident as for the reflected k. Below Brewster's angle
+    r_s and r_p have opposite signs in these axes."""
     square = 1 - (1 - cos1 * cos1) / (n * n)
     total = real(square) <= 0
     cos2 = where(total, 0.0, sqrt(where(total, 1.0, square)))
@@ -249,25 +272,30 @@ class Slab:
     """A layer that transmits and reflects: matrices for light from the front (r, t) and from behind (r_back, t_back).
 
     `a.before(b)`: light from the front meets b first and a last, all reflections between them summed (adding method,
-    van de Hulst 1980; matrices from behind refer to axes that look back).
-    """
+    van de Hulst 1980; matrices from behind refer to axes that look back)."""
 
-    def __init__(self, t: Mueller, r: Mueller | None = None, t_back: Mueller | None = None, r_back: Mueller | None = None):
+    def __init__(
+        self, t: Mueller, r: Mueller | None = None, t_back: Mueller | None = None, r_back: Mueller | None = None
+    ):
         zero = Mueller([[0] * 4] * 4)
         self.t, self.t_back = t, t.reversed if t_back is None else t_back
         self.r, self.r_back = zero if r is None else r, zero if r_back is None else r_back
 
-    def after(self, first: "Slab", orders: int = 4) -> "Slab":
-        """This layer behind `first`: the light meets `first` before this one. The series ends after `orders` round trips."""
+    def after(self, first: Slab, orders: int = 4) -> Slab:
+        """This layer behind `first`: the light meets `first` before this one. The series ends after `orders` round
+        trips."""
         loop = first.r_back @ self.r  # one round trip between the two, starting towards this layer
         back = self.r @ first.r_back
         series, series_back, power, power_back = identity(), identity(), identity(), identity()
         for _ in range(orders):
             power, power_back = loop @ power, back @ power_back
             series, series_back = series + power, series_back + power_back
-        return Slab(self.t @ series @ first.t, first.r + first.t_back @ self.r @ series @ first.t,
-                    first.t_back @ series_back @ self.t_back,
-                    self.r_back + self.t @ first.r_back @ series_back @ self.t_back)
+        return Slab(
+            self.t @ series @ first.t,
+            first.r + first.t_back @ self.r @ series @ first.t,
+            first.t_back @ series_back @ self.t_back,
+            self.r_back + self.t @ first.r_back @ series_back @ self.t_back,
+        )
 
 
 def face(r) -> Slab:
@@ -279,7 +307,8 @@ def face(r) -> Slab:
 
 
 def physical(matrix: np.ndarray) -> np.ndarray:
-    """Smallest eigenvalue of the coherency matrix of M (..., 4, 4), over its trace: >= 0 where M is physically realisable.
+    """Smallest eigenvalue of the coherency matrix of M (..., 4, 4), over its trace: >= 0 where M is physically
+    realisable.
 
     H = 1/4 sum_ij M_ij (sigma_i x conj(sigma_j)); Cloude (1989).
     """
@@ -300,7 +329,7 @@ def degree_of_polarization(stokes: np.ndarray, linear: bool = True) -> np.ndarra
     """sqrt(S1^2 + S2^2 (+ S3^2))/S0 of (..., 4); NaN in the dark."""
     s = np.asarray(stokes, float)
     with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(s[..., 0] > 0, np.linalg.norm(s[..., 1:3 if linear else 4], axis=-1) / s[..., 0], np.nan)
+        return np.where(s[..., 0] > 0, np.linalg.norm(s[..., 1 : 3 if linear else 4], axis=-1) / s[..., 0], np.nan)
 
 
 def angle_of_polarization(stokes: np.ndarray) -> np.ndarray:

@@ -1,8 +1,7 @@
 """One cell: captures made, the loop run blind on them, and the record of what it said.
 
-The loop sees the captures alone. It is what a user does: calibrate, diagnose; add what a CLAIM names, or the pair that a PARTIAL
-verdict has found to be complete, and diagnose again, while more than one effect may be hidden.
-"""
+The loop sees the captures alone. It is what a user does: calibrate, diagnose; add what a CLAIM names, or the pair that
+a PARTIAL verdict has found to be complete, and diagnose again, while more than one effect may be hidden."""
 
 from __future__ import annotations
 
@@ -26,10 +25,17 @@ STEPS = 3  # effects that the loop may add where two are hidden
 
 
 def run(rig, cell: Cell) -> dict:
-    """The record of a cell: the truth, every diagnosis in short, and the time. Errors that the program means to raise are records too."""
+    """The record of a cell: the truth, every diagnosis in short, and the time. Errors that the program means to raise
+    are records too."""
     clock = time.perf_counter()
-    record = {"cell": cell.json(), "truth": {}, "steps": [], "failed": "", "unreachable": False,
-              "coordinates": list(rig.unknown.get(cell.hidden[0], ())) if cell.kind == "unknown" else []}
+    record = {
+        "cell": cell.json(),
+        "truth": {},
+        "steps": [],
+        "failed": "",
+        "unreachable": False,
+        "coordinates": list(rig.unknown.get(cell.hidden[0], ())) if cell.kind == "unknown" else [],
+    }
     with tempfile.TemporaryDirectory() as folder:
         captures, study_folder = Path(folder) / "captures", Path(folder) / "study"
         record["truth"] = rig.make(captures, cell)
@@ -68,17 +74,26 @@ def _step(rig, model, cell: Cell, d: Diagnosis) -> dict:
     refitted = sorted((r for r in d.rows if r.refit is not None), key=lambda r: -r.net_refit)
     best = refitted[0].net_refit if refitted else 0.0
     # what frees less and does as well goes first, as in a diagnosis
-    first = next((r for r in refitted[1:] if set(r.variables) < set(refitted[0].variables) and best - r.net_refit < CLEAR), None)
+    first = next(
+        (r for r in refitted[1:] if set(r.variables) < set(refitted[0].variables) and best - r.net_refit < CLEAR), None
+    )
     refitted.sort(key=lambda r: r is not first)
     return {
-        "word": d.word, "claimed": d.claimed, "ambiguous": d.ambiguous, "sentence": d.sentence,
+        "word": d.word,
+        "claimed": d.claimed,
+        "ambiguous": d.ambiguous,
+        "sentence": d.sentence,
         "p_best": min((r.p_family for r in d.rows), default=1.0),
-        "score": [r.name for r in d.rows[:5]], "refit": [r.name for r in refitted[:5]],
+        "score": [r.name for r in d.rows[:5]],
+        "refit": [r.name for r in refitted[:5]],
         "set": _close(refitted, lambda r: r.net_refit) or _close(d.rows, lambda r: r.net),
         "falls": {r.name: [r.refit.predicted, r.refit.fall] for r in refitted},
-        "noise": d.basis.noise, "excess_sd": d.basis.excess_sd, "phi": d.basis.phi,
+        "noise": d.basis.noise,
+        "excess_sd": d.basis.excess_sd,
+        "phi": d.basis.phi,
         "conditions": {c.name: [c.value, c.holds] for c in d.conditions},
-        "held_out": [level.chi2_held_out for level in d.levels], "misfit": [level.held_out for level in d.levels],
+        "held_out": [level.chi2_held_out for level in d.levels],
+        "misfit": [level.held_out for level in d.levels],
         "complete": {r.name: r.refit.complete for r in refitted[:1]},
         "coordinates": [f.coordinate for f in d.fingerprints[:4]],
         "pair": _to_add(d) if d.word == "PARTIAL" else [],
@@ -87,8 +102,8 @@ def _step(rig, model, cell: Cell, d: Diagnosis) -> dict:
 
 
 def _close(rows: Sequence[Row], fall: Callable[[Row], float]) -> list[str]:
-    """What explains more than chance does and is not told from the best, of effects that were added in earnest; where none stands out enough
-    for that, by score."""
+    """What explains more than chance does and is not told from the best, of effects that were added and refitted; where
+    none stands out enough for that, by score."""
     best = max(map(fall, rows), default=0.0)
     return [r.name for r in rows if fall(r) > 0 and close(best, fall(r))]
 
@@ -103,7 +118,9 @@ def _strengths(rig, model, cell: Cell, d: Diagnosis) -> dict[str, list[float]]:
     if set(weights) - set(names):
         return {}
     w = np.array([weights.get(name, 0.0) for name in names])
-    value = sum(weight * value_of(model, fit.values, fit.variables[names.index(key)]) for key, weight in weights.items())
+    value = sum(
+        weight * value_of(model, fit.values, fit.variables[names.index(key)]) for key, weight in weights.items()
+    )
     own = np.flatnonzero(w)
     variance = max(float(w[own] @ np.asarray(fit.covariance)[np.ix_(own, own)] @ w[own]), 0.0)
     row = d.row(d.claimed)

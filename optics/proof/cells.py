@@ -1,4 +1,5 @@
-"""The plan: what is hidden where. Rounds of cells, each round of another seed, so that any number of rounds is balanced."""
+"""The plan: what is hidden where. Rounds of cells, each round of another seed, so that any number of rounds is
+balanced."""
 
 from __future__ import annotations
 
@@ -8,15 +9,20 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 CLUTTER = (0.0, 0.15, 0.5, 1.0)
-# (raw change of the picture, clutter, law), as often as they count: most where the targets are asked
+# (raw change of the image, clutter, law), as often as they count: most where the targets are asked
 LIBRARY = (
-    *[(0.005, 0.0, "same")] * 8, *[(0.002, 0.0, "same")] * 4, *[(0.02, 0.0, "same")] * 3,
-    *[(0.02, c, "same") for c in CLUTTER[1:]] * 3, *[(0.005, c, "same") for c in CLUTTER[1:]], *[(0.002, c, "same") for c in CLUTTER[1:]],
-    *[(0.02, c, "other") for c in CLUTTER], *[(0.005, 0.0, "other")] * 2,
+    *[(0.005, 0.0, "same")] * 8,
+    *[(0.002, 0.0, "same")] * 4,
+    *[(0.02, 0.0, "same")] * 3,
+    *[(0.02, c, "same") for c in CLUTTER[1:]] * 3,
+    *[(0.005, c, "same") for c in CLUTTER[1:]],
+    *[(0.002, c, "same") for c in CLUTTER[1:]],
+    *[(0.02, c, "other") for c in CLUTTER],
+    *[(0.005, 0.0, "other")] * 2,
 )
 UNKNOWN_CHANGE = 0.01
 PAIR_CHANGE = 0.01
-# what is written down wrongly of the camera, or done to its pictures (diagnosis laboratory, 3.3)
+# what is written down wrongly of the camera, or done to its images (diagnosis laboratory, 3.3)
 MISTAKES = ("gain +20 %", "gain -20 %", "pattern 0.3 %", "pattern 1 %", "black level 0.5 DN", "demosaiced")
 
 
@@ -25,7 +31,7 @@ class Cell:
     """One capture set to be made and judged.
 
     kind     library, none, pair, unknown, mistake;   hidden   effects, or the unknown kind
-    change   rms of the picture's change by each, over its mean;   law   "same" as the library's, or "other"
+    change   rms of the image's change by each, over its mean;   law   "same" as the library's, or "other"
     """
 
     rig: str
@@ -39,7 +45,14 @@ class Cell:
 
     @property
     def name(self) -> str:
-        words = [self.rig, self.kind, "+".join(self.hidden) or "none", f"{100 * self.change:g}", f"c{self.clutter:g}", self.law]
+        words = [
+            self.rig,
+            self.kind,
+            "+".join(self.hidden) or "none",
+            f"{100 * self.change:g}",
+            f"c{self.clutter:g}",
+            self.law,
+        ]
         words += [self.mistake] if self.mistake else []
         text = "_".join([*words, f"s{self.seed:03d}"])
         return "".join(ch if ch.isalnum() or ch in "+-._" else "-" for ch in text)
@@ -48,12 +61,13 @@ class Cell:
         return asdict(self)
 
     @classmethod
-    def of(cls, data: dict) -> "Cell":
+    def of(cls, data: dict) -> Cell:
         return cls(**{**data, "hidden": tuple(data["hidden"])})
 
 
 def rounds(rig, count: int, first: int = 0) -> Iterator[list[Cell]]:
-    """Cells of one rig, round by round: every effect once, three sets with nothing hidden, unknown kinds, a pair, a mistake.
+    """Cells of one rig, round by round: every effect once, three sets with nothing hidden, unknown kinds, a pair, a
+    mistake.
 
     rig   with `name`, `effects`, `others` (effects with another law), `unknown`, `pairs`, `mistakes`, `cluttered`
     """
@@ -78,11 +92,17 @@ def rounds(rig, count: int, first: int = 0) -> Iterator[list[Cell]]:
             both = rig.pairs[number % len(rig.pairs)]
             cells.append(Cell(rig.name, "pair", tuple(both), PAIR_CHANGE, 0.0, "same", "", number))
         if rig.mistakes:
-            cells.append(Cell(rig.name, "mistake", (), 0.0, 0.0, "same", rig.mistakes[number % len(rig.mistakes)], number))
+            cells.append(
+                Cell(rig.name, "mistake", (), 0.0, 0.0, "same", rig.mistakes[number % len(rig.mistakes)], number)
+            )
         yield [cells[i] for i in rng.permutation(len(cells))]  # so that what is done when time is up is balanced
 
 
 def pairs_of(effects: Sequence[str], apart: int = 3) -> list[tuple[str, str]]:
     """Pairs of neighbours in a circle, and of those some places apart: each effect in four of them."""
     count = len(effects)
-    return [(effects[i], effects[(i + step) % count]) for step in (1, apart) for i in range(count)] if count > apart else []
+    return (
+        [(effects[i], effects[(i + step) % count]) for step in (1, apart) for i in range(count)]
+        if count > apart
+        else []
+    )

@@ -18,22 +18,30 @@ from optics.proof import cells as plan
 QUICK = {"polarizer_bench": 1}
 
 
-def main(output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Records, table and page; taken up again if there.")]
-         = Path("renders/proof"),
-         rig: Annotated[list[str] | None, typer.Option(help="Only this sensor or bench; may be given again.")] = None,
-         rounds: Annotated[int, typer.Option(help="Rounds of cells: some thirty cells each.")] = 40,
-         kind: Annotated[list[str] | None, typer.Option(help="Only cells of this kind: library, none, pair, unknown, mistake.")] = None,
-         jobs: Annotated[int, typer.Option(help="Processes; 0: one per core.")] = 0,
-         minutes: Annotated[float, typer.Option(help="Begin no cell after so long; 0: go on to the end.")] = 0.0,
-         quick: Annotated[bool, typer.Option("--quick", help="One round of the fastest bench, in a minute.")] = False,
-         count_only: Annotated[bool, typer.Option("--count", help="Run nothing: count what is there.")] = False) -> None:
-    """Hide effects in captures made by another path than the model, run the loop blind on each, and count what it said."""
+def main(
+    output: Annotated[
+        Path, typer.Option("-o", "--output", metavar="DIR", help="Records, table and page; taken up again if there.")
+    ] = Path("renders/proof"),
+    rig: Annotated[list[str] | None, typer.Option(help="Only this sensor or bench; may be given again.")] = None,
+    rounds: Annotated[int, typer.Option(help="Rounds of cells: some thirty cells each.")] = 40,
+    kind: Annotated[
+        list[str] | None, typer.Option(help="Only cells of this kind: library, none, pair, unknown, mistake.")
+    ] = None,
+    jobs: Annotated[int, typer.Option(help="Processes; 0: one per core.")] = 0,
+    minutes: Annotated[float, typer.Option(help="Begin no cell after so long; 0: go on to the end.")] = 0.0,
+    quick: Annotated[bool, typer.Option("--quick", help="One round of the fastest bench, in a minute.")] = False,
+    count_only: Annotated[bool, typer.Option("--count", help="Run nothing: count what is there.")] = False,
+) -> None:
+    """Hide effects in captures made by another path than the model, run the loop blind on each, and count what it
+    said."""
     from optics.proof import count, page
     from optics.proof.rigs import RIGS
 
     names = list(QUICK) if quick else rig or list(RIGS)
     if unknown := set(names) - set(RIGS):
-        raise typer.BadParameter(f"no rig {', '.join(sorted(unknown))}; there are {', '.join(RIGS)}", param_hint="--rig")
+        raise typer.BadParameter(
+            f"no rig {', '.join(sorted(unknown))}; there are {', '.join(RIGS)}", param_hint="--rig"
+        )
     folder = output / "records"
     folder.mkdir(parents=True, exist_ok=True)
     wanted = []
@@ -42,7 +50,11 @@ def main(output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", h
         wanted.append([[c for c in batch if not kind or c.kind in kind] for batch in batches])
     # round by round over all rigs, so that what is done when time is up is balanced
     tasks = [(name, batch) for turn in zip(*wanted) for name, batch in zip(names, turn)]
-    todo = [(name, left) for name, batch in tasks if (left := [c for c in batch if blind.take_up(folder / f"{c.name}.json") is None])]
+    todo = [
+        (name, left)
+        for name, batch in tasks
+        if (left := [c for c in batch if blind.take_up(folder / f"{c.name}.json") is None])
+    ]
     if not count_only:
         _run(todo, folder, jobs or os.cpu_count() or 1, minutes)
     records = [r for _, batch in tasks for c in batch if (r := blind.take_up(folder / f"{c.name}.json"))]
@@ -59,8 +71,14 @@ def _run(todo, folder: Path, jobs: int, minutes: float) -> None:
     if not total:
         return
     until = time.time() + 60 * minutes if minutes else float("inf")
-    with Progress(TextColumn("cells"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), TextColumn("{task.description}"),
-                  disable=not sys.stdout.isatty()) as bar:
+    with Progress(
+        TextColumn("cells"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+        TextColumn("{task.description}"),
+        disable=not sys.stdout.isatty(),
+    ) as bar:
         shown = bar.add_task("", total=total)
         if jobs == 1:
             for name, batch in todo:
@@ -86,7 +104,7 @@ def _whole(task) -> list[str]:
 
 
 def _batch(name: str, batch, folder: Path, until: float):
-    """Cells of one round, whose pictures share their geometry."""
+    """Cells of one round, whose images share their geometry."""
     from optics.proof.rigs import RIGS
 
     rig = _RIGS.setdefault(name, RIGS[name]())

@@ -5,9 +5,11 @@ A target is reached when the near end of the interval reaches it: few cells reac
     top-1        the hidden effect has the largest fall of chi2 after refit; top-3: is among the three best by score
     in the set   is among the effects that the refit cannot tell from the best
     precision    of claims where a library effect, two, or none was hidden: share that name a hidden one
-    strength     of right claims by the library's own law: within 20 %; pulls: (found - true)/sd of those without clutter
-    fall         of chi2, brought by the refit over predicted before it (by the score; where the picture of a weak effect is not that of a
-                 strong one, by its picture at the strength that the score found), of the right effects
+    strength     of right claims by the library's own law: within 20 %; pulls: (found - true)/sd of those without
+                 clutter
+    fall         of chi2, brought by the refit over predicted before it (by the score; where the image of a weak effect
+                 is not that of a
+                 strong one, by its image at the strength that the score found), of the right effects
 """
 
 from __future__ import annotations
@@ -80,7 +82,7 @@ class Count:
     null_p: list[float]
     held_out: list[float]
     seconds: float
-    rigs: dict[str, "Count"] = field(default_factory=dict)
+    rigs: dict[str, Count] = field(default_factory=dict)
 
     def rate(self, name: str) -> Rate:
         return next(r for r in self.rates if r.name == name)
@@ -92,29 +94,43 @@ class Count:
 
     def text(self) -> str:
         """For a terminal."""
-        lines = [f"proof: {self.done} of {self.planned} cells ({self.unreachable} cannot be made that strong, {len(self.failed)} failed), "
-                 f"{self.seconds / max(self.done, 1):.0f} s each"]
+        lines = [
+            f"proof: {self.done} of {self.planned} cells ({self.unreachable} cannot be made that strong, {len(self.failed)} failed), "
+            f"{self.seconds / max(self.done, 1):.0f} s each"
+        ]
         for name, one in {"": self, **self.rigs}.items():
             if name and len(self.rigs) < 2:
                 continue
-            lines += ["", f"{name or 'all'}:", f"  {'':<52}{'rate':>7}{'n':>6}   {'95 %':<13} {'first':>6} {'ambit.':>7}  reached"]
+            lines += [
+                "",
+                f"{name or 'all'}:",
+                f"  {'':<52}{'rate':>7}{'n':>6}   {'95 %':<13} {'first':>6} {'ambit.':>7}  reached",
+            ]
             for r in one.rates:
                 lo, hi = r.interval
-                lines.append(f"  {r.name:<52}{r.value:>7.3f}{r.n:>6}   {lo:.3f}-{hi:.3f}   {r.first:>5g} {r.ambitious:>7g}  {r.verdict}")
+                lines.append(
+                    f"  {r.name:<52}{r.value:>7.3f}{r.n:>6}   {lo:.3f}-{hi:.3f}   {r.first:>5g} {r.ambitious:>7g}  {r.verdict}"
+                )
             lines += [f"  ties declared {one.ties[1]}, with the hidden effect among them {one.ties[0]}"]
             if one.set_size is not None:
                 lines += [f"  effects in the set at 0.2 %, on average: {one.set_size:.2f} (to be: 2 at most)"]
             for law, values in one.pulls.items():
                 if len(values) > 1:
-                    lines.append(f"  pulls of strengths ({law}): n {len(values)}, mean {np.mean(values):+.2f}, sd {np.std(values, ddof=1):.2f}")
+                    lines.append(
+                        f"  pulls of strengths ({law}): n {len(values)}, mean {np.mean(values):+.2f}, sd {np.std(values, ddof=1):.2f}"
+                    )
             if one.falls:
                 q = np.percentile(one.falls, [10, 50, 90])
-                lines.append(f"  fall of chi2 over its prediction: {q[1]:.2f} ({q[0]:.2f} to {q[2]:.2f}), n {len(one.falls)}")
+                lines.append(
+                    f"  fall of chi2 over its prediction: {q[1]:.2f} ({q[0]:.2f} to {q[2]:.2f}), n {len(one.falls)}"
+                )
             if len(one.null_p) > 4:
                 from scipy.stats import kstest
 
-                lines.append(f"  family-wise p of {len(one.null_p)} clean null sets, uniform with p {kstest(one.null_p, 'uniform').pvalue:.2g} "
-                             "(Kolmogorov-Smirnov)")
+                lines.append(
+                    f"  family-wise p of {len(one.null_p)} clean null sets, uniform with p {kstest(one.null_p, 'uniform').pvalue:.2g} "
+                    "(Kolmogorov-Smirnov)"
+                )
             if one.held_out:
                 lines.append(f"  held-out chi2 per value after a right claim: median {np.median(one.held_out):.3f}")
         lines += [f"failed: {f}" for f in self.failed[:10]]
@@ -139,7 +155,11 @@ def named(r: dict) -> set[str]:
 def count(records: Sequence[dict], planned: int, parts: bool = True) -> Count:
     """Count records; `planned`: how many cells the plan has."""
     made = [r for r in records if not r["unreachable"]]
-    failed = [f"{r['cell']['rig']} {'+'.join(r['cell']['hidden'])} s{r['cell']['seed']}: {r['failed']}" for r in made if r["failed"]]
+    failed = [
+        f"{r['cell']['rig']} {'+'.join(r['cell']['hidden'])} s{r['cell']['seed']}: {r['failed']}"
+        for r in made
+        if r["failed"]
+    ]
     good = [r for r in made if r["steps"] and not r["failed"]]
 
     def some(kind: str, test: Callable[[dict], bool] = lambda c: True) -> list[dict]:
@@ -166,35 +186,72 @@ def count(records: Sequence[dict], planned: int, parts: bool = True) -> Count:
         return named(r) <= set(hidden(r))
 
     rates = [
-        rate("top-1 after refit, 0.5 %, no clutter", middle, lambda r: [_last(r)["claimed"] or (_last(r)["refit"] or [""])[0]] == hidden(r), 0.95, 0.99),
+        rate(
+            "top-1 after refit, 0.5 %, no clutter",
+            middle,
+            lambda r: [_last(r)["claimed"] or (_last(r)["refit"] or [""])[0]] == hidden(r),
+            0.95,
+            0.99,
+        ),
         rate("top-3 by score, 0.5 %, no clutter", middle, lambda r: hidden(r)[0] in _last(r)["score"][:3], 0.97, 0.99),
         rate("in the set, 0.2 %, no clutter", weak, lambda r: hidden(r)[0] in _last(r)["set"], 0.97, 0.99),
-        rate("in the set, 0.2 %, no clutter, where one stands out", shown, lambda r: hidden(r)[0] in _last(r)["set"], 0.97, 0.99),
-        rate("an effect stands out where none is hidden", calm, lambda r: _last(r)["p_best"] < LEVEL, 0.03, 0.015, True),
+        rate(
+            "in the set, 0.2 %, no clutter, where one stands out",
+            shown,
+            lambda r: hidden(r)[0] in _last(r)["set"],
+            0.97,
+            0.99,
+        ),
+        rate(
+            "an effect stands out where none is hidden", calm, lambda r: _last(r)["p_best"] < LEVEL, 0.03, 0.015, True
+        ),
         rate("claims where none is hidden, any clutter", none, named, 0.03, 0.01, True),
         rate("precision of claims, own law, any clutter", claims([*own, *pair, *none]), right, 0.95, 0.99),
-        rate("precision of claims, another law", claims(some("library", lambda c: c["law"] == "other")), right, 0.85, 0.95),
+        rate(
+            "precision of claims, another law",
+            claims(some("library", lambda c: c["law"] == "other")),
+            right,
+            0.85,
+            0.95,
+        ),
     ]
     for clutter, first, ambitious in ((0.0, 0.8, 0.9), (0.15, 0.7, 0.85), (0.5, 0.5, 0.65), (1.0, 0.3, 0.5)):
         of = [r for r in own if r["cell"]["change"] == 0.02 and r["cell"]["clutter"] == clutter]
-        rates.append(rate(f"right claims, 2 %, clutter {clutter:g}", of, lambda r: named(r) == set(hidden(r)), first, ambitious))
+        rates.append(
+            rate(f"right claims, 2 %, clutter {clutter:g}", of, lambda r: named(r) == set(hidden(r)), first, ambitious)
+        )
     judged = [r for r in own if _last(r)["strength"]]
     rates += [
         rate("unknown kinds falsely claimed", unknown, named, 0.10, 0.03, True),
-        rate("unknown kind's coordinate in the top two, no clutter", [r for r in unknown if r["cell"]["clutter"] == CLEAN],
-             lambda r: set(r["coordinates"]) & set(_last(r)["coordinates"][:2]), 0.75, 0.90),
+        rate(
+            "unknown kind's coordinate in the top two, no clutter",
+            [r for r in unknown if r["cell"]["clutter"] == CLEAN],
+            lambda r: set(r["coordinates"]) & set(_last(r)["coordinates"][:2]),
+            0.75,
+            0.90,
+        ),
         rate("pairs named exactly, 1 % + 1 %, no clutter", pair, lambda r: named(r) == set(hidden(r)), 0.85, 0.95),
         rate("strength within 20 % where claimed", judged, lambda r: abs(_ratio(r) - 1) < 0.2, 0.80, 0.95),
-        rate("fall of chi2 within 20 % of its prediction, to 0.5 %", (seen := [r for r in clean if r["cell"]["change"] <= 0.005 and _fall(r)]),
-             lambda r: abs(_fall(r) - 1) < 0.2, 0.90, 0.90),
+        rate(
+            "fall of chi2 within 20 % of its prediction, to 0.5 %",
+            (seen := [r for r in clean if r["cell"]["change"] <= 0.005 and _fall(r)]),
+            lambda r: abs(_fall(r) - 1) < 0.2,
+            0.90,
+            0.90,
+        ),
     ]
     ties = [r for r in [*own, *some("library", lambda c: c["law"] == "other")] if _last(r)["word"] == "AMBIGUOUS"]
     confusion: dict[str, dict[str, int]] = {}
     words: dict[str, dict[str, int]] = {}
     for r in good:
         c = r["cell"]
-        kind = {"library": hidden(r)[0] if hidden(r) else "", "none": "nothing", "pair": "two effects", "unknown": f"not in the library: "
-                f"{hidden(r)[0] if hidden(r) else ''}", "mistake": f"noise mistaken: {c['mistake']}"}[c["kind"]]
+        kind = {
+            "library": hidden(r)[0] if hidden(r) else "",
+            "none": "nothing",
+            "pair": "two effects",
+            "unknown": f"not in the library: {hidden(r)[0] if hidden(r) else ''}",
+            "mistake": f"noise mistaken: {c['mistake']}",
+        }[c["kind"]]
         names, true = named(r), set(hidden(r))
         told = next(iter(names), _last(r)["word"])
         if c["kind"] == "pair" and names:
@@ -208,15 +265,28 @@ def count(records: Sequence[dict], planned: int, parts: bool = True) -> Count:
         own_rig = power.setdefault(r["cell"]["rig"], {}).setdefault(f"{100 * r['cell']['change']:g}", [0, 0])
         own_rig[0] += named(r) == set(hidden(r))
         own_rig[1] += 1
-    pulls = {"no clutter": [_pull(r) for r in judged if r["cell"]["clutter"] == CLEAN and _pull(r) is not None],
-             "clutter": [_pull(r) for r in judged if r["cell"]["clutter"] > CLEAN and _pull(r) is not None]}
+    pulls = {
+        "no clutter": [_pull(r) for r in judged if r["cell"]["clutter"] == CLEAN and _pull(r) is not None],
+        "clutter": [_pull(r) for r in judged if r["cell"]["clutter"] > CLEAN and _pull(r) is not None],
+    }
     falls = [_fall(r) for r in seen]
     found = Count(
-        len(records), planned, len(records) - len(made), failed, rates, confusion, words, power,
+        len(records),
+        planned,
+        len(records) - len(made),
+        failed,
+        rates,
+        confusion,
+        words,
+        power,
         (sum(hidden(r)[0] in _last(r)["ambiguous"] for r in ties), len(ties)),
-        float(np.mean([len(_last(r)["set"]) for r in weak])) if weak else None, pulls, falls, [_last(r)["p_best"] for r in calm],
+        float(np.mean([len(_last(r)["set"]) for r in weak])) if weak else None,
+        pulls,
+        falls,
+        [_last(r)["p_best"] for r in calm],
         [_last(r)["held_out"][-1] for r in own if named(r) == set(hidden(r)) and _last(r)["held_out"][-1] is not None],
-        float(sum(r.get("seconds", 0.0) for r in records)))
+        float(sum(r.get("seconds", 0.0) for r in records)),
+    )
     if parts:
         names = sorted({r["cell"]["rig"] for r in records})
         found.rigs = {n: count([r for r in records if r["cell"]["rig"] == n], planned, parts=False) for n in names}
@@ -229,7 +299,8 @@ def _ratio(r: dict) -> float:
 
 
 def _fall(r: dict) -> float | None:
-    """Fall of chi2 by the hidden effect over its prediction, where that says that there is something; None elsewhere."""
+    """Fall of chi2 by the hidden effect over its prediction, where that says that there is something; None
+    elsewhere."""
     before, after = _last(r)["falls"].get(r["cell"]["hidden"][0], (0.0, 0.0))
     return after / before if before > CLEAR else None
 

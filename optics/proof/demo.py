@@ -1,9 +1,9 @@
 """The demonstration: a sensor with a secret, and the loop that finds it.
 
-Captures of a shipped sensor are made by another path than the model (`optics.proof.makers.touch`: stock Mitsuba, a denser mesh,
-photons, read noise, 8 bits), with one effect that the base model lacks, chosen by the seed. Then the loop runs blind: calibrate,
-compare, name the missing effect, add it, watch the error on held-out presses fall; and a report tells the story.
-"""
+Captures of a shipped sensor are made by another path than the model (`optics.proof.makers.touch`: stock Mitsuba, a
+denser mesh, photons, read noise, 8 bits), with one effect that the base model lacks, chosen by the seed. Then the loop
+runs blind: calibrate, compare, name the missing effect, add it, watch the error on held-out presses fall; and a report
+tells the story."""
 
 from __future__ import annotations
 
@@ -20,26 +20,47 @@ from optics.scene import loader as scenes
 from optics.scene.registry import registry
 from optics.study import loop
 
-# Hidden strengths, in the units of the effects' own parameters: a few percent of the picture, as real sensors have it.
-# Not here: interreflection, 0.2 % of the light under a dent this shallow. White LEDs cannot show colour crosstalk: it is to be
-# had on request, with the coloured ones of digit.
+# Hidden strengths, in the units of the effects' own parameters: a few percent of the image, as real sensors have it.
+# Not here: interreflection, 0.2 % of the light under a dent this shallow. White LEDs cannot show colour crosstalk: it
+# is to be had on request, with the coloured ones of digit.
 SECRETS = {
-    "lens vignetting": 0.8, "veiling glare": 0.03, "ambient light": 1e-4, "lens blur": 0.6, "radial distortion": 0.03,
-    "gel absorption": 0.02, "gel haze": 0.005, "gel wedge": 0.4, "gel bulge": 0.5, "specular lobe": 0.06, "LED size": 1.5,
-    "residual response curve": 0.12, "gain drift": 0.02,
+    "lens vignetting": 0.8,
+    "veiling glare": 0.03,
+    "ambient light": 1e-4,
+    "lens blur": 0.6,
+    "radial distortion": 0.03,
+    "gel absorption": 0.02,
+    "gel haze": 0.005,
+    "gel wedge": 0.4,
+    "gel bulge": 0.5,
+    "specular lobe": 0.06,
+    "LED size": 1.5,
+    "residual response curve": 0.12,
+    "gain drift": 0.02,
 }
-SENSORS = {"gelsight": ((160, 120), 200.0), "digit": ((120, 160), 700.0)}  # px; exposure: one LED at a time is near full scale
-BENCH = "polarizer_bench"  # 1000 readings of a photodiode, by coherency matrices (optics.proof.makers.bench); of effects that can be told apart
+SENSORS = {
+    "gelsight": ((160, 120), 200.0),
+    "digit": ((120, 160), 700.0),
+}  # px; exposure: one LED at a time is near full scale
+# 1000 readings of a photodiode, by coherency matrices (optics.proof.makers.bench); of effects that can be told apart
+BENCH = "polarizer_bench"
 BENCH_SECRETS = {
-    "polarizer misalignment": 1.0, "servo scale": 1.01, "servo backlash": 1.0, "analyzer wobble": 0.01, "retardance": 12.0,
-    "camera gamma": 0.03, "polarized source": 0.02, "extinction leak": 0.004,
+    "polarizer misalignment": 1.0,
+    "servo scale": 1.01,
+    "servo backlash": 1.0,
+    "analyzer wobble": 0.01,
+    "retardance": 12.0,
+    "camera gamma": 0.03,
+    "polarized source": 0.02,
+    "extinction leak": 0.004,
 }
 PRESSES = 4
 STEPS = 3  # effects that the loop may add before it must stop
 
 
 def truth(scene, seed: int) -> dict[str, float]:
-    """A sensor as it was built and not as it was drawn: LEDs half a millimetre and some degrees off, powers by a tenth."""
+    """A sensor as it was built and not as it was drawn: LEDs half a millimetre and some degrees off, powers by a
+    tenth."""
     rng = np.random.default_rng([seed, 1])
     drawn, built = scene.values(), {}
     for led in scene.leds:
@@ -64,8 +85,9 @@ def secret(seed: int, name: str | None = None, sensor: str = "gelsight") -> tupl
     return effect, known[effect]
 
 
-def make(folder: Path, seed: int, name: str | None = None, progress: Callable | None = None,
-         sensor: str = "gelsight") -> tuple[str, float]:
+def make(
+    folder: Path, seed: int, name: str | None = None, progress: Callable | None = None, sensor: str = "gelsight"
+) -> tuple[str, float]:
     """Write the captures of a demonstration; returns the secret, which the captures do not tell."""
     effect, strength = secret(seed, name, sensor)
     if sensor == BENCH:
@@ -84,19 +106,28 @@ def make(folder: Path, seed: int, name: str | None = None, progress: Callable | 
 
 
 def make_bench(folder: Path, seed: int, effect: str, strength: float) -> None:
-    """Readings of the polarizer bench with one effect: P1 at five angles, the analyser round and back, two powers of the lamp."""
+    """Readings of the polarizer bench with one effect: P1 at five angles, the analyser round and back, two powers of
+    the lamp."""
     from optics.captures.noise import Noise
     from optics.proof.makers.bench import malus_sweep, with_effects, write
 
     settings = malus_sweep(1000, polarizer_angles=(0.0, 60.0, 100.0, 190.0, 250.0))
     for i, own in enumerate(settings):
         own.update({"source.power": (1.0, 0.5)[i % 2], "sample.angle": (0.0, 45.0)[i // 2 % 2]})
-    truth = with_effects({effect: strength - (effect == "servo scale")}, gain=2.2)  # a scale is known by its value, 1 is none
+    truth = with_effects(
+        {effect: strength - (effect == "servo scale")}, gain=2.2
+    )  # a scale is known by its value, 1 is none
     write(folder, truth, settings, Noise(0.05, 2.0, 64.0, 4095.0, 0.0), seed + 1000)
 
 
-def run(folder: str | Path, seed: int = 1, effect: str | None = None, sensor: str = "gelsight",
-        progress: Callable | None = None, say: Callable[[str], None] = lambda text: None) -> dict:
+def run(
+    folder: str | Path,
+    seed: int = 1,
+    effect: str | None = None,
+    sensor: str = "gelsight",
+    progress: Callable | None = None,
+    say: Callable[[str], None] = lambda text: None,
+) -> dict:
     """Make captures, run the loop, write the report; returns what happened.
 
     folder   gets `captures/`, `study/` and `report.html`; what is there already from the same seed is taken up
@@ -112,12 +143,16 @@ def run(folder: str | Path, seed: int = 1, effect: str | None = None, sensor: st
     hidden = json.loads(note.read_text())
     asked = (seed, sensor, registry().find_effect(effect).name if effect else hidden["effect"])
     if asked != (hidden["seed"], hidden["sensor"], hidden["effect"]):
-        raise OutputExists(f"{folder} holds the demonstration of {hidden['sensor']}, seed {hidden['seed']}, with a secret of its "
-                           "own; choose another folder for this one (-o)")
-    say("1000 readings of a photodiode behind two polarizers, made by coherency matrices with an effect that the base model lacks."
-        if sensor == BENCH else
-        f"{PRESSES} presses under the LEDs of {sensor}, one at a time and in the dark, made by stock Mitsuba with an effect that "
-        "the base model lacks.")
+        raise OutputExists(
+            f"{folder} holds the demonstration of {hidden['sensor']}, seed {hidden['seed']}, with a secret of its "
+            "own; choose another folder for this one (-o)"
+        )
+    say(
+        "1000 readings of a photodiode behind two polarizers, made by coherency matrices with an effect that the base model lacks."
+        if sensor == BENCH
+        else f"{PRESSES} presses under the LEDs of {sensor}, one at a time and in the dark, made by stock Mitsuba with an effect that "
+        "the base model lacks."
+    )
     # The stage is trusted (S1.2): solving for every press as well takes three times as long and tells the same story.
     setup = loop.Setup(captures=str(folder / "captures"), per_group=[], seed=seed)
     study, model, fit = loop.begin(setup, folder / "study", title="Demonstration", resume=True, progress=progress)
@@ -138,6 +173,13 @@ def run(folder: str | Path, seed: int = 1, effect: str | None = None, sensor: st
     last = study.steps[-1]["held_out"]
     keys = {key for name in claimed for key in sum(model.scene.keys_of(registry().find_effect(name)).values(), [])}
     strengths = {v["name"]: (v["value"], v["sd"]) for v in study.steps[-1]["variables"] if keys & set(v["keys"])}
-    return {"hidden": hidden, "claimed": claimed, "strengths": strengths, "verdict": diagnosis.word, "held_out": last["chi2_per_dof"],
-            "first": study.steps[0]["held_out"]["chi2_per_dof"], "report": str(page),
-            "right": claimed[:1] == [hidden["effect"]] and last["chi2_per_dof"] <= 1.1}
+    return {
+        "hidden": hidden,
+        "claimed": claimed,
+        "strengths": strengths,
+        "verdict": diagnosis.word,
+        "held_out": last["chi2_per_dof"],
+        "first": study.steps[0]["held_out"]["chi2_per_dof"],
+        "report": str(page),
+        "right": claimed[:1] == [hidden["effect"]] and last["chi2_per_dof"] <= 1.1,
+    }

@@ -19,17 +19,45 @@ def write(found: Count, records: Sequence[dict], file: Path) -> Path:
     """Write the page, and the counts beside it as proof.json."""
     from jinja2 import Environment, FileSystemLoader, select_autoescape
 
-    environment = Environment(loader=FileSystemLoader(Path(__file__).parent), autoescape=select_autoescape(["html", "j2"]), trim_blocks=True,
-                              lstrip_blocks=True)
-    cells = sorted(({"rig": r["cell"]["rig"], "kind": r["cell"]["kind"], "hidden": " + ".join(r["cell"]["hidden"]) or "nothing",
-                     "change": 100 * r["cell"]["change"], "clutter": r["cell"]["clutter"], "law": r["cell"]["law"],
-                     "mistake": r["cell"]["mistake"], "seed": r["cell"]["seed"], "word": _last(r)["word"].replace("_", " ") if r["steps"] else "",
-                     "named": " + ".join(sorted(named(r))) or ", ".join(_last(r)["ambiguous"] if r["steps"] else []),
-                     "right": _right(r), "note": r["failed"] or (_last(r)["sentence"] if r["steps"] else "cannot be made that strong")}
-                    for r in records), key=lambda c: (c["rig"], c["kind"], c["hidden"], c["change"], c["clutter"], c["seed"]))
-    figures = {"confusion": confusion(found), "power": power(found), "falls": falls(records), "pulls": pulls(found), "nulls": nulls(found)}
-    html = environment.get_template("page.html.j2").render(found=found, figures=figures, cells=cells, tables=[("all", found), *(
-        found.rigs.items() if len(found.rigs) > 1 else [])])
+    environment = Environment(
+        loader=FileSystemLoader(Path(__file__).parent),
+        autoescape=select_autoescape(["html", "j2"]),
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    cells = sorted(
+        (
+            {
+                "rig": r["cell"]["rig"],
+                "kind": r["cell"]["kind"],
+                "hidden": " + ".join(r["cell"]["hidden"]) or "nothing",
+                "change": 100 * r["cell"]["change"],
+                "clutter": r["cell"]["clutter"],
+                "law": r["cell"]["law"],
+                "mistake": r["cell"]["mistake"],
+                "seed": r["cell"]["seed"],
+                "word": _last(r)["word"].replace("_", " ") if r["steps"] else "",
+                "named": " + ".join(sorted(named(r))) or ", ".join(_last(r)["ambiguous"] if r["steps"] else []),
+                "right": _right(r),
+                "note": r["failed"] or (_last(r)["sentence"] if r["steps"] else "cannot be made that strong"),
+            }
+            for r in records
+        ),
+        key=lambda c: (c["rig"], c["kind"], c["hidden"], c["change"], c["clutter"], c["seed"]),
+    )
+    figures = {
+        "confusion": confusion(found),
+        "power": power(found),
+        "falls": falls(records),
+        "pulls": pulls(found),
+        "nulls": nulls(found),
+    }
+    html = environment.get_template("page.html.j2").render(
+        found=found,
+        figures=figures,
+        cells=cells,
+        tables=[("all", found), *(found.rigs.items() if len(found.rigs) > 1 else [])],
+    )
     for path, text in ((file, html), (file.with_name("proof.json"), json.dumps(found.json(), indent=1))):
         temporary = path.with_suffix(".part")
         temporary.write_text(text, encoding="utf-8")
@@ -50,8 +78,17 @@ def _svg(draw, width: float = 5.2, height: float = 3.4) -> str:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    with matplotlib.rc_context({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False, "svg.fonttype": "none",
-                                "text.color": INK, "axes.labelcolor": INK, "svg.hashsalt": "proof"}):
+    with matplotlib.rc_context(
+        {
+            "font.size": 9,
+            "axes.spines.top": False,
+            "axes.spines.right": False,
+            "svg.fonttype": "none",
+            "text.color": INK,
+            "axes.labelcolor": INK,
+            "svg.hashsalt": "proof",
+        }
+    ):
         figure, axes = plt.subplots(figsize=(width, height), layout="constrained")
         try:
             draw(axes)
@@ -60,12 +97,15 @@ def _svg(draw, width: float = 5.2, height: float = 3.4) -> str:
         finally:
             plt.close(figure)
     text = out.getvalue()
-    return text[text.index("<svg"):]
+    return text[text.index("<svg") :]
 
 
 def confusion(found: Count) -> str:
     """Rows: what was hidden; columns: what was claimed, or the verdict where nothing was."""
-    rows = sorted(found.confusion, key=lambda k: (k.startswith("noise"), k.startswith("not in"), k in ("nothing", "two effects"), k))
+    rows = sorted(
+        found.confusion,
+        key=lambda k: (k.startswith("noise"), k.startswith("not in"), k in ("nothing", "two effects"), k),
+    )
     words = ["both", "another", "one of two", "AMBIGUOUS", "PARTIAL", "UNKNOWN", "CANNOT_TELL", "NOTHING"]
     told = {t for row in found.confusion.values() for t in row}
     columns = [r for r in rows if r in told] + sorted(told - set(rows) - set(words)) + [w for w in words if w in told]
@@ -76,9 +116,22 @@ def confusion(found: Count) -> str:
         ax.imshow(np.where(table > 0, share, np.nan), cmap="Blues", vmin=0, vmax=1.4, aspect="auto")
         for i, j in zip(*np.nonzero(table)):
             wrong = columns[j] not in words[2:] and columns[j] not in (rows[i], "both")
-            ax.text(j, i, f"{table[i, j]:.0f}", ha="center", va="center", color=BAD if wrong else INK, weight="bold" if wrong else "normal")
-        ax.set_xticks(range(len(columns)), [c.replace("_", " ").lower() if c.isupper() else c for c in columns], rotation=60, ha="right",
-                      rotation_mode="anchor")
+            ax.text(
+                j,
+                i,
+                f"{table[i, j]:.0f}",
+                ha="center",
+                va="center",
+                color=BAD if wrong else INK,
+                weight="bold" if wrong else "normal",
+            )
+        ax.set_xticks(
+            range(len(columns)),
+            [c.replace("_", " ").lower() if c.isupper() else c for c in columns],
+            rotation=60,
+            ha="right",
+            rotation_mode="anchor",
+        )
         ax.set_yticks(range(len(rows)), rows)
         ax.set_xlabel("named")
         ax.set_ylabel("hidden")
@@ -90,18 +143,27 @@ def confusion(found: Count) -> str:
 
 def power(found: Count) -> str:
     """Share of right claims against the raw change, without clutter."""
+
     def draw(ax):
         for k, (rig, levels) in enumerate(sorted(found.power.items())):
             x = sorted(levels, key=float)
             rates = [Rate("", *levels[v], 0, 0) for v in x]
             y = [r.value for r in rates]
             error = np.array([[r.value - r.interval[0], r.interval[1] - r.value] for r in rates]).T
-            ax.errorbar([float(v) * 1.03**k for v in x], y, error, marker="o", capsize=3, color=(GOOD, BAD, SOFT, INK)[k % 4], label=rig)
+            ax.errorbar(
+                [float(v) * 1.03**k for v in x],
+                y,
+                error,
+                marker="o",
+                capsize=3,
+                color=(GOOD, BAD, SOFT, INK)[k % 4],
+                label=rig,
+            )
         ax.set_xscale("log")
         ax.set_xticks([0.2, 0.5, 2], ["0.2", "0.5", "2"])
         ax.minorticks_off()
         ax.set_ylim(0, 1.03)
-        ax.set_xlabel("change of the picture by the hidden effect, %")
+        ax.set_xlabel("change of the image by the hidden effect, %")
         ax.set_ylabel("claimed rightly")
         if ax.get_legend_handles_labels()[0]:
             ax.legend(frameon=False)
@@ -111,8 +173,13 @@ def power(found: Count) -> str:
 
 def falls(records: Sequence[dict]) -> str:
     """Fall of chi2 that the refit brought, against the prediction by the score."""
-    points = [(before, after, name in r["cell"]["hidden"]) for r in records if r["steps"] and not r["failed"] and r["cell"]["kind"] == "library"
-              for name, (before, after) in _last(r)["falls"].items() if before > 1 and after > 1]
+    points = [
+        (before, after, name in r["cell"]["hidden"])
+        for r in records
+        if r["steps"] and not r["failed"] and r["cell"]["kind"] == "library"
+        for name, (before, after) in _last(r)["falls"].items()
+        if before > 1 and after > 1
+    ]
 
     def draw(ax):
         for right, colour, label in ((False, SOFT, "other effects"), (True, GOOD, "the hidden effect")):

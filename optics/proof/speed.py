@@ -1,10 +1,10 @@
 """Speed, measured beside stock Mitsuba in one run: `make bench`. Prints ratios; judges nothing.
 
-    new press    geometry, hits, shadows and images of six LEDs, 320 x 240
-    derivatives  all derivative images of 30 parameters, in units of the primal
-    render       the same scene by `tactile` and by stock `path`: time x variance, which is time at equal noise
-    prediction   the images of six LEDs against `path` with as many samples as its noise needs to fall to their error
-    ranking      every effect scored on 16 frames of 160 x 120, presses solved for as well
+new press    geometry, hits, shadows and images of six LEDs, 320 x 240
+derivatives  all derivative images of 30 parameters, in units of the primal
+render       the same scene by `tactile` and by stock `path`: time x variance, which is time at equal noise
+prediction   the images of six LEDs against `path` with as many samples as its noise needs to fall to their error
+ranking      every effect scored on 16 frames of 160 x 120, presses solved for as well
 """
 
 from __future__ import annotations
@@ -58,7 +58,9 @@ def lamps(emitter: str) -> str:
     return "\n".join(
         f'<shape type="rectangle" id="panel_{k}"><transform name="to_world"><scale x="6" y="2"/><lookat origin="{x}, {y}, -2.5" '
         f'target="0, 0, -2.5" up="0, 0, 1"/></transform><bsdf type="diffuse"><spectrum name="reflectance" value="0"/></bsdf>'
-        f'{emitter.format(k)}</shape>' for k, (x, y) in enumerate(SIDES))
+        f"{emitter.format(k)}</shape>"
+        for k, (x, y) in enumerate(SIDES)
+    )
 
 
 def printed_grid() -> None:
@@ -66,18 +68,23 @@ def printed_grid() -> None:
     from optics.light.transport import Transport
     from optics.scene import loader as scenes
 
-    ours = {"MEDIA": "", "INTEGRATOR": '<integrator type="tactile" id="integrator"><string name="bands" value="540"/></integrator>',
-            "WALLS": '<bsdf type="clear" id="walls"><float name="index" value="1.5"/><float name="absorption" value="0.05"/></bsdf>',
-            "FILLING": '<bsdf type="clear" id="filling"><string name="outside" value="walls"/><float name="index" value="1.4"/>'
-                       '<float name="absorption" value="0.1"/></bsdf>',
-            "LAMPS": lamps('<emitter type="source" id="lamp_{}"/>')}
+    ours = {
+        "MEDIA": "",
+        "INTEGRATOR": '<integrator type="tactile" id="integrator"><string name="bands" value="540"/></integrator>',
+        "WALLS": '<bsdf type="clear" id="walls"><float name="index" value="1.5"/><float name="absorption" value="0.05"/></bsdf>',
+        "FILLING": '<bsdf type="clear" id="filling"><string name="outside" value="walls"/><float name="index" value="1.4"/>'
+        '<float name="absorption" value="0.1"/></bsdf>',
+        "LAMPS": lamps('<emitter type="source" id="lamp_{}"/>'),
+    }
     medium = '<medium type="homogeneous" id="{}"><spectrum name="sigma_t" value="{}"/><spectrum name="albedo" value="0"/></medium>'
     glass = '<bsdf type="dielectric"><float name="int_ior" value="{}"/><float name="ext_ior" value="{}"/></bsdf>'
-    stock = {"MEDIA": medium.format("resin", 0.05) + medium.format("support", 0.1),
-             "INTEGRATOR": '<integrator type="volpath"><integer name="max_depth" value="512"/><integer name="rr_depth" value="1000"/></integrator>',
-             "WALLS": glass.format(1.5, 1.0) + '<ref id="resin" name="interior"/>',
-             "FILLING": glass.format(1.4, 1.5) + '<ref id="support" name="interior"/><ref id="resin" name="exterior"/>',
-             "LAMPS": lamps('<emitter type="area"><spectrum name="radiance" value="1"/></emitter>')}
+    stock = {
+        "MEDIA": medium.format("resin", 0.05) + medium.format("support", 0.1),
+        "INTEGRATOR": '<integrator type="volpath"><integer name="max_depth" value="512"/><integer name="rr_depth" value="1000"/></integrator>',
+        "WALLS": glass.format(1.5, 1.0) + '<ref id="resin" name="interior"/>',
+        "FILLING": glass.format(1.4, 1.5) + '<ref id="support" name="interior"/><ref id="resin" name="exterior"/>',
+        "LAMPS": lamps('<emitter type="area"><spectrum name="radiance" value="1"/></emitter>'),
+    }
 
     def text(slots, width, height):
         found = GRID.replace("WIDTH", str(width)).replace("HEIGHT", str(height))
@@ -93,10 +100,10 @@ def printed_grid() -> None:
 
         seeds = iter(range(10**6))
         start = time.perf_counter()
-        pictures = [transport.take(rays=256, packets=100_000, seed=next(seeds)) for _ in range(2)]
+        images = [transport.take(rays=256, packets=100_000, seed=next(seeds)) for _ in range(2)]
         cost = (time.perf_counter() - start) / 2
-        level = pictures[0].radiance.sum(0).mean()
-        variance = float(np.mean([(p.error**2).sum(0).mean() for p in pictures]))
+        level = images[0].radiance.sum(0).mean()
+        variance = float(np.mean([(p.error**2).sum(0).mean() for p in images]))
         file.write_text(text(stock, 80, 60))
         theirs = mi.load_file(str(file), optimize=False)
         np.array(mi.render(theirs, spp=1, seed=0))
@@ -104,19 +111,30 @@ def printed_grid() -> None:
         images = [np.array(mi.render(theirs, spp=64, seed=next(seeds)))[..., 0] for _ in range(6)]
         cost_stock = (time.perf_counter() - start) / 6
         variance_stock = float(np.mean(np.var(images, 0, ddof=1)))
-        row("printed grid, stock volpath, 80x60, 64 samples", f"{cost_stock:.1f} s", f"noise {variance_stock**0.5 / np.mean(images):.0%} a pixel")
+        row(
+            "printed grid, stock volpath, 80x60, 64 samples",
+            f"{cost_stock:.1f} s",
+            f"noise {variance_stock**0.5 / np.mean(images):.0%} a pixel",
+        )
         row("printed grid, ours, three lights apart", f"{cost:.1f} s", f"noise {variance**0.5 / level:.0%} a pixel")
-        row("ours / stock volpath at equal noise", f"{cost * variance / (cost_stock * variance_stock):.2g} x",
-            f"time x variance; target 0.1; means differ by {level / np.mean(images) - 1:+.1%}")
+        row(
+            "ours / stock volpath at equal noise",
+            f"{cost * variance / (cost_stock * variance_stock):.2g} x",
+            f"time x variance; target 0.1; means differ by {level / np.mean(images) - 1:+.1%}",
+        )
 
         file.write_text(text(ours, 160, 120))
         transport = Transport(scenes.load(file, variant="llvm_ad_mono_polarized"))
         start = time.perf_counter()
-        picture = transport.take(rays=256, packets=1_500_000)
+        image = transport.take(rays=256, packets=1_500_000)
         cost = time.perf_counter() - start
-        image, error = picture.radiance.sum(0), (picture.error**2).sum(0) ** 0.5
-        row("20x20x6 cells, 160x120", f"{cost:.0f} s", f"noise {np.median(error / np.maximum(image, 1e-12)):.1%} in the median pixel, "
-            f"{(error**2).mean() ** 0.5 / image.mean():.0%} rms; target 5 % below 60 s")
+        image, error = image.radiance.sum(0), (image.error**2).sum(0) ** 0.5
+        row(
+            "20x20x6 cells, 160x120",
+            f"{cost:.0f} s",
+            f"noise {np.median(error / np.maximum(image, 1e-12)):.1%} in the median pixel, "
+            f"{(error**2).mean() ** 0.5 / image.mean():.0%} rms; target 5 % below 60 s",
+        )
     from optics.scene.mitsuba_parts import use_variant
 
     use_variant("llvm_ad_spectral_polarized")
@@ -147,14 +165,22 @@ def main() -> int:
     derivatives = timed(lambda: [renderer.led_tangent(now, k.split(".")[0], k) for k in keys], 3)
     row("30 derivative images", f"{derivatives / lit:.1f} x primal", "target below 30 x")
 
-    stock = scenes.load("gelsight", {"width": "320", "height": "240", "depth": "0.61"}, variant="llvm_ad_mono_polarized")
+    stock = scenes.load(
+        "gelsight", {"width": "320", "height": "240", "depth": "0.61"}, variant="llvm_ad_mono_polarized"
+    )
     import mitsuba as mi
 
     bounces = {"max_depth": 3, "rr_depth": 100}  # `path` counts the window
     cost, variance = {}, {}
-    for name, integrator in (("tactile", stock.mitsuba.integrator()), ("path", mi.load_dict({"type": "path", **bounces}))):
+    for name, integrator in (
+        ("tactile", stock.mitsuba.integrator()),
+        ("path", mi.load_dict({"type": "path", **bounces})),
+    ):
         seeds = iter(range(10**6))
-        images = [np.array(mi.render(stock.mitsuba, integrator=integrator, spp=16, seed=next(seeds)))[..., 0] for _ in range(8)]
+        images = [
+            np.array(mi.render(stock.mitsuba, integrator=integrator, spp=16, seed=next(seeds)))[..., 0]
+            for _ in range(8)
+        ]
         variance[name] = float(np.mean(np.var(images, 0, ddof=1)))
         cost[name] = timed(lambda: np.array(mi.render(stock.mitsuba, integrator=integrator, spp=16, seed=next(seeds))))  # noqa: B023
         row(f"{name}, 16 samples per pixel", f"{cost[name] * 1e3:.0f} ms", f"variance {variance[name]:.3g}")
@@ -166,13 +192,18 @@ def main() -> int:
     level = scene.values()["membrane.rho_r"] / stock.values()["membrane.rho_r"]
     ours_image = sum(renderer.led(now, led).radiance for led in scene.leds)[..., 0] / level
     use_variant("llvm_ad_mono_polarized")
-    many = [np.array(mi.render(stock.mitsuba, integrator=stock.mitsuba.integrator(), spp=512, seed=10**6 + k))[..., 0]
-            for k in range(4)]
+    many = [
+        np.array(mi.render(stock.mitsuba, integrator=stock.mitsuba.integrator(), spp=512, seed=10**6 + k))[..., 0]
+        for k in range(4)
+    ]
     own = float(np.mean(np.var(many, 0, ddof=1))) / len(many)
     error = max(float(np.mean((ours_image - np.mean(many, 0)) ** 2)) - own, own)
     needed = 16 * variance["path"] / error
-    row("ours / stock path at equal error", f"{ours / (cost['path'] * needed / 16):.2g} x",
-        f"path needs {needed:.3g} samples for our rms error of {error**0.5:.1e}; its time extrapolated from 16")
+    row(
+        "ours / stock path at equal error",
+        f"{ours / (cost['path'] * needed / 16):.2g} x",
+        f"path needs {needed:.3g} samples for our rms error of {error**0.5:.1e}; its time extrapolated from 16",
+    )
     use_variant("llvm_ad_spectral_polarized")
     printed_grid()
 
@@ -186,19 +217,26 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as folder:
         small = scenes.load("gelsight", {"width": "160", "height": "120"})
         made = synthetic.Maker(small, demo.truth(small, 1), {}, seed=1).captures(
-            synthetic.presses(4, 1), drives=[{led: 1.0} for led in list(small.leds)[:4]])
+            synthetic.presses(4, 1), drives=[{led: 1.0} for led in list(small.leds)[:4]]
+        )
         files.write(made, Path(folder) / "captures", bits=8)
         setup = loop.Setup(captures=str(Path(folder) / "captures"), held_out=[])
         model = loop.open_model(setup)
-        fit = loop.fit_base(model, loop.variables_of_base(model, setup, range(16)), list(range(16)),
-                            Values(demo.truth(small, 1)))
+        fit = loop.fit_base(
+            model, loop.variables_of_base(model, setup, range(16)), list(range(16)), Values(demo.truth(small, 1))
+        )
         from optics.scene.registry import registry
 
         effects = [e for e in registry().effects.values() if model.scene.can_express(e)]
         start = time.perf_counter()
-        diagnosis.diagnose(model, fit, effects, lambda e: loop.effect_variables(model, e), fitted=list(range(16)), top=0)
-        row(f"ranking {len(effects)} effects, 16 frames 160x120", f"{time.perf_counter() - start:.0f} s",
-            f"{len(fit.variables)} parameters in the base; target below 60 s")
+        diagnosis.diagnose(
+            model, fit, effects, lambda e: loop.effect_variables(model, e), fitted=list(range(16)), top=0
+        )
+        row(
+            f"ranking {len(effects)} effects, 16 frames 160x120",
+            f"{time.perf_counter() - start:.0f} s",
+            f"{len(fit.variables)} parameters in the base; target below 60 s",
+        )
     return 0
 
 

@@ -1,1 +1,2 @@
-"""What a robot computes from the images of a touch sensor that also sees: marker displacements, and how near a thing is."""
+"""What a robot computes from the images of a touch sensor that also sees: marker displacements, and how near a thing
+is."""

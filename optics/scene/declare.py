@@ -12,19 +12,24 @@ Where an effect enters, in the order that light takes (`STAGES`):
     reflection  membrane  fr = f(geometry, membrane)  added to the BRDF, 1/sr; Dr.Jit
     volume      gel       L  = f(path, gel)           radiance added by the gel itself, per LED; Dr.Jit
     ambient     membrane  L  = f(geometry, membrane)  radiance added that no LED made; Dr.Jit
-    glow        interface L  = f(glow, interface)     (B,) radiance that a boundary sends to the camera, per light; numpy
-    index       clear     n  = f(n, wavelengths, clear)  refractive index per band; arithmetic of optics.polarization.mueller
-    absorption  clear     a  = f(a, wavelengths, clear)  absorption coefficient per band, 1/mm; arithmetic of optics.polarization.mueller
-    layer       a layer   M  = f(crossing, layer)     Mueller matrix that light passes after the layer's own (optics.polarization.layers)
+    glow        interface L  = f(glow, interface)     (B,) radiance that a boundary sends to the camera, per light;
+                numpy
+    index       clear     n  = f(n, wavelengths, clear)  refractive index per band; arithmetic of
+                optics.polarization.mueller
+    absorption  clear     a  = f(a, wavelengths, clear)  absorption coefficient per band, 1/mm; arithmetic of
+                optics.polarization.mueller
+    layer       a layer   M  = f(crossing, layer)     Mueller matrix that light passes after the layer's own
+                (optics.polarization.layers)
     lens        camera    I  = f(image, camera)       irradiance per band, (H, W, B); numpy
     sensor      camera    I  = f(image, camera)       signal per channel, (H, W, C), 1 = full scale; numpy
     response    camera    m  = f(image, camera)       response per channel, 1 = full scale; numpy
 
-`camera` has the camera's parameters, the geometry of its pixels (optics.light.development), and in `settings` all values by key, such as `source.time`.
-Functions of the stages `lens` and `sensor` are affine in the image, those of `response` act pixel by pixel. All three must
-be analytic (no abs, max or branches on their complex arguments): their derivatives are taken by complex step, exact to
-rounding (Squire & Trapp, SIAM Rev. 40, 110, 1998). An effect without functions frees parameters that its part has.
-"""
+`camera` has the camera's parameters, the geometry of its pixels (optics.light.development), and in `settings` all
+values by key, such as `source.time`. Functions of the stages `lens` and `sensor` are affine in the image, those of
+`response` act pixel by pixel. All three must be analytic (no abs, max or branches on their complex arguments): their
+derivatives are taken by complex step, exact to rounding (Squire & Trapp, SIAM Rev. 40, 110, 1998). An effect without
+functions frees parameters that its part has."""
+
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
@@ -34,9 +39,19 @@ from optics.scene.parameter import Parameter
 from optics.words import key_of
 
 STAGES = {
-    "surface": "gel", "emission": "led", "segment": "gel", "reflection": "membrane", "volume": "gel",
-    "ambient": "membrane", "glow": "interface", "index": "clear", "absorption": "clear", "layer": "", "lens": "camera",
-    "sensor": "camera", "response": "camera",
+    "surface": "gel",
+    "emission": "led",
+    "segment": "gel",
+    "reflection": "membrane",
+    "volume": "gel",
+    "ambient": "membrane",
+    "glow": "interface",
+    "index": "clear",
+    "absorption": "clear",
+    "layer": "",
+    "lens": "camera",
+    "sensor": "camera",
+    "response": "camera",
 }
 IMAGE_STAGES = ("lens", "sensor", "response")
 CATEGORIES = ("bsdf", "emitter", "sensor", "shape", "integrator")
@@ -48,7 +63,8 @@ class Part:
 
     build   called once per Mitsuba variant, returns the plugin class (a subclass of mi.BSDF, mi.Emitter, ...)
     checks  functions without arguments that raise AssertionError: the closed forms that the part must meet
-    mueller of a layer: its Mueller matrix (optics.polarization.layers);   stokes   of a source: the Stokes vector that it sends
+    mueller of a layer: its Mueller matrix (optics.polarization.layers);   stokes   of a source: the Stokes vector that
+    it sends
     """
 
     kind: str
@@ -76,10 +92,11 @@ class Effect:
     scope       'common' (one value in all frames) or 'frame' (a value per frame)
     per         'kind' (one value shared by all parts of the kind, such as all LEDs) or 'part' (each its own)
     requires    kinds of further parts that a scene must have for the effect to make sense in it
-    pictures    True where it mixes the pixels of a picture: point readings cannot have it
+    mixes_pixels  True where it mixes the pixels of an image: point readings cannot have it
     acts        coordinates that it acts through: radius, height, slope, led, channel, frame, intensity ...
     needs       what a capture set must vary for it to be seen, in words
-    seek        where an effect has a place that no derivative leads to: f(model, values, frames) -> {key: value} of further parameters
+    seek        where an effect has a place that no derivative leads to: f(model, values, frames) -> {key: value} of
+                further parameters
                 that do nothing at neutral, found from the residual before the effect is scored or added
     checks      closed forms, as in Part
     """
@@ -93,7 +110,7 @@ class Effect:
     scope: str = "common"
     per: str = "kind"
     requires: tuple[str, ...] = ()
-    pictures: bool = False
+    mixes_pixels: bool = False
     acts: tuple[str, ...] = ()
     needs: str = ""
     seek: Callable | None = None

@@ -1,4 +1,5 @@
-"""Layers as parts: the declaration of a thin sheet by its Mueller matrix, and the null BSDF by which Mitsuba meets it."""
+"""Layers as parts: the declaration of a thin sheet by its Mueller matrix, and the null BSDF by which Mitsuba meets
+it."""
 
 from __future__ import annotations
 
@@ -15,17 +16,22 @@ MONO = 540.0  # nm: the wavelength of variants that know none
 
 
 def active_effects(kind: str, values: Mapping) -> list:
-    """Effects of the stage `layer` that do not rest at neutral, for values by parameter name (numbers, arrays, complex)."""
+    """Effects of the stage `layer` that do not rest at neutral, for values by parameter name (numbers, arrays,
+    complex)."""
     import numpy as np
 
     neutral = {p.name: p.neutral for p in registry().parameters_of(kind)}
-    return [e for e in registry().at_stage(kind, "layer")
-            if any(np.any(np.asarray(values[n]) != neutral[n]) for n in e.parameter_names)]
+    return [
+        e
+        for e in registry().at_stage(kind, "layer")
+        if any(np.any(np.asarray(values[n]) != neutral[n]) for n in e.parameter_names)
+    ]
 
 
 class PatternImage:
-    """A pattern of two numbers from an image (H, W, 2 or more): f(x, y, size) over a square of `size` mm about the layer's middle,
-    row 0 at +y, linear between the pixels' centres, 0 outside; x, y and size may be numpy's (complex ones too) or Dr.Jit's."""
+    """A pattern of two numbers from an image (H, W, 2 or more): f(x, y, size) over a square of `size` mm about the
+    layer's middle, row 0 at +y, linear between the pixels' centres, 0 outside; x, y and size may be numpy's (complex
+    ones too) or Dr.Jit's."""
 
     def __init__(self, path):
         from pathlib import Path
@@ -44,7 +50,9 @@ class PatternImage:
 
             values, _ = read_image(path, str(path))
         if values.ndim != 3 or values.shape[2] < 2 or not np.isfinite(values).all():
-            raise BadScene(f"{path}: shape {values.shape}; allowed: (H, W, 2 or more), all finite: s_xx - s_yy and 2 s_xy")
+            raise BadScene(
+                f"{path}: shape {values.shape}; allowed: (H, W, 2 or more), all finite: s_xx - s_yy and 2 s_xy"
+            )
         self.values = np.asarray(values[..., :2], float)
         self.texture = Texture(self.values)
 
@@ -76,7 +84,8 @@ class PatternImage:
 
 
 def crossing_of(si, band: float | None = None, extent: tuple[float, float] | None = None) -> Crossing:
-    """How light that leaves a surface interaction towards si.wi passes the surface, in Mitsuba's implicit axes (Dr.Jit).
+    """How light that leaves a surface interaction towards si.wi passes the surface, in Mitsuba's implicit axes
+    (Dr.Jit).
 
     band    nm, of mono variants;   extent  width and length at rest of a sheet that stretches
     """
@@ -96,7 +105,11 @@ def crossing_of(si, band: float | None = None, extent: tuple[float, float] | Non
 
 def numbers_of(part) -> SimpleNamespace:
     """A part's parameters as its functions read them, in Dr.Jit."""
-    return SimpleNamespace(name=part.name, field=getattr(part, "field", None), **{n: getattr(part, n) for n in (*part.numbers, *part.words)})
+    return SimpleNamespace(
+        name=part.name,
+        field=getattr(part, "field", None),
+        **{n: getattr(part, n) for n in (*part.numbers, *part.words)},
+    )
 
 
 def layer(kind: str, parameters: tuple, mueller: Callable) -> Part:

@@ -1,7 +1,7 @@
 """Scene XML in and out; the only file that knows Mitsuba's parameter paths.
 
-A scene is a Mitsuba XML file. Every part of ours in it (LED, membrane, camera, gel, interface, integrator) has an id, and its
-parameters have the keys `id.name`. Parameters of stock Mitsuba plugins are reachable under Mitsuba's own keys.
+A scene is a Mitsuba XML file. Every part of ours in it (LED, membrane, camera, gel, interface, integrator) has an id,
+and its parameters have the keys `id.name`. Parameters of stock Mitsuba plugins are reachable under Mitsuba's own keys.
 """
 
 from __future__ import annotations
@@ -20,11 +20,22 @@ from optics.scene.mitsuba_parts import DEFAULT_VARIANT, Declared, collecting, is
 from optics.scene.parameter import Parameter, Variable
 from optics.scene.registry import registry
 
-LED_BY_LED = {"emission", "segment", "volume", "reflection", "ambient"}  # stages that light followed by chance does not pass
+LED_BY_LED = {
+    "emission",
+    "segment",
+    "volume",
+    "reflection",
+    "ambient",
+}  # stages that light followed by Monte Carlo does not pass
 KEEPS = "use 'interface', 'rough_interface' or 'sheet', which keep it"
 DEPOLARIZERS = {  # stock materials without a Mueller matrix, by the name that Mitsuba prints
-    "ThinDielectric": KEEPS, "RoughDielectric": KEEPS, "SmoothPlastic": "use 'pplastic'", "RoughPlastic": "use 'pplastic'",
-    "Principled": KEEPS, "The Thin Principled": KEEPS, "Hair": "leave it out",
+    "ThinDielectric": KEEPS,
+    "RoughDielectric": KEEPS,
+    "SmoothPlastic": "use 'pplastic'",
+    "RoughPlastic": "use 'pplastic'",
+    "Principled": KEEPS,
+    "The Thin Principled": KEEPS,
+    "Hair": "leave it out",
 }
 
 
@@ -36,7 +47,9 @@ def find(name: str | Path) -> Path:
             raise BadScene(f"{path}: no such scene file; shipped scenes: {', '.join(shipped_scenes())}")
         return path.resolve()
     if str(name) not in shipped_scenes():
-        raise UnknownKey(str(name), shipped_scenes(), "scene", hint="give a shipped scene's name or a path ending in .xml")
+        raise UnknownKey(
+            str(name), shipped_scenes(), "scene", hint="give a shipped scene's name or a path ending in .xml"
+        )
     return shipped("scenes") / f"{name}.xml"
 
 
@@ -44,9 +57,14 @@ def shipped_scenes() -> list[str]:
     return sorted(p.stem for p in shipped("scenes").glob("*.xml"))
 
 
-def load(name: str | Path, defines: Mapping[str, str] | None = None, variant: str = DEFAULT_VARIANT,
-         plugins: Path | None = None) -> "Scene":
-    """Load a scene by its name or path; `defines` replace the XML's <default>s; `plugins` is a further folder of plugins.
+def load(
+    name: str | Path,
+    defines: Mapping[str, str] | None = None,
+    variant: str = DEFAULT_VARIANT,
+    plugins: Path | None = None,
+) -> Scene:
+    """Load a scene by its name or path; `defines` replace the XML's <default>s; `plugins` is a further folder of
+    plugins.
 
     A folder `plugins` beside the user's scene is scanned as well.
     """
@@ -65,7 +83,13 @@ class Scene:
     camera, integrator, gel, block, leds, membranes    the parts by role (None or empty where the scene has none)
     """
 
-    MOVED = ("carried", "markers", "target", "block", "cells")  # kinds of shapes besides the gel whose parameters move geometry
+    MOVED = (
+        "carried",
+        "markers",
+        "target",
+        "block",
+        "cells",
+    )  # kinds of shapes besides the gel whose parameters move geometry
 
     def __init__(self, path: Path, defines: Mapping[str, str], variant: str = DEFAULT_VARIANT):
         self.path, self.defines, self.variant = Path(path), dict(defines), variant
@@ -80,8 +104,9 @@ class Scene:
         with collecting() as created:
             try:
                 # one by one: in parallel the parts are made, and then listed, in an order that changes from run to run
-                self.mitsuba = mi.load_file(str(self.path), parallel=False, optimize=False,
-                                            **{k: str(v) for k, v in self.defines.items()})
+                self.mitsuba = mi.load_file(
+                    str(self.path), parallel=False, optimize=False, **{k: str(v) for k, v in self.defines.items()}
+                )
             except (RuntimeError, ValueError, TypeError, KeyError) as error:
                 raise BadScene(f"{self.path}: {_reason(error, self.path)}") from error
         self.parts: dict[str, Declared] = {}
@@ -122,25 +147,32 @@ class Scene:
     def _warn_of_depolarizers(self) -> None:
         """Say which stock materials lose all polarization, and nobody says so, in a scene with polarizers."""
         shapes = self.mitsuba.shapes()
-        if not any(p.kind == "polarizer_film" for p in self.parts.values()) and not any("LinearPolarizer[" in str(s.bsdf()) for s in shapes):
+        if not any(p.kind == "polarizer_film" for p in self.parts.values()) and not any(
+            "LinearPolarizer[" in str(s.bsdf()) for s in shapes
+        ):
             return
         for shape in shapes:
             for name, advice in DEPOLARIZERS.items():
                 if re.search(rf"\b{name}(\[| BSDF)", str(shape.bsdf())):
-                    warnings.warn(f"{self.path}: the material '{name}' of the shape '{shape.id()}' takes all polarization out of the "
-                                  f"light that it lets through or reflects, whatever the physics; {advice}", stacklevel=2)
+                    warnings.warn(
+                        f"{self.path}: the material '{name}' of the shape '{shape.id()}' takes all polarization out of the "
+                        f"light that it lets through or reflects, whatever the physics; {advice}",
+                        stacklevel=2,
+                    )
 
     def _nest(self) -> None:
-        """Tell each clear body which clear material is around it."""
+        """Tell each dielectric body which clear material is around it."""
         clear = {n: p for n, p in self.parts.items() if p.kind == "clear"}
-        self.by_chance = bool(clear)
+        self.monte_carlo = bool(clear)
         for shape in self.mitsuba.shapes():
             if getattr(shape, "kind", "") == "cells" and getattr(shape.bsdf(), "kind", "") == "clear":
                 shape.bsdf().fills_cells = True
         for name, part in clear.items():
             if part.outside and part.outside not in clear:
-                raise BadScene(f"{self.path}: '{name}': outside = '{part.outside}'; allowed: the id of a clear material ("
-                               f"{', '.join(n for n in clear if n != name) or 'there is no other'}), or nothing for air")
+                raise BadScene(
+                    f"{self.path}: '{name}': outside = '{part.outside}'; allowed: the id of a clear material ("
+                    f"{', '.join(n for n in clear if n != name) or 'there is no other'}), or nothing for air"
+                )
             part.around = clear.get(part.outside)
             part.bands = len(self.integrator.bands) if self.integrator is not None else part.bands
 
@@ -161,8 +193,17 @@ class Scene:
                 continue
             value = self._traversed[key]
             if type(value) is mi.Float and len(value) == 1 and not key.endswith("silhouette_sampling_weight"):
-                found[key] = (Parameter(key.rsplit(".", 1)[-1], "", float(value[0]), doc="parameter of a stock Mitsuba plugin",
-                                        plausible=max(abs(float(value[0])) * 0.05, 1e-3), how="difference"), key)
+                found[key] = (
+                    Parameter(
+                        key.rsplit(".", 1)[-1],
+                        "",
+                        float(value[0]),
+                        doc="parameter of a stock Mitsuba plugin",
+                        plausible=max(abs(float(value[0])) * 0.05, 1e-3),
+                        how="difference",
+                    ),
+                    key,
+                )
         return found
 
     # -- values ---------------------------------------------------------------------------------------------------------
@@ -235,8 +276,8 @@ class Scene:
                 part.rebuild(mi.traverse(part))
 
     def _strain(self) -> None:
-        """Hand the sheets their stress patterns: from a file, or the present press's stress in the skin, from their depth on
-        both sides alike up to the skin's inner face."""
+        """Hand the sheets their stress patterns: from a file, or the present press's stress in the skin, from their
+        depth on both sides alike up to the skin's inner face."""
         from optics.skin.halfspace import SkinStress
 
         for shape in self.mitsuba.shapes():
@@ -248,8 +289,10 @@ class Scene:
                 sheet.field = PatternImage(self.path.parent / pattern)
             if pattern == "gel":
                 if self.gel is None or not hasattr(shape, "carry"):
-                    raise BadScene(f"{self.path}: '{sheet.name}': stress_pattern = 'gel' needs a sheet in the skin, a shape of the "
-                                   "type 'carried'")
+                    raise BadScene(
+                        f"{self.path}: '{sheet.name}': stress_pattern = 'gel' needs a sheet in the skin, a shape of the "
+                        "type 'carried'"
+                    )
                 thickness = self.gel.number("thickness")
                 near = max(2 * shape.number("depth") - thickness, 0.0)
                 sheet.field = SkinStress(self.gel, near, thickness)
@@ -259,17 +302,19 @@ class Scene:
         """Names of gel parameters that move its surface."""
         effects = registry().effects.values()
         return {p.name for p in registry().parts["gel"].parameters} | {
-            n for e in effects if "surface" in e.stages for n in (*e.parameter_names, *(p.name for p in e.shape))}
+            n for e in effects if "surface" in e.stages for n in (*e.parameter_names, *(p.name for p in e.shape))
+        }
 
     def keys_of(self, effect: Effect) -> dict[str, list[str]]:
-        """The effect's parameter names, each with the keys it has in this scene (empty where the scene lacks the part)."""
+        """The effect's parameter names, each with the keys it has in this scene (empty where the scene lacks the
+        part)."""
         holders = {n: p for n, p in self.parts.items() if p.kind == effect.part}
         return {name: [f"{n}.{name}" for n, p in holders.items() if p.takes(name)] for name in effect.parameter_names}
 
     def can_express(self, effect: Effect) -> bool:
         kinds = {p.kind for p in self.parts.values()}
         layered = any(p.how == "layer" for p in registry().effect_parameters(effect))
-        if self.by_chance and (set(effect.stages) & LED_BY_LED or effect.part == "tactile" or layered):
+        if self.monte_carlo and (set(effect.stages) & LED_BY_LED or effect.part == "tactile" or layered):
             return False
         return all(self.keys_of(effect).values()) and kinds.issuperset(effect.requires)
 
@@ -278,8 +323,11 @@ class Scene:
         variables = []
         for name, keys in self.keys_of(effect).items():
             parameter = registry().parameter(effect.part, name)
-            groups = [(f"{effect.part}.{name}" if len(keys) > 1 else keys[0], tuple(keys))] if effect.per == "kind" else \
-                [(key, (key,)) for key in keys]
+            groups = (
+                [(f"{effect.part}.{name}" if len(keys) > 1 else keys[0], tuple(keys))]
+                if effect.per == "kind"
+                else [(key, (key,)) for key in keys]
+            )
             for label, group in groups:
                 if effect.scope == "frame":
                     variables += [Variable(f"{label}[{i}]", group, parameter, (i,)) for i in range(frames)]
@@ -300,7 +348,11 @@ def _reason(error: Exception, path: Path) -> str:
     parts = registry().parts
     if (unknown := re.search(r'Plugin "([^"]+)" not found', text)) is not None:
         near = difflib.get_close_matches(unknown[1], parts, n=1)
-        text += f" Did you mean '{near[0]}'?" if near else f" Own types are {', '.join(sorted(parts))}; others are Mitsuba's."
+        text += (
+            f" Did you mean '{near[0]}'?"
+            if near
+            else f" Own types are {', '.join(sorted(parts))}; others are Mitsuba's."
+        )
     unused = re.search(r'unreferenced propert.* plugin of type "([^"]+)": - \w+ "([^"]+)"', text)
     if unused is not None and unused[1] in parts:
         near = difflib.get_close_matches(unused[2], [p.name for p in registry().parameters_of(unused[1])], n=1)

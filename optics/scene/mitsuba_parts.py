@@ -1,4 +1,5 @@
-"""What Mitsuba needs of a part: the variant, the plugin classes built for it, and a base that reads and exposes parameters."""
+"""What Mitsuba needs of a part: the variant, the plugin classes built for it, and a base that reads and exposes
+parameters."""
 
 from __future__ import annotations
 
@@ -46,8 +47,10 @@ def _built(reg: Registry, part: Part) -> type:
     for p in reg.parameters_of(part.kind):
         if is_taken(p.name, cls):
             files = [e.file for e in reg.effects.values() if e.part == part.kind and p in (*e.parameters, *e.shape)]
-            raise BadPlugin(f"{files[0] if files else part.file}: parameter '{p.name}' has the name of something else that the part "
-                            f"'{part.kind}' has; choose another name")
+            raise BadPlugin(
+                f"{files[0] if files else part.file}: parameter '{p.name}' has the name of something else that the part "
+                f"'{part.kind}' has; choose another name"
+            )
     return cls
 
 
@@ -79,13 +82,20 @@ class Declared:
     @staticmethod
     def on(base: type) -> type:
         """A subclass of a Mitsuba class that has the methods of this one."""
-        return type(f"Declared{base.__name__}", (base,), {n: f for n, f in vars(Declared).items()
-                                                          if (callable(f) or n == "band") and not n.startswith("__")
-                                                          and n not in ("on", "on_mesh")})
+        return type(
+            f"Declared{base.__name__}",
+            (base,),
+            {
+                n: f
+                for n, f in vars(Declared).items()
+                if (callable(f) or n == "band") and not n.startswith("__") and n not in ("on", "on_mesh")
+            },
+        )
 
     @staticmethod
     def on_mesh() -> type:
-        """`on(mi.Mesh)` for a shape that makes its own vertices: `rebuild(params)` follows every change of its parameters."""
+        """`on(mi.Mesh)` for a shape that makes its own vertices: `rebuild(params)` follows every change of its
+        parameters."""
         import mitsuba as mi
 
         class DeclaredMesh(Declared.on(mi.Mesh)):
@@ -155,14 +165,18 @@ class Declared:
     def functions(self, stage: str) -> tuple[Callable, ...]:
         """The functions of effects at a stage, but for those that rest at neutral and carry no derivative.
 
-        Leaving them out saves time and changes nothing: the contract tests hold every effect to the identity at neutral. A part of
-        an earlier scene knows no effect that was scanned since.
-        """
+        Leaving them out saves time and changes nothing: the contract tests hold every effect to the identity at
+        neutral. A part of an earlier scene knows no effect that was scanned since."""
         import drjit as dr
 
-        return tuple(e.stages[stage] for e in registry().at_stage(self.kind, stage)
-                     if any(n in self.held and (self.held[n] != self.numbers[n].neutral or dr.grad_enabled(getattr(self, n)))
-                            for n in e.parameter_names))
+        return tuple(
+            e.stages[stage]
+            for e in registry().at_stage(self.kind, stage)
+            if any(
+                n in self.held and (self.held[n] != self.numbers[n].neutral or dr.grad_enabled(getattr(self, n)))
+                for n in e.parameter_names
+            )
+        )
 
 
 HELD = ("name", "numbers", "words", "held")  # what every part holds beside its parameters

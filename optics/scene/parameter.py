@@ -1,7 +1,7 @@
 """The one vocabulary: a parameter of a part of the scene, with its key, unit, bounds and neutral value.
 
-Settings, free parameters and effects are roles that a parameter plays; see `optics.scene.registry` for the declarations.
-"""
+Settings, free parameters and effects are roles that a parameter plays; see `optics.scene.registry` for the
+declarations."""
 
 from __future__ import annotations
 
@@ -26,17 +26,21 @@ class Parameter:
     doc         what it means, in one sentence, with its symbol in the source
     neutral     value at which its effect vanishes; None where it has none (a position has no neutral value)
     plausible   the size of a change that a real sensor shows; sets steps and scales, > 0
-    step        half width of a central difference, in plausible sizes: narrow where the image bends, wide where an edge that
+    step        half width of a central difference, in plausible sizes: narrow where the image bends, wide where an edge
+                that
                 moves changes a rim's pixel by jumps of one sample
     how         how its derivative image is made: 'ad' (forward mode through the render), 'difference' (central, common
-                random numbers: it moves shadows or geometry), 'image' (arithmetic on the linear images), 'layer' (complex step
-                through the Mueller matrices of the layers and the Stokes vectors of sources), 'path' (by the lengths of the ways
-                that light took through clear bodies)
-    squared     True where the image depends on the square of it (a roughness): a fit steps in the square, whose onset is
+                random numbers: it moves shadows or geometry), 'image' (arithmetic on the linear images), 'layer'
+                (complex step through the Mueller matrices of the layers and the Stokes vectors of sources), 'path' (by
+                the lengths of the ways that light took through dielectric bodies)
+    squared     True where the image depends on the square of it (a roughness): a fit steps in the square, whose onset
+                is
                 linear, and stays above a thousandth of `plausible`
-    saturates   of a squared parameter s: the value v beyond which its effect levels off; a fit steps in s^2/(1 + s^2/v^2)
+    saturates   of a squared parameter s: the value v beyond which its effect levels off; a fit steps in s^2/(1 +
+                s^2/v^2)
     linear      True where the image is exactly linear in it (one render serves every value)
-    choices     the allowed words, for a parameter that is a choice and not a number; files: endings of files that serve as well
+    choices     the allowed words, for a parameter that is a choice and not a number; files: endings of files that serve
+                as well
     """
 
     name: str
@@ -82,9 +86,9 @@ class Parameter:
         return math.sqrt(max(u, 0.0) / max(1 - u / self.saturates**2, 1e-12)) if self.squared else u
 
     def stepped(self, value: float, du: float, bent: bool = True) -> float:
-        """Where a step of du in the coordinate leads. A factor, such as a power, moves by its logarithm if `bent`: what it multiplies may
-        shrink by as much (brightness and reflectance), and the image stays. Beyond e times the value it goes on straight, as a logarithm that
-        overshoots does so without measure."""
+        """Where a step of du in the coordinate leads. A factor, such as a power, moves by its logarithm if `bent`: what
+        it multiplies may shrink by as much (brightness and reflectance), and the image stays. Beyond e times the value
+        it goes on straight, as a logarithm that overshoots does so without measure."""
         if not bent or not self.factor or value <= 0:
             return self.at_coordinate(self.coordinate(value) + du)
         t = du / value
@@ -115,13 +119,20 @@ class Parameter:
         """Return the value in its own type, or raise: not a number, not finite, out of bounds, not a choice."""
         if self.choices:
             if value not in self.choices and not (self.files and str(value).endswith(self.files)):
-                raise UnknownKey(str(value), self.choices, f"choice for {key}", where,
-                                 f"or a file ({', '.join(self.files)})" if self.files else "")
+                raise UnknownKey(
+                    str(value),
+                    self.choices,
+                    f"choice for {key}",
+                    where,
+                    f"or a file ({', '.join(self.files)})" if self.files else "",
+                )
             return str(value)
         try:
             number = float(value)
         except (TypeError, ValueError):
-            raise ValueError(f"{where + ': ' if where else ''}{key} = {value!r} is not a number{f' in {self.unit}' if spaced(self.unit) else ''}") from None
+            raise ValueError(
+                f"{where + ': ' if where else ''}{key} = {value!r} is not a number{f' in {self.unit}' if spaced(self.unit) else ''}"
+            ) from None
         if not math.isfinite(number):
             raise ValueError(f"{where + ': ' if where else ''}{key} = {number}{spaced(self.unit)} is not finite")
         if not self.bounds[0] <= number <= self.bounds[1]:
@@ -150,7 +161,7 @@ class Variable:
     def holds_in(self, frame: int) -> bool:
         return self.frames is None or frame in self.frames
 
-    def with_prior(self, mean: float, sd: float) -> "Variable":
+    def with_prior(self, mean: float, sd: float) -> Variable:
         return replace(self, prior=(float(mean), float(sd)))
 
 
@@ -180,5 +191,5 @@ class Values:
             for index in variable.frames:
                 self.frame.setdefault(index, {}).update({key: float(value) for key in variable.keys})
 
-    def copy(self) -> "Values":
+    def copy(self) -> Values:
         return Values(dict(self.common), {index: dict(own) for index, own in self.frame.items()})

@@ -29,8 +29,13 @@ class Registry:
     def parameters_of(self, kind: str) -> tuple[Parameter, ...]:
         """A part's own parameters and those that effects bring to it."""
         own = self.parts[kind].parameters
-        brought = [p for e in self.effects.values() if e.part == kind for p in (*e.parameters, *e.shape)
-                   if not isinstance(p, str)]
+        brought = [
+            p
+            for e in self.effects.values()
+            if e.part == kind
+            for p in (*e.parameters, *e.shape)
+            if not isinstance(p, str)
+        ]
         return own + tuple(brought)
 
     def parameter(self, kind: str, name: str) -> Parameter:
@@ -48,8 +53,11 @@ class Registry:
 
     def at_stage(self, kind: str, stage: str) -> tuple[Effect, ...]:
         """The effects that act on a part at a stage, in a fixed order (by key)."""
-        return tuple(self.effects[k] for k in sorted(self.effects)
-                     if self.effects[k].part == kind and stage in self.effects[k].stages)
+        return tuple(
+            self.effects[k]
+            for k in sorted(self.effects)
+            if self.effects[k].part == kind and stage in self.effects[k].stages
+        )
 
     def find_effect(self, name: str) -> Effect:
         key = key_of(name)
@@ -68,7 +76,9 @@ class Registry:
             self.parts[item.kind] = item
             return
         if item.key == "new":
-            raise BadPlugin(f"{file}: an effect cannot be called 'new', which is the word for writing one; choose another name")
+            raise BadPlugin(
+                f"{file}: an effect cannot be called 'new', which is the word for writing one; choose another name"
+            )
         if item.key in self.effects:
             raise BadPlugin(f"{file}: the effect '{item.name}' exists already ({self.effects[item.key].file})")
         for stage in item.stages:
@@ -90,8 +100,10 @@ class Registry:
                 if kind not in self.parts:
                     raise BadPlugin(f"{effect.file}: part '{kind}' is none of {', '.join(sorted(self.parts))}")
             if "layer" in effect.stages and self.parts[effect.part].mueller is None:
-                raise BadPlugin(f"{effect.file}: stage 'layer' belongs to a layer (a part with a Mueller matrix), which "
-                                f"'{effect.part}' is not")
+                raise BadPlugin(
+                    f"{effect.file}: stage 'layer' belongs to a layer (a part with a Mueller matrix), which "
+                    f"'{effect.part}' is not"
+                )
             for name in effect.parameter_names:
                 if self.parameter(effect.part, name).neutral is None:
                     raise BadPlugin(f"{effect.file}: {effect.part}.{name} has no neutral value to rest at")

@@ -1,7 +1,7 @@
 """Surfaces: what matt surfaces, and surfaces that send light one way only, have in common as Mitsuba BSDFs.
 
-Classes belong to the Mitsuba variant that is set when they are made, so these functions are called where a part is built.
-"""
+Classes belong to the Mitsuba variant that is set when they are made, so these functions are called where a part is
+built."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from optics.scene.mitsuba_parts import Declared
 
 
 def matt() -> type:
-    """A base for surfaces that reflect into all directions and depolarize: `brdf(si, wo, active)` is f(wi, wo) per band, 1/sr.
+    """A base for surfaces that reflect into all directions and depolarize: `brdf(si, wo, active)` is f(wi, wo) per
+    band, 1/sr.
 
     Directions are sampled by their cosine; light comes from the side that the normal points to.
     """
@@ -26,7 +27,7 @@ def matt() -> type:
         def rho(self):
             """Reflectance in each band: rho_r, rho_g, rho_b, 1."""
             rho = (self.rho_r, self.rho_g, self.rho_b, mi.Float(1.0))
-            return mi.UnpolarizedSpectrum(*rho[:dr.size_v(mi.UnpolarizedSpectrum)])
+            return mi.UnpolarizedSpectrum(*rho[: dr.size_v(mi.UnpolarizedSpectrum)])
 
         def sample(self, ctx, si, sample1, sample2, active=True):
             bs = dr.zeros(mi.BSDFSample3f)
@@ -63,7 +64,8 @@ def unpolarized(value):
 
 
 def passing(flags: int) -> type:
-    """A base for surfaces that send light on in one direction and scatter none: `sample` and `eval_null_transmission` are theirs.
+    """A base for surfaces that send light on in one direction and scatter none: `sample` and `eval_null_transmission`
+    are theirs.
 
     flags  what passing counts as, of mi.BSDFFlags
     """

@@ -102,8 +102,7 @@ def gaussian_blur(a: np.ndarray, sd: float) -> np.ndarray:
 
     Transfer function exp(-sd^2 (1 - cos k)) per axis (Lindeberg 1990): positive, unit sum and variance exactly sd^2
     also below one node, where a sampled Gaussian fails. Returns a square of an FFT-friendly size >= that of `a`, which
-    is filled up with zeros.
-    """
+    is filled up with zeros."""
     from scipy.fft import irfft2, next_fast_len, rfft2
 
     m = next_fast_len(max(a.shape), real=True)
@@ -472,7 +471,8 @@ def displacement(
     thickness  mm of the gel: D0 = clip(depth - h, 0, thickness), h = Profile.envelope
     smoothing  mm, standard deviation of the widest Gaussian; 0: D = D0 but for the last blur
     levels     number of Gaussians, each half as wide as the one before
-    skirt      mm over which the skin beside the contact falls to 1/e, see `dragged`; 0: the pyramid alone makes the skirt
+    skirt      mm over which the skin beside the contact falls to 1/e, see `dragged`; 0: the pyramid alone makes the
+               skirt
 
     Pyramid (S1.6): D <- max(D0, G_k * D) for the sd smoothing, smoothing/2, smoothing/4, ... The maximum restores the
     contact after each blur: the skin rests on the indenter where it would otherwise pass through it and leaves it where
@@ -486,7 +486,9 @@ def displacement(
 
     Both maps fade to zero over the outer eighth of the local grid. Results are cached: do not write into them.
     """
-    if not (math.isfinite(depth) and math.isfinite(smoothing) and smoothing >= 0 and thickness > 0 and 0 <= skirt < 1e3):
+    if not (
+        math.isfinite(depth) and math.isfinite(smoothing) and smoothing >= 0 and thickness > 0 and 0 <= skirt < 1e3
+    ):
         raise ValueError(
             f"press: depth = {depth:g} mm, smoothing = {smoothing:g} mm, thickness = {thickness:g} mm, skirt = {skirt:g} mm; "
             "need finite depth, smoothing >= 0, thickness > 0 and skirt >= 0"
@@ -570,8 +572,7 @@ def ring_bulge(pressed: LocalMap, contact: LocalMap, spread: float) -> LocalMap:
     spread  mm; the gel thickness is the natural value (a bonded layer passes stress on over about its thickness)
 
     The map is wider (by four spreads) and coarser (spread/16 at most) than `pressed`. What would be raised beyond the
-    border of the gel is lost there.
-    """
+    border of the gel is lost there."""
     if not spread > 0:
         raise ValueError(f"ring spread = {spread:g} mm; it must be above 0, the gel thickness is usual")
     n, pitch = len(pressed.values), pressed.pitch

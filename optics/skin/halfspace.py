@@ -1,11 +1,13 @@
 """How a dent of the skin's face carries along what lies deeper: a soft incompressible half-space, in Fourier space.
 
-    ux, uy, uz = carried(pressed, pressed.pitch, depth)         displacement at a depth, three maps around the press axis
+    ux, uy, uz = carried(pressed, pressed.pitch, depth)         displacement at a depth, three maps around the press
+    axis
     points = displaced(gel, x, y, depth)                        where the skin's points at (x, y, -depth) are now, mm
-    q, u = stress_integrals(pressed, pressed.pitch, h1, h2)     stress differences that light collects between two depths
+    q, u = stress_integrals(pressed, pressed.pitch, h1, h2)     stress differences that light collects between two
+    depths
 
-The face of the body h >= 0 (h = -z: depth, towards the camera) is pushed in by D(x, y) without friction. With the transform
-f^ = integral f exp(-i(kx x + ky y)), k = |(kx, ky)|, the shear modulus G and Poisson's ratio nu:
+The face of the body h >= 0 (h = -z: depth, towards the camera) is pushed in by D(x, y) without friction. With the
+transform f^ = integral f exp(-i(kx x + ky y)), k = |(kx, ky)|, the shear modulus G and Poisson's ratio nu:
 
     uz^ =  D^ (1 + kh/(2(1 - nu))) exp(-kh)                     along h, positive where D is
     ux^ =  D^ (i kx/k) ((1 - 2 nu) - kh)/(2(1 - nu)) exp(-kh)   and uy^ with ky
@@ -15,14 +17,15 @@ f^ = integral f exp(-i(kx x + ky y)), k = |(kx, ky)|, the shear modulus G and Po
 
 At nu = 1/2 the face itself does not move sideways, and
 
-    u(x, y, h) = integral D(x', y') 3 h^2 (x - x', y - y', h) / (2 pi R^5) dx' dy'      R: distance to the point of the face
+    u(x, y, h) = integral D(x', y') 3 h^2 (x - x', y - y', h) / (2 pi R^5) dx' dy'      R: distance to the point of the
+    face
 
-so that every bit of a dent pushes all points straight away from itself: downwards below it, outwards beside it, fading as R^-4
-(sideways) and R^-5 (down). uz keeps the dent's volume at every depth.
+so that every bit of a dent pushes all points straight away from itself: downwards below it, outwards beside it, fading
+as R^-4 (sideways) and R^-5 (down). uz keeps the dent's volume at every depth.
 
-Validity: small strains. What lies in order stays in order down to dents as deep as the first sheet under the face, and further
-where they are wide. The body has no end: a skin whose inner face is free bends and follows a dent further than this, one that
-is backed by something hard follows less.
+Validity: small strains. What lies in order stays in order down to dents as deep as the first sheet under the face, and
+further where they are wide. The body has no end: a skin whose inner face is free bends and follows a dent further than
+this, one that is backed by something hard follows less.
 
 Source: Boussinesq's point load, Johnson, Contact Mechanics (1985), 3.2, by the transforms 1/R -> 2 pi exp(-kh)/k and
 log(R + h) -> -2 pi exp(-kh)/k^2; the tests hold it against the point load and against Hertz' contact.
@@ -46,7 +49,8 @@ WIDEST = 1001  # nodes a side
 def carried(
     dent: LocalMap | np.ndarray, pitch: float, depth: float, poisson: float = 0.5
 ) -> tuple[LocalMap, LocalMap, LocalMap]:
-    """Displacement (ux, uy, uz) in mm at a depth below the face: ux, uy along x and y, uz into the skin (-z) like the dent.
+    """Displacement (ux, uy, uz) in mm at a depth below the face: ux, uy along x and y, uz into the skin (-z) like the
+    dent.
 
     dent     (n, n) D in mm, n odd, [v, u] around the press axis, zero at the border
     pitch    mm
@@ -54,8 +58,7 @@ def carried(
     poisson  0.5: incompressible. Below, sideways tails fade as r^-2, and the border of the maps takes a share of them
 
     The maps are REACH depths wider than the dent on each side and as coarse as the depth allows. They fade to zero over
-    their outer eighth as a LocalMap must.
-    """
+    their outer eighth as a LocalMap must."""
     _check(pitch, poisson, depth)
     plane = Plane(dent, pitch, depth, depth)
     kh = plane.k * depth
@@ -67,14 +70,14 @@ def carried(
 def stress_integrals(
     dent: LocalMap | np.ndarray, pitch: float, h1: float, h2: float, poisson: float = 0.5
 ) -> tuple[LocalMap, LocalMap]:
-    """Q = integral (s_xx - s_yy) dh and U = integral 2 s_xy dh from depth h1 to h2, over the shear modulus: mm; tension positive.
+    """Q = integral (s_xx - s_yy) dh and U = integral 2 s_xy dh from depth h1 to h2, over the shear modulus: mm; tension
+    positive.
 
     dent, pitch, poisson    as in `carried`
     h1, h2                  mm, 0 <= h1 <= h2
 
-    Both are taken along lines across the skin. Beside a contact the skin is compressed along the radius: Q < 0 on the x axis,
-    Q > 0 on the y axis, U < 0 where x y > 0. The greater tension lies at atan2(U, Q)/2 from x to y.
-    """
+    Both are taken along lines across the skin. Beside a contact the skin is compressed along the radius: Q < 0 on the x
+    axis, Q > 0 on the y axis, U < 0 where x y > 0. The greater tension lies at atan2(U, Q)/2 from x to y."""
     _check(pitch, poisson, h1, h2)
     plane = Plane(dent, pitch, h1, h2)
 
@@ -82,14 +85,18 @@ def stress_integrals(
         return ((1 - 2 * poisson) - (1 + plane.k * h)) * np.exp(-plane.k * h)
 
     size = (antiderivative(h2) - antiderivative(h1)) / (1 - poisson)
-    return (plane.map(size * (plane.cos - plane.sin) * (plane.cos + plane.sin)),
-            plane.map(size * 2 * plane.cos * plane.sin))
+    return (
+        plane.map(size * (plane.cos - plane.sin) * (plane.cos + plane.sin)),
+        plane.map(size * 2 * plane.cos * plane.sin),
+    )
 
 
 def displaced(gel, x: np.ndarray, y: np.ndarray, depth: float) -> np.ndarray:
-    """(..., 3) world mm: where the points that rest at (x, y, -depth) in the skin are under the gel part's present dent.
+    """(..., 3) world mm: where the points that rest at (x, y, -depth) in the skin are under the gel part's present
+    dent.
 
-    x, y  mm, broadcast together; fastest as a grid, x of shape (1, nx) and y of shape (ny, 1). gel: None for an untouched skin
+    x, y  mm, broadcast together; fastest as a grid, x of shape (1, nx) and y of shape (ny, 1). gel: None for an
+          untouched skin
     """
     ux = uy = uz = 0.0
     if gel is not None and gel.map.values.any():
@@ -100,7 +107,8 @@ def displaced(gel, x: np.ndarray, y: np.ndarray, depth: float) -> np.ndarray:
 
 @lru_cache(maxsize=8)
 def _carried(dent: LocalMap, depth: float) -> tuple[LocalMap, LocalMap, LocalMap]:
-    """`carried`, kept: a gel's map stays the same object while the press only moves, and sheets at one depth share it."""
+    """`carried`, kept: a gel's map stays the same object while the press only moves, and sheets at one depth share
+    it."""
     return carried(dent, dent.pitch, depth)
 
 
@@ -110,9 +118,8 @@ class Plane:
     near, far    depths in mm: `near` sets how coarse the maps may be, `far` how wide they must be
     spectrum     (m, m/2 + 1) D^ in mm^3; k 1/mm, cos = kx/k and sin = ky/k (0 at k = 0) broadcast against it
 
-    The sum over the dent is taken at those wave numbers directly, so that a coarse grid costs no accuracy. The period is twice
-    the maps' width: the nearest image of the dent is farther from every node than the cut-off border.
-    """
+    The sum over the dent is taken at those wave numbers directly, so that a coarse grid costs no accuracy. The period
+    is twice the maps' width: the nearest image of the dent is farther from every node than the cut-off border."""
 
     def __init__(self, dent, pitch: float, near: float, far: float):
         from scipy.fft import next_fast_len
@@ -151,11 +158,11 @@ def _check(pitch: float, poisson: float, *depths: float) -> None:
 
 
 class SkinStress:
-    """The stress pattern of a pressed skin for a sheet in it (plugins/effects/stress.py): f(x, y, size) -> (P_q, P_u) in mm.
+    """The stress pattern of a pressed skin for a sheet in it (plugins/effects/stress.py): f(x, y, size) -> (P_q, P_u)
+    in mm.
 
-    x, y are the sheet's own axes as the camera sees it (x right, y up): y of the world and 2 s_xy change their signs. The integral
-    runs from h1 to h2. Taken over by whoever traces rays, as the scene moves on to other presses.
-    """
+    x, y are the sheet's own axes as the camera sees it (x right, y up): y of the world and 2 s_xy change their signs.
+    The integral runs from h1 to h2. Taken over by whoever traces rays, as the scene moves on to other presses."""
 
     def __init__(self, gel, h1: float, h2: float):
         self.press = gel.number("press_x"), gel.number("press_y")

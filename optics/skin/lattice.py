@@ -5,61 +5,67 @@
     pressed = settle(skin, Push(sphere(6.0), depth=1.0))                     at rest, by damped motion: seconds
     corners = pressed.positions.reshape(-1, 3)[cells(skin.shape)]            (cells, 8, 3) mm: hexahedra for a renderer
 
-Frame and units. mm, N, MPa, g, ms: one set, as 1 N = 1 g mm/ms^2. Node (m, n, l) rests at x = (m - (R-1)/2) h,
-y = (n - (C-1)/2) h, z = (l - (L-1)) h: the outer face is z = 0, the glued face z = -(L-1) h lies towards the camera. Indenters
+Frame and units. mm, N, MPa, g, ms: one set, as 1 N = 1 g mm/ms^2. Node (m, n, l) rests at x = (m - (R-1)/2) h, y = (n -
+(C-1)/2) h, z = (l - (L-1)) h: the outer face is z = 0, the glued face z = -(L-1) h lies towards the camera. Indenters
 come from +z. Cells are cubes of edge h, the pitch: only for these do the weights below give an isotropic body.
 
-Springs. A node has 6 neighbours along the axes (weight g = 2) and 8 across the cells' diagonals, sqrt(3) h away (g = 3/4). Each
-cell owns a share of its springs, a quarter of an edge and all of a diagonal, so that faces, edges and soft cells have springs of
-the right strength and a uniform stress is exact up to the surface (but for shear at the block's eight corners, where a single
-diagonal pulls with alpha h e_yz/2 along x, and so on). With x the vector from node to node, X the same at rest and V = h^3 the
-energy of a cell is
+Springs. A node has 6 neighbours along the axes (weight g = 2) and 8 across the cells' diagonals, sqrt(3) h away (g =
+3/4). Each cell owns a share of its springs, a quarter of an edge and all of a diagonal, so that faces, edges and soft
+cells have springs of the right strength and a uniform stress is exact up to the surface (but for shear at the block's
+eight corners, where a single diagonal pulls with alpha h e_yz/2 along x, and so on). With x the vector from node to
+node, X the same at rest and V = h^3 the energy of a cell is
 
     sum_springs share { alpha g/2 (|x| - |X|)^2 + chi beta g/(2 |X|^2) |x - T X|^2 } + kappa/2 V (J - 1)^2
 
 alpha   N/mm  linear springs, along their lines at any length and direction
-beta    N mm  shear springs, chi = 2/3: what a spring's end moves in the frame that turns with the cell; T is the rotation in the
+beta    N mm  shear springs, chi = 2/3: what a spring's end moves in the frame that turns with the cell; T is the
+        rotation in the
               polar decomposition of the cell's mean deformation gradient
 kappa   MPa   the cell's resistance to a change of its volume V J, of the hexahedron with trilinear faces
 
-The first two are the source's. For long waves, with C_ijkl = 1/(2V) sum_j alpha g_j X_i X_j X_k X_l / |X|^2 over the 14 springs
-and the same for the others, the body is isotropic and has Lame's constants
+The first two are the source's. For long waves, with C_ijkl = 1/(2V) sum_j alpha g_j X_i X_j X_k X_l / |X|^2 over the 14
+springs and the same for the others, the body is isotropic and has Lame's constants
 
     lambda = alpha/h + kappa        mu = alpha/h + beta/h^3
 
-The linear springs are isotropic for g_1/g_3 = 8/3, which 2 and 3/4 are; the shear springs are with any weights and any chi, and
-with these weights chi = 2/3 makes their modulus just beta/V. nu = lambda/(2 (lambda + mu)) reaches 1/4 without kappa. Beyond,
-beta would be negative, and the lattice would fold: a pattern that alternates along two axes and moves along the third stretches
-no linear spring at all. Rubber has nu near 1/2, hence kappa. `spring_constants` lets the shear springs bear SHARE of mu; where
-nu < 1/6 they bear more, and kappa = 0: the source's model, complete.
+The linear springs are isotropic for g_1/g_3 = 8/3, which 2 and 3/4 are; the shear springs are with any weights and any
+chi, and with these weights chi = 2/3 makes their modulus just beta/V. nu = lambda/(2 (lambda + mu)) reaches 1/4 without
+kappa. Beyond, beta would be negative, and the lattice would fold: a pattern that alternates along two axes and moves
+along the third stretches no linear spring at all. Rubber has nu near 1/2, hence kappa. `spring_constants` lets the
+shear springs bear SHARE of mu; where nu < 1/6 they bear more, and kappa = 0: the source's model, complete.
 
 Where the printed equations do not agree with each other or with the lattice, this is used:
-(7), (8)  alpha and beta are spring constants, so the braces are an energy and a force; over V they are densities, which (9) then
-          adds to a weight in N and (12) divides by a mass. Here: without 1/V. (12) is right with F in N and theta in 1/ms.
-(8)       F = +d phi/du has the wrong sign. The right-hand side is the force -d Phi/du of Phi = 1/2 sum_i phi_i, which counts
+(7), (8)  alpha and beta are spring constants, so the braces are an energy and a force; over V they are densities, which
+          (9) then
+          adds to a weight in N and (12) divides by a mass. Here: without 1/V. (12) is right with F in N and theta in
+          1/ms.
+(8)       F = +d phi/du has the wrong sign. The right-hand side is the force -d Phi/du of Phi = 1/2 sum_i phi_i, which
+          counts
           every spring once.
-(7)       No angle of D3Q14 has the cosine sqrt(2)/2: they are 54.7 deg (1/sqrt(3)) between edge and diagonal and 70.5 deg (1/3)
-          between diagonals. With 45 deg the lattice is under stress at rest. With the right ones it is not isotropic: what
-          springs on these angles add to C44 is 2 times what they add to (C11 - C12)/2 for the former alone, 0.95 times for both.
-(8)       The second term belongs to the energy chi beta g/2 |u_j - u_i|^2/|x|^2, which is no linearised angle and charges for
+(7)       No angle of D3Q14 has the cosine sqrt(2)/2: they are 54.7 deg (1/sqrt(3)) between edge and diagonal and 70.5
+          deg (1/3) between diagonals. With 45 deg the lattice is under stress at rest. With the right ones it is not
+          isotropic: what springs on these angles add to C44 is 2 times what they add to (C11 - C12)/2 for the former
+          alone, 0.95 times for both.
+(8)       The second term belongs to the energy chi beta g/2 |u_j - u_i|^2/|x|^2, which is no linearised angle and
+          charges for
           turning the body as a whole (a Born spring). Here it is taken in the frame of the cell, as above.
 
-Validity. Small strains: isotropic linear elasticity, turned by any angle. Large strains: a law of its own. For nu = 0.47 its
-stress is within 4 % of a neo-Hookean body's from 0.6 to 1.1 times the length, 9 % above it at 1.2. Cells turn inside out, which
-is an error, at a third to a half of the thickness, under a small sphere at about 0.8 of its radius. The body is uniform within
-a cell: walls and filling enter by their mixture (`grid_material`), single cells by `factors`.
+Validity. Small strains: isotropic linear elasticity, turned by any angle. Large strains: a law of its own. For nu =
+0.47 its stress is within 4 % of a neo-Hookean body's from 0.6 to 1.1 times the length, 9 % above it at 1.2. Cells turn
+inside out, which is an error, at a third to a half of the thickness, under a small sphere at about 0.8 of its radius.
+The body is uniform within a cell: walls and filling enter by their mixture (`grid_material`), single cells by
+`factors`.
 
-Accuracy against linear elasticity (quadratic finite elements, nu = 0.47, `linear`). Glued block, 6 cells over the thickness: the
-force of a plate 2 %, the give under shear 3 %; 8 cells 1.3 and 2.1 %. Sphere: 18 % with 5 nodes in contact, 5 % with 9 to 13,
-2 % from 30 on. Against neo-Hookean elements, a sphere of 6 mm pressed 0.25 to 1 mm into 5 mm: 5 to 10 % too little force with 6
-cells, 4 to 6 % with 10.
+Accuracy against linear elasticity (quadratic finite elements, nu = 0.47, `linear`). Glued block, 6 cells over the
+thickness: the force of a plate 2 %, the give under shear 3 %; 8 cells 1.3 and 2.1 %. Sphere: 18 % with 5 nodes in
+contact, 5 % with 9 to 13, 2 % from 30 on. Against neo-Hookean elements, a sphere of 6 mm pressed 0.25 to 1 mm into 5
+mm: 5 to 10 % too little force with 6 cells, 4 to 6 % with 10.
 
-Time for 1 mm of a 6 mm sphere into 5 mm, one core: 21 x 21 x 7 nodes 0.5 s (`balance`) or 1.4 s (`settle`), 26 x 32 x 8 nodes 1.2
-or 2.7 s.
+Time for 1 mm of a 6 mm sphere into 5 mm, one core: 21 x 21 x 7 nodes 0.5 s (`balance`) or 1.4 s (`settle`), 26 x 32 x 8
+nodes 1.2 or 2.7 s.
 
-Source: Fan, Li, Cong & Zhang, "MagicGripper" (mini-MagicTac), supplementary VII-A, eqs. (4)-(17); kappa and the cell's frame are
-additions.
-"""
+Source: Fan, Li, Cong & Zhang, "MagicGripper" (mini-MagicTac), supplementary VII-A, eqs. (4)-(17); kappa and the cell's
+frame are additions."""
 
 from __future__ import annotations
 
@@ -82,8 +88,9 @@ TOLERANCE = 1e-6  # residual force at rest over all forces on the skin
 CHECKED = 20  # time steps between looks at whether it rests
 SAFETY = 0.8  # of the longest stable time step: the springs of a pressed skin are stiffer than at rest
 
-# A cell's corners (i, j, k), 0 or 1; its springs as differences of corners; and its modes: the position of a point of the cell
-# at xi, eta, zeta in -1 ... 1 is the sum of modes times 1, xi, eta, zeta, eta zeta, zeta xi, xi eta, xi eta zeta.
+# A cell's corners (i, j, k), 0 or 1; its springs as differences of corners; and its modes: the position of a point of
+# the cell at xi, eta, zeta in -1 ... 1 is the sum of modes times 1, xi, eta, zeta, eta zeta, zeta xi, xi eta, xi eta
+# zeta.
 CORNERS = np.array(list(product((0, 1), repeat=3)))
 ENDS = [(a, b) for a in range(8) for b in range(a + 1, 8) if np.abs(CORNERS[a] - CORNERS[b]).sum() == 1]
 ENDS += [(a, 7 - a) for a in range(4)]
@@ -166,8 +173,8 @@ class Equivalent:
 def equivalent(springs: Springs, pitch: float, weights: tuple[float, float] = WEIGHTS, chi: float = CHI) -> Equivalent:
     """E = (C11 - C12)(C11 + 2 C12)/(C11 + C12), nu = C12/(C11 + C12) of the lattice.
 
-    C11 = (g1 + 4/3 g3) alpha/h + 2 M + kappa, C12 = 4/3 g3 alpha/h + kappa, C44 = 4/3 g3 alpha/h + M with the shear springs'
-    modulus M = chi beta (g1 + 4/3 g3)/(2 h^3).
+    C11 = (g1 + 4/3 g3) alpha/h + 2 M + kappa, C12 = 4/3 g3 alpha/h + kappa, C44 = 4/3 g3 alpha/h + M with the shear
+    springs' modulus M = chi beta (g1 + 4/3 g3)/(2 h^3).
 
     pitch    h in mm
     weights  (g1, g3) of springs along axes and diagonals; any but the source's are for comparison only
@@ -210,10 +217,9 @@ def grid_material(wall: Material, filling: Material, wall_thickness: float, cell
     wall_thickness  t in mm, >= 0
     cell_size       c in mm, > 0: inner edge of a cell, from wall to wall
 
-    The bounds hold for any arrangement. A resolved cell with walls of 0.2 and a cube of 0.8 mm has Hill's E to 10 % while the
-    filling is 0.3 to 10 times as stiff as the walls; at 0.1 times it has 1.3 of it, as closed walls bear what the filling does
-    not.
-    """
+    The bounds hold for any arrangement. A resolved cell with walls of 0.2 and a cube of 0.8 mm has Hill's E to 10 %
+    while the filling is 0.3 to 10 times as stiff as the walls; at 0.1 times it has 1.3 of it, as closed walls bear what
+    the filling does not."""
     _positive("cell size", cell_size, "mm")
     if not (math.isfinite(wall_thickness) and wall_thickness >= 0):
         raise ValueError(f"wall thickness = {wall_thickness:g} mm; it must be 0 or more, 0.1 to 0.4 is usual")
@@ -239,9 +245,11 @@ class Lattice:
     shape     (R, C, L) nodes along x, y and z, each >= 2; `nodes` finds it from a size in mm
     pitch     h in mm, the edge of a cell
     material  of a full cell
-    factors   (R-1, C-1, L-1) > 0 that multiply the stiffness of single cells: 0.01 for one that was not filled; None: all 1.
+    factors   (R-1, C-1, L-1) > 0 that multiply the stiffness of single cells: 0.01 for one that was not filled; None:
+              all 1.
               Below about 1e-4 a press takes long to solve. Masses stay
-    held      'base' (the face z = -(L-1) h is glued), 'base and sides', or (R, C, L, 3) bool: coordinates of nodes that stay
+    held      'base' (the face z = -(L-1) h is glued), 'base and sides', or (R, C, L, 3) bool: coordinates of nodes that
+              stay
 
     Raises ValueError for shapes and numbers that make no lattice, and where the skin could move as a whole.
     """
@@ -254,7 +262,9 @@ class Lattice:
 
     def __post_init__(self):
         if np.ndim(self.pitch):
-            raise ValueError(f"pitch = {self.pitch} mm; give one number: cells must be cubes, only then is D3Q14 isotropic")
+            raise ValueError(
+                f"pitch = {self.pitch} mm; give one number: cells must be cubes, only then is D3Q14 isotropic"
+            )
         _positive("pitch", self.pitch, "mm")
         if len(self.shape) != 3 or min(self.shape) < 2 or any(n != int(n) for n in self.shape):
             raise ValueError(f"lattice shape = {self.shape} nodes; need three whole numbers (R, C, L), each 2 or more")
@@ -272,7 +282,9 @@ class Lattice:
             if self.held not in ("base", "base and sides"):
                 raise ValueError(f"held = '{self.held}'; must be 'base', 'base and sides' or (R, C, L, 3) bool")
         elif np.shape(self.held) != (*self.shape, 3) or np.asarray(self.held).dtype != bool:
-            raise ValueError(f"held has shape {np.shape(self.held)}; need bool of {(*self.shape, 3)}: coordinates that stay")
+            raise ValueError(
+                f"held has shape {np.shape(self.held)}; need bool of {(*self.shape, 3)}: coordinates that stay"
+            )
         x, stays = self._rest, ~self._free
         turns = np.stack([np.cross(axis, x)[stays] for axis in np.eye(3)], -1)
         shifts = np.broadcast_to(np.eye(3), (len(x), 3, 3))[stays]
@@ -301,7 +313,8 @@ class Lattice:
 
     @cached_property
     def frequency(self) -> float:
-        """rad/ms: (pi/(2 H)) sqrt(mu/rho), the lowest of a wide skin of thickness H, glued on one face, swinging sideways."""
+        """rad/ms: (pi/(2 H)) sqrt(mu/rho), the lowest of a wide skin of thickness H, glued on one face, swinging
+        sideways."""
         return math.pi / (2 * self.thickness) * math.sqrt(self.material.lame[1] / (self.material.density * 1e-3))
 
     @cached_property
@@ -317,7 +330,8 @@ class Lattice:
         return 2 / math.sqrt(8 * largest / (self.material.density * 1e-3 * self.pitch**3))
 
     def forces(self, positions: np.ndarray) -> tuple[np.ndarray, float]:
-        """The springs' forces on the nodes, -d Phi/dx, (R, C, L, 3) N, and their energy Phi in N mm at `positions` in mm."""
+        """The springs' forces on the nodes, -d Phi/dx, (R, C, L, 3) N, and their energy Phi in N mm at `positions` in
+        mm."""
         f, energy = _forces(self, _shaped("positions", positions, (*self.shape, 3), "mm").reshape(-1, 3))
         return f.reshape(*self.shape, 3), energy
 
@@ -354,8 +368,8 @@ def nodes(size: tuple[float, float, float], pitch: float) -> tuple[int, int, int
 def cells(shape: tuple[int, int, int]) -> np.ndarray:
     """(cells, 8) int: the nodes of each hexahedron, for positions.reshape(-1, 3); cells in the order of `factors`.
 
-    Corners go round the face nearer the camera, (0,0) (1,0) (1,1) (0,1) in (x, y), then likewise round the outer one: as in VTK.
-    """
+    Corners go round the face nearer the camera, (0,0) (1,0) (1,1) (0,1) in (x, y), then likewise round the outer one:
+    as in VTK."""
     return _corners(tuple(shape))[[0, 4, 6, 2, 1, 5, 7, 3]].T.copy()
 
 
@@ -367,7 +381,8 @@ def volume_ratio(positions: np.ndarray, pitch: float) -> np.ndarray:
 
 
 def inverted(positions: np.ndarray) -> np.ndarray:
-    """(R-1, C-1, L-1) bool: cells that are turned inside out at a corner, where the three edges no longer span a volume > 0."""
+    """(R-1, C-1, L-1) bool: cells that are turned inside out at a corner, where the three edges no longer span a volume
+    > 0."""
     shape = np.shape(positions)[:3]
     x = _gather(np.reshape(positions, (-1, 3)), shape)
     found = np.zeros(x.shape[2], bool)
@@ -509,7 +524,8 @@ def _stiffness(lattice: Lattice, x) -> np.ndarray:
 
 @lru_cache(maxsize=4)
 def _pattern(shape) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Where the blocks of cells go in a block-sparse matrix: place of (8, 8, cells), column indices, row starts, diagonal."""
+    """Where the blocks of cells go in a block-sparse matrix: place of (8, 8, cells), column indices, row starts,
+    diagonal."""
     index, n = _corners(shape), math.prod(shape)
     keys, place = np.unique(index[:, None] * n + index[None], return_inverse=True)
     columns = keys % n
@@ -536,7 +552,8 @@ Height = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
 def sphere(diameter: float) -> Height:
-    """R - sqrt(R^2 - r^2) in mm above the lowest point; from 75 deg on its tangent cone, reached at a depth of 0.74 R."""
+    """R - sqrt(R^2 - r^2) in mm above the lowest point; from 75 deg on its tangent cone, reached at a depth of 0.74
+    R."""
     _positive("sphere diameter", diameter, "mm")
     radius = diameter / 2
     steep = radius * STEEPEST / math.hypot(1.0, STEEPEST)
@@ -552,8 +569,8 @@ def sphere(diameter: float) -> Height:
 def punch(diameter: float, rounding: float = 0.1) -> Height:
     """A flat round face with a side of 75 deg; between r = D/2 and D/2 + 2 `rounding` (mm) it is rounded off.
 
-    With a rounding below half a pitch a node near the rim may rest under it or beside it: forces then differ by some 4 %.
-    """
+    With a rounding below half a pitch a node near the rim may rest under it or beside it: forces then differ by some 4
+    %."""
     _positive("punch diameter", diameter, "mm")
     _positive("rounding of a punch", rounding, "mm")
     return lambda x, y: STEEPEST * soft_ramp(np.hypot(x, y) - diameter / 2 - rounding, rounding)
@@ -568,12 +585,14 @@ def plate() -> Height:
 class Push:
     """An indenter that comes from +z, without friction.
 
-    shape  f(x, y) -> mm above its lowest point, for arrays of mm from its own axis; inf where there is nothing. `sphere`,
+    shape  f(x, y) -> mm above its lowest point, for arrays of mm from its own axis; inf where there is nothing.
+           `sphere`,
            `punch`, `plate` or any function with bounded slopes: walls are to be cones, as in optics/skin/contact.py
     depth  mm, >= 0: how far its lowest point lies under the untouched face
     at     (x, y) mm of its axis
     shear  (x, y) mm by which it then moves sideways
-    stuck  True: nodes that touch before the shear move with the indenter, whole; the others stay free and may come to touch it.
+    stuck  True: nodes that touch before the shear move with the indenter, whole; the others stay free and may come to
+           touch it.
            False: it slides, so only where it ends matters
     """
 
@@ -585,9 +604,13 @@ class Push:
 
     def __post_init__(self):
         if not callable(self.shape):
-            raise ValueError(f"indenter shape = {self.shape!r}; must be sphere(D), punch(D), plate() or a function f(x, y) in mm")
+            raise ValueError(
+                f"indenter shape = {self.shape!r}; must be sphere(D), punch(D), plate() or a function f(x, y) in mm"
+            )
         if not (math.isfinite(self.depth) and self.depth >= 0):
-            raise ValueError(f"depth = {self.depth:g} mm; it must be 0 (touching) or more, less than the skin's thickness")
+            raise ValueError(
+                f"depth = {self.depth:g} mm; it must be 0 (touching) or more, less than the skin's thickness"
+            )
         for name in ("at", "shear"):
             if np.shape(getattr(self, name)) != (2,) or not np.isfinite(getattr(self, name)).all():
                 raise ValueError(f"{name} = {getattr(self, name)}; need two numbers (x, y) in mm")
@@ -669,7 +692,9 @@ class _Setup:
                 f"over {len(rest)} nodes; it must give one height in mm for each x, y, and inf where there is nothing"
             )
         if ((heights < push.depth) & ~lattice._free[self.face, 2]).any():
-            raise ValueError(f"depth = {push.depth:g} mm pushes the indenter into nodes that are held; keep it off them")
+            raise ValueError(
+                f"depth = {push.depth:g} mm pushes the indenter into nodes that are held; keep it off them"
+            )
         if push.depth > 0 and heights.min() >= push.depth:
             raise ValueError(
                 f"depth = {push.depth:g} mm reaches no node: over the nearest one the indenter is {heights.min():g} mm above "
@@ -704,7 +729,8 @@ class _Setup:
 
 
 class _Leg:
-    """Part of a push: depth and place (2: from, to), and whether nodes stick to the indenter; `share` goes from 0 to 1."""
+    """Part of a push: depth and place (2: from, to), and whether nodes stick to the indenter; `share` goes from 0 to
+    1."""
 
     def __init__(self, setup: _Setup, depth, place, sticks: bool):
         self.setup, self.depth, self.place, self.sticks = setup, depth, place, sticks
@@ -763,12 +789,15 @@ class _Indenter:
         return found * self.free
 
     def put_out(self, x) -> tuple[np.ndarray, np.ndarray]:
-        """Nodes inside the indenter moved to the nearest point of its surface, so along its normal; and which they were."""
+        """Nodes inside the indenter moved to the nearest point of its surface, so along its normal; and which they
+        were."""
         inside = (self.gap(x) < 0) & self.free[:, 2]
         found, i = x.copy(), inside[:, None]
         for _ in range(30):
             slope, off, gap = self.slope(found), x - found, self.gap(found)
-            ahead = ((off * slope).sum(1) + np.where(np.isfinite(gap), gap, 0.0)) / np.maximum((slope * slope).sum(1), 1.0)
+            ahead = ((off * slope).sum(1) + np.where(np.isfinite(gap), gap, 0.0)) / np.maximum(
+                (slope * slope).sum(1), 1.0
+            )
             move = np.where(i, off - ahead[:, None] * slope, 0.0)
             found += move
             if not np.abs(move).max() > 1e-12:
@@ -777,7 +806,8 @@ class _Indenter:
 
 
 class _Bounds:
-    """What may not move: coordinates that are not `free` (nodes, 3), and touching `nodes` along their `normals` (k, 3)."""
+    """What may not move: coordinates that are not `free` (nodes, 3), and touching `nodes` along their `normals` (k,
+    3)."""
 
     def __init__(self, leg: _Leg, x, touching, indenter: _Indenter | None):
         self.free, self.nodes = leg.free, leg.setup.face[touching]
@@ -821,9 +851,18 @@ def _result(leg: _Leg, share, x, touching, at_rest, steps, duration=0.0) -> Defo
     contact[bounds.nodes] = True
     inside = 0.0 if indenter is None else -float(indenter.gap(x[setup.face])[~leg.stuck[setup.face]].min(initial=0.0))
     return Deformed(
-        setup.lattice, positions, outside[contact].sum(0), outside[~contact].sum(0),
-        contact[setup.face].reshape(positions.shape[:2]), inside, energy, bounds.residual(total, nodal), at_rest, steps,
-        time.perf_counter() - setup.start, duration,
+        setup.lattice,
+        positions,
+        outside[contact].sum(0),
+        outside[~contact].sum(0),
+        contact[setup.face].reshape(positions.shape[:2]),
+        inside,
+        energy,
+        bounds.residual(total, nodal),
+        at_rest,
+        steps,
+        time.perf_counter() - setup.start,
+        duration,
     )
 
 
@@ -843,17 +882,18 @@ def balance(
 
     forces     (R, C, L, 3) N on the nodes
     gravity    (3,) m/s^2, along x, y, z
-    linear     True: small strains and displacements, as in linear elasticity: the stiffness at rest, heights of the indenter over
+    linear     True: small strains and displacements, as in linear elasticity: the stiffness at rest, heights of the
+               indenter over
                the nodes at rest, contact forces along z. For comparisons; the default is exact for the lattice
     tolerance  of Deformed.residual
     progress   called with (steps done, residual)
 
-    Each step solves for the touching nodes that it assumes, by conjugate gradients; then those that are pulled are let go and
-    those inside the indenter are taken in (the primal-dual active set). The depth grows by at most a pitch at a time.
+    Each step solves for the touching nodes that it assumes, by conjugate gradients; then those that are pulled are let
+    go and those inside the indenter are taken in (the primal-dual active set). The depth grows by at most a pitch at a
+    time.
 
-    Raises ValueError for loads that do not fit the lattice, before any work, for cells turned inside out, and where no rest is
-    found.
-    """
+    Raises ValueError for loads that do not fit the lattice, before any work, for cells turned inside out, and where no
+    rest is found."""
     setup = _Setup(lattice, push, forces, gravity, linear)
     x, touching, steps = lattice._rest, np.zeros(len(setup.face), bool), 0
     for leg in setup.legs():
@@ -874,8 +914,11 @@ def balance(
         else:
             raise ValueError(
                 f"no rest found in {steps} steps: "
-                + (f"a depth of {push.depth:g} mm may be too much for {lattice.thickness:g} mm; press less deep, " if push else
-                   "the forces may be too large; use smaller ones, ")
+                + (
+                    f"a depth of {push.depth:g} mm may be too much for {lattice.thickness:g} mm; press less deep, "
+                    if push
+                    else "the forces may be too large; use smaller ones, "
+                )
                 + "take a finer lattice, or use `settle`"
             )
         x, touching = found
@@ -923,7 +966,8 @@ def _newton(leg: _Leg, share, x, touching, tolerance, steps, progress):
 
 
 def _solve(matrix, diagonal, right, bounds: _Bounds, tolerance: float, most: int = 3000) -> np.ndarray:
-    """What moves freely, (nodes, 3), by conjugate gradients with the inverse of each node's own stiffness before them."""
+    """What moves freely, (nodes, 3), by conjugate gradients with the inverse of each node's own stiffness before
+    them."""
     inverse = np.linalg.inv(diagonal)
     x, r = np.zeros_like(right), bounds.loose(right)
     p, rz, enough = np.zeros_like(right), 1.0, tolerance * np.linalg.norm(r)
@@ -980,7 +1024,8 @@ def motion(
 
     positions, velocities  (R, C, L, 3) mm and mm/ms at the start; held coordinates stay where they are
     step                   dt in ms; stable below (sqrt(theta^2 + 4 w^2) - theta)/w^2, w = 2/lattice.longest_step
-    damping                theta in 1/ms; energy is kept to order dt^2 without, and falls as it should to order dt with it
+    damping                theta in 1/ms; energy is kept to order dt^2 without, and falls as it should to order dt with
+                           it
     load                   (R, C, L, 3) N on the nodes, or a function of the time
     constrain              (time, U') -> U' where the nodes may be; V* follows: how indenters act
 
@@ -988,7 +1033,9 @@ def motion(
     """
     _positive("time step", step, "ms")
     if not (math.isfinite(damping) and damping >= 0):
-        raise ValueError(f"damping = {damping:g} 1/ms; it must be 0 or more, {2 * lattice.frequency:.3g} damps the lowest swing")
+        raise ValueError(
+            f"damping = {damping:g} 1/ms; it must be 0 or more, {2 * lattice.frequency:.3g} damps the lowest swing"
+        )
     limit = _longest_step(lattice, damping)
     if step > limit:
         raise ValueError(f"time step = {step:g} ms; Verlet is stable up to {limit:.3g} ms here, take {SAFETY} of that")
@@ -1027,7 +1074,9 @@ def _moments(lattice, u, v, step, damping, load, constrain) -> Iterator[Moment]:
         with np.errstate(all="ignore"):
             f, energy = pushed(now, u)
         if not math.isfinite(energy):
-            raise ValueError(f"positions are not finite at {now:g} ms; take a step below {step:g} ms, smaller or slower loads")
+            raise ValueError(
+                f"positions are not finite at {now:g} ms; take a step below {step:g} ms, smaller or slower loads"
+            )
         a = (f / mass - damping * half) * free
         v = half + a * (step / 2)
         yield Moment(now, u, v, half, f, energy)
@@ -1054,9 +1103,8 @@ def settle(
     tolerance   rest: Deformed.residual and kinetic energy over the springs' are both below
     most_steps  the motion is given up after so many; `at_rest` is then False
 
-    Nodes that get into the indenter in a step are put back out along its normal, and lose their velocity into it: no penalty
-    stiffness, and the same contact at rest as in `balance`. Raises as `balance` and `motion` do.
-    """
+    Nodes that get into the indenter in a step are put back out along its normal, and lose their velocity into it: no
+    penalty stiffness, and the same contact at rest as in `balance`. Raises as `balance` and `motion` do."""
     setup = _Setup(lattice, push, forces, gravity)
     theta = 2 * lattice.frequency if damping is None else damping
     step = SAFETY * _longest_step(lattice, theta) if step is None else step
@@ -1112,5 +1160,7 @@ def _shaped(what: str, array: np.ndarray, shape: tuple[int, ...], unit: str) -> 
     array = np.asarray(array, float)
     if array.shape != shape or not np.isfinite(array).all():
         bad = (~np.isfinite(array)).sum()
-        raise ValueError(f"{what} of shape {array.shape}, {bad} of them not finite; need finite {unit} of shape {shape}")
+        raise ValueError(
+            f"{what} of shape {array.shape}, {bad} of them not finite; need finite {unit} of shape {shape}"
+        )
     return array

@@ -1,14 +1,14 @@
-"""Many pictures of one scene, from a job file; any process can stop and go on, and the result is the same bit by bit.
+"""Many images of one scene, from a job file; any process can stop and go on, and the result is the same bit by bit.
 
     scene   = "gelsight"                       # a shipped scene, or an XML file relative to this one
     out     = "presses"                        # folder, relative to this file
     count   = 1000                             # random draws; with grids: draws per point of the grid
     seed    = 1
-    lights  = "together"                       # or "each": one picture per LED
+    lights  = "together"                       # or "each": one image per LED
     outputs = ["exr", "png", "dn"]             # everything; the camera's DN; the camera's DN with noise (needs [noise])
     [defines]                                  # of the XML's <default>s
     width = 320
-    [parameters]                               # the same in every picture
+    [parameters]                               # the same in every image
     "gel.indenter_size" = 2.0
     [sample]
     "gel.press_x"     = { uniform = [-4, 4] }
@@ -17,10 +17,9 @@
     "gel.indenter"    = { choice = ["sphere", "cube"] }
     "gel.press_rz"    = { grid = [0, 30, 60] } # every value; several grids: every combination, the last one fastest
 
-A draw depends on seed, index and key alone: not on the order of work, on shards or workers, nor on what else is sampled.
-The folder gets images/, job.json (what it was made from), manifest.jsonl (a line per sample, appended once its files stand)
-and, when all is done, manifest.csv.
-"""
+A draw depends on seed, index and key alone: not on the order of work, on shards or workers, nor on what else is
+sampled. The folder gets images/, job.json (what it was made from), manifest.jsonl (a line per sample, appended once its
+files stand) and, when all is done, manifest.csv."""
 
 from __future__ import annotations
 
@@ -45,7 +44,7 @@ from optics.captures.noise import Noise
 from optics.errors import OutOfBounds, OutputExists, UnknownKey
 from optics.files import toml_checks as checks
 from optics.files.output import check_folder, file_hash, replacing
-from optics.light.output import LAYERS, Pictures
+from optics.light.rendering import LAYERS, RenderJob
 from optics.scene import loader as scenes
 from optics.scene.mitsuba_parts import DEFAULT_VARIANT
 
@@ -81,8 +80,10 @@ class Distribution(Strict):
     def _one(self):
         given = [name for name in type(self).model_fields if getattr(self, name) is not None]
         if len(given) != 1:
-            raise ValueError(f"{' and '.join(given) or 'nothing'} given; allowed: exactly one of "
-                             f"{', '.join(type(self).model_fields)}")
+            raise ValueError(
+                f"{' and '.join(given) or 'nothing'} given; allowed: exactly one of "
+                f"{', '.join(type(self).model_fields)}"
+            )
         pair = self.uniform or self.log_uniform
         if pair and not pair[0] < pair[1]:
             raise ValueError(f"{given[0]} = {pair}; allowed: [low, high] with low < high")
@@ -122,10 +123,13 @@ class Job(Strict):
     out: Annotated[str, Field(min_length=1)] = Field(description="a folder, relative to the job file")
     count: Annotated[int, Field(ge=1)] | None = Field(None, description="a whole number from 1 on")
     seed: Annotated[int, Field(ge=0)] = Field(0, description="a whole number from 0 on")
-    lights: Literal["together", "each"] = Field("together", description="\"together\" or \"each\"")
+    lights: Literal["together", "each"] = Field("together", description='"together" or "each"')
     outputs: Annotated[list[Literal["exr", "png", "dn"]], Field(min_length=1)] = Field(
-        ["exr"], description="a list of \"exr\", \"png\", \"dn\"")
-    layers: list[Literal[LAYERS]] = Field(list(LAYERS), description=f"what an EXR holds beside the preview: {', '.join(LAYERS)}")
+        ["exr"], description='a list of "exr", "png", "dn"'
+    )
+    layers: list[Literal[LAYERS]] = Field(
+        list(LAYERS), description=f"what an EXR holds beside the preview: {', '.join(LAYERS)}"
+    )
     spp: Annotated[int, Field(ge=1)] | None = Field(None, description="samples per pixel from 1 on: Monte Carlo")
     variant: str = Field(DEFAULT_VARIANT, description="a Mitsuba variant")
     defines: dict[str, Value | int] = Field({}, description="numbers or texts")
@@ -145,7 +149,7 @@ class Job(Strict):
         if self.count is None and not self.grids:
             raise ValueError("count is missing; allowed: a whole number from 1 on, or a grid in [sample]")
         if "dn" in self.outputs and self.noise is None:
-            raise ValueError("outputs names \"dn\", but [noise] is missing; give " + ", ".join(Camera.model_fields))
+            raise ValueError('outputs names "dn", but [noise] is missing; give ' + ", ".join(Camera.model_fields))
         twice = sorted(set(self.parameters) & set(self.sample))
         if twice:
             raise ValueError(f"{twice[0]} stands in [parameters] and in [sample]; allowed: one of them")
@@ -162,8 +166,10 @@ class Job(Strict):
         return math.prod(len(values) for values in self.grids.values()) * (self.count or 1)
 
     def values(self, index: int) -> dict[str, float | str]:
-        """What is sampled in the picture of this index, by key."""
-        point = np.unravel_index(index // (self.count or 1), [len(v) for v in self.grids.values()]) if self.grids else ()
+        """What is sampled in the image of this index, by key."""
+        point = (
+            np.unravel_index(index // (self.count or 1), [len(v) for v in self.grids.values()]) if self.grids else ()
+        )
         chosen = {key: grid[int(i)] for (key, grid), i in zip(self.grids.items(), point)}
         return {key: chosen[key] if key in chosen else d.draw(self.rng(index, key)) for key, d in self.sample.items()}
 
@@ -184,9 +190,15 @@ def read(file: str | Path) -> Job:
     for name in ("parameters", "sample"):
         for key, value in (data.get(name) or {}).items() if isinstance(data.get(name), dict) else ():
             names = Distribution.model_fields if name == "sample" else ()
-            if isinstance(value, dict) and not set(value) & set(names) and any(isinstance(v, (dict, float, int)) for v in value.values()):
-                raise BadJob(f"{file}: [{name}]: {key} is a table; a key with a dot stands in quotes: "
-                             f"\"{key}.{next(iter(value))}\"")
+            if (
+                isinstance(value, dict)
+                and not set(value) & set(names)
+                and any(isinstance(v, (dict, float, int)) for v in value.values())
+            ):
+                raise BadJob(
+                    f"{file}: [{name}]: {key} is a table; a key with a dot stands in quotes: "
+                    f'"{key}.{next(iter(value))}"'
+                )
     try:
         job = Job.model_validate(data)
         job.camera_noise()
@@ -216,11 +228,15 @@ def _explained(error: ValidationError, file: Path) -> Exception:
     text = first["msg"].removeprefix("Value error, ")
     if first["type"] != "value_error":
         text = f"{first['input']!r}; allowed: {field.description if field else text}"
-    return BadJob(f"{where}{f'{name} = ' if first['type'] != 'value_error' else f'{name}: ' if name else ''}{text}"
-                  + (f" (and {more} more)" if more and first["type"] not in ("union",) else ""))
+    return BadJob(
+        f"{where}{f'{name} = ' if first['type'] != 'value_error' else f'{name}: ' if name else ''}{text}"
+        + (f" (and {more} more)" if more and first["type"] not in ("union",) else "")
+    )
 
 
-# -- one sample ---------------------------------------------------------------------------------------------------------
+# -- one sample
+# ---------------------------------------------------------------------------------------------------------
+
 
 class Maker:
     """Makes the files of one sample after the other."""
@@ -232,16 +248,18 @@ class Maker:
         noise = job.camera_noise()
         options = {} if noise is None else {"black": noise.black_level, "saturation": noise.saturation}
         self.noise = noise
-        self.pictures = Pictures(scene, spp=job.spp, layers=job.layers, **options)
+        self.images = RenderJob(scene, spp=job.spp, layers=job.layers, **options)
         self.folder = folder_of(job, self.file)
 
     def check(self) -> None:
         """Hold every value that can be drawn against the scene; raises before anything is rendered."""
-        job, scene = self.job, self.pictures.scene
+        job, scene = self.job, self.images.scene
         if job.lights == "each" and not scene.lights:
-            raise BadJob(f"{self.file}: lights = \"each\", but {scene.path} has no LED or source; allowed: \"together\"")
-        if "dn" in job.outputs and self.pictures.developer is None:
-            raise BadJob(f"{self.file}: outputs names \"dn\", but {scene.path} has no part 'camera' to make DN; allowed: exr, png")
+            raise BadJob(f'{self.file}: lights = "each", but {scene.path} has no LED or source; allowed: "together"')
+        if "dn" in job.outputs and self.images.developer is None:
+            raise BadJob(
+                f"{self.file}: outputs names \"dn\", but {scene.path} has no part 'camera' to make DN; allowed: exr, png"
+            )
         scene.check(job.parameters, f"{self.file}: [parameters]")
         for key, d in job.sample.items():
             where = f"{self.file}: [sample]"
@@ -249,7 +267,9 @@ class Maker:
                 raise UnknownKey(key, scene.parameters, "parameter", where, "`optics params SCENE` lists them")
             parameter = scene.parameters[key]
             if not parameter.is_number and not (d.choice or d.grid):
-                raise BadJob(f"{where}: {key} is a word and no number; allowed: choice or grid of {', '.join(parameter.choices)}")
+                raise BadJob(
+                    f"{where}: {key} is a word and no number; allowed: choice or grid of {', '.join(parameter.choices)}"
+                )
             for value in d.extremes:
                 parameter.check(value, key, where)
             if d.normal is not None:
@@ -257,56 +277,75 @@ class Maker:
 
     def _check_normal(self, key: str, d: Distribution) -> None:
         """A normal has no ends, so its draws themselves are checked."""
-        parameter = self.pictures.scene.parameters[key]
+        parameter = self.images.scene.parameters[key]
         low, high = parameter.bounds
         if low <= d.normal[0] - 40 * d.normal[1] and d.normal[0] + 40 * d.normal[1] <= high:
             return
         for index in range(self.job.total):
             value = d.draw(self.job.rng(index, key))
             if not low <= value <= high:
-                raise OutOfBounds(key, value, parameter.unit, parameter.bounds,
-                                  f"{self.file}: [sample]: normal = {d.normal} draws at index {index}")
+                raise OutOfBounds(
+                    key,
+                    value,
+                    parameter.unit,
+                    parameter.bounds,
+                    f"{self.file}: [sample]: normal = {d.normal} draws at index {index}",
+                )
 
     def identity(self) -> dict:
         """What the files depend on."""
-        record = self.pictures.record
+        record = self.images.record
         numbers = {k: v for k, v in record["versions"].items() if k not in ("python", "system")}
-        return {"job": self.job.model_dump(mode="json", exclude={"out"}), "scene": record["scene"], "plugins": record["plugins"],
-                "versions": numbers}
+        return {
+            "job": self.job.model_dump(mode="json", exclude={"out"}),
+            "scene": record["scene"],
+            "plugins": record["plugins"],
+            "versions": numbers,
+        }
 
     def make(self, index: int) -> dict:
         """Write the files of one sample, each whole or not at all, and return its line of the manifest."""
         job = self.job
         values = job.values(index)
-        lights = [None] if job.lights == "together" else list(self.pictures.scene.lights)
+        lights = [None] if job.lights == "together" else list(self.images.scene.lights)
         files = {}
         for led in lights:
             stem = self.folder / "images" / (f"{index:06d}" if led is None else f"{index:06d}-{led}")
             seed = int(job.rng(index, "render").integers(2**31))
-            picture = self.pictures.take({**job.parameters, **values}, seed, None if led is None else [led])
+            image = self.images.take({**job.parameters, **values}, seed, None if led is None else [led])
             for output in job.outputs:
-                path = self._write(picture, output, stem, index)
+                path = self._write(image, output, stem, index)
                 files[output if led is None else f"{led}.{output}"] = {
-                    "file": path.relative_to(self.folder).as_posix(), "size": path.stat().st_size, "hash": file_hash(path)}
+                    "file": path.relative_to(self.folder).as_posix(),
+                    "size": path.stat().st_size,
+                    "hash": file_hash(path),
+                }
         return {"index": index, "sample": values, "files": files}
 
-    def _write(self, picture, output: str, stem: Path, index: int) -> Path:
+    def _write(self, image, output: str, stem: Path, index: int) -> Path:
         if output == "exr":
-            return picture.write_exr(stem.with_name(stem.name + ".exr"))
+            return image.write_exr(stem.with_name(stem.name + ".exr"))
         if output == "png":
-            return picture.write_png(stem.with_name(stem.name + ".png"), 255.0 if self.noise is None else self.noise.saturation)
+            return image.write_png(
+                stem.with_name(stem.name + ".png"), 255.0 if self.noise is None else self.noise.saturation
+            )
         from optics.files.images import write_image
 
-        pattern = self.noise.fixed_pattern(picture.camera.shape, self.job.rng(0, "fixed pattern"))
-        frame = self.noise.expose(picture.camera, self.job.rng(index, f"noise {stem.name}"), pattern)
+        pattern = self.noise.fixed_pattern(image.camera.shape, self.job.rng(0, "fixed pattern"))
+        frame = self.noise.expose(image.camera, self.job.rng(index, f"noise {stem.name}"), pattern)
         path = stem.with_name(stem.name + "-dn.png")
         with replacing(path) as temporary:
-            write_image(temporary.with_name(temporary.stem), np.clip(np.round(frame), 0, None),
-                        8 if self.noise.saturation <= 255 else 16)
+            write_image(
+                temporary.with_name(temporary.stem),
+                np.clip(np.round(frame), 0, None),
+                8 if self.noise.saturation <= 255 else 16,
+            )
         return path
 
 
-# -- the folder ---------------------------------------------------------------------------------------------------------
+# -- the folder
+# ---------------------------------------------------------------------------------------------------------
+
 
 def folder_of(job: Job, file: Path) -> Path:
     return Path(os.path.abspath(Path(file).parent / job.out))
@@ -319,11 +358,15 @@ def _open_folder(folder: Path, identity: Mapping) -> None:
         try:
             before = json.loads(note.read_text(encoding="utf-8"))
         except ValueError as error:
-            raise OutputExists(f"{note}: unreadable ({error}); restore it, or choose another folder for `out`") from error
+            raise OutputExists(
+                f"{note}: unreadable ({error}); restore it, or choose another folder for `out`"
+            ) from error
         if before != identity:
             changed = _changes(before, json.loads(json.dumps(identity)))
-            raise OutputExists(f"{folder} was made from another job: changed {', '.join(changed[:4])}"
-                               f"{' ...' if len(changed) > 4 else ''}; choose another folder for `out`, or undo the change")
+            raise OutputExists(
+                f"{folder} was made from another job: changed {', '.join(changed[:4])}"
+                f"{' ...' if len(changed) > 4 else ''}; choose another folder for `out`, or undo the change"
+            )
         return
     check_folder(folder)
     if folder.exists() and (not folder.is_dir() or any(not p.name.startswith(".") for p in folder.iterdir())):
@@ -334,8 +377,11 @@ def _open_folder(folder: Path, identity: Mapping) -> None:
 
 def _changes(before, now, name: str = "") -> list[str]:
     if isinstance(before, dict) and isinstance(now, dict):
-        return [c for key in sorted(before.keys() | now.keys())
-                for c in _changes(before.get(key), now.get(key), f"{name}.{key}" if name else str(key))]
+        return [
+            c
+            for key in sorted(before.keys() | now.keys())
+            for c in _changes(before.get(key), now.get(key), f"{name}.{key}" if name else str(key))
+        ]
     return [] if before == now else [name]
 
 
@@ -356,8 +402,9 @@ def _alone(folder: Path, shard: tuple[int, int]) -> Iterator[None]:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
-            raise OutputExists(f"{folder}: another process works on shard {shard[0]}/{shard[1]}; wait for it, or take "
-                               "another shard") from error
+            raise OutputExists(
+                f"{folder}: another process works on shard {shard[0]}/{shard[1]}; wait for it, or take another shard"
+            ) from error
         yield
 
 
@@ -416,7 +463,9 @@ def _finish(folder: Path, job: Job) -> bool:
     return True
 
 
-# -- the work -----------------------------------------------------------------------------------------------------------
+# -- the work
+# -----------------------------------------------------------------------------------------------------------
+
 
 @dataclass(frozen=True)
 class Result:
@@ -437,8 +486,13 @@ def parse_shard(text: str) -> tuple[int, int]:
     return int(head), int(tail)
 
 
-def run(file: str | Path, shard: tuple[int, int] = (1, 1), workers: int | None = None, plugins: Path | None = None,
-        progress: Progress | None = None) -> Result:
+def run(
+    file: str | Path,
+    shard: tuple[int, int] = (1, 1),
+    workers: int | None = None,
+    plugins: Path | None = None,
+    progress: Progress | None = None,
+) -> Result:
     """Make what is missing of a job's shard. May be ended at any moment and called again.
 
     workers   processes of one thread each; None: as many as there are cores. With 1 everything happens in this process.
@@ -505,7 +559,9 @@ def _here(maker: Maker, todo: Sequence[int]) -> Iterator[dict]:
     import drjit as dr
 
     threads = dr.thread_count()
-    dr.set_thread_count(0)  # sums over faces (normals) and samples (a film) take the order of threads into their last bit
+    dr.set_thread_count(
+        0
+    )  # sums over faces (normals) and samples (a film) take the order of threads into their last bit
     try:
         for index in todo:
             try:
@@ -518,8 +574,9 @@ def _here(maker: Maker, todo: Sequence[int]) -> Iterator[dict]:
 
 def _failed(job: Job, index: int, why: str) -> SampleFailed:
     values = ", ".join(f"{k} = {v:.4g}" if isinstance(v, float) else f"{k} = {v}" for k, v in job.values(index).items())
-    return SampleFailed(f"sample {index} ({values or 'nothing sampled'}): {why}; what was made before is kept, the same "
-                        "command goes on")
+    return SampleFailed(
+        f"sample {index} ({values or 'nothing sampled'}): {why}; what was made before is kept, the same command goes on"
+    )
 
 
 def _cores() -> int:

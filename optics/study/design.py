@@ -1,15 +1,15 @@
 """A capture session before it is taken: which frames keep a scene's effects apart, and which no frames will.
 
-Candidate frames (places and depths of a press, lights, exposures; angles of polarizers and powers where there is no gel; distances of an
-object) are rendered once, with the derivative images of all that `optics calibrate` solves for and of every effect. Frames are then
-chosen one after the other for the greatest mean probability to decide rightly,
+Candidate frames (places and depths of a press, lights, exposures; angles of polarizers and powers where there is no
+gel; distances of an object) are rendered once, with the derivative images of all that `optics calibrate` solves for and
+of every effect. Frames are then chosen one after the other for the greatest mean probability to decide rightly,
 
     mean over ordered pairs (a, b) of Phi(sqrt(D_ab)/2),      b another effect, or none
 
-with every effect at a tenth of its plausible strength, the size at which a diagnosis states its power. The mean and not the smallest D:
-two effects that no frame can tell apart would have a D of 0 whatever is chosen, and hide what can be gained for all others. Each
-term saturates once a pair is decided, so that frames go to what is not. Nothing is assumed known but the noise and what is set.
-"""
+with every effect at a tenth of its plausible strength, the size at which a diagnosis states its power. The mean and not
+the smallest D: two effects that no frame can tell apart would have a D of 0 whatever is chosen, and hide what can be
+gained for all others. Each term saturates once a pair is decided, so that frames go to what is not. Nothing is assumed
+known but the noise and what is set."""
 
 from __future__ import annotations
 
@@ -39,8 +39,8 @@ from optics.words import spaced, table
 SHARE = 0.1  # of the plausible strength
 FEWEST = 2  # frames: with one, nothing can be held out and nothing be compared
 GROUPS = 4  # below, a calibration holds nothing out by itself
-FULL = 0.8  # of full scale: where an exposure puts the brightest half per cent of a picture
-LONG_SIDE = 64  # px of the pictures that are rendered for a plan, where -D does not say otherwise
+FULL = 0.8  # of full scale: where an exposure puts the brightest half per cent of an image
+LONG_SIDE = 64  # px of the images that are rendered for a plan, where -D does not say otherwise
 ROWS = 400_000  # values of all candidates that are kept, thinned evenly
 SWEEPS = 60  # candidates where a camera has one pixel: each a sweep of the analyser in steps of STEP
 STEP = 15.0  # deg
@@ -61,7 +61,7 @@ class Choice:
 
     @property
     def readings(self) -> list[dict[str, float]]:
-        """The settings of each reading; one for a picture."""
+        """The settings of each reading; one for an image."""
         count = max((len(v) for v in self.swept.values()), default=1)
         return [{**self.settings, **{k: v[i] for k, v in self.swept.items()}} for i in range(count)]
 
@@ -101,26 +101,56 @@ class Plan:
     pool: int
     size: tuple[int, int]
     nested: list[tuple[str, str]] = field(default_factory=list)
-    unseen: list[str] = field(default_factory=list)  # effects that no candidate frame shows, or with an image that is not finite
+    unseen: list[str] = field(
+        default_factory=list
+    )  # effects that no candidate frame shows, or with an image that is not finite
     warnings: list[str] = field(default_factory=list)
 
     def json(self) -> dict:
-        return {"scene": self.scene, "frames": [{"words": f.words, "group": f.group, "parameters": f.settings, "swept": f.swept, "worth": w}
-                                                for f, w in zip(self.frames, self.worth)],
-                "effects": [{**asdict(e), "correct": e.correct} for e in self.effects], "confused": self.confused,
-                "contained": [list(pair) for pair in self.nested], "unseen": self.unseen, "share_of_plausible": self.share, "candidates": self.pool,
-                "size": list(self.size), "warnings": self.warnings}
+        return {
+            "scene": self.scene,
+            "frames": [
+                {"words": f.words, "group": f.group, "parameters": f.settings, "swept": f.swept, "worth": w}
+                for f, w in zip(self.frames, self.worth)
+            ],
+            "effects": [{**asdict(e), "correct": e.correct} for e in self.effects],
+            "confused": self.confused,
+            "contained": [list(pair) for pair in self.nested],
+            "unseen": self.unseen,
+            "share_of_plausible": self.share,
+            "candidates": self.pool,
+            "size": list(self.size),
+            "warnings": self.warnings,
+        }
 
     def text(self) -> str:
-        lines = [f"design: {len(self.frames)} of {self.pool} candidate frames for {self.scene}, "
-                 + ("sweeps of readings, " if self.size == (1, 1) else f"pictures of {self.size[0]} x {self.size[1]} px (D grows with their number), ")
-                 + f"every effect at {self.share:g} of its plausible strength", ""]
-        rows = [("", "group", "frame", "mean P(correct)"), *((str(i + 1), f.group, f.words, f"{w:.3f}")
-                                                              for i, (f, w) in enumerate(zip(self.frames, self.worth)))]
+        lines = [
+            f"design: {len(self.frames)} of {self.pool} candidate frames for {self.scene}, "
+            + (
+                "sweeps of readings, "
+                if self.size == (1, 1)
+                else f"images of {self.size[0]} x {self.size[1]} px (D grows with their number), "
+            )
+            + f"every effect at {self.share:g} of its plausible strength",
+            "",
+        ]
+        rows = [
+            ("", "group", "frame", "mean P(correct)"),
+            *((str(i + 1), f.group, f.words, f"{w:.3f}") for i, (f, w) in enumerate(zip(self.frames, self.worth))),
+        ]
         lines += [table(rows), ""]
         rows = [("effect", "strength", "noticed", "hardest to tell from", "D", "P(correct)")]
-        rows += [(e.effect, e.strength, f"{e.power:.0%}", f"{e.rival} (cos {e.cos:.2f})" if e.rival else "-", f"{e.gap:.3g}", f"{e.correct:.2f}")
-                 for e in sorted(self.effects, key=lambda e: -e.correct)]
+        rows += [
+            (
+                e.effect,
+                e.strength,
+                f"{e.power:.0%}",
+                f"{e.rival} (cos {e.cos:.2f})" if e.rival else "-",
+                f"{e.gap:.3g}",
+                f"{e.correct:.2f}",
+            )
+            for e in sorted(self.effects, key=lambda e: -e.correct)
+        ]
         lines.append(table(rows))
         alike = [c for c in self.confused if not c["weak"]]
         if alike:
@@ -130,7 +160,10 @@ class Plan:
                 lines.append(f"  and {len(alike) - 20} more (--json lists all)")
         weak = [f"{e.effect} ({e.d:.2g})" for e in self.effects if e.d < CLEAR]
         if weak:
-            lines += ["", f"too weak to be noticed at {self.share:g} of the plausible strength (D against none): {', '.join(weak)}"]
+            lines += [
+                "",
+                f"too weak to be noticed at {self.share:g} of the plausible strength (D against none): {', '.join(weak)}",
+            ]
         if self.unseen:
             lines.append(f"no candidate frame shows: {', '.join(self.unseen)}")
         if self.nested:
@@ -138,15 +171,19 @@ class Plan:
         return "\n".join([*lines, *(f"warning: {w}" for w in self.warnings)]) + "\n"
 
 
-# -- candidates ---------------------------------------------------------------------------------------------------------
+# -- candidates
+# ---------------------------------------------------------------------------------------------------------
 
 
 def candidates(parameters: dict[str, Parameter], base: dict, swept: bool, fixed_exposure: bool = False) -> list[Choice]:
     """The frames to choose from: every place under several lights and exposures; of a camera of one pixel, sweeps.
 
-    Exposures are factors here, 1 where a picture is as bright as it may be; `plan` turns them into settings.
+    Exposures are factors here, 1 where an image is as bright as it may be; `plan` turns them into settings.
     """
-    lights, exposures = keys_named(parameters, "power"), [] if fixed_exposure else keys_named(parameters, "exposure")[:1]
+    lights, exposures = (
+        keys_named(parameters, "power"),
+        [] if fixed_exposure else keys_named(parameters, "exposure")[:1],
+    )
     if swept:
         return _sweeps(parameters, base, lights, exposures)
     found = []
@@ -162,13 +199,23 @@ def candidates(parameters: dict[str, Parameter], base: dict, swept: bool, fixed_
             own |= single[k % len(single)] if single else {}
         for light, lit in own.items():
             for factor in (1.0, *advise.EXPOSURES[:1]) if exposures and light == "all lights" else (1.0,):
-                found.append(Choice(f"{words}; {light}" + ("" if factor == 1 else f", {factor:g} of the exposure"), place,
-                                    {**settings, **{k: float(k in lit) for k in lights}, **{k: factor for k in exposures}}))
-    return found + [Choice("all lights off", "dark", {**places[0][2], **dict.fromkeys(lights, 0.0), **dict.fromkeys(exposures, 1.0)})]
+                found.append(
+                    Choice(
+                        f"{words}; {light}" + ("" if factor == 1 else f", {factor:g} of the exposure"),
+                        place,
+                        {**settings, **{k: float(k in lit) for k in lights}, **dict.fromkeys(exposures, factor)},
+                    )
+                )
+    return found + [
+        Choice(
+            "all lights off", "dark", {**places[0][2], **dict.fromkeys(lights, 0.0), **dict.fromkeys(exposures, 1.0)}
+        )
+    ]
 
 
 def _places(parameters: dict[str, Parameter], base: dict) -> list[tuple[str, str, dict]]:
-    """(group, words, settings) of the places of a press, distances of an object, angles of films; one place where nothing moves."""
+    """(group, words, settings) of the places of a press, distances of an object, angles of films; one place where
+    nothing moves."""
     keys = partial(keys_named, parameters)
     if depth := keys("press_depth"):
         gel = depth[0].rpartition(".")[0]
@@ -178,30 +225,52 @@ def _places(parameters: dict[str, Parameter], base: dict) -> list[tuple[str, str
         found = []
         for i, (x, y) in enumerate(spots):
             for to in (normal, 2 * normal) if i < 3 else (normal,):
-                found.append((f"press-{len(found):02d}", f"press at x = {x:.2g}, y = {y:.2g} mm, {to:.2g} mm deep",
-                              {f"{gel}.press_x": x, f"{gel}.press_y": y, f"{gel}.press_depth": round(to, 4)}))
-        return [*found, ("untouched", "nothing pressed", dict.fromkeys((f"{gel}.press_x", f"{gel}.press_y", f"{gel}.press_depth"), 0.0))]
+                found.append(
+                    (
+                        f"press-{len(found):02d}",
+                        f"press at x = {x:.2g}, y = {y:.2g} mm, {to:.2g} mm deep",
+                        {f"{gel}.press_x": x, f"{gel}.press_y": y, f"{gel}.press_depth": round(to, 4)},
+                    )
+                )
+        return [
+            *found,
+            (
+                "untouched",
+                "nothing pressed",
+                dict.fromkeys((f"{gel}.press_x", f"{gel}.press_y", f"{gel}.press_depth"), 0.0),
+            ),
+        ]
     if distance := keys("distance"):
         here = float(base[distance[0]]) or 1.0
-        return [(f"distance-{i}", f"object at {to:g} mm", {distance[0]: to}) for i, to in enumerate((here, here / 2, 2 * here, here / 8, 0.0))]
+        return [
+            (f"distance-{i}", f"object at {to:g} mm", {distance[0]: to})
+            for i, to in enumerate((here, here / 2, 2 * here, here / 8, 0.0))
+        ]
     angles = [k for k in keys("angle") if base.get(k.rpartition(".")[0] + ".inserted", 1.0)]
     if angles:
-        return [(f"angle-{to:g}", f"{angles[0]} = {to:g} deg", {angles[0]: float(base[angles[0]]) + to})
-                for to in (0.0, 30.0, 45.0, 60.0, 90.0, 135.0)]
+        return [
+            (f"angle-{to:g}", f"{angles[0]} = {to:g} deg", {angles[0]: float(base[angles[0]]) + to})
+            for to in (0.0, 30.0, 45.0, 60.0, 90.0, 135.0)
+        ]
     return [("", "the scene", {})]
 
 
 def _sweeps(parameters: dict, base: dict, lights: Sequence[str], exposures: Sequence[str]) -> list[Choice]:
-    """Sweeps of the analyser, with everything else that a bench turns dealt out to SWEEPS points that cover each setting evenly."""
+    """Sweeps of the analyser, with everything else that a bench turns dealt out to SWEEPS points that cover each
+    setting evenly."""
     from scipy.stats import qmc
 
     inserted = {k: base.get(k.rpartition(".")[0] + ".inserted", 1.0) for k in keys_named(parameters, "angle")}
     films = [k for k, there in inserted.items() if there and k.rpartition(".")[0] + ".inserted" in base]
     if not films:
-        raise Underdetermined("design: a camera of one pixel and no polarizer to turn: no two readings differ but in brightness; allowed: a scene "
-                              "with pictures (-D width=..., -D height=...) or with a polarizer film")
+        raise Underdetermined(
+            "design: a camera of one pixel and no polarizer to turn: no two readings differ but in brightness; allowed: a scene "
+            "with images (-D width=..., -D height=...) or with a polarizer film"
+        )
     swept, *others = films
-    levels: dict[str, list[float]] = {k: [0.0, 20.0, 45.0, 90.0] for k in (*others, *(k for k in inserted if k not in films))}
+    levels: dict[str, list[float]] = {
+        k: [0.0, 20.0, 45.0, 90.0] for k in (*others, *(k for k in inserted if k not in films))
+    }
     levels |= {k.rpartition(".")[0] + ".inserted": [0.0, 0.0, 1.0] for k, there in inserted.items() if not there}
     levels |= {k: [1.0, 0.4] for k in (*lights, *exposures)}
     levels |= {k: [1.0, -1.0] for k in parameters if k == swept.replace(".angle", ".approach")}
@@ -211,20 +280,36 @@ def _sweeps(parameters: dict, base: dict, lights: Sequence[str], exposures: Sequ
     for row in points:
         own = {k: values[int(u * len(values))] for u, (k, values) in zip(row, levels.items())}
         out = [k for k, there in own.items() if k.endswith(".inserted") and not there]
-        words = ", ".join(f"{k} {v:g}" for k, v in own.items() if not k.startswith(tuple(o.rpartition(".")[0] + "." for o in out)))
+        words = ", ".join(
+            f"{k} {v:g}" for k, v in own.items() if not k.startswith(tuple(o.rpartition(".")[0] + "." for o in out))
+        )
         found.append(Choice(f"{swept} 0 ... {180 - STEP:g}, {words}", "", own, angles))
     return [*found, Choice("all lights off", "", {**found[0].settings, **dict.fromkeys(lights, 0.0)}, angles)]
 
 
-# -- the plan -----------------------------------------------------------------------------------------------------------
+# -- the plan
+# -----------------------------------------------------------------------------------------------------------
 
 
-def plan(scene, frames: int, effects: Sequence | None = None, *, noise: Noise = NOISE, values: Values | None = None, setup=None,
-         added: Sequence = (), share: float = SHARE, fixed_exposure: bool = False, seed: int = 0, progress: Progress | None = None) -> Plan:
+def plan(
+    scene,
+    frames: int,
+    effects: Sequence | None = None,
+    *,
+    noise: Noise = NOISE,
+    values: Values | None = None,
+    setup=None,
+    added: Sequence = (),
+    share: float = SHARE,
+    fixed_exposure: bool = False,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> Plan:
     """Choose `frames` frames of a scene (optics.scene.loader.Scene) that keep its effects apart.
 
     effects   that may be missing; None: all that the scene can express
-    values    of a calibration, in place of the scene's own; setup: what it solves for (optics.study.loop.Setup), added: effects that it has
+    values    of a calibration, in place of the scene's own; setup: what it solves for (optics.study.loop.Setup), added:
+              effects that it has
     share     of the plausible strength, at which effects are told apart
     fixed_exposure   leave the exposure as the scene has it
 
@@ -240,14 +325,20 @@ def plan(scene, frames: int, effects: Sequence | None = None, *, noise: Noise = 
     _require(frames, share)
     for part, kind, tag in ((scene.camera, "camera", "sensor"), (scene.integrator, "tactile", "integrator")):
         if part is None:
-            raise BadScene(f"{scene.path}: no part of the type '{kind}'; a capture session needs one: add a <{tag} type=\"{kind}\">")
+            raise BadScene(
+                f"{scene.path}: no part of the type '{kind}'; a capture session needs one: add a <{tag} type=\"{kind}\">"
+            )
     width, height = scene.camera.resolution
     swept = width * height == 1
-    known = [e for _, e in sorted(registry().effects.items()) if scene.can_express(e) and not (swept and e.pictures)]
+    known = [
+        e for _, e in sorted(registry().effects.items()) if scene.can_express(e) and not (swept and e.mixes_pixels)
+    ]
     effects = list({e.key: e for e in effects or ()}.values())  # an effect named twice would be its own rival
     for e in effects:
         if e not in known:
-            raise BadScene(f"{scene.path}: the scene cannot express the effect '{e.name}'; it can: {', '.join(k.key for k in known)}")
+            raise BadScene(
+                f"{scene.path}: the scene cannot express the effect '{e.name}'; it can: {', '.join(k.key for k in known)}"
+            )
     setup = setup or loop.Setup(captures="")
     values = Values() if values is None else Values(dict(values.common))
     base = {**scene.values(), **values.common}
@@ -258,26 +349,45 @@ def plan(scene, frames: int, effects: Sequence | None = None, *, noise: Noise = 
     table = Table("readings.csv", ["reading"]) if swept else None
     model = Model(scene, Captures(Path("."), str(scene.path), [first], noise=noise, table=table), noise)
     model.frames = []
-    model = model.imagine([Frame(
-        f"candidate-{i}", np.repeat(blank, len(c.readings), 0) if c.swept else blank, group=c.group or None, parameters=dict(c.settings),
-        file="design", readings={k: np.array(v).reshape(-1, 1, 1) for k, v in c.swept.items()}) for i, c in enumerate(pool)])
+    model = model.imagine(
+        [
+            Frame(
+                f"candidate-{i}",
+                np.repeat(blank, len(c.readings), 0) if c.swept else blank,
+                group=c.group or None,
+                parameters=dict(c.settings),
+                file="design",
+                readings={k: np.array(v).reshape(-1, 1, 1) for k, v in c.swept.items()},
+            )
+            for i, c in enumerate(pool)
+        ]
+    )
     for key in model.driven:
         values.common.setdefault(key, float(base[key]))
     pool = _expose(model, values, pool, base, say)
     places = [c.group or str(i) for i, c in enumerate(pool)]
     depths = keys_named(scene.parameters, "press_depth")
-    untouched = {i for i, c in enumerate(pool) if any(c.settings.get(k) == 0 for k in depths)}  # where nobody has to find a place
-    solved = [v for v in loop.variables_of_base(model, setup, range(len(pool)))
-              if v.frames is None or not (advise.is_place(model, v.keys[0]) and untouched.issuperset(v.frames))]
+    untouched = {
+        i for i, c in enumerate(pool) if any(c.settings.get(k) == 0 for k in depths)
+    }  # where nobody has to find a place
+    solved = [
+        v
+        for v in loop.variables_of_base(model, setup, range(len(pool)))
+        if v.frames is None or not (advise.is_place(model, v.keys[0]) and untouched.issuperset(v.frames))
+    ]
     solved += [v for e in added for v in loop.effect_variables(model, e)]
     taken = {key for v in solved for key in v.keys}
     members = [Candidate.at(model, values, e, loop.effect_variables(model, e)) for e in effects or known]
     members = [c for c in members if not any(k in taken for v in c.variables for k in v.keys)]
     if not members:
-        raise Underdetermined(f"{scene.path}: none of the effects asked for is free to be missing; the calibration solves for them already")
+        raise Underdetermined(
+            f"{scene.path}: none of the effects asked for is free to be missing; the calibration solves for them already"
+        )
     evidence = measure(model, values, solved, members, range(len(pool)), ROWS, seed, say, "what candidate frames show")
     diagonal = np.diag(evidence.normal.gram)
-    unseen = [c.effect.name for c in members if c.broken or not any(diagonal[i] > 0 for own in c.forms.values() for i in own)]
+    unseen = [
+        c.effect.name for c in members if c.broken or not any(diagonal[i] > 0 for own in c.forms.values() for i in own)
+    ]
     members = [c for c in members if c.effect.name not in unseen]
     if not members:
         raise Underdetermined(f"{scene.path}: none of {len(pool)} candidate frames shows {' or '.join(unseen)}")
@@ -300,10 +410,19 @@ def plan(scene, frames: int, effects: Sequence | None = None, *, noise: Noise = 
     return _report(scene, [pool[s] for s in chosen], path, seen, chosen, members, share, noise, len(pool), unseen)
 
 
-def session(subject: str | Path, frames: int, effects: Sequence[str] = (), defines: dict | None = None, plugins: Path | None = None,
-            noise: dict | None = None, share: float = SHARE, fixed_exposure: bool = False, progress: Progress | None = None) -> Plan:
-    """Plan a session for a scene by its name, or for a study by its folder: with its values, its noise, and what it has added. The
-    frames that a study has are not counted: a session stands by itself.
+def session(
+    subject: str | Path,
+    frames: int,
+    effects: Sequence[str] = (),
+    defines: dict | None = None,
+    plugins: Path | None = None,
+    noise: dict | None = None,
+    share: float = SHARE,
+    fixed_exposure: bool = False,
+    progress: Progress | None = None,
+) -> Plan:
+    """Plan a session for a scene by its name, or for a study by its folder: with its values, its noise, and what it has
+    added. The frames that a study has are not counted: a session stands by itself.
 
     Raises as `plan`, and UnknownKey for an effect that nobody knows.
     """
@@ -318,9 +437,18 @@ def session(subject: str | Path, frames: int, effects: Sequence[str] = (), defin
         chosen = [registry().find_effect(name) for name in effects] or loop.candidates(model, study)
         scene = scenes.load(model.scene.path, {**model.scene.defines, **(defines or {})}, plugins=plugins)
         scene.set(model.captures.parameters)  # what was set in all frames stays so
-        return plan(scene, frames, chosen, noise=replace(model.noise, **(noise or {})), setup=setup, added=loop.effects_of(study),
-                    values=Values(dict(study.fit(len(study.steps) - 1)["parameters"])), share=share, fixed_exposure=fixed_exposure,
-                    progress=progress)
+        return plan(
+            scene,
+            frames,
+            chosen,
+            noise=replace(model.noise, **(noise or {})),
+            setup=setup,
+            added=loop.effects_of(study),
+            values=Values(dict(study.fit(len(study.steps) - 1)["parameters"])),
+            share=share,
+            fixed_exposure=fixed_exposure,
+            progress=progress,
+        )
     file = scenes.find(subject)
     text, defines = file.read_text(encoding="utf-8"), dict(defines or {})
     sizes = {n: re.search(rf'<default name="{n}" value="(\d+)"', text) for n in ("width", "height")}
@@ -330,24 +458,34 @@ def session(subject: str | Path, frames: int, effects: Sequence[str] = (), defin
             defines |= {n: str(max(round(int(m[1]) * LONG_SIDE / longest), 1)) for n, m in sizes.items()}
     scene = scenes.load(file, defines, plugins=plugins)
     chosen = [registry().find_effect(name) for name in effects]
-    return plan(scene, frames, chosen, noise=replace(NOISE, **(noise or {})), share=share, fixed_exposure=fixed_exposure, progress=progress)
+    return plan(
+        scene,
+        frames,
+        chosen,
+        noise=replace(NOISE, **(noise or {})),
+        share=share,
+        fixed_exposure=fixed_exposure,
+        progress=progress,
+    )
 
 
 def _require(frames: int, share: float) -> None:
     if frames < FEWEST:
-        raise Underdetermined(f"design: {frames} frames; allowed: {FEWEST} or more, as with one nothing can be held out and nothing compared")
+        raise Underdetermined(
+            f"design: {frames} frames; allowed: {FEWEST} or more, as with one nothing can be held out and nothing compared"
+        )
     if not 0 < share < math.inf:
         raise ValueError(f"design: strength of {share:g} plausible sizes; allowed: > 0, finite")
 
 
 def _expose(model, values: Values, pool: list[Choice], base: dict, say: Progress) -> list[Choice]:
-    """Turn factors of the exposure into exposures that fill the camera's range, and put predictions in place of pictures.
+    """Turn factors of the exposure into exposures that fill the camera's range, and put predictions in place of images.
 
     One exposure per light, the same at all places: what a session can do.
     """
     key = next(iter(keys_named(model.parameters, "exposure")), None)
     lights = keys_named(model.parameters, "power")
-    pictures = model.captures.table is None
+    images = model.captures.table is None
     fitting: dict[tuple, float] = {}
     found = []
     for i, c in enumerate(pool):
@@ -357,9 +495,11 @@ def _expose(model, values: Values, pool: list[Choice], base: dict, say: Progress
             light, present = tuple(own.get(k, 1.0) for k in lights), float(base[key])
             if light not in fitting:
                 model.frames[i].parameters[key] = present
-                fitting[light] = float(f"{present * _brighter(model, values, i):.3g}") if pictures and any(light) else present
+                fitting[light] = (
+                    float(f"{present * _brighter(model, values, i):.3g}") if images and any(light) else present
+                )
             own[key] = model.frames[i].parameters[key] = own[key] * fitting[light]
-            words += f", exposure {own[key]:g}" if pictures else ""
+            words += f", exposure {own[key]:g}" if images else ""
         model.frames[i].image = np.minimum(model.predict(values, [i])[0], model.noise.saturation).astype(np.float32)
         found.append(replace(c, settings=own, words=words))
     say("exposures", len(pool), len(pool))
@@ -374,7 +514,8 @@ def _brighter(model, values: Values, frame: int) -> float:
 
 
 def _outlook(evidence: Evidence, members: Sequence[Candidate], share: float, seed: int) -> advise.Outlook:
-    """Informations of all candidate frames, every effect at its share of the plausible strength; of one per frame, with random signs."""
+    """Informations of all candidate frames, every effect at its share of the plausible strength; of one per frame, with
+    random signs."""
     rng, squares = np.random.default_rng([seed, 17]), np.diag(evidence.normal.gram)
     found = []
     for c in members:
@@ -394,12 +535,21 @@ def _outlook(evidence: Evidence, members: Sequence[Candidate], share: float, see
                 member.bring(v.frames[0], column, side, size)
         found.append(member)
     grams = advise.informations(evidence)
-    return advise.Outlook(np.zeros_like(evidence.normal.gram), grams, evidence.base, evidence.precision, found, [[] for _ in grams],
-                          evidence.normal.truncation(evidence.base), advise.nested_in(members))
+    return advise.Outlook(
+        np.zeros_like(evidence.normal.gram),
+        grams,
+        evidence.base,
+        evidence.precision,
+        found,
+        [[] for _ in grams],
+        evidence.normal.truncation(evidence.base),
+        advise.nested_in(members),
+    )
 
 
 def _onset(c: Candidate, squares: np.ndarray) -> tuple[str, int]:
-    """Which derivative images describe an effect at a small strength, and the power of the strength that they grow with.
+    """Which derivative images describe an effect at a small strength, and the power of the strength that they grow
+    with.
 
     Where both are at hand the tangent, unless it is nothing beside the finite step: then the onset is quadratic.
     """
@@ -416,7 +566,9 @@ def _report(scene, frames, path, seen, chosen, members, share, noise, count, uns
     information, rest = seen.information(chosen)
     names = [m.name for m in seen.members]
     share_left = np.divide(gaps, alone[:, None], out=np.full_like(gaps, np.inf), where=alone[:, None] > 0)
-    cos = np.sqrt(np.maximum(1 - share_left, 0.0))  # of what a calibration leaves of both; 0 where there is nothing to compare
+    cos = np.sqrt(
+        np.maximum(1 - share_left, 0.0)
+    )  # of what a calibration leaves of both; 0 where there is nothing to compare
     effects, confused = [], []
     for i, (m, c) in enumerate(zip(seen.members, members)):
         columns, sides, strength = m.at(chosen)
@@ -426,36 +578,71 @@ def _report(scene, frames, path, seen, chosen, members, share, noise, count, uns
         j = int(np.argmin(gaps[i]))
         rival, gap = (names[j], gaps[i, j]) if math.isfinite(gaps[i, j]) else ("", alone[i])
         parameter = c.variables[0].parameter
-        effects.append(Power(m.name, f"{share * parameter.plausible:.2g}{spaced(parameter.unit)}", float(alone[i]), float(power), rival,
-                             float(gap), float(cos[i, j])))
-        confused += [{"effect": m.name, "rival": names[k], "d": float(gaps[i, k]), "weak": bool(alone[i] < CLEAR),
-                      "why": f"what a calibration leaves of them has cos {cos[i, k]:.3f}; D {alone[i]:.3g} against none"}
-                     for k in np.flatnonzero(gaps[i] < CLEAR)]
+        effects.append(
+            Power(
+                m.name,
+                f"{share * parameter.plausible:.2g}{spaced(parameter.unit)}",
+                float(alone[i]),
+                float(power),
+                rival,
+                float(gap),
+                float(cos[i, j]),
+            )
+        )
+        confused += [
+            {
+                "effect": m.name,
+                "rival": names[k],
+                "d": float(gaps[i, k]),
+                "weak": bool(alone[i] < CLEAR),
+                "why": f"what a calibration leaves of them has cos {cos[i, k]:.3f}; D {alone[i]:.3g} against none",
+            }
+            for k in np.flatnonzero(gaps[i] < CLEAR)
+        ]
     confused.sort(key=lambda c: (c["weak"], c["d"]))
     nested = [(names[a], names[b]) for a, b in sorted(seen.nested)]
     warnings = []
     groups = len({f.group for f in frames}) if any(f.group for f in frames) else len(frames)
     if groups < GROUPS and not frames[0].swept:  # readings are dealt out to sweeps, of which there are enough
-        warnings.append(f"{groups} presses or places: fewer than {GROUPS} groups are not held out by themselves, and without held-out frames "
-                        "there is no CLAIM; plan more frames, or name one with --hold-out")
+        warnings.append(
+            f"{groups} presses or places: fewer than {GROUPS} groups are not held out by themselves, and without held-out frames "
+            "there is no CLAIM; plan more frames, or name one with --hold-out"
+        )
     name = scene.path.stem if scene.path.parent == shipped("scenes") else str(scene.path)
-    return Plan(name, frames, path, effects, confused, share, noise, count,
-                tuple(scene.camera.resolution), nested, unseen, warnings)
+    return Plan(
+        name,
+        frames,
+        path,
+        effects,
+        confused,
+        share,
+        noise,
+        count,
+        tuple(scene.camera.resolution),
+        nested,
+        unseen,
+        warnings,
+    )
 
 
-# -- what to fill in ----------------------------------------------------------------------------------------------------
+# -- what to fill in
+# ----------------------------------------------------------------------------------------------------
 
 
 def write(planned: Plan, folder: str | Path) -> Path:
-    """A folder with a captures.toml that names the frames to take, and no picture yet. Raises OutputExists."""
+    """A folder with a captures.toml that names the frames to take, and no image yet. Raises OutputExists."""
     import tomlkit
 
     folder = Path(os.path.abspath(folder))
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise OutputExists(f"{folder} exists and is not empty; choose another folder")
     document = tomlkit.document()
-    # not captures.MARK: once its pictures are in, the folder is a measured set, which no writing of captures may replace
-    document.add(tomlkit.comment("A session to be taken, planned by optics. Put each picture where `image` says, correct what you set otherwise,"))
+    # not captures.MARK: once its images are in, the folder is a measured set, which no writing of captures may replace
+    document.add(
+        tomlkit.comment(
+            "A session to be taken, planned by optics. Put each image where `image` says, correct what you set otherwise,"
+        )
+    )
     document.add(tomlkit.comment("and put your camera's numbers under [noise]."))
     document["scene"] = planned.scene
     document["noise"] = tomlkit.table()
@@ -474,7 +661,9 @@ def write(planned: Plan, folder: str | Path) -> Path:
             tables.append(table)
     folder.mkdir(parents=True, exist_ok=True)
     if planned.size == (1, 1):
-        readings.write(folder / "readings.csv", [(own, [""]) for f in planned.frames for own in f.readings], ["reading"])
+        readings.write(
+            folder / "readings.csv", [(own, [""]) for f in planned.frames for own in f.readings], ["reading"]
+        )
     else:
         (folder / "frames").mkdir(exist_ok=True)
     (folder / FILE).write_text(tomlkit.dumps(document), encoding="utf-8")

@@ -5,8 +5,8 @@
     extend(study, "lens vignetting")        free that effect, calibrate everything again
     ... until the verdict is NOTHING, or UNKNOWN
 
-Every step is a folder of the study (optics.study.record), and each can be taken up again by another process from that folder.
-"""
+Every step is a folder of the study (optics.study.record), and each can be taken up again by another process from that
+folder."""
 
 from __future__ import annotations
 
@@ -39,7 +39,8 @@ Progress = Callable[[str, int, int], None]
 
 POSE = ("press_x", "press_y", "press_depth")  # what is solved for per press, unless the user says otherwise
 POSE_SD = 0.05  # mm: how well a stage usually knows it
-CHANCE = 0.3  # of the noise: error of a prediction that is followed by chance, below which it adds less than 5 % to the noise
+# of the noise: error of a prediction that is followed by Monte Carlo, below which it adds less than 5 % to the noise
+CHANCE = 0.3
 ASPECT = 0.02  # by which the sides of images may be in another ratio than the scene's
 GROUPS = 4  # of frames, from which on one in so many is held out
 GAUGE = 10.0  # plausible sizes: how far what no data hold may be from the scene's value
@@ -57,7 +58,8 @@ class Setup:
     priors      pattern -> (mean or None for the present value, standard deviation)
     held_out    names of groups that the calibration does not see; None: one in four, evenly spread
     values      start values, by key;   flat_field  how a background image enters, see `optics.fit.model.Model`
-    robust      residuals beyond three sigmas count less (Huber), as dirt and glints ask for; a diagnosis weighs all alike
+    robust      residuals beyond three sigmas count less (Huber), as dirt and glints ask for; a diagnosis weighs all
+                alike
     """
 
     captures: str
@@ -89,7 +91,8 @@ def setup_for(captures: str | Path, **given) -> Setup:
 
 
 def plugins_of(setup: Setup) -> Path:
-    """The folder of plugins that belongs to a setup, whether it is there or not: the one that was named, or the one beside the captures."""
+    """The folder of plugins that belongs to a setup, whether it is there or not: the one that was named, or the one
+    beside the captures."""
     return Path(setup.plugins) if setup.plugins else Path(setup.captures) / "plugins"
 
 
@@ -103,10 +106,16 @@ def open_model(setup: Setup, model_class: type = Model) -> Model:
     for name, size in (("width", width), ("height", height)):
         if name in usual:
             defines.setdefault(name, str(size))
-    if found.table is None and len(usual) == 2 and abs(width * int(usual["height"]) / (height * int(usual["width"])) - 1) > ASPECT:
-        found.warnings.append(f"the images are {width} x {height} px, the scene's own are {usual['width']} x {usual['height']}: cut or turned "
-                              "pictures show another part of the sensor than the scene's camera; give them whole, row 0 at the top, or "
-                              "write x_fov and principal point of what is left into the scene")
+    if (
+        found.table is None
+        and len(usual) == 2
+        and abs(width * int(usual["height"]) / (height * int(usual["width"])) - 1) > ASPECT
+    ):
+        found.warnings.append(
+            f"the images are {width} x {height} px, the scene's own are {usual['width']} x {usual['height']}: cut or turned "
+            "images show another part of the sensor than the scene's camera; give them whole, row 0 at the top, or "
+            "write x_fov and principal point of what is left into the scene"
+        )
     plugins = plugins_of(setup)
     loaded = scenes.load(path, defines, plugins=plugins if setup.plugins or plugins.is_dir() else None)
     capture_files.check(found, loaded.parameters)
@@ -190,30 +199,44 @@ def effects_of(study: Study) -> list[Effect]:
 
 
 def effect_variables(model: Model, effect: Effect) -> list[Variable]:
-    """What adding an effect frees. Of several strengths a common part may show nowhere, such as the gain of all frames: where no data
-    hold it, it stays where the scene has it, by a prior GAUGE times what is plausible, which data that do hold it outweigh."""
+    """What adding an effect frees. Of several strengths a common part may show nowhere, such as the gain of all frames:
+    where no data hold it, it stays where the scene has it, by a prior GAUGE times what is plausible, which data that do
+    hold it outweigh."""
     found = model.scene.variables_of(effect, len(model.frames))
-    return [_with_prior(model, v, "*", (None, GAUGE * v.parameter.plausible)) for v in found] if len(found) > 1 else found
+    return (
+        [_with_prior(model, v, "*", (None, GAUGE * v.parameter.plausible)) for v in found] if len(found) > 1 else found
+    )
 
 
-def fit_base(model: Model, variables: Sequence[Variable], fitted: Sequence[int], start: Values,
-             progress: Progress | None = None, tolerance: float = 0.05, robust: bool = False) -> calibrate.Fit:
-    """Calibrate in three stages: what holds in all frames, then the poses, a press at a time, then everything together."""
+def fit_base(
+    model: Model,
+    variables: Sequence[Variable],
+    fitted: Sequence[int],
+    start: Values,
+    progress: Progress | None = None,
+    tolerance: float = 0.05,
+    robust: bool = False,
+) -> calibrate.Fit:
+    """Calibrate in three stages: what holds in all frames, then the poses, a press at a time, then everything
+    together."""
     variables = list(variables)
     begun = np.array([calibrate.start_of(model, v, start) for v in variables])  # where the first stage starts
     common = [v for v in variables if v.frames is None]
     if len(common) < len(variables):
         values = start
         if common:
-            values = calibrate.fit(model, common, start, fitted, max_iterations=12, tolerance=20.0, robust=robust,
-                                   progress=progress).values
+            values = calibrate.fit(
+                model, common, start, fitted, max_iterations=12, tolerance=20.0, robust=robust, progress=progress
+            ).values
         start = values.copy()
         groups: dict[tuple[int, ...], list[Variable]] = {}
         for v in variables:
             if v.frames is not None:
                 groups.setdefault(v.frames, []).append(v)
         for frames, own in groups.items():
-            found = calibrate.fit(model, own, values, frames, max_iterations=6, tolerance=2.0, robust=robust, progress=progress)
+            found = calibrate.fit(
+                model, own, values, frames, max_iterations=6, tolerance=2.0, robust=robust, progress=progress
+            )
             for index in frames:
                 start.frame.setdefault(index, {}).update(found.values.frame[index])
     found = calibrate.fit(model, variables, start, fitted, tolerance=tolerance, robust=robust, progress=progress)
@@ -222,7 +245,8 @@ def fit_base(model: Model, variables: Sequence[Variable], fitted: Sequence[int],
 
 
 def off_neutral(model: Model, values: Values, variables: Sequence[Variable]) -> Values:
-    """Values with variables a tenth of their plausible size off: one-sided onsets have no slope to follow at a bound."""
+    """Values with variables a tenth of their plausible size off: one-sided onsets have no slope to follow at a
+    bound."""
     moved = values.copy()
     for v in variables:
         moved.put(v, calibrate.start_of(model, v, moved) + 0.1 * v.parameter.plausible)
@@ -235,20 +259,37 @@ def held_out_values(model: Model, found: calibrate.Fit, held: Sequence[int]) -> 
     return (calibrate.fit(model, own, found.values, held).values if own else found.values), len(own)
 
 
-def comparison_of(model: Model, values: Values, held: Sequence[int], parameters: int, held_parameters: int) -> Comparison:
+def comparison_of(
+    model: Model, values: Values, held: Sequence[int], parameters: int, held_parameters: int
+) -> Comparison:
     """All frames measured against predicted, by optics.fit.compare."""
     predicted = model.predict(values)
-    return compare([f.image for f in model.frames], predicted, [np.sqrt(model.variance(values, i, p)) for i, p in enumerate(predicted)],
-                   [model.usable(i) for i in range(len(model.frames))],
-                   [model.coordinates(values, i) for i in range(len(model.frames))],
-                   [f.parameters for f in model.frames], [f.group or f.name for f in model.frames],
-                   names=[f.name for f in model.frames], full_scale=model.noise.saturation - model.noise.black_level,
-                   black_level=model.noise.black_level, held_out=held, parameters=parameters,
-                   held_out_parameters=held_parameters)
+    return compare(
+        [f.image for f in model.frames],
+        predicted,
+        [np.sqrt(model.variance(values, i, p)) for i, p in enumerate(predicted)],
+        [model.usable(i) for i in range(len(model.frames))],
+        [model.coordinates(values, i) for i in range(len(model.frames))],
+        [f.parameters for f in model.frames],
+        [f.group or f.name for f in model.frames],
+        names=[f.name for f in model.frames],
+        full_scale=model.noise.saturation - model.noise.black_level,
+        black_level=model.noise.black_level,
+        held_out=held,
+        parameters=parameters,
+        held_out_parameters=held_parameters,
+    )
 
 
-def begin(setup: Setup, folder: str | Path, *, title: str = "", command: Sequence[str] = (), resume: bool = False,
-          progress: Progress | None = None) -> tuple[Study, Model, calibrate.Fit]:
+def begin(
+    setup: Setup,
+    folder: str | Path,
+    *,
+    title: str = "",
+    command: Sequence[str] = (),
+    resume: bool = False,
+    progress: Progress | None = None,
+) -> tuple[Study, Model, calibrate.Fit]:
     """Start a study: calibrate the base model and record it as the first step."""
     model = open_model(setup)
     fitted, held = split(model, setup)
@@ -260,12 +301,25 @@ def begin(setup: Setup, folder: str | Path, *, title: str = "", command: Sequenc
     model.scene.check(setup.values, "start values")
     usable = [model.usable(i) for i in range(len(model.frames))]
     study = Study.create(
-        folder, scene=str(model.captures.scene), captures=str(setup.captures),
-        inputs=[setup.captures, model.scene.path, *registry().folders], seed=setup.seed, command=command, title=title,
-        noise=asdict(model.noise), warnings=[*_warnings(model), *_unverified(model, setup, held)], resume=resume,
-        facts={"frames": len(model.frames), "fitted": len(fitted), "held_out": len(held),
-               "image": list(model.shape), "masked": 1 - float(np.mean([u.sum() / model.size for u in usable])),
-               "setup": asdict(setup)})
+        folder,
+        scene=str(model.captures.scene),
+        captures=str(setup.captures),
+        inputs=[setup.captures, model.scene.path, *registry().folders],
+        seed=setup.seed,
+        command=command,
+        title=title,
+        noise=asdict(model.noise),
+        warnings=[*_warnings(model), *_unverified(model, setup, held)],
+        resume=resume,
+        facts={
+            "frames": len(model.frames),
+            "fitted": len(fitted),
+            "held_out": len(held),
+            "image": list(model.shape),
+            "masked": 1 - float(np.mean([u.sum() / model.size for u in usable])),
+            "setup": asdict(setup),
+        },
+    )
     if study.steps:
         return study, model, restore(study, model)
     start = Values(dict(setup.values))
@@ -281,15 +335,21 @@ def begin(setup: Setup, folder: str | Path, *, title: str = "", command: Sequenc
 
 def _warnings(model: Model) -> list[str]:
     from optics.captures.noise import warnings_of
-    from optics.light.output import veiled
+    from optics.light.rendering import veiled
 
     texts = [*model.captures.warnings, *warnings_of(model.noise, model.captures), *_unnamed(model), *_astray(model)]
-    if model.renderer.layered and model.captures.table is None and (what := veiled(model.renderer, model.at(Values(), 0))):
+    if (
+        model.renderer.layered
+        and model.captures.table is None
+        and (what := veiled(model.renderer, model.at(Values(), 0)))
+    ):
         texts.append(f"the model leaves out light that comes through layers: {what}")
-    if model.by_chance and (share := model.chance()) > CHANCE:
-        texts.append(f"the prediction of clear bodies is an estimate by chance; its error is {share:.2g} of the noise in the first frame. It is "
-                     f"added to the noise, pixel by pixel, but is the same in frames of the same geometry: raise `rays` and `packets` of "
-                     f"the scene's integrator until it is below {CHANCE:g}")
+    if model.monte_carlo and (share := model.chance()) > CHANCE:
+        texts.append(
+            f"the prediction of dielectric bodies is an estimate by Monte Carlo; its error is {share:.2g} of the noise in the first frame. It is "
+            f"added to the noise, pixel by pixel, but is the same in frames of the same geometry: raise `rays` and `packets` of "
+            f"the scene's integrator until it is below {CHANCE:g}"
+        )
     return list(dict.fromkeys(texts))
 
 
@@ -298,8 +358,10 @@ def _unverified(model: Model, setup: Setup, held: Sequence[int]) -> list[str]:
     groups = len(capture_files.groups(model.captures))
     if held or setup.held_out is not None or groups < 2:
         return []
-    return [f"{groups} groups of frames: none is held out, so nothing verifies what is found; take {GROUPS} or more, or name one to hold out "
-            "(--hold-out)"]
+    return [
+        f"{groups} groups of frames: none is held out, so nothing verifies what is found; take {GROUPS} or more, or name one to hold out "
+        "(--hold-out)"
+    ]
 
 
 def _astray(model: Model) -> list[str]:
@@ -311,53 +373,81 @@ def _astray(model: Model) -> list[str]:
         key, size = f"{gel.name}.{axis}", float(model.base[f"{gel.name}.{side}"])
         for f in model.frames:
             if abs(f.parameters.get(key, 0.0)) > size / 2:
-                return [f"frame '{f.name}': {key} = {f.parameters[key]:g} mm lies beyond the gel, which is {size:g} mm wide there: check units"]
+                return [
+                    f"frame '{f.name}': {key} = {f.parameters[key]:g} mm lies beyond the gel, which is {size:g} mm wide there: check units"
+                ]
     return []
 
 
 def _unnamed(model: Model) -> list[str]:
     """Lights that some frames set and others leave to the scene, which has them on."""
     own = [{*f.parameters, *f.readings} for f in model.frames]
-    left = {key: i for key in (f"{n}.power" for n in model.scene.lights) if model.base[key] and any(key in keys for keys in own)
-            for i, keys in enumerate(own) if key not in keys}
+    left = {
+        key: i
+        for key in (f"{n}.power" for n in model.scene.lights)
+        if model.base[key] and any(key in keys for keys in own)
+        for i, keys in enumerate(own)
+        if key not in keys
+    }
     if not left:
         return []
     key, frame = next(iter(left.items()))
-    return [f"{', '.join(left)}: set in some frames and not in others, such as '{model.frames[frame].name}', where {key} is the scene's "
-            f"{model.base[key]:g}; write 0 where a light was off"]
+    return [
+        f"{', '.join(left)}: set in some frames and not in others, such as '{model.frames[frame].name}', where {key} is the scene's "
+        f"{model.base[key]:g}; write 0 where a light was off"
+    ]
 
 
 def _far(model: Model, found: calibrate.Fit, level: Row) -> list[str]:
     """What no effect explains: a model that is nowhere near its images, or values far from what is known of them."""
     texts = []
     if level.rms > FAR * level.signal:
-        texts.append(f"the model misses the images by {level.rms / max(level.signal, 1e-9):.0%} of its own mean, which is no matter of effects: check {AT_FAULT}")
+        texts.append(
+            f"the model misses the images by {level.rms / max(level.signal, 1e-9):.0%} of its own mean, which is no matter of effects: check {AT_FAULT}"
+        )
     moved = [(v, found.values.get(v, model.base)) for v in found.variables if v.prior is not None]
     moved = [(v, value) for v, value in moved if abs(value - v.prior[0]) > 3 * v.prior[1]]
     if moved:
         v, value = max(moved, key=lambda t: abs(t[1] - t[0].prior[0]) / t[0].prior[1])
-        texts.append(f"{some([v.name for v, _ in moved], 4)}: calibrated to more than "
-                     f"3 sd from what is known, most {v.name}: {value:.4g}{spaced(v.parameter.unit)} for {v.prior[0]:.4g} +- {v.prior[1]:g}; "
-                     f"check {AT_FAULT}")
+        texts.append(
+            f"{some([v.name for v, _ in moved], 4)}: calibrated to more than "
+            f"3 sd from what is known, most {v.name}: {value:.4g}{spaced(v.parameter.unit)} for {v.prior[0]:.4g} +- {v.prior[1]:g}; "
+            f"check {AT_FAULT}"
+        )
     return texts
 
 
-def record(study: Study, model: Model, name: str, effect: Effect | None, found: calibrate.Fit,
-           held: Sequence[int], seconds: float) -> Comparison:
+def record(
+    study: Study,
+    model: Model,
+    name: str,
+    effect: Effect | None,
+    found: calibrate.Fit,
+    held: Sequence[int],
+    seconds: float,
+) -> Comparison:
     """Write a calibrated model down as the next step of the study."""
     values, extra = held_out_values(model, found, held)
     comparison = comparison_of(model, values, held, len(found.variables), extra)
     found.warnings += _far(model, found, comparison.fitted)
     everywhere = Values(dict(found.values.common), {**values.frame, **found.values.frame})
     kept = calibrate.Fit(**{**found.__dict__, "values": everywhere})
-    study.add_step(name, effect.key if effect else None, kept, comparison,
-                   frames=ladder.shown_frames(model, everywhere, held), seconds=seconds,
-                   nulls=null_models(model, values, found.frames, held), background=background_of(model, values))
+    study.add_step(
+        name,
+        effect.key if effect else None,
+        kept,
+        comparison,
+        frames=ladder.shown_frames(model, everywhere, held),
+        seconds=seconds,
+        nulls=null_models(model, values, found.frames, held),
+        background=background_of(model, values),
+    )
     return comparison
 
 
 def null_models(model: Model, values: Values, fitted: Sequence[int], held: Sequence[int]) -> dict | None:
-    """How an imported set's model stands beside models without physics (optics.fit.null_models); None where there is nothing to compare."""
+    """How an imported set's model stands beside models without physics (optics.fit.null_models); None where there is
+    nothing to compare."""
     from optics.captures import importing
     from optics.fit import null_models as nulls
 
@@ -386,15 +476,18 @@ def kept(study: Study, model: Model, index: int = -1) -> tuple[list[Variable], V
     """What a step's folder has of its fit: the variables, the values, and the frames that were fitted."""
     setup = Setup(**study.record["facts"]["setup"])
     fitted, _ = split(model, setup)
-    steps = study.steps[:len(study.steps) + index + 1] if index < 0 else study.steps[:index + 1]
+    steps = study.steps[: len(study.steps) + index + 1] if index < 0 else study.steps[: index + 1]
     data = study.fit(len(steps) - 1)
     names = {f.name: i for i, f in enumerate(model.frames)}
     values = Values(dict(data["parameters"]), {names[n]: dict(own) for n, own in data["frames"].items()})
     variables = variables_of_base(model, setup, fitted)
     for step in steps:
         if step["effect"]:
-            variables += [v for v in effect_variables(model, registry().find_effect(step["effect"]))
-                          if v.frames is None or set(v.frames) <= set(fitted)]
+            variables += [
+                v
+                for v in effect_variables(model, registry().find_effect(step["effect"]))
+                if v.frames is None or set(v.frames) <= set(fitted)
+            ]
     return variables, values, fitted
 
 
@@ -407,8 +500,11 @@ def restore(study: Study, model: Model, index: int = -1) -> calibrate.Fit:
 def candidates(model: Model, study: Study) -> list[Effect]:
     """Every effect that the scene can express and the study has not added."""
     done = {e.key for e in effects_of(study)}
-    return [e for k, e in sorted(registry().effects.items()) if k not in done and model.scene.can_express(e)
-            and not (e.pictures and model.captures.table is not None)]
+    return [
+        e
+        for k, e in sorted(registry().effects.items())
+        if k not in done and model.scene.can_express(e) and not (e.mixes_pixels and model.captures.table is not None)
+    ]
 
 
 def seek(model: Model, values: Values, effects: Sequence[Effect], frames: Sequence[int]) -> None:
@@ -418,9 +514,16 @@ def seek(model: Model, values: Values, effects: Sequence[Effect], frames: Sequen
             values.common.update(model.scene.check(effect.seek(model, values, frames), effect.name))
 
 
-def examine(study: Study, model: Model, setup: Setup, found: calibrate.Fit, progress: Progress | None = None, advised: bool = True):
-    """Diagnose the last step and write the diagnosis, with the best effects' fingerprints, into it; `advised`: where effects tie, also what
-    to measure next, which is rendered shot by shot."""
+def examine(
+    study: Study,
+    model: Model,
+    setup: Setup,
+    found: calibrate.Fit,
+    progress: Progress | None = None,
+    advised: bool = True,
+):
+    """Diagnose the last step and write the diagnosis, with the best effects' fingerprints, into it; `advised`: where
+    effects tie, also what to measure next, which is rendered shot by shot."""
     from optics.diagnosis.advice import advise
     from optics.diagnosis.diagnose import USUALLY, diagnose
 
@@ -453,8 +556,17 @@ def examine(study: Study, model: Model, setup: Setup, found: calibrate.Fit, prog
             return best
         return calibrate.fit(model, variables, quick.values, frames, max_iterations=4, tolerance=0.5)
 
-    result = diagnose(model, found, tested, lambda e: effect_variables(model, e), held, fitted=fitted, refit=refit,
-                      seed=setup.seed, progress=progress)
+    result = diagnose(
+        model,
+        found,
+        tested,
+        lambda e: effect_variables(model, e),
+        held,
+        fitted=fitted,
+        refit=refit,
+        seed=setup.seed,
+        progress=progress,
+    )
     result.advice = advise(model, result, effect_variables, setup.seed, progress) if advised else []
     if result.advice:
         result.hints = [hint for hint in result.hints if hint != USUALLY]
@@ -463,17 +575,30 @@ def examine(study: Study, model: Model, setup: Setup, found: calibrate.Fit, prog
     return result
 
 
-def extend(study: Study, model: Model, setup: Setup, found: calibrate.Fit, effect: Effect, start: Values | None = None,
-           progress: Progress | None = None) -> tuple[calibrate.Fit, Comparison]:
+def extend(
+    study: Study,
+    model: Model,
+    setup: Setup,
+    found: calibrate.Fit,
+    effect: Effect,
+    start: Values | None = None,
+    progress: Progress | None = None,
+) -> tuple[calibrate.Fit, Comparison]:
     """Free an effect, calibrate everything again, and record the step.
 
-    start   values to begin from, such as those of the diagnosis's refit; else the present ones with the effect off neutral
+    start   values to begin from, such as those of the diagnosis's refit; else the present ones with the effect off
+            neutral
     """
     fitted, held = split(model, setup)
     if not model.scene.can_express(effect):
         missing = [n for n, keys in model.scene.keys_of(effect).items() if not keys]
-        raise UnknownKey(effect.part, [p.kind for p in model.scene.parts.values()], "part of the scene",
-                         str(model.scene.path), f"the effect '{effect.name}' needs it for {', '.join(missing)}")
+        raise UnknownKey(
+            effect.part,
+            [p.kind for p in model.scene.parts.values()],
+            "part of the scene",
+            str(model.scene.path),
+            f"the effect '{effect.name}' needs it for {', '.join(missing)}",
+        )
     extra = [v for v in effect_variables(model, effect) if v.frames is None or set(v.frames) <= set(fitted)]
     variables = [*found.variables, *extra]
     if start is None:
@@ -485,6 +610,8 @@ def extend(study: Study, model: Model, setup: Setup, found: calibrate.Fit, effec
     comparison = record(study, model, effect.name, effect, best, held, time.perf_counter() - clock)
     before, after = (step["held_out"]["chi2_per_dof"] if step["held_out"] else math.nan for step in study.steps[-2:])
     if after > before:
-        best.warnings.append(f"held-out chi2/dof rises from {before:.4g} to {after:.4g} with {effect.name}: it does not predict what it was not "
-                             "fitted to, and is not the cause, or not by itself")
+        best.warnings.append(
+            f"held-out chi2/dof rises from {before:.4g} to {after:.4g} with {effect.name}: it does not predict what it was not "
+            "fitted to, and is not the cause, or not by itself"
+        )
     return best, comparison

@@ -91,10 +91,23 @@ class Study:
     # -- life -------------------------------------------------------------------------------------------------------
 
     @classmethod
-    def create(cls, folder: str | Path, *, scene: str, captures: str, inputs: Sequence[str | Path] = (), seed: int = 0,
-               command: Sequence[str] = (), title: str = "", noise=None,
-               warnings: Sequence[str] = (), facts: Mapping | None = None, noise_floor: float = 1.0,
-               noise_floor_source: str = "noise model", resume: bool = False) -> "Study":
+    def create(
+        cls,
+        folder: str | Path,
+        *,
+        scene: str,
+        captures: str,
+        inputs: Sequence[str | Path] = (),
+        seed: int = 0,
+        command: Sequence[str] = (),
+        title: str = "",
+        noise=None,
+        warnings: Sequence[str] = (),
+        facts: Mapping | None = None,
+        noise_floor: float = 1.0,
+        noise_floor_source: str = "noise model",
+        resume: bool = False,
+    ) -> Study:
         """Start a study in a folder that does not exist yet, or is empty.
 
         inputs       files and folders that the result depends on; each file is recorded by SHA-256
@@ -108,24 +121,39 @@ class Study:
         hashes = input_hashes(inputs)
         if (folder / "ladder.json").exists():
             if not resume:
-                raise OutputExists(f"{folder} holds a study already; choose another folder, or go on with it (--resume)")
+                raise OutputExists(
+                    f"{folder} holds a study already; choose another folder, or go on with it (--resume)"
+                )
             study = cls.open(folder, empty=True)
             old = study.record
             changed = [k for k, new in (("scene", scene), ("seed", seed)) if old[k] != new]
             changed += sorted(k for k in hashes.keys() | old["inputs"].keys() if hashes.get(k) != old["inputs"].get(k))
             if changed:
-                raise BadCapture(f"{folder}: cannot resume, changed since the study began: {', '.join(changed[:5])}"
-                                 f"{' ...' if len(changed) > 5 else ''}; start a study in a new folder")
+                raise BadCapture(
+                    f"{folder}: cannot resume, changed since the study began: {', '.join(changed[:5])}"
+                    f"{' ...' if len(changed) > 5 else ''}; start a study in a new folder"
+                )
             return study
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
             raise OutputExists(f"{folder} exists and holds no study; choose another folder")
         if not (math.isfinite(noise_floor) and noise_floor > 0):
             raise ValueError(f"noise_floor = {noise_floor} (chi2/dof) is not above 0")
         record = {
-            "format": FORMAT, "title": title, "scene": scene, "captures": captures, "created": _now(), "seed": seed,
-            "command": list(map(str, command)), "versions": versions(), "inputs": hashes, "noise": _as_dict(noise) or {},
+            "format": FORMAT,
+            "title": title,
+            "scene": scene,
+            "captures": captures,
+            "created": _now(),
+            "seed": seed,
+            "command": list(map(str, command)),
+            "versions": versions(),
+            "inputs": hashes,
+            "noise": _as_dict(noise) or {},
             "noise_floor": {"chi2_per_dof": float(noise_floor), "source": noise_floor_source},
-            "warnings": list(warnings), "facts": dict(facts or {}), "shown": [], "steps": [],
+            "warnings": list(warnings),
+            "facts": dict(facts or {}),
+            "shown": [],
+            "steps": [],
         }
         (folder / "steps").mkdir(parents=True, exist_ok=True)
         study = cls(folder, json.loads(_dumps(record)))
@@ -133,15 +161,17 @@ class Study:
         return study
 
     @classmethod
-    def open(cls, folder: str | Path, empty: bool = False) -> "Study":
+    def open(cls, folder: str | Path, empty: bool = False) -> Study:
         """Read a study; steps that were written whole but not yet listed are taken in.
 
-        Raises FileNotFoundError without a ladder.json, ValueError when it cannot be read, or has no step and may not be `empty`.
-        """
+        Raises FileNotFoundError without a ladder.json, ValueError when it cannot be read, or has no step and may not be
+        `empty`."""
         folder = Path(folder)
         file = folder / "ladder.json"
         if not file.is_file():
-            raise FileNotFoundError(f"{folder} is no study: it has no ladder.json; name the folder that `optics calibrate CAPTURES -o STUDY` wrote")
+            raise FileNotFoundError(
+                f"{folder} is no study: it has no ladder.json; name the folder that `optics calibrate CAPTURES -o STUDY` wrote"
+            )
         try:
             record = json.loads(file.read_text(encoding="utf-8"))
             if record["format"] != FORMAT:
@@ -154,12 +184,16 @@ class Study:
         wanted = list(range(len(record["steps"])))
         if [s["index"] for s in record["steps"]] != wanted:
             found = ", ".join(s["folder"] for s in record["steps"])
-            raise ValueError(f"{folder}/steps: steps are missing or double ({found}); restore them or start a new study")
+            raise ValueError(
+                f"{folder}/steps: steps are missing or double ({found}); restore them or start a new study"
+            )
         if record["steps"] and not record["shown"]:
             record["shown"] = [f["name"] for f in record["steps"][0]["frames"]]
         if not record["steps"] and not empty:
-            raise ValueError(f"{folder}: the study has no step yet, its calibration was cut off; `optics calibrate {record['captures']} -o "
-                             f"{folder} --resume` finishes it")
+            raise ValueError(
+                f"{folder}: the study has no step yet, its calibration was cut off; `optics calibrate {record['captures']} -o "
+                f"{folder} --resume` finishes it"
+            )
         return cls(folder, record)
 
     def discard(self) -> None:
@@ -184,14 +218,29 @@ class Study:
 
     def changed_inputs(self) -> list[str]:
         """Input files that are gone or differ from the recorded hash."""
-        return [path for path, digest in self.record["inputs"].items()
-                if not Path(path).is_file() or file_hash(Path(path)) != digest]
+        return [
+            path
+            for path, digest in self.record["inputs"].items()
+            if not Path(path).is_file() or file_hash(Path(path)) != digest
+        ]
 
     # -- a step -----------------------------------------------------------------------------------------------------
 
-    def add_step(self, name: str, effect: str | None, fit, comparison: Comparison, diagnosis=None,
-                 frames: Sequence[Shown] = (), fingerprints: Sequence[Fingerprint] = (), *, nulls: Mapping | None = None,
-                 background: Mapping | None = None, seconds: float | None = None, warnings: Sequence[str] = ()) -> Path:
+    def add_step(
+        self,
+        name: str,
+        effect: str | None,
+        fit,
+        comparison: Comparison,
+        diagnosis=None,
+        frames: Sequence[Shown] = (),
+        fingerprints: Sequence[Fingerprint] = (),
+        *,
+        nulls: Mapping | None = None,
+        background: Mapping | None = None,
+        seconds: float | None = None,
+        warnings: Sequence[str] = (),
+    ) -> Path:
         """Append a step and return its folder.
 
         name         as in a sentence: "base", "lens vignetting"; the folder becomes NN-lens-vignetting
@@ -217,31 +266,62 @@ class Study:
         record = fit_record(fit, [f["frame"] for f in comparison.frames])
         diagnosis = _as_dict(diagnosis)
         entry = {
-            "index": index, "name": name, "effect": effect, "folder": folder, "created": _now(), "seconds": seconds,
-            "fitted": _level(comparison.fitted), "held_out": _level(comparison.held_out), "total": _level(comparison.total),
-            "converged": record["converged"], "reason": record["reason"], "variables": record["variables"],
-            "correlations": record["correlations"], "warnings": [*record["warnings"], *warnings],
-            "frames": [{"file": f"images/frame-{i:02d}.npz", "name": f.name, "led": f.led, "group": f.group,
-                        "held_out": bool(f.held_out), **({"units": dict(f.units)} if f.settings else {})}
-                       for i, f in enumerate(kept)],
-            "fingerprints": [{"file": f"images/fingerprint-{i:02d}.npz", "effect": f.effect, "frame": f.frame,
-                              "strength": float(f.strength)} for i, f in enumerate(fingerprints)],
+            "index": index,
+            "name": name,
+            "effect": effect,
+            "folder": folder,
+            "created": _now(),
+            "seconds": seconds,
+            "fitted": _level(comparison.fitted),
+            "held_out": _level(comparison.held_out),
+            "total": _level(comparison.total),
+            "converged": record["converged"],
+            "reason": record["reason"],
+            "variables": record["variables"],
+            "correlations": record["correlations"],
+            "warnings": [*record["warnings"], *warnings],
+            "frames": [
+                {
+                    "file": f"images/frame-{i:02d}.npz",
+                    "name": f.name,
+                    "led": f.led,
+                    "group": f.group,
+                    "held_out": bool(f.held_out),
+                    **({"units": dict(f.units)} if f.settings else {}),
+                }
+                for i, f in enumerate(kept)
+            ],
+            "fingerprints": [
+                {
+                    "file": f"images/fingerprint-{i:02d}.npz",
+                    "effect": f.effect,
+                    "frame": f.frame,
+                    "strength": float(f.strength),
+                }
+                for i, f in enumerate(fingerprints)
+            ],
         }
         entry = json.loads(_dumps(entry))
         with self._new_folder(folder) as new:
             (new / "images").mkdir()
             (new / "fit.toml").write_text(fit_toml(record, name), encoding="utf-8")
-            (new / "metrics.json").write_text(_dumps({
-                **comparison.to_dict(), "nulls": nulls or {}, "background": background or {}}), encoding="utf-8")
+            (new / "metrics.json").write_text(
+                _dumps({**comparison.to_dict(), "nulls": nulls or {}, "background": background or {}}), encoding="utf-8"
+            )
             if diagnosis is not None:
                 (new / "diagnosis.json").write_text(_dumps(diagnosis), encoding="utf-8")
             for item, f in zip(entry["frames"], kept):
                 shape = np.shape(f.measured)
                 use = np.asarray(f.usable, bool)
                 use = np.broadcast_to(use[..., None] if use.ndim < len(shape) else use, shape)
-                np.savez_compressed(new / item["file"], measured=_single(f.measured), predicted=_single(f.predicted),
-                                    sd=_single(np.broadcast_to(f.sd, shape)), usable=use,
-                                    **{SETTING + key: np.asarray(value) for key, value in f.settings.items()})
+                np.savez_compressed(
+                    new / item["file"],
+                    measured=_single(f.measured),
+                    predicted=_single(f.predicted),
+                    sd=_single(np.broadcast_to(f.sd, shape)),
+                    usable=use,
+                    **{SETTING + key: np.asarray(value) for key, value in f.settings.items()},
+                )
             for item, f in zip(entry["fingerprints"], fingerprints):
                 np.savez_compressed(new / item["file"], image=_single(f.image), residual=_single(f.residual))
             if comparison.rms_map is not None:
@@ -254,8 +334,15 @@ class Study:
     def put_diagnosis(self, index: int, diagnosis, fingerprints: Sequence[Fingerprint] = ()) -> None:
         """Add the diagnosis of a recorded step, and what its best effects would explain; a later one replaces it."""
         folder, entry = self.path(index), self.steps[index]
-        items = [{"file": f"images/fingerprint-{i:02d}.npz", "effect": f.effect, "frame": f.frame,
-                  "strength": float(f.strength)} for i, f in enumerate(fingerprints)]
+        items = [
+            {
+                "file": f"images/fingerprint-{i:02d}.npz",
+                "effect": f.effect,
+                "frame": f.frame,
+                "strength": float(f.strength),
+            }
+            for i, f in enumerate(fingerprints)
+        ]
         for item, f in zip(items, fingerprints):
             with replaced(folder / item["file"]) as new:
                 np.savez_compressed(new, image=_single(f.image), residual=_single(f.residual))
@@ -313,8 +400,20 @@ class Study:
         for f in self.steps[index]["frames"]:
             with np.load(self.path(index) / f["file"]) as a:
                 settings = {k.removeprefix(SETTING): a[k] for k in a.files if k.startswith(SETTING)}
-                out.append(Shown(f["name"], a["measured"], a["predicted"], a["sd"], a["usable"], f["led"], f["group"],
-                                 f["held_out"], settings, f.get("units", {})))
+                out.append(
+                    Shown(
+                        f["name"],
+                        a["measured"],
+                        a["predicted"],
+                        a["sd"],
+                        a["usable"],
+                        f["led"],
+                        f["group"],
+                        f["held_out"],
+                        settings,
+                        f.get("units", {}),
+                    )
+                )
         return out
 
     def fingerprints(self, index: int) -> list[Fingerprint]:
@@ -331,14 +430,21 @@ class Study:
         for step in self.steps:
             fitted, held = step["fitted"], step["held_out"]
             level = held or fitted or step["total"]
-            lines.append((
-                f"{step['index']:02d} {'+ ' if step['index'] else ''}{step['name']}",
-                _format(fitted, "chi2_per_dof", "{:.3f}"), _format(held, "chi2_per_dof", "{:.3f}"),
-                _format(held, "misfit", "{:.2%}"), _format(level, "noise", "{:.2%}"), str(len(step["variables"])),
-                "" if step["converged"] else f"not converged: {step['reason']}",
-            ))
+            lines.append(
+                (
+                    f"{step['index']:02d} {'+ ' if step['index'] else ''}{step['name']}",
+                    _format(fitted, "chi2_per_dof", "{:.3f}"),
+                    _format(held, "chi2_per_dof", "{:.3f}"),
+                    _format(held, "misfit", "{:.2%}"),
+                    _format(level, "noise", "{:.2%}"),
+                    str(len(step["variables"])),
+                    "" if step["converged"] else f"not converged: {step['reason']}",
+                )
+            )
         floor = self.record["noise_floor"]
-        return "\n".join([words.table(lines, left=(0, 6)), f"noise floor: chi2/dof {floor['chi2_per_dof']:.3f} ({floor['source']})"])
+        return "\n".join(
+            [words.table(lines, left=(0, 6)), f"noise floor: chi2/dof {floor['chi2_per_dof']:.3f} ({floor['source']})"]
+        )
 
 
 @contextlib.contextmanager
@@ -353,7 +459,9 @@ def replaced(file: Path) -> Iterator:
         temporary.unlink(missing_ok=True)
 
 
-# -- images of a model ---------------------------------------------------------------------------------------------------
+# -- images of a model
+# ---------------------------------------------------------------------------------------------------
+
 
 def shown_frames(model, values, held_out: Sequence[int] = (), frames: Sequence[int] | None = None) -> list[Shown]:
     """All frames, or the given ones, of an optics.fit.model.Model with its predictions for `values`."""
@@ -361,11 +469,28 @@ def shown_frames(model, values, held_out: Sequence[int] = (), frames: Sequence[i
     out = []
     for i in indices:
         f, prediction = model.frames[i], np.asarray(model.predict(values, [i])[0])
-        settings = {} if model.captures.table is None else {
-            key: np.broadcast_to(np.ravel(value), len(prediction)) for key, value in (*f.parameters.items(), *f.readings.items())}
-        out.append(Shown(f.name, np.asarray(f.image), prediction, np.sqrt(model.variance(values, i, prediction)), model.usable(i),
-                         led_label(f.parameters), f.group or "", i in set(held_out), settings,
-                         {key: model.parameters[key].unit for key in settings}))
+        settings = (
+            {}
+            if model.captures.table is None
+            else {
+                key: np.broadcast_to(np.ravel(value), len(prediction))
+                for key, value in (*f.parameters.items(), *f.readings.items())
+            }
+        )
+        out.append(
+            Shown(
+                f.name,
+                np.asarray(f.image),
+                prediction,
+                np.sqrt(model.variance(values, i, prediction)),
+                model.usable(i),
+                led_label(f.parameters),
+                f.group or "",
+                i in set(held_out),
+                settings,
+                {key: model.parameters[key].unit for key in settings},
+            )
+        )
     return out
 
 
@@ -391,14 +516,24 @@ def fingerprints_of(model, fit, diagnosis, frame: int, count: int = 4) -> list[F
 
 # -- fits ---------------------------------------------------------------------------------------------------------------
 
+
 def fit_record(fit, frame_names: Sequence[str] = ()) -> dict:
     """An optics.fit.calibrate.Fit as plain data; a mapping of that form is completed and returned.
 
     variables: name, keys, unit, value, sd, frames (names or None), prior, pull = (value - prior mean) / prior sd,
     neutral, plausible, at_bound. `pull` is against the prior's own sd: it says how far the calibration had to leave it.
     """
-    blank = {"parameters": {}, "frames": {}, "variables": [], "correlations": [], "chi2": None, "dof": None,
-             "converged": True, "reason": "", "warnings": []}
+    blank = {
+        "parameters": {},
+        "frames": {},
+        "variables": [],
+        "correlations": [],
+        "chi2": None,
+        "dof": None,
+        "converged": True,
+        "reason": "",
+        "warnings": [],
+    }
     if isinstance(fit, Mapping):
         return {**blank, **fit}
 
@@ -408,14 +543,21 @@ def fit_record(fit, frame_names: Sequence[str] = ()) -> dict:
     variables = []
     for v, value, sd in zip(fit.variables, np.asarray(fit.estimate, float), np.asarray(fit.sd, float)):
         p = v.parameter
-        variables.append({
-            "name": v.name, "keys": list(v.keys), "unit": p.unit, "value": float(value), "sd": float(sd),
-            "frames": None if v.frames is None else [name_of(i) for i in v.frames],
-            "prior": None if v.prior is None else list(v.prior),
-            "pull": None if v.prior is None else (float(value) - v.prior[0]) / v.prior[1],
-            "neutral": p.neutral, "plausible": p.plausible,
-            "at_bound": v.name in getattr(fit, "at_bound", ()),
-        })
+        variables.append(
+            {
+                "name": v.name,
+                "keys": list(v.keys),
+                "unit": p.unit,
+                "value": float(value),
+                "sd": float(sd),
+                "frames": None if v.frames is None else [name_of(i) for i in v.frames],
+                "prior": None if v.prior is None else list(v.prior),
+                "pull": None if v.prior is None else (float(value) - v.prior[0]) / v.prior[1],
+                "neutral": p.neutral,
+                "plausible": p.plausible,
+                "at_bound": v.name in getattr(fit, "at_bound", ()),
+            }
+        )
     pairs = []
     if len(variables) > 1:
         with np.errstate(invalid="ignore"):  # an undetermined variable has an infinite variance
@@ -423,10 +565,15 @@ def fit_record(fit, frame_names: Sequence[str] = ()) -> dict:
         for i, j in zip(*np.nonzero(np.triu(np.abs(r) > CORRELATION_SHOWN, 1))):
             pairs.append([variables[i]["name"], variables[j]["name"], float(r[i, j])])
     return {
-        **blank, "parameters": dict(fit.values.common),
+        **blank,
+        "parameters": dict(fit.values.common),
         "frames": {name_of(i): dict(own) for i, own in sorted(fit.values.frame.items()) if own},
-        "variables": variables, "correlations": sorted(pairs, key=lambda p: -abs(p[2]))[:20],
-        "chi2": float(fit.chi2), "dof": float(fit.dof), "converged": bool(fit.converged), "reason": str(fit.reason),
+        "variables": variables,
+        "correlations": sorted(pairs, key=lambda p: -abs(p[2]))[:20],
+        "chi2": float(fit.chi2),
+        "dof": float(fit.dof),
+        "converged": bool(fit.converged),
+        "reason": str(fit.reason),
         "warnings": list(getattr(fit, "warnings", ()) or ()),
     }
 
@@ -437,8 +584,12 @@ def fit_toml(record: Mapping, name: str = "") -> str:
 
     unit = {key: v["unit"] for v in record["variables"] for key in v["keys"]}
     document = tomlkit.document()
-    document.add(tomlkit.comment(f"Calibrated values{f' of the step {chr(34)}{name}{chr(34)}' if name else ''}: lay them over "
-                                 "the scene with --values FILE."))
+    document.add(
+        tomlkit.comment(
+            f"Calibrated values{f' of the step {chr(34)}{name}{chr(34)}' if name else ''}: lay them over "
+            "the scene with --values FILE."
+        )
+    )
 
     def table(values: Mapping):
         out = tomlkit.table()
@@ -463,7 +614,7 @@ def fit_toml(record: Mapping, name: str = "") -> str:
         own: dict = {}
         for v in record["variables"]:
             for frame in v["frames"] or ():
-                own.setdefault(frame, {}).update({key: v["sd"] for key in v["keys"]})
+                own.setdefault(frame, {}).update(dict.fromkeys(v["keys"], v["sd"]))
         if own:
             document.add("frames_uncertainty", nested(own))
     fit = tomlkit.table()
@@ -482,12 +633,16 @@ def read_fit(file: str | Path) -> dict:
     return {key: data.get(key, {}) for key in ("parameters", "uncertainty", "frames", "frames_uncertainty", "fit")}
 
 
-# -- provenance ---------------------------------------------------------------------------------------------------------
+# -- provenance
+# ---------------------------------------------------------------------------------------------------------
 
-# -- small things -------------------------------------------------------------------------------------------------------
+# -- small things
+# -------------------------------------------------------------------------------------------------------
+
 
 def _choose(frames: Sequence[Shown], comparison: Comparison) -> list[str]:
-    """At most SHOWN_MAX names, worst first, with a held-out one among them where there is one; every sweep of readings."""
+    """At most SHOWN_MAX names, worst first, with a held-out one among them where there is one; every sweep of
+    readings."""
     given = {f.name: f for f in frames}
     if any(f.settings for f in frames):
         return list(given)
@@ -505,9 +660,19 @@ def _level(row: Row | None) -> dict | None:
     if row is None or not row.n:
         return None
     signal = abs(row.signal) or math.nan
-    return {"chi2": row.chi2, "dof": row.dof, "chi2_per_dof": row.chi2_per_dof, "n": row.n, "rms": row.rms,
-            "noise_dn": row.noise, "misfit": row.rms / signal, "noise": row.noise / signal, "l1": row.l1,
-            "psnr": row.psnr, "ssim": row.ssim}
+    return {
+        "chi2": row.chi2,
+        "dof": row.dof,
+        "chi2_per_dof": row.chi2_per_dof,
+        "n": row.n,
+        "rms": row.rms,
+        "noise_dn": row.noise,
+        "misfit": row.rms / signal,
+        "noise": row.noise / signal,
+        "l1": row.l1,
+        "psnr": row.psnr,
+        "ssim": row.ssim,
+    }
 
 
 def _as_dict(record) -> dict | None:
@@ -535,4 +700,3 @@ def _slug(name: str) -> str:
 
 def _now() -> str:
     return datetime.now(timezone.utc).isoformat(timespec="seconds")
-

@@ -3,7 +3,7 @@
 Definition
     alpha(lambda) = absorption exp(absorption_slope (lambda - 540)/100)
 Fingerprint
-    the colour of the picture shifts with the length of the way through the material: printed resins turn yellow.
+    the colour of the image shifts with the length of the way through the material: printed resins turn yellow.
 Validity
     an exponential over the bands; nothing where nothing is absorbed.
 References
@@ -20,7 +20,22 @@ def fade(alpha, wavelengths, clear):
 
 
 effect = Effect(
-    name="coloured absorption", part="clear", stages={"absorption": fade}, per="part",
-    parameters=(Parameter("absorption_slope", "1", 0.0, (-10.0, 10.0), "change of ln(alpha) per 100 nm", neutral=0.0, plausible=0.2,
-                          how="path"),),
-    acts=("channel", "led_distance"), needs="LEDs of two colours at the same side")
+    name="coloured absorption",
+    part="clear",
+    stages={"absorption": fade},
+    per="part",
+    parameters=(
+        Parameter(
+            "absorption_slope",
+            "1",
+            0.0,
+            (-10.0, 10.0),
+            "change of ln(alpha) per 100 nm",
+            neutral=0.0,
+            plausible=0.2,
+            how="path",
+        ),
+    ),
+    acts=("channel", "led_distance"),
+    needs="LEDs of two colours at the same side",
+)

@@ -2,11 +2,11 @@
 
 Definition
     L' = L + rho_c E / pi (A + B g(t)),    g(t) = (sin t (t - sin t cos t) + 2/3 tan t (1 - sin^3 t)) / pi
-with the irradiance E of the face, the same from every direction and in every band, the reflectance rho_c and what the face's roughness
-(A, B) makes of such light at the angle t of sight: the integral of its reflection over the hemisphere.
+with the irradiance E of the face, the same from every direction and in every band, the reflectance rho_c and what the
+face's roughness (A, B) makes of such light at the angle t of sight: the integral of its reflection over the hemisphere.
 Fingerprint
-    an offset that does not follow the LEDs' powers, proportional to the reflectance. Veiling glare and a wrong black level look
-    alike; frames of different power, or one with all LEDs off, separate them.
+    an offset that does not follow the LEDs' powers, proportional to the reflectance. Veiling glare and a wrong black
+    level look alike; frames of different power, or one with all LEDs off, separate them.
 Validity
     diffuse leak, no shadow of its own; a lamp outside a clear skin is not this.
 References
@@ -28,7 +28,21 @@ def leak(geometry, membrane):
 
 
 effect = Effect(
-    name="ambient light", part="membrane", stages={"ambient": leak},
-    parameters=(Parameter("ambient", "1/mm^2", 0.0, (0.0, 10.0), "irradiance E, in the unit of (S2)'s kappa", neutral=0.0,
-                          plausible=2e-4, linear=True),),
-    acts=("intensity", "frame", "channel"), needs="frames of different LED power, or a frame with all LEDs off")
+    name="ambient light",
+    part="membrane",
+    stages={"ambient": leak},
+    parameters=(
+        Parameter(
+            "ambient",
+            "1/mm^2",
+            0.0,
+            (0.0, 10.0),
+            "irradiance E, in the unit of (S2)'s kappa",
+            neutral=0.0,
+            plausible=2e-4,
+            linear=True,
+        ),
+    ),
+    acts=("intensity", "frame", "channel"),
+    needs="frames of different LED power, or a frame with all LEDs off",
+)

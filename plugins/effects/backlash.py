@@ -12,5 +12,10 @@ References
 
 from optics.scene.declare import Effect
 
-effect = Effect(name="servo backlash", part="polarizer_film", parameters=("backlash",), acts=("analyzer.approach",),
-                needs="the same angles from both sides, with the setting `approach`")
+effect = Effect(
+    name="servo backlash",
+    part="polarizer_film",
+    parameters=("backlash",),
+    acts=("analyzer.approach",),
+    needs="the same angles from both sides, with the setting `approach`",
+)

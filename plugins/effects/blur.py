@@ -1,13 +1,12 @@
-"""Lens blur: defocus and diffraction smear the picture.
+"""Lens blur: defocus and diffraction smear the image.
 
 Definition
     I' = I * G,  G a Gaussian of variance V (px^2) along each axis
-computed in the cosine transform, exp(-V (pi k/N)^2 / 2), which mirrors the picture at its borders and is exact for any V, also
-far below a pixel. The strength is the variance and not the width, so that its onset is linear; on sharp edges it is straight only
-up to 1/16 px^2, so the ranking tries a finite step as well.
-Fingerprint
-    acts where the picture is curved: shadow rims, the rim of the contact. LED size blurs shadow rims only, smoothing of the
-    gel only the dent.
+computed in the cosine transform, exp(-V (pi k/N)^2 / 2), which mirrors the image at its borders and is exact for any V,
+also far below a pixel. The strength is the variance and not the width, so that its onset is linear; on sharp edges it
+is straight only up to 1/16 px^2, so the ranking tries a finite step as well. Fingerprint
+    acts where the image is curved: shadow rims, the rim of the contact. LED size blurs shadow rims only, smoothing of
+    the gel only the dent.
 Validity
     the same blur over the whole field; wider tails than a Gaussian are glare or halo.
 References
@@ -30,7 +29,14 @@ def smear(image, camera):
 
 
 effect = Effect(
-    name="lens blur", part="camera", stages={"lens": smear}, onset="both", pictures=True,
-    parameters=(Parameter("blur", "px^2", 0.0, (0.0, 400.0), "variance V of the blur", neutral=0.0, plausible=1.0,
-                          how="image"),),
-    acts=("curvature", "rim"), needs="sharp edges: deep presses with shadows, small indenters")
+    name="lens blur",
+    part="camera",
+    stages={"lens": smear},
+    onset="both",
+    mixes_pixels=True,
+    parameters=(
+        Parameter("blur", "px^2", 0.0, (0.0, 400.0), "variance V of the blur", neutral=0.0, plausible=1.0, how="image"),
+    ),
+    acts=("curvature", "rim"),
+    needs="sharp edges: deep presses with shadows, small indenters",
+)

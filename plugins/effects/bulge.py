@@ -4,8 +4,8 @@ Definition
     z'(x, y) = z(x, y) + b ring(x, y),   integral of ring = displaced volume
 the volume that the indenter displaces comes back as a wide ring around the contact; b = 1 conserves the volume.
 Fingerprint
-    a faint halo of opposite slope around every contact, a few millimetres wide. Smoothing of the dent's skirt changes the inner
-    part of the same region with the other sign.
+    a faint halo of opposite slope around every contact, a few millimetres wide. Smoothing of the dent's skirt changes
+    the inner part of the same region with the other sign.
 Validity
     small strains, gel much wider than the contact; elastic constants enter only through the ring's width.
 References
@@ -24,7 +24,22 @@ def rise(x, y, gel):
 
 
 effect = Effect(
-    name="gel bulge", part="gel", stages={"surface": rise},
-    parameters=(Parameter("bulge", "1", 0.0, (0.0, 2.0), "share b of the displaced volume that comes back", neutral=0.0,
-                          plausible=0.5, how="difference", step=0.8),),
-    acts=("contact_distance", "slope"), needs="deep presses, seen with their surroundings")
+    name="gel bulge",
+    part="gel",
+    stages={"surface": rise},
+    parameters=(
+        Parameter(
+            "bulge",
+            "1",
+            0.0,
+            (0.0, 2.0),
+            "share b of the displaced volume that comes back",
+            neutral=0.0,
+            plausible=0.5,
+            how="difference",
+            step=0.8,
+        ),
+    ),
+    acts=("contact_distance", "slope"),
+    needs="deep presses, seen with their surroundings",
+)

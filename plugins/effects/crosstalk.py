@@ -4,8 +4,8 @@ Definition
     I'_c = (1 - (n - 1) x) I_c + x sum of the other channels      n channels
 from overlapping colour filters and charge that wanders between the pixels of the mosaic.
 Fingerprint
-    colours move towards grey, by the same share everywhere. Strong where LEDs of different colour light different flanks,
-    invisible where all channels agree (white LEDs on a grey membrane).
+    colours move towards grey, by the same share everywhere. Strong where LEDs of different colour light different
+    flanks, invisible where all channels agree (white LEDs on a grey membrane).
 Validity
     one share for all pairs; a full matrix is a matter of the camera's `sensitivity`.
 References
@@ -22,7 +22,21 @@ def mix(image, camera):
 
 
 effect = Effect(
-    name="colour crosstalk", part="camera", stages={"sensor": mix},
-    parameters=(Parameter("crosstalk", "1", 0.0, (0.0, 0.33), "share x from each other channel", neutral=0.0, plausible=0.03,
-                          how="image"),),
-    acts=("channel",), needs="LEDs of different colours, or a coloured membrane")
+    name="colour crosstalk",
+    part="camera",
+    stages={"sensor": mix},
+    parameters=(
+        Parameter(
+            "crosstalk",
+            "1",
+            0.0,
+            (0.0, 0.33),
+            "share x from each other channel",
+            neutral=0.0,
+            plausible=0.03,
+            how="image",
+        ),
+    ),
+    acts=("channel",),
+    needs="LEDs of different colours, or a coloured membrane",
+)

@@ -3,8 +3,9 @@
 Definition
     DN' = DN + offset
 Fingerprint
-    the same number at every pixel, whatever light there is and whatever the exposure. Where it is claimed of an offset that was there
-    from the start, `black_level` of captures.toml is too low by as much. Half a DN looks like glare where there is no such effect.
+    the same number at every pixel, whatever light there is and whatever the exposure. Where it is claimed of an offset
+    that was there from the start, `black_level` of captures.toml is too low by as much. Half a DN looks like glare
+    where there is no such effect.
 Validity
     constant over a session; one number for all channels.
 References
@@ -13,5 +14,10 @@ References
 
 from optics.scene.declare import Effect
 
-effect = Effect(name="dark offset", part="camera", parameters=("offset",), acts=("intensity",),
-                needs="dark frames, or readings at two exposures and two powers")
+effect = Effect(
+    name="dark offset",
+    part="camera",
+    parameters=("offset",),
+    acts=("intensity",),
+    needs="dark frames, or readings at two exposures and two powers",
+)

@@ -20,7 +20,22 @@ def disperse(n, wavelengths, clear):
 
 
 effect = Effect(
-    name="dispersion", part="clear", stages={"index": disperse}, per="part",
-    parameters=(Parameter("dispersion", "1", 0.0, (-0.1, 0.1), "dispersion of the index", neutral=0.0, plausible=0.005,
-                          how="difference"),),
-    acts=("channel", "radius"), needs="pictures in two colours")
+    name="dispersion",
+    part="clear",
+    stages={"index": disperse},
+    per="part",
+    parameters=(
+        Parameter(
+            "dispersion",
+            "1",
+            0.0,
+            (-0.1, 0.1),
+            "dispersion of the index",
+            neutral=0.0,
+            plausible=0.005,
+            how="difference",
+        ),
+    ),
+    acts=("channel", "radius"),
+    needs="images in two colours",
+)

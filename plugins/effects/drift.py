@@ -13,5 +13,11 @@ References
 
 from optics.scene.declare import Effect
 
-effect = Effect(name="gain drift", part="camera", parameters=("gain",), scope="frame", acts=("frame",),
-                needs="repeated frames of the same press, in another order")
+effect = Effect(
+    name="gain drift",
+    part="camera",
+    parameters=("gain",),
+    scope="frame",
+    acts=("frame",),
+    needs="repeated frames of the same press, in another order",
+)

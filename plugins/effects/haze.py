@@ -2,11 +2,10 @@
 
 Definition
     L' = L exp(-h (d_light + d_view)) + h/(4 pi) int_0^d_view kappa(x) exp(-h (s + |x - S|)) ds
-with the scattering coefficient h, isotropic single scattering, kappa of (S2) without the cosine, and the integral along the
-camera's ray inside the gel by Gauss-Legendre quadrature with eight nodes.
-Fingerprint
-    a veil that brightens towards the LEDs and fills shadows, without the structure of the face; grows with the gel's thickness.
-    Veiling glare is flat; ambient light follows the reflectance.
+with the scattering coefficient h, isotropic single scattering, kappa of (S2) without the cosine, and the integral along
+the camera's ray inside the gel by Gauss-Legendre quadrature with eight nodes. Fingerprint
+    a veil that brightens towards the LEDs and fills shadows, without the structure of the face; grows with the gel's
+    thickness. Veiling glare is flat; ambient light follows the reflectance.
 Validity
     thin: h d << 1. Shadows inside the volume are neglected.
 References
@@ -40,12 +39,19 @@ def veil(path, gel):
         point.wavelengths = path.wavelengths
         to_led = path.lamp - point.p
         distance = dr.maximum(dr.norm(to_led), 0.2)  # a ray through the LED itself would diverge
-        total += (path.led.radiance(point, to_led / distance, distance)
-                  * dr.exp(-gel.haze * (path.view - s + distance)) * float(weight / 2))
+        total += (
+            path.led.radiance(point, to_led / distance, distance)
+            * dr.exp(-gel.haze * (path.view - s + distance))
+            * float(weight / 2)
+        )
     return total * path.view * gel.haze * (1 / (4 * dr.pi))
 
 
 effect = Effect(
-    name="gel haze", part="gel", stages={"segment": dim, "volume": veil},
+    name="gel haze",
+    part="gel",
+    stages={"segment": dim, "volume": veil},
     parameters=(Parameter("haze", "1/mm", 0.0, (0.0, 2.0), "scattering coefficient h", neutral=0.0, plausible=0.01),),
-    acts=("led_distance", "gel_path", "shadow"), needs="shadows, and frames with one LED each")
+    acts=("led_distance", "gel_path", "shadow"),
+    needs="shadows, and frames with one LED each",
+)

@@ -13,5 +13,11 @@ References
 
 from optics.scene.declare import Effect
 
-effect = Effect(name="oblique leak", part="polarizer_film", parameters=("leak_oblique",), onset="both", acts=("radius", "intensity"),
-                needs="crossed polarizers in a wide field")
+effect = Effect(
+    name="oblique leak",
+    part="polarizer_film",
+    parameters=("leak_oblique",),
+    onset="both",
+    acts=("radius", "intensity"),
+    needs="crossed polarizers in a wide field",
+)

@@ -1,12 +1,13 @@
 """Marker leak: part of the markers' light is caught in the clear skin and leaves it elsewhere.
 
 Definition
-    L = m <L_markers>                                            from the skin's face to the camera, the same everywhere on it
-with the share m and the mean radiance of the fluorescent markers in the picture. Light that enters the skin under a marker
-beyond the critical angle is guided by total reflection until a flaw of the face lets it out.
-Fingerprint
-    a faint glow in the colour of the markers over the skin, between them; it is there at every angle of the analyser and goes with
-    the ultraviolet lamps. A polarizer's leak has the colours of the background and is gone when that is dark.
+    L = m <L_markers>                                            from the skin's face to the camera, the same everywhere
+    on it
+with the share m and the mean radiance of the fluorescent markers in the image. Light that enters the skin under a
+marker beyond the critical angle is guided by total reflection until a flaw of the face lets it out. Fingerprint
+    a faint glow in the colour of the markers over the skin, between them; it is there at every angle of the analyser
+    and goes with the ultraviolet lamps. A polarizer's leak has the colours of the background and is gone when that is
+    dark.
 Validity
     even over the face: guided light goes to and fro many times. A quick prediction; mi.render leaves it out.
 References
@@ -22,7 +23,23 @@ def shine(glow, interface):
 
 
 effect = Effect(
-    name="marker leak", part="interface", stages={"glow": shine}, per="part", requires=("fluorescent",),
-    parameters=(Parameter("marker_leak", "1", 0.0, (0.0, 1.0), "share m of the markers' mean radiance", neutral=0.0,
-                          plausible=0.005, how="layer"),),
-    acts=("channel", "intensity"), needs="crossed polarizers and a dark background, ultraviolet lamps on and off")
+    name="marker leak",
+    part="interface",
+    stages={"glow": shine},
+    per="part",
+    requires=("fluorescent",),
+    parameters=(
+        Parameter(
+            "marker_leak",
+            "1",
+            0.0,
+            (0.0, 1.0),
+            "share m of the markers' mean radiance",
+            neutral=0.0,
+            plausible=0.005,
+            how="layer",
+        ),
+    ),
+    acts=("channel", "intensity"),
+    needs="crossed polarizers and a dark background, ultraviolet lamps on and off",
+)

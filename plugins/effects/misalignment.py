@@ -3,8 +3,8 @@
 Definition
     axis = scale angle + offset                                  one offset for each polarizer
 Fingerprint
-    Malus' curve is shifted: the dark is not at 90 degrees. Unpolarized light shows only the difference between two polarizers;
-    a third one, or partly polarized light, shows each.
+    Malus' curve is shifted: the dark is not at 90 degrees. Unpolarized light shows only the difference between two
+    polarizers; a third one, or partly polarized light, shows each.
 Validity
     any angle; half a turn is none.
 References
@@ -13,5 +13,11 @@ References
 
 from optics.scene.declare import Effect
 
-effect = Effect(name="polarizer misalignment", part="polarizer_film", parameters=("offset",), per="part",
-                acts=("analyzer.angle",), needs="the analyser on both flanks of Malus' curve")
+effect = Effect(
+    name="polarizer misalignment",
+    part="polarizer_film",
+    parameters=("offset",),
+    per="part",
+    acts=("analyzer.angle",),
+    needs="the analyser on both flanks of Malus' curve",
+)

@@ -13,5 +13,10 @@ References
 
 from optics.scene.declare import Effect
 
-effect = Effect(name="dispersive retardance", part="sheet", parameters=("retard_dispersion",), acts=("channel", "analyzer.angle"),
-                needs="a retardance, in two colours or more")
+effect = Effect(
+    name="dispersive retardance",
+    part="sheet",
+    parameters=("retard_dispersion",),
+    acts=("channel", "analyzer.angle"),
+    needs="a retardance, in two colours or more",
+)

@@ -1,10 +1,11 @@
 """Room light: light of the surroundings comes in through a clear skin.
 
 Definition
-    L = power power_c                                            radiance of a surface before the sensor, the same from every side
+    L = power power_c                                            radiance of a surface before the sensor, the same from
+    every side
 Fingerprint
-    the same in every frame, whichever LED is on; through the clear cells it is seen directly, sharp and uncoloured, and what stands
-    before the sensor shades it.
+    the same in every frame, whichever LED is on; through the clear cells it is seen directly, sharp and uncoloured, and
+    what stands before the sensor shades it.
 Validity
     as even as the scene's `room` is; steady. A scene without one cannot express it.
 References
@@ -13,4 +14,11 @@ References
 
 from optics.scene.declare import Effect
 
-effect = Effect(name="room light", part="room", parameters=("power",), per="part", acts=("intensity", "frame"), needs="a frame with all LEDs off")
+effect = Effect(
+    name="room light",
+    part="room",
+    parameters=("power",),
+    per="part",
+    acts=("intensity", "frame"),
+    needs="a frame with all LEDs off",
+)

@@ -3,7 +3,8 @@
 Definition
     axis = scale angle + offset                                  one scale for each dial
 Fingerprint
-    the period of Malus' curve is not 180 degrees: an error of the angle that grows with it. An offset is the same everywhere.
+    the period of Malus' curve is not 180 degrees: an error of the angle that grows with it. An offset is the same
+    everywhere.
 Validity
     a constant ratio of gears or pulse widths.
 References
@@ -12,6 +13,11 @@ References
 
 from optics.scene.declare import Effect
 
-effect = Effect(name="servo scale", part="polarizer_film", parameters=("scale",), per="part",
-                acts=("analyzer.angle",),
-                needs="angles over half a turn or more")
+effect = Effect(
+    name="servo scale",
+    part="polarizer_film",
+    parameters=("scale",),
+    per="part",
+    acts=("analyzer.angle",),
+    needs="angles over half a turn or more",
+)

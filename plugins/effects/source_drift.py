@@ -12,5 +12,10 @@ References
 
 from optics.scene.declare import Effect
 
-effect = Effect(name="source drift", part="source", parameters=("drift",), acts=("source.time",),
-                needs="the setting `time`, and the same angle early and late")
+effect = Effect(
+    name="source drift",
+    part="source",
+    parameters=("drift",),
+    acts=("source.time",),
+    needs="the setting `time`, and the same angle early and late",
+)

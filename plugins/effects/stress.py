@@ -2,21 +2,24 @@
 
 Definition
     delta(lambda) = 2 pi C (sigma_1 - sigma_2) d/lambda          stress-optic law
-The pattern turns with the sheet's `angle`, but for the skin's. In components (a, b) = 2 pi C d/lambda stress (P_q, P_u), with the
-coefficient C = `stress_optic` (C > 0: the larger tension is the fast axis), the thickness d = `stress_thickness`, and the pattern
-(P_q, P_u) = (s_xx - s_yy, 2 s_xy) per unit of `stress`:
+The pattern turns with the sheet's `angle`, but for the skin's. In components (a, b) = 2 pi C d/lambda stress (P_q,
+P_u), with the coefficient C = `stress_optic` (C > 0: the larger tension is the fast axis), the thickness d =
+`stress_thickness`, and the pattern (P_q, P_u) = (s_xx - s_yy, 2 s_xy) per unit of `stress`:
     even    (1, 0): uniform tension along the sheet's x axis
-    disc    a disc of the diameter `stress_size` pressed along its y axis: s_ij of the two point loads, in units of 2P/(pi D d)
+    disc    a disc of the diameter `stress_size` pressed along its y axis: s_ij of the two point loads, in units of
+            2P/(pi D d)
     bend    a bar along x, bent: (2 y/size, 0)
-    gel     of the skin that the present press deforms (set by the scene), stress in units of its shear modulus, thickness included
+    gel     of the skin that the present press deforms (set by the scene), stress in units of its shear modulus,
+            thickness included
     a file  an image (H, W, 2 or more) in NPY or EXR: P_q and P_u over the square of `stress_size`, row 0 on top
 Fingerprint
-    a pattern of fringes that follows the stress; between crossed polarizers dark where a principal stress is along a polarizer.
-    The second order of a faint one hides; see `retardance`.
+    a pattern of fringes that follows the stress; between crossed polarizers dark where a principal stress is along a
+    polarizer. The second order of a faint one hides; see `retardance`.
 Validity
     linear elasticity in the sheet's plane, stress constant through the thickness (or integrated through it: `gel`).
 References
-    Frocht, Photoelasticity II (1948), 4.19 (disc); Goldstein, Polarized Light, 3rd ed., 24.6; Brewster's law 1 B = 1e-12/Pa.
+    Frocht, Photoelasticity II (1948), 4.19 (disc); Goldstein, Polarized Light, 3rd ed., 24.6; Brewster's law 1 B =
+    1e-12/Pa.
 """
 
 import math
@@ -57,12 +60,34 @@ def disc(x, y, radius):
 
 
 effect = Effect(
-    name="stress birefringence", part="sheet", stages={"layer": strain}, onset="both",
-    parameters=(Parameter("stress", "MPa", 0.0, (-1e3, 1e3), "stress of the pattern", neutral=0.0, plausible=0.2, how="layer"),),
-    shape=(Parameter("stress_optic", "1e-12/Pa", 5.0, (-1e5, 1e5), "stress-optic coefficient C, in Brewster", plausible=0.5,
-                     how="layer"),
-           Parameter("stress_thickness", "mm", 3.0, (1e-6, 100.0), "thickness d", plausible=0.1, how="layer"),
-           Parameter("stress_size", "mm", 20.0, (1e-3, 1000.0), "size of the pattern", plausible=1.0, how="layer"),
-           Parameter("stress_pattern", "-", "even", choices=("even", "disc", "bend", "gel"), doc="even, disc, bend, gel or a file",
-                     files=(".npy", ".exr"))),
-    acts=("analyzer.angle", "sample.angle", "radius"), needs="the sheet at two angles, best behind a quarter-wave plate")
+    name="stress birefringence",
+    part="sheet",
+    stages={"layer": strain},
+    onset="both",
+    parameters=(
+        Parameter("stress", "MPa", 0.0, (-1e3, 1e3), "stress of the pattern", neutral=0.0, plausible=0.2, how="layer"),
+    ),
+    shape=(
+        Parameter(
+            "stress_optic",
+            "1e-12/Pa",
+            5.0,
+            (-1e5, 1e5),
+            "stress-optic coefficient C, in Brewster",
+            plausible=0.5,
+            how="layer",
+        ),
+        Parameter("stress_thickness", "mm", 3.0, (1e-6, 100.0), "thickness d", plausible=0.1, how="layer"),
+        Parameter("stress_size", "mm", 20.0, (1e-3, 1000.0), "size of the pattern", plausible=1.0, how="layer"),
+        Parameter(
+            "stress_pattern",
+            "-",
+            "even",
+            choices=("even", "disc", "bend", "gel"),
+            doc="even, disc, bend, gel or a file",
+            files=(".npy", ".exr"),
+        ),
+    ),
+    acts=("analyzer.angle", "sample.angle", "radius"),
+    needs="the sheet at two angles, best behind a quarter-wave plate",
+)

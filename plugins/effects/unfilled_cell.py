@@ -5,8 +5,8 @@ Definition
 Fingerprint
     one cell with bright and dark edges, as its walls reflect totally; the cells behind it are displaced.
 Validity
-    one cell, and which is sought where the residual is, before u is fitted: `seek` weighs the misfit by the cells that each pixel is
-    seen through, and tries those that come first, the best of them in all frames.
+    one cell, and which is sought where the residual is, before u is fitted: `seek` weighs the misfit by the cells that
+    each pixel is seen through, and tries those that come first, the best of them in all frames.
 References
     Fan, Li, Cong & Zhang, MagicGripper, III.A, prints cells that are all filled.
 """
@@ -15,7 +15,7 @@ import numpy as np
 
 from optics.scene.declare import Effect
 
-TRIED = 12  # cells whose picture is made
+TRIED = 12  # cells whose image is made
 FINALS = 3  # of these, the ones that are weighed in all frames
 RAYS = 16  # per pixel, for what it is seen through
 SEED = 1001
@@ -29,31 +29,44 @@ def seek(model, values, frames):
     name, grid = next((n, p) for n, p in model.scene.parts.items() if p.kind == "cells")
     predictions = model.predict(values, frames)
     sd = [np.sqrt(model.variance(values, i, p)) for i, p in zip(frames, predictions)]
-    residual = [np.where(model.usable(i), model.frames[i].image - p, 0.0) / s for i, p, s in zip(frames, predictions, sd)]
+    residual = [
+        np.where(model.usable(i), model.frames[i].image - p, 0.0) / s for i, p, s in zip(frames, predictions, sd)
+    ]
     excess = np.mean([(r**2).mean(-1) for r in residual], 0)
     model.renderer._apply(model.at(values, frames[0]))
     seen = Transport(model.scene).seen_through(RAYS)
-    seen = seen[:np.prod(grid.counts)].reshape(-1, excess.size)
+    seen = seen[: np.prod(grid.counts)].reshape(-1, excess.size)
     size = np.sqrt((seen**2).sum(1))
     score = seen @ (excess - np.median(excess)).ravel() / np.maximum(size, 0.05 * size.max())
-    # frames of one geometry first: all lights are in one picture
+    # frames of one geometry first: all lights are in one image
     geometry = model.renderer.geometry(model.at(values, frames[0]))
     alike = [k for k, i in enumerate(frames) if model.renderer.geometry(model.at(values, i)) == geometry]
-    # the change is taken between pictures of another seed: the error of the predictions is in the residual, and would look like a change
+    # the change is taken between images of another seed: the error of the predictions is in the residual, and would
+    # look like a change
     plain: dict[int, np.ndarray] = {}
 
     def worth(cell: int, used: list[int]) -> float:
-        """Fall of chi2 that the emptied cell's picture would bring in these frames, at its best strength."""
+        """Fall of chi2 that the emptied cell's image would bring in these frames, at its best strength."""
         trial = Values({**values.common, **at[cell], f"{name}.unfilled": 1.0}, values.frame)
         new = [k for k in used if k not in plain]
         plain.update(zip(new, model.predict(values, [frames[k] for k in new], SEED)))
         changes = [(p - plain[k]) / sd[k] for k, p in zip(used, model.predict(trial, [frames[k] for k in used], SEED))]
-        along, length = (sum(float((c * o).sum()) for c, o in zip(changes, others)) for others in ([residual[k] for k in used], changes))
+        along, length = (
+            sum(float((c * o).sum()) for c, o in zip(changes, others))
+            for others in ([residual[k] for k in used], changes)
+        )
         return along**2 / length if length > 0 and along > 0 else 0.0
 
     tried = [int(cell) for cell in np.argsort(-score)[:TRIED]]
-    at = {cell: dict(zip((f"{name}.unfilled_{axis}" for axis in ("column", "row", "layer")), map(float, np.unravel_index(cell, grid.counts))))
-          for cell in tried}
+    at = {
+        cell: dict(
+            zip(
+                (f"{name}.unfilled_{axis}" for axis in ("column", "row", "layer")),
+                map(float, np.unravel_index(cell, grid.counts)),
+            )
+        )
+        for cell in tried
+    }
     falls = {cell: worth(cell, alike) for cell in tried}
     finals = sorted(tried, key=lambda cell: -falls[cell])[:FINALS]
     if len(alike) < len(frames):
@@ -62,5 +75,13 @@ def seek(model, values, frames):
     return at[best] if falls[best] > 0 else {}
 
 
-effect = Effect(name="unfilled cell", part="cells", parameters=("unfilled",), per="part", onset="secant", seek=seek,
-                acts=("row", "column"), needs="sharp pictures of the grid")
+effect = Effect(
+    name="unfilled cell",
+    part="cells",
+    parameters=("unfilled",),
+    per="part",
+    onset="secant",
+    seek=seek,
+    acts=("row", "column"),
+    needs="sharp images of the grid",
+)

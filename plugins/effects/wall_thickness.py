@@ -12,5 +12,11 @@ References
 
 from optics.scene.declare import Effect
 
-effect = Effect(name="wall thickness", part="cells", parameters=("wall_error",), per="part", acts=("row", "column"),
-                needs="sharp pictures of the grid")
+effect = Effect(
+    name="wall thickness",
+    part="cells",
+    parameters=("wall_error",),
+    per="part",
+    acts=("row", "column"),
+    needs="sharp images of the grid",
+)

@@ -3,8 +3,8 @@
 Definition
     z'(x, y) = z(x, y) + x tan(w_x) + y tan(w_y)
 Fingerprint
-    a smooth gradient across every frame that turns with the side the light comes from. Positions and axes of the LEDs absorb most
-    of it; presses at different places keep a share.
+    a smooth gradient across every frame that turns with the side the light comes from. Positions and axes of the LEDs
+    absorb most of it; presses at different places keep a share.
 Validity
     a plane face; a bent one needs more terms.
 References
@@ -22,9 +22,33 @@ def tilt(x, y, gel):
 
 
 effect = Effect(
-    name="gel wedge", part="gel", stages={"surface": tilt},
-    parameters=(Parameter("wedge_x", "deg", 0.0, (-20.0, 20.0), "tilt w_x along x", neutral=0.0, plausible=0.5,
-                          how="difference", step=0.8),
-                Parameter("wedge_y", "deg", 0.0, (-20.0, 20.0), "tilt w_y along y", neutral=0.0, plausible=0.5,
-                          how="difference", step=0.8)),
-    acts=("row", "column", "led"), needs="frames lit from different sides, one LED each")
+    name="gel wedge",
+    part="gel",
+    stages={"surface": tilt},
+    parameters=(
+        Parameter(
+            "wedge_x",
+            "deg",
+            0.0,
+            (-20.0, 20.0),
+            "tilt w_x along x",
+            neutral=0.0,
+            plausible=0.5,
+            how="difference",
+            step=0.8,
+        ),
+        Parameter(
+            "wedge_y",
+            "deg",
+            0.0,
+            (-20.0, 20.0),
+            "tilt w_y along y",
+            neutral=0.0,
+            plausible=0.5,
+            how="difference",
+            step=0.8,
+        ),
+    ),
+    acts=("row", "column", "led"),
+    needs="frames lit from different sides, one LED each",
+)

@@ -13,5 +13,11 @@ References
 
 from optics.scene.declare import Effect
 
-effect = Effect(name="analyzer wobble", part="polarizer_film", parameters=("wobble_c", "wobble_s"), per="part", acts=("analyzer.angle",),
-                needs="a whole turn of the analyser")
+effect = Effect(
+    name="analyzer wobble",
+    part="polarizer_film",
+    parameters=("wobble_c", "wobble_s"),
+    per="part",
+    acts=("analyzer.angle",),
+    needs="a whole turn of the analyser",
+)

@@ -2,16 +2,15 @@
 
 Definition
     -thickness < z < 0, |x| < width/2, |y| < length/2 at rest; the face at z = -thickness is glued, the others are free.
-A `target` in the scene with distance < 0 is pressed -distance into the face at z = 0. How the body gives way is that of springs
-between the corners of cubes (D3Q14, optics.skin.lattice), between them a cubic spline; the cells of a grid are carried along. Where the
-target touches, it is in optical contact: its surface lies inside the body, by 5 micrometres, so that light that would be
-totally reflected meets it instead.
-Fingerprint
-    the touched cells change from what total reflection shows to the colour of what touches, lit through the walls; around it the
-    walls' lines bend, the wider the deeper.
+A `target` in the scene with distance < 0 is pressed -distance into the face at z = 0. How the body gives way is that of
+springs between the corners of cubes (D3Q14, optics.skin.lattice), between them a cubic spline; the cells of a grid are
+carried along. Where the target touches, it is in optical contact: its surface lies inside the body, by 5 micrometres,
+so that light that would be totally reflected meets it instead. Fingerprint
+    the touched cells change from what total reflection shows to the colour of what touches, lit through the walls;
+    around it the walls' lines bend, the wider the deeper.
 Validity
-    one elastic material without friction, glued to a rigid base; what is printed of two is their mixture (lattice.grid_material). The
-    whole touched area is in contact: no rough gap.
+    one elastic material without friction, glued to a rigid base; what is printed of two is their mixture
+    (lattice.grid_material). The whole touched area is in contact: no rough gap.
 References
     Fan, Li, Cong & Zhang, MagicGripper, supplementary VII-A, eqs. (4)-(17); physics of the contact: III.B and Fig. 4.
 """
@@ -23,8 +22,25 @@ from optics.scene.parameter import Parameter
 PARAMETERS = (
     Parameter("width", "mm", 16.4, (0.1, 1000.0), "size along x", plausible=0.1, how="difference", step=1.0),
     Parameter("length", "mm", 16.4, (0.1, 1000.0), "size along y", plausible=0.1, how="difference", step=1.0),
-    Parameter("thickness", "mm", 5.5, (0.01, 100.0), "from the glued to the touched face", plausible=0.1, how="difference", step=1.0),
-    Parameter("young", "MPa", 0.6, (1e-4, 1e5), "Young's modulus, for forces: shapes do not depend on it", plausible=0.1, how="difference"),
+    Parameter(
+        "thickness",
+        "mm",
+        5.5,
+        (0.01, 100.0),
+        "from the glued to the touched face",
+        plausible=0.1,
+        how="difference",
+        step=1.0,
+    ),
+    Parameter(
+        "young",
+        "MPa",
+        0.6,
+        (1e-4, 1e5),
+        "Young's modulus, for forces: shapes do not depend on it",
+        plausible=0.1,
+        how="difference",
+    ),
     Parameter("poisson", "1", 0.45, (0.0, 0.49), "Poisson's ratio", plausible=0.01, how="difference", step=1.0),
 )
 REACH = 0.005  # mm: how far a target lies inside the body that it touches
@@ -47,7 +63,10 @@ def build():
             self.layers = int(props.get("layers", 7))  # of the lattice
             self.pitch = float(props.get("pitch", 0.1))  # mm, of the mesh of the face
             props["face_normals"] = True
-            counts = [max(int(np.ceil(float(props.get(n, d)) / self.pitch)), 1) for n, d in (("width", 16.4), ("length", 16.4))]
+            counts = [
+                max(int(np.ceil(float(props.get(n, d)) / self.pitch)), 1)
+                for n, d in (("width", 16.4), ("length", 16.4))
+            ]
             self.counts = (*counts, 4 * self.layers)
             faces, number = self.faces()
             mi.Mesh.__init__(self, "block", number, len(faces), props, False, False)
@@ -89,7 +108,8 @@ def build():
         # -- the press ------------------------------------------------------------------------------------------------
 
         def press(self):
-            """The lattice under the present target (optics.skin.lattice.Deformed), or None where no corner is reached; kept."""
+            """The lattice under the present target (optics.skin.lattice.Deformed), or None where no corner is reached;
+            kept."""
             target = self.target
             if target is None or target.number("distance") >= 0:
                 return None
@@ -97,25 +117,32 @@ def build():
             key = tuple(n(p) for p in self.numbers) + tuple(t(p) for p in target.numbers) + (target.stance,)
             if key != self.pressed_by:
                 pitch = n("thickness") / self.layers
-                shape = tuple(int(np.ceil(n(side) / pitch - 1e-9)) + 1 for side in ("width", "length")) + (self.layers + 1,)
+                shape = tuple(int(np.ceil(n(side) / pitch - 1e-9)) + 1 for side in ("width", "length")) + (
+                    self.layers + 1,
+                )
                 skin = lattice.Lattice(shape, pitch, lattice.Material(n("young"), n("poisson"), DENSITY))
                 at = skin.positions[:, :, -1]
                 reached = (target.height(at[..., 0] - t("x"), at[..., 1] - t("y")) < -t("distance")).any()
                 push = lattice.Push(target.height, -t("distance"), (t("x"), t("y")))
                 self.pressed, self.pressed_by = lattice.balance(skin, push) if reached else None, key
                 if reached:
-                    self.splines = [spline_filter(self.pressed.displacement[..., a], 3, mode="nearest") for a in range(3)]
+                    self.splines = [
+                        spline_filter(self.pressed.displacement[..., a], 3, mode="nearest") for a in range(3)
+                    ]
             return self.pressed
 
         def displacement(self, points):
-            """(..., 3) mm by which points of the body at rest (..., 3) move: a cubic spline through the lattice's nodes."""
+            """(..., 3) mm by which points of the body at rest (..., 3) move: a cubic spline through the lattice's
+            nodes."""
             pressed, points = self.press(), np.asarray(points, float)
             if pressed is None:
                 return np.zeros_like(points)
             size = np.array(pressed.lattice.shape)
             at = points / pressed.lattice.pitch + [(size[0] - 1) / 2, (size[1] - 1) / 2, size[2] - 1]
             at = np.moveaxis(np.clip(at, 0, size - 1), -1, 0)
-            return np.stack([map_coordinates(s, at, order=3, mode="nearest", prefilter=False) for s in self.splines], -1)
+            return np.stack(
+                [map_coordinates(s, at, order=3, mode="nearest", prefilter=False) for s in self.splines], -1
+            )
 
         def rebuild(self, params):
             """Vertices for the present parameters and press."""
@@ -124,7 +151,9 @@ def build():
             target = self.target
             if target is not None and target.number("distance") < 0:
                 face = vertices[rest[:, 2] == 0]
-                surface = target.number("distance") + target.height(face[:, 0] - target.number("x"), face[:, 1] - target.number("y"))
+                surface = target.number("distance") + target.height(
+                    face[:, 0] - target.number("x"), face[:, 1] - target.number("y")
+                )
                 gap = np.maximum(surface - face[:, 2], 0.0)
                 near = np.exp(-((gap / (CLING * self.number("thickness") / self.layers)) ** 2))
                 face[:, 2] = surface - gap + near * (gap + REACH)

@@ -6,14 +6,14 @@ Definition
     I_c = exposure gain gain_c sum_b M_cb L_b                    irradiance of channel c; 1 = full scale
     G_c(m) = m + a_c (m^2 - m) + b_c (m^3 - m),  m = G_c^-1(I)   response, inverse of a cubic (S1.1)
     DN = black_level + (saturation - black_level) m + offset
-so that with the default gains, response and offset DN = black_level + (saturation - black_level) exposure radiance: `exposure`
-is full scale per unit of radiance. black_level and saturation are those of [noise] in captures.toml (0 and 255 DN in `optics
-render`). Effects of the stage `lens` act on L_b, `sensor` on I_c, `response` on m.
-f_x comes from the horizontal field of view, f_y = f_x aspect, the principal point (c_x, c_y) is given as an offset from the middle
-of the image, L_b is the radiance in band b, and M the sensitivities of the channels in the bands (identity, or a measured camera
-of the colour-science library by its name). XML may give `fx`, `fy`, `cx`, `cy` (px) in place of the field of view.
-Frame: x right, y down, z forward (OpenCV); the transform `to_world` gives the nominal pose, `x` ... `roll` what departs from it.
-Fingerprint
+so that with the default gains, response and offset DN = black_level + (saturation - black_level) exposure radiance:
+`exposure` is full scale per unit of radiance. black_level and saturation are those of [noise] in captures.toml (0 and
+255 DN in `optics render`). Effects of the stage `lens` act on L_b, `sensor` on I_c, `response` on m. f_x comes from the
+horizontal field of view, f_y = f_x aspect, the principal point (c_x, c_y) is given as an offset from the middle of the
+image, L_b is the radiance in band b, and M the sensitivities of the channels in the bands (identity, or a measured
+camera of the colour-science library by its name). XML may give `fx`, `fy`, `cx`, `cy` (px) in place of the field of
+view. Frame: x right, y down, z forward (OpenCV); the transform `to_world` gives the nominal pose, `x` ... `roll` what
+departs from it. Fingerprint
     principal point and pose shift the image; distortion grows with the third power of the radius; exposure scales all.
 Validity
     central projection; a fisheye needs another part. Monotone response: G'(m) > 0 on [0, 1].
@@ -28,32 +28,125 @@ from optics.scene.mitsuba_parts import Declared
 from optics.scene.parameter import Parameter
 
 PARAMETERS = (
-    Parameter("x_fov", "deg", 40.0, (1.0, 170.0), "horizontal field of view", plausible=0.5, how="difference", step=0.8),
+    Parameter(
+        "x_fov", "deg", 40.0, (1.0, 170.0), "horizontal field of view", plausible=0.5, how="difference", step=0.8
+    ),
     Parameter("aspect", "1", 1.0, (0.5, 2.0), "f_y / f_x", plausible=0.01, how="difference", step=0.8),
-    Parameter("principal_x", "px", 0.0, (-4000.0, 4000.0), "c_x minus half the width", plausible=2.0, how="difference", step=0.2),
-    Parameter("principal_y", "px", 0.0, (-4000.0, 4000.0), "c_y minus half the height", plausible=2.0, how="difference", step=0.2),
-    Parameter("k1", "1", 0.0, (-2.0, 2.0), "radial distortion, r^2", neutral=0.0, plausible=0.02, how="difference", step=0.8),
-    Parameter("k2", "1", 0.0, (-5.0, 5.0), "radial distortion, r^4", neutral=0.0, plausible=0.05, how="difference", step=0.8),
-    Parameter("k3", "1", 0.0, (-20.0, 20.0), "radial distortion, r^6", neutral=0.0, plausible=0.2, how="difference", step=0.8),
-    Parameter("p1", "1", 0.0, (-1.0, 1.0), "tangential distortion", neutral=0.0, plausible=0.005, how="difference", step=0.8),
-    Parameter("p2", "1", 0.0, (-1.0, 1.0), "tangential distortion", neutral=0.0, plausible=0.005, how="difference", step=0.8),
-    Parameter("x", "mm", 0.0, (-100.0, 100.0), "shift from the nominal pose, right", plausible=0.2, how="difference", step=0.2),
-    Parameter("y", "mm", 0.0, (-100.0, 100.0), "shift from the nominal pose, down", plausible=0.2, how="difference", step=0.2),
-    Parameter("z", "mm", 0.0, (-100.0, 100.0), "shift from the nominal pose, forward", plausible=0.2, how="difference", step=0.8),
+    Parameter(
+        "principal_x",
+        "px",
+        0.0,
+        (-4000.0, 4000.0),
+        "c_x minus half the width",
+        plausible=2.0,
+        how="difference",
+        step=0.2,
+    ),
+    Parameter(
+        "principal_y",
+        "px",
+        0.0,
+        (-4000.0, 4000.0),
+        "c_y minus half the height",
+        plausible=2.0,
+        how="difference",
+        step=0.2,
+    ),
+    Parameter(
+        "k1", "1", 0.0, (-2.0, 2.0), "radial distortion, r^2", neutral=0.0, plausible=0.02, how="difference", step=0.8
+    ),
+    Parameter(
+        "k2", "1", 0.0, (-5.0, 5.0), "radial distortion, r^4", neutral=0.0, plausible=0.05, how="difference", step=0.8
+    ),
+    Parameter(
+        "k3", "1", 0.0, (-20.0, 20.0), "radial distortion, r^6", neutral=0.0, plausible=0.2, how="difference", step=0.8
+    ),
+    Parameter(
+        "p1", "1", 0.0, (-1.0, 1.0), "tangential distortion", neutral=0.0, plausible=0.005, how="difference", step=0.8
+    ),
+    Parameter(
+        "p2", "1", 0.0, (-1.0, 1.0), "tangential distortion", neutral=0.0, plausible=0.005, how="difference", step=0.8
+    ),
+    Parameter(
+        "x", "mm", 0.0, (-100.0, 100.0), "shift from the nominal pose, right", plausible=0.2, how="difference", step=0.2
+    ),
+    Parameter(
+        "y", "mm", 0.0, (-100.0, 100.0), "shift from the nominal pose, down", plausible=0.2, how="difference", step=0.2
+    ),
+    Parameter(
+        "z",
+        "mm",
+        0.0,
+        (-100.0, 100.0),
+        "shift from the nominal pose, forward",
+        plausible=0.2,
+        how="difference",
+        step=0.8,
+    ),
     Parameter("pan", "deg", 0.0, (-80.0, 80.0), "turn about the y axis", plausible=0.5, how="difference", step=0.2),
     Parameter("tilt", "deg", 0.0, (-80.0, 80.0), "turn about the x axis", plausible=0.5, how="difference", step=0.2),
     Parameter("roll", "deg", 0.0, (-180.0, 180.0), "turn about the z axis", plausible=0.5, how="difference", step=0.8),
     Parameter("exposure", "1", 1.0, (0.0, 1e6), "full scale per unit of radiance", plausible=0.1, how="image"),
-    Parameter("gain", "1", 1.0, (0.0, 100.0), "gain of a frame relative to the others", neutral=1.0, plausible=0.02,
-              how="image"),
-    *(Parameter(f"gain_{c}", "1", 1.0, (0.0, 100.0), f"gain of channel {c} in a frame, times `gain`", neutral=1.0,
-                plausible=0.02, how="image") for c in "rgb"),
-    Parameter("offset", "DN", 0.0, (-1e4, 1e4), "added to every pixel after the response", neutral=0.0, plausible=1.0,
-              how="image", linear=True),
-    *(Parameter(f"response2_{c}", "1", 0.0, (-0.9, 0.9), f"a_c: quadratic term of the inverse response, channel {c}",
-                neutral=0.0, plausible=0.1, how="image") for c in "rgb"),
-    *(Parameter(f"response3_{c}", "1", 0.0, (-0.45, 0.45), f"b_c: cubic term of the inverse response, channel {c}",
-                neutral=0.0, plausible=0.1, how="image") for c in "rgb"),
+    Parameter(
+        "gain",
+        "1",
+        1.0,
+        (0.0, 100.0),
+        "gain of a frame relative to the others",
+        neutral=1.0,
+        plausible=0.02,
+        how="image",
+    ),
+    *(
+        Parameter(
+            f"gain_{c}",
+            "1",
+            1.0,
+            (0.0, 100.0),
+            f"gain of channel {c} in a frame, times `gain`",
+            neutral=1.0,
+            plausible=0.02,
+            how="image",
+        )
+        for c in "rgb"
+    ),
+    Parameter(
+        "offset",
+        "DN",
+        0.0,
+        (-1e4, 1e4),
+        "added to every pixel after the response",
+        neutral=0.0,
+        plausible=1.0,
+        how="image",
+        linear=True,
+    ),
+    *(
+        Parameter(
+            f"response2_{c}",
+            "1",
+            0.0,
+            (-0.9, 0.9),
+            f"a_c: quadratic term of the inverse response, channel {c}",
+            neutral=0.0,
+            plausible=0.1,
+            how="image",
+        )
+        for c in "rgb"
+    ),
+    *(
+        Parameter(
+            f"response3_{c}",
+            "1",
+            0.0,
+            (-0.45, 0.45),
+            f"b_c: cubic term of the inverse response, channel {c}",
+            neutral=0.0,
+            plausible=0.1,
+            how="image",
+        )
+        for c in "rgb"
+    ),
 )
 
 
@@ -94,7 +187,8 @@ def build():
             return fx, fx * self.aspect
 
         def undistort(self, xd, yd):
-            """Undistorted normalised coordinates, by fixed-point iteration (10 steps: below 1e-7 for |k1| r^2 < 0.1)."""
+            """Undistorted normalised coordinates, by fixed-point iteration (10 steps: below 1e-7 for |k1| r^2 <
+            0.1)."""
             x, y = xd, yd
             for _ in range(10):
                 r2 = x * x + y * y
@@ -121,7 +215,9 @@ def build():
             width, height = self.resolution
             x, y = self.undistort((u - width / 2 - self.principal_x) / fx, (v - height / 2 - self.principal_y) / fy)
             origin = self.columns[3] + self.to_world(mi.Vector3f(self.x, self.y, self.z))
-            return mi.Point3f(origin) + dr.zeros(mi.Point3f, dr.width(u)), self.turned(dr.normalize(mi.Vector3f(x, y, 1)))
+            return mi.Point3f(origin) + dr.zeros(mi.Point3f, dr.width(u)), self.turned(
+                dr.normalize(mi.Vector3f(x, y, 1))
+            )
 
         def sample_ray(self, time, sample1, sample2, sample3, active=True):
             wavelengths, weight = self.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), sample1, active)

@@ -1,18 +1,18 @@
 """Carried sheet: a thin sheet in the soft skin, or its inner face, that goes along when the face is pressed.
 
 Definition
-    (x, y, -depth) -> (x + u_x, y + u_y, -depth - u_z)       u: displacement of an incompressible half-space at that depth
+    (x, y, -depth) -> (x + u_x, y + u_y, -depth - u_z)       u: displacement of an incompressible half-space at that
+    depth
                                                              under the gel's dent D (optics.skin.halfspace)
-A rectangle `width` x `length` around the world's z axis, `depth` below the untouched face at z = 0; it lies flat while the gel is
-not pressed. Its texture coordinates are those of the place at rest, u = x/width + 1/2, v = y/length + 1/2: the first direction
-runs along x at rest and turns with the sheet. Its normals look at the camera, towards -z. A layer on it (a polarizer film, a
-stressed plate) moves, tilts and turns with it.
-Fingerprint
+A rectangle `width` x `length` around the world's z axis, `depth` below the untouched face at z = 0; it lies flat while
+the gel is not pressed. Its texture coordinates are those of the place at rest, u = x/width + 1/2, v = y/length + 1/2:
+the first direction runs along x at rest and turns with the sheet. Its normals look at the camera, towards -z. A layer
+on it (a polarizer film, a stressed plate) moves, tilts and turns with it. Fingerprint
     a press tilts and shifts the sheet over about its depth around the contact; without a press nothing.
 Validity
-    dents shallower than `depth`, small strains; effects of the face's shape other than the press are not carried. The sheet
-    stretches with the skin and does not stiffen it: a film resists. On the mesh of `columns` x `rows` vertices (XML integers,
-    121 x 109) heights are linear and the first direction is constant in each triangle.
+    dents shallower than `depth`, small strains; effects of the face's shape other than the press are not carried. The
+    sheet stretches with the skin and does not stiffen it: a film resists. On the mesh of `columns` x `rows` vertices
+    (XML integers, 121 x 109) heights are linear and the first direction is constant in each triangle.
 References
     Vi2TaP (RA-L 2025), II.B: a film embedded in a silicone skin of 5 mm. Johnson, Contact Mechanics (1985), 3.2.
 """
@@ -24,8 +24,16 @@ from optics.scene.parameter import Parameter
 PARAMETERS = (
     Parameter("width", "mm", 48.0, (0.1, 1000.0), "size along x", plausible=0.1, how="difference", step=1.0),
     Parameter("length", "mm", 43.0, (0.1, 1000.0), "size along y", plausible=0.1, how="difference", step=1.0),
-    Parameter("depth", "mm", 2.5, (0.0, 100.0), "below the untouched face; at most the gel's thickness", plausible=0.1,
-              how="difference", step=1.0),
+    Parameter(
+        "depth",
+        "mm",
+        2.5,
+        (0.0, 100.0),
+        "below the untouched face; at most the gel's thickness",
+        plausible=0.1,
+        how="difference",
+        step=1.0,
+    ),
 )
 
 

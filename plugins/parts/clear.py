@@ -3,15 +3,17 @@
 Definition
     n1 sin(theta1) = n2 sin(theta2)                              Snell (21-23), n1 and n2 of the two materials that meet
     s'' = s - 2 g (g.s)                                          reflection (24), of all light beyond asin(n2/n1)
-    R, T by Fresnel's formulae                                   with polarization, in place of the free factors mu', mu'' of (25, 26)
+    R, T by Fresnel's formulae                                   with polarization, in place of the free factors mu',
+    mu'' of (25, 26)
     I exp(-alpha d)                                              Beer-Lambert along every stretch d inside (27-29)
-`index` and `absorption` hold at 540 nm; how they change with the wavelength are effects (`dispersion`, `coloured absorption`).
-The surface's normals point out of the body. `outside` (XML) names the clear material around it, as the wall around a cell's
-filling; without it that is air.
-Fingerprint
-    walls show as bright and dark lines, totally reflecting where they are met at grazing incidence; absorption darkens long ways.
+`index` and `absorption` hold at 540 nm; how they change with the wavelength are effects (`dispersion`, `coloured
+absorption`). The surface's normals point out of the body. `outside` (XML) names the clear material around it, as the
+wall around a cell's filling; without it that is air. Fingerprint
+    walls show as bright and dark lines, totally reflecting where they are met at grazing incidence; absorption darkens
+    long ways.
 Validity
-    thicker than the coherence length of an LED's light (some 10 um): no interference. Faces are smooth but for `rough walls`.
+    thicker than the coherence length of an LED's light (some 10 um): no interference. Faces are smooth but for `rough
+    walls`.
 References
     Fan, Li, Cong & Zhang, MagicGripper, supplementary VII-A, eqs. (18)-(29); Born & Wolf, Principles of Optics, 1.5.
 """
@@ -22,8 +24,16 @@ from optics.scene.surfaces import passing
 
 PARAMETERS = (
     Parameter("index", "1", 1.5, (1.0, 2.5), "refractive index n at 540 nm", plausible=0.01, how="difference"),
-    Parameter("absorption", "1/mm", 0.0, (0.0, 10.0), "absorption coefficient alpha at 540 nm", neutral=0.0, plausible=0.01,
-              how="path"),
+    Parameter(
+        "absorption",
+        "1/mm",
+        0.0,
+        (0.0, 10.0),
+        "absorption coefficient alpha at 540 nm",
+        neutral=0.0,
+        plausible=0.01,
+        how="path",
+    ),
 )
 
 
@@ -44,8 +54,10 @@ def build():
             self.outside = str(props.get("outside", ""))
             super().__init__(props)
             sides = mi.BSDFFlags.FrontSide | mi.BSDFFlags.BackSide
-            self.m_components = [mi.BSDFFlags.DeltaReflection | sides,
-                                 mi.BSDFFlags.DeltaTransmission | mi.BSDFFlags.NonSymmetric | sides]
+            self.m_components = [
+                mi.BSDFFlags.DeltaReflection | sides,
+                mi.BSDFFlags.DeltaTransmission | mi.BSDFFlags.NonSymmetric | sides,
+            ]
             self.m_flags = self.m_components[0] | self.m_components[1]
 
         def takes(self, name):
@@ -64,7 +76,9 @@ def build():
         def sample(self, ctx, si, sample1, sample2, active=True):
             cos = mi.Frame3f.cos_theta(si.wi)
             front = cos >= 0
-            bands = mi.UnpolarizedSpectrum(si.wavelengths) if mi.is_spectral else mi.UnpolarizedSpectrum(self.band or 540.0)
+            bands = (
+                mi.UnpolarizedSpectrum(si.wavelengths) if mi.is_spectral else mi.UnpolarizedSpectrum(self.band or 540.0)
+            )
             around = self.around
             # a ray has one direction for all bands: that of the first
             n = self.refractive(bands)[0] / (around.refractive(bands)[0] if around is not None else 1.0)
@@ -76,12 +90,17 @@ def build():
             reflected = sample1 < chance
             back = dr.select(front, 1.0, -1.0)
             bs = dr.zeros(mi.BSDFSample3f)
-            bs.wo = dr.select(reflected, mi.Vector3f(-si.wi.x, -si.wi.y, si.wi.z),
-                              mi.Vector3f(-si.wi.x / n, -si.wi.y / n, -back * cos2))
+            bs.wo = dr.select(
+                reflected,
+                mi.Vector3f(-si.wi.x, -si.wi.y, si.wi.z),
+                mi.Vector3f(-si.wi.x / n, -si.wi.y / n, -back * cos2),
+            )
             bs.eta = dr.select(reflected, 1.0, n)
             bs.pdf = dr.select(reflected, chance, 1 - chance)
             bs.sampled_component = dr.select(reflected, mi.UInt32(0), mi.UInt32(1))
-            bs.sampled_type = dr.select(reflected, mi.UInt32(+mi.BSDFFlags.DeltaReflection), mi.UInt32(+mi.BSDFFlags.DeltaTransmission))
+            bs.sampled_type = dr.select(
+                reflected, mi.UInt32(+mi.BSDFFlags.DeltaReflection), mi.UInt32(+mi.BSDFFlags.DeltaTransmission)
+            )
             # along the stretch that the ray has come, towards the camera: it lies outside where the front was met
             alpha = dr.select(front, around.fading(bands) if around is not None else 0.0, self.fading(bands))
             weight = dr.exp(-alpha * si.t) / bs.pdf
@@ -89,9 +108,17 @@ def build():
             if not mi.is_polarized:
                 value = mi.Spectrum(weight * dr.select(reflected, share, 1 - share))
             else:
-                value = self.turned(ctx, si.wi, bs.wo, dr.select(
-                    reflected, fresnel_reflection(dr.minimum(dr.abs(cos), 1.0), n).mitsuba(),
-                    diattenuator(1.0, 0.0, 1 - r_s, 1 - r_p).mitsuba()) * mi.mueller.absorber(weight))
+                value = self.turned(
+                    ctx,
+                    si.wi,
+                    bs.wo,
+                    dr.select(
+                        reflected,
+                        fresnel_reflection(dr.minimum(dr.abs(cos), 1.0), n).mitsuba(),
+                        diattenuator(1.0, 0.0, 1 - r_s, 1 - r_p).mitsuba(),
+                    )
+                    * mi.mueller.absorber(weight),
+                )
             return bs, dr.select(active & (bs.pdf > 0), value, 0.0)
 
         def turned(self, ctx, wi, wo, matrix):

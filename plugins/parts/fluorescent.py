@@ -4,16 +4,19 @@ Definition
     E_abs = int kappa cos(theta) w(l) a(l) l dl                  absorbed light of an LED, as a number of photons
     L(lambda) = yield E_abs f(lambda)/(pi lambda)                radiance of the fluorescence, Lambertian, unpolarized
     f_r = rho/pi                                                 and what is reflected
-with kappa and the spectrum w of the LED (S2), the absorptance a (a Gaussian of peak `absorptance` at `absorption_peak`), the quantum
-`yield`, and the emission's photon spectrum f (a Gaussian of unit area at `emission_peak`). Both w and a are Gaussians, whose
-product has a closed form: with their widths s1, s2, S^2 = s1^2 + s2^2 and the peaks l1, l2
+with kappa and the spectrum w of the LED (S2), the absorptance a (a Gaussian of peak `absorptance` at
+`absorption_peak`), the quantum `yield`, and the emission's photon spectrum f (a Gaussian of unit area at
+`emission_peak`). Both w and a are Gaussians, whose product has a closed form: with their widths s1, s2, S^2 = s1^2 +
+s2^2 and the peaks l1, l2
     int w a l dl = absorptance sqrt(2 pi) s1 s2/S exp(-(l1 - l2)^2/(2 S^2)) (l1 s2^2 + l2 s1^2)/S^2
 Fingerprint
-    markers shine in the colour of the emission, as bright as the ultraviolet at their place, at every angle of an analyser.
+    markers shine in the colour of the emission, as bright as the ultraviolet at their place, at every angle of an
+    analyser.
 Validity
     LEDs of a known wavelength (a white LED excites nothing); opaque markers: no light passes, none is absorbed twice.
 References
-    Vi2TaP (RA-L 2025), II.B: Silc Pig pigment under UVC LEDs; Lakowicz, Principles of Fluorescence Spectroscopy, 3rd ed., ch. 1.
+    Vi2TaP (RA-L 2025), II.B: Silc Pig pigment under UVC LEDs; Lakowicz, Principles of Fluorescence Spectroscopy, 3rd
+    ed., ch. 1.
 """
 
 import math
@@ -24,13 +27,19 @@ from optics.scene.surfaces import matt
 
 PARAMETERS = (
     Parameter("yield", "1", 0.5, (0.0, 1.0), "photons out per photon absorbed", plausible=0.1, linear=True),
-    Parameter("absorptance", "1", 0.9, (0.0, 1.0), "share of the light absorbed at the peak", plausible=0.1, linear=True),
+    Parameter(
+        "absorptance", "1", 0.9, (0.0, 1.0), "share of the light absorbed at the peak", plausible=0.1, linear=True
+    ),
     Parameter("absorption_peak", "nm", 300.0, (100.0, 1000.0), "wavelength absorbed best", plausible=10.0),
     Parameter("absorption_fwhm", "nm", 120.0, (1.0, 1000.0), "full width at half maximum", plausible=10.0),
     Parameter("emission_peak", "nm", 525.0, (200.0, 2000.0), "wavelength emitted most", plausible=5.0),
     Parameter("emission_fwhm", "nm", 70.0, (1.0, 1000.0), "full width at half maximum", plausible=5.0),
-    *(Parameter(f"rho_{c}", "1", 0.3, (0.0, 10.0), f"reflectance in the {word} band ({colour})", plausible=0.1, linear=True)
-      for c, word, colour in (("r", "first", "red"), ("g", "second", "green"), ("b", "third", "blue"))),
+    *(
+        Parameter(
+            f"rho_{c}", "1", 0.3, (0.0, 10.0), f"reflectance in the {word} band ({colour})", plausible=0.1, linear=True
+        )
+        for c, word, colour in (("r", "first", "red"), ("g", "second", "green"), ("b", "third", "blue"))
+    ),
 )
 WIDTH = 2 * math.sqrt(2 * math.log(2))  # fwhm over standard deviation
 
@@ -47,11 +56,20 @@ def build():
             s1, s2 = led.fwhm / WIDTH, self.absorption_fwhm / WIDTH
             square = dr.square(s1) + dr.square(s2)
             middle = (led.wavelength * dr.square(s2) + self.absorption_peak * dr.square(s1)) / square
-            overlap = self.absorptance * math.sqrt(2 * math.pi) * s1 * s2 / dr.sqrt(square) * dr.exp(
-                -dr.square(led.wavelength - self.absorption_peak) / (2 * square)) * middle
+            overlap = (
+                self.absorptance
+                * math.sqrt(2 * math.pi)
+                * s1
+                * s2
+                / dr.sqrt(square)
+                * dr.exp(-dr.square(led.wavelength - self.absorption_peak) / (2 * square))
+                * middle
+            )
             cos = dr.maximum(dr.dot(si.sh_frame.n, to_led), 0.0)
             absorbed = dr.select(led.wavelength > 0, led.kappa(si, to_led, distance) * cos * overlap, 0.0)
-            bands = mi.UnpolarizedSpectrum(si.wavelengths) if mi.is_spectral else mi.UnpolarizedSpectrum(self.band or 540.0)
+            bands = (
+                mi.UnpolarizedSpectrum(si.wavelengths) if mi.is_spectral else mi.UnpolarizedSpectrum(self.band or 540.0)
+            )
             s = self.emission_fwhm / WIDTH
             photons = dr.exp(-dr.square((bands - self.emission_peak) / s) / 2) / (math.sqrt(2 * math.pi) * s)
             seen = mi.Frame3f.cos_theta(si.wi) > 0

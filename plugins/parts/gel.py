@@ -5,14 +5,13 @@ Definition
     D0 = clip(press_depth - h, 0, thickness)                   h(x, y): height of the indenter over its lowest point
     D <- max(D0, G_sd * D), from D = D0, sd = smoothing, smoothing/2, smoothing/4, smoothing/8                  (S1.6)
     D <- G_sd * D once more, sd^2 = (smoothing/16)^2 + map_pitch^2                        without restoring the contact
-with G_sd * D the blur by a Gaussian of that standard deviation (mm); the maximum puts the skin back onto the indenter after each
-blur. Steep walls of h are cut to a slope, and the rim of D0 is rounded, within about a node of the map (optics.skin.contact).
-The gel fills -thickness < z < 0; the camera stands at z < -thickness. The face is a triangle mesh on a graded grid that
-is fine around the contact and moves with it, so that images vary smoothly with the press.
-With `skirt` > 0 the skin beside the contact falls off as exp(-distance / skirt) before the smoothing: in place of D0 stands the
-max over touched points p of D0(p) exp(-|x - p| / skirt).
-Indenters: sphere (`indenter_size` = radius), cylinder lying on its side (radius), cube face down (edge), or a mesh file
-(STL, OBJ, PLY; `indenter_size` = scale).
+with G_sd * D the blur by a Gaussian of that standard deviation (mm); the maximum puts the skin back onto the indenter
+after each blur. Steep walls of h are cut to a slope, and the rim of D0 is rounded, within about a node of the map
+(optics.skin.contact). The gel fills -thickness < z < 0; the camera stands at z < -thickness. The face is a triangle
+mesh on a graded grid that is fine around the contact and moves with it, so that images vary smoothly with the press.
+With `skirt` > 0 the skin beside the contact falls off as exp(-distance / skirt) before the smoothing: in place of D0
+stands the max over touched points p of D0(p) exp(-|x - p| / skirt). Indenters: sphere (`indenter_size` = radius),
+cylinder lying on its side (radius), cube face down (edge), or a mesh file (STL, OBJ, PLY; `indenter_size` = scale).
 Fingerprint
     position and depth of the press move the dent; `smoothing` widens its skirt, `skirt` gives it a long tail.
 Validity
@@ -28,24 +27,78 @@ from optics.scene.parameter import Parameter
 PARAMETERS = (
     Parameter("width", "mm", 20.0, (0.1, 1000.0), "size along x", plausible=0.1, how="difference"),
     Parameter("length", "mm", 16.0, (0.1, 1000.0), "size along y", plausible=0.1, how="difference"),
-    Parameter("thickness", "mm", 4.0, (0.01, 100.0), "from the window to the coated face", plausible=0.1, how="difference"),
-    Parameter("press_x", "mm", 0.0, (-500.0, 500.0), "where the indenter's axis meets the face, right", plausible=0.1,
-              how="difference"),
-    Parameter("press_y", "mm", 0.0, (-500.0, 500.0), "where the indenter's axis meets the face, down", plausible=0.1,
-              how="difference"),
-    Parameter("press_depth", "mm", 0.0, (0.0, 50.0), "how far the indenter's lowest point is below the face",
-              plausible=0.05, how="difference", step=0.4),
+    Parameter(
+        "thickness", "mm", 4.0, (0.01, 100.0), "from the window to the coated face", plausible=0.1, how="difference"
+    ),
+    Parameter(
+        "press_x",
+        "mm",
+        0.0,
+        (-500.0, 500.0),
+        "where the indenter's axis meets the face, right",
+        plausible=0.1,
+        how="difference",
+    ),
+    Parameter(
+        "press_y",
+        "mm",
+        0.0,
+        (-500.0, 500.0),
+        "where the indenter's axis meets the face, down",
+        plausible=0.1,
+        how="difference",
+    ),
+    Parameter(
+        "press_depth",
+        "mm",
+        0.0,
+        (0.0, 50.0),
+        "how far the indenter's lowest point is below the face",
+        plausible=0.05,
+        how="difference",
+        step=0.4,
+    ),
     Parameter("press_rx", "deg", 0.0, (-180.0, 180.0), "turn of the indenter about x", plausible=1.0, how="difference"),
     Parameter("press_ry", "deg", 0.0, (-180.0, 180.0), "turn of the indenter about y", plausible=1.0, how="difference"),
     Parameter("press_rz", "deg", 0.0, (-180.0, 180.0), "turn of the indenter about z", plausible=1.0, how="difference"),
-    Parameter("indenter", "-", "sphere", choices=("sphere", "cylinder", "cube"), doc="sphere, cylinder, cube or a mesh file",
-              files=(".stl", ".obj", ".ply")),
-    Parameter("indenter_size", "mm", 1.5, (1e-3, 1000.0), "radius, radius, edge, or scale of the mesh", plausible=0.02,
-              how="difference", step=0.8),
-    Parameter("smoothing", "mm", 0.25, (0.01, 5.0), "standard deviation of the widest kernel of S1.6", plausible=0.05,
-              how="difference", step=0.4),
-    Parameter("skirt", "mm", 0.0, (0.0, 5.0), "length over which the skin beside the contact falls to 1/e; 0: a Gaussian "
-              "skirt, by smoothing alone", neutral=0.0, plausible=0.3, how="difference"),
+    Parameter(
+        "indenter",
+        "-",
+        "sphere",
+        choices=("sphere", "cylinder", "cube"),
+        doc="sphere, cylinder, cube or a mesh file",
+        files=(".stl", ".obj", ".ply"),
+    ),
+    Parameter(
+        "indenter_size",
+        "mm",
+        1.5,
+        (1e-3, 1000.0),
+        "radius, radius, edge, or scale of the mesh",
+        plausible=0.02,
+        how="difference",
+        step=0.8,
+    ),
+    Parameter(
+        "smoothing",
+        "mm",
+        0.25,
+        (0.01, 5.0),
+        "standard deviation of the widest kernel of S1.6",
+        plausible=0.05,
+        how="difference",
+        step=0.4,
+    ),
+    Parameter(
+        "skirt",
+        "mm",
+        0.0,
+        (0.0, 5.0),
+        "length over which the skin beside the contact falls to 1/e; 0: a Gaussian skirt, by smoothing alone",
+        neutral=0.0,
+        plausible=0.3,
+        how="difference",
+    ),
 )
 
 
@@ -58,8 +111,18 @@ def build():
 
     class Gel(Declared.on_mesh()):
         kind = "gel"
-        pressing = ("press_x", "press_y", "press_depth", "press_rx", "press_ry", "press_rz", "indenter", "indenter_size",
-                    "smoothing", "skirt")  # what does nothing while press_depth is 0
+        pressing = (
+            "press_x",
+            "press_y",
+            "press_depth",
+            "press_rx",
+            "press_ry",
+            "press_rz",
+            "indenter",
+            "indenter_size",
+            "smoothing",
+            "skirt",
+        )  # what does nothing while press_depth is 0
 
         def __init__(self, props):
             self.pitch = float(props.get("pitch", 0.06))  # mm, of the fine part of the mesh
@@ -80,13 +143,18 @@ def build():
         def press(self):
             """Displacement and contact maps on the indenter's own grid (optics.skin.contact)."""
             n = self.number
-            profile = contact.indenter_profile(self.indenter, n("indenter_size"),
-                                               (n("press_rx"), n("press_ry"), n("press_rz")), self.extent, self.map_pitch)
-            return contact.displacement(profile, n("press_depth"), n("thickness"), n("smoothing"),
-                                        skirt=n("skirt"))
+            profile = contact.indenter_profile(
+                self.indenter,
+                n("indenter_size"),
+                (n("press_rx"), n("press_ry"), n("press_rz")),
+                self.extent,
+                self.map_pitch,
+            )
+            return contact.displacement(profile, n("press_depth"), n("thickness"), n("smoothing"), skirt=n("skirt"))
 
         def heights(self, x, y):
-            """z of the coated face (mm) at x (columns,) and y (rows,), mm, with every `surface` effect: (rows, columns)."""
+            """z of the coated face (mm) at x (columns,) and y (rows,), mm, with every `surface` effect: (rows,
+            columns)."""
             n = self.number
             self.map, self.touch = self.press()
             x, y = np.asarray(x, float)[None, :], np.asarray(y, float)[:, None]
@@ -99,8 +167,10 @@ def build():
             """Coordinates of the grid's columns and rows, mm."""
             n = self.number
             half = (n("width") / 2, n("length") / 2)
-            return tuple(contact.graded_axis(-h, h, n(press), min(self.extent, h), self.pitch, count)
-                         for h, press, count in zip(half, ("press_x", "press_y"), (self.columns, self.rows)))
+            return tuple(
+                contact.graded_axis(-h, h, n(press), min(self.extent, h), self.pitch, count)
+                for h, press, count in zip(half, ("press_x", "press_y"), (self.columns, self.rows))
+            )
 
         def rebuild(self, params):
             """Vertices of the face for the present parameters."""
@@ -116,8 +186,10 @@ def build():
 
             values, pitch = self.touch.values, self.touch.pitch
             middle = (len(values) - 1) / 2
-            at = [(np.asarray(y) - self.number("press_y")) / pitch + middle,
-                  (np.asarray(x) - self.number("press_x")) / pitch + middle]
+            at = [
+                (np.asarray(y) - self.number("press_y")) / pitch + middle,
+                (np.asarray(x) - self.number("press_x")) / pitch + middle,
+            ]
             return map_coordinates(values, at, order=1, mode="constant")
 
         # -- the way of light in the gel ------------------------------------------------------------------------------
@@ -137,18 +209,21 @@ def build():
     def chord_corrected(z, x, y):
         """Vertex heights whose linear interpolation has the surface's mean: z - (h_x^2 z_xx + h_y^2 z_yy)/12.
 
-        A mesh with its vertices on a dent lies inside the dent, by h^2/12 of its curvature on average; uncorrected, cast
-        shadows come out shorter, by 0.01 px at a pitch of 0.06 mm, which a calibration on many frames notices.
-        """
+        A mesh with its vertices on a dent lies inside the dent, by h^2/12 of its curvature on average; uncorrected,
+        cast shadows come out shorter, by 0.01 px at a pitch of 0.06 mm, which a calibration on many frames notices."""
         out = z.copy()
         hx, hy = np.diff(x), np.diff(y)
-        out[:, 1:-1] -= (np.diff(z, axis=1)[:, 1:] / hx[1:] - np.diff(z, axis=1)[:, :-1] / hx[:-1]) * (hx[1:] + hx[:-1]) / 24
+        out[:, 1:-1] -= (
+            (np.diff(z, axis=1)[:, 1:] / hx[1:] - np.diff(z, axis=1)[:, :-1] / hx[:-1]) * (hx[1:] + hx[:-1]) / 24
+        )
         out[1:-1] -= (np.diff(z, axis=0)[1:] / hy[1:, None] - np.diff(z, axis=0)[:-1] / hy[:-1, None]) * (
-            (hy[1:] + hy[:-1]) / 24)[:, None]
+            (hy[1:] + hy[:-1]) / 24
+        )[:, None]
         return out
 
     class Path:
-        """What a `segment` or `volume` function sees: lit point, camera, lamp, LED and the lengths inside the gel (mm)."""
+        """What a `segment` or `volume` function sees: lit point, camera, lamp, LED and the lengths inside the gel
+        (mm)."""
 
         def __init__(self, gel, p, camera, lamp, led, si):
             self.p, self.camera, self.lamp, self.led, self.si = p, camera, lamp, led, si

@@ -4,11 +4,10 @@ Definition
     n1 sin(theta1) = n2 sin(theta2)                              Snell, `index` = n2/n1
     T_s = 1 - ((c1 - n c2)/(c1 + n c2))^2,  T_p = 1 - ((n c1 - c2)/(n c1 + c2))^2
     L1 = T L2 / n^2                                              radiance seen from the side of medium 1
-with c = cos(theta), n = index; medium 1 is on the side that the surface's normal points to (the camera's side). Light is
-always transmitted; the reflected share is lost (its weight is the transmitted one), so that a ray never branches and the
-index never enters a sampling probability. Two of them make a window: air to acrylic, acrylic to gel.
-Fingerprint
-    the picture shrinks towards the axis, more with depth; a small fall-off towards the corners.
+with c = cos(theta), n = index; medium 1 is on the side that the surface's normal points to (the camera's side). Light
+is always transmitted; the reflected share is lost (its weight is the transmitted one), so that a ray never branches and
+the index never enters a sampling probability. Two of them make a window: air to acrylic, acrylic to gel. Fingerprint
+    the image shrinks towards the axis, more with depth; a small fall-off towards the corners.
 Validity
     no reflection from the window; flat and parallel to itself. At index 1 the interface is not there.
 References
@@ -20,8 +19,16 @@ from optics.scene.parameter import Parameter
 from optics.scene.surfaces import passing
 
 PARAMETERS = (
-    Parameter("index", "1", 1.0, (0.4, 2.5), "n2/n1: index of the far side relative to the camera's side", neutral=1.0,
-              plausible=0.4, how="difference"),
+    Parameter(
+        "index",
+        "1",
+        1.0,
+        (0.4, 2.5),
+        "n2/n1: index of the far side relative to the camera's side",
+        neutral=1.0,
+        plausible=0.4,
+        how="difference",
+    ),
 )
 
 
@@ -33,7 +40,8 @@ def build():
         kind = "interface"
 
         def refract(self, wi):
-            """Direction beyond the interface, transmittances T_s and T_p, relative index met; for a local direction wi."""
+            """Direction beyond the interface, transmittances T_s and T_p, relative index met; for a local direction
+            wi."""
             front = mi.Frame3f.cos_theta(wi) >= 0
             n = dr.select(front, self.index, 1 / self.index)
             c1 = dr.abs(mi.Frame3f.cos_theta(wi))
@@ -57,8 +65,18 @@ def build():
                 level = dr.squared_norm(side_in) < 1e-12  # at normal incidence every basis serves
                 side_in = dr.select(level, mi.mueller.stokes_basis(-wo), dr.normalize(side_in))
                 side_out = dr.select(level, mi.mueller.stokes_basis(si.wi), dr.normalize(side_out))
-                weight = mi.mueller.rotate_mueller_basis(matrix, -wo, side_in, mi.mueller.stokes_basis(-wo),
-                                                         si.wi, side_out, mi.mueller.stokes_basis(si.wi)) * scale
+                weight = (
+                    mi.mueller.rotate_mueller_basis(
+                        matrix,
+                        -wo,
+                        side_in,
+                        mi.mueller.stokes_basis(-wo),
+                        si.wi,
+                        side_out,
+                        mi.mueller.stokes_basis(si.wi),
+                    )
+                    * scale
+                )
             else:
                 weight = mi.Spectrum((t_s + t_p) / 2 * scale)
             return bs, weight & active

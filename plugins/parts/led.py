@@ -4,15 +4,15 @@ Definition
     kappa = eta cos(a)^mu / d^2,  cos(a) = -s.p                  1/mm^2; 0 where cos(a) <= 0                     (S2)
     kappa_b = kappa w_b power_b prod(`emission` effects)         in the band b: irradiance across the beam, relative
     L_b = V T f_b(wi, s) cos(theta) kappa_b                      radiance that the lit point x sends to the camera (S5)
-with the distance d = |S - x| (mm) of the LED's position S from x, the unit vector s = (S - x)/d towards the LED, the axis p (so
-that a is the angle between axis and beam), the power eta = `power` and the lobe exponent mu (1 for a Lambertian chip, larger for
-a lens). V is 1 where the straight line to the LED is free and else 0, T what the gel's effects let pass, f the membrane's
-reflection, theta the angle between s and the skin's normal. w is the relative spectrum: a Gaussian of the given peak wavelength
-and full width at half maximum, or 1 in every band when `wavelength` is 0 (a white LED). power_b is `power_r`, `power_g`,
-`power_b` in the first three bands, 1 in a fourth: what an LED of unknown spectrum is calibrated by. They share a scale with
-`power` and, over all LEDs of a band, with the membrane's rho: hold one of them.
-With an emitting area A > 0 the source is a disc across the axis, of radius sqrt(A/pi): shadows get a penumbra.
-Fingerprint
+with the distance d = |S - x| (mm) of the LED's position S from x, the unit vector s = (S - x)/d towards the LED, the
+axis p (so that a is the angle between axis and beam), the power eta = `power` and the lobe exponent mu (1 for a
+Lambertian chip, larger for a lens). V is 1 where the straight line to the LED is free and else 0, T what the gel's
+effects let pass, f the membrane's reflection, theta the angle between s and the skin's normal. w is the relative
+spectrum: a Gaussian of the given peak wavelength and full width at half maximum, or 1 in every band when `wavelength`
+is 0 (a white LED). power_b is `power_r`, `power_g`, `power_b` in the first three bands, 1 in a fourth: what an LED of
+unknown spectrum is calibrated by. They share a scale with `power` and, over all LEDs of a band, with the membrane's
+rho: hold one of them. With an emitting area A > 0 the source is a disc across the axis, of radius sqrt(A/pi): shadows
+get a penumbra. Fingerprint
     position and power shape the field of every frame in which the LED is lit; mu shows far from the axis.
 Validity
     distances much larger than the die; no colour change over the lobe.
@@ -30,17 +30,41 @@ PARAMETERS = (
     Parameter("x", "mm", 0.0, doc="position S, to the right in the image", plausible=0.5, how="ad", step=0.2),
     Parameter("y", "mm", 0.0, doc="position S, down in the image", plausible=0.5, how="ad", step=0.2),
     Parameter("z", "mm", -5.0, doc="position S, from the camera towards the skin", plausible=0.5, how="ad", step=0.2),
-    Parameter("pan", "deg", 0.0, (-89.0, 89.0), "turn of the axis p from its nominal direction, about the local up axis",
-              plausible=5.0),
-    Parameter("tilt", "deg", 0.0, (-89.0, 89.0), "turn of the axis p from its nominal direction, about the local side "
-              "axis", plausible=5.0),
+    Parameter(
+        "pan",
+        "deg",
+        0.0,
+        (-89.0, 89.0),
+        "turn of the axis p from its nominal direction, about the local up axis",
+        plausible=5.0,
+    ),
+    Parameter(
+        "tilt",
+        "deg",
+        0.0,
+        (-89.0, 89.0),
+        "turn of the axis p from its nominal direction, about the local side axis",
+        plausible=5.0,
+    ),
     Parameter("mu", "1", 1.2, (0.0, 200.0), "lobe exponent mu of (S2)", plausible=0.3),
-    Parameter("power", "1", 1.0, (0.0, 1e6), "power eta of (S2), relative; 0 switches the LED off", plausible=0.1,
-              linear=True),
-    *(Parameter(f"power_{c}", "1", 1.0, (0.0, 1e6), f"share of the power in the {word} band ({colour})", plausible=0.1,
-                linear=True) for c, word, colour in (("r", "first", "red"), ("g", "second", "green"), ("b", "third", "blue"))),
-    Parameter("area", "mm^2", 0.0, (0.0, 25.0), "emitting area A of the disc", neutral=0.0, plausible=1.0,
-              how="difference"),
+    Parameter(
+        "power", "1", 1.0, (0.0, 1e6), "power eta of (S2), relative; 0 switches the LED off", plausible=0.1, linear=True
+    ),
+    *(
+        Parameter(
+            f"power_{c}",
+            "1",
+            1.0,
+            (0.0, 1e6),
+            f"share of the power in the {word} band ({colour})",
+            plausible=0.1,
+            linear=True,
+        )
+        for c, word, colour in (("r", "first", "red"), ("g", "second", "green"), ("b", "third", "blue"))
+    ),
+    Parameter(
+        "area", "mm^2", 0.0, (0.0, 25.0), "emitting area A of the disc", neutral=0.0, plausible=1.0, how="difference"
+    ),
     Parameter("wavelength", "nm", 0.0, (0.0, 2000.0), "peak wavelength; 0: the same in every band", plausible=3.0),
     Parameter("fwhm", "nm", 30.0, (1.0, 1000.0), "full width at half maximum of the spectrum", plausible=5.0),
 )
@@ -64,16 +88,24 @@ def build():
             nominal = [float(t) - self.number(n) for t, n in zip(target, "xyz")]
             length = math.sqrt(sum(c * c for c in nominal))
             if length == 0:
-                raise ValueError(f"led '{self.name}': position and target are the same point; the axis has no direction")
+                raise ValueError(
+                    f"led '{self.name}': position and target are the same point; the axis has no direction"
+                )
             axis = [c / length for c in nominal]
             # a side axis that does not degenerate for the usual LEDs, which shine along +-z or towards the middle
             helper = [0.0, 1.0, 0.0] if abs(axis[1]) < 0.9 else [1.0, 0.0, 0.0]
-            side = [helper[1] * axis[2] - helper[2] * axis[1], helper[2] * axis[0] - helper[0] * axis[2],
-                    helper[0] * axis[1] - helper[1] * axis[0]]
+            side = [
+                helper[1] * axis[2] - helper[2] * axis[1],
+                helper[2] * axis[0] - helper[0] * axis[2],
+                helper[0] * axis[1] - helper[1] * axis[0],
+            ]
             norm = math.sqrt(sum(c * c for c in side))
             side = [c / norm for c in side]
-            up = [axis[1] * side[2] - axis[2] * side[1], axis[2] * side[0] - axis[0] * side[2],
-                  axis[0] * side[1] - axis[1] * side[0]]
+            up = [
+                axis[1] * side[2] - axis[2] * side[1],
+                axis[2] * side[0] - axis[0] * side[2],
+                axis[0] * side[1] - axis[1] * side[0],
+            ]
             self.frame = [dr.opaque(mi.Vector3f, v) for v in (side, up, axis)]
             self.m_flags = +mi.EmitterFlags.DeltaPosition
             self.m_needs_sample_3 = False
@@ -98,7 +130,7 @@ def build():
         def colour(self):
             """Share of the power in each band."""
             shares = (self.power_r, self.power_g, self.power_b, mi.Float(1.0))
-            return mi.UnpolarizedSpectrum(*shares[:dr.size_v(mi.UnpolarizedSpectrum)])
+            return mi.UnpolarizedSpectrum(*shares[: dr.size_v(mi.UnpolarizedSpectrum)])
 
         def point(self, sample):
             """A point of the emitting disc for a sample of the unit square; the centre when the area is 0."""
@@ -116,7 +148,9 @@ def build():
         def radiance(self, it, to_led, distance):
             """kappa of (S2) per band, with all that effects do to it."""
             cos = dr.dot(-to_led, self.axis())
-            kappa = mi.UnpolarizedSpectrum(self.kappa(it, to_led, distance)) * self.spectrum(it.wavelengths) * self.colour()
+            kappa = (
+                mi.UnpolarizedSpectrum(self.kappa(it, to_led, distance)) * self.spectrum(it.wavelengths) * self.colour()
+            )
             for function in self.functions("emission"):
                 kappa *= function(Beam(cos, distance, to_led, it.p, it.wavelengths), self)
             return kappa
@@ -153,8 +187,11 @@ def build():
             return mi.ScalarBoundingBox3f(mi.ScalarPoint3f(*[self.number(n) for n in "xyz"]))
 
         def sample_wavelengths(self, si, sample, active=True):
-            wavelengths, weight = mi.sample_rgb_spectrum(mi.sample_shifted(sample)) if mi.is_spectral else (
-                mi.Color0f(), mi.UnpolarizedSpectrum(1.0))
+            wavelengths, weight = (
+                mi.sample_rgb_spectrum(mi.sample_shifted(sample))
+                if mi.is_spectral
+                else (mi.Color0f(), mi.UnpolarizedSpectrum(1.0))
+            )
             return wavelengths, weight * self.spectrum(wavelengths) * self.colour()
 
         def to_string(self):

@@ -4,10 +4,9 @@ Definition
     base   (x, y, -depth) -> (x + u_x, y + u_y, -depth - u_z)     middle of a marker's foot; u as in the part `carried`
     axis   across the face: normal to its mean slopes over the foot, (u(x + r) - u(x - r))/(2r)
     cap    base + height axis, radius r, facing the camera (-z)
-`columns` x `rows` of them (XML integers, 5 x 4) at pitch_x, pitch_y around the world's z axis. The cap moves as a rigid disc, the
-foot's rim stays on the face, and the wall runs straight between them, so that no light passes under a marker on a bent face. The
-foot is open: the skin is there.
-Fingerprint
+`columns` x `rows` of them (XML integers, 5 x 4) at pitch_x, pitch_y around the world's z axis. The cap moves as a rigid
+disc, the foot's rim stays on the face, and the wall runs straight between them, so that no light passes under a marker
+on a bent face. The foot is open: the skin is there. Fingerprint
     a press moves markers outwards and towards the camera and tilts them away from the contact.
 Validity
     markers as soft as the skin or small against the bend of its face; otherwise as for the part `carried`.
@@ -23,9 +22,19 @@ PARAMETERS = (
     Parameter("pitch_x", "mm", 9.5, (0.0, 100.0), "distance of columns", plausible=0.05, how="difference", step=1.0),
     Parameter("pitch_y", "mm", 8.5, (0.0, 100.0), "distance of rows", plausible=0.05, how="difference", step=1.0),
     Parameter("radius", "mm", 1.5, (0.01, 50.0), "radius r", plausible=0.05, how="difference", step=1.0),
-    Parameter("height", "mm", 1.0, (0.001, 50.0), "from the face to the cap", plausible=0.05, how="difference", step=1.0),
-    Parameter("depth", "mm", 5.0, (0.0, 100.0), "of the face that they stand on, below the untouched outer face",
-              plausible=0.1, how="difference", step=1.0),
+    Parameter(
+        "height", "mm", 1.0, (0.001, 50.0), "from the face to the cap", plausible=0.05, how="difference", step=1.0
+    ),
+    Parameter(
+        "depth",
+        "mm",
+        5.0,
+        (0.0, 100.0),
+        "of the face that they stand on, below the untouched outer face",
+        plausible=0.1,
+        how="difference",
+        step=1.0,
+    ),
 )
 SEGMENTS = 96  # of a circle: 0.07 % of the area is lost
 
@@ -45,9 +54,19 @@ def build():
             count = self.columns * self.rows
             i = np.arange(SEGMENTS)
             j = (i + 1) % SEGMENTS
-            foot, top, rim, middle = i, i + SEGMENTS, i + 2 * SEGMENTS, 3 * SEGMENTS  # the cap's rim is its own: a sharp edge
-            faces = np.concatenate([np.stack([foot, foot[j], top[j]], -1), np.stack([foot, top[j], top], -1),
-                                    np.stack([rim, rim[j], np.full_like(i, middle)], -1)])
+            foot, top, rim, middle = (
+                i,
+                i + SEGMENTS,
+                i + 2 * SEGMENTS,
+                3 * SEGMENTS,
+            )  # the cap's rim is its own: a sharp edge
+            faces = np.concatenate(
+                [
+                    np.stack([foot, foot[j], top[j]], -1),
+                    np.stack([foot, top[j], top], -1),
+                    np.stack([rim, rim[j], np.full_like(i, middle)], -1),
+                ]
+            )
             faces = faces + (middle + 1) * np.arange(count)[:, None, None]
             mi.Mesh.__init__(self, "markers", (middle + 1) * count, faces.size // 3, props, True, False)
             self.declare(props)
@@ -64,7 +83,8 @@ def build():
             self.rebuild(mi.traverse(self))
 
         def rest(self):
-            """(N, 2) places (x, y) of the feet's middles at rest, mm: row by row, from low y to high and from low x to high."""
+            """(N, 2) places (x, y) of the feet's middles at rest, mm: row by row, from low y to high and from low x to
+            high."""
             x = self.number("pitch_x") * (np.arange(self.columns) - (self.columns - 1) / 2)
             y = self.number("pitch_y") * (np.arange(self.rows) - (self.rows - 1) / 2)
             return np.stack([np.tile(x, self.rows), np.repeat(y, self.columns)], -1)

@@ -5,13 +5,13 @@ Definition
     A = 1 - 0.5 s2/(s2 + 0.33)      B = 0.45 s2/(s2 + 0.09)      s2 = sigma^2
 with the reflectance rho_c of each band (red, green, blue: the first three bands of the integrator, times an optional
 texture `reflectance`), the roughness sigma (rad) of the facets, alpha and beta the larger and the smaller of the angles
-to the normal. With s = wi.wo - cos_i cos_o the product cos(phi) sin(alpha) tan(beta) is s / max(cos_i, cos_o), which has
-no singularity (Oren & Nayar's qualitative model).
-Fingerprint
+to the normal. With s = wi.wo - cos_i cos_o the product cos(phi) sin(alpha) tan(beta) is s / max(cos_i, cos_o), which
+has no singularity (Oren & Nayar's qualitative model). Fingerprint
     rho scales a band everywhere; sigma brightens grazing views of slopes that face the light and flattens the shading.
 Validity
-    opaque coating, no lobe towards the mirror direction (the effect "specular lobe" adds one); depolarizes fully. The formula as
-    published returns up to 1.5 % more light than it gets from beyond 65 deg for sigma of 0.05 to 0.3; over all directions less.
+    opaque coating, no lobe towards the mirror direction (the effect "specular lobe" adds one); depolarizes fully. The
+    formula as published returns up to 1.5 % more light than it gets from beyond 65 deg for sigma of 0.05 to 0.3; over
+    all directions less.
 References
     F-TAC Hand supplementary information, S1.4, eq. (S3); Oren & Nayar, IJCV 14, 227 (1995).
 """
@@ -24,8 +24,7 @@ PARAMETERS = (
     Parameter("rho_r", "1", 1.0, (0.0, 10.0), "reflectance rho in the first band (red)", plausible=0.1, linear=True),
     Parameter("rho_g", "1", 1.0, (0.0, 10.0), "reflectance rho in the second band (green)", plausible=0.1, linear=True),
     Parameter("rho_b", "1", 1.0, (0.0, 10.0), "reflectance rho in the third band (blue)", plausible=0.1, linear=True),
-    Parameter("sigma", "rad", 0.2, (0.0, 1.5), "roughness sigma of (S3)", plausible=0.1, squared=True,
-              saturates=0.3),
+    Parameter("sigma", "rad", 0.2, (0.0, 1.5), "roughness sigma of (S3)", plausible=0.1, squared=True, saturates=0.3),
 )
 
 
@@ -76,7 +75,8 @@ def build():
 
 
 class Geometry:
-    """What a `reflection` or `ambient` function sees: surface interaction, local direction to the light, cosines, rho."""
+    """What a `reflection` or `ambient` function sees: surface interaction, local direction to the light, cosines,
+    rho."""
 
     def __init__(self, si, wo, cos_view, cos_light, albedo):
         self.si, self.wi, self.wo = si, si.wi, wo

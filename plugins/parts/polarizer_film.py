@@ -5,20 +5,20 @@ Definition
     angle = scale psi + offset + approach backlash / 2           psi: what the dial says, `angle`
     T1 = transmittance exp(transmittance_slope (lambda - 540)/100)   along the transmission axis t
     T2 = leak + leak_tilt (lambda - 540)/100 + leak_oblique sin(theta)^2       across it, not below 0
-with t across the ray and across the absorbing molecules, t = k x a: two crossed sheets that are dark on the axis leak away
-from it, in a cross of dark arms. A sheet of the polarization ratio P lets T2 = T1 (1 - P)/(1 + P) through: 99 % is 0.005 T1.
-The angle counts from the surface's x axis (the first edge of a rectangle) to its y axis: counterclockwise for a viewer at whom
-the surface's normal points. T1 and T2 are those of the whole sheet. With `face` > 0 both its faces reflect that share, and light that goes to
-and fro between them and the faces of other films is summed.
-Fingerprint
-    two of them follow Malus, cos^2 of the angle between; a leak lifts the dark end, an offset shifts the curve, a wobble returns
-    once per turn (Malus twice), a backlash splits the curves turned one way and the other.
+with t across the ray and across the absorbing molecules, t = k x a: two crossed sheets that are dark on the axis leak
+away from it, in a cross of dark arms. A sheet of the polarization ratio P lets T2 = T1 (1 - P)/(1 + P) through: 99 % is
+0.005 T1. The angle counts from the surface's x axis (the first edge of a rectangle) to its y axis: counterclockwise for
+a viewer at whom the surface's normal points. T1 and T2 are those of the whole sheet. With `face` > 0 both its faces
+reflect that share, and light that goes to and fro between them and the faces of other films is summed. Fingerprint
+    two of them follow Malus, cos^2 of the angle between; a leak lifts the dark end, an offset shifts the curve, a
+    wobble returns once per turn (Malus twice), a backlash splits the curves turned one way and the other.
 Validity
-    thin sheets, no refraction in them; reflections between films as at normal incidence. At T2 = 0 the leak of a film that
-    polarized light reaches (the middle one of three, one behind a tilted face) starts as a square root, whose slope is left out.
+    thin sheets, no refraction in them; reflections between films as at normal incidence. At T2 = 0 the leak of a film
+    that polarized light reaches (the middle one of three, one behind a tilted face) starts as a square root, whose
+    slope is left out.
 References
-    Vi2TaP (RA-L 2025), eq. (1); Korger et al., Opt. Express 21, 27032 (2013), oblique incidence; Goldstein, Polarized Light,
-    3rd ed., 5.2.
+    Vi2TaP (RA-L 2025), eq. (1); Korger et al., Opt. Express 21, 27032 (2013), oblique incidence; Goldstein, Polarized
+    Light, 3rd ed., 5.2.
 """
 
 import math
@@ -28,26 +28,112 @@ from optics.scene.layer import layer
 from optics.scene.parameter import Parameter
 
 PARAMETERS = (
-    Parameter("inserted", "1", 1.0, (0.0, 1.0), "1: the film stands in the light; 0: it was taken out", how="layer",
-              plausible=0.1),
-    Parameter("angle", "deg", 0.0, (-7200.0, 7200.0), "dial angle psi of the transmission axis", plausible=1.0, how="layer"),
+    Parameter(
+        "inserted",
+        "1",
+        1.0,
+        (0.0, 1.0),
+        "1: the film stands in the light; 0: it was taken out",
+        how="layer",
+        plausible=0.1,
+    ),
+    Parameter(
+        "angle", "deg", 0.0, (-7200.0, 7200.0), "dial angle psi of the transmission axis", plausible=1.0, how="layer"
+    ),
     Parameter("transmittance", "1", 0.8, (0.0, 1.0), "transmittance T1 along the axis", plausible=0.05, how="layer"),
-    Parameter("transmittance_slope", "1", 0.0, (-2.0, 2.0), "change of ln T1 per 100 nm", neutral=0.0, plausible=0.05, how="layer"),
-    Parameter("leak", "1", 0.0, (0.0, 1.0), "transmittance T2 across the axis at 540 nm", neutral=0.0, plausible=0.005, how="layer"),
+    Parameter(
+        "transmittance_slope",
+        "1",
+        0.0,
+        (-2.0, 2.0),
+        "change of ln T1 per 100 nm",
+        neutral=0.0,
+        plausible=0.05,
+        how="layer",
+    ),
+    Parameter(
+        "leak",
+        "1",
+        0.0,
+        (0.0, 1.0),
+        "transmittance T2 across the axis at 540 nm",
+        neutral=0.0,
+        plausible=0.005,
+        how="layer",
+    ),
     Parameter("leak_tilt", "1", 0.0, (-0.2, 0.2), "change of T2 per 100 nm", neutral=0.0, plausible=0.005, how="layer"),
-    Parameter("leak_oblique", "1", 0.0, (0.0, 0.5), "leak that grows with sin(theta)^2 of the incidence", neutral=0.0,
-              plausible=0.01, how="layer"),
-    Parameter("offset", "deg", 0.0, (-90.0, 90.0), "misalignment: axis at dial 0", neutral=0.0, plausible=1.0, how="layer"),
-    Parameter("scale", "1", 1.0, (0.5, 2.0), "axis turns this much per turn of the dial", neutral=1.0, plausible=0.01, how="layer"),
-    Parameter("approach", "1", 0.0, (-1.0, 1.0), "side from which the dial came: +1 from below, -1 from above, 0 unknown",
-              plausible=1.0, how="layer"),
-    Parameter("backlash", "deg", 0.0, (-20.0, 20.0), "width of the dead zone of the drive", neutral=0.0, plausible=0.5, how="layer"),
-    Parameter("wobble_c", "1", 0.0, (-0.5, 0.5), "change of transmittance once per turn, cosine part w_c", neutral=0.0,
-              plausible=0.01, how="layer"),
-    Parameter("wobble_s", "1", 0.0, (-0.5, 0.5), "change of transmittance once per turn, sine part w_s", neutral=0.0,
-              plausible=0.01, how="layer"),
-    Parameter("face", "1", 0.0, (0.0, 0.1), "reflectance r of each face, T1 <= (1 - r)^2; 0: reflections are left out", neutral=0.0,
-              plausible=0.04, how="layer"),
+    Parameter(
+        "leak_oblique",
+        "1",
+        0.0,
+        (0.0, 0.5),
+        "leak that grows with sin(theta)^2 of the incidence",
+        neutral=0.0,
+        plausible=0.01,
+        how="layer",
+    ),
+    Parameter(
+        "offset", "deg", 0.0, (-90.0, 90.0), "misalignment: axis at dial 0", neutral=0.0, plausible=1.0, how="layer"
+    ),
+    Parameter(
+        "scale",
+        "1",
+        1.0,
+        (0.5, 2.0),
+        "axis turns this much per turn of the dial",
+        neutral=1.0,
+        plausible=0.01,
+        how="layer",
+    ),
+    Parameter(
+        "approach",
+        "1",
+        0.0,
+        (-1.0, 1.0),
+        "side from which the dial came: +1 from below, -1 from above, 0 unknown",
+        plausible=1.0,
+        how="layer",
+    ),
+    Parameter(
+        "backlash",
+        "deg",
+        0.0,
+        (-20.0, 20.0),
+        "width of the dead zone of the drive",
+        neutral=0.0,
+        plausible=0.5,
+        how="layer",
+    ),
+    Parameter(
+        "wobble_c",
+        "1",
+        0.0,
+        (-0.5, 0.5),
+        "change of transmittance once per turn, cosine part w_c",
+        neutral=0.0,
+        plausible=0.01,
+        how="layer",
+    ),
+    Parameter(
+        "wobble_s",
+        "1",
+        0.0,
+        (-0.5, 0.5),
+        "change of transmittance once per turn, sine part w_s",
+        neutral=0.0,
+        plausible=0.01,
+        how="layer",
+    ),
+    Parameter(
+        "face",
+        "1",
+        0.0,
+        (0.0, 0.1),
+        "reflectance r of each face, T1 <= (1 - r)^2; 0: reflections are left out",
+        neutral=0.0,
+        plausible=0.04,
+        how="layer",
+    ),
 )
 
 

@@ -3,39 +3,61 @@
 Definition
     f(wi, wo) cos(theta_o) = M(m) D(m) G1(wi) G1(wo) |wi.m| / |wi.n| J
     J = 1/(4 |wo.m|) reflected,   nu^2 |wo.m| / (wi.m + nu wo.m)^2 refracted (over nu^2 where radiance is followed)
-of mirror-like facets with normals m about the surface's normal n, as common as D(m) says and seen as often as Smith's G1
-says (`distribution` beckmann or ggx; roughness `alpha`, the rms slope of beckmann's facets). nu is `index` from the side that n
-points to, 1/index from behind. M(m) is Fresnel's Mueller matrix of the facet, its axes s and p across and in the plane of wi and
-wo, turned to the axes that Mitsuba implies for a ray:
-    M_r = [[a, b, 0, 0], [b, a, 0, 0], [0, 0, Re z, -Im z], [0, 0, Im z, Re z]],   a, b = (|r_s|^2 +- |r_p|^2)/2,  z = r_p r_s*
+of mirror-like facets with normals m about the surface's normal n, as common as D(m) says and seen as often as Smith's
+G1 says (`distribution` beckmann or ggx; roughness `alpha`, the rms slope of beckmann's facets). nu is `index` from the
+side that n points to, 1/index from behind. M(m) is Fresnel's Mueller matrix of the facet, its axes s and p across and
+in the plane of wi and wo, turned to the axes that Mitsuba implies for a ray:
+    M_r = [[a, b, 0, 0], [b, a, 0, 0], [0, 0, Re z, -Im z], [0, 0, Im z, Re z]],   a, b = (|r_s|^2 +- |r_p|^2)/2,  z =
+    r_p r_s*
     M_t = [[a, b, 0, 0], [b, a, 0, 0], [0, 0, c, 0], [0, 0, 0, c]],    a, b = (T_s +- T_p)/2,  c = sqrt(T_s T_p)
-    r_s = (c1 - nu c2)/(c1 + nu c2),  r_p = (nu c1 - c2)/(nu c1 + c2),  T_s = 4 nu c1 c2/(c1 + nu c2)^2,  T_p with nu c1 + c2
+    r_s = (c1 - nu c2)/(c1 + nu c2),  r_p = (nu c1 - c2)/(nu c1 + c2),  T_s = 4 nu c1 c2/(c1 + nu c2)^2,  T_p with nu c1
+                                      + c2
 c2 = -i sqrt((1 - c1^2)/nu^2 - 1) beyond the critical angle: all is reflected, with the phase between p and s as arg z.
 Fingerprint
-    what lies behind is blurred, the more the farther behind it lies; lights show as broad glints, polarized away from the normal.
-    Crossed polarizers stay nearly dark: facets that light meets obliquely leave four weak lobes about the glint.
+    what lies behind is blurred, the more the farther behind it lies; lights show as broad glints, polarized away from
+    the normal. Crossed polarizers stay nearly dark: facets that light meets obliquely leave four weak lobes about the
+    glint.
 Validity
-    light that facets pass on to each other is lost: of a beam along the normal of index 1.5, beckmann loses nothing at alpha 0.3
-    and 1 % at 0.7 (from the dense side 0 and 19 %), ggx 1 and 6 % (10 and 40 %). One index for all bands. A lobe narrower than
-    1e-4 rad is one direction; at index 1 the boundary is not there, whatever its roughness. The effect of alpha is its square for
-    beckmann; the tail of ggx makes it alpha^2 ln(1/alpha). For mi.render: the quick prediction LED by LED looks through flat
-    interfaces only. To pass it is a bounce of the integrator `tactile`, which its `max_depth` and `interreflection` count.
+    light that facets pass on to each other is lost: of a beam along the normal of index 1.5, beckmann loses nothing at
+    alpha 0.3 and 1 % at 0.7 (from the dense side 0 and 19 %), ggx 1 and 6 % (10 and 40 %). One index for all bands. A
+    lobe narrower than 1e-4 rad is one direction; at index 1 the boundary is not there, whatever its roughness. The
+    effect of alpha is its square for beckmann; the tail of ggx makes it alpha^2 ln(1/alpha). For mi.render: the quick
+    prediction LED by LED looks through flat interfaces only. To pass it is a bounce of the integrator `tactile`, which
+    its `max_depth` and `interreflection` count.
 References
-    Walter, Marschner, Li & Torrance, EGSR 2007, eqs. (17), (20)-(27), (33), (34); Heitz & d'Eon, CGF 33, 103 (2014), for the
-    sampling of visible facets; Born & Wolf, Principles of Optics, 1.5.2 and 1.5.4.
+    Walter, Marschner, Li & Torrance, EGSR 2007, eqs. (17), (20)-(27), (33), (34); Heitz & d'Eon, CGF 33, 103 (2014),
+    for the sampling of visible facets; Born & Wolf, Principles of Optics, 1.5.2 and 1.5.4.
 """
 
 from optics.scene.declare import Part
 from optics.scene.mitsuba_parts import Declared
 from optics.scene.parameter import Parameter
 
-SHARP = 1e-4  # a lobe narrower than this (rad) is one direction: float32 leaves 6e-8 of a direction, 6e-4 of such a lobe's width
+# a lobe narrower than this (rad) is one direction: float32 leaves 6e-8 of a direction, 6e-4 of such a lobe's width
+SHARP = 1e-4
 
 PARAMETERS = (
-    Parameter("index", "1", 1.0, (0.4, 2.5), "n2/n1: index of the far side relative to the side that the normal points to",
-              neutral=1.0, plausible=0.4, how="difference"),
-    Parameter("alpha", "1", 0.0, (0.0, 1.0), "roughness alpha of the facets; 0: smooth", neutral=0.0, plausible=0.1,
-              how="difference", squared=True),
+    Parameter(
+        "index",
+        "1",
+        1.0,
+        (0.4, 2.5),
+        "n2/n1: index of the far side relative to the side that the normal points to",
+        neutral=1.0,
+        plausible=0.4,
+        how="difference",
+    ),
+    Parameter(
+        "alpha",
+        "1",
+        0.0,
+        (0.0, 1.0),
+        "roughness alpha of the facets; 0: smooth",
+        neutral=0.0,
+        plausible=0.1,
+        how="difference",
+        squared=True,
+    ),
     Parameter("distribution", "-", "beckmann", choices=("beckmann", "ggx"), doc="distribution D of the facets' slopes"),
 )
 
@@ -45,14 +67,15 @@ def build():
     import mitsuba as mi
 
     def turn(forward, axis, target):
-        """Stokes vectors of light along `forward`, from one axis across it to another (rotate_stokes_basis without angles, whose
-        derivative is not finite where the two axes agree)."""
+        """Stokes vectors of light along `forward`, from one axis across it to another (rotate_stokes_basis without
+        angles, whose derivative is not finite where the two axes agree)."""
         c, s = dr.dot(axis, target), dr.dot(forward, dr.cross(axis, target))
         q, u = c * c - s * s, 2 * c * s
         return mi.Matrix4f(1, 0, 0, 0, 0, q, u, 0, 0, -u, q, 0, 0, 0, 0, 1)
 
     class Facet:
-        """Fresnel's formulae at one facet: nu, cosines, amplitudes, reflectance r; for c1 = wi.m of any sign, all in mi.Float."""
+        """Fresnel's formulae at one facet: nu, cosines, amplitudes, reflectance r; for c1 = wi.m of any sign, all in
+        mi.Float."""
 
         def __init__(self, nu, along):
             self.nu, self.along = nu, along
@@ -83,8 +106,10 @@ def build():
             f = mi.BSDFFlags
             sides = f.FrontSide | f.BackSide
             # also Delta and Null: what a smooth surface, or one of index 1, is
-            self.m_components = [f.GlossyReflection | f.DeltaReflection | sides,
-                                 f.GlossyTransmission | f.DeltaTransmission | f.Null | f.NonSymmetric | sides]
+            self.m_components = [
+                f.GlossyReflection | f.DeltaReflection | sides,
+                f.GlossyTransmission | f.DeltaTransmission | f.Null | f.NonSymmetric | sides,
+            ]
             self.m_flags = self.m_components[0] | self.m_components[1]
 
         def facets(self):
@@ -98,7 +123,8 @@ def build():
             return dr.abs(self.index - 1) < 1e-6
 
         def sharp(self, reflected):
-            """Whether a lobe is one direction: the reflected one as wide as alpha, the refracted one as alpha |index - 1|."""
+            """Whether a lobe is one direction: the reflected one as wide as alpha, the refracted one as alpha |index -
+            1|."""
             return self.alpha * dr.select(reflected, 1, dr.abs(self.index - 1)) <= SHARP
 
         def share(self, ctx, facet, reflected):
@@ -108,7 +134,8 @@ def build():
             return dr.select(reflected, r, 1 - r) * float(any(ways))
 
         def passed(self, ctx, wi, wo, facet, reflected):
-            """M of a facet between Mitsuba's axes of both rays, over nu^2 where radiance is refracted; else M_00 as a spectrum."""
+            """M of a facet between Mitsuba's axes of both rays, over nu^2 where radiance is refracted; else M_00 as a
+            spectrum."""
             to_source = ctx.mode == mi.TransportMode.Radiance
             scale = dr.select(reflected | (not to_source), 1, 1 / dr.square(facet.nu))
             matrix = dr.select(reflected, facet.reflection(), facet.transmission()) * scale
@@ -138,8 +165,15 @@ def build():
             wo = dr.select(reflected, 2 * along * m - wi, (along / nu - dr.mulsign(facet.c2, along)) * m - wi / nu)
             probability = self.share(ctx, facet, reflected)
             seen, sharp = dr.select(smooth, 1, facets.smith_g1(wo, m)), self.sharp(reflected)
-            valid = active & (wi.z != 0) & (density > 0) & (seen > 0) & (probability > 0) & (
-                (wi.z * wo.z > 0) == reflected) & (reflected | (facet.c2 > 0))
+            valid = (
+                active
+                & (wi.z != 0)
+                & (density > 0)
+                & (seen > 0)
+                & (probability > 0)
+                & ((wi.z * wo.z > 0) == reflected)
+                & (reflected | (facet.c2 > 0))
+            )
 
             bs = dr.zeros(mi.BSDFSample3f)
             bs.wo, bs.eta = wo, dr.select(reflected, 1, nu)
@@ -148,8 +182,10 @@ def build():
             f = mi.BSDFFlags
             through = dr.select(self.absent(), mi.UInt32(f.DeltaTransmission | f.Null), mi.UInt32(+f.DeltaTransmission))
             bs.sampled_type = dr.select(
-                sharp, dr.select(reflected, mi.UInt32(+f.DeltaReflection), through),
-                dr.select(reflected, mi.UInt32(+f.GlossyReflection), mi.UInt32(+f.GlossyTransmission)))
+                sharp,
+                dr.select(reflected, mi.UInt32(+f.DeltaReflection), through),
+                dr.select(reflected, mi.UInt32(+f.GlossyReflection), mi.UInt32(+f.GlossyTransmission)),
+            )
             bs.sampled_component = dr.select(reflected, mi.UInt32(0), mi.UInt32(1))
             weight = self.passed(ctx, wi, wo, facet, reflected) * (seen / dr.detach(probability))
             return bs, dr.select(valid, weight, 0)
@@ -162,7 +198,8 @@ def build():
             along, across = dr.dot(wi, m), dr.dot(wo, m)
             facet = Facet(nu, along)
             asked = ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 0) & reflected | (
-                ctx.is_enabled(mi.BSDFFlags.GlossyTransmission, 1) & ~reflected)
+                ctx.is_enabled(mi.BSDFFlags.GlossyTransmission, 1) & ~reflected
+            )
             valid = active & asked & (along * wi.z > 0) & (across * wo.z > 0) & ~self.sharp(reflected)
             density = facets.pdf(dr.mulsign(wi, wi.z), m) * self.spread(along, across, nu, reflected)
             value = self.passed(ctx, wi, wo, facet, reflected) * (density * facets.smith_g1(wo, m))

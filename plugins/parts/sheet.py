@@ -3,10 +3,10 @@
 Definition
     M = t F                    transmittance t = transmittance exp(transmittance_slope (lambda - 540)/100)
     F = diattenuator(s, (1 - R_s)^2, (1 - R_p)^2)      both faces, Fresnel's R_s, R_p
-n = `index` is the sheet's index over that of what surrounds it: 1 in the middle of a skin of its own kind, 1.5 for a plate in air.
-What the sheet does to polarization besides are effects: `retardance`, `stress`, `depolarization`. With them it is a wave plate, a
-stressed plate, or a depolarizing foil; their axes turn with the sheet's `angle`.
-Angles count from the surface's x axis to its y axis: counterclockwise for a viewer at whom the surface's normal points.
+n = `index` is the sheet's index over that of what surrounds it: 1 in the middle of a skin of its own kind, 1.5 for a
+plate in air. What the sheet does to polarization besides are effects: `retardance`, `stress`, `depolarization`. With
+them it is a wave plate, a stressed plate, or a depolarizing foil; their axes turn with the sheet's `angle`. Angles
+count from the surface's x axis to its y axis: counterclockwise for a viewer at whom the surface's normal points.
 Fingerprint
     weakens the light behind it; a tilted one polarizes weakly, across the plane of incidence.
 Validity
@@ -20,11 +20,36 @@ from optics.scene.layer import layer
 from optics.scene.parameter import Parameter
 
 PARAMETERS = (
-    Parameter("transmittance", "1", 1.0, (0.0, 1.0), "transmittance at 540 nm without the faces' losses", neutral=1.0,
-              plausible=0.05, how="layer"),
-    Parameter("transmittance_slope", "1", 0.0, (-2.0, 2.0), "change of ln t per 100 nm", neutral=0.0, plausible=0.05, how="layer"),
-    Parameter("index", "1", 1.0, (1.0, 2.5), "refractive index n of the sheet over that of its surroundings", neutral=1.0,
-              plausible=0.1, how="layer"),
+    Parameter(
+        "transmittance",
+        "1",
+        1.0,
+        (0.0, 1.0),
+        "transmittance at 540 nm without the faces' losses",
+        neutral=1.0,
+        plausible=0.05,
+        how="layer",
+    ),
+    Parameter(
+        "transmittance_slope",
+        "1",
+        0.0,
+        (-2.0, 2.0),
+        "change of ln t per 100 nm",
+        neutral=0.0,
+        plausible=0.05,
+        how="layer",
+    ),
+    Parameter(
+        "index",
+        "1",
+        1.0,
+        (1.0, 2.5),
+        "refractive index n of the sheet over that of its surroundings",
+        neutral=1.0,
+        plausible=0.1,
+        how="layer",
+    ),
     Parameter("angle", "deg", 0.0, (-7200.0, 7200.0), "turn of the sheet about its normal", plausible=1.0, how="layer"),
 )
 

@@ -3,13 +3,14 @@
 Definition
     S = L (1, q, u, 0)                    Stokes vector, the same in all directions
     L = power power_c w(lambda) (1 + drift time)
-with the power (radiance, relative), the shares of the first three bands, the spectrum w of an LED (a Gaussian; 1 in every band
-when `wavelength` is 0), and the linear polarization q = `dop_q` = p cos(2a), u = `dop_u` = p sin(2a) of the degree p along the
-angle a, from the surface's x axis to its y axis. `time` is the experimenter's clock, a setting of a frame or a reading.
-Fingerprint
-    power scales a reading; polarized light makes the first polarizer's own angle count; a drift grows with time, whatever is set.
+with the power (radiance, relative), the shares of the first three bands, the spectrum w of an LED (a Gaussian; 1 in
+every band when `wavelength` is 0), and the linear polarization q = `dop_q` = p cos(2a), u = `dop_u` = p sin(2a) of the
+degree p along the angle a, from the surface's x axis to its y axis. `time` is the experimenter's clock, a setting of a
+frame or a reading. Fingerprint
+    power scales a reading; polarized light makes the first polarizer's own angle count; a drift grows with time,
+    whatever is set.
 Validity
-    an even surface. Among clear bodies it lights what stands there; elsewhere it lights nothing else.
+    an even surface. Among dielectric bodies it lights what stands there; elsewhere it lights nothing else.
 A `room` is such a surface before the sensor, off (power 0) until somebody adds it: the light of the surroundings.
 References
     Goldstein, Polarized Light, 3rd ed., ch. 4.
@@ -24,19 +25,64 @@ from optics.scene.mitsuba_parts import Declared
 from optics.scene.parameter import Parameter
 
 PARAMETERS = (
-    Parameter("power", "1", 1.0, (0.0, 1e6), "radiance L, relative; 0 switches the source off", plausible=0.1, linear=True),
-    *(Parameter(f"power_{c}", "1", 1.0, (0.0, 1e6), f"share of the power in the {word} band ({colour})", plausible=0.1,
-                linear=True) for c, word, colour in (("r", "first", "red"), ("g", "second", "green"), ("b", "third", "blue"))),
-    Parameter("dop_q", "1", 0.0, (-1.0, 1.0), "linear polarization along 0 deg, less that along 90", neutral=0.0, plausible=0.05,
-              how="layer"),
-    Parameter("dop_u", "1", 0.0, (-1.0, 1.0), "linear polarization along 45 deg, less that along 135", neutral=0.0,
-              plausible=0.05, how="layer"),
-    Parameter("drift", "1", 0.0, (-1.0, 1.0), "relative change per unit of time", neutral=0.0, plausible=0.01, how="layer"),
-    Parameter("time", "1", 0.0, (-1e6, 1e6), "the clock: minutes, or any unit that `drift` is meant in", plausible=1.0, how="layer"),
-    Parameter("wavelength", "nm", 0.0, (0.0, 2000.0), "peak wavelength; 0: the same in every band", plausible=3.0, how="layer"),
-    Parameter("fwhm", "nm", 30.0, (1.0, 1000.0), "full width at half maximum of the spectrum", plausible=5.0, how="layer"),
+    Parameter(
+        "power", "1", 1.0, (0.0, 1e6), "radiance L, relative; 0 switches the source off", plausible=0.1, linear=True
+    ),
+    *(
+        Parameter(
+            f"power_{c}",
+            "1",
+            1.0,
+            (0.0, 1e6),
+            f"share of the power in the {word} band ({colour})",
+            plausible=0.1,
+            linear=True,
+        )
+        for c, word, colour in (("r", "first", "red"), ("g", "second", "green"), ("b", "third", "blue"))
+    ),
+    Parameter(
+        "dop_q",
+        "1",
+        0.0,
+        (-1.0, 1.0),
+        "linear polarization along 0 deg, less that along 90",
+        neutral=0.0,
+        plausible=0.05,
+        how="layer",
+    ),
+    Parameter(
+        "dop_u",
+        "1",
+        0.0,
+        (-1.0, 1.0),
+        "linear polarization along 45 deg, less that along 135",
+        neutral=0.0,
+        plausible=0.05,
+        how="layer",
+    ),
+    Parameter(
+        "drift", "1", 0.0, (-1.0, 1.0), "relative change per unit of time", neutral=0.0, plausible=0.01, how="layer"
+    ),
+    Parameter(
+        "time",
+        "1",
+        0.0,
+        (-1e6, 1e6),
+        "the clock: minutes, or any unit that `drift` is meant in",
+        plausible=1.0,
+        how="layer",
+    ),
+    Parameter(
+        "wavelength", "nm", 0.0, (0.0, 2000.0), "peak wavelength; 0: the same in every band", plausible=3.0, how="layer"
+    ),
+    Parameter(
+        "fwhm", "nm", 30.0, (1.0, 1000.0), "full width at half maximum of the spectrum", plausible=5.0, how="layer"
+    ),
 )
-ROOM = (replace(PARAMETERS[0], default=0.0, neutral=0.0, plausible=1e-5, doc="radiance L of the surroundings, relative"), *PARAMETERS[1:])
+ROOM = (
+    replace(PARAMETERS[0], default=0.0, neutral=0.0, plausible=1e-5, doc="radiance L of the surroundings, relative"),
+    *PARAMETERS[1:],
+)
 
 
 def stokes(crossing, source):
@@ -65,7 +111,7 @@ def build(kind_of="source"):
 
         def colour(self):
             shares = (self.power_r, self.power_g, self.power_b, mi.Float(1.0))
-            return self.power * mi.UnpolarizedSpectrum(*shares[:dr.size_v(mi.UnpolarizedSpectrum)])
+            return self.power * mi.UnpolarizedSpectrum(*shares[: dr.size_v(mi.UnpolarizedSpectrum)])
 
         def emitted(self, si):
             """What leaves towards si.wi, in Mitsuba's implicit axes; light leaves on the side of the normal."""
@@ -93,7 +139,9 @@ def build(kind_of="source"):
         def level(self, wavelengths):
             bands = mi.UnpolarizedSpectrum(wavelengths) if mi.is_spectral else mi.UnpolarizedSpectrum(540.0)
             u = (bands - self.wavelength) / self.fwhm
-            return dr.select(self.wavelength > 0, dr.exp(-4 * math.log(2) * dr.square(u)), 1.0) * (1 + self.drift * self.time)
+            return dr.select(self.wavelength > 0, dr.exp(-4 * math.log(2) * dr.square(u)), 1.0) * (
+                1 + self.drift * self.time
+            )
 
         def pdf_direction(self, it, ds, active=True):
             return dr.select(dr.dot(ds.d, ds.n) < 0, self.get_shape().pdf_direction(it, ds, active), 0.0)

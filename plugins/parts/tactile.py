@@ -3,19 +3,19 @@
 Definition
     L(x -> camera) = sum_k V(x, S_k) T_gel f(wi, s_k) cos(theta_k) kappa_k + ambient + volume            (S5)
                    + s sum (one more bounce), s = `interreflection`
-in the bands given by `bands` (nm, at most four; red first), so that a spectral render has no spectral noise. The camera's
-ray passes flat interfaces (part `interface`) by Snell's law with the transmitted share as weight; LEDs are sampled through
-null and index-matched surfaces; homogeneous media are followed analytically, exp(-sigma_a d) per segment; the gel's own
-effects (stages `segment` and `volume`) act on the path inside -thickness < z < 0. Every surface is lit by all point lights and by
-one of the others, drawn by chance: to draw one of the LEDs would be most of the noise. Every bounce after the first is scaled by
-`interreflection`: 1 is physics, 0 is direct light only.
-Fingerprint
+in the bands given by `bands` (nm, at most four; red first), so that a spectral render has no spectral noise. The
+camera's ray passes flat interfaces (part `interface`) by Snell's law with the transmitted share as weight; LEDs are
+sampled through null and index-matched surfaces; homogeneous media are followed analytically, exp(-sigma_a d) per
+segment; the gel's own effects (stages `segment` and `volume`) act on the path inside -thickness < z < 0. Every surface
+is lit by all point lights and by one of the others, drawn by Monte Carlo: to draw one of the LEDs would be most of the
+noise. Every bounce after the first is scaled by `interreflection`: 1 is physics, 0 is direct light only. Fingerprint
     interreflection fills shadows and the inner flanks of a dent.
 Validity
-    scattering media only to first order (effect "gel haze"); refraction of the light on its way from an LED to the membrane
-    is not followed: LEDs belong on the gel's side of a refracting interface.
+    scattering media only to first order (effect "gel haze"); refraction of the light on its way from an LED to the
+    membrane is not followed: LEDs belong on the gel's side of a refracting interface.
 References
-    F-TAC Hand supplementary information, S1.4-S1.5, eq. (S5); Veach, thesis (1997), ch. 8, for the direct-light estimator.
+    F-TAC Hand supplementary information, S1.4-S1.5, eq. (S5); Veach, thesis (1997), ch. 8, for the direct-light
+    estimator.
 """
 
 import math
@@ -25,8 +25,16 @@ from optics.scene.mitsuba_parts import Declared
 from optics.scene.parameter import Parameter
 
 PARAMETERS = (
-    Parameter("interreflection", "1", 0.0, (0.0, 4.0), "scale of every bounce after the first; 1 is physics",
-              neutral=0.0, plausible=1.0, linear=True),
+    Parameter(
+        "interreflection",
+        "1",
+        0.0,
+        (0.0, 4.0),
+        "scale of every bounce after the first; 1 is physics",
+        neutral=0.0,
+        plausible=1.0,
+        linear=True,
+    ),
 )
 
 
@@ -41,12 +49,15 @@ def scaled(value):
 
 
 def build():
-    global dr, mi, mis_weight, REFLECTED  # dr.syntax rewrites a function with the globals of its file and without its closure
+    # dr.syntax rewrites a function with the globals of its file and without its closure
+    global dr, mi, mis_weight, REFLECTED
     import drjit as dr
     import mitsuba as mi
     from mitsuba.python.ad.integrators.common import ADIntegrator, mis_weight
 
-    REFLECTED = int(mi.BSDFFlags.DiffuseReflection | mi.BSDFFlags.GlossyReflection)  # by a rough surface, not through it
+    REFLECTED = int(
+        mi.BSDFFlags.DiffuseReflection | mi.BSDFFlags.GlossyReflection
+    )  # by a rough surface, not through it
 
     class Tactile(Declared.on(ADIntegrator)):
         kind = "tactile"
@@ -61,8 +72,10 @@ def build():
             self.bands = tuple(float(w) for w in text.replace(",", " ").split())
             self.lanes = dr.size_v(mi.UnpolarizedSpectrum)
             if len(self.bands) > self.lanes and mi.is_spectral:
-                raise ValueError(f"tactile: {len(self.bands)} bands, but a render carries at most {self.lanes}; "
-                                 "render the others in a second scene")
+                raise ValueError(
+                    f"tactile: {len(self.bands)} bands, but a render carries at most {self.lanes}; "
+                    "render the others in a second scene"
+                )
             self.declare(props)
             self.gel_of = {}
             self.glowing_of = {}
@@ -80,7 +93,7 @@ def build():
             if not mi.is_spectral:
                 return mi.Color0f()
             bands = (self.bands or (620.0, 540.0, 460.0)) + (self.bands or (460.0,))[-1:] * self.lanes
-            return dr.zeros(type(mi.Ray3f().wavelengths), size) + mi.UnpolarizedSpectrum(*bands[:self.lanes])
+            return dr.zeros(type(mi.Ray3f().wavelengths), size) + mi.UnpolarizedSpectrum(*bands[: self.lanes])
 
         def gel(self, scene):
             """The gel part of the scene, if it has one."""
@@ -93,7 +106,9 @@ def build():
             """The fluorescent pigments of the scene."""
             key = scene.ptr if hasattr(scene, "ptr") else id(scene)
             if key not in self.glowing_of:
-                found = {s.bsdf().name: s.bsdf() for s in scene.shapes() if getattr(s.bsdf(), "kind", "") == "fluorescent"}
+                found = {
+                    s.bsdf().name: s.bsdf() for s in scene.shapes() if getattr(s.bsdf(), "kind", "") == "fluorescent"
+                }
                 self.glowing_of[key] = tuple(found.values())
             return self.glowing_of[key]
 
@@ -105,7 +120,8 @@ def build():
                 total += dr.select(own, pigment.fluorescence(si, led, to_led, distance), 0.0)
             return total
 
-        # -- one LED at a time: what calibration and batches use ---------------------------------------------------------
+        # -- one LED at a time: what calibration and batches use
+        # ---------------------------------------------------------
 
         def hits(self, scene, camera, u, v):
             """Where the camera's rays through the pixel positions (u, v) meet the membrane: (si, weight, origin)."""
@@ -117,7 +133,9 @@ def build():
                 flat = si.is_valid() & mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.DeltaTransmission)
                 bs, passed = si.bsdf().sample(mi.BSDFContext(), si, mi.Float(0.5), mi.Point2f(0.5), flat)
                 d = si.to_world(bs.wo)
-                start = si.p + d * (1e-4 * (1 + dr.max(dr.abs(si.p))))  # spawn_ray would shift it sideways, along the normal
+                start = si.p + d * (
+                    1e-4 * (1 + dr.max(dr.abs(si.p)))
+                )  # spawn_ray would shift it sideways, along the normal
                 through = scene.ray_intersect(mi.Ray3f(start, d, mi.Float(0), si.wavelengths), flat)
                 weight = dr.select(flat, weight * mi.unpolarized_spectrum(passed), weight)
                 si = dr.select(flat, through, si)
@@ -126,8 +144,11 @@ def build():
         def windows(self, scene, led):
             """How many flat interfaces stand between an LED and the skin."""
             reach = math.sqrt(led.number("area") / math.pi)
-            return sum(1 for s in scene.shapes() if getattr(s.bsdf(), "kind", "") == "interface"
-                       and s.bbox().max.z > led.number("z") - reach)
+            return sum(
+                1
+                for s in scene.shapes()
+                if getattr(s.bsdf(), "kind", "") == "interface" and s.bbox().max.z > led.number("z") - reach
+            )
 
         def visible(self, scene, si, point, led):
             """Whether the straight line from the surface to a point of an LED meets nothing but windows (detached)."""
@@ -179,14 +200,17 @@ def build():
                     weight = weight * function(last, gel)
             return total * weight / count
 
-        # -- any scene, any light: what mi.render calls --------------------------------------------------------------------
+        # -- any scene, any light: what mi.render calls
+        # --------------------------------------------------------------------
 
         def aov_names(self):
             return [f"S{i}.{j}" for i in range(4) for j in range(self.lanes)] if self.stokes and mi.is_polarized else []
 
         def sample_rays(self, scene, sensor, sampler, *args, **kwargs):
             ray, weight, position = super().sample_rays(scene, sensor, sampler, *args, **kwargs)
-            down = mi.Vector3f(0, 1, 0)  # of our camera's frame; up in a stock one's, which is the same for Stokes vectors
+            down = mi.Vector3f(
+                0, 1, 0
+            )  # of our camera's frame; up in a stock one's, which is the same for Stokes vectors
             self.vertical = sensor.turned(down) if hasattr(sensor, "turned") else sensor.world_transform() @ down
             if mi.is_spectral and self.bands:
                 ray.wavelengths = self.wavelengths(dr.width(ray.o))
@@ -201,19 +225,26 @@ def build():
             return sigma_t - sigma_s
 
         def look_up(self, scene):
-            """What acts in a scene besides its surfaces and lights: the gel and its effects, LEDs, membranes that shine."""
+            """What acts in a scene besides its surfaces and lights: the gel and its effects, LEDs, membranes that
+            shine."""
             self.inside = gel = self.gel(scene)
             self.fading, self.veils = (gel.functions(s) if gel is not None else () for s in ("segment", "volume"))
             emitters = scene.emitters()
             points = [i for i, e in enumerate(emitters) if mi.has_flag(e.flags(), mi.EmitterFlags.DeltaPosition)]
             self.points, self.others = len(points), len(points) < len(emitters)
             self.point_lights = dr.gather(mi.EmitterPtr, scene.emitters_dr(), mi.UInt32(points)) if points else None
-            self.lamps = [e for e in emitters if getattr(e, "kind", "") == "led"] if self.veils or self.glowing(scene) else []
-            self.shining = [m for m in {s.bsdf() for s in scene.shapes()} if getattr(m, "kind", "") == "membrane"
-                            and m.functions("ambient")]
+            self.lamps = (
+                [e for e in emitters if getattr(e, "kind", "") == "led"] if self.veils or self.glowing(scene) else []
+            )
+            self.shining = [
+                m
+                for m in {s.bsdf() for s in scene.shapes()}
+                if getattr(m, "kind", "") == "membrane" and m.functions("ambient")
+            ]
 
         def kept(self, si, origin, point):
-            """Share of the light that effects of the gel leave on its way from a point over the surface to where a ray began."""
+            """Share of the light that effects of the gel leave on its way from a point over the surface to where a ray
+            began."""
             share = mi.UnpolarizedSpectrum(1.0)
             for function in self.fading:
                 share *= function(self.inside.path(si.p, origin, point, None, si), self.inside)
@@ -258,8 +289,9 @@ def build():
                 remaining = remaining - length
                 ray = dr.select(met, hit.spawn_ray(ray.d), ray)
                 step += 1
-                going = met & (remaining > 1e-4) & (step < self.max_null) & (
-                    dr.max(mi.unpolarized_spectrum(through)) > 0)
+                going = (
+                    met & (remaining > 1e-4) & (step < self.max_null) & (dr.max(mi.unpolarized_spectrum(through)) > 0)
+                )
             return through
 
         def sent(self, scene, si, origin, medium, ds, weight, active):
@@ -318,8 +350,10 @@ def build():
 
                 # light that is sampled: of every point light, and of one of the others
                 last = bounce + 1 >= self.max_depth
-                clear = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null) | (mi.has_flag(
-                    bsdf.flags(), mi.BSDFFlags.DeltaTransmission) & ~mi.has_flag(bsdf.flags(), mi.BSDFFlags.DeltaReflection))
+                clear = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null) | (
+                    mi.has_flag(bsdf.flags(), mi.BSDFFlags.DeltaTransmission)
+                    & ~mi.has_flag(bsdf.flags(), mi.BSDFFlags.DeltaReflection)
+                )
                 onward = active & si.is_valid() & (~last | clear)
                 lit = onward & ~last & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
                 throughput = dr.select(lit & reflected, throughput * self.interreflection, throughput)
@@ -347,8 +381,9 @@ def build():
                 delta = dr.select(scattered, mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta), delta)
                 bounce = dr.select(scattered, bounce + 1, bounce)
                 step += 1
-                active = onward & (dr.max(mi.unpolarized_spectrum(throughput)) > 0) & (
-                    step < self.max_depth + self.max_null)
+                active = (
+                    onward & (dr.max(mi.unpolarized_spectrum(throughput)) > 0) & (step < self.max_depth + self.max_null)
+                )
             channels = []
             if dr.hint(self.stokes and mi.is_polarized, mode="scalar"):
                 basis = mi.mueller.stokes_basis(-first)

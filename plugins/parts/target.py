@@ -1,16 +1,17 @@
-"""Target: a solid body in front of the sensor, a cylinder or a ball, for what the camera sees through the skin and what presses it.
+"""Target: a solid body in front of the sensor, a cylinder or a ball, for what the camera sees through the skin and what
+presses it.
 
 Definition
     stance lying      a cylinder, axis along x at z = distance + diameter/2, from x - length/2 to x + length/2
-    stance standing   a cylinder, axis along z at (x, y), flat end towards the sensor, from z = distance to z = distance + length
+    stance standing   a cylinder, axis along z at (x, y), flat end towards the sensor, from z = distance to z = distance
+                      + length
     stance ball       a ball of the diameter, its middle at (x, y, distance + diameter/2)
-The nearest point stands `distance` before the untouched face at z = 0; a negative distance is that of an object that presses it:
-a `block` gives way to it, a `gel` has a press of its own.
-Fingerprint
-    its picture shrinks with the distance, as 1/(distance + camera's distance from the face).
+The nearest point stands `distance` before the untouched face at z = 0; a negative distance is that of an object that
+presses it: a `block` gives way to it, a `gel` has a press of its own. Fingerprint
+    its image shrinks with the distance, as 1/(distance + camera's distance from the face).
 Validity
-    circles are polygons of 256 sides, inside them by 8e-5 of the radius. Coordinates (u, v) on it, for maps of light and patterns, are
-    fine on what looks at the sensor and coarse behind; they jump nowhere in view.
+    circles are polygons of 256 sides, inside them by 8e-5 of the radius. Coordinates (u, v) on it, for maps of light
+    and patterns, are fine on what looks at the sensor and coarse behind; they jump nowhere in view.
 References
     Vi2TaP (RA-L 2025), Fig. 5: cylinders of 20, 30 and 40 mm diameter, 60 to 10 mm before the skin.
 """
@@ -20,18 +21,44 @@ from optics.scene.mitsuba_parts import Declared
 from optics.scene.parameter import Parameter
 
 PARAMETERS = (
-    Parameter("diameter", "mm", 20.0, (0.1, 1000.0), "of the cylinder or ball", plausible=0.1, how="difference", step=1.0),
-    Parameter("length", "mm", 80.0, (0.1, 2000.0), "of the cylinder along its axis", plausible=0.2, how="difference", step=1.0),
-    Parameter("distance", "mm", 20.0, (-5.0, 2000.0), "from the untouched face to its nearest point", plausible=0.2,
-              how="difference", step=1.0),
+    Parameter(
+        "diameter", "mm", 20.0, (0.1, 1000.0), "of the cylinder or ball", plausible=0.1, how="difference", step=1.0
+    ),
+    Parameter(
+        "length", "mm", 80.0, (0.1, 2000.0), "of the cylinder along its axis", plausible=0.2, how="difference", step=1.0
+    ),
+    Parameter(
+        "distance",
+        "mm",
+        20.0,
+        (-5.0, 2000.0),
+        "from the untouched face to its nearest point",
+        plausible=0.2,
+        how="difference",
+        step=1.0,
+    ),
     Parameter("x", "mm", 0.0, (-1000.0, 1000.0), "its middle, right", plausible=0.2, how="difference", step=1.0),
     Parameter("y", "mm", 0.0, (-1000.0, 1000.0), "its middle, down", plausible=0.2, how="difference", step=1.0),
-    Parameter("stance", "-", "lying", choices=("lying", "standing", "ball"),
-              doc="a cylinder lying across the view along x, one standing on end, or a ball"),
+    Parameter(
+        "stance",
+        "-",
+        "lying",
+        choices=("lying", "standing", "ball"),
+        doc="a cylinder lying across the view along x, one standing on end, or a ball",
+    ),
 )
 SEGMENTS = 256  # around the axis
 ROWS = 130  # from pole to pole
-EDGES = (0, 32, 33, 49, 81, 97, 98, 130)  # of a cylinder: middle, rim of the end, of the mantle, two of the mantle, and back
+EDGES = (
+    0,
+    32,
+    33,
+    49,
+    81,
+    97,
+    98,
+    130,
+)  # of a cylinder: middle, rim of the end, of the mantle, two of the mantle, and back
 FINE = 10.0  # mm of a lying cylinder to either side of its middle, that have four fifths of the coordinate u
 NEAR = 48  # of the segments to either side of its nearest line, that have four fifths of v
 
@@ -78,14 +105,20 @@ def build():
                 v = np.interp(column - SEGMENTS / 2, (-SEGMENTS / 2, -NEAR, NEAR, SEGMENTS / 2), (0, 0.1, 0.9, 1))
                 return np.stack(np.meshgrid(u, v, indexing="ij"), -1)
             # a disc around the nearest point: of a ball, areas are in proportion
-            radius = np.sin(np.pi * row / ROWS / 2) if self.stance == "ball" else np.interp(row, EDGES, (0, 0.8, 0.8, 0.84, 0.91, 0.95, 0.95, 1))
+            radius = (
+                np.sin(np.pi * row / ROWS / 2)
+                if self.stance == "ball"
+                else np.interp(row, EDGES, (0, 0.8, 0.8, 0.84, 0.91, 0.95, 0.95, 1))
+            )
             return 0.5 + 0.5 * radius[:, None, None] * self.circle
 
         def rebuild(self, params):
             """Vertices for the present parameters."""
             n = self.number
             radius, (out, along) = n("diameter") / 2, self.profile()
-            if self.stance == "lying":  # rows: directions of the circle and of the axis; a corner lies nearest to the face
+            if (
+                self.stance == "lying"
+            ):  # rows: directions of the circle and of the axis; a corner lies nearest to the face
                 across, axis = np.array([(0.0, 0.0, -1.0), (0.0, 1.0, 0.0)]), np.array([-1.0, 0.0, 0.0])
                 start = np.array([n("x") + n("length") / 2, n("y"), n("distance") + radius])
             else:
@@ -97,7 +130,8 @@ def build():
             params.update()
 
         def height(self, x, y):
-            """mm of its lower surface above its nearest point, at mm from its own middle; cones of 75 deg in place of walls."""
+            """mm of its lower surface above its nearest point, at mm from its own middle; cones of 75 deg in place of
+            walls."""
             n = self.number
             if self.stance == "ball":
                 return lattice.sphere(n("diameter"))(x, y)

@@ -1,8 +1,7 @@
 """The contract that the library relies on, held against every part and effect that a scan finds.
 
-A user's plugins are held to it as well: `pytest tests/contract --plugin-folder DIR`. The checks are plain functions, so that
-the tests at the end can show that each of them notices what it is there for.
-"""
+A user's plugins are held to it as well: `pytest tests/contract --plugin-folder DIR`. The checks are plain functions, so
+that the tests at the end can show that each of them notices what it is there for."""
 
 from __future__ import annotations
 
@@ -21,9 +20,16 @@ from optics.scene.declare import IMAGE_STAGES, Effect
 from optics.scene.registry import Registry, registry
 
 PARTS = sorted(registry().parts)
-CHANCE = ("clear", "cells", "block", "room")  # parts that light is followed through by chance: their contract stands in test_by_chance.py
+CHANCE = (
+    "clear",
+    "cells",
+    "block",
+    "room",
+)  # parts that light is followed through by Monte Carlo: their contract stands in test_by_chance.py
 EFFECTS = sorted(k for k, e in registry().effects.items() if e.part not in CHANCE)
-NUMBERS = [(kind, p.name) for kind in PARTS if kind not in CHANCE for p in registry().parameters_of(kind) if p.is_number]
+NUMBERS = [
+    (kind, p.name) for kind in PARTS if kind not in CHANCE for p in registry().parameters_of(kind) if p.is_number
+]
 LAYERS = [kind for kind in PARTS if registry().parts[kind].mueller is not None]
 MOVED = ("carried", "markers", "target")  # kinds of shapes that a scene moves besides the gel
 LAYERED = ("layer", "glow")  # stages whose functions are differentiated by complex step
@@ -40,8 +46,16 @@ SURROUNDINGS = {  # parameter: what has to stand about it for it to be seen, and
     # below 0 a leak is cut off
     "polarizer_film.leak_tilt": {f"{film}.leak": 0.01 for film in FILMS},
     # what a ball does not show
-    **{f"gel.press_r{axis}": {"gel.indenter": "cube", "gel.indenter_size": 6.0, "gel.press_rx": 25.0, "gel.press_ry": 20.0,
-                              "gel.press_rz": 30.0} for axis in "xyz"},
+    **{
+        f"gel.press_r{axis}": {
+            "gel.indenter": "cube",
+            "gel.indenter_size": 6.0,
+            "gel.press_rx": 25.0,
+            "gel.press_ry": 20.0,
+            "gel.press_rz": 30.0,
+        }
+        for axis in "xyz"
+    },
     "gel.thickness": {"gel.absorption": 0.02},
     # the first direction of a carried film is constant in each triangle: a film that bends makes small jumps
     "gel.press_depth": {"film.inserted": 0.0},
@@ -51,18 +65,26 @@ SURROUNDINGS = {  # parameter: what has to stand about it for it to be seen, and
 
 def ways(how):
     """Parameters by the way of their derivative."""
-    return [pytest.param(kind, name, id=f"{kind}.{name}") for kind, name in NUMBERS if registry().parameter(kind, name).how == how]
+    return [
+        pytest.param(kind, name, id=f"{kind}.{name}")
+        for kind, name in NUMBERS
+        if registry().parameter(kind, name).how == how
+    ]
 
 
 def settling():
     """Every effect, and every parameter with a neutral value that none frees, as an effect of its own."""
     freed = {(e.part, name) for e in registry().effects.values() for name in e.parameter_names}
-    alone = [Effect(f"{kind} {name}", kind, (name,)) for kind, name in NUMBERS
-             if registry().parameter(kind, name).neutral is not None and (kind, name) not in freed]
+    alone = [
+        Effect(f"{kind} {name}", kind, (name,))
+        for kind, name in NUMBERS
+        if registry().parameter(kind, name).neutral is not None and (kind, name) not in freed
+    ]
     return [pytest.param(e, id=e.key) for e in (*(registry().effects[k] for k in EFFECTS), *alone)]
 
 
-# -- what a plugin says about itself ------------------------------------------------------------------------------------------
+# -- what a plugin says about itself
+# ------------------------------------------------------------------------------------------
 
 
 def check_documentation(item):
@@ -73,7 +95,7 @@ def check_documentation(item):
     found = {s: [i for i, line in enumerate(lines) if line.strip() == s] for s in SECTIONS}
     for section, where in found.items():
         assert len(where) == 1, f"{name}: {len(where)} sections '{section}'; one is needed"
-        assert lines[where[0] + 1:] and lines[where[0] + 1].strip(), f"{name}: the section '{section}' is empty"
+        assert lines[where[0] + 1 :] and lines[where[0] + 1].strip(), f"{name}: the section '{section}' is empty"
     order = [found[s][0] for s in SECTIONS]
     assert order == sorted(order), f"{name}: the sections are not in the order {', '.join(SECTIONS)}"
 
@@ -121,7 +143,9 @@ def test_parts_document_and_declare_themselves(kind, mitsuba):
         check_declaration(p)
     if part.mueller is not None or part.stokes is not None:
         for p in registry().parameters_of(kind):
-            assert not p.is_number or p.how == ("ad" if part.stokes and p.name in POWERS else "layer"), f"{kind}.{p.name}: {p.how}"
+            assert not p.is_number or p.how == ("ad" if part.stokes and p.name in POWERS else "layer"), (
+                f"{kind}.{p.name}: {p.how}"
+            )
     for check in part.checks:
         check()
 
@@ -135,14 +159,16 @@ def test_effects_document_and_declare_themselves(key, mitsuba):
         check()
 
 
-# -- where a parameter is seen ------------------------------------------------------------------------------------------------
+# -- where a parameter is seen
+# ------------------------------------------------------------------------------------------------
 
 
 class Material:
-    """A material alone, as a bench, for what only mi.render can pass: a smooth world that it reflects (left) and lets through.
+    """A material alone, as a bench, for what only mi.render can pass: a smooth world that it reflects (left) and lets
+    through.
 
-    Rows of the image are directions of sight, channels S0, S1 and S3; the mean over a grid of sampled directions has no noise.
-    """
+    Rows of the image are directions of sight, channels S0, S1 and S3; the mean over a grid of sampled directions has no
+    noise."""
 
     SIDE = 32  # of the grid
 
@@ -257,7 +283,8 @@ def inward(p, value, step):
 
 
 def places(bench, key, p, base):
-    """Where a derivative is tested: at neutral, unless it means nothing there, and away from it where that costs little.
+    """Where a derivative is tested: at neutral, unless it means nothing there, and away from it where that costs
+    little.
 
     A parameter without a neutral value is tested at the working point in place of neutral.
     """
@@ -271,7 +298,8 @@ def places(bench, key, p, base):
 
 
 def differences(f, value, step, bounds):
-    """Derivative of f by differences of second order, central or, next to a bound, one-sided (and the values it used)."""
+    """Derivative of f by differences of second order, central or, next to a bound, one-sided (and the values it
+    used)."""
     if bounds[0] <= value - step and value + step <= bounds[1]:
         return (f(value + step) - f(value - step)) / (2 * step), (value - step, value + step)
     s = step if value + 2 * step <= bounds[1] else -step
@@ -279,7 +307,8 @@ def differences(f, value, step, bounds):
 
 
 def calm(bench, key, values, base):
-    """Pixels that are no rim (of a shadow or of the face) under any of the values: elsewhere an edge moves through the samples."""
+    """Pixels that are no rim (of a shadow or of the face) under any of the values: elsewhere an edge moves through the
+    samples."""
     rim = np.zeros(bench.model.shape[:2], bool)
     for value in values:
         now = {**base, key: value}
@@ -291,11 +320,15 @@ def calm(bench, key, values, base):
 def moves(bench, key):
     """Whether the parameter moves geometry, and with it the rims of shadows."""
     kind, name = bench.renderer.kind(key), key.rsplit(".", 1)[1]
-    return kind in ("gel", "camera", "interface", *MOVED) and bench.scene.parameters[key].how == "difference" or (
-        kind == "led" and name in ("x", "y", "z", "area"))
+    return (
+        kind in ("gel", "camera", "interface", *MOVED)
+        and bench.scene.parameters[key].how == "difference"
+        or (kind == "led" and name in ("x", "y", "z", "area"))
+    )
 
 
-# -- effects at and near neutral ------------------------------------------------------------------------------------------------
+# -- effects at and near neutral
+# ------------------------------------------------------------------------------------------------
 
 
 def beside(p):
@@ -327,7 +360,9 @@ def at_rest(bench, effect, p):
 
 def moved(bench, effect, p, step):
     """Image with one parameter of an effect set off neutral in all parts that have it."""
-    return bench.image({**at_rest(bench, effect, p), **dict.fromkeys(keys(bench, effect.part, p.name), p.neutral + step)})
+    return bench.image(
+        {**at_rest(bench, effect, p), **dict.fromkeys(keys(bench, effect.part, p.name), p.neutral + step)}
+    )
 
 
 def directions(p):
@@ -335,20 +370,22 @@ def directions(p):
 
 
 def check_continuity(bench, effect):
-    """A ten-thousandth of a plausible strength changes the image by about as little of what the plausible one changes."""
+    """A ten-thousandth of a plausible strength changes the image by about as little of what the plausible one
+    changes."""
     for p in registry().effect_parameters(effect):
         rest = bench.image(at_rest(bench, effect, p))
         for sign in directions(p):
             whole = np.abs(moved(bench, effect, p, sign * p.plausible) - rest).mean()
             little = np.abs(moved(bench, effect, p, sign * 1e-4 * p.plausible) - rest).mean()
             assert whole > 1e-7, f"{effect.name}: a plausible {p.name} does nothing to the bench"
-            # 20 times: an onset like a square root, which ranking by a finite step can still use, would give 100. The floor: a
-            # single sample of the 16 of a rim that flips is worth up to 1e-6 of the mean.
+            # 20 times: an onset like a square root, which ranking by a finite step can still use, would give 100. The
+            # floor: a single sample of the 16 of a rim that flips is worth up to 1e-6 of the mean.
             assert little <= 20e-4 * whole + 1e-6, f"{effect.name}: {p.name} jumps by {little:.2g} at neutral"
 
 
 def check_onset(bench, effect):
-    """The slope from neutral agrees within 5 % when a step of 3 % of plausible is halved twice, or a secant is declared."""
+    """The slope from neutral agrees within 5 % when a step of 3 % of plausible is halved twice, or a secant is
+    declared."""
     if effect.onset == "secant":
         return
     for p in registry().effect_parameters(effect):
@@ -366,7 +403,8 @@ def check_onset(bench, effect):
             off = np.linalg.norm((one - other)[keep])
             rounding = FLOAT * np.linalg.norm(rest) / abs(h)
             assert off <= 0.05 * size + rounding, (
-                f"{effect.name}: the slope in {p.name} changes by {off / size:.0%} when the step is halved or turned round")
+                f"{effect.name}: the slope in {p.name} changes by {off / size:.0%} when the step is halved or turned round"
+            )
 
 
 @pytest.mark.parametrize("key", EFFECTS)
@@ -410,7 +448,9 @@ def test_a_window_of_index_1_is_not_there(bench, tmp_path):
     values = {k: v for k, v in bench.values.items() if k in renderer.scene.parameters}
     exposure = values["camera.exposure"]
     for led in bench.model.lit(values):
-        found, expected = (r.led(values if r is renderer else bench.values, led).radiance for r in (bench.renderer, renderer))
+        found, expected = (
+            r.led(values if r is renderer else bench.values, led).radiance for r in (bench.renderer, renderer)
+        )
         assert np.abs(found - expected).max() * exposure <= 10 * IDENTITY  # a ray that starts again is rounded again
 
 
@@ -420,8 +460,11 @@ def test_a_sheet_at_rest_and_a_film_taken_out_are_not_there(benches, tmp_path):
 
     bench = benches("polarizer_bench")
     file = without(tmp_path, "polarizer_bench", "middle_plate", "sample_plate")
-    values = {**bench.values, "middle.inserted": 0.0, **{
-        f"sample.{p.name}": p.neutral for p in registry().parameters_of("sheet") if p.neutral is not None}}
+    values = {
+        **bench.values,
+        "middle.inserted": 0.0,
+        **{f"sample.{p.name}": p.neutral for p in registry().parameters_of("sheet") if p.neutral is not None},
+    }
     defines = {k: v for k, v in bench.scene.defines.items() if k not in ("middle", "pattern")}
     bare = type(bench)(scene.load(file, defines), values)
     assert np.abs(bare.image() - bench.image(values)).max() <= IDENTITY
@@ -429,19 +472,22 @@ def test_a_sheet_at_rest_and_a_film_taken_out_are_not_there(benches, tmp_path):
 
 def test_a_rough_boundary_of_index_1_is_not_there_in_a_render(benches, tmp_path):
     """mi.render with and without it in the sample slot, rough as it is."""
-    from optics.light.output import Pictures
+    from optics.light.rendering import RenderJob
     from optics.scene import loader as scene
 
     bench = benches("polarizer_bench", slot="rough_interface")
     bare = scene.load(without(tmp_path, "polarizer_bench", "sample_plate"), bench.scene.defines)
     values = {**bench.values, "sample.index": 1.0}
-    images = [Pictures(loaded, spp=16, saturation=1.0, layers=()).take({k: values[k] for k in loaded.parameters}).camera
-              for loaded in (bench.scene, bare)]
+    images = [
+        RenderJob(loaded, spp=16, saturation=1.0, layers=()).take({k: values[k] for k in loaded.parameters}).camera
+        for loaded in (bench.scene, bare)
+    ]
     assert images[1].max() > 0.01
     assert np.abs(images[0] - images[1]).max() <= 10 * IDENTITY  # spawned once more, a ray is rounded once more
 
 
-# -- derivatives ----------------------------------------------------------------------------------------------------------------
+# -- derivatives
+# ----------------------------------------------------------------------------------------------------------------
 
 
 def compare(found, reference, image, step, tolerance, keep=True, what=""):
@@ -450,7 +496,9 @@ def compare(found, reference, image, step, tolerance, keep=True, what=""):
     off, size = np.linalg.norm((found - reference)[keep]), np.linalg.norm(reference[keep])
     rounding = FLOAT * np.linalg.norm(image) / step
     assert np.isfinite(found).all(), f"{what}: not finite"
-    assert off <= tolerance * size + rounding, f"{what}: off by {off / max(size, 1e-300):.2g} (rounding {rounding / max(size, 1e-300):.1g})"
+    assert off <= tolerance * size + rounding, (
+        f"{what}: off by {off / max(size, 1e-300):.2g} (rounding {rounding / max(size, 1e-300):.1g})"
+    )
 
 
 def check_forward_mode(bench, key):
@@ -464,8 +512,9 @@ def check_forward_mode(bench, key):
         step = 0.5 * p.step * p.plausible
         reference, used = differences(lambda v: r.image({**base, key: v}, led), value, step, p.bounds)
         keep = calm(bench, key, [value, *used], base) if moves(bench, key) else True
-        # 5e-4: what the third derivative leaves of a step of 5 % of a plausible change; where the LED moves, some pixels cross
-        # the kink of (S3) at perpendicular azimuths within the step, and their differences are off by some percent
+        # 5e-4: what the third derivative leaves of a step of 5 % of a plausible change; where the LED moves, some
+        # pixels cross the kink of (S3) at perpendicular azimuths within the step, and their differences are off by some
+        # percent
         tolerance = 2e-3 if moves(bench, key) else 5e-4
         compare(r.led_tangent(now, led, key), reference, r.image(now, led), step, tolerance, keep, f"{key} = {value:g}")
 
@@ -495,7 +544,8 @@ def test_complex_step_against_differences(kind, name, bench_of):
 
 
 def check_layer_step(bench, key):
-    """The model's derivative by complex step through layers and sources against differences of its images; how strong it is."""
+    """The model's derivative by complex step through layers and sources against differences of its images; how strong
+    it is."""
     p = bench.scene.parameters[key]
     base, strongest = about(bench, key), 0.0
     for value in places(bench, key, p, base):
@@ -503,9 +553,11 @@ def check_layer_step(bench, key):
         reference, _ = differences(lambda v: bench.image({**base, key: v}), value, 3e-3 * p.plausible, p.bounds)
         size = np.linalg.norm(reference)
         off = np.linalg.norm(found - reference)
-        # 1e-5: as for the camera; 1e-7 of the image over a plausible change: a slope that is 0, of which a step leaves that much
+        # 1e-5: as for the camera; 1e-7 of the image over a plausible change: a slope that is 0, of which a step leaves
+        # that much
         assert off <= 1e-5 * size + 1e-7 * np.linalg.norm(bench.image(base)) / p.plausible, (
-            f"{key} = {value:g}: off by {off / max(size, 1e-300):.2g}")
+            f"{key} = {value:g}: off by {off / max(size, 1e-300):.2g}"
+        )
         strongest = max(strongest, size * p.plausible)
     return strongest
 
@@ -518,7 +570,8 @@ def test_complex_step_through_layers_against_differences(kind, name, bench_of):
 
 
 def check_model_derivative(bench, key, tolerance, rims=False):
-    """Model.derivatives against differences of Model.predict over other steps than it takes itself; how strong they are."""
+    """Model.derivatives against differences of Model.predict over other steps than it takes itself; how strong they
+    are."""
     p = bench.scene.parameters[key]
     base = about(bench, key)
     if key == bench.renderer.bounce_key:
@@ -528,7 +581,9 @@ def check_model_derivative(bench, key, tolerance, rims=False):
         found = bench.derivative(key, {**base, key: value})
         step = 0.5 * p.step * p.plausible
         reference, used = differences(lambda v: bench.image({**base, key: v}), value, step, p.bounds)
-        own = [min(max(value + s * p.step * p.plausible, p.bounds[0]), p.bounds[1]) for s in (-1, 1)]  # the model's own steps
+        own = [
+            min(max(value + s * p.step * p.plausible, p.bounds[0]), p.bounds[1]) for s in (-1, 1)
+        ]  # the model's own steps
         keep = calm(bench, key, [value, *used, *own], base) if moves(bench, key) else True
         compare(found, reference, bench.image({**base, key: value}), step, tolerance, keep, f"{key} = {value:g}")
         if rims:
@@ -557,21 +612,45 @@ def test_differences_do_not_depend_on_their_step(kind, name, bench_of):
 
 
 # What layers, glow and a pressed skin make of derivatives by each of the four ways, in the finger.
-IN_THE_FINGER = ("analyzer.angle", "film.offset", "silicone.stress", "inner_face.index", "skin.press_depth", "uv_left.power",
-                 "uv_left.x", "room_left.tilt", "object_paint.rho_g", "wall_paint.ambient", "camera.gain_g")
+IN_THE_FINGER = (
+    "analyzer.angle",
+    "film.offset",
+    "silicone.stress",
+    "inner_face.index",
+    "skin.press_depth",
+    "uv_left.power",
+    "uv_left.x",
+    "room_left.tilt",
+    "object_paint.rho_g",
+    "wall_paint.ambient",
+    "camera.gain_g",
+)
 
 
 @pytest.mark.parametrize("key", IN_THE_FINGER)
 def test_derivatives_behind_layers(key, bench_of):
     bench = bench_of("fluorescent")
-    checks = {"layer": (check_layer_step,), "image": (check_complex_step,),
-              "ad": (check_model_derivative, 2e-3), "difference": (check_model_derivative, 0.03)}
+    checks = {
+        "layer": (check_layer_step,),
+        "image": (check_complex_step,),
+        "ad": (check_model_derivative, 2e-3),
+        "difference": (check_model_derivative, 0.03),
+    }
     check, *tolerance = checks[bench.scene.parameters[key].how]
     assert check(bench, key, *tolerance) > 1e-5
 
 
-@pytest.mark.parametrize("key", ("analyzer.angle", "film.offset", "analyzer.transmittance", "object_paint.rho_g", "wall_paint.ambient",
-                                 "object.bsdf.reflectance.value"))
+@pytest.mark.parametrize(
+    "key",
+    (
+        "analyzer.angle",
+        "film.offset",
+        "analyzer.transmittance",
+        "object_paint.rho_g",
+        "wall_paint.ambient",
+        "object.bsdf.reflectance.value",
+    ),
+)
 def test_derivatives_of_light_that_no_lamp_made(key, bench_of, monkeypatch):
     """With every lamp off, what the paints shine by themselves is still seen through the layers."""
     bench = bench_of("fluorescent")
@@ -581,9 +660,12 @@ def test_derivatives_of_light_that_no_lamp_made(key, bench_of, monkeypatch):
     assert (check_layer_step(bench, key) if layer else check_model_derivative(bench, key, 2e-3)) > 1e-5
 
 
-def test_a_picture_does_not_depend_on_those_before_it(bench):
+def test_a_image_does_not_depend_on_those_before_it(bench):
     """Values of stock plugins take hold whatever geometry is at hand, light of the room included."""
-    key, room = "membrane.reflectance.value", {"membrane.ambient": 0.01, **{f"{n}.power": 0.0 for n in bench.scene.leds}}
+    key, room = (
+        "membrane.reflectance.value",
+        {"membrane.ambient": 0.01, **{f"{n}.power": 0.0 for n in bench.scene.leds}},
+    )
     for light in (room, {}):
         before = bench.image(light)
         brighter = bench.image({**light, key: 1.1})
@@ -604,8 +686,14 @@ def check_linear(bench, key):
         assert np.linalg.norm(twice - rest) == pytest.approx(4 * np.linalg.norm(once - rest), rel=0.05)
 
 
-@pytest.mark.parametrize("kind, name", [pytest.param(k, n, id=f"{k}.{n}") for k, n in NUMBERS
-                                        if registry().parameter(k, n).linear or registry().parameter(k, n).squared])
+@pytest.mark.parametrize(
+    "kind, name",
+    [
+        pytest.param(k, n, id=f"{k}.{n}")
+        for k, n in NUMBERS
+        if registry().parameter(k, n).linear or registry().parameter(k, n).squared
+    ],
+)
 def test_declared_linear_or_squared_is_true(kind, name, bench_of):
     bench = bench_of(kind, name)
     check_linear(bench, key_of(bench, kind, name))
@@ -622,9 +710,18 @@ def test_shared_and_mixed_variables(bench):
 
 
 def test_derivatives_through_a_bent_response(bench):
-    """The chain rule through lens, sensor and response: light's derivative against differences with every camera effect on."""
-    camera = {"camera.vignetting": 0.7, "camera.blur": 0.8, "camera.glare": 0.05, "camera.crosstalk": 0.04,
-              "camera.response2_r": 0.2, "camera.response3_g": 0.1, "camera.response_bend": 0.1, "camera.offset": 2.0}
+    """The chain rule through lens, sensor and response: light's derivative against differences with every camera effect
+    on."""
+    camera = {
+        "camera.vignetting": 0.7,
+        "camera.blur": 0.8,
+        "camera.glare": 0.05,
+        "camera.crosstalk": 0.04,
+        "camera.response2_r": 0.2,
+        "camera.response3_g": 0.1,
+        "camera.response_bend": 0.1,
+        "camera.offset": 2.0,
+    }
     for key in ("led_1.mu", "membrane.sigma", "gel.absorption", "led_3.power"):
         p = bench.scene.parameters[key]
         value = bench.values[key] + 0.5 * p.plausible
@@ -644,8 +741,16 @@ def test_derivatives_with_a_flat_field(bench, mode):
     v, u = np.mgrid[:height, :width]
     flat = 60 + 20 * np.sin(u / 9)[..., None] * [1, 0.5, -0.5] + v[..., None] / 3
     flattened = type(bench)(bench.scene, bench.values, flat.astype(np.float32), mode)
-    for key in ("led_1.mu", "led_3.power", "membrane.rho_g", "camera.gain_r", "camera.response2_g", "gel.absorption", "gel.wedge_x",
-                "gel.press_depth"):
+    for key in (
+        "led_1.mu",
+        "led_3.power",
+        "membrane.rho_g",
+        "camera.gain_r",
+        "camera.response2_g",
+        "gel.absorption",
+        "gel.wedge_x",
+        "gel.press_depth",
+    ):
         p = bench.scene.parameters[key]
         value = bench.values[key] + 0.5 * p.plausible
         step = 0.5 * p.step * p.plausible
@@ -655,13 +760,22 @@ def test_derivatives_with_a_flat_field(bench, mode):
         if moves(bench, key):
             keep = calm(bench, key, [value, *used, *own], bench.values)
             keep &= calm(bench, key, [value, *used, *own], {**bench.values, "gel.press_depth": 0.0})
-        # what a wedge does to the face at rest and to the dented face nearly cancels: 0.3 % of either is 6 % of the rest
-        compare(flattened.derivative(key, {key: value}), reference, flattened.image({key: value}), step,
-                {"gel.wedge_x": 0.1, "gel.press_depth": 0.03}.get(key, 1e-3), keep, key)
+        # what a wedge does to the face at rest and to the dented face nearly cancels: 0.3 % of either is 6 % of the
+        # rest
+        compare(
+            flattened.derivative(key, {key: value}),
+            reference,
+            flattened.image({key: value}),
+            step,
+            {"gel.wedge_x": 0.1, "gel.press_depth": 0.03}.get(key, 1e-3),
+            keep,
+            key,
+        )
 
 
 def check_rim(found, reference, rim, key):
-    """At rims derivatives are finite samples of a moving edge: their sum over the rim, not each pixel, is to be trusted.
+    """At rims derivatives are finite samples of a moving edge: their sum over the rim, not each pixel, is to be
+    trusted.
 
     At 80 x 60 px and 64 samples the sum is good to 10 %; single pixels of a press's rim are off by 80 %.
     """
@@ -677,15 +791,24 @@ def test_moved_rims_carry_about_the_right_light(key, bench):
     check_rim(bench.derivative(key), reference, ~calm(bench, key, [value, *used], bench.values), key)
 
 
-# -- images stay images -----------------------------------------------------------------------------------------------------------
+# -- images stay images
+# -----------------------------------------------------------------------------------------------------------
 
 
 def check_image_function(effect, stage, bench):
-    """lens and sensor are affine in the image; response acts pixel by pixel; none changes the shape; none is in place."""
+    """lens and sensor are affine in the image; response acts pixel by pixel; none changes the shape; none is in
+    place."""
     function = effect.stages[stage]
-    view = bench.model.developer.view({**bench.values, **{k: inward(p, p.neutral, p.plausible)
-                                                          for p in registry().effect_parameters(effect)
-                                                          for k in keys(bench, effect.part, p.name)}})
+    view = bench.model.developer.view(
+        {
+            **bench.values,
+            **{
+                k: inward(p, p.neutral, p.plausible)
+                for p in registry().effect_parameters(effect)
+                for k in keys(bench, effect.part, p.name)
+            },
+        }
+    )
     rng = np.random.default_rng(5)
     a, b = rng.uniform(0, 1, (2, view.height, view.width, 3))
     kept = a.copy()
@@ -696,7 +819,9 @@ def check_image_function(effect, stage, bench):
     poked[2, 3] += 0.5
     elsewhere = np.abs(function(poked, view) - out).max(-1) > 1e-9
     elsewhere[2, 3] = False
-    assert elsewhere.any() == effect.pictures, f"{effect.name}: pictures = {effect.pictures}, but pixels mix or do not"
+    assert elsewhere.any() == effect.mixes_pixels, (
+        f"{effect.name}: mixes_pixels = {effect.mixes_pixels}, but pixels mix or do not"
+    )
     if stage == "response":
         order = rng.permutation(a.shape[0] * a.shape[1])
         shuffled = a.reshape(-1, 3)[order].reshape(a.shape)
@@ -705,7 +830,9 @@ def check_image_function(effect, stage, bench):
         assert np.abs(function(0.3 * a + 0.7 * b, view) - 0.3 * out - 0.7 * function(b, view)).max() < 1e-12
 
 
-@pytest.mark.parametrize("key, stage", [(k, s) for k in EFFECTS for s in registry().effects[k].stages if s in IMAGE_STAGES])
+@pytest.mark.parametrize(
+    "key, stage", [(k, s) for k in EFFECTS for s in registry().effects[k].stages if s in IMAGE_STAGES]
+)
 def test_image_functions_are_affine_or_act_pixel_by_pixel(key, stage, bench_of):
     effect = registry().effects[key]
     check_image_function(effect, stage, bench_of(effect))
@@ -739,7 +866,8 @@ def test_random_strengths_give_images(key, bench_of):
 
 @pytest.mark.parametrize("seed", range(2))
 def test_everything_drawn_at_once_gives_images(seed, bench):
-    """All parameters of the sensor within a plausible change, all effects on; and derivatives at that point are finite."""
+    """All parameters of the sensor within a plausible change, all effects on; and derivatives at that point are
+    finite."""
     values = draw(np.random.default_rng(seed), bench)
     image = bench.image(values)
     assert np.isfinite(image).all() and image.std() > 0
@@ -749,10 +877,15 @@ def test_everything_drawn_at_once_gives_images(seed, bench):
 
 @pytest.mark.parametrize("kind, seed", [("source", 0), ("source", 1), ("fluorescent", 0)])
 def test_all_layers_drawn_at_once_give_derivatives(kind, seed, bench_of):
-    """All parameters of a layered scene within a plausible change: an image, and the right derivatives by those of layers."""
+    """All parameters of a layered scene within a plausible change: an image, and the right derivatives by those of
+    layers."""
     bench = bench_of(kind)
     rng = np.random.default_rng(seed)
-    values = {**bench.values, **draw(rng, bench), bench.renderer.bounce_key: 0.0}  # of a second bounce only powers have derivatives
+    values = {
+        **bench.values,
+        **draw(rng, bench),
+        bench.renderer.bounce_key: 0.0,
+    }  # of a second bounce only powers have derivatives
     if kind != "source":  # reflections between films take their time
         values.update({k: 0.0 for k in values if k.endswith(".face")})
     image = bench.image(values)
@@ -762,20 +895,25 @@ def test_all_layers_drawn_at_once_give_derivatives(kind, seed, bench_of):
         p = bench.scene.parameters[key]
         reference, _ = differences(lambda v: bench.image({**values, key: v}), values[key], 3e-3 * p.plausible, p.bounds)
         off = np.linalg.norm(bench.derivative(key, values) - reference)
-        assert off <= 1e-5 * np.linalg.norm(reference) + 1e-7 * np.linalg.norm(image) / p.plausible, f"{key}: off by {off:.2g}"
+        assert off <= 1e-5 * np.linalg.norm(reference) + 1e-7 * np.linalg.norm(image) / p.plausible, (
+            f"{key}: off by {off:.2g}"
+        )
 
 
 @pytest.mark.parametrize("key", EFFECTS)
 def test_no_light_no_image(key, bench_of):
     """With every light off all is black whatever the strength, but for effects that bring their own light.
 
-    A camera that adds to the signal does so at every pixel alike, unless the effect says that it acts through the dark signal.
-    """
+    A camera that adds to the signal does so at every pixel alike, unless the effect says that it acts through the dark
+    signal."""
     effect = registry().effects[key]
     bench = bench_of(effect)
-    dark = {**bench.values, **{k: bench.scene.parameters[k].neutral for k in bench.renderer.ambient_keys},
-            **{f"{light}.power": 0.0 for light in bench.scene.lights},
-            **at(bench, effect, lambda p: inward(p, p.neutral, p.plausible))}
+    dark = {
+        **bench.values,
+        **{k: bench.scene.parameters[k].neutral for k in bench.renderer.ambient_keys},
+        **{f"{light}.power": 0.0 for light in bench.scene.lights},
+        **at(bench, effect, lambda p: inward(p, p.neutral, p.plausible)),
+    }
     image, shines = bench.image(dark), "ambient" in effect.stages
     assert (bench.model.radiance(dark).max() > 0) == shines
     assert shines or "dark" in effect.acts or np.ptp(image, axis=(0, 1)).max() == 0
@@ -799,7 +937,8 @@ def test_bounds_are_kept(kind, name, bench_of):
             bench.scene.check({key: wrong})
 
 
-# -- layers and sources ------------------------------------------------------------------------------------------------------------
+# -- layers and sources
+# ------------------------------------------------------------------------------------------------------------
 
 
 def crossings(rng, count, bands=(620.0, 540.0, 460.0), steepest=60.0):
@@ -807,11 +946,13 @@ def crossings(rng, count, bands=(620.0, 540.0, 460.0), steepest=60.0):
     from optics.polarization.layers import Crossing
 
     theta, phi, turn = np.radians([steepest, 360, 360])[:, None] * rng.uniform(0, 1, (3, count))
-    k = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), rng.choice([-1, 1], count) * np.cos(theta)], -1)
+    k = np.stack(
+        [np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), rng.choice([-1, 1], count) * np.cos(theta)], -1
+    )
     s = np.stack([-np.sin(phi), np.cos(phi), 0 * phi], -1)
     x = np.cos(turn)[:, None] * s + np.sin(turn)[:, None] * np.cross(k, s)
     u, v = rng.uniform(-10, 10, (2, count, 1))
-    return Crossing(*(tuple(a[:, i:i + 1] for i in range(3)) for a in (k, x)), u, v, np.array(bands))
+    return Crossing(*(tuple(a[:, i : i + 1] for i in range(3)) for a in (k, x)), u, v, np.array(bands))
 
 
 def layer_of(bench, kind, values):
@@ -823,7 +964,8 @@ def layer_of(bench, kind, values):
 
 
 def check_realisable(bench, kind, seed):
-    """Within a plausible change of the bench a layer's own matrix, and that of each of its effects, is one of something passive."""
+    """Within a plausible change of the bench a layer's own matrix, and that of each of its effects, is one of something
+    passive."""
     from optics.polarization.mueller import gain, physical
 
     rng = np.random.default_rng(seed)
@@ -831,7 +973,9 @@ def check_realisable(bench, kind, seed):
     for _ in range(5):
         layer = layer_of(bench, kind, {**bench.values, **draw(rng, bench)})
         crossing = crossings(rng, 40)
-        matrices = [e.stages["layer"](crossing, layer) for e in effects] + [registry().parts[kind].mueller(crossing, layer)]
+        matrices = [e.stages["layer"](crossing, layer) for e in effects] + [
+            registry().parts[kind].mueller(crossing, layer)
+        ]
         for name, matrix in zip([*(e.name for e in effects), kind], matrices):
             m = matrix.numpy()
             assert np.isfinite(m).all()
@@ -846,7 +990,9 @@ def check_emission(bench, kind, seed):
         source = layer_of(bench, kind, {**bench.values, **draw(rng, bench)})
         vector = np.stack(np.broadcast_arrays(*registry().parts[kind].stokes(crossings(rng, 40), source)), -1)
         assert np.isfinite(vector).all()
-        assert (np.linalg.norm(vector[..., 1:], axis=-1) <= vector[..., 0] * (1 + 1e-12)).all(), f"{kind}: polarized beyond 1"
+        assert (np.linalg.norm(vector[..., 1:], axis=-1) <= vector[..., 0] * (1 + 1e-12)).all(), (
+            f"{kind}: polarized beyond 1"
+        )
 
 
 def check_readings(bench, kind):
@@ -865,9 +1011,15 @@ def check_readings(bench, kind):
 
         def rows(value):
             values = {**bench.values, key: value}
-            return np.array([np.broadcast_to(e, (np.size(value), len(bands))) for e in (
-                *paths.transmission(scene, path, values, bands),
-                *(c for n in sources for c in paths.emitted(scene, n, path, values, bands)))])
+            return np.array(
+                [
+                    np.broadcast_to(e, (np.size(value), len(bands)))
+                    for e in (
+                        *paths.transmission(scene, path, values, bands),
+                        *(c for n in sources for c in paths.emitted(scene, n, path, values, bands)),
+                    )
+                ]
+            )
 
         together, alone = rows(many), np.concatenate([rows(float(m)) for m in many], 1)
         assert np.abs(together - alone).max() <= 1e-12, f"{key}: readings differ from single values"
@@ -881,13 +1033,18 @@ def check_both_arithmetics(mi, bench, kind):
     part, bands = registry().parts[kind], (620.0, 540.0, 460.0)
     bench.scene.set(bench.values)
     here = crossings(np.random.default_rng(3), 30, bands)
-    there = Crossing(*(tuple(mi.Float(c.ravel().astype("f")) for c in a) for a in (here.k, here.x)),
-                     *(mi.Float(c.ravel().astype("f")) for c in (here.u, here.v)),
-                     mi.UnpolarizedSpectrum(*bands, *bands[-1:] * (len(mi.UnpolarizedSpectrum()) - len(bands))))
+    there = Crossing(
+        *(tuple(mi.Float(c.ravel().astype("f")) for c in a) for a in (here.k, here.x)),
+        *(mi.Float(c.ravel().astype("f")) for c in (here.u, here.v)),
+        mi.UnpolarizedSpectrum(*bands, *bands[-1:] * (len(mi.UnpolarizedSpectrum()) - len(bands))),
+    )
     own = next(p for p in bench.scene.parts.values() if p.kind == kind)
-    found, expected = ([e for row in evaluate(part.mueller, c, layer, registry().at_stage(kind, "layer")).rows for e in row] if part.mueller is not None
-                       else part.stokes(c, layer)
-                       for c, layer in ((there, numbers_of(own)), (here, layer_of(bench, kind, bench.values))))
+    found, expected = (
+        [e for row in evaluate(part.mueller, c, layer, registry().at_stage(kind, "layer")).rows for e in row]
+        if part.mueller is not None
+        else part.stokes(c, layer)
+        for c, layer in ((there, numbers_of(own)), (here, layer_of(bench, kind, bench.values)))
+    )
     for dr_entry, entry in zip(found, expected):
         lanes = mi.UnpolarizedSpectrum(dr_entry)
         for b in range(len(bands)):
@@ -919,7 +1076,8 @@ def test_renders_meet_the_same_matrices(kind, bench_of, mitsuba):
     check_both_arithmetics(mitsuba, bench_of(kind), kind)
 
 
-# -- a user's own folder ----------------------------------------------------------------------------------------------------------
+# -- a user's own folder
+# ----------------------------------------------------------------------------------------------------------
 
 GOOD = '''"""LED halo: the package of an LED scatters a little light aside.
 
@@ -982,33 +1140,54 @@ effect = Effect(name="cloudy cell", part="sugar_cell", stages={"layer": scramble
 
 BAD = {  # what is wrong -> (replacements in the good plugin, the check that has to notice)
     "not the identity at neutral": ([("return 1 +", "return 1.001 +")], check_identity),
-    "jumps at neutral": ([("return 1 + led.halo *", "import drjit as dr\n    return 1 + dr.select(led.halo > 0, 0.2 + led.halo, 0) *")],
-                         check_continuity),
+    "jumps at neutral": (
+        [("return 1 + led.halo *", "import drjit as dr\n    return 1 + dr.select(led.halo > 0, 0.2 + led.halo, 0) *")],
+        check_continuity,
+    ),
     "sets in with the square": ([("led.halo *", "led.halo * led.halo *")], check_onset),
-    "hides its derivative": ([("return 1 + led.halo", "import drjit as dr\n    return 1 + dr.detach(led.halo)")], check_forward_mode),
+    "hides its derivative": (
+        [("return 1 + led.halo", "import drjit as dr\n    return 1 + dr.detach(led.halo)")],
+        check_forward_mode,
+    ),
     "not documented": ([("Fingerprint\n    brighter far from the axis.\n", "")], check_documentation),
 }
 BAD_LAYER = {
     "not the identity at neutral": ([("1.0 - cell.cloud", "0.999 - cell.cloud")], check_identity),
-    "jumps at neutral": ([("1.0 - cell.cloud", "where(real(cell.cloud) > 0, 0.8, 1.0) - cell.cloud")], check_continuity),
+    "jumps at neutral": (
+        [("1.0 - cell.cloud", "where(real(cell.cloud) > 0, 0.8, 1.0) - cell.cloud")],
+        check_continuity,
+    ),
     "sets in with the square": ([("cell.cloud)", "cell.cloud * cell.cloud)")], check_onset),
     "hides its derivative": ([("cell.cloud)", "real(cell.cloud))")], check_layer_step),
     "is no physical matrix": ([("1.0 - cell.cloud", "1.0 + cell.cloud")], check_realisable),
     "makes light": ([("* cell.transmittance", "* (1.3 * cell.transmittance)")], check_realisable),
     "is not linear": ([("* cell.transmittance", "* cell.transmittance * cell.transmittance")], check_linear),
-    "takes single values alone": ([("* cell.rotation *", "* (cell.rotation if real(cell.rotation) < 30 else 30.0) *")],
-                                  check_readings),
+    "takes single values alone": (
+        [("* cell.rotation *", "* (cell.rotation if real(cell.rotation) < 30 else 30.0) *")],
+        check_readings,
+    ),
     "mixes readings": ([("* cell.rotation *", "* (cell.rotation + 0 * crossing.u).mean() *")], check_readings),
-    "is another one in a render": ([("1.0 - cell.cloud", "1.0 - cell.cloud - (0 if hasattr(crossing.u, 'shape') and "
-                                     "type(crossing.u).__module__ == 'numpy' else 0.1)")], check_both_arithmetics),
-    "differentiates another way": ([("plausible=0.05, how=\"layer\"),))", "plausible=0.05),))")], check_effect_declaration),
+    "is another one in a render": (
+        [
+            (
+                "1.0 - cell.cloud",
+                "1.0 - cell.cloud - (0 if hasattr(crossing.u, 'shape') and "
+                "type(crossing.u).__module__ == 'numpy' else 0.1)",
+            )
+        ],
+        check_both_arithmetics,
+    ),
+    "differentiates another way": (
+        [('plausible=0.05, how="layer"),))', "plausible=0.05),))")],
+        check_effect_declaration,
+    ),
 }
 
 
 @pytest.fixture
 def user_bench(tmp_path, load_bench, monkeypatch):
-    """Writes a plugin, or several by the names of their files, into a user's folder and loads a shipped scene with it as a bench, in a
-    registry of its own."""
+    """Writes a plugin, or several by the names of their files, into a user's folder and loads a shipped scene with it
+    as a bench, in a registry of its own."""
     import optics.scene.registry as declarations
 
     usual = declarations.registry()
@@ -1086,9 +1265,12 @@ def test_the_contract_notices_in_layers(fault, user_bench, mitsuba):
     bench = user_bench(spoil(CELL, replacements), "polarizer_bench", "sugar_cell")
     effect = registry().find_effect("cloudy cell")
     arguments = {
-        check_layer_step: (bench, "sample.cloud"), check_linear: (bench, "sample.transmittance"),
-        check_realisable: (bench, "sugar_cell", 1), check_readings: (bench, "sugar_cell"),
-        check_both_arithmetics: (mitsuba, bench, "sugar_cell"), check_effect_declaration: (effect, registry()),
+        check_layer_step: (bench, "sample.cloud"),
+        check_linear: (bench, "sample.transmittance"),
+        check_realisable: (bench, "sugar_cell", 1),
+        check_readings: (bench, "sugar_cell"),
+        check_both_arithmetics: (mitsuba, bench, "sugar_cell"),
+        check_effect_declaration: (effect, registry()),
     }.get(check, (bench, effect))
     with pytest.raises((AssertionError, ValueError)):  # an array that is asked for its truth raises by itself
         check(*arguments)
@@ -1112,7 +1294,10 @@ def test_stubs_of_new_effects_meet_the_contract(user_bench):
             check()
 
 
-RAMP = {"place": range(16), "channel": range(3)}  # cells; of other coordinates: a straight line from 0 to beyond any value
+RAMP = {
+    "place": range(16),
+    "channel": range(3),
+}  # cells; of other coordinates: a straight line from 0 to beyond any value
 STEEP = {"height", "gel_path", "press_distance", "led_distance"}  # mm
 
 
@@ -1123,28 +1308,34 @@ def along(name):
 
 @pytest.fixture
 def drafts(user_bench):
-    """A bench with a draft along every coordinate that one can follow, each a gain that is linear in it; LED 1 alone is lit."""
+    """A bench with a draft along every coordinate that one can follow, each a gain that is linear in it; LED 1 alone is
+    lit."""
     from optics.diagnosis.verdict import Fingerprint
     from optics.study import draft
 
     texts = {}
     for name in draft.CARRIERS:
         at = [float(x) for x in RAMP.get(name, (-1000, 1000))]
-        curve = Fingerprint(name, 9.0, 1, 0.0, 8.0, 2.0, "gain", at, [along(name) * x for x in at], [1e-5] * len(at), [], "geometry")
+        curve = Fingerprint(
+            name, 9.0, 1, 0.0, 8.0, 2.0, "gain", at, [along(name) * x for x in at], [1e-5] * len(at), [], "geometry"
+        )
         found = SimpleNamespace(fingerprints=[curve], families=[], basis=SimpleNamespace(signal=1.0))
-        texts[f"along_{name}"] = draft.draft_effect(found, name, name=f"along {name}", black_level=0.0, saturation=255.0)
+        texts[f"along_{name}"] = draft.draft_effect(
+            found, name, name=f"along {name}", black_level=0.0, saturation=255.0
+        )
     bench = user_bench(texts)
-    bench.values.update({k: 0.0 for k in ("led_3.power", "led_5.power")})
+    bench.values.update(dict.fromkeys(("led_3.power", "led_5.power"), 0.0))
     return bench
 
 
 def draft_key(name):
     effect = registry().find_effect(f"along {name}")
-    return f"{ {'gel': 'gel', 'led': 'led_1', 'camera': 'camera'}[effect.part]}.{effect.parameter_names[0]}"
+    return f"{ {'gel': 'gel', 'led': 'led_1', 'camera': 'camera'}[effect.part] }.{effect.parameter_names[0]}"
 
 
 def test_drafts_act_along_the_coordinate_that_was_diagnosed(drafts):
-    """What a draft's stage computes is what the fingerprint was binned by, pixel by pixel, but at rims and where a press's edge bends."""
+    """What a draft's stage computes is what the fingerprint was binned by, pixel by pixel, but at rims and where a
+    press's edge bends."""
     from optics.diagnosis import fingerprints
     from optics.study import draft
 
@@ -1154,7 +1345,9 @@ def test_drafts_act_along_the_coordinate_that_was_diagnosed(drafts):
     v, u = np.mgrid[:height, :width]
     known.update(row=v, column=u, place=v * 4 // height * 4 + u * 4 // width)
     rest = bench.image()
-    bent = bench.model.renderer.hits(bench.model.at(bench.at(), 0)).bent > 0  # means over the pixel, where coordinates are its middle's
+    bent = (
+        bench.model.renderer.hits(bench.model.at(bench.at(), 0)).bent > 0
+    )  # means over the pixel, where coordinates are its middle's
     lit = (rest.min(-1) > 1e-3) & ~known["rim"] & ~known["shadow"] & ~bent
     assert lit.mean() > 0.6
     for name in draft.CARRIERS:
@@ -1168,16 +1361,29 @@ def test_drafts_act_along_the_coordinate_that_was_diagnosed(drafts):
         off = np.abs(gain / (along(name) * strength) - expected)[lit]
         assert np.isfinite(off).all()
         # rounding of float32: 1e-6 of the image is 7e-4 deg; a degree near 0 is an arc cosine near 1, good to 0.02
-        assert np.quantile(off, 0.99) < 0.03 + 1e-3 * np.nanmax(np.abs(expected)), f"{name}: off by {np.quantile(off, 0.99):.3g}"
+        assert np.quantile(off, 0.99) < 0.03 + 1e-3 * np.nanmax(np.abs(expected)), (
+            f"{name}: off by {np.quantile(off, 0.99):.3g}"
+        )
 
 
-@pytest.mark.parametrize("name, key, tolerance", [
-    ("incidence", "led_1.x", 2e-3), ("led_distance", "led_1.z", 2e-3), ("half_angle", "led_1.y", 2e-3),
-    ("led_angle", "led_1.tilt", 5e-3),  # an angle to an axis is a cone: within the step, 0.25 deg, pixels cross its tip
-    ("height", "gel.press_depth", 0.03),
-    ("slope", "gel.press_x", 0.12)])  # the slope bends at the edge of the contact, which the two steps cross by more or less
+@pytest.mark.parametrize(
+    "name, key, tolerance",
+    [
+        ("incidence", "led_1.x", 2e-3),
+        ("led_distance", "led_1.z", 2e-3),
+        ("half_angle", "led_1.y", 2e-3),
+        (
+            "led_angle",
+            "led_1.tilt",
+            5e-3,
+        ),  # an angle to an axis is a cone: within the step, 0.25 deg, pixels cross its tip
+        ("height", "gel.press_depth", 0.03),
+        ("slope", "gel.press_x", 0.12),
+    ],
+)  # the slope bends at the edge of the contact, which the two steps cross by more or less
 def test_derivatives_go_through_a_draft(name, key, tolerance, drafts):
-    """Of what moves the coordinate itself, with the draft at a strength at which it matters; tolerances as without drafts."""
+    """Of what moves the coordinate itself, with the draft at a strength at which it matters; tolerances as without
+    drafts."""
     strong = {draft_key(name): 8.0}
     before = drafts.derivative(key)
     drafts.values.update(strong)
@@ -1187,7 +1393,7 @@ def test_derivatives_go_through_a_draft(name, key, tolerance, drafts):
 
 def test_a_layers_effect_of_what_is_no_layer_is_refused(user_bench):
     with pytest.raises(BadPlugin, match="'led' is not"):
-        user_bench(spoil(CELL, [("part=\"sugar_cell\", stages", "part=\"led\", stages")]), "polarizer_bench", "sugar_cell")
+        user_bench(spoil(CELL, [('part="sugar_cell", stages', 'part="led", stages')]), "polarizer_bench", "sugar_cell")
 
 
 def test_the_contract_notices_light_polarized_beyond_itself(benches, monkeypatch):
@@ -1204,7 +1410,7 @@ def test_the_contract_notices_light_polarized_beyond_itself(benches, monkeypatch
 
 def test_the_contract_notices_pixels_that_mix(benches):
     with pytest.raises(AssertionError, match="pixels mix"):
-        check_image_function(replace(registry().effects["lens-blur"], pictures=False), "lens", benches("gelsight"))
+        check_image_function(replace(registry().effects["lens-blur"], mixes_pixels=False), "lens", benches("gelsight"))
 
 
 def test_the_contract_notices_glow_without_a_derivative(benches, monkeypatch):

@@ -1,8 +1,9 @@
-"""The integrator `tactile` against stock `path` and `volpath`, pixel by pixel, and the prediction LED by LED against both.
+"""The integrator `tactile` against stock `path` and `volpath`, pixel by pixel, and the prediction LED by LED against
+both.
 
-Two unbiased renders of a scene differ by noise alone. Each pixel gets Welch's t from the means of independent renders; the
-smallest p-value must pass after Sidak's correction for the number of pixels. Seeds are fixed, so the outcome is too.
-"""
+Two unbiased renders of a scene differ by noise alone. Each pixel gets Welch's t from the means of independent renders;
+the smallest p-value must pass after Sidak's correction for the number of pixels. Seeds are fixed, so the outcome is
+too."""
 
 from __future__ import annotations
 
@@ -29,7 +30,9 @@ def least_p(a, b):
     from scipy.stats import ttest_ind
 
     a, b = (x.mean(-1) if x.shape[-1] <= 4 else x for x in (a, b))  # channels of a pixel share their noise
-    moving = (a.std(0) > 1e-6 * a.max()) | (b.std(0) > 1e-6 * b.max())  # others have no noise and must agree by themselves
+    moving = (a.std(0) > 1e-6 * a.max()) | (
+        b.std(0) > 1e-6 * b.max()
+    )  # others have no noise and must agree by themselves
     still = np.abs(a.mean(0) - b.mean(0))[~moving]
     assert still.size == 0 or still.max() <= 1e-5 * np.abs(b).max(), f"noise-free pixels differ by {still.max():g}"
     p = ttest_ind(a[:, moving], b[:, moving], equal_var=False).pvalue
@@ -47,23 +50,36 @@ def agree(scene, ours, stock, **options):
 
 def sensor(mi, size=(32, 24), distance=8.0, tilt=(0.0, -4.0, 0.0)):
     """A stock camera above the plane z = 0, looking down at the origin from the side."""
-    return {"type": "perspective", "fov": 35,
-            "to_world": mi.ScalarTransform4f().look_at([tilt[0], tilt[1], distance], [0, 0, 0], [0, 1, 0]),
-            "film": {"type": "hdrfilm", "width": size[0], "height": size[1], "rfilter": {"type": "box"},
-                     "component_format": "float32"},
-            "sampler": {"type": "independent"}}
+    return {
+        "type": "perspective",
+        "fov": 35,
+        "to_world": mi.ScalarTransform4f().look_at([tilt[0], tilt[1], distance], [0, 0, 0], [0, 1, 0]),
+        "film": {
+            "type": "hdrfilm",
+            "width": size[0],
+            "height": size[1],
+            "rfilter": {"type": "box"},
+            "component_format": "float32",
+        },
+        "sampler": {"type": "independent"},
+    }
 
 
 def floor(mi, reflectance=0.5):
-    return {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(6),
-            "bsdf": {"type": "diffuse", "reflectance": {"type": "uniform", "value": reflectance}}}
+    return {
+        "type": "rectangle",
+        "to_world": mi.ScalarTransform4f().scale(6),
+        "bsdf": {"type": "diffuse", "reflectance": {"type": "uniform", "value": reflectance}},
+    }
 
 
 def lamp(mi, radiance=3.0, half=0.5):
     """A square lamp at height 4, shining down."""
-    return {"type": "rectangle",
-            "to_world": mi.ScalarTransform4f().translate([1.0, 0.5, 4]).rotate([1, 0, 0], 180).scale(half),
-            "emitter": {"type": "area", "radiance": {"type": "uniform", "value": radiance}}}
+    return {
+        "type": "rectangle",
+        "to_world": mi.ScalarTransform4f().translate([1.0, 0.5, 4]).rotate([1, 0, 0], 180).scale(half),
+        "emitter": {"type": "area", "radiance": {"type": "uniform", "value": radiance}},
+    }
 
 
 def point(where=(0.5, 0.5, 4.0), intensity=20.0):
@@ -72,8 +88,11 @@ def point(where=(0.5, 0.5, 4.0), intensity=20.0):
 
 def block(mi):
     """A box on the floor: shadows, and a corner that lights itself."""
-    return {"type": "cube", "to_world": mi.ScalarTransform4f().translate([-0.6, 0.2, 0.6]).scale(0.6),
-            "bsdf": {"type": "diffuse", "reflectance": {"type": "uniform", "value": 0.8}}}
+    return {
+        "type": "cube",
+        "to_world": mi.ScalarTransform4f().translate([-0.6, 0.2, 0.6]).scale(0.6),
+        "bsdf": {"type": "diffuse", "reflectance": {"type": "uniform", "value": 0.8}},
+    }
 
 
 def built(**parts):
@@ -100,10 +119,16 @@ def test_an_absorbing_medium(variant):
     """A clear block of absorbing gel on the floor: exp(-sigma d) along the ray here, tracking in `volpath`."""
     import mitsuba as mi
 
-    gel = {"type": "cube", "to_world": mi.ScalarTransform4f().translate([0, 0, 1]).scale([1.5, 1.5, 0.9]),
-           "bsdf": {"type": "null"},
-           "interior": {"type": "homogeneous", "albedo": {"type": "uniform", "value": 0.0},
-                        "sigma_t": {"type": "uniform", "value": 0.4}}}
+    gel = {
+        "type": "cube",
+        "to_world": mi.ScalarTransform4f().translate([0, 0, 1]).scale([1.5, 1.5, 0.9]),
+        "bsdf": {"type": "null"},
+        "interior": {
+            "type": "homogeneous",
+            "albedo": {"type": "uniform", "value": 0.0},
+            "sigma_t": {"type": "uniform", "value": 0.4},
+        },
+    }
     scene = built(sensor=sensor(mi), floor=floor(mi), gel=gel, light=point())
     agree(scene, tactile(3), {"type": "volpath", "max_depth": 3, "rr_depth": 100})
 
@@ -113,9 +138,11 @@ def test_light_through_a_polarizer(variant):
     """Shadow rays pass a polarizer that is tilted against both the lamp and the camera."""
     import mitsuba as mi
 
-    film = {"type": "rectangle",
-            "to_world": mi.ScalarTransform4f().translate([0, 0, 1.5]).rotate([1, 0, 0], 20).scale(1.2),
-            "bsdf": {"type": "polarizer", "theta": {"type": "uniform", "value": 30.0}}}
+    film = {
+        "type": "rectangle",
+        "to_world": mi.ScalarTransform4f().translate([0, 0, 1.5]).rotate([1, 0, 0], 20).scale(1.2),
+        "bsdf": {"type": "polarizer", "theta": {"type": "uniform", "value": 30.0}},
+    }
     scene = built(sensor=sensor(mi), floor=floor(mi), film=film, light=point())
     agree(scene, tactile(3), {"type": "volpath", "max_depth": 3, "rr_depth": 100})
 
@@ -123,11 +150,18 @@ def test_light_through_a_polarizer(variant):
 @BOTH
 @pytest.mark.parametrize("max_depth", [2, 3])
 def test_an_area_light_behind_a_null_surface(variant, max_depth):
-    """A ray that runs into the lamp must not lose its last bounce to the sheet before it; a wide lamp is often run into."""
+    """A ray that runs into the lamp must not lose its last bounce to the sheet before it; a wide lamp is often run
+    into."""
     import mitsuba as mi
 
-    sheet = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, 3]).scale(4), "bsdf": {"type": "null"}}
-    scene = built(sensor=sensor(mi, distance=2.5), floor=floor(mi), block=block(mi), lamp=lamp(mi, 0.1, half=3), sheet=sheet)
+    sheet = {
+        "type": "rectangle",
+        "to_world": mi.ScalarTransform4f().translate([0, 0, 3]).scale(4),
+        "bsdf": {"type": "null"},
+    }
+    scene = built(
+        sensor=sensor(mi, distance=2.5), floor=floor(mi), block=block(mi), lamp=lamp(mi, 0.1, half=3), sheet=sheet
+    )
     agree(scene, tactile(max_depth), {"type": "volpath", "max_depth": max_depth, "rr_depth": 100})
 
 
@@ -135,7 +169,11 @@ def test_an_area_light_behind_a_null_surface(variant, max_depth):
 def test_null_surfaces_are_not_there(variant):
     import mitsuba as mi
 
-    sheet = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, 1.5]).scale(1.2), "bsdf": {"type": "null"}}
+    sheet = {
+        "type": "rectangle",
+        "to_world": mi.ScalarTransform4f().translate([0, 0, 1.5]).scale(1.2),
+        "bsdf": {"type": "null"},
+    }
     plain = {"floor": floor(mi), "block": block(mi), "light": point()}
     scene = built(sensor=sensor(mi), sheet=sheet, **plain)
     agree(scene, tactile(3), {"type": "volpath", "max_depth": 3, "rr_depth": 100})
@@ -153,11 +191,13 @@ def test_the_comparison_notices_two_percent(mitsuba):
     assert least_p(two, 1.02 * renders(scene, tactile(2), first=500))[1] < 1e-6
 
 
-# -- the shipped sensor ---------------------------------------------------------------------------------------------------
+# -- the shipped sensor
+# ---------------------------------------------------------------------------------------------------
 
 
 def gelsight(tmp_path, variant, leds=None, window=True, size=(32, 24), stokes=False, bands=True, **defines):
-    """The GelSight-type scene, pressed; with some LEDs only, without its window, without bands, or with Stokes channels."""
+    """The GelSight-type scene, pressed; with some LEDs only, without its window, without bands, or with Stokes
+    channels."""
     import re
 
     from optics.scene import loader as scene
@@ -170,8 +210,10 @@ def gelsight(tmp_path, variant, leds=None, window=True, size=(32, 24), stokes=Fa
     if not bands:
         text = re.sub(r'<string name="bands"[^>]*>', "", text)
     if stokes:
-        text = text.replace('<integrator type="tactile" id="integrator">',
-                            '<integrator type="tactile" id="integrator"><boolean name="stokes" value="true"/>')
+        text = text.replace(
+            '<integrator type="tactile" id="integrator">',
+            '<integrator type="tactile" id="integrator"><boolean name="stokes" value="true"/>',
+        )
     file = tmp_path / "scene.xml"
     file.write_text(text, encoding="utf-8")
     return scene.load(file, {"width": size[0], "height": size[1], "depth": 0.6, **defines}, variant)
@@ -183,13 +225,14 @@ def band_images(scene, spp, seeds=4, first=0):
 
     images = np.array([np.array(mi.render(scene.mitsuba, spp=spp, seed=first + k)) for k in range(seeds)], float)
     start = images.shape[-1] - len(scene.integrator.aov_names())
-    return images[..., start:start + 3]
+    return images[..., start : start + 3]
 
 
 @BOTH
 @pytest.mark.parametrize("max_depth", [2, 3])
 def test_a_pressed_gelsight(variant, max_depth, tmp_path):
-    """Six LEDs, a dent with shadows, a rough membrane; without bands, as `path` draws its wavelengths by chance."""
+    """Six LEDs, a dent with shadows, a rough membrane; without bands, as `path` draws its wavelengths by Monte
+    Carlo."""
     scene = gelsight(tmp_path, variant, window=False, bands=False)
     agree(scene.mitsuba, tactile(max_depth), {"type": "path", "max_depth": max_depth, "rr_depth": 100})
 
@@ -221,28 +264,37 @@ def test_led_by_led_is_what_the_integrator_renders(mitsuba, tmp_path):
     whole = gelsight(tmp_path, SPECTRAL, leds=["led_2"], size=(40, 30), stokes=True)
     images = band_images(whole, spp=256)
     error, noise = np.abs(images.mean(0) - led), images.std(0, ddof=1) / 2
-    # away from rims the only difference is where in the pixel the samples lie: 0.1 % of the brightest pixel bounds it; at rims
-    # both are finite samples of the shadow's edge, 16 x 16 of the regular grid against 1024 at random
+    # away from rims the only difference is where in the pixel the samples lie: 0.1 % of the brightest pixel bounds it;
+    # at rims both are finite samples of the shadow's edge, 16 x 16 of the regular grid against 1024 at random
     assert (error <= 5 * noise + 1e-3 * led.max()).all(), (error - 5 * noise).max() / led.max()
     assert abs(images.mean() / led.mean() - 1) < 5e-4  # over all pixels these average out
 
 
 def test_all_leds_and_two_bounces_are_what_the_integrator_renders(mitsuba, tmp_path):
-    """The prediction's linear image (six LEDs, powers, interreflection, absorption) against mi.render with `tactile`."""
+    """The prediction's linear image (six LEDs, powers, interreflection, absorption) against mi.render with
+    `tactile`."""
     from optics.light.renderer import Renderer
 
     fine = gelsight(tmp_path, SPECTRAL, size=(160, 120))
     powers = {f"led_{k}.power": 0.4 + 0.1 * k for k in range(1, 7)}
-    values = {**fine.values(), **powers, "membrane.rho_r": 0.9, "membrane.rho_b": 0.3, "integrator.interreflection": 1.0,
-              "gel.absorption": 0.05}
+    values = {
+        **fine.values(),
+        **powers,
+        "membrane.rho_r": 0.9,
+        "membrane.rho_b": 0.3,
+        "integrator.interreflection": 1.0,
+        "gel.absorption": 0.05,
+    }
     renderer = Renderer(fine)
 
     def ours(image):
         total = sum(renderer.powers(values, n) * image(values, n) for n in fine.leds)
         return total.reshape(30, 4, 40, 4, -1).mean((1, 3))
 
-    direct, second = ours(lambda v, n: renderer.led(v, n).radiance), np.mean(
-        [ours(lambda v, n: renderer.bounced(v, n, seed)) for seed in range(16)], 0)  # noqa: B023
+    direct, second = (
+        ours(lambda v, n: renderer.led(v, n).radiance),
+        np.mean([ours(lambda v, n: renderer.bounced(v, n, seed)) for seed in range(16)], 0),
+    )
     small = gelsight(tmp_path, SPECTRAL, size=(40, 30), stokes=True)
     small.set(values)
     once = band_images(small, spp=512, seeds=6)
@@ -252,12 +304,19 @@ def test_all_leds_and_two_bounces_are_what_the_integrator_renders(mitsuba, tmp_p
     over = np.abs(once.mean(0) - direct) - 5 * noise
     # 0.1 %: where in a pixel the samples lie, as above
     assert over.max() <= 1e-3 * direct.max(), f"{over.max() / direct.max():.2g} of the brightest pixel beyond the noise"
-    # the second bounce is 0.2 % of the light; six LEDs share 16 x 32 directions per cell, which leaves 2 % of noise in its sum
+    # the second bounce is 0.2 % of the light; six LEDs share 16 x 32 directions per cell, which leaves 2 % of noise in
+    # its sum
     more = twice.mean(0) - once.mean(0)
     assert more.mean() == pytest.approx(second.mean(), rel=0.06)
 
 
-EFFECTS = {"gel.absorption": 0.05, "gel.haze": 0.03, "gel.height_loss": 0.2, "membrane.ambient": 2e-3, "membrane.specular": 0.1}
+EFFECTS = {
+    "gel.absorption": 0.05,
+    "gel.haze": 0.03,
+    "gel.height_loss": 0.2,
+    "membrane.ambient": 2e-3,
+    "membrane.specular": 0.1,
+}
 
 
 @pytest.mark.parametrize("key", EFFECTS)
@@ -278,7 +337,8 @@ def test_effects_of_light_are_in_both_renders(mitsuba, tmp_path, key):
     (led_0, whole_0), (led_1, whole_1) = both(values[key]), both(EFFECTS[key])
     change, expected = whole_1.mean(0) - whole_0.mean(0), led_1 - led_0  # same seeds: same places in the pixels
     assert np.abs(expected).max() > 0.005 * led_0.max()
-    # 8 % of the largest change, met at the rims of shadows, where both are samples of a pixel; all pixels together: 0.5 %
+    # 8 % of the largest change, met at the rims of shadows, where both are samples of a pixel; all pixels together: 0.5
+    # %
     assert np.abs(change - expected).max() <= 0.08 * np.abs(expected).max()
     assert change.sum() == pytest.approx(expected.sum(), rel=0.005)
 
@@ -296,7 +356,7 @@ def test_bands_are_the_monochrome_renders_of_stock_path(mitsuba, tmp_path):
             grey = gelsight(tmp_path, MONO, window=False)
             grey.set({"membrane.rho_r": value})
             stock = renders(grey.mitsuba, {"type": "path", "max_depth": 2, "rr_depth": 100}, first=1000 * (band + 1))
-            worst, whole = least_p(ours[..., band:band + 1], stock)
+            worst, whole = least_p(ours[..., band : band + 1], stock)
             assert worst > SIGNIFICANCE / 3 and whole > SIGNIFICANCE / 10, f"band {band}"
     finally:
         use_variant()
@@ -316,7 +376,8 @@ def test_a_mono_variant_refuses_three_bands(mitsuba, tmp_path):
 
 
 def test_bands_bring_no_spectral_noise(mitsuba, tmp_path):
-    """A narrow LED: with bands the only noise is where in the pixel a sample falls; wavelengths by chance mostly miss it."""
+    """A narrow LED: with bands the only noise is where in the pixel a sample falls; wavelengths by Monte Carlo mostly
+    miss it."""
     narrow = {"led_1.wavelength": 540.0, "led_1.fwhm": 30.0}
     steady = gelsight(tmp_path, SPECTRAL, leds=["led_1"], stokes=True, size=(64, 48))
     steady.set({**narrow, "gel.press_depth": 0.0})
@@ -330,17 +391,24 @@ def test_bands_bring_no_spectral_noise(mitsuba, tmp_path):
     assert loud > 20 * quiet
 
 
-# -- polarization ---------------------------------------------------------------------------------------------------------
+# -- polarization
+# ---------------------------------------------------------------------------------------------------------
 
 
 def polarizer(mi, angle, height, tilt=0.0):
-    return {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, height]).rotate([1, 0, 0], tilt).scale(3),
-            "bsdf": {"type": "polarizer", "theta": {"type": "uniform", "value": float(angle)}}}
+    return {
+        "type": "rectangle",
+        "to_world": mi.ScalarTransform4f().translate([0, 0, height]).rotate([1, 0, 0], tilt).scale(3),
+        "bsdf": {"type": "polarizer", "theta": {"type": "uniform", "value": float(angle)}},
+    }
 
 
 def panel(mi):
-    return {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(5),
-            "emitter": {"type": "area", "radiance": {"type": "uniform", "value": 2.0}}}
+    return {
+        "type": "rectangle",
+        "to_world": mi.ScalarTransform4f().scale(5),
+        "emitter": {"type": "area", "radiance": {"type": "uniform", "value": 2.0}},
+    }
 
 
 def stokes(scene, spp=4):
@@ -349,7 +417,7 @@ def stokes(scene, spp=4):
 
     image = np.array(mi.render(scene, integrator=mi.load_dict(tactile(3, stokes=True, bands="550")), spp=spp), float)
     lanes = (image.shape[-1] - {1: 1}.get(image.shape[-1] % 4, 3)) // 4
-    return image[..., image.shape[-1] - 4 * lanes::lanes]
+    return image[..., image.shape[-1] - 4 * lanes :: lanes]
 
 
 @BOTH
@@ -358,8 +426,12 @@ def test_malus(variant, angle):
     """Unpolarized light 2 behind two films: S0 = 2/2 cos^2(angle) on the axis, and fully polarized."""
     import mitsuba as mi
 
-    scene = built(sensor=sensor(mi, (3, 3), tilt=(0, 0, 0)), panel=panel(mi), first=polarizer(mi, 0, 1),
-                  second=polarizer(mi, angle, 2))
+    scene = built(
+        sensor=sensor(mi, (3, 3), tilt=(0, 0, 0)),
+        panel=panel(mi),
+        first=polarizer(mi, 0, 1),
+        second=polarizer(mi, angle, 2),
+    )
     s = stokes(scene)[1, 1]
     expected = np.cos(np.radians(angle)) ** 2
     # the pixel is 12 deg wide: off the axis the films' projected angle departs by up to tan^2(6 deg)/2 = 0.6 %
@@ -376,9 +448,13 @@ def test_stokes_channels_follow_the_stock_convention(variant, angle):
 
     scene = built(sensor=sensor(mi, (9, 7)), panel=panel(mi), film=polarizer(mi, angle, 1.5, tilt=15))
     ours = stokes(scene, 256)
-    stock = np.array(mi.render(scene, integrator=mi.load_dict(
-        {"type": "stokes", "inner": {"type": "path", "max_depth": 3}}), spp=256), float)
-    stock = stock[..., stock.shape[-1] - 12::3]
+    stock = np.array(
+        mi.render(
+            scene, integrator=mi.load_dict({"type": "stokes", "inner": {"type": "path", "max_depth": 3}}), spp=256
+        ),
+        float,
+    )
+    stock = stock[..., stock.shape[-1] - 12 :: 3]
     assert np.abs(stock[..., 0]).min() > 0
     # both vary over a pixel (by up to 0.1) and are sampled at random places: 256 samples leave 0.1/sqrt(12)/16 = 0.002
     assert np.abs(ours[..., 1:] / ours[..., :1] - stock[..., 1:] / stock[..., :1]).max() < 0.01
@@ -387,16 +463,27 @@ def test_stokes_channels_follow_the_stock_convention(variant, angle):
 
 @pytest.mark.parametrize("variant", [MONO], indirect=True)
 def test_metal_polarizes_in_the_stock_frame(variant):
-    """A rough, dark conductor lit by a lamp: light that is sampled and light that is hit, each turned into the sensor's frame."""
+    """A rough, dark conductor lit by a lamp: light that is sampled and light that is hit, each turned into the sensor's
+    frame."""
     import mitsuba as mi
 
-    turned = mi.ScalarTransform4f().rotate([1, 2, 0], 12).rotate([0, 0, 1], 40).scale(6)  # its own frame is not the world's
-    metal = {"type": "rectangle", "to_world": turned, "bsdf": {"type": "roughconductor", "alpha": 0.4, "eta": 1.5, "k": 0.1}}
+    turned = (
+        mi.ScalarTransform4f().rotate([1, 2, 0], 12).rotate([0, 0, 1], 40).scale(6)
+    )  # its own frame is not the world's
+    metal = {
+        "type": "rectangle",
+        "to_world": turned,
+        "bsdf": {"type": "roughconductor", "alpha": 0.4, "eta": 1.5, "k": 0.1},
+    }
     scene = built(sensor=sensor(mi, (9, 7), distance=3.0, tilt=(1.0, -5.0, 0.0)), metal=metal, lamp=lamp(mi, half=1.5))
     ours = stokes(scene, 4096)
-    stock = np.array(mi.render(scene, integrator=mi.load_dict(
-        {"type": "stokes", "inner": {"type": "path", "max_depth": 3}}), spp=4096), float)
-    stock = stock[..., stock.shape[-1] - 12::3]
+    stock = np.array(
+        mi.render(
+            scene, integrator=mi.load_dict({"type": "stokes", "inner": {"type": "path", "max_depth": 3}}), spp=4096
+        ),
+        float,
+    )
+    stock = stock[..., stock.shape[-1] - 12 :: 3]
     bright = stock[..., 0] > 0.2 * stock[..., 0].max()
     degree = stock[bright][:, 1:] / stock[bright][:, :1]
     assert np.abs(degree[:, 0]).max() > 0.3 and np.abs(degree[:, 1]).max() > 0.1  # there is something to compare
@@ -411,20 +498,37 @@ def test_a_membrane_depolarizes(mitsuba, tmp_path):
     image = np.array(mi.render(scene.mitsuba, spp=4))
     names = scene.integrator.aov_names()
     start = image.shape[-1] - len(names)
-    assert np.abs(image[..., start + len(names) // 4:]).max() == 0
+    assert np.abs(image[..., start + len(names) // 4 :]).max() == 0
     assert image[..., start].min() > 0
 
 
 def test_stokes_vectors_turn_with_our_camera(mitsuba):
-    """Light polarized along the world's x: horizontal in the image, vertical after a quarter turn, diagonal in between."""
+    """Light polarized along the world's x: horizontal in the image, vertical after a quarter turn, diagonal in
+    between."""
     mi = mitsuba
 
     def behind_film(roll):
-        camera = {"type": "camera", "x_fov": 10.0, "roll": roll, "to_world": mi.ScalarTransform4f().translate([0, 0, -8]),
-                  "film": {"type": "hdrfilm", "width": 3, "height": 3, "rfilter": {"type": "box"}, "component_format": "float32"}}
+        camera = {
+            "type": "camera",
+            "x_fov": 10.0,
+            "roll": roll,
+            "to_world": mi.ScalarTransform4f().translate([0, 0, -8]),
+            "film": {
+                "type": "hdrfilm",
+                "width": 3,
+                "height": 3,
+                "rfilter": {"type": "box"},
+                "component_format": "float32",
+            },
+        }
         film = polarizer(mi, 0, -2)
-        s = stokes(built(sensor=camera, panel=panel(mi) | {"to_world": mi.ScalarTransform4f().rotate([1, 0, 0], 180).scale(5)},
-                         film=film))[1, 1]
+        s = stokes(
+            built(
+                sensor=camera,
+                panel=panel(mi) | {"to_world": mi.ScalarTransform4f().rotate([1, 0, 0], 180).scale(5)},
+                film=film,
+            )
+        )[1, 1]
         return s[1:3] / s[0]
 
     # 0.01: the film's axis projected onto a pixel of 3 deg
@@ -435,13 +539,19 @@ def test_stokes_vectors_turn_with_our_camera(mitsuba):
 
 
 def test_painted_edges_are_as_smooth_as_those_of_shapes(mitsuba):
-    """The chequers of the finger's wall against a picture eight times as fine: within what the samples of a rim resolve of a step of 0.4."""
+    """The chequers of the finger's wall against an image eight times as fine: within what the samples of a rim resolve
+    of a step of 0.4."""
     from optics.light.renderer import Renderer
     from optics.scene import loader as scenes
 
     def picture(width):
         scene = scenes.load("vi2tap", {"width": str(width), "height": str(width * 3 // 4)})
-        values = {**scene.values(), **{f"{n}.power": 0.0 for n in scene.lights}, "analyzer.inserted": 0.0, "film.inserted": 0.0}
+        values = {
+            **scene.values(),
+            **{f"{n}.power": 0.0 for n in scene.lights},
+            "analyzer.inserted": 0.0,
+            "film.inserted": 0.0,
+        }
         return Renderer(scene).radiance(values)[..., 0]
 
     fine = picture(384).reshape(36, 8, 48, 8)

@@ -42,7 +42,8 @@ def load(tmp_path, mitsuba):
 
     (tmp_path / "scene.xml").write_text(SCENE)
     return lambda variant="llvm_ad_spectral_polarized", **defines: scene.load(
-        tmp_path / "scene.xml", {k: str(v) for k, v in defines.items()}, variant)
+        tmp_path / "scene.xml", {k: str(v) for k, v in defines.items()}, variant
+    )
 
 
 def triangles(shape):
@@ -61,7 +62,8 @@ def volume(shape):
 
 @pytest.mark.parametrize("distance", [1.0, -0.4, -1.2])
 def test_the_body_is_closed(load, distance):
-    """Each edge belongs to two triangles that run along it in opposite ways; the volume is that of the skin, normals outwards."""
+    """Each edge belongs to two triangles that run along it in opposite ways; the volume is that of the skin, normals
+    outwards."""
     block = load(distance=distance).parts["block"]
     points, faces = triangles(block)
     _, same = np.unique(points, axis=0, return_inverse=True)
@@ -79,13 +81,15 @@ def test_the_body_is_closed(load, distance):
 def test_light_meets_the_target_where_it_touches(load):
     """Rays from within, upwards: under the contact they meet the target, around it the face, nowhere a gap in between.
 
-    The radius lies between that of a half space, a^2 = R d (Hertz), and that of a thin incompressible layer, a^2 = 2 R d.
-    """
+    The radius lies between that of a half space, a^2 = R d (Hertz), and that of a thin incompressible layer, a^2 = 2 R
+    d."""
     import mitsuba as mi
 
     depth, radius = 0.5, 4.0
     scene = load(distance=-depth)
-    r, turn = np.meshgrid(np.linspace(0, 2.9, 117), 0.0137 + np.linspace(0, 2 * np.pi, 25)[:-1])  # off the meshes' edges
+    r, turn = np.meshgrid(
+        np.linspace(0, 2.9, 117), 0.0137 + np.linspace(0, 2 * np.pi, 25)[:-1]
+    )  # off the meshes' edges
     origin = mi.Point3f(*(mi.Float((r * f(turn)).ravel().astype(np.float32)) for f in (np.cos, np.sin)), -0.55)
     si = scene.mitsuba.ray_intersect(mi.Ray3f(origin, mi.Vector3f(0, 0, 1)))
     touches = np.array(si.shape == mi.ShapePtr(scene.parts["object"])).reshape(r.shape)
@@ -117,25 +121,49 @@ def test_cells_move_along_and_keep_their_volumes(load):
 
 
 def volume_of(corner):
-    box = np.array([[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1], [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]])
+    box = np.array(
+        [
+            [0, 1, 3],
+            [0, 3, 2],
+            [4, 6, 7],
+            [4, 7, 5],
+            [0, 4, 5],
+            [0, 5, 1],
+            [2, 3, 7],
+            [2, 7, 6],
+            [0, 2, 6],
+            [0, 6, 4],
+            [1, 5, 7],
+            [1, 7, 3],
+        ]
+    )
     a, b, c = (corner[box[:, k]] for k in range(3))
     return (a * np.cross(b, c)).sum() / 6
 
 
 def test_a_cell_that_was_not_filled(load):
-    """Where it is the only one, as if the filling were air; half filled, half of what makes it differ; and the derivative by the filling's
-    absorption, of what is left of it."""
+    """Where it is the only one, as if the filling were air; half filled, half of what makes it differ; and the
+    derivative by the filling's absorption, of what is left of it."""
     from optics.light.transport import Transport
 
     one = dict(columns=1, rows=1, layers=1, scattering=0.2)
-    pictures = []
-    for lack, index, alpha, sigma in ((1.0, 1.42, 0.1, 0.2), (0.0, 1.0, 0.0, 0.0), (0.5, 1.42, 0.1, 0.2), (0.0, 1.21, 0.05, 0.1)):
+    images = []
+    for lack, index, alpha, sigma in (
+        (1.0, 1.42, 0.1, 0.2),
+        (0.0, 1.0, 0.0, 0.0),
+        (0.5, 1.42, 0.1, 0.2),
+        (0.0, 1.21, 0.05, 0.1),
+    ):
         scene = load(**one)
-        scene.set({"grid.unfilled": lack, "filling.index": index, "filling.absorption": alpha, "filling.scattering": sigma})
-        pictures.append(Transport(scene).take(rays=16, packets=4000, slopes=True))
-    for a, b, share in ((*pictures[:2], 0.0), (*pictures[2:], 0.5)):
+        scene.set(
+            {"grid.unfilled": lack, "filling.index": index, "filling.absorption": alpha, "filling.scattering": sigma}
+        )
+        images.append(Transport(scene).take(rays=16, packets=4000, slopes=True))
+    for a, b, share in ((*images[:2], 0.0), (*images[2:], 0.5)):
         np.testing.assert_allclose(a.radiance, b.radiance, rtol=0, atol=1e-5 * b.radiance.max())
-        np.testing.assert_allclose(a.slopes["filling"], share * b.slopes["filling"], rtol=0, atol=1e-5 * np.abs(b.slopes["filling"]).max())
+        np.testing.assert_allclose(
+            a.slopes["filling"], share * b.slopes["filling"], rtol=0, atol=1e-5 * np.abs(b.slopes["filling"]).max()
+        )
     scene.set({"grid.unfilled": 0.5, "grid.unfilled_column": 1.0})
     with pytest.raises(ValueError, match="grid.unfilled_column = 1; allowed: 0 to 0"):
         Transport(scene)
@@ -143,14 +171,19 @@ def test_a_cell_that_was_not_filled(load):
 
 @pytest.mark.parametrize("scattering", [pytest.param(0.0, marks=pytest.mark.slow), 0.5])
 def test_a_pressed_grid_by_two_routes(load, scattering):
-    """Maps against rays that find the lamp by themselves, in contact: the target's light and the cells' (z, and the mean)."""
+    """Maps against rays that find the lamp by themselves, in contact: the target's light and the cells' (z, and the
+    mean)."""
     from optics.light.transport import Transport
 
     t = Transport(load(distance=-0.5, scattering=scattering))
     quick, slow = t.take(rays=256, packets=150_000), t.take(rays=6000, reach="paths", seed=3)
     sd = np.hypot(quick.error, slow.error)[0]
     z = np.divide(quick.radiance[0] - slow.radiance[0], sd, out=np.zeros_like(sd), where=sd > 0)
-    # of Student's t with 7 to 14 degrees of freedom .49; the maps' resolution adds, and rare bright paths make the mean useless
+    # of Student's t with 7 to 14 degrees of freedom .49; the maps' resolution adds, and rare bright paths make the mean
+    # useless
     assert np.median(z**2) < 0.9, np.median(z**2)
-    off, error = quick.radiance.mean() / slow.radiance.mean() - 1, np.sqrt((sd**2).sum()) / sd.size / slow.radiance.mean()
+    off, error = (
+        quick.radiance.mean() / slow.radiance.mean() - 1,
+        np.sqrt((sd**2).sum()) / sd.size / slow.radiance.mean(),
+    )
     assert abs(off) < 0.01 + SIGMAS * error, (off, error)

@@ -119,8 +119,10 @@ def test_markers_at_rest(load, variant):
 
 
 def test_other_numbers_of_markers(load):
-    text = '<scene version="3.0.0"> <shape type="markers" id="m"> <integer name="columns" value="2"/> ' \
-           '<integer name="rows" value="1"/> <float name="pitch_x" value="4"/> </shape> </scene>'
+    text = (
+        '<scene version="3.0.0"> <shape type="markers" id="m"> <integer name="columns" value="2"/> '
+        '<integer name="rows" value="1"/> <float name="pitch_x" value="4"/> </shape> </scene>'
+    )
     np.testing.assert_allclose(load(text).parts["m"].centres(), [(-2, 0, -6), (2, 0, -6)])
 
 
@@ -143,7 +145,9 @@ def test_a_press_carries_sheets_and_markers(load, variant):
     distance = np.linalg.norm(away, axis=-1)
     out = (shift[:, :2] * away).sum(-1) / distance
     assert (out > 0).all() and (shift[:, 2] < 0).all()  # outwards and towards the camera, each of them
-    assert (np.abs(shift[:, 0] * away[:, 1] - shift[:, 1] * away[:, 0]) / distance < 0.02 * out).all()  # along the radius
+    assert (
+        np.abs(shift[:, 0] * away[:, 1] - shift[:, 1] * away[:, 0]) / distance < 0.02 * out
+    ).all()  # along the radius
     # the base moves as the half-space says, the cap tilts by the face's slope at a lever of 1 mm: away from the contact
     base = moved(scene, x, y, 5.0)
     lever = markers.centres() - base
@@ -157,7 +161,8 @@ def test_a_press_carries_sheets_and_markers(load, variant):
 
 @BOTH
 def test_nothing_comes_out_of_order(load, variant):
-    """Rays from the camera's side meet inner face, film and outer face in this order, at depths that the half-space says."""
+    """Rays from the camera's side meet inner face, film and outer face in this order, at depths that the half-space
+    says."""
     import mitsuba as mi
 
     scene = load(SCENE % "", 2.2, variant)
@@ -225,9 +230,14 @@ def test_parameters_move_what_they_name(load):
 
 
 def test_the_foot_of_a_marker_stays_on_the_face(load):
-    """No light passes under a marker: the foot's rim lies on the inner face's mesh, which is linear between its vertices."""
-    scene = load((SCENE % '<shape type="markers" id="markers"> <float name="height" value="0.5"/> </shape>')
-                 .replace('name="press_x" value="3"', 'name="press_x" value="0"'), 2.0)
+    """No light passes under a marker: the foot's rim lies on the inner face's mesh, which is linear between its
+    vertices."""
+    scene = load(
+        (SCENE % '<shape type="markers" id="markers"> <float name="height" value="0.5"/> </shape>').replace(
+            'name="press_x" value="3"', 'name="press_x" value="0"'
+        ),
+        2.0,
+    )
     foot = vertices(scene.parts["markers"]).reshape(20, -1, 3)[:, :96].reshape(-1, 3)
     middles = foot.reshape(20, 96, 3).mean(1, keepdims=True)[..., :2]
     x, y = (middles + 1.002 * (foot[:, :2].reshape(20, 96, 2) - middles)).reshape(-1, 2).T

@@ -1,8 +1,7 @@
 """Every formula that a docstring states, against numpy in double precision, in the form of its source.
 
-The parts compute in float32, whose rounding is 6e-8; tolerances near 1e-5 relative are what a chain of some ten operations
-leaves of it. Looser ones say why.
-"""
+The parts compute in float32, whose rounding is 6e-8; tolerances near 1e-5 relative are what a chain of some ten
+operations leaves of it. Looser ones say why."""
 
 from __future__ import annotations
 
@@ -25,7 +24,8 @@ def cosine(a, b):
 
 
 def close(found, expected, tolerance=CLOSE, floor=0.0):
-    """Largest |found - expected| relative to the expected value, or to the largest one where that is smaller than floor x it."""
+    """Largest |found - expected| relative to the expected value, or to the largest one where that is smaller than floor
+    x it."""
     found, expected = np.asarray(found, float), np.asarray(expected, float)
     scale = np.maximum(np.abs(expected), max(floor, 1e-12) * np.abs(expected).max())
     worst = float((np.abs(found - expected) / scale).max())
@@ -33,7 +33,8 @@ def close(found, expected, tolerance=CLOSE, floor=0.0):
 
 
 def angle_form(wi, wo, rho, sigma):
-    """(S3) as printed: angles of the local frame, alpha and beta the larger and the smaller one; 1/sr without the cosine."""
+    """(S3) as printed: angles of the local frame, alpha and beta the larger and the smaller one; 1/sr without the
+    cosine."""
     theta_r, theta_i = np.arccos(wi[..., 2]), np.arccos(wo[..., 2])
     phi = np.arctan2(wi[..., 1], wi[..., 0]) - np.arctan2(wo[..., 1], wo[..., 0])
     alpha, beta = np.maximum(theta_r, theta_i), np.minimum(theta_r, theta_i)
@@ -57,7 +58,8 @@ def hemisphere(rng, count, lowest=0.05):
     return np.stack([r * np.cos(phi), r * np.sin(phi), z], -1)
 
 
-# -- the LED --------------------------------------------------------------------------------------------------------------
+# -- the LED
+# --------------------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -101,7 +103,8 @@ def test_led_sends_nothing_backwards(mitsuba, plugin):
 
 
 def test_led_pan_and_tilt_turn_the_axis_by_their_angle(mitsuba, plugin):
-    """pan about the local up axis, tilt about the local side axis; the world's y spans up, or x where the LED shines along y."""
+    """pan about the local up axis, tilt about the local side axis; the world's y spans up, or x where the LED shines
+    along y."""
     for target, helper in (([0.0, 0.0, 0.0], [0, 1, 0]), ([3.0, 8.0, -5.0], [1, 0, 0]), ([-3.0, 1.0, 2.0], [0, 1, 0])):
         where = np.array([3.0, -7.0, -5.0])
         nominal = unit(np.array(target) - where)
@@ -137,7 +140,8 @@ def test_led_disc_has_its_area_and_lies_across_the_axis(mitsuba, plugin):
     assert (offset**2).sum(1).mean() == pytest.approx(3.0 / (2 * np.pi), rel=2e-3)
 
 
-# -- the membrane -----------------------------------------------------------------------------------------------------------
+# -- the membrane
+# -----------------------------------------------------------------------------------------------------------
 
 
 def reflect(mi, membrane, wi, wo, cosine_too=True):
@@ -147,7 +151,11 @@ def reflect(mi, membrane, wi, wo, cosine_too=True):
     si = dr.zeros(mi.SurfaceInteraction3f, len(wi))
     si.t, si.wi = mi.Float(1), vectors(mi, wi)
     wo = vectors(mi, wo)
-    value = mi.unpolarized_spectrum(membrane.eval(mi.BSDFContext(), si, wo, True)) if cosine_too else membrane.brdf(si, wo, True)
+    value = (
+        mi.unpolarized_spectrum(membrane.eval(mi.BSDFContext(), si, wo, True))
+        if cosine_too
+        else membrane.brdf(si, wo, True)
+    )
     return np.array(value + dr.zeros(mi.UnpolarizedSpectrum, len(np.asarray(wi)))).T
 
 
@@ -164,11 +172,14 @@ def test_membrane_is_s3_in_angles(mitsuba, plugin, sigma):
 
 
 def test_specular_lobe_is_normalised_blinn_phong(mitsuba, plugin):
-    """f' - f = k (e + 2)/(8 pi) (n.h)^e, white; and k is about the share of the light from straight above that it returns."""
+    """f' - f = k (e + 2)/(8 pi) (n.h)^e, white; and k is about the share of the light from straight above that it
+    returns."""
     rng = RNG(14)
     wi, wo = hemisphere(rng, 1000, 0.3), hemisphere(rng, 1000, 0.3)
     k, e = 0.2, 15.0
-    plain, shiny = (plugin(type="membrane", rho_r=0.5, rho_g=0.2, sigma=0.3, specular=s, specular_exponent=e) for s in (0.0, k))
+    plain, shiny = (
+        plugin(type="membrane", rho_r=0.5, rho_g=0.2, sigma=0.3, specular=s, specular_exponent=e) for s in (0.0, k)
+    )
     half = unit(wi + wo)
     lobe = reflect(mitsuba, shiny, wi, wo, False) - reflect(mitsuba, plain, wi, wo, False)
     expected = k * (e + 2) / (8 * np.pi) * half[:, 2] ** e
@@ -217,9 +228,8 @@ def test_a_smooth_membrane_in_a_white_furnace_returns_rho(mitsuba, plugin):
 def test_a_rough_membrane_creates_no_energy(mitsuba, plugin, sigma):
     """The albedo is at most rho for light from all sides, and for any one direction up to 60 deg.
 
-    Beyond, (S3) as published exceeds it: at 90 deg the albedo is rho (A + B/2), at most 1.0151 rho (sigma = 0.2). That much is
-    allowed, and no more.
-    """
+    Beyond, (S3) as published exceeds it: at 90 deg the albedo is rho (A + B/2), at most 1.0151 rho (sigma = 0.2). That
+    much is allowed, and no more."""
     membrane = plugin(type="membrane", rho_r=1.0, sigma=sigma)
     x, w = np.polynomial.legendre.leggauss(12)
     cosines, weights = (x + 1) / 2, w / 2
@@ -227,7 +237,9 @@ def test_a_rough_membrane_creates_no_energy(mitsuba, plugin, sigma):
     assert 2 * (albedo * cosines * weights).sum() <= 1
     assert albedo[cosines > 0.5].max() <= 1
     a, b = 1 - 0.5 * sigma**2 / (sigma**2 + 0.33), 0.45 * sigma**2 / (sigma**2 + 0.09)
-    assert directional_albedo(mitsuba, membrane, 0.001) == pytest.approx(a + b / 2, rel=2e-3)  # A + B/2 but for the last 0.06 deg
+    assert directional_albedo(mitsuba, membrane, 0.001) == pytest.approx(
+        a + b / 2, rel=2e-3
+    )  # A + B/2 but for the last 0.06 deg
     assert albedo.max() <= 1.0152
 
 
@@ -247,7 +259,8 @@ def test_membrane_sampling_returns_the_albedo(mitsuba, plugin):
     assert mean == pytest.approx(directional_albedo(mi, membrane, 0.6), rel=2e-4)  # midpoints against quadrature
 
 
-# -- the camera -------------------------------------------------------------------------------------------------------------
+# -- the camera
+# -------------------------------------------------------------------------------------------------------------
 
 
 def camera_of(mi, width=320, height=240, **values):
@@ -298,18 +311,24 @@ def test_pose_is_roll_then_tilt_then_pan_about_fixed_axes(mitsuba):
     f = 160 / np.tan(np.radians(25))
     d = unit(np.stack([(u - 160) / f, (v - 120) / f, np.ones_like(u)], -1))
     outer = Rotation.from_rotvec([0, np.radians(12), 0])
-    turn = outer * Rotation.from_rotvec([0, np.radians(4), 0]) * Rotation.from_rotvec([np.radians(-3), 0, 0]) * \
-        Rotation.from_rotvec([0, 0, np.radians(25)])
+    turn = (
+        outer
+        * Rotation.from_rotvec([0, np.radians(4), 0])
+        * Rotation.from_rotvec([np.radians(-3), 0, 0])
+        * Rotation.from_rotvec([0, 0, np.radians(25)])
+    )
     o, found = rays(mi, camera, u, v)
     close(found, turn.apply(d), CLOSE, floor=0.1)
     close(o, np.broadcast_to(np.array([1, 2, -24]) + outer.apply([0.3, -0.2, 0.5]), o.shape), CLOSE)
 
 
-# -- the whole pixel --------------------------------------------------------------------------------------------------------
+# -- the whole pixel
+# --------------------------------------------------------------------------------------------------------
 
 
 def flat_pixel(values, width, height, led="led_1", camera_z=-24.0, absorption=0.0):
-    """(H, W, 3) radiance of the flat face z = 0 under one LED at power 1, in numpy: rays, distances, (S2), (S3), paths."""
+    """(H, W, 3) radiance of the flat face z = 0 under one LED at power 1, in numpy: rays, distances, (S2), (S3),
+    paths."""
     v, u = np.mgrid[:height, :width] + 0.5
     f = width / 2 / np.tan(np.radians(values["camera.x_fov"]) / 2)
     d = unit(np.stack([(u - width / 2) / f, (v - height / 2) / f, np.ones_like(u)], -1))
@@ -319,8 +338,11 @@ def flat_pixel(values, width, height, led="led_1", camera_z=-24.0, absorption=0.
     axis = unit(-lamp)
     helper = np.array([0.0, 1, 0]) if abs(axis[1]) < 0.9 else np.array([1.0, 0, 0])
     side = unit(np.cross(helper, axis))
-    axis = unit(axis + np.tan(np.radians(values[f"{led}.pan"])) * side
-                + np.tan(np.radians(values[f"{led}.tilt"])) * np.cross(axis, side))
+    axis = unit(
+        axis
+        + np.tan(np.radians(values[f"{led}.pan"])) * side
+        + np.tan(np.radians(values[f"{led}.tilt"])) * np.cross(axis, side)
+    )
     to_led, to_camera = unit(lamp - p), unit(camera - p)
 
     def local(w):  # the face's normal is -z
@@ -337,8 +359,17 @@ def flat_pixel(values, width, height, led="led_1", camera_z=-24.0, absorption=0.
     return (light * fr * -to_led[..., 2])[..., None] * rho, paths
 
 
-FLAT = {"gel.press_depth": 0.0, "led_1.pan": 7.0, "led_1.tilt": -11.0, "led_1.mu": 1.7, "membrane.sigma": 0.35,
-        "membrane.rho_g": 0.4, "led_1.wavelength": 0.0, "gel.press_x": 0.0, "gel.press_y": 0.0}
+FLAT = {
+    "gel.press_depth": 0.0,
+    "led_1.pan": 7.0,
+    "led_1.tilt": -11.0,
+    "led_1.mu": 1.7,
+    "membrane.sigma": 0.35,
+    "membrane.rho_g": 0.4,
+    "led_1.wavelength": 0.0,
+    "gel.press_x": 0.0,
+    "gel.press_y": 0.0,
+}
 
 
 def test_a_flat_gel_under_one_led_is_the_closed_form_in_every_pixel(bench):
@@ -348,12 +379,16 @@ def test_a_flat_gel_under_one_led_is_the_closed_form_in_every_pixel(bench):
 
 
 def test_absorption_follows_the_lengths_inside_the_gel(bench):
-    """Beer-Lambert over both ways between z = -thickness and the face; the LED stands below the window's plane at z = -5."""
+    """Beer-Lambert over both ways between z = -thickness and the face; the LED stands below the window's plane at z =
+    -5."""
     values = {**bench.values, **FLAT, "gel.absorption": 0.13}
     width, height = bench.scene.camera.resolution
     close(bench.renderer.led(values, "led_1").radiance, flat_pixel(values, width, height, absorption=0.13)[0])
     above = {**values, "led_1.z": -2.5}  # an LED inside the gel: its whole way counts
-    found = bench.renderer.led(above, "led_1").radiance / bench.renderer.led({**above, "gel.absorption": 0.0}, "led_1").radiance
+    found = (
+        bench.renderer.led(above, "led_1").radiance
+        / bench.renderer.led({**above, "gel.absorption": 0.0}, "led_1").radiance
+    )
     p = flat_pixel(above, width, height)[1].p
     lamp = np.array([values["led_1.x"], values["led_1.y"], -2.5])
     d_view = 4 * np.linalg.norm(p - [0, 0, -24], axis=-1) / 24
@@ -371,33 +406,49 @@ def test_haze_is_the_single_scattering_integral(bench):
     for share in (np.arange(500) + 0.5) / 500:  # s from the face to where the ray enters the gel
         s = way.view * share
         x = way.p + toward * s[..., None]
-        veil += (kappa(x, way.lamp, way.axis, 1.0, 1.2) * way.view / 500
-                 * np.exp(-h * (way.view - s + np.linalg.norm(way.lamp - x, axis=-1))))
+        veil += (
+            kappa(x, way.lamp, way.axis, 1.0, 1.2)
+            * way.view
+            / 500
+            * np.exp(-h * (way.view - s + np.linalg.norm(way.lamp - x, axis=-1)))
+        )
     found = bench.renderer.led({**values, "gel.haze": h}, "led_1").radiance
     expected = clear * np.exp(-h * (way.light + way.view))[..., None] + h / (4 * np.pi) * veil[..., None]
     close(found, expected)
 
 
 def test_light_from_everywhere_meets_the_facets_that_light_of_leds_meets(bench):
-    """Ambient light on a rough face: rho E/pi times the integral of Oren and Nayar's qualitative model over the hemisphere, by numbers."""
+    """Ambient light on a rough face: rho E/pi times the integral of Oren and Nayar's qualitative model over the
+    hemisphere, by numbers."""
     sigma, values = 0.4, {**bench.values, "membrane.sigma": 0.4, "membrane.ambient": 0.3, "gel.press_depth": 0.6}
     hits = bench.renderer.hits(values)
     eye = np.array(hits.origin).T - hits.position.reshape(-1, 3)
     cos = np.sum(eye * hits.normal.reshape(-1, 3), -1) / np.linalg.norm(eye, axis=-1)
     view = np.arccos(np.clip(cos, -1, 1)).reshape(hits.shape)
     a, b = 1 - 0.5 * sigma**2 / (sigma**2 + 0.33), 0.45 * sigma**2 / (sigma**2 + 0.09)
-    light, turn = np.meshgrid((np.arange(900) + 0.5) / 900 * np.pi / 2, (np.arange(360) + 0.5) / 180 * np.pi, indexing="ij")
+    light, turn = np.meshgrid(
+        (np.arange(900) + 0.5) / 900 * np.pi / 2, (np.arange(360) + 0.5) / 180 * np.pi, indexing="ij"
+    )
     steps = np.pi / 2 / 900 * np.pi / 180
     at = np.linspace(0, view.max(), 12)
-    share = [np.sum((a + b * np.maximum(0, np.cos(turn)) * np.sin(np.maximum(light, v)) * np.tan(np.minimum(light, v))) / np.pi
-                    * np.cos(light) * np.sin(light)) * steps for v in at]
+    share = [
+        np.sum(
+            (a + b * np.maximum(0, np.cos(turn)) * np.sin(np.maximum(light, v)) * np.tan(np.minimum(light, v)))
+            / np.pi
+            * np.cos(light)
+            * np.sin(light)
+        )
+        * steps
+        for v in at
+    ]
     found = bench.renderer.ambient(values)[..., 0] / (values["membrane.rho_r"] * 0.3 / np.pi)
-    assert 0.8 < found.min() and np.ptp(found) > 0.02
+    assert found.min() > 0.8 and np.ptp(found) > 0.02
     assert np.abs(found - np.interp(view, at, share)).max() < 2e-3  # straight lines between twelve angles
 
 
 def test_height_fall_off_and_light_of_no_led(bench):
-    """exp(-c h) with the height of the face; rho E/pi everywhere on a smooth one; rho G/pi (1 - n_z)/2 with n_z towards the camera."""
+    """exp(-c h) with the height of the face; rho E/pi everywhere on a smooth one; rho G/pi (1 - n_z)/2 with n_z towards
+    the camera."""
     values = {**bench.values, "gel.press_depth": 0.8}
     hits, plain = bench.renderer.hits(values), bench.renderer.led(values, "led_1").radiance
     rim = bench.renderer.led(values, "led_1").rim  # sampled finely: the hit at the centre is not its height
@@ -407,7 +458,10 @@ def test_height_fall_off_and_light_of_no_led(bench):
     lit = ~rim & (hits.bent == 0) & (plain[..., 0] > 0)
     close(faded[lit], plain[lit] * np.exp(-0.5 * height[lit])[:, None])
     rho = np.array([values[f"membrane.rho_{c}"] for c in "rgb"])
-    close(bench.renderer.ambient({**values, "membrane.ambient": 0.3, "membrane.sigma": 0}), np.broadcast_to(rho * 0.3 / np.pi, plain.shape))
+    close(
+        bench.renderer.ambient({**values, "membrane.ambient": 0.3, "membrane.sigma": 0}),
+        np.broadcast_to(rho * 0.3 / np.pi, plain.shape),
+    )
     ground = np.array([0.2, 0.1, 0.4])
     found = bench.renderer.ambient({**values, **{f"membrane.ground_{c}": g for c, g in zip("rgb", ground)}})
     share = (1 + hits.normal[..., 2:]) / 2
@@ -415,7 +469,8 @@ def test_height_fall_off_and_light_of_no_led(bench):
     assert np.abs(found - rho * ground / np.pi * share).max() < 1e-7  # 1 + n_z cancels where the face is flat
 
 
-# -- the window -------------------------------------------------------------------------------------------------------------
+# -- the window
+# -------------------------------------------------------------------------------------------------------------
 
 WINDOWED = """<scene version="3.0.0">
     <integrator type="tactile" id="integrator"><string name="bands" value="610, 540, 460"/></integrator>
@@ -494,7 +549,12 @@ def test_fresnel_at_normal_incidence_at_brewsters_angle_and_beyond_the_critical_
         _, e_s, e_p = fresnel(n, np.cos(angles))
         close(np.array(t_s), e_s)
         close(np.array(t_p), e_p)
-        close(np.array(wo).T, np.stack([-np.sin(angles) / n, 0 * angles, -np.sqrt(1 - np.sin(angles) ** 2 / n**2)], -1), CLOSE, 0.1)
+        close(
+            np.array(wo).T,
+            np.stack([-np.sin(angles) / n, 0 * angles, -np.sqrt(1 - np.sin(angles) ** 2 / n**2)], -1),
+            CLOSE,
+            0.1,
+        )
     window = plugin(type="interface", index=1 / 1.41)
     _, t_s, t_p, _ = window.refract(mi.Vector3f(0.8, 0, 0.6))  # beyond asin(1/1.41) = 45 deg
     assert float(t_s[0]) == float(t_p[0]) == 0
@@ -515,7 +575,8 @@ def test_passing_a_window_there_and_back_is_the_identity(mitsuba, plugin):
 
 
 def test_window_polarizes_by_its_transmittances(mitsuba, plugin):
-    """Unpolarized light leaves with S1/S0 = (T_s - T_p)/(T_s + T_p) across the plane of incidence; with T/n^2 as weight."""
+    """Unpolarized light leaves with S1/S0 = (T_s - T_p)/(T_s + T_p) across the plane of incidence; with T/n^2 as
+    weight."""
     import drjit as dr
 
     mi = mitsuba
@@ -525,16 +586,32 @@ def test_window_polarizes_by_its_transmittances(mitsuba, plugin):
     si.t, si.wi = mi.Float(1), mi.Vector3f(float(np.sin(angle)), 0, float(np.cos(angle)))
     bs, weight = window.sample(mi.BSDFContext(), si, mi.Float(0.5), mi.Point2f(0.5), True)
     across = mi.Vector3f(0, 1, 0)  # s-polarized: perpendicular to the plane of incidence
-    turned = mi.mueller.rotate_mueller_basis(weight, -bs.wo, mi.mueller.stokes_basis(-bs.wo), across,
-                                             si.wi, mi.mueller.stokes_basis(si.wi), across)
-    m = np.array(turned)[..., 0].reshape(4, 4, -1)[:, :, 0] if np.array(turned).ndim > 3 else np.array(turned).reshape(4, 4, -1)[:, :, 0]
+    turned = mi.mueller.rotate_mueller_basis(
+        weight, -bs.wo, mi.mueller.stokes_basis(-bs.wo), across, si.wi, mi.mueller.stokes_basis(si.wi), across
+    )
+    m = (
+        np.array(turned)[..., 0].reshape(4, 4, -1)[:, :, 0]
+        if np.array(turned).ndim > 3
+        else np.array(turned).reshape(4, 4, -1)[:, :, 0]
+    )
     _, t_s, t_p = fresnel(n, np.cos(angle))
-    expected = np.array([[t_s + t_p, t_s - t_p, 0, 0], [t_s - t_p, t_s + t_p, 0, 0],
-                         [0, 0, 2 * np.sqrt(t_s * t_p), 0], [0, 0, 0, 2 * np.sqrt(t_s * t_p)]]) / 2 / n**2
+    expected = (
+        np.array(
+            [
+                [t_s + t_p, t_s - t_p, 0, 0],
+                [t_s - t_p, t_s + t_p, 0, 0],
+                [0, 0, 2 * np.sqrt(t_s * t_p), 0],
+                [0, 0, 0, 2 * np.sqrt(t_s * t_p)],
+            ]
+        )
+        / 2
+        / n**2
+    )
     assert np.abs(m - expected).max() < 1e-5
 
 
-# -- the gel's shape ----------------------------------------------------------------------------------------------------------
+# -- the gel's shape
+# ----------------------------------------------------------------------------------------------------------
 
 
 def test_wedge_is_a_tilted_plane(bench):
@@ -572,10 +649,13 @@ def test_a_pressed_sphere_is_seen_where_it_is(bench):
     inside = r < 0.6
     assert inside.sum() > 10
     sphere = -0.5 + 1.5 - np.sqrt(1.5**2 - r[inside] ** 2)
-    assert np.abs(p[..., 2][inside] - sphere).max() < 2e-3  # mm; grid pitch 0.06: sagitta 0.06^2/8/1.5 = 3e-4, and smoothing
+    assert (
+        np.abs(p[..., 2][inside] - sphere).max() < 2e-3
+    )  # mm; grid pitch 0.06: sagitta 0.06^2/8/1.5 = 3e-4, and smoothing
 
 
-# -- the camera's arithmetic ----------------------------------------------------------------------------------------------------
+# -- the camera's arithmetic
+# ----------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -604,8 +684,14 @@ def test_response_is_the_inverse_of_its_cubic(mitsuba):
             h = 1e-6
             low, high = ((a - h * (1 - which), b - h * which), (a + h * (1 - which), b + h * which))
             differences = (inverse_cubic(irradiance, *high) - inverse_cubic(irradiance, *low)) / (2 * h)
-            step = inverse_cubic(irradiance.astype(complex), a + (1j * STEP if which == 0 else 0),
-                                 b + (1j * STEP if which == 1 else 0)).imag / STEP
+            step = (
+                inverse_cubic(
+                    irradiance.astype(complex),
+                    a + (1j * STEP if which == 0 else 0),
+                    b + (1j * STEP if which == 1 else 0),
+                ).imag
+                / STEP
+            )
             assert np.abs(differences - step)[inside].max() < 1e-8
     with pytest.raises(ValueError, match="not monotone"):
         inverse_cubic(irradiance, 0.9, 0.45)
@@ -636,7 +722,8 @@ def test_blur_spreads_a_point_by_its_variance(view):
         assert spread.sum() == pytest.approx(1, abs=1e-12)  # no light is lost at the borders
         assert spread.min() > -2e-3  # band-limited: below half a pixel of width it rings a little
         for axis, middle in ((v, 30), (u, 40)):
-            # exp(-V w^2/2) has the second moment V; the sampled kernel repeats it to what its tails leave at the borders
+            # exp(-V w^2/2) has the second moment V; the sampled kernel repeats it to what its tails leave at the
+            # borders
             assert ((axis - middle) ** 2 * spread[..., 0]).sum() == pytest.approx(variance, rel=1e-3)
     twice = smear(smear(image, changed(view, blur=1.5)), changed(view, blur=0.5))
     assert np.abs(twice - smear(image, changed(view, blur=2.0))).max() < 1e-12  # variances add
@@ -658,8 +745,15 @@ def test_bend_and_the_chain_to_digital_numbers(bench):
 
     camera = bench.scene.camera
     developer = Developer(camera, bench.scene.integrator.bands, black=7.0, saturation=250.0)
-    values = {**bench.values, "camera.exposure": 2.0, "camera.gain": 1.1, "camera.response2_g": 0.2, "camera.response3_g": -0.1,
-              "camera.response_bend": 0.15, "camera.offset": 0.5}
+    values = {
+        **bench.values,
+        "camera.exposure": 2.0,
+        "camera.gain": 1.1,
+        "camera.response2_g": 0.2,
+        "camera.response3_g": -0.1,
+        "camera.response_bend": 0.15,
+        "camera.offset": 0.5,
+    }
     image = RNG(12).uniform(0, 0.4, (*camera.resolution[::-1], 3))
     irradiance = 2.2 * image
     m = irradiance.copy()
@@ -668,20 +762,51 @@ def test_bend_and_the_chain_to_digital_numbers(bench):
     assert np.abs(developer.develop(image, values) - (7 + 243 * m + 0.5)).max() < 1e-10
 
 
-# -- light that the face sends to itself ------------------------------------------------------------------------------------
+# -- light that the face sends to itself
+# ------------------------------------------------------------------------------------
 
 
 def ball(mi, rho, max_depth=2, **led):
     """A membrane all around, seen from inside, with an LED in its middle: the integrating sphere."""
-    return mi.load_dict({
-        "type": "scene",
-        "integrator": {"type": "tactile", "max_depth": max_depth, "interreflection": 1.0, "bands": "610, 540, 460", "stokes": True},
-        "ball": {"type": "sphere", "radius": 5.0, "flip_normals": True,
-                 "bsdf": {"type": "membrane", "rho_r": rho, "rho_g": rho, "rho_b": rho, "sigma": 0.0}},
-        "led": {"type": "led", "position": [0.0, 0.0, 0.0], "target": [0.0, 0.0, 1.0], "mu": 1.0, "power": 100.0, **led},
-        "camera": {"type": "camera", "x_fov": 30.0, "to_world": mi.ScalarTransform4f().rotate([0, 1, 0], 180),
-                   "film": {"type": "hdrfilm", "width": 8, "height": 8, "rfilter": {"type": "box"}, "component_format": "float32"}},
-    }, optimize=False)
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {
+                "type": "tactile",
+                "max_depth": max_depth,
+                "interreflection": 1.0,
+                "bands": "610, 540, 460",
+                "stokes": True,
+            },
+            "ball": {
+                "type": "sphere",
+                "radius": 5.0,
+                "flip_normals": True,
+                "bsdf": {"type": "membrane", "rho_r": rho, "rho_g": rho, "rho_b": rho, "sigma": 0.0},
+            },
+            "led": {
+                "type": "led",
+                "position": [0.0, 0.0, 0.0],
+                "target": [0.0, 0.0, 1.0],
+                "mu": 1.0,
+                "power": 100.0,
+                **led,
+            },
+            "camera": {
+                "type": "camera",
+                "x_fov": 30.0,
+                "to_world": mi.ScalarTransform4f().rotate([0, 1, 0], 180),
+                "film": {
+                    "type": "hdrfilm",
+                    "width": 8,
+                    "height": 8,
+                    "rfilter": {"type": "box"},
+                    "component_format": "float32",
+                },
+            },
+        },
+        optimize=False,
+    )
 
 
 def ball_image(mi, scene, spp, seed=0):
@@ -691,11 +816,11 @@ def ball_image(mi, scene, spp, seed=0):
 
 
 def test_the_integrating_sphere(mitsuba):
-    """In a sphere every point lights every other alike: after k reflections L_k = rho^(k-1) mean(L_1), whatever lit it first.
+    """In a sphere every point lights every other alike: after k reflections L_k = rho^(k-1) mean(L_1), whatever lit it
+    first.
 
-    The LED's lobe cos(theta) fills one half: mean(L_1) = rho/pi eta/R^2 int cos dw/(4 pi) = rho eta/(4 pi R^2). The camera looks
-    at the dark half, where L_1 = 0, so that only reflected light arrives.
-    """
+    The LED's lobe cos(theta) fills one half: mean(L_1) = rho/pi eta/R^2 int cos dw/(4 pi) = rho eta/(4 pi R^2). The
+    camera looks at the dark half, where L_1 = 0, so that only reflected light arrives."""
     mi = mitsuba
     rho, eta, radius = 0.6, 100.0, 5.0
     mean = rho * eta / (4 * np.pi * radius**2)
@@ -751,28 +876,51 @@ def test_energy_is_never_created_in_a_furnace(mitsuba):
 
 
 def test_a_fold_lights_itself_by_its_form_factor(bench, mitsuba):
-    """Two wide plates at a right angle, one lit evenly: radiance of the dark one at height h is rho L (1 - cos-weighted factor).
+    """Two wide plates at a right angle, one lit evenly: radiance of the dark one at height h is rho L (1 - cos-weighted
+    factor).
 
-    A point of an endless plate at the distance h from the fold sees an endless perpendicular strip of width w under the factor
-    (1 - h/sqrt(h^2 + w^2))/2 (Howell, A Catalog of Radiation Heat Transfer Configuration Factors, B-5).
-    """
+    A point of an endless plate at the distance h from the fold sees an endless perpendicular strip of width w under the
+    factor (1 - h/sqrt(h^2 + w^2))/2 (Howell, A Catalog of Radiation Heat Transfer Configuration Factors, B-5)."""
     mi = mitsuba
     width, length, rho = 4.0, 400.0, 0.5
     white = {"type": "membrane", "rho_r": rho, "rho_g": rho, "rho_b": rho, "sigma": 0.0}
-    lit = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([width / 2, 0, 0]).scale([width / 2, length / 2, 1]),
-           "bsdf": white, "emitter": {"type": "area", "radiance": {"type": "uniform", "value": 3.0}}}
-    dark = {"type": "rectangle", "bsdf": white,
-            "to_world": mi.ScalarTransform4f().translate([0, 0, 50]).rotate([0, 1, 0], 90).scale([50, length / 2, 1])}
+    lit = {
+        "type": "rectangle",
+        "to_world": mi.ScalarTransform4f().translate([width / 2, 0, 0]).scale([width / 2, length / 2, 1]),
+        "bsdf": white,
+        "emitter": {"type": "area", "radiance": {"type": "uniform", "value": 3.0}},
+    }
+    dark = {
+        "type": "rectangle",
+        "bsdf": white,
+        "to_world": mi.ScalarTransform4f().translate([0, 0, 50]).rotate([0, 1, 0], 90).scale([50, length / 2, 1]),
+    }
     heights = np.array([0.5, 1.5, 3.0, 6.0])
     for h in heights:
-        scene = mi.load_dict({
-            "type": "scene", "lit": lit, "dark": dark,
-            "integrator": {"type": "tactile", "max_depth": 2, "bands": "610, 540, 460", "stokes": True},
-            "camera": {"type": "perspective", "fov": 0.1,
-                       "to_world": mi.ScalarTransform4f().look_at([30, 0, 40], [0, 0, float(h)], [0, 1, 0]),
-                       "film": {"type": "hdrfilm", "width": 2, "height": 2, "rfilter": {"type": "box"},
-                                "component_format": "float32"}}}, optimize=False)
+        scene = mi.load_dict(
+            {
+                "type": "scene",
+                "lit": lit,
+                "dark": dark,
+                "integrator": {"type": "tactile", "max_depth": 2, "bands": "610, 540, 460", "stokes": True},
+                "camera": {
+                    "type": "perspective",
+                    "fov": 0.1,
+                    "to_world": mi.ScalarTransform4f().look_at([30, 0, 40], [0, 0, float(h)], [0, 1, 0]),
+                    "film": {
+                        "type": "hdrfilm",
+                        "width": 2,
+                        "height": 2,
+                        "rfilter": {"type": "box"},
+                        "component_format": "float32",
+                    },
+                },
+            },
+            optimize=False,
+        )
         image = np.array(mi.render(scene, spp=20000), float)
         expected = rho * 3.0 * (1 - h / np.hypot(h, width)) / 2
         found = image[..., image.shape[-1] - 16].mean()
-        assert found == pytest.approx(expected, rel=0.02)  # 80 000 paths of the BSDF's sampling and the light's: about 0.5 %
+        assert found == pytest.approx(
+            expected, rel=0.02
+        )  # 80 000 paths of the BSDF's sampling and the light's: about 0.5 %

@@ -152,8 +152,12 @@ def test_blur_is_a_gaussian_of_the_variance_asked_for():
 
 def test_profiles_lie_on_their_envelopes():
     for shape, size, rotation in (
-        ("sphere", 1.5, (0, 0, 0)), ("cube", 2.0, (10, 5, 20)), ("cube", 2.0, (0, 0, 0)),
-        ("cylinder", 1.0, (0, 0, 30)), ("cylinder", 0.7, (0, 25, 10)), ("cylinder", 0.7, (0, 90, 0)),
+        ("sphere", 1.5, (0, 0, 0)),
+        ("cube", 2.0, (10, 5, 20)),
+        ("cube", 2.0, (0, 0, 0)),
+        ("cylinder", 1.0, (0, 0, 30)),
+        ("cylinder", 0.7, (0, 25, 10)),
+        ("cylinder", 0.7, (0, 90, 0)),
     ):
         p = indenter_profile(shape, size, rotation, 4.0, 0.04)
         seen = np.isfinite(p.height)

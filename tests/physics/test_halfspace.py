@@ -1,4 +1,5 @@
-"""A dent's reach into the skin against Boussinesq's and Hertz' closed forms, and against equilibrium: optics/skin/halfspace.py."""
+"""A dent's reach into the skin against Boussinesq's and Hertz' closed forms, and against equilibrium:
+optics/skin/halfspace.py."""
 
 import math
 
@@ -8,8 +9,8 @@ import pytest
 from optics.skin.contact import LocalMap, displacement, indenter_profile, local_axis, surface
 from optics.skin.halfspace import carried, stress_integrals
 
-# Three loads P_i s_i / (2 pi (r^2 + s_i^2)^1.5), point loads seen from s_i further away (mm, G = 1): chosen so that P and P s^2
-# sum to 0, and the dent with its tails in 1/r and 1/r^3 ends within the map
+# Three loads P_i s_i / (2 pi (r^2 + s_i^2)^1.5), point loads seen from s_i further away (mm, G = 1): chosen so that P
+# and P s^2 sum to 0, and the dent with its tails in 1/r and 1/r^3 ends within the map
 LOADS = ((5 / 3, 1.0), (-8 / 3, 2.0), (1.0, 3.0))
 PITCH = 0.15
 RATIOS = (0.5, 0.3)
@@ -20,7 +21,8 @@ def superposed(term):
 
 
 def loaded(poisson):
-    """The dent of the three loads on a map of 60 mm: D = P (1 - nu)/(2 pi G sqrt(r^2 + s^2)); 5e-7 is left at its border."""
+    """The dent of the three loads on a map of 60 mm: D = P (1 - nu)/(2 pi G sqrt(r^2 + s^2)); 5e-7 is left at its
+    border."""
     axis = local_axis(401, PITCH)
     r = np.hypot(axis, axis[:, None])
     return superposed(lambda s: (1 - poisson) / (2 * np.pi) / np.sqrt(r**2 + s**2))
@@ -45,7 +47,8 @@ def pressed(depth=1.0):
 @pytest.mark.parametrize("depth", [0.0, 0.5, 2.5, 5.0])
 @pytest.mark.parametrize("poisson", RATIOS)
 def test_point_loads_of_boussinesq(depth, poisson):
-    """u_z = P/(4 pi G) (2(1-nu)/R + h H/R^3), u_r = P/(4 pi G) (h r/R^3 - (1-2nu) r/(R(R+H))), H = h + s: Johnson 3.2."""
+    """u_z = P/(4 pi G) (2(1-nu)/R + h H/R^3), u_r = P/(4 pi G) (h r/R^3 - (1-2nu) r/(R(R+H))), H = h + s: Johnson
+    3.2."""
     x, y = points()
     r = np.hypot(x, y)
 
@@ -64,7 +67,8 @@ def test_point_loads_of_boussinesq(depth, poisson):
 
 
 def test_hertz_on_the_axis():
-    """uz(h) = D(0) + (p0 a/4G) (t - t^2 acot t - atan t), t = h/a: e_zz = (s_z - s_r)/3G of Johnson (3.45), integrated."""
+    """uz(h) = D(0) + (p0 a/4G) (t - t^2 acot t - atan t), t = h/a: e_zz = (s_z - s_r)/3G of Johnson (3.45),
+    integrated."""
     a, scale = 3.0, 0.4  # mm contact radius, p0/G
     axis = local_axis(501, 0.12)
     r = np.hypot(axis, axis[:, None])
@@ -95,7 +99,8 @@ def test_every_bit_of_a_dent_pushes_straight_away_from_itself(depth):
         return (weight * dx).sum(), (weight * dy).sum(), depth * weight.sum()
 
     largest = maps[2].values.max()
-    # 6e-5 from the spline, for so narrow a dent, up to where maps fade; there an R^-4 tail is cut off 9 depths away: 1.5e-4
+    # 6e-5 from the spline, for so narrow a dent, up to where maps fade; there an R^-4 tail is cut off 9 depths away:
+    # 1.5e-4
     for low, high, tolerance in ((0, 4, 1e-4), (4, 0.85 * half, 1e-4), (0.87 * half, 1.2 * half, 3e-4)):
         angle, r = np.linspace(0, 6, 12), np.linspace(low, high, 12)
         x, y = r * np.cos(angle), r * np.sin(angle)
@@ -113,7 +118,8 @@ def test_at_the_face_it_is_the_dent_and_nothing_moves_sideways():
 def test_volume_is_kept_at_every_depth():
     dent = pressed()
     for depth in (0.3, 2.5, 5.0):
-        # what lies beyond 9 depths of the dent: integral of 3 h^3/R^5 is 1/9^3 = 1.4e-3 of a point dent's, less of a wide one's
+        # what lies beyond 9 depths of the dent: integral of 3 h^3/R^5 is 1/9^3 = 1.4e-3 of a point dent's, less of a
+        # wide one's
         assert carried(dent, dent.pitch, depth)[2].volume == pytest.approx(dent.volume, rel=1.4e-3)
 
 
@@ -140,11 +146,20 @@ def test_incompressible_and_in_equilibrium():
     # differences of second order: step^2/6 times third derivatives, up to 15/h^2 of the first: 0.9 %
     assert np.abs(divergence).max() < 0.015 * size
     inner = u[1:-1, 1:-1, 1:-1]
-    laplace = (u[2:, 1:-1, 1:-1] + u[:-2, 1:-1, 1:-1] + u[1:-1, 2:, 1:-1] + u[1:-1, :-2, 1:-1] + u[1:-1, 1:-1, 2:]
-               + u[1:-1, 1:-1, :-2] - 6 * inner) / step**2
+    laplace = (
+        u[2:, 1:-1, 1:-1]
+        + u[:-2, 1:-1, 1:-1]
+        + u[1:-1, 2:, 1:-1]
+        + u[1:-1, :-2, 1:-1]
+        + u[1:-1, 1:-1, 2:]
+        + u[1:-1, 1:-1, :-2]
+        - 6 * inner
+    ) / step**2
     third = [[middle(d(laplace[:, :, :, c], axis)) for axis in (2, 1, 0)] for c in range(3)]
     for a, b in ((0, 1), (1, 2), (0, 2)):
-        assert np.abs(third[a][b] - third[b][a]).max() < 0.03 * np.abs(third).max()  # fifth derivatives, larger yet: 1.7 %
+        assert (
+            np.abs(third[a][b] - third[b][a]).max() < 0.03 * np.abs(third).max()
+        )  # fifth derivatives, larger yet: 1.7 %
 
 
 # -- Stress ------------------------------------------------------------------------------------------------------------
@@ -161,7 +176,9 @@ def test_stress_of_point_loads(between, poisson):
 
     def difference(s):
         big, deep = np.sqrt(r**2 + (h + s) ** 2), h + s
-        return ((1 - 2 * poisson) * r**2 * (2 * big + deep) / (big**3 * (big + deep) ** 2) - 3 * r**2 * h / big**5) / (2 * np.pi)
+        return ((1 - 2 * poisson) * r**2 * (2 * big + deep) / (big**3 * (big + deep) ** 2) - 3 * r**2 * h / big**5) / (
+            2 * np.pi
+        )
 
     total = weights @ superposed(difference) * (between[1] - between[0]) / 2
     found = at(stress_integrals(loaded(poisson), PITCH, *between, poisson), x, y)
@@ -208,11 +225,18 @@ def test_maps_fit_a_local_map_and_change_smoothly_with_depth():
     assert np.abs(np.diff(fine, 2, axis=0)).max() < 1e-5
 
 
-@pytest.mark.parametrize("call", [
-    lambda d: carried(d, d.pitch, -1.0), lambda d: carried(d, 0.0, 1.0), lambda d: carried(d, d.pitch, math.nan),
-    lambda d: carried(d, d.pitch, 1.0, 0.6), lambda d: stress_integrals(d, d.pitch, 2.0, 1.0),
-    lambda d: carried(d.values[:, :-2], d.pitch, 1.0), lambda d: carried(d.values[:-1, :-1], d.pitch, 1.0),
-])
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda d: carried(d, d.pitch, -1.0),
+        lambda d: carried(d, 0.0, 1.0),
+        lambda d: carried(d, d.pitch, math.nan),
+        lambda d: carried(d, d.pitch, 1.0, 0.6),
+        lambda d: stress_integrals(d, d.pitch, 2.0, 1.0),
+        lambda d: carried(d.values[:, :-2], d.pitch, 1.0),
+        lambda d: carried(d.values[:-1, :-1], d.pitch, 1.0),
+    ],
+)
 def test_says_what_is_wrong(call):
     with pytest.raises(ValueError, match="half-space|dent of shape"):
         call(LocalMap(np.zeros((9, 9)), 0.1))

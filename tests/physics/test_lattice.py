@@ -1,4 +1,5 @@
-"""Lattice springs of a grid skin: the continuum they stand for, finite elements, motion, contact: optics/skin/lattice.py."""
+"""Lattice springs of a grid skin: the continuum they stand for, finite elements, motion, contact:
+optics/skin/lattice.py."""
 
 import math
 from functools import lru_cache
@@ -97,7 +98,8 @@ def test_spring_constants_give_the_material_asked_for(poisson):
 
 
 def test_linear_springs_alone_do_not_resist_a_pattern():
-    """Alternating along x and y, moving along z: no spring changes its length, whence beta > 0 for every Poisson's ratio."""
+    """Alternating along x and y, moving along z: no spring changes its length, whence beta > 0 for every Poisson's
+    ratio."""
     pattern = np.zeros((8, 3))
     pattern[:, 2] = (1 - 2 * CORNERS[:, 0]) * (1 - 2 * CORNERS[:, 1])
     assert not ((SPRINGS @ pattern) * (SPRINGS @ CORNERS)).sum(1).any()
@@ -119,10 +121,14 @@ def test_angles_as_printed_are_not_isotropic():
         for strain in (np.array([[0, 1, 0], [1, 0, 0], [0, 0, 0.0]]), np.diag([1.0, -1.0, 0.0])):
             y = x + 1e-5 * x @ strain
             y /= np.linalg.norm(y, axis=1)[:, None]
-            energies.append(sum(
-                g[j] * (y[j] @ y[k] - n[j] @ n[k]) ** 2 for j in range(14) for k in range(14)
-                if any(abs(n[j] @ n[k] - c) < 1e-9 for c in rest)
-            ))
+            energies.append(
+                sum(
+                    g[j] * (y[j] @ y[k] - n[j] @ n[k]) ** 2
+                    for j in range(14)
+                    for k in range(14)
+                    if any(abs(n[j] @ n[k] - c) < 1e-9 for c in rest)
+                )
+            )
         return energies[0] / energies[1]
 
     assert ratio(3**-0.5) == pytest.approx(2.0, abs=1e-3)
@@ -150,7 +156,8 @@ def tractions(skin, stress):
 
 
 def corner_pull(skin, strain):
-    """What a uniform shear asks for at the block's eight corners besides: alpha h e_yz/2 along x, and so on, with signs +-1.
+    """What a uniform shear asks for at the block's eight corners besides: alpha h e_yz/2 along x, and so on, with signs
+    +-1.
 
     There a node has one diagonal spring of the eight that balance each other elsewhere.
     """
@@ -164,12 +171,17 @@ def corner_pull(skin, strain):
 @pytest.mark.parametrize("poisson", RATIOS)
 @pytest.mark.parametrize("turned", [False, True])
 def test_uniform_strain_is_uniform_stress_up_to_the_surface(poisson, turned):
-    """Compression, shear and all else: nodes inside balance, and faces pull with sigma = lambda tr e + 2 mu e; turned or not."""
+    """Compression, shear and all else: nodes inside balance, and faces pull with sigma = lambda tr e + 2 mu e; turned
+    or not."""
     material = Material(0.8, poisson)
     skin = Lattice((4, 5, 3), 0.7, material)
     strain = 1e-7 * np.array([[-1.0, 0.4, 0.2], [0.4, 0.3, -0.6], [0.2, -0.6, 0.8]])
     c, s = math.cos(0.9), math.sin(0.9)
-    turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) @ np.array([[1, 0, 0], [0, c, -s], [0, s, c]]) if turned else np.eye(3)
+    turn = (
+        np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) @ np.array([[1, 0, 0], [0, c, -s], [0, s, c]])
+        if turned
+        else np.eye(3)
+    )
     lam, mu = material.lame
     stress = lam * np.trace(strain) * np.eye(3) + 2 * mu * strain
     forces, energy = skin.forces(skin.positions @ (np.eye(3) + strain) @ turn.T)
@@ -181,7 +193,9 @@ def test_uniform_strain_is_uniform_stress_up_to_the_surface(poisson, turned):
 
 
 @pytest.mark.parametrize("poisson", (0.1, 0.3, 0.47))
-@pytest.mark.parametrize("stress", [np.diag([-1.0, 0, 0]), np.array([[0, 0, 1.0], [0, 0, 0], [1, 0, 0]])], ids=["pull", "shear"])
+@pytest.mark.parametrize(
+    "stress", [np.diag([-1.0, 0, 0]), np.array([[0, 0, 1.0], [0, 0, 0], [1, 0, 0]])], ids=["pull", "shear"]
+)
 def test_loaded_block_strains_by_young_and_poisson(poisson, stress):
     """Uniaxial stress: e_xx = s/E, e_yy = e_zz = -nu s/E; shear: e_xz = s/(2 mu). Held at six coordinates only."""
     material = Material(0.8, poisson)
@@ -193,7 +207,9 @@ def test_loaded_block_strains_by_young_and_poisson(poisson, stress):
     pressed = balance(skin, forces=forces, linear=True, tolerance=1e-10)
     x = skin.positions
     gradient = np.linalg.lstsq((x - x[0, 0, 0]).reshape(-1, 3), pressed.displacement.reshape(-1, 3), rcond=None)[0]
-    np.testing.assert_allclose(pressed.displacement, (x - x[0, 0, 0]) @ gradient, atol=1e-9)  # uniform, to the solver's 1e-10
+    np.testing.assert_allclose(
+        pressed.displacement, (x - x[0, 0, 0]) @ gradient, atol=1e-9
+    )  # uniform, to the solver's 1e-10
     np.testing.assert_allclose((gradient + gradient.T) / 2, strain, atol=1e-9)
     np.testing.assert_allclose(pressed.reaction, 0, atol=1e-9)
 
@@ -207,7 +223,9 @@ def test_forces_are_the_energys_slope_and_stiffness_that_of_forces(poisson):
     x = skin.positions @ np.array([[0.6, -0.8, 0], [0.8, 0.6, 0], [0, 0, 1]]) + random.normal(0, 0.07, (3, 4, 3, 3))
     way, e = random.normal(size=x.shape), 1e-5
     (ahead, more), (behind, less) = skin.forces(x + e * way), skin.forces(x - e * way)
-    assert -(skin.forces(x)[0] * way).sum() == pytest.approx((more - less) / (2 * e), rel=1e-7)  # e^2 and rounding, 1e-10/e
+    assert -(skin.forces(x)[0] * way).sum() == pytest.approx(
+        (more - less) / (2 * e), rel=1e-7
+    )  # e^2 and rounding, 1e-10/e
     stiffness = _assembled(skin, x.reshape(-1, 3))[0]
     np.testing.assert_allclose((stiffness @ way.ravel()).reshape(x.shape), (behind - ahead) / (2 * e), atol=1e-7)
 
@@ -240,10 +258,14 @@ class Elastic:
             self.fixed |= on[plane] & np.isin(self.component, components)
         self.top = np.isclose(self.at[2], 0)
         self.size = np.array([x[-1], y[-1], z[0]])
-        self.factor = lru_cache(None)(lambda free: splu(
-            self.stiffness[np.frombuffer(free, int)][:, np.frombuffer(free, int)], permc_spec="MMD_AT_PLUS_A",
-            diag_pivot_thresh=0.0, options={"SymmetricMode": True},
-        ))
+        self.factor = lru_cache(None)(
+            lambda free: splu(
+                self.stiffness[np.frombuffer(free, int)][:, np.frombuffer(free, int)],
+                permc_spec="MMD_AT_PLUS_A",
+                diag_pivot_thresh=0.0,
+                options={"SymmetricMode": True},
+            )
+        )
 
     def solve(self, forces, moved=None):
         """Displacements (dofs, ...) under forces (dofs, ...); moved: (dofs,) bool and mm."""
@@ -282,7 +304,8 @@ def block(half, thickness, n, material=RUBBER):
 
 @pytest.fixture(scope="module")
 def tall_block():
-    """6 x 6 x 3 mm, a quarter of it, finer towards the edges where stress is singular: force and displacement to 0.4 %."""
+    """6 x 6 x 3 mm, a quarter of it, finer towards the edges where stress is singular: force and displacement to 0.4
+    %."""
     return lambda at_x: Elastic(RUBBER, graded(3.0, 5), graded(3.0, 5), both_ends(3.0, 6), at_x, (1,))
 
 
@@ -296,7 +319,8 @@ def test_glued_block_under_a_plate_is_that_of_finite_elements(tall_block):
     for n in (4, 8):
         pressed = balance(block(3.0, 3.0, n), Push(plate(), 0.1), linear=True)
         wrong[n] = -pressed.force[2] / force - 1
-        # springs resist bending of a cell too much, an error of order h^2, and the glued edge is singular: 3.1 and 1.1 %
+        # springs resist bending of a cell too much, an error of order h^2, and the glued edge is singular: 3.1 and 1.1
+        # %
         assert elastic.compare(u, pressed) < {4: 0.045, 8: 0.02}[n]
     assert 0 < wrong[8] < 0.45 * wrong[4] < 0.45 * 0.04
 
@@ -321,7 +345,8 @@ def test_glued_block_under_shear_is_that_of_finite_elements(tall_block):
 
 
 def contact(elastic, shape, depth, reach):
-    """Displacement and force of a frictionless indenter on finite elements, by its nodes' unit loads and an active set."""
+    """Displacement and force of a frictionless indenter on finite elements, by its nodes' unit loads and an active
+    set."""
     face = np.flatnonzero(elastic.top & (elastic.component == 2) & (np.hypot(*elastic.at[:2]) < reach))
     unit = np.zeros((elastic.basis.N, len(face)))
     unit[face, np.arange(len(face))] = 1
@@ -392,7 +417,9 @@ def test_large_strains_are_nearly_neo_hookean(stretch, allowed):
         return mu / 2 * (a * a + 2 * b * b - 3 - 2 * math.log(j)) + lam / 2 * (j - 1) ** 2
 
     def stress(energy):
-        b = minimize_scalar(lambda b: energy(stretch, b), bounds=(0.7, 1.5), method="bounded", options={"xatol": 1e-9}).x
+        b = minimize_scalar(
+            lambda b: energy(stretch, b), bounds=(0.7, 1.5), method="bounded", options={"xatol": 1e-9}
+        ).x
         return (energy(stretch + 1e-5, b) - energy(stretch - 1e-5, b)) / 2e-5
 
     assert stress(lattice) == pytest.approx(stress(neo_hooke), rel=allowed)
@@ -471,12 +498,16 @@ def test_the_longest_step_is_safe_and_no_smaller_than_needed():
     assert 0.6 * 2 / fastest < skin.longest_step <= 2 / fastest
 
 
-@pytest.mark.parametrize("push, forces, gravity", [
-    (Push(sphere(6.0), 0.8, at=(0.3, -0.4)), False, (0, 0, 0)),
-    (Push(sphere(6.0), 0.6, shear=(0.5, 0.2), stuck=True), False, (0, 0, 0)),
-    (Push(plate(), 0.3), True, (3.0, 0, 9.81)),
-    (None, True, (0, 0, 9.81)),
-], ids=["sphere", "stuck", "plate", "forces"])
+@pytest.mark.parametrize(
+    "push, forces, gravity",
+    [
+        (Push(sphere(6.0), 0.8, at=(0.3, -0.4)), False, (0, 0, 0)),
+        (Push(sphere(6.0), 0.6, shear=(0.5, 0.2), stuck=True), False, (0, 0, 0)),
+        (Push(plate(), 0.3), True, (3.0, 0, 9.81)),
+        (None, True, (0, 0, 9.81)),
+    ],
+    ids=["sphere", "stuck", "plate", "forces"],
+)
 def test_motion_comes_to_the_rest_that_balance_finds(push, forces, gravity):
     random = np.random.default_rng(3)
     skin = Lattice((9, 10, 5), 1.0, RUBBER, factors=random.uniform(0.5, 1.5, (8, 9, 4)))
@@ -494,9 +525,12 @@ def test_motion_comes_to_the_rest_that_balance_finds(push, forces, gravity):
 
 
 PUSHES = {
-    "sphere": Push(sphere(6.0), 1.2, at=(0.3, -0.2)), "punch": Push(punch(4.0, 0.5), 0.5), "plate": Push(plate(), 0.5),
+    "sphere": Push(sphere(6.0), 1.2, at=(0.3, -0.2)),
+    "punch": Push(punch(4.0, 0.5), 0.5),
+    "plate": Push(plate(), 0.5),
     "wedge": Push(lambda x, y: 0.5 * np.abs(x) + 0.1 * y**2, 0.8, at=(0.2, 0.1)),
-    "stuck": Push(sphere(6.0), 0.8, shear=(0.6, -0.3), stuck=True), "slid": Push(sphere(6.0), 0.8, shear=(0.6, -0.3)),
+    "stuck": Push(sphere(6.0), 0.8, shear=(0.6, -0.3), stuck=True),
+    "slid": Push(sphere(6.0), 0.8, shear=(0.6, -0.3)),
 }
 
 
@@ -535,7 +569,9 @@ def test_a_stuck_indenter_takes_the_skin_along():
     assert moved.force[0] > 0.2 and moved.force[1] == pytest.approx(-moved.force[0] / 2, rel=0.05)
     slid = balance(SKIN, PUSHES["slid"])
     assert np.abs(slid.force[:2]).max() < 0.05 * np.abs(moved.force[:2]).max()
-    np.testing.assert_allclose(slid.positions, balance(SKIN, Push(sphere(6.0), 0.8, at=(0.6, -0.3))).positions, atol=1e-12)
+    np.testing.assert_allclose(
+        slid.positions, balance(SKIN, Push(sphere(6.0), 0.8, at=(0.6, -0.3))).positions, atol=1e-12
+    )
 
 
 def test_a_symmetric_press_gives_a_symmetric_field():
@@ -561,7 +597,9 @@ def test_deeper_is_harder_and_rubber_keeps_its_volume():
     for depth in (0.4, 0.8, 1.2):
         pressed = balance(SKIN, Push(sphere(6.0), depth))
         forces.append(-pressed.force[2])
-    assert forces[0] > 0 and forces[1] > 2 * forces[0] and forces[2] > forces[1] * 1.5  # Hertz: depth^1.5, more on a thin skin
+    assert (
+        forces[0] > 0 and forces[1] > 2 * forces[0] and forces[2] > forces[1] * 1.5
+    )  # Hertz: depth^1.5, more on a thin skin
     hydrostatic = pressed.volume_ratio
     # K = 5.6 E: a pressure of E/3 takes 6 %
     assert 0.9 < hydrostatic.min() < 1 and hydrostatic.max() < 1.01
@@ -607,9 +645,10 @@ def test_hexahedra_and_their_volumes():
     index = cells(skin.shape)
     assert index.shape == (12, 8) and index.dtype.kind == "i"
     x = skin.positions.reshape(-1, 3)[index]
-    np.testing.assert_allclose(x[0] - x[0, 0], 0.5 * np.array(
-        [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]]
-    ))
+    np.testing.assert_allclose(
+        x[0] - x[0, 0],
+        0.5 * np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]]),
+    )
     assert skin.positions[..., 2].max() == 0 and skin.positions[..., 2].min() == -skin.thickness == -1.0
     np.testing.assert_allclose(skin.positions.mean((0, 1, 2)), [0, 0, -0.5])
     stretch = np.array([[1.1, 0.2, 0], [0, 0.9, 0.1], [0.1, 0, 1.2]])
@@ -618,7 +657,9 @@ def test_hexahedra_and_their_volumes():
     bent = skin.positions + np.random.default_rng(4).normal(0, 0.05, (3, 4, 3, 3))
     t, total = np.array([-1, 1]) / math.sqrt(3), 0.0
     corners = bent.reshape(-1, 3)[index[5]]
-    signs = np.array([[-1, -1, -1], [1, -1, -1], [1, 1, -1], [-1, 1, -1], [-1, -1, 1], [1, -1, 1], [1, 1, 1], [-1, 1, 1]])
+    signs = np.array(
+        [[-1, -1, -1], [1, -1, -1], [1, 1, -1], [-1, 1, -1], [-1, -1, 1], [1, -1, 1], [1, 1, 1], [-1, 1, 1]]
+    )
     for p in product(t, repeat=3):
         linear = (1 + signs * p) / 2
         slopes = [signs[:, a] / 2 * np.prod(np.delete(linear, a, 1), 1) for a in range(3)]
@@ -647,7 +688,8 @@ def test_walls_and_filling():
 
 @pytest.mark.parametrize("ratio", [0.1, 0.3, 3.0])
 def test_a_resolved_cell_lies_between_the_bounds(ratio):
-    """An eighth of a periodic cell with mirror planes all around: its stiffness in compression without lateral strain."""
+    """An eighth of a periodic cell with mirror planes all around: its stiffness in compression without lateral
+    strain."""
     n = 10
     factors = np.full((n, n, n), ratio)
     factors[:2] = factors[:, :2] = factors[:, :, :2] = 1
@@ -665,35 +707,38 @@ def test_a_resolved_cell_lies_between_the_bounds(ratio):
 # -- Errors ------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("call, text", [
-    (lambda: Material(-1.0, 0.3), "Young's modulus = -1"),
-    (lambda: Material(1.0, 0.5), "0.47 to 0.49 for rubber"),
-    (lambda: Material(1.0, math.nan), "Poisson"),
-    (lambda: Lattice((5, 5, 1), 1.0, RUBBER), "each 2 or more"),
-    (lambda: Lattice((5, 5, 4), (1.0, 1.0, 1.2), RUBBER), "must be cubes"),
-    (lambda: Lattice((5, 5, 4), 0.0, RUBBER), "pitch = 0"),
-    (lambda: Lattice((5, 5, 4), 1.0, RUBBER, factors=np.ones((5, 5, 4))), r"\(4, 4, 3\)"),
-    (lambda: Lattice((5, 5, 4), 1.0, RUBBER, factors=np.zeros((4, 4, 3))), "above 0"),
-    (lambda: Lattice((5, 5, 4), 1.0, RUBBER, held="sides"), "'base and sides'"),
-    (lambda: Lattice((5, 5, 4), 1.0, RUBBER, held=np.zeros((5, 5, 4, 3), bool)), "move as a whole"),
-    (lambda: sphere(-3.0), "diameter = -3"),
-    (lambda: Push(6.0, 1.0), "sphere"),
-    (lambda: Push(plate(), -0.1), "depth = -0.1 mm"),
-    (lambda: Push(plate(), 0.1, at=(1.0,)), "two numbers"),
-    (lambda: balance(SKIN, Push(plate(), 5.0)), "5 mm thick"),
-    (lambda: balance(SKIN, Push(sphere(0.5), 0.1, at=(0.5, 0.5))), "reaches no node"),
-    (lambda: balance(SKIN, Push(sphere(6.0), 0.5, at=(30.0, 0.0))), "over the skin"),
-    (lambda: balance(SKIN, Push(lambda x, y: 0.0, 0.5)), "one height"),
-    (lambda: balance(Lattice((7, 7, 6), 1.0, RUBBER, held="base and sides"), Push(plate(), 0.1)), "held"),
-    (lambda: balance(SKIN, forces=np.zeros((3, 3))), "nodal forces"),
-    (lambda: balance(SKIN, gravity=(0, 9.81)), "gravity"),
-    (lambda: settle(SKIN, step=1.0), "stable up to"),
-    (lambda: settle(SKIN, damping=-1.0), "damping"),
-    (lambda: motion(SKIN, SKIN.positions[1:], SKIN.positions, 1e-3), "positions of shape"),
-    (lambda: grid_material(RUBBER, RUBBER, -0.1, 0.8), "wall thickness"),
-    (lambda: equivalent(Springs(1.0, -2.0), 1.0), "carry no load"),
-    (lambda: nodes((1.0, 0.0, 1.0), 0.1), "skin size"),
-])
+@pytest.mark.parametrize(
+    "call, text",
+    [
+        (lambda: Material(-1.0, 0.3), "Young's modulus = -1"),
+        (lambda: Material(1.0, 0.5), "0.47 to 0.49 for rubber"),
+        (lambda: Material(1.0, math.nan), "Poisson"),
+        (lambda: Lattice((5, 5, 1), 1.0, RUBBER), "each 2 or more"),
+        (lambda: Lattice((5, 5, 4), (1.0, 1.0, 1.2), RUBBER), "must be cubes"),
+        (lambda: Lattice((5, 5, 4), 0.0, RUBBER), "pitch = 0"),
+        (lambda: Lattice((5, 5, 4), 1.0, RUBBER, factors=np.ones((5, 5, 4))), r"\(4, 4, 3\)"),
+        (lambda: Lattice((5, 5, 4), 1.0, RUBBER, factors=np.zeros((4, 4, 3))), "above 0"),
+        (lambda: Lattice((5, 5, 4), 1.0, RUBBER, held="sides"), "'base and sides'"),
+        (lambda: Lattice((5, 5, 4), 1.0, RUBBER, held=np.zeros((5, 5, 4, 3), bool)), "move as a whole"),
+        (lambda: sphere(-3.0), "diameter = -3"),
+        (lambda: Push(6.0, 1.0), "sphere"),
+        (lambda: Push(plate(), -0.1), "depth = -0.1 mm"),
+        (lambda: Push(plate(), 0.1, at=(1.0,)), "two numbers"),
+        (lambda: balance(SKIN, Push(plate(), 5.0)), "5 mm thick"),
+        (lambda: balance(SKIN, Push(sphere(0.5), 0.1, at=(0.5, 0.5))), "reaches no node"),
+        (lambda: balance(SKIN, Push(sphere(6.0), 0.5, at=(30.0, 0.0))), "over the skin"),
+        (lambda: balance(SKIN, Push(lambda x, y: 0.0, 0.5)), "one height"),
+        (lambda: balance(Lattice((7, 7, 6), 1.0, RUBBER, held="base and sides"), Push(plate(), 0.1)), "held"),
+        (lambda: balance(SKIN, forces=np.zeros((3, 3))), "nodal forces"),
+        (lambda: balance(SKIN, gravity=(0, 9.81)), "gravity"),
+        (lambda: settle(SKIN, step=1.0), "stable up to"),
+        (lambda: settle(SKIN, damping=-1.0), "damping"),
+        (lambda: motion(SKIN, SKIN.positions[1:], SKIN.positions, 1e-3), "positions of shape"),
+        (lambda: grid_material(RUBBER, RUBBER, -0.1, 0.8), "wall thickness"),
+        (lambda: equivalent(Springs(1.0, -2.0), 1.0), "carry no load"),
+        (lambda: nodes((1.0, 0.0, 1.0), 0.1), "skin size"),
+    ],
+)
 def test_says_what_is_wrong(call, text):
     with pytest.raises(ValueError, match=text):
         call()
@@ -713,4 +758,6 @@ def test_a_motion_cut_short_says_so():
 def test_progress_is_told():
     seen = []
     pressed = balance(SKIN, Push(sphere(6.0), 0.5), progress=lambda *told: seen.append(told))
-    assert [step for step, _ in seen] == list(range(1, pressed.steps + 1)) and seen[-1][1] == pytest.approx(pressed.residual)
+    assert [step for step, _ in seen] == list(range(1, pressed.steps + 1)) and seen[-1][1] == pytest.approx(
+        pressed.residual
+    )

@@ -1,9 +1,9 @@
 """Polarized light from single matrices to whole scenes, against the physics written out a second time.
 
-Here matrices are plain (..., 4, 4) arrays of the textbooks' elements along x, turned by rotations of axes; oblique layers are
-worked out in world coordinates from their physics: molecules that absorb, the index ellipsoid, Fresnel's amplitudes. Fields go as
-exp(-i w t); Stokes vectors stand in axes x (right), y (up) of whom the light reaches, and S3 = 2 Im(E_x conj E_y).
-"""
+Here matrices are plain (..., 4, 4) arrays of the textbooks' elements along x, turned by rotations of axes; oblique
+layers are worked out in world coordinates from their physics: molecules that absorb, the index ellipsoid, Fresnel's
+amplitudes. Fields go as exp(-i w t); Stokes vectors stand in axes x (right), y (up) of whom the light reaches, and S3 =
+2 Im(E_x conj E_y)."""
 
 from __future__ import annotations
 
@@ -26,17 +26,21 @@ BOTH = pytest.mark.parametrize("variant", [MONO, SPECTRAL], indirect=True)
 JUST_MONO = pytest.mark.parametrize("variant", [MONO], indirect=True)  # Mitsuba's `stokes` shows no bands
 BANDS = {MONO: "540", SPECTRAL: "620, 540, 460"}  # nm
 ROUNDING = 1e-10  # of products of some ten 4 x 4 matrices in double precision, along rays that float32 holds exactly
-GEOMETRY = 5e-6  # of intensities: directions and normals come in float32 (6e-8), and retardances of 1e3 deg multiply them
+GEOMETRY = (
+    5e-6  # of intensities: directions and normals come in float32 (6e-8), and retardances of 1e3 deg multiply them
+)
 FLOAT32 = 2e-5  # of intensities: matrices in float32 through some ten surfaces, retardances as above
 
 
-# -- the textbooks' elements ------------------------------------------------------------------------------------------------
+# -- the textbooks' elements
+# ------------------------------------------------------------------------------------------------
 
 
 def rows(*entries):
     """(..., 4, 4) of sixteen entries that broadcast."""
     return np.stack(np.broadcast_arrays(*(np.asarray(e, float) for e in entries)), -1).reshape(
-        *np.broadcast_shapes(*(np.shape(e) for e in entries)), 4, 4)
+        *np.broadcast_shapes(*(np.shape(e) for e in entries)), 4, 4
+    )
 
 
 def turn(phi):
@@ -67,7 +71,8 @@ def linear(angle, degree=1.0):
 
 
 def amplitudes(cos1, n):
-    """r_s, r_p of Fresnel for a wave on a boundary of relative index n, and the cosine beyond, complex where all is reflected."""
+    """r_s, r_p of Fresnel for a wave on a boundary of relative index n, and the cosine beyond, complex where all is
+    reflected."""
     cos2 = np.sqrt(1 - (1 - np.asarray(cos1) ** 2) / n**2 + 0j)
     return (cos1 - n * cos2) / (cos1 + n * cos2), (n * cos1 - cos2) / (n * cos1 + cos2), cos2
 
@@ -87,7 +92,8 @@ def off(found, expected, scale=None):
     return float((np.abs(found - expected) / (np.abs(expected).max() if scale is None else scale)).max())
 
 
-# -- stacks of plates -------------------------------------------------------------------------------------------------------
+# -- stacks of plates
+# -------------------------------------------------------------------------------------------------------
 
 
 class Plate(NamedTuple):
@@ -140,7 +146,9 @@ def loaded(file, variant, **defines):
 def stack(folder, variant, plates, **defines):
     """A scene of plates (name -> Plate) before a wide lamp, for a camera at the origin that looks along z."""
     lamp = LAMP.xml("lamp", 3000).replace("</shape>", '<emitter type="source" id="source"/></shape>')
-    text = STACK.replace("SAMPLER", CENTRES).replace("PLATES", "\n".join([p.xml(n) for n, p in plates.items()] + [lamp]))
+    text = STACK.replace("SAMPLER", CENTRES).replace(
+        "PLATES", "\n".join([p.xml(n) for n, p in plates.items()] + [lamp])
+    )
     file = folder / "stack.xml"
     file.write_text(text)
     return loaded(file, variant, **defines)
@@ -174,11 +182,12 @@ def rendered(scene, values):
 
     scene.set({k: v for k, v in values.items() if k in scene.parameters})
     lanes, bands = scene.integrator.lanes, len(scene.integrator.bands)
-    image = np.array(mi.render(scene.mitsuba, spp=1, seed=0), float)[..., -4 * lanes:]
+    image = np.array(mi.render(scene.mitsuba, spp=1, seed=0), float)[..., -4 * lanes :]
     return np.moveaxis(image.reshape(*image.shape[:2], 4, lanes)[..., :bands], 2, 0)
 
 
-# -- layers by hand ---------------------------------------------------------------------------------------------------------
+# -- layers by hand
+# ---------------------------------------------------------------------------------------------------------
 
 
 def azimuth(axis, k, x):
@@ -200,11 +209,11 @@ def film_by_hand(own, wavelength, k, x, e1, e2):
 
 
 def birefringent(delta, axis, k, x, e1, e2, index):
-    """A sheet that retards by delta (N,) at normal incidence, fast along `axis` (N, rad): by the section of its index ellipsoid.
+    """A sheet that retards by delta (N,) at normal incidence, fast along `axis` (N, rad): by the section of its index
+    ellipsoid.
 
-    Across the wave inside, the impermeability 1/N^2 has two axes and two values 1/n^2; over the path d/cos they make the
-    retardance. A birefringence of 1e-6 is the limit of a small one.
-    """
+    Across the wave inside, the impermeability 1/N^2 has two axes and two values 1/n^2; over the path d/cos they make
+    the retardance. A birefringence of 1e-6 is the limit of a small one."""
     tiny, normal = 1e-6, np.cross(e1, e2)
     fast = np.cos(axis)[:, None] * e1 + np.sin(axis)[:, None] * e2
     slow = np.cross(normal, fast)
@@ -212,7 +221,9 @@ def birefringent(delta, axis, k, x, e1, e2, index):
     def dyad(v):
         return v[..., :, None] * v[..., None, :]
 
-    impermeability = dyad(fast) / (index - tiny / 2) ** 2 + dyad(slow) / (index + tiny / 2) ** 2 + dyad(normal) / index**2
+    impermeability = (
+        dyad(fast) / (index - tiny / 2) ** 2 + dyad(slow) / (index + tiny / 2) ** 2 + dyad(normal) / index**2
+    )
     cos = dot(k, normal)
     inside = np.sqrt(1 - (1 - cos**2) / index**2)
     bent = k / index + (np.sign(cos) * inside - cos / index)[:, None] * normal
@@ -221,7 +232,9 @@ def birefringent(delta, axis, k, x, e1, e2, index):
     across = np.stack([s, np.cross(bent, s)], -2)  # s and p of the wave inside
     values, vectors = np.linalg.eigh(across @ impermeability @ np.swapaxes(across, -1, -2))
     n_slow, n_fast = (values[:, i] ** -0.5 for i in range(2))
-    leading = vectors[:, :1, 1] * s + vectors[:, 1:, 1] * np.cross(k, s)  # s stays s and p stays p where the wave leaves
+    leading = vectors[:, :1, 1] * s + vectors[:, 1:, 1] * np.cross(
+        k, s
+    )  # s stays s and p stays p where the wave leaves
     return at(azimuth(leading, k, x), retarder(delta * (n_slow - n_fast) / tiny / inside))
 
 
@@ -231,7 +244,8 @@ def stress_by_hand(pattern, x, y, size):
         return 1 + 0 * x, 0 * x
     if pattern == "bend":
         return 2 * y / size, 0 * x
-    total = 0  # disc: a point load on a half plane spreads as -cos/r along the radius (Flamant), here from the top and below
+    # disc: a point load on a half plane spreads as -cos/r along the radius (Flamant), here from the top and below
+    total = 0
     for side in (1, -1):
         r = np.stack([x, y - side * size / 2], -1)
         length = np.linalg.norm(r, axis=-1)
@@ -256,9 +270,21 @@ def sheet_by_hand(own, wavelength, k, x, e1, e2, u, v):
     total = birefringent(np.radians(delta) + 0 * u, axis + 0 * u, k, x, e1, e2, own("index")) @ total
     c, s = np.cos(dial), np.sin(dial)
     q, p = stress_by_hand(own("stress_pattern"), u * c + v * s, v * c - u * s, own("stress_size"))
-    metres = own("stress_optic") * 1e-12 * own("stress") * 1e6 * own("stress_thickness") * 1e-3  # path difference per pattern
-    return birefringent(2 * np.pi * metres / (wavelength * 1e-9) * np.hypot(q, p), np.arctan2(p, q) / 2 + dial, k, x, e1, e2,
-                        own("index")) @ total
+    metres = (
+        own("stress_optic") * 1e-12 * own("stress") * 1e6 * own("stress_thickness") * 1e-3
+    )  # path difference per pattern
+    return (
+        birefringent(
+            2 * np.pi * metres / (wavelength * 1e-9) * np.hypot(q, p),
+            np.arctan2(p, q) / 2 + dial,
+            k,
+            x,
+            e1,
+            e2,
+            own("index"),
+        )
+        @ total
+    )
 
 
 def camera_rays(size, x_fov, roll=0.0):
@@ -271,7 +297,8 @@ def camera_rays(size, x_fov, roll=0.0):
 
 
 def follow(plates, values, wavelength, d, vertical, o=(0.0, 0.0, 0.0)):
-    """Stokes axes at the end: (M (N, 4, 4) from there to the camera, k, x), for rays (N, 3) through plates in their order."""
+    """Stokes axes at the end: (M (N, 4, 4) from there to the camera, k, x), for rays (N, 3) through plates in their
+    order."""
     total, o = np.eye(4), np.broadcast_to(np.array(o, float), d.shape)
     k, x = -d, unit(np.cross(vertical, d))
     for name, p in plates.items():
@@ -283,7 +310,8 @@ def follow(plates, values, wavelength, d, vertical, o=(0.0, 0.0, 0.0)):
             total = total @ film_by_hand(own, wavelength, k, x, e1, e2)
         elif p.kind == "sheet":
             total = total @ sheet_by_hand(own, wavelength, k, x, e1, e2, u, v)
-        else:  # an interface, met from the side of its normal: what comes through is weighed by 1/n^2, and new axes begin
+        # an interface, met from the side of its normal: what comes through is weighed by 1/n^2, and new axes begin
+        else:
             n, cos = own("index"), dot(k, normal)
             r_s, r_p, cos2 = amplitudes(cos, n)
             s = np.cross(k, normal)
@@ -300,12 +328,35 @@ def source_by_hand(values, k, x, e1):
     return (turn(-azimuth(e1, k, x)) @ linear(np.arctan2(u, q) / 2, np.hypot(q, u))[:, None])[..., 0]
 
 
-FILM = {"inserted": (0.5, 1), "angle": (-180, 180), "transmittance": (0.6, 0.95), "transmittance_slope": (-0.05, 0.05),
-        "leak": (0.01, 0.3), "leak_tilt": (-0.02, 0.02), "leak_oblique": (0, 0.1), "offset": (-20, 20), "scale": (0.9, 1.1),
-        "approach": (-1, 1), "backlash": (-5, 5), "wobble_c": (-0.03, 0.03), "wobble_s": (-0.03, 0.03)}
-SHEET = {"transmittance": (0.6, 1), "transmittance_slope": (-0.2, 0.2), "index": (1.0, 1.7), "angle": (-180, 180),
-         "depolarization": (0, 0.5), "retard_0": (-300, 300), "retard_45": (-300, 300), "retard_dispersion": (-0.5, 0.5),
-         "stress": (-5, 5), "stress_optic": (1, 6), "stress_thickness": (1, 3), "stress_size": (500, 800)}
+FILM = {
+    "inserted": (0.5, 1),
+    "angle": (-180, 180),
+    "transmittance": (0.6, 0.95),
+    "transmittance_slope": (-0.05, 0.05),
+    "leak": (0.01, 0.3),
+    "leak_tilt": (-0.02, 0.02),
+    "leak_oblique": (0, 0.1),
+    "offset": (-20, 20),
+    "scale": (0.9, 1.1),
+    "approach": (-1, 1),
+    "backlash": (-5, 5),
+    "wobble_c": (-0.03, 0.03),
+    "wobble_s": (-0.03, 0.03),
+}
+SHEET = {
+    "transmittance": (0.6, 1),
+    "transmittance_slope": (-0.2, 0.2),
+    "index": (1.0, 1.7),
+    "angle": (-180, 180),
+    "depolarization": (0, 0.5),
+    "retard_0": (-300, 300),
+    "retard_45": (-300, 300),
+    "retard_dispersion": (-0.5, 0.5),
+    "stress": (-5, 5),
+    "stress_optic": (1, 6),
+    "stress_thickness": (1, 3),
+    "stress_size": (500, 800),
+}
 SOURCE = {"dop_q": (-0.7, 0.7), "dop_u": (-0.7, 0.7)}
 DRAWN = {"polarizer_film": FILM, "sheet": SHEET, "interface": {"index": (1.2, 1.6)}}
 
@@ -314,7 +365,8 @@ def drawn(rng, bounds, name):
     return {f"{name}.{p}": rng.uniform(*b) for p, b in bounds.items()}
 
 
-# -- the bench --------------------------------------------------------------------------------------------------------------
+# -- the bench
+# --------------------------------------------------------------------------------------------------------------
 
 TURNS = np.arange(0.0, 360.0, 5.0)
 
@@ -341,20 +393,30 @@ def test_three_polarizers(variant):
     """cos(a)^2 cos(b)^2 for the angles between neighbours: a film between crossed ones brings light back."""
     scene, renderer = bench(variant, middle=1)
     a, b = (x.ravel() for x in np.meshgrid(np.radians(TURNS), np.radians(TURNS)))
-    values = {**scene.values(), "polarizer.angle": 10.0, "middle.angle": 10 + np.degrees(a),
-              "analyzer.angle": 10 + np.degrees(a + b)}
+    values = {
+        **scene.values(),
+        "polarizer.angle": 10.0,
+        "middle.angle": 10 + np.degrees(a),
+        "analyzer.angle": 10 + np.degrees(a + b),
+    }
     assert off(renderer.image(values, "source")[:, 0, 0], 0.8**3 / 2 * np.cos(a) ** 2 * np.cos(b) ** 2) < ROUNDING
 
 
 @BOTH
 def test_wave_plates_turn_light_as_the_textbooks_say(variant):
-    """Half a wave mirrors the plane at the fast axis; a quarter makes S3 = sin 2(axis - plane), and +-1 at 45 degrees."""
+    """Half a wave mirrors the plane at the fast axis; a quarter makes S3 = sin 2(axis - plane), and +-1 at 45
+    degrees."""
     scene, renderer = bench(variant)
     ratio = 540 / renderer.wavelengths  # the plates are made for 540 nm, and only there half or a quarter of a wave
     middle = int(np.argmin(np.abs(ratio - 1)))
     for plane in (0.0, 25.0, 100.0):
         for axis in (0.0, 30.0, 45.0, 130.0):
-            values = {**scene.values(), "analyzer.inserted": 0.0, "polarizer.angle": plane, "polarizer.transmittance": 1.0}
+            values = {
+                **scene.values(),
+                "analyzer.inserted": 0.0,
+                "polarizer.angle": plane,
+                "polarizer.transmittance": 1.0,
+            }
             for delta in (180.0, 90.0, 37.0):
                 found = renderer.stokes({**values, "sample.retard_0": delta, "sample.angle": axis})[:, 0, 0] * 2
                 plates = at(np.radians(axis), retarder(np.radians(delta * ratio)))
@@ -369,7 +431,8 @@ def test_wave_plates_turn_light_as_the_textbooks_say(variant):
 
 
 def test_retardance_follows_the_wavelength(mitsuba):
-    """delta = 2 pi d dn/lambda, with the sample's dispersion, and the stress-optic law in SI units; read as angle of S2 and S3."""
+    """delta = 2 pi d dn/lambda, with the sample's dispersion, and the stress-optic law in SI units; read as angle of S2
+    and S3."""
     scene, renderer = bench(SPECTRAL, bands="660, 540, 470, 430")
     values = {**scene.values(), "analyzer.inserted": 0.0, "polarizer.angle": 45.0}
     nm = renderer.wavelengths
@@ -388,7 +451,8 @@ def test_retardance_follows_the_wavelength(mitsuba):
 
 @BOTH
 def test_a_polarization_ratio_of_99_percent(variant):
-    """T2 = T1 (1 - P)/(1 + P): the contrast (max - min)/(max + min) of one film in polarized light is P, that of two P^2."""
+    """T2 = T1 (1 - P)/(1 + P): the contrast (max - min)/(max + min) of one film in polarized light is P, that of two
+    P^2."""
     scene, renderer = bench(variant)
     ratio, t1 = 0.99, 0.76
     t2 = t1 * (1 - ratio) / (1 + ratio)
@@ -404,7 +468,8 @@ def test_a_polarization_ratio_of_99_percent(variant):
     assert off(two, (t1**2 + t2**2) / 2 * c2 + t1 * t2 * (1 - c2)) < ROUNDING
 
 
-# -- single matrices --------------------------------------------------------------------------------------------------------
+# -- single matrices
+# --------------------------------------------------------------------------------------------------------
 
 KNOWN = ((45.0, 36.239), (51.782, 45.000), (60.0, 40.336), (75.0, 21.902), (85.0, 7.425))  # deg, n = 1.49661
 
@@ -430,8 +495,8 @@ def test_total_reflection_retards_by_the_known_angles():
 
 @pytest.mark.parametrize(("index", "angle"), [(1.51, 48 + 37 / 60), (1.51, 54 + 37 / 60), (1.49661, 51.782)])
 def test_two_reflections_in_fresnels_rhomb_make_a_quarter_wave_plate(index, angle):
-    """Born & Wolf, 1.5.4: glass of n = 1.51 at 48 37' or 54 37'. Light at 45 degrees leaves circular, with the handedness that
-    the fields of both reflections have."""
+    """Born & Wolf, 1.5.4: glass of n = 1.51 at 48 37' or 54 37'. Light at 45 degrees leaves circular, with the
+    handedness that the fields of both reflections have."""
     cos = np.cos(np.radians(angle))
     reflection = mueller.fresnel_reflection(cos, 1 / index).numpy()
     s = reflection @ reflection @ linear(np.pi / 4)
@@ -456,7 +521,8 @@ def test_light_reflected_at_brewsters_angle_is_polarized_across_the_plane(n):
 
 @pytest.mark.parametrize("n", [1.33, 1.5, 1 / 1.41, 1 / 1.49661])
 def test_reflectance_is_the_same_from_both_sides_and_nothing_is_lost(n):
-    """R(theta_1, n) = R(theta_2, 1/n), and |r|^2 + n cos2/cos1 |t|^2 = 1 with the amplitudes t of the electric field."""
+    """R(theta_1, n) = R(theta_2, 1/n), and |r|^2 + n cos2/cos1 |t|^2 = 1 with the amplitudes t of the electric
+    field."""
     cos1 = np.linspace(1, 0.02, 200)
     cos1 = cos1[1 - (1 - cos1**2) / n**2 > 1e-6]
     r_s, r_p, cos2 = mueller.fresnel(cos1, n)
@@ -475,16 +541,21 @@ def test_reflectance_is_the_same_from_both_sides_and_nothing_is_lost(n):
 
 @pytest.mark.parametrize("index", [1.41, 1 / 1.41])
 def test_an_interface_in_a_white_furnace_passes_what_it_does_not_reflect(mitsuba, tmp_path, index):
-    """Light of radiance 1 from all of medium 2: what leaves into medium 1 (T/n^2, over its directions) and what is reflected
-    (over directions in medium 2) add up to pi, and with n^2 in the way of etendue T is the same in both directions."""
-    scene, _ = stack(tmp_path, SPECTRAL, {"window": Plate("interface", 20.0, bsdf=f'<float name="index" value="{index}"/>')})
+    """Light of radiance 1 from all of medium 2: what leaves into medium 1 (T/n^2, over its directions) and what is
+    reflected (over directions in medium 2) add up to pi, and with n^2 in the way of etendue T is the same in both
+    directions."""
+    scene, _ = stack(
+        tmp_path, SPECTRAL, {"window": Plate("interface", 20.0, bsdf=f'<float name="index" value="{index}"/>')}
+    )
     values = {**scene.values(), "window.index": index}
     x, w = np.polynomial.legendre.leggauss(200)
     zero = np.zeros((200, 1))
 
     def passed(cos, sign):
         sine = np.sqrt(1 - cos**2)
-        crossing = Crossing((-sine[:, None], zero, sign * cos[:, None]), (zero, zero + 1, zero), zero, zero, np.array([540.0]))
+        crossing = Crossing(
+            (-sine[:, None], zero, sign * cos[:, None]), (zero, zero + 1, zero), zero, zero, np.array([540.0])
+        )
         return paths.layer_matrix(scene, "window", crossing, values).numpy()[:, 0]
 
     def flux(of, limit):
@@ -495,7 +566,10 @@ def test_an_interface_in_a_white_furnace_passes_what_it_does_not_reflect(mitsuba
 
     ends = [np.arcsin(min(1, n)) for n in (index, 1 / index)]  # in medium 1, in medium 2: beyond, all is reflected
     away = flux(lambda c: passed(c, 1)[:, 0, 0], ends[0])
-    kept = flux(lambda c: sum(np.abs(r) ** 2 for r in amplitudes(c, 1 / index)[:2]) / 2, ends[1]) + np.pi * np.cos(ends[1]) ** 2
+    kept = (
+        flux(lambda c: sum(np.abs(r) ** 2 for r in amplitudes(c, 1 / index)[:2]) / 2, ends[1])
+        + np.pi * np.cos(ends[1]) ** 2
+    )
     assert away + kept == pytest.approx(np.pi, rel=1e-9)  # 200 points of a smooth function
     cos1 = np.linspace(0.99, np.cos(ends[0]) + 0.01, 200)
     cos2 = np.sqrt(1 - (1 - cos1**2) / index**2)
@@ -503,20 +577,30 @@ def test_an_interface_in_a_white_furnace_passes_what_it_does_not_reflect(mitsuba
 
 
 def test_signs_are_mitsubas(mitsuba):
-    """Retarder, diattenuator, turned elements, rotation of axes and specular reflection below and beyond the critical angle."""
+    """Retarder, diattenuator, turned elements, rotation of axes and specular reflection below and beyond the critical
+    angle."""
     mi = mitsuba
     rng = RNG(1)
-    phi, delta, t1, t2 = rng.uniform(-np.pi, np.pi, 50), rng.uniform(-6, 6, 50), rng.uniform(0, 1, 50), rng.uniform(0, 1, 50)
+    phi, delta, t1, t2 = (
+        rng.uniform(-np.pi, np.pi, 50),
+        rng.uniform(-6, 6, 50),
+        rng.uniform(0, 1, 50),
+        rng.uniform(0, 1, 50),
+    )
     q, u = np.cos(2 * phi), np.sin(2 * phi)
 
     def theirs(name, *values):
-        made = getattr(mi.mueller, name)(*(v if not isinstance(v, np.ndarray) else mi.Float(v.astype(np.float32)) for v in values))
+        made = getattr(mi.mueller, name)(
+            *(v if not isinstance(v, np.ndarray) else mi.Float(v.astype(np.float32)) for v in values)
+        )
         return np.moveaxis(np.array(made), -1, 0)
 
     f = [mi.Float(v.astype(np.float32)) for v in (phi, delta, t1, t2)]
     single = 5e-6  # Mitsuba's side is float32, angles up to 6 rad
-    for ours, element in ((mueller.retarder(delta * q, delta * u), mi.mueller.linear_retarder(f[1])),
-                          (mueller.diattenuator(q, u, t1, t2), mi.mueller.diattenuator(f[2], f[3]))):
+    for ours, element in (
+        (mueller.retarder(delta * q, delta * u), mi.mueller.linear_retarder(f[1])),
+        (mueller.diattenuator(q, u, t1, t2), mi.mueller.diattenuator(f[2], f[3])),
+    ):
         assert off(ours.numpy(), theirs("rotated_element", f[0], element)) < single
     assert off(mueller.retarder(delta * q, delta * u).numpy(), at(phi, retarder(delta))) < 1e-12
     assert off(mueller.diattenuator(q, u, t1, t2).numpy(), at(phi, polarizer(t1, t2))) < 1e-12
@@ -542,22 +626,25 @@ def test_an_element_met_from_behind_is_its_mirror_image():
     assert off(plates.reversed.reversed.numpy(), plates.numpy()) < 1e-12
 
 
-# -- stacks of layers -------------------------------------------------------------------------------------------------------
+# -- stacks of layers
+# -------------------------------------------------------------------------------------------------------
 
 
 def summed(elements):
     """(4, 4) that a row of elements leaves of light that passes them in order, all reflections solved for at once.
 
-    Elements are matrices, or numbers: the reflectances of clear faces. Stokes vectors keep the axes x, y of the room on both
-    ways, S3 the phase between them: a face returns r S, and a layer met from behind has the transposed Jones matrix.
-    """
+    Elements are matrices, or numbers: the reflectances of clear faces. Stokes vectors keep the axes x, y of the room on
+    both ways, S3 the phase between them: a face returns r S, and a layer met from behind has the transposed Jones
+    matrix."""
     count, flip = len(elements), np.diag([1, 1, 1, -1])
     system, start = np.eye(8 * (count + 1)), np.zeros((8 * (count + 1), 4))
     forth, back = (lambda gap: slice(8 * gap, 8 * gap + 4)), (lambda gap: slice(8 * gap + 4, 8 * gap + 8))
     start[forth(0)] = np.eye(4)
     for gap, element in enumerate(elements):
         r = element * np.eye(4) if np.ndim(element) == 0 else np.zeros((4, 4))
-        through, behind = ((1 - element) * np.eye(4),) * 2 if np.ndim(element) == 0 else (element, flip @ element.T @ flip)
+        through, behind = (
+            ((1 - element) * np.eye(4),) * 2 if np.ndim(element) == 0 else (element, flip @ element.T @ flip)
+        )
         system[forth(gap + 1), forth(gap)] -= through
         system[forth(gap + 1), back(gap + 1)] -= r
         system[back(gap), back(gap + 1)] -= behind
@@ -588,7 +675,9 @@ def explicit(values, name, kind, wavelength):
     clear = own("transmittance") * np.exp(own("transmittance_slope") * steps) * (4 * n / (n + 1) ** 2) ** 2
     delta = np.hypot(own("retard_0"), own("retard_45")) * ratio * (1 + own("retard_dispersion") * (ratio**2 - 1))
     wave = at(dial + np.arctan2(own("retard_45"), own("retard_0")) / 2, retarder(np.radians(delta)))
-    load = 2 * np.pi * own("stress_optic") * own("stress") * own("stress_thickness") / wavelength  # 1e-12/Pa MPa mm/nm = 1
+    load = (
+        2 * np.pi * own("stress_optic") * own("stress") * own("stress_thickness") / wavelength
+    )  # 1e-12/Pa MPa mm/nm = 1
     if own("stress_pattern") == "disc":  # in the middle of a pressed disc s_xx - s_yy is 4 times 2P/(pi D d)
         load = 4 * load
     return at(dial, retarder(load)) @ wave @ np.diag([1.0] + [1 - own("depolarization")] * 3) * clear
@@ -606,7 +695,9 @@ def test_a_stack_at_normal_incidence_is_the_product_of_its_matrices(variant, tmp
         values.update({f"layer_{i}.stress_pattern": "disc" if trial % 2 else "even" for i in (1, 3, 4)})
         for name in plates if trial >= 10 else ():
             if f"{name}.leak" in values:
-                values[f"{name}.leak"] = values[f"{name}.leak_tilt"] = 0.0  # nothing passes across: as ideal as films are
+                values[f"{name}.leak"] = values[f"{name}.leak_tilt"] = (
+                    0.0  # nothing passes across: as ideal as films are
+                )
         found = matrix(scene, renderer, values)[0]
         for band, wavelength in enumerate(renderer.wavelengths):
             expected = np.eye(4)
@@ -635,12 +726,14 @@ def test_faces_of_films_reflect_to_and_fro(mitsuba, tmp_path):
             else:
                 elements.append(alone)
         found = matrix(scene, renderer, values)[0, list(renderer.wavelengths).index(540.0)]
-        # left out is the fifth round trip between a face and all that stands behind it, at most four times as bright: (4 r^2)^5
+        # left out is the fifth round trip between a face and all that stands behind it, at most four times as bright:
+        # (4 r^2)^5
         assert off(found, summed(elements)) < 6e-10
 
 
 def random_stack(rng):
-    """Plates that are spun and tilted, and all that they can do: in front a window of two faces, behind it films and sheets."""
+    """Plates that are spun and tilted, and all that they can do: in front a window of two faces, behind it films and
+    sheets."""
     kinds = ["interface", "interface", *rng.permutation(["polarizer_film", "polarizer_film", "sheet", "sheet"])]
     plates, values = {}, {}
     for i, kind in enumerate(kinds):
@@ -667,7 +760,8 @@ def test_a_tilted_stack_before_a_wide_camera(variant, tmp_path, seed):
         through, k, x = follow(plates, values, wavelength, d, vertical)
         expected = (through @ source_by_hand(values, k, x, LAMP.axes[0])[..., None])[..., 0]
         assert off(found[..., band].reshape(4, -1).T, expected, expected[:, :1]) < GEOMETRY
-    # rays that Mitsuba sends on start beside the surface, by 1e-4 of its coordinates: patterns of stress are met elsewhere
+    # rays that Mitsuba sends on start beside the surface, by 1e-4 of its coordinates: patterns of stress are met
+    # elsewhere
     assert off(rendered(scene, values), found, found[:1]) < 1e-4
     # oblique rays see other axes and longer ways: the axial matrix alone would be far off
     assert off(found, found[:, 4:5, 4:5] + 0 * found, found[:1]) > 0.05
@@ -675,28 +769,52 @@ def test_a_tilted_stack_before_a_wide_camera(variant, tmp_path, seed):
 
 def stock(mi, shapes, fov, size):
     """(4, H, W) Stokes vectors by `stokes(volpath)` of plates before an area light of radiance 1."""
-    scene = mi.load_dict({
-        "type": "scene", **shapes,
-        "lamp": {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, 200]).scale(3000).rotate([1, 0, 0], 180),
-                 "bsdf": {"type": "diffuse", "reflectance": {"type": "uniform", "value": 0.0}},
-                 "emitter": {"type": "area", "radiance": {"type": "uniform", "value": 1.0}}},
-        "integrator": {"type": "stokes", "own": {"type": "volpath", "max_depth": 3}},
-        "sensor": {"type": "perspective", "fov": fov,
-                   "to_world": mi.ScalarTransform4f().look_at([0, 0, 0], [0, 0, 1], [0, -1, 0]),
-                   "sampler": {"type": "stratified", "jitter": False, "sample_count": 1},
-                   "film": {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "box"},
-                            "component_format": "float32"}}}, optimize=False)
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            **shapes,
+            "lamp": {
+                "type": "rectangle",
+                "to_world": mi.ScalarTransform4f().translate([0, 0, 200]).scale(3000).rotate([1, 0, 0], 180),
+                "bsdf": {"type": "diffuse", "reflectance": {"type": "uniform", "value": 0.0}},
+                "emitter": {"type": "area", "radiance": {"type": "uniform", "value": 1.0}},
+            },
+            "integrator": {"type": "stokes", "own": {"type": "volpath", "max_depth": 3}},
+            "sensor": {
+                "type": "perspective",
+                "fov": fov,
+                "to_world": mi.ScalarTransform4f().look_at([0, 0, 0], [0, 0, 1], [0, -1, 0]),
+                "sampler": {"type": "stratified", "jitter": False, "sample_count": 1},
+                "film": {
+                    "type": "hdrfilm",
+                    "width": size,
+                    "height": size,
+                    "rfilter": {"type": "box"},
+                    "component_format": "float32",
+                },
+            },
+        },
+        optimize=False,
+    )
     image = np.array(mi.render(scene, spp=1), float)[..., -12:]
     return np.moveaxis(image.reshape(size, size, 4, 3)[..., 0], -1, 0)
 
 
 @JUST_MONO
 def test_stock_polarizers_and_retarders_on_the_axis(variant, tmp_path):
-    """Mitsuba's own plates under its own integrator `stokes(volpath)`; the `theta` of its polarizer turns the other way round."""
+    """Mitsuba's own plates under its own integrator `stokes(volpath)`; the `theta` of its polarizer turns the other way
+    round."""
     import mitsuba as mi
 
-    scene, renderer = stack(tmp_path, variant, {f"layer_{i}": Plate(k, 20.0 + 20 * i) for i, k in enumerate(
-        ("polarizer_film", "sheet", "sheet", "polarizer_film"))}, x_fov=1)
+    scene, renderer = stack(
+        tmp_path,
+        variant,
+        {
+            f"layer_{i}": Plate(k, 20.0 + 20 * i)
+            for i, k in enumerate(("polarizer_film", "sheet", "sheet", "polarizer_film"))
+        },
+        x_fov=1,
+    )
     rng = RNG(7)
     for last in (0.0, 1.0):  # with and without the analyser
         theta, delta = rng.uniform(-90, 90, 4), rng.uniform(-180, 180, 4)
@@ -709,8 +827,11 @@ def test_stock_polarizers_and_retarders_on_the_axis(variant, tmp_path):
             else:
                 own = {"type": "polarizer", "transmittance": {"type": "uniform", "value": 0.8}}
             own["theta"] = {"type": "uniform", "value": angle if i in (1, 2) else -angle}
-            shapes[name] = {"type": "rectangle", "bsdf": own, "to_world": mi.ScalarTransform4f().translate(
-                [0, 0, 20.0 + 20 * i]).scale(50).rotate([1, 0, 0], 180)}
+            shapes[name] = {
+                "type": "rectangle",
+                "bsdf": own,
+                "to_world": mi.ScalarTransform4f().translate([0, 0, 20.0 + 20 * i]).scale(50).rotate([1, 0, 0], 180),
+            }
         if not last:
             del shapes["layer_0"]
         found = stock(mi, shapes, 0.002, 2)
@@ -720,23 +841,34 @@ def test_stock_polarizers_and_retarders_on_the_axis(variant, tmp_path):
         assert off(found, expected[:, None, None] + 0 * found, expected[0]) < FLOAT32
 
 
-# -- crossed films in a wide field ------------------------------------------------------------------------------------------
+# -- crossed films in a wide field
+# ------------------------------------------------------------------------------------------
 
 
 @JUST_MONO
 def test_crossed_films_in_a_wide_field(variant, tmp_path):
-    """Korger et al. (2013): T = |t1.t2|^2/2 with t = k x a/|k x a|, in every azimuth up to 62 deg from the axis; dark along both
-    films' axes, bright between them. Mitsuba's `polarizer` is of the same kind."""
+    """Korger et al. (2013): T = |t1.t2|^2/2 with t = k x a/|k x a|, in every azimuth up to 62 deg from the axis; dark
+    along both films' axes, bright between them. Mitsuba's `polarizer` is of the same kind."""
     import mitsuba as mi
 
     size, fov = 41, 106
-    scene, renderer = stack(tmp_path, variant, {n: Plate("polarizer_film", z) for n, z in (("front", 20.0), ("rear", 40.0))},
-                            size=size, x_fov=fov)
+    scene, renderer = stack(
+        tmp_path,
+        variant,
+        {n: Plate("polarizer_film", z) for n, z in (("front", 20.0), ("rear", 40.0))},
+        size=size,
+        x_fov=fov,
+    )
     d = camera_rays(size, fov)[0].reshape(size, size, 3)
     assert np.degrees(np.arccos(d[..., 2].min())) > 60
     for first in (0.0, 35.0):
-        values = {**scene.values(), "front.angle": first, "rear.angle": first + 90, "front.transmittance": 1.0,
-                  "rear.transmittance": 1.0}
+        values = {
+            **scene.values(),
+            "front.angle": first,
+            "rear.angle": first + 90,
+            "front.transmittance": 1.0,
+            "rear.transmittance": 1.0,
+        }
         found = renderer.stokes(values)[0, ..., 0]
         t = []
         for angle in np.radians([first, first + 90]):  # counterclockwise as the camera sees it: y points down
@@ -746,9 +878,14 @@ def test_crossed_films_in_a_wide_field(variant, tmp_path):
         assert expected.max() > 0.05
         assert off(found, expected, 0.5) < 1e-6  # directions in float32
         assert found[size // 2, size // 2] < 1e-15
-        films = {f"film_{i}": {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, 20 + 20 * i]).scale(
-            600).rotate([1, 0, 0], 180), "bsdf": {"type": "polarizer", "theta": {"type": "uniform", "value": -angle}}}
-            for i, angle in enumerate((first, first + 90))}
+        films = {
+            f"film_{i}": {
+                "type": "rectangle",
+                "to_world": mi.ScalarTransform4f().translate([0, 0, 20 + 20 * i]).scale(600).rotate([1, 0, 0], 180),
+                "bsdf": {"type": "polarizer", "theta": {"type": "uniform", "value": -angle}},
+            }
+            for i, angle in enumerate((first, first + 90))
+        }
         assert off(stock(mi, films, fov, size)[0], expected, 0.5) < FLOAT32
         if first == 0:
             arms = np.concatenate([found[size // 2], found[:, size // 2]])
@@ -760,22 +897,28 @@ def test_crossed_films_in_a_wide_field(variant, tmp_path):
             assert corner == pytest.approx(0.5 * np.cos(2 * np.arctan(cos)) ** 2, rel=1e-5)
 
 
-# -- what light can be ------------------------------------------------------------------------------------------------------
+# -- what light can be
+# ------------------------------------------------------------------------------------------------------
 
 
 def crossings(rng, count, wavelengths=(400.0, 540.0, 700.0)):
     """Light from both sides up to 80 deg from the normal, in any axes across it."""
-    cos, phi, roll = rng.uniform(np.cos(np.radians(80)), 1, count), rng.uniform(0, 2 * np.pi, count), rng.uniform(0, 7, count)
+    cos, phi, roll = (
+        rng.uniform(np.cos(np.radians(80)), 1, count),
+        rng.uniform(0, 2 * np.pi, count),
+        rng.uniform(0, 7, count),
+    )
     sine = np.sqrt(1 - cos**2)
     k = np.stack([sine * np.cos(phi), sine * np.sin(phi), cos * rng.choice([-1, 1], count)], -1)
     s = unit(np.cross(k, rng.normal(size=(count, 3))))
     x = np.cos(roll)[:, None] * s + np.sin(roll)[:, None] * np.cross(k, s)
     u, v = rng.uniform(-30, 30, (2, count, 1))
-    return Crossing(*(tuple(a[:, i:i + 1] for i in range(3)) for a in (k, x)), u, v, np.array(wavelengths))
+    return Crossing(*(tuple(a[:, i : i + 1] for i in range(3)) for a in (k, x)), u, v, np.array(wavelengths))
 
 
 def settings(rng, kind, count):
-    """Values of every parameter anywhere within its bounds (angles within two turns), each neutral in a quarter of the draws."""
+    """Values of every parameter anywhere within its bounds (angles within two turns), each neutral in a quarter of the
+    draws."""
     own = {}
     for p in registry().parameters_of(kind):
         if not p.is_number:
@@ -801,18 +944,20 @@ def largest_transmittance(kind, own, crossing):
 
 @pytest.mark.parametrize("kind", sorted(kind for kind, part in registry().parts.items() if part.mueller is not None))
 def test_layers_are_physical_for_all_settings_and_directions(mitsuba, kind):
-    """Cloude's eigenvalues are >= 0 for every setting within bounds, a leak above the transmittance and huge retardances too.
+    """Cloude's eigenvalues are >= 0 for every setting within bounds, a leak above the transmittance and huge
+    retardances too.
 
-    Left out of the gain alone, and of nothing else: settings whose slopes and wobbles lift a transmittance above 1, which the
-    bounds, made for each parameter by itself, do not forbid.
-    """
+    Left out of the gain alone, and of nothing else: settings whose slopes and wobbles lift a transmittance above 1,
+    which the bounds, made for each parameter by itself, do not forbid."""
     rng = RNG(8)
     for pattern in ("even", "disc", "bend"):
         crossing, own = crossings(rng, 4000), settings(rng, kind, 4000)
         if "stress_pattern" in own:
             own["stress_pattern"] = pattern
         own = {"name": kind, "field": None, **own}
-        found = evaluate(registry().parts[kind].mueller, crossing, SimpleNamespace(**own), registry().at_stage(kind, "layer")).numpy()
+        found = evaluate(
+            registry().parts[kind].mueller, crossing, SimpleNamespace(**own), registry().at_stage(kind, "layer")
+        ).numpy()
         assert np.isfinite(found).all()
         dark = found[..., 0, 0] < 1e-12  # of a film that lets nothing through eigenvalues are rounding
         assert dark.mean() < 0.05
@@ -840,7 +985,8 @@ def test_interfaces_are_physical_from_all_sides(mitsuba, tmp_path, index):
 
 
 def test_slabs_with_reflecting_faces_keep_the_energy(mitsuba):
-    """What a row of films with faces transmits and reflects, from both sides: realisable, and together no more than came."""
+    """What a row of films with faces transmits and reflects, from both sides: realisable, and together no more than
+    came."""
     rng = RNG(10)
     count = 2000
     share = np.where(rng.random((count, 1)) < 0.2, 0.0, rng.uniform(0, 0.5, (count, 1)))
@@ -850,10 +996,21 @@ def test_slabs_with_reflecting_faces_keep_the_energy(mitsuba):
         if kind == "polarizer_film":
             # left out: transmittances that are no film's: above 1, as before, and above what its two faces let through
             faces = (1 - share) ** 2
-            own.update(wobble_c=0.0, wobble_s=0.0, inserted=1.0, transmittance=own["transmittance"] * faces, leak_tilt=0.0,
-                       leak=own["leak"] / 2 * faces, leak_oblique=own["leak_oblique"] * faces)
-        matrices = evaluate(registry().parts[kind].mueller, crossing, SimpleNamespace(name=kind, field=None, **own),
-                                registry().at_stage(kind, "layer"))
+            own.update(
+                wobble_c=0.0,
+                wobble_s=0.0,
+                inserted=1.0,
+                transmittance=own["transmittance"] * faces,
+                leak_tilt=0.0,
+                leak=own["leak"] / 2 * faces,
+                leak_oblique=own["leak_oblique"] * faces,
+            )
+        matrices = evaluate(
+            registry().parts[kind].mueller,
+            crossing,
+            SimpleNamespace(name=kind, field=None, **own),
+            registry().at_stage(kind, "layer"),
+        )
         slab = mueller.Slab(matrices)
         if kind == "polarizer_film":
             slab = paths.slab("film", matrices, {"film.face": share.ravel(), "film.inserted": 1.0})
@@ -867,7 +1024,8 @@ def test_slabs_with_reflecting_faces_keep_the_energy(mitsuba):
     assert r[..., 0, 0].max() > 0.3
 
 
-# -- derivatives ------------------------------------------------------------------------------------------------------------
+# -- derivatives
+# ------------------------------------------------------------------------------------------------------------
 
 
 def generic(scene):
@@ -905,15 +1063,32 @@ def test_derivatives_by_a_complex_step_are_those_of_differences(variant):
 @pytest.mark.parametrize("variant", [MONO, pytest.param(SPECTRAL, marks=pytest.mark.slow)], indirect=True)
 @pytest.mark.parametrize("key", ["analyzer.angle", "analyzer.leak"])
 def test_forward_derivatives_of_a_render_are_those_of_differences(variant, key, tmp_path):
-    """mi.render with a gradient on one parameter, in all four components; loops are differentiated where they are not recorded."""
+    """mi.render with a gradient on one parameter, in all four components; loops are differentiated where they are not
+    recorded."""
     import drjit as dr
     import mitsuba as mi
 
-    plates = {n: Plate(k, z) for n, k, z in (("analyzer", "polarizer_film", 20.0), ("sample", "sheet", 30.0),
-                                             ("polarizer", "polarizer_film", 40.0))}
+    plates = {
+        n: Plate(k, z)
+        for n, k, z in (
+            ("analyzer", "polarizer_film", 20.0),
+            ("sample", "sheet", 30.0),
+            ("polarizer", "polarizer_film", 40.0),
+        )
+    }
     scene, _ = stack(tmp_path, variant, plates, size=3, x_fov=60)
-    scene.set({"analyzer.angle": 25.0, "analyzer.leak": 0.15, "polarizer.angle": -30.0, "polarizer.leak": 0.1,
-               "sample.angle": 10.0, "sample.retard_0": 60.0, "source.dop_q": 0.3, "source.dop_u": -0.2})
+    scene.set(
+        {
+            "analyzer.angle": 25.0,
+            "analyzer.leak": 0.15,
+            "polarizer.angle": -30.0,
+            "polarizer.leak": 0.1,
+            "sample.angle": 10.0,
+            "sample.retard_0": 60.0,
+            "source.dop_q": 0.3,
+            "source.dop_u": -0.2,
+        }
+    )
     parameters = mi.traverse(scene.mitsuba)
     part, name = key.split(".")
     path = f"{part}_plate.bsdf.{name}"
@@ -934,7 +1109,8 @@ def test_forward_derivatives_of_a_render_are_those_of_differences(variant, key, 
     h = 0.5 if name == "angle" else 0.005
     expected = (np.array(shown(mi.Float(start + h)), float) - np.array(shown(mi.Float(start - h)), float)) / (2 * h)
     assert np.abs(expected).max() > 1e-3
-    # (2 x 0.5 deg)^2/6 = 5e-5 of a derivative by an angle, h^2/(8 leak^2) = 1.4e-4 of one by a leak's root, and float32 over 2h
+    # (2 x 0.5 deg)^2/6 = 5e-5 of a derivative by an angle, h^2/(8 leak^2) = 1.4e-4 of one by a leak's root, and float32
+    # over 2h
     assert off(found, expected) < 3e-4
 
 
@@ -948,7 +1124,9 @@ ROOM = ("room_left", "room_right")
 @pytest.fixture(scope="module")
 def finger(mitsuba, tmp_path_factory):
     """The scene at rest, small, its object out of the way, sampled in the middles of pixels."""
-    scene, renderer = loaded(centred("vi2tap", tmp_path_factory.mktemp("finger")), SPECTRAL, width=64, height=48, x_fov=100)
+    scene, renderer = loaded(
+        centred("vi2tap", tmp_path_factory.mktemp("finger")), SPECTRAL, width=64, height=48, x_fov=100
+    )
     values = {**scene.values(), "object.y": 900.0}
     hits = renderer.hits(values)
     names = [shape.id() for shape in scene.mitsuba.shapes()]
@@ -971,9 +1149,13 @@ def lit_by(finger, lights):
 
 
 def test_the_room_behind_the_finger_fades_by_malus(finger):
-    """Near the axis cos^2 + T_crossed/T_parallel sin^2; everywhere what oblique films and refracting faces make of it."""
+    """Near the axis cos^2 + T_crossed/T_parallel sin^2; everywhere what oblique films and refracting faces make of
+    it."""
     wall, values = finger.on["wall"], finger.values
-    image = {a: finger.renderer.stokes({**lit_by(finger, ROOM), "analyzer.angle": a})[0, wall, 1] for a in (0.0, 30.0, 60.0, 90.0)}
+    image = {
+        a: finger.renderer.stokes({**lit_by(finger, ROOM), "analyzer.angle": a})[0, wall, 1]
+        for a in (0.0, 30.0, 60.0, 90.0)
+    }
     near = (np.degrees(np.arccos(finger.d[..., 2])) < 6)[wall]
     assert near.sum() >= 4 and len(near) > 100
     t1, t2 = values["film.transmittance"], values["film.leak"]
@@ -1011,7 +1193,8 @@ def test_light_that_is_reflected_twice_has_its_derivative_by_a_layer(finger):
 
 
 def test_markers_shine_at_every_angle_of_the_analyser_and_polarized_by_it(finger):
-    """Unpolarized light: (T1 + T2)/2 of it passes whatever the angle, as S = (1, P cos 2a, P sin 2a, 0) along the seen axis a."""
+    """Unpolarized light: (T1 + T2)/2 of it passes whatever the angle, as S = (1, P cos 2a, P sin 2a, 0) along the seen
+    axis a."""
     markers, values, uv = finger.on["markers"], finger.values, lit_by(finger, ("uv_left", "uv_right"))
     assert markers.sum() > 10
     t1, t2 = values["analyzer.transmittance"], values["analyzer.leak"]
@@ -1029,11 +1212,14 @@ def test_markers_shine_at_every_angle_of_the_analyser_and_polarized_by_it(finger
 
 
 def test_fluorescence_of_a_marker_is_the_integral_over_the_spectra(finger):
-    """One LED on one cap: photons absorbed, by quadrature over the LED's and the pigment's spectra, and emitted at the bands."""
+    """One LED on one cap: photons absorbed, by quadrature over the LED's and the pigment's spectra, and emitted at the
+    bands."""
     values, markers = finger.values, finger.on["markers"]
     hits, bands = finger.hits, finger.renderer.wavelengths
     flat = markers & (hits.normal[..., 2] < -0.9999)
-    image = finger.renderer.image(values, "uv_left") / ((values["analyzer.transmittance"] + values["analyzer.leak"]) / 2)
+    image = finger.renderer.image(values, "uv_left") / (
+        (values["analyzer.transmittance"] + values["analyzer.leak"]) / 2
+    )
     flat &= image[..., 1] > 0
     row, column = np.argwhere(flat)[np.argmin(np.abs(np.argwhere(flat) - [24, 32]).sum(1))]
     own, led = (lambda p: values[f"pigment.{p}"]), (lambda p: values[f"uv_left.{p}"])
@@ -1042,8 +1228,13 @@ def test_fluorescence_of_a_marker_is_the_integral_over_the_spectra(finger):
         return np.exp(-4 * np.log(2) * ((x - peak) / fwhm) ** 2)
 
     nm = np.linspace(100, 700, 60001)
-    absorbed = np.trapezoid(gauss(nm, led("wavelength"), led("fwhm")) * own("absorptance")
-                            * gauss(nm, own("absorption_peak"), own("absorption_fwhm")) * nm, nm)
+    absorbed = np.trapezoid(
+        gauss(nm, led("wavelength"), led("fwhm"))
+        * own("absorptance")
+        * gauss(nm, own("absorption_peak"), own("absorption_fwhm"))
+        * nm,
+        nm,
+    )
     place = np.array([led(a) for a in "xyz"])
     start = place - hits.position[row, column]
     target = finger.scene.parts["uv_left"]
@@ -1051,7 +1242,8 @@ def test_fluorescence_of_a_marker_is_the_integral_over_the_spectra(finger):
     kappa = cos ** led("mu") / dot(start, start)
     wide = np.linspace(-500, 2000, 250001)
     photons = gauss(bands, own("emission_peak"), own("emission_fwhm")) / np.trapezoid(
-        gauss(wide, own("emission_peak"), own("emission_fwhm")), wide)
+        gauss(wide, own("emission_peak"), own("emission_fwhm")), wide
+    )
     incidence = dot(unit(start), hits.normal[row, column])
     expected = own("yield") * kappa * incidence * absorbed * photons / (np.pi * bands)
     # an LED of 275 nm and 11 nm width reflects nothing visible: what is there is fluorescence; float32
@@ -1061,21 +1253,23 @@ def test_fluorescence_of_a_marker_is_the_integral_over_the_spectra(finger):
 
 
 def test_the_render_of_the_finger_is_its_prediction(finger):
-    """mi.render with lamps, layers, refraction and fluorescence together, pixel by pixel away from rims, in all components."""
+    """mi.render with lamps, layers, refraction and fluorescence together, pixel by pixel away from rims, in all
+    components."""
     values = {**finger.values, "analyzer.angle": 25.0, "silicone.retard_0": 60.0, "silicone.retard_45": -20.0}
     try:
         found, expected = rendered(finger.scene, values), finger.renderer.stokes(values)
     finally:
         finger.scene.set(finger.values)
-    # Rays that Mitsuba sends on start up to 2 um beside the surface: nothing on a wall 185 mm away, but 13 mm from an LED twice
-    # that over the distance, 4e-4 of its light
+    # Rays that Mitsuba sends on start up to 2 um beside the surface: nothing on a wall 185 mm away, but 13 mm from an
+    # LED twice that over the distance, 4e-4 of its light
     for name, tolerance in (("wall", 1e-4), ("markers", 1e-3)):
         seen = finger.on[name]
         assert off(found[:, seen], expected[:, seen], expected[0][seen]) < tolerance
 
 
 def test_a_press_moves_the_images_of_markers_outwards(mitsuba):
-    """Middles of the caps' images against the projection of where their caps go, and all of them away from the press."""
+    """Middles of the caps' images against the projection of where their caps go, and all of them away from the
+    press."""
     from scipy.ndimage import label
 
     scene, renderer = loaded("vi2tap", SPECTRAL, width=160, height=120, x_fov=70)

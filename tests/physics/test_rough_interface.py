@@ -1,9 +1,9 @@
-"""The rough boundary against Walter's formulae with Jones vectors in double precision, and against Mitsuba's own boundaries.
+"""The rough boundary against Walter's formulae with Jones vectors in double precision, and against Mitsuba's own
+boundaries.
 
-Light that comes from `wo` leaves along `wi`, unless a test asks for the opposite way (importance). Directions whose cosine
-to the surface is below 0.05 are left out of comparisons, and facets within some 0.1 deg of the critical angle: float32 leaves
-less than four digits of 1/cos there, and of the root that the refracted cosine is.
-"""
+Light that comes from `wo` leaves along `wi`, unless a test asks for the opposite way (importance). Directions whose
+cosine to the surface is below 0.05 are left out of comparisons, and facets within some 0.1 deg of the critical angle:
+float32 leaves less than four digits of 1/cos there, and of the root that the refracted cosine is."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ import pytest
 
 RNG = np.random.default_rng  # every test seeds its own
 KINDS = ("beckmann", "ggx")
-CLOSE = 1e-4  # relative: rounding of the facet's normal (1e-7) over the width of the lobe (0.1), through exp() or a fourth power
+# relative: rounding of the facet's normal (1e-7) over the width of the lobe (0.1), through exp() or a fourth power
+CLOSE = 1e-4
 
 
 def unit(v):
@@ -53,7 +54,9 @@ def boundary(mi, index=1.5, alpha=0.2, distribution="beckmann"):
 
 
 def stock(mi, index=1.5, alpha=0.2, distribution="beckmann"):
-    return mi.load_dict({"type": "roughdielectric", "int_ior": index, "ext_ior": 1.0, "alpha": alpha, "distribution": distribution})
+    return mi.load_dict(
+        {"type": "roughdielectric", "int_ior": index, "ext_ior": 1.0, "alpha": alpha, "distribution": distribution}
+    )
 
 
 def context(mi, component=None, mode="Radiance"):
@@ -85,7 +88,8 @@ def grid(mi, size):
 
 
 def met(index, wi, wo):
-    """The facet that joins two directions: relative index nu, reflected or not, normal, square of nu times the refracted cosine."""
+    """The facet that joins two directions: relative index nu, reflected or not, normal, square of nu times the
+    refracted cosine."""
     nu = np.where(wi[:, 2] > 0, index, 1 / index)
     back = wi[:, 2] * wo[:, 2] > 0
     m = unit(wi + np.where(back, 1, nu)[:, None] * wo)
@@ -105,7 +109,8 @@ def pairs(mi, bsdf, index, rng, count):
     return wi[keep], wo[keep]
 
 
-# -- Walter's formulae with Jones vectors, in double precision --------------------------------------------------------------
+# -- Walter's formulae with Jones vectors, in double precision
+# --------------------------------------------------------------
 
 
 def facets(kind, alpha, m, *directions):
@@ -116,8 +121,11 @@ def facets(kind, alpha, m, *directions):
     shading = 1.0
     for v in directions:
         a = np.abs(v[:, 2]) / np.sqrt(1 - v[:, 2] ** 2) / alpha
-        g1 = np.where(a < 1.6, (3.535 * a + 2.181 * a**2) / (1 + 2.276 * a + 2.577 * a**2), 1) if kind == "beckmann" else \
-            2 / (1 + np.sqrt(1 + a**-2))
+        g1 = (
+            np.where(a < 1.6, (3.535 * a + 2.181 * a**2) / (1 + 2.276 * a + 2.577 * a**2), 1)
+            if kind == "beckmann"
+            else 2 / (1 + np.sqrt(1 + a**-2))
+        )
         shading = shading * g1 * (dot(v, m) * v[:, 2] > 0)
     return common / (np.pi * alpha**2 * cos2**2), shading
 
@@ -129,7 +137,8 @@ def jones_to_mueller(j):
 
 
 def walter(mi, kind, index, alpha, wi, wo):
-    """(N, 4, 4): eqs. (20), (21) times the cosine to the source, with Fresnel's amplitudes along s and p of each facet."""
+    """(N, 4, 4): eqs. (20), (21) times the cosine to the source, with Fresnel's amplitudes along s and p of each
+    facet."""
     wi, wo = unit(wi), unit(wo)
     nu, back, m, square = met(index, wi, wo)
     along, across = dot(wi, m), dot(wo, m)
@@ -139,13 +148,17 @@ def walter(mi, kind, index, alpha, wi, wo):
     amplitudes = [np.where(back, r, np.sqrt(1 - np.minimum(np.abs(r) ** 2, 1))) for r in (r_s, r_p)]
     into, out = -wo, wi
     s = unit(np.cross(wi, wo))
-    field = sum(a[:, None, None] * x[:, :, None] * y[:, None, :]  # (N, 3, 3): from the electric field before to the one after
-                for a, x, y in zip(amplitudes, (s, np.cross(out, s)), (s, np.cross(into, s))))
+    field = sum(
+        a[:, None, None] * x[:, :, None] * y[:, None, :]  # (N, 3, 3): from the electric field before to the one after
+        for a, x, y in zip(amplitudes, (s, np.cross(out, s)), (s, np.cross(into, s)))
+    )
     x_in, x_out = (np.array(mi.mueller.stokes_basis(vectors(mi, k)), float).T for k in (into, out))
     ends = [np.stack([x, np.cross(k, x)], -1) for k, x in ((into, x_in), (out, x_out))]
     matrix = jones_to_mueller(np.einsum("nia,nij,njb->nab", ends[1], field, ends[0]))
     d, g = facets(kind, alpha, m, wi, wo)
-    scale = np.where(back, d * g / (4 * np.abs(wi[:, 2])), np.abs(along * across / wi[:, 2]) * d * g / (along + nu * across) ** 2)
+    scale = np.where(
+        back, d * g / (4 * np.abs(wi[:, 2])), np.abs(along * across / wi[:, 2]) * d * g / (along + nu * across) ** 2
+    )
     return matrix * scale[:, None, None]
 
 
@@ -191,15 +204,18 @@ def test_forward_derivatives_of_every_element_are_those_of_the_formula(mitsuba, 
     scale = np.abs(expected).max(axis=(1, 2)) + size  # the derivative passes through 0 somewhere
     worst = np.abs(found - expected).max(axis=(1, 2))[bright] / scale[bright]
     assert np.isfinite(found).all() and bright.mean() > 0.2
-    # 1e-3: rounding of the facet's normal once more over the lobe's width; the kink of the Beckmann G1 at a = 1.6 is 1e-3 of it
+    # 1e-3: rounding of the facet's normal once more over the lobe's width; the kink of the Beckmann G1 at a = 1.6 is
+    # 1e-3 of it
     assert worst.max() <= 1e-3
 
 
-# -- against Mitsuba's own boundaries ----------------------------------------------------------------------------------------
+# -- against Mitsuba's own boundaries
+# ----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("variant", ["llvm_ad_rgb", "llvm_ad_mono", "llvm_ad_mono_polarized", "llvm_ad_spectral_polarized"],
-                         indirect=True)
+@pytest.mark.parametrize(
+    "variant", ["llvm_ad_rgb", "llvm_ad_mono", "llvm_ad_mono_polarized", "llvm_ad_spectral_polarized"], indirect=True
+)
 def test_intensities_densities_and_draws_are_those_of_the_stock_rough_dielectric(variant):
     import mitsuba as mi
 
@@ -207,14 +223,18 @@ def test_intensities_densities_and_draws_are_those_of_the_stock_rough_dielectric
         both = boundary(mi, index, alpha, kind), stock(mi, index, alpha, kind)
         wi, wo = pairs(mi, both[1], index, RNG(2), 4000)
         (value, density), (stock_value, stock_density) = (
-            b.eval_pdf(context(mi, mode=mode), surface(mi, wi), vectors(mi, wo), True) for b in both)
-        for found, expected in ((intensity(mi, value, len(wi)), intensity(mi, stock_value, len(wi))),
-                                (np.array(density), np.array(stock_density))):
+            b.eval_pdf(context(mi, mode=mode), surface(mi, wi), vectors(mi, wo), True) for b in both
+        )
+        for found, expected in (
+            (intensity(mi, value, len(wi)), intensity(mi, stock_value, len(wi))),
+            (np.array(density), np.array(stock_density)),
+        ):
             there = expected > 0
             assert there.mean() > 0.5 and (found[~there] == 0).all()
             assert np.abs(found / np.where(there, expected, 1) - 1)[there].max() <= CLOSE
         (drawn, weight), (stock_drawn, stock_weight) = (
-            b.sample(context(mi, mode=mode), surface(mi, wi), *draws(mi, RNG(13), len(wi)), True) for b in both)
+            b.sample(context(mi, mode=mode), surface(mi, wi), *draws(mi, RNG(13), len(wi)), True) for b in both
+        )
         there = (np.array(drawn.pdf) > 0) & (np.abs(np.array(drawn.wo)[2]) > 0.05)
         assert there.mean() > 0.8
         assert np.abs(np.array(drawn.wo) - np.array(stock_drawn.wo))[:, there].max() <= CLOSE
@@ -225,7 +245,8 @@ def test_intensities_densities_and_draws_are_those_of_the_stock_rough_dielectric
 @pytest.mark.parametrize("index", [1.5, 0.75])
 @pytest.mark.parametrize("degrees", [0.0, 33.0, 65.0, 125.0, 170.0])
 def test_smooth_facets_are_the_smooth_dielectric(mitsuba, index, degrees):
-    """Mean Mueller matrices over the lobe, reflected and transmitted, in both directions of transport; at alpha 0 exactly."""
+    """Mean Mueller matrices over the lobe, reflected and transmitted, in both directions of transport; at alpha 0
+    exactly."""
     mi = mitsuba
     flat = mi.load_dict({"type": "dielectric", "int_ior": index, "ext_ior": 1.0})
     size, wi = 128, slanted(degrees)
@@ -234,8 +255,8 @@ def test_smooth_facets_are_the_smooth_dielectric(mitsuba, index, degrees):
             ask = context(mi, way, mode)
             bs, weight = flat.sample(ask, surface(mi, wi), mi.Float(0.5), mi.Point2f(0.5), True)
             expected = matrices(mi, weight, 1)[0]
-            # 3e-6: rounding; 1e-4: the lobe of 2e-3 rad turns the light's axes and the angle of incidence by 4e-6 on average (the
-            # tail of ggx more), and the grid of 128 x 128 does not quite balance both sides
+            # 3e-6: rounding; 1e-4: the lobe of 2e-3 rad turns the light's axes and the angle of incidence by 4e-6 on
+            # average (the tail of ggx more), and the grid of 128 x 128 does not quite balance both sides
             for alpha, kind, tolerance in ((0.0, "ggx", 3e-6), (2e-3, "beckmann", 1e-4), (2e-3, "ggx", 1e-4)):
                 rough = boundary(mi, index, alpha, kind)
                 found, weight = rough.sample(ask, surface(mi, wi, size**2), mi.Float(0.5), grid(mi, size), True)
@@ -243,26 +264,33 @@ def test_smooth_facets_are_the_smooth_dielectric(mitsuba, index, degrees):
                 assert np.abs(mean - expected).max() <= tolerance
                 if expected[0, 0] > 0:
                     beside = np.array(found.wo) - np.array(bs.wo)
-                    assert np.abs(beside if alpha == 0 else beside.mean(1)).max() <= tolerance  # of alpha 0 no draw at all
+                    assert (
+                        np.abs(beside if alpha == 0 else beside.mean(1)).max() <= tolerance
+                    )  # of alpha 0 no draw at all
                     assert np.array(found.eta) == pytest.approx(np.array(bs.eta)[0])
 
 
 def test_total_reflection_keeps_its_phase(mitsuba):
-    """tan(delta/2) = cos(theta) sqrt(sin(theta)^2 - n^2)/sin(theta)^2 (Born & Wolf, 1.5.4), n = 1/1.49661: 45 deg at 51.782 deg."""
+    """tan(delta/2) = cos(theta) sqrt(sin(theta)^2 - n^2)/sin(theta)^2 (Born & Wolf, 1.5.4), n = 1/1.49661: 45 deg at
+    51.782 deg."""
     mi = mitsuba
     for degrees in (45.0, 51.782, 60.0, 80.0):
         c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
         delta = 2 * np.arctan(c * np.sqrt(s**2 - 1.49661**-2) / s**2)
-        _, weight = boundary(mi, 1.49661, 0.0).sample(context(mi), surface(mi, slanted(180 - degrees)), mi.Float(0.5),
-                                                      mi.Point2f(0.5), True)
+        _, weight = boundary(mi, 1.49661, 0.0).sample(
+            context(mi), surface(mi, slanted(180 - degrees)), mi.Float(0.5), mi.Point2f(0.5), True
+        )
         matrix = matrices(mi, weight, 1)[0]
         assert matrix[0, 0] == pytest.approx(1, abs=1e-6)
-        assert matrix[3, 3] == pytest.approx(np.cos(delta), abs=2e-6)  # turning the axes leaves this element; 2e-6: rounding
+        assert matrix[3, 3] == pytest.approx(
+            np.cos(delta), abs=2e-6
+        )  # turning the axes leaves this element; 2e-6: rounding
         assert np.linalg.norm(matrix[3, 1:3]) == pytest.approx(np.sin(delta), abs=2e-6)
     assert delta < np.radians(45)
 
 
-# -- what makes it a scattering function -------------------------------------------------------------------------------------
+# -- what makes it a scattering function
+# -------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -280,8 +308,15 @@ def test_samples_fall_as_the_density_says(mitsuba, kind, index, degrees, tmp_pat
         bs, _ = bsdf.sample(context(mi), surface(mi, wi, dr.width(u)), u.x, mi.Point2f(u.y, u.z), True)
         return bs.wo, dr.select(bs.pdf > 0, mi.Float(1), 0)
 
-    test = ChiSquareTest(domain=SphericalDomain(), sample_func=sample, sample_dim=3, sample_count=300_000, res=51, ires=16,
-                         pdf_func=lambda wo: bsdf.pdf(context(mi), surface(mi, wi, dr.width(wo)), wo, True))
+    test = ChiSquareTest(
+        domain=SphericalDomain(),
+        sample_func=sample,
+        sample_dim=3,
+        sample_count=300_000,
+        res=51,
+        ires=16,
+        pdf_func=lambda wo: bsdf.pdf(context(mi), surface(mi, wi, dr.width(wo)), wo, True),
+    )
     assert test.run(significance_level=1e-3)  # the draws are always the same: this passes or fails for good
 
 
@@ -295,9 +330,16 @@ def test_weights_are_value_over_density(mitsuba, kind):
     for way in (None, 0, 1):
         bs, weight = bsdf.sample(context(mi, way), si, u1, u2, True)
         value, density = bsdf.eval_pdf(context(mi, way), si, bs.wo, True)
-        weight, value, density, drawn = matrices(mi, weight, count), matrices(mi, value, count), np.array(density), np.array(bs.pdf)
+        weight, value, density, drawn = (
+            matrices(mi, weight, count),
+            matrices(mi, value, count),
+            np.array(density),
+            np.array(bs.pdf),
+        )
         valid = drawn > 0
-        assert valid.mean() > (0.6 if way == 1 else 0.9) and (weight[~valid] == 0).all()  # nothing passes in total reflection
+        assert (
+            valid.mean() > (0.6 if way == 1 else 0.9) and (weight[~valid] == 0).all()
+        )  # nothing passes in total reflection
         wo = unit(np.array(bs.wo).T)
         regular = valid & (np.abs(wo[:, 2]) > 0.05) & (np.abs(met(1.4, wi, wo)[3]) > 1e-3)
         assert regular.mean() > 0.5
@@ -321,8 +363,8 @@ def quadrature(size):
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("index", [1.5, 0.7])
 def test_no_light_is_made_of_whatever_polarization(mitsuba, kind, index):
-    """All that a beam sends to both sides is at most the beam, for the polarization that fares best (m00 + |m01, m02, m03|); the
-    integral of eval is what sampling returns, that of the density the share of draws that count."""
+    """All that a beam sends to both sides is at most the beam, for the polarization that fares best (m00 + |m01, m02,
+    m03|); the integral of eval is what sampling returns, that of the density the share of draws that count."""
     import drjit as dr
 
     mi = mitsuba
@@ -341,18 +383,20 @@ def test_no_light_is_made_of_whatever_polarization(mitsuba, kind, index):
             sent = (row(value, len(wo)) * solid).sum(1)
             bs, weight = bsdf.sample(ask, surface(mi, slanted(degrees), count), u1, u2, True)
             drawn = row(weight, count).mean(1)
-            # 5e-3: Walter's rational G1 of the Beckmann distribution is good to 3.5e-3, and the density (the stock one's, too) is
-            # made of it; the quadrature leaves 1e-3 next to critical angles, a quarter of a million draws 1e-3
+            # 5e-3: Walter's rational G1 of the Beckmann distribution is good to 3.5e-3, and the density (the stock
+            # one's, too) is made of it; the quadrature leaves 1e-3 next to critical angles, a quarter of a million
+            # draws 1e-3
             assert np.abs(sent - drawn).max() <= 5e-3
             assert (np.array(density) * solid).sum() == pytest.approx((np.array(bs.pdf) > 0).mean(), abs=5e-3)
             for total in (sent, drawn):
-                assert 0.4 < total[0] and total[0] + np.linalg.norm(total[1:]) <= 1 + 1e-3
+                assert total[0] > 0.4 and total[0] + np.linalg.norm(total[1:]) <= 1 + 1e-3
 
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("index, alpha", [(1.5, 0.05), (0.7, 0.3), (1.001, 0.5), (2.3, 0.9), (0.45, 0.01), (1.4, 0.0)])
 def test_every_matrix_is_physical(mitsuba, kind, index, alpha):
-    """The coherency matrix of every value and every weight has no negative eigenvalue (Cloude, Proc. SPIE 1166, 177, 1989)."""
+    """The coherency matrix of every value and every weight has no negative eigenvalue (Cloude, Proc. SPIE 1166, 177,
+    1989)."""
     mi = mitsuba
     bsdf, rng, count = boundary(mi, index, alpha, kind), RNG(7), 4000
     wi, (u1, u2) = sphere(rng, count, 0.0), draws(mi, rng, count)  # along the surface, too
@@ -363,7 +407,9 @@ def test_every_matrix_is_physical(mitsuba, kind, index, alpha):
         assert np.isfinite(found).all()
         some = found[found[:, 0, 0] > 1e-20]
         assert len(some) > 0.7 * count or (alpha == 0 and len(some) == 0)  # a smooth boundary has no values
-        coherency = sum(some[:, i, j, None, None] * np.kron(sigma[i], sigma[j].conj()) for i in range(4) for j in range(4)) / 4
+        coherency = (
+            sum(some[:, i, j, None, None] * np.kron(sigma[i], sigma[j].conj()) for i in range(4) for j in range(4)) / 4
+        )
         lowest = np.linalg.eigvalsh(coherency)[:, :1] / np.real(np.trace(coherency, axis1=1, axis2=2))[:, None]
         assert (lowest >= -1e-5).all()  # rounding leaves -1e-6
 
@@ -372,26 +418,44 @@ def test_a_slightly_rough_boundary_keeps_the_polarization_that_the_stock_one_los
     """Light polarized at 45 deg that meets the boundary at the normal, all that passes summed up."""
     mi, size = mitsuba, 128
     for kind in KINDS:
-        for alpha, floor in ((0.05, 0.99999), (0.4, 0.999)):  # measured: 0.999999 and 0.9996 (ggx), 1 and 0.99997 (beckmann)
-            kept, lost = (matrices(mi, make(mi, 1.5, alpha, kind).sample(
-                context(mi, 1, "Importance"), surface(mi, slanted(0.0), size**2), mi.Float(0.5), grid(mi, size), True)[1],
-                size**2).mean(0) @ [1, 0, 1, 0] for make in (boundary, stock))
+        for alpha, floor in (
+            (0.05, 0.99999),
+            (0.4, 0.999),
+        ):  # measured: 0.999999 and 0.9996 (ggx), 1 and 0.99997 (beckmann)
+            kept, lost = (
+                matrices(
+                    mi,
+                    make(mi, 1.5, alpha, kind).sample(
+                        context(mi, 1, "Importance"),
+                        surface(mi, slanted(0.0), size**2),
+                        mi.Float(0.5),
+                        grid(mi, size),
+                        True,
+                    )[1],
+                    size**2,
+                ).mean(0)
+                @ [1, 0, 1, 0]
+                for make in (boundary, stock)
+            )
             assert floor <= np.linalg.norm(kept[1:]) / kept[0] <= 1 + 1e-5
             assert kept[2] / kept[0] > floor and (lost[1:] == 0).all()
             assert kept[0] == pytest.approx(lost[0], rel=1e-5)
 
 
-# -- near the values where an effect vanishes ----------------------------------------------------------------------------------
+# -- near the values where an effect vanishes
+# ----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("index", [1.5, 0.7])
 def test_roughness_sets_in_with_its_square(mitsuba, index):
-    """Means over the refracted lobe of `beckmann`: four times as far from the smooth boundary at twice the roughness."""
+    """Means over the refracted lobe of `beckmann`: four times as far from the smooth boundary at twice the
+    roughness."""
     mi, size = mitsuba, 256
     means = []
     for alpha in (0.0, 0.02, 0.04):
-        bs, weight = boundary(mi, index, alpha).sample(context(mi, 1), surface(mi, slanted(20.0), size**2), mi.Float(0.5),
-                                                       grid(mi, size), True)
+        bs, weight = boundary(mi, index, alpha).sample(
+            context(mi, 1), surface(mi, slanted(20.0), size**2), mi.Float(0.5), grid(mi, size), True
+        )
         matrix = matrices(mi, weight, size**2)
         means.append([(matrix[:, 0, 0] * np.array(bs.wo)[2]).mean(), matrix[:, 1, 1].mean()])
     rest, once, twice = np.array(means, float)
@@ -403,7 +467,10 @@ def test_a_smooth_boundary_is_one_direction_each_way(mitsuba):
     mi = mitsuba
     f = mi.BSDFFlags
     wi, count = sphere(RNG(8), 500), 500
-    for alpha, types in ((0.0, f.DeltaReflection | f.DeltaTransmission), (0.01, f.GlossyReflection | f.GlossyTransmission)):
+    for alpha, types in (
+        (0.0, f.DeltaReflection | f.DeltaTransmission),
+        (0.01, f.GlossyReflection | f.GlossyTransmission),
+    ):
         bsdf = boundary(mi, 1.5, alpha)
         bs, _ = bsdf.sample(context(mi), surface(mi, wi), *draws(mi, RNG(9), count), True)
         kinds = np.array(bs.sampled_type)
@@ -430,8 +497,8 @@ def test_at_index_1_it_is_not_there(mitsuba, alpha):
 
 @pytest.mark.parametrize("name", ["index", "alpha"])
 def test_derivatives_follow_the_sampled_directions(mitsuba, name):
-    """Forward mode through sample, directions and weights: each way alone against central differences with the same random
-    numbers, and the chance of either way against both ways' sum."""
+    """Forward mode through sample, directions and weights: each way alone against central differences with the same
+    random numbers, and the chance of either way against both ways' sum."""
     import drjit as dr
 
     mi, count = mitsuba, 2**16
@@ -445,7 +512,9 @@ def test_derivatives_follow_the_sampled_directions(mitsuba, name):
             dr.enable_grad(held[name])
         held.update()
         bs, weight = bsdf.sample(context(mi, way), surface(mi, slanted(55.0), count), u1, u2, True)
-        image = weight[0, 0][0] * (1 + bs.wo.x + dr.square(bs.wo.z)) + weight[1, 0][0]  # a smooth world, lit a little polarized
+        image = (
+            weight[0, 0][0] * (1 + bs.wo.x + dr.square(bs.wo.z)) + weight[1, 0][0]
+        )  # a smooth world, lit a little polarized
         if derivative:
             dr.set_grad(held[name], 1.0)
             dr.forward_to(image)
@@ -463,29 +532,67 @@ def test_derivatives_follow_the_sampled_directions(mitsuba, name):
     assert both.std() / np.sqrt(count) < 0.03 * abs(total)
 
 
-# -- in a scene ------------------------------------------------------------------------------------------------------------------
+# -- in a scene
+# ------------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("integrator, stride", [({"type": "stokes", "nested": {"type": "path", "max_depth": 5}}, 3),
-                                                ({"type": "tactile", "stokes": True, "max_depth": 3}, 4)], ids=["path", "tactile"])
+@pytest.mark.parametrize(
+    "integrator, stride",
+    [
+        ({"type": "stokes", "nested": {"type": "path", "max_depth": 5}}, 3),
+        ({"type": "tactile", "stokes": True, "max_depth": 3}, 4),
+    ],
+    ids=["path", "tactile"],
+)
 def test_a_lamp_behind_a_polarizer_seen_through_rough_glass(mitsuba, integrator, stride):
-    """Its Stokes vector is the bare one times T/n^2 or T n^2, however the glass is turned about its normal; stock: unpolarized."""
+    """Its Stokes vector is the bare one times T/n^2 or T n^2, however the glass is turned about its normal; stock:
+    unpolarized."""
     mi = mitsuba
     turn = mi.ScalarTransform4f
 
     def stokes(bsdf, roll=0.0, flip=180.0):
-        pane = {} if bsdf is None else {"pane": {
-            "type": "rectangle", "bsdf": bsdf, "to_world": turn().rotate([0, 0, 1], roll).rotate([1, 0, 0], flip).scale(3)}}
-        scene = mi.load_dict({
-            "type": "scene", "integrator": integrator, **pane,
-            "sensor": {"type": "perspective", "fov": 8, "to_world": turn().look_at([0, 0, -9], [0, 0, 0], [0, 1, 0]),
-                       "film": {"type": "hdrfilm", "width": 4, "height": 4, "rfilter": {"type": "box"}, "pixel_format": "rgb"},
-                       "sampler": {"type": "independent", "sample_count": 256}},
-            "film": {"type": "rectangle", "to_world": turn().translate([0, 0, 4]).rotate([1, 0, 0], 180).scale(60),
-                     "bsdf": {"type": "polarizer", "theta": 27.0}},
-            "lamp": {"type": "rectangle", "to_world": turn().translate([0, 0, 5]).rotate([1, 0, 0], 180).scale(60),
-                     "emitter": {"type": "area", "radiance": {"type": "uniform", "value": 1.0}}},
-        }, optimize=False)
+        pane = (
+            {}
+            if bsdf is None
+            else {
+                "pane": {
+                    "type": "rectangle",
+                    "bsdf": bsdf,
+                    "to_world": turn().rotate([0, 0, 1], roll).rotate([1, 0, 0], flip).scale(3),
+                }
+            }
+        )
+        scene = mi.load_dict(
+            {
+                "type": "scene",
+                "integrator": integrator,
+                **pane,
+                "sensor": {
+                    "type": "perspective",
+                    "fov": 8,
+                    "to_world": turn().look_at([0, 0, -9], [0, 0, 0], [0, 1, 0]),
+                    "film": {
+                        "type": "hdrfilm",
+                        "width": 4,
+                        "height": 4,
+                        "rfilter": {"type": "box"},
+                        "pixel_format": "rgb",
+                    },
+                    "sampler": {"type": "independent", "sample_count": 256},
+                },
+                "film": {
+                    "type": "rectangle",
+                    "to_world": turn().translate([0, 0, 4]).rotate([1, 0, 0], 180).scale(60),
+                    "bsdf": {"type": "polarizer", "theta": 27.0},
+                },
+                "lamp": {
+                    "type": "rectangle",
+                    "to_world": turn().translate([0, 0, 5]).rotate([1, 0, 0], 180).scale(60),
+                    "emitter": {"type": "area", "radiance": {"type": "uniform", "value": 1.0}},
+                },
+            },
+            optimize=False,
+        )
         image = np.array(mi.render(scene, seed=1)).mean((0, 1))
         return image[3:][::stride][:4]
 

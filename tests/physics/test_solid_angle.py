@@ -1,4 +1,5 @@
-"""Directions to a rectangle: even in solid angle, which is that of van Oosterom & Strackee; and the light of a panel near a surface."""
+"""Directions to a rectangle: even in solid angle, which is that of van Oosterom & Strackee; and the light of a panel
+near a surface."""
 
 import numpy as np
 import pytest
@@ -10,17 +11,29 @@ FAR = (80.0, 90.0, 40.0)  # less than 1e-3 sr: points of the area
 @pytest.fixture
 def shape(mitsuba):
     mi = mitsuba
-    return mi.load_dict({"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([1, 2, 3]).rotate([0.6, 0.8, 0], 40).scale([2.5, 1, 1])})
+    return mi.load_dict(
+        {
+            "type": "rectangle",
+            "to_world": mi.ScalarTransform4f().translate([1, 2, 3]).rotate([0.6, 0.8, 0], 40).scale([2.5, 1, 1]),
+        }
+    )
 
 
 def corners(shape):
     import mitsuba as mi
 
-    return np.array([np.ravel(np.array(shape.sample_position(mi.Float(0), mi.Point2f(*at)).p)) for at in ((0, 0), (1, 0), (1, 1), (0, 1))], float)
+    return np.array(
+        [
+            np.ravel(np.array(shape.sample_position(mi.Float(0), mi.Point2f(*at)).p))
+            for at in ((0, 0), (1, 0), (1, 1), (0, 1))
+        ],
+        float,
+    )
 
 
 def triangle(a, b, c):
-    """Solid angle of a triangle, from the origin (van Oosterom & Strackee, IEEE Trans. Biomed. Eng. 30, 125 (1983), eq. 8)."""
+    """Solid angle of a triangle, from the origin (van Oosterom & Strackee, IEEE Trans. Biomed. Eng. 30, 125 (1983), eq.
+    8)."""
     la, lb, lc = (np.linalg.norm(v) for v in (a, b, c))
     over = la * lb * lc + a @ b * lc + a @ c * lb + b @ c * la
     return 2 * abs(np.arctan2(a @ np.cross(b, c), over))
@@ -45,7 +58,8 @@ def test_the_solid_angle_and_even_directions(shape, place):
     assert np.ptp(omega) == 0
     to = np.array(point).T - np.array(place)
     ways = to / np.linalg.norm(to, axis=1)[:, None]
-    # the mean direction times Omega is half of the sum of the sides' arcs, each along its plane's normal (Lambert's formula)
+    # the mean direction times Omega is half of the sum of the sides' arcs, each along its plane's normal (Lambert's
+    # formula)
     lit = np.zeros(3)
     for a, b in zip(at, np.roll(at, -1, 0)):
         across = np.cross(a, b)

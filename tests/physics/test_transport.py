@@ -1,4 +1,5 @@
-"""Clear bodies: the way of light through many faces, against closed forms, ray by ray, by two routes, and against stock Mitsuba.
+"""dielectric bodies: the way of light through many faces, against closed forms, ray by ray, by two routes, and against
+stock Mitsuba.
 
 The account by hand follows fields and not Stokes vectors: amplitudes of Fresnel along s and p, in world coordinates.
 """
@@ -27,8 +28,10 @@ BLACK = '<bsdf type="diffuse"><spectrum name="reflectance" value="0"/></bsdf>'
 def clear(name, index, absorption=0.0, outside="", more="", roughness=0.0):
     more += f'<float name="roughness" value="{roughness}"/>' if roughness else ""
     where = f'<string name="outside" value="{outside}"/>' if outside else ""
-    return (f'<bsdf type="clear" id="{name}">{where}<float name="index" value="{index}"/><float name="absorption" value="{absorption}"/>'
-            f'{more}</bsdf>')
+    return (
+        f'<bsdf type="clear" id="{name}">{where}<float name="index" value="{index}"/><float name="absorption" value="{absorption}"/>'
+        f"{more}</bsdf>"
+    )
 
 
 def box(name, bsdf, half, middle=(0, 0, 0), turn=""):
@@ -38,14 +41,18 @@ def box(name, bsdf, half, middle=(0, 0, 0), turn=""):
 
 def screen(z, half=400.0, name="screen", more=""):
     """A luminous plane that faces the camera."""
-    return (f'<shape type="rectangle" id="{name}_plane"><transform name="to_world"><rotate x="1" angle="180"/><scale x="{half}" y="{half}"/>'
-            f'<translate z="{z}"/></transform>{BLACK}<emitter type="source" id="{name}">{more}</emitter></shape>')
+    return (
+        f'<shape type="rectangle" id="{name}_plane"><transform name="to_world"><rotate x="1" angle="180"/><scale x="{half}" y="{half}"/>'
+        f'<translate z="{z}"/></transform>{BLACK}<emitter type="source" id="{name}">{more}</emitter></shape>'
+    )
 
 
 def grid(cells, bsdf, pitch=0.8, wall=0.2, skin=0.5):
     counts = "".join(f'<integer name="{n}" value="{v}"/>' for n, v in zip(("columns", "rows", "layers"), cells))
-    return (f'<shape type="cells" id="grid">{counts}<float name="pitch" value="{pitch}"/><float name="wall" value="{wall}"/>'
-            f'<float name="skin" value="{skin}"/>{bsdf}</shape>')
+    return (
+        f'<shape type="cells" id="grid">{counts}<float name="pitch" value="{pitch}"/><float name="wall" value="{wall}"/>'
+        f'<float name="skin" value="{skin}"/>{bsdf}</shape>'
+    )
 
 
 def load(folder, bodies, fov=1.0, variant=SPECTRAL, bands="620, 540, 460", **defines):
@@ -68,23 +75,26 @@ def near(found, error, expected):
 
 @pytest.mark.parametrize("alpha", [0.0, 0.4])
 def test_a_slab_transmits_all_orders(tmp_path, mitsuba, alpha):
-    """T = (1 - R)^2 a/(1 - R^2 a^2), a = exp(-alpha d), and its derivative by alpha (Born & Wolf, 7.6.1, without interference)."""
+    """T = (1 - R)^2 a/(1 - R^2 a^2), a = exp(-alpha d), and its derivative by alpha (Born & Wolf, 7.6.1, without
+    interference)."""
     n, d = 1.5, 2.0
     t = load(tmp_path, [box("slab", clear("glass", n, alpha), (300, 300, d / 2)), screen(20)])
     found = t.take(rays=4000, slopes=True)
     r, a = ((n - 1) / (n + 1)) ** 2, np.exp(-alpha * d)
     near(found.radiance[0], found.error[0], (1 - r) ** 2 * a / (1 - r**2 * a**2))
     slope = -d * a * (1 - r) ** 2 * (1 + r**2 * a**2) / (1 - r**2 * a**2) ** 2
-    # the slope's own error is about d times that of the picture
+    # the slope's own error is about d times that of the image
     near(found.slopes["glass"][0], d * 1.5 * found.error[0], slope)
 
 
 def test_tilted_plates_hand_polarization_on(tmp_path, mitsuba):
-    """Two plates at 60 degrees: T = (T_s^2 + T_p^2)/2, each with all orders between its faces, T = (1 - R)/(1 + R); what the plates
-    reflect leaves sideways. A scalar account, which forgets the polarization in between, is 2 % off."""
+    """Two plates at 60 degrees: T = (T_s^2 + T_p^2)/2, each with all orders between its faces, T = (1 - R)/(1 + R);
+    what the plates reflect leaves sideways. A scalar account, which forgets the polarization in between, is 2 % off."""
     n, angle = 1.5, 60.0
-    plates = [box("one", clear("glass", n), (60, 60, 0.5), (0, 0, 0), f'<rotate x="1" angle="{angle}"/>'),
-              box("two", clear("glass_2", n), (60, 60, 0.5), (0, 0, 200), f'<rotate x="1" angle="{angle}"/>')]
+    plates = [
+        box("one", clear("glass", n), (60, 60, 0.5), (0, 0, 0), f'<rotate x="1" angle="{angle}"/>'),
+        box("two", clear("glass_2", n), (60, 60, 0.5), (0, 0, 200), f'<rotate x="1" angle="{angle}"/>'),
+    ]
     t = load(tmp_path, [*plates, screen(400, half=60)], fov=1)
     found = t.take(rays=6000)
     c, s = np.cos(np.radians(angle)), np.sin(np.radians(angle))
@@ -97,27 +107,44 @@ def test_tilted_plates_hand_polarization_on(tmp_path, mitsuba):
 
 
 def test_a_wave_plate_between_tilted_plates(tmp_path, mitsuba):
-    """The plates above, turned by 45 degrees, and between them a body that neither reflects nor absorbs, birefringent along x:
-    T = ((T_s + T_p)^2 + (T_s - T_p)^2 cos delta)/4, delta = 2 pi dn d/lambda, for three wavelengths."""
+    """The plates above, turned by 45 degrees, and between them a body that neither reflects nor absorbs, birefringent
+    along x: T = ((T_s + T_p)^2 + (T_s - T_p)^2 cos delta)/4, delta = 2 pi dn d/lambda, for three wavelengths."""
     n, angle, dn, d = 1.5, 60.0, 1e-4, 1.7
     turn = f'<rotate x="1" angle="{angle}"/><rotate z="1" angle="45"/>'
-    bodies = [box("one", clear("glass", n), (60, 60, 0.5), (0, 0, 0), turn), box("two", clear("glass_2", n), (60, 60, 0.5), (0, 0, 300), turn),
-              box("plate", clear("plain", 1.0, more=f'<float name="birefringence" value="{dn}"/>'), (60, 60, d / 2), (0, 0, 150))]
+    bodies = [
+        box("one", clear("glass", n), (60, 60, 0.5), (0, 0, 0), turn),
+        box("two", clear("glass_2", n), (60, 60, 0.5), (0, 0, 300), turn),
+        box(
+            "plate",
+            clear("plain", 1.0, more=f'<float name="birefringence" value="{dn}"/>'),
+            (60, 60, d / 2),
+            (0, 0, 150),
+        ),
+    ]
     t = load(tmp_path, [*bodies, screen(500, half=60)], fov=1)
     found = t.take(rays=8000)
     c, s = np.cos(np.radians(angle)), np.sin(np.radians(angle))
     inside = np.sqrt(1 - (s / n) ** 2)
     r = np.array([((c - n * inside) / (c + n * inside)) ** 2, ((n * c - inside) / (n * c + inside)) ** 2])
     one = (1 - r) / (1 + r)
-    expected = (one.sum() ** 2 + (one[0] - one[1]) ** 2 * np.cos(2 * np.pi * dn * d * 1e6 / np.array([620, 540, 460]))) / 4
+    expected = (
+        one.sum() ** 2 + (one[0] - one[1]) ** 2 * np.cos(2 * np.pi * dn * d * 1e6 / np.array([620, 540, 460]))
+    ) / 4
     assert np.ptp(expected) > 0.01
     near(found.radiance[0], found.error[0], expected)
 
 
 def test_the_furnace_neither_gains_nor_loses(tmp_path, mitsuba):
-    """Radiance 1 from everywhere is radiance 1 behind any clear body, here a grid in a block (0.5 %)."""
-    t = load(tmp_path, [box("block", clear("walls", 1.5), (2.2, 2.2, 1.5), (0, 0, -1.4)), grid((4, 4, 2), clear("filling", 1.4, outside="walls")),
-                        SKY], fov=14)
+    """Radiance 1 from everywhere is radiance 1 behind any dielectric body, here a grid in a block (0.5 %)."""
+    t = load(
+        tmp_path,
+        [
+            box("block", clear("walls", 1.5), (2.2, 2.2, 1.5), (0, 0, -1.4)),
+            grid((4, 4, 2), clear("filling", 1.4, outside="walls")),
+            SKY,
+        ],
+        fov=14,
+    )
     found = t.take(rays=512)
     assert found.lost < 1e-3
     assert np.abs(found.radiance[0].mean((0, 1)) - 1).max() < 0.005
@@ -130,12 +157,22 @@ def test_light_goes_both_ways_alike(tmp_path, mitsuba):
 
     power = []
     for lamp, target in ((-1, 1), (1, -1)):
+
         def panel(side, inner):
-            return (f'<shape type="rectangle" id="p{side + 1}"><transform name="to_world"><scale x="0.7" y="0.7"/><lookat '
-                    f'origin="{side * 3},{0.4 * side},-1.5" target="0,0,-1.2" up="0,1,0"/></transform>{BLACK}{inner}</shape>')
-        t = load(tmp_path, [box("block", clear("walls", 1.5, 0.05), (2.2, 2.2, 1.5), (0, 0, -1.4)),
-                            grid((4, 4, 2), clear("filling", 1.4, 0.1, outside="walls")),
-                            panel(lamp, '<emitter type="source" id="light"/>'), panel(target, "")])
+            return (
+                f'<shape type="rectangle" id="p{side + 1}"><transform name="to_world"><scale x="0.7" y="0.7"/><lookat '
+                f'origin="{side * 3},{0.4 * side},-1.5" target="0,0,-1.2" up="0,1,0"/></transform>{BLACK}{inner}</shape>'
+            )
+
+        t = load(
+            tmp_path,
+            [
+                box("block", clear("walls", 1.5, 0.05), (2.2, 2.2, 1.5), (0, 0, -1.4)),
+                grid((4, 4, 2), clear("filling", 1.4, 0.1, outside="walls")),
+                panel(lamp, '<emitter type="source" id="light"/>'),
+                panel(target, ""),
+            ],
+        )
         run = Run(t, [0, 1, 2], 1, 0)
         run.images(1, 40_000, True)
         # mean irradiance in the first band times the area, of each batch
@@ -147,26 +184,35 @@ def test_light_goes_both_ways_alike(tmp_path, mitsuba):
 
 # -- rough faces -------------------------------------------------------------------------------------------------------
 
-SKY = ('<shape type="sphere" id="sky"><float name="radius" value="60"/><boolean name="flip_normals" value="true"/>'
-       f'{BLACK}<emitter type="source" id="light"/></shape>')
+SKY = (
+    '<shape type="sphere" id="sky"><float name="radius" value="60"/><boolean name="flip_normals" value="true"/>'
+    f'{BLACK}<emitter type="source" id="light"/></shape>'
+)
 
 
 def rough_dielectric(roughness, index=1.5):
-    return (f'<bsdf type="roughdielectric"><float name="int_ior" value="{index}"/><float name="ext_ior" value="1"/><float name="alpha" '
-            f'value="{roughness}"/><string name="distribution" value="beckmann"/></bsdf>')
+    return (
+        f'<bsdf type="roughdielectric"><float name="int_ior" value="{index}"/><float name="ext_ior" value="1"/><float name="alpha" '
+        f'value="{roughness}"/><string name="distribution" value="beckmann"/></bsdf>'
+    )
 
 
 def stock_lamp(shape):
     """A luminous shape of ours as Mitsuba's own."""
-    return shape[:shape.index("<emitter")] + '<emitter type="area"><spectrum name="radiance" value="1"/></emitter></shape>'
+    return (
+        shape[: shape.index("<emitter")]
+        + '<emitter type="area"><spectrum name="radiance" value="1"/></emitter></shape>'
+    )
 
 
 def by_stock(folder, bodies, fov, integrator="path"):
     import mitsuba as mi
 
     text = SCENE.replace("BANDS", "540").replace("FOV", str(fov)).replace("BODIES", "\n".join(bodies))
-    text = text.replace('<integrator type="tactile"><string name="bands" value="540"/></integrator>',
-                        f'<integrator type="{integrator}"><integer name="max_depth" value="512"/><integer name="rr_depth" value="1000"/></integrator>')
+    text = text.replace(
+        '<integrator type="tactile"><string name="bands" value="540"/></integrator>',
+        f'<integrator type="{integrator}"><integer name="max_depth" value="512"/><integer name="rr_depth" value="1000"/></integrator>',
+    )
     (folder / "stock.xml").write_text(text)
     return mi.load_file(str(folder / "stock.xml"), optimize=False, size="8")
 
@@ -180,8 +226,8 @@ def rendered(scene, spp, seeds):
 
 
 def test_facets_have_beckmanns_slopes(tmp_path, mitsuba):
-    """Along the normal all facets are seen: slopes across either axis have the mean square alpha^2/2 and the mean fourth power 3 alpha^4/4,
-    by the directions that rays are reflected and refracted into."""
+    """Along the normal all facets are seen: slopes across either axis have the mean square alpha^2/2 and the mean
+    fourth power 3 alpha^4/4, by the directions that rays are reflected and refracted into."""
     n, roughness, count = 1.5, 0.1, 200_000
     t = load(tmp_path, [box("block", clear("glass", n, roughness=roughness), (50, 50, 50)), screen(300)])
     d = np.tile([0.0, 0.0, 1.0], (count, 1))
@@ -197,30 +243,46 @@ def test_facets_have_beckmanns_slopes(tmp_path, mitsuba):
 
 
 def test_faces_hardly_rough_are_nearly_smooth(tmp_path, mitsuba):
-    """The same random numbers at every roughness: the picture of a grid does not move up to 1e-4, and at 1e-3 by less than its noise."""
-    smooth, least, little = (load(tmp_path, little_grid(0.1, r), fov=9).take(rays=256, packets=40_000) for r in (0.0, 1e-4, 1e-3))
-    np.testing.assert_allclose(least.radiance, smooth.radiance, rtol=0, atol=1e-5 * smooth.radiance.max())  # the order of atomic sums
+    """The same random numbers at every roughness: the image of a grid does not move up to 1e-4, and at 1e-3 by less
+    than its noise."""
+    smooth, least, little = (
+        load(tmp_path, little_grid(0.1, r), fov=9).take(rays=256, packets=40_000) for r in (0.0, 1e-4, 1e-3)
+    )
+    np.testing.assert_allclose(
+        least.radiance, smooth.radiance, rtol=0, atol=1e-5 * smooth.radiance.max()
+    )  # the order of atomic sums
     moved = (little.radiance - smooth.radiance).std()
-    assert 0 < moved < 0.7 * np.sqrt(2 * (smooth.error**2).mean())  # of two pictures with random numbers of their own: 1
+    assert 0 < moved < 0.7 * np.sqrt(2 * (smooth.error**2).mean())  # of two images with random numbers of their own: 1
 
 
 @pytest.mark.parametrize("roughness", [0.1, 0.3])
 def test_stock_rough_dielectric_sees_the_same(tmp_path, mitsuba, roughness):
-    """A rough slab before the edge of a luminous half plane, pixel by pixel: z has no mean and the spread of noise. Mitsuba's takes all
-    polarization out of the light; what that changes is below 1e-5 here, as light crosses the faces near their normal."""
+    """A rough slab before the edge of a luminous half plane, pixel by pixel: z has no mean and the spread of noise.
+    Mitsuba's takes all polarization out of the light; what that changes is below 1e-5 here, as light crosses the faces
+    near their normal."""
     half_plane = screen(20).replace('<translate z="20"/>', '<translate x="400" z="20"/>')
-    own, other = (box("slab", bsdf, (300, 300, 1)) for bsdf in (clear("glass", 1.5, roughness=roughness), rough_dielectric(roughness)))
+    own, other = (
+        box("slab", bsdf, (300, 300, 1))
+        for bsdf in (clear("glass", 1.5, roughness=roughness), rough_dielectric(roughness))
+    )
     ours = load(tmp_path, [own, half_plane], fov=12, variant=MONO, bands="540", size=8).take(rays=8000, reach="paths")
     theirs, error = rendered(by_stock(tmp_path, [other, stock_lamp(half_plane)], 12), 1000, 12)
     found, own = ours.radiance[0, ..., 0], ours.error[0, ..., 0]
     z = (found - theirs) / np.hypot(error, own)
-    assert np.ptp(found[3]) > 0.5 and abs(z.mean()) < SIGMAS / 8 and 0.5 < np.mean(z**2) < 2.0, (z.mean(), np.mean(z**2))
+    assert np.ptp(found[3]) > 0.5 and abs(z.mean()) < SIGMAS / 8 and 0.5 < np.mean(z**2) < 2.0, (
+        z.mean(),
+        np.mean(z**2),
+    )
 
 
 @pytest.mark.parametrize("roughness", [0.1, 0.3, 0.5])
 def test_what_rough_faces_lose(tmp_path, mitsuba, roughness):
-    """Light that facets pass on to each other: of radiance 1 from everywhere a slab shows 0.4 % less at 0.3 and 7 % at 0.5, as by stock."""
-    own, other = (box("slab", bsdf, (20, 20, 1)) for bsdf in (clear("glass", 1.5, roughness=roughness), rough_dielectric(roughness)))
+    """Light that facets pass on to each other: of radiance 1 from everywhere a slab shows 0.4 % less at 0.3 and 7 % at
+    0.5, as by stock."""
+    own, other = (
+        box("slab", bsdf, (20, 20, 1))
+        for bsdf in (clear("glass", 1.5, roughness=roughness), rough_dielectric(roughness))
+    )
     found = load(tmp_path, [own, SKY], variant=MONO, bands="540").take(rays=4000)
     theirs, error = rendered(by_stock(tmp_path, [other, stock_lamp(SKY)], 1), 1000, 8)
     loss, sd = 1 - found.radiance.mean(), np.sqrt((error**2 + found.error[0, ..., 0] ** 2).mean()) / 8
@@ -239,8 +301,8 @@ def amplitudes(cos, n):
 
 
 def followed(t, p, d, steps, x=None, group=(0, 1, 2)):
-    """(steps, N, 15) of rays that start at p along d: where each stretch begins, its direction, the axis x, the row of sensitivities, the
-    weight, the number of the material; zeros beyond a ray's end."""
+    """(steps, N, 15) of rays that start at p along d: where each stretch begins, its direction, the axis x, the row of
+    sensitivities, the weight, the number of the material; zeros beyond a ray's end."""
     import drjit as dr
     import mitsuba as mi
 
@@ -257,25 +319,37 @@ def followed(t, p, d, steps, x=None, group=(0, 1, 2)):
     x = np.cross(d, (0, 1, 0)) if x is None else x
     x /= np.linalg.norm(x, axis=1, keepdims=True)
     vector = [mi.Vector3f(*a.T.astype(np.float32)) for a in (d, x)]
-    start = {"p": mi.Point3f(*p.T.astype(np.float32)), "d": vector[0], "x": vector[1], "tau": [mi.Float(1.0)] * len(group),
-             "rng": mi.PCG32(size=count, initstate=7), "pixel": dr.arange(mi.UInt32, count)}
+    start = {
+        "p": mi.Point3f(*p.T.astype(np.float32)),
+        "d": vector[0],
+        "x": vector[1],
+        "tau": [mi.Float(1.0)] * len(group),
+        "rng": mi.PCG32(size=count, initstate=7),
+        "pixel": dr.arange(mi.UInt32, count),
+    }
     run.fly(start, False, False, along, lambda *_: mi.Bool(False))
     return np.array(log).reshape(steps, count, width).astype(float)
 
 
 def test_one_cell_ray_by_ray(tmp_path, mitsuba):
-    """Every stretch of many rays through one cell in a block against (23), (24) and (29): direction, absorption, and what the faces
-    leave of two crossed linear polarizations, followed as fields."""
+    """Every stretch of many rays through one cell in a block against (23), (24) and (29): direction, absorption, and
+    what the faces leave of two crossed linear polarizations, followed as fields."""
     n_wall, n_fill, a_wall, a_fill = 1.5, 1.42, 0.3, 0.7
-    t = load(tmp_path, [box("block", clear("walls", n_wall, a_wall), (0.6, 0.6, 0.6), (0, 0, -0.6)),
-                        grid((1, 1, 1), clear("filling", n_fill, a_fill, outside="walls"), skin=0.2), screen(30)])
+    t = load(
+        tmp_path,
+        [
+            box("block", clear("walls", n_wall, a_wall), (0.6, 0.6, 0.6), (0, 0, -0.6)),
+            grid((1, 1, 1), clear("filling", n_fill, a_fill, outside="walls"), skin=0.2),
+            screen(30),
+        ],
+    )
     rng, count, steps = np.random.default_rng(2), 2000, 12
     p = rng.uniform(-4, 4, (count, 3)) * (1, 1, 0) + (0, 0, -6)
     to = rng.uniform(-0.55, 0.55, (count, 3)) + (0, 0, -0.6)
     d = to - p
     d /= np.linalg.norm(d, axis=1, keepdims=True)
     log = followed(t, p, d, steps)
-    flown = (np.linalg.norm(log[..., 3:6], axis=-1) > 0.5)
+    flown = np.linalg.norm(log[..., 3:6], axis=-1) > 0.5
     assert flown[2].mean() > 0.9  # the others leave by one reflection
     checked = {"reflected": 0, "total": 0, "refracted": 0}
     half, middle = 0.3, np.array([0.0, 0.0, -0.6])  # of the cell
@@ -293,7 +367,13 @@ def test_one_cell_ray_by_ray(tmp_path, mitsuba):
                 continue  # at an edge the place does not say which face was met
             # which materials meet: by where the ray came from
             back = at - 1e-2 * s
-            came = n_fill if (np.abs(back - middle) < half).all() else n_wall if (np.abs(back - middle) < 0.6).all() else 1.0
+            came = (
+                n_fill
+                if (np.abs(back - middle) < half).all()
+                else n_wall
+                if (np.abs(back - middle) < 0.6).all()
+                else 1.0
+            )
             pairs = {n_fill: n_wall, 1.0: n_wall, n_wall: 1.0 if outer else n_fill}
             n1, n2 = came, pairs[came]
             gs = g @ s
@@ -315,13 +395,16 @@ def test_one_cell_ray_by_ray(tmp_path, mitsuba):
 
 
 def stokes(a, b):
-    """Stokes vector of a field; circular as optics.polarization.mueller has it: a quarter-wave plate, fast at 45 degrees, makes S3 > 0 of x."""
-    return np.array([abs(a) ** 2 + abs(b) ** 2, abs(a) ** 2 - abs(b) ** 2, 2 * (a * np.conj(b)).real, 2 * (a * np.conj(b)).imag])
+    """Stokes vector of a field; circular as optics.polarization.mueller has it: a quarter-wave plate, fast at 45
+    degrees, makes S3 > 0 of x."""
+    return np.array(
+        [abs(a) ** 2 + abs(b) ** 2, abs(a) ** 2 - abs(b) ** 2, 2 * (a * np.conj(b)).real, 2 * (a * np.conj(b)).imag]
+    )
 
 
 def fields_off(was, now, g, n):
-    """By how much the rows of two stretches differ, at most, about fields that meet a face of the normal g (along the ray) and the relative
-    index n in between: light comes along -s2 and leaves along -s."""
+    """By how much the rows of two stretches differ, at most, about fields that meet a face of the normal g (along the
+    ray) and the relative index n in between: light comes along -s2 and leaves along -s."""
     s, s2, side = was[3:6], now[3:6], np.cross(was[3:6], g)
     if np.linalg.norm(side) < 1e-3:
         return 0.0
@@ -329,8 +412,11 @@ def fields_off(was, now, g, n):
     share = (abs(r_s) ** 2 + abs(r_p) ** 2) / 2
     side /= np.linalg.norm(side)
     e_in, e_out = (side, np.cross(-s2, side)), (side, np.cross(-s, side))
-    ways = np.diag([r_s, r_p]) / np.sqrt(share) if s2 @ g < 0 else np.diag(
-        [np.sqrt(1 - abs(r_s) ** 2), np.sqrt(1 - abs(r_p) ** 2)]) / np.sqrt(1 - share) / n
+    ways = (
+        np.diag([r_s, r_p]) / np.sqrt(share)
+        if s2 @ g < 0
+        else np.diag([np.sqrt(1 - abs(r_s) ** 2), np.sqrt(1 - abs(r_p) ** 2)]) / np.sqrt(1 - share) / n
+    )
     worst = 0.0
     for field in ((1, 0), (0, 1), (1, 1), (1, 1j)):  # along the new axes x and k cross x
         field = np.array(field, complex) / np.linalg.norm(field)
@@ -343,8 +429,9 @@ def fields_off(was, now, g, n):
 
 
 def test_a_facet_acts_as_a_face(tmp_path, mitsuba):
-    """What a rough face leaves of fields, by the facet that sent a ray where it went; the weight is G1 of Smith for Beckmann's slopes,
-    2/(1 + erf(a) + exp(-a^2)/(a sqrt(pi))), a = 1/(alpha tan(theta)) (Walter et al. 2007), as Mitsuba rounds it."""
+    """What a rough face leaves of fields, by the facet that sent a ray where it went; the weight is G1 of Smith for
+    Beckmann's slopes, 2/(1 + erf(a) + exp(-a^2)/(a sqrt(pi))), a = 1/(alpha tan(theta)) (Walter et al. 2007), as
+    Mitsuba rounds it."""
     from scipy.special import erf
 
     n, roughness, count, angle = 1.5, 0.3, 2000, np.radians(65)
@@ -368,7 +455,8 @@ def test_a_facet_acts_as_a_face(tmp_path, mitsuba):
 
 
 def test_the_critical_angle(tmp_path, mitsuba):
-    """A ray that leaves glass of 1.5 through its flat face passes to 0.01 deg below asin(1/1.5), and not 0.01 deg above."""
+    """A ray that leaves glass of 1.5 through its flat face passes to 0.01 deg below asin(1/1.5), and not 0.01 deg
+    above."""
     import drjit as dr
     import mitsuba as mi
 
@@ -388,9 +476,13 @@ def through_prism(folder, apex, n, incidence, copies=8):
     height = float(1 / np.tan(half))
     corners = [(x, y, z) for y in (-5, 5) for x, z in ((-1, 0), (1, 0), (0, height))]
     faces = [(1, 2, 3), (4, 6, 5), (1, 3, 6), (1, 6, 4), (2, 5, 6), (2, 6, 3), (1, 4, 5), (1, 5, 2)]
-    (folder / "prism.obj").write_text("".join("{} {} {} {}\n".format(*row) for row in [("v", *c) for c in corners] + [("f", *f) for f in faces]))
-    shape = (f'<shape type="obj" id="prism"><string name="filename" value="{folder / "prism.obj"}"/><boolean name="face_normals" value="true"/>'
-             f'{clear("glass", n)}</shape>')
+    (folder / "prism.obj").write_text(
+        "".join("{} {} {} {}\n".format(*row) for row in [("v", *c) for c in corners] + [("f", *f) for f in faces])
+    )
+    shape = (
+        f'<shape type="obj" id="prism"><string name="filename" value="{folder / "prism.obj"}"/><boolean name="face_normals" value="true"/>'
+        f"{clear('glass', n)}</shape>"
+    )
     t = load(folder, [shape, screen(30)])
     angle = np.repeat(np.radians(incidence) - half, copies)  # of the ray above the base
     d = np.stack([np.cos(angle), 0 * angle, np.sin(angle)], -1)
@@ -414,11 +506,18 @@ def test_a_prism_deviates(tmp_path, mitsuba, apex, n):
 
 
 def test_the_aperture_of_a_light_guide(tmp_path, mitsuba):
-    """A core of n1 in a coat of n2 guides what arrives below asin(sqrt(n1^2 - n2^2)) at its end, through the coat's flat end as well, which
-    leaves n sin(theta) as it is; to 0.002 deg, where 4 % already leak at their first reflection."""
+    """A core of n1 in a coat of n2 guides what arrives below asin(sqrt(n1^2 - n2^2)) at its end, through the coat's
+    flat end as well, which leaves n sin(theta) as it is; to 0.002 deg, where 4 % already leak at their first
+    reflection."""
     n1, n2, copies = 1.5, 1.42, 250
-    t = load(tmp_path, [box("outer", clear("coat", n2), (2, 2, 10)), box("inner", clear("core", n1, outside="coat"), (0.5, 0.5, 9.5)),
-                        screen(300)])
+    t = load(
+        tmp_path,
+        [
+            box("outer", clear("coat", n2), (2, 2, 10)),
+            box("inner", clear("core", n1, outside="coat"), (0.5, 0.5, 9.5)),
+            screen(300),
+        ],
+    )
     limit = np.degrees(np.arcsin(np.sqrt(n1**2 - n2**2)))
     fan = limit + np.arange(-0.1, 0.1, 3.1e-4)
     angle = np.repeat(np.radians(fan), copies)
@@ -435,16 +534,25 @@ def test_the_aperture_of_a_light_guide(tmp_path, mitsuba):
 
 # -- two routes, and stock Mitsuba -------------------------------------------------------------------------------------
 
-LAMPS = [f'<shape type="rectangle" id="lamp_{i}"><transform name="to_world"><scale x="1.4" y="1.0"/><lookat origin="{x},{y},-1.4" '
-         f'target="0,0,-1.3" up="0,0,1"/></transform>{BLACK}<emitter type="source" id="light_{i}"/></shape>' for i, (x, y) in enumerate(((3, 0), (0, -3)))]
-COAT = ('<shape type="rectangle" id="coat"><transform name="to_world"><rotate x="1" angle="180"/><scale x="2.6" y="2.6"/><translate z="0.2"/></transform>'
-        '<bsdf type="diffuse"><spectrum name="reflectance" value="0.6"/></bsdf></shape>')
+LAMPS = [
+    f'<shape type="rectangle" id="lamp_{i}"><transform name="to_world"><scale x="1.4" y="1.0"/><lookat origin="{x},{y},-1.4" '
+    f'target="0,0,-1.3" up="0,0,1"/></transform>{BLACK}<emitter type="source" id="light_{i}"/></shape>'
+    for i, (x, y) in enumerate(((3, 0), (0, -3)))
+]
+COAT = (
+    '<shape type="rectangle" id="coat"><transform name="to_world"><rotate x="1" angle="180"/><scale x="2.6" y="2.6"/><translate z="0.2"/></transform>'
+    '<bsdf type="diffuse"><spectrum name="reflectance" value="0.6"/></bsdf></shape>'
+)
 
 
 def little_grid(scattering=0.0, roughness=0.0):
     more = f'<float name="scattering" value="{scattering}"/>'
-    return [box("block", clear("walls", 1.5, 0.05, roughness=roughness), (1.8, 1.8, 1.2), (0, 0, -1.2)),
-            grid((3, 3, 2), clear("filling", 1.4, 0.1, outside="walls", more=more, roughness=roughness), skin=0.4), *LAMPS, COAT]
+    return [
+        box("block", clear("walls", 1.5, 0.05, roughness=roughness), (1.8, 1.8, 1.2), (0, 0, -1.2)),
+        grid((3, 3, 2), clear("filling", 1.4, 0.1, outside="walls", more=more, roughness=roughness), skin=0.4),
+        *LAMPS,
+        COAT,
+    ]
 
 
 @pytest.mark.parametrize("scattering, roughness", [(0.0, 0.0), (0.3, 0.0), (0.1, 0.15)])
@@ -464,8 +572,9 @@ def test_maps_and_paths_agree(tmp_path, mitsuba, scattering, roughness):
 
 def stock(folder, roughness, alpha_wall=0.05, alpha_fill=0.1, fill=1.4):
     """The little grid of stock dielectrics, or of rough interfaces, with stock media and lamps, for `volpath`."""
+
     def medium(name, alpha):
-        return (f'<medium type="homogeneous" id="{name}"><spectrum name="sigma_t" value="{alpha}"/><spectrum name="albedo" value="0"/></medium>')
+        return f'<medium type="homogeneous" id="{name}"><spectrum name="sigma_t" value="{alpha}"/><spectrum name="albedo" value="0"/></medium>'
 
     def face(inside, outside, within, without=""):
         around = f'<ref id="{without}" name="exterior"/>' if without else ""
@@ -473,15 +582,26 @@ def stock(folder, roughness, alpha_wall=0.05, alpha_fill=0.1, fill=1.4):
         rough = f'<bsdf type="rough_interface"><float name="index" value="{inside / outside}"/><float name="alpha" value="{roughness}"/></bsdf>'
         return f'{rough if roughness else smooth}<ref id="{within}" name="interior"/>{around}'
 
-    return by_stock(folder, [medium("resin", alpha_wall), medium("support", alpha_fill),
-                             box("block", face(1.5, 1.0, "resin"), (1.8, 1.8, 1.2), (0, 0, -1.2)),
-                             grid((3, 3, 2), face(fill, 1.5, "support", "resin"), skin=0.4), *map(stock_lamp, LAMPS), COAT], 9, "volpath")
+    return by_stock(
+        folder,
+        [
+            medium("resin", alpha_wall),
+            medium("support", alpha_fill),
+            box("block", face(1.5, 1.0, "resin"), (1.8, 1.8, 1.2), (0, 0, -1.2)),
+            grid((3, 3, 2), face(fill, 1.5, "support", "resin"), skin=0.4),
+            *map(stock_lamp, LAMPS),
+            COAT,
+        ],
+        9,
+        "volpath",
+    )
 
 
 @pytest.mark.parametrize("roughness", [0.0, 0.15])
 def test_stock_volpath_sees_the_same(tmp_path, mitsuba, roughness):
-    """The same grid by Mitsuba's own dielectrics, media and integrator, pixel by pixel: z has no mean and the spread of noise. Of rough faces
-    by the part `rough_interface`, which keeps polarization where stock `roughdielectric` loses it."""
+    """The same grid by Mitsuba's own dielectrics, media and integrator, pixel by pixel: z has no mean and the spread of
+    noise. Of rough faces by the part `rough_interface`, which keeps polarization where stock `roughdielectric` loses
+    it."""
     t = load(tmp_path, little_grid(roughness=roughness), fov=9, variant=MONO, bands="540", size=8)
     ours = t.take(rays=4000, packets=400_000)
     theirs, error = rendered(stock(tmp_path, roughness), 1500, 12)
@@ -490,7 +610,10 @@ def test_stock_volpath_sees_the_same(tmp_path, mitsuba, roughness):
     assert theirs.mean() > 20 * np.sqrt((error**2).mean()) / 8
     assert abs(z.mean()) < SIGMAS / 8 and 0.5 < np.mean(z**2) < 2.0, (z.mean(), np.mean(z**2))
     # over all pixels to a per cent of what is seen, beside the noise
-    assert abs(found.mean() / theirs.mean() - 1) < 0.01 + SIGMAS * np.hypot(*(np.sqrt((e**2).mean()) / 8 for e in (error, own))) / theirs.mean()
+    assert (
+        abs(found.mean() / theirs.mean() - 1)
+        < 0.01 + SIGMAS * np.hypot(*(np.sqrt((e**2).mean()) / 8 for e in (error, own))) / theirs.mean()
+    )
 
 
 def test_derivatives_by_absorption(tmp_path, mitsuba, monkeypatch):
@@ -515,7 +638,11 @@ def test_derivatives_by_absorption(tmp_path, mitsuba, monkeypatch):
 
 
 def test_what_is_nested_wrongly_is_refused(tmp_path, mitsuba):
-    bodies = [box("block", clear("walls", 1.5), (1.8, 1.8, 1.2), (0, 0, -1.2)), grid((3, 3, 2), clear("filling", 1.4), skin=0.4), screen(20)]
+    bodies = [
+        box("block", clear("walls", 1.5), (1.8, 1.8, 1.2), (0, 0, -1.2)),
+        grid((3, 3, 2), clear("filling", 1.4), skin=0.4),
+        screen(20),
+    ]
     with pytest.raises(BadScene, match="not its neighbour.*`outside` names the wrong material"):
         load(tmp_path, bodies, fov=9).take(rays=8)
     bodies[1] = grid((3, 3, 2), clear("filling", 1.4, outside="wall"), skin=0.4)
@@ -524,8 +651,8 @@ def test_what_is_nested_wrongly_is_refused(tmp_path, mitsuba):
 
 
 def test_the_stated_error_is_that_between_seeds(mitsuba):
-    """Variance of eight pictures, pixel by pixel, over the mean of the squares of their stated errors: 1, and .01 by chance (measured over
-    six sets; pixels share maps). Generators that start beside one another gave 1.4."""
+    """Variance of eight images, pixel by pixel, over the mean of the squares of their stated errors: 1, and .01 by
+    Monte Carlo (measured over six sets; pixels share maps). Generators that start beside one another gave 1.4."""
     from optics.light.transport import Transport
     from optics.scene import loader as scenes
 

@@ -1,9 +1,10 @@
-"""A touch sensor in numpy that speaks the language of `optics.fit.model.Model`, to judge `diagnose` on known truths in seconds.
+"""A touch sensor in numpy that speaks the language of `optics.fit.model.Model`, to judge `diagnose` on known truths in
+seconds.
 
 A plane that balls press into (smooth cap), six point LEDs (two per colour), a camera above. Ten effects, among them
 one-sided ones, one whose onset is quadratic (defocus width), one with a strength per frame (flicker); five more exist
-that no library holds (stain, banding, height gain, slope gain, drift of the red light). Derivatives are complex steps, so exact.
-"""
+that no library holds (stain, banding, height gain, slope gain, drift of the red light). Derivatives are complex steps,
+so exact."""
 
 from __future__ import annotations
 
@@ -70,7 +71,7 @@ class Frame:
 class Exact:
     """A model whose predictions have no error of their own."""
 
-    by_chance = False
+    monte_carlo = False
 
     def imagine(self, frames):
         twin = copy(self)
@@ -84,8 +85,14 @@ class Exact:
 class MockModel(Exact):
     """The mock; `unit` rescales the unit of parameters, {'vignetting': 100} is per cent."""
 
-    def __init__(self, presses: int, side: int = 28, noise: Noise | None = None, unit: dict | None = None,
-                 render_noise: float = 0.0):
+    def __init__(
+        self,
+        presses: int,
+        side: int = 28,
+        noise: Noise | None = None,
+        unit: dict | None = None,
+        render_noise: float = 0.0,
+    ):
         self.noise = noise or Noise(system_gain=0.02, dark_noise=1.0, black_level=64.0, saturation=1023.0, prnu=0.0)
         self.shape = (side, side, 3)
         self.unit, self.render_noise = unit or {}, render_noise
@@ -95,13 +102,22 @@ class MockModel(Exact):
         self.base: dict[str, float] = {}
         for i in range(LEDS):
             angle = 2 * np.pi * (i + 0.3) / LEDS
-            for name, value, plausible in (("x", 9 * np.cos(angle), 0.3), ("y", 9 * np.sin(angle), 0.3), ("z", 5.0, 0.3),
-                                           ("power", 1.0, 0.1)):
+            for name, value, plausible in (
+                ("x", 9 * np.cos(angle), 0.3),
+                ("y", 9 * np.sin(angle), 0.3),
+                ("z", 5.0, 0.3),
+                ("power", 1.0, 0.1),
+            ):
                 bounds = (1e-3, 10.0) if name == "power" else (-30.0, 30.0)
-                self._add(f"led{i}.{name}", Parameter(name, "1" if name == "power" else "mm", value, bounds,
-                                                      plausible=plausible))
-        for name, value, bounds in (("press_x", 0.0, (-5.0, 5.0)), ("press_y", 0.0, (-5.0, 5.0)),
-                                    ("press_depth", 0.6, (0.05, 2.0))):
+                self._add(
+                    f"led{i}.{name}",
+                    Parameter(name, "1" if name == "power" else "mm", value, bounds, plausible=plausible),
+                )
+        for name, value, bounds in (
+            ("press_x", 0.0, (-5.0, 5.0)),
+            ("press_y", 0.0, (-5.0, 5.0)),
+            ("press_depth", 0.6, (0.05, 2.0)),
+        ):
             self._add(f"gel.{name}", Parameter(name, "mm", value, bounds, plausible=0.1))
         for name, parameter in EFFECT_PARAMETERS.items():
             self._add(f"sensor.{name}", parameter)
@@ -116,16 +132,21 @@ class MockModel(Exact):
         u = self.unit.get(key, self.unit.get(key.split(".")[1], 1.0))
         if u != 1.0:
             low, high = parameter.bounds
-            parameter = replace(parameter, default=parameter.default * u, bounds=(low * u, high * u),
-                                plausible=parameter.plausible * u,
-                                neutral=None if parameter.neutral is None else parameter.neutral * u)
+            parameter = replace(
+                parameter,
+                default=parameter.default * u,
+                bounds=(low * u, high * u),
+                plausible=parameter.plausible * u,
+                neutral=None if parameter.neutral is None else parameter.neutral * u,
+            )
         self.parameters[key], self.base[key] = parameter, float(parameter.default)
 
     def _at(self, values: Values, frame: int) -> dict:
         now = {**self.base, **values.common, **self.frames[frame].parameters, **values.frame.get(frame, {})}
         return {k: v / self.unit.get(k, self.unit.get(k.split(".")[1], 1.0)) for k, v in now.items()}
 
-    # -- the physics ----------------------------------------------------------------------------------------------------
+    # -- the physics
+    # ----------------------------------------------------------------------------------------------------
 
     def surface(self, v: dict):
         """Height (mm) and its slopes: a ball's cap with a soft rim."""
@@ -165,7 +186,9 @@ class MockModel(Exact):
 
     def _blur(self, image, width):
         c = self.cosines
-        return np.moveaxis(c.T @ (np.exp(-0.5 * width**2 * self.waves) * (c @ np.moveaxis(image, -1, 0) @ c.T)) @ c, 0, -1)
+        return np.moveaxis(
+            c.T @ (np.exp(-0.5 * width**2 * self.waves) * (c @ np.moveaxis(image, -1, 0) @ c.T)) @ c, 0, -1
+        )
 
     def _image(self, v: dict) -> np.ndarray:
         """Noise-free DN of one frame; analytic in every parameter."""
@@ -197,7 +220,8 @@ class MockModel(Exact):
             image = np.exp((1 + e["gamma"]) * np.log(np.where(image.real > 1e-6, image, 1e-6)))
         return self.noise.black_level + (self.noise.saturation - self.noise.black_level) * image
 
-    # -- the interface --------------------------------------------------------------------------------------------------
+    # -- the interface
+    # --------------------------------------------------------------------------------------------------
 
     def predict(self, values: Values, frames=None, seed: int = 0) -> list[np.ndarray]:
         return [self._image(self._at(values, f)) for f in (range(len(self.frames)) if frames is None else frames)]
@@ -232,9 +256,16 @@ class MockModel(Exact):
         now = self._at(values, frame)
         h, sx, sy = self.surface(now)
         distance = np.hypot(self.x - now["gel.press_x"], self.y - now["gel.press_y"])
-        return {"radius": np.hypot(self.x, self.y), "row": self.y, "column": self.x, "height": h,
-                "slope": np.degrees(np.arctan(np.hypot(sx, sy))), "contact": h > 3 * EDGE, "contact_distance": distance,
-                "intensity": self._image(now)}
+        return {
+            "radius": np.hypot(self.x, self.y),
+            "row": self.y,
+            "column": self.x,
+            "height": h,
+            "slope": np.degrees(np.arctan(np.hypot(sx, sy))),
+            "contact": h > 3 * EDGE,
+            "contact_distance": distance,
+            "intensity": self._image(now),
+        }
 
     # -- roles ----------------------------------------------------------------------------------------------------------
 
@@ -262,14 +293,18 @@ class PointModel(Exact):
         "lamp.drift": Parameter("drift", "1", 0.0, (-1.0, 1.0), neutral=0.0, plausible=0.02),
         "lamp.ripple": Parameter("ripple", "1", 0.0, (-1.0, 1.0), neutral=0.0, plausible=0.02),
     }
-    library = (Effect("extinction", "polarizer", ("leak",), acts=("analyzer.angle",)),
-               Effect("lamp drift", "lamp", ("drift",), acts=("frame",)))
+    library = (
+        Effect("extinction", "polarizer", ("leak",), acts=("analyzer.angle",)),
+        Effect("lamp drift", "lamp", ("drift",), acts=("frame",)),
+    )
 
     def __init__(self, angles, rng, **truth):
         self.noise = Noise(0.02, 1.0, 20.0, 4095.0, 0.0, 0.0)
         self.base = {key: float(p.default) for key, p in self.parameters.items()}
-        self.frames = [Frame(f"reading-{i:02d}", np.zeros(self.shape), parameters={"analyzer.angle": float(a)})
-                       for i, a in enumerate(angles)]
+        self.frames = [
+            Frame(f"reading-{i:02d}", np.zeros(self.shape), parameters={"analyzer.angle": float(a)})
+            for i, a in enumerate(angles)
+        ]
         true = Values({"polarizer.angle": 3.0, **truth})
         for frame, signal in zip(self.frames, self.predict(true)):
             frame.image = (signal + self.noise.sd(signal) * rng.standard_normal(self.shape)).astype(np.float32)
@@ -281,13 +316,18 @@ class PointModel(Exact):
         return 20.0 + 3000.0 * light * np.ones(self.shape)
 
     def predict(self, values, frames=None, seed=0):
-        return [self._read({**self.base, **values.common}, f) for f in (range(len(self.frames)) if frames is None else frames)]
+        return [
+            self._read({**self.base, **values.common}, f)
+            for f in (range(len(self.frames)) if frames is None else frames)
+        ]
 
     def derivatives(self, values, variables, frames=None, secant=None, seed=0):
         now = {**self.base, **values.common}
         for f in range(len(self.frames)) if frames is None else frames:
-            yield self._read(now, f), {v.name: self._read({**now, v.keys[0]: now[v.keys[0]] + 1j * STEP}, f).imag / STEP
-                                       for v in variables}
+            yield (
+                self._read(now, f),
+                {v.name: self._read({**now, v.keys[0]: now[v.keys[0]] + 1j * STEP}, f).imag / STEP for v in variables},
+            )
 
     def usable(self, frame):
         return np.ones(self.shape, bool)
@@ -319,8 +359,11 @@ def simulate(model: MockModel, rng: np.random.Generator, truth: dict | None = No
             true.common[key] = model.base[key] + size * rng.standard_normal()
             start.common[key] = true.common[key] + size / 3 * rng.standard_normal()
     for f in range(count):
-        place = {"gel.press_x": rng.uniform(-1.8, 1.8), "gel.press_y": rng.uniform(-1.8, 1.8),
-                 "gel.press_depth": rng.uniform(0.4, 1.0)}
+        place = {
+            "gel.press_x": rng.uniform(-1.8, 1.8),
+            "gel.press_y": rng.uniform(-1.8, 1.8),
+            "gel.press_depth": rng.uniform(0.4, 1.0),
+        }
         true.frame[f] = {k: v * model.unit.get(k, 1.0) for k, v in place.items()}
         start.frame[f] = {k: (v + 0.02 * rng.standard_normal()) * model.unit.get(k, 1.0) for k, v in place.items()}
         for name, value in (truth or {}).items():
@@ -381,7 +424,9 @@ class Fit:
     warnings: list[str]
 
 
-def mock_fit(model, variables, start: Values, frames=None, max_iterations: int = 40, progress=None, robust=False) -> Fit:
+def mock_fit(
+    model, variables, start: Values, frames=None, max_iterations: int = 40, progress=None, robust=False
+) -> Fit:
     """Levenberg-Marquardt with weights from the prediction, priors as rows, bounds by clipping."""
     frames = list(range(len(model.frames))) if frames is None else list(frames)
     variables = [v for v in variables if v.frames is None or set(v.frames) & set(frames)]
@@ -436,7 +481,7 @@ def mock_fit(model, variables, start: Values, frames=None, max_iterations: int =
         for _ in range(12):
             lhs = gram * scale * scale[:, None] + damping * np.eye(len(x))
             step = np.zeros(len(x))
-            step[active] = (scale[active] * np.linalg.solve(lhs[np.ix_(active, active)], (scale * score)[active]))
+            step[active] = scale[active] * np.linalg.solve(lhs[np.ix_(active, active)], (scale * score)[active])
             trial = values.copy()
             for v, value in zip(variables, np.clip(x + step, low, high)):
                 trial.put(v, value)
@@ -456,5 +501,19 @@ def mock_fit(model, variables, start: Values, frames=None, max_iterations: int =
     scale = 1 / np.sqrt(np.maximum(np.diag(gram), 1e-300))
     covariance = np.linalg.pinv(gram * scale * scale[:, None], rcond=1e-10, hermitian=True) * scale * scale[:, None]
     sd = np.sqrt(np.diag(covariance))
-    return Fit(values, list(variables), read(values), covariance, sd, covariance / np.outer(sd, sd), sum(square),
-               sum(counts) - len(variables), square, counts, converged, reason, history, [])
+    return Fit(
+        values,
+        list(variables),
+        read(values),
+        covariance,
+        sd,
+        covariance / np.outer(sd, sd),
+        sum(square),
+        sum(counts) - len(variables),
+        square,
+        counts,
+        converged,
+        reason,
+        history,
+        [],
+    )

@@ -1,4 +1,5 @@
-"""The next measurement, on a mock sensor whose truth is known: the algebra, what shots there are, and that the advice followed resolves the tie."""
+"""The next measurement, on a mock sensor whose truth is known: the algebra, what shots there are, and that the advice
+followed resolves the tie."""
 
 import itertools
 import json
@@ -20,7 +21,7 @@ from optics.scene.parameter import Parameter, Values
 from optics.study import design
 
 sys.path.insert(0, str(Path(__file__).parent))
-from mock_model import LEDS, LIBRARY, Frame, MockModel, mock_fit  # noqa: E402
+from mock_model import LEDS, LIBRARY, Frame, MockModel, mock_fit
 
 SIDE = 20
 PLACE = ("gel.press_x", "gel.press_y", "gel.press_depth")
@@ -99,7 +100,11 @@ def stacked(model, values, variables, effect_variables, frames):
         prediction, images = next(iter(model.derivatives(values, [*variables, *effect_variables], [f])))
         use, sd = model.usable(f), np.sqrt(model.noise.variance(prediction))
         for columns, found in zip((variables, effect_variables), rows):
-            found.append(np.stack([(images[v.name] / sd)[use] if v.name in images else np.zeros(int(use.sum())) for v in columns], 1))
+            found.append(
+                np.stack(
+                    [(images[v.name] / sd)[use] if v.name in images else np.zeros(int(use.sum())) for v in columns], 1
+                )
+            )
     return (np.concatenate(r) for r in rows)
 
 
@@ -107,18 +112,26 @@ def stacked(model, values, variables, effect_variables, frames):
 
 
 def test_gaps_are_those_of_the_frames_taken_together():
-    """D by normal equations of each shot against least squares on all pixels of all frames at once, pose and prior of the new press included."""
+    """D by normal equations of each shot against least squares on all pixels of all frames at once, pose and prior of
+    the new press included."""
     model, true, _, _ = session(2, 1)
-    base = [v.with_prior(true.frame[v.frames[0]][v.keys[0]], 0.05) if v.frames else v for v in model.base_variables(range(2))]
+    base = [
+        v.with_prior(true.frame[v.frames[0]][v.keys[0]], 0.05) if v.frames else v
+        for v in model.base_variables(range(2))
+    ]
     found, members = scored(model, true, base, ("gamma", "LED lobe"))
-    shots = [advise.Shot("exposure", "darker", 0, {"camera.exposure": 0.4}),
-             advise.Shot("another place", "there", 0, dict(zip(PLACE, (-1.0, 0.5, 0.8))), press="new")]
+    shots = [
+        advise.Shot("exposure", "darker", 0, {"camera.exposure": 0.4}),
+        advise.Shot("another place", "there", 0, dict(zip(PLACE, (-1.0, 0.5, 0.8))), press="new"),
+    ]
     seen = advise.outlook(model, true, found, members, [np.array([0.01]), np.array([-0.02])], shots, variables_of)
     assert seen.nuisances == [[], [f"{k} +- 0.05 mm" for k in PLACE]]
 
     for chosen in ([], [0], [1], [0, 1]):
         twin, values = advise.imagined(model, true, shots)
-        known = [replace(v, frames=(0, 2)) if v.frames == (0,) else v for v in base]  # the shot in the dark shows press 0
+        known = [
+            replace(v, frames=(0, 2)) if v.frames == (0,) else v for v in base
+        ]  # the shot in the dark shows press 0
         known += [replace(v, name=v.name + "new", frames=(3,)) for v in base if v.frames == (0,)]
         j, g = stacked(twin, values, known, [c.variables[0] for c in members], [0, 1, *(2 + s for s in chosen)])
         priors = np.diag([0.0 if v.prior is None else 1 / 0.05 for v in known])
@@ -161,14 +174,19 @@ def test_an_effect_per_frame_has_a_strength_of_its_own_in_a_shot():
 
 
 def test_gaps_are_those_of_a_diagnosis():
-    """D and what is visible as optics.diagnosis.statistics has them: columns that the base has twice or absorbs, strengths with one side, several."""
+    """D and what is visible as optics.diagnosis.statistics has them: columns that the base has twice or absorbs,
+    strengths with one side, several."""
     rng = np.random.default_rng(8)
     j = rng.standard_normal((200, 9))
     j[:, 1] = j[:, 0]  # a direction that no calibration determines
     j[:, 8] = j[:, 0] - 2 * j[:, 2] + 1e-5 * rng.standard_normal(200)  # an effect of which a calibration leaves nothing
     j[:, 4] -= 0.8 * j[:, 3]
-    members = [advise.Member("free", [3], [0], [0.7]), advise.Member("one-sided", [4], [1], [0.4]),
-               advise.Member("several", [5, 6, 7], [0, 1, -1], [0.3, 0.2, -0.5]), advise.Member("absorbed", [8], [0], [1.0])]
+    members = [
+        advise.Member("free", [3], [0], [0.7]),
+        advise.Member("one-sided", [4], [1], [0.4]),
+        advise.Member("several", [5, 6, 7], [0, 1, -1], [0.3, 0.2, -0.5]),
+        advise.Member("absorbed", [8], [0], [1.0]),
+    ]
     normal = statistics.Normal(9)
     normal.add(range(9), j, np.zeros(200))
     seen = advise.Outlook(normal.gram, [], [0, 1, 2], np.zeros(3), members, [], statistics.TRUNCATION)
@@ -177,14 +195,24 @@ def test_gaps_are_those_of_a_diagnosis():
     places = [np.array(m.columns) - 3 for m in members]
     for a, m in enumerate(members):
         for b, rival in enumerate(members):
-            d = statistics.gap(v, places[a], np.array(m.strength), places[b], statistics.Cone(v[np.ix_(places[b], places[b])], rival.sides))
-            assert seen.gaps()[a, b] == (math.inf if a == b else pytest.approx(d, rel=1e-6, abs=1e-9))  # 1e-6: a ridge of 1e-9 per column
+            d = statistics.gap(
+                v,
+                places[a],
+                np.array(m.strength),
+                places[b],
+                statistics.Cone(v[np.ix_(places[b], places[b])], rival.sides),
+            )
+            assert seen.gaps()[a, b] == (
+                math.inf if a == b else pytest.approx(d, rel=1e-6, abs=1e-9)
+            )  # 1e-6: a ridge of 1e-9 per column
 
 
 def two(cos, nested=frozenset()):
     """Two effects that are worth 100 each, at an angle to each other."""
     members = [advise.Member(name, [i], [0], [1.0]) for i, name in enumerate("ab")]
-    return advise.Outlook(100 * np.array([[1.0, cos], [cos, 1.0]]), [], [], np.zeros(0), members, [], statistics.TRUNCATION, nested)
+    return advise.Outlook(
+        100 * np.array([[1.0, cos], [cos, 1.0]]), [], [], np.zeros(0), members, [], statistics.TRUNCATION, nested
+    )
 
 
 def test_what_can_do_all_that_an_effect_can_is_no_rival():
@@ -222,7 +250,9 @@ def test_a_new_press_does_not_inherit_a_place():
 def test_a_member_that_is_not_likely_is_a_rival_only():
     model, true, _, _ = session(2, 1)
     found, members = scored(model, true, model.base_variables(range(2)), ("gamma", "LED lobe"))
-    seen = advise.outlook(model, true, found, members, [np.array([0.01])] * 2, [advise.Shot("repeat", "again", 0)], variables_of)
+    seen = advise.outlook(
+        model, true, found, members, [np.array([0.01])] * 2, [advise.Shot("repeat", "again", 0)], variables_of
+    )
     seen.members[1].likely = False
     gaps = seen.gaps()
     assert np.isfinite(gaps[0, 1]) and np.isinf(gaps[1]).all()
@@ -241,7 +271,9 @@ def test_a_planned_effect_has_a_share_of_its_plausible_size():
     model, true, _, _ = session(6, 1)
     found, members = scored(model, true, model.base_variables(range(6)), ("flicker", "vignetting", "defocus"))
     own = {m.name: m for m in design._outlook(found, members, 0.1, 0).members}
-    assert own["vignetting"].strength == pytest.approx([0.1 * 0.3]) and own["defocus"].strength == pytest.approx([0.1**2 * 0.7])
+    assert own["vignetting"].strength == pytest.approx([0.1 * 0.3]) and own["defocus"].strength == pytest.approx(
+        [0.1**2 * 0.7]
+    )
     drawn = [strength for _, _, (strength,) in own["flicker"].more.values()]
     assert len(drawn) == 6 and {round(x, 9) for x in drawn} == {-0.002, 0.002} and not own["flicker"].columns
 
@@ -253,13 +285,24 @@ def test_families_come_from_what_the_model_has():
     model, true, _, _ = session(3, 1)
     found = advise.families(model, true, range(3))
     kinds = {s.family for s in found}
-    assert {"exposure", "another place", "farther out", "deeper press", "shallower press", "other light", "dark", "repeat"} <= kinds
+    assert {
+        "exposure",
+        "another place",
+        "farther out",
+        "deeper press",
+        "shallower press",
+        "other light",
+        "dark",
+        "repeat",
+    } <= kinds
     assert len(found) <= advise.SHOTS and all(s.like in range(3) for s in found)
     for shot in found:
         for key, value in shot.settings.items():
             low, high = model.parameters[key].bounds
             assert low <= value <= high
-    assert max(s.settings.get("camera.exposure", 0.0) for s in found) < 1  # the frames are near full scale: more light would saturate most of them
+    assert (
+        max(s.settings.get("camera.exposure", 0.0) for s in found) < 1
+    )  # the frames are near full scale: more light would saturate most of them
     dim = Exposed(1)
     dim.frames[0].image = np.full(dim.shape, dim.noise.black_level + 50.0)
     assert any(s.settings.get("camera.exposure", 0.0) > 1 for s in advise.families(dim, Values(), [0]))
@@ -272,7 +315,9 @@ def test_settings_that_frames_turned_are_taken_between_and_beyond():
     model.parameters["lamp.current"], model.base["lamp.current"] = Parameter("current", "mA", 10.0, (0.0, 100.0)), 10.0
     for frame, value in zip(model.frames, (10.0, 20.0, 50.0)):
         frame.parameters["lamp.current"] = value
-    taken = {s.settings["lamp.current"] for s in advise.families(model, true, range(3)) if s.family == "another lamp.current"}
+    taken = {
+        s.settings["lamp.current"] for s in advise.families(model, true, range(3)) if s.family == "another lamp.current"
+    }
     assert taken == {35.0, 70.0, 0.0}
 
 
@@ -302,19 +347,35 @@ def pairs_of(number):
     rows = []
     for a, b in itertools.combinations(range(len(members)), 2):
         both = replace(seen, members=[seen.members[a], seen.members[b]], nested=set())
-        gaps, alone = both.gaps(), [float(np.array(m.strength) @ replace(both, members=[m]).information(())[0] @ m.strength)
-                                    for m in both.members]
+        gaps, alone = (
+            both.gaps(),
+            [
+                float(np.array(m.strength) @ replace(both, members=[m]).information(())[0] @ m.strength)
+                for m in both.members
+            ],
+        )
         cos = max(math.sqrt(max(1 - gaps[i, 1 - i] / alone[i], 0)) for i in (0, 1))
         if cos < CONFUSED:
             continue
-        both.members = [replace(m, strength=[s * math.sqrt(3 / gaps[i, 1 - i]) for s in m.strength]) for i, m in enumerate(both.members)]
-        rows.append((cos, (members[a].effect.name, members[b].effect.name), both.least(both.choose(3, both.least)), both.least(more)))
+        both.members = [
+            replace(m, strength=[s * math.sqrt(3 / gaps[i, 1 - i]) for s in m.strength])
+            for i, m in enumerate(both.members)
+        ]
+        rows.append(
+            (
+                cos,
+                (members[a].effect.name, members[b].effect.name),
+                both.least(both.choose(3, both.least)),
+                both.least(more),
+            )
+        )
     return rows
 
 
 def test_three_advised_shots_are_worth_more_than_three_more_presses():
-    """On all pairs that are confused: 1.5 times D in nearly all. No shot can make D more than 1/(1 - cos^2) times what its light is worth,
-    so that effects which are not alike are told apart by light alone, and three presses bring as much of that as any three frames."""
+    """On all pairs that are confused: 1.5 times D in nearly all. No shot can make D more than 1/(1 - cos^2) times what
+    its light is worth, so that effects which are not alike are told apart by light alone, and three presses bring as
+    much of that as any three frames."""
     rows = [row for number in range(len(SESSIONS)) for row in pairs_of(number)]
     ratios = {(n, pair): advised / more for n, (_, pair, advised, more) in enumerate(rows)}
     assert len(ratios) >= 10
@@ -328,12 +389,20 @@ def diagnosed(model, start, variables, held, names, fitted):
     return fit, diagnose(model, fit, library(*names), model.variables_of, held, fitted=fitted, refit=mock_fit)
 
 
-TIES = (("gamma", "LED lobe"), ("glare", "gamma"), ("gamma", "glare"), ("LED lobe", "vignetting"), ("absorption", "interreflection"))
-FALL = 14.0  # of chi2 that the true effect, the first of a pair, brings in three presses: seen, but hardly told from the other
+TIES = (
+    ("gamma", "LED lobe"),
+    ("glare", "gamma"),
+    ("gamma", "glare"),
+    ("LED lobe", "vignetting"),
+    ("absorption", "interreflection"),
+)
+# of chi2 that the true effect, the first of a pair, brings in three presses: seen, but hardly told from the other
+FALL = 14.0
 
 
 def follow(names, seed, advised, fall=FALL):
-    """(first verdict, second one): four presses, one held out; then the advised shots, or as many other presses, as frames 4 ..."""
+    """(first verdict, second one): four presses, one held out; then the advised shots, or as many other presses, as
+    frames 4 ..."""
     model, true, _, _ = session(4, seed)
     key = library(names[0])[0].parameter_names[0]
     found, members = scored(model, true, model.base_variables(range(4)), names[:1])
@@ -358,7 +427,9 @@ def follow(names, seed, advised, fall=FALL):
             variables += [model.variable(k, number) for k in PLACE]
         else:
             true.frame[number], start.frame[number] = dict(true.frame[like]), dict(start.frame[like])
-            variables = [replace(v, frames=(*v.frames, number)) if v.frames and like in v.frames else v for v in variables]
+            variables = [
+                replace(v, frames=(*v.frames, number)) if v.frames and like in v.frames else v for v in variables
+            ]
         expose(model, true, number, rng)
     _, second = diagnosed(model, start, variables, (3,), names, [0, 1, 2, *range(4, len(model.frames))])
     return first, second
@@ -430,8 +501,12 @@ def test_only_verdicts_that_hang_on_a_tie_ask_for_advice():
     lost = [replace(c, holds=c.name != "lead") for c in found.conditions]
     lead = replace(found, word="CANNOT_TELL", ambiguous=[], conditions=lost)
     assert len(advise.asked_for(lead)) == 2
-    assert advise.asked_for(replace(lead, rows=[found.rows[0], replace(found.rows[1], fall=-1e3, refit=None)])) == []  # far behind
-    assert advise.advise(model, Diagnosis.from_json(found.to_json()), variables_of) == []  # read from a file: nothing to render from
+    assert (
+        advise.asked_for(replace(lead, rows=[found.rows[0], replace(found.rows[1], fall=-1e3, refit=None)])) == []
+    )  # far behind
+    assert (
+        advise.advise(model, Diagnosis.from_json(found.to_json()), variables_of) == []
+    )  # read from a file: nothing to render from
 
 
 def test_a_member_is_taken_to_be_as_strong_as_its_refit_found_it():
@@ -450,7 +525,11 @@ def test_misfit_that_is_left_asks_for_a_margin(excess, judge, monkeypatch):
     first, *others = found.evidence.candidates
     refit = replace(first.row.refit, excess_sd=excess, structure_p=1.0)
     members = [replace(c, row=replace(c.row, refit=own)) for c, own in ((first, refit), *((c, None) for c in others))]
-    shares = [p.share_after for a in advise.next_measurement(model, found.evidence.values, found.evidence, members, variables_of) for p in a.pairs]
+    shares = [
+        p.share_after
+        for a in advise.next_measurement(model, found.evidence.values, found.evidence, members, variables_of)
+        for p in a.pairs
+    ]
     assert shares and all(0 <= s <= 1 for s in shares) if excess else np.isnan(shares).all()
     asked = []
     for name in ("least", "worth"):
@@ -463,16 +542,30 @@ def test_advice_that_does_not_help_says_so():
     _, found = tie()
     poor = Advice("the same press once more", "together", [{}], [""], 1, [Apart("a", "b", 0.0, 0.0, 0.5, 0.5)], [])
     assert "hardly tells a from b" in replace(found, advice=[poor]).text()
-    for after, verb in ((0.1, "hardly tells"), (0.3, ": tells")):  # noise had told them, but not the misfit that is left
+    for after, verb in (
+        (0.1, "hardly tells"),
+        (0.3, ": tells"),
+    ):  # noise had told them, but not the misfit that is left
         pair = Apart("a", "b", 60.0, 3600.0, 1.0, 1.0, 0.01, after)
         text = replace(found, advice=[replace(poor, pairs=[pair])]).text()
-        assert f"{verb} a from b" in text and f"D over the fall 1 % -> {100 * after:.0f} % (20 % needed while misfit is left)" in text
+        assert (
+            f"{verb} a from b" in text
+            and f"D over the fall 1 % -> {100 * after:.0f} % (20 % needed while misfit is left)" in text
+        )
 
 
 def test_a_plan_ends_where_it_is_enough():
     model, found = tie()
     members = [c for c in found.evidence.candidates if c.effect.name in advise.asked_for(found)]
-    plans = [next(a for a in advise.next_measurement(model, found.evidence.values, found.evidence, members, variables_of, enough=enough)
-                  if a.family == "together") for enough in (CLEAR, math.inf)]
+    plans = [
+        next(
+            a
+            for a in advise.next_measurement(
+                model, found.evidence.values, found.evidence, members, variables_of, enough=enough
+            )
+            if a.family == "together"
+        )
+        for enough in (CLEAR, math.inf)
+    ]
     assert plans[0].frames < plans[1].frames == 3 and plans[0].least >= CLEAR
     assert advise.next_measurement(model, found.evidence.values, found.evidence, members[:1], variables_of) == []

@@ -1,4 +1,5 @@
-"""The pieces of a calibration: bounded steps, coordinates in which a fit steps, and what is solved for in other frames."""
+"""The pieces of a calibration: bounded steps, coordinates in which a fit steps, and what is solved for in other
+frames."""
 
 from types import SimpleNamespace
 
@@ -13,7 +14,7 @@ from optics.scene.parameter import Parameter, Values, Variable
 
 def problem(rng, n, flat=0):
     j = rng.normal(size=(4 * n, n)) * 10.0 ** rng.uniform(-3, 3, n)  # units differ by many orders
-    j[:, n - flat:] = 0
+    j[:, n - flat :] = 0
     return j.T @ j, j.T @ rng.normal(size=4 * n)
 
 
@@ -75,7 +76,9 @@ def test_a_factor_moves_by_its_logarithm():
 @pytest.mark.parametrize("side", [-1, 1])
 def test_a_step_to_a_bound_ends_on_it(side):
     """Not beside it by rounding: what stands at a bound is taken as known, and has no slope to be judged by."""
-    sigma = Variable("sigma", ("skin.sigma",), Parameter("sigma", "rad", 0.2, (0.0, 1.5), plausible=0.1, squared=True, saturates=0.3))
+    sigma = Variable(
+        "sigma", ("skin.sigma",), Parameter("sigma", "rad", 0.2, (0.0, 1.5), plausible=0.1, squared=True, saturates=0.3)
+    )
     model = SimpleNamespace(parameters={"skin.sigma": sigma.parameter}, base={"skin.sigma": 0.2}, frames=[])
     for start in np.linspace(0.01, 1.4, 40):
         descent = Descent(model, [sigma], Values({"sigma": start}), [])
@@ -86,19 +89,30 @@ def test_a_step_to_a_bound_ends_on_it(side):
 
 
 class Twice:
-    """Three lights, one picture each, on a face that sends light on once and, to a share of 3e-3, twice: with the reflectances rho_c
-    L_fc = P_f m_fc (rho_c + 3e-3 rho_c^2 w_c) / (1 + ((x - x_f)/5)^2). A vignetting, 1 % if not told otherwise, is in the pictures alone."""
+    """Three lights, one image each, on a face that sends light on once and, to a share of 3e-3, twice: with the
+    reflectances rho_c L_fc = P_f m_fc (rho_c + 3e-3 rho_c^2 w_c) / (1 + ((x - x_f)/5)^2). A vignetting, 1 % if not told
+    otherwise, is in the images alone."""
 
     shape, captures = (100, 100, 3), None
-    parameters = {f"{part}{name}": Parameter(name, unit, start, bounds, plausible=0.1, linear=unit == "1") for i in range(3)
-                  for part, name, unit, start, bounds in ((f"led_{i}.", "power", "1", 1.0, (0.0, 1e6)), ("face.", f"rho_{i}", "1", 0.3, (0.0, 10.0)),
-                                                          (f"led_{i}.", "x", "mm", 0.0, (-5.0, 5.0)))}
+    parameters = {
+        f"{part}{name}": Parameter(name, unit, start, bounds, plausible=0.1, linear=unit == "1")
+        for i in range(3)
+        for part, name, unit, start, bounds in (
+            (f"led_{i}.", "power", "1", 1.0, (0.0, 1e6)),
+            ("face.", f"rho_{i}", "1", 0.3, (0.0, 10.0)),
+            (f"led_{i}.", "x", "mm", 0.0, (-5.0, 5.0)),
+        )
+    }
 
     def __init__(self, rng, vignetting=0.01):
         self.noise = Noise(system_gain=0.02, dark_noise=1.0, black_level=0.0, saturation=4095.0, prnu=0.0)
         self.base = {key: p.default for key, p in self.parameters.items()}
         self.frames = [SimpleNamespace(name=f"f{i}", parameters={}, repeats=[]) for i in range(3)]
-        self.at, self.mixed, self.w = np.linspace(-4, 4, 100), np.eye(3) + 0.02 * rng.uniform(size=(3, 3)), rng.uniform(0.5, 1, self.shape)
+        self.at, self.mixed, self.w = (
+            np.linspace(-4, 4, 100),
+            np.eye(3) + 0.02 * rng.uniform(size=(3, 3)),
+            rng.uniform(0.5, 1, self.shape),
+        )
         self.true = {f"led_{i}.x": 0.4 * i - 0.3 for i in range(3)} | {f"face.rho_{i}": 0.5 + 0.2 * i for i in range(3)}
         for frame, light in zip(self.frames, self.predict(Values(self.true))):
             light = light * (1 - vignetting * np.add.outer(self.at**2, self.at**2) / 16)[..., None]
@@ -108,7 +122,13 @@ class Twice:
         rho = np.array([now[f"face.rho_{c}"] for c in range(3)])
         if f == 3:
             return np.zeros(self.shape)
-        return 2500 * now[f"led_{f}.power"] * self.mixed[f] * (rho + 3e-3 * rho**2 * self.w) / (1 + ((self.at - now[f"led_{f}.x"]) / 5) ** 2)[:, None]
+        return (
+            2500
+            * now[f"led_{f}.power"]
+            * self.mixed[f]
+            * (rho + 3e-3 * rho**2 * self.w)
+            / (1 + ((self.at - now[f"led_{f}.x"]) / 5) ** 2)[:, None]
+        )
 
     def predict(self, values, frames=None, seed=0):
         return [self._lit({**self.base, **values.common}, f) for f in (frames if frames is not None else range(3))]
@@ -116,8 +136,14 @@ class Twice:
     def derivatives(self, values, variables, frames=None, secant=None, seed=0):
         now = {**self.base, **values.common}
         for f in frames:
-            yield self._lit(now, f), {v.name: self._lit({**now, v.name: now[v.name] + 1e-30j}, f).imag / 1e-30 for v in variables
-                                      if f < 3 and v.name.startswith(("face", f"led_{f}"))}
+            yield (
+                self._lit(now, f),
+                {
+                    v.name: self._lit({**now, v.name: now[v.name] + 1e-30j}, f).imag / 1e-30
+                    for v in variables
+                    if f < 3 and v.name.startswith(("face", f"led_{f}"))
+                },
+            )
 
     def linear_in(self, variable):
         return variable.name.endswith("power")
@@ -131,31 +157,38 @@ class Twice:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_powers_and_reflectances_that_hardly_differ_are_found_from_anywhere(seed):
-    """Along P rho = const chi2 is almost flat, and pulled by what the model lacks: straight or damped steps get stuck in that bent valley."""
+    """Along P rho = const chi2 is almost flat, and pulled by what the model lacks: straight or damped steps get stuck
+    in that bent valley."""
     model = Twice(np.random.default_rng(seed))
     variables = [Variable(key, (key,), p) for key, p in model.parameters.items()]
     one, two = [fit(model, variables, Values({f"led_{i}.power": power for i in range(3)})) for power in (1.0, 2.0)]
     assert one.converged and two.converged and max(len(one.history), len(two.history)) < 8
     assert abs(one.chi2 - two.chi2) < len(variables)  # what `converged` promises
     for i in range(3):
-        assert one.values.common[f"led_{i}.power"] * one.values.common[f"face.rho_{i}"] == pytest.approx(0.5 + 0.2 * i, rel=0.01)
+        assert one.values.common[f"led_{i}.power"] * one.values.common[f"face.rho_{i}"] == pytest.approx(
+            0.5 + 0.2 * i, rel=0.01
+        )
 
 
 @pytest.mark.parametrize("seed", range(4))
 def test_where_much_is_missing_the_last_of_chi2_is_not_waited_for(seed, monkeypatch):
-    """A thousandth of what noise does not explain: below that, steps along flat valleys cost more than they can tell."""
+    """A thousandth of what noise does not explain: below that, steps along flat valleys cost more than they can
+    tell."""
     model = Twice(np.random.default_rng(seed), vignetting=0.1)
     variables = [Variable(key, (key,), p) for key, p in model.parameters.items()]
     soon = fit(model, variables, Values({f"led_{i}.power": 1.5 for i in range(3)}))
     monkeypatch.setattr(calibrate, "NEGLIGIBLE", 0.0)
     late = fit(model, variables, Values({f"led_{i}.power": 1.5 for i in range(3)}))
     excess = late.chi2 - late.dof
-    assert soon.converged and len(soon.history) < len(late.history) and excess > 1e6  # without it two of these four do not converge
+    assert (
+        soon.converged and len(soon.history) < len(late.history) and excess > 1e6
+    )  # without it two of these four do not converge
     assert 0 < soon.chi2 - late.chi2 < 2e-3 * excess
 
 
 class Bend:
-    """One pixel, 100 arctan(x): from x = 1.39 a full step leads as far to the other side, and brings nothing of what it promises."""
+    """One pixel, 100 arctan(x): from x = 1.39 a full step leads as far to the other side, and brings nothing of what it
+    promises."""
 
     shape, captures = (1, 1, 1), None
     parameters = {"led.x": Parameter("x", "mm", 1.0, (-50.0, 50.0), plausible=1.0)}
@@ -177,8 +210,8 @@ class Bend:
 
 @pytest.mark.parametrize("start", [1.3, 1.36, 1.38, 1.39, 1.4, -1.38])
 def test_a_step_that_brings_a_hundredth_of_its_promise_is_shortened(start):
-    """On the same derivative images, which are dear: at most four linearisations with the one that sees the end, where taking any gain
-    for progress needs five to eight. To .05 in chi2, which `fit` allows a variable."""
+    """On the same derivative images, which are dear: at most four linearisations with the one that sees the end, where
+    taking any gain for progress needs five to eight. To .05 in chi2, which `fit` allows a variable."""
     model = Bend()
     found = fit(model, [Variable("led.x", ("led.x",), model.parameters["led.x"])], Values({"led.x": start}))
     assert found.converged and len(found.history) <= 4 and found.chi2 < 0.05
@@ -187,7 +220,12 @@ def test_a_step_that_brings_a_hundredth_of_its_promise_is_shortened(start):
 def test_far_from_the_best_a_factor_moves_straight():
     """By its logarithm a light that turns away would grow without measure."""
     power = Variable("power", ("led.power",), Parameter("power", "1", 1.0, (0.0, 1e6), linear=True))
-    descent = Descent(SimpleNamespace(parameters={"led.power": power.parameter}, base={"led.power": 1.0}, frames=[]), [power], Values(), [])
+    descent = Descent(
+        SimpleNamespace(parameters={"led.power": power.parameter}, base={"led.power": 1.0}, frames=[]),
+        [power],
+        Values(),
+        [],
+    )
     descent.take(Normal(np.eye(1), np.array([0.5]), 0.0, 0.0, [], [], []))
     assert descent._step(0.0)[0] == pytest.approx(1.5)
     descent.creep()
@@ -196,15 +234,23 @@ def test_far_from_the_best_a_factor_moves_straight():
 
 def test_an_effect_may_do_nothing_in_a_dark_frame():
     model = Twice(np.random.default_rng(0))
-    model.frames.append(SimpleNamespace(name="dark", parameters={}, repeats=[], image=model.noise.sd(0.0) * np.ones(model.shape)))
-    power, x = [[Variable(f"led_{i}.{name}", (f"led_{i}.{name}",), model.parameters[f"led_{i}.{name}"]) for i in range(3)] for name in ("power", "x")]
+    model.frames.append(
+        SimpleNamespace(name="dark", parameters={}, repeats=[], image=model.noise.sd(0.0) * np.ones(model.shape))
+    )
+    power, x = [
+        [Variable(f"led_{i}.{name}", (f"led_{i}.{name}",), model.parameters[f"led_{i}.{name}"]) for i in range(3)]
+        for name in ("power", "x")
+    ]
     base = fit(model, power, Values(model.true), frames=range(4))
     more = extended(model, base, x)
     assert [len(where) for where, *_ in base.normal.rows] == [1, 1, 1, 0] and more.converged and more.chi2 < base.chi2
 
 
 def test_priors_go_along_to_other_frames_where_they_say_something_about_them():
-    frames = [SimpleNamespace(name=f"f{i}", group=f"press-{i // 2}", parameters={"gel.press_x": float(i // 2)}) for i in range(6)]
+    frames = [
+        SimpleNamespace(name=f"f{i}", group=f"press-{i // 2}", parameters={"gel.press_x": float(i // 2)})
+        for i in range(6)
+    ]
     model = SimpleNamespace(frames=frames, base={"gel.press_x": 0.0, "camera.gain": 1.0})
     x, gain = Parameter("press_x", "mm", 0.0), Parameter("gain", "1", 1.0)
 
@@ -224,9 +270,13 @@ def test_what_is_correlated_among_each_other_is_one_warning():
     common = np.zeros((len(names), 3))
     common[:7, 0], common[7, 1], common[8, 1] = 1, 1, -1
     covariance = common @ common.T + 1e-3 * np.eye(len(names))
-    result = Fit(None, [SimpleNamespace(name=n) for n in names], np.zeros(len(names)), covariance, 1.0, 1, [], [], [], True, "")
+    result = Fit(
+        None, [SimpleNamespace(name=n) for n in names], np.zeros(len(names)), covariance, 1.0, 1, [], [], [], True, ""
+    )
     every, pair = warnings_of(result, np.linalg.inv(covariance))
-    assert every.startswith("led_1.power, led_2.power, led_3.power, led_4.power, led_5.power and 2 more are correlated among each other")
+    assert every.startswith(
+        "led_1.power, led_2.power, led_3.power, led_4.power, led_5.power and 2 more are correlated among each other"
+    )
     assert every.endswith("hold one of them, or give it a prior")
     direction = np.r_[np.ones(7), np.zeros(3)] / np.sqrt(7)
     flat = np.eye(10) - (1 - 1e-9) * np.outer(direction, direction)  # the same set, undetermined: said once

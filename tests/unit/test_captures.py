@@ -15,7 +15,7 @@ from optics.files import exr
 from optics.files.images import read_image
 from optics.scene.parameter import Parameter
 
-NOISE = ("[noise]\nsystem_gain = 0.05\ndark_noise = 1.5\nblack_level = 8.0\nsaturation = 255.0\nprnu = 0.003\n")
+NOISE = "[noise]\nsystem_gain = 0.05\ndark_noise = 1.5\nblack_level = 8.0\nsaturation = 255.0\nprnu = 0.003\n"
 FRAME = '[[frames]]\nimage = "frames/000.png"\n'
 BENCH = 'scene = "bench"\n[table]\nfile = "malus.csv"\nvalues = ["reading"]\n'
 
@@ -47,9 +47,16 @@ def folder(tmp_path):
     (frames / "cut.png").write_bytes((frames / "000.png").read_bytes()[:60])
     nan, inf = gray.astype(np.float32), gray.astype(np.float32)
     nan[2, 3], inf[0, 0] = np.nan, np.inf
-    for name, array in (("nan", nan), ("inf", inf), ("complex", gray + 0j), ("words", np.full((6, 8), "x")),
-                        ("object", np.array([[None]])), ("cube", np.zeros((2, 6, 8, 3))), ("front", np.zeros((3, 6, 80))),
-                        ("huge", np.full((6, 8), 1e300))):
+    for name, array in (
+        ("nan", nan),
+        ("inf", inf),
+        ("complex", gray + 0j),
+        ("words", np.full((6, 8), "x")),
+        ("object", np.array([[None]])),
+        ("cube", np.zeros((2, 6, 8, 3))),
+        ("front", np.zeros((3, 6, 80))),
+        ("huge", np.full((6, 8), 1e300)),
+    ):
         np.save(frames / f"{name}.npy", array)
     tifffile.imwrite(frames / "pages.tif", np.stack([gray, gray]), photometric="minisblack")
     exr.write(frames / "depth.exr", {"depth.Z": np.ones((6, 8)), "Y": np.ones((6, 8))})
@@ -64,14 +71,21 @@ def load(folder, text):
     return captures.load(folder)
 
 
-# -- What is right ------------------------------------------------------------------------------------------------------
+# -- What is right
+# ------------------------------------------------------------------------------------------------------
+
 
 def test_every_key_of_the_format(folder):
     Image.fromarray(np.full((6, 8), 200, np.uint8)).save(folder / "background.png")
-    c = load(folder, 'scene = "scene.xml"\nflat_field = "background.png"\ncfa = "RGGB"\nvalues_are = "DN"\n' + NOISE
-             + '[parameters]\n"camera.x_fov" = 40\n"indenter.shape" = "ball"\n' + FRAME
-             + 'mask = "frames/mask.png"\nrepeats = ["frames/000b.png"]\ngroup = "press-03"\n[frames.parameters]\n'
-             '"led_red.power" = 1.0\n"analyzer.angle" = 45\n[[frames]]\nimage = "frames/001.png"\n')
+    c = load(
+        folder,
+        'scene = "scene.xml"\nflat_field = "background.png"\ncfa = "RGGB"\nvalues_are = "DN"\n'
+        + NOISE
+        + '[parameters]\n"camera.x_fov" = 40\n"indenter.shape" = "ball"\n'
+        + FRAME
+        + 'mask = "frames/mask.png"\nrepeats = ["frames/000b.png"]\ngroup = "press-03"\n[frames.parameters]\n'
+        '"led_red.power" = 1.0\n"analyzer.angle" = 45\n[[frames]]\nimage = "frames/001.png"\n',
+    )
     frame = c.frames[0]
     assert c.folder == folder and c.scene == str((folder / "scene.xml").resolve()) and c.cfa == "RGGB" and c.bits == 8
     assert c.noise == Noise(0.05, 1.5, 8.0, 255.0, 0.003, quantisation=1.0)
@@ -87,10 +101,14 @@ def test_every_key_of_the_format(folder):
 
 
 def test_table_rows_become_frames_of_one_pixel(folder):
-    c = load(folder, BENCH + 'rename = { "angle (rad)" = "analyzer.angle" }\nscale = { "analyzer.angle" = 57.29577951 }\n')
+    c = load(
+        folder, BENCH + 'rename = { "angle (rad)" = "analyzer.angle" }\nscale = { "analyzer.angle" = 57.29577951 }\n'
+    )
     assert [f.image.shape for f in c.frames] == [(1, 1, 1)] * 3 and c.table.values == ["reading"]
     assert [float(f.image[0, 0, 0]) for f in c.frames] == [100.0, 50.5, 1.0]
-    assert [f.parameters["analyzer.angle"] for f in c.frames] == pytest.approx([0, 45, 90], abs=1e-6)  # ten digits in the file
+    assert [f.parameters["analyzer.angle"] for f in c.frames] == pytest.approx(
+        [0, 45, 90], abs=1e-6
+    )  # ten digits in the file
 
 
 def test_what_costs_trust_is_a_warning(folder):
@@ -100,11 +118,21 @@ def test_what_costs_trust_is_a_warning(folder):
     assert load(folder, 'scene = "bench"\n' + FRAME + NOISE).warnings == []
 
 
-@pytest.mark.parametrize(("suffix", "dtype", "channels"), [
-    *[(suffix, dtype, channels) for suffix in (".png", ".tif", ".tiff") for dtype in (np.uint8, np.uint16) for channels in (1, 3)],
-    *[(".npy", dtype, channels) for dtype in (np.uint8, np.uint16, np.float32) for channels in (1, 3, 5)],
-    (".exr", np.float32, 1), (".exr", np.float32, 3), (".tif", np.float32, 1),
-])
+@pytest.mark.parametrize(
+    ("suffix", "dtype", "channels"),
+    [
+        *[
+            (suffix, dtype, channels)
+            for suffix in (".png", ".tif", ".tiff")
+            for dtype in (np.uint8, np.uint16)
+            for channels in (1, 3)
+        ],
+        *[(".npy", dtype, channels) for dtype in (np.uint8, np.uint16, np.float32) for channels in (1, 3, 5)],
+        (".exr", np.float32, 1),
+        (".exr", np.float32, 3),
+        (".tif", np.float32, 1),
+    ],
+)
 def test_files_are_read_to_the_last_digit(tmp_path, suffix, channels, dtype):
     rng = np.random.default_rng(3)
     top = 1 if dtype == np.float32 else np.iinfo(dtype).max
@@ -155,7 +183,9 @@ def test_the_step_is_read_off_the_images(folder):
     assert load(folder, 'scene = "bench"\n' + NOISE + FRAME.replace("000.png", "mean.npy")).noise.quantisation == 0.0
 
 
-# -- What is wrong ------------------------------------------------------------------------------------------------------
+# -- What is wrong
+# ------------------------------------------------------------------------------------------------------
+
 
 def frames(extra="", image="frames/000.png", before=""):
     return f'scene = "bench"\n{before}{NOISE}[[frames]]\nimage = "{image}"\n{extra}'
@@ -173,7 +203,10 @@ BAD = {
     "scene file missing": ('scene = "scena.xml"\n' + NOISE + FRAME, "no such file.*did you mean 'scene.xml'"),
     "unknown key": (frames(before='flatfield = "a.png"\n'), "unknown key 'flatfield'; did you mean 'flat_field'"),
     "unknown frame key": (frames('repeat = ["a.png"]\n'), "frame 0: unknown key 'repeat'; did you mean 'repeats'"),
-    "unknown noise key": (noise("dark_noise", "read_noise"), r"\[noise\]: unknown key 'read_noise'; did you mean 'dark_noise'"),
+    "unknown noise key": (
+        noise("dark_noise", "read_noise"),
+        r"\[noise\]: unknown key 'read_noise'; did you mean 'dark_noise'",
+    ),
     "noise keys missing": (noise("dark_noise = 1.5\n", ""), r"dark_noise \(DN, rms\) missing; give all"),
     "negative noise": (noise("1.5", "-1.5"), "dark_noise = -1.5 DN, rms; allowed: >= 0"),
     "negative prnu": (noise("0.003", "-0.003"), "prnu = -0.003 .*allowed: >= 0"),
@@ -187,8 +220,14 @@ BAD = {
     "values_are": (frames(before='values_are = "lux"\n'), "values_are = 'lux'; allowed: DN, radiance"),
     "cfa pattern": (frames(before='cfa = "RGB"\n'), "cfa = 'RGB'; allowed: RGGB"),
     "cfa on colour": (frames(before='cfa = "RGGB"\n', image="frames/rgb.png"), "3 channels; allowed: the raw mosaic"),
-    "parameter NaN": (frames(before='[parameters]\n"camera.x_fov" = nan\n'), r'\[parameters\]: "camera.x_fov" = nan; allowed'),
-    "parameter a list": (frames('[frames.parameters]\n"led.power" = [1.0]\n'), r'frame 0 .*"led.power" = \[1.0\]; allowed'),
+    "parameter NaN": (
+        frames(before='[parameters]\n"camera.x_fov" = nan\n'),
+        r'\[parameters\]: "camera.x_fov" = nan; allowed',
+    ),
+    "parameter a list": (
+        frames('[frames.parameters]\n"led.power" = [1.0]\n'),
+        r'frame 0 .*"led.power" = \[1.0\]; allowed',
+    ),
     "key without quotes": (frames("[frames.parameters]\nled_red.power = 1.0\n"), 'stands in quotes: "led_red.power"'),
     "zero frames": ('scene = "bench"\nframes = []\n', "zero frames; allowed: one"),
     "no frames at all": ('scene = "bench"\n' + NOISE, "zero frames; allowed: one"),
@@ -202,10 +241,16 @@ BAD = {
     "repeats a text": (frames('repeats = "frames/001.png"\n'), "repeats = 'frames/001.png'; allowed: a list"),
     "repeat missing": (frames('repeats = ["frames/9.png"]\n'), "repeats = 'frames/9.png': no such file"),
     "group a number": (frames("group = 3\n"), "group = 3; allowed: text in quotes"),
-    "two sizes": (frames('[[frames]]\nimage = "frames/other_size.png"\n'), r"frame 1 .*\(4, 8, 1\) pixels; allowed: \(6, 8, 1\)"),
+    "two sizes": (
+        frames('[[frames]]\nimage = "frames/other_size.png"\n'),
+        r"frame 1 .*\(4, 8, 1\) pixels; allowed: \(6, 8, 1\)",
+    ),
     "two sizes in repeats": (frames('repeats = ["frames/other_size.png"]\n'), r"frame 0 .*\(4, 8, 1\) pixels; allowed"),
     "two depths": (frames('[[frames]]\nimage = "frames/deep.png"\n'), "different depth.*8 bit.*16 bit"),
-    "flat field of another size": (frames(before='flat_field = "frames/other_size.png"\n'), "flat_field: .*pixels; allowed"),
+    "flat field of another size": (
+        frames(before='flat_field = "frames/other_size.png"\n'),
+        "flat_field: .*pixels; allowed",
+    ),
     "flat field missing": (frames(before='flat_field = "flat.png"\n'), "flat_field = 'flat.png': no such file"),
     "flat field saturated": (frames(before='flat_field = "frames/white.png"\n'), "flat_field: all saturated"),
     "NaN": (frames(image="frames/nan.npy"), "1 values are NaN or infinite, the first in row 2, column 3, channel 0"),
@@ -229,10 +274,16 @@ BAD = {
     "mask of another size": (frames('mask = "frames/other_size.png"\n'), r"mask.*\(4, 8\) pixels; allowed: \(6, 8\)"),
     "mask empty": (frames('mask = "frames/empty.png"\n'), "mask.*empty.*non-zero = use"),
     "mask missing": (frames('mask = "frames/m.png"\n'), "mask = 'frames/m.png': no such file"),
-    "table file missing": (BENCH.replace("malus", "malu"), r"file = 'malu.csv': no such file.*did you mean 'malus.csv'"),
+    "table file missing": (
+        BENCH.replace("malus", "malu"),
+        r"file = 'malu.csv': no such file.*did you mean 'malus.csv'",
+    ),
     "table without values": ('scene = "bench"\n[table]\nfile = "malus.csv"\n', r"values = \[\]; allowed"),
     "table column missing": (BENCH.replace("reading", "readings"), "unknown column 'readings'; did you mean 'reading'"),
-    "rename of no column": (BENCH + 'rename = { "angle" = "a.b" }\n', "unknown column 'angle'; did you mean 'angle .rad.'"),
+    "rename of no column": (
+        BENCH + 'rename = { "angle" = "a.b" }\n',
+        "unknown column 'angle'; did you mean 'angle .rad.'",
+    ),
     "scale of no column": (BENCH + 'scale = { "a.b" = 2.0 }\n', "scale: unknown column 'a.b'"),
     "scale not a number": (BENCH + 'scale = { "angle (rad)" = "2" }\n', "scale: .*= '2'; allowed: a finite number"),
     "column twice": (BENCH + 'rename = { "angle (rad)" = "reading" }\n', "each name once"),
@@ -252,10 +303,16 @@ def test_bad_input_is_refused_in_words(folder, kind):
     assert re.search(expected, message), message
 
 
-@pytest.mark.parametrize(("rows", "expected"), [
-    ("a.b,reading\n0,dark\n", "frame 0: reading = 'dark' is no number"), ("a.b,reading\n0\n", r"1 cells \['0'\]; allowed: 2"),
-    ("a.b,reading\n", "zero frames"), ("a.b,reading\n,3\n", "a.b = '' is no number"), ("a.b;reading\n0;1\n", "separated by .;."),
-])
+@pytest.mark.parametrize(
+    ("rows", "expected"),
+    [
+        ("a.b,reading\n0,dark\n", "frame 0: reading = 'dark' is no number"),
+        ("a.b,reading\n0\n", r"1 cells \['0'\]; allowed: 2"),
+        ("a.b,reading\n", "zero frames"),
+        ("a.b,reading\n,3\n", "a.b = '' is no number"),
+        ("a.b;reading\n0;1\n", "separated by .;."),
+    ],
+)
 def test_bad_rows_are_refused_in_words(folder, rows, expected):
     (folder / "malus.csv").write_text(rows)
     with pytest.raises((BadCapture, UnknownKey), match=expected):
@@ -265,26 +322,38 @@ def test_bad_rows_are_refused_in_words(folder, rows, expected):
 def test_missing_sets_and_other_encodings(tmp_path):
     with pytest.raises(BadCapture, match="no such file; a capture set is a folder"):
         captures.load(tmp_path / "nowhere")
-    (tmp_path / "captures.toml").write_bytes(b"scene = \"\xff\"\n")
+    (tmp_path / "captures.toml").write_bytes(b'scene = "\xff"\n')
     with pytest.raises(BadCapture, match="not valid TOML"):
         captures.load(tmp_path)
 
 
 def test_settings_are_held_against_the_scene(folder):
-    known = {"led_red.power": Parameter("power", "W", 1.0, (0.0, 10.0)), "analyzer.angle": Parameter("angle", "deg", 0.0, (-180, 180)),
-             "indenter.shape": Parameter("shape", "", "ball", choices=("ball", "edge"))}
-    c = load(folder, 'scene = "bench"\n[parameters]\n"indenter.shape" = "edge"\n' + FRAME + '[frames.parameters]\n"analyzer.angle" = 45\n')
+    known = {
+        "led_red.power": Parameter("power", "W", 1.0, (0.0, 10.0)),
+        "analyzer.angle": Parameter("angle", "deg", 0.0, (-180, 180)),
+        "indenter.shape": Parameter("shape", "", "ball", choices=("ball", "edge")),
+    }
+    c = load(
+        folder,
+        'scene = "bench"\n[parameters]\n"indenter.shape" = "edge"\n'
+        + FRAME
+        + '[frames.parameters]\n"analyzer.angle" = 45\n',
+    )
     captures.check(c, known)
-    for settings, error, text in (({"led_red.powr": 1.0}, UnknownKey, "frame 0 .'frames/000.png'.*did you mean 'led_red.power'"),
-                                  ({"analyzer.angle": 450.0}, OutOfBounds, r"frame 0.*analyzer.angle = 450 deg .*\[-180, 180\] deg"),
-                                  ({"led_red.power": "high"}, ValueError, "frame 0.*'high' is not a number in W"),
-                                  ({"indenter.shape": "bal"}, UnknownKey, "frame 0.*did you mean 'ball'")):
+    for settings, error, text in (
+        ({"led_red.powr": 1.0}, UnknownKey, "frame 0 .'frames/000.png'.*did you mean 'led_red.power'"),
+        ({"analyzer.angle": 450.0}, OutOfBounds, r"frame 0.*analyzer.angle = 450 deg .*\[-180, 180\] deg"),
+        ({"led_red.power": "high"}, ValueError, "frame 0.*'high' is not a number in W"),
+        ({"indenter.shape": "bal"}, UnknownKey, "frame 0.*did you mean 'ball'"),
+    ):
         c.frames[0].parameters = settings
         with pytest.raises(error, match=text):
             captures.check(c, known)
 
 
-# -- Using and writing --------------------------------------------------------------------------------------------------
+# -- Using and writing
+# --------------------------------------------------------------------------------------------------
+
 
 def made(folder, shape=(6, 8, 3), bits=8):
     rng = np.random.default_rng(2)
@@ -293,16 +362,36 @@ def made(folder, shape=(6, 8, 3), bits=8):
     def image():
         return rng.integers(9, top, shape).astype(np.float32) + (0.0 if bits else 0.25)
 
-    listed = [captures.Frame(f"press {i}", image(), rng.random(shape[:2]) > 0.3 if i else None, "a" if i else None,
-                             {"led.power": 0.1 * i, "indenter.shape": "ball"}, [image() for _ in range(i)])
-              for i in range(3)]
-    return captures.Captures(folder, "bench", listed, {"camera.x_fov": 1 / 3},
-                             Noise(0.05, 1.5, 8.0, float(top), 0.003, 1.0 if bits else 0.0), image() + 0.5,
-                             "RGGB" if shape[2] == 1 else None)
+    listed = [
+        captures.Frame(
+            f"press {i}",
+            image(),
+            rng.random(shape[:2]) > 0.3 if i else None,
+            "a" if i else None,
+            {"led.power": 0.1 * i, "indenter.shape": "ball"},
+            [image() for _ in range(i)],
+        )
+        for i in range(3)
+    ]
+    return captures.Captures(
+        folder,
+        "bench",
+        listed,
+        {"camera.x_fov": 1 / 3},
+        Noise(0.05, 1.5, 8.0, float(top), 0.003, 1.0 if bits else 0.0),
+        image() + 0.5,
+        "RGGB" if shape[2] == 1 else None,
+    )
 
 
 def assert_same(a, b):
-    assert (a.scene, a.parameters, a.noise, a.cfa, a.values_are) == (b.scene, b.parameters, b.noise, b.cfa, b.values_are)
+    assert (a.scene, a.parameters, a.noise, a.cfa, a.values_are) == (
+        b.scene,
+        b.parameters,
+        b.noise,
+        b.cfa,
+        b.values_are,
+    )
     assert captures.groups(a).keys() == captures.groups(b).keys() and len(a.frames) == len(b.frames)
     np.testing.assert_array_equal(a.flat_field, b.flat_field)
     for f, g in zip(a.frames, b.frames):
@@ -326,7 +415,9 @@ def test_written_sets_come_back(tmp_path, bits, channels):
 
 
 def test_a_written_table_comes_back_in_parameter_units(folder):
-    c = load(folder, BENCH + 'rename = { "angle (rad)" = "analyzer.angle" }\nscale = { "analyzer.angle" = 57.29577951 }\n')
+    c = load(
+        folder, BENCH + 'rename = { "angle (rad)" = "analyzer.angle" }\nscale = { "analyzer.angle" = 57.29577951 }\n'
+    )
     back = captures.load(captures.write(c, folder / "copy"))
     assert [f.parameters for f in back.frames] == [f.parameters for f in c.frames]
     assert [float(f.image[0, 0, 0]) for f in back.frames] == [100.0, 50.5, 1.0]
@@ -359,13 +450,16 @@ def test_nothing_is_overwritten_unasked(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["set"]
 
 
-@pytest.mark.parametrize(("change", "text"), [
-    (lambda c: c.frames[1].image.__setitem__((0, 0, 0), 0.5), "do not fit 8 bit"),
-    (lambda c: c.frames[1].image.__setitem__((0, 0, 0), 256), "do not fit 8 bit"),
-    (lambda c: c.frames[1].image.__setitem__((0, 0, 0), math.nan), "NaN or infinite"),
-    (lambda c: setattr(c.frames[1], "name", "press/2"), "two frames are called 'press_2'"),
-    (lambda c: c.frames.clear(), "zero frames"),
-])
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        (lambda c: c.frames[1].image.__setitem__((0, 0, 0), 0.5), "do not fit 8 bit"),
+        (lambda c: c.frames[1].image.__setitem__((0, 0, 0), 256), "do not fit 8 bit"),
+        (lambda c: c.frames[1].image.__setitem__((0, 0, 0), math.nan), "NaN or infinite"),
+        (lambda c: setattr(c.frames[1], "name", "press/2"), "two frames are called 'press_2'"),
+        (lambda c: c.frames.clear(), "zero frames"),
+    ],
+)
 def test_a_failed_write_leaves_nothing(tmp_path, change, text):
     c = made(tmp_path)
     change(c)

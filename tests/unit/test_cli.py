@@ -13,7 +13,7 @@ from optics import cli
 from optics.captures import capture_set as capture_files
 from optics.captures.noise import Noise
 from optics.files import exr
-from optics.light.output import Pictures
+from optics.light.rendering import RenderJob
 from optics.scene import loader as scene
 from optics.scene.parameter import Values
 
@@ -27,24 +27,35 @@ def measured(tmp_path_factory):
     folder = tmp_path_factory.mktemp("measured")
     loaded = scene.load("gelsight", {"width": "48", "height": "36"})
     noise, rng = Noise(0.05, 1.0, 8.0, 255.0, 0.0), np.random.default_rng(0)
-    pictures = Pictures(loaded, black=8.0)
+    images = RenderJob(loaded, black=8.0)
     frames = []
     for k, (x, y, depth) in enumerate([(-2.0, 1.0, 0.4), (2.0, -1.0, 0.5), (3.0, 2.0, 0.4)]):
         for led in ("led_1", "led_3"):
-            values = {**{f"{n}.power": float(n == led) for n in loaded.leds}, "gel.press_x": x, "gel.press_y": y,
-                      "gel.press_depth": depth}
-            signal = pictures.take({**values, "camera.exposure": 150.0, f"{led}.power": 1.25}).camera
-            frames.append(capture_files.Frame(f"p{k}-{led}", noise.expose(signal, rng).astype(np.float32), group=f"press-{k}",
-                                              parameters=values))
+            values = {
+                **{f"{n}.power": float(n == led) for n in loaded.leds},
+                "gel.press_x": x,
+                "gel.press_y": y,
+                "gel.press_depth": depth,
+            }
+            signal = images.take({**values, "camera.exposure": 150.0, f"{led}.power": 1.25}).camera
+            frames.append(
+                capture_files.Frame(
+                    f"p{k}-{led}", noise.expose(signal, rng).astype(np.float32), group=f"press-{k}", parameters=values
+                )
+            )
     found = capture_files.Captures(Path("."), "gelsight", frames, {"camera.exposure": 150.0}, noise)
     return capture_files.write(found, folder / "set", bits=8)
 
 
-# -- looking around -------------------------------------------------------------------------------------------------------
+# -- looking around
+# -------------------------------------------------------------------------------------------------------
+
 
 def test_help_needs_nothing_heavy():
-    code = ("import sys, optics.cli as c\ntry: c.main(['--help'])\nfinally: print([m for m in sys.argv[1].split() if m in "
-            "sys.modules])")
+    code = (
+        "import sys, optics.cli as c\ntry: c.main(['--help'])\nfinally: print([m for m in sys.argv[1].split() if m in "
+        "sys.modules])"
+    )
     child = subprocess.run([sys.executable, "-c", code, " ".join(HEAVY)], capture_output=True, text=True, timeout=60)
     assert child.stdout.splitlines()[-1] == "[]", child.stdout + child.stderr
 
@@ -80,9 +91,20 @@ def test_params_are_complete(optics):
     assert [line.split()[0] for line in text.splitlines()[1:]] == [r["key"] for r in rows]
     by_key = {r["key"]: r for r in rows}
     assert by_key["membrane.sigma"] == {
-        "key": "membrane.sigma", "value": pytest.approx(0.2), "unit": "rad", "bounds": [0.0, 1.5], "choices": None,
-        "neutral": None, "plausible": 0.1, "differentiable": True, "derivative": "ad", "linear": False, "squared": True,
-        "effect": None, "meaning": "roughness sigma of (S3)"}
+        "key": "membrane.sigma",
+        "value": pytest.approx(0.2),
+        "unit": "rad",
+        "bounds": [0.0, 1.5],
+        "choices": None,
+        "neutral": None,
+        "plausible": 0.1,
+        "differentiable": True,
+        "derivative": "ad",
+        "linear": False,
+        "squared": True,
+        "effect": None,
+        "meaning": "roughness sigma of (S3)",
+    }
     assert by_key["camera.vignetting"]["effect"] == "lens vignetting" and by_key["camera.vignetting"]["neutral"] == 0
     assert by_key["led_1.x"]["bounds"] == [None, None]  # unbounded; JSON has no infinity
     assert by_key["gel.indenter"]["choices"] and not by_key["gel.indenter"]["differentiable"]
@@ -91,13 +113,24 @@ def test_params_are_complete(optics):
 @pytest.mark.parametrize("name", scene.shipped_scenes())
 def test_params_of_every_scene(optics, name):
     code, text, err = optics("params", name)
-    assert (code, err) == (0, "") and text.splitlines()[0].split() == ["key", "value", "unit", "bounds", "neutral", "derivative", "meaning"]
+    assert (code, err) == (0, "") and text.splitlines()[0].split() == [
+        "key",
+        "value",
+        "unit",
+        "bounds",
+        "neutral",
+        "derivative",
+        "meaning",
+    ]
 
 
 def test_params_by_pattern_and_definition(optics):
     _, text, _ = optics("params", "gelsight", "gel.press_d*", "led_?.x", *SIZE, "-D", "depth=0.25")
     lines = text.splitlines()[1:]
-    assert [line.split()[0] for line in lines] == ["gel.press_depth", *(f"led_{i}.x" for i in range(1, 7))]  # as in the file
+    assert [line.split()[0] for line in lines] == [
+        "gel.press_depth",
+        *(f"led_{i}.x" for i in range(1, 7)),
+    ]  # as in the file
     assert lines[0].split()[1:3] == ["0.25", "mm"]
 
 
@@ -118,7 +151,9 @@ def test_parts_have_pages_too(optics):
     for kind, part in found.parts.items():
         code, page, _ = optics("effects", kind.replace("_", "-"))
         assert code == 0 and part.doc.strip() in page and part.file in page
-        assert [line.split()[0] for line in page.splitlines()[-len(part.parameters):]] == [p.name for p in part.parameters]
+        assert [line.split()[0] for line in page.splitlines()[-len(part.parameters) :]] == [
+            p.name for p in part.parameters
+        ]
     record = json.loads(optics("effects", "led", "--json")[1])
     assert record["key"] == "led" and "led-size" in record["effects"] and "cos(a)^mu / d^2" in record["page"]
     assert {p["name"]: p["unit"] for p in record["parameters"]}["x"] == "mm"
@@ -128,8 +163,10 @@ def test_a_users_plugin_is_listed_beside_the_shipped_ones(optics, tmp_path, monk
     from optics.scene import registry as effect
 
     monkeypatch.setattr(effect, "_registry", None)
-    (tmp_path / "rust.py").write_text('"""Rust: reddens."""\nfrom optics.scene.declare import Effect\nfrom optics.parameter import '
-                                      'Parameter\neffect = Effect("rust", "membrane", (Parameter("rust", "1", 0.0, neutral=0.0),))\n')
+    (tmp_path / "rust.py").write_text(
+        '"""Rust: reddens."""\nfrom optics.scene.declare import Effect\nfrom optics.parameter import '
+        'Parameter\neffect = Effect("rust", "membrane", (Parameter("rust", "1", 0.0, neutral=0.0),))\n'
+    )
     code, page, _ = optics("effects", "rust", "--plugins", tmp_path)
     assert code == 0 and "reddens" in page
 
@@ -142,11 +179,17 @@ def test_doctor(optics):
     assert {"ok", "rows"} <= json.loads(optics("doctor", "--json")[1]).keys()
 
 
-# -- arguments and errors -------------------------------------------------------------------------------------------------
+# -- arguments and errors
+# -------------------------------------------------------------------------------------------------
+
 
 def test_priors():
     assert cli.priors(["led_*.x=11+-0.5", "gel.press_*=+-0.05", "a=-1e-3±2", "b=1 +/- .1"]) == {
-        "led_*.x": (11.0, 0.5), "gel.press_*": (None, 0.05), "a": (-1e-3, 2.0), "b": (1.0, 0.1)}
+        "led_*.x": (11.0, 0.5),
+        "gel.press_*": (None, 0.05),
+        "a": (-1e-3, 2.0),
+        "b": (1.0, 0.1),
+    }
 
 
 @pytest.mark.parametrize("text", ["a=1", "a=1+-", "a=1+-0", "a=1+--2", "a", "=1+-1", "a=x+-1", "a=+-nan"])
@@ -169,6 +212,7 @@ def test_a_bug_shows_its_traceback(optics, monkeypatch):
 @pytest.mark.parametrize("inside", [False, True])
 def test_ctrl_c_is_said_in_one_line(optics, monkeypatch, inside):
     """Python's own exception, and Dr.Jit's for a Ctrl-C within a render, which it puts around Python's."""
+
     def stopped():
         try:
             raise KeyboardInterrupt
@@ -183,7 +227,9 @@ def test_ctrl_c_is_said_in_one_line(optics, monkeypatch, inside):
 
 def test_a_reader_that_has_seen_enough_is_no_error():
     run = "import sys; from optics import cli; sys.exit(cli.main(['scenes', '--json']))"
-    with subprocess.Popen([sys.executable, "-c", run], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as child:
+    with subprocess.Popen(
+        [sys.executable, "-c", run], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as child:
         child.stdout.close()
         assert (child.stderr.read(), child.wait(60)) == ("", 0)
 
@@ -195,10 +241,24 @@ def test_quiet_says_nothing_but_results(optics, tmp_path):
 
 # -- render ---------------------------------------------------------------------------------------------------------------
 
-def test_a_picture_of_a_sensor(optics, tmp_path):
+
+def test_a_image_of_a_sensor(optics, tmp_path):
     file = tmp_path / "new" / "a.exr"
-    code, out, _ = optics("render", "digit", "-D", "width=48", "-D", "height=64", "-D", "depth=0.5", "--set", "gel.press_x=1",
-                          "-o", file, "--png")
+    code, out, _ = optics(
+        "render",
+        "digit",
+        "-D",
+        "width=48",
+        "-D",
+        "height=64",
+        "-D",
+        "depth=0.5",
+        "--set",
+        "gel.press_x=1",
+        "-o",
+        file,
+        "--png",
+    )
     assert code == 0 and out.split() == [str(file), str(file.with_suffix(".json")), str(file.with_suffix(".png"))]
     channels, header = exr.read(file)
     bands, spectra = exr.spectral_image(channels)
@@ -219,19 +279,22 @@ def test_a_picture_of_a_sensor(optics, tmp_path):
     assert {**json.loads(file.with_suffix(".json").read_text()), "command": 0} == {**record, "command": 0}
 
     again = scene.load("digit", record["scene"]["defines"])  # the record is enough to make it again
-    picture = Pictures(again).take(record["parameters"], record["seed"])
-    np.testing.assert_allclose(picture.channels["S0.625,000000nm"], channels["S0.625,000000nm"], rtol=1e-5)
+    image = RenderJob(again).take(record["parameters"], record["seed"])
+    np.testing.assert_allclose(image.channels["S0.625,000000nm"], channels["S0.625,000000nm"], rtol=1e-5)
     with Image.open(file.with_suffix(".png")) as opened:
         shown = np.asarray(opened, float)
-    assert np.abs(shown - np.clip(np.round(picture.camera), 0, 255)).max() <= 1  # a DN on the edge of two
+    assert np.abs(shown - np.clip(np.round(image.camera), 0, 255)).max() <= 1  # a DN on the edge of two
 
 
-def test_existing_pictures_are_kept_unless_forced(optics, tmp_path):
+def test_existing_images_are_kept_unless_forced(optics, tmp_path):
     file = tmp_path / "a.exr"
     assert optics("render", "gelsight", *SIZE, "-o", file)[0] == 0
     before = file.read_bytes()
     assert optics("render", "gelsight", *SIZE, "-D", "depth=0.5", "-o", file)[0] == 2 and file.read_bytes() == before
-    assert optics("render", "gelsight", *SIZE, "-D", "depth=0.5", "-o", file, "--force")[0] == 0 and file.read_bytes() != before
+    assert (
+        optics("render", "gelsight", *SIZE, "-D", "depth=0.5", "-o", file, "--force")[0] == 0
+        and file.read_bytes() != before
+    )
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.exr", "a.json"]
 
 
@@ -251,8 +314,12 @@ def test_monte_carlo_agrees_within_its_own_variance(optics, tmp_path):
 
 def test_stokes_channels_where_the_integrator_has_them(optics, tmp_path):
     text = scene.find("gelsight").read_text(encoding="utf-8")
-    (tmp_path / "s.xml").write_text(text.replace('<integrator type="tactile" id="integrator">',
-                                                 '<integrator type="tactile" id="integrator"><boolean name="stokes" value="true"/>'))
+    (tmp_path / "s.xml").write_text(
+        text.replace(
+            '<integrator type="tactile" id="integrator">',
+            '<integrator type="tactile" id="integrator"><boolean name="stokes" value="true"/>',
+        )
+    )
     code, out, err = optics("render", tmp_path / "s.xml", *SIZE, "--spp", "4", "-o", tmp_path / "s.exr", "--json")
     channels, header = exr.read(tmp_path / "s.exr")
     _, stokes = exr.spectral_image(channels)
@@ -279,10 +346,18 @@ def test_any_other_mitsuba_scene(optics, tmp_path, variant):
 
     trimesh.creation.box((2, 2, 0.4)).export(tmp_path / "block.obj")
     trimesh.creation.icosphere(radius=0.7).apply_translation((0, 0, 0.8)).export(tmp_path / "ball.ply")
-    Image.fromarray(np.kron(np.indices((4, 4)).sum(0) % 2, np.ones((4, 4))).astype(np.uint8) * 255).save(tmp_path / "check.png")
+    Image.fromarray(np.kron(np.indices((4, 4)).sum(0) % 2, np.ones((4, 4))).astype(np.uint8) * 255).save(
+        tmp_path / "check.png"
+    )
     (tmp_path / "stock.xml").write_text(STOCK)
-    code, _, err = optics("render", tmp_path / "stock.xml", *(["--variant", variant] if variant else []), "-o",
-                          tmp_path / "stock.exr", "--png")
+    code, _, err = optics(
+        "render",
+        tmp_path / "stock.xml",
+        *(["--variant", variant] if variant else []),
+        "-o",
+        tmp_path / "stock.exr",
+        "--png",
+    )
     channels, header = exr.read(tmp_path / "stock.exr")
     assert code == 0, err
     assert {"R", "G", "B", "variance.R", "depth.Z", "normal.X"} <= channels.keys() and "contact.Y" not in channels
@@ -303,25 +378,43 @@ def test_a_sensor_beside_other_lights_goes_through_mitsuba(optics, tmp_path):
     assert exr.read(tmp_path / "lit.exr")[0]["S0.610,000000nm"].mean() > 0.1  # of a sky of 1
 
 
-# -- models and measurements ----------------------------------------------------------------------------------------------
+# -- models and measurements
+# ----------------------------------------------------------------------------------------------
+
 
 def test_compare(optics, measured, tmp_path):
     code, text, _ = optics("compare", measured, "-o", tmp_path / "cmp")
     assert code == 0 and text.splitlines()[1].split()[1] == str(6 * 48 * 36 * 3)
     record = json.loads((tmp_path / "cmp" / "comparison.json").read_text())
-    assert json.loads(optics("compare", measured, "--json")[1])["rows"][0]["rms"] == pytest.approx(record["rows"][0]["rms"])
+    assert json.loads(optics("compare", measured, "--json")[1])["rows"][0]["rms"] == pytest.approx(
+        record["rows"][0]["rms"]
+    )
     images = sorted((tmp_path / "cmp" / "images").iterdir())
     with Image.open(images[0]) as shown:
         assert len(images) == 6 and shown.size == (3 * 48, 36)
     chi2 = record["rows"][0]["chi2"] / record["rows"][0]["dof"]
-    right = json.loads(optics("compare", measured, "--json", "--set", "led_1.power=1.25", "--set", "led_3.power=1.25")[1])["rows"][0]
+    right = json.loads(
+        optics("compare", measured, "--json", "--set", "led_1.power=1.25", "--set", "led_3.power=1.25")[1]
+    )["rows"][0]
     assert chi2 > 2 and right["chi2"] / right["dof"] == pytest.approx(1, abs=0.03)  # 31104 values: sd 0.008
 
 
 def test_calibrate_writes_a_study_that_compare_can_use(optics, measured, tmp_path):
     study = tmp_path / "study"
-    code, out, err = optics("calibrate", measured, "--free", "led_[13].power", "--per-group", "none", "--prior",
-                            "led_1.power=+-1", "--hold-out", "press-2", "-o", study)
+    code, out, err = optics(
+        "calibrate",
+        measured,
+        "--free",
+        "led_[13].power",
+        "--per-group",
+        "none",
+        "--prior",
+        "led_1.power=+-1",
+        "--hold-out",
+        "press-2",
+        "-o",
+        study,
+    )
     assert code == 0, err
     assert out.splitlines()[-1] == str(study) and "warning: 8 bit" in err
     from optics.study.record import Study
@@ -331,7 +424,9 @@ def test_calibrate_writes_a_study_that_compare_can_use(optics, measured, tmp_pat
         assert abs(found[name]["value"] - 1.25) < 4 * found[name]["sd"] < 0.05
     step = Study.open(study).steps[0]
     assert step["held_out"]["chi2_per_dof"] == pytest.approx(1, abs=0.06)  # 10368 values: sd 0.014
-    rows = json.loads(optics("compare", measured, "--json", "--fit", study / "steps" / "00-base" / "fit.toml")[1])["rows"]
+    rows = json.loads(optics("compare", measured, "--json", "--fit", study / "steps" / "00-base" / "fit.toml")[1])[
+        "rows"
+    ]
     assert rows[0]["chi2"] / rows[0]["dof"] == pytest.approx(1, abs=0.03)
     apart = json.loads(optics("compare", measured, "--json", "--hold-out", "press-2")[1])["rows"]
     assert {"fitted", "held out"} <= {r["scope"].get("role") for r in apart}

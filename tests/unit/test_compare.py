@@ -48,7 +48,8 @@ def test_similarity_is_that_of_scikit_image():
         x, p = y[i] / 255, f[i] / 255
         assert found.row(frame=name).psnr == pytest.approx(peak_signal_noise_ratio(x, p, data_range=1.0), abs=1e-9)
         assert found.row(frame=name).ssim == pytest.approx(
-            structural_similarity(x, p, data_range=1.0, channel_axis=2), abs=1e-9)
+            structural_similarity(x, p, data_range=1.0, channel_axis=2), abs=1e-9
+        )
     values = [found.row(frame=n).ssim for n in "ab"]
     assert found.similarity["ssim"] == pytest.approx((np.mean(values), np.std(values, ddof=1)))
 
@@ -84,8 +85,18 @@ def test_marginals_add_up_and_regions_partition():
     contact[5:12, 5:12] = True
     rim = np.zeros((H, W), bool)
     rim[12:15, 5:12] = True
-    found = compare(y, f, sd, use, [{"contact": contact, "rim": rim}] * 4, parameters=10, held_out=[3],
-                    held_out_parameters=3, groups={"p0": [0, 1], "p1": [2, 3]}, leds=["red", "red", "green", "green"])
+    found = compare(
+        y,
+        f,
+        sd,
+        use,
+        [{"contact": contact, "rim": rim}] * 4,
+        parameters=10,
+        held_out=[3],
+        held_out_parameters=3,
+        groups={"p0": [0, 1], "p1": [2, 3]},
+        leds=["red", "red", "green", "green"],
+    )
     for scope in ("frame", "led", "group", "channel", "role", "region"):
         assert sum(r.chi2 for r in found.by(scope)) == pytest.approx(found.total.chi2)
         assert sum(r.dof for r in found.by(scope)) == pytest.approx(found.total.dof)
@@ -98,7 +109,9 @@ def test_marginals_add_up_and_regions_partition():
 def test_worst_frame_comes_first_and_leds_are_named_by_power():
     y, f, sd, use = frames(3)
     y[1] = y[1] + 5
-    settings = [{"led_red.power": 1.0, "led_green.power": g, "analyzer.angle": a} for g, a in ((0, 10), (0, 20), (0.5, 20))]
+    settings = [
+        {"led_red.power": 1.0, "led_green.power": g, "analyzer.angle": a} for g, a in ((0, 10), (0, 20), (0.5, 20))
+    ]
     found = compare(y, f, sd, use, settings=settings)
     assert found.worst()[0] == 1
     assert found.frames[2]["settings"] == {"analyzer.angle": 20.0}  # one power never varied, the other is only switched
@@ -110,7 +123,7 @@ def test_worst_frame_comes_first_and_leds_are_named_by_power():
 
 def test_curve_finds_the_coordinate_with_its_error():
     y, f, sd, use = frames(2, sd=1.0)
-    radius = np.hypot(*np.mgrid[-H / 2:H / 2, -W / 2:W / 2])
+    radius = np.hypot(*np.mgrid[-H / 2 : H / 2, -W / 2 : W / 2])
     depth = np.where(radius < 8, radius, np.nan)  # NaN: no depth outside the contact
     y = [v + 0.2 * radius[..., None] for v in y]
     found = compare(y, f, sd, use, [{"radius": radius, "depth": depth}] * 2, bins=8)
@@ -154,11 +167,14 @@ def test_text_shows_every_part_in_aligned_columns():
     assert len({len(line) for line in block}) == 1
 
 
-@pytest.mark.parametrize("change, words", [
-    ({"names": ["one"]}, "names has 1 entries for 2"),
-    ({"coordinates": [{"radius": np.zeros((3, 3))}] * 2}, "coordinate 'radius' has shape"),
-    ({"full_scale": 0}, "full_scale = 0 DN"),
-])
+@pytest.mark.parametrize(
+    "change, words",
+    [
+        ({"names": ["one"]}, "names has 1 entries for 2"),
+        ({"coordinates": [{"radius": np.zeros((3, 3))}] * 2}, "coordinate 'radius' has shape"),
+        ({"full_scale": 0}, "full_scale = 0 DN"),
+    ],
+)
 def test_what_disagrees_is_refused(change, words):
     with pytest.raises(ValueError, match=words):
         compare(*frames(2), **change)

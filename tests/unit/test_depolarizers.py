@@ -21,16 +21,23 @@ def bench_with(tmp_path, bsdf):
     return path
 
 
-@pytest.mark.parametrize("bsdf, name", [
-    ('<bsdf type="thindielectric"/>', "ThinDielectric"), ('<bsdf type="principled"/>', "Principled"),
-    ('<bsdf type="twosided"><bsdf type="roughplastic"/></bsdf>', "RoughPlastic"),
-    ('<bsdf type="mask"><bsdf type="roughdielectric"/></bsdf>', "RoughDielectric")])
+@pytest.mark.parametrize(
+    "bsdf, name",
+    [
+        ('<bsdf type="thindielectric"/>', "ThinDielectric"),
+        ('<bsdf type="principled"/>', "Principled"),
+        ('<bsdf type="twosided"><bsdf type="roughplastic"/></bsdf>', "RoughPlastic"),
+        ('<bsdf type="mask"><bsdf type="roughdielectric"/></bsdf>', "RoughDielectric"),
+    ],
+)
 def test_a_depolarizing_material_is_named(bsdf, name, tmp_path):
     with pytest.warns(UserWarning, match=f"'{name}' of the shape 'extra' takes all polarization"):
         scenes.load(bench_with(tmp_path, bsdf))
 
 
-@pytest.mark.parametrize("bsdf", ['<bsdf type="dielectric"/>', '<bsdf type="rough_interface" id="pane"/>', '<bsdf type="diffuse"/>'])
+@pytest.mark.parametrize(
+    "bsdf", ['<bsdf type="dielectric"/>', '<bsdf type="rough_interface" id="pane"/>', '<bsdf type="diffuse"/>']
+)
 def test_what_keeps_polarization_or_is_opaque_is_not(bsdf, tmp_path):
     with warnings.catch_warnings():
         warnings.simplefilter("error")

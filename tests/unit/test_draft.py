@@ -1,4 +1,5 @@
-"""Fingerprints by family, and effects drafted from curves: the right family is named, a draft carries its curve, errors name what can be done."""
+"""Fingerprints by family, and effects drafted from curves: the right family is named, a draft carries its curve, errors
+name what can be done."""
 
 import base64
 import io
@@ -34,7 +35,7 @@ from optics.scene.registry import Registry, declared
 from optics.study import draft
 
 sys.path.insert(0, str(Path(__file__).parent))
-from mock_model import MockModel, mock_fit, simulate  # noqa: E402
+from mock_model import MockModel, mock_fit, simulate
 
 FITTED = (0, 1, 2, 3)
 DRIFT = [0.02, -0.04, 0.03, 0.0]
@@ -47,20 +48,33 @@ def case(name, strength):
     start = simulate(model, np.random.default_rng(3), {name: DRIFT if name == "red_drift" else strength})
     fit = mock_fit(model, model.base_variables(FITTED), start, FITTED)
     evidence = measure(model, fit.values, fit.variables, [], FITTED, 400_000, 0, lambda *a: None)
-    return model, fit, evidence, fingerprints(model, evidence, places(model, fit.values, evidence), 1.0, lambda *a: None)
+    return (
+        model,
+        fit,
+        evidence,
+        fingerprints(model, evidence, places(model, fit.values, evidence), 1.0, lambda *a: None),
+    )
 
 
-@pytest.mark.parametrize("name, strength, family, coordinates", [
-    ("stain", 0.06, "camera", {"place", "row", "column", "radius"}), ("banding", 0.03, "camera", {"row"}),
-    ("height_gain", 0.05, "geometry", {"height", "contact_distance", "contact"}),
-    ("slope_gain", 0.4, "geometry", {"slope", "contact_distance", "contact"}), ("red_drift", 0.0, "time", {"frame"})])
+@pytest.mark.parametrize(
+    "name, strength, family, coordinates",
+    [
+        ("stain", 0.06, "camera", {"place", "row", "column", "radius"}),
+        ("banding", 0.03, "camera", {"row"}),
+        ("height_gain", 0.05, "geometry", {"height", "contact_distance", "contact"}),
+        ("slope_gain", 0.4, "geometry", {"slope", "contact_distance", "contact"}),
+        ("red_drift", 0.0, "time", {"frame"}),
+    ],
+)
 def test_an_unknown_effect_is_put_into_its_family(name, strength, family, coordinates):
     found = case(name, strength)[3]
     first = families(found)[0]
     assert first.family == family and first.coordinate in coordinates
     assert "of the excess misfit a curve along it explains" in goes_with(families(found))
     assert first.of_best == 1 and all(f.of_best <= 1 / 0.8 for f in families(found))
-    assert goes_with(families(found)).startswith(f"It goes with {'the ' if family == 'camera' else ''}{family} ({first.coordinate}")
+    assert goes_with(families(found)).startswith(
+        f"It goes with {'the ' if family == 'camera' else ''}{family} ({first.coordinate}"
+    )
 
 
 def test_the_numbers_of_a_curve_are_of_all_values_where_it_was_found_in_some():
@@ -68,7 +82,11 @@ def test_the_numbers_of_a_curve_are_of_all_values_where_it_was_found_in_some():
     whole = next(f for f in found if f.coordinate == "row")
     some = measure(model, fit.values, fit.variables, [], FITTED, 2 * evidence.normal.count // 5, 0, lambda *a: None)
     assert some.thinning == 3
-    row = next(f for f in fingerprints(model, some, places(model, fit.values, some), 50.0, lambda *a: None) if f.coordinate == "row")
+    row = next(
+        f
+        for f in fingerprints(model, some, places(model, fit.values, some), 50.0, lambda *a: None)
+        if f.coordinate == "row"
+    )
     # chi2 of a third of the values falls by net/3 with a variance of about 4 net/3 + 2 dof; 3 sd, tripled
     assert abs(row.net - whole.net) < 9 * np.sqrt(4 * whole.net / 3 + 2 * whole.dof)
     assert row.net == pytest.approx(3 * (row.fall - row.dof)) and row.ratio == pytest.approx(row.net / 50)
@@ -77,8 +95,9 @@ def test_the_numbers_of_a_curve_are_of_all_values_where_it_was_found_in_some():
 
 
 @pytest.mark.parametrize("pattern", ["scratch", "none", "banding"])
-def test_a_pattern_fixed_in_the_picture_is_told_from_a_curve(pattern):
-    """A scratch of one pixel's width across the picture, dark by 10 % in every frame: no curve along a coordinate is it."""
+def test_a_pattern_fixed_in_the_image_is_told_from_a_curve(pattern):
+    """A scratch of one pixel's width across the image, dark by 10 % in every frame: no curve along a coordinate is
+    it."""
     model = MockModel(len(FITTED), 24)
     start = simulate(model, np.random.default_rng(3), {"banding": 0.03} if pattern == "banding" else None)
     if pattern == "scratch":
@@ -92,14 +111,19 @@ def test_a_pattern_fixed_in_the_picture_is_told_from_a_curve(pattern):
     assert bool(fixed_text(share, best)) == (pattern == "scratch")
     if pattern == "scratch":
         assert share > 0.8
-    few, swept = replace(evidence, blocks=evidence.blocks[:2]), replace(evidence, spectrum=Sweeps())  # a table has no picture
+    few, swept = (
+        replace(evidence, blocks=evidence.blocks[:2]),
+        replace(evidence, spectrum=Sweeps()),
+    )  # a table has no image
     assert all(np.isnan(fixed_pattern(model, *given)) for given in ((few, excess), (swept, excess), (evidence, 0.0)))
 
 
 def test_in_noise_no_curve_stands_out_and_none_has_a_share():
     found = case("banding", 0.0)[3]
     assert min(f.p for f in found) * len(found) > 0.01 and all(np.isnan(f.share) for f in found)
-    assert "how much a curve along it explains of what the best curve does" in goes_with([Family("camera", "row", 9.0, np.nan, 1.0)])
+    assert "how much a curve along it explains of what the best curve does" in goes_with(
+        [Family("camera", "row", 9.0, np.nan, 1.0)]
+    )
 
 
 def test_directions_that_calibration_absorbs_are_not_drawn():
@@ -108,13 +132,18 @@ def test_directions_that_calibration_absorbs_are_not_drawn():
     channel, frame = (next(f for f in found if f.coordinate == name) for name in ("channel", "frame"))
     assert channel.kind == frame.kind == "offset" and not any(channel.curve)
     values = evidence.normal.count / len(FITTED)
-    assert max(frame.sd) < 2 * np.median(evidence.sigma) / np.sqrt(values)  # of a mean of noise; ten times that with the level
+    assert max(frame.sd) < 2 * np.median(evidence.sigma) / np.sqrt(
+        values
+    )  # of a mean of noise; ten times that with the level
 
 
 def test_places_know_texture_and_settings():
     model, fit, evidence, _ = case("banding", 0.03)
     turned = copy(model)
-    turned.frames = [replace(f, parameters={**f.parameters, "room.heat": 10.0 * i, "led0.power": i}) for i, f in enumerate(model.frames)]
+    turned.frames = [
+        replace(f, parameters={**f.parameters, "room.heat": 10.0 * i, "led0.power": i})
+        for i, f in enumerate(model.frames)
+    ]
     found = places(turned, fit.values, evidence)
     assert [set(p["room.heat"]) for p in found] == [{0.0}, {10.0}, {20.0}, {30.0}] and "led0.power" not in found[0]
     prediction = turned.predict(fit.values, [FITTED[0]])[0]
@@ -128,8 +157,14 @@ def test_a_map_or_a_number_per_frame_comes_first_only_where_no_curve_is_nearly_a
     def curve(name, net):
         return Fingerprint(name, net, 4, 0.0, net, 2.0, "gain", [], [], [], [], family_of(name))
 
-    assert [f.coordinate for f in families([curve("place", 100.0), curve("row", 90.0), curve("frame", 95.0)])] == ["row", "frame"]
-    assert [f.coordinate for f in families([curve("place", 100.0), curve("row", 70.0), curve("frame", 95.0)])] == ["place", "frame"]
+    assert [f.coordinate for f in families([curve("place", 100.0), curve("row", 90.0), curve("frame", 95.0)])] == [
+        "row",
+        "frame",
+    ]
+    assert [f.coordinate for f in families([curve("place", 100.0), curve("row", 70.0), curve("frame", 95.0)])] == [
+        "place",
+        "frame",
+    ]
     one = Family("camera", "row", 100.0, 0.9, 1.0)
     assert " or " not in goes_with([one, Family("time", "frame", 95.0, 0.85, 0.95)])
 
@@ -137,7 +172,9 @@ def test_a_map_or_a_number_per_frame_comes_first_only_where_no_curve_is_nearly_a
 def test_what_curve_effect_and_neither_explain_adds_up():
     found = case("banding", 0.03)[3]
     row = next(f for f in found if f.coordinate == "row")
-    assert "along 'row', explains 100%; 0% neither" in unexplained([replace(row, net=2000.0)], 100.0, 1000.0)  # chance makes it more
+    assert "along 'row', explains 100%; 0% neither" in unexplained(
+        [replace(row, net=2000.0)], 100.0, 1000.0
+    )  # chance makes it more
     assert 0.5 < row.share < 1.1 and row.unit == "px"
     assert "best effect explains 10%, so 90% is unexplained" in unexplained([replace(row, net=900.0)], 100.0, 1000.0)
     assert "along 'row', explains 90%; 10% neither" in unexplained([replace(row, net=900.0)], 100.0, 1000.0)
@@ -152,9 +189,17 @@ def test_families_that_explain_alike_are_not_told_apart():
 
 
 def test_a_setting_has_the_family_of_its_part():
-    assert [family_of(*a) for a in (("camera.exposure", "camera"), ("source.time", "source"), ("analyzer.angle", "polarizer_film"),
-                                    ("led_3.distance", "led"), ("skin.press_depth", "gel"), ("object.distance", "target"))] == [
-        "camera", "time", "setting", "light", "geometry", "geometry"]
+    assert [
+        family_of(*a)
+        for a in (
+            ("camera.exposure", "camera"),
+            ("source.time", "source"),
+            ("analyzer.angle", "polarizer_film"),
+            ("led_3.distance", "led"),
+            ("skin.press_depth", "gel"),
+            ("object.distance", "target"),
+        )
+    ] == ["camera", "time", "setting", "light", "geometry", "geometry"]
 
 
 @pytest.mark.parametrize("name, count", [("place", 16), ("channel", 3), ("frame", len(FITTED))])
@@ -170,15 +215,28 @@ def test_a_named_bin_without_data_keeps_its_number(name, count):
 
 
 def lit_point(powers):
-    """A camera at the origin that looks along z at one point 2 mm off its axis; two lamps that point along z. No Mitsuba."""
-    hits = SimpleNamespace(position=np.array([[[2.0, 0.0, 4.0]]]), normal=np.array([[[0.0, 0.0, -1.0]]]), origin=np.zeros(3),
-                           valid=np.ones((1, 1), bool), shape=(1, 1))
+    """A camera at the origin that looks along z at one point 2 mm off its axis; two lamps that point along z. No
+    Mitsuba."""
+    hits = SimpleNamespace(
+        position=np.array([[[2.0, 0.0, 4.0]]]),
+        normal=np.array([[[0.0, 0.0, -1.0]]]),
+        origin=np.zeros(3),
+        valid=np.ones((1, 1), bool),
+        shape=(1, 1),
+    )
     axes = tuple(tuple(np.array([float(i == j)]) for j in range(3)) for i in range(3))
-    now = {f"{led}.{n}": 0.0 for led in ("near", "above") for n in ("x", "y", "pan", "tilt")} | {"near.z": 2.0, "above.z": 0.0, "above.x": 2.0}
+    now = {f"{led}.{n}": 0.0 for led in ("near", "above") for n in ("x", "y", "pan", "tilt")} | {
+        "near.z": 2.0,
+        "above.z": 0.0,
+        "above.x": 2.0,
+    }
     return SimpleNamespace(
-        renderer=SimpleNamespace(hits=lambda now: hits, image=lambda now, led: np.ones((1, 1, 3))), at=lambda values, frame: now,
-        captures=SimpleNamespace(table=None), lit=lambda now: powers,
-        scene=SimpleNamespace(gel=None, leds={led: SimpleNamespace(frame=axes) for led in ("near", "above")}))
+        renderer=SimpleNamespace(hits=lambda now: hits, image=lambda now, led: np.ones((1, 1, 3))),
+        at=lambda values, frame: now,
+        captures=SimpleNamespace(table=None),
+        lit=lambda now: powers,
+        scene=SimpleNamespace(gel=None, leds={led: SimpleNamespace(frame=axes) for led in ("near", "above")}),
+    )
 
 
 def test_how_the_brightest_led_stands_to_a_point_and_that_no_frame_loses_a_coordinate():
@@ -195,7 +253,9 @@ def test_how_the_brightest_led_stands_to_a_point_and_that_no_frame_loses_a_coord
 
 def diagnosis(*found, named=None):
     """As much of a diagnosis as a draft reads."""
-    return SimpleNamespace(fingerprints=list(found), families=[named] if named else [], basis=SimpleNamespace(signal=50.0))
+    return SimpleNamespace(
+        fingerprints=list(found), families=[named] if named else [], basis=SimpleNamespace(signal=50.0)
+    )
 
 
 def load(text, folder, name):
@@ -210,13 +270,17 @@ def test_a_draft_carries_its_curve_and_lowers_chi2_by_it(tmp_path):
     model, fit, evidence, found = case("banding", 0.03)
     row = next(f for f in found if f.coordinate == "row")
     assert row.kind == "gain"
-    text = draft.draft_effect(diagnosis(*found), "row", name="bands", black_level=model.noise.black_level, saturation=model.noise.saturation)
+    text = draft.draft_effect(
+        diagnosis(*found), "row", name="bands", black_level=model.noise.black_level, saturation=model.noise.saturation
+    )
     act = load(text, tmp_path, "bands").stages["lens"]
     side, black = model.shape[0], model.noise.black_level
     v, u = np.mgrid[:side, :side] + 0.5
     camera = SimpleNamespace(v=v, u=u, bands=1.0)
     flat = act(np.ones((side, side, 3)), camera)
-    assert flat[:, 0, 0] - 1 == pytest.approx(row.curve, abs=2e-4 * np.abs(row.curve).max())  # a bin per row, written with 4 digits
+    assert flat[:, 0, 0] - 1 == pytest.approx(
+        row.curve, abs=2e-4 * np.abs(row.curve).max()
+    )  # a bin per row, written with 4 digits
     assert (act(np.ones((side, side, 3)), SimpleNamespace(v=v, u=u, bands=0.0)) == 1).all()
     before = after = 0.0
     for frame, sigma, use in zip(evidence.frames, evidence.sigma, evidence.use):
@@ -233,12 +297,19 @@ def test_the_best_coordinate_is_drafted_unless_one_is_named(tmp_path):
     named = Family("geometry", "height", height.net, height.share, 1.0)
     text = draft.draft_effect(diagnosis(*found, named=named), name="falls off", black_level=64.0, saturation=1023.0)
     effect = load(text, tmp_path, "falls off")
-    assert (effect.part, list(effect.stages), effect.acts, effect.name) == ("gel", ["segment"], ("height",), "falls off")
+    assert (effect.part, list(effect.stages), effect.acts, effect.name) == (
+        "gel",
+        ["segment"],
+        ("height",),
+        "falls off",
+    )
     assert "lowered chi2" in effect.doc
 
 
 def test_an_offset_becomes_what_its_stage_can_do(tmp_path):
-    curve = Fingerprint("row", 100.0, 4, 0.0, 96.0, 2.0, "offset", [0.0, 10.0, 20.0], [1.0, -2.0, 1.0], [0.1] * 3, [], "camera")
+    curve = Fingerprint(
+        "row", 100.0, 4, 0.0, 96.0, 2.0, "offset", [0.0, 10.0, 20.0], [1.0, -2.0, 1.0], [0.1] * 3, [], "camera"
+    )
     options = dict(black_level=5.0, saturation=205.0)
     effect = load(draft.draft_effect(diagnosis(curve), "row", name="amp glow", **options), tmp_path, "amp glow")
     v, u = np.mgrid[:30, :2] + 0.5
@@ -248,41 +319,74 @@ def test_an_offset_becomes_what_its_stage_can_do(tmp_path):
     channel = replace(curve, coordinate="channel", centres=[0.0, 1.0, 2.0])
     tint = load(draft.draft_effect(diagnosis(channel), name="tint", **options), tmp_path, "tint").stages["sensor"]
     assert tint(np.zeros((2, 2, 3)), SimpleNamespace(tint=1.0))[1, 1] * 200 == pytest.approx([1.0, -2.0, 1.0])
-    text = draft.draft_effect(diagnosis(replace(curve, coordinate="height", family="geometry")), "height", name="step", **options)
+    text = draft.draft_effect(
+        diagnosis(replace(curve, coordinate="height", family="geometry")), "height", name="step", **options
+    )
     assert "relative to the mean signal of 50 DN" in text and "0.02, -0.04, 0.02" in text
 
 
 def test_signal_and_cells_are_read_where_they_are(tmp_path):
     options = dict(black_level=5.0, saturation=205.0)
-    curve = Fingerprint("signal", 100.0, 4, 0.0, 96.0, 2.0, "gain", [5.0, 105.0, 205.0], [0.0, 0.1, 0.0], [0.01] * 3, [], "camera")
-    bend = load(draft.draft_effect(diagnosis(curve), "signal", name="bend", **options), tmp_path, "bend").stages["response"]
+    curve = Fingerprint(
+        "signal", 100.0, 4, 0.0, 96.0, 2.0, "gain", [5.0, 105.0, 205.0], [0.0, 0.1, 0.0], [0.01] * 3, [], "camera"
+    )
+    bend = load(draft.draft_effect(diagnosis(curve), "signal", name="bend", **options), tmp_path, "bend").stages[
+        "response"
+    ]
     image = np.array([0.0, 0.25, 0.5, 0.9])
     assert bend(image, SimpleNamespace(bend=1.0)) == pytest.approx(image * (1 + np.array([0.0, 0.05, 0.1, 0.02])))
     slope = bend(image + 1e-30j, SimpleNamespace(bend=1.0)).imag / 1e-30
     step = (bend(image + 1e-6, SimpleNamespace(bend=1.0)) - bend(image - 1e-6, SimpleNamespace(bend=1.0))) / 2e-6
     assert slope[[1, 3]] == pytest.approx(step[[1, 3]], rel=1e-6)  # 0 and 0.5 are corners of the polygon
-    cells = replace(curve, coordinate="place", centres=list(range(16)), curve=[0.01 * k for k in range(16)], sd=[0.001] * 16)
-    stain = load(draft.draft_effect(diagnosis(cells), "place", name="stain", **options), tmp_path, "stain").stages["lens"]
+    cells = replace(
+        curve, coordinate="place", centres=list(range(16)), curve=[0.01 * k for k in range(16)], sd=[0.001] * 16
+    )
+    stain = load(draft.draft_effect(diagnosis(cells), "place", name="stain", **options), tmp_path, "stain").stages[
+        "lens"
+    ]
     v, u = np.mgrid[:10, :14] + 0.5  # sides that four does not divide, as `places` cuts them
     out = stain(np.ones((10, 14, 3)), SimpleNamespace(v=v, u=u, width=14, height=10, stain=1.0))
     row, column = np.mgrid[:10, :14]
     assert out[..., 0] == pytest.approx(1 + 0.01 * (row * 4 // 10 * 4 + column * 4 // 14))
 
 
-@pytest.mark.parametrize("x", [2.0, np.array([1.0, 2.0, 9.0]).reshape(3, 1, 1)])  # set in a frame; swept from reading to reading
+@pytest.mark.parametrize(
+    "x", [2.0, np.array([1.0, 2.0, 9.0]).reshape(3, 1, 1)]
+)  # set in a frame; swept from reading to reading
 def test_a_setting_of_any_part_is_drafted_whatever_the_scene_calls_it(x, tmp_path):
     curve = Fingerprint("eye.gain", 100.0, 4, 0.0, 96.0, 2.0, "gain", [1.0, 3.0], [0.0, 0.2], [0.01] * 2, [], "camera")
-    found = diagnosis(curve, replace(curve, coordinate="lamp.time", family="time"), replace(curve, coordinate="led_1.distance", family="geometry"))
+    found = diagnosis(
+        curve,
+        replace(curve, coordinate="lamp.time", family="time"),
+        replace(curve, coordinate="led_1.distance", family="geometry"),
+    )
     assert draft.drafted(found) == ["eye.gain", "lamp.time"]
     for along in draft.drafted(found):
-        act = load(draft.draft_effect(found, along, name="step", black_level=0.0, saturation=1.0), tmp_path / along, "step").stages["sensor"]
+        act = load(
+            draft.draft_effect(found, along, name="step", black_level=0.0, saturation=1.0), tmp_path / along, "step"
+        ).stages["sensor"]
         image = act(np.ones((3, 2, 3)), SimpleNamespace(settings={along: x}, step=1.0))
-        assert image == pytest.approx(np.broadcast_to(1.1 if np.ndim(x) == 0 else np.array([1.0, 1.1, 1.2]).reshape(3, 1, 1), (3, 2, 3)))
+        assert image == pytest.approx(
+            np.broadcast_to(1.1 if np.ndim(x) == 0 else np.array([1.0, 1.1, 1.2]).reshape(3, 1, 1), (3, 2, 3))
+        )
 
 
 def test_a_table_has_each_place_once_and_a_strength_that_is_plausible():
     options, nan = dict(name="x", black_level=0.0, saturation=1.0), np.nan
-    curve = Fingerprint("incidence", 9.0, 4, 0.0, 8.0, 2.0, "gain", [30.0, 10.0, nan, 10.0], [0.5, -2.0, 7.0, 8.0], [0.01] * 4, [], "light")
+    curve = Fingerprint(
+        "incidence",
+        9.0,
+        4,
+        0.0,
+        8.0,
+        2.0,
+        "gain",
+        [30.0, 10.0, nan, 10.0],
+        [0.5, -2.0, 7.0, 8.0],
+        [0.01] * 4,
+        [],
+        "light",
+    )
     text = draft.draft_effect(diagnosis(curve), **options)
     assert "AT = [\n    10, 30,\n]" in text and "    -2, 0.5,\n]" in text
     assert "plausible=0.25," in text  # half of the light at most
@@ -308,20 +412,27 @@ def test_lookup_of_dr_jit_is_that_of_numpy_and_so_is_its_slope(mitsuba):
 
 def test_lookup():
     at, values = [0.0, 1.0, 3.0], [1.0, 2.0, -2.0]
-    assert lookup(np.array([-5.0, 0.0, 0.5, 1.0, 2.0, 3.0, 9.0]), at, values) == pytest.approx([1.0, 1.0, 1.5, 2.0, 0.0, -2.0, -2.0])
-    assert np.imag(lookup(np.array([-5.0, 0.5, 2.0, 9.0]) + 1e-30j, at, values)) / 1e-30 == pytest.approx([0.0, 1.0, -2.0, 0.0])
+    assert lookup(np.array([-5.0, 0.0, 0.5, 1.0, 2.0, 3.0, 9.0]), at, values) == pytest.approx(
+        [1.0, 1.0, 1.5, 2.0, 0.0, -2.0, -2.0]
+    )
+    assert np.imag(lookup(np.array([-5.0, 0.5, 2.0, 9.0]) + 1e-30j, at, values)) / 1e-30 == pytest.approx(
+        [0.0, 1.0, -2.0, 0.0]
+    )
     assert np.isnan(lookup(np.nan, at, values))
     for wrong in ([0.0, 0.0, 1.0], [0.0, 1.0]):
         with pytest.raises(ValueError, match="places rising"):
             lookup(0.5, wrong, values)
 
 
-# -- what cannot be -----------------------------------------------------------------------------------------------------
+# -- what cannot be
+# -----------------------------------------------------------------------------------------------------
 
 
 def test_what_no_draft_can_carry_is_said_with_what_can():
-    known = [Fingerprint(c, 9.0, 1, 0.0, 8.0, 2.0, "gain", [0.0, 1.0], [0.0, 0.1], [0.01] * 2, [], "camera")
-             for c in ("laplacian", "row", "contact_distance")]
+    known = [
+        Fingerprint(c, 9.0, 1, 0.0, 8.0, 2.0, "gain", [0.0, 1.0], [0.0, 0.1], [0.01] * 2, [], "camera")
+        for c in ("laplacian", "row", "contact_distance")
+    ]
     options = dict(name="x", black_level=0.0, saturation=1.0)
     with pytest.raises(ValueError, match="no draft along 'laplacian': .* mixes pixels.*; a draft can follow row"):
         draft.draft_effect(diagnosis(*known), "laplacian", **options)
@@ -336,21 +447,50 @@ def test_what_no_draft_can_carry_is_said_with_what_can():
 @pytest.fixture
 def study(tmp_path):
     """The record of a study with a diagnosis, as much of it as a draft reads."""
-    known = [Fingerprint(c, 9.0, 1, 0.0, 8.0, 2.0, "gain", [0.0, 1.0], [0.0, 0.1], [0.01] * 2, [], "camera") for c in ("row", "height")]
-    record = {"format": 1, "scene": "gelsight", "noise": {"black_level": 8.0, "saturation": 255.0}, "inputs": {}, "shown": [],
-              "facts": {"setup": {"captures": str(tmp_path / "captures"), "plugins": None}},
-              "steps": []}
-    told = {"word": "UNKNOWN", "sentence": "", "conditions": [], "rows": [], "ambiguous": [], "compared": [], "gaps": [], "correct": [],
-            "splits": [], "levels": [], "shifts": [], "hints": [], "not_tested": {}, "warnings": [],
-            "basis": {f.name: [] if f.name.startswith("frame_") else 0 for f in fields(Basis)},
-            # as written before coordinates had families
-            "fingerprints": [{k: getattr(f, k) for k in ("coordinate", "fall", "dof", "p", "net", "ratio", "kind", "centres", "curve", "sd",
-                                                         "labels")} for f in known]}
+    known = [
+        Fingerprint(c, 9.0, 1, 0.0, 8.0, 2.0, "gain", [0.0, 1.0], [0.0, 0.1], [0.01] * 2, [], "camera")
+        for c in ("row", "height")
+    ]
+    record = {
+        "format": 1,
+        "scene": "gelsight",
+        "noise": {"black_level": 8.0, "saturation": 255.0},
+        "inputs": {},
+        "shown": [],
+        "facts": {"setup": {"captures": str(tmp_path / "captures"), "plugins": None}},
+        "steps": [],
+    }
+    told = {
+        "word": "UNKNOWN",
+        "sentence": "",
+        "conditions": [],
+        "rows": [],
+        "ambiguous": [],
+        "compared": [],
+        "gaps": [],
+        "correct": [],
+        "splits": [],
+        "levels": [],
+        "shifts": [],
+        "hints": [],
+        "not_tested": {},
+        "warnings": [],
+        "basis": {f.name: [] if f.name.startswith("frame_") else 0 for f in fields(Basis)},
+        # as written before coordinates had families
+        "fingerprints": [
+            {
+                k: getattr(f, k)
+                for k in ("coordinate", "fall", "dof", "p", "net", "ratio", "kind", "centres", "curve", "sd", "labels")
+            }
+            for f in known
+        ],
+    }
     folder = tmp_path / "study"
     (folder / "steps" / "00-base").mkdir(parents=True)
     (folder / "ladder.json").write_text(json.dumps(record))
-    (folder / "steps" / "00-base" / "step.json").write_text(json.dumps(
-        {"index": 0, "name": "base", "folder": "00-base", "effect": None, "frames": [], "fingerprints": []}))
+    (folder / "steps" / "00-base" / "step.json").write_text(
+        json.dumps({"index": 0, "name": "base", "folder": "00-base", "effect": None, "frames": [], "fingerprints": []})
+    )
     (folder / "steps" / "00-base" / "diagnosis.json").write_text(json.dumps(told))
     return folder
 
@@ -385,9 +525,13 @@ def test_a_draft_is_of_the_last_diagnosis_and_goes_where_the_study_looks(study, 
     base = study / "steps" / "00-base"
     later = base.with_name("01-more")
     later.mkdir()
-    (later / "step.json").write_text(json.dumps({**json.loads((base / "step.json").read_text()), "index": 1, "name": "more", "folder": later.name}))
+    (later / "step.json").write_text(
+        json.dumps({**json.loads((base / "step.json").read_text()), "index": 1, "name": "more", "folder": later.name})
+    )
     told = json.loads((base / "diagnosis.json").read_text())
-    (later / "diagnosis.json").write_text(json.dumps({**told, "fingerprints": [{**told["fingerprints"][0], "coordinate": "column"}]}))
+    (later / "diagnosis.json").write_text(
+        json.dumps({**told, "fingerprints": [{**told["fingerprints"][0], "coordinate": "column"}]})
+    )
     code, said, _ = optics("effects", "new", "stripes", "--from", study)
     assert code == 0 and Path(said.strip()) == study.parent / "own" / "stripes.py"
     assert "along 'column'" in Path(said.strip()).read_text() and "step 'more'" in Path(said.strip()).read_text()
@@ -400,16 +544,29 @@ def test_effects_new_writes_a_stub(tmp_path, own_registry, optics):
     assert code == 0 and "emission" in page
 
 
-@pytest.mark.parametrize("words, error", [
-    (("new",), "no name"), (("new", "2 fast"), "the first a letter"), (("new", "new"), "not 'new'"), (("new", "class"), "not a word of Python"),
-    (("new", "lens vignetting"), "exists already"), (("new", "gain"), "has a parameter 'gain'"), (("new", "tan"), "means something else"), (("new", "number", "--part", "gel"), "choose another"),
-    (("new", "a", "-o", "file"), "is a file and no folder"), (("new", "a", "--stage", "layer"), "copy a file"),
-    (("new", "a", "--stage", "lense"), "did you mean 'lens'"), (("new", "a", "--part", "sheet"), "unknown part"),
-    (("new", "a", "--part", "gel", "--stage", "lens"), "belongs to the part 'camera'"), (("new", "a", "--along", "row"), "Add --from STUDY"),
-    (("vignetting", "--stage", "lens"), "only with `optics effects new NAME`"), (("halo", "bright"), "only with"),
-    (("new", "a", "--from", "STUDY", "--along", "rows"), "did you mean 'row'"),
-    (("new", "a", "--from", "STUDY", "--stage", "lens"), "leave them out"),
-])
+@pytest.mark.parametrize(
+    "words, error",
+    [
+        (("new",), "no name"),
+        (("new", "2 fast"), "the first a letter"),
+        (("new", "new"), "not 'new'"),
+        (("new", "class"), "not a word of Python"),
+        (("new", "lens vignetting"), "exists already"),
+        (("new", "gain"), "has a parameter 'gain'"),
+        (("new", "tan"), "means something else"),
+        (("new", "number", "--part", "gel"), "choose another"),
+        (("new", "a", "-o", "file"), "is a file and no folder"),
+        (("new", "a", "--stage", "layer"), "copy a file"),
+        (("new", "a", "--stage", "lense"), "did you mean 'lens'"),
+        (("new", "a", "--part", "sheet"), "unknown part"),
+        (("new", "a", "--part", "gel", "--stage", "lens"), "belongs to the part 'camera'"),
+        (("new", "a", "--along", "row"), "Add --from STUDY"),
+        (("vignetting", "--stage", "lens"), "only with `optics effects new NAME`"),
+        (("halo", "bright"), "only with"),
+        (("new", "a", "--from", "STUDY", "--along", "rows"), "did you mean 'row'"),
+        (("new", "a", "--from", "STUDY", "--stage", "lens"), "leave them out"),
+    ],
+)
 def test_errors_of_effects_new(words, error, study, tmp_path, own_registry, optics, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "file").touch()
@@ -425,7 +582,7 @@ def test_a_study_without_a_diagnosis_or_without_a_gel(study, own_registry, optic
     assert code == 2 and "passes no gel; a draft can follow row" in error
     (study / "ladder.json").write_text(json.dumps({**record, "scene": "magictac"}))
     code, _, error = optics("effects", "new", "a", "--from", study, "--along", "height")
-    assert code == 2 and "followed by chance" in error and "a draft can follow row" in error
+    assert code == 2 and "followed by Monte Carlo" in error and "a draft can follow row" in error
     (study / "steps" / "00-base" / "diagnosis.json").unlink()
     code, _, error = optics("effects", "new", "a", "--from", study)
     assert code == 2 and "optics diagnose" in error
@@ -435,7 +592,12 @@ def test_names_that_functions_of_a_camera_see_are_those_that_no_effect_may_take(
     from optics.light.development import Developer
 
     own = {"x_fov": 40.0, "principal_x": 0.0, "principal_y": 0.0, "aspect": 1.0}
-    camera = SimpleNamespace(name="camera", resolution=(4, 3), sensitivity="identity", numbers={n: SimpleNamespace(neutral=None) for n in own})
+    camera = SimpleNamespace(
+        name="camera",
+        resolution=(4, 3),
+        sensitivity="identity",
+        numbers={n: SimpleNamespace(neutral=None) for n in own},
+    )
     view = Developer(camera, (450.0, 550.0, 650.0)).view({f"camera.{n}": value for n, value in own.items()})
     assert set(vars(view)) - set(own) == set(draft.VIEW)
 
@@ -455,13 +617,15 @@ def test_no_parameter_hides_what_its_part_has(word, tmp_path, own_registry):
 
     (tmp_path / "glint.py").write_text(
         "from optics.scene.declare import Effect\nfrom optics.scene.parameter import Parameter\n\n"
-        f"GLINT = Effect(name='glint', part='membrane', parameters=(Parameter('{word}', '1', 0.0, neutral=0.0),))\n")
+        f"GLINT = Effect(name='glint', part='membrane', parameters=(Parameter('{word}', '1', 0.0, neutral=0.0),))\n"
+    )
     own_registry.scan(tmp_path)
     with pytest.raises(BadPlugin, match=f"glint.py: parameter '{word}' has the name of something else"):
         use_variant()
 
 
-# -- residuals in a report ----------------------------------------------------------------------------------------------
+# -- residuals in a report
+# ----------------------------------------------------------------------------------------------
 
 
 def test_components_find_what_frames_have_in_common():
@@ -471,7 +635,10 @@ def test_components_find_what_frames_have_in_common():
     rng = np.random.default_rng(0)
     one, pattern = np.ones((20, 30, 1)), np.sin(np.arange(30) / 3)[None, :, None] * np.ones((20, 1, 1))
     weights = (2.0, -2.0, 1.0, 0.0, 0.0, 0.0)
-    frames = [Shown(f"f{i}", w * pattern + rng.standard_normal((20, 30, 1)), 0 * one, one, one > 0) for i, w in enumerate(weights)]
+    frames = [
+        Shown(f"f{i}", w * pattern + rng.standard_normal((20, 30, 1)), 0 * one, one, one > 0)
+        for i, w in enumerate(weights)
+    ]
     found = components(frames)
     scores = np.array([float(s["score"].replace("−", "-")) for s in found["components"][0]["scores"]])
     assert scores[0] * scores[1] < 0 and np.abs(scores[:2]).min() > 1 and np.abs(scores[3:]).max() < 0.6
@@ -481,7 +648,9 @@ def test_components_find_what_frames_have_in_common():
     one = np.ones((192, 288, 1))
     fine = [Shown(f"f{i}", rng.standard_normal(one.shape), 0 * one, one, one > 0) for i in range(6)]
     of_noise = [float(s["score"].replace("−", "-")) for s in components(fine)["components"][0]["scores"]]
-    assert sum(s * s for s in of_noise) == pytest.approx(1, abs=0.15)  # means over 3 x 3 px, still in sigmas; the largest of six is above 1
+    assert sum(s * s for s in of_noise) == pytest.approx(
+        1, abs=0.15
+    )  # means over 3 x 3 px, still in sigmas; the largest of six is above 1
 
 
 def test_pages_are_of_the_first_and_the_last_step():
@@ -494,7 +663,12 @@ def test_pages_are_of_the_first_and_the_last_step():
     steps = [{"index": i, "name": name} for i, name in enumerate(("base", "a", "b"))]
     assert [len(pages([c] * n, [[]] * n, steps[:n])) for n in (1, 3)] == [1, 2]
     assert [p["step"] for p in pages([c] * 3, [[]] * 3, steps)] == ["base", "+ b"]
-    told = {"fingerprints": [{"coordinate": n, "net": net, "share": 0.5, "ratio": 2.0, "family": "camera"} for n, net in (("row", 8), ("x", -1))]}
+    told = {
+        "fingerprints": [
+            {"coordinate": n, "net": net, "share": 0.5, "ratio": 2.0, "family": "camera"}
+            for n, net in (("row", 8), ("x", -1))
+        ]
+    }
     assert [(r["name"], r["bar"]) for r in coordinates(told)] == [("row", "100.0")] and coordinates(None) == []
 
 
@@ -504,7 +678,7 @@ def picture(uri):
     return Image.open(io.BytesIO(base64.b64decode(uri.partition(",")[2])))
 
 
-def test_colours_of_noise_are_alike_in_a_picture_and_in_a_mosaic():
+def test_colours_of_noise_are_alike_in_a_image_and_in_a_mosaic():
     """In a mosaic a block holds a quarter of the pixels of a channel, and its mean scatters twice as much."""
     from optics.fit.compare import compare
     from optics.pages.residual_maps import colours, regions
@@ -516,7 +690,9 @@ def test_colours_of_noise_are_alike_in_a_picture_and_in_a_mosaic():
     mosaic[:8, :8] = False  # a block that holds nothing
     for usable in (full, mosaic):
         c = compare(list(images), [np.zeros_like(images[0])] * 8, [np.ones_like(images[0])] * 8, [usable] * 8)
-        sd = np.asarray(picture(colours(c)), float).std((0, 1)) / 255 * 10  # of 4096 blocks: good to 1 %, and 4 % more of 16 levels
+        sd = (
+            np.asarray(picture(colours(c)), float).std((0, 1)) / 255 * 10
+        )  # of 4096 blocks: good to 1 %, and 4 % more of 16 levels
         assert sd == pytest.approx(1.0, abs=0.08)
         regions(c)
 
@@ -529,10 +705,14 @@ def test_regions_tell_a_wrong_mean_from_a_wide_spread():
     images = rng.standard_normal((12, 32, 48, 1))
     images[:, :16] += 0.5
     images[:, 16:, 24:] *= 1.6
-    c = compare(list(images), [np.zeros((32, 48, 1))] * 12, [np.ones((32, 48, 1))] * 12, [np.ones((32, 48, 1), bool)] * 12)
+    c = compare(
+        list(images), [np.zeros((32, 48, 1))] * 12, [np.ones((32, 48, 1))] * 12, [np.ones((32, 48, 1), bool)] * 12
+    )
     found = regions(c)
     assert picture(found["mean"]).size == picture(found["sd"]).size == (16, 11) and found["cell"] == 3
     assert 0.4 < float(found["mean_top"]) < 0.95 and 1.4 < float(found["worst"]) < 2.1
     images = 5 + 0.1 * rng.standard_normal((12, 32, 48, 1))  # wrong, and steady
-    c = compare(list(images), [np.zeros((32, 48, 1))] * 12, [np.ones((32, 48, 1))] * 12, [np.ones((32, 48, 1), bool)] * 12)
+    c = compare(
+        list(images), [np.zeros((32, 48, 1))] * 12, [np.ones((32, 48, 1))] * 12, [np.ones((32, 48, 1), bool)] * 12
+    )
     assert float(regions(c)["worst"]) < 0.2

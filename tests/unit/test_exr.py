@@ -75,18 +75,21 @@ def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
     assert [p.name for p in tmp_path.iterdir()] == ["a.exr"]
 
 
-@pytest.mark.parametrize(("channels", "options", "text"), [
-    ({}, {}, "no channels"),
-    ({"Y": np.ones((2, 2, 3))}, {}, r"\(H, W\)"),
-    ({"Y": np.ones((2, 2), complex)}, {}, "complex128"),
-    ({"": np.ones((2, 2))}, {}, "a name"),
-    ({"R": np.ones((2, 2)), "G": np.ones((2, 3))}, {}, "one size"),
-    ({"Y": np.full((2, 2), 1e39)}, {}, "do not fit float32"),
-    ({"Y": np.full((2, 2), 1e5)}, {"half": ["Y"]}, "do not fit float16"),
-    ({"Y": np.ones((2, 2))}, {"half": ["X"]}, "no such channel"),
-    ({"Y": np.ones((2, 2))}, {"header": {"compression": "none"}}, "belongs to the format"),
-    ({"Y": np.ones((2, 2))}, {"header": {"done": True}}, "allowed: text"),
-])
+@pytest.mark.parametrize(
+    ("channels", "options", "text"),
+    [
+        ({}, {}, "no channels"),
+        ({"Y": np.ones((2, 2, 3))}, {}, r"\(H, W\)"),
+        ({"Y": np.ones((2, 2), complex)}, {}, "complex128"),
+        ({"": np.ones((2, 2))}, {}, "a name"),
+        ({"R": np.ones((2, 2)), "G": np.ones((2, 3))}, {}, "one size"),
+        ({"Y": np.full((2, 2), 1e39)}, {}, "do not fit float32"),
+        ({"Y": np.full((2, 2), 1e5)}, {"half": ["Y"]}, "do not fit float16"),
+        ({"Y": np.ones((2, 2))}, {"half": ["X"]}, "no such channel"),
+        ({"Y": np.ones((2, 2))}, {"header": {"compression": "none"}}, "belongs to the format"),
+        ({"Y": np.ones((2, 2))}, {"header": {"done": True}}, "allowed: text"),
+    ],
+)
 def test_bad_writes_say_why(tmp_path, channels, options, text):
     with pytest.raises(ValueError, match=text):
         exr.write(tmp_path / "a.exr", channels, **options)
@@ -105,8 +108,9 @@ def test_bad_reads_say_why(tmp_path):
         exr.read(tmp_path / "b.exr")
 
 
-@pytest.mark.parametrize(("bands", "shape"), [([500], (2, 2)), ([500], (2, 2, 2)), ([500, 600], (2, 2, 2, 3)),
-                                              ([500, 500], (2, 2, 2))])
+@pytest.mark.parametrize(
+    ("bands", "shape"), [([500], (2, 2)), ([500], (2, 2, 2)), ([500, 600], (2, 2, 2, 3)), ([500, 500], (2, 2, 2))]
+)
 def test_bad_spectra_say_why(bands, shape):
     with pytest.raises(ValueError, match="allowed|the same"):
         exr.spectral_channels(bands, np.zeros(shape))
@@ -125,6 +129,11 @@ def test_png_shows_dn_as_they_are_and_light_as_srgb(tmp_path):
     light = Image.open(exr.write_png(tmp_path / "light.png", np.full((2, 3, 3), 0.5)))
     assert light.size == (3, 2) and np.all(np.array(light) == 188)  # sRGB of 0.5 is 0.7354 = 187.5 / 255
     assert exr.srgb(np.array([-1.0, 0.0, 0.0031308, 1.0, 2.0])) == pytest.approx([0, 0, 0.04045, 1, 1], abs=1e-5)
-    for bad, options in ((np.full((2, 2), np.nan), {}), (np.zeros((2, 2, 2)), {}), (dn, {"tone": "film"}), (dn, {"white": 0})):
+    for bad, options in (
+        (np.full((2, 2), np.nan), {}),
+        (np.zeros((2, 2, 2)), {}),
+        (dn, {"tone": "film"}),
+        (dn, {"white": 0}),
+    ):
         with pytest.raises(ValueError, match="allowed|not finite"):
             exr.write_png(tmp_path / "bad.png", bad, **options)

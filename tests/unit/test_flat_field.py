@@ -12,8 +12,17 @@ from optics.scene.parameter import Values, Variable
 
 WIDTH, HEIGHT = 48, 36  # px
 PRESSED = {"gel.press_x": 1.0, "gel.press_y": -0.5, "gel.press_depth": 0.4}
-KEYS = {"camera.gain": 1.03, "camera.gain_g": 0.98, "led_1.power": 1.2, "led_1.power_b": 0.7, "led_2.mu": 1.6,
-        "membrane.ground_g": 2e-3, "gel.height_loss": 0.2, "gel.skirt": 0.4, "gel.press_depth": 0.4}
+KEYS = {
+    "camera.gain": 1.03,
+    "camera.gain_g": 0.98,
+    "led_1.power": 1.2,
+    "led_1.power_b": 0.7,
+    "led_2.mu": 1.6,
+    "membrane.ground_g": 2e-3,
+    "gel.height_loss": 0.2,
+    "gel.skirt": 0.4,
+    "gel.press_depth": 0.4,
+}
 
 
 @pytest.fixture(scope="module")
@@ -23,7 +32,9 @@ def models(mitsuba):
 
     loaded = scene.load("gelsight", {"width": WIDTH, "height": HEIGHT})
     frame = Frame("press", np.zeros((HEIGHT, WIDTH, 3), np.float32), parameters=dict(PRESSED))
-    flat = (80 + np.arange(WIDTH)[None, :, None] * np.array([1.0, 0.5, 0.2]) + np.zeros((HEIGHT, 1, 1))).astype(np.float32)
+    flat = (80 + np.arange(WIDTH)[None, :, None] * np.array([1.0, 0.5, 0.2]) + np.zeros((HEIGHT, 1, 1))).astype(
+        np.float32
+    )
     captures = Captures(Path("."), str(loaded.path), [frame], noise=Noise(0.1, 1.0, 2.0, 255.0, 0.0), flat_field=flat)
     return {mode: Model(loaded, captures, flat_field=mode) for mode in ("multiplicative", "additive", None)}
 
@@ -75,4 +86,6 @@ def test_a_power_per_band_scales_that_band_alone(models):
     model = models[None]
     dim = model.predict(Values(common={f"led_{k}.power_g": 0.5 for k in range(1, 7)}))[0] - 2
     full = model.predict(Values())[0] - 2
-    assert dim[..., 1] == pytest.approx(full[..., 1] / 2, rel=1e-6) and np.array_equal(dim[..., [0, 2]], full[..., [0, 2]])
+    assert dim[..., 1] == pytest.approx(full[..., 1] / 2, rel=1e-6) and np.array_equal(
+        dim[..., [0, 2]], full[..., [0, 2]]
+    )

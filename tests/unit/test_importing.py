@@ -14,7 +14,7 @@ H, W, R = 48, 64, 8  # px
 
 @pytest.fixture
 def presses():
-    """Twelve pictures of 48 x 64 px with a bright disc where each circle is, noise of 2 DN and gains of 1 and 1.04."""
+    """Twelve images of 48 x 64 px with a bright disc where each circle is, noise of 2 DN and gains of 1 and 1.04."""
     rng = np.random.default_rng(3)
     v, u = np.mgrid[:H, :W]
     circles = np.column_stack([rng.uniform(8, W - 8, 12), rng.uniform(8, H - 8, 12), np.full(12, R / 3)])
@@ -22,7 +22,9 @@ def presses():
     images = []
     for i, (x, y, r) in enumerate(circles):
         disc = np.hypot(u - x, v - y) < r
-        images.append(np.round(flat * (1.04 if i == 5 else 1.0) + 40 * disc[..., None] + 2 * rng.standard_normal((H, W, 3))))
+        images.append(
+            np.round(flat * (1.04 if i == 5 else 1.0) + 40 * disc[..., None] + 2 * rng.standard_normal((H, W, 3)))
+        )
     return importing.Presses("made here", [f"p{i}" for i in range(12)], np.array(images), circles, flat + 12)
 
 
@@ -32,12 +34,18 @@ OPTIONS = dict(ball_radius=2.0, mm_per_pixel=0.2)
 def test_presses_become_captures_with_a_scene_and_numbers(presses, tmp_path):
     found = importing.import_presses(presses, tmp_path / "set", **OPTIONS)
     loaded = captures.load(found.folder)
-    assert sorted(p.name for p in found.folder.iterdir()) == ["README.txt", "captures.toml", "flat_field.exr", "frames",
-                                                             "import.json", "scene.xml"]
+    assert sorted(p.name for p in found.folder.iterdir()) == [
+        "README.txt",
+        "captures.toml",
+        "flat_field.exr",
+        "frames",
+        "import.json",
+        "scene.xml",
+    ]
     assert loaded.scene == str(found.folder / "scene.xml") and len(loaded.frames) == 12
     first = loaded.frames[0]
     assert first.group == "p0"
-    # label (0, 0) is the centre of the first pixel, (W/2, H/2) - 1/2 the middle of the picture
+    # label (0, 0) is the centre of the first pixel, (W/2, H/2) - 1/2 the middle of the image
     assert first.parameters["gel.press_x"] == pytest.approx((presses.circles[0, 0] + 0.5 - W / 2) * 0.2, abs=1e-5)
     assert first.parameters["gel.press_y"] == pytest.approx((presses.circles[0, 1] + 0.5 - H / 2) * 0.2, abs=1e-5)
     a = 0.85 * R / 3 * 0.2
@@ -52,11 +60,24 @@ def test_presses_become_captures_with_a_scene_and_numbers(presses, tmp_path):
 
 
 def test_contradictions_are_said_with_their_numbers(presses, tmp_path):
-    found = importing.import_presses(presses, tmp_path / "set", ball_radius=0.5, mm_per_pixel=0.2, mm_per_pixel_check=0.19,
-                                     contact_share=0.5, skirt=0.2)
+    found = importing.import_presses(
+        presses,
+        tmp_path / "set",
+        ball_radius=0.5,
+        mm_per_pixel=0.2,
+        mm_per_pixel_check=0.19,
+        contact_share=0.5,
+        skirt=0.2,
+    )
     text = "\n".join(found.warnings)
-    for words in ("12 of 12 labelled circles are larger than the ball", "0.53 mm, ball radius 0.50 mm", "-5.0%",
-                  "not the background of these presses", "12 / 12 / 12 DN", "frames differ in gain"):
+    for words in (
+        "12 of 12 labelled circles are larger than the ball",
+        "0.53 mm, ball radius 0.50 mm",
+        "-5.0%",
+        "not the background of these presses",
+        "12 / 12 / 12 DN",
+        "frames differ in gain",
+    ):
         assert words in text
     assert text.splitlines()[0] in (found.folder / "README.txt").read_text()
 
@@ -75,7 +96,7 @@ def test_depth_of_a_touched_radius_is_what_the_skin_does():
     profile = contact.indenter_profile("sphere", 2.5, (0, 0, 0), 6.0, 0.05)
     pressed, _ = contact.displacement(profile, depth, 4.0, 0.0, skirt=0.7)
     middle = len(pressed.values) // 2
-    row = pressed.values[middle, middle:middle + 90]  # 4.5 mm; the map fades to zero from 5.2 mm on
+    row = pressed.values[middle, middle : middle + 90]  # 4.5 mm; the map fades to zero from 5.2 mm on
     slope = -np.gradient(np.log(row), 0.05)
     x = 0.05 * np.arange(len(slope))
     # beyond the touched radius the skin falls by 1/e per 0.7 mm; the last blur of one pitch rounds the edge only
@@ -95,8 +116,12 @@ def test_an_import_is_replaced_only_when_asked(presses, tmp_path):
 
 @pytest.fixture
 def pack(presses):
-    return {"imgs": presses.images.astype(np.uint8), "touch_center": presses.circles[:, :2],
-            "touch_radius": presses.circles[:, 2], "f0": presses.given.astype(np.uint8)}
+    return {
+        "imgs": presses.images.astype(np.uint8),
+        "touch_center": presses.circles[:, :2],
+        "touch_radius": presses.circles[:, 2],
+        "f0": presses.given.astype(np.uint8),
+    }
 
 
 def test_a_pack_is_read(pack, tmp_path):
@@ -105,13 +130,16 @@ def test_a_pack_is_read(pack, tmp_path):
     assert found.images.shape == (12, H, W, 3) and found.given.shape == (H, W, 3)
 
 
-@pytest.mark.parametrize("change, words", [
-    ({"imgs": None}, "imgs missing"),
-    ({"touch_radius": np.ones(5)}, r"touch_radius has the shape \(5,\)"),
-    ({"imgs": np.zeros((12, H, W), np.uint8)}, r"imgs has the shape"),
-    ({"f0": np.zeros((2, 2, 3))}, "f0 has the shape"),
-    ({"touch_center": np.array([{}] * 12, object)}, "without pickles"),
-])
+@pytest.mark.parametrize(
+    "change, words",
+    [
+        ({"imgs": None}, "imgs missing"),
+        ({"touch_radius": np.ones(5)}, r"touch_radius has the shape \(5,\)"),
+        ({"imgs": np.zeros((12, H, W), np.uint8)}, r"imgs has the shape"),
+        ({"f0": np.zeros((2, 2, 3))}, "f0 has the shape"),
+        ({"touch_center": np.array([{}] * 12, object)}, "without pickles"),
+    ],
+)
 def test_a_bad_pack_is_refused(pack, tmp_path, change, words):
     np.savez(tmp_path / "pack.npz", **{k: v for k, v in {**pack, **change}.items() if v is not None})
     with pytest.raises(BadCapture, match=words):
@@ -126,13 +154,16 @@ def test_files_that_are_no_pack_are_refused(tmp_path):
             importing.read_taxim(tmp_path / name)
 
 
-@pytest.mark.parametrize("table, words", [
-    ("file,center_x,center_y_px,contact_radius_px\na.png,1,2,3", "unknown column 'center_x_px'"),
-    ("file,center_x_px,center_y_px,contact_radius_px\n", "zero rows"),
-    ("file,center_x_px,center_y_px,contact_radius_px\nb.png,1,2,3", "no picture 'b.png'"),
-    ("file,center_x_px,center_y_px,contact_radius_px\na.png,1,two,3", "line 2: center_y_px = 'two'"),
-    ("file,center_x_px,center_y_px,contact_radius_px\na.png,1,2,3\na.png,1,2,3", "given in line 2 already"),
-])
+@pytest.mark.parametrize(
+    "table, words",
+    [
+        ("file,center_x,center_y_px,contact_radius_px\na.png,1,2,3", "unknown column 'center_x_px'"),
+        ("file,center_x_px,center_y_px,contact_radius_px\n", "zero rows"),
+        ("file,center_x_px,center_y_px,contact_radius_px\nb.png,1,2,3", "no image 'b.png'"),
+        ("file,center_x_px,center_y_px,contact_radius_px\na.png,1,two,3", "line 2: center_y_px = 'two'"),
+        ("file,center_x_px,center_y_px,contact_radius_px\na.png,1,2,3\na.png,1,2,3", "given in line 2 already"),
+    ],
+)
 def test_a_bad_table_of_circles_is_refused(tmp_path, table, words):
     from PIL import Image
 
@@ -143,7 +174,11 @@ def test_a_bad_table_of_circles_is_refused(tmp_path, table, words):
 
 
 def test_circles_and_options_out_of_range_are_refused(presses, tmp_path):
-    for options, words in (({"ball_radius": -1}, "ball_radius = -1"), ({"bin": 5}, "do not divide"), ({"leds": 4}, "leds = 4")):
+    for options, words in (
+        ({"ball_radius": -1}, "ball_radius = -1"),
+        ({"bin": 5}, "do not divide"),
+        ({"leds": 4}, "leds = 4"),
+    ):
         with pytest.raises(BadCapture, match=words):
             importing.import_presses(presses, tmp_path / "set", **{**OPTIONS, **options})
     presses.circles[2, 0] = 500

@@ -14,13 +14,17 @@ from optics.proof.makers.bench import Photodiode, Polarizer, Sample, Source, Tru
 
 DIODE = Noise(system_gain=0.5, dark_noise=1.5, black_level=100.0, saturation=4095.0, prnu=0.0)
 RGB = np.array([620.0, 540.0, 460.0])  # nm
-EXACT = 1e-12  # of unit light: some 100 operations of double precision, each off by 1e-16, and what is left of the bounces
+EXACT = (
+    1e-12  # of unit light: some 100 operations of double precision, each off by 1e-16, and what is left of the bounces
+)
 ANGLES = np.linspace(-180, 360, 37)
 
 
 def turns(angles=ANGLES, **others):
     """One reading per analyzer angle; others by key with _ for the dot."""
-    return [{"analyzer.angle": float(a), **{key.replace("_", "."): value for key, value in others.items()}} for a in angles]
+    return [
+        {"analyzer.angle": float(a), **{key.replace("_", "."): value for key, value in others.items()}} for a in angles
+    ]
 
 
 def cos(angle):
@@ -39,7 +43,9 @@ def check(found, wanted, error=EXACT):
     np.testing.assert_allclose(found, wanted, rtol=0, atol=error)
 
 
-# -- Polarizers ---------------------------------------------------------------------------------------------------------
+# -- Polarizers
+# ---------------------------------------------------------------------------------------------------------
+
 
 @pytest.mark.parametrize("angle", [0.0, 25.0, -130.0])
 def test_malus(angle):
@@ -52,11 +58,18 @@ def test_two_leaking_polarizers_and_crossed_leak():
     check(mono(Truth(p1=one, p2=two), turns()), wanted)
     check(mono(Truth(p1=one, p2=one), turns([90.0])), 0.8 * 0.01)  # T1 T2 of unit light
     faint = replace(one, leak=1e-9)
-    assert mono(Truth(p1=faint, p2=faint), turns([90.0])) == pytest.approx(0.8e-9, rel=1e-7)  # sqrt(T2) is 3e-5, rounding 1e-16
+    assert mono(Truth(p1=faint, p2=faint), turns([90.0])) == pytest.approx(
+        0.8e-9, rel=1e-7
+    )  # sqrt(T2) is 3e-5, rounding 1e-16
 
 
 def test_three_polarizers():
-    settings = [{"polarizer.angle": p, "middle.angle": m, "analyzer.angle": a} for p in (0, 20) for m in (45, 80) for a in (90, 10)]
+    settings = [
+        {"polarizer.angle": p, "middle.angle": m, "analyzer.angle": a}
+        for p in (0, 20)
+        for m in (45, 80)
+        for a in (90, 10)
+    ]
     p, m, a = (np.array([s[f"{part}.angle"] for s in settings]) for part in ("polarizer", "middle", "analyzer"))
     check(mono(Truth(pm=Polarizer(0.9)), settings), 0.8**2 * 0.9 / 2 * cos(m - p) ** 2 * cos(a - m) ** 2)
 
@@ -64,19 +77,31 @@ def test_three_polarizers():
 def test_partly_polarized_source():
     source = Source(dop=0.3, dop_angle=20.0)
     check(mono(Truth(source, p1=None), turns()), 0.8 / 2 * (1 + 0.3 * cos(2 * (ANGLES - 20))))
-    check(mono(Truth(replace(source, dop=1.0), p1=None), turns()), 0.8 * cos(ANGLES - 20) ** 2)  # T1: of light along the axis
+    check(
+        mono(Truth(replace(source, dop=1.0), p1=None), turns()), 0.8 * cos(ANGLES - 20) ** 2
+    )  # T1: of light along the axis
     check(mono(Truth(source, p1=None, p2=None), [{}]), 1.0)
 
 
 def test_turning_the_whole_bench_changes_nothing():
-    truth = Truth(Source(dop=0.4, dop_angle=10), Polarizer(0.8, 0.02, face_reflectance=0.04),
-                  Sample(50, 15, 0.1, 30, -40, 0.1), Polarizer(0.7, 0.1), Polarizer(0.8, 0.01, face_reflectance=0.05))
+    truth = Truth(
+        Source(dop=0.4, dop_angle=10),
+        Polarizer(0.8, 0.02, face_reflectance=0.04),
+        Sample(50, 15, 0.1, 30, -40, 0.1),
+        Polarizer(0.7, 0.1),
+        Polarizer(0.8, 0.01, face_reflectance=0.05),
+    )
     turned = replace(truth, source=replace(truth.source, dop_angle=10 + 33))
     here = [{"polarizer.angle": 5.0, "middle.angle": 40.0, "analyzer.angle": a, "sample.angle": 12.0} for a in ANGLES]
-    check(jones.radiance(turned, [{key: value + 33 for key, value in s.items()} for s in here]), jones.radiance(truth, here))
+    check(
+        jones.radiance(turned, [{key: value + 33 for key, value in s.items()} for s in here]),
+        jones.radiance(truth, here),
+    )
 
 
-# -- The sample ---------------------------------------------------------------------------------------------------------
+# -- The sample
+# ---------------------------------------------------------------------------------------------------------
+
 
 def between(p, a, axis, phase):
     """Fraction of Malus' maximum behind a retarder: cos^2(a - p) - sin 2(axis - p) sin 2(axis - a) sin^2(phase/2)."""
@@ -89,8 +114,13 @@ def test_retarder(phase, axis):
     wanted = 0.32 * between(10.0, ANGLES, axis, phase)
     check(mono(Truth(sample=Sample(phase, axis)), turns(polarizer_angle=10.0)), wanted)
     check(mono(Truth(sample=Sample(phase, axis - 30)), turns(polarizer_angle=10.0, sample_angle=30.0)), wanted)
-    check(mono(Truth(sample=Sample(stress_retardance=phase, stress_axis=axis - 30)), turns(polarizer_angle=10.0, sample_angle=30.0)),
-          wanted)
+    check(
+        mono(
+            Truth(sample=Sample(stress_retardance=phase, stress_axis=axis - 30)),
+            turns(polarizer_angle=10.0, sample_angle=30.0),
+        ),
+        wanted,
+    )
 
 
 def test_half_wave_plate_mirrors_and_quarter_wave_plate_makes_circular():
@@ -113,12 +143,16 @@ def test_colours():
 
 
 def test_two_retarders_in_order():
-    """Quarter wave with its fast axis at 45 deg: what swings at 45 runs ahead, so light from x turns clockwise, and y leads x
-    by a quarter; a second one with its fast axis at x brings x level with y: linear at +45 deg. The other order leaves x alone
-    first and makes it circular then."""
-    check(mono(Truth(sample=Sample(90, 45, stress_retardance=90, stress_axis=0)), turns()), 0.32 * cos(ANGLES - 45) ** 2)
+    """Quarter wave with its fast axis at 45 deg: what swings at 45 runs ahead, so light from x turns clockwise, and y
+    leads x by a quarter; a second one with its fast axis at x brings x level with y: linear at +45 deg. The other order
+    leaves x alone first and makes it circular then."""
+    check(
+        mono(Truth(sample=Sample(90, 45, stress_retardance=90, stress_axis=0)), turns()), 0.32 * cos(ANGLES - 45) ** 2
+    )
     check(mono(Truth(sample=Sample(90, 0, stress_retardance=90, stress_axis=45)), turns()), 0.32 / 2)
-    check(mono(Truth(sample=Sample(90, 25, stress_retardance=90, stress_axis=25)), turns()), 0.32 * cos(ANGLES - 50) ** 2)
+    check(
+        mono(Truth(sample=Sample(90, 25, stress_retardance=90, stress_axis=25)), turns()), 0.32 * cos(ANGLES - 50) ** 2
+    )
     check(mono(Truth(sample=Sample(70, 25, stress_retardance=70, stress_axis=115)), turns()), 0.32 * cos(ANGLES) ** 2)
 
 
@@ -131,7 +165,9 @@ def test_depolarizer():
     check([np.trace(light).real, 2 * light[1, 0].imag], [1.0, -0.8])  # circular light too; S3 < 0: clockwise, as above
 
 
-# -- Reflections between the faces --------------------------------------------------------------------------------------
+# -- Reflections between the faces
+# --------------------------------------------------------------------------------------
+
 
 def film(t, r):
     """(transmittance, reflectance) of face, absorber, face for one polarization: sums of geometric series."""
@@ -158,15 +194,20 @@ def test_clear_films_lose_light_by_reflection_alone(reflectance):
 
 
 def test_light_goes_twice_through_a_quarter_wave_plate():
-    """Behind a polarizer at 0 deg the plate at 45 deg turns what a clear film sends back by 90 deg, each time it does so."""
-    truth = Truth(p1=Polarizer(0.8, face_reflectance=0.2), sample=Sample(90, 45), p2=Polarizer(1.0, 1.0, face_reflectance=0.3))
+    """Behind a polarizer at 0 deg the plate at 45 deg turns what a clear film sends back by 90 deg, each time it does
+    so."""
+    truth = Truth(
+        p1=Polarizer(0.8, face_reflectance=0.2), sample=Sample(90, 45), p2=Polarizer(1.0, 1.0, face_reflectance=0.3)
+    )
     (t, along), (_, across), (u, clear) = film(0.8, 0.2), film(0.0, 0.2), film(1.0, 0.3)
     check(mono(truth, [{}]), t / 2 * u * (1 + clear * across) / (1 - clear**2 * along * across))
     check(mono(replace(truth, sample=Sample()), [{}]), t / 2 * u / (1 - clear * along))  # without the plate
 
 
 def test_all_orders_of_reflection_against_an_inversion():
-    """Layers added one by one as 4 x 4 matrices on vec(J), with all bounces between two of them summed by an inverse."""
+    """Layers added one by one as 4 x 4 matrices on vec(J), with all bounces between two of them summed by an
+    inverse."""
+
     def operator(*modes):
         return sum(np.kron(m, m.conj()) for m in modes)
 
@@ -189,8 +230,10 @@ def test_all_orders_of_reflection_against_an_inversion():
             return [face(f.face_reflectance), (body, 0 * body, body, 0 * body), face(f.face_reflectance)]
 
         s = truth.sample
-        own, stress = (matrix(np.exp(-0.5j * np.deg2rad(d)), np.exp(0.5j * np.deg2rad(d)), axis + turn)
-                       for d, axis in ((s.retardance, s.axis), (s.stress_retardance, s.stress_axis)))
+        own, stress = (
+            matrix(np.exp(-0.5j * np.deg2rad(d)), np.exp(0.5j * np.deg2rad(d)), axis + turn)
+            for d, axis in ((s.retardance, s.axis), (s.stress_retardance, s.stress_axis))
+        )
         shrink = (1 - s.depolarization) * np.eye(4)
         shrink[np.ix_([0, 3], [0, 3])] += s.depolarization / 2  # vec(J) = (xx, xy, yx, yy); the trace stays
         sample = shrink @ operator(stress @ own), np.zeros((4, 4)), operator(own @ stress) @ shrink, np.zeros((4, 4))
@@ -198,8 +241,12 @@ def test_all_orders_of_reflection_against_an_inversion():
 
     rng = np.random.default_rng(4)
     for _ in range(5):
-        films = [Polarizer(rng.uniform(0.6, 1), rng.uniform(0, 0.5), face_reflectance=rng.uniform(0, 0.4)) for _ in range(3)]
-        sample = Sample(rng.uniform(0, 360), rng.uniform(0, 180), 0, rng.uniform(0, 360), rng.uniform(0, 180), rng.uniform(0, 1))
+        films = [
+            Polarizer(rng.uniform(0.6, 1), rng.uniform(0, 0.5), face_reflectance=rng.uniform(0, 0.4)) for _ in range(3)
+        ]
+        sample = Sample(
+            rng.uniform(0, 360), rng.uniform(0, 180), 0, rng.uniform(0, 360), rng.uniform(0, 180), rng.uniform(0, 1)
+        )
         truth = Truth(Source(dop=rng.uniform(), dop_angle=30.0), films[0], sample, films[1], films[2])
         p, m, a, turn = rng.uniform(0, 360, 4)
         stack, *others = layers(truth, p, m, a, turn)
@@ -207,10 +254,14 @@ def test_all_orders_of_reflection_against_an_inversion():
             stack = add(stack, other)
         light = (1 - truth.source.dop) / 2 * np.eye(2) + truth.source.dop * matrix(1, 0, 30.0)
         wanted = (stack[0] @ light.ravel())[[0, 3]].sum().real
-        check(mono(truth, [{"polarizer.angle": p, "middle.angle": m, "analyzer.angle": a, "sample.angle": turn}]), wanted)
+        check(
+            mono(truth, [{"polarizer.angle": p, "middle.angle": m, "analyzer.angle": a, "sample.angle": turn}]), wanted
+        )
 
 
-# -- Dials, lamp and photodiode -----------------------------------------------------------------------------------------
+# -- Dials, lamp and photodiode
+# -----------------------------------------------------------------------------------------
+
 
 def test_dial_to_angle():
     crooked = Polarizer(offset=2.0, scale=1.01, backlash=3.0)
@@ -224,7 +275,9 @@ def test_dial_to_angle():
 def test_wobble_has_one_cycle_per_turn_of_the_dial():
     truth = Truth(p2=Polarizer(leak=0.01, offset=30.0, wobble_c=0.05, wobble_s=-0.02))
     plain = mono(Truth(p2=Polarizer(leak=0.01, offset=30.0)), turns())
-    check(mono(truth, turns()), plain * (1 + 0.05 * cos(ANGLES) - 0.02 * sin(ANGLES)))  # of the dial, not of the true angle
+    check(
+        mono(truth, turns()), plain * (1 + 0.05 * cos(ANGLES) - 0.02 * sin(ANGLES))
+    )  # of the dial, not of the true angle
 
 
 def test_power_drift_and_stray_light():
@@ -259,16 +312,28 @@ def test_readings_are_clipped():
     assert np.all(high == 4095) and np.all(low == 0)
 
 
-# -- Sweeps and files ---------------------------------------------------------------------------------------------------
+# -- Sweeps and files
+# ---------------------------------------------------------------------------------------------------
+
 
 def test_sweep():
     settings = jones.malus_sweep(73, (0.0, 45.0, 90.0), turns=2, minutes=36, fixed={"sample.angle": 5.0})
     column = {key: np.array([s[key] for s in settings]) for key in settings[0]}
-    assert len(settings) == 73 and set(column) == {"source.power", "source.time", "polarizer.angle", "analyzer.angle",
-                                                   "analyzer.approach", "sample.angle"}
+    assert len(settings) == 73 and set(column) == {
+        "source.power",
+        "source.time",
+        "polarizer.angle",
+        "analyzer.angle",
+        "analyzer.approach",
+        "sample.angle",
+    }
     check(column["source.time"], np.arange(73) / 2, 1e-12)  # rounding of 36 minutes
     assert list(np.unique(column["polarizer.angle"])) == [0, 45, 90]
-    assert np.all(column["sample.angle"] == 5) and column["analyzer.angle"].min() == 0 and column["analyzer.angle"].max() == 720
+    assert (
+        np.all(column["sample.angle"] == 5)
+        and column["analyzer.angle"].min() == 0
+        and column["analyzer.angle"].max() == 720
+    )
     for angle in (0, 45, 90):
         run = column["polarizer.angle"] == angle
         steps = np.diff(column["analyzer.angle"][run])
@@ -331,8 +396,21 @@ def test_shares_no_optics_with_the_models():
     """What a fit is tried on must not come from the code that is fitted."""
     import subprocess
 
-    loaded = subprocess.run([sys.executable, "-c", "import sys, optics.proof.makers.bench; print(*sys.modules)"], text=True, capture_output=True,
-                            check=True).stdout.split()
-    models = ("optics.polarization.mueller", "optics.polarization.layers", "optics.light.renderer", "optics.scene.loader", "optics.light.development", "optics.scene.registry", "plugins",
-              "mitsuba", "drjit")
+    loaded = subprocess.run(
+        [sys.executable, "-c", "import sys, optics.proof.makers.bench; print(*sys.modules)"],
+        text=True,
+        capture_output=True,
+        check=True,
+    ).stdout.split()
+    models = (
+        "optics.polarization.mueller",
+        "optics.polarization.layers",
+        "optics.light.renderer",
+        "optics.scene.loader",
+        "optics.light.development",
+        "optics.scene.registry",
+        "plugins",
+        "mitsuba",
+        "drjit",
+    )
     assert "optics.proof.makers.bench" in loaded and not [name for name in loaded if name.startswith(models)]

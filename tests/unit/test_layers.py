@@ -26,7 +26,11 @@ def picture(scene, **values):
 
 
 def test_a_pattern_from_a_file_is_the_formula_that_it_was_made_from(tmp_path):
-    disc = next(e for e in registry().effects.values() if e.name == "stress birefringence").stages["layer"].__globals__["disc"]
+    disc = (
+        next(e for e in registry().effects.values() if e.name == "stress birefringence")
+        .stages["layer"]
+        .__globals__["disc"]
+    )
     n = 480
     x, y = np.meshgrid((np.arange(n) + 0.5) / n * 24 - 12, 12 - (np.arange(n) + 0.5) / n * 24)  # row 0 at +y
     np.save(tmp_path / "disc.npy", np.stack(disc(x, y, 12.0), -1).clip(-40, 40))  # the loads' points are infinite
@@ -46,7 +50,9 @@ def test_a_pattern_from_a_file_is_one_function_in_both_arithmetics(mitsuba, tmp_
     found = pattern(mitsuba.Float(x.ravel().astype(np.float32)), mitsuba.Float(y.ravel().astype(np.float32)), 10.0)
     clear = (np.abs(np.abs(x) - 5) > 1e-4) & (np.abs(np.abs(y) - 5) > 1e-4)  # not on the border, where rounding decides
     for e, f in zip(exact, found):
-        np.testing.assert_allclose(np.array(f)[clear.ravel()], e[clear], rtol=0, atol=2e-5)  # float32 of coordinates up to 7
+        np.testing.assert_allclose(
+            np.array(f)[clear.ravel()], e[clear], rtol=0, atol=2e-5
+        )  # float32 of coordinates up to 7
         assert (e[(np.abs(x) > 5) | (np.abs(y) > 5)] == 0).all() and np.ptp(e) > 2
 
 
@@ -64,16 +70,27 @@ def test_a_pattern_from_a_file_has_its_derivatives(tmp_path):
         assert np.abs(found).max() > 1e-3
 
 
-def test_a_pattern_that_is_changed_changes_the_picture(tmp_path):
+def test_a_pattern_that_is_changed_changes_the_image(tmp_path):
     scene = bench(tmp_path, pattern="even")
     renderer, even = picture(scene)
-    now = {**scene.values(), "sample.angle": 20.0, "sample.stress": 3.0, "sample.stress_size": 24.0, "sample.stress_pattern": "disc"}
+    now = {
+        **scene.values(),
+        "sample.angle": 20.0,
+        "sample.stress": 3.0,
+        "sample.stress_size": 24.0,
+        "sample.stress_pattern": "disc",
+    }
     assert np.abs(renderer.image(now, "source") - even).max() > 0.1
 
 
-@pytest.mark.parametrize("name, array, text", [
-    ("flat.npy", np.zeros((4, 4)), r"flat.npy: shape \(4, 4\); allowed: \(H, W, 2 or more\)"),
-    ("hole.npy", np.full((4, 4, 2), np.nan), "all finite"), ("none.npy", None, "no such file")])
+@pytest.mark.parametrize(
+    "name, array, text",
+    [
+        ("flat.npy", np.zeros((4, 4)), r"flat.npy: shape \(4, 4\); allowed: \(H, W, 2 or more\)"),
+        ("hole.npy", np.full((4, 4, 2), np.nan), "all finite"),
+        ("none.npy", None, "no such file"),
+    ],
+)
 def test_a_bad_pattern_is_refused(name, array, text, tmp_path):
     if array is not None:
         np.save(tmp_path / name, array)
@@ -93,6 +110,8 @@ def test_the_skin_s_stress_needs_a_sheet_in_the_skin(tmp_path):
 
 def test_a_film_on_a_disk_is_refused(tmp_path):
     text = scenes.find("polarizer_bench").read_text(encoding="utf-8")
-    (tmp_path / "disk.xml").write_text(text.replace('type="rectangle" id="analyzer_plate"', 'type="disk" id="analyzer_plate"'))
+    (tmp_path / "disk.xml").write_text(
+        text.replace('type="rectangle" id="analyzer_plate"', 'type="disk" id="analyzer_plate"')
+    )
     with pytest.raises(BadScene, match="'analyzer' stands on a disk"):
         Renderer(scenes.load(tmp_path / "disk.xml"))

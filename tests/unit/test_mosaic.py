@@ -22,16 +22,21 @@ def models(mitsuba):
     noise = Noise(0.04, 0.8, 8.0, 255.0, 0.0)
     full = Model(sensor, Captures(Path("."), "gelsight", [dark], noise=noise))
     rng = np.random.default_rng(3)
-    picture = noise.expose(full.predict(Values())[0], rng).astype(np.float32)
-    channel = cfa_channel(picture.shape, PATTERN)[..., None]
-    raw = Frame("a", np.take_along_axis(picture, channel, 2), parameters=settings)
+    image = noise.expose(full.predict(Values())[0], rng).astype(np.float32)
+    channel = cfa_channel(image.shape, PATTERN)[..., None]
+    raw = Frame("a", np.take_along_axis(image, channel, 2), parameters=settings)
     return full, Model(sensor, Captures(Path("."), "gelsight", [raw], noise=noise, cfa=PATTERN)), channel
 
 
 def test_every_pixel_counts_once_in_the_channel_of_its_filter(models):
     full, mosaic, channel = models
     use = mosaic.usable(0)
-    assert use.shape == (20, 24, 3) and mosaic.size == 480 and full.size == 1440 and np.array_equal(use.sum(-1), np.ones((20, 24)))
+    assert (
+        use.shape == (20, 24, 3)
+        and mosaic.size == 480
+        and full.size == 1440
+        and np.array_equal(use.sum(-1), np.ones((20, 24)))
+    )
     assert np.array_equal(use.argmax(-1), channel[..., 0]) and channel[0, 0, 0] == 1 and channel[1, 0, 0] == 0
 
 
@@ -47,7 +52,9 @@ def test_a_fit_finds_the_reflectance_of_each_channel(models):
     from optics.fit import calibrate
 
     _, mosaic, _ = models
-    free = [Variable(f"membrane.rho_{c}", (f"membrane.rho_{c}",), mosaic.parameters[f"membrane.rho_{c}"]) for c in "rgb"]
+    free = [
+        Variable(f"membrane.rho_{c}", (f"membrane.rho_{c}",), mosaic.parameters[f"membrane.rho_{c}"]) for c in "rgb"
+    ]
     truth = mosaic.scene.values()
     found = calibrate.fit(mosaic, free, Values({v.name: 1.4 * truth[v.name] for v in free}))
     pulls = (found.estimate - [truth[v.name] for v in free]) / found.sd

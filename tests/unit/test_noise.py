@@ -26,7 +26,9 @@ def record(noise, seed, exposures=EXPOSURES, readings=4, size=64, slope=0.0, **c
     return replace(Captures(None, "bench", frames), **changes)
 
 
-# -- The model ----------------------------------------------------------------------------------------------------------
+# -- The model
+# ----------------------------------------------------------------------------------------------------------
+
 
 def test_variance_is_the_sum_of_its_terms():
     assert CAMERA.variance(8.0) == pytest.approx(1.5**2 + 1 / 12)
@@ -38,7 +40,9 @@ def test_variance_is_the_sum_of_its_terms():
     assert CAMERA.sd(np.array([8.0, 108.0])) == pytest.approx(np.sqrt(CAMERA.variance(np.array([8.0, 108.0]))))
 
 
-@pytest.mark.parametrize("noise", [CAMERA, replace(CAMERA, system_gain=2.0, saturation=4095.0, prnu=0.0), replace(CAMERA, dark_noise=0.5)])
+@pytest.mark.parametrize(
+    "noise", [CAMERA, replace(CAMERA, system_gain=2.0, saturation=4095.0, prnu=0.0), replace(CAMERA, dark_noise=0.5)]
+)
 @pytest.mark.parametrize("frames", [1, 9])
 def test_exposures_scatter_as_the_model_says(noise, frames):
     rng = np.random.default_rng(5)
@@ -47,14 +51,20 @@ def test_exposures_scatter_as_the_model_says(noise, frames):
     mean = np.mean([noise.expose(signal, rng, pattern) for _ in range(frames)], axis=0)
     pulls = (mean - signal) / noise.sd(signal, frames)
     assert np.mean(pulls) == pytest.approx(0.0, abs=4 / np.sqrt(40_000))
-    assert np.mean(pulls**2) == pytest.approx(1.0, abs=4 * np.sqrt(2 / 40_000) + 0.005)  # + Poisson's kurtosis, 1/N electrons
+    assert np.mean(pulls**2) == pytest.approx(
+        1.0, abs=4 * np.sqrt(2 / 40_000) + 0.005
+    )  # + Poisson's kurtosis, 1/N electrons
 
 
 @pytest.mark.parametrize(("dark_noise", "error"), [(0.5, 0.03), (0.3, 0.5)])
 def test_the_step_acts_as_noise_where_it_is_dithered(dark_noise, error):
     noise, rng = replace(CAMERA, system_gain=1e-6, dark_noise=dark_noise, prnu=0.0), np.random.default_rng(1)
-    ratios = [noise.expose(np.full(200_000, 20 + phase), rng).var() / noise.variance(20.0) for phase in (0.0, 0.25, 0.5)]
-    assert error / 2 < np.abs(np.array(ratios) - 1).max() < error  # the worst phase between two steps; sampling adds 0.3 %
+    ratios = [
+        noise.expose(np.full(200_000, 20 + phase), rng).var() / noise.variance(20.0) for phase in (0.0, 0.25, 0.5)
+    ]
+    assert (
+        error / 2 < np.abs(np.array(ratios) - 1).max() < error
+    )  # the worst phase between two steps; sampling adds 0.3 %
 
 
 def test_exposures_are_whole_and_clipped():
@@ -66,10 +76,17 @@ def test_exposures_are_whole_and_clipped():
     assert np.all(coarse % 4 == 0)
 
 
-@pytest.mark.parametrize(("name", "value", "text"), [
-    ("system_gain", 0.0, "system_gain = 0 DN per electron; allowed: > 0"), ("dark_noise", -1.0, "dark_noise = -1 DN, rms; allowed: >= 0"),
-    ("prnu", float("nan"), "prnu = nan .relative, rms.; allowed"), ("black_level", float("inf"), "allowed: finite"),
-    ("saturation", 8.0, "allowed: > black_level = 8 DN"), ("quantisation", -1.0, "allowed: >= 0")])
+@pytest.mark.parametrize(
+    ("name", "value", "text"),
+    [
+        ("system_gain", 0.0, "system_gain = 0 DN per electron; allowed: > 0"),
+        ("dark_noise", -1.0, "dark_noise = -1 DN, rms; allowed: >= 0"),
+        ("prnu", float("nan"), "prnu = nan .relative, rms.; allowed"),
+        ("black_level", float("inf"), "allowed: finite"),
+        ("saturation", 8.0, "allowed: > black_level = 8 DN"),
+        ("quantisation", -1.0, "allowed: >= 0"),
+    ],
+)
 def test_impossible_numbers_are_refused(name, value, text):
     with pytest.raises(ValueError, match=text):
         replace(CAMERA, **{name: value})
@@ -81,21 +98,41 @@ def test_masks_follow_data_and_noise_per_channel():
     image[0, 6, 1] = 1.0
     usable = CAMERA.usable(image)
     assert not usable[2:5, 2:5, 0].any() and usable[..., 0].sum() == 49 - 9 and usable[..., 1].all()
-    assert CAMERA.usable(image, dilate=0)[..., 0].sum() == 48 and CAMERA.usable(image, dilate=2)[..., 0].sum() == 49 - 25
+    assert (
+        CAMERA.usable(image, dilate=0)[..., 0].sum() == 48 and CAMERA.usable(image, dilate=2)[..., 0].sum() == 49 - 25
+    )
     bare = replace(CAMERA, black_level=0.0)  # no pedestal: 3 sigma of 0 is 3 sqrt(0.05 S + 1.5^2 + 1/12), S = 4.7 DN
-    assert not bare.usable(image)[0, 6, 1] and bare.usable(np.full((1, 1, 1), 5.0)).all() and not bare.usable(np.full((1, 1, 1), 4.5)).any()
+    assert (
+        not bare.usable(image)[0, 6, 1]
+        and bare.usable(np.full((1, 1, 1), 5.0)).all()
+        and not bare.usable(np.full((1, 1, 1), 4.5)).any()
+    )
     assert CAMERA.pedestal and not bare.pedestal
 
 
-# -- Estimation ---------------------------------------------------------------------------------------------------------
+# -- Estimation
+# ---------------------------------------------------------------------------------------------------------
+
 
 @pytest.mark.parametrize("slope", [0.0, 0.5])
-@pytest.mark.parametrize("noise", [
-    CAMERA, replace(CAMERA, system_gain=0.2, prnu=0.01), Noise(1.0, 6.0, 64.0, 4095.0, 0.005), Noise(0.8, 1.0, 20.0, 1023.0, 0.004)])
+@pytest.mark.parametrize(
+    "noise",
+    [
+        CAMERA,
+        replace(CAMERA, system_gain=0.2, prnu=0.01),
+        Noise(1.0, 6.0, 64.0, 4095.0, 0.005),
+        Noise(0.8, 1.0, 20.0, 1023.0, 0.004),
+    ],
+)
 def test_a_known_camera_is_recovered(noise, slope):
     runs = [estimate(record(noise, seed, slope=slope)) for seed in range(24)]
     assert all(run.saturation == noise.saturation and run.quantisation == 1.0 for run in runs)
-    for name, most in (("system_gain", 0.03), ("dark_noise", 0.02), ("black_level", 0.005), ("prnu", 0.25)):  # one run's scatter
+    for name, most in (
+        ("system_gain", 0.03),
+        ("dark_noise", 0.02),
+        ("black_level", 0.005),
+        ("prnu", 0.25),
+    ):  # one run's scatter
         values, truth = np.array([getattr(run, name) for run in runs]), getattr(noise, name)
         sd = values.std(ddof=1)
         assert sd < most * truth, name
@@ -138,7 +175,9 @@ def test_a_mosaic_compares_pixels_of_one_colour():
     c = record(replace(CAMERA, prnu=0.01), 3)
     for f in c.frames[1:]:
         for image in (f.image, *f.repeats):
-            image[:, ::2] = np.round(8 + (image[:, ::2] - 8) * 0.8)  # neighbours of another colour; their noise shrinks as well
+            image[:, ::2] = np.round(
+                8 + (image[:, ::2] - 8) * 0.8
+            )  # neighbours of another colour; their noise shrinks as well
     assert estimate(replace(c, cfa="RGGB")).prnu == pytest.approx(0.01, rel=0.15)
     assert estimate(c).prnu > 0.03  # taken for a pattern where the mosaic is not declared
 
@@ -152,13 +191,19 @@ def test_what_was_given_is_not_estimated():
     assert found.dark_noise == pytest.approx(1.5, rel=0.1)  # extrapolated from 10 % of saturation
 
 
-@pytest.mark.parametrize(("captures", "text"), [
-    (record(CAMERA, 0, readings=1), "no frame has repeats"),
-    (record(CAMERA, 0, exposures=(0.0, 0.5)), "2 signal levels can be used, 3 are needed; add repeats at six exposures"),
-    (record(CAMERA, 0, exposures=(0.0, 0.01, 0.02), size=24), "needed to 10 %; add repeats at six exposures"),
-    (record(replace(CAMERA, black_level=0.0), 0), "dark values are clipped at 0 DN; set a pedestal"),
-    (record(replace(CAMERA, quantisation=0.0), 0), "give saturation in DN"),
-])
+@pytest.mark.parametrize(
+    ("captures", "text"),
+    [
+        (record(CAMERA, 0, readings=1), "no frame has repeats"),
+        (
+            record(CAMERA, 0, exposures=(0.0, 0.5)),
+            "2 signal levels can be used, 3 are needed; add repeats at six exposures",
+        ),
+        (record(CAMERA, 0, exposures=(0.0, 0.01, 0.02), size=24), "needed to 10 %; add repeats at six exposures"),
+        (record(replace(CAMERA, black_level=0.0), 0), "dark values are clipped at 0 DN; set a pedestal"),
+        (record(replace(CAMERA, quantisation=0.0), 0), "give saturation in DN"),
+    ],
+)
 def test_what_cannot_be_told_says_what_to_supply(captures, text):
     with pytest.raises(Underdetermined, match=text):
         estimate(captures)

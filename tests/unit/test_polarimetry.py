@@ -37,7 +37,9 @@ def embedded(block, column=(0, 0, 0)):
     return matrix
 
 
-# -- decomposition --------------------------------------------------------------------------------------------------------
+# -- decomposition
+# --------------------------------------------------------------------------------------------------------
+
 
 @pytest.mark.parametrize("seed", range(12))
 def test_the_factors_of_a_product_come_back(seed):
@@ -66,7 +68,10 @@ def test_wave_plates(angle, retardance):
     assert min(abs(found.fast_axis - f) for f in fast) == pytest.approx(0, abs=1e-6)
     assert found.fast_ellipticity == pytest.approx(0, abs=1e-6)
     assert (found.transmittance, found.diattenuation, found.depolarization) == (
-        pytest.approx(0.9), pytest.approx(0, abs=EXACT), pytest.approx(0, abs=1e-9))
+        pytest.approx(0.9),
+        pytest.approx(0, abs=EXACT),
+        pytest.approx(0, abs=1e-9),
+    )
     assert np.isnan(found.axis) and found.depolarization_index == pytest.approx(1)
 
 
@@ -82,18 +87,29 @@ def test_polarizers(angle):
     found = decompose(polarizer(angle, 0.8, 0.004))
     assert found.axis == pytest.approx(angle) and found.polarizance_axis == pytest.approx(angle)
     assert (found.largest, found.smallest) == (pytest.approx(0.8), pytest.approx(0.004))
-    assert found.diattenuation == pytest.approx(0.796 / 0.804) and found.polarizance == pytest.approx(found.diattenuation)
+    assert found.diattenuation == pytest.approx(0.796 / 0.804) and found.polarizance == pytest.approx(
+        found.diattenuation
+    )
     assert found.retardance == pytest.approx(0, abs=1e-5) and found.depolarization == pytest.approx(0, abs=1e-9)
     assert found.realisable > -EXACT
     perfect = decompose(polarizer(angle, 0.8))
-    assert perfect.smallest == pytest.approx(0, abs=EXACT) and np.isnan(perfect.retardance) and np.isnan(perfect.fast_axis)
+    assert (
+        perfect.smallest == pytest.approx(0, abs=EXACT) and np.isnan(perfect.retardance) and np.isnan(perfect.fast_axis)
+    )
 
 
 def test_behind_a_perfect_polarizer_the_factors_still_make_the_matrix():
-    for whole in (polarizer(30) @ plate(10, 70) @ polarizer(80), polarizer(0) @ polarizer(90, 1, 1e-3), polarizer(0) @ polarizer(45),
-                  mueller.depolarizer(0.6).numpy() @ polarizer(25), plate(0, 180) @ polarizer(45)):
+    for whole in (
+        polarizer(30) @ plate(10, 70) @ polarizer(80),
+        polarizer(0) @ polarizer(90, 1, 1e-3),
+        polarizer(0) @ polarizer(45),
+        mueller.depolarizer(0.6).numpy() @ polarizer(25),
+        plate(0, 180) @ polarizer(45),
+    ):
         found = decompose(whole)
-        np.testing.assert_allclose(whole, found.transmittance * found.depolarizer @ found.retarder @ found.diattenuator, atol=1e-9)
+        np.testing.assert_allclose(
+            whole, found.transmittance * found.depolarizer @ found.retarder @ found.diattenuator, atol=1e-9
+        )
 
 
 def test_depolarizers():
@@ -117,10 +133,13 @@ def test_no_light_and_no_matrix():
 
 # -- rays -----------------------------------------------------------------------------------------------------------------
 
+
 @pytest.fixture(scope="module")
 def scenes(mitsuba):
-    return {"bench": scene.load("polarizer_bench", {"bands": "620, 540, 460", "width": "5", "height": "5", "x_fov": "8"}),
-            "finger": scene.load("vi2tap", {"width": "48", "height": "36", "depth": "1.5", "bands": "650, 580, 520, 460"})}
+    return {
+        "bench": scene.load("polarizer_bench", {"bands": "620, 540, 460", "width": "5", "height": "5", "x_fov": "8"}),
+        "finger": scene.load("vi2tap", {"width": "48", "height": "36", "depth": "1.5", "bands": "650, 580, 520, 460"}),
+    }
 
 
 @pytest.fixture
@@ -139,10 +158,18 @@ def finger(scenes):
     scenes["finger"].set(values)
 
 
-SET = {"sample.retard_0": 70.0, "sample.angle": 25.0, "analyzer.angle": 40.0, "analyzer.leak": 0.01, "middle.angle": 10.0}
+SET = {
+    "sample.retard_0": 70.0,
+    "sample.angle": 25.0,
+    "analyzer.angle": 40.0,
+    "analyzer.leak": 0.01,
+    "middle.angle": 10.0,
+}
 
 
-@pytest.mark.parametrize("values", [SET, {**SET, "analyzer.face": 0.05, "polarizer.face": 0.04}], ids=["clear", "faces"])
+@pytest.mark.parametrize(
+    "values", [SET, {**SET, "analyzer.face": 0.05, "polarizer.face": 0.04}], ids=["clear", "faces"]
+)
 def test_the_whole_is_what_the_prediction_multiplies(bench, values):
     values = {**bench.values(), **values}
     bands = np.array([620.0, 540.0, 460.0])
@@ -191,7 +218,8 @@ def test_places(bench):
         polarimetry.pixel(bare, None)
 
 
-# -- pictures -------------------------------------------------------------------------------------------------------------
+# -- images -------------------------------------------------------------------------------------------------------------
+
 
 def test_the_colours_of_angles_close_and_keep_their_lightness():
     angles = np.arange(0, 180, 5.0)
@@ -217,9 +245,11 @@ def test_maps_are_black_where_nothing_can_be_said():
     assert not degree[1].any() and not angle[1].any()
 
 
-# -- readings against a parameter -----------------------------------------------------------------------------------------
+# -- readings against a parameter
+# -----------------------------------------------------------------------------------------
 
-def test_a_spot_is_a_pixel_of_the_picture(finger):
+
+def test_a_spot_is_a_pixel_of_the_image(finger):
     whole, values = Renderer(finger), {**finger.values(), "analyzer.angle": 20.0}
     picture = sum(whole.powers(values, n) * whole.image(values, n) for n in finger.lights) + whole.ambient(values)
     hits = whole.hits(values)
@@ -234,10 +264,14 @@ def test_a_spot_is_a_pixel_of_the_picture(finger):
 
 
 def test_malus_and_the_ratio_of_extinction(bench):
-    found = polarimetry.sweep(bench, "analyzer.angle", np.linspace(0, 180, 37), (2.5, 2.5), {"analyzer.leak": 0.004, "polarizer.angle": 30})
+    found = polarimetry.sweep(
+        bench, "analyzer.angle", np.linspace(0, 180, 37), (2.5, 2.5), {"analyzer.leak": 0.004, "polarizer.angle": 30}
+    )
     curve = found.curves[0]
     turn = np.radians(curve.x - 30)
-    expected = 255 * 0.4 * (0.8 * np.cos(turn) ** 2 + 0.004 * np.sin(turn) ** 2)  # T1 of the first is halved by unpolarized light
+    expected = (
+        255 * 0.4 * (0.8 * np.cos(turn) ** 2 + 0.004 * np.sin(turn) ** 2)
+    )  # T1 of the first is halved by unpolarized light
     np.testing.assert_allclose(curve.y, np.repeat(expected[:, None], 3, 1), rtol=1e-6)
     row = found.summary()[0]
     assert row["extinction_ratio"] == pytest.approx(200) and (row["at"], row["dark_at"]) == (30, 120)
@@ -246,8 +280,12 @@ def test_malus_and_the_ratio_of_extinction(bench):
 
 
 def test_other_parameters_and_their_ends(bench):
-    found = polarimetry.sweep(bench, "sample.depolarization", [0, 0.5, 1], (2.5, 2.5), {"analyzer.angle": 90}, radiance=True)
-    np.testing.assert_allclose(found.curves[0].y, np.repeat([[0], [0.08], [0.16]], 3, 1), atol=1e-9)  # 0.8 x 0.8 / 2 x d / 2
+    found = polarimetry.sweep(
+        bench, "sample.depolarization", [0, 0.5, 1], (2.5, 2.5), {"analyzer.angle": 90}, radiance=True
+    )
+    np.testing.assert_allclose(
+        found.curves[0].y, np.repeat([[0], [0.08], [0.16]], 3, 1), atol=1e-9
+    )  # 0.8 x 0.8 / 2 x d / 2
     assert found.ideal(found.curves[0]) is None and found.summary()[0]["extinction_ratio"] == float("inf")
     assert polarimetry.span(bench, "analyzer.angle", None, 90) == (0, 90)
     with pytest.raises(ValueError, match="--from is missing; allowed: 0 to 1"):
@@ -258,16 +296,16 @@ def test_other_parameters_and_their_ends(bench):
         polarimetry.span(bench, "sample.stress_pattern", 0, 1)
 
 
-def test_effects_that_mix_pixels_see_the_whole_picture(finger):
+def test_effects_that_mix_pixels_see_the_whole_image(finger):
     values = {"camera.glare": 0.2, "camera.exposure": 3.0}
     found = polarimetry.sweep(finger, "analyzer.angle", [0.0, 90.0], (24, 18), values)
-    from optics.light.output import Pictures
+    from optics.light.rendering import RenderJob
 
-    picture = Pictures(finger).take({**values, "analyzer.angle": 90.0})
-    np.testing.assert_allclose(found.curves[0].y[1], picture.camera[18, 24], rtol=1e-5)
+    image = RenderJob(finger).take({**values, "analyzer.angle": 90.0})
+    np.testing.assert_allclose(found.curves[0].y[1], image.camera[18, 24], rtol=1e-5)
 
 
-def test_plots_and_maps_are_pictures(bench, tmp_path):
+def test_plots_and_maps_are_images(bench, tmp_path):
     from PIL import Image
 
     polarimetry.sweep(bench, "analyzer.angle", np.linspace(0, 180, 7), (2.5, 2.5)).plot(tmp_path / "a.png")

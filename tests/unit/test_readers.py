@@ -1,4 +1,5 @@
-"""What robots compute from such a sensor's images: markers to a fraction of a pixel, areas without steps, one r for all sizes."""
+"""What robots compute from such a sensor's images: markers to a fraction of a pixel, areas without steps, one r for all
+sizes."""
 
 import numpy as np
 import pytest
@@ -78,7 +79,8 @@ def test_noise_moves_centres_as_photon_statistics_say():
         found = find(draw(true) + np.random.default_rng(100 + seed).normal(0, noise, (HEIGHT, WIDTH)))
         assert len(found) == 20
         off.append(errors(true, found))
-    # sum of (x noise)^2 over the disc / (area excess)^2 = (noise / excess)^2 / (4 pi) per axis; the skirt adds, its cut takes
+    # sum of (x noise)^2 over the disc / (area excess)^2 = (noise / excess)^2 / (4 pi) per axis; the skirt adds, its cut
+    # takes
     expected = np.sqrt(2 / (4 * np.pi)) * noise / excess
     assert 0.6 * expected < np.sqrt(np.mean(np.square(off))) < 2 * expected
 
@@ -87,7 +89,9 @@ def test_blur_leaves_centres_and_areas():
     true = grid(seed=2)
     found = find(ndimage.gaussian_filter(draw(true), 1.5))
     assert len(found) == 20
-    assert errors(true, found).max() < 0.05  # symmetric blur moves nothing; what is cut at the skirt's end is 2 % of the light
+    assert (
+        errors(true, found).max() < 0.05
+    )  # symmetric blur moves nothing; what is cut at the skirt's end is 2 % of the light
     # +- one pixel of outline in a radius of four: pixels count as a whole here
     assert np.median(found.areas) == pytest.approx(np.pi * RADIUS**2, rel=0.15)
 
@@ -99,7 +103,8 @@ def test_a_lamp_on_one_side_and_a_sloping_background_lose_no_marker():
     image = draw(true, bright=DARK + slope * true[:, 0] + excess, behind=behind)
     found = find(image)
     assert len(found) == 20
-    # opaque discs on a slope g are found g r^2 / (4 excess) downhill: 0.044 px for the dimmest; 0.02 as on an even ground
+    # opaque discs on a slope g are found g r^2 / (4 excess) downhill: 0.044 px for the dimmest; 0.02 as on an even
+    # ground
     assert np.all(errors(true, found) < slope * RADIUS**2 / (4 * excess) + 0.02)
 
 
@@ -129,6 +134,7 @@ def test_perspective_makes_ellipses_whose_centroids_are_found():
     tilt = np.array([[1.0, 0.08, 0.0], [0.0, 1.0, 0.0], [0.0018, 0.0012, 1.0]])  # about the middle: 1.7 : 1 in size
     true, image = [], np.full((HEIGHT, WIDTH), DARK)
     for x, y in grid() - [WIDTH / 2, HEIGHT / 2]:
+
         def inside(u, v, x=x, y=y):
             p = np.tensordot(np.linalg.inv(tilt), np.stack(np.broadcast_arrays(u - WIDTH / 2, v - HEIGHT / 2, 1.0)), 1)
             return np.hypot(p[0] / p[2] - x, p[1] / p[2] - y) < RADIUS
@@ -136,7 +142,7 @@ def test_perspective_makes_ellipses_whose_centroids_are_found():
         u, v, w = tilt @ (x, y, 1.0)
         left, top = int(u / w + WIDTH / 2) - 8, int(v / w + HEIGHT / 2) - 8
         a = cover(lambda s, t: inside(s + left, t + top), (17, 17))
-        image[top:top + 17, left:left + 17] += (BRIGHT - DARK) * a
+        image[top : top + 17, left : left + 17] += (BRIGHT - DARK) * a
         rows, columns = np.indices(a.shape) + 0.5
         true.append([left + (a * columns).sum() / a.sum(), top + (a * rows).sum() / a.sum()])
     true, found = np.array(true), find(image)
@@ -145,9 +151,16 @@ def test_perspective_makes_ellipses_whose_centroids_are_found():
     assert np.linalg.norm(found.centres[grid_order(found)] - true, axis=1).max() < 0.03
 
 
-@pytest.mark.parametrize("image", [np.zeros((60, 80)), np.full((60, 80, 3), 7, np.uint8), np.tile(np.arange(80.0), (60, 1)),
-                                   np.random.default_rng(0).normal(20, 3, (60, 80))],
-                         ids=["black", "grey", "ramp", "noise"])
+@pytest.mark.parametrize(
+    "image",
+    [
+        np.zeros((60, 80)),
+        np.full((60, 80, 3), 7, np.uint8),
+        np.tile(np.arange(80.0), (60, 1)),
+        np.random.default_rng(0).normal(20, 3, (60, 80)),
+    ],
+    ids=["black", "grey", "ramp", "noise"],
+)
 def test_an_image_without_markers_has_none(image):
     found = find(image, count=20)
     assert len(find(image, detectable=0, roundness=0)) == 0  # no candidate, before any is weighed
@@ -189,10 +202,16 @@ def test_whole_numbers_and_channels_change_nothing_but_their_step():
     assert np.isfinite(found.score).all() and found.score.max() < 100 * 12**0.5
 
 
-@pytest.mark.parametrize("image, options, said", [
-    (np.zeros(9), {}, "allowed: real"), (np.full((40, 40), np.nan), {}, "1600 pixels are NaN"),
-    (np.zeros((40, 40)), {"largest": 60}, "largest marker = 60 px"), (np.zeros((40, 40)), {"roundness": 2}, "roundness = 2"),
-    (np.zeros((40, 40)), {"count": -1}, "count = -1")])
+@pytest.mark.parametrize(
+    "image, options, said",
+    [
+        (np.zeros(9), {}, "allowed: real"),
+        (np.full((40, 40), np.nan), {}, "1600 pixels are NaN"),
+        (np.zeros((40, 40)), {"largest": 60}, "largest marker = 60 px"),
+        (np.zeros((40, 40)), {"roundness": 2}, "roundness = 2"),
+        (np.zeros((40, 40)), {"count": -1}, "count = -1"),
+    ],
+)
 def test_find_refuses_what_it_cannot_mean(image, options, said):
     with pytest.raises(ValueError, match=said):
         find(image, **options)
@@ -242,19 +261,21 @@ def test_nothing_matches_nothing_and_one_marker_needs_a_reach():
         match(grid(), np.full((3, 2), np.nan))
 
 
-def test_displacement_reads_two_pictures_row_by_row():
+def test_displacement_reads_two_images_row_by_row():
     rest = grid(seed=12)
     true = push(rest, 5.0)
     shown = np.delete(rest + true, 6, axis=0)  # one is lost
     rng = np.random.default_rng(13)
-    pictures = [draw(p) + rng.normal(0, 2, (HEIGHT, WIDTH)) for p in (rest, shown)]
-    places, moved = displacement(*pictures, grid=(COLUMNS, ROWS))
-    assert np.abs(places - rest).max() < 0.08  # five sd of the noise's 0.28 noise / excess = 0.006, and the cut of the skirt
+    images = [draw(p) + rng.normal(0, 2, (HEIGHT, WIDTH)) for p in (rest, shown)]
+    places, moved = displacement(*images, grid=(COLUMNS, ROWS))
+    assert (
+        np.abs(places - rest).max() < 0.08
+    )  # five sd of the noise's 0.28 noise / excess = 0.006, and the cut of the skirt
     assert np.flatnonzero(np.isnan(moved[:, 0])).tolist() == [6]
     assert np.nanmax(np.abs(moved - true)) < 0.1
-    assert len(displacement(*pictures)[0]) == 20
+    assert len(displacement(*images)[0]) == 20
     with pytest.raises(ValueError, match="19 markers for 5 columns x 4 rows"):
-        displacement(pictures[1], pictures[0], grid=(COLUMNS, ROWS))
+        displacement(images[1], images[0], grid=(COLUMNS, ROWS))
 
 
 @pytest.mark.parametrize("turn", [-20, 0, 20])  # deg
@@ -270,8 +291,12 @@ def test_grid_order_bears_perspective_turn_and_displacement(turn, seed):
 
 
 def test_grid_order_refuses_rather_than_guesses():
-    for wrong in (grid()[:, ::-1], np.random.default_rng(0).uniform(0, 100, (20, 2)), np.zeros((20, 2)),
-                  np.repeat(np.arange(20.0)[:, None], 2, axis=1)):  # 4 x 5, a cloud, a point, a line
+    for wrong in (
+        grid()[:, ::-1],
+        np.random.default_rng(0).uniform(0, 100, (20, 2)),
+        np.zeros((20, 2)),
+        np.repeat(np.arange(20.0)[:, None], 2, axis=1),
+    ):  # 4 x 5, a cloud, a point, a line
         with pytest.raises(ValueError, match="do not form 5 columns x 4 rows"):
             grid_order(wrong)
     with pytest.raises(ValueError, match="exactly 20"):
@@ -282,7 +307,7 @@ def test_grid_order_refuses_rather_than_guesses():
 
 
 def scene(a, thing=100.0, behind=None, noise=0.0, blur=0.0, seed=20):
-    """(picture with the object, picture without), DN: coverage a of the object before a textured room."""
+    """(image with the object, image without), DN: coverage a of the object before a textured room."""
     behind = texture(21, 10, 40) if behind is None else behind
     rng = np.random.default_rng(seed)
     pair = (behind + a * (thing - behind), behind)
@@ -295,13 +320,16 @@ def test_area_grows_with_the_object_without_steps(noise, blur):
     true = np.array([disc(80.3, 60.2, r).sum() for r in radius])
     found = np.array([area(*scene(disc(80.3, 60.2, r), noise=noise, blur=blur)) for r in radius])
     assert found == pytest.approx(true, rel=0.02)  # a fifth of a pixel all around: the room's texture in the difference
-    # 113 px of outline: whole pixels would come in jumps of several; a pixel in parts is off by a tenth, and they average
+    # 113 px of outline: whole pixels would come in jumps of several; a pixel in parts is off by a tenth, and they
+    # average
     assert np.std(found - true) < 2.0
 
 
 @pytest.mark.parametrize("radius", [2.5, 4.0, 10.0, 45.0, 75.0])
 def test_area_holds_from_a_speck_to_a_filled_and_clipped_view(radius):
-    a = disc(80.3, 60.2, radius)  # 75 px: nine tenths of the view, cut by the border; no statistic of the whole image holds
+    a = disc(
+        80.3, 60.2, radius
+    )  # 75 px: nine tenths of the view, cut by the border; no statistic of the whole image holds
     # a tenth of a pixel all around, 0.2 / radius: the level at the rim is that of the texture within
     assert area(*scene(a, noise=2)) == pytest.approx(a.sum(), rel=0.02 + 0.2 / radius)
 
@@ -329,11 +357,16 @@ def test_area_is_zero_where_nothing_is_and_the_threshold_decides_what_is_somethi
 def test_shadows_do_not_win_and_a_threshold_in_dn_keeps_them_off():
     a, beside, touching = disc(110, 60, 15.3), disc(40, 60, 35.0), disc(75, 60, 35.0)
     room = texture(23, 60, 70)
-    wide = [room * (1 - 0.15 * beside) * (1 - a) + 150 * a, room]  # a shadow of 10 DN, five times as large as the object
+    wide = [
+        room * (1 - 0.15 * beside) * (1 - a) + 150 * a,
+        room,
+    ]  # a shadow of 10 DN, five times as large as the object
     assert area(*wide) == pytest.approx(a.sum(), rel=0.01)
     wide = [room * (1 - 0.15 * touching) * (1 - a) + 150 * a, room]
     assert area(*wide) > 3 * a.sum()  # what `falls short` says
-    assert area(*wide, threshold=20, noise=1) == pytest.approx(a.sum(), rel=0.03)  # 10 of 85 DN in half of the rim's pixels
+    assert area(*wide, threshold=20, noise=1) == pytest.approx(
+        a.sum(), rel=0.03
+    )  # 10 of 85 DN in half of the rim's pixels
 
 
 @pytest.mark.parametrize("x, radius", [(80.3, 25.0), (78.0, 30.0), (86.0, 28.0)])
@@ -342,11 +375,14 @@ def test_markers_before_an_object_are_bridged(x, radius):
     hidden = find(markers).mask(markers.shape)
     view, room = (np.where(markers > 0, markers, p) for p in scene(a, noise=1))
     depth = np.where(markers > 0, 20.0, 30 * a + 150 * (1 - a))  # nearer than the object
-    # each of up to six markers on the rim hides 120 px of which a cut by a straight line is wrong by its sagitta, some 3 px
+    # each of up to six markers on the rim hides 120 px of which a cut by a straight line is wrong by its sagitta, some
+    # 3 px
     for found in (area(view, room, hidden=hidden), area(depth, threshold=60, hidden=hidden)):
         assert found == pytest.approx(a.sum(), rel=0.025)
     alone = np.where(markers > 0, 20.0, 150.0)
-    assert area(alone, threshold=60, hidden=hidden) == 0.0 and area(alone, threshold=60) > 40  # a marker passes for an object
+    assert (
+        area(alone, threshold=60, hidden=hidden) == 0.0 and area(alone, threshold=60) > 40
+    )  # a marker passes for an object
     with pytest.raises(ValueError, match="see Markers.mask"):
         area(view, room, hidden=hidden[1:])
 
@@ -357,21 +393,33 @@ def test_area_of_a_depth_map_counts_mixed_pixels_by_their_depth():
     depth = 30 * a + wall * (1 - a)
     depth -= 20 * disc(140, 20, 6.0)  # nearer than the wall there, but not than the threshold
     depth = np.minimum(depth, np.where(disc(93, 55, 6.0) > 0, 30.0, np.inf))  # 2 px beside it, another thing
-    assert area(depth, threshold=60) == pytest.approx(a.sum(), rel=0.007)  # the wall: 0.5 mm/px over 3 px of rim, of 100 mm
+    assert area(depth, threshold=60) == pytest.approx(
+        a.sum(), rel=0.007
+    )  # the wall: 0.5 mm/px over 3 px of rim, of 100 mm
     slope = np.where(np.abs(np.arange(HEIGHT)[:, None] - 60) < 25, np.linspace(20, 100, WIDTH), 200.0)
-    assert area(slope, threshold=60) == pytest.approx((slope < 60).sum(), rel=0.005)  # its end without a jump: 0.3 px along 49
+    assert area(slope, threshold=60) == pytest.approx(
+        (slope < 60).sum(), rel=0.005
+    )  # its end without a jump: 0.3 px along 49
     assert area(np.full((HEIGHT, WIDTH), 200.0), threshold=60) == 0.0
     assert area(np.full((HEIGHT, WIDTH), 20.0), threshold=60) == HEIGHT * WIDTH
     full = scene(np.ones((HEIGHT, WIDTH)), thing=texture(22, 60, 140))
     assert area(*full) == HEIGHT * WIDTH  # no rim along the border of the view
-    empty = np.where(a > 0.5, np.linspace(30, 55, WIDTH), np.inf)  # a tilted thing, nothing behind: whole pixels are all there is
+    empty = np.where(
+        a > 0.5, np.linspace(30, 55, WIDTH), np.inf
+    )  # a tilted thing, nothing behind: whole pixels are all there is
     assert area(empty, threshold=60) == pytest.approx((a > 0.5).sum(), abs=1e-6)
 
 
-@pytest.mark.parametrize("arguments, said", [
-    ((np.zeros((9, 9)),), "threshold in mm"), ((np.zeros((9, 9, 3)), None, 5.0), "threshold in mm"),
-    ((np.zeros((9, 9)), np.zeros((9, 8))), "the same shape"), ((np.zeros((9, 9)), None, -1.0), "threshold = -1"),
-    ((np.full((9, 9), np.nan), np.zeros((9, 9))), "81 values are NaN")])
+@pytest.mark.parametrize(
+    "arguments, said",
+    [
+        ((np.zeros((9, 9)),), "threshold in mm"),
+        ((np.zeros((9, 9, 3)), None, 5.0), "threshold in mm"),
+        ((np.zeros((9, 9)), np.zeros((9, 8))), "the same shape"),
+        ((np.zeros((9, 9)), None, -1.0), "threshold = -1"),
+        ((np.full((9, 9), np.nan), np.zeros((9, 9))), "81 values are NaN"),
+    ],
+)
 def test_area_refuses_what_it_cannot_mean(arguments, said):
     with pytest.raises(ValueError, match=said):
         area(*arguments)
@@ -390,7 +438,8 @@ def view(fov):
 
 
 def standing(diameter, d, fov):
-    """Share of a pinhole's view that a disc at distance d, centred, covers: the closed form of a circle cut by a rectangle."""
+    """Share of a pinhole's view that a disc at distance d, centred, covers: the closed form of a circle cut by a
+    rectangle."""
     w, h = view(fov)
     r = diameter / 2 / (CAMERA + d)
 
@@ -410,7 +459,7 @@ def lying(diameter, d, fov):
 
 
 def curves(share, form, fov=120.0, initial=30.0, pixels=640 * 480):
-    k = int(np.flatnonzero(DISTANCES == initial)[0])
+    k = int(np.flatnonzero(initial == DISTANCES)[0])
     px = {size: share(size, DISTANCES, fov) * pixels for size in SIZES}
     return {size: metric(px[size], px[size][k], px[20][k], pixels, form) for size in SIZES}
 
@@ -437,7 +486,9 @@ def test_the_consistent_form_makes_standing_cylinders_share_one_curve_and_the_pr
 def test_lying_cylinders_share_a_curve_to_a_few_per_cent_in_the_consistent_form_only():
     r = curves(lying, "consistent")
     apart = np.abs(r[40] / r[20] - 1)
-    assert 0.03 < apart.max() < 0.04  # the outline is not that of a flat strip: sqrt((z + 20) / (z + 40)) changes with z
+    assert (
+        0.03 < apart.max() < 0.04
+    )  # the outline is not that of a flat strip: sqrt((z + 20) / (z + 40)) changes with z
     assert apart[DISTANCES == 30] == pytest.approx(0, abs=1e-12)
     printed = curves(lying, "printed")
     assert (printed[40] / printed[20]).min() > 3
@@ -491,9 +542,16 @@ def test_distance_between_nodes_is_monotone_on_a_rough_curve():
     assert np.all(np.diff(read) > 0) and read[[0, -1]] == pytest.approx([10, 60])
 
 
-@pytest.mark.parametrize("r, d, said", [
-    ([0.3, 0.1, 0.2], [10, 20, 30], "r = 0.1 at 20 mm and 0.2 at 30 mm"), ([0.3, 0.3], [10, 20], "falls strictly"),
-    ([0.3, 0.2], [10, 10], "average repeats"), ([0.3], [10], "n >= 2"), ([0.3, 0.0], [10, 20], "r above 0")])
+@pytest.mark.parametrize(
+    "r, d, said",
+    [
+        ([0.3, 0.1, 0.2], [10, 20, 30], "r = 0.1 at 20 mm and 0.2 at 30 mm"),
+        ([0.3, 0.3], [10, 20], "falls strictly"),
+        ([0.3, 0.2], [10, 10], "average repeats"),
+        ([0.3], [10], "n >= 2"),
+        ([0.3, 0.0], [10, 20], "r above 0"),
+    ],
+)
 def test_distance_refuses_curves_that_give_one_r_two_distances(r, d, said):
     with pytest.raises(ValueError, match=said):
         distance(0.2, np.array(r), np.array(d))

@@ -1,4 +1,5 @@
-"""What a rehearsal says of hidden effects, against the closed form for two rivals and against a diagnosis of what was really hidden."""
+"""What a rehearsal says of hidden effects, against the closed form for two rivals and against a diagnosis of what was
+really hidden."""
 
 import sys
 from pathlib import Path
@@ -10,7 +11,7 @@ from optics.diagnosis.diagnose import score
 from optics.diagnosis.rehearse import rehearse
 
 sys.path.insert(0, str(Path(__file__).parent))
-from mock_model import LIBRARY, MockModel, mock_fit, simulate  # noqa: E402
+from mock_model import LIBRARY, MockModel, mock_fit, simulate
 
 FITTED = (0, 1, 2, 3)
 
@@ -43,19 +44,27 @@ def test_strengths_make_the_change_that_is_hidden(model):
         values.common[f"sensor.{effect.parameter_names[0]}"] = row.strength
         change = np.concatenate([(a - b)[u] for a, b, u in zip(mock.predict(values), plain, usable)])
         signal = np.concatenate([a[u] for a, u in zip(plain, usable)]).mean() - mock.noise.black_level
-        assert np.sqrt(np.mean(change**2)) / signal == pytest.approx(0.004, rel=0.03)  # effects bend by so much at this size
+        assert np.sqrt(np.mean(change**2)) / signal == pytest.approx(
+            0.004, rel=0.03
+        )  # effects bend by so much at this size
 
 
 def test_what_every_frame_has_for_itself_is_not_hidden_as_one_scale(model):
     """Frames up and down in turn: the same for all would be a scale, which calibration takes up (2 % were noticed)."""
-    row = next(r for r in rehearse(*model, LIBRARY, model[0].variables_of, FITTED, change=0.004, draws=200).rows if r.effect == "flicker")
-    assert row.noticed > 0.9 and row.first > 0.9  # 0.4 % in each of four frames of 1200 values with 1 % noise: 10 sd and more
+    row = next(
+        r
+        for r in rehearse(*model, LIBRARY, model[0].variables_of, FITTED, change=0.004, draws=200).rows
+        if r.effect == "flicker"
+    )
+    assert (
+        row.noticed > 0.9 and row.first > 0.9
+    )  # 0.4 % in each of four frames of 1200 values with 1 % noise: 10 sd and more
 
 
 @pytest.mark.parametrize("change", [0.0005, 0.001, 0.002, 0.004])
 def test_who_comes_first_is_as_two_rivals_have_it(model, change):
-    """Of two free strengths, scores over their sd are x ~ N(a, 1) and y ~ N(a c, 1) with the correlation c, and |x| > |y| where x - y and
-    x + y, which are independent, have one sign. 4000 draws: 2.5 % are three sd."""
+    """Of two free strengths, scores over their sd are x ~ N(a, 1) and y ~ N(a c, 1) with the correlation c, and |x| >
+    |y| where x - y and x + y, which are independent, have one sign. 4000 draws: 2.5 % are three sd."""
     from scipy.special import ndtr
 
     pair = rivals("gamma", "LED lobe")

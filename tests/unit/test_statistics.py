@@ -174,7 +174,8 @@ def candidates_of(information, sizes, sides):
 
 
 def test_family_wise_alarms_come_as_often_as_stated():
-    """R9: nominal 1 %, at most 2 % in 4000 nulls (and no fewer than 0.5 %), with look-alikes, one-sided and grouped effects."""
+    """R9: nominal 1 %, at most 2 % in 4000 nulls (and no fewer than 0.5 %), with look-alikes, one-sided and grouped
+    effects."""
     sizes, sides = (1, 1, 1, 2, 4, 1, 1, 3), (0, 1, 1, 0, 0, -1, 0, 1)
     j, _, _ = data(n=600, p=5)
     rng = np.random.default_rng(6)
@@ -226,14 +227,19 @@ def test_gap_predicts_how_often_the_right_effect_wins():
 
 @pytest.mark.parametrize("kappa", [0.1, 0.3])
 def test_two_renders_of_a_derivative_remove_the_bias(kappa):
-    """R8: strength to 5 % at kappa 0.1 and, on average, at 0.3 as well, where one render gives 1/(1 + kappa^2/survival)."""
+    """R8: strength to 5 % at kappa 0.1 and, on average, at 0.3 as well, where one render gives 1/(1 +
+    kappa^2/survival)."""
     rng = np.random.default_rng(8)
     n, strength, found, naive = 20_000, 0.4, [], []
     j = np.stack([np.ones(n), np.linspace(-1, 1, n)], 1)
     g = (j[:, 0] + 0.5 * np.linspace(-1, 1, n) ** 2)[:, None]  # nearly all of it is absorbed
     a = np.hstack([j, g])
     for _ in range(12):
-        r = strength * g[:, 0] - j @ np.linalg.lstsq(j, strength * g[:, 0], rcond=None)[0] + 0.02 * rng.standard_normal(n)
+        r = (
+            strength * g[:, 0]
+            - j @ np.linalg.lstsq(j, strength * g[:, 0], rcond=None)[0]
+            + 0.02 * rng.standard_normal(n)
+        )
         one, two = (a + kappa * np.sqrt(np.mean(a**2, 0)) * rng.standard_normal(a.shape) for _ in range(2))
         twin = st.Normal(3)
         twin.add(range(3), one, r, two)
@@ -311,19 +317,29 @@ def test_white_noise_has_no_structure_whatever_its_size_and_mask():
 
 
 def sweeps(rng, count=126, parts=6):
-    """Readings in turn in `parts` sweeps: a power and an offset are calibrated; an angle, a lamp of two powers, and time were swept."""
-    time, angle, power = np.arange(count) * 1.0, rng.permutation(np.repeat(np.arange(0, 180, 20.0), count // 9)), np.arange(count) % 2.0
+    """Readings in turn in `parts` sweeps: a power and an offset are calibrated; an angle, a lamp of two powers, and
+    time were swept."""
+    time, angle, power = (
+        np.arange(count) * 1.0,
+        rng.permutation(np.repeat(np.arange(0, 180, 20.0), count // 9)),
+        np.arange(count) % 2.0,
+    )
     columns = np.stack([np.cos(np.radians(angle)) ** 2 * (1 + power), np.ones(count)], -1)
     found, of = st.Sweeps(), [np.arange(k, count, parts) for k in range(parts)]
     for rows in of:
         along = {name: x[rows].reshape(-1, 1, 1) for name, x in (("time", time), ("angle", angle), ("power", power))}
         found.add(np.ones((len(rows), 1, 1), bool), [0, 1], columns[rows].reshape(-1, 1, 1, 2), along)
     off = np.eye(count) - columns @ np.linalg.pinv(columns)
-    return lambda r: found.test([(off @ r)[rows].reshape(-1, 1, 1) for rows in of], [0, 1], np.zeros((2, 2))), time, angle
+    return (
+        lambda r: found.test([(off @ r)[rows].reshape(-1, 1, 1) for rows in of], [0, 1], np.zeros((2, 2))),
+        time,
+        angle,
+    )
 
 
 def test_readings_without_structure_have_none_whatever_their_noise():
-    """Bonferroni over three coordinates: never more often than nominal (3 sd of 600), and not much less, as they hardly share anything."""
+    """Bonferroni over three coordinates: never more often than nominal (3 sd of 600), and not much less, as they hardly
+    share anything."""
     rng = np.random.default_rng(15)
     test, _, _ = sweeps(rng)
     p = np.array([test(3.0 * rng.standard_normal(126)).p for _ in range(600)])
@@ -345,9 +361,16 @@ def test_smooth_structure_is_found_and_calibrated_columns_are_counted():
     rng = np.random.default_rng(13)
     use = np.ones((32, 32, 1), bool)
     x = np.linspace(-1, 1, 32)
-    smooth = np.stack([np.multiply.outer(np.polynomial.legendre.legval(x, np.eye(4)[i]),
-                                         np.polynomial.legendre.legval(x, np.eye(4)[k]))[..., None]
-                       for i in range(4) for k in range(4)], -1)
+    smooth = np.stack(
+        [
+            np.multiply.outer(
+                np.polynomial.legendre.legval(x, np.eye(4)[i]), np.polynomial.legendre.legval(x, np.eye(4)[k])
+            )[..., None]
+            for i in range(4)
+            for k in range(4)
+        ],
+        -1,
+    )
     spectrum = spectrum_of(use, smooth)
     a = smooth.reshape(-1, 16)
     inv, _ = st.inverse(a.T @ a)

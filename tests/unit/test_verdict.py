@@ -25,7 +25,7 @@ from optics.scene.declare import Effect
 from optics.scene.parameter import Parameter, Values, Variable
 
 sys.path.insert(0, str(Path(__file__).parent))
-from mock_model import LIBRARY, Exact, Frame, MockModel, PointModel, mock_fit, simulate  # noqa: E402
+from mock_model import LIBRARY, Exact, Frame, MockModel, PointModel, mock_fit, simulate
 
 PRESSES, HELD = 6, (4, 5)
 FITTED = (0, 1, 2, 3)
@@ -46,7 +46,9 @@ def calibrated(truth=None, seed=1, clutter=0.0, unit=None, side=22, extra=(), pr
 
 
 def judge(model, fit, effects=LIBRARY, held=HELD, **options):
-    return diagnose(model, fit, effects, model.variables_of, held, fitted=FITTED, **{"refit": mock_fit, "top": 3, **options})
+    return diagnose(
+        model, fit, effects, model.variables_of, held, fitted=FITTED, **{"refit": mock_fit, "top": 3, **options}
+    )
 
 
 @cache
@@ -71,8 +73,11 @@ def test_nothing_is_said_of_a_complete_model():
     d = case("null")
     assert d.word == "NOTHING" and len(d.rows) == len(LIBRARY)
     assert all(r.p_family >= 0.01 and r.refit is None for r in d.rows)
-    assert all(np.nanmax(r.upper) < 0.3 * MockModel(1).parameters[f"sensor.{v.split('.')[1].split('[')[0]}"].plausible
-               for r in d.rows for v in r.variables[:1])  # "not present" is a result too
+    assert all(
+        np.nanmax(r.upper) < 0.3 * MockModel(1).parameters[f"sensor.{v.split('.')[1].split('[')[0]}"].plausible
+        for r in d.rows
+        for v in r.variables[:1]
+    )  # "not present" is a result too
     assert abs(d.basis.phi - 1) < 5 * math.sqrt(2 / d.basis.dof)
     assert d.basis.gradient < 0.1
 
@@ -112,7 +117,8 @@ def test_an_effect_with_a_strength_per_frame_is_claimed():
 
 @pytest.mark.parametrize("follows", [True, False])
 def test_a_number_per_frame_that_follows_a_setting_is_no_drift(follows):
-    """A gain that goes with what was set in each frame is not named after the frames, as one that goes its own way is."""
+    """A gain that goes with what was set in each frame is not named after the frames, as one that goes its own way
+    is."""
     count, fitted = 14, tuple(range(12))
     angles = 15.0 * np.arange(count)
     gains = 0.02 * np.cos(np.radians(3 * angles))
@@ -122,7 +128,16 @@ def test_a_number_per_frame_that_follows_a_setting_is_no_drift(follows):
     for frame, angle in zip(model.frames, angles):
         frame.parameters["sensor.angle"] = angle
     fit = mock_fit(model, model.base_variables(fitted), start, fitted)
-    d = diagnose(model, fit, library("flicker", "gamma", "glare"), model.variables_of, (12, 13), fitted=fitted, refit=mock_fit, top=3)
+    d = diagnose(
+        model,
+        fit,
+        library("flicker", "gamma", "glare"),
+        model.variables_of,
+        (12, 13),
+        fitted=fitted,
+        refit=mock_fit,
+        top=3,
+    )
     assert d.word == ("UNKNOWN" if follows else "CLAIM"), d.sentence
     assert ("depends on 'sensor.angle'" in d.sentence) == follows and (d.claimed == "flicker") == (not follows)
 
@@ -148,7 +163,9 @@ def test_what_the_library_lacks_is_unknown_and_named_by_its_coordinate(name, coo
 
 @pytest.mark.parametrize("height_gain, faint", [(0.04, False), (0.025, True)])
 def test_what_a_good_sensors_own_mottle_makes_as_well_is_called_faint(height_gain, faint):
-    d = judge(*calibrated({"height_gain": height_gain}, seed=2), library("vignetting", "absorption", "crosstalk", "defocus"))
+    d = judge(
+        *calibrated({"height_gain": height_gain}, seed=2), library("vignetting", "absorption", "crosstalk", "defocus")
+    )
     assert d.word == "UNKNOWN" and (d.basis.misfit**2 - d.basis.noise**2 < CLUTTERED**2) == faint
     assert ("It is faint" in d.sentence) == faint
 
@@ -211,47 +228,61 @@ def test_a_cause_cannot_be_put_where_there_is_no_claim():
         replace(case("null"), word="PROBABLY")
 
 
-GOOD = Findings(p_family=1e-6, structure_p=1e-6, winner="a", p_winner=1e-6, fall=1000.0, runner_up=100.0, ratio=0.9,
-                share=0.9, excess_sd=50.0, uneven=0.01, held_out=200.0)
+GOOD = Findings(
+    p_family=1e-6,
+    structure_p=1e-6,
+    winner="a",
+    p_winner=1e-6,
+    fall=1000.0,
+    runner_up=100.0,
+    ratio=0.9,
+    share=0.9,
+    excess_sd=50.0,
+    uneven=0.01,
+    held_out=200.0,
+)
 
 
-@pytest.mark.parametrize("changes, word", [
-    ({}, "CLAIM"),
-    ({"p_family": 0.02, "structure_p": 0.02}, "NOTHING"),
-    ({"p_family": 0.02, "structure_p": math.nan, "excess_sd": 1.0}, "NOTHING"),
-    ({"p_family": 0.02, "structure_p": math.nan}, "CANNOT_TELL"),
-    ({"p_family": 0.02, "structure_p": math.nan, "rival": True, "ratio": 3.0}, "UNKNOWN"),
-    ({"p_family": 0.02}, "CANNOT_TELL"),
-    ({"p_family": 0.02, "rival": True, "ratio": 3.0}, "UNKNOWN"),
-    ({"runner_up": 1000 * (1 - MARGIN) + 1}, "AMBIGUOUS"),
-    ({"runner_up": 1000 * (1 - MARGIN) + 1, "refuted": True}, "CLAIM"),
-    ({"fall": 30.0, "runner_up": 30.5 - CLEAR}, "AMBIGUOUS"),
-    ({"fall": 30.0, "runner_up": 30.5 - CLEAR, "refuted": True}, "AMBIGUOUS"),
-    ({"runner_up": 990.0, "some_even": False, "even": False}, "CANNOT_TELL"),
-    ({"share": 0.02}, "PARTIAL"),
-    ({"share": 0.02, "excess_sd": 3.0}, "CLAIM"),
-    ({"share": math.nan, "excess_sd": 0.1}, "CLAIM"),
-    ({"even": False, "uneven": 0.4}, "PARTIAL"),
-    ({"rival": True, "ratio": 2.0}, "UNKNOWN"),
-    ({"rival": True, "ratio": 2.0, "runner_up": 990.0}, "UNKNOWN"),
-    ({"rival": True, "ratio": 2.0, "structure_p": 0.5}, "CANNOT_TELL"),
-    ({"held_out": -3.0}, "CANNOT_TELL"),
-    ({"held_out": math.nan}, "CANNOT_TELL"),
-    ({"p_winner": 0.5}, "CANNOT_TELL"),
-    ({"p_winner": 0.5, "structure_p": 0.5, "excess_sd": 1.0}, "NOTHING"),
-    ({"clear": 0.3, "structure_p": 0.5, "excess_sd": 1.0}, "NOTHING"),
-    ({"clear": 0.3}, "CANNOT_TELL"),
-    ({"chance": 0.02}, "CANNOT_TELL"),
-    ({"chance": 0.02, "runner_up": 990.0}, "CANNOT_TELL"),
-    ({"chance": 0.002}, "CLAIM"),
-    ({"winner": ""}, "CANNOT_TELL"),
-    ({"left": 0.29}, "CLAIM"),
-    ({"left": 0.31}, "CANNOT_TELL"),
-    ({"left": 0.31, "runner_up": 990.0}, "CANNOT_TELL"),
-    ({"rival": True, "ratio": 2.0, "curve_share": 0.06}, "UNKNOWN"),
-    ({"rival": True, "ratio": 2.0, "curve_share": 0.04}, "CANNOT_TELL"),
-    ({"p_family": 0.02, "rival": True, "ratio": 3.0, "curve_share": 0.01}, "CANNOT_TELL"),
-])
+@pytest.mark.parametrize(
+    "changes, word",
+    [
+        ({}, "CLAIM"),
+        ({"p_family": 0.02, "structure_p": 0.02}, "NOTHING"),
+        ({"p_family": 0.02, "structure_p": math.nan, "excess_sd": 1.0}, "NOTHING"),
+        ({"p_family": 0.02, "structure_p": math.nan}, "CANNOT_TELL"),
+        ({"p_family": 0.02, "structure_p": math.nan, "rival": True, "ratio": 3.0}, "UNKNOWN"),
+        ({"p_family": 0.02}, "CANNOT_TELL"),
+        ({"p_family": 0.02, "rival": True, "ratio": 3.0}, "UNKNOWN"),
+        ({"runner_up": 1000 * (1 - MARGIN) + 1}, "AMBIGUOUS"),
+        ({"runner_up": 1000 * (1 - MARGIN) + 1, "refuted": True}, "CLAIM"),
+        ({"fall": 30.0, "runner_up": 30.5 - CLEAR}, "AMBIGUOUS"),
+        ({"fall": 30.0, "runner_up": 30.5 - CLEAR, "refuted": True}, "AMBIGUOUS"),
+        ({"runner_up": 990.0, "some_even": False, "even": False}, "CANNOT_TELL"),
+        ({"share": 0.02}, "PARTIAL"),
+        ({"share": 0.02, "excess_sd": 3.0}, "CLAIM"),
+        ({"share": math.nan, "excess_sd": 0.1}, "CLAIM"),
+        ({"even": False, "uneven": 0.4}, "PARTIAL"),
+        ({"rival": True, "ratio": 2.0}, "UNKNOWN"),
+        ({"rival": True, "ratio": 2.0, "runner_up": 990.0}, "UNKNOWN"),
+        ({"rival": True, "ratio": 2.0, "structure_p": 0.5}, "CANNOT_TELL"),
+        ({"held_out": -3.0}, "CANNOT_TELL"),
+        ({"held_out": math.nan}, "CANNOT_TELL"),
+        ({"p_winner": 0.5}, "CANNOT_TELL"),
+        ({"p_winner": 0.5, "structure_p": 0.5, "excess_sd": 1.0}, "NOTHING"),
+        ({"clear": 0.3, "structure_p": 0.5, "excess_sd": 1.0}, "NOTHING"),
+        ({"clear": 0.3}, "CANNOT_TELL"),
+        ({"chance": 0.02}, "CANNOT_TELL"),
+        ({"chance": 0.02, "runner_up": 990.0}, "CANNOT_TELL"),
+        ({"chance": 0.002}, "CLAIM"),
+        ({"winner": ""}, "CANNOT_TELL"),
+        ({"left": 0.29}, "CLAIM"),
+        ({"left": 0.31}, "CANNOT_TELL"),
+        ({"left": 0.31, "runner_up": 990.0}, "CANNOT_TELL"),
+        ({"rival": True, "ratio": 2.0, "curve_share": 0.06}, "UNKNOWN"),
+        ({"rival": True, "ratio": 2.0, "curve_share": 0.04}, "CANNOT_TELL"),
+        ({"p_family": 0.02, "rival": True, "ratio": 3.0, "curve_share": 0.01}, "CANNOT_TELL"),
+    ],
+)
 def test_the_rule(changes, word):
     got, conditions = decide(replace(GOOD, **changes))
     assert got == word in WORDS
@@ -261,17 +292,27 @@ def test_the_rule(changes, word):
 
 
 def test_every_condition_is_needed_for_a_claim():
-    for broken in ({"p_winner": 0.1}, {"runner_up": 999.0}, {"rival": True}, {"share": 0.01}, {"even": False}, {"chance": 0.5},
-                   {"held_out": 0.0}, {"winner": ""}):
+    for broken in (
+        {"p_winner": 0.1},
+        {"runner_up": 999.0},
+        {"rival": True},
+        {"share": 0.01},
+        {"even": False},
+        {"chance": 0.5},
+        {"held_out": 0.0},
+        {"winner": ""},
+    ):
         assert decide(replace(GOOD, **broken))[0] != "CLAIM"
 
 
 class Slope(Exact):
-    """An even picture, and a slope of its brightness across it."""
+    """An even image, and a slope of its brightness across it."""
 
     shape, captures = (32, 32, 1), None
-    parameters = {"lamp.power": Parameter("power", "1", 1.0, (0.0, 10.0), plausible=0.1),
-                  "lamp.slope": Parameter("slope", "1", 0.0, (-1.0, 1.0), neutral=0.0, plausible=0.02)}
+    parameters = {
+        "lamp.power": Parameter("power", "1", 1.0, (0.0, 10.0), plausible=0.1),
+        "lamp.slope": Parameter("slope", "1", 0.0, (-1.0, 1.0), neutral=0.0, plausible=0.02),
+    }
     noise = Noise(system_gain=0.02, dark_noise=1.0, black_level=64.0, saturation=1023.0, prnu=0.0)
     base = {key: p.default for key, p in parameters.items()}
 
@@ -284,18 +325,21 @@ class Slope(Exact):
         return [64 + 400 * (power + slope * self.across)]
 
     def derivatives(self, values, variables, frames=None, secant=None, seed=0):
-        yield self.predict(values)[0], {v.name: 400 * (self.across if "slope" in v.name else np.ones(self.shape)) for v in variables}
+        yield (
+            self.predict(values)[0],
+            {v.name: 400 * (self.across if "slope" in v.name else np.ones(self.shape)) for v in variables},
+        )
 
     def usable(self, frame):
         return np.ones(self.shape, bool)
 
 
 def test_a_strength_is_held_against_what_neighbours_share():
-    """Patches of 8 x 8 px with 1 % of their own: white noise alone would find a slope in most sets. 300 sets: .05 and .01 to three sd.
+    """Patches of 8 x 8 px with 1 % of their own: white noise alone would find a slope in most sets. 300 sets: .05 and
+    .01 to three sd.
 
-    Its error, clutter included: pulls as of Student's t with 8 degrees of freedom, as a slope weighs the outer of the 16 patches most;
-    0.92 within 2, to three sd.
-    """
+    Its error, clutter included: pulls as of Student's t with 8 degrees of freedom, as a slope weighs the outer of the
+    16 patches most; 0.92 within 2, to three sd."""
     rng, ps, naive, pulls = np.random.default_rng(3), [], [], []
     place = np.add.outer(4 * (np.arange(32) // 8), np.arange(32) // 8).astype(float).ravel()
     variables = [Variable(key, (key,), p) for key, p in Slope.parameters.items()]
@@ -316,8 +360,9 @@ def test_a_strength_is_held_against_what_neighbours_share():
 
 
 def test_a_lamp_that_wanders_does_not_pass_for_a_tone_of_the_session():
-    """600 readings, a wander that 50 neighbours share, as strong as noise, and a tone of 240 readings, as of a second dial. By noise most
-    sets would show it, by the scatter between 16 parts 4 % do at .01 (2000 sets), 7 % between 64. 1000 sets, to three sd."""
+    """600 readings, a wander that 50 neighbours share, as strong as noise, and a tone of 240 readings, as of a second
+    dial. By noise most sets would show it, by the scatter between 16 parts 4 % do at .01 (2000 sets), 7 % between 64.
+    1000 sets, to three sd."""
     from scipy.ndimage import gaussian_filter1d
 
     count = 600
@@ -332,14 +377,17 @@ def test_a_lamp_that_wanders_does_not_pass_for_a_tone_of_the_session():
         score = tone.T @ y
         left = y - tone @ score / power
         noise.append(score[0] ** 2 / power > 6.63)
-        ps.append(evenness.by_clutter(score, np.array([[power]]), evenness.variances([tone], [left], [{"reading": order}])))
+        ps.append(
+            evenness.by_clutter(score, np.array([[power]]), evenness.variances([tone], [left], [{"reading": order}]))
+        )
     assert np.mean(noise) > 0.6 and np.mean(np.array(ps) < 0.01) < 0.055
 
 
 @pytest.mark.parametrize("count", [2, 8, 15, 20])
 def test_as_many_strengths_as_parts_are_held_against_clutter(count):
-    """A strength per frame, each with its own clutter in 16 parts of the sensor, .1 to 10 times that of noise. Without one, .05 and .01 are
-    kept; one of ten sd (of noise and clutter) in each is beyond it in nine of ten sets. 500 sets, to three sd."""
+    """A strength per frame, each with its own clutter in 16 parts of the sensor, .1 to 10 times that of noise. Without
+    one, .05 and .01 are kept; one of ten sd (of noise and clutter) in each is beyond it in nine of ten sets. 500 sets,
+    to three sd."""
     rng = np.random.default_rng(count)
     information = np.diag(10.0 ** rng.uniform(-2, 2, count))  # in units as they come
     variance = np.diag(information) * 10.0 ** np.linspace(-1, 1, count)
@@ -356,8 +404,8 @@ def test_as_many_strengths_as_parts_are_held_against_clutter(count):
 
 
 def test_a_combination_that_nothing_tells_is_no_clutter():
-    """Gains of 12 frames beside a light that all frames share: their sum is left in V as rounding, 1e-7 of it, and scatters by the same
-    rounding, 1e4 times as much as V says. That says nothing of the others, which are 100 sd."""
+    """Gains of 12 frames beside a light that all frames share: their sum is left in V as rounding, 1e-7 of it, and
+    scatters by the same rounding, 1e4 times as much as V says. That says nothing of the others, which are 100 sd."""
     rng, count = np.random.default_rng(3), 12
     common = np.full((count, count), 1 / count)
     others = np.eye(count) - common
@@ -380,9 +428,9 @@ def test_a_fit_that_stopped_short_is_no_clutter():
 
 @pytest.mark.parametrize("proxy", [False, True])
 def test_what_splits_a_strength_is_held_against_clutter_too(proxy):
-    """Patches of 8 x 8 px with 1 % of their own, and a slope of 6 %, which a proxy has in the upper half alone. Between quadrants, of four
-    patches each, noise would call all strengths uneven; their scatter calls a proxy's so, and of true ones 8 % at .01 (300 sets), as four
-    patches tell a scatter badly. 100 sets, to three sd."""
+    """Patches of 8 x 8 px with 1 % of their own, and a slope of 6 %, which a proxy has in the upper half alone. Between
+    quadrants, of four patches each, noise would call all strengths uneven; their scatter calls a proxy's so, and of
+    true ones 8 % at .01 (300 sets), as four patches tell a scatter badly. 100 sets, to three sd."""
     rng, effect, uneven, naive = np.random.default_rng(6), Effect("slope", "lamp", ("slope",)), [], []
     side = np.arange(32)
     place = np.add.outer(4 * (side // 8), side // 8).astype(float).ravel()
@@ -407,8 +455,9 @@ def test_what_splits_a_strength_is_held_against_clutter_too(proxy):
 
 
 def two_effects(apart, hidden, sets=4000, count=600):
-    """Share of sets in which the right one of two effects refutes the other, and the other it. Their images are two tones along the
-    readings, mixed so that D = `apart` between them; beside the true one hide smooth misfit of `hidden` in chi2, and noise."""
+    """Share of sets in which the right one of two effects refutes the other, and the other it. Their images are two
+    tones along the readings, mixed so that D = `apart` between them; beside the true one hide smooth misfit of `hidden`
+    in chi2, and noise."""
     from scipy.ndimage import gaussian_filter1d
 
     rng = np.random.default_rng(4)
@@ -421,9 +470,23 @@ def two_effects(apart, hidden, sets=4000, count=600):
     told = []
     for first, second in ((a, b), (b, a)):
         falls = [(r @ e) ** 2 / (e @ e) for e in (first, second)]
-        rows = [[SimpleNamespace(row=SimpleNamespace(net_refit=f, refit=SimpleNamespace(
-            complete=(c - f - count) / math.sqrt(2 * count) < 5, converged=True, structure_p=math.nan,
-            excess_sd=(c - f - count) / math.sqrt(2 * count)))) for f, c in zip(fall, chi2)] for fall in falls]
+        rows = [
+            [
+                SimpleNamespace(
+                    row=SimpleNamespace(
+                        net_refit=f,
+                        refit=SimpleNamespace(
+                            complete=(c - f - count) / math.sqrt(2 * count) < 5,
+                            converged=True,
+                            structure_p=math.nan,
+                            excess_sd=(c - f - count) / math.sqrt(2 * count),
+                        ),
+                    )
+                )
+                for f, c in zip(fall, chi2)
+            ]
+            for fall in falls
+        ]
         told.append(np.mean([_refuted(winner, rival, count) for winner, rival in zip(*rows)]))
     return told
 
@@ -431,7 +494,8 @@ def two_effects(apart, hidden, sets=4000, count=600):
 @pytest.mark.parametrize("hidden", [0, 35, 100, 300])
 @pytest.mark.parametrize("apart", [15, 60, 120])
 def test_misfit_that_hides_refutes_no_true_effect(apart, hidden):
-    """In 5 % at most, as with CLEAR in noise alone. The misfit is smooth over 15 of 600 readings, the effects' difference smoother still."""
+    """In 5 % at most, as with CLEAR in noise alone. The misfit is smooth over 15 of 600 readings, the effects'
+    difference smoother still."""
     right, wrong = two_effects(apart, hidden)
     assert wrong < 0.05
     if apart == 120 and not hidden:
@@ -461,7 +525,13 @@ def test_the_report_can_be_read():
     text = case("vignetting").text()
     assert text.startswith("diagnose: 4 frames,") and "\nCLAIM: " in text and "nan" not in text
     assert max(len(line) for line in text.splitlines() if line.startswith("vignetting ")) < 220
-    for part in ("upper limits", "evenness", "held out", "curves along coordinates", "calibrated parameters had moved"):
+    for part in (
+        "upper limits",
+        "homogeneity",
+        "held out",
+        "curves along coordinates",
+        "calibrated parameters had moved",
+    ):
         assert part in text
 
 
@@ -469,9 +539,17 @@ def test_the_report_can_be_read():
 
 
 def test_units_change_nothing_and_one_seed_gives_one_table():
-    """R7 and R20: T, p, survival and cos to 1e-6 under other units of effects and base parameters; same seed, same bytes."""
+    """R7 and R20: T, p, survival and cos to 1e-6 under other units of effects and base parameters; same seed, same
+    bytes."""
     effects = library("vignetting", "glare", "defocus", "albedo gradient")
-    unit = {"vignetting": 100.0, "albedo_x": 1e-3, "defocus": 5.0, "led0.x": 10.0, "led3.power": 1e-3, "gel.press_x": 1e3}
+    unit = {
+        "vignetting": 100.0,
+        "albedo_x": 1e-3,
+        "defocus": 5.0,
+        "led0.x": 10.0,
+        "led3.power": 1e-3,
+        "gel.press_x": 1e3,
+    }
     first, second = (judge(*calibrated({"glare": 0.02}, unit=u), effects) for u in (None, unit))
     assert [r.name for r in first.rows] == [r.name for r in second.rows]
     for a, b in zip(first.rows, second.rows):
@@ -568,7 +646,8 @@ def test_thinning_is_stated_and_changes_neither_ranking_nor_verdict():
 
 
 def test_noisy_derivatives_are_rendered_twice_with_seeds_of_their_own():
-    """R8: strength within 5 % at kappa = 0.1, kappa reported, seeds of derivatives differ and are not the prediction's 0."""
+    """R8: strength within 5 % at kappa = 0.1, kappa reported, seeds of derivatives differ and are not the prediction's
+    0."""
     model, fit = calibrated({"vignetting": 0.1}, side=32)
     clean = judge(model, fit, library("vignetting", "glare")).row("vignetting")
     model.render_noise = 0.1
@@ -594,9 +673,10 @@ def test_noisy_derivatives_are_rendered_twice_with_seeds_of_their_own():
 
 
 class ByChance(MockModel):
-    """The mock with pictures that are estimates: the same error in a picture and in what follows it (a lamp's power), by the seed."""
+    """The mock with images that are estimates: the same error in an image and in what follows it (a lamp's power), by
+    the seed."""
 
-    by_chance, relative = True, 0.002
+    monte_carlo, relative = True, 0.002
 
     def error(self, frame, seed):
         return 1 + self.relative * np.random.default_rng([seed, frame]).standard_normal(self.shape)
@@ -620,19 +700,28 @@ class ByChance(MockModel):
         return {**super().coordinates(values, frame), "intensity": self.predict(values, [frame], seed)[0]}
 
 
-def test_no_curve_follows_the_error_of_a_picture_made_by_chance():
-    """The error of the prediction is in the residual: binned or scaled by that same picture, it would look like a curve (8 % of the
-    variance here, so hundreds of chi2 of 5 800 values)."""
+def test_no_curve_follows_the_error_of_a_image_made_by_monte_carlo():
+    """The error of the prediction is in the residual: binned or scaled by that same image, it would look like a curve
+    (8 % of the variance here, so hundreds of chi2 of 5 800 values)."""
     exact, fit = calibrated(side=22)
     model = ByChance(PRESSES, 22)
     model.frames = exact.frames
-    share = np.mean([(model.variance(fit.values, f, p) / model.noise.variance(p)).mean() - 1 for f, p in enumerate(model.predict(fit.values))])
+    share = np.mean(
+        [
+            (model.variance(fit.values, f, p) / model.noise.variance(p)).mean() - 1
+            for f, p in enumerate(model.predict(fit.values))
+        ]
+    )
     assert 0.05 < share < 0.2
     scored = score(model, fit, library("glare"), model.variables_of, FITTED)
-    found = fingerprints.fingerprints(model, scored.evidence, fingerprints.places(model, fit.values, scored.evidence), 1.0, lambda *a: None)
+    found = fingerprints.fingerprints(
+        model, scored.evidence, fingerprints.places(model, fit.values, scored.evidence), 1.0, lambda *a: None
+    )
     assert {"intensity", "signal", "frame", "laplacian", "row"} <= {f.coordinate for f in found}
     worst = max(found, key=lambda f: f.net / np.sqrt(2 * f.dof))
-    assert worst.net < 5 * np.sqrt(2 * worst.dof), f"{worst.coordinate}: {worst.net:.0f} of {worst.dof}"  # the largest of some twenty
+    assert worst.net < 5 * np.sqrt(2 * worst.dof), (
+        f"{worst.coordinate}: {worst.net:.0f} of {worst.dof}"
+    )  # the largest of some twenty
 
 
 def test_an_effect_that_is_lost_in_the_noise_of_its_image_is_not_ranked():
@@ -643,8 +732,13 @@ def test_an_effect_that_is_lost_in_the_noise_of_its_image_is_not_ranked():
     def derivatives(values, variables, frames=None, secant=None, seed=0):
         for index, (prediction, images) in zip(frames, plain(values, variables, frames, secant, seed)):
             rng = np.random.default_rng([seed, index])
-            yield prediction, {name: 1e-3 * rng.standard_normal(image.shape).astype(image.dtype) if "glare" in name else image
-                               for name, image in images.items()}
+            yield (
+                prediction,
+                {
+                    name: 1e-3 * rng.standard_normal(image.shape).astype(image.dtype) if "glare" in name else image
+                    for name, image in images.items()
+                },
+            )
 
     model.derivatives = derivatives
     d = judge(model, fit, library("vignetting", "glare"))
@@ -658,8 +752,11 @@ def test_family_wise_alarms_on_the_images_of_the_mock():
     for e in LIBRARY:
         variables = [v for v in model.variables_of(e) if v.frames is None or v.frames[0] in FITTED]
         sides = [1 if v.parameter.bounds[0] == 0 else 0 for v in variables]
-        candidates.append(Candidate(e, variables, np.zeros(len(variables)), sides,
-                                    np.array([v.parameter.plausible for v in variables])))
+        candidates.append(
+            Candidate(
+                e, variables, np.zeros(len(variables)), sides, np.array([v.parameter.plausible for v in variables])
+            )
+        )
     base = [v for v in fit.variables]
     evidence = measure(model, fit.values, base, candidates, FITTED, 10**6, 0, lambda *a: None)
     rng = np.random.default_rng(3)
@@ -679,8 +776,9 @@ def test_family_wise_alarms_on_the_images_of_the_mock():
     assert 0.003 <= np.mean([family.p(p) < 0.01 for p in best]) <= 0.02
 
 
-@pytest.mark.parametrize("truth, word", [({}, "NOTHING"), ({"polarizer.leak": 0.02}, "CLAIM"),
-                                         ({"lamp.ripple": 0.02}, "UNKNOWN")])
+@pytest.mark.parametrize(
+    "truth, word", [({}, "NOTHING"), ({"polarizer.leak": 0.02}, "CLAIM"), ({"lamp.ripple": 0.02}, "UNKNOWN")]
+)
 def test_point_readings_are_judged_like_images(truth, word):
     """One value per frame: no structure test, curves along the settings, and no claim of what the library lacks."""
     model = PointModel(np.arange(0, 360, 4.0), np.random.default_rng(4), **truth)
@@ -702,11 +800,13 @@ def test_values_are_not_changed_by_a_diagnosis():
     assert fit.values == before
 
 
-# -- two at once --------------------------------------------------------------------------------------------------------
+# -- two at once
+# --------------------------------------------------------------------------------------------------------
 
 
 def test_pairs_expect_nothing_of_what_the_projection_left_as_rounding():
-    """b has a second strength that shows nowhere, as of a film that no frame turns: its share of chi2 would be rounding over rounding."""
+    """b has a second strength that shows nowhere, as of a film that no frame turns: its share of chi2 would be rounding
+    over rounding."""
     information, score = np.diag([4.0, 9.0, 1e-9]), np.array([8.0, 9.0, 1.0])  # falls of 16, 9, and 1e9
     variables = [Variable(key, (key,), Slope.parameters["lamp.slope"]) for key in "abc"]
 
@@ -714,11 +814,19 @@ def test_pairs_expect_nothing_of_what_the_projection_left_as_rounding():
         own = [variables[i] for i in columns]
         seen = np.array([i < 2 for i in columns], float)
         cone = st.Cone(information[np.ix_(columns, columns)] * np.outer(seen, seen), [0] * len(own))
-        return Candidate(Effect(name, "lamp", ("slope",)), own, np.zeros(len(own)), [0] * len(own), np.ones(len(own)), columns=columns, cone=cone)
+        return Candidate(
+            Effect(name, "lamp", ("slope",)),
+            own,
+            np.zeros(len(own)),
+            [0] * len(own),
+            np.ones(len(own)),
+            columns=columns,
+            cone=cone,
+        )
 
     a, b = candidate("a", [0]), candidate("b", [1, 2])
     evidence = SimpleNamespace(base=[], projected=SimpleNamespace(information=information, score=score))
-    (fall, *both, linear), = pairs.ranked(evidence, [a, b])
+    ((fall, *both, linear),) = pairs.ranked(evidence, [a, b])
     assert both == [a, b] and np.isclose(fall, 16 + 9 - 2) and np.allclose(linear, [2, 1, 0])
 
 
@@ -728,6 +836,11 @@ def test_two_effects_are_not_named_for_what_one_curve_does():
     one, two = Pair(["a", "b"], 1016.0, 3.0, 0.5), Pair(["a", "c"], 1300.0, 3.0, 0.5)  # 22 more than the curve, and 307
     found = pairs.beside_curves([two, one], [maps, curve], {"a": 2.0, "b": 2.0, "c": 1.0})
     assert [p.complete for p in found] == [True, False] and pairs.doubt(found[:1]) == ""
-    assert pairs.doubt(found) == " a with b would leave nothing, but one curve, along 'angle', explains 98% of what both do."
-    assert pairs.beside_curves([replace(one, excess_sd=0.0)], [curve], {"a": 2.0, "b": 2.0})[0].complete  # noise alone is left: it decides
+    assert (
+        pairs.doubt(found)
+        == " a with b would leave nothing, but one curve, along 'angle', explains 98% of what both do."
+    )
+    assert pairs.beside_curves([replace(one, excess_sd=0.0)], [curve], {"a": 2.0, "b": 2.0})[
+        0
+    ].complete  # noise alone is left: it decides
     assert pairs.beside_curves([one], [maps], {"a": 2.0, "b": 2.0}) == [one]

@@ -1,9 +1,8 @@
 """What a user gets wrong is refused in one line that names it, before anything is written.
 
-Every case is a command line. It must end with exit code 2, say exactly one line on stderr, which matches the pattern given here (the
-thing, where it stands, what is allowed or what to do), show no traceback, print nothing on stdout, and leave every file as it
-was.
-"""
+Every case is a command line. It must end with exit code 2, say exactly one line on stderr, which matches the pattern
+given here (the thing, where it stands, what is allowed or what to do), show no traceback, print nothing on stdout, and
+leave every file as it was."""
 
 import re
 import shutil
@@ -19,7 +18,7 @@ from optics.scene import registry as effect
 
 NOISE = "[noise]\nsystem_gain = 0.05\ndark_noise = 1.0\nblack_level = 8.0\nsaturation = 255.0\nprnu = 0.0\n"
 JOB = 'scene = "small.xml"\nout = "{out}"\ncount = 2\n'
-SIZE = (48, 36)  # px, width and height: the smallest that keeps every region of a picture
+SIZE = (48, 36)  # px, width and height: the smallest that keeps every region of an image
 
 
 def small(text):
@@ -37,55 +36,102 @@ def broken_scenes(good):
     """Name -> XML, each wrong in one way."""
     sigma = '<float name="sigma" value="0.2"/>'
     return {
-        "torn": good.replace("</scene>", ""), "prose": "hello", "empty": "",
-        "type": good.replace('type="membrane"', 'type="membrain"'), "property": good.replace(sigma, sigma.replace("sigma", "sigmma")),
-        "word": good.replace(sigma, sigma.replace("0.2", "rough")), "bounds": good.replace(sigma, sigma.replace("0.2", "9")),
-        "nan": good.replace(sigma, sigma.replace("0.2", "nan")), "twins": good.replace('id="led_2"', 'id="led_1"'),
+        "torn": good.replace("</scene>", ""),
+        "prose": "hello",
+        "empty": "",
+        "type": good.replace('type="membrane"', 'type="membrain"'),
+        "property": good.replace(sigma, sigma.replace("sigma", "sigmma")),
+        "word": good.replace(sigma, sigma.replace("0.2", "rough")),
+        "bounds": good.replace(sigma, sigma.replace("0.2", "9")),
+        "nan": good.replace(sigma, sigma.replace("0.2", "nan")),
+        "twins": good.replace('id="led_2"', 'id="led_1"'),
         "cameras": good.replace("</scene>", sensor_of(good).replace('id="camera"', 'id="second"') + "</scene>"),
-        "blind": good.replace(sensor_of(good), ""), "dark": re.sub(r"<emitter.*?</emitter>", "", good, flags=re.DOTALL),
+        "blind": good.replace(sensor_of(good), ""),
+        "dark": re.sub(r"<emitter.*?</emitter>", "", good, flags=re.DOTALL),
         "reference": good.replace('<ref id="membrane"/>', '<ref id="membran"/>'),
-        "texture": good.replace(sigma, sigma + '<texture type="bitmap" name="reflectance"><string name="filename" '
-                                'value="absent.png"/></texture>'),
-        "mesh": good.replace("</scene>", '<shape type="ply"><string name="filename" value="absent.ply"/></shape></scene>'),
-        "sensitivity": good.replace('<float name="x_fov"', '<string name="sensitivity" value="Nikon 5100"/><float name="x_fov"'),
-        "bands": good.replace("610, 540, 460", "610, 570, 540, 500, 460"), "band": good.replace("610, 540, 460", "610, green"),
-        "axis": good.replace('<point name="target" x="0" y="0" z="0"/>', '<point name="target" x="11" y="0" z="-5"/>', 1),
+        "texture": good.replace(
+            sigma,
+            sigma + '<texture type="bitmap" name="reflectance"><string name="filename" value="absent.png"/></texture>',
+        ),
+        "mesh": good.replace(
+            "</scene>", '<shape type="ply"><string name="filename" value="absent.ply"/></shape></scene>'
+        ),
+        "sensitivity": good.replace(
+            '<float name="x_fov"', '<string name="sensitivity" value="Nikon 5100"/><float name="x_fov"'
+        ),
+        "bands": good.replace("610, 540, 460", "610, 570, 540, 500, 460"),
+        "band": good.replace("610, 540, 460", "610, green"),
+        "axis": good.replace(
+            '<point name="target" x="0" y="0" z="0"/>', '<point name="target" x="11" y="0" z="-5"/>', 1
+        ),
         "bench": re.sub(r'<default name="(width|height)".*', "", good).replace("$width", "20").replace("$height", "20"),
     }
 
 
 PLUGINS = {
-    "syntax": ("bad.py", "effect = Effect(\n"), "nothing": ("bad.py", "x = 1\n"),
+    "syntax": ("bad.py", "effect = Effect(\n"),
+    "nothing": ("bad.py", "x = 1\n"),
     "raises": ("bad.py", "import no_such_package\n"),
     "kind": ("led.py", "from optics.scene.declare import Part\npart = Part('led', 'emitter', (), lambda: None)\n"),
     "category": ("lamp.py", "from optics.scene.declare import Part\npart = Part('lamp', 'light', (), lambda: None)\n"),
-    "neutral": ("bad.py", "from optics.scene.declare import Effect\nfrom optics.scene.parameter import Parameter\n"
-                "effect = Effect('rust', 'camera', (Parameter('rust', '1', 0.0),))\n"),
-    "part": ("bad.py", "from optics.scene.declare import Effect\nfrom optics.scene.parameter import Parameter\n"
-             "effect = Effect('rust', 'hinge', (Parameter('rust', '1', 0.0, neutral=0.0),))\n"),
-    "stage": ("bad.py", "from optics.scene.declare import Effect\nfrom optics.scene.parameter import Parameter\n"
-              "effect = Effect('rust', 'camera', (Parameter('rust', '1', 0.0, neutral=0.0),), {'emission': abs})\n"),
-    "twice": ("bad.py", "from optics.scene.declare import Effect\nfrom optics.scene.parameter import Parameter\n"
-              "effect = Effect('rust', 'camera', (Parameter('k1', '1', 0.0, neutral=0.0),))\n"),
+    "neutral": (
+        "bad.py",
+        "from optics.scene.declare import Effect\nfrom optics.scene.parameter import Parameter\n"
+        "effect = Effect('rust', 'camera', (Parameter('rust', '1', 0.0),))\n",
+    ),
+    "part": (
+        "bad.py",
+        "from optics.scene.declare import Effect\nfrom optics.scene.parameter import Parameter\n"
+        "effect = Effect('rust', 'hinge', (Parameter('rust', '1', 0.0, neutral=0.0),))\n",
+    ),
+    "stage": (
+        "bad.py",
+        "from optics.scene.declare import Effect\nfrom optics.scene.parameter import Parameter\n"
+        "effect = Effect('rust', 'camera', (Parameter('rust', '1', 0.0, neutral=0.0),), {'emission': abs})\n",
+    ),
+    "twice": (
+        "bad.py",
+        "from optics.scene.declare import Effect\nfrom optics.scene.parameter import Parameter\n"
+        "effect = Effect('rust', 'camera', (Parameter('k1', '1', 0.0, neutral=0.0),))\n",
+    ),
 }
 
 DRAW = '[sample]\n"gel.press_x" = {{ {} }}\n'
 JOBS = {
-    "toml": 'scene = small.xml\n', "key": JOB + 'lihgts = "each"\n', "missing": 'scene = "small.xml"\ncount = 2\n',
-    "negative": JOB.replace("2", "-3"), "fraction": JOB.replace("2", "2.5"), "text": JOB.replace("2", '"2"'),
-    "endless": JOB.replace("count = 2\n", ""), "output": JOB + 'outputs = ["jpg"]\n', "none": JOB + "outputs = []\n",
-    "seed": JOB + "seed = -1\n", "lights": JOB + 'lights = "some"\n', "noise": JOB + 'outputs = ["dn"]\n',
-    "camera": JOB + NOISE.replace("system_gain = 0.05", "system_gain = 0.0"), "dark": JOB + "[noise]\nprnu = 0.0\n",
-    "define": JOB + "[defines]\nwidht = 20\n", "fixed": JOB + '[parameters]\n"gel.press_z" = 1\n',
-    "unquoted": JOB + "[parameters]\ngel.press_x = 1\n", "both": JOB + '[parameters]\n"gel.press_x" = 1\n' + DRAW.format("uniform = [0, 1]"),
+    "toml": "scene = small.xml\n",
+    "key": JOB + 'lihgts = "each"\n',
+    "missing": 'scene = "small.xml"\ncount = 2\n',
+    "negative": JOB.replace("2", "-3"),
+    "fraction": JOB.replace("2", "2.5"),
+    "text": JOB.replace("2", '"2"'),
+    "endless": JOB.replace("count = 2\n", ""),
+    "output": JOB + 'outputs = ["jpg"]\n',
+    "none": JOB + "outputs = []\n",
+    "seed": JOB + "seed = -1\n",
+    "lights": JOB + 'lights = "some"\n',
+    "noise": JOB + 'outputs = ["dn"]\n',
+    "camera": JOB + NOISE.replace("system_gain = 0.05", "system_gain = 0.0"),
+    "dark": JOB + "[noise]\nprnu = 0.0\n",
+    "define": JOB + "[defines]\nwidht = 20\n",
+    "fixed": JOB + '[parameters]\n"gel.press_z" = 1\n',
+    "unquoted": JOB + "[parameters]\ngel.press_x = 1\n",
+    "both": JOB + '[parameters]\n"gel.press_x" = 1\n' + DRAW.format("uniform = [0, 1]"),
     "unquoted_sample": JOB + "[sample]\ngel.press_x = { uniform = [0, 1] }\n",
-    "sample": JOB + '[sample]\n"gel.press_z" = { uniform = [0, 1] }\n', "shape": JOB + DRAW.format("unifrom = [0, 1]"),
-    "two": JOB + DRAW.format("uniform = [0, 1], grid = [1]"), "turned": JOB + DRAW.format("uniform = [1, 0]"),
-    "one": JOB + DRAW.format("uniform = [1]"), "log": JOB + DRAW.format("log_uniform = [0, 1]"),
-    "sd": JOB + DRAW.format("normal = [0, 0]"), "infinite": JOB + DRAW.format("uniform = [0, inf]"),
-    "beyond": JOB + DRAW.format("uniform = [0, 900]"), "tail": JOB.replace("2", "50") + '[sample]\n"membrane.rho_r" = { normal = [0.1, 0.1] }\n',
-    "wordless": JOB + '[sample]\n"gel.indenter" = { uniform = [0, 1] }\n', "choice": JOB + '[sample]\n"gel.indenter" = { choice = ["ball"] }\n',
-    "scene": JOB.replace("small.xml", "absent.xml"), "foreign": JOB.replace("{out}", "foreign"), "file": JOB.replace("{out}", "small.xml/x"),
+    "sample": JOB + '[sample]\n"gel.press_z" = { uniform = [0, 1] }\n',
+    "shape": JOB + DRAW.format("unifrom = [0, 1]"),
+    "two": JOB + DRAW.format("uniform = [0, 1], grid = [1]"),
+    "turned": JOB + DRAW.format("uniform = [1, 0]"),
+    "one": JOB + DRAW.format("uniform = [1]"),
+    "log": JOB + DRAW.format("log_uniform = [0, 1]"),
+    "sd": JOB + DRAW.format("normal = [0, 0]"),
+    "infinite": JOB + DRAW.format("uniform = [0, inf]"),
+    "beyond": JOB + DRAW.format("uniform = [0, 900]"),
+    "tail": JOB.replace("2", "50") + '[sample]\n"membrane.rho_r" = { normal = [0.1, 0.1] }\n',
+    "wordless": JOB + '[sample]\n"gel.indenter" = { uniform = [0, 1] }\n',
+    "choice": JOB + '[sample]\n"gel.indenter" = { choice = ["ball"] }\n',
+    "scene": JOB.replace("small.xml", "absent.xml"),
+    "foreign": JOB.replace("{out}", "foreign"),
+    "file": JOB.replace("{out}", "small.xml/x"),
 }
 
 BENCH = 'scene = "polarizer_bench"\n' + NOISE
@@ -102,21 +148,33 @@ def capture_sets(folder):
     frames = "".join(f'[[frames]]\nimage = "{name}.png"\ngroup = "{name}"\n' for name in ("a", "b"))
     head = f'scene = "{folder / "small.xml"}"\n'
     return {
-        "good": head + NOISE + frames, "toml": "scene = small\n", "key": head + NOISE.replace("[noise]", "[niose]") + frames,
-        "absent": head + NOISE + frames.replace("b.png", "c.png"), "sizes": head + NOISE + frames.replace("b.png", "small.png"),
-        "nan": head + NOISE + frames.replace("a.png", "nan.npy"), "white": head + NOISE + frames.replace("b.png", "white.png"),
-        "jpeg": head + NOISE + frames.replace("b.png", "b.jpg"), "mask": head + NOISE + frames + 'mask = "black.png"\n',
+        "good": head + NOISE + frames,
+        "toml": "scene = small\n",
+        "key": head + NOISE.replace("[noise]", "[niose]") + frames,
+        "absent": head + NOISE + frames.replace("b.png", "c.png"),
+        "sizes": head + NOISE + frames.replace("b.png", "small.png"),
+        "nan": head + NOISE + frames.replace("a.png", "nan.npy"),
+        "white": head + NOISE + frames.replace("b.png", "white.png"),
+        "jpeg": head + NOISE + frames.replace("b.png", "b.jpg"),
+        "mask": head + NOISE + frames + 'mask = "black.png"\n',
         "photo": head + NOISE + frames.replace("b.png", "photo.png"),
         "setting": head + NOISE + frames + '[frames.parameters]\n"led_7.power" = 1.0\n',
         "beyond": head + NOISE + frames + '[frames.parameters]\n"gel.press_depth" = -1.0\n',
-        "silent": head + frames, "half": head + NOISE.replace("prnu = 0.0\n", "") + frames,
-        "sunk": head + NOISE + frames.replace("b.png", "black.png"), "sceneless": NOISE + frames,
+        "silent": head + frames,
+        "half": head + NOISE.replace("prnu = 0.0\n", "") + frames,
+        "sunk": head + NOISE + frames.replace("b.png", "black.png"),
+        "sceneless": NOISE + frames,
         "elsewhere": head.replace("small.xml", "absent.xml") + NOISE + frames,
-        "size": head.replace("small.xml", "bench.xml") + NOISE + frames, "dark": head.replace("small.xml", "dark.xml") + NOISE + frames,
-        "single": head + NOISE + frames.split("[[frames]]\nimage = \"b")[0], "black": head + NOISE.replace("8.0", "0.0") + frames.replace(
-            "a.png", "black.png").replace("b.png", "black2.png"),
-        "gray": head + NOISE + frames.replace("a.png", "gray.png").split("[[frames]]\nimage = \"b")[0],
-        "volts": BENCH + TABLE.format("volts"), "column": BENCH + TABLE.format("column"), "semicolons": BENCH + TABLE.format("semicolons"),
+        "size": head.replace("small.xml", "bench.xml") + NOISE + frames,
+        "dark": head.replace("small.xml", "dark.xml") + NOISE + frames,
+        "single": head + NOISE + frames.split('[[frames]]\nimage = "b')[0],
+        "black": head
+        + NOISE.replace("8.0", "0.0")
+        + frames.replace("a.png", "black.png").replace("b.png", "black2.png"),
+        "gray": head + NOISE + frames.replace("a.png", "gray.png").split('[[frames]]\nimage = "b')[0],
+        "volts": BENCH + TABLE.format("volts"),
+        "column": BENCH + TABLE.format("column"),
+        "semicolons": BENCH + TABLE.format("semicolons"),
         "columns": BENCH + TABLE.format("column").replace('["reading"]', '["reading", "angle"]'),
     }
 
@@ -138,7 +196,7 @@ def place(tmp_path_factory):
     for name in ("foreign", "taken"):
         (folder / name).mkdir()
         (folder / name / "thesis.txt").write_text("years of work")
-    (folder / "old.exr").write_text("an earlier picture")
+    (folder / "old.exr").write_text("an earlier image")
     (folder / "other.json").write_text("somebody's notes")
     rng = np.random.default_rng(0)
     for name, text in capture_sets(folder).items():
@@ -172,8 +230,11 @@ def own_registry(monkeypatch, request):
 
 def standing(folder):
     """Every file with its size and time of change."""
-    return {p.relative_to(folder).as_posix(): (p.stat().st_size, p.stat().st_mtime_ns) if p.is_file() else None
-            for p in sorted(folder.rglob("*")) if "__pycache__" not in p.parts}
+    return {
+        p.relative_to(folder).as_posix(): (p.stat().st_size, p.stat().st_mtime_ns) if p.is_file() else None
+        for p in sorted(folder.rglob("*"))
+        if "__pycache__" not in p.parts
+    }
 
 
 RENDER = "render small.xml -o new.exr"
@@ -201,7 +262,10 @@ CASES = [
     ("params axis.xml", r"axis\.xml: line \d+.*led_1.*position and target are the same point"),
     ("render blind.xml -o new.exr", r"blind\.xml: (Found unused|0 cameras)"),
     ("render dark.xml -o new.exr", r"dark\.xml: no light; add an LED"),
-    ("render sensitivity.xml -o new.exr", r"unknown camera sensitivity 'Nikon 5100'; did you mean 'Nikon 5100 \(NPL\)'"),
+    (
+        "render sensitivity.xml -o new.exr",
+        r"unknown camera sensitivity 'Nikon 5100'; did you mean 'Nikon 5100 \(NPL\)'",
+    ),
     # what is said of a scene on the command line
     ("params small.xml ledd_1.x", r"small\.xml: unknown parameter 'ledd_1\.x'; did you mean 'led_1\.x'"),
     ("params small.xml -D widht=20", r"small\.xml: unknown definition 'widht'; did you mean 'width'"),
@@ -225,7 +289,7 @@ CASES = [
     ("render small.xml", r"Missing option '-o'.*--help"),
     ("rendr small.xml", r"No such command 'rendr'\. Did you mean 'render'"),
     ("effects vignettign", r"unknown effect or part 'vignettign'; did you mean '.*vignetting'"),
-    # where a picture goes
+    # where an image goes
     ("render small.xml -o old.exr", r"old\.exr exists; choose another name, or --force"),
     ("render small.xml -o other.exr", r"other\.json exists; choose another name, or --force"),
     ("render small.xml -o new.jpg", r"new\.jpg.*allowed: a name ending in \.exr"),
@@ -260,7 +324,10 @@ CASES = [
     ("batch dark.toml", r"dark\.toml: \[noise\] system_gain is missing; allowed: DN per electron"),
     ("batch define.toml", r"small\.xml: unknown definition 'widht'; did you mean 'width'"),
     ("batch fixed.toml", r"fixed\.toml: \[parameters\]: unknown parameter 'gel\.press_z'"),
-    ("batch unquoted.toml", r"unquoted\.toml: \[parameters\]: gel is a table; a key with a dot stands in quotes: \"gel\.press_x\""),
+    (
+        "batch unquoted.toml",
+        r"unquoted\.toml: \[parameters\]: gel is a table; a key with a dot stands in quotes: \"gel\.press_x\"",
+    ),
     ("batch unquoted_sample.toml", r"\[sample\]: gel is a table; a key with a dot stands in quotes: \"gel\.press_x\""),
     ("batch both.toml", r"both\.toml: gel\.press_x stands in \[parameters\] and in \[sample\]"),
     ("batch sample.toml", r"sample\.toml: \[sample\]: unknown parameter 'gel\.press_z'"),
@@ -290,24 +357,45 @@ CASES = [
     ("compare captures/sizes", r"frame 1.*\(10, 10, 3\) pixels; allowed: \(36, 48, 3\)"),
     ("compare captures/nan", r"frame 0.*NaN or infinite.*row 0"),
     ("compare captures/white", r"frame 1.*all saturated"),
-    ("compare captures/sunk", r"frame 1 \('black\.png'\): half of its values are 0 DN or less, far below .* black_level = 8 DN; allowed: 2\.796 DN"),
+    (
+        "compare captures/sunk",
+        r"frame 1 \('black\.png'\): half of its values are 0 DN or less, far below .* black_level = 8 DN; allowed: 2\.796 DN",
+    ),
     ("compare captures/jpeg", r"frame 1.*'\.jpg' files are not read; allowed"),
     ("compare captures/photo", r"frame 1.*a JPEG by the name of \.png"),
     ("compare captures/mask", r"frame 1.*mask.*empty"),
     ("compare captures/setting", r"frame 1.*unknown parameter 'led_7\.power'; did you mean 'led_"),
     ("compare captures/beyond", r"frame 1.*gel\.press_depth = -1 mm is outside its bounds"),
-    ("compare captures/silent", r"silent/captures\.toml: noise: no frame has repeats; add `repeats`.* or give \[noise\]"),
+    (
+        "compare captures/silent",
+        r"silent/captures\.toml: noise: no frame has repeats; add `repeats`.* or give \[noise\]",
+    ),
     ("compare captures/half", r"\[noise\]: prnu .* missing; give all of"),
     ("compare captures/sceneless", r"captures\.toml: scene is missing"),
     ("compare captures/elsewhere", r"absent\.xml': no such file"),
     ("compare captures/size", r"images of 48 x 36 px, but the scene's camera has 20 x 20 px"),
     ("compare captures/dark", r"dark\.xml: the scene has no light"),
-    ("compare captures/black", r"captures\.toml: none of the 10368 values of 'black\.png' \.\.\. \(0 to 0\) is usable: 10368 not above black_level = 0 DN; allowed"),
-    ("compare captures/volts", r"none of the 9 values of 'volts\.csv' \(0\.1 to 1\.7\) is usable: 9 not above black_level = 8 DN; allowed: raw DN \(no volts"),
-    ("compare captures/column", r"frame 0 \('column\.csv'\): unknown parameter 'angle'.*rename = \{ \"angle\" = \"KEY\" \} under \[table\] of captures\.toml"),
-    ("compare captures/columns", r"'column\.csv' has channels: 2, .*'polarizer_bench' has 1; allowed: 1, a column of `values` for each"),
+    (
+        "compare captures/black",
+        r"captures\.toml: none of the 10368 values of 'black\.png' \.\.\. \(0 to 0\) is usable: 10368 not above black_level = 0 DN; allowed",
+    ),
+    (
+        "compare captures/volts",
+        r"none of the 9 values of 'volts\.csv' \(0\.1 to 1\.7\) is usable: 9 not above black_level = 8 DN; allowed: raw DN \(no volts",
+    ),
+    (
+        "compare captures/column",
+        r"frame 0 \('column\.csv'\): unknown parameter 'angle'.*rename = \{ \"angle\" = \"KEY\" \} under \[table\] of captures\.toml",
+    ),
+    (
+        "compare captures/columns",
+        r"'column\.csv' has channels: 2, .*'polarizer_bench' has 1; allowed: 1, a column of `values` for each",
+    ),
     ("compare captures/semicolons", r"semicolons\.csv: its cells are separated by ';'; allowed: commas, and points"),
-    ("compare captures/gray", r"captures\.toml: 'gray\.png' has channels: 1, .*small\.xml' has 3; allowed: 3, or one with cfa = \"RGGB\""),
+    (
+        "compare captures/gray",
+        r"captures\.toml: 'gray\.png' has channels: 1, .*small\.xml' has 3; allowed: 3, or one with cfa = \"RGGB\"",
+    ),
     ("compare captures/good --set led_7.x=1", r"unknown parameter 'led_7\.x'"),
     ("compare captures/good --fit absent.toml", r"absent\.toml: no such file"),
     ("compare captures/good --fit fit.toml", r"fit\.toml: \[parameters\]: unknown parameter 'led_9\.x'"),
@@ -317,7 +405,10 @@ CASES = [
     ("compare captures/good -o taken", r"taken exists and is not empty"),
     # calibration
     (CALIBRATE.format("good") + " --free led_9.*", r"unknown parameter 'led_9\.\*'"),
-    (CALIBRATE.format("good") + " --per-group gel.presx", r"unknown parameter 'gel\.presx'; did you mean 'gel\.press_x'"),
+    (
+        CALIBRATE.format("good") + " --per-group gel.presx",
+        r"unknown parameter 'gel\.presx'; did you mean 'gel\.press_x'",
+    ),
     (CALIBRATE.format("good") + " --prior led_1.x=11", r"--prior led_1\.x=11: allowed: PATTERN=MEAN\+-SD"),
     (CALIBRATE.format("good") + " --prior led_1.x=11+-0", r"--prior led_1\.x=11\+-0: allowed: .*SD above 0"),
     (CALIBRATE.format("good") + " --prior led_9.x=11+-1", r"free parameter for a prior 'led_9\.x'; did you mean"),
@@ -325,7 +416,10 @@ CASES = [
     (CALIBRATE.format("good") + " --hold-out a --hold-out b", r"every group is held out; leave some"),
     (CALIBRATE.format("single") + " --hold-out a", r"every group is held out; leave some"),
     (CALIBRATE.format("good") + " --set led_1.x=left", r"led_1\.x = 'left' is not a number in mm"),
-    (CALIBRATE.format("good") + " --free led_1.fwhm --per-group none --hold-out none", r"none of the 1 free parameters changes any frame: at led_1\.fwhm = 30 nm; allowed"),
+    (
+        CALIBRATE.format("good") + " --free led_1.fwhm --per-group none --hold-out none",
+        r"none of the 1 free parameters changes any frame: at led_1\.fwhm = 30 nm; allowed",
+    ),
     (CALIBRATE.format("black"), r"none of the 10368 values .* is usable"),
     (CALIBRATE.format("good").replace("study", "taken"), r"taken exists and holds no study; choose another"),
     (CALIBRATE.format("good").replace("study", "small.xml/study"), r"small\.xml' is a file and no folder"),

@@ -18,7 +18,7 @@ from PIL import Image
 from optics.cli import main
 from optics.errors import OutputExists
 from optics.files import exr
-from optics.light.output import Pictures
+from optics.light.rendering import RenderJob
 from optics.study import batch
 
 JOB = """
@@ -48,8 +48,11 @@ TOTAL = 10
 
 def content(folder):
     """Every file by its hash; locks hold nothing."""
-    return {p.relative_to(folder).as_posix(): hashlib.sha256(p.read_bytes()).hexdigest() for p in sorted(folder.rglob("*"))
-            if p.is_file() and not p.name.startswith(".lock")}
+    return {
+        p.relative_to(folder).as_posix(): hashlib.sha256(p.read_bytes()).hexdigest()
+        for p in sorted(folder.rglob("*"))
+        if p.is_file() and not p.name.startswith(".lock")
+    }
 
 
 @pytest.fixture
@@ -68,7 +71,9 @@ def whole(tmp_path_factory):
     return folder / "out"
 
 
-# -- what is drawn --------------------------------------------------------------------------------------------------------
+# -- what is drawn
+# --------------------------------------------------------------------------------------------------------
+
 
 def draws(tmp_path, sample, count=400, **more):
     text = f'scene = "gelsight"\nout = "out"\ncount = {count}\n' + "".join(f"{k} = {v}\n" for k, v in more.items())
@@ -78,8 +83,12 @@ def draws(tmp_path, sample, count=400, **more):
 
 
 def test_distributions(tmp_path):
-    found = draws(tmp_path, "a = {uniform = [2, 4]}\nb = {log_uniform = [0.01, 100]}\nc = {normal = [5, 2]}\n"
-                            'd = {choice = ["x", "y", 3]}\n', 4000)
+    found = draws(
+        tmp_path,
+        "a = {uniform = [2, 4]}\nb = {log_uniform = [0.01, 100]}\nc = {normal = [5, 2]}\n"
+        'd = {choice = ["x", "y", 3]}\n',
+        4000,
+    )
     a, b, c = (np.array([v[k] for v in found]) for k in "abc")
     # 4000 draws: standard errors 0.009, 0.06 (of ln b, sd 2.66: 0.042), 0.03; four of each
     assert a.min() >= 2 and a.max() <= 4 and a.mean() == pytest.approx(3, abs=0.037)
@@ -110,7 +119,9 @@ def test_shards(text, shard):
     assert batch.parse_shard(text) == shard
 
 
-# -- what is written ------------------------------------------------------------------------------------------------------
+# -- what is written
+# ------------------------------------------------------------------------------------------------------
+
 
 def test_files_tell_how_they_were_made(whole):
     names = [f"{i:06d}{end}" for i in range(TOTAL) for end in ("-dn.png", ".exr", ".png")]
@@ -127,7 +138,10 @@ def test_files_tell_how_they_were_made(whole):
             assert entry["hash"] == "sha256:" + hashlib.sha256(data).hexdigest()
     channels, header = exr.read(whole / rows[7]["exr"])
     made = json.loads(header["provenance"])
-    assert made["parameters"]["gel.press_x"] == records[7]["sample"]["gel.press_x"] and made["parameters"]["gel.press_depth"] == 0.6
+    assert (
+        made["parameters"]["gel.press_x"] == records[7]["sample"]["gel.press_x"]
+        and made["parameters"]["gel.press_depth"] == 0.6
+    )
     assert channels["depth.Z"].min() == pytest.approx(24 - 0.6, abs=0.1)  # pixels of 0.56 mm
 
 
@@ -148,8 +162,11 @@ def test_noise_is_the_cameras(whole):
 
 
 def test_each_light_alone(tmp_path):
-    (tmp_path / "job.toml").write_text(JOB.replace("count = 5", 'count = 1\nlights = "each"\nlayers = ["spectral"]').replace(
-        "grid = [0.2, 0.6]", "grid = [0.6]"))
+    (tmp_path / "job.toml").write_text(
+        JOB.replace("count = 5", 'count = 1\nlights = "each"\nlayers = ["spectral"]').replace(
+            "grid = [0.2, 0.6]", "grid = [0.6]"
+        )
+    )
     result = batch.run(tmp_path / "job.toml", workers=1)
     record = json.loads((result.folder / "manifest.jsonl").read_text())
     assert len(record["files"]) == 18 and record["files"]["led_3.exr"]["file"] == "images/000000-led_3.exr"
@@ -158,11 +175,17 @@ def test_each_light_alone(tmp_path):
     job = batch.read(tmp_path / "job.toml")
     from optics.scene import loader as scene
 
-    together = Pictures(scene.load("gelsight", {"width": "32", "height": "24"})).take({**job.parameters, **job.values(0)})
-    np.testing.assert_allclose(sum(c["S0.540,000000nm"] for c in alone), together.channels["S0.540,000000nm"], rtol=1e-5)
+    together = RenderJob(scene.load("gelsight", {"width": "32", "height": "24"})).take(
+        {**job.parameters, **job.values(0)}
+    )
+    np.testing.assert_allclose(
+        sum(c["S0.540,000000nm"] for c in alone), together.channels["S0.540,000000nm"], rtol=1e-5
+    )
 
 
-# -- what happens on the way ----------------------------------------------------------------------------------------------
+# -- what happens on the way
+# ----------------------------------------------------------------------------------------------
+
 
 def test_nothing_is_made_twice(whole):
     before = content(whole)
@@ -184,10 +207,16 @@ def command(job, *options):
 
 
 def started(job, *options):
-    """A process at work, once it has made three samples; it heeds interrupts even where these tests run in the background."""
-    process = subprocess.Popen(command(job, *options), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-                               env={**os.environ, "PYTHONPATH": str(Path(batch.__file__).parents[2])},
-                               preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL))
+    """A process at work, once it has made three samples; it heeds interrupts even where these tests run in the
+    background."""
+    process = subprocess.Popen(
+        command(job, *options),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "PYTHONPATH": str(Path(batch.__file__).parents[2])},
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
     manifest = job.parent / "out" / "manifest.jsonl"
     deadline = time.monotonic() + 60
     while not manifest.exists() or manifest.read_text().count("\n") < 3:
@@ -222,7 +251,7 @@ def test_killed_in_the_middle_and_resumed(whole, job):
     out = job.parent / "out"
     done = (out / "manifest.jsonl").read_text().count("\n")
     assert 3 <= done < TOTAL
-    (out / "images" / ".000009.0123456789abcdef.exr").write_bytes(b"half a picture")  # as a kill in mid-write leaves it
+    (out / "images" / ".000009.0123456789abcdef.exr").write_bytes(b"half an image")  # as a kill in mid-write leaves it
     with open(out / "manifest.jsonl", "a") as file:
         file.write('{"index": 9, "sam')
     result = batch.run(job, workers=1)
@@ -234,7 +263,10 @@ def test_interrupted_says_how_to_go_on(whole, job):
     process = started(job, "--workers", "1")
     process.send_signal(signal.SIGINT)
     out, err = process.communicate(timeout=60)
-    assert process.returncode == 130 and err.splitlines()[-1] == "interrupted: what was made is kept, the same command goes on"
+    assert (
+        process.returncode == 130
+        and err.splitlines()[-1] == "interrupted: what was made is kept, the same command goes on"
+    )
     assert "Traceback" not in err and out == ""
     assert not [p for p in (job.parent / "out" / "images").iterdir() if p.name.startswith(".")]
     assert batch.run(job, workers=1).complete and content(job.parent / "out") == content(whole)
@@ -255,10 +287,15 @@ def test_damage_is_found_and_mended(whole, tmp_path):
     assert result.made == 3 and content(tmp_path / "out") == content(whole)
 
 
-@pytest.mark.parametrize(("old", "new", "changed"), [
-    ("seed = 7", "seed = 8", "job.seed"), ("[-4, 4]", "[-4, 5]", r"job.sample.gel.press_x.uniform"),
-    ("width = 32", "width = 40", "job.defines.width"), ('"dn"]', '"dn"]\nspp = 4', "job.spp"),
-])
+@pytest.mark.parametrize(
+    ("old", "new", "changed"),
+    [
+        ("seed = 7", "seed = 8", "job.seed"),
+        ("[-4, 4]", "[-4, 5]", r"job.sample.gel.press_x.uniform"),
+        ("width = 32", "width = 40", "job.defines.width"),
+        ('"dn"]', '"dn"]\nspp = 4', "job.spp"),
+    ],
+)
 def test_another_job_is_refused(whole, tmp_path, old, new, changed):
     (tmp_path / "job.toml").write_text(JOB.replace(old, new).replace('"out"', f'"{whole}"'))
     before = content(whole)
@@ -268,11 +305,11 @@ def test_another_job_is_refused(whole, tmp_path, old, new, changed):
 
 
 def test_a_changed_plugin_is_another_job(whole, tmp_path, monkeypatch):
-    from optics.light import output as picture
+    from optics.light import rendering
 
     (tmp_path / "job.toml").write_text(JOB.replace('"out"', f'"{whole}"'))
-    monkeypatch.setattr(batch, "Pictures", picture.Pictures)
-    monkeypatch.setattr(picture, "plugins_record", lambda: {"effects/vignetting.py": "sha256:0"})
+    monkeypatch.setattr(batch, "RenderJob", rendering.RenderJob)
+    monkeypatch.setattr(rendering, "plugins_record", lambda: {"effects/vignetting.py": "sha256:0"})
     with pytest.raises(OutputExists, match="changed plugins"):
         batch.run(tmp_path / "job.toml", workers=1)
 
@@ -305,7 +342,9 @@ def test_a_stock_scene_is_the_same_bit_by_bit(tmp_path):
         <integer name="width" value="48"/><integer name="height" value="32"/></film></sensor>
         <shape type="sphere"><bsdf type="diffuse"/></shape><emitter type="constant" id="sky"/></scene>""")
     for name in ("a", "b"):
-        (tmp_path / f"{name}.toml").write_text(f'scene = "stock.xml"\nout = "{name}"\ncount = 2\nspp = 32\nvariant = "llvm_ad_rgb"\n')
+        (tmp_path / f"{name}.toml").write_text(
+            f'scene = "stock.xml"\nout = "{name}"\ncount = 2\nspp = 32\nvariant = "llvm_ad_rgb"\n'
+        )
         assert batch.run(tmp_path / f"{name}.toml", workers=1).complete
     assert content(tmp_path / "a") == content(tmp_path / "b")
 
@@ -314,4 +353,10 @@ def test_command_line(whole, capsys):
     assert main(["batch", str(whole.parent / "job.toml"), "--workers", "1"]) == 0
     assert capsys.readouterr().out == f"{whole}: 10 of 10 samples, 0 of them made now, all complete: manifest.csv\n"
     assert main(["batch", str(whole.parent / "job.toml"), "--shard", "2/5", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out) == {"folder": str(whole), "total": 10, "own": 2, "made": 0, "complete": True}
+    assert json.loads(capsys.readouterr().out) == {
+        "folder": str(whole),
+        "total": 10,
+        "own": 2,
+        "made": 0,
+        "complete": True,
+    }

@@ -1,8 +1,8 @@
-"""The loop on the polarizer bench: readings by coherency matrices (optics.proof.makers.bench), one effect hidden at a time, two together, none.
+"""The loop on the polarizer bench: readings by coherency matrices (optics.proof.makers.bench), one effect hidden at a
+time, two together, none.
 
-The base model is ideal: two polarizers without a leak, a clear slot, a lamp of unknown power. Data and model share no line; noise is
-that of a photodiode read with 12 bits.
-"""
+The base model is ideal: two polarizers without a leak, a clear slot, a lamp of unknown power. Data and model share no
+line; noise is that of a photodiode read with 12 bits."""
 
 from dataclasses import dataclass, field
 
@@ -51,41 +51,83 @@ def colours(**more):
 LEAKY = Polarizer(leak=0.004)
 SHINY = Polarizer(transmittance=0.8 / 0.9**2, face_reflectance=0.1)  # 0.8 with the faces' losses, as the model's
 CASES = {
-    "leak": Case(Truth(**lamp(p1=LEAKY, p2=LEAKY)), ("extinction leak",), ("depolarization", "retardance"),
-                 {"polarizer_film.leak": 0.004}),
+    "leak": Case(
+        Truth(**lamp(p1=LEAKY, p2=LEAKY)),
+        ("extinction leak",),
+        ("depolarization", "retardance"),
+        {"polarizer_film.leak": 0.004},
+    ),
     "coloured leak": Case(
-        Truth(**colours(p1=Polarizer(leak=0.004, leak_slope=0.3), p2=Polarizer(leak=0.004, leak_slope=0.3))), ("coloured leak",),
-        ("extinction leak", "depolarization")),  # an exponential in the data, a straight line in the model
+        Truth(**colours(p1=Polarizer(leak=0.004, leak_slope=0.3), p2=Polarizer(leak=0.004, leak_slope=0.3))),
+        ("coloured leak",),
+        ("extinction leak", "depolarization"),
+    ),  # an exponential in the data, a straight line in the model
     "misalignment": Case(Truth(**lamp(p2=Polarizer(offset=1.0))), ("polarizer misalignment",)),
     "scale": Case(Truth(**lamp(p2=Polarizer(scale=1.01))), ("servo scale",)),
-    "backlash": Case(Truth(**lamp(p2=Polarizer(backlash=1.0))), ("servo backlash",), (), {"polarizer_film.backlash": 1.0}),
+    "backlash": Case(
+        Truth(**lamp(p2=Polarizer(backlash=1.0))), ("servo backlash",), (), {"polarizer_film.backlash": 1.0}
+    ),
     "wobble": Case(Truth(**lamp(p2=Polarizer(wobble_c=0.01, wobble_s=-0.005))), ("analyzer wobble",)),
-    "retardance": Case(Truth(**lamp(sample=Sample(retardance=12.0, axis=20.0))), ("retardance",), (), {},
-                       {"sample.angle": [0.0, 45.0]}),
-    # light comes nearly along the sheet's 0 degrees: one component shows by its product with the other, which no chord knows
-    "retardance along a polarizer": Case(Truth(**lamp(sample=Sample(retardance=15.0, axis=-20.0))), ("retardance",),
-                                         polarizers=(0.0, 8.0)),
+    "retardance": Case(
+        Truth(**lamp(sample=Sample(retardance=12.0, axis=20.0))), ("retardance",), (), {}, {"sample.angle": [0.0, 45.0]}
+    ),
+    # light comes nearly along the sheet's 0 degrees: one component shows by its product with the other, which no chord
+    # knows
+    "retardance along a polarizer": Case(
+        Truth(**lamp(sample=Sample(retardance=15.0, axis=-20.0))), ("retardance",), polarizers=(0.0, 8.0)
+    ),
     "dispersive retardance": Case(
-        Truth(**colours(sample=Sample(retardance=40.0, axis=20.0, dispersion=0.1))), ("retardance", "dispersive retardance"), (), {
-            "sample.retard_dispersion": 0.1}, {"sample.angle": [0.0, 45.0]}),
-    "stress": Case(Truth(**colours(sample=Sample(stress_retardance=12.0))), ("stress birefringence",), ("retardance",), {},
-                   {"sample.angle": [0.0, 45.0, 20.0]}),
-    "depolarization": Case(Truth(**lamp(sample=Sample(depolarization=0.01))), ("depolarization",), ("extinction leak", "retardance"),
-                           {"sample.depolarization": 0.01}),
+        Truth(**colours(sample=Sample(retardance=40.0, axis=20.0, dispersion=0.1))),
+        ("retardance", "dispersive retardance"),
+        (),
+        {"sample.retard_dispersion": 0.1},
+        {"sample.angle": [0.0, 45.0]},
+    ),
+    "stress": Case(
+        Truth(**colours(sample=Sample(stress_retardance=12.0))),
+        ("stress birefringence",),
+        ("retardance",),
+        {},
+        {"sample.angle": [0.0, 45.0, 20.0]},
+    ),
+    "depolarization": Case(
+        Truth(**lamp(sample=Sample(depolarization=0.01))),
+        ("depolarization",),
+        ("extinction leak", "retardance"),
+        {"sample.depolarization": 0.01},
+    ),
     "stray light": Case(Truth(**lamp(stray=0.004)), ("stray light",), ("dark offset",)),
-    "dark offset": Case(Truth(photodiode=Photodiode(gain=2.2, offset=10.0)), ("dark offset",), ("stray light",),
-                        {"camera.offset": 10.0}),
+    "dark offset": Case(
+        Truth(photodiode=Photodiode(gain=2.2, offset=10.0)), ("dark offset",), ("stray light",), {"camera.offset": 10.0}
+    ),
     "gamma": Case(Truth(photodiode=Photodiode(gain=2.2, gamma=1.03)), ("camera gamma",), (), {"camera.gamma": 0.03}),
-    "drift": Case(Truth(**lamp(source=Source(drift=0.001))), ("source drift",), ("polarized source",), {"source.drift": 0.001}),
-    "polarized source": Case(Truth(**lamp(source=Source(dop=0.02, dop_angle=30.0))), ("polarized source",), (), {
-        "source.dop_q": 0.02 * np.cos(np.pi / 3), "source.dop_u": 0.02 * np.sin(np.pi / 3)}),
+    "drift": Case(
+        Truth(**lamp(source=Source(drift=0.001))), ("source drift",), ("polarized source",), {"source.drift": 0.001}
+    ),
+    "polarized source": Case(
+        Truth(**lamp(source=Source(dop=0.02, dop_angle=30.0))),
+        ("polarized source",),
+        (),
+        {"source.dop_q": 0.02 * np.cos(np.pi / 3), "source.dop_u": 0.02 * np.sin(np.pi / 3)},
+    ),
     # the reflections change the curve by r^2: seen at a tenth of the noise, and with films of high index
-    "film reflections": Case(Truth(**lamp(p1=SHINY, p2=SHINY)), ("film reflections",), (), {"polarizer_film.face": 0.1},
-                             noise=Noise(0.0005, 0.2, 64.0, 4095.0, 0.0)),
-    "misalignment and leak": Case(Truth(**lamp(p1=LEAKY, p2=Polarizer(leak=0.004, offset=1.0))),
-                                  ("polarizer misalignment", "extinction leak"), ("depolarization", "retardance")),
-    "depolarization and drift": Case(Truth(**lamp(source=Source(drift=0.002), sample=Sample(depolarization=0.01))),
-                                     ("depolarization", "source drift"), ("extinction leak", "retardance", "coloured leak")),
+    "film reflections": Case(
+        Truth(**lamp(p1=SHINY, p2=SHINY)),
+        ("film reflections",),
+        (),
+        {"polarizer_film.face": 0.1},
+        noise=Noise(0.0005, 0.2, 64.0, 4095.0, 0.0),
+    ),
+    "misalignment and leak": Case(
+        Truth(**lamp(p1=LEAKY, p2=Polarizer(leak=0.004, offset=1.0))),
+        ("polarizer misalignment", "extinction leak"),
+        ("depolarization", "retardance"),
+    ),
+    "depolarization and drift": Case(
+        Truth(**lamp(source=Source(drift=0.002), sample=Sample(depolarization=0.01))),
+        ("depolarization", "source drift"),
+        ("extinction leak", "retardance", "coloured leak"),
+    ),
 }
 
 
@@ -117,7 +159,9 @@ def test_a_hidden_effect_is_found(name, tmp_path):
         assert case.effects[0] in diagnosis.ambiguous and set(diagnosis.ambiguous) <= known, diagnosis.sentence
         assert case.alike, diagnosis.sentence
         needs = registry().find_effect(case.effects[0]).needs
-        assert any(needs in hint for hint in diagnosis.hints), "no word about the measurement that would tell them apart"
+        assert any(needs in hint for hint in diagnosis.hints), (
+            "no word about the measurement that would tell them apart"
+        )
     else:  # two effects at once
         assert diagnosis.word == "PARTIAL" and len(case.effects) == 2, f"{diagnosis.word}: {diagnosis.sentence}"
         whole = [set(p.effects) for p in diagnosis.pairs if p.complete]
@@ -146,7 +190,8 @@ def test_a_perfect_bench_lacks_nothing(seed, tmp_path):
 
 
 def test_what_goes_with_a_setting_is_drafted_then_claimed_as_a_formula(tmp_path, monkeypatch):
-    """A lamp that warms up as exp(-t/4 min), which no effect has: the curve along its clock, as a table, then as a formula."""
+    """A lamp that warms up as exp(-t/4 min), which no effect has: the curve along its clock, as a table, then as a
+    formula."""
     import optics.scene.registry as declarations
     from optics.proof.rigs.bench import Bench, sweep
     from optics.study import draft
@@ -164,9 +209,14 @@ def test_what_goes_with_a_setting_is_drafted_then_claimed_as_a_formula(tmp_path,
     file = draft.write(text, plugins, "warm up")
     study, model, setup = loop.take_up(study.folder)
     table, _ = loop.extend(study, model, setup, loop.restore(study, model), fresh.find_effect("warm-up"))
-    assert table.chi2 - table.dof < 0.4 * (fit.chi2 - fit.dof)  # straight lines between few points, where the lamp is steepest
+    assert table.chi2 - table.dof < 0.4 * (
+        fit.chi2 - fit.dof
+    )  # straight lines between few points, where the lamp is steepest
 
-    file.write_text("import numpy as np\n" + text.replace("lookup(x, AT, CURVE)", "-np.exp(-np.asarray(x) / 4.0)").replace("checks=(meets_its_table,)", ""))
+    file.write_text(
+        "import numpy as np\n"
+        + text.replace("lookup(x, AT, CURVE)", "-np.exp(-np.asarray(x) / 4.0)").replace("checks=(meets_its_table,)", "")
+    )
     fresh.effects.pop("warm-up")
     fresh.folders.remove(plugins.resolve())
     study, model, fit = loop.begin(setup, tmp_path / "formula")

@@ -19,8 +19,14 @@ def truth_of(sensor, rng) -> dict[str, float]:
     values = {"membrane.rho_r": 0.62, "membrane.rho_g": 0.55, "membrane.rho_b": 0.48, "membrane.sigma": 0.25}
     for led in sensor.leds:
         values.update({f"{led}.{a}": sensor.values()[f"{led}.{a}"] + 0.7 * rng.uniform(-1, 1) for a in "xyz"})
-        values.update({f"{led}.pan": 5 * rng.uniform(-1, 1), f"{led}.tilt": 5 * rng.uniform(-1, 1),
-                       f"{led}.mu": 1.2 + 0.3 * rng.uniform(-1, 1), f"{led}.power": 1 + 0.2 * rng.uniform(-1, 1)})
+        values.update(
+            {
+                f"{led}.pan": 5 * rng.uniform(-1, 1),
+                f"{led}.tilt": 5 * rng.uniform(-1, 1),
+                f"{led}.mu": 1.2 + 0.3 * rng.uniform(-1, 1),
+                f"{led}.power": 1 + 0.2 * rng.uniform(-1, 1),
+            }
+        )
     values["led_1.power"] = 1.0  # the gauge: only the product of powers and reflectance is determined
     return values
 
@@ -79,7 +85,9 @@ def test_robust_weights_shrug_off_glints(solved):
     free = calibrate.variables_from(model, ["membrane.rho_*"])
     clean = calibrate.fit(model, free, fit.values, [0])
     before, rng = model.frames[0].image, np.random.default_rng(4)
-    model.frames[0].image = np.where(rng.random(before.shape) < 0.01, np.minimum(before + 60, 250), before).astype(np.float32)
+    model.frames[0].image = np.where(rng.random(before.shape) < 0.01, np.minimum(before + 60, 250), before).astype(
+        np.float32
+    )
     try:
         plain, robust = (calibrate.fit(model, free, fit.values, [0], robust=r) for r in (False, True))
     finally:
@@ -123,11 +131,23 @@ def test_pulls_of_twenty_repeats_at_full_size():
         assert fit.converged, fit.reason
         errors.append(fit.estimate - [truth[v.keys[0]] for v in fit.variables])
         pulls.append(errors[-1] / fit.sd)
-        print(f"{repeat}: {seconds[-1]:.0f} s, {fit.reason}, rms pull {np.sqrt(np.mean(pulls[-1] ** 2)):.2f}", flush=True)
+        print(
+            f"{repeat}: {seconds[-1]:.0f} s, {fit.reason}, rms pull {np.sqrt(np.mean(pulls[-1] ** 2)):.2f}", flush=True
+        )
     names, pulls, errors = [v.name for v in fit.variables], np.array(pulls), np.abs(errors)
     relative = errors / [abs(truth[n]) for n in names]
-    print("pulls: mean of all", pulls.mean(), "sd of all", pulls.std(), "worst mean", names[np.argmax(np.abs(pulls.mean(0)))],
-          np.abs(pulls.mean(0)).max(), "median time", np.median(seconds), "s")
+    print(
+        "pulls: mean of all",
+        pulls.mean(),
+        "sd of all",
+        pulls.std(),
+        "worst mean",
+        names[np.argmax(np.abs(pulls.mean(0)))],
+        np.abs(pulls.mean(0)).max(),
+        "median time",
+        np.median(seconds),
+        "s",
+    )
 
     def worst(of, *ends):
         return max(of[:, i].max() for i, n in enumerate(names) if n.endswith(ends))

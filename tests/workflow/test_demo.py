@@ -1,8 +1,7 @@
 """A sensor with a secret, made by another path than the model: the loop names it, adds it, and reaches the noise.
 
-One secret of the polarizer bench runs always and one of a sensor, the others with the slow tests. White LEDs cannot show colour
-crosstalk: DIGIT's have to.
-"""
+One secret of the polarizer bench runs always and one of a sensor, the others with the slow tests. White LEDs cannot
+show colour crosstalk: DIGIT's have to."""
 
 import runpy
 import sys
@@ -16,8 +15,8 @@ from optics.proof import demo
 ROOT = Path(__file__).resolve().parents[2]
 
 
-# How near the strengths come, relative. One standard error is 5 % of the wedge and 8 % of the specular lobe. The makers draw an LED's
-# disc at random, mesh a bulge finer (measured: -6 %) and interpolate a distorted picture (-8 %).
+# How near the strengths come, relative. One standard error is 5 % of the wedge and 8 % of the specular lobe. The makers
+# draw an LED's disc at random, mesh a bulge finer (measured: -6 %) and interpolate a distorted image (-8 %).
 NEAR = {"LED size": 0.15, "gel wedge": 0.25, "gel bulge": 0.15, "radial distortion": 0.1, "specular lobe": 0.1}
 
 
@@ -44,7 +43,9 @@ def test_the_hidden_effect_is_named_added_and_the_noise_reached(mitsuba, tmp_pat
 SHOWN = "lens vignetting"  # by `make demo`: never left to the slow tests
 
 
-@pytest.mark.parametrize("name", [pytest.param(n, marks=() if n == SHOWN else pytest.mark.slow) for n in sorted(demo.SECRETS)])
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=() if n == SHOWN else pytest.mark.slow) for n in sorted(demo.SECRETS)]
+)
 def test_every_secret_is_found(mitsuba, tmp_path, name):
     found(tmp_path, name)
 

@@ -17,11 +17,19 @@ NOISE = Noise(system_gain=0.05, dark_noise=2.0, black_level=64.0, saturation=409
 
 @pytest.mark.parametrize("wrong", [False, True])
 def test_angles_in_radians_are_no_matter_of_effects(wrong, tmp_path):
-    folder = jones.write(tmp_path / "captures", jones.Truth(photodiode=jones.Photodiode(gain=2.2)), jones.malus_sweep(120, (0.0, 60.0)), NOISE, 3)
+    folder = jones.write(
+        tmp_path / "captures",
+        jones.Truth(photodiode=jones.Photodiode(gain=2.2)),
+        jones.malus_sweep(120, (0.0, 60.0)),
+        NOISE,
+        3,
+    )
     if wrong:
         file = next(folder.glob("*.csv"))
         head, *rows = csv.reader(file.read_text().splitlines())
-        turned = [[f"{np.radians(float(x)):.6f}" if k.endswith(".angle") else x for k, x in zip(head, row)] for row in rows]
+        turned = [
+            [f"{np.radians(float(x)):.6f}" if k.endswith(".angle") else x for k, x in zip(head, row)] for row in rows
+        ]
         file.write_text("\n".join(",".join(row) for row in [head, *turned]) + "\n")
     _, _, fit = loop.begin(loop.Setup(captures=str(folder)), tmp_path / "study")
     assert any("no matter of effects: check units" in w for w in fit.warnings) == wrong
@@ -33,20 +41,33 @@ def test_a_value_far_from_what_is_known_of_it_is_named():
     model, near = SimpleNamespace(base={"gel.press_depth": 0.2}), SimpleNamespace(rms=1.0, signal=100.0)
 
     def told(*depths):
-        fit = SimpleNamespace(variables=variables, values=Values(frame={i: {"gel.press_depth": d} for i, d in enumerate(depths)}))
+        fit = SimpleNamespace(
+            variables=variables, values=Values(frame={i: {"gel.press_depth": d} for i, d in enumerate(depths)})
+        )
         return loop._far(model, fit, near)
 
     assert told(0.2, 0.34, 0.06) == []
-    assert "gel.press_depth[1]: calibrated to more than 3 sd" in told(0.2, 0.36, 0.2)[0] and "0.36 mm for 0.2 +- 0.05" in told(0.2, 0.36, 0.2)[0]
+    assert (
+        "gel.press_depth[1]: calibrated to more than 3 sd" in told(0.2, 0.36, 0.2)[0]
+        and "0.36 mm for 0.2 +- 0.05" in told(0.2, 0.36, 0.2)[0]
+    )
 
 
-@pytest.mark.parametrize("frames, key", [
-    ([{"led_1.power": 1.0}, {"led_2.power": 1.0}], "led_1.power, led_2.power"), ([{"led_1.power": 1.0, "led_2.power": 0.0}, {"led_2.power": 1.0}],
-                                                                               "led_1.power"),
-    ([{"led_1.power": 1.0}, {"led_1.power": 0.5}], None), ([{}, {}], None)])
+@pytest.mark.parametrize(
+    "frames, key",
+    [
+        ([{"led_1.power": 1.0}, {"led_2.power": 1.0}], "led_1.power, led_2.power"),
+        ([{"led_1.power": 1.0, "led_2.power": 0.0}, {"led_2.power": 1.0}], "led_1.power"),
+        ([{"led_1.power": 1.0}, {"led_1.power": 0.5}], None),
+        ([{}, {}], None),
+    ],
+)
 def test_lights_named_in_some_frames_only(frames, key):
-    model = SimpleNamespace(frames=[SimpleNamespace(name=f"f{i}", parameters=p, readings={}) for i, p in enumerate(frames)],
-                            scene=SimpleNamespace(lights=["led_1", "led_2", "led_3"]), base={f"led_{k}.power": 1.0 for k in (1, 2, 3)})
+    model = SimpleNamespace(
+        frames=[SimpleNamespace(name=f"f{i}", parameters=p, readings={}) for i, p in enumerate(frames)],
+        scene=SimpleNamespace(lights=["led_1", "led_2", "led_3"]),
+        base={f"led_{k}.power": 1.0 for k in (1, 2, 3)},
+    )
     texts = loop._unnamed(model)
     assert (key is None) == (texts == [])
     assert key is None or texts[0].startswith(f"{key}: set in some frames and not in others") and "write 0" in texts[0]
@@ -55,14 +76,20 @@ def test_lights_named_in_some_frames_only(frames, key):
 @pytest.mark.parametrize("x, warned", [(9.3, False), (35.0, True), (-9.5, True)])
 def test_a_press_beyond_the_gel_is_named(x, warned):
     gel = SimpleNamespace(name="gel")
-    model = SimpleNamespace(scene=SimpleNamespace(gel=gel), base={"gel.width": 18.8, "gel.length": 14.0},
-                            frames=[SimpleNamespace(name="a", parameters={}), SimpleNamespace(name="b", parameters={"gel.press_x": x})])
+    model = SimpleNamespace(
+        scene=SimpleNamespace(gel=gel),
+        base={"gel.width": 18.8, "gel.length": 14.0},
+        frames=[SimpleNamespace(name="a", parameters={}), SimpleNamespace(name="b", parameters={"gel.press_x": x})],
+    )
     texts = loop._astray(model)
     assert bool(texts) == warned
     assert not warned or f"frame 'b': gel.press_x = {x:g} mm lies beyond the gel, which is 18.8 mm wide" in texts[0]
 
 
-@pytest.mark.parametrize("groups, held, asked, warned", [(3, [], None, True), (1, [], None, False), (4, [1], None, False), (3, [], [], False)])
+@pytest.mark.parametrize(
+    "groups, held, asked, warned",
+    [(3, [], None, True), (1, [], None, False), (4, [1], None, False), (3, [], [], False)],
+)
 def test_a_set_of_which_nothing_is_held_out_says_so(groups, held, asked, warned):
     frames = [SimpleNamespace(name=f"f{i}", group=f"g{i}") for i in range(groups)]
     model = SimpleNamespace(captures=SimpleNamespace(frames=frames))
@@ -84,24 +111,34 @@ def test_an_effect_that_does_not_predict_is_said_to_be_no_cause(monkeypatch):
     model = SimpleNamespace(scene=SimpleNamespace(can_express=lambda effect: True))
     effect = SimpleNamespace(name="row curve", file="")
     found, _ = loop.extend(study, model, SimpleNamespace(robust=False), SimpleNamespace(variables=[]), effect, Values())
-    assert found.warnings == ["held-out chi2/dof rises from 1.5 to 1.6 with row curve: it does not predict what it was not fitted to, and is "
-                              "not the cause, or not by itself"]
+    assert found.warnings == [
+        "held-out chi2/dof rises from 1.5 to 1.6 with row curve: it does not predict what it was not fitted to, and is "
+        "not the cause, or not by itself"
+    ]
 
 
 @pytest.mark.parametrize("size, warned", [((30, 48), True), ((36, 48), False), ((48, 36), True)])
-def test_cut_and_turned_pictures_are_noticed(size, warned, tmp_path):
+def test_cut_and_turned_images_are_noticed(size, warned, tmp_path):
     image = np.random.default_rng(1).uniform(50, 60, (*size, 3)).astype(np.float32)
     frames = [capture_files.Frame("a", image, file="frames/a.png", parameters={"led_1.power": 1.0})]
-    folder = capture_files.write(capture_files.Captures(tmp_path, "gelsight", frames, noise=Noise(0.05, 1.0, 8.0, 255.0, 0.0)), tmp_path / "set")
+    folder = capture_files.write(
+        capture_files.Captures(tmp_path, "gelsight", frames, noise=Noise(0.05, 1.0, 8.0, 255.0, 0.0)), tmp_path / "set"
+    )
     model = loop.open_model(loop.Setup(captures=str(folder)))
     assert any("the scene's own are 320 x 240" in w for w in loop._warnings(model)) == warned
 
 
 def test_a_gel_that_nothing_presses_has_no_press_to_solve_for(tmp_path):
     image = np.random.default_rng(1).uniform(50, 60, (240, 320, 3)).astype(np.float32)
-    frames = [capture_files.Frame(n, image, file=f"frames/{n}.png", group=n, parameters={"led_1.power": 1.0, "gel.press_depth": depth})
-              for n, depth in (("rest", 0.0), ("pressed", 0.4))]
-    folder = capture_files.write(capture_files.Captures(tmp_path, "gelsight", frames, noise=Noise(0.05, 1.0, 8.0, 255.0, 0.0)), tmp_path / "set")
+    frames = [
+        capture_files.Frame(
+            n, image, file=f"frames/{n}.png", group=n, parameters={"led_1.power": 1.0, "gel.press_depth": depth}
+        )
+        for n, depth in (("rest", 0.0), ("pressed", 0.4))
+    ]
+    folder = capture_files.write(
+        capture_files.Captures(tmp_path, "gelsight", frames, noise=Noise(0.05, 1.0, 8.0, 255.0, 0.0)), tmp_path / "set"
+    )
     setup = loop.Setup(captures=str(folder))
     names = [v.name for v in loop.variables_of_base(loop.open_model(setup), setup, [0, 1])]
     assert "gel.press_depth[pressed]" in names and not any("[rest]" in n for n in names)

@@ -1,8 +1,8 @@
-"""The loop on the Vi2TaP finger: pictures by stock Mitsuba's `path` and finer meshes (optics.proof.makers.finger), effects hidden in turn.
+"""The loop on the Vi2TaP finger: images by stock Mitsuba's `path` and finer meshes (optics.proof.makers.finger),
+effects hidden in turn.
 
-Four scenes (skin untouched and pressed, the object at four distances) at five angles of the analyser, 8 bits. Free are the
-paints and the pigment's yield; held out is one scene.
-"""
+Four scenes (skin untouched and pressed, the object at four distances) at five angles of the analyser, 8 bits. Free are
+the paints and the pigment's yield; held out is one scene."""
 
 import numpy as np
 import pytest
@@ -13,16 +13,26 @@ from optics.scene import loader as scenes
 from optics.scene.registry import registry
 from optics.study import loop
 
-DEFINES = {"width": "64", "height": "48", "wall_dark": "1"}  # an even wall: its chequers have edges that nobody measures
+DEFINES = {
+    "width": "64",
+    "height": "48",
+    "wall_dark": "1",
+}  # an even wall: its chequers have edges that nobody measures
 SCENES = [((0, 0, 0), 30.0), ((4, 3, 2.0), 15.0), ((-6, 2, 1.2), 45.0), ((2, -6, 1.6), 22.0)]
 ANGLES = [0.0, 40.0, 75.0, 90.0, 120.0]
-BUILT = {"camera.exposure": 6.5, "object_paint.rho_r": 0.7, "object_paint.rho_g": 0.45, "wall_paint.rho_b": 0.3, "pigment.yield": 0.47}
+BUILT = {
+    "camera.exposure": 6.5,
+    "object_paint.rho_r": 0.7,
+    "object_paint.rho_g": 0.45,
+    "wall_paint.rho_b": 0.3,
+    "pigment.yield": 0.47,
+}
 FREE = ["object_paint.rho_*", "wall_paint.rho_*", "pigment.yield"]
 
 # case: (what is hidden, look-alikes, {variable: true value})
 HIDDEN = {
     "extinction leak": ({"extinction leak": 0.012}, ("depolarization",), {"polarizer_film.leak": 0.012}),
-    "coloured leak": ({"coloured leak": 0.3}, (), {}),  # an exponential in the pictures, a straight line in the model
+    "coloured leak": ({"coloured leak": 0.3}, (), {}),  # an exponential in the images, a straight line in the model
     "depolarization": ({"depolarization": 0.02}, ("extinction leak",), {"silicone.depolarization": 0.02}),
     "polarizer misalignment": ({"polarizer misalignment": 2.0}, (), {}),
     "servo scale": ({"servo scale": 1.02}, ("polarizer misalignment",), {}),
@@ -33,7 +43,8 @@ HIDDEN = {
     "stray light": ({"stray light": 0.002}, ("dark offset", "ambient light"), {"camera.stray": 0.002}),
     "dark offset": ({"dark offset": 2.0}, ("stray light", "ambient light"), {"camera.offset": 2.0}),
     "camera gamma": ({"camera gamma": 0.05}, (), {"camera.gamma": 0.05}),
-    # on a narrow field, see NARROW; 15 cos 60 and 15 sin 60 deg, of which the common sign shows behind a wave plate only
+    # on a narrow field, see NARROW; 15 cos 60 and 15 sin 60 deg, of which the common sign shows behind a wave plate
+    # only
     "retardance": ({"retardance": 15.0}, (), {"silicone.retard_0": 7.5, "silicone.retard_45": 12.99}),
     "marker leak": ({"marker leak": 0.03}, (), {"inner_face.marker_leak": 0.03}),
     "gain drift": ({"gain drift": 0.02}, (), {}),
@@ -42,17 +53,26 @@ HIDDEN = {
 }
 
 
-# films at 45 degrees to an axis stand for a retarder: off the axis they differ by the product of the two angles, 2 degrees in the corners;
-# the near object then fills the picture, and one lamp lights it: to draw one of two would be noise above that of the photons
-# and the skin is left alone: so near, the two accounts of carried markers differ by more than the noise at their edges
-NARROW = {"retardance": {"x_fov": "30", "built": {"room_right.power": 0.0}, "views": [((0, 0, 0), d) for d in (30.0, 15.0, 45.0, 22.0)]}}
+# films at 45 degrees to an axis stand for a retarder: off the axis they differ by the product of the two angles, 2
+# degrees in the corners; the near object then fills the image, and one lamp lights it: to draw one of two would be
+# noise above that of the photons and the skin is left alone: so near, the two accounts of carried markers differ by
+# more than the noise at their edges
+NARROW = {
+    "retardance": {
+        "x_fov": "30",
+        "built": {"room_right.power": 0.0},
+        "views": [((0, 0, 0), d) for d in (30.0, 15.0, 45.0, 22.0)],
+    }
+}
 
 
 def study_of(folder, effects, seed=5, built=None, views=SCENES, **defines):
     scene = scenes.load("vi2tap", {**DEFINES, **defines})
     maker = FingerMaker(scene, {**BUILT, **(built or {})}, effects, spp=144, seed=seed)
     capture_files.write(maker.captures(views, ANGLES), folder / "captures", bits=8)
-    setup = loop.Setup(captures=str(folder / "captures"), defines={"wall_dark": "1", **defines}, free=FREE, per_group=[])
+    setup = loop.Setup(
+        captures=str(folder / "captures"), defines={"wall_dark": "1", **defines}, free=FREE, per_group=[]
+    )
     return (setup, *loop.begin(setup, folder / "study"))
 
 
@@ -64,7 +84,9 @@ def test_the_maker_and_the_model_are_two_accounts_of_one_finger():
     maker = FingerMaker(scenes.load("vi2tap", DEFINES), BUILT, {}, spp=64, seed=2)
     captures = maker.captures(SCENES[1:2], [0.0, 90.0])
     model = Model(scenes.load("vi2tap", DEFINES), captures)
-    for index, predicted in enumerate(model.predict(Values({k: v for k, v in BUILT.items() if k != "camera.exposure"}))):
+    for index, predicted in enumerate(
+        model.predict(Values({k: v for k, v in BUILT.items() if k != "camera.exposure"}))
+    ):
         use = model.usable(index)
         z = ((model.frames[index].image - predicted) / model.noise.sd(predicted))[use]
         assert use.mean() > 0.8  # edges that the samples do not resolve are masked, not more
@@ -102,11 +124,15 @@ def test_a_hidden_effect_is_found(case, tmp_path):
     assert fit.chi2 / fit.dof < 1.05 and held < 1.05  # the noise floor; edges add two per cent
     mirrored = fit.values.common.get("silicone.retard_0", 0.0) < 0  # both components together
     for variable, sd in zip(fit.variables, fit.sd):
-        if variable.name in truth:  # four standard deviations, and a fiftieth for what the two accounts differ by at edges
+        if (
+            variable.name in truth
+        ):  # four standard deviations, and a fiftieth for what the two accounts differ by at edges
             found = fit.values.get(variable, model.base)
             if mirrored and "retard" in variable.name:
                 found = -found
-            assert abs(found - truth[variable.name]) < 4 * sd + 0.02 * truth[variable.name], f"{variable.name}: {found} +- {sd}"
+            assert abs(found - truth[variable.name]) < 4 * sd + 0.02 * truth[variable.name], (
+                f"{variable.name}: {found} +- {sd}"
+            )
 
 
 @pytest.mark.slow

@@ -1,7 +1,8 @@
-"""The loop on a printed grid: pictures by stock Mitsuba's `volpath` and other meshes (optics.proof.makers.grid), effects hidden in turn.
+"""The loop on a printed grid: images by stock Mitsuba's `volpath` and other meshes (optics.proof.makers.grid), effects
+hidden in turn.
 
-A matt rod at three distances, lit by one panel after the other, 8 bits. Free are the powers of the panels; held out is one distance.
-"""
+A matt rod at three distances, lit by one panel after the other, 8 bits. Free are the powers of the panels; held out is
+one distance."""
 
 import numpy as np
 import pytest
@@ -13,7 +14,10 @@ from optics.scene.registry import registry
 from optics.study import loop
 
 SCENE = {"width": "32", "height": "24"}
-CHANCE = {"rays": "1024", "packets": "100000"}  # the model's error is then a quarter of the camera's noise, which it adds to it
+CHANCE = {
+    "rays": "1024",
+    "packets": "100000",
+}  # the model's error is then a quarter of the camera's noise, which it adds to it
 DISTANCES = [2.5, 4.0, 6.0]
 HELD = ["distance-01"]
 BUILT = {"panel_left.power": 1.1, "panel_right.power": 0.9}
@@ -26,7 +30,8 @@ HIDDEN = {
     "rough walls": (0.05, (), {"filling.roughness": 0.05}),
     "index mismatch": (0.01, (), {}),  # free are both indices: their ratio is what walls between them tell
     "body absorption": (0.15, (), {"filling.absorption": 0.15}),
-    # 262 in chi2, where the error of the model's own picture of a cell that is emptied is 33; of (3, 2, 1) it is 32, and 2 to the one behind
+    # 262 in chi2, where the error of the model's own image of a cell that is emptied is 33; of (3, 2, 1) it is 32, and
+    # 2 to the one behind
     "unfilled cell": ((1, 2, 1), (), {"grid.unfilled": 1.0}),
     "wall thickness": (0.02, (), {"grid.wall_error": 0.02}),
 }
@@ -48,10 +53,14 @@ def test_frames_are_lit_by_one_panel_each_and_as_noisy_as_they_say():
     made = small().captures([2.5, 6.0])
     assert [f.group for f in made.frames] == 3 * ["distance-00"] + 3 * ["distance-01"]
     for frame in made.frames:
-        assert frame.image.shape == (9, 12, 1) and sum(v for k, v in frame.parameters.items() if k.endswith(".power")) == 1
+        assert (
+            frame.image.shape == (9, 12, 1) and sum(v for k, v in frame.parameters.items() if k.endswith(".power")) == 1
+        )
         assert frame.image.max() <= 255 and (frame.image == np.round(frame.image)).all()
     again, other = small().captures([2.5]), small(seed=2).captures([2.5])
-    assert (again.frames[0].image == made.frames[0].image).all() and (other.frames[0].image != made.frames[0].image).any()
+    assert (again.frames[0].image == made.frames[0].image).all() and (
+        other.frames[0].image != made.frames[0].image
+    ).any()
     maker, rng = small(), np.random.default_rng(0)
     stack = np.array([maker.photograph(np.full((9, 12), 0.01), np.zeros((9, 12)), rng) for _ in range(200)])
     expected = 8 + 247 * 15 * 0.01
@@ -70,9 +79,13 @@ def test_the_makers_error_falls_with_its_samples():
     assert shares[0] / shares[1] == pytest.approx(4, rel=0.25)  # errors of eight passes
 
 
-@pytest.mark.parametrize("effects, said", [
-    ({"fog": 1.0}, "no independent way to make fog"),
-    ({"unfilled cell": (8, 0, 0)}, r"unfilled cell = \(8, 0, 0\); allowed: \(column, row, layer\) below")])
+@pytest.mark.parametrize(
+    "effects, said",
+    [
+        ({"fog": 1.0}, "no independent way to make fog"),
+        ({"unfilled cell": (8, 0, 0)}, r"unfilled cell = \(8, 0, 0\); allowed: \(column, row, layer\) below"),
+    ],
+)
 def test_what_the_maker_cannot_make_is_refused(effects, said):
     with pytest.raises(ValueError, match=said):
         small(effects)
@@ -80,7 +93,8 @@ def test_what_the_maker_cannot_make_is_refused(effects, said):
 
 @pytest.mark.slow
 def test_the_maker_and_the_model_are_two_accounts_of_one_grid():
-    """At equal values, without a fit: half a per cent in the mean, and no more from pixel to pixel than both errors say."""
+    """At equal values, without a fit: half a per cent in the mean, and no more from pixel to pixel than both errors
+    say."""
     from optics.light.transport import Transport
 
     scene = scenes.load("grid_bench", SCENE)
@@ -89,7 +103,9 @@ def test_the_maker_and_the_model_are_two_accounts_of_one_grid():
     taken = Transport(scene).take(1024, 2_000_000)
     for name, radiance, error in zip(taken.lights, taken.radiance[..., 0], taken.error[..., 0]):
         stock, own = made[name]
-        assert radiance.mean() == pytest.approx(stock.mean(), rel=0.005)  # texels of the model's maps are shared by pixels
+        assert radiance.mean() == pytest.approx(
+            stock.mean(), rel=0.005
+        )  # texels of the model's maps are shared by pixels
         assert np.mean((radiance - stock) ** 2) < 1.3 * np.mean(error**2 + own**2)
 
 
@@ -107,11 +123,15 @@ def test_a_hidden_effect_is_found(case, tmp_path):
     start = diagnosis.fits[case].values if case in diagnosis.fits else None
     fit = loop.extend(study, model, setup, fit, registry().find_effect(case), start)[0]
     held = study.steps[-1]["held_out"]["chi2_per_dof"]
-    assert held < before and fit.chi2 / fit.dof < 1.1 and held < 1.1  # the noise floor; the maker's error adds two per cent
+    assert (
+        held < before and fit.chi2 / fit.dof < 1.1 and held < 1.1
+    )  # the noise floor; the maker's error adds two per cent
     for variable, sd in zip(fit.variables, fit.sd):
         if variable.name in truth:  # four standard deviations, and a twentieth: the model's error is not in sd
             found = fit.values.get(variable, model.base)
-            assert abs(found - truth[variable.name]) < 4 * sd + 0.05 * truth[variable.name], f"{variable.name}: {found} +- {sd}"
+            assert abs(found - truth[variable.name]) < 4 * sd + 0.05 * truth[variable.name], (
+                f"{variable.name}: {found} +- {sd}"
+            )
     if case == "unfilled cell":
         place = [fit.values.common.get(f"grid.unfilled_{axis}", 0.0) for axis in ("column", "row", "layer")]
         assert tuple(place) == strength

@@ -1,4 +1,5 @@
-"""Captures as a model would take them: the command line from a study to what an effect would look like, and that the loop finds it."""
+"""Captures as a model would take them: the command line from a study to what an effect would look like, and that the
+loop finds it."""
 
 import json
 
@@ -23,10 +24,18 @@ def study(tmp_path_factory, mitsuba):
     scene = scenes.load("digit", SIZE)
     built = {**demo.truth(scene, 1), "camera.exposure": 700.0}
     everything = dict.fromkeys(scene.leds, 1.0)
-    shots = [touch.Shot(f"press{k}", f"press-{k}", at, everything) for k, at in enumerate([(-1.5, 1.0, 0.5), (1.0, -1.5, 0.6), (0.5, 2.0, 0.7)])]
+    shots = [
+        touch.Shot(f"press{k}", f"press-{k}", at, everything)
+        for k, at in enumerate([(-1.5, 1.0, 0.5), (1.0, -1.5, 0.6), (0.5, 2.0, 0.7)])
+    ]
     capture_files.write(touch.Wild(scene, built, spp=64).shoot(shots, "digit"), folder / "captures", bits=16)
-    setup = loop.Setup(captures=str(folder / "captures"), free=["led_*.power", "membrane.sigma"], per_group=[], held_out=["press-1"],
-                       values={k: v for k, v in built.items() if k != "camera.exposure"})
+    setup = loop.Setup(
+        captures=str(folder / "captures"),
+        free=["led_*.power", "membrane.sigma"],
+        per_group=[],
+        held_out=["press-1"],
+        values={k: v for k, v in built.items() if k != "camera.exposure"},
+    )
     loop.begin(setup, folder / "study")
     return folder / "study"
 
@@ -53,7 +62,7 @@ def test_imitated_captures_are_the_models_own_with_the_cameras_noise(study, tmp_
 def test_a_rehearsal_from_the_command_line(study):
     said = CliRunner().invoke(app, ["rehearse", str(study), "--change", "1", "--json"])
     assert said.exit_code == 0, said.output
-    found = json.loads(said.output[said.output.index("{"):])
+    found = json.loads(said.output[said.output.index("{") :])
     shares = {r["effect"]: r["named"] for r in found["rows"]}
     assert found["change"] == 0.01 and shares["colour crosstalk"] > 0.9  # three LEDs of three colours
     assert all(0 <= v <= 1 for v in shares.values())

@@ -1,6 +1,6 @@
 """Two real sensors: the physical model beats three null models on presses that no fit has seen.
 
-The pictures lie beside the repository (`../shared/data`), never in it; without them these tests are skipped.
+The images lie beside the repository (`../shared/data`), never in it; without them these tests are skipped.
 """
 
 import importlib.util
@@ -17,7 +17,7 @@ ROOT = Path(__file__).resolve().parents[2]
 DATA = ROOT.parent / "shared" / "data"
 TAXIM = DATA / "taxim_gelsight_ball" / "dataPack_small.npz"
 DIGIT = DATA / "digitdepth_digit_ball"
-pytestmark = pytest.mark.skipif(not (TAXIM.is_file() and DIGIT.is_dir()), reason=f"no real pictures in {DATA}")
+pytestmark = pytest.mark.skipif(not (TAXIM.is_file() and DIGIT.is_dir()), reason=f"no real images in {DATA}")
 
 spec = importlib.util.spec_from_file_location("real_ball_presses", ROOT / "examples" / "real_ball_presses.py")
 example = importlib.util.module_from_spec(spec)
@@ -27,7 +27,10 @@ spec.loader.exec_module(example)
 def test_the_gelsight_pack_contradicts_itself_and_says_so(tmp_path):
     found = importing.import_taxim(TAXIM, tmp_path / "set", **example.TAXIM)
     text = "\n".join(found.warnings)
-    assert "40 of 49 labelled circles are larger than the ball itself: radius up to 17 px = 2.12 mm, ball radius 2.00 mm" in text
+    assert (
+        "40 of 49 labelled circles are larger than the ball itself: radius up to 17 px = 2.12 mm, ball radius 2.00 mm"
+        in text
+    )
     assert "0.1245 mm/px and 0.12 mm/px, -3.6%" in text
     assert "not the background of these presses" in text
     assert not list(tmp_path.glob(".*"))
@@ -45,14 +48,17 @@ def test_the_digit_set_is_imported_with_one_group_per_press(tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("sensor", ["gelsight", "digit"])
 def test_the_physical_model_beats_the_nulls_in_two_channels(mitsuba, tmp_path, sensor):
-    """On held-out presses: one in four, and with few presses over three folds, as one fold is at the mercy of one press."""
+    """On held-out presses: one in four, and with few presses over three folds, as one fold is at the mercy of one
+    press."""
     if sensor == "gelsight":
         found, folds = importing.import_taxim(TAXIM, tmp_path / "set", **example.TAXIM), [None]
     else:
         found = importing.import_circles(DIGIT / "images", DIGIT / "labels.csv", tmp_path / "set", **example.DIGIT)
         order = [captures.load(found.folder).frames[i].name for i in np.random.default_rng(5).permutation(14)]
-        folds = [order[3 * k:3 * k + 3] for k in range(3)]
-    last = [example.study(found.folder, tmp_path / f"study-{k}", example.ADDED[sensor], held_out)[-1]
-            for k, held_out in enumerate(folds)]
+        folds = [order[3 * k : 3 * k + 3] for k in range(3)]
+    last = [
+        example.study(found.folder, tmp_path / f"study-{k}", example.ADDED[sensor], held_out)[-1]
+        for k, held_out in enumerate(folds)
+    ]
     table = nulls.pooled(last)
     assert sum(table.wins()) >= 2, table.text()

@@ -33,7 +33,9 @@ def shading(h, w, place, depth, lit, powers, vignetting=0.0, absorption=0.0):
     x, y = (x - w / 2) * 16 / w, (y - h / 2) * 16 / w
     r = np.hypot(x - place[0], y - place[1])
     a = np.sqrt(2 * 4.0 * depth)
-    height = np.where(r < a, depth - r**2 / 8, 0.25 * depth * np.exp(-(r - a) / 0.8)) - 0.25 * depth * (r < a) * (r / a) ** 8
+    height = (
+        np.where(r < a, depth - r**2 / 8, 0.25 * depth * np.exp(-(r - a) / 0.8)) - 0.25 * depth * (r < a) * (r / a) ** 8
+    )
     gy, gx = np.gradient(height, 16 / w)
     slope = np.hypot(gx, gy)
     image = np.zeros((h, w, 3))
@@ -50,8 +52,15 @@ def shading(h, w, place, depth, lit, powers, vignetting=0.0, absorption=0.0):
     image *= (1 - vignetting * (1 - np.cos(angle) ** 4) * 4)[..., None]
     path = (2.2 - height) * (1 / np.cos(angle) + 1.4)
     image *= np.exp(-absorption * path[..., None] * np.array([0.6, 1.0, 1.9]))
-    known = {"radius": np.hypot(x, y) * w / 16, "height": height, "slope": np.degrees(np.arctan(slope)), "gel_path": path,
-             "contact": r < 0.9 * a, "rim": (r >= 0.9 * a) & (r < 1.25 * a), "shadow": shadow}
+    known = {
+        "radius": np.hypot(x, y) * w / 16,
+        "height": height,
+        "slope": np.degrees(np.arctan(slope)),
+        "gel_path": path,
+        "contact": r < 0.9 * a,
+        "rim": (r >= 0.9 * a) & (r < 1.25 * a),
+        "shadow": shadow,
+    }
     return BLACK + 175 * image, known
 
 
@@ -85,12 +94,22 @@ def demo(folder: Path, height=72, width=96, presses=4, seed=3, steps=3) -> Study
     capture_file.parent.mkdir(parents=True, exist_ok=True)
     capture_file.write_text('scene = "gelsight"\n')
     study = Study.create(
-        folder, scene="gelsight", captures=str(capture_file.parent), inputs=[capture_file], seed=7,
-        command=["optics", "study", "captures", "--out", "study"], title="GelSight, dome presses",
+        folder,
+        scene="gelsight",
+        captures=str(capture_file.parent),
+        inputs=[capture_file],
+        seed=7,
+        command=["optics", "study", "captures", "--out", "study"],
+        title="GelSight, dome presses",
         noise={"system_gain": GAIN, "dark_noise": READ, "black_level": BLACK, "saturation": FULL, "prnu": 0.0},
         warnings=["8 bit: quantisation is a sixth of the dark noise; deeper images decide more"],
-        facts={"frames": len(shots), "held_out": len(held_out), "image": [height, width, 3],
-               "setup": {"free": ["led*.power"], "seed": 7}})
+        facts={
+            "frames": len(shots),
+            "held_out": len(held_out),
+            "image": [height, width, 3],
+            "setup": {"free": ["led*.power"], "seed": 7},
+        },
+    )
 
     def calibrated(strengths):
         """LED powers that fit best: the image is linear in them, so weighted least squares is exact in one step."""
@@ -103,8 +122,11 @@ def demo(folder: Path, height=72, width=96, presses=4, seed=3, steps=3) -> Study
         return dict(zip(LEDS, np.linalg.solve(gram, right)))
 
     free = [f"{n}.power" for n in LEDS]
-    ladder = [("base", None, (0, 0)), ("lens vignetting", "lens-vignetting", (TRUTH["camera.vignetting"], 0)),
-              ("gel absorption", "gel-absorption", tuple(TRUTH.values()))][:steps]
+    ladder = [
+        ("base", None, (0, 0)),
+        ("lens vignetting", "lens-vignetting", (TRUTH["camera.vignetting"], 0)),
+        ("gel absorption", "gel-absorption", tuple(TRUTH.values())),
+    ][:steps]
     fitted = [i for i in range(len(shots)) if i not in held_out]
     effects = {"lens vignetting": (TRUTH["camera.vignetting"], 0.0), "gel absorption": (0.0, TRUTH["gel.absorption"])}
     for index, (name, effect, strengths) in enumerate(ladder):
@@ -113,28 +135,61 @@ def demo(folder: Path, height=72, width=96, presses=4, seed=3, steps=3) -> Study
         predicted, known = [b[0] for b in both], [b[1] for b in both]
         spread = [sd(p) for p in predicted]
         found = compare(
-            measured, predicted, spread, usable, known, [{f"{n}.power": float(n in s[3]) for n in LEDS} for s in shots],
-            [s[0] for s in shots], names=names, held_out=held_out, parameters=3 + index, full_scale=FULL,
-            black_level=BLACK)
+            measured,
+            predicted,
+            spread,
+            usable,
+            known,
+            [{f"{n}.power": float(n in s[3]) for n in LEDS} for s in shots],
+            [s[0] for s in shots],
+            names=names,
+            held_out=held_out,
+            parameters=3 + index,
+            full_scale=FULL,
+            black_level=BLACK,
+        )
         sds = np.array([0.0011, 0.0010, 0.0012] + [0.004, 0.0009][:index])
-        values = Values({**{f"{n}.power": powers[n] for n in LEDS}, **dict(list(TRUTH.items())[:index])},
-                        {i: {"gel.press_x": shots[i][1][0]} for i in range(len(shots))})
+        values = Values(
+            {**{f"{n}.power": powers[n] for n in LEDS}, **dict(list(TRUTH.items())[:index])},
+            {i: {"gel.press_x": shots[i][1][0]} for i in range(len(shots))},
+        )
         power = Parameter("power", "1", 1.0, (0.0, 10.0), plausible=0.1)
-        extra = [Parameter("vignetting", "1", 0.0, (0, 1), neutral=0.0, plausible=0.3),
-                 Parameter("absorption", "1/mm", 0.0, (0, 1), neutral=0.0, plausible=0.05)][:index]
+        extra = [
+            Parameter("vignetting", "1", 0.0, (0, 1), neutral=0.0, plausible=0.3),
+            Parameter("absorption", "1/mm", 0.0, (0, 1), neutral=0.0, plausible=0.05),
+        ][:index]
         variables = [Variable(k, (k,), power, prior=(1.0, 0.05)) for k in free]
         variables += [Variable(k, (k,), p) for k, p in zip(TRUTH, extra)]
-        variables += [Variable(f"gel.press_x[{g}]", ("gel.press_x",), Parameter("press_x", "mm", 0.0),
-                               tuple(i for i, s in enumerate(shots) if s[0] == g)) for g in dict.fromkeys(s[0] for s in shots)]
-        estimate = np.array([powers[n] for n in LEDS] + list(TRUTH.values())[:index]
-                            + [next(s[1][0] for s in shots if s[0] == v.name[12:-1]) for v in variables[3 + index:]])
+        variables += [
+            Variable(
+                f"gel.press_x[{g}]",
+                ("gel.press_x",),
+                Parameter("press_x", "mm", 0.0),
+                tuple(i for i, s in enumerate(shots) if s[0] == g),
+            )
+            for g in dict.fromkeys(s[0] for s in shots)
+        ]
+        estimate = np.array(
+            [powers[n] for n in LEDS]
+            + list(TRUTH.values())[:index]
+            + [next(s[1][0] for s in shots if s[0] == v.name[12:-1]) for v in variables[3 + index :]]
+        )
         sds = np.concatenate([sds, np.full(len(estimate) - len(sds), 0.0021)])
         correlation = np.eye(len(estimate))
         if index:
             correlation[0, 3] = correlation[3, 0] = 0.93
-        fit = SimpleNamespace(values=values, variables=variables, estimate=estimate, sd=sds, correlation=correlation,
-                              chi2=found.fitted.chi2, dof=found.fitted.dof, converged=True, reason="gradient small",
-                              warnings=[])
+        fit = SimpleNamespace(
+            values=values,
+            variables=variables,
+            estimate=estimate,
+            sd=sds,
+            correlation=correlation,
+            chi2=found.fitted.chi2,
+            dof=found.fitted.dof,
+            converged=True,
+            reason="gradient small",
+            warnings=[],
+        )
         r = [np.where(u, (m - p) / s, np.nan) for m, p, s, u in zip(measured, predicted, spread, usable)]
         fingerprints, rows, worst = [], [], found.worst()[0]
         for title, step in effects.items():
@@ -148,78 +203,182 @@ def demo(folder: Path, height=72, width=96, presses=4, seed=3, steps=3) -> Study
             rows.append((title, fall, max(step)))
         order = np.argsort([-r[1] for r in rows])
         diagnosis = demo_diagnosis([rows[i] for i in order], found, index, names)
-        frames = [Shown(n, m, p, s, u, found.frames[i]["led"], shots[i][0], i in held_out)
-                  for i, (n, m, p, s, u) in enumerate(zip(names, measured, predicted, spread, usable))]
-        study.add_step(name, effect, fit, found, diagnosis, frames, [fingerprints[i] for i in order],
-                       nulls=null_models(), background={"mode": "additive", "channels": [
-                           {"structure": 12.0, "left": 6.0, "share": 0.75}] * 3}, seconds=12.0)
+        frames = [
+            Shown(n, m, p, s, u, found.frames[i]["led"], shots[i][0], i in held_out)
+            for i, (n, m, p, s, u) in enumerate(zip(names, measured, predicted, spread, usable))
+        ]
+        study.add_step(
+            name,
+            effect,
+            fit,
+            found,
+            diagnosis,
+            frames,
+            [fingerprints[i] for i in order],
+            nulls=null_models(),
+            background={"mode": "additive", "channels": [{"structure": 12.0, "left": 6.0, "share": 0.75}] * 3},
+            seconds=12.0,
+        )
     return study
 
 
 def null_models() -> dict:
     """Errors of a physical model that wins two channels, as optics.fit.null_models writes them."""
-    scores = [Score(name, split, "own", [near, near, near + worse], [1.5] * 3, [near] * 3, [1.0] * 3)
-              for split in ("held out", "fitted")
-              for name, near, worse in ((PHYSICAL, 4.25, 9.0), ("background", 28.5, 0.0), ("linear in the normal", 5.5, 0.0))]
+    scores = [
+        Score(name, split, "own", [near, near, near + worse], [1.5] * 3, [near] * 3, [1.0] * 3)
+        for split in ("held out", "fitted")
+        for name, near, worse in ((PHYSICAL, 4.25, 9.0), ("background", 28.5, 0.0), ("linear in the normal", 5.5, 0.0))
+    ]
     return NullTable(scores, [1.9] * 3, ["a", "b"], ["c"]).json()
 
 
 def demo_diagnosis(rows, found, index, names) -> dict:
-    """What optics.diagnosis.diagnose would say at this step of the ladder: vignetting, then absorption, then nothing."""
+    """What optics.diagnosis.diagnose would say at this step of the ladder: vignetting, then absorption, then
+    nothing."""
     claim = index < 2
     total, noise = found.total, found.total.noise / found.total.signal
-    unit, plausible = {"lens vignetting": "1", "gel absorption": "1/mm"}, {"lens vignetting": 0.3, "gel absorption": 0.05}
+    unit, plausible = (
+        {"lens vignetting": "1", "gel absorption": "1/mm"},
+        {"lens vignetting": 0.3, "gel absorption": 0.05},
+    )
     table = []
     for k, (name, fall, strength) in enumerate(rows):
         sd = strength / np.sqrt(max(fall, 100.0))
-        table.append({
-            "name": name, "units": [unit[name]], "fall": 0.96 * fall, "p_family": 0.0 if claim else 0.8, "start": [0.0],
-            "change": [strength if claim else 0.0], "sd": [sd], "of_plausible": strength / plausible[name],
-            "image": 0.021 + 0.03 * k, "share": fall / (total.chi2 - total.dof) if claim else None,
-            "survival": 0.07 + 0.1 * k, "upper": [strength + 2 * sd], "confused_with": "LED lobe" if k == 0 else "",
-            "cos": 0.79, "flags": [], "verdict": "MISSING" if k == 0 and claim else "",
-            "refit": {"fall": fall, "strength": [strength], "sd": [sd]} if claim else None})
+        table.append(
+            {
+                "name": name,
+                "units": [unit[name]],
+                "fall": 0.96 * fall,
+                "p_family": 0.0 if claim else 0.8,
+                "start": [0.0],
+                "change": [strength if claim else 0.0],
+                "sd": [sd],
+                "of_plausible": strength / plausible[name],
+                "image": 0.021 + 0.03 * k,
+                "share": fall / (total.chi2 - total.dof) if claim else None,
+                "survival": 0.07 + 0.1 * k,
+                "upper": [strength + 2 * sd],
+                "confused_with": "LED lobe" if k == 0 else "",
+                "cos": 0.79,
+                "flags": [],
+                "verdict": "MISSING" if k == 0 and claim else "",
+                "refit": {"fall": fall, "strength": [strength], "sd": [sd]} if claim else None,
+            }
+        )
     for name, upper in (("glare", 0.0007), ("LED lobe", 0.03), ("response gamma", 0.02)):
-        table.append({"name": name, "units": ["1"], "fall": 1.3, "p_family": 0.9, "start": [0.0], "change": [0.0],
-                      "sd": [upper / 2], "upper": [upper], "refit": None, "verdict": "no evidence"})
+        table.append(
+            {
+                "name": name,
+                "units": ["1"],
+                "fall": 1.3,
+                "p_family": 0.9,
+                "start": [0.0],
+                "change": [0.0],
+                "sd": [upper / 2],
+                "upper": [upper],
+                "refit": None,
+                "verdict": "no evidence",
+            }
+        )
     data = {
-        "word": "NOTHING", "rows": table, "not_tested": {"retardance": "no polarizer in the scene"}, "warnings": [],
+        "word": "NOTHING",
+        "rows": table,
+        "not_tested": {"retardance": "no polarizer in the scene"},
+        "warnings": [],
         "sentence": f"none of {len(table)} effects stands out (family-wise p 0.8) and no low-frequency structure is left "
-                    "(p 0.31).",
-        "conditions": [{"name": "an effect stands out", "holds": claim, "text": "family-wise p <1e-9 against 0.01"},
-                       {"name": "structure is left", "holds": False, "text": "low-frequency test p 0.31 against 0.01"}]}
+        "(p 0.31).",
+        "conditions": [
+            {"name": "an effect stands out", "holds": claim, "text": "family-wise p <1e-9 against 0.01"},
+            {"name": "structure is left", "holds": False, "text": "low-frequency test p 0.31 against 0.01"},
+        ],
+    }
     if not claim:
         return data
     best, rng = table[0], np.random.default_rng(5)
-    parts = {"channel": ["R", "G", "B"], "frame": names, "LED": ["all", "led_red", "led_green"],
-             "contact": ["no contact", "contact"], "quadrant": ["top left", "top right", "bottom left", "bottom right"]}
-    splits = [{"effect": best["name"], "by": by, "labels": labels, "sd": [0.012] * len(labels), "h": 0.004, "p": 0.4,
-               "strength": (1 + 0.012 * rng.normal(size=len(labels))).tolist(), "holds": True}
-              for by, labels in parts.items()]
-    level = {"fitted": total.rms / total.signal, "held_out": found.held_out.rms / found.held_out.signal, "frames": 2,
-             "chi2_fitted": found.fitted.chi2_per_dof, "chi2_held_out": found.held_out.chi2_per_dof, "fall": None,
-             "frames_better": 0}
+    parts = {
+        "channel": ["R", "G", "B"],
+        "frame": names,
+        "LED": ["all", "led_red", "led_green"],
+        "contact": ["no contact", "contact"],
+        "quadrant": ["top left", "top right", "bottom left", "bottom right"],
+    }
+    splits = [
+        {
+            "effect": best["name"],
+            "by": by,
+            "labels": labels,
+            "sd": [0.012] * len(labels),
+            "h": 0.004,
+            "p": 0.4,
+            "strength": (1 + 0.012 * rng.normal(size=len(labels))).tolist(),
+            "holds": True,
+        }
+        for by, labels in parts.items()
+    ]
+    level = {
+        "fitted": total.rms / total.signal,
+        "held_out": found.held_out.rms / found.held_out.signal,
+        "frames": 2,
+        "chi2_fitted": found.fitted.chi2_per_dof,
+        "chi2_held_out": found.held_out.chi2_per_dof,
+        "fall": None,
+        "frames_better": 0,
+    }
     radius = next(c for c in found.curves if c.coordinate == "radius" and c.channel == "all")
     return {
-        **data, "word": "CLAIM", "claimed": best["name"], "splits": splits,
+        **data,
+        "word": "CLAIM",
+        "claimed": best["name"],
+        "splits": splits,
         "sentence": f"{best['name']} is missing, strength {best['change'][0]:.3f} +- {best['sd'][0]:.4f}. Its strength is "
-                    "the same in every part of the data. Not glare < 0.0007, not LED lobe < 0.03. Before, led_red.power "
-                    "stood 0.26 off.",
-        "levels": [{"model": "base", **level},
-                   {"model": f"+ {best['name']}", **level, "fitted": 1.1 * noise, "held_out": 1.1 * noise,
-                    "chi2_fitted": 1.2, "chi2_held_out": 1.21, "fall": 0.2 * best["fall"], "frames_better": 2}],
-        "shifts": [{"variable": "led_red.power", "unit": "1", "before": 0.5025, "after": 0.7641, "in_sd": 237.0,
-                    "warn": True}],
+        "the same in every part of the data. Not glare < 0.0007, not LED lobe < 0.03. Before, led_red.power "
+        "stood 0.26 off.",
+        "levels": [
+            {"model": "base", **level},
+            {
+                "model": f"+ {best['name']}",
+                **level,
+                "fitted": 1.1 * noise,
+                "held_out": 1.1 * noise,
+                "chi2_fitted": 1.2,
+                "chi2_held_out": 1.21,
+                "fall": 0.2 * best["fall"],
+                "frames_better": 2,
+            },
+        ],
+        "shifts": [
+            {"variable": "led_red.power", "unit": "1", "before": 0.5025, "after": 0.7641, "in_sd": 237.0, "warn": True}
+        ],
         "fingerprints": [
-            {"coordinate": "radius", "net": 0.6 * best["fall"], "dof": 30, "ratio": 0.61, "kind": "gain", "labels": [],
-             "centres": radius.centre.tolist(), "curve": (radius.mean / 60).tolist(), "sd": (radius.se / 60).tolist()},
-            {"coordinate": "place", "net": 0.2 * best["fall"], "dof": 90, "ratio": 0.2, "kind": "offset", "labels": [],
-             "centres": list(range(64)), "curve": rng.normal(size=64).tolist(), "sd": [0.3] * 64}],
+            {
+                "coordinate": "radius",
+                "net": 0.6 * best["fall"],
+                "dof": 30,
+                "ratio": 0.61,
+                "kind": "gain",
+                "labels": [],
+                "centres": radius.centre.tolist(),
+                "curve": (radius.mean / 60).tolist(),
+                "sd": (radius.se / 60).tolist(),
+            },
+            {
+                "coordinate": "place",
+                "net": 0.2 * best["fall"],
+                "dof": 90,
+                "ratio": 0.2,
+                "kind": "offset",
+                "labels": [],
+                "centres": list(range(64)),
+                "curve": rng.normal(size=64).tolist(),
+                "sd": [0.3] * 64,
+            },
+        ],
         "hints": ["the same press at 0.4 of the exposure, and one deeper press, often tell more than repeats"],
     }
 
 
 # -- tests --------------------------------------------------------------------------------------------------------------
+
 
 @pytest.fixture(scope="module")
 def studied(tmp_path_factory):
@@ -228,7 +387,7 @@ def studied(tmp_path_factory):
     return study, report(folder / "study", folder / "report.html").read_text(encoding="utf-8")
 
 
-def pictures_in(html: str) -> list:
+def images_in(html: str) -> list:
     from PIL import Image
 
     found = re.findall(r"data:image/(?:png|webp);base64,([A-Za-z0-9+/=]+)", html)
@@ -242,28 +401,36 @@ def test_page_is_one_file_without_outside_resources(studied):
     assert not re.search(r"<link(?![^>]*href=\"data:)|<script[^>]*\ssrc", html)
 
 
-def test_page_holds_every_step_frame_and_picture(studied):
+def test_page_holds_every_step_frame_and_image(studied):
     study, html = studied
     data = json.loads(re.search(r'<script type="application/json" id="data">(.*?)</script>', html, re.S)[1])
     assert [s["name"] for s in data["steps"]] == ["base", "lens vignetting", "gel absorption"]
     assert [f["name"] for f in data["frames"]] and all(len(s["frames"]) == len(data["frames"]) for s in data["steps"])
     assert any(f["heldOut"] for f in data["frames"])
-    images = pictures_in(html)
+    images = images_in(html)
     assert len(images) >= len(data["frames"]) * (1 + 2 * len(data["steps"])) + 3 * 2 + 4  # viewer, fingerprints, maps
     assert all(min(i.size) > 4 for i in images)
     for step in study.steps:
         assert step["name"] in html
-    for word in ("CLAIM", "NOTHING", "upper limits", "the same everywhere", "noise floor", "Null models", "system gain",
-                 "sha256:"):
+    for word in (
+        "CLAIM",
+        "NOTHING",
+        "upper limits",
+        "the same everywhere",
+        "noise floor",
+        "Null models",
+        "system gain",
+        "sha256:",
+    ):
         assert word in html
 
 
-def test_residual_pictures_carry_the_residual(studied):
+def test_residual_images_carry_the_residual(studied):
     """A quarter of a sigma per code, so a read value is within an eighth; masked pixels are 0."""
     study, html = studied
     data = json.loads(re.search(r'<script type="application/json" id="data">(.*?)</script>', html, re.S)[1])
     shown = {f.name: f for f in study.frames(2)}[data["frames"][0]["name"]]
-    code = np.asarray(pictures_in(data["steps"][2]["frames"][0]["residual"])[0]).astype(float)
+    code = np.asarray(images_in(data["steps"][2]["frames"][0]["residual"])[0]).astype(float)
     z = shown.residual
     assert np.array_equal(code == 0, np.isnan(z))
     inner = np.isfinite(z) & (np.abs(z) < 31)
@@ -286,10 +453,21 @@ def test_ladder_falls_to_the_noise_floor(studied):
 
 
 def test_the_noise_band_of_few_readings_stays_within_its_chart():
-    steps = [{"index": 0, "name": "base", "fitted": {"chi2_per_dof": 2.0, "dof": 20}, "held_out": {"chi2_per_dof": 1.7, "dof": 6}}]
+    steps = [
+        {
+            "index": 0,
+            "name": "base",
+            "fitted": {"chi2_per_dof": 2.0, "dof": 20},
+            "held_out": {"chi2_per_dof": 1.7, "dof": 6},
+        }
+    ]
     study = SimpleNamespace(steps=steps, record={"noise_floor": {"chi2_per_dof": 1.0}})
-    top, height = map(float, re.search(r'floorband".*? y="([\d.]+)" height="([\d.]+)"', ladder_chart(study, 900, 340)).groups())
-    assert 34 <= top and top + height <= 340 - 62 + 0.1  # chi2/dof of 6 readings scatters by 58 %, twice that goes below the axis
+    top, height = map(
+        float, re.search(r'floorband".*? y="([\d.]+)" height="([\d.]+)"', ladder_chart(study, 900, 340)).groups()
+    )
+    assert (
+        top >= 34 and top + height <= 340 - 62 + 0.1
+    )  # chi2/dof of 6 readings scatters by 58 %, twice that goes below the axis
 
 
 def test_step_folder_can_be_read_without_this_program(studied):
@@ -392,7 +570,9 @@ def test_any_number_of_channels_is_shown(tmp_path, channels, shown):
 
 
 def test_point_readings_are_drawn_against_their_setting(tmp_path):
-    html = report(small(tmp_path / "study", size=(1, 1), count=12).folder, tmp_path / "r.html").read_text(encoding="utf-8")
+    html = report(small(tmp_path / "study", size=(1, 1), count=12).folder, tmp_path / "r.html").read_text(
+        encoding="utf-8"
+    )
     assert "Readings and predictions against analyzer.angle" in html and 'id="data"' not in html
 
 
@@ -405,9 +585,15 @@ def swept(tmp_path_factory):
     from optics.study import loop
 
     folder = tmp_path_factory.mktemp("swept")
-    truth = jones.Truth(photodiode=jones.Photodiode(gain=2.2), p1=jones.Polarizer(leak=0.02), p2=jones.Polarizer(leak=0.02))
-    settings = [{"polarizer.angle": a, "analyzer.angle": 11.25 * i, "source.power": p, "source.time": i / 9}
-                for a in (0.0, 60.0, 100.0) for p in (0.5, 1.0) for i in range(16)]
+    truth = jones.Truth(
+        photodiode=jones.Photodiode(gain=2.2), p1=jones.Polarizer(leak=0.02), p2=jones.Polarizer(leak=0.02)
+    )
+    settings = [
+        {"polarizer.angle": a, "analyzer.angle": 11.25 * i, "source.power": p, "source.time": i / 9}
+        for a in (0.0, 60.0, 100.0)
+        for p in (0.5, 1.0)
+        for i in range(16)
+    ]
     jones.write(folder / "captures", truth, settings, Noise(0.05, 2.0, 64.0, 4095.0, 0.0), 3)
     setup = loop.Setup(captures=str(folder / "captures"))
     study, model, fit = loop.begin(setup, folder / "study")
@@ -418,7 +604,10 @@ def swept(tmp_path_factory):
 def panels_in(html: str) -> list[list[str]]:
     """Per step the charts of readings."""
     found = re.findall(r'<div class="sweep".*?</div>\n  </div>', html, re.S)
-    return [[svg for svg in re.findall(r"<svg.*?</svg>", block, re.S) if "Readings and predictions" in svg] for block in found]
+    return [
+        [svg for svg in re.findall(r"<svg.*?</svg>", block, re.S) if "Readings and predictions" in svg]
+        for block in found
+    ]
 
 
 def test_a_sweep_keeps_the_settings_of_its_readings(swept):
@@ -432,7 +621,8 @@ def test_a_sweep_keeps_the_settings_of_its_readings(swept):
 
 
 def test_sweeps_are_drawn_as_curves_with_residuals(swept):
-    """Along the analyzer; colours tell the polarizer's angles, panels the powers; every reading once above and once below."""
+    """Along the analyzer; colours tell the polarizer's angles, panels the powers; every reading once above and once
+    below."""
     study, _, html = swept
     steps = panels_in(html)
     assert [len(p) for p in steps] == [2, 2] and 'id="data"' not in html and "<img" not in html
@@ -442,7 +632,9 @@ def test_sweeps_are_drawn_as_curves_with_residuals(swept):
             marks = re.findall(r'<path class="mark (k\d)( held)?" d="([^"]*)"', svg)
             assert sum(d.count("h0") for _, _, d in marks) == 2 * 48 and {k for k, _, _ in marks} == {"k0", "k1", "k2"}
             assert "analyzer.angle, deg" in svg and svg.count('class="sigmas"') == 2
-            assert re.search(r'class="curve k0" d="M[^"]*C', svg), "predictions are smooth, so a curve goes through them"
+            assert re.search(r'class="curve k0" d="M[^"]*C', svg), (
+                "predictions are smooth, so a curve goes through them"
+            )
         held = re.findall(r'class="mark k\d held" d="([^"]*)"', "".join(panels))
         assert sum(d.count("h0") for d in held) == 2 * sum(len(f.measured) for f in study.frames(0) if f.held_out)
     rms = [[float(re.search(r"rms residual ([\d.]+)", svg)[1]) for svg in panels] for panels in steps]
@@ -455,7 +647,7 @@ def test_the_page_speaks_of_readings(swept):
     _, _, html = swept
     page = re.sub(r"<style>.*?</style>", "", html, flags=re.S)
     assert "on held-out readings" in page and "96 readings in 8 sweeps" in page
-    for word in ("frames", "pixel", "picture"):
+    for word in ("frames", "pixel", "image"):
         assert word not in page, word
 
 
@@ -477,11 +669,18 @@ def test_sweeps_recorded_without_settings_still_show(swept, tmp_path):
     assert "Readings and predictions against place in the sweep" in html and 'id="data"' not in html
 
 
-@pytest.mark.parametrize("along, other, expected", [
-    ("analyzer.angle", "source.power", ("analyzer.angle", ["source.power"], [])),  # an angle before what has few values
-    ("source.time", "source.power", ("source.time", ["source.power"], [])),  # time where nothing else takes many
-    ("source.power", "source.time", ("source.power", [], [])),  # time last where both take many
-])
+@pytest.mark.parametrize(
+    "along, other, expected",
+    [
+        (
+            "analyzer.angle",
+            "source.power",
+            ("analyzer.angle", ["source.power"], []),
+        ),  # an angle before what has few values
+        ("source.time", "source.power", ("source.time", ["source.power"], [])),  # time where nothing else takes many
+        ("source.power", "source.time", ("source.power", [], [])),  # time last where both take many
+    ],
+)
 def test_readings_are_drawn_along_the_setting_with_most_values(along, other, expected):
     from optics.pages.report import Readings
 
@@ -502,8 +701,11 @@ def test_large_frames_are_made_to_fit(tmp_path, monkeypatch):
 
 
 def test_names_cannot_break_out_of_the_page(tmp_path):
-    diagnosis = {"word": "CANNOT_TELL", "sentence": "<img src=x> -> nothing +- holds",
-                 "rows": [{"name": "<b>x</b>", "p_family": 0.0, "fall": None, "refit": {"fall": "inf"}}]}
+    diagnosis = {
+        "word": "CANNOT_TELL",
+        "sentence": "<img src=x> -> nothing +- holds",
+        "rows": [{"name": "<b>x</b>", "p_family": 0.0, "fall": None, "refit": {"fall": "inf"}}],
+    }
     study = small(tmp_path / "study", diagnosis=diagnosis)
     study.record["title"] = "</script><b>"
     study._save()
@@ -524,12 +726,16 @@ def test_what_the_page_reads_is_what_a_diagnosis_writes():
     declared = typing.get_type_hints(Diagnosis)
     read = {
         "rows": "name units fall p_family start change sd of_plausible image share survival confused_with cos upper refit flags "
-                "verdict",
-        "splits": "effect by labels strength sd h p holds", "shifts": "variable unit before after in_sd warn",
-        "fingerprints": "coordinate net dof ratio kind centres curve sd labels", "conditions": "name holds text",
+        "verdict",
+        "splits": "effect by labels strength sd h p holds",
+        "shifts": "variable unit before after in_sd warn",
+        "fingerprints": "coordinate net dof ratio kind centres curve sd labels",
+        "conditions": "name holds text",
         "levels": "model fitted held_out chi2_fitted chi2_held_out fall frames_better frames",
     }
-    assert {*read, *"word sentence hints not_tested warnings compared correct ambiguous".split()} <= set(declared)
+    assert {*read, *["word", "sentence", "hints", "not_tested", "warnings", "compared", "correct", "ambiguous"]} <= set(
+        declared
+    )
     for name, wanted in read.items():
         assert set(wanted.split()) <= keys(typing.get_args(declared[name])[0]), name
     row = typing.get_args(declared["rows"])[0]
@@ -562,9 +768,21 @@ def test_images_of_a_model_become_frames_and_fingerprints():
     assert frames[0].held_out and frames[0].residual == pytest.approx(2.0) and frames[0].led == "led"
 
 
-@pytest.mark.parametrize("value, text", [(None, "–"), (float("nan"), "–"), ("inf", "∞"), (0, "0"), (-0.0123, "−0.0123"),
-                                         (12345.6, "12\u202f346"), (3.2e7, "3.2·10⁷"), (1.5e-6, "1.5·10⁻⁶"),
-                                         (999.7, "1\u202f000"), (-99.96, "−100")])
+@pytest.mark.parametrize(
+    "value, text",
+    [
+        (None, "–"),
+        (float("nan"), "–"),
+        ("inf", "∞"),
+        (0, "0"),
+        (-0.0123, "−0.0123"),
+        (12345.6, "12\u202f346"),
+        (3.2e7, "3.2·10⁷"),
+        (1.5e-6, "1.5·10⁻⁶"),
+        (999.7, "1\u202f000"),
+        (-99.96, "−100"),
+    ],
+)
 def test_numbers_are_written_for_readers(value, text):
     assert number(value) == text
 

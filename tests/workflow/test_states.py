@@ -1,4 +1,5 @@
-"""What a printed grid says of its surroundings, as in examples/states_magictac.py: MagicGripper's Figures 25 to 28, with its thresholds."""
+"""What a printed grid says of its surroundings, as in examples/states_magictac.py: MagicGripper's Figures 25 to 28,
+with its thresholds."""
 
 import importlib.util
 from pathlib import Path
@@ -13,7 +14,7 @@ spec.loader.exec_module(states)
 
 @pytest.mark.slow
 def test_states_as_published(mitsuba):
-    made = states.pictures()
+    made = states.images()
     _, rows, wide = states.readings(made)
     by = {state: [k for k, m in enumerate(made) if m[0] == state] for state in states.PUBLISHED}
     fixed, held = rows["fixed"][0], rows["holds its mean"][0]
@@ -25,6 +26,10 @@ def test_states_as_published(mitsuba):
     for k in by["flashlight"]:  # entropy up, correlation up to nearly 1
         assert fixed[k].entropy > 1 and fixed[k].proximity == "Noise" and fixed[k].correlation > 0.7
     assert fixed[by["flashlight"][-1]].correlation > 0.9 and walls[by["flashlight"][-1]].similarity < 0.5
-    for k in by["touch"]:  # from 0.85 to below 0.8, where the camera holds its mean; with a fixed exposure light only adds
+    for k in by[
+        "touch"
+    ]:  # from 0.85 to below 0.8, where the camera holds its mean; with a fixed exposure light only adds
         assert held[k].similarity < 0.8 < fixed[k].similarity
-    assert wide[still] == 0 and (sorted(wide) == wide) and wide[by["touch"][-1]] > 2 * wide[by["touch"][0]] > 0  # wider with force
+    assert (
+        wide[still] == 0 and (sorted(wide) == wide) and wide[by["touch"][-1]] > 2 * wide[by["touch"][0]] > 0
+    )  # wider with force

@@ -11,7 +11,8 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def test_the_formula_is_what_the_maker_does_to_rows(tmp_path):
-    """The ripple integrated over each row's exposure, by the maker, against the formula that the tutorial fills into the stub."""
+    """The ripple integrated over each row's exposure, by the maker, against the formula that the tutorial fills into
+    the stub."""
     from optics.captures.noise import Noise
     from optics.scene.registry import declared
     from optics.study.draft import new_effect, write
@@ -32,7 +33,9 @@ def test_the_formula_is_what_the_maker_does_to_rows(tmp_path):
         check()
     v, u = np.mgrid[:height, :width] + 0.5
     camera = SimpleNamespace(v=v, u=u, width=width, height=height, shutter_ripple=amplitude)
-    assert effect.stages["lens"](np.ones((height, width, 3)), camera)[:, 0, 0] - 1 == pytest.approx(rows, abs=5e-5)  # phase to 3 digits
+    assert effect.stages["lens"](np.ones((height, width, 3)), camera)[:, 0, 0] - 1 == pytest.approx(
+        rows, abs=5e-5
+    )  # phase to 3 digits
 
 
 @pytest.mark.slow
@@ -47,8 +50,8 @@ def test_the_tutorial_goes_from_a_puzzling_residual_to_the_noise_floor(mitsuba, 
     value, sd = found["strength"]
     assert abs(value - found["expected"]) < 4 * sd < 0.002
     page = (tmp_path / "story" / "index.html").read_text(encoding="utf-8")
-    for picture in ("1-residual", "2-curves", "3-draft", "4-formula", "5-answer", "6-ladder"):
-        assert f"{picture}.png" in page and (tmp_path / "story" / f"{picture}.png").stat().st_size > 5000
+    for image in ("1-residual", "2-curves", "3-draft", "4-formula", "5-answer", "6-ladder"):
+        assert f"{image}.png" in page and (tmp_path / "story" / f"{image}.png").stat().st_size > 5000
     assert (tmp_path / "story" / "answer" / "report.html").is_file()
     with pytest.raises(FileExistsError, match="not empty"):
         story["main"](tmp_path / "story")
@@ -70,7 +73,8 @@ def own_registry(mitsuba, monkeypatch):
 
 @pytest.mark.slow
 def test_a_curve_along_geometry_becomes_an_effect_as_well(own_registry, tmp_path, optics):
-    """A coating that shines the brighter the steeper it stands, by 0.6 % per degree, which no effect of the library does."""
+    """A coating that shines the brighter the steeper it stands, by 0.6 % per degree, which no effect of the library
+    does."""
     from optics.captures import capture_set as captures
     from optics.proof import demo
     from optics.proof.makers.touch import Maker, presses
@@ -90,8 +94,19 @@ def test_a_curve_along_geometry_becomes_an_effect_as_well(own_registry, tmp_path
     found.parameters["camera.exposure"] = 200.0
     captures.write(found, tmp_path / "captures", bits=8)
     study = tmp_path / "study"
-    free = [w for n in ("led_[1-3].[xyz]", "led_[1-3].pan", "led_[1-3].tilt", "led_[1-3].mu", "led_[1-3].power", "membrane.rho_[gb]",
-                        "membrane.sigma") for w in ("--free", n)]
+    free = [
+        w
+        for n in (
+            "led_[1-3].[xyz]",
+            "led_[1-3].pan",
+            "led_[1-3].tilt",
+            "led_[1-3].mu",
+            "led_[1-3].power",
+            "membrane.rho_[gb]",
+            "membrane.sigma",
+        )
+        for w in ("--free", n)
+    ]
     assert optics("calibrate", tmp_path / "captures", "-o", study, "--per-group", "none", *free)[0] == 0
     assert optics("diagnose", study)[0] == 1
     told = Study.open(study).diagnosis(0)

@@ -24,7 +24,7 @@ import pytest
 
 from optics.captures import capture_set as capture_files
 from optics.captures.noise import Noise
-from optics.light.output import Pictures
+from optics.light.rendering import RenderJob
 from optics.pages.view import Kept, Server, View
 from optics.scene import loader as scene
 from optics.study import loop
@@ -32,26 +32,46 @@ from optics.study.record import Study, read_fit
 
 HIDDEN = 0.4  # camera.vignetting
 VIGNETTING, SIZE, POSE, ROUGHNESS = "camera.vignetting", "led.area", "gel.press_x[press-0]", "membrane.sigma"
-SINGLE = 2e-6  # float32, relative: pictures travel in it, and are added up in it
+SINGLE = 2e-6  # float32, relative: images travel in it, and are added up in it
 
 
 @pytest.fixture(scope="module")
 def study(tmp_path_factory, mitsuba):
-    """A study of the base model: two powers, a roughness, in whose square the picture is linear, and where each press is."""
+    """A study of the base model: two powers, a roughness, in whose square the image is linear, and where each press
+    is."""
     folder = tmp_path_factory.mktemp("view")
     loaded = scene.load("gelsight", {"width": "48", "height": "36"})
     noise, rng, frames = Noise(0.05, 1.0, 8.0, 255.0, 0.0), np.random.default_rng(0), []
-    pictures = Pictures(loaded, black=8.0)
+    images = RenderJob(loaded, black=8.0)
     for k, (x, y, depth) in enumerate([(-2.0, 1.0, 0.4), (2.0, -1.0, 0.5), (3.0, 2.0, 0.4)]):
         for led in ("led_1", "led_3"):
-            values = {**{f"{n}.power": float(n == led) for n in loaded.leds}, "gel.press_x": x, "gel.press_y": y, "gel.press_depth": depth}
-            made = pictures.take({**values, "camera.exposure": 150.0, "camera.vignetting": HIDDEN})
-            frames.append(capture_files.Frame(f"p{k}-{led}", noise.expose(made.camera, rng).astype(np.float32), group=f"press-{k}",
-                                              parameters=values))
-    captures = capture_files.write(capture_files.Captures(Path("."), "gelsight", frames, {"camera.exposure": 150.0}, noise),
-                                   folder / "captures", bits=8)
-    setup = loop.Setup(captures=str(captures), free=["led_[13].power", "membrane.sigma"], per_group=["gel.press_x"], held_out=["press-2"],
-                       priors={"gel.press_x*": (None, 0.05)})
+            values = {
+                **{f"{n}.power": float(n == led) for n in loaded.leds},
+                "gel.press_x": x,
+                "gel.press_y": y,
+                "gel.press_depth": depth,
+            }
+            made = images.take({**values, "camera.exposure": 150.0, "camera.vignetting": HIDDEN})
+            frames.append(
+                capture_files.Frame(
+                    f"p{k}-{led}",
+                    noise.expose(made.camera, rng).astype(np.float32),
+                    group=f"press-{k}",
+                    parameters=values,
+                )
+            )
+    captures = capture_files.write(
+        capture_files.Captures(Path("."), "gelsight", frames, {"camera.exposure": 150.0}, noise),
+        folder / "captures",
+        bits=8,
+    )
+    setup = loop.Setup(
+        captures=str(captures),
+        free=["led_[13].power", "membrane.sigma"],
+        per_group=["gel.press_x"],
+        held_out=["press-2"],
+        priors={"gel.press_x*": (None, 0.05)},
+    )
     loop.begin(setup, folder / "study")
     return folder / "study"
 
@@ -84,6 +104,7 @@ def view(server):
 @pytest.fixture
 def ask(server):
     """POST a question: (status, body, headers)."""
+
     def put(path, method="POST", headers=None, text=None, **question):
         connection = http.client.HTTPConnection(*server.server_address, timeout=60)
         with contextlib.closing(connection):
@@ -123,7 +144,9 @@ def busy(view):
         job.result(60)
 
 
-# -- what the server answers ------------------------------------------------------------------------------------------------
+# -- what the server answers
+# ------------------------------------------------------------------------------------------------
+
 
 def test_the_record_names_frames_sliders_and_effects(ask, study):
     status, body, headers = ask("/study", "GET")
@@ -158,15 +181,20 @@ def test_a_tangent_is_the_slope_and_a_secant_meets_its_end(ask, model, view):
     status, body, headers = ask("/derivative", frame=0, name=VIGNETTING)
     slope, h = floats((status, body, headers))[0], 1e-3
     ends = [found.predict(moved(model, view, **{VIGNETTING: v})[1], [0])[0] for v in (0.0, h, 2 * h)]
-    # one-sided at the bound, of second order: what is left is h^2/3 f''', about 1e-7 of the picture, and float32
-    assert np.allclose(slope, (4 * ends[1] - 3 * ends[0] - ends[2]) / (2 * h), rtol=1e-4, atol=1e-3) and headers["X-Step"] is None
+    # one-sided at the bound, of second order: what is left is h^2/3 f''', about 1e-7 of the image, and float32
+    assert (
+        np.allclose(slope, (4 * ends[1] - 3 * ends[0] - ends[2]) / (2 * h), rtol=1e-4, atol=1e-3)
+        and headers["X-Step"] is None
+    )
     status, body, headers = ask("/derivative", frame=0, name=SIZE)
     step = float(headers["X-Step"])
     assert step == view.sliders[SIZE].variable.parameter.plausible
     end = found.predict(moved(model, view, **{SIZE: step})[1], [0])[0]
     assert np.abs(end - ends[0]).max() > 0.1  # DN
     assert np.allclose(ends[0] + step * floats((status, body, headers))[0], end, rtol=0, atol=1e-4)
-    assert ask("/derivative", frame=0, name=SIZE, values={SIZE: 0.5})[2]["X-Step"] is None  # off neutral the tangent says enough
+    assert (
+        ask("/derivative", frame=0, name=SIZE, values={SIZE: 0.5})[2]["X-Step"] is None
+    )  # off neutral the tangent says enough
 
 
 def test_a_slider_of_another_press_does_nothing(ask):
@@ -185,7 +213,9 @@ def test_rows_are_the_misfit_of_the_linear_prediction(ask, model, view):
     for what, weight in (("chi2", 1 / sd), ("square", np.ones_like(sd))):
         q = row[what]
         quadratic = q["c"] - 2 * np.dot(q["b"], x) + x @ np.array(q["a"]) @ x
-        assert quadratic == pytest.approx(np.sum((residual * weight)[use] ** 2), rel=1e-4)  # sums of 5000 float32 products
+        assert quadratic == pytest.approx(
+            np.sum((residual * weight)[use] ** 2), rel=1e-4
+        )  # sums of 5000 float32 products
 
 
 def test_best_is_least_squares_over_the_fitted_frames(ask, view):
@@ -196,8 +226,10 @@ def test_best_is_least_squares_over_the_fitted_frames(ask, view):
     for i in view.fitted:
         prediction, sd = floats(ask("/predict", frame=i))
         measured, use = floats(ask("/capture", frame=i))
-        power, own = ((None if s == 204 else floats((s, b, h))[0]) for s, b, h in (
-            ask("/derivative", frame=i, name=n) for n in ("led_1.power", VIGNETTING)))
+        power, own = (
+            (None if s == 204 else floats((s, b, h))[0])
+            for s, b, h in (ask("/derivative", frame=i, name=n) for n in ("led_1.power", VIGNETTING))
+        )
         known = 0 if power is None else 0.02 * view.sliders["led_1.power"].value * power
         use = use.astype(bool)
         residual.append(((measured - prediction - known) / sd)[use])
@@ -219,18 +251,23 @@ def test_best_is_least_squares_over_the_fitted_frames(ask, view):
 
 @pytest.mark.parametrize("name, off, mean", [(VIGNETTING, 0.1, 0.2), (ROUGHNESS, 0.01, 0.005)])
 def test_a_prior_is_one_more_measurement(ask, view, monkeypatch, name, off, mean):
-    """Estimate and prior meet in the mean weighted by 1/sd^2, wherever the picture was linearised, in the parameter's coordinate u."""
+    """Estimate and prior meet in the mean weighted by 1/sd^2, wherever the image was linearised, in the parameter's
+    coordinate u."""
     slider, p = view.sliders[name], view.sliders[name].variable.parameter
     there = slider.value + off
     question, slope = {"names": [name], "values": {}, "there": {name: there}}, p.per_coordinate(there)
     free = json.loads(ask("/best", **question)[1])
     value, sd = free["values"][name], free["sd"][name] / p.per_coordinate(free["values"][name])  # sd of u
-    monkeypatch.setitem(view.sliders, name, replace(slider, variable=slider.variable.with_prior(there + mean, 0.5 * sd * slope)))
+    monkeypatch.setitem(
+        view.sliders, name, replace(slider, variable=slider.variable.with_prior(there + mean, 0.5 * sd * slope))
+    )
     found = json.loads(ask("/best", **question)[1])
     prior = p.coordinate(there) + mean / slope
     assert p.coordinate(found["values"][name]) == pytest.approx(0.2 * p.coordinate(value) + 0.8 * prior, rel=1e-4)
     assert found["sd"][name] / p.per_coordinate(found["values"][name]) == pytest.approx(sd / np.sqrt(5), rel=1e-4)
-    assert found["before"] - free["before"] == pytest.approx(((prior - p.coordinate(slider.value)) / (0.5 * sd)) ** 2, rel=1e-6)
+    assert found["before"] - free["before"] == pytest.approx(
+        ((prior - p.coordinate(slider.value)) / (0.5 * sd)) ** 2, rel=1e-6
+    )
 
 
 def test_best_of_a_bounded_effect_stays_within(ask):
@@ -238,34 +275,52 @@ def test_best_of_a_bounded_effect_stays_within(ask):
     assert found["values"]["membrane.ambient"] == 0 and found["after"] <= found["before"]
 
 
-@pytest.mark.parametrize("path, question, words", [
-    ("/predict", {"frame": 0, "values": {"camera.vignettin": 1}},
-     "unknown parameter of this page 'camera.vignettin'; did you mean 'camera.vignetting'?"),
-    ("/predict", {"frame": 0, "values": {VIGNETTING: -1}}, r"camera.vignetting = -1 is outside its bounds [0, 20]"),
-    ("/predict", {"frame": 0, "values": {VIGNETTING: "much"}}, "is not a number"),
-    ("/predict", {"frame": 0, "values": [1]}, "values: not a table"),
-    ("/predict", {"frame": 6}, "no frame 6; allowed: 0 to 5"),
-    ("/predict", {"frame": "../../etc/passwd"}, "no frame '../../etc/passwd'"),
-    ("/capture", {}, "no frame None"),
-    ("/derivative", {"frame": 0, "name": ["x"]}, "unknown parameter of this page"),
-    ("/rows", {"frame": 0, "names": "x"}, "names: not a list"),
-    ("/best", {"names": []}, "nothing to solve for"),
-])
+@pytest.mark.parametrize(
+    "path, question, words",
+    [
+        (
+            "/predict",
+            {"frame": 0, "values": {"camera.vignettin": 1}},
+            "unknown parameter of this page 'camera.vignettin'; did you mean 'camera.vignetting'?",
+        ),
+        ("/predict", {"frame": 0, "values": {VIGNETTING: -1}}, r"camera.vignetting = -1 is outside its bounds [0, 20]"),
+        ("/predict", {"frame": 0, "values": {VIGNETTING: "much"}}, "is not a number"),
+        ("/predict", {"frame": 0, "values": [1]}, "values: not a table"),
+        ("/predict", {"frame": 6}, "no frame 6; allowed: 0 to 5"),
+        ("/predict", {"frame": "../../etc/passwd"}, "no frame '../../etc/passwd'"),
+        ("/capture", {}, "no frame None"),
+        ("/derivative", {"frame": 0, "name": ["x"]}, "unknown parameter of this page"),
+        ("/rows", {"frame": 0, "names": "x"}, "names: not a list"),
+        ("/best", {"names": []}, "nothing to solve for"),
+    ],
+)
 def test_a_wrong_question_is_answered_with_a_sentence(ask, path, question, words):
     status, body, _ = ask(path, **question)
     assert status == 400 and words in json.loads(body)["error"]
 
 
 def test_no_other_place_is_served(ask, study, server):
-    for path in ("/../ladder.json", "/ladder.json", "/%2e%2e/ladder.json", "//etc/passwd", "/study/../../ladder.json", "/predict/", "/index.html"):
+    for path in (
+        "/../ladder.json",
+        "/ladder.json",
+        "/%2e%2e/ladder.json",
+        "//etc/passwd",
+        "/study/../../ladder.json",
+        "/predict/",
+        "/index.html",
+    ):
         for method in ("GET", "POST"):
             status, body, _ = ask(path, method)
             assert status == 404 and b"nothing is at this place" in body, path
     assert ask("/predict", "GET")[0] == 404 and ask("/study", "POST")[0] == 404
     assert ask("/capture", text="{")[0] == 400 and ask("/capture", text="[]")[0] == 400
     port = server.server_address[1]
-    for headers in ({"Host": f"evil.example:{port}"}, {"Host": f"192.168.0.1:{port}"}, {"Origin": "http://evil.example"},
-                    {"Content-Type": "text/plain"}):
+    for headers in (
+        {"Host": f"evil.example:{port}"},
+        {"Host": f"192.168.0.1:{port}"},
+        {"Origin": "http://evil.example"},
+        {"Content-Type": "text/plain"},
+    ):
         assert ask("/write", headers=headers)[0] == 403, headers
     assert ask("/study", "GET", {"Host": "evil.example"})[0] == 403
     assert not list(study.glob("view-*.toml"))
@@ -305,12 +360,12 @@ def test_a_plugins_mistake_is_told(ask, view, monkeypatch):
     assert (status, json.loads(body)["error"], headers["Connection"]) == (400, "division by zero", "close")
 
 
-def test_pictures_longest_unused_are_forgotten():
-    kept, picture = Kept(size=250), np.zeros(25, np.float32)  # 100 bytes each
+def test_images_longest_unused_are_forgotten():
+    kept, image = Kept(size=250), np.zeros(25, np.float32)  # 100 bytes each
     for name in "ab":
-        kept.put(name, (picture, None))
+        kept.put(name, (image, None))
     kept.get("a")
-    kept.put("c", (picture,))
+    kept.put("c", (image,))
     assert kept.get("b") is None and kept.get("a") is not None and kept.get("c") is not None
 
 
@@ -325,8 +380,10 @@ def test_written_values_are_read_by_compare(ask, optics, model, view, study):
     assert command[:2] == ["optics", "compare"] and Path(first["file"]).read_text() == first["text"]
     rows = json.loads(optics(*command[1:], "--json")[1])["rows"]
     found, values = moved(model, view, **changes)
-    chi2 = [np.sum(((f.image - p) ** 2 / found.variance(values, i, p))[found.usable(i)])
-            for i, (f, p) in enumerate(zip(found.frames, found.predict(values)))]
+    chi2 = [
+        np.sum(((f.image - p) ** 2 / found.variance(values, i, p))[found.usable(i)])
+        for i, (f, p) in enumerate(zip(found.frames, found.predict(values)))
+    ]
     by_role = {row["scope"].get("role", ""): row["chi2"] for row in rows if row["scope"].keys() <= {"role"}}
     assert by_role == pytest.approx({"": sum(chi2), "fitted": sum(chi2[:4]), "held out": sum(chi2[4:])}, rel=1e-5)
 
@@ -349,25 +406,38 @@ def test_a_frames_name_survives_in_the_file(view, monkeypatch, tmp_path):
     assert list(read_fit(tmp_path / "fit.toml")["frames"])[:2] == names[:2]
 
 
-# -- the command ----------------------------------------------------------------------------------------------------------------
+# -- the command
+# ----------------------------------------------------------------------------------------------------------------
+
 
 def test_what_is_no_study_is_refused_in_a_line(optics, study, tmp_path):
-    Study.create(tmp_path / "empty", scene="gelsight", captures="x", facts={"setup": Study.open(study).record["facts"]["setup"]})
+    Study.create(
+        tmp_path / "empty", scene="gelsight", captures="x", facts={"setup": Study.open(study).record["facts"]["setup"]}
+    )
     with contextlib.closing(socket.create_server(("127.0.0.1", 0))) as taken:
         port = taken.getsockname()[1]
         for arguments, words in (
-                ((tmp_path,), "is no study: it has no ladder.json"), ((tmp_path / "absent",), "is no study"),
-                ((tmp_path / "empty",), "the study has no step yet"), ((study, "--step", "3"), "--step 3: no such step"),
-                ((study, "--port", port), f"--port {port}: ")):
+            ((tmp_path,), "is no study: it has no ladder.json"),
+            ((tmp_path / "absent",), "is no study"),
+            ((tmp_path / "empty",), "the study has no step yet"),
+            ((study, "--step", "3"), "--step 3: no such step"),
+            ((study, "--port", port), f"--port {port}: "),
+        ):
             code, out, err = optics("view", *arguments, "--no-browser")
             assert code == 2 and out == "" and words in err and len(err.splitlines()) == 1, err
 
 
 def test_the_command_serves_until_it_is_interrupted(study):
-    code = ("import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # which background jobs ignore
-            "from optics.cli import main; sys.exit(main(sys.argv[1:]))")
-    child = subprocess.Popen([sys.executable, "-c", code, "view", str(study), "--no-browser"], stdout=subprocess.PIPE,
-                             stderr=subprocess.PIPE, text=True)
+    code = (
+        "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # which background jobs ignore
+        "from optics.cli import main; sys.exit(main(sys.argv[1:]))"
+    )
+    child = subprocess.Popen(
+        [sys.executable, "-c", code, "view", str(study), "--no-browser"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
     try:
         url = child.stdout.readline().strip()
         assert url.startswith("http://127.0.0.1:"), child.stderr.read()
@@ -384,7 +454,9 @@ def test_the_command_serves_until_it_is_interrupted(study):
     assert child.returncode == 0 and err.splitlines() == ["Ctrl-C ends it"]
 
 
-# -- the page ---------------------------------------------------------------------------------------------------------------------
+# -- the page
+# ---------------------------------------------------------------------------------------------------------------------
+
 
 class Chromium:
     """A headless Chromium, spoken to by its DevTools protocol over a pipe: JSON messages that end in NUL."""
@@ -392,10 +464,22 @@ class Chromium:
     def __init__(self, program, folder):
         down, self._down = os.pipe()
         self._up, up = os.pipe()
-        flags = ["--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--hide-scrollbars", "--remote-debugging-pipe",
-                 f"--user-data-dir={folder}", "about:blank"]
-        self._process = subprocess.Popen(["bash", "-c", f'exec "$@" 3<&{down} 4>&{up}', "bash", program, *flags], pass_fds=(down, up),
-                                         stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        flags = [
+            "--headless",
+            "--no-sandbox",
+            "--disable-gpu",
+            "--no-first-run",
+            "--hide-scrollbars",
+            "--remote-debugging-pipe",
+            f"--user-data-dir={folder}",
+            "about:blank",
+        ]
+        self._process = subprocess.Popen(
+            ["bash", "-c", f'exec "$@" 3<&{down} 4>&{up}', "bash", program, *flags],
+            pass_fds=(down, up),
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
         os.close(down)
         os.close(up)
         self._rest, self._number, self._session, self.errors, self.requests = b"", 0, None, [], []
@@ -410,7 +494,12 @@ class Chromium:
 
     def tell(self, method, **parameters):
         self._number += 1
-        message = {"id": self._number, "method": method, "params": parameters, **({"sessionId": self._session} if self._session else {})}
+        message = {
+            "id": self._number,
+            "method": method,
+            "params": parameters,
+            **({"sessionId": self._session} if self._session else {}),
+        }
         os.write(self._down, json.dumps(message).encode() + b"\0")
         until = time.monotonic() + 60
         while True:
@@ -464,7 +553,11 @@ class Chromium:
         codes = {"ArrowLeft": 37, "ArrowRight": 39, "Tab": 9, "Escape": 27}
         for key in keys:
             text = key if len(key) == 1 else ""
-            common = {"key": key, "modifiers": 8 if shift else 0, "windowsVirtualKeyCode": codes.get(key, ord(key[0].upper()))}
+            common = {
+                "key": key,
+                "modifiers": 8 if shift else 0,
+                "windowsVirtualKeyCode": codes.get(key, ord(key[0].upper())),
+            }
             self.tell("Input.dispatchKeyEvent", type="keyDown", **common, **({"text": text} if text else {}))
             self.tell("Input.dispatchKeyEvent", type="keyUp", **common)
 
@@ -516,7 +609,8 @@ VALUE = f"sliders.get('{VIGNETTING}').now"
 
 
 def test_an_effect_is_switched_and_slid_by_keyboard(page, model, view):
-    """Filter, Tab, Space, Tab, arrows: linear while the model is busy, equal to numpy; then the render, equal to the model's."""
+    """Filter, Tab, Space, Tab, arrows: linear while the model is busy, equal to numpy; then the render, equal to the
+    model's."""
     found, values = model
     before = page.numbers("rms", "chi")
     base = found.predict(values, [0])[0]
@@ -543,10 +637,14 @@ def test_an_effect_is_switched_and_slid_by_keyboard(page, model, view):
         shown = np.array(page.run("Array.from(last.prediction)")).reshape(base.shape)
         assert np.allclose(shown, base + value * slope, rtol=0, atol=1e-4 + 255 * SINGLE)
         assert page.text("which")[0] == "All 6 frames linear."
-        everywhere = [misfit(model, i, p + value * d[VIGNETTING], np.sqrt(found.variance(values, i, p))) for i, (p, d) in enumerate(
-            found.derivatives(values, [view.sliders[VIGNETTING].variable]))]
+        everywhere = [
+            misfit(model, i, p + value * d[VIGNETTING], np.sqrt(found.variance(values, i, p)))
+            for i, (p, d) in enumerate(found.derivatives(values, [view.sliders[VIGNETTING].variable]))
+        ]
         counts = [found.usable(i).sum() for i in range(6)]
-        assert page.numbers("chiAll")[0] == pytest.approx(np.average([c for _, c in everywhere], weights=counts), rel=SHOWN)
+        assert page.numbers("chiAll")[0] == pytest.approx(
+            np.average([c for _, c in everywhere], weights=counts), rel=SHOWN
+        )
     page.idle()
     _, there = moved(model, view, **{VIGNETTING: value})
     render = found.predict(there, [0])[0]
@@ -613,7 +711,8 @@ def test_frames_that_a_pose_leaves_alone_keep_the_studys_misfit(page, model, vie
     chi2 = [misfit(model, i, p, np.sqrt(found.variance(values, i, p)))[1] for i, p in enumerate(found.predict(values))]
     counts = [found.usable(i).sum() for i in range(6)]
     assert page.numbers("chiAll", "chiHeld") == pytest.approx(
-        [np.average(chi2, weights=counts), np.average(chi2[4:], weights=counts[4:])], rel=SHOWN)
+        [np.average(chi2, weights=counts), np.average(chi2[4:], weights=counts[4:])], rel=SHOWN
+    )
 
 
 def test_back_undoes_a_reset_and_a_fit(page, view):
@@ -636,7 +735,7 @@ def test_back_undoes_a_reset_and_a_fit(page, view):
     assert page.run(f"[{VALUE}, on.size]") == [0, 0]
 
 
-def test_pictures_follow_mode_wipe_channel_and_frame(page, model):
+def test_images_follow_mode_wipe_channel_and_frame(page, model):
     found, values = model
     pixels = "Array.from(context.getImageData(0, 0, 48, 36).data)"
 
@@ -657,25 +756,35 @@ def test_pictures_follow_mode_wipe_channel_and_frame(page, model):
     assert np.array_equal(seen(), np.concatenate([capture[:, :24], prediction[:, 24:]], 1))
     page.key("ArrowRight", shift=True)
     assert np.array_equal(seen(), np.concatenate([capture[:, :29], prediction[:, 29:]], 1))
-    assert page.run("view.wipe") == pytest.approx(0.6) and page.run("at('divider').getAttribute('aria-valuenow')") == "60"
+    assert (
+        page.run("view.wipe") == pytest.approx(0.6) and page.run("at('divider').getAttribute('aria-valuenow')") == "60"
+    )
     page.key("ArrowLeft", shift=True)
     page.key("c", "2")
     assert page.run("view.channel") == "R" and np.abs(seen() - prediction[..., :1]).max() <= 1
     page.key("c", "c", "c", "5")
     whitened = seen()
-    z = ((found.frames[0].image - found.predict(values, [0])[0]) / np.sqrt(found.variance(values, 0, found.predict(values, [0])[0])))
+    z = (found.frames[0].image - found.predict(values, [0])[0]) / np.sqrt(
+        found.variance(values, 0, found.predict(values, [0])[0])
+    )
     z = np.where(found.usable(0).all(2), z.sum(2) / np.sqrt(3), 0)
-    assert (whitened[z > 3][:, 0] > whitened[z > 3][:, 2]).all() and (whitened[z < -3][:, 2] > whitened[z < -3][:, 0]).all()
+    assert (whitened[z > 3][:, 0] > whitened[z > 3][:, 2]).all() and (
+        whitened[z < -3][:, 2] > whitened[z < -3][:, 0]
+    ).all()
     assert (np.abs(z) > 3).sum() > 10
     page.run("captures.get(0).use.fill(0, 0, 3), redraw()")  # the first pixel
     assert len(set(seen()[0, 0])) == 1 and np.array_equal(seen()[1:], whitened[1:])
     page.key(".")
     page.idle()
-    assert page.run("at('frame').value") == "1" and page.run("document.querySelector('.bars [aria-current=true]').textContent").startswith("p0-led_3")
+    assert page.run("at('frame').value") == "1" and page.run(
+        "document.querySelector('.bars [aria-current=true]').textContent"
+    ).startswith("p0-led_3")
     page.key(",", ",")
     page.idle()
     assert page.run("at('frame').value") == "5"  # round to the last one, which was held out
-    visible = page.run("[...sliders.values()].filter(s => s.name.startsWith('gel.press_x') && !s.row.hidden).map(s => s.name)")
+    visible = page.run(
+        "[...sliders.values()].filter(s => s.name.startsWith('gel.press_x') && !s.row.hidden).map(s => s.name)"
+    )
     assert visible == ["gel.press_x[press-2]"]
 
 
@@ -692,7 +801,9 @@ def test_the_best_fit_is_the_servers_and_is_written(page, ask, study):
         page.key("l")
         page.idle()
         assert page.run("shifted(0).length") == 0 and page.run(f"there['{VIGNETTING}']") == page.run(VALUE)
-    assert abs(page.run(VALUE) - HIDDEN) < 0.05 and page.numbers("chi")[0] == pytest.approx(1, abs=0.1)  # 5184 values: sd 0.02, and 8 bits
+    assert abs(page.run(VALUE) - HIDDEN) < 0.05 and page.numbers("chi")[0] == pytest.approx(
+        1, abs=0.1
+    )  # 5184 values: sd 0.02, and 8 bits
     assert page.numbers("chi")[0] < 0.9 * page.numbers("chi0")[0]
     page.key("w")
     page.wait("at('written').open")
@@ -709,13 +820,17 @@ def test_a_secant_is_said_to_be_one_and_bad_numbers_are_refused(page):
     page.run("at('e-led-size').click()")
     page.wait(f"sliders.get('{SIZE}').note.textContent")
     assert "secant: the change over a step of 1" in page.run(f"sliders.get('{SIZE}').note.textContent")
-    page.run(f"sliders.get('{SIZE}').number.value = -3; sliders.get('{SIZE}').number.dispatchEvent(new Event('change'))")
+    page.run(
+        f"sliders.get('{SIZE}').number.value = -3; sliders.get('{SIZE}').number.dispatchEvent(new Event('change'))"
+    )
     page.wait("at('message').textContent.includes('allowed: 0 to')")
     assert page.run(f"sliders.get('{SIZE}').now") == 0
 
 
 def test_the_address_brings_a_state_back_and_names_what_is_unknown(page, server):
-    page.open(f"{server.url}#on=lens-vignetting&camera.vignetting=0.3&frame=3&mode=residual&on=no-such-effect&camera.vignettin=1")
+    page.open(
+        f"{server.url}#on=lens-vignetting&camera.vignetting=0.3&frame=3&mode=residual&on=no-such-effect&camera.vignettin=1"
+    )
     assert page.run(f"[{VALUE}, view.frame, view.mode, on.has('lens-vignetting')]") == [0.3, 2, "residual", True]
     assert "no-such-effect, camera.vignettin=1" in page.text("message")[0]
 
@@ -725,7 +840,9 @@ def test_everything_has_a_name_and_fits(page):
     page.run("for (const d of document.querySelectorAll('details')) d.open = true; toggle('led-size', true)")
     nameless = page.run("""[...document.querySelectorAll('input, button, select, [role=slider]')].filter(e => !(e.ariaLabel || e.textContent.trim()
         || (e.labels && [...e.labels].some(l => l.textContent.trim())) || e.placeholder)).map(e => e.outerHTML)""")
-    unreachable = page.run("[...document.querySelectorAll('input, button, select, [role=slider]')].filter(e => e.tabIndex < 0).map(e => e.outerHTML)")
+    unreachable = page.run(
+        "[...document.querySelectorAll('input, button, select, [role=slider]')].filter(e => e.tabIndex < 0).map(e => e.outerHTML)"
+    )
     assert nameless == [] and unreachable == []
     page.run("document.activeElement.blur()")
     page.key("?")
@@ -744,9 +861,15 @@ def test_point_readings_are_drawn_as_points(chromium, mitsuba, tmp_path):
     """A bench with a leak: its linear prediction in the page is the server's, and the points move."""
     from optics.proof.makers import bench as jones
 
-    truth = jones.Truth(photodiode=jones.Photodiode(gain=2.2), p1=jones.Polarizer(leak=0.02), p2=jones.Polarizer(leak=0.02))
-    settings = [{"polarizer.angle": a, "analyzer.angle": 11.25 * i, "source.power": p, "source.time": i / 9}
-                for a in (0.0, 60.0) for p in (0.5, 1.0) for i in range(16)]
+    truth = jones.Truth(
+        photodiode=jones.Photodiode(gain=2.2), p1=jones.Polarizer(leak=0.02), p2=jones.Polarizer(leak=0.02)
+    )
+    settings = [
+        {"polarizer.angle": a, "analyzer.angle": 11.25 * i, "source.power": p, "source.time": i / 9}
+        for a in (0.0, 60.0)
+        for p in (0.5, 1.0)
+        for i in range(16)
+    ]
     jones.write(tmp_path / "captures", truth, settings, Noise(0.05, 2.0, 64.0, 4095.0, 0.0), 3)
     loop.begin(loop.Setup(captures=str(tmp_path / "captures")), tmp_path / "study")
     found = Server()
@@ -756,15 +879,24 @@ def test_point_readings_are_drawn_as_points(chromium, mitsuba, tmp_path):
     chromium.errors.clear()
     try:
         chromium.open(found.url)
-        assert chromium.run("S.shape === null && canvas.width > 300") and chromium.text("state") == ["rendered: the study’s values"]
-        picture = "context.getImageData(0, 0, canvas.width, canvas.height).data.reduce((a, b) => (31 * a + b) % 1000003, 0)"
-        before = chromium.run(picture)
+        assert chromium.run("S.shape === null && canvas.width > 300") and chromium.text("state") == [
+            "rendered: the study’s values"
+        ]
+        image = (
+            "context.getImageData(0, 0, canvas.width, canvas.height).data.reduce((a, b) => (31 * a + b) % 1000003, 0)"
+        )
+        before = chromium.run(image)
         chromium.run("at('e-extinction-leak').click()")
         chromium.key("b")
         chromium.wait("at('message').textContent.startsWith('Best fit')")
         chromium.idle()
-        (prediction, _) = found.view.predict(0, {"polarizer_film.leak": chromium.run("sliders.get('polarizer_film.leak').now")})
-        assert np.array_equal(chromium.run("Array.from(last.prediction)"), prediction.ravel()) and chromium.run(picture) != before
+        (prediction, _) = found.view.predict(
+            0, {"polarizer_film.leak": chromium.run("sliders.get('polarizer_film.leak').now")}
+        )
+        assert (
+            np.array_equal(chromium.run("Array.from(last.prediction)"), prediction.ravel())
+            and chromium.run(image) != before
+        )
         assert chromium.numbers("chi")[0] < 0.2 * chromium.numbers("chi0")[0]
         for key in "12345":
             chromium.key(key)

@@ -1,13 +1,14 @@
-"""Captures of the Vi2TaP finger made by another path than the model: stock Mitsuba's `path`, its `polarizer`, finer meshes.
+"""Captures of the Vi2TaP finger made by another path than the model: stock Mitsuba's `path`, its `polarizer`, finer
+meshes.
 
-Nothing of `optics.light.renderer`, `optics.light.paths`, `optics.polarization.mueller` or the `tactile` integrator takes part. A polarizer with a leak is a mixture of
-two ideal ones, T1 along its axis and T2 across it: exact for light that enters unpolarized and is only weighed in the end. Four
-renders in the mono variant (each film along or across) hold every such pair; what is outside and what the markers send are rendered
-apart, for unit reflectance and unit excitation, and get their colours by quadrature over the spectra. Effects are made by
-mixing renders, by turning a film, or by numpy on the image; then photons, read noise and 8 bits. A retarder is a mixture of films
-too: the stock one turns by the angle to its x axis, which is not across an oblique ray, and has a seam there. Shared with the model
-are the shape of a dent, the boundary's Snell and Fresnel and the LED's lobe, which tests hold to closed forms.
-"""
+Nothing of `optics.light.renderer`, `optics.light.paths`, `optics.polarization.mueller` or the `tactile` integrator
+takes part. A polarizer with a leak is a mixture of two ideal ones, T1 along its axis and T2 across it: exact for light
+that enters unpolarized and is only weighed in the end. Four renders in the mono variant (each film along or across)
+hold every such pair; what is outside and what the markers send are rendered apart, for unit reflectance and unit
+excitation, and get their colours by quadrature over the spectra. Effects are made by mixing renders, by turning a film,
+or by numpy on the image; then photons, read noise and 8 bits. A retarder is a mixture of films too: the stock one turns
+by the angle to its x axis, which is not across an oblique ray, and has a seam there. Shared with the model are the
+shape of a dent, the boundary's Snell and Fresnel and the LED's lobe, which tests hold to closed forms."""
 
 from __future__ import annotations
 
@@ -24,28 +25,53 @@ from optics.scene.mitsuba_parts import use_variant
 
 VARIANT = "llvm_ad_mono_polarized"
 AXIS = 30.0  # deg: a retarder's fast axis
-MAKERS = ("extinction leak", "coloured leak", "oblique leak", "polarizer misalignment", "servo scale", "servo backlash",
-          "analyzer wobble", "depolarization", "retardance", "stray light", "dark offset", "camera gamma", "gain drift",
-          "lens vignetting", "marker leak", "veiling glare")
+MAKERS = (
+    "extinction leak",
+    "coloured leak",
+    "oblique leak",
+    "polarizer misalignment",
+    "servo scale",
+    "servo backlash",
+    "analyzer wobble",
+    "depolarization",
+    "retardance",
+    "stray light",
+    "dark offset",
+    "camera gamma",
+    "gain drift",
+    "lens vignetting",
+    "marker leak",
+    "veiling glare",
+)
 
 
 class FingerMaker:
     """Makes frames of a vi2tap scene's values with hidden effects {name: strength} or none."""
 
-    def __init__(self, scene: Scene, values: Mapping[str, float] | None = None, effects: Mapping[str, float] | None = None,
-                 noise: Noise = CAMERA, seed: int = 0, spp: int = 100):
+    def __init__(
+        self,
+        scene: Scene,
+        values: Mapping[str, float] | None = None,
+        effects: Mapping[str, float] | None = None,
+        noise: Noise = CAMERA,
+        seed: int = 0,
+        spp: int = 100,
+    ):
         self.values = {**scene.values(), **(values or {})}
         self.effects = dict(effects or {})
         unknown = set(self.effects) - set(MAKERS)
         if unknown:
             raise ValueError(f"no independent way to make {', '.join(sorted(unknown))}; known: {', '.join(MAKERS)}")
         self.size, self.bands = scene.camera.resolution, np.array(scene.integrator.bands)
-        self.frames = {n: np.array([[float(c[0]) for c in axis] for axis in led.frame]) for n, led in scene.leds.items()}
+        self.frames = {
+            n: np.array([[float(c[0]) for c in axis] for axis in led.frame]) for n, led in scene.leds.items()
+        }
         self.noise, self.seed, self.spp, self.count = noise, seed, spp, 0
-        self._kept: dict = {}  # displacements and pictures of the present geometry
+        self._kept: dict = {}  # displacements and images of the present geometry
         self.wall_dark = scene.defines.get("wall_dark", 0.6)
 
-    # -- geometry -------------------------------------------------------------------------------------------------------
+    # -- geometry
+    # -------------------------------------------------------------------------------------------------------
 
     def dent(self, press: Sequence[float]):
         """The pressed outer face's displacement map, or None."""
@@ -55,7 +81,9 @@ class FingerMaker:
         if press[2] <= 0:
             return None
         profile = contact.indenter_profile("sphere", v["skin.indenter_size"], (0.0, 0.0, 0.0), 16.0, 0.08)
-        return contact.displacement(profile, press[2], v["skin.thickness"], v["skin.smoothing"], skirt=v["skin.skirt"])[0]
+        return contact.displacement(profile, press[2], v["skin.thickness"], v["skin.smoothing"], skirt=v["skin.skirt"])[
+            0
+        ]
 
     def kept(self, key, make: Callable):
         if key not in self._kept:
@@ -93,7 +121,9 @@ class FingerMaker:
         properties["bsdf"] = mi.load_dict(bsdf)
         if shines:
             properties["emitter"] = mi.load_dict({"type": "area", "radiance": {"type": "uniform", "value": 1.0}})
-        mesh = mi.Mesh(name, len(points), len(faces), properties, has_vertex_normals=False, has_vertex_texcoords=uv is not None)
+        mesh = mi.Mesh(
+            name, len(points), len(faces), properties, has_vertex_normals=False, has_vertex_texcoords=uv is not None
+        )
         params = mi.traverse(mesh)
         params["vertex_positions"] = mi.Float(np.asarray(points, np.float32).ravel())
         params["faces"] = mi.UInt32(np.asarray(faces, np.uint32).ravel())
@@ -111,7 +141,11 @@ class FingerMaker:
         maps = None if dent is None else self.maps(dent, depth)
 
         def moved(x, y):
-            u = [0.0] * 3 if maps is None else [contact.surface(np.atleast_1d(x), np.atleast_1d(y), press[0], press[1], m) for m in maps]
+            u = (
+                [0.0] * 3
+                if maps is None
+                else [contact.surface(np.atleast_1d(x), np.atleast_1d(y), press[0], press[1], m) for m in maps]
+            )
             return np.stack(np.broadcast_arrays(x + u[0], y + u[1], -depth - u[2]), -1)
 
         angle = 2 * np.pi * np.arange(sides) / sides
@@ -121,8 +155,10 @@ class FingerMaker:
             for column in range(5):
                 at = np.array([(column - 2) * v["markers.pitch_x"], (row - 1.5) * v["markers.pitch_y"]])
                 foot = moved(at[0], at[1]).reshape(3)
-                slope = [(moved(*(at + d))[..., 2] - moved(*(at - d))[..., 2]).item() / (2 * radius)
-                         for d in (np.array([radius, 0.0]), np.array([0.0, radius]))]
+                slope = [
+                    (moved(*(at + d))[..., 2] - moved(*(at - d))[..., 2]).item() / (2 * radius)
+                    for d in (np.array([radius, 0.0]), np.array([0.0, radius]))
+                ]
                 axis = np.array([slope[0], slope[1], -1.0])
                 axis /= np.linalg.norm(axis)
                 e1 = np.cross(axis, [0.0, -1.0, 0.0])
@@ -133,10 +169,20 @@ class FingerMaker:
                 ring = foot + circle[:, :1] * e1 + circle[:, 1:] * e2
                 base, i = sum(map(len, points)), np.arange(sides)
                 j = (i + 1) % sides
-                points += [moved(at[0] + circle[:, 0], at[1] + circle[:, 1]), ring + height * axis, ring + height * axis,
-                           (foot + height * axis)[None]]
-                faces += [base + np.stack(f, -1) for f in ((i, j, sides + j), (i, sides + j, sides + i), (
-                    2 * sides + i, 2 * sides + j, np.full(sides, 3 * sides)))]
+                points += [
+                    moved(at[0] + circle[:, 0], at[1] + circle[:, 1]),
+                    ring + height * axis,
+                    ring + height * axis,
+                    (foot + height * axis)[None],
+                ]
+                faces += [
+                    base + np.stack(f, -1)
+                    for f in (
+                        (i, j, sides + j),
+                        (i, sides + j, sides + i),
+                        (2 * sides + i, 2 * sides + j, np.full(sides, 3 * sides)),
+                    )
+                ]
         return self.mesh(np.concatenate(points), np.concatenate(faces), bsdf, "markers", None, shines)
 
     def cylinder(self, distance: float, bsdf):
@@ -147,9 +193,17 @@ class FingerMaker:
         middles = np.array([[v["object.x"] + s * half, v["object.y"], distance + radius] for s in (-1, 1)])
         i = np.arange(sides)
         j = (i + 1) % sides
-        faces = np.concatenate([np.stack(f, -1) for f in (
-            (i, j, sides + j), (i, sides + j, sides + i), (np.full(sides, 2 * sides), j, i),
-            (np.full(sides, 2 * sides + 1), sides + i, sides + j))])
+        faces = np.concatenate(
+            [
+                np.stack(f, -1)
+                for f in (
+                    (i, j, sides + j),
+                    (i, sides + j, sides + i),
+                    (np.full(sides, 2 * sides), j, i),
+                    (np.full(sides, 2 * sides + 1), sides + i, sides + j),
+                )
+            ]
+        )
         return self.mesh(np.concatenate([*ends, middles]), faces, bsdf, "object")
 
     # -- light ----------------------------------------------------------------------------------------------------------
@@ -158,19 +212,28 @@ class FingerMaker:
         import mitsuba as mi
 
         t = mi.ScalarTransform4f
-        return {"type": "rectangle", "to_world": t().translate([0, 0, z]) @ t().rotate([1, 0, 0], 180) @ t().scale([half, half, 1]),
-                "bsdf": bsdf}
+        return {
+            "type": "rectangle",
+            "to_world": t().translate([0, 0, z]) @ t().rotate([1, 0, 0], 180) @ t().scale([half, half, 1]),
+            "bsdf": bsdf,
+        }
 
     def led(self, name: str) -> dict:
         import mitsuba as mi
 
         v, axis = self.values, self.frames[name][2]
         position = [float(v[f"{name}.{a}"]) for a in "xyz"]
-        return {"type": "led", "position": mi.ScalarPoint3f(*position), "mu": float(v[f"{name}.mu"]),
-                "target": mi.ScalarPoint3f(*[float(p + a) for p, a in zip(position, axis)]), "power": float(v[f"{name}.power"])}
+        return {
+            "type": "led",
+            "position": mi.ScalarPoint3f(*position),
+            "mu": float(v[f"{name}.mu"]),
+            "target": mi.ScalarPoint3f(*[float(p + a) for p, a in zip(position, axis)]),
+            "power": float(v[f"{name}.power"]),
+        }
 
     def render(self, geometry, analyzer: float, film: float, what: str) -> np.ndarray:
-        """(H, W) luminance behind ideal films with their axes at these angles; `what` is lit: object, wall or markers."""
+        """(H, W) luminance behind ideal films with their axes at these angles; `what` is lit: object, wall or
+        markers."""
         import mitsuba as mi
 
         dent, press, distance = geometry
@@ -184,21 +247,43 @@ class FingerMaker:
             return {"type": "polarizer", "theta": {"type": "uniform", "value": float(-angle)}}
 
         black, t = {"type": "diffuse", "reflectance": {"type": "uniform", "value": 0.0}}, mi.ScalarTransform4f
-        wall = {"type": "diffuse", "reflectance": {"type": "checkerboard", "to_uv": t().scale([20, 20, 1]),
-                                                   "color0": {"type": "uniform", "value": float(self.wall_dark)},
-                                                   "color1": {"type": "uniform", "value": 1.0}}}
+        wall = {
+            "type": "diffuse",
+            "reflectance": {
+                "type": "checkerboard",
+                "to_uv": t().scale([20, 20, 1]),
+                "color0": {"type": "uniform", "value": float(self.wall_dark)},
+                "color1": {"type": "uniform", "value": 1.0},
+            },
+        }
         scene = {
-            "type": "scene", # `path` counts films as scattering: from the fifth surface on it would draw rays by lot
+            "type": "scene",  # `path` counts films as scattering: from the fifth surface on it would draw rays by lot
             "integrator": {"type": "path", "max_depth": 8 if what in ("object", "wall") else 4, "rr_depth": 100},
-            "sensor": {"type": "perspective", "fov": float(self.values["camera.x_fov"]), "fov_axis": "x", "near_clip": 0.01,
-                       "far_clip": 1e4, "to_world": looking, "film": {
-                           "type": "hdrfilm", "width": width, "height": height, "rfilter": {"type": "box"},
-                           "pixel_format": "luminance", "component_format": "float32"},
-                       "sampler": {"type": "multijitter", "sample_count": self.spp}},
+            "sensor": {
+                "type": "perspective",
+                "fov": float(self.values["camera.x_fov"]),
+                "fov_axis": "x",
+                "near_clip": 0.01,
+                "far_clip": 1e4,
+                "to_world": looking,
+                "film": {
+                    "type": "hdrfilm",
+                    "width": width,
+                    "height": height,
+                    "rfilter": {"type": "box"},
+                    "pixel_format": "luminance",
+                    "component_format": "float32",
+                },
+                "sampler": {"type": "multijitter", "sample_count": self.spp},
+            },
             "analyzer": self.rectangle(-23, 10, ideal(analyzer)),
             "film": self.face(dent, press, 2.5, ideal(film), "film"),
-            "outer": self.face(dent, press, 0.0, {"type": "interface", "index": float(self.values["outer_face.index"])}, "outer"),
-            "inner": self.face(dent, press, 5.0, {"type": "interface", "index": float(self.values["inner_face.index"])}, "inner"),
+            "outer": self.face(
+                dent, press, 0.0, {"type": "interface", "index": float(self.values["outer_face.index"])}, "outer"
+            ),
+            "inner": self.face(
+                dent, press, 5.0, {"type": "interface", "index": float(self.values["inner_face.index"])}, "inner"
+            ),
             "markers": self.markers(dent, press, paint("markers"), what == "coverage"),
             "object": self.cylinder(distance, paint("object")),
             "wall": self.rectangle(160, 1000, wall if what == "wall" else black),
@@ -208,35 +293,48 @@ class FingerMaker:
             turn = t().rotate([0, 1, 0], 90 * sign) if axis == "x" else t().rotate([1, 0, 0], 90 * sign)
             place = [-x * sign, 0, -15] if axis == "x" else [0, y * sign, -15]
             size = [15, y, 1] if axis == "x" else [x, 15, 1]
-            scene[f"body_{name}"] = {"type": "rectangle", "to_world": t().translate(place) @ turn @ t().scale(size), "bsdf": black}
+            scene[f"body_{name}"] = {
+                "type": "rectangle",
+                "to_world": t().translate(place) @ turn @ t().scale(size),
+                "bsdf": black,
+            }
         lights = ("uv_left", "uv_right") if what == "markers" else ("room_left", "room_right")
-        lights = [n for n in lights if self.values[f"{n}.power"] > 0]  # `path` would draw a dark one as often as a bright one
+        lights = [
+            n for n in lights if self.values[f"{n}.power"] > 0
+        ]  # `path` would draw a dark one as often as a bright one
         scene.update({name: self.led(name) for name in lights})
         self.count += 1
         image = np.array(mi.render(mi.load_dict(scene), seed=(self.seed * 7919 + self.count) % 2**31))
         return image.reshape(height, width).astype(float)
 
     def excitation(self) -> np.ndarray:
-        """(B,) radiance per nm of the pigment per unit of pi x irradiance's kappa cos: by quadrature over both spectra."""
+        """(B,) radiance per nm of the pigment per unit of pi x irradiance's kappa cos: by quadrature over both
+        spectra."""
         v = self.values
         l = np.linspace(150, 700, 20001)
         gauss = lambda x, peak, fwhm: np.exp(-4 * np.log(2) * ((x - peak) / fwhm) ** 2)  # noqa: E731
         lamp = gauss(l, v["uv_left.wavelength"], v["uv_left.fwhm"])
-        photons = np.trapezoid(lamp * v["pigment.absorptance"] * gauss(l, v["pigment.absorption_peak"], v["pigment.absorption_fwhm"]) * l, l)
+        photons = np.trapezoid(
+            lamp * v["pigment.absorptance"] * gauss(l, v["pigment.absorption_peak"], v["pigment.absorption_fwhm"]) * l,
+            l,
+        )
         wide = np.linspace(200, 1200, 40001)
         shape = gauss(wide, v["pigment.emission_peak"], v["pigment.emission_fwhm"])
         emission = gauss(self.bands, v["pigment.emission_peak"], v["pigment.emission_fwhm"]) / np.trapezoid(shape, wide)
         return v["pigment.yield"] * photons * emission / self.bands
 
     def parts(self, geometry, analyzer: float) -> dict[str, np.ndarray]:
-        """{what: (2, 2, H, W, 1 or B)} behind ideal films: [analyser along | across][skin's film along | across]; markers (2, 2, H, W)."""
+        """{what: (2, 2, H, W, 1 or B)} behind ideal films: [analyser along | across][skin's film along | across];
+        markers (2, 2, H, W)."""
         e, v = self.effects, self.values
         offset = e.get("polarizer misalignment", 0.0)
         film = v["film.angle"] + v["film.offset"]
         found = {}
         for what in ("object", "wall"):
             angles = [analyzer + offset, analyzer + offset + 90]
-            found[what] = np.array([[self.render(geometry, a, film + f, what) for f in (0, 90)] for a in angles])[..., None]
+            found[what] = np.array([[self.render(geometry, a, film + f, what) for f in (0, 90)] for a in angles])[
+                ..., None
+            ]
             if "retardance" in e:
                 found[what] = found[what] - self.taken_by_retarder(geometry, angles, film, what)
         # markers are in front of the skin's film, and their light is unpolarized: one render serves all four
@@ -248,14 +346,17 @@ class FingerMaker:
             focal = width / 2 / np.tan(np.radians(v["camera.x_fov"]) / 2)
             y, x = np.mgrid[:height, :width] + 0.5
             at = 20 / focal  # mm per px in the plane of the inner face, 20 mm before the camera
-            skin = (np.abs(x - width / 2) * at < v["skin.width"] / 2) & (np.abs(y - height / 2) * at < v["skin.length"] / 2)
+            skin = (np.abs(x - width / 2) * at < v["skin.width"] / 2) & (
+                np.abs(y - height / 2) * at < v["skin.length"] / 2
+            )
             mean = one.sum() / np.maximum(cover.sum() / 2, 1e-9)
             found["glow"] = e["marker leak"] * mean * (skin * (1 - np.clip(cover, 0, 1)))
         return found
 
     def taken_by_retarder(self, geometry, analyzers: Sequence[float], film: float, what: str) -> np.ndarray:
-        """(2, 2, H, W, B) that a retarder behind the skin's film takes from its light: of light at f, the part polarized at 45 deg to the
-        fast axis psi, sin 2(f - psi), is left with cos Gamma of itself; Gamma = retardance x 540 nm/lambda, psi = AXIS."""
+        """(2, 2, H, W, B) that a retarder behind the skin's film takes from its light: of light at f, the part
+        polarized at 45 deg to the fast axis psi, sin 2(f - psi), is left with cos Gamma of itself; Gamma = retardance x
+        540 nm/lambda, psi = AXIS."""
         diagonal = [[self.render(geometry, a, AXIS + d, what) for d in (45, 135)] for a in analyzers]
         lost = np.array([(plus - minus) / 2 for plus, minus in diagonal])[:, None, ..., None]
         share = np.array([np.sin(np.radians(2 * (film + f - AXIS))) for f in (0, 90)])[:, None, None, None]
@@ -279,11 +380,14 @@ class FingerMaker:
                 through = (weights[0][0] + weights[0][1]) * self.excitation()
                 light = images[0, 0][..., None] * 2 * through
             else:
-                rho = np.array([v[f"{paints[what]}.rho_{c}"] for c in "rgb"])[:len(self.bands)]
+                rho = np.array([v[f"{paints[what]}.rho_{c}"] for c in "rgb"])[: len(self.bands)]
                 light = sum(images[i, j] * weights[0][i] * weights[1][j] for i in (0, 1) for j in (0, 1)) * rho
                 if "depolarization" in e:  # a share comes through with its polarization mixed
-                    mixed = sum(images[i, j] * weights[1][j] for i in (0, 1) for j in (0, 1)) * (
-                        (weights[0][0] + weights[0][1]) / 2) * rho
+                    mixed = (
+                        sum(images[i, j] * weights[1][j] for i in (0, 1) for j in (0, 1))
+                        * ((weights[0][0] + weights[0][1]) / 2)
+                        * rho
+                    )
                     light = light + e["depolarization"] * (mixed - light)
             total = total + light
         if "oblique leak" in e:
@@ -294,10 +398,12 @@ class FingerMaker:
             sin2 = (tan2 / (1 + tan2))[..., None] * e["oblique leak"]  # at the analyser; refracted at the film
             inside = sin2 / v["inner_face.index"] ** 2
             for what in ("object", "wall"):
-                rho = np.array([v[f"{paints[what]}.rho_{c}"] for c in "rgb"])[:len(self.bands)]
+                rho = np.array([v[f"{paints[what]}.rho_{c}"] for c in "rgb"])[: len(self.bands)]
                 images = parts[what] * rho
-                total = total + (sin2 * (images[1, 0] * weights[1][0] + images[1, 1] * weights[1][1])
-                                 + inside * (images[0, 1] * weights[0][0] + images[1, 1] * weights[0][1]))
+                total = total + (
+                    sin2 * (images[1, 0] * weights[1][0] + images[1, 1] * weights[1][1])
+                    + inside * (images[0, 1] * weights[0][0] + images[1, 1] * weights[0][1])
+                )
             total = total + sin2 * images_of_markers(parts, self.excitation())
         if "analyzer wobble" in e:
             total = total * (1 + e["analyzer wobble"] * np.cos(np.radians(dial)))
@@ -324,8 +430,12 @@ class FingerMaker:
             signal = np.maximum(signal, 0) ** (1 + e["camera gamma"])
         return n.expose(n.black_level + (n.saturation - n.black_level) * signal + e.get("dark offset", 0.0), rng)
 
-    def captures(self, geometries: Sequence[tuple[Sequence[float], float]], dials: Sequence[float],
-                 progress: Callable[[str, int, int], None] | None = None) -> capture_files.Captures:
+    def captures(
+        self,
+        geometries: Sequence[tuple[Sequence[float], float]],
+        dials: Sequence[float],
+        progress: Callable[[str, int, int], None] | None = None,
+    ) -> capture_files.Captures:
         """Frames of every geometry ((x, y, depth) of the press, distance of the object) at every dial of the analyser.
 
         With backlash, dials are come to from below in even frames and from above in odd ones.
@@ -339,21 +449,40 @@ class FingerMaker:
             for dial in dials:
                 approach = 1.0 if len(frames) % 2 == 0 else -1.0
                 true = dial * e.get("servo scale", 1.0) + approach * e.get("servo backlash", 0.0) / 2
-                image = self.photograph(self.radiance(self.parts(geometry, true), dial), rng, len(frames)).astype(np.float32)
-                settings = {"analyzer.angle": float(dial), "analyzer.approach": approach, "object.distance": float(distance),
-                            "skin.press_x": float(press[0]), "skin.press_y": float(press[1]), "skin.press_depth": float(press[2])}
-                frames.append(capture_files.Frame(f"scene{k:02d}-{dial:g}", image, None, f"scene-{k:02d}", settings, [],
-                                                  f"frames/scene{k:02d}-{dial:g}.png"))
+                image = self.photograph(self.radiance(self.parts(geometry, true), dial), rng, len(frames)).astype(
+                    np.float32
+                )
+                settings = {
+                    "analyzer.angle": float(dial),
+                    "analyzer.approach": approach,
+                    "object.distance": float(distance),
+                    "skin.press_x": float(press[0]),
+                    "skin.press_y": float(press[1]),
+                    "skin.press_depth": float(press[2]),
+                }
+                frames.append(
+                    capture_files.Frame(
+                        f"scene{k:02d}-{dial:g}",
+                        image,
+                        None,
+                        f"scene-{k:02d}",
+                        settings,
+                        [],
+                        f"frames/scene{k:02d}-{dial:g}.png",
+                    )
+                )
             if progress:
                 progress("captures", k + 1, len(geometries))
-        return capture_files.Captures(
-            Path("."), "vi2tap", frames, self.known(), self.noise, None, None, "DN", None, [])
+        return capture_files.Captures(Path("."), "vi2tap", frames, self.known(), self.noise, None, None, "DN", None, [])
 
     def known(self) -> dict[str, float]:
-        """What is written down of the set-up: its exposure and lights; matt paints and no light but the room's lamps."""
+        """What is written down of the set-up: its exposure and lights; matt paints and no light but the room's
+        lamps."""
         lights = [f"{n}.power" for n in ("room_left", "room_right", "uv_left", "uv_right")]
-        return {**{k: float(self.values[k]) for k in ("camera.exposure", *lights)},
-                **{f"{paint}_paint.{n}": 0.0 for paint in ("object", "wall") for n in ("ambient", "sigma")}}
+        return {
+            **{k: float(self.values[k]) for k in ("camera.exposure", *lights)},
+            **{f"{paint}_paint.{n}": 0.0 for paint in ("object", "wall") for n in ("ambient", "sigma")},
+        }
 
 
 def images_of_markers(parts: Mapping[str, np.ndarray], excitation: np.ndarray) -> np.ndarray:

@@ -1,11 +1,12 @@
-"""Captures of a small printed grid made by another path than the model: stock Mitsuba's `volpath`, `dielectric` faces around stock media.
+"""Captures of a small printed grid made by another path than the model: stock Mitsuba's `volpath`, `dielectric` faces
+around stock media.
 
-Nothing of `optics.light.transport` or of our parts takes part: rays come from the camera alone and meet the panels where a matt surface sends
-a shadow ray, or by chance; absorption and scattering are drawn, not weighed; the faces of cells and of the rod are meshes of their own.
-Each panel is rendered alone and unpolarized light stays what the faces make of it (mono variant, Mueller matrices). Effects are stock
-means: a medium's coefficients, an index, `roughdielectric` (Beckmann, which takes all polarization away), another mesh. Then photons,
-read noise and 8 bits. A picture's own error, from independent passes, is reported as a share of the camera's noise: to stay below 0.3.
-"""
+Nothing of `optics.light.transport` or of our parts takes part: rays come from the camera alone and meet the panels
+where a matt surface sends a shadow ray, or by Monte Carlo; absorption and scattering are drawn, not weighed; the faces
+of cells and of the rod are meshes of their own. Each panel is rendered alone and unpolarized light stays what the faces
+make of it (mono variant, Mueller matrices). Effects are stock means: a medium's coefficients, an index,
+`roughdielectric` (Beckmann, which takes all polarization away), another mesh. Then photons, read noise and 8 bits. An
+image's own error, from independent passes, is reported as a share of the camera's noise: to stay below 0.3."""
 
 from __future__ import annotations
 
@@ -23,22 +24,33 @@ VARIANT = "llvm_ad_mono_polarized"
 # small pixels at high gain: 800 electrons are white
 CAMERA = Noise(system_gain=0.3, dark_noise=2.0, black_level=8.0, saturation=255.0, prnu=0.0)
 MAKERS = ("volume scattering", "rough walls", "index mismatch", "body absorption", "unfilled cell", "wall thickness")
-PASSES = 8  # independent renders of a picture
-BOX = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])  # sides, seen from outside
+PASSES = 8  # independent renders of an image
+BOX = np.array(
+    [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
+)  # sides, seen from outside
 
 
 class GridMaker:
     """Makes frames of a grid_bench scene's values with hidden effects {name: strength} or none.
 
     effects   volume scattering   sigma_s of the filling, 1/mm;       body absorption   alpha of the filling, 1/mm
-              rough walls         alpha of the cells' faces;          index mismatch    what is added to the filling's index
-              unfilled cell       (column, row, layer), full of air;  wall thickness    what is added to that of walls, mm
-    spp       samples per pixel of a picture, over all passes
-    shares    of every frame made so far: rms of the picture's own error over the camera's noise
+              rough walls         alpha of the cells' faces;          index mismatch    what is added to the filling's
+                                  index
+              unfilled cell       (column, row, layer), full of air;  wall thickness    what is added to that of walls,
+                                  mm
+    spp       samples per pixel of an image, over all passes
+    shares    of every frame made so far: rms of the image's own error over the camera's noise
     """
 
-    def __init__(self, scene: Scene, values: Mapping[str, float] | None = None, effects: Mapping | None = None, noise: Noise = CAMERA,
-                 seed: int = 0, spp: int = 8192):
+    def __init__(
+        self,
+        scene: Scene,
+        values: Mapping[str, float] | None = None,
+        effects: Mapping | None = None,
+        noise: Noise = CAMERA,
+        seed: int = 0,
+        spp: int = 8192,
+    ):
         import mitsuba as mi
 
         self.values, self.effects = {**scene.values(), **(values or {})}, dict(effects or {})
@@ -53,8 +65,12 @@ class GridMaker:
         body = next(s for s in scene.mitsuba.shapes() if s.id() == "body").bbox()
         self.body = np.array([np.array(body.min).ravel(), np.array(body.max).ravel()], float)
         placed = mi.traverse(scene.mitsuba)
-        self.panels = {name: np.array(placed[f"{s.id()}.to_world"].matrix, float).reshape(4, 4) for name, part in scene.sources.items()
-                       for s in scene.mitsuba.shapes() if s.emitter() is part}
+        self.panels = {
+            name: np.array(placed[f"{s.id()}.to_world"].matrix, float).reshape(4, 4)
+            for name, part in scene.sources.items()
+            for s in scene.mitsuba.shapes()
+            if s.emitter() is part
+        }
         self.noise, self.seed, self.spp, self.count = noise, seed, spp, 0
         self.shares: list[float] = []
 
@@ -81,14 +97,22 @@ class GridMaker:
         at = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
         points = low[:, None] + at * (high - low)[:, None]
         faces = np.concatenate([BOX[:, [0, 1, 2]], BOX[:, [0, 2, 3]]])
-        return self.mesh(name, points.reshape(-1, 3), (faces + 8 * np.arange(len(low))[:, None, None]).reshape(-1, 3), **has)
+        return self.mesh(
+            name, points.reshape(-1, 3), (faces + 8 * np.arange(len(low))[:, None, None]).reshape(-1, 3), **has
+        )
 
     def cells(self) -> tuple[np.ndarray, np.ndarray]:
         """Corners (columns, rows, layers, 3) of the cells, low and high."""
         pitch, skin = self.values["grid.pitch"], self.values["grid.skin"]
         half = (pitch - self.values["grid.wall"] - self.effects.get("wall thickness", 0.0)) / 2
-        middle = np.stack(np.meshgrid(*[(np.arange(n) - (n - 1) / 2) * pitch for n in self.counts[:2]],
-                                      -skin - (np.arange(self.counts[2]) + 0.5) * pitch, indexing="ij"), -1)
+        middle = np.stack(
+            np.meshgrid(
+                *[(np.arange(n) - (n - 1) / 2) * pitch for n in self.counts[:2]],
+                -skin - (np.arange(self.counts[2]) + 0.5) * pitch,
+                indexing="ij",
+            ),
+            -1,
+        )
         return middle - half, middle + half
 
     def rod(self, distance: float, bsdf):
@@ -99,8 +123,17 @@ class GridMaker:
         ends = [np.stack(np.broadcast_arrays(x, y, z), -1) for z in (distance, distance + v["object.length"])]
         i, middle = np.arange(sides), np.full(sides, 2 * sides)
         j = (i + 1) % sides
-        faces = np.concatenate([np.stack(f, -1) for f in ((i, j, sides + j), (i, sides + j, sides + i), (middle, j, i),
-                                                          (middle + 1, sides + i, sides + j))])
+        faces = np.concatenate(
+            [
+                np.stack(f, -1)
+                for f in (
+                    (i, j, sides + j),
+                    (i, sides + j, sides + i),
+                    (middle, j, i),
+                    (middle + 1, sides + i, sides + j),
+                )
+            ]
+        )
         centres = [[v["object.x"], v["object.y"], z] for z in (distance, distance + v["object.length"])]
         return self.mesh("rod", np.concatenate([*ends, centres]), faces, bsdf=bsdf)
 
@@ -116,18 +149,30 @@ class GridMaker:
             total = absorption + scattering
             if total == 0:
                 return None
-            return mi.load_dict({"type": "homogeneous", "sigma_t": {"type": "uniform", "value": float(total)},
-                                 "albedo": {"type": "uniform", "value": float(scattering / total)}, "phase": {"type": "isotropic"}})
+            return mi.load_dict(
+                {
+                    "type": "homogeneous",
+                    "sigma_t": {"type": "uniform", "value": float(total)},
+                    "albedo": {"type": "uniform", "value": float(scattering / total)},
+                    "phase": {"type": "isotropic"},
+                }
+            )
 
         def face(inside, outside, alpha=0.0):
-            kind = {"type": "roughdielectric", "distribution": "beckmann", "alpha": float(alpha)} if alpha else {"type": "dielectric"}
+            kind = (
+                {"type": "roughdielectric", "distribution": "beckmann", "alpha": float(alpha)}
+                if alpha
+                else {"type": "dielectric"}
+            )
             return mi.load_dict({**kind, "int_ior": float(inside), "ext_ior": float(outside)})
 
         def matt(reflectance):
             return {"type": "diffuse", "reflectance": {"type": "uniform", "value": float(reflectance)}}
 
         resin = medium(v["walls.absorption"])
-        support = medium(e.get("body absorption", v["filling.absorption"]), e.get("volume scattering", v["filling.scattering"]))
+        support = medium(
+            e.get("body absorption", v["filling.absorption"]), e.get("volume scattering", v["filling.scattering"])
+        )
         low, high = self.cells()
         filled = np.ones(self.counts, bool)
         if "unfilled cell" in e:
@@ -135,17 +180,35 @@ class GridMaker:
         width, height = self.size
         looking = mi.ScalarTransform4f([[-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 1, self.camera_z], [0, 0, 0, 1]])
         content = {
-            "type": "scene", "integrator": {"type": "volpath", "max_depth": 512, "rr_depth": 10_000},
-            "sensor": {"type": "perspective", "fov": float(v["camera.x_fov"]), "fov_axis": "x", "near_clip": 0.01, "far_clip": 1e3,
-                       "to_world": looking, "film": {"type": "hdrfilm", "width": width, "height": height, "rfilter": {"type": "box"},
-                                                     "pixel_format": "luminance", "component_format": "float32"},
-                       "sampler": {"type": "multijitter", "sample_count": 64}},
+            "type": "scene",
+            "integrator": {"type": "volpath", "max_depth": 512, "rr_depth": 10_000},
+            "sensor": {
+                "type": "perspective",
+                "fov": float(v["camera.x_fov"]),
+                "fov_axis": "x",
+                "near_clip": 0.01,
+                "far_clip": 1e3,
+                "to_world": looking,
+                "film": {
+                    "type": "hdrfilm",
+                    "width": width,
+                    "height": height,
+                    "rfilter": {"type": "box"},
+                    "pixel_format": "luminance",
+                    "component_format": "float32",
+                },
+                "sampler": {"type": "multijitter", "sample_count": 64},
+            },
             "body": self.boxes("body", self.body[:1], self.body[1:], bsdf=face(walls, 1.0), interior=resin),
-            "cells": self.boxes("cells", low[filled], high[filled], bsdf=face(filling, walls, rough), interior=support, exterior=resin),
+            "cells": self.boxes(
+                "cells", low[filled], high[filled], bsdf=face(filling, walls, rough), interior=support, exterior=resin
+            ),
             "rod": self.rod(distance, mi.load_dict(matt(v["object.bsdf.reflectance.value"]))),
         }
         if not filled.all():
-            content["hollow"] = self.boxes("hollow", low[~filled], high[~filled], bsdf=face(1.0, walls, rough), exterior=resin)
+            content["hollow"] = self.boxes(
+                "hollow", low[~filled], high[~filled], bsdf=face(1.0, walls, rough), exterior=resin
+            )
         for name, place in self.panels.items():
             content[name] = {"type": "rectangle", "to_world": t(place), "bsdf": matt(0.0)}
             if name == panel:
@@ -162,7 +225,9 @@ class GridMaker:
             passes = []
             for _ in range(PASSES):
                 self.count += 1
-                image = mi.render(scene, spp=max(self.spp // PASSES, 1), seed=(self.seed * 100_003 + self.count) % 2**31)
+                image = mi.render(
+                    scene, spp=max(self.spp // PASSES, 1), seed=(self.seed * 100_003 + self.count) % 2**31
+                )
                 passes.append(np.array(image, float).reshape(*self.size[::-1]))
             return np.mean(passes, 0), np.std(passes, 0, ddof=1) / np.sqrt(PASSES)
         finally:
@@ -171,14 +236,16 @@ class GridMaker:
     # -- camera ---------------------------------------------------------------------------------------------------------
 
     def photograph(self, radiance: np.ndarray, error: np.ndarray, rng) -> np.ndarray:
-        """(H, W, 1) noisy, quantised DN; what the picture's own error is of that noise goes to `shares`."""
+        """(H, W, 1) noisy, quantised DN; what the image's own error is of that noise goes to `shares`."""
         n = self.noise
         full = (n.saturation - n.black_level) * self.values["camera.exposure"]
         signal = n.black_level + full * radiance
         self.shares.append(float(np.sqrt(np.mean((full * error / n.sd(signal)) ** 2))))
         return n.expose(signal, rng)[..., None].astype(np.float32)
 
-    def captures(self, distances: Sequence[float], progress: Callable[[str, int, int], None] | None = None) -> capture_files.Captures:
+    def captures(
+        self, distances: Sequence[float], progress: Callable[[str, int, int], None] | None = None
+    ) -> capture_files.Captures:
         """Frames of the rod at every distance (mm), a group each, lit by one panel after the other."""
         rng = np.random.default_rng([self.seed, 3])
         frames = []
@@ -186,10 +253,22 @@ class GridMaker:
             for panel in self.panels:
                 radiance, error = self.radiance(distance, panel)
                 power = self.values[f"{panel}.power"]
-                settings = {"object.distance": float(distance), **{f"{n}.power": float(n == panel) for n in self.panels}}
+                settings = {
+                    "object.distance": float(distance),
+                    **{f"{n}.power": float(n == panel) for n in self.panels},
+                }
                 name = f"distance{k:02d}-{panel}"
-                frames.append(capture_files.Frame(name, self.photograph(power * radiance, power * error, rng), None, f"distance-{k:02d}",
-                                                  settings, [], f"frames/{name}.png"))
+                frames.append(
+                    capture_files.Frame(
+                        name,
+                        self.photograph(power * radiance, power * error, rng),
+                        None,
+                        f"distance-{k:02d}",
+                        settings,
+                        [],
+                        f"frames/{name}.png",
+                    )
+                )
             if progress:
                 progress("captures", k + 1, len(distances))
         known = {"camera.exposure": float(self.values["camera.exposure"])}

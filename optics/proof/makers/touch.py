@@ -1,11 +1,11 @@
 """Captures made by another path than the model that is fitted to them: stock Mitsuba, a denser mesh, its own seeds.
 
-Nothing of `optics.light.renderer` or of the `tactile` integrator takes part. The light is traced by Mitsuba's `path` in the mono
-variant, one channel and one LED at a time, with its `perspective` camera, on a uniform mesh three times denser than the model's;
-effects are made by stock means (more bounces, a `constant` emitter, an LED's disc sampled at random) or by scipy on the
-image, not by the functions that a fit uses; then photons, read noise and 8 bits. What is shared is the LED's and the
-membrane's formula, which tests hold to closed forms, the shape of a dent, and measured sensitivities of a camera.
-"""
+Nothing of `optics.light.renderer` or of the `tactile` integrator takes part. The light is traced by Mitsuba's `path` in
+the mono variant, one channel and one LED at a time, with its `perspective` camera, on a uniform mesh three times denser
+than the model's; effects are made by stock means (more bounces, a `constant` emitter, an LED's disc sampled at random)
+or by scipy on the image, not by the functions that a fit uses; then photons, read noise and 8 bits. What is shared is
+the LED's and the membrane's formula, which tests hold to closed forms, the shape of a dent, and measured sensitivities
+of a camera."""
 
 from __future__ import annotations
 
@@ -21,9 +21,25 @@ from optics.scene.loader import Scene
 from optics.scene.mitsuba_parts import DEFAULT_VARIANT, use_variant
 
 CAMERA = Noise(system_gain=0.04, dark_noise=0.8, black_level=8.0, saturation=255.0, prnu=0.0)
-MAKERS = ("lens vignetting", "veiling glare", "lens blur", "colour crosstalk", "residual response curve", "interreflection",
-          "ambient light", "LED size", "gel absorption", "radial distortion", "gain drift", "gel wedge", "gel bulge",
-          "refraction at the window", "specular lobe", "gel haze", "dark offset")
+MAKERS = (
+    "lens vignetting",
+    "veiling glare",
+    "lens blur",
+    "colour crosstalk",
+    "residual response curve",
+    "interreflection",
+    "ambient light",
+    "LED size",
+    "gel absorption",
+    "radial distortion",
+    "gain drift",
+    "gel wedge",
+    "gel bulge",
+    "refraction at the window",
+    "specular lobe",
+    "gel haze",
+    "dark offset",
+)
 
 
 def presses(count: int, seed: int, width: float = 7.0, length: float = 5.0, depth: tuple[float, float] = (0.35, 0.8)):
@@ -31,8 +47,9 @@ def presses(count: int, seed: int, width: float = 7.0, length: float = 5.0, dept
     from scipy.stats import qmc
 
     cube = qmc.LatinHypercube(d=3, rng=np.random.default_rng([seed, 11])).random(count)
-    return np.column_stack([(cube[:, 0] - 0.5) * width, (cube[:, 1] - 0.5) * length,
-                            depth[0] + cube[:, 2] * (depth[1] - depth[0])])
+    return np.column_stack(
+        [(cube[:, 0] - 0.5) * width, (cube[:, 1] - 0.5) * length, depth[0] + cube[:, 2] * (depth[1] - depth[0])]
+    )
 
 
 class Maker:
@@ -42,13 +59,22 @@ class Maker:
     spp       samples per pixel; their noise is far below the photons'
     """
 
-    def __init__(self, scene: Scene, values: Mapping[str, float] | None = None, effects: Mapping[str, float] | None = None,
-                 noise: Noise = CAMERA, seed: int = 0, spp: int = 64):
+    def __init__(
+        self,
+        scene: Scene,
+        values: Mapping[str, float] | None = None,
+        effects: Mapping[str, float] | None = None,
+        noise: Noise = CAMERA,
+        seed: int = 0,
+        spp: int = 64,
+    ):
         self.values = {**scene.values(), **(values or {})}
         self.leds = list(scene.leds)
         self.gel, self.camera, self.membrane = scene.gel.name, scene.camera.name, next(iter(scene.membranes))
         self.size = scene.camera.resolution
-        self.frames = {n: np.array([[float(c[0]) for c in axis] for axis in led.frame]) for n, led in scene.leds.items()}
+        self.frames = {
+            n: np.array([[float(c[0]) for c in axis] for axis in led.frame]) for n, led in scene.leds.items()
+        }
         self.effects = dict(effects or {})
         unknown = set(self.effects) - set(MAKERS)
         if unknown:
@@ -57,9 +83,12 @@ class Maker:
         self.count = 0
         self.camera_z = float(scene.camera.columns[3].z[0])
         self.bands = np.array(scene.integrator.bands)
-        self.matrix = sensitivities(scene.camera.sensitivity, scene.integrator.bands)  # of the camera's channels, (3, 3)
+        self.matrix = sensitivities(
+            scene.camera.sensitivity, scene.integrator.bands
+        )  # of the camera's channels, (3, 3)
 
-    # -- the face ---------------------------------------------------------------------------------------------------------
+    # -- the face
+    # ---------------------------------------------------------------------------------------------------------
 
     def mesh(self, press: Sequence[float], pitch: float = 0.02):
         """The coated face on a grid three times as fine as the model's around the dent, with its exact normals."""
@@ -69,8 +98,9 @@ class Maker:
 
         v, g = self.values, self.gel
         profile = contact.indenter_profile(v[f"{g}.indenter"], v[f"{g}.indenter_size"], (0.0, 0.0, 0.0), 3.0, 0.03)
-        pressed, touch = contact.displacement(profile, press[2], v[f"{g}.thickness"], v[f"{g}.smoothing"],
-                                               skirt=v.get(f"{g}.skirt", 0.0))
+        pressed, touch = contact.displacement(
+            profile, press[2], v[f"{g}.thickness"], v[f"{g}.smoothing"], skirt=v.get(f"{g}.skirt", 0.0)
+        )
         width, length = v[f"{g}.width"], v[f"{g}.length"]
         x = contact.graded_axis(-width / 2, width / 2, press[0], 3.0, pitch, 481)
         y = contact.graded_axis(-length / 2, length / 2, press[1], 3.0, pitch, 481)
@@ -97,8 +127,12 @@ class Maker:
 
     def coating(self, rho: float) -> dict:
         v = self.values
-        return {"type": "membrane", "rho_r": float(rho), "sigma": float(v[f"{self.membrane}.sigma"]),
-                "specular": float(self.effects.get("specular lobe", 0.0))}
+        return {
+            "type": "membrane",
+            "rho_r": float(rho),
+            "sigma": float(v[f"{self.membrane}.sigma"]),
+            "specular": float(self.effects.get("specular lobe", 0.0)),
+        }
 
     # -- light ------------------------------------------------------------------------------------------------------------
 
@@ -107,11 +141,23 @@ class Maker:
 
         width, height = self.size
         looking = mi.ScalarTransform4f([[-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 1, self.camera_z], [0, 0, 0, 1]])
-        return {"type": "perspective", "fov": float(self.values[f"{self.camera}.x_fov"]), "fov_axis": "x",
-                "near_clip": 0.01, "far_clip": 1000.0, "to_world": looking,
-                "film": {"type": "hdrfilm", "width": width, "height": height, "rfilter": {"type": "box"},
-                         "pixel_format": "luminance", "component_format": "float32"},
-                "sampler": {"type": "multijitter", "sample_count": self.spp}}
+        return {
+            "type": "perspective",
+            "fov": float(self.values[f"{self.camera}.x_fov"]),
+            "fov_axis": "x",
+            "near_clip": 0.01,
+            "far_clip": 1000.0,
+            "to_world": looking,
+            "film": {
+                "type": "hdrfilm",
+                "width": width,
+                "height": height,
+                "rfilter": {"type": "box"},
+                "pixel_format": "luminance",
+                "component_format": "float32",
+            },
+            "sampler": {"type": "multijitter", "sample_count": self.spp},
+        }
 
     def emitter(self, led: str) -> dict:
         """The LED aimed by an axis of its own making: straight ahead, then panned and tilted to the true axis."""
@@ -119,11 +165,18 @@ class Maker:
         side, up, ahead = self.frames[led]
         axis = ahead + np.tan(np.radians(v[f"{led}.pan"])) * side + np.tan(np.radians(v[f"{led}.tilt"])) * up
         place = {n: float(v[f"{led}.{n}"]) for n in ("x", "y", "z", "mu")}
-        return {"type": "led", "power": 1.0, "target": [place["x"], place["y"], place["z"] + 1.0], **place,
-                "pan": float(np.degrees(np.arctan(axis[0] / axis[2]))), "tilt": float(np.degrees(np.arctan(axis[1] / axis[2])))}
+        return {
+            "type": "led",
+            "power": 1.0,
+            "target": [place["x"], place["y"], place["z"] + 1.0],
+            **place,
+            "pan": float(np.degrees(np.arctan(axis[0] / axis[2]))),
+            "tilt": float(np.degrees(np.arctan(axis[1] / axis[2]))),
+        }
 
     def colour(self, led: str) -> np.ndarray:
-        """(3,) share of an LED's power in each band: a Gaussian about its wavelength, or white, times its power per band."""
+        """(3,) share of an LED's power in each band: a Gaussian about its wavelength, or white, times its power per
+        band."""
         v = self.values
         peak, width = v[f"{led}.wavelength"], v[f"{led}.fwhm"]
         line = np.exp(-4 * np.log(2) * ((self.bands - peak) / width) ** 2) if peak > 0 else np.ones(3)
@@ -133,18 +186,34 @@ class Maker:
         """The LED as a disc across its axis, for the hidden effect "LED size"."""
         v = self.values
         place = {n: float(v[f"{led}.{n}"]) for n in ("x", "y", "z", "mu", "pan", "tilt")}
-        return {"type": "led", "power": 1.0, "area": float(self.effects["LED size"]), **place,
-                "target": [float(v[f"{led}.{c}"] + a) for c, a in zip("xyz", self.frames[led][2])]}
+        return {
+            "type": "led",
+            "power": 1.0,
+            "area": float(self.effects["LED size"]),
+            **place,
+            "target": [float(v[f"{led}.{c}"] + a) for c, a in zip("xyz", self.frames[led][2])],
+        }
 
     def scene(self, mesh, light: dict, depth: int):
         import mitsuba as mi
 
-        content = {"type": "scene", "integrator": {"type": "path", "max_depth": depth, "rr_depth": 1000},
-                   "sensor": self.sensor(), "face": mesh, "light": light}
+        content = {
+            "type": "scene",
+            "integrator": {"type": "path", "max_depth": depth, "rr_depth": 1000},
+            "sensor": self.sensor(),
+            "face": mesh,
+            "light": light,
+        }
         if "refraction at the window" in self.effects:
-            content["window"] = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -8]).rotate(
-                [1, 0, 0], 180).scale([30, 30, 1]), "bsdf": {"type": "dielectric", "ext_ior": 1.0, "int_ior": float(
-                    self.effects["refraction at the window"])}}
+            content["window"] = {
+                "type": "rectangle",
+                "to_world": mi.ScalarTransform4f().translate([0, 0, -8]).rotate([1, 0, 0], 180).scale([30, 30, 1]),
+                "bsdf": {
+                    "type": "dielectric",
+                    "ext_ior": 1.0,
+                    "int_ior": float(self.effects["refraction at the window"]),
+                },
+            }
         return mi.load_dict(content, optimize=False)
 
     def traced(self, scene, rho: float, led: str | None = None, depth: int = 2) -> np.ndarray:
@@ -160,7 +229,9 @@ class Maker:
         params.update()
         self.count += 1
         integrator = mi.load_dict({"type": "path", "max_depth": depth, "rr_depth": 1000})
-        return np.array(mi.render(scene, integrator=integrator, spp=self.spp, seed=self.seed * 100003 + self.count))[..., 0]
+        return np.array(mi.render(scene, integrator=integrator, spp=self.spp, seed=self.seed * 100003 + self.count))[
+            ..., 0
+        ]
 
     def light(self, press: Sequence[float]) -> dict[str, np.ndarray]:
         """{LED: (H, W, 3) radiance at power 1}, and under 'ambient' what no LED made."""
@@ -187,7 +258,10 @@ class Maker:
                     images[led] = self.through_gel(images[led], led, press)
                 images[led] = images[led] * self.colour(led)
             if "ambient light" in self.effects:
-                sky = {"type": "constant", "radiance": {"type": "uniform", "value": self.effects["ambient light"] / np.pi}}
+                sky = {
+                    "type": "constant",
+                    "radiance": {"type": "uniform", "value": self.effects["ambient light"] / np.pi},
+                }
                 images["ambient"] = self.traced(self.scene(mesh, sky, 2), 1.0)[..., None] * np.array(rho)
             return images
         finally:
@@ -203,7 +277,9 @@ class Maker:
         along = camera - point
 
         def inside(p, q):
-            rise = np.where(q[..., 2] < -thickness, (p[..., 2] + thickness) / np.maximum(p[..., 2] - q[..., 2], 1e-9), 1.0)
+            rise = np.where(
+                q[..., 2] < -thickness, (p[..., 2] + thickness) / np.maximum(p[..., 2] - q[..., 2], 1e-9), 1.0
+            )
             return np.linalg.norm(q - p, axis=-1) * np.clip(rise, 0, 1)
 
         view = inside(point, np.broadcast_to(camera, point.shape))
@@ -233,8 +309,9 @@ class Maker:
         y, x = np.mgrid[:height, :width] + 0.5
         direction = np.stack([(x - width / 2) / focal, (y - height / 2) / focal, np.ones_like(x)], -1)
         profile = contact.indenter_profile(v[f"{g}.indenter"], v[f"{g}.indenter_size"], (0.0, 0.0, 0.0), 3.0, 0.03)
-        pressed, _ = contact.displacement(profile, press[2], v[f"{g}.thickness"], v[f"{g}.smoothing"],
-                                               skirt=v.get(f"{g}.skirt", 0.0))
+        pressed, _ = contact.displacement(
+            profile, press[2], v[f"{g}.thickness"], v[f"{g}.smoothing"], skirt=v.get(f"{g}.skirt", 0.0)
+        )
         camera = np.array([0.0, 0.0, self.camera_z])
         z = np.zeros_like(x)
         for _ in range(12):
@@ -279,9 +356,15 @@ class Maker:
         n = self.noise
         return n.expose(n.black_level + (n.saturation - n.black_level) * signal + e.get("dark offset", 0.0), rng)
 
-    def captures(self, at: np.ndarray, drives: Sequence[Mapping[str, float]] | None = None, known_to: float = 0.0,
-                 cfa: str | None = None,
-                 progress: Callable[[str, int, int], None] | None = None, scene_name: str = "gelsight") -> capture_files.Captures:
+    def captures(
+        self,
+        at: np.ndarray,
+        drives: Sequence[Mapping[str, float]] | None = None,
+        known_to: float = 0.0,
+        cfa: str | None = None,
+        progress: Callable[[str, int, int], None] | None = None,
+        scene_name: str = "gelsight",
+    ) -> capture_files.Captures:
         """A capture set: every press under every lighting of `drives` (default: each LED alone).
 
         known_to   mm: standard deviation of the error of the press positions that are written down
@@ -299,17 +382,39 @@ class Maker:
                 if np.ndim(radiance) == 0:
                     radiance = np.zeros((*self.size[::-1], 3))
                 settings = {f"{led}.power": float(drive.get(led, 0.0)) for led in self.leds}
-                settings.update({f"{self.gel}.press_x": float(noted[0]), f"{self.gel}.press_y": float(noted[1]),
-                                 f"{self.gel}.press_depth": float(max(noted[2], 0.0))})
+                settings.update(
+                    {
+                        f"{self.gel}.press_x": float(noted[0]),
+                        f"{self.gel}.press_y": float(noted[1]),
+                        f"{self.gel}.press_depth": float(max(noted[2], 0.0)),
+                    }
+                )
                 on = "+".join(led for led, p in drive.items() if p) or "dark"
                 image = self.photograph(radiance, rng, len(frames)).astype(np.float32)
                 if cfa is not None:
                     image = np.take_along_axis(image, capture_files.cfa_channel(image.shape, cfa)[..., None], axis=2)
-                frames.append(capture_files.Frame(
-                    name=f"press{k:02d}-{on}", image=image, mask=None,
-                    group=f"press-{k:02d}", parameters=settings, repeats=[], file=f"frames/press{k:02d}-{on}.png"))
+                frames.append(
+                    capture_files.Frame(
+                        name=f"press{k:02d}-{on}",
+                        image=image,
+                        mask=None,
+                        group=f"press-{k:02d}",
+                        parameters=settings,
+                        repeats=[],
+                        file=f"frames/press{k:02d}-{on}.png",
+                    )
+                )
             if progress:
                 progress("captures", k + 1, len(at))
         return capture_files.Captures(
-            folder=Path("."), scene=scene_name, frames=frames, parameters={}, noise=self.noise, flat_field=None, cfa=cfa,
-            values_are="DN", table=None, warnings=[])
+            folder=Path("."),
+            scene=scene_name,
+            frames=frames,
+            parameters={},
+            noise=self.noise,
+            flat_field=None,
+            cfa=cfa,
+            values_are="DN",
+            table=None,
+            warnings=[],
+        )

@@ -1,10 +1,11 @@
-"""Sensors and benches of the proof, a file each: what can be hidden, by which independent path captures are made, how a study begins.
+"""Sensors and benches of the proof, a file each: what can be hidden, by which independent path captures are made, how a
+study begins.
 
-    base     what all of them are: strengths that make a change, the truth of a cell, captures with what is noted wrongly
-    touch    digit, gelsight: stock Mitsuba's `path` (optics.proof.makers.touch)
-    finger   vi2tap: stock films in the mono variant (optics.proof.makers.finger)
-    grid     grid_bench: stock `volpath` (optics.proof.makers.grid)
-    bench    polarizer_bench: coherency matrices (optics.proof.makers.bench)
+base     what all of them are: strengths that make a change, the truth of a cell, captures with what is noted wrongly
+touch    digit, gelsight: stock Mitsuba's `path` (optics.proof.makers.touch)
+finger   vi2tap: stock films in the mono variant (optics.proof.makers.finger)
+grid     grid_bench: stock `volpath` (optics.proof.makers.grid)
+bench    polarizer_bench: coherency matrices (optics.proof.makers.bench)
 """
 
 from optics.proof.rigs.base import Rig

@@ -1,4 +1,5 @@
-"""What all rigs are: strengths that make a given change, the truth of a cell, and captures as a workshop would hand them in."""
+"""What all rigs are: strengths that make a given change, the truth of a cell, and captures as a workshop would hand
+them in."""
 
 from __future__ import annotations
 
@@ -20,12 +21,14 @@ PATTERNS = {"pattern 0.3 %": 0.003, "pattern 1 %": 0.01}  # rms of one that nobo
 
 
 class Rig:
-    """A sensor or bench. Strengths are in the units of the effects' own parameters, from where the sensor without them has these.
+    """A sensor or bench. Strengths are in the units of the effects' own parameters, from where the sensor without them
+    has these.
 
     effects    that can be hidden;                       others     of these, with another law
     unknown    {kind: coordinates by any of which it is rightly named};        pairs, mistakes
     random     effects whose strength is a standard deviation over frames, not a value
-    free       what is calibrated (empty: the scene's own);                    defines   of the scene, for maker and model
+    free       what is calibrated (empty: the scene's own);                    defines   of the scene, for maker and
+               model
     """
 
     name = ""
@@ -43,23 +46,29 @@ class Rig:
     def __init__(self):
         self._strengths: dict[tuple[str, float], float] = {}
 
-    # -- what a sensor says of itself -----------------------------------------------------------------------------------
+    # -- what a sensor says of itself
+    # -----------------------------------------------------------------------------------
 
-    def captures(self, cell: Cell, truth: Mapping[str, float], unknown: Mapping[str, float], *, mean: bool = False) -> capture_files.Captures:
-        """Frames with {effect: strength} or {unknown kind: size} in them; `mean`: as they are in the mean, without noise."""
+    def captures(
+        self, cell: Cell, truth: Mapping[str, float], unknown: Mapping[str, float], *, mean: bool = False
+    ) -> capture_files.Captures:
+        """Frames with {effect: strength} or {unknown kind: size} in them; `mean`: as they are in the mean, without
+        noise."""
         raise NotImplementedError
 
     def strength_of(self, effect: str, change: float) -> float:
         raise NotImplementedError
 
     def parameters(self, effect: str) -> tuple[dict[str, float], float] | None:
-        """({key: weight}, start) of the sum of parameters that a hidden strength is, from its start; None: nothing to compare with."""
+        """({key: weight}, start) of the sum of parameters that a hidden strength is, from its start; None: nothing to
+        compare with."""
         raise NotImplementedError
 
-    # -- what follows ---------------------------------------------------------------------------------------------------
+    # -- what follows
+    # ---------------------------------------------------------------------------------------------------
 
     def strength(self, effect: str, change: float) -> float:
-        """That changes the picture by so much (rms over mean, before any calibration); inf where none does."""
+        """That changes the image by so much (rms over mean, before any calibration); inf where none does."""
         if (effect, change) not in self._strengths:
             self._strengths[effect, change] = change if effect in self.random else self.strength_of(effect, change)
         return self._strengths[effect, change]
@@ -73,7 +82,9 @@ class Rig:
 
     def unknown_change(self, cell: Cell) -> float:
         """Rms change over the mean signal by an unknown kind of size 1, in the maker's own means."""
-        plain, changed = (self._signal(self.captures(cell, {}, unknown, mean=True)) for unknown in ({}, {cell.hidden[0]: 0.01}))
+        plain, changed = (
+            self._signal(self.captures(cell, {}, unknown, mean=True)) for unknown in ({}, {cell.hidden[0]: 0.01})
+        )
         return change_of(changed, plain) / 0.01
 
     @staticmethod
@@ -97,14 +108,22 @@ class Rig:
         return truth
 
     def setup(self, folder: Path, seed: int) -> loop.Setup:
-        return loop.Setup(captures=str(folder), defines=dict(self.defines), free=list(self.free), per_group=[], seed=seed,
-                          held_out=None if self.held_out is None else list(self.held_out))
+        return loop.Setup(
+            captures=str(folder),
+            defines=dict(self.defines),
+            free=list(self.free),
+            per_group=[],
+            seed=seed,
+            held_out=None if self.held_out is None else list(self.held_out),
+        )
 
 
-class Pictures(Rig):
-    """A rig whose strengths the model's noise-free pictures tell: that sets how much is hidden, and takes no part in the making.
+class ImageRig(Rig):
+    """A rig whose strengths the model's noise-free images tell: that sets how much is hidden, and takes no part in the
+    making.
 
-    several   {effect: keys} that a hidden strength moves together, where it is not the first parameter of the effect alone
+    several   {effect: keys} that a hidden strength moves together, where it is not the first parameter of the effect
+              alone
     most      {effect: strength} that the sensor can have, where that is less than the parameter's bounds
     frames    of a set that strengths are found from
     """
@@ -132,7 +151,7 @@ class Pictures(Rig):
         from optics.scene.parameter import Values
 
         captures = self.captures(Cell(self.name, "none", (), 0.0, 0.0, "same", "", 0), {}, {}, mean=True)
-        captures.frames = captures.frames[:self.frames]
+        captures.frames = captures.frames[: self.frames]
         scene = self.scene()  # after the captures, whose makers work in another variant
         built, keys = self.built(scene, 0), self.keys(scene, effect)
         start = {key: self.start(scene, key) for key in keys}  # a scene's values follow its predictions
@@ -144,8 +163,12 @@ class Pictures(Rig):
             return np.minimum(images, captures.noise.saturation) - captures.noise.black_level
 
         plain, first = signal(0.0), scene.parameters[keys[0]]
-        return strength_at(change, lambda s: change_of(signal(s), plain), 0.1 * first.plausible,
-                           self.most.get(effect, first.bounds[1] - start[keys[0]]))
+        return strength_at(
+            change,
+            lambda s: change_of(signal(s), plain),
+            0.1 * first.plausible,
+            self.most.get(effect, first.bounds[1] - start[keys[0]]),
+        )
 
     def parameters(self, effect: str) -> tuple[dict[str, float], float] | None:
         if effect in self.random:
@@ -161,7 +184,8 @@ def change_of(image: np.ndarray, plain: np.ndarray) -> float:
 
 
 def strength_at(change: float, changed_by: Callable[[float], float], start: float, most: float) -> float:
-    """The strength whose change of the picture is so large, by secant steps in the logarithm; inf where `most` does not reach it."""
+    """The strength whose change of the image is so large, by secant steps in the logarithm; inf where `most` does not
+    reach it."""
     if changed_by(most) < change:
         return math.inf
     trial = min(start, most)
@@ -175,7 +199,7 @@ def strength_at(change: float, changed_by: Callable[[float], float], start: floa
     return trial
 
 
-# -- what is written down wrongly, or done to pictures ------------------------------------------------------------------
+# -- what is written down wrongly, or done to images ------------------------------------------------------------------
 
 
 def noted(noise: Noise, mistake: str) -> Noise:
@@ -200,7 +224,8 @@ def demosaiced(image: np.ndarray) -> np.ndarray:
     return np.stack(out, -1).astype(np.float32)
 
 
-# -- makers from a workshop ---------------------------------------------------------------------------------------------
+# -- makers from a workshop
+# ---------------------------------------------------------------------------------------------
 
 
 class Mean:
@@ -222,7 +247,7 @@ def smooth(shape: tuple[int, int], sd: float, rng: np.random.Generator) -> np.nd
     return found / found.std()
 
 
-# gains of order 1 over the picture: u across it, v down it, r from its middle to its corners, all to 1
+# gains of order 1 over the image: u across it, v down it, r from its middle to its corners, all to 1
 SCREENS: dict[str, Callable] = {
     "stain": lambda u, v, r: np.exp(-(((u - 0.7) / 0.12) ** 2 + ((v - 0.35) / 0.1) ** 2) / 2),
     "banding": lambda u, v, r: np.sin(2 * np.pi * 2.6 * v + 0.5),
@@ -232,14 +257,23 @@ SCREENS: dict[str, Callable] = {
 
 
 class Workshop:
-    """For a maker's class: clutter of the camera, gains that no library knows, and effects by another law, about its own `photograph`.
+    """For a maker's class: clutter of the camera, gains that no library knows, and effects by another law, about its
+    own `photograph`.
 
-    The maker brings values, effects, noise, seed, size, and a photograph(radiance, rng, frame) that ends in noise.expose.
-    """
+    The maker brings values, effects, noise, seed, size, and a photograph(radiance, rng, frame) that ends in
+    noise.expose."""
 
-    def furnish(self, unknown: Mapping[str, float], kinds, clutter: float = 0.0, other: bool = False, pattern: float | None = None) -> None:
+    def furnish(
+        self,
+        unknown: Mapping[str, float],
+        kinds,
+        clutter: float = 0.0,
+        other: bool = False,
+        pattern: float | None = None,
+    ) -> None:
         """unknown   {kind: size}: the signal gains (1 + size p), p of order 1
-        clutter   1 is what a good sensor has;   pattern   rms of a fixed pattern of the sensor, in place of the clutter's
+        clutter   1 is what a good sensor has;   pattern   rms of a fixed pattern of the sensor, in place of the
+                  clutter's
         other     effects act in `lens` and `sensed`, not in the maker's own photograph
         """
         if lacking := set(unknown) - set(kinds):
@@ -247,7 +281,9 @@ class Workshop:
         self.unknown, self.clutter, self.other = dict(unknown), float(clutter), other
         width, height = self.size
         rng = np.random.default_rng([self.seed, 17])
-        self.pattern = (self.clutter * PATTERN if pattern is None else pattern) * rng.standard_normal((height, width, 3))
+        self.pattern = (self.clutter * PATTERN if pattern is None else pattern) * rng.standard_normal(
+            (height, width, 3)
+        )
 
     def gain(self, kind: str, size: float, frame: int, press) -> np.ndarray:
         """(H, W, 1 or 3) gain by a kind that the library lacks."""
@@ -273,4 +309,6 @@ class Workshop:
         signal = (mean - noise.black_level) / (noise.saturation - noise.black_level)
         if self.other:
             signal = self.sensed(signal, frame)
-        return noise.expose(noise.black_level + (noise.saturation - noise.black_level) * signal * (1 + self.pattern), rng)
+        return noise.expose(
+            noise.black_level + (noise.saturation - noise.black_level) * signal * (1 + self.pattern), rng
+        )

@@ -1,8 +1,10 @@
-"""`polarizer_bench`: readings of a photodiode behind two or three films, by coherency matrices (optics.proof.makers.bench).
+"""`polarizer_bench`: readings of a photodiode behind two or three films, by coherency matrices
+(optics.proof.makers.bench).
 
-    clutter    c = 1: the lamp wanders by 0.3 % rms in some minutes, the analyser is off its dial by 0.05 deg rms from reading to reading
-    law        "other": effects with the same cause and size as the library's, but another law, as in OTHER
-    unknown    what the library does not have, as in UNKNOWN
+clutter    c = 1: the lamp wanders by 0.3 % rms in some minutes, the analyser is off its dial by 0.05 deg rms from
+           reading to reading
+law        "other": effects with the same cause and size as the library's, but another law, as in OTHER
+unknown    what the library does not have, as in UNKNOWN
 """
 
 from __future__ import annotations
@@ -25,8 +27,12 @@ PHOTODIODE = Noise(0.01, 1.0, 64.0, 4095.0, 0.0)  # 400 000 electrons: 0.3 % at 
 GAIN = 2.0  # full scale per unit radiance
 WANDER, JITTER = 0.003, 0.05  # of the lamp, rms relative; deg rms of the analyser; at clutter 1
 # kind -> coordinates by any of which it is rightly named
-UNKNOWN = {"third harmonic": ("analyzer.angle",), "warm-up": ("source.time",), "lamp step": ("source.power",),
-           "smeared film": ("polarizer.angle",)}
+UNKNOWN = {
+    "third harmonic": ("analyzer.angle",),
+    "warm-up": ("source.time",),
+    "lamp step": ("source.power",),
+    "smeared film": ("polarizer.angle",),
+}
 
 # effect -> how the other law differs from that of the library, with its strength s; what is not here has one law only
 OTHER = {
@@ -44,9 +50,12 @@ OTHER = {
 }
 
 
-def bench_light(truth: jones.Truth, settings: jones.Settings, noise: Noise = PHOTODIODE, turned: np.ndarray | None = None) -> np.ndarray:
-    """(n, 1) mean of readings above black, DN, at settings in the model's keys: films that are out (`middle.inserted`, ...) and the
-    exposure too, which `jones` knows as parts of the bench. `turned`: deg by which the analyser is off its dial."""
+def bench_light(
+    truth: jones.Truth, settings: jones.Settings, noise: Noise = PHOTODIODE, turned: np.ndarray | None = None
+) -> np.ndarray:
+    """(n, 1) mean of readings above black, DN, at settings in the model's keys: films that are out (`middle.inserted`,
+    ...) and the exposure too, which `jones` knows as parts of the bench. `turned`: deg by which the analyser is off its
+    dial."""
     turned = np.zeros(len(settings)) if turned is None else turned
     light = np.zeros((len(settings), 1))
     sets = [(s.get("middle.inserted", 0.0), s.get("camera.exposure", 1.0)) for s in settings]
@@ -54,7 +63,10 @@ def bench_light(truth: jones.Truth, settings: jones.Settings, noise: Noise = PHO
         own = [i for i, s in enumerate(sets) if s == (middle, exposure)]
         film = replace(truth.p1, offset=0.0, scale=1.0, backlash=0.0) if middle else None  # of the same roll
         bench = replace(truth, pm=film, photodiode=replace(truth.photodiode, gain=truth.photodiode.gain * exposure))
-        dials = [{k: v for k, v in settings[i].items() if k in jones.DEFAULTS and (middle or not k.startswith("middle."))} for i in own]
+        dials = [
+            {k: v for k, v in settings[i].items() if k in jones.DEFAULTS and (middle or not k.startswith("middle."))}
+            for i in own
+        ]
         for i, dial in zip(own, dials):
             dial["analyzer.angle"] = dial["analyzer.angle"] + turned[i]
         light[own] = jones.expected(bench, dials, noise) - noise.black_level
@@ -62,11 +74,14 @@ def bench_light(truth: jones.Truth, settings: jones.Settings, noise: Noise = PHO
 
 
 def other_light(effect: str, s: float, settings: jones.Settings, turned: np.ndarray | None = None) -> np.ndarray:
-    """`bench_light` with one effect of strength s by its law of OTHER: by turned dials, and by mixtures of benches, as light adds up."""
+    """`bench_light` with one effect of strength s by its law of OTHER: by turned dials, and by mixtures of benches, as
+    light adds up."""
     plain = jones.with_effects({}, GAIN)
     turned = np.zeros(len(settings)) if turned is None else turned
-    dial, turn, time, power, way = (np.array([row.get(key, jones.DEFAULTS[key]) for row in settings])[:, None]
-                                    for key in ("analyzer.angle", "sample.angle", "source.time", "source.power", "analyzer.approach"))
+    dial, turn, time, power, way = (
+        np.array([row.get(key, jones.DEFAULTS[key]) for row in settings])[:, None]
+        for key in ("analyzer.angle", "sample.angle", "source.time", "source.power", "analyzer.approach")
+    )
     psi, warmed = np.radians(dial), 1 - np.exp(-time / 8.0)
 
     def lit(truth: jones.Truth = plain, off: np.ndarray | float = 0.0) -> np.ndarray:
@@ -78,13 +93,17 @@ def other_light(effect: str, s: float, settings: jones.Settings, turned: np.ndar
     if effect == "servo scale":
         return lit(off=s * dial**2 / 360)
     if effect == "servo backlash":
-        back = np.flatnonzero(np.diff(way[:, 0], prepend=np.nan) != 0)  # readings before which it turned back, the first among them
+        back = np.flatnonzero(
+            np.diff(way[:, 0], prepend=np.nan) != 0
+        )  # readings before which it turned back, the first among them
         since = np.abs(dial - dial[back[np.searchsorted(back, np.arange(len(dial)), side="right") - 1]])
         return lit(off=s * way * (np.minimum(since / 20, 1) - 0.5))
     if effect == "analyzer wobble":
         return lit() * (1 + s * (np.cos(psi) + 0.5 * np.cos(2 * psi)))
     if effect == "retardance":
-        return lit(replace(plain, sample=jones.Sample(retardance=s / 2, axis=5.0, stress_retardance=s / 2, stress_axis=35.0)))
+        return lit(
+            replace(plain, sample=jones.Sample(retardance=s / 2, axis=5.0, stress_retardance=s / 2, stress_axis=35.0))
+        )
     if effect == "camera gamma":
         swing = PHOTODIODE.saturation - PHOTODIODE.black_level
         m = lit() / swing
@@ -109,18 +128,28 @@ def other_light(effect: str, s: float, settings: jones.Settings, turned: np.ndar
 
 def gain(kind: str, settings: jones.Settings) -> np.ndarray:
     """(n, 1) relative gain of the readings, less 1, by a kind of UNKNOWN of size 1."""
-    analyzer, polarizer, time, power = (np.array([s.get(key, jones.DEFAULTS[key]) for s in settings])[:, None]
-                                        for key in ("analyzer.angle", "polarizer.angle", "source.time", "source.power"))
-    return {"third harmonic": lambda: np.cos(3 * np.radians(analyzer)),
-            "warm-up": lambda: -np.exp(-time / 4.0),
-            "lamp step": lambda: (power < 0.75).astype(float),
-            "smeared film": lambda: -((polarizer > 80) & (polarizer < 120)).astype(float)}[kind]()
+    analyzer, polarizer, time, power = (
+        np.array([s.get(key, jones.DEFAULTS[key]) for s in settings])[:, None]
+        for key in ("analyzer.angle", "polarizer.angle", "source.time", "source.power")
+    )
+    return {
+        "third harmonic": lambda: np.cos(3 * np.radians(analyzer)),
+        "warm-up": lambda: -np.exp(-time / 4.0),
+        "lamp step": lambda: (power < 0.75).astype(float),
+        "smeared film": lambda: -((polarizer > 80) & (polarizer < 120)).astype(float),
+    }[kind]()
 
 
-def sweep(light: Callable[..., np.ndarray], settings: jones.Settings, seed: int, unknown: Mapping[str, float] | None = None,
-          clutter: float = 0.0, mean: bool = False) -> capture_files.Captures:
-    """Readings of a bench as a capture set with a table. `light(settings, turned=)`: `bench_light` or `other_light` of a bench;
-    see the module for `unknown` and `clutter`."""
+def sweep(
+    light: Callable[..., np.ndarray],
+    settings: jones.Settings,
+    seed: int,
+    unknown: Mapping[str, float] | None = None,
+    clutter: float = 0.0,
+    mean: bool = False,
+) -> capture_files.Captures:
+    """Readings of a bench as a capture set with a table. `light(settings, turned=)`: `bench_light` or `other_light` of
+    a bench; see the module for `unknown` and `clutter`."""
     rng = np.random.default_rng([seed, 19])
     count = len(settings)
     signal = light(settings, turned=clutter * JITTER * rng.standard_normal(count))
@@ -130,41 +159,87 @@ def sweep(light: Callable[..., np.ndarray], settings: jones.Settings, seed: int,
     values = PHOTODIODE.black_level + signal
     values = values if mean else PHOTODIODE.expose(values, rng)
     keys = list(dict.fromkeys(key for s in settings for key in s))
-    frames = [capture_files.Frame(f"row {i}", value.astype(np.float32).reshape(1, 1, -1),
-                                  parameters={key: float(s.get(key, jones.DEFAULTS.get(key, 0.0))) for key in keys})
-              for i, (s, value) in enumerate(zip(settings, values))]
-    return capture_files.Captures(Path("."), "polarizer_bench", frames, noise=PHOTODIODE, table=capture_files.Table("readings.csv", ["reading"]))
+    frames = [
+        capture_files.Frame(
+            f"row {i}",
+            value.astype(np.float32).reshape(1, 1, -1),
+            parameters={key: float(s.get(key, jones.DEFAULTS.get(key, 0.0))) for key in keys},
+        )
+        for i, (s, value) in enumerate(zip(settings, values))
+    ]
+    return capture_files.Captures(
+        Path("."), "polarizer_bench", frames, noise=PHOTODIODE, table=capture_files.Table("readings.csv", ["reading"])
+    )
 
 
 class Bench(Rig):
-    """600 readings: five angles of P1, the analyser round and back, two powers
-    of the lamp, two angles of the sample; a third of them with a film put in between, or at 0.15 of the exposure, as `optics diagnose`
-    advises: without, a leak looks like a hazy sample, and stray light like an offset."""
+    """600 readings: five angles of P1, the analyser round and back, two powers of the lamp, two angles of the sample; a
+    third of them with a film put in between, or at 0.15 of the exposure, as `optics diagnose` advises: without, a leak
+    looks like a hazy sample, and stray light like an offset."""
 
     name = "polarizer_bench"
-    effects = ("polarizer misalignment", "servo scale", "servo backlash", "analyzer wobble", "retardance", "camera gamma", "polarized source",
-               "extinction leak", "depolarization", "dark offset", "stray light", "source drift")
+    effects = (
+        "polarizer misalignment",
+        "servo scale",
+        "servo backlash",
+        "analyzer wobble",
+        "retardance",
+        "camera gamma",
+        "polarized source",
+        "extinction leak",
+        "depolarization",
+        "dark offset",
+        "stray light",
+        "source drift",
+    )
     others, unknown = tuple(OTHER), UNKNOWN
     mistakes = ("gain +20 %", "gain -20 %", "black level 0.5 DN")
     # of the rest, the sum of two looks like another: leak and depolarization, offset and stray light
     # and an angle too far on average, which is what a scale does: of opposite sign they leave nothing to be seen
-    pairs = [p for p in pairs_of([e for e in effects if e not in ("depolarization", "stray light")])
-             if set(p) != {"polarizer misalignment", "servo scale"}]
+    pairs = [
+        p
+        for p in pairs_of([e for e in effects if e not in ("depolarization", "stray light")])
+        if set(p) != {"polarizer misalignment", "servo scale"}
+    ]
     count = 600
-    most = {"polarizer misalignment": 20, "servo scale": 0.2, "servo backlash": 20, "analyzer wobble": 0.4, "retardance": 80, "camera gamma": 1,
-            "polarized source": 0.9, "extinction leak": 0.3, "depolarization": 0.9, "dark offset": 500, "stray light": 1.0, "source drift": 0.03}
+    most = {
+        "polarizer misalignment": 20,
+        "servo scale": 0.2,
+        "servo backlash": 20,
+        "analyzer wobble": 0.4,
+        "retardance": 80,
+        "camera gamma": 1,
+        "polarized source": 0.9,
+        "extinction leak": 0.3,
+        "depolarization": 0.9,
+        "dark offset": 500,
+        "stray light": 1.0,
+        "source drift": 0.03,
+    }
     # what of the effect's parameters the readings know: of two films' misalignments, the difference
     seen: Mapping[str, tuple[dict[str, float], float]] = {
-        "polarizer misalignment": ({"analyzer.offset": 1.0, "polarizer.offset": -1.0}, 0.0), "servo scale": ({"analyzer.scale": 1.0}, 1.0),
-        "servo backlash": ({"analyzer.backlash": 1.0}, 0.0), "analyzer wobble": ({"analyzer.wobble_c": 1.0}, 0.0),
-        "camera gamma": ({"camera.gamma": 1.0}, 0.0), "depolarization": ({"sample.depolarization": 1.0}, 0.0),
-        "dark offset": ({"camera.offset": 1.0}, 0.0), "source drift": ({"source.drift": 1.0}, 0.0)}
+        "polarizer misalignment": ({"analyzer.offset": 1.0, "polarizer.offset": -1.0}, 0.0),
+        "servo scale": ({"analyzer.scale": 1.0}, 1.0),
+        "servo backlash": ({"analyzer.backlash": 1.0}, 0.0),
+        "analyzer wobble": ({"analyzer.wobble_c": 1.0}, 0.0),
+        "camera gamma": ({"camera.gamma": 1.0}, 0.0),
+        "depolarization": ({"sample.depolarization": 1.0}, 0.0),
+        "dark offset": ({"camera.offset": 1.0}, 0.0),
+        "source drift": ({"source.drift": 1.0}, 0.0),
+    }
 
     def settings(self) -> list[dict[str, float]]:
         found = jones.malus_sweep(self.count, polarizer_angles=(0.0, 60.0, 100.0, 190.0, 250.0))
         for i, own in enumerate(found):
-            own.update({"source.power": (1.0, 0.5)[i % 2], "sample.angle": (0.0, 45.0)[i // 2 % 2], "middle.inserted": float(i // 4 % 6 == 0),
-                        "middle.angle": 20.0, "camera.exposure": 0.15 if i // 4 % 6 == 1 else 1.0})
+            own.update(
+                {
+                    "source.power": (1.0, 0.5)[i % 2],
+                    "sample.angle": (0.0, 45.0)[i // 2 % 2],
+                    "middle.inserted": float(i // 4 % 6 == 0),
+                    "middle.angle": 20.0,
+                    "camera.exposure": 0.15 if i // 4 % 6 == 1 else 1.0,
+                }
+            )
         return found
 
     def light(self, hidden: Mapping[str, float]) -> Callable[..., np.ndarray]:
@@ -175,7 +250,9 @@ class Bench(Rig):
 
     def strength_of(self, effect: str, change: float) -> float:
         plain = self.mean({})
-        return strength_at(change, lambda s: change_of(self.mean({effect: s}), plain), 0.01 * self.most[effect], self.most[effect])
+        return strength_at(
+            change, lambda s: change_of(self.mean({effect: s}), plain), 0.01 * self.most[effect], self.most[effect]
+        )
 
     def captures(self, cell: Cell, truth, unknown, *, mean: bool = False) -> capture_files.Captures:
         light = partial(other_light, *next(iter(truth.items()))) if cell.law == "other" else self.light(truth)

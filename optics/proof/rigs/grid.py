@@ -1,4 +1,5 @@
-"""`grid_bench`: a small printed grid, a rod at three distances, by stock Mitsuba's `volpath` (optics.proof.makers.grid)."""
+"""`grid_bench`: a small printed grid, a rod at three distances, by stock Mitsuba's `volpath`
+(optics.proof.makers.grid)."""
 
 from __future__ import annotations
 
@@ -7,23 +8,30 @@ import numpy as np
 from optics.captures import capture_set as capture_files
 from optics.proof.cells import Cell
 from optics.proof.makers.grid import CAMERA, GridMaker
-from optics.proof.rigs.base import Mean, Pictures
+from optics.proof.rigs.base import ImageRig, Mean
 from optics.scene import loader as scenes
 
 
-class Grid(Pictures):
-    """A matt rod at three distances, lit by one panel after the other; one distance is held out. 8 bits, 800 electrons: what the stock integrator
-    can give in minutes is noisier than a better camera. Clutter and kinds that the library lacks are not made; which cell was
-    not filled is no strength."""
+class Grid(ImageRig):
+    """A matt rod at three distances, lit by one panel after the other; one distance is held out. 8 bits, 800 electrons:
+    what the stock integrator can give in minutes is noisier than a better camera. Clutter and kinds that the library
+    lacks are not made; which cell was not filled is no strength."""
 
     name = "grid_bench"
     effects = ("volume scattering", "rough walls", "index mismatch", "body absorption", "wall thickness")
     mistakes = ("gain +20 %", "gain -20 %")
     cluttered = False
     free = ("panel_*.power",)
-    defines = {"rays": "1024", "packets": "100000"}  # the model's error is then a quarter of the camera's noise, which it adds to it
+    defines = {
+        "rays": "1024",
+        "packets": "100000",
+    }  # the model's error is then a quarter of the camera's noise, which it adds to it
     held_out = ("distance-01",)
-    several = {"rough walls": ("filling.roughness",), "index mismatch": ("filling.index_offset",), "body absorption": ("filling.absorption",)}
+    several = {
+        "rough walls": ("filling.roughness",),
+        "index mismatch": ("filling.index_offset",),
+        "body absorption": ("filling.absorption",),
+    }
     most = {"wall thickness": 0.3}
     uncounted = ("index mismatch",)  # free are both indices
     distances = (2.5, 4.0, 6.0)
@@ -38,8 +46,18 @@ class Grid(Pictures):
 
     def captures(self, cell: Cell, truth, unknown, *, mean: bool = False) -> capture_files.Captures:
         scene = scenes.load(self.name, {"width": str(self.width), "height": str(self.height)})
-        hidden = {e: s + (self.start(scene, self.keys(scene, e)[0]) if e != "wall thickness" else 0.0) for e, s in truth.items()}
-        maker = GridMaker(scene, self.built(scene, cell.seed), hidden, Mean(CAMERA) if mean else CAMERA, 1000 + cell.seed, 64 if mean else self.spp)
+        hidden = {
+            e: s + (self.start(scene, self.keys(scene, e)[0]) if e != "wall thickness" else 0.0)
+            for e, s in truth.items()
+        }
+        maker = GridMaker(
+            scene,
+            self.built(scene, cell.seed),
+            hidden,
+            Mean(CAMERA) if mean else CAMERA,
+            1000 + cell.seed,
+            64 if mean else self.spp,
+        )
         found = maker.captures(self.distances)
         found.noise = CAMERA
         return found

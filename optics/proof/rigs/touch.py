@@ -1,8 +1,10 @@
-"""Sensors that see a pressed gel lit by LEDs: `digit` and `gelsight`, by stock Mitsuba's path tracer on meshes of its own.
+"""Sensors that see a pressed gel lit by LEDs: `digit` and `gelsight`, by stock Mitsuba's path tracer on meshes of its
+own.
 
 `Wild` is `optics.proof.makers.touch.Maker` as it comes from a workshop, with
 
-    clutter    c = 1: fixed pattern of the sensor 0.5 % rms, mottle of the coating 1 % rms (0.4 mm), wrinkles of the skin of 0.3 deg rms,
+    clutter    c = 1: fixed pattern of the sensor 0.5 % rms, mottle of the coating 1 % rms (0.4 mm), wrinkles of the
+               skin of 0.3 deg rms,
                the same in every frame; of these no effect of the library knows (diagnosis laboratory, 3.4)
     shape      "other": effects with the same cause and size as the library's, but another law, as in OTHER
     unknown    what the library does not have, as in UNKNOWN
@@ -21,24 +23,34 @@ from optics.captures.noise import Noise
 from optics.proof import demo
 from optics.proof.cells import Cell, pairs_of
 from optics.proof.makers import touch as synthetic
-from optics.proof.rigs.base import PATTERNS, Mean, Pictures, Workshop, smooth
+from optics.proof.rigs.base import PATTERNS, ImageRig, Mean, Workshop, smooth
 from optics.scene import loader as scenes
 
-CAMERA = Noise(system_gain=0.1, dark_noise=2.0, black_level=256.0, saturation=4095.0, prnu=0.0)  # 12 bits, 38 000 electrons
+CAMERA = Noise(
+    system_gain=0.1, dark_noise=2.0, black_level=256.0, saturation=4095.0, prnu=0.0
+)  # 12 bits, 38 000 electrons
 MOTTLE, WRINKLE = 0.01, 0.3  # rms: of the coating, deg of the skin's slope; at clutter 1
 GRAIN = 0.4  # mm: of mottle and wrinkles
-IN_CAMERA = ("lens vignetting", "veiling glare", "lens blur", "colour crosstalk", "residual response curve", "radial distortion", "gain drift",
-             "dark offset")
+IN_CAMERA = (
+    "lens vignetting",
+    "veiling glare",
+    "lens blur",
+    "colour crosstalk",
+    "residual response curve",
+    "radial distortion",
+    "gain drift",
+    "dark offset",
+)
 
 # effect -> how the other law differs; what is not here has one law only
 OTHER = {
     "lens vignetting": "1 - 2 a t^2 (1 + 0.6 t^2/t_max^2) of the tangent t, as measured lenses fall off, for cos^(4 a)",
-    "veiling glare": "light spreads over a fifth of the picture, not over all of it",
+    "veiling glare": "light spreads over a fifth of the image, not over all of it",
     "lens blur": "an even disc of the same variance, for a Gaussian",
     "colour crosstalk": "three times as much between neighbours in wavelength as between red and blue",
     "residual response curve": "bent more in the shadows: k s (1 - s) (1.6 - 1.2 s)",
     "interreflection": "all bounces, for one",
-    "ambient light": "half as much again on one side of the picture as in the middle, half as much on the other",
+    "ambient light": "half as much again on one side of the image as in the middle, half as much on the other",
     "LED size": "a bar along the LED's first side, of the same variance as the disc",
     "gel absorption": "a tenth stronger in red, a tenth weaker in blue",
     "radial distortion": "k (r^2 + r^4/r_max^2)/2",
@@ -48,19 +60,38 @@ OTHER = {
 }
 # kind -> coordinates by any of which it is rightly named
 UNKNOWN = {
-    "stain": ("place",), "banding": ("row",), "tap": ("column",), "ring": ("radius",), "height gain": ("height", "gel_path"),
-    "slope gain": ("slope",), "contact film": ("contact", "contact_distance"), "red drift": ("frame",),
+    "stain": ("place",),
+    "banding": ("row",),
+    "tap": ("column",),
+    "ring": ("radius",),
+    "height gain": ("height", "gel_path"),
+    "slope gain": ("slope",),
+    "contact film": ("contact", "contact_distance"),
+    "red drift": ("frame",),
 }
+
 
 class Wild(Workshop, synthetic.Maker):
     """A maker of frames with clutter, laws of another shape, and kinds that the library lacks: see `Workshop.furnish`.
 
-    kept   pictures of presses, by geometry: makers that share them make only what differs anew
+    kept   images of presses, by geometry: makers that share them make only what differs anew
     """
 
-    def __init__(self, scene, values=None, effects=None, noise: Noise | Mean = CAMERA, seed: int = 0, spp: int = 256, *,
-                 unknown: Mapping[str, float] | None = None, clutter: float = 0.0, other: bool = False, pattern: float | None = None,
-                 kept: dict | None = None):
+    def __init__(
+        self,
+        scene,
+        values=None,
+        effects=None,
+        noise: Noise | Mean = CAMERA,
+        seed: int = 0,
+        spp: int = 256,
+        *,
+        unknown: Mapping[str, float] | None = None,
+        clutter: float = 0.0,
+        other: bool = False,
+        pattern: float | None = None,
+        kept: dict | None = None,
+    ):
         super().__init__(scene, values, effects, noise, seed, spp)
         if other and (lacking := set(self.effects) - set(OTHER)):
             raise ValueError(f"{', '.join(sorted(lacking))}: one law only; allowed with another: {', '.join(OTHER)}")
@@ -68,7 +99,9 @@ class Wild(Workshop, synthetic.Maker):
         self.kept = {} if kept is None else kept
         width, height = self.size
         rng = np.random.default_rng([seed, 18])
-        self.mottle = self.clutter * MOTTLE * smooth((height, width), GRAIN / (2 * self._half() / width), rng)[..., None]
+        self.mottle = (
+            self.clutter * MOTTLE * smooth((height, width), GRAIN / (2 * self._half() / width), rng)[..., None]
+        )
         self.wrinkle = smooth((256, 256), GRAIN / (24.0 / 256), rng)  # over 24 mm
 
     def _half(self) -> float:
@@ -81,7 +114,8 @@ class Wild(Workshop, synthetic.Maker):
         y, x = np.mgrid[:height, :width] + 0.5
         return (x - width / 2) / focal, (y - height / 2) / focal
 
-    # -- the face -------------------------------------------------------------------------------------------------------
+    # -- the face
+    # -------------------------------------------------------------------------------------------------------
 
     def mesh(self, press: Sequence[float], pitch: float = 0.02):
         import mitsuba as mi
@@ -107,7 +141,9 @@ class Wild(Workshop, synthetic.Maker):
         normals[:, 0] -= sign[:, 0] * slope_x
         normals[:, 1] -= sign[:, 0] * slope_y
         params["vertex_positions"] = mi.Float(points.astype(np.float32).ravel())
-        params["vertex_normals"] = mi.Float((normals / np.linalg.norm(normals, axis=1, keepdims=True)).astype(np.float32).ravel())
+        params["vertex_normals"] = mi.Float(
+            (normals / np.linalg.norm(normals, axis=1, keepdims=True)).astype(np.float32).ravel()
+        )
         params.update()
         return mesh
 
@@ -119,7 +155,9 @@ class Wild(Workshop, synthetic.Maker):
         coefficients = spline_filter(self.wrinkle, order=3, mode="grid-wrap")
 
         def at(dx=0.0, dy=0.0):
-            return map_coordinates(coefficients, [(y + dy) / step + 128, (x + dx) / step + 128], order=3, mode="grid-wrap", prefilter=False)
+            return map_coordinates(
+                coefficients, [(y + dy) / step + 128, (x + dx) / step + 128], order=3, mode="grid-wrap", prefilter=False
+            )
 
         h = 0.01
         rise, slope_x, slope_y = at(), (at(h) - at(-h)) / (2 * h), (at(0, h) - at(0, -h)) / (2 * h)
@@ -130,8 +168,13 @@ class Wild(Workshop, synthetic.Maker):
     # -- light ----------------------------------------------------------------------------------------------------------
 
     def light(self, press: Sequence[float]) -> dict[str, np.ndarray]:
-        key = (self.seed, self.clutter, self.other, tuple(np.round(press, 9)),
-               tuple(sorted((n, s) for n, s in self.effects.items() if n not in IN_CAMERA)))
+        key = (
+            self.seed,
+            self.clutter,
+            self.other,
+            tuple(np.round(press, 9)),
+            tuple(sorted((n, s) for n, s in self.effects.items() if n not in IN_CAMERA)),
+        )
         if key not in self.kept:
             while len(self.kept) > 60:
                 self.kept.pop(next(iter(self.kept)))
@@ -151,7 +194,8 @@ class Wild(Workshop, synthetic.Maker):
         return self._bar(scene, rho, depth)
 
     def _bar(self, scene, rho, depth):
-        """Three points along the LED's side with the variance of a disc of the area A along a line, A/(4 pi) (scene: of the disc)."""
+        """Three points along the LED's side with the variance of a disc of the area A along a line, A/(4 pi) (scene: of
+        the disc)."""
         import mitsuba as mi
 
         light = mi.traverse(scene)
@@ -173,10 +217,12 @@ class Wild(Workshop, synthetic.Maker):
         for band, share in enumerate((1.1, 1.0, 0.9)):
             own = {"gel absorption": effects["gel absorption"] * share} if "gel absorption" in effects else {}
             self.effects = {**effects, **own}
-            bands.append(super().through_gel(image[..., band:band + 1], led, press))
+            bands.append(super().through_gel(image[..., band : band + 1], led, press))
         self.effects = effects
         out = np.concatenate(bands, -1)
-        if "gel haze" in effects:  # the veil alone, weighed by the phase function's ratio at the mean angle of the picture
+        if (
+            "gel haze" in effects
+        ):  # the veil alone, weighed by the phase function's ratio at the mean angle of the image
             self.effects = {"gel absorption": effects["gel haze"]}
             clear = super().through_gel(image, led, press)
             self.effects = effects
@@ -232,7 +278,9 @@ class Wild(Workshop, synthetic.Maker):
         if "colour crosstalk" in e:
             k = e["colour crosstalk"]
             near, far = 1.5 * k, 0.5 * k
-            signal = signal @ np.array([[1 - near - far, near, far], [near, 1 - 2 * near, near], [far, near, 1 - near - far]])
+            signal = signal @ np.array(
+                [[1 - near - far, near, far], [near, 1 - 2 * near, near], [far, near, 1 - near - far]]
+            )
         if "residual response curve" in e:
             signal = signal + e["residual response curve"] * signal * (1 - signal) * (1.6 - 1.2 * signal)
         return signal
@@ -256,9 +304,11 @@ class Wild(Workshop, synthetic.Maker):
 
         v, g = self.values, self.gel
         profile = contact.indenter_profile(v[f"{g}.indenter"], v[f"{g}.indenter_size"], (0.0, 0.0, 0.0), 3.0, 0.03)
-        return contact.displacement(profile, press[2], v[f"{g}.thickness"], v[f"{g}.smoothing"], skirt=v.get(f"{g}.skirt", 0.0))[1]
+        return contact.displacement(
+            profile, press[2], v[f"{g}.thickness"], v[f"{g}.smoothing"], skirt=v.get(f"{g}.skirt", 0.0)
+        )[1]
 
-    def shoot(self, shots: Sequence["Shot"], scene_name: str) -> capture_files.Captures:
+    def shoot(self, shots: Sequence[Shot], scene_name: str) -> capture_files.Captures:
         """A capture set of these shots."""
         rng = np.random.default_rng([self.seed, 3])
         frames = []
@@ -270,7 +320,9 @@ class Wild(Workshop, synthetic.Maker):
             settings |= {f"{self.gel}.press_{n}": float(v) for n, v in zip(("x", "y", "depth"), shot.press)}
             settings[f"{self.camera}.exposure"] = float(self.values[f"{self.camera}.exposure"] * shot.exposure)
             image = self.photograph(radiance, rng, number, shot.press, shot.exposure).astype(np.float32)
-            frames.append(capture_files.Frame(shot.name, image, None, shot.group, settings, [], f"frames/{shot.name}.png"))
+            frames.append(
+                capture_files.Frame(shot.name, image, None, shot.group, settings, [], f"frames/{shot.name}.png")
+            )
         return capture_files.Captures(Path("."), scene_name, frames, {}, self.noise, None, None, "DN", None, [])
 
 
@@ -294,15 +346,31 @@ def _disc(radius: float) -> np.ndarray:
     return kernel / kernel.sum()
 
 
-# -- the sensors --------------------------------------------------------------------------------------------------------
+# -- the sensors
+# --------------------------------------------------------------------------------------------------------
 
 
-class Touch(Pictures):
+class Touch(ImageRig):
     """12 bits, 38 000 electrons: noise of 1 % at the mean signal of a bright frame."""
 
-    effects = ("lens vignetting", "veiling glare", "lens blur", "colour crosstalk", "residual response curve", "interreflection",
-               "ambient light", "LED size", "gel absorption", "radial distortion", "gain drift", "gel wedge", "gel bulge", "specular lobe",
-               "gel haze", "dark offset")
+    effects = (
+        "lens vignetting",
+        "veiling glare",
+        "lens blur",
+        "colour crosstalk",
+        "residual response curve",
+        "interreflection",
+        "ambient light",
+        "LED size",
+        "gel absorption",
+        "radial distortion",
+        "gain drift",
+        "gel wedge",
+        "gel bulge",
+        "specular lobe",
+        "gel haze",
+        "dark offset",
+    )
     others = tuple(OTHER)
     unknown = UNKNOWN
     random = ("gain drift",)
@@ -324,31 +392,41 @@ class Touch(Pictures):
 
     def captures(self, cell: Cell, truth, unknown, *, mean: bool = False) -> capture_files.Captures:
         scene = self.scene()
-        maker = Wild(scene, self.built(scene, cell.seed), truth, Mean(CAMERA) if mean else CAMERA, 1000 + cell.seed, unknown=unknown,
-                     clutter=cell.clutter, other=cell.law == "other", pattern=PATTERNS.get(cell.mistake), kept=self.kept)
+        maker = Wild(
+            scene,
+            self.built(scene, cell.seed),
+            truth,
+            Mean(CAMERA) if mean else CAMERA,
+            1000 + cell.seed,
+            unknown=unknown,
+            clutter=cell.clutter,
+            other=cell.law == "other",
+            pattern=PATTERNS.get(cell.mistake),
+            kept=self.kept,
+        )
         found = maker.shoot(self.shots(scene, cell.seed), self.name)
         found.noise = CAMERA
         return found
 
 
 class Digit(Touch):
-    """Ten presses lit by red, green and blue LEDs at once, one of them at 0.4 of the exposure as well, and a dark frame; three of the
-    presses are held out."""
+    """Ten presses lit by red, green and blue LEDs at once, one of them at 0.4 of the exposure as well, and a dark
+    frame; three of the presses are held out."""
 
     name = "digit"
     pairs = pairs_of([e for e in Touch.effects if e not in ("interreflection", "gain drift")])
     width, height, exposure = 36, 48, 700.0
 
     def shots(self, scene, seed: int) -> list[Shot]:
-        everything = {led: 1.0 for led in scene.leds}
+        everything = dict.fromkeys(scene.leds, 1.0)
         at = [tuple(float(v) for v in p) for p in synthetic.presses(10, seed)]
         shots = [Shot(f"press{k:02d}", f"press-{k:02d}", p, everything) for k, p in enumerate(at)]
         return [*shots, Shot("press00-short", "press-00", at[0], everything, 0.4), Shot("dark", "press-00", at[0], {})]
 
 
 class Gelsight(Touch):
-    """Eight presses under two of the six white LEDs each, one after the other; one of them at 0.4 of the exposure as well, and a dark
-    frame; two of the presses are held out. White light hardly shows crosstalk between colours."""
+    """Eight presses under two of the six white LEDs each, one after the other; one of them at 0.4 of the exposure as
+    well, and a dark frame; two of the presses are held out. White light hardly shows crosstalk between colours."""
 
     name = "gelsight"
     effects = tuple(e for e in Touch.effects if e != "colour crosstalk")
@@ -362,4 +440,8 @@ class Gelsight(Touch):
             for step in (0, len(leds) // 2):
                 led = leds[(k + step) % len(leds)]
                 shots.append(Shot(f"press{k:02d}-{led}", f"press-{k:02d}", press, {led: 1.0}))
-        return [*shots, Shot("press00-short", "press-00", at[0], {leds[0]: 1.0}, 0.4), Shot("dark", "press-00", at[0], {})]
+        return [
+            *shots,
+            Shot("press00-short", "press-00", at[0], {leds[0]: 1.0}, 0.4),
+            Shot("dark", "press-00", at[0], {}),
+        ]

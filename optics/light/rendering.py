@@ -1,19 +1,20 @@
-"""One picture of a scene with everything that is known of it: what `optics render` and `optics batch` write.
+"""One image of a scene with everything that is known of it: what `optics render` and `optics batch` write.
 
-A sensor of this program's parts is rendered LED by LED, without noise (optics.light.renderer), through polarizing layers as well. Every
-other Mitsuba scene, and a sensor beside stock lights or behind stock glass, goes through `mi.render`, with the variance of each
-mean. An EXR holds
+A sensor of this program's parts is rendered LED by LED, without noise (optics.light.renderer), through polarizing
+layers as well. Every other Mitsuba scene, and a sensor beside stock lights or behind stock glass, goes through
+`mi.render`, with the variance of each mean. An EXR holds
 
     R, G, B                      preview, linear sRGB; of a sensor times its exposure, so that 1 is full scale
-    S0.610,000000nm ...          radiance per band; S1 to S3 in scenes with layers, and where the integrator has `stokes`
+    S0.610,000000nm ...          radiance per band; S1 to S3 in scenes with layers, and where the integrator has
+                                 `stokes`
     depth.Z                      mm from the camera along its axis; infinite where a ray met nothing
     normal.X, .Y, .Z             of the surface, in the scene's frame
     contact.Y                    1 where the indenter touches what is seen
     led_1.R, .G, .B ...          what one LED sends, in the first three bands; with the ambient light they add up to S0
     variance.*                   variance of the mean of a Monte Carlo channel
 
-and its provenance: scene and plugins by hash, every parameter, versions, seed. It names no place and no time, so that on
-one thread (optics.study.batch) the same input gives the same bytes; with several, sums may differ in their last bit.
+and its provenance: scene and plugins by hash, every parameter, versions, seed. It names no place and no time, so that
+on one thread (optics.study.batch) the same input gives the same bytes; with several, sums may differ in their last bit.
 """
 
 from __future__ import annotations
@@ -42,12 +43,13 @@ LAYERS = ("spectral", "aov", "leds")
 
 
 @dataclass
-class Picture:
-    """A rendered picture.
+class Rendering:
+    """A rendered image.
 
     channels   EXR name -> (H, W)
     header     EXR header
-    camera     (H, W, C) DN of the camera, free of noise and not clipped; None for scenes without a camera of this program's
+    camera     (H, W, C) DN of the camera, free of noise and not clipped; None for scenes without a camera of this
+               program's
     """
 
     channels: dict[str, np.ndarray]
@@ -55,10 +57,10 @@ class Picture:
     camera: np.ndarray | None = None
 
     def stokes(self) -> tuple[np.ndarray, np.ndarray]:
-        """Bands in nm (B,) and Stokes vectors (H, W, B, 4); raises ValueError where the picture has none."""
+        """Bands in nm (B,) and Stokes vectors (H, W, B, 4); raises ValueError where the image has none."""
         bands, vectors = exr.spectral_image(self.channels)
         if vectors.shape[3] != 4:
-            raise ValueError("the picture holds no Stokes vectors: S0 only; allowed: pictures with S0 to S3")
+            raise ValueError("the image holds no Stokes vectors: S0 only; allowed: images with S0 to S3")
         return bands, vectors
 
     def write_exr(self, path: Path) -> Path:
@@ -72,17 +74,26 @@ class Picture:
         return exr.write_png(path, np.nan_to_num(np.stack([self.channels[n] for n in names], -1)))
 
 
-class Pictures:
-    """Makes pictures of one scene, with other values each time.
+class RenderJob:
+    """Makes images of one scene, with other values each time.
 
     black, saturation   DN, of the camera
     spp                 samples per pixel: render by Monte Carlo, even where LED by LED is possible
     stokes              S1 to S3 in every scene; without it, where there are layers or the integrator has `stokes`
-    method              "LED by LED", "from lights and camera" (clear bodies), or why the scene goes through `mi.render`
+    method              "LED by LED", "from lights and camera" (dielectric bodies), or why the scene goes through
+                        `mi.render`
     """
 
-    def __init__(self, scene: Scene, *, spp: int | None = None, black: float = 0.0, saturation: float = 255.0,
-                 layers: Sequence[str] = LAYERS, stokes: bool = False):
+    def __init__(
+        self,
+        scene: Scene,
+        *,
+        spp: int | None = None,
+        black: float = 0.0,
+        saturation: float = 255.0,
+        layers: Sequence[str] = LAYERS,
+        stokes: bool = False,
+    ):
         if spp is not None and spp < 1:
             raise ValueError(f"spp = {spp}; allowed: whole numbers from 1 on (samples per pixel)")
         self.scene, self.spp, self.layers = scene, spp, tuple(layers)
@@ -91,52 +102,74 @@ class Pictures:
         if len(sensors) != 1:
             raise BadScene(f"{scene.path}: {len(sensors)} cameras; one is allowed: write one <sensor>")
         if not scene.mitsuba.emitters():
-            raise BadScene(f"{scene.path}: no light; add an LED, <emitter type=\"led\" id=\"led_1\">, or another emitter")
+            raise BadScene(f'{scene.path}: no light; add an LED, <emitter type="led" id="led_1">, or another emitter')
         if scene.mitsuba.integrator() is None:
-            raise BadScene(f"{scene.path}: no integrator; add <integrator type=\"tactile\" id=\"integrator\">, or another one")
+            raise BadScene(
+                f'{scene.path}: no integrator; add <integrator type="tactile" id="integrator">, or another one'
+            )
         if stokes and not (scene.integrator is not None and scene.integrator.bands and "polarized" in scene.variant):
-            raise BadScene(f"{scene.path}: no Stokes vectors from this integrator and the variant {scene.variant}; allowed: the "
-                           "integrator 'tactile' with `bands`, and a variant with 'polarized' in its name")
+            raise BadScene(
+                f"{scene.path}: no Stokes vectors from this integrator and the variant {scene.variant}; allowed: the "
+                "integrator 'tactile' with `bands`, and a variant with 'polarized' in its name"
+            )
         reason = "samples per pixel were asked for" if spp is not None else obstacle(scene, chance=True)
-        if not reason and stokes and (scene.by_chance or not paths.layered(scene)):
+        if not reason and stokes and (scene.monte_carlo or not paths.layered(scene)):
             reason = "Stokes vectors were asked for of a scene without layers"
-        if reason and scene.by_chance and scene.leds:
-            raise BadScene(f"{scene.path}: {reason}, but mi.render brings no light of an LED, which is a point, through clear bodies; allowed: "
-                           "without --spp and --stokes, or luminous areas (emitters of the type 'source') in place of LEDs")
+        if reason and scene.monte_carlo and scene.leds:
+            raise BadScene(
+                f"{scene.path}: {reason}, but mi.render brings no light of an LED, which is a point, through dielectric bodies; allowed: "
+                "without --spp and --stokes, or luminous areas (emitters of the type 'source') in place of LEDs"
+            )
         self.renderer = None if reason else renderer_of(scene, remember=2)
         if self.renderer is not None and self.renderer.layered:
             reason = veiled(self.renderer, self.base)
             self.renderer = None if reason else self.renderer
         self.stokes = stokes or paths.layered(scene) or (scene.integrator is not None and scene.integrator.stokes)
-        self.method = f"Monte Carlo: {reason}" if reason else "from lights and camera" if self.renderer.by_chance else "LED by LED"
+        self.method = (
+            f"Monte Carlo: {reason}"
+            if reason
+            else "from lights and camera"
+            if self.renderer.monte_carlo
+            else "LED by LED"
+        )
         self.developer = None
         if scene.camera is not None and scene.integrator is not None:
             self.bands = scene.integrator.bands
             self.developer = Developer(scene.camera, self.bands or (0.0,), black, saturation)
-        self.record = {"scene": scene_record(scene), "plugins": plugins_record(), "variant": scene.variant,
-                       "method": self.method, "versions": versions()}
+        self.record = {
+            "scene": scene_record(scene),
+            "plugins": plugins_record(),
+            "variant": scene.variant,
+            "method": self.method,
+            "versions": versions(),
+        }
 
     @property
     def exact(self) -> bool:
-        """Whether pictures are made LED by LED."""
+        """Whether images are made LED by LED."""
         return self.renderer is not None
 
-    def take(self, values: Mapping[str, float | str] | None = None, seed: int = 0, lit: Sequence[str] | None = None,
-             progress: Callable[[str, int, int], None] | None = None) -> Picture:
-        """The picture for values that replace the scene's; lit: the lights that are on (None: all with power)."""
-        if self.exact and self.renderer.by_chance:
+    def take(
+        self,
+        values: Mapping[str, float | str] | None = None,
+        seed: int = 0,
+        lit: Sequence[str] | None = None,
+        progress: Callable[[str, int, int], None] | None = None,
+    ) -> Rendering:
+        """The image for values that replace the scene's; lit: the lights that are on (None: all with power)."""
+        if self.exact and self.renderer.monte_carlo:
             self.renderer.progress = progress
         now = {**self.base, **self.scene.check(values or {})}
         if lit is not None:
             now.update({f"{led}.power": 0.0 for led in self.scene.lights if led not in lit})
-        picture = self._exact(now, seed) if self.renderer is not None else self._monte_carlo(now, seed)
-        picture.header["provenance"] = {**self.record, "seed": seed, "parameters": now}
+        image = self._exact(now, seed) if self.renderer is not None else self._monte_carlo(now, seed)
+        image.header["provenance"] = {**self.record, "seed": seed, "parameters": now}
         pressed = None if self.scene.block is None else self.scene.block.press()
         if pressed is not None:
-            picture.header["provenance"]["press"] = {"force": [float(f) for f in pressed.force], "unit": "N"}
-        return picture
+            image.header["provenance"]["press"] = {"force": [float(f) for f in pressed.force], "unit": "N"}
+        return image
 
-    def _exact(self, now: Mapping, seed: int) -> Picture:
+    def _exact(self, now: Mapping, seed: int) -> Rendering:
         renderer = self.renderer
         alone = {light: renderer.light(now, light, seed) for light in renderer.lit(now)}
         totals = [sum(alone.values(), renderer.ambient(now))]
@@ -148,15 +181,15 @@ class Pictures:
         if "leds" in self.layers:
             for light, image in alone.items():
                 channels.update(zip((f"{light}.{n}" for n in self._band_names()), np.moveaxis(image, -1, 0)))
-        if renderer.by_chance:
+        if renderer.monte_carlo:
             scatter = renderer.error(now) ** 2
             scatter = exr.spectral_channels(self.bands, scatter) if self.bands else {"Y": scatter[..., 0]}
             channels.update({f"variance.{name}": image for name, image in scatter.items() if name in channels})
         header = exr.spectral_header(renderer.layered, UNITS) if self.bands else {}
         self.scene.set(now)  # the renderer leaves the LEDs at power 1
-        return Picture(channels, header, self.developer.develop(totals[0], now))
+        return Rendering(channels, header, self.developer.develop(totals[0], now))
 
-    def _monte_carlo(self, now: Mapping, seed: int) -> Picture:
+    def _monte_carlo(self, now: Mapping, seed: int) -> Rendering:
         scene = self.scene
         scene.set(now)
         polarized, ours = "polarized" in scene.variant, scene.integrator is not None
@@ -184,12 +217,16 @@ class Pictures:
         channels.update({f"variance.{name}": image for name, image in variance.items() if name in channels})
         if "aov" in self.layers:
             channels.update(self._surface(self._hits(), now))
-        header = {**(exr.spectral_header(self.stokes, UNITS) if radiance is not None and self.bands else {}), "samplesPerPixel": spp}
+        header = {
+            **(exr.spectral_header(self.stokes, UNITS) if radiance is not None and self.bands else {}),
+            "samplesPerPixel": spp,
+        }
         camera = self.developer.develop(radiance, now) if radiance is not None else None
-        return Picture(channels, header, camera)
+        return Rendering(channels, header, camera)
 
     def _passes(self, seed: int) -> tuple[dict, dict, int]:
-        """Mean and variance of the mean of every channel by name, and the samples per pixel; passes of different seeds."""
+        """Mean and variance of the mean of every channel by name, and the samples per pixel; passes of different
+        seeds."""
         import mitsuba as mi
 
         sensor = self.scene.mitsuba.sensors()[0]
@@ -240,7 +277,9 @@ class Pictures:
             if self.developer is not None:
                 si, weight, origin = self.scene.integrator.hits(scene, self.scene.camera, u, v)
             else:
-                ray, _ = sensor.sample_ray(mi.Float(0), mi.Float(0.5), mi.Point2f(u / width, v / height), mi.Point2f(0.5))
+                ray, _ = sensor.sample_ray(
+                    mi.Float(0), mi.Float(0.5), mi.Point2f(u / width, v / height), mi.Point2f(0.5)
+                )
                 si, weight, origin = scene.ray_intersect(ray), None, ray.o
         return Hits(Sample(si, weight, origin), height, width)
 
@@ -268,8 +307,10 @@ class Pictures:
         camera = self.scene.camera
         if camera is not None:
             width, height = camera.resolution
-            o, d = camera.ray(mi.Float(width / 2 + now[f"{camera.name}.principal_x"]),
-                              mi.Float(height / 2 + now[f"{camera.name}.principal_y"]))
+            o, d = camera.ray(
+                mi.Float(width / 2 + now[f"{camera.name}.principal_x"]),
+                mi.Float(height / 2 + now[f"{camera.name}.principal_y"]),
+            )
         else:
             pose = self.scene.mitsuba.sensors()[0].world_transform()
             o, d = pose @ mi.Point3f(0), pose @ mi.Vector3f(0, 0, 1)
@@ -277,7 +318,8 @@ class Pictures:
 
 
 def obstacle(scene: Scene, chance: bool = False) -> str:
-    """Why a scene cannot be rendered LED by LED; empty where it can. chance: clear bodies are none, as light is followed by chance."""
+    """Why a scene cannot be rendered LED by LED; empty where it can. chance: dielectric bodies are none, as light is
+    followed by Monte Carlo."""
     import mitsuba as mi
 
     if scene.camera is None or scene.integrator is None or not scene.lights:
@@ -305,7 +347,8 @@ def obstacle(scene: Scene, chance: bool = False) -> str:
 
 
 def polarizes(bsdf) -> bool:
-    """Whether a surface makes polarized light of unpolarized light, or keeps polarization; in unpolarized variants nothing does."""
+    """Whether a surface makes polarized light of unpolarized light, or keeps polarization; in unpolarized variants
+    nothing does."""
     import drjit as dr
     import mitsuba as mi
 
@@ -314,18 +357,25 @@ def polarizes(bsdf) -> bool:
     n = 64
     rng = np.random.default_rng(0)
     si = dr.zeros(mi.SurfaceInteraction3f, n)
-    si.t, si.n, si.sh_frame, si.uv = mi.Float(1), mi.Normal3f(0, 0, 1), mi.Frame3f(mi.Vector3f(0, 0, 1)), mi.Point2f(0.5)
+    si.t, si.n, si.sh_frame, si.uv = (
+        mi.Float(1),
+        mi.Normal3f(0, 0, 1),
+        mi.Frame3f(mi.Vector3f(0, 0, 1)),
+        mi.Point2f(0.5),
+    )
     if mi.is_spectral:
         si.wavelengths = mi.UnpolarizedSpectrum(540.0)
-    si.wi, wo = (mi.warp.square_to_uniform_hemisphere(mi.Point2f(*rng.random((2, n)).astype(np.float32))) for _ in range(2))
+    si.wi, wo = (
+        mi.warp.square_to_uniform_hemisphere(mi.Point2f(*rng.random((2, n)).astype(np.float32))) for _ in range(2)
+    )
     matrix = bsdf.eval(mi.BSDFContext(), si, wo)
     own = [np.abs(np.array(matrix[i, j])).max() for i in range(4) for j in range(4)]
     return max(own[1:]) > 1e-5 * own[0]  # rounding leaves 1e-7
 
 
 def veiled(renderer: Renderer, values: Mapping) -> str:
-    """What LEDs light the picture through layers, by more than a thousandth of their light: LED by LED, a layer in the way of
-    their light is taken for a wall. Empty for none."""
+    """What LEDs light the image through layers, by more than a thousandth of their light: LED by LED, a layer in the
+    way of their light is taken for a wall. Empty for none."""
     import drjit as dr
     import mitsuba as mi
 
@@ -347,14 +397,21 @@ def veiled(renderer: Renderer, values: Mapping) -> str:
                 if not np.any(np.array(going)):
                     break
             if np.any(np.array(behind)):
-                light = [scene.integrator.direct(scene.mitsuba, hits.si, 1.0, hits.origin, led, way) for way in (seen, behind)]
-                direct, through = (np.array([float(np.array(a[i]).sum()) for i in range(renderer.bands)]) for a in light)
+                light = [
+                    scene.integrator.direct(scene.mitsuba, hits.si, 1.0, hits.origin, led, way)
+                    for way in (seen, behind)
+                ]
+                direct, through = (
+                    np.array([float(np.array(a[i]).sum()) for i in range(renderer.bands)]) for a in light
+                )
                 if np.any(through > 1e-3 * direct):
                     found.append(name)
     return f"the light of {' and '.join(found)} passes layers before it meets anything" if found else ""
 
 
-# -- provenance ---------------------------------------------------------------------------------------------------------
+# -- provenance
+# ---------------------------------------------------------------------------------------------------------
+
 
 def scene_record(scene: Scene) -> dict:
     """Name and hash of the scene file, its definitions, and the hash of every file that it names."""
@@ -367,14 +424,22 @@ def scene_record(scene: Scene) -> dict:
             if (folder / name).is_file():
                 files[Path(name).name] = file_hash(folder / name)
                 break
-    return {"name": scene.path.name, "hash": file_hash(scene.path), "files": dict(sorted(files.items())),
-            "defines": {k: str(v) for k, v in sorted(scene.defines.items())}}
+    return {
+        "name": scene.path.name,
+        "hash": file_hash(scene.path),
+        "files": dict(sorted(files.items())),
+        "defines": {k: str(v) for k, v in sorted(scene.defines.items())},
+    }
 
 
 def plugins_record() -> dict[str, str]:
     """Plugin file, relative to its folder, -> hash."""
-    return {file.relative_to(folder).as_posix(): file_hash(file) for folder in registry().folders
-            for file in sorted(folder.rglob("*.py")) if not file.name.startswith("_")}
+    return {
+        file.relative_to(folder).as_posix(): file_hash(file)
+        for folder in registry().folders
+        for file in sorted(folder.rglob("*.py"))
+        if not file.name.startswith("_")
+    }
 
 
 # -- files --------------------------------------------------------------------------------------------------------------
