@@ -20,7 +20,7 @@ endif
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test bench proof lock clean
+.PHONY: help setup demo test docs bench proof lock clean
 
 help:  ## list these targets
 	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /  make \1\t/' | expand -t 16
@@ -43,6 +43,11 @@ demo: setup  ## run the demonstration
 test: setup  ## run the tests, but for the slow ones
 	@$(BIN)/pytest -q -m "not slow" $(ARGS)
 
+docs: setup  ## build the documentation into build/docs
+	@$(BIN)/python -W error -m sphinx -q -W --keep-going -d build/doctrees docs build/docs $(ARGS)
+	@$(BIN)/python docs/tools/links.py build/docs
+	@echo "build/docs/index.html"
+
 bench: setup  ## measure the speed
 	@$(BIN)/python -m optics.proof.speed $(ARGS)
 
@@ -51,7 +56,7 @@ proof: setup  ## hide effects, run the loop blind on each, count what it said (h
 
 lock:  ## resolve requirements.lock again from pyproject.toml (newest versions: make lock ARGS=--upgrade)
 	@command -v uv >/dev/null || { echo "make lock needs uv: pip install uv" >&2; exit 1; }
-	uv pip compile pyproject.toml --extra test --group build --universal --python-version 3.10 --generate-hashes \
+	uv pip compile pyproject.toml --extra test --extra docs --group build --universal --python-version 3.10 --generate-hashes \
 	    --no-annotate --no-emit-index-url --no-emit-find-links --custom-compile-command "make lock" --quiet \
 	    --output-file requirements.lock $(ARGS)
 

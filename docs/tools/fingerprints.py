@@ -74,6 +74,8 @@ SHOWN: dict[str, tuple[View, tuple[str, ...] | None]] = {
     "colour-crosstalk": (COLOURED, None),  # white light on a grey skin has no colour to mix
     "dark-offset": (ONE_SIDE, None),
     "veiling-glare": (ONE_SIDE, None),
+    # a shallow dent, whose long skirt ends within the fine part of the mesh
+    "exponential-skirt": (View("gelsight", {"width": "240", "height": "180", "depth": "0.3", "radius": "1.2"}, SIDES), None),
     "led-size": (ONE_SIDE, None),  # one light: rims of shadows
     "height-fall-off": (ONE_SIDE, None),
     "specular-lobe": (ONE_SIDE, None),
@@ -94,9 +96,9 @@ SHOWN: dict[str, tuple[View, tuple[str, ...] | None]] = {
     ),
     "coloured-leak": (View("polarizer_bench", {"bands": "620, 540, 460"}, {}, "analyzer.angle"), None),
     "oblique-leak": (
-        View("polarizer_bench", {"width": "180", "height": "180", "x_fov": "30", "analyzer": "90"}),
+        View("polarizer_bench", {"width": "180", "height": "180", "x_fov": "11", "analyzer": "90"}),
         None,
-    ),  # crossed, and seen obliquely
+    ),  # crossed, and seen obliquely, as far as the films reach
     "coloured-absorption": (
         View(GRID.scene, GRID.defines, {"walls.absorption": 0.05, "filling.absorption": 0.05}),
         None,
@@ -131,7 +133,8 @@ class Shot:
         from optics.light.polarimetry import sweep
 
         x = np.linspace(*self.view.span, 73)
-        now = {k: v for k, v in now.items() if k != self.view.along}
+        # all values, as a sweep leaves those of its own in the scene
+        now = {k: v for k, v in {**self.job.base, **now}.items() if k != self.view.along}
         return np.asarray(sweep(self.scene, self.view.along, x, (0, 0), now).curves[0].y, float)
 
 
@@ -190,13 +193,13 @@ def draw(effect, reg) -> dict:
 
 
 def panels(key: str, without: np.ndarray, image: np.ndarray) -> float:
-    """without | with | change; returns the change in DN that is drawn black or white."""
+    """without | with | change; returns the change in DN that is drawn nearly black or white."""
     from PIL import Image
 
     change = image - without
     scale = max(float(np.quantile(np.abs(change), 0.998)), 1e-9)
     white = max(float(np.quantile(without, 0.999)), float(np.quantile(image, 0.999)), 1e-9)
-    shown = [without / white, image / white, 0.5 + 0.5 * change / scale]
+    shown = [without / white, image / white, 0.5 + 0.4 * change / scale]  # an even change stays off pure white
     if shown[0].shape[2] == 1:
         shown = [np.repeat(s, 3, axis=2) for s in shown]
     enlarge = max(PANEL // shown[0].shape[1], 1)
