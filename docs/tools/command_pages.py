@@ -1,4 +1,4 @@
-"""Writes the reference of the command line from the program itself: what `optics COMMAND --help` says, command by command."""
+"""Writes the reference of the command line from the program itself: what `optics COMMAND --help` says."""
 
 from __future__ import annotations
 
@@ -42,8 +42,8 @@ def write_page(file: Path) -> None:
     finally:
         os.environ.pop("COLUMNS") if before is None else os.environ.update(COLUMNS=before)
     head = (
-        "# Commands\n\nWritten from the program: `optics COMMAND --help` says the same. Every command takes `--quiet` (no "
-        "progress, no remarks) and `--debug` (where in the program an error came from)."
+        "# Commands\n\nWritten from the program: `optics COMMAND --help` says the same. Every command takes `--quiet` "
+        "(no progress, no remarks) and `--debug` (where in the program an error came from)."
     )
     overview = ":::{container} wide\n| command | what it does |\n|---|---|\n"
     overview += "\n".join(f"| [`{n}`](#{n}) | {escaped(sentence(t))} |" for n, t in texts.items()) + "\n:::"

@@ -35,9 +35,7 @@ def reshaped(lines: list[str]) -> list[str]:
 def escaped(line: str) -> str:
     """A line without markup; `code` becomes ``code``."""
     pieces = re.split(r"(`[^`]+`)", line)
-    return "".join(
-        f"`{p}`" if p.startswith("`") and len(p) > 1 else re.sub(r"([\\*_|`])", r"\\\1", p) for p in pieces
-    )
+    return "".join(f"`{p}`" if p.startswith("`") and len(p) > 1 else re.sub(r"([\\*_|`])", r"\\\1", p) for p in pieces)
 
 
 def process(app, what, name, obj, options, lines) -> None:

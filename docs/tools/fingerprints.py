@@ -2,13 +2,13 @@
 
     python docs/tools/fingerprints.py [EFFECT ...] [--missing]
 
-A scene is rendered with the effect at rest and with it in force; the figure shows both and their difference. The strength
-is the plausible one, multiplied by the first of 1, 2, 5, 10, 20 ... that changes the image visibly. Effects of polarizers
-and sheets are shown as the readings of a photodiode against an angle. Every effect that a scan finds gets a figure without
-an entry anywhere; `SHOWN` only chooses a better view for those whose first view says little.
+A scene is rendered with the effect at rest and with it in force; the figure shows both and their difference. The
+strength is the plausible one, multiplied by the first of 1, 2, 5, 10, 20 ... that changes the image visibly. Effects of
+polarizers and sheets are shown as the readings of a photodiode against an angle. Every effect that a scan finds gets a
+figure without an entry anywhere; `SHOWN` only chooses a better view for those whose first view says little.
 
-Writes docs/fingerprints/KEY.webp and, with strengths and captions, docs/fingerprints/figures.json. All of them take about
-ten minutes on two cores; `make docs` uses the files as they are."""
+Writes docs/fingerprints/KEY.webp and, with strengths and captions, docs/fingerprints/figures.json. All of them take
+about ten minutes on two cores; `make docs` uses the files as they are."""
 
 from __future__ import annotations
 
@@ -25,6 +25,7 @@ FOLDER = Path(__file__).resolve().parent.parent / "fingerprints"
 RECORD = FOLDER / "figures.json"
 VISIBLE = 0.03  # rms change over the mean signal: a contrast of a few per cent is seen at a glance
 VISIBLE_CURVE = 0.04  # largest change of a reading over the largest reading, for the same reason
+FAINT = 50.0  # DN: what is dimmer, as behind crossed polarizers, is held against this
 STEPS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)  # of the plausible strength
 GAP = 6  # px of white between the panels
 PANEL = 240  # px: smallest width of a panel; smaller images are enlarged by whole factors
@@ -75,7 +76,10 @@ SHOWN: dict[str, tuple[View, tuple[str, ...] | None]] = {
     "dark-offset": (ONE_SIDE, None),
     "veiling-glare": (ONE_SIDE, None),
     # a shallow dent, whose long skirt ends within the fine part of the mesh
-    "exponential-skirt": (View("gelsight", {"width": "240", "height": "180", "depth": "0.3", "radius": "1.2"}, SIDES), None),
+    "exponential-skirt": (
+        View("gelsight", {"width": "240", "height": "180", "depth": "0.3", "radius": "1.2"}, SIDES),
+        None,
+    ),
     "led-size": (ONE_SIDE, None),  # one light: rims of shadows
     "height-fall-off": (ONE_SIDE, None),
     "specular-lobe": (ONE_SIDE, None),
@@ -91,7 +95,9 @@ SHOWN: dict[str, tuple[View, tuple[str, ...] | None]] = {
         None,
     ),
     "dispersive-retardance": (
-        View("polarizer_bench", {"bands": "620, 540, 460", "analyzer": "90"}, {"sample.retard_0": 180.0}, "sample.angle"),
+        View(
+            "polarizer_bench", {"bands": "620, 540, 460", "analyzer": "90"}, {"sample.retard_0": 180.0}, "sample.angle"
+        ),
         None,
     ),
     "coloured-leak": (View("polarizer_bench", {"bands": "620, 540, 460"}, {}, "analyzer.angle"), None),
@@ -173,15 +179,15 @@ def draw(effect, reg) -> dict:
             raise FloatingPointError(f"{effect.name}: the image is not finite at {values}")
         change = image - without
         if view.along is None:
-            seen = np.sqrt((change**2).mean()) / max(without.mean(), 1e-9) >= VISIBLE
+            seen = np.sqrt((change**2).mean()) / max(without.mean(), FAINT / 5) >= VISIBLE
         else:
-            seen = np.abs(change).max() / without.max() >= VISIBLE_CURVE
+            seen = np.abs(change).max() / max(without.max(), FAINT) >= VISIBLE_CURVE
         if seen or strengths(effect, reg, shot.scene, holders, 2 * factor) == values:
             break
     if not np.any(change):
         raise ValueError(f"{effect.name}: changes nothing in the view '{view.words()}'; choose another one in SHOWN")
     scale = panels(effect.key, without, image) if view.along is None else curves(effect.key, view, shot, without, image)
-    signal = max(without.mean(), 1e-9)
+    signal = max(without.mean(), image.mean())
     return {
         "view": view.words(),
         "along": view.along,

@@ -31,7 +31,9 @@ def prose(text: str) -> str:
 
 
 def anchors(file: Path) -> set[str]:
-    return {slug(h) for h in re.findall(r"^#{1,6}\s+(.+?)\s*#*$", FENCE.sub("", file.read_text(encoding="utf-8")), re.M)}
+    return {
+        slug(h) for h in re.findall(r"^#{1,6}\s+(.+?)\s*#*$", FENCE.sub("", file.read_text(encoding="utf-8")), re.M)
+    }
 
 
 def targets(file: Path) -> list[str]:
@@ -42,7 +44,10 @@ def targets(file: Path) -> list[str]:
 
 
 def broken_in_markdown(file: Path, elsewhere: dict[str, Path] | None = None) -> list[str]:
-    """Sentences about links of a Markdown file that lead nowhere; elsewhere: folders that a build writes, by their prefix."""
+    """Sentences about links of a Markdown file that lead nowhere.
+
+    elsewhere   folders that a build writes, by the prefix of links to them
+    """
     found = []
     for target in targets(file):
         parts = urlsplit(target)

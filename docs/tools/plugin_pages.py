@@ -4,7 +4,7 @@
 
 The page of a plugin is its docstring, its parameters (name, type, unit, default, bounds, neutral value, plausible size,
 derivative, meaning), for a part the further XML attributes that its docstring lists under `XML`, and for an effect its
-fingerprint figure. `make docs` calls `write_pages` before it builds the site; nothing of what it writes is kept in git."""
+fingerprint figure. `make docs` calls `write_pages` before it builds the site; nothing that it writes is kept in git."""
 
 from __future__ import annotations
 
@@ -74,7 +74,9 @@ def attributes(doc: str) -> list[Attribute]:
 def escaped(text: str) -> str:
     """Plain text as markdown that shows it unchanged; `code` stays code."""
     pieces = re.split(r"(`[^`]+`)", text)
-    return "".join(p if p.startswith("`") and len(p) > 1 else re.sub(r"([\\*_<>\[\]|$#~{}])", r"\\\1", p) for p in pieces)
+    return "".join(
+        p if p.startswith("`") and len(p) > 1 else re.sub(r"([\\*_<>\[\]|$#~{}])", r"\\\1", p) for p in pieces
+    )
 
 
 def prose(lines: list[str]) -> str:
@@ -181,7 +183,8 @@ def figure_of(effect, record: dict) -> str:
     times = "the plausible strength" if own["factor"] == 1 else f"{own['factor']} times the plausible strength"
     if own["along"] is None:
         seen = (
-            f"Without, with, and the difference (gray: none; white and black: ±{own['scale']:g} DN), at {times}: {values}{more}. "
+            f"Without, with, and the difference (gray: none; near white and black: ±{own['scale']:g} DN), at {times}: "
+            f"{values}{more}. "
             f"The image changes by {own['rms']:.1%} rms of its mean."
         )
     else:
@@ -223,8 +226,8 @@ def effect_page(effect, reg, record: dict) -> str:
         + f"\n\n```sh\noptics effects {effect.key}                 # this page on the terminal\n"
         + f"optics add STUDY '{effect.name}'   # free {key} and refit everything\n```\n\n"
         + body(effect.doc, figure_of(effect, record))
-        + "\n\n## Parameters\n\nAs XML: "
-        + f'`<float name="{effect.parameter_names[0]}" value="..."/>` within the element of the type `{effect.part}`.\n\n'
+        + f'\n\n## Parameters\n\nAs XML: `<float name="{effect.parameter_names[0]}" value="..."/>` within the element '
+        + f"of the type `{effect.part}`.\n\n"
         + parameter_table(rows)
         + "\n"
     )
@@ -253,14 +256,17 @@ def part_page(part, reg) -> str:
         + f'In a scene: `<{ELEMENT[part.category]} type="{part.kind}" id="...">`. File: `{place(part.file)}`. '
         + f"On the terminal: `optics effects {part.kind}`.\n\n"
         + body(part.doc)
-        + "\n\n## Parameters\n\nEach is written in XML as `<float name=\"...\" value=\"...\"/>` (or `<string>`), and set by its "
-        + "key `ID.NAME` from the command line, a capture file or Python.\n\n"
+        + '\n\n## Parameters\n\nEach is written in XML as `<float name="..." value="..."/>` (or `<string>`), and set '
+        + "by its key `ID.NAME` from the command line, a capture file or Python.\n\n"
         + parameter_table(rows)
     )
     if known:
-        text += "\n\n## Further XML attributes\n\nThey are read once, when the scene is loaded, and are not parameters.\n\n" + table(
-            ["name", "meaning", "type", "default"],
-            [[f"`{a.name}`", escaped(a.meaning), a.type, escaped(a.default) or "none"] for a in known],
+        text += (
+            "\n\n## Further XML attributes\n\nThey are read once, when the scene is loaded, and are not parameters.\n\n"
+            + table(
+                ["name", "meaning", "type", "default"],
+                [[f"`{a.name}`", escaped(a.meaning), a.type, escaped(a.default) or "none"] for a in known],
+            )
         )
     if acting:
         text += "\n\n## Effects that act on it\n\n" + "\n".join(
@@ -273,8 +279,8 @@ def effect_index(reg, record: dict) -> str:
     """All effects by the part that they act on."""
     pieces = [
         "# Effects",
-        f"{len(reg.effects)} physical effects ship with the program; each is one file in `plugins/effects`. Every figure is "
-        "measured: the scene is rendered with the effect and without it (`python docs/tools/fingerprints.py`).",
+        f"{len(reg.effects)} physical effects ship with the program; each is one file in `plugins/effects`. Every "
+        "figure is measured: the scene is rendered with the effect and without it (`python docs/tools/fingerprints.py`).",
     ]
     for kind in sorted({e.part for e in reg.effects.values()}, key=lambda k: (k != "camera", k)):
         pieces.append(f"## {kind}\n\nOf the part [{kind}](../parts/{kind}.md).")
@@ -302,7 +308,8 @@ def put(file: Path, text: str) -> None:
 
 
 def write_pages(folder: Path) -> int:
-    """Write all pages below a folder (`parts/`, `effects/`), remove those of plugins that are gone; their number."""
+    """Write all pages below a folder (`parts/`, `effects/`) and the files that they are made of (`sources/`), and
+    remove those of plugins that are gone; their number."""
     from optics.scene.registry import registry
 
     reg = registry()
@@ -314,9 +321,16 @@ def write_pages(folder: Path) -> int:
     pages = {"effects/index.md": effect_index(reg, record), "parts/index.md": part_index(reg)}
     pages.update({f"effects/{key}.md": effect_page(e, reg, record) for key, e in reg.effects.items()})
     pages.update({f"parts/{kind}.md": part_page(p, reg) for kind, p in reg.parts.items()})
+    # pages show whole files by the key of what they declare, wherever the files are
+    pages.update(
+        {
+            f"sources/{k}.py": Path(i.file).read_text(encoding="utf-8")
+            for k, i in (*reg.effects.items(), *reg.parts.items())
+        }
+    )
     for name, text in pages.items():
         put(folder / name, text)
-    for file in folder.glob("*/*.md"):
+    for file in [*folder.glob("*/*.md"), *folder.glob("sources/*.py")]:
         if file.relative_to(folder).as_posix() not in pages:
             file.unlink()
     return len(pages)

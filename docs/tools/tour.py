@@ -2,10 +2,11 @@
 
     python docs/tools/tour.py FOLDER [--real] [--write]
 
-FOLDER is where the commands work. The page's `sh` and `python` blocks are executed as they stand; `text` blocks hold lines of
-what the command before them printed, with "..." for what is left out. `--real` includes the part that needs the measured
-images: FOLDER/digit-depth, fetched as the page says, or made from a copy (`lay_out`). `--write` puts the present lines and
-images into the page and into docs/images; without it, lines that the program no longer prints are reported."""
+FOLDER is where the commands work. The page's `sh` and `python` blocks are executed as they stand; `text` blocks hold
+lines of what the command before them printed, with "..." for what is left out. `--real` includes the part that needs
+the measured images: FOLDER/digit-depth, fetched as the page says, or made from a copy (`lay_out`). `--write` puts the
+present lines and images into the page and into docs/images; without it, lines that the program no longer prints are
+reported."""
 
 from __future__ import annotations
 
@@ -82,8 +83,10 @@ def present(shown: str, printed: str) -> tuple[str, list[str]]:
             found.append(line)
             continue
         for i in range(at, len(lines)):
-            if skeleton(lines[i]) == skeleton(line) or line.endswith(" ...") and skeleton(lines[i]).startswith(
-                skeleton(line[:-4])
+            if (
+                skeleton(lines[i]) == skeleton(line)
+                or line.endswith(" ...")
+                and skeleton(lines[i]).startswith(skeleton(line[:-4]))
             ):
                 found.append(cut(line, lines[i].rstrip()))
                 at = i + 1
@@ -135,7 +138,7 @@ def walk(folder: Path, real: bool = False, quick: bool = True, page: str | None 
             else:
                 out = io.StringIO()
                 with contextlib.redirect_stdout(out):
-                    exec(compile(block.text, str(PAGE), "exec"), space)  # noqa: S102
+                    exec(compile(block.text, str(PAGE), "exec"), space)
                 printed = out.getvalue()
     finally:
         os.chdir(here)

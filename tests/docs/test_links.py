@@ -6,7 +6,7 @@ import links
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-FILES = [f for f in (*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md"))]
+FILES = [*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")]
 
 
 @pytest.mark.parametrize("file", FILES, ids=lambda f: f.relative_to(ROOT).as_posix())
@@ -33,10 +33,12 @@ def test_a_broken_link_is_noticed(tmp_path):
     (tmp_path / "other.md").write_text("# One heading: `code`\n")
     page.write_text(
         "[a](other.md#one-heading-code) [b](gone.md) [c](other.md#two) ![d](no.png) [e](https://x.org) [f](#none)\n"
-        "`[not](a-link.md)`\n```text\n[nor](this.md)\n```\n<img src=\"gone.webp\">\n:::{figure} missing.webp\n:::\n"
+        '`[not](a-link.md)`\n```text\n[nor](this.md)\n```\n<img src="gone.webp">\n:::{figure} missing.webp\n:::\n'
     )
     told = " ".join(links.broken_in_markdown(page))
-    assert [name for name in ("gone.md", "#two", "no.png", "#none", "gone.webp", "missing.webp") if name not in told] == []
+    assert [
+        name for name in ("gone.md", "#two", "no.png", "#none", "gone.webp", "missing.webp") if name not in told
+    ] == []
     assert not any(name in told for name in ("one-heading", "x.org", "a-link.md", "this.md"))
 
 

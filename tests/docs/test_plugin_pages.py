@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import json
 import sys
+from pathlib import Path
 
 import plugin_pages
 import pytest
@@ -22,7 +23,7 @@ def record():
     return json.loads((plugin_pages.FIGURES / "figures.json").read_text(encoding="utf-8"))
 
 
-# -- figures ------------------------------------------------------------------------------------------------------------
+# -- figures ----------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("key", EFFECTS)
@@ -47,7 +48,7 @@ def test_no_figure_is_left_of_an_effect_that_is_gone(record):
     assert sorted(f.stem for f in plugin_pages.FIGURES.glob("*.webp")) == EFFECTS
 
 
-# -- pages --------------------------------------------------------------------------------------------------------------
+# -- pages ------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("kind", PARTS)
@@ -84,12 +85,12 @@ def test_a_docstrings_sections_are_found_wherever_their_headings_stand():
     assert plugin_pages.definition(found["Definition"]) == "```text\na = b\n```\n\nwith b."
 
 
-# -- XML attributes that are no parameters --------------------------------------------------------------------------------
+# -- XML attributes that are no parameters ----------------------------------------------------------------------------
 
 
 def read_by_the_file(kind: str) -> set[str]:
     """Names that a part's file asks `props` for, by its source: also those that no shipped scene makes it ask for."""
-    tree = ast.parse(open(registry().parts[kind].file, encoding="utf-8").read())
+    tree = ast.parse(Path(registry().parts[kind].file).read_text(encoding="utf-8"))
     names = set()
     for node in ast.walk(tree):
         if (
