@@ -12,23 +12,18 @@ COLUMNS = re.compile(r"\S {2,}\S")  # two or more spaces within a line: a column
 
 def reshaped(lines: list[str]) -> list[str]:
     """reStructuredText that shows plain text as it stands."""
-    blocks: list[tuple[bool, list[str]]] = []
+    paragraphs: list[list[str]] = [[]]
     for line in lines:
-        if not line.strip():
-            blocks.append((False, []))
-            continue
-        literal = line.startswith("  ") or bool(COLUMNS.search(line))
-        if not blocks or blocks[-1][0] != literal or not blocks[-1][1]:
-            blocks.append((literal, []))
-        blocks[-1][1].append(line)
-    found: list[str] = []
-    for literal, own in blocks:
-        if not own:
-            found.append("")
-        elif literal:
-            found += ["", "::", "", *(f"   {line}" for line in own), ""]
+        if line.strip():
+            paragraphs[-1].append(line)
         else:
-            found += [escaped(line) for line in own]
+            paragraphs.append([])
+    found: list[str] = []
+    for own in paragraphs:
+        if any(line.startswith("  ") or COLUMNS.search(line) for line in own):
+            found += [".. code-block:: text", "   :class: wrapped", "", *(f"   {line}" for line in own), ""]
+        else:
+            found += [*(escaped(line) for line in own), ""]
     return found
 
 

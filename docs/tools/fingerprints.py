@@ -24,6 +24,7 @@ import numpy as np
 FOLDER = Path(__file__).resolve().parent.parent / "fingerprints"
 RECORD = FOLDER / "figures.json"
 VISIBLE = 0.03  # rms change over the mean signal: a contrast of a few per cent is seen at a glance
+LOCAL = 0.15  # change over the mean signal in one value of a hundred: seen as well, where an effect is local
 VISIBLE_CURVE = 0.04  # largest change of a reading over the largest reading, for the same reason
 FAINT = 50.0  # DN: what is dimmer, as behind crossed polarizers, is held against this
 STEPS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)  # of the plausible strength
@@ -77,7 +78,7 @@ SHOWN: dict[str, tuple[View, tuple[str, ...] | None]] = {
     "veiling-glare": (ONE_SIDE, None),
     # a shallow dent, whose long skirt ends within the fine part of the mesh
     "exponential-skirt": (
-        View("gelsight", {"width": "240", "height": "180", "depth": "0.3", "radius": "1.2"}, SIDES),
+        View("gelsight", {"width": "240", "height": "180", "depth": "0.5", "radius": "1.5"}, SIDES),
         None,
     ),
     "led-size": (ONE_SIDE, None),  # one light: rims of shadows
@@ -105,6 +106,10 @@ SHOWN: dict[str, tuple[View, tuple[str, ...] | None]] = {
         View("polarizer_bench", {"width": "180", "height": "180", "x_fov": "11", "analyzer": "90"}),
         None,
     ),  # crossed, and seen obliquely, as far as the films reach
+    "unfilled-cell": (
+        View(GRID.scene, GRID.defines, {"grid.unfilled_column": 3.0, "grid.unfilled_row": 4.0}),
+        None,
+    ),  # a cell in view, beside the touched ones
     "coloured-absorption": (
         View(GRID.scene, GRID.defines, {"walls.absorption": 0.05, "filling.absorption": 0.05}),
         None,
@@ -179,7 +184,8 @@ def draw(effect, reg) -> dict:
             raise FloatingPointError(f"{effect.name}: the image is not finite at {values}")
         change = image - without
         if view.along is None:
-            seen = np.sqrt((change**2).mean()) / max(without.mean(), FAINT / 5) >= VISIBLE
+            level = max(without.mean(), FAINT / 5)
+            seen = np.sqrt((change**2).mean()) >= VISIBLE * level or np.quantile(np.abs(change), 0.99) >= LOCAL * level
         else:
             seen = np.abs(change).max() / max(without.max(), FAINT) >= VISIBLE_CURVE
         if seen or strengths(effect, reg, shot.scene, holders, 2 * factor) == values:

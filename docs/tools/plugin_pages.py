@@ -235,6 +235,8 @@ def effect_page(effect, reg, record: dict) -> str:
 
 def part_page(part, reg) -> str:
     title, sentence = summary(part.doc)
+    if sum(p.file == part.file for p in reg.parts.values()) > 1:  # parts of one file share its text
+        title = part.kind.replace("_", " ").capitalize()
     own = {p.name for p in part.parameters}
     source = {
         p.name: f"[{e.name}](../effects/{e.key}.md)"
@@ -280,7 +282,7 @@ def effect_index(reg, record: dict) -> str:
     pieces = [
         "# Effects",
         f"{len(reg.effects)} physical effects ship with the program; each is one file in `plugins/effects`. Every "
-        "figure is measured: the scene is rendered with the effect and without it (`python docs/tools/fingerprints.py`).",
+        "figure is measured: a scene is rendered with the effect and without it (`python docs/tools/fingerprints.py`).",
     ]
     for kind in sorted({e.part for e in reg.effects.values()}, key=lambda k: (k != "camera", k)):
         pieces.append(f"## {kind}\n\nOf the part [{kind}](../parts/{kind}.md).")
