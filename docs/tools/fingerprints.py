@@ -24,7 +24,7 @@ import numpy as np
 FOLDER = Path(__file__).resolve().parent.parent / "fingerprints"
 RECORD = FOLDER / "figures.json"
 VISIBLE = 0.03  # rms change over the mean signal: a contrast of a few per cent is seen at a glance
-LOCAL = 0.15  # change over the mean signal in one value of a hundred: seen as well, where an effect is local
+LOCAL = 0.1  # change over the mean signal in two values of a thousand: seen as well, where an effect is local
 VISIBLE_CURVE = 0.04  # largest change of a reading over the largest reading, for the same reason
 FAINT = 50.0  # DN: what is dimmer, as behind crossed polarizers, is held against this
 STEPS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)  # of the plausible strength
@@ -185,7 +185,7 @@ def draw(effect, reg) -> dict:
         change = image - without
         if view.along is None:
             level = max(without.mean(), FAINT / 5)
-            seen = np.sqrt((change**2).mean()) >= VISIBLE * level or np.quantile(np.abs(change), 0.99) >= LOCAL * level
+            seen = np.sqrt((change**2).mean()) >= VISIBLE * level or np.quantile(np.abs(change), 0.998) >= LOCAL * level
         else:
             seen = np.abs(change).max() / max(without.max(), FAINT) >= VISIBLE_CURVE
         if seen or strengths(effect, reg, shot.scene, holders, 2 * factor) == values:
