@@ -10,7 +10,6 @@ import base64
 import io
 import json
 import math
-import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -19,6 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from optics.errors import OutputExists
+from optics.files.output import write_text
 from optics.fit.compare import UNITS, Comparison, Curve
 from optics.study.record import Fingerprint, Shown, Study
 from optics.words import some, spaced
@@ -58,12 +58,7 @@ def report(study_folder: str | Path, out: str | Path, *, overwrite: bool = False
     out = out / "report.html" if out.is_dir() or not out.suffix else out
     if out.exists() and not overwrite:
         raise OutputExists(f"{out} exists; name another file, or --force to replace it")
-    html = render(Study.open(study_folder))
-    out.parent.mkdir(parents=True, exist_ok=True)
-    temporary = out.with_name(f".{out.name}.{os.getpid()}")
-    temporary.write_text(html, encoding="utf-8")
-    os.replace(temporary, out)
-    return out
+    return write_text(out, render(Study.open(study_folder)))
 
 
 def render(study: Study) -> str:

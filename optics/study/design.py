@@ -31,8 +31,8 @@ from optics.diagnosis import statistics as st
 from optics.diagnosis.advice import keys_named
 from optics.diagnosis.evidence import Candidate, Evidence, Progress, measure
 from optics.diagnosis.verdict import CLEAR, LEVEL
-from optics.errors import BadScene, OutputExists, Underdetermined
-from optics.files.output import shipped
+from optics.errors import BadScene, Underdetermined
+from optics.files.output import new_folder, shipped
 from optics.scene.parameter import Parameter, Values
 from optics.words import spaced, table
 
@@ -630,12 +630,10 @@ def _report(scene, frames, path, seen, chosen, members, share, noise, count, uns
 
 
 def write(planned: Plan, folder: str | Path) -> Path:
-    """A folder with a captures.toml that names the frames to take, and no image yet. Raises OutputExists."""
+    """Write a folder with a captures.toml that lists the frames to take, without images. Raises OutputExists."""
     import tomlkit
 
     folder = Path(os.path.abspath(folder))
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise OutputExists(f"{folder} exists and is not empty; choose another folder")
     document = tomlkit.document()
     # not captures.MARK: once its images are in, the folder is a measured set, which no writing of captures may replace
     document.add(
@@ -659,12 +657,11 @@ def write(planned: Plan, folder: str | Path) -> Path:
                 table["group"] = f.group
             table["parameters"] = {k: float(v) for k, v in f.settings.items()}
             tables.append(table)
-    folder.mkdir(parents=True, exist_ok=True)
-    if planned.size == (1, 1):
-        readings.write(
-            folder / "readings.csv", [(own, [""]) for f in planned.frames for own in f.readings], ["reading"]
-        )
-    else:
-        (folder / "frames").mkdir(exist_ok=True)
-    (folder / FILE).write_text(tomlkit.dumps(document), encoding="utf-8")
+    with new_folder(folder) as new:
+        if planned.size == (1, 1):
+            rows = [(own, [""]) for f in planned.frames for own in f.readings]
+            readings.write(new / "readings.csv", rows, ["reading"])
+        else:
+            (new / "frames").mkdir()
+        (new / FILE).write_text(tomlkit.dumps(document), encoding="utf-8")
     return folder
