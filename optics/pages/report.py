@@ -20,7 +20,8 @@ import numpy as np
 from optics.errors import OutputExists
 from optics.files.output import write_text
 from optics.fit.compare import UNITS, Comparison, Curve
-from optics.study.record import Fingerprint, Shown, Study
+from optics.study.record import Record
+from optics.study.shown import Fingerprint, Shown
 from optics.words import some, spaced
 
 BUDGET = 4_500_000  # bytes of embedded images; the page stays below 6 MB
@@ -58,10 +59,10 @@ def report(study_folder: str | Path, out: str | Path, *, overwrite: bool = False
     out = out / "report.html" if out.is_dir() or not out.suffix else out
     if out.exists() and not overwrite:
         raise OutputExists(f"{out} exists; name another file, or --force to replace it")
-    return write_text(out, render(Study.open(study_folder)))
+    return write_text(out, render(Record.open(study_folder)))
 
 
-def render(study: Study) -> str:
+def render(study: Record) -> str:
     """The page as text."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
@@ -85,7 +86,7 @@ def render(study: Study) -> str:
     nouns = FRAMES if points is None else SWEEPS
     verdicts = [verdict(told(study.diagnosis(i), points)) for i in range(len(study.steps))]
     return environment.get_template("report.html.j2").render(
-        study=study.record,
+        study=study.ladder,
         steps=study.steps,
         headline=headline(study, verdicts, nouns),
         verdicts=verdicts,
@@ -104,7 +105,7 @@ def render(study: Study) -> str:
         maps=map_images(comparisons, study.steps) if points is None else [],
         pages=residual_maps.pages(comparisons, shown, study.steps) if points is None else [],
         coordinates=[residual_maps.coordinates(told(study.diagnosis(i), points)) for i in range(len(study.steps))],
-        facts=facts(study.record["facts"], points),
+        facts=facts(study.ladder["facts"], points),
         numbers=number_tables(comparisons, nouns),
         nulls=null_table(study.metrics(len(study.steps) - 1)),
         background=study.metrics(len(study.steps) - 1).get("background") or {},
@@ -116,10 +117,10 @@ def render(study: Study) -> str:
 # -- words --------------------------------------------------------------------------------------------------------------
 
 
-def headline(study: Study, verdicts: list, nouns: Mapping[str, str]) -> dict:
+def headline(study: Record, verdicts: list, nouns: Mapping[str, str]) -> dict:
     """One sentence with the numbers that matter, and the last verdict."""
     first, last = _level(study.steps[0]), _level(study.steps[-1])
-    floor = study.record["noise_floor"]["chi2_per_dof"]
+    floor = study.ladder["noise_floor"]["chi2_per_dof"]
     where = f"on held-out {nouns['data']}" if study.steps[-1]["held_out"] else f"on the fitted {nouns['data']}"
     added = _and([s["name"] for s in study.steps[1:]])
     now = f"{percent(last['misfit'])} of the signal, where noise alone is {percent(last['noise'])}"
@@ -141,7 +142,7 @@ def headline(study: Study, verdicts: list, nouns: Mapping[str, str]) -> dict:
         "text": text,
         "rest": rest,
         "verdict": verdicts[-1],
-        "title": study.record["title"] or study.record["scene"],
+        "title": study.ladder["title"] or study.ladder["scene"],
     }
 
 
@@ -291,12 +292,12 @@ def pvalue(value) -> str:
 # -- images -----------------------------------------------------------------------------------------------------------
 
 
-def pictures(study: Study, steps: list[list[Shown]]) -> dict:
+def pictures(study: Record, steps: list[list[Shown]]) -> dict:
     """What the viewer shows: measured once per frame, predicted and residual per frame and step.
 
     Fewer frames, then binned pixels, keep the page small; `note` says so.
     """
-    names = [n for n in study.record["shown"] if all(any(f.name == n for f in frames) for frames in steps)]
+    names = [n for n in study.ladder["shown"] if all(any(f.name == n for f in frames) for frames in steps)]
     if not names or max(steps[0][0].measured.shape[:2]) < SIDE_MIN:
         return NO_IMAGES
     table = [{f.name: f for f in frames} for frames in steps]
@@ -802,10 +803,10 @@ def _angles(low: float, high: float, unit: str) -> list[float]:
 # -- charts -------------------------------------------------------------------------------------------------------------
 
 
-def ladder_chart(study: Study, width: int, height: int, nouns: Mapping[str, str] = FRAMES) -> str:
+def ladder_chart(study: Record, width: int, height: int, nouns: Mapping[str, str] = FRAMES) -> str:
     """SVG: chi2/dof of every step, held out and fitted, over the noise floor, on a logarithmic scale."""
     steps = study.steps
-    floor = study.record["noise_floor"]["chi2_per_dof"]
+    floor = study.ladder["noise_floor"]["chi2_per_dof"]
     lines = [(key, [_value(s[key], "chi2_per_dof") for s in steps]) for key in ("fitted", "held_out")]
     values = [v for _, line in lines for v in line if math.isfinite(v) and v > 0] or [floor]
     low, high = 0.88 * min([floor, *values]), 1.3 * max([1.25 * floor, *values])

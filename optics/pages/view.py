@@ -34,6 +34,7 @@ from optics.fit.compare import led_label
 from optics.pages.report import DIVERGING, MASKED, SIGMA_RANGE, colour_bar, ramp
 from optics.scene.parameter import Values, Variable
 from optics.study import loop
+from optics.study.setup import effect_variables
 from optics.words import spaced
 
 HOST = "127.0.0.1"
@@ -122,7 +123,7 @@ class View:
         self.held = sorted(set(range(len(self.model.frames))) - set(self.fitted))
         sd = {v["name"]: v["sd"] for v in self.step["variables"]}
         added = [s["effect"] for s in self.study.steps[: self.step["index"] + 1] if s["effect"]]
-        known = (*loop.candidates(self.model, self.study), *loop.effects_of(self.study))
+        known = (*loop.candidates(self.model, self.study), *loop.effects_of(self.study, self.model))
         self.effects = {e.key: e for e in sorted(known, key=lambda e: e.key)}
         own = {
             key: {k for keys in self.model.scene.keys_of(e).values() for k in keys} for key, e in self.effects.items()
@@ -135,7 +136,7 @@ class View:
         self.clashes = {key: sorted(keys & taken) for key, keys in own.items() if key not in added and keys & taken}
         for key, e in self.effects.items():
             if key not in added and key not in self.clashes:
-                for v in loop.effect_variables(self.model, e):
+                for v in effect_variables(self.model, e):
                     self._slide(v, None, key)
         self.added, self._sought = added, set(added)
         self.comparison = self.study.comparison(self.step["index"])
@@ -155,9 +156,9 @@ class View:
         """Everything but images: frames, sliders, effects, and how the study's own numbers stand."""
         rows = {row.scope["frame"]: row for row in self.comparison.by("frame")}
         return {
-            "title": self.study.record["title"] or Path(self.study.folder).resolve().name,
+            "title": self.study.ladder["title"] or Path(self.study.folder).resolve().name,
             "folder": str(self.study.folder),
-            "scene": Path(self.study.record["scene"]).stem,
+            "scene": Path(self.study.ladder["scene"]).stem,
             "step": self.step["index"],
             "steps": [s["name"] for s in self.study.steps],
             "shape": list(self.model.shape) if self.model.captures.table is None else None,

@@ -157,7 +157,7 @@ def run(
     setup = loop.Setup(captures=str(folder / "captures"), per_group=[], seed=seed)
     study, model, fit = loop.begin(setup, folder / "study", title="Demonstration", resume=True, progress=progress)
     say(study.table())
-    claimed = [e.name for e in loop.effects_of(study)]
+    claimed = [e.name for e in loop.effects_of(study, model)]
     diagnosis = None
     for _ in range(STEPS + 1):
         diagnosis = loop.examine(study, model, setup, fit, progress)

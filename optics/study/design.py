@@ -34,6 +34,7 @@ from optics.diagnosis.verdict import CLEAR, LEVEL
 from optics.errors import BadScene, Underdetermined
 from optics.files.output import new_folder, shipped
 from optics.scene.parameter import Parameter, Values
+from optics.study.setup import Setup, effect_variables, variables_of_base
 from optics.words import spaced, table
 
 SHARE = 0.1  # of the plausible strength
@@ -298,7 +299,7 @@ def plan(
     *,
     noise: Noise = NOISE,
     values: Values | None = None,
-    setup=None,
+    setup: Setup | None = None,
     added: Sequence = (),
     share: float = SHARE,
     fixed_exposure: bool = False,
@@ -308,7 +309,7 @@ def plan(
     """Choose `frames` frames of a scene (optics.scene.loader.Scene) that keep its effects apart.
 
     effects   that may be missing; None: all that the scene can express
-    values    of a calibration, in place of the scene's own; setup: what it solves for (optics.study.loop.Setup), added:
+    values    of a calibration, in place of the scene's own; setup: what it solves for (optics.study.setup.Setup), added:
               effects that it has
     share     of the plausible strength, at which effects are told apart
     fixed_exposure   leave the exposure as the scene has it
@@ -319,7 +320,6 @@ def plan(
 
     from optics.fit.model import Model
     from optics.scene.registry import registry
-    from optics.study import loop
 
     say = progress or (lambda what, done, total: None)
     _require(frames, share)
@@ -339,7 +339,7 @@ def plan(
             raise BadScene(
                 f"{scene.path}: the scene cannot express the effect '{e.name}'; it can: {', '.join(k.key for k in known)}"
             )
-    setup = setup or loop.Setup(captures="")
+    setup = setup or Setup(captures="")
     values = Values() if values is None else Values(dict(values.common))
     base = {**scene.values(), **values.common}
     pool = candidates(scene.parameters, base, swept, fixed_exposure)
@@ -372,12 +372,12 @@ def plan(
     }  # where nobody has to find a place
     solved = [
         v
-        for v in loop.variables_of_base(model, setup, range(len(pool)))
+        for v in variables_of_base(model, setup, range(len(pool)))
         if v.frames is None or not (advise.is_place(model, v.keys[0]) and untouched.issuperset(v.frames))
     ]
-    solved += [v for e in added for v in loop.effect_variables(model, e)]
+    solved += [v for e in added for v in effect_variables(model, e)]
     taken = {key for v in solved for key in v.keys}
-    members = [Candidate.at(model, values, e, loop.effect_variables(model, e)) for e in effects or known]
+    members = [Candidate.at(model, values, e, effect_variables(model, e)) for e in effects or known]
     members = [c for c in members if not any(k in taken for v in c.variables for k in v.keys)]
     if not members:
         raise Underdetermined(
@@ -443,7 +443,7 @@ def session(
             chosen,
             noise=replace(model.noise, **(noise or {})),
             setup=setup,
-            added=loop.effects_of(study),
+            added=loop.effects_of(study, model),
             values=Values(dict(study.fit(len(study.steps) - 1)["parameters"])),
             share=share,
             fixed_exposure=fixed_exposure,

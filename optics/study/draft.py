@@ -31,8 +31,8 @@ from optics.scene import loader as scenes
 from optics.scene.declare import STAGES
 from optics.scene.mitsuba_parts import is_taken
 from optics.scene.registry import Registry
-from optics.study import loop
-from optics.study.record import Study
+from optics.study.record import Record
+from optics.study.setup import plugins_of, recorded
 
 BENT = 0.5  # the largest relative change that a strength of 1 is called plausible for
 CELLS = ("place", "channel")  # coordinates of cells, each with a value of its own: none lies between two of them
@@ -457,21 +457,21 @@ def from_study(folder: str | Path, along: str | None, name: str, registry: Regis
 
     Raises ValueError where there is no diagnosis, or where the scene cannot carry the draft.
     """
-    study = Study.open(folder)
+    study = Record.open(folder)
     index = next((i for i in reversed(range(len(study.steps))) if study.diagnosis(i)), None)
     if index is None:
         raise ValueError(f"{folder}: no diagnosis to draft from; run `optics diagnose {folder}` first")
     diagnosis = Diagnosis.from_json(json.dumps(study.diagnosis(index)))
     f = fingerprint_of(diagnosis, along)
     part = STAGES[_carrier(f).stage]
-    plugins = loop.plugins_of(loop.Setup(**study.record["facts"]["setup"]))
+    plugins = plugins_of(recorded(study.ladder["facts"]["setup"]))
     if plugins.is_dir():
         registry.scan(plugins)
-    text = scenes.find(study.record["scene"]).read_text(encoding="utf-8")
+    text = scenes.find(study.ladder["scene"]).read_text(encoding="utf-8")
     if part != "camera" and (f'type="{part}"' not in text or 'type="clear"' in text):
         can = [g.coordinate for g in diagnosis.fingerprints if _carrier(g) and STAGES[_carrier(g).stage] == "camera"]
         raise ValueError(
-            f"no draft along '{f.coordinate}': light in the scene {study.record['scene']} "
+            f"no draft along '{f.coordinate}': light in the scene {study.ladder['scene']} "
             + (
                 "is followed by Monte Carlo, where effects do not act on its path"
                 if 'type="clear"' in text
@@ -480,7 +480,7 @@ def from_study(folder: str | Path, along: str | None, name: str, registry: Regis
             + f"; a draft can follow {', '.join(can) or 'none of these curves'}"
         )
     check_name(name, part, registry)
-    noise = study.record["noise"]
+    noise = study.ladder["noise"]
     return draft_effect(
         diagnosis,
         f.coordinate,

@@ -324,7 +324,7 @@ def test_a_study_is_told_of_the_error_of_its_predictions(bench, tmp_path):
     from optics.captures.capture_set import Captures, Frame
     from optics.captures.noise import Noise
     from optics.fit.model import Model
-    from optics.study import loop
+    from optics.study import checks
 
     scene, _, values = bench
     frame = Frame(
@@ -341,5 +341,5 @@ def test_a_study_is_told_of_the_error_of_its_predictions(bench, tmp_path):
             shares.append(model.chance())
     finally:
         scene.integrator.rays, scene.integrator.packets = rays, packets
-    assert 1.4 < shares[0] / shares[1] < 2.8 and shares[0] > loop.CHANCE
-    assert any("an estimate by Monte Carlo" in text for text in loop._warnings(model)) == (shares[1] > loop.CHANCE)
+    assert 1.4 < shares[0] / shares[1] < 2.8 and shares[0] > checks.CHANCE
+    assert any("an estimate by Monte Carlo" in text for text in checks.of_captures(model)) == (shares[1] > checks.CHANCE)

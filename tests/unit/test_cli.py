@@ -417,12 +417,12 @@ def test_calibrate_writes_a_study_that_compare_can_use(optics, measured, tmp_pat
     )
     assert code == 0, err
     assert out.splitlines()[-1] == str(study) and "warning: 8 bit" in err
-    from optics.study.record import Study
+    from optics.study.record import Record
 
-    found = {v["name"]: v for v in Study.open(study).steps[0]["variables"]}
+    found = {v["name"]: v for v in Record.open(study).steps[0]["variables"]}
     for name in ("led_1.power", "led_3.power"):
         assert abs(found[name]["value"] - 1.25) < 4 * found[name]["sd"] < 0.05
-    step = Study.open(study).steps[0]
+    step = Record.open(study).steps[0]
     assert step["held_out"]["chi2_per_dof"] == pytest.approx(1, abs=0.06)  # 10368 values: sd 0.014
     rows = json.loads(optics("compare", measured, "--json", "--fit", study / "steps" / "00-base" / "fit.toml")[1])[
         "rows"
