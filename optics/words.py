@@ -136,6 +136,11 @@ def html_block(title: str, *parts: str, note: str = "") -> str:
     return f"<div><b>{html.escape(title)}</b>{below}{''.join(parts)}</div>"
 
 
+def escaped(text: str) -> str:
+    """Text that may stand in HTML."""
+    return html.escape(text)
+
+
 def html_list(texts: Sequence[str]) -> str:
     """Sentences as a list for a notebook, escaped; nothing for none."""
     return f"<ul>{''.join(f'<li>{html.escape(t)}</li>' for t in texts)}</ul>" if texts else ""

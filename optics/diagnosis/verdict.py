@@ -20,12 +20,17 @@ import math
 import typing
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, fields, is_dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from optics.diagnosis import showing
 from optics.errors import Underdetermined
 from optics.fit.compare import plain
 from optics.words import p_text, percent, spaced, table, with_sd
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 LEVEL = 0.01  # nominal level of the family-wise test and of the structure test
 CLEAR = 10.8  # chi2 between two effects at which the right one wins in 95 % of cases: Phi(sqrt(10.8)/2)
@@ -438,6 +443,17 @@ class Diagnosis:
     def text(self, width: int = 0) -> str:
         """The report for a terminal."""
         return _text(self)
+
+    def records(self) -> list[dict[str, Any]]:
+        """One record per effect (optics.diagnosis.showing.records)."""
+        return showing.records(self)
+
+    def plot(self) -> Figure:
+        """A chart of the ranking and of curves along coordinates (optics.diagnosis.showing.plot)."""
+        return showing.plot(self)
+
+    def _repr_html_(self) -> str:
+        return showing.html(self)
 
 
 def _record(value):

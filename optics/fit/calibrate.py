@@ -11,14 +11,19 @@ from __future__ import annotations
 import fnmatch
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.optimize import lsq_linear
 from scipy.sparse.csgraph import connected_components
 
 from optics.errors import Underdetermined, UnknownKey
+from optics.fit import showing
 from optics.scene.parameter import Values, Variable
 from optics.words import some, spaced
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 REACH = 4.0  # plausible sizes that one step may change what the image is not linear in
 POOR = 0.25  # of the gain that a linearisation promises: with less, it has been followed too far
@@ -90,6 +95,17 @@ class Fit:
             f"chi2 per degree of freedom {self.chi2_per_dof:.4f} ({self.dof} degrees of freedom); {self.reason}"
         )
         return "\n".join([*lines, *(f"warning: {w}" for w in self.warnings)])
+
+    def records(self) -> list[dict[str, Any]]:
+        """One record per variable (optics.fit.showing.records)."""
+        return showing.records(self)
+
+    def plot(self) -> Figure:
+        """A chart of changes, pulls and misfit by frame (optics.fit.showing.plot)."""
+        return showing.plot(self)
+
+    def _repr_html_(self) -> str:
+        return showing.html(self)
 
 
 @dataclass

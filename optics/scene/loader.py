@@ -14,6 +14,7 @@ from pathlib import Path
 
 from optics.errors import BadScene, UnknownKey
 from optics.files.output import shipped
+from optics.scene import showing
 from optics.scene.declare import Effect
 from optics.scene.layer import PatternImage
 from optics.scene.mitsuba_parts import DEFAULT_VARIANT, Declared, collecting, is_part, use_variant
@@ -211,6 +212,13 @@ class Scene:
     def values(self) -> dict[str, float | str]:
         """The present value of every parameter."""
         return dict(self._now)
+
+    def records(self) -> list[dict]:
+        """One record per parameter (optics.scene.showing.records)."""
+        return showing.records(self)
+
+    def _repr_html_(self) -> str:
+        return showing.html(self)
 
     def _read(self) -> dict[str, float | str]:
         now = {}
