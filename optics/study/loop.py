@@ -26,7 +26,8 @@ from optics.diagnosis.verdict import AT_FAULT, FAR
 from optics.errors import BadCapture, Underdetermined, UnknownKey
 from optics.fit import calibrate
 from optics.fit.compare import Comparison, Row, compare
-from optics.fit.model import Model
+from optics.fit.model import value_of
+from optics.fit.scene_model import SceneModel as Model
 from optics.scene import loader as scenes
 from optics.scene.declare import Effect
 from optics.scene.parameter import Values, Variable
@@ -57,7 +58,7 @@ class Setup:
     per_group   key patterns with a value per group of frames; None: the press, where groups are given
     priors      pattern -> (mean or None for the present value, standard deviation)
     held_out    names of groups that the calibration does not see; None: one in four, evenly spread
-    values      start values, by key;   flat_field  how a background image enters, see `optics.fit.model.Model`
+    values      start values, by key;   flat_field  how a background image enters, see `optics.fit.scene_model.SceneModel`
     robust      residuals beyond three sigmas count less (Huber), as dirt and glints ask for; a diagnosis weighs all
                 alike
     """
@@ -189,7 +190,7 @@ def _untouched(model: Model, frames: Sequence[int]) -> bool:
 def _with_prior(model, variable: Variable, pattern: str, prior) -> Variable:
     if not (fnmatch(variable.keys[0], pattern) or fnmatch(variable.name, pattern)):
         return variable
-    mean = calibrate.start_of(model, variable, Values()) if prior[0] is None else prior[0]
+    mean = value_of(model, Values(), variable) if prior[0] is None else prior[0]
     return variable.with_prior(mean, prior[1])
 
 
@@ -220,7 +221,7 @@ def fit_base(
     """Calibrate in three stages: what holds in all frames, then the poses, a press at a time, then everything
     together."""
     variables = list(variables)
-    begun = np.array([calibrate.start_of(model, v, start) for v in variables])  # where the first stage starts
+    begun = np.array([value_of(model, start, v) for v in variables])  # where the first stage starts
     common = [v for v in variables if v.frames is None]
     if len(common) < len(variables):
         values = start
@@ -249,7 +250,7 @@ def off_neutral(model: Model, values: Values, variables: Sequence[Variable]) -> 
     bound."""
     moved = values.copy()
     for v in variables:
-        moved.put(v, calibrate.start_of(model, v, moved) + 0.1 * v.parameter.plausible)
+        moved.put(v, value_of(model, moved, v) + 0.1 * v.parameter.plausible)
     return moved
 
 
@@ -405,7 +406,7 @@ def _far(model: Model, found: calibrate.Fit, level: Row) -> list[str]:
         texts.append(
             f"the model misses the images by {level.rms / max(level.signal, 1e-9):.0%} of its own mean, which is no matter of effects: check {AT_FAULT}"
         )
-    moved = [(v, found.values.get(v, model.base)) for v in found.variables if v.prior is not None]
+    moved = [(v, value_of(model, found.values, v)) for v in found.variables if v.prior is not None]
     moved = [(v, value) for v, value in moved if abs(value - v.prior[0]) > 3 * v.prior[1]]
     if moved:
         v, value = max(moved, key=lambda t: abs(t[1] - t[0].prior[0]) / t[0].prior[1])

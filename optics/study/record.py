@@ -464,7 +464,7 @@ def replaced(file: Path) -> Iterator:
 
 
 def shown_frames(model, values, held_out: Sequence[int] = (), frames: Sequence[int] | None = None) -> list[Shown]:
-    """All frames, or the given ones, of an optics.fit.model.Model with its predictions for `values`."""
+    """All frames, or the given ones, of an optics.fit.scene_model.SceneModel with its predictions for `values`."""
     indices = list(range(len(model.frames))) if frames is None else list(frames)
     out = []
     for i in indices:
