@@ -102,7 +102,7 @@ def _now(model, values: Values, frame: int) -> dict[str, float]:
     """Numbers that hold in a frame, by key; of a sweep of readings what they share, and the middle of what they do
     not."""
     own = model.frames[frame]
-    swept = {k: float(np.median(v)) for k, v in getattr(own, "readings", {}).items()}
+    swept = {k: float(np.median(v)) for k, v in own.readings.items()}
     return {**model.base, **values.common, **own.parameters, **swept, **values.frame.get(frame, {})}
 
 
@@ -118,7 +118,7 @@ def _press(model) -> tuple[str, str, str] | None:
 
 
 def _same(model, like: int) -> str:
-    if getattr(model.frames[like], "readings", None):
+    if model.frames[like].readings:
         return f"{len(model.frames[like].image)} of the same readings"
     return "the same press" if _press(model) else "the same frame"
 
@@ -221,7 +221,7 @@ def places(known: np.ndarray, reach: np.ndarray, count: int) -> list[tuple[float
 
 def _lights(model, values: Values, frames: Sequence[int], now: Mapping, like: int) -> Iterator[Shot]:
     keys = keys_named(model.parameters, "power")
-    driven = getattr(model, "driven", None)
+    driven = model.driven
     if not keys:
         return
 
@@ -290,7 +290,7 @@ def _turned(model, frames: Sequence[int], now: Mapping, like: int) -> Iterator[S
     turned: dict[str, set[float]] = {}
     for f in frames:
         own = model.frames[f]
-        for key, value in (*own.parameters.items(), *getattr(own, "readings", {}).items()):
+        for key, value in (*own.parameters.items(), *own.readings.items()):
             if key not in special and not isinstance(value, str):
                 turned.setdefault(key, set()).update(np.unique(value).tolist())
     for key, taken in turned.items():
@@ -545,7 +545,7 @@ def imagined(model, values: Values, shots: Sequence[Shot]):
     """(model, values) with the shots as further frames, whose images are what the model predicts."""
     first = len(model.frames)
     twin, values = model.imagine([_frame(model, shot, n) for n, shot in enumerate(shots)]), values.copy()
-    for key in getattr(twin, "driven", set()) - getattr(model, "driven", set()):
+    for key in (twin.driven or set()) - (model.driven or set()):
         values.common.setdefault(key, float(model.base[key]))  # what was the light's power is now its power at drive 1
     for n, shot in enumerate(shots, first):
         own = values.frame.get(shot.like, {})
@@ -558,14 +558,15 @@ def imagined(model, values: Values, shots: Sequence[Shot]):
 
 def _frame(model, shot: Shot, number: int):
     like = model.frames[shot.like]
-    readings = {k: v for k, v in getattr(like, "readings", {}).items() if k not in shot.settings}
+    readings = {k: v for k, v in like.readings.items() if k not in shot.settings}
     return replace(
         like,
         name=f"shot-{number + 1}",
         repeats=[],
         parameters={**like.parameters, **shot.settings},
         group=shot.press or like.group,
-        **({"readings": readings, "rows": None} if hasattr(like, "readings") else {}),
+        readings=readings,
+        rows=None,
     )
 
 

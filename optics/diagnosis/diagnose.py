@@ -18,7 +18,7 @@ from optics.diagnosis import fingerprints as prints
 from optics.diagnosis import homogeneity as evenness
 from optics.diagnosis import pairs
 from optics.diagnosis import statistics as st
-from optics.diagnosis.evidence import Candidate, Evidence, Progress, at_bound, measure, value_of
+from optics.diagnosis.evidence import Candidate, Evidence, Progress, at_bound, measure
 from optics.diagnosis.verdict import (
     AS_GOOD,
     AT_FAULT,
@@ -47,6 +47,7 @@ from optics.diagnosis.verdict import (
 )
 from optics.errors import Underdetermined
 from optics.fit.calibrate import for_frames
+from optics.fit.model import Model, value_of
 from optics.scene.declare import Effect
 from optics.scene.parameter import Values, Variable
 from optics.words import some

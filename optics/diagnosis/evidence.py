@@ -16,21 +16,11 @@ import numpy as np
 from optics.diagnosis import statistics as st
 from optics.diagnosis.verdict import Row
 from optics.errors import Underdetermined
+from optics.fit.model import Model, value_of
 from optics.scene.declare import Effect
 from optics.scene.parameter import Values, Variable
 
 Progress = Callable[[str, int, int], None]
-
-
-def value_of(model, values: Values, variable: Variable) -> float:
-    """The present value of a variable: fitted in a frame <- set in it <- fitted in all <- the scene's."""
-    key = variable.keys[0]
-    if variable.frames is not None:
-        frame = variable.frames[0]
-        own = {**model.frames[frame].parameters, **values.frame.get(frame, {})}
-        if key in own:
-            return float(own[key])
-    return float(values.common.get(key, model.base[key]))
 
 
 def at_bound(variable: Variable, value: float) -> bool:
@@ -266,9 +256,9 @@ def measure(
     total, used = 0, 0
     for frame in frames:
         mask = model.usable(frame)
-        total, used = total + getattr(model, "size", mask.size), used + int(mask.sum())
+        total, used = total + model.size, used + int(mask.sum())
     k = st.thinning(used, rows_max)
-    sweeps = all(getattr(model.frames[f], "readings", None) for f in frames)
+    sweeps = all(model.frames[f].readings for f in frames)
     normal, spectrum = st.Normal(len(columns)), st.Sweeps() if sweeps else st.Spectrum(len(columns))
     evidence = Evidence(
         columns,

@@ -250,9 +250,9 @@ class Bench:
             normal = hits.normal * np.array([1, 1, -1])  # towards the camera, which stands at -z
             tilt = np.where(hits.valid[..., None], normal - np.array([0, 0, 1]), 0)
             self.kept[index, pose] = tilt.astype(np.float32)
-            self.model.renderer._hits.clear()
+            self.model.renderer.forget_hits()
         now = self.model.at(self.base, index)
-        flat = self.model.noise.black_level + self.model.flat * self.model._gains(now)
+        flat = self.model.noise.black_level + self.model.flat * self.model.gains(now)
         return Shape(flat, self.kept[index, pose].astype(float), self.x, self.y)
 
     def misfit(self, null, index: int, pose) -> float:

@@ -12,7 +12,7 @@ from optics import words
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from optics.fit.calibrate import Fit
+    from optics.fit.result import Fit
 
 SHOWN_MOST = 40  # variables in a chart: those that moved most
 SURPRISING = 3.0  # standard deviations beyond which a pull is marked

@@ -803,19 +803,19 @@ def ladder_chart(study: Record, width: int, height: int, nouns: Mapping[str, str
             ]
     slot = (width - left - right) / max(len(steps), 1)
     for i, step in enumerate(steps):
-        for k, words in enumerate(_wrap(("+ " if i else "") + step["name"], max(8, int(slot / 6.6)))[:3]):
+        for k, label in enumerate(_wrap(("+ " if i else "") + step["name"], max(8, int(slot / 6.6)))[:3]):
             parts.append(
                 f'<text class="step" x="{x(i):.1f}" y="{height - bottom + 22 + 15 * k}" text-anchor="middle">'
-                f"{_escape(words)}</text>"
+                f"{_escape(label)}</text>"
             )
     parts.append(f'<text class="tick" x="{left}" y="14">χ²/dof</text>')
     legend = width - right
-    for key, words, wide in (("fitted", f"fitted {nouns['data']}", 92), ("held_out", f"held-out {nouns['data']}", 122)):
+    for key, label, wide in (("fitted", f"fitted {nouns['data']}", 92), ("held_out", f"held-out {nouns['data']}", 122)):
         if any(math.isfinite(v) for v in dict(lines)[key]):
             legend -= wide
             parts.append(
                 f'<circle class="dot {key}" cx="{legend:.0f}" cy="10" r="5"/>'
-                f'<text class="tick" x="{legend + 10:.0f}" y="14">{words}</text>'
+                f'<text class="tick" x="{legend + 10:.0f}" y="14">{label}</text>'
             )
     said = "; ".join(
         f"{step_name(s)}: held out {number(_value(s['held_out'], 'chi2_per_dof'))}, "

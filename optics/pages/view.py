@@ -29,8 +29,9 @@ import numpy as np
 
 from optics.captures import capture_set as capture_files
 from optics.errors import UnknownKey
-from optics.fit import calibrate
+from optics.fit import calibrate, descent
 from optics.fit.compare import led_label
+from optics.fit.model import value_of
 from optics.pages.report import DIVERGING, MASKED, SIGMA_RANGE, colour_bar, ramp
 from optics.scene.parameter import Values, Variable
 from optics.study import loop
@@ -144,7 +145,7 @@ class View:
     def _slide(self, variable: Variable, sd: float | None, effect: str) -> None:
         self.sliders[variable.name] = Slider(
             variable,
-            calibrate.start_of(self.model, variable, self.values),
+            value_of(self.model, self.values, variable),
             math.nan if sd is None else float(sd),
             effect,
         )
@@ -393,7 +394,7 @@ class View:
             return np.array([p.per_coordinate(v) if v or not p.squared else math.inf for p, v in zip(parameters, of)])
 
         k = len(sliders)  # a prior is one more measured value, linear in u like the images
-        pull, curvature, prior = calibrate.prior_terms(self.model, [s.variable for s in sliders], self.moved(there))
+        pull, curvature, prior = descent.prior_terms(self.model, [s.variable for s in sliders], self.moved(there))
         slope = np.nan_to_num(slopes([there.get(name, s.value) for name, s in zip(names, sliders)]), posinf=0.0)
         a[:k, :k] += np.diag(slope**2 * curvature)
         b[:k] += slope * pull
@@ -406,12 +407,12 @@ class View:
         low, high = (np.array([p.coordinate(p.bounds[side]) for p in parameters[:k]]) for side in (0, 1))
         held = x.copy()
         held[:k] = 0
-        free = calibrate.solve(a[:k, :k], (b - a @ held)[:k], low - at[:k], high - at[:k])
+        free = descent.solve(a[:k, :k], (b - a @ held)[:k], low - at[:k], high - at[:k])
         found = held.copy()
         found[:k] = free
         estimate = [float(np.clip(p.at_coordinate(u), *p.bounds)) for p, u in zip(parameters, (at + found)[:k])]
         with np.errstate(invalid="ignore"):
-            sd = np.sqrt(np.maximum(np.diag(calibrate.covariance_of(a[:k, :k])), 0)) * slopes(estimate)
+            sd = np.sqrt(np.maximum(np.diag(descent.covariance_of(a[:k, :k])), 0)) * slopes(estimate)
         return {
             "values": dict(zip(names[:k], estimate)),
             "sd": dict(zip(names[:k], sd.tolist())),

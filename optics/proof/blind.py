@@ -14,10 +14,10 @@ from pathlib import Path
 
 import numpy as np
 
-from optics.diagnosis.evidence import value_of
 from optics.diagnosis.verdict import CLEAR, Diagnosis, Row, close
 from optics.files.output import write_text
 from optics.fit.compare import plain
+from optics.fit.model import value_of
 from optics.proof.cells import Cell
 from optics.scene.registry import registry
 from optics.study import loop

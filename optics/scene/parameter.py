@@ -176,13 +176,6 @@ class Values:
         """base <- common <- this frame's own."""
         return {**(base or {}), **self.common, **self.frame.get(frame, {})}
 
-    def get(self, variable: Variable, base: Mapping[str, float]) -> float:
-        if variable.frames is not None:
-            own = self.frame.get(variable.frames[0], {})
-            if variable.keys[0] in own:
-                return float(own[variable.keys[0]])
-        return float(self.common.get(variable.keys[0], base[variable.keys[0]]))
-
     def put(self, variable: Variable, value: float) -> None:
         if variable.frames is None:
             for key in variable.keys:

@@ -6,9 +6,10 @@ from collections.abc import Sequence
 
 from optics.captures import capture_set as capture_files
 from optics.diagnosis.verdict import AT_FAULT, FAR
-from optics.fit import calibrate
 from optics.fit.compare import Row
-from optics.fit.model import Model
+from optics.fit.model import value_of
+from optics.fit.result import Fit
+from optics.fit.scene_model import SceneModel
 from optics.scene.parameter import Values
 from optics.study.setup import GROUPS, Setup
 from optics.words import some, spaced
@@ -18,12 +19,12 @@ CHANCE = 0.3
 SURPRISING = 3.0  # standard deviations of a prior, beyond which a calibrated value contradicts it
 
 
-def before_calibration(model: Model, setup: Setup, held: Sequence[int]) -> list[str]:
+def before_calibration(model: SceneModel, setup: Setup, held: Sequence[int]) -> list[str]:
     """Doubts about captures and scene, each once."""
     return [*of_captures(model), *_unverified(model, setup, held)]
 
 
-def of_captures(model: Model) -> list[str]:
+def of_captures(model: SceneModel) -> list[str]:
     """Doubts about the captures, their noise, and what the model can predict of them."""
     from optics.captures.noise import warnings_of
     from optics.light.rendering import veiled
@@ -42,7 +43,7 @@ def of_captures(model: Model) -> list[str]:
     return list(dict.fromkeys(texts))
 
 
-def after_calibration(model: Model, found: calibrate.Fit, level: Row) -> list[str]:
+def after_calibration(model: SceneModel, found: Fit, level: Row) -> list[str]:
     """What no effect explains: a model nowhere near its images, or values that contradict their priors."""
     texts = []
     if level.rms > FAR * level.signal:
@@ -50,7 +51,7 @@ def after_calibration(model: Model, found: calibrate.Fit, level: Row) -> list[st
             f"the model misses the images by {level.rms / max(level.signal, 1e-9):.0%} of its own mean, too far for a "
             f"missing effect: check {AT_FAULT}"
         )
-    known = [(v, found.values.get(v, model.base), v.prior) for v in found.variables if v.prior is not None]
+    known = [(v, value_of(model, found.values, v), v.prior) for v in found.variables if v.prior is not None]
     moved = [(v, value, prior) for v, value, prior in known if abs(value - prior[0]) > SURPRISING * prior[1]]
     if moved:
         v, value, prior = max(moved, key=lambda t: abs(t[1] - t[2][0]) / t[2][1])
@@ -61,7 +62,7 @@ def after_calibration(model: Model, found: calibrate.Fit, level: Row) -> list[st
     return texts
 
 
-def _unverified(model: Model, setup: Setup, held: Sequence[int]) -> list[str]:
+def _unverified(model: SceneModel, setup: Setup, held: Sequence[int]) -> list[str]:
     """Several groups of frames, of which none is held out because there are too few."""
     groups = len(capture_files.groups(model.captures))
     if held or setup.held_out is not None or groups < 2:
@@ -72,7 +73,7 @@ def _unverified(model: Model, setup: Setup, held: Sequence[int]) -> list[str]:
     ]
 
 
-def _astray(model: Model) -> list[str]:
+def _astray(model: SceneModel) -> list[str]:
     """Presses that lie beyond the gel."""
     gel = model.scene.gel
     if gel is None:
@@ -88,7 +89,7 @@ def _astray(model: Model) -> list[str]:
     return []
 
 
-def _unnamed(model: Model) -> list[str]:
+def _unnamed(model: SceneModel) -> list[str]:
     """Lights that some frames set and others leave to the scene, which has them on."""
     own = [{*f.parameters, *f.readings} for f in model.frames]
     left = {

@@ -318,7 +318,7 @@ def plan(
     """
     from scipy.special import ndtr
 
-    from optics.fit.model import Model
+    from optics.fit.scene_model import SceneModel
     from optics.scene.registry import registry
 
     say = progress or (lambda what, done, total: None)
@@ -347,7 +347,7 @@ def plan(
     blank = np.zeros((height, width, channels), np.float32)
     first = Frame("first", blank, parameters=pool[0].readings[0], file="design")
     table = Table("readings.csv", ["reading"]) if swept else None
-    model = Model(scene, Captures(Path("."), str(scene.path), [first], noise=noise, table=table), noise)
+    model = SceneModel(scene, Captures(Path("."), str(scene.path), [first], noise=noise, table=table), noise)
     model.frames = []
     model = model.imagine(
         [

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from optics.errors import UnknownKey
-from optics.fit.calibrate import Fit
-from optics.fit.model import Model
+from optics.fit.result import Fit
+from optics.fit.scene_model import SceneModel
 from optics.scene.parameter import Values
 
 CORRELATION_SHOWN = 0.9  # absolute correlation beyond which a pair of variables is listed
@@ -140,7 +140,7 @@ def read_fit(file: str | Path) -> dict[str, dict]:
     return {key: data.get(key, {}) for key in ("parameters", "uncertainty", "frames", "frames_uncertainty", "fit")}
 
 
-def values_of(model: Model, file: str | Path | None, sets: Mapping[str, float | str]) -> Values:
+def values_of(model: SceneModel, file: str | Path | None, sets: Mapping[str, float | str]) -> Values:
     """The values of a fit.toml (None: none), and above them those of `sets`.
 
     Raises UnknownKey for a frame that the model's captures do not have, ValueError for what is not TOML, and what

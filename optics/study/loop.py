@@ -22,7 +22,8 @@ from optics.diagnosis.verdict import Diagnosis
 from optics.errors import BadCapture, UnknownKey
 from optics.fit import calibrate
 from optics.fit.compare import Comparison
-from optics.fit.model import Model
+from optics.fit.result import Fit
+from optics.fit.scene_model import SceneModel
 from optics.scene.declare import Effect
 from optics.scene.parameter import Values, Variable
 from optics.study import checks
@@ -65,7 +66,7 @@ def begin(
     command: Sequence[str] = (),
     resume: bool = False,
     progress: Progress | None = None,
-) -> tuple[Record, Model, calibrate.Fit]:
+) -> tuple[Record, SceneModel, Fit]:
     """Start a study: calibrate the base model and record it as the first step."""
     model = open_model(setup)
     fitted, held = split(model, setup)
@@ -106,7 +107,7 @@ def begin(
     return record, model, found
 
 
-def take_up(folder: str | Path) -> tuple[Record, Model, Setup]:
+def take_up(folder: str | Path) -> tuple[Record, SceneModel, Setup]:
     """The record, model and setup of an existing study. Raises BadCapture where an input has changed since it began."""
     record = Record.open(folder)
     setup = recorded(record.record["facts"]["setup"])
@@ -116,7 +117,7 @@ def take_up(folder: str | Path) -> tuple[Record, Model, Setup]:
     return record, open_model(setup), setup
 
 
-def kept(record: Record, model: Model, index: int = -1) -> tuple[list[Variable], Values, list[int]]:
+def kept(record: Record, model: SceneModel, index: int = -1) -> tuple[list[Variable], Values, list[int]]:
     """What a step's folder holds of its fit: the variables, the values, and the frames that were fitted."""
     setup = recorded(record.record["facts"]["setup"])
     fitted, _ = split(model, setup)
@@ -131,7 +132,7 @@ def kept(record: Record, model: Model, index: int = -1) -> tuple[list[Variable],
     return variables, values, fitted
 
 
-def restore(record: Record, model: Model, index: int = -1) -> calibrate.Fit:
+def restore(record: Record, model: SceneModel, index: int = -1) -> Fit:
     """The fit of a step, from its folder: the same variables and values, with derivatives and errors computed anew."""
     variables, values, fitted = kept(record, model, index)
     most = AGAIN if record.steps[index]["converged"] else FURTHER
@@ -146,12 +147,12 @@ def _of_fitted(variables: Sequence[Variable], fitted: Sequence[int]) -> list[Var
 # -- what can be added --------------------------------------------------------------------------------------------------
 
 
-def effects_of(record: Record, model: Model) -> list[Effect]:
+def effects_of(record: Record, model: SceneModel) -> list[Effect]:
     """The effects that the study has added so far."""
     return [registry_of(model).find_effect(step["effect"]) for step in record.steps if step["effect"]]
 
 
-def candidates(model: Model, record: Record) -> list[Effect]:
+def candidates(model: SceneModel, record: Record) -> list[Effect]:
     """Every effect that the scene can express and the study has not added."""
     done = {e.key for e in effects_of(record, model)}
     return [
@@ -161,7 +162,7 @@ def candidates(model: Model, record: Record) -> list[Effect]:
     ]
 
 
-def seek(model: Model, values: Values, effects: Sequence[Effect], frames: Sequence[int]) -> None:
+def seek(model: SceneModel, values: Values, effects: Sequence[Effect], frames: Sequence[int]) -> None:
     """Set, in the values, the place of effects that have one (an unfilled cell), as their residual suggests."""
     for effect in effects:
         if effect.seek is not None:
@@ -173,9 +174,9 @@ def seek(model: Model, values: Values, effects: Sequence[Effect], frames: Sequen
 
 def examine(
     record: Record,
-    model: Model,
+    model: SceneModel,
     setup: Setup,
-    found: calibrate.Fit,
+    found: Fit,
     progress: Progress | None = None,
     advised: bool = True,
 ) -> Diagnosis:
@@ -211,14 +212,14 @@ def examine(
 class Refits:
     """The refits that a diagnosis asks for: chord steps on the base's derivative images where they will do, else a fit."""
 
-    def __init__(self, model: Model, setup: Setup, base: calibrate.Fit, tested: Sequence[Effect]):
+    def __init__(self, model: SceneModel, setup: Setup, base: Fit, tested: Sequence[Effect]):
         self.model, self.setup, self.base = model, setup, base
         self.known = {v.name for v in base.variables}
         curved = [v for e in tested if e.onset != "tangent" for v in effect_variables(model, e)]
         self.steps = {v.name: v.parameter.plausible for v in curved}  # of variables without a slope at neutral
-        self.results: dict[tuple[str, ...], calibrate.Fit] = {}
+        self.results: dict[tuple[str, ...], Fit] = {}
 
-    def of(self, model: Model, variables: Sequence[Variable], start: Values, frames: Sequence[int]) -> calibrate.Fit:
+    def of(self, model: SceneModel, variables: Sequence[Variable], start: Values, frames: Sequence[int]) -> Fit:
         """The fit of these variables from this start."""
         base = self.base
         extra = [v for v in variables if v.name not in self.known]
@@ -236,8 +237,8 @@ class Refits:
         return self.results[names]
 
     def afresh(
-        self, variables: Sequence[Variable], extra: Sequence[Variable], frames: Sequence[int], quick: calibrate.Fit
-    ) -> calibrate.Fit:
+        self, variables: Sequence[Variable], extra: Sequence[Variable], frames: Sequence[int], quick: Fit
+    ) -> Fit:
         """Calibrate from the study's start values: a strong effect may have bent the base's values far from the truth."""
         values = off_neutral(self.model, Values(dict(self.setup.values)), extra)
         best = fit_base(self.model, variables, frames, values, tolerance=ROUGH)
@@ -251,13 +252,13 @@ class Refits:
 
 def extend(
     record: Record,
-    model: Model,
+    model: SceneModel,
     setup: Setup,
-    found: calibrate.Fit,
+    found: Fit,
     effect: Effect,
     start: Values | None = None,
     progress: Progress | None = None,
-) -> tuple[calibrate.Fit, Comparison]:
+) -> tuple[Fit, Comparison]:
     """Free an effect, calibrate everything again, and record the step.
 
     start   values to begin from, such as those of a diagnosis's refit; None: the present ones, with the effect a little
@@ -293,10 +294,10 @@ def extend(
 
 def write_step(
     record: Record,
-    model: Model,
+    model: SceneModel,
     name: str,
     effect: Effect | None,
-    found: calibrate.Fit,
+    found: Fit,
     held: Sequence[int],
     seconds: float,
 ) -> Comparison:
@@ -308,7 +309,7 @@ def write_step(
     record.add_step(
         name,
         effect.key if effect else None,
-        calibrate.Fit(**{**found.__dict__, "values": everywhere}),
+        Fit(**{**found.__dict__, "values": everywhere}),
         comparison,
         frames=shown_frames(model, everywhere, held),
         seconds=seconds,

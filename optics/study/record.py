@@ -33,8 +33,8 @@ from optics import words
 from optics.diagnosis.verdict import Diagnosis
 from optics.errors import BadCapture, OutputExists
 from optics.files.output import file_hash, input_hashes, new_folder, replacing, versions, write_text
-from optics.fit.calibrate import Fit
 from optics.fit.compare import Comparison, Row, plain
+from optics.fit.result import Fit
 from optics.study.fit_files import fit_record, fit_toml, read_fit
 from optics.study.shown import Fingerprint, Shown
 
@@ -210,7 +210,7 @@ class Record:
 
         name         as in a sentence: "base", "lens vignetting"; the folder becomes NN-lens-vignetting
         effect       key of the effect that was added; None for the base
-        fit          optics.fit.calibrate.Fit, or what `fit_record` makes of one
+        fit          optics.fit.Fit, or what `fit_record` makes of one
         comparison   of all frames, with held_out given where there are any
         diagnosis    a Diagnosis, or its dictionary
         frames       all frames or some; at most 8 are kept: the worst of the first step, the same ones in every later

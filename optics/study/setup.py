@@ -12,7 +12,8 @@ from pathlib import Path
 from optics.captures import capture_set as capture_files
 from optics.errors import Underdetermined, UnknownKey
 from optics.fit import calibrate
-from optics.fit.model import Model
+from optics.fit.model import value_of
+from optics.fit.scene_model import SceneModel
 from optics.scene import loader as scenes
 from optics.scene.declare import Effect
 from optics.scene.parameter import Values, Variable
@@ -83,7 +84,7 @@ def plugins_of(setup: Setup) -> Path:
     return Path(setup.plugins) if setup.plugins else Path(setup.captures) / "plugins"
 
 
-def registry_of(model: Model) -> Registry:
+def registry_of(model: SceneModel) -> Registry:
     """The parts and effects that a model's scene can be made of."""
     return registry()
 
@@ -91,7 +92,7 @@ def registry_of(model: Model) -> Registry:
 # -- the model ----------------------------------------------------------------------------------------------------------
 
 
-def open_model(setup: Setup, model_class: type = Model) -> Model:
+def open_model(setup: Setup, model_class: type = SceneModel) -> SceneModel:
     """Captures and scene of a setup as a model; raises, before anything is rendered, where they contradict each other."""
     found = capture_files.load(setup.captures)
     path = scenes.find(found.scene)
@@ -121,7 +122,7 @@ def open_model(setup: Setup, model_class: type = Model) -> Model:
     return model_class(loaded, found, noise, **options)
 
 
-def split(model: Model, setup: Setup) -> tuple[list[int], list[int]]:
+def split(model: SceneModel, setup: Setup) -> tuple[list[int], list[int]]:
     """Indices of fitted and of held-out frames. Raises UnknownKey for a group that does not exist."""
     groups = capture_files.groups(model.captures)
     names = list(groups)
@@ -141,7 +142,7 @@ def split(model: Model, setup: Setup) -> tuple[list[int], list[int]]:
 # -- what is free -------------------------------------------------------------------------------------------------------
 
 
-def default_free(model: Model) -> list[str]:
+def default_free(model: SceneModel) -> list[str]:
     """Position, axis, lobe and power of every LED, reflectance and roughness of every membrane, power of every source."""
     patterns = []
     spectral = len(model.scene.integrator.bands or (0,))
@@ -154,7 +155,7 @@ def default_free(model: Model) -> list[str]:
     return patterns
 
 
-def variables_of_base(model: Model, setup: Setup, frames: Sequence[int]) -> list[Variable]:
+def variables_of_base(model: SceneModel, setup: Setup, frames: Sequence[int]) -> list[Variable]:
     """The base model's variables in these frames: those of all frames, then those of each group."""
     priors = dict(setup.priors)
     if not setup.free:
@@ -173,7 +174,7 @@ def variables_of_base(model: Model, setup: Setup, frames: Sequence[int]) -> list
     return variables
 
 
-def check_priors(model: Model, setup: Setup) -> None:
+def check_priors(model: SceneModel, setup: Setup) -> None:
     """Raises UnknownKey for a prior on something that the setup does not solve for."""
     everywhere = variables_of_base(model, setup, range(len(model.frames)))
     for pattern in setup.priors:
@@ -181,7 +182,7 @@ def check_priors(model: Model, setup: Setup) -> None:
             raise UnknownKey(pattern, [v.name for v in everywhere], "free parameter for a prior")
 
 
-def effect_variables(model: Model, effect: Effect) -> list[Variable]:
+def effect_variables(model: SceneModel, effect: Effect) -> list[Variable]:
     """What adding an effect frees.
 
     Of several strengths a common mode may be degenerate, such as a gain that all frames share. A prior of GAUGE
@@ -193,14 +194,14 @@ def effect_variables(model: Model, effect: Effect) -> list[Variable]:
     return [_with_prior(model, v, "*", (None, GAUGE * v.parameter.plausible)) for v in found]
 
 
-def _untouched(model: Model, frames: Sequence[int]) -> bool:
+def _untouched(model: SceneModel, frames: Sequence[int]) -> bool:
     """Whether frames say that nothing presses the gel, so that there is no place of a press to solve for."""
     key = f"{model.scene.gel.name}.press_depth"
     return all(model.frames[i].parameters.get(key) == 0 for i in frames)
 
 
-def _with_prior(model: Model, variable: Variable, pattern: str, prior: tuple[float | None, float]) -> Variable:
+def _with_prior(model: SceneModel, variable: Variable, pattern: str, prior: tuple[float | None, float]) -> Variable:
     if not (fnmatch(variable.keys[0], pattern) or fnmatch(variable.name, pattern)):
         return variable
-    mean = calibrate.start_of(model, variable, Values()) if prior[0] is None else prior[0]
+    mean = value_of(model, Values(), variable) if prior[0] is None else prior[0]
     return variable.with_prior(mean, prior[1])

@@ -9,9 +9,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from optics.diagnosis.verdict import Diagnosis
-from optics.fit.calibrate import Fit
 from optics.fit.compare import led_label
-from optics.fit.model import Model
+from optics.fit.result import Fit
+from optics.fit.scene_model import SceneModel
 from optics.scene.parameter import Values
 
 
@@ -59,7 +59,7 @@ class Fingerprint:
 
 
 def shown_frames(
-    model: Model, values: Values, held_out: Sequence[int] = (), frames: Sequence[int] | None = None
+    model: SceneModel, values: Values, held_out: Sequence[int] = (), frames: Sequence[int] | None = None
 ) -> list[Shown]:
     """All frames of a model, or the given ones, with its predictions for `values`."""
     indices = list(range(len(model.frames))) if frames is None else list(frames)
@@ -91,7 +91,7 @@ def shown_frames(
     return out
 
 
-def fingerprints_of(model: Model, fit: Fit, diagnosis: Diagnosis, frame: int, count: int = 4) -> list[Fingerprint]:
+def fingerprints_of(model: SceneModel, fit: Fit, diagnosis: Diagnosis, frame: int, count: int = 4) -> list[Fingerprint]:
     """What the best effects of a diagnosis change in a frame when they are added and everything is calibrated again.
 
     image = (prediction of the refit - prediction of the base) / sd, beside residual = (measured - base) / sd: the right

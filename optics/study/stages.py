@@ -8,7 +8,9 @@ import numpy as np
 
 from optics.fit import calibrate
 from optics.fit.compare import Comparison, compare
-from optics.fit.model import Model
+from optics.fit.model import value_of
+from optics.fit.result import Fit
+from optics.fit.scene_model import SceneModel
 from optics.scene.parameter import Values, Variable
 
 Progress = Callable[[str, int, int], None]
@@ -21,17 +23,17 @@ OFF = 0.1  # plausible sizes off neutral from which an effect is followed
 
 
 def fit_base(
-    model: Model,
+    model: SceneModel,
     variables: Sequence[Variable],
     fitted: Sequence[int],
     start: Values,
     progress: Progress | None = None,
     tolerance: float = TOGETHER,
     robust: bool = False,
-) -> calibrate.Fit:
+) -> Fit:
     """Calibrate in three stages: what all frames share, then the poses of one press at a time, then everything together."""
     variables = list(variables)
-    begun = np.array([calibrate.start_of(model, v, start) for v in variables])  # where the first stage starts
+    begun = np.array([value_of(model, start, v) for v in variables])  # where the first stage starts
     common = [v for v in variables if v.frames is None]
     if len(common) < len(variables):
         values = start
@@ -51,15 +53,15 @@ def fit_base(
     return found
 
 
-def off_neutral(model: Model, values: Values, variables: Sequence[Variable]) -> Values:
+def off_neutral(model: SceneModel, values: Values, variables: Sequence[Variable]) -> Values:
     """Values with variables a tenth of their plausible size off: at a bound a one-sided onset has no slope to follow."""
     moved = values.copy()
     for v in variables:
-        moved.put(v, calibrate.start_of(model, v, moved) + OFF * v.parameter.plausible)
+        moved.put(v, value_of(model, moved, v) + OFF * v.parameter.plausible)
     return moved
 
 
-def held_out_values(model: Model, found: calibrate.Fit, held: Sequence[int]) -> tuple[Values, int]:
+def held_out_values(model: SceneModel, found: Fit, held: Sequence[int]) -> tuple[Values, int]:
     """Values for all frames, and the number of variables fitted for it: on held-out frames only those with a value per
     frame or group are fitted."""
     own = calibrate.for_frames(model, found.variables, held)
@@ -67,7 +69,7 @@ def held_out_values(model: Model, found: calibrate.Fit, held: Sequence[int]) -> 
 
 
 def comparison_of(
-    model: Model, values: Values, held: Sequence[int] = (), parameters: int = 0, held_parameters: int = 0
+    model: SceneModel, values: Values, held: Sequence[int] = (), parameters: int = 0, held_parameters: int = 0
 ) -> Comparison:
     """All frames, measured against predicted; `parameters` were fitted to the frames that are not held out,
     `held_parameters` to the held-out ones."""
@@ -89,7 +91,7 @@ def comparison_of(
     )
 
 
-def null_models(model: Model, values: Values, fitted: Sequence[int], held: Sequence[int]) -> dict | None:
+def null_models(model: SceneModel, values: Values, fitted: Sequence[int], held: Sequence[int]) -> dict | None:
     """An imported set's model beside models without physics (optics.fit.null_models); None without held-out frames or a
     background."""
     from optics.captures import importing
@@ -100,6 +102,6 @@ def null_models(model: Model, values: Values, fitted: Sequence[int], held: Seque
     return nulls.compare(model, values, fitted, held, importing.circles_of(model.captures)).json()
 
 
-def background_of(model: Model, values: Values) -> dict | None:
+def background_of(model: SceneModel, values: Values) -> dict | None:
     """The flat field's mode, and how much of the background the scene explains without it, per channel."""
     return None if model.flat is None else {"mode": model.flat_field, "channels": model.background_share(values)}

@@ -21,6 +21,7 @@ from optics.diagnosis.diagnose import _refuted, diagnose, score
 from optics.diagnosis.evidence import Candidate, measure
 from optics.diagnosis.verdict import CLEAR, CLUTTERED, MARGIN, WORDS, Diagnosis, Findings, Pair, decide
 from optics.errors import Underdetermined
+from optics.fit.model import value_of
 from optics.scene.declare import Effect
 from optics.scene.parameter import Parameter, Values, Variable
 
@@ -620,7 +621,7 @@ def test_one_sided_effects_are_never_found_below_their_bound():
 def test_a_base_parameter_at_its_bound_is_taken_as_known():
     model, fit = calibrated()
     low, high = model.parameters["led1.z"].bounds
-    edge = fit.values.get(model.variable("led1.z"), model.base)
+    edge = value_of(model, fit.values, model.variable("led1.z"))
     model.parameters["led1.z"] = replace(model.parameters["led1.z"], default=edge, bounds=(low, edge))
     fit.variables = [model.variable(v.name) if v.name == "led1.z" else v for v in fit.variables]
     d = judge(model, fit, library("glare"))
