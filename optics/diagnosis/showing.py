@@ -109,7 +109,9 @@ def html(diagnosis: Diagnosis) -> str:
         diagnosis.word.replace("_", " "),
         f"<p>{words.escaped(diagnosis.sentence)}</p>",
         words.html_table(head, lines, left=(0, 5, 7)) if lines else "",
-        words.html_list([*(f"next: {hint}" for hint in diagnosis.hints), *(f"warning: {w}" for w in diagnosis.warnings)]),
+        words.html_list(
+            [*(f"next: {hint}" for hint in diagnosis.hints), *(f"warning: {w}" for w in diagnosis.warnings)]
+        ),
         note=f"{b.frames} frames; noise {words.percent(b.noise, typeset=True)} of the signal, misfit "
         f"{words.percent(b.misfit, typeset=True)}",
     )

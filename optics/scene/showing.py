@@ -47,7 +47,9 @@ def html(scene: Scene) -> str:
         lines = [
             (
                 r["key"],
-                words.number(r["value"], 6) if isinstance(r["value"], str) else words.number(r["value"], 6, typeset=True),
+                words.number(r["value"], 6)
+                if isinstance(r["value"], str)
+                else words.number(r["value"], 6, typeset=True),
                 r["unit"] if words.spaced(r["unit"]) else "",
                 _bounds(r["low"], r["high"]),
                 r["meaning"],
