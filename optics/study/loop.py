@@ -110,7 +110,7 @@ def begin(
 def take_up(folder: str | Path) -> tuple[Record, SceneModel, Setup]:
     """The record, model and setup of an existing study. Raises BadCapture where an input has changed since it began."""
     record = Record.open(folder)
-    setup = recorded(record.record["facts"]["setup"])
+    setup = recorded(record.ladder["facts"]["setup"])
     changed = record.changed_inputs()
     if changed:
         raise BadCapture(f"{folder}: changed since the study began: {', '.join(changed[:5])}; start a new study")
@@ -119,7 +119,7 @@ def take_up(folder: str | Path) -> tuple[Record, SceneModel, Setup]:
 
 def kept(record: Record, model: SceneModel, index: int = -1) -> tuple[list[Variable], Values, list[int]]:
     """What a step's folder holds of its fit: the variables, the values, and the frames that were fitted."""
-    setup = recorded(record.record["facts"]["setup"])
+    setup = recorded(record.ladder["facts"]["setup"])
     fitted, _ = split(model, setup)
     steps = record.steps[: len(record.steps) + index + 1] if index < 0 else record.steps[: index + 1]
     data = record.fit(len(steps) - 1)
