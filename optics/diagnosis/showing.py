@@ -41,9 +41,10 @@ def _record(row: Row) -> dict[str, Any]:
 
 def plot(diagnosis: Diagnosis) -> Figure:
     """The ranking of effects by what they explain, and what curves along coordinates explain beside them."""
-    from optics.files.charts import BLUE, GREY, RED, chart, height_for
+    from optics.files.charts import BLUE, GREY, RED, chart, height_for, legend_below
 
-    rows = sorted((r for r in diagnosis.rows if r.net > 0 or r.refit), key=lambda r: -r.fall)[:SHOWN_MOST][::-1]
+    rows = [r for r in diagnosis.rows if r.net > 0 or r.refit is not None]
+    rows = sorted(rows, key=lambda r: -(r.refit.fall if r.refit else r.fall))[:SHOWN_MOST][::-1]
     curves = [f for f in diagnosis.fingerprints if f.net > 0][:SHOWN_MOST][::-1]
     figure, axes = chart(11 if curves else 7, height_for(max(len(rows), len(curves), 6)), 2 if curves else 1)
     left = axes[0] if curves else axes
@@ -59,7 +60,7 @@ def plot(diagnosis: Diagnosis) -> Figure:
             color=colours,
             label="refit, everything calibrated again",
         )
-        left.legend(fontsize=8, loc="lower right")
+        legend_below(left, 2)
     left.set(yticks=at, xlabel="fall of chi2")
     left.set_yticklabels([r.name for r in rows], fontsize=8)
     left.set_title("effects", fontsize=10)
@@ -75,11 +76,12 @@ def plot(diagnosis: Diagnosis) -> Figure:
             right.axvline(best, color=RED, lw=1, label="best effect")
         for family in dict.fromkeys(f.family for f in curves):
             right.bar(0, 0, color=COLOURS.get(family, COLOURS[""]), label=family or "other")
-        right.legend(fontsize=8, loc="lower right")
+        legend_below(right, 4)
         right.set(yticks=range(len(curves)), xlabel="fall of chi2, less its number of bins")
         right.set_yticklabels([f.coordinate for f in curves], fontsize=8)
         right.set_title("a free curve along a coordinate", fontsize=10)
-    title = diagnosis.word.replace("_", " ") + (f": {diagnosis.claimed}" if diagnosis.claimed else "")
+    named = diagnosis.claimed or words.some(diagnosis.ambiguous, 4)
+    title = diagnosis.word.replace("_", " ") + (f": {named}" if named else "")
     figure.suptitle(title, fontsize=12)
     return figure
 

@@ -11,6 +11,8 @@ from matplotlib.figure import Figure
 # Told apart with every kind of colour vision, and in grey.
 BLUE, ORANGE, RED, GREY = "#1d5fa6", "#d9962f", "#b22f33", "#8a8a8a"
 
+LEGEND_AT = -0.16  # heights of the axis: below its label
+
 
 class Chart(Figure):
     """A figure to save (`chart.savefig("fit.png")`) or to end a notebook cell with."""
@@ -28,6 +30,11 @@ def chart(width: float, height: float, columns: int = 1, shares: Sequence[float]
     for axis in [axes] if columns == 1 else axes:
         axis.spines[["top", "right"]].set_visible(False)
     return figure, axes
+
+
+def legend_below(axis: Any, columns: int) -> None:
+    """A legend under the axis label, where it hides no data."""
+    axis.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, LEGEND_AT), ncol=columns, frameon=False)
 
 
 def height_for(rows: int) -> float:

@@ -21,7 +21,7 @@ PACKAGES = ("mitsuba", "drjit", "numpy", "scipy", "scikit-image")
 
 @contextmanager
 def replacing(path: str | Path) -> Iterator[Path]:
-    """A temporary file beside `path` that replaces it when the block ends without an error, and is removed otherwise."""
+    """A temporary file beside `path` that replaces it when the block ends without an error; removed otherwise."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.parent / f".{path.stem}.{uuid.uuid4().hex}{path.suffix}"
@@ -43,8 +43,8 @@ def write_text(path: str | Path, text: str) -> Path:
 def new_folder(folder: str | Path, *, replace: bool = False) -> Iterator[Path]:
     """A temporary folder beside `folder` that takes its place when the block ends without an error.
 
-    An empty folder gives way. One with content gives way only with `replace`: it is moved aside first, and back again if
-    the new one cannot take its place. Raises OutputExists, before anything is written.
+    An empty folder gives way. One with content gives way only with `replace`: it is moved aside first, and back again
+    if the new one cannot take its place. Raises OutputExists, before anything is written.
     """
     folder = Path(os.path.abspath(folder))
     if not replace:

@@ -49,7 +49,7 @@ def records(fit: Fit) -> list[dict[str, Any]]:
 
 def plot(fit: Fit) -> Figure:
     """How far each variable moved, how far priors were left, and the misfit of each frame in units of the noise."""
-    from optics.files.charts import BLUE, GREY, ORANGE, RED, chart, height_for
+    from optics.files.charts import BLUE, GREY, ORANGE, RED, chart, height_for, legend_below
 
     rows = records(fit)
     moved = [(r, _moved(r)) for r in rows if r["start"] is not None]
@@ -87,7 +87,7 @@ def plot(fit: Fit) -> Figure:
         axis.set_yscale("log")
     axis.set(xlabel="frame", ylabel="chi2 per value")
     axis.set_title(f"misfit by frame; all: chi2/dof {fit.chi2_per_dof:.3g}", fontsize=10)
-    axis.legend(fontsize=8)
+    legend_below(axis, 2)
     return figure
 
 
@@ -101,10 +101,10 @@ def html(fit: Fit) -> str:
             (
                 r["name"],
                 words.with_sd(r["value"], r["sd"], typeset=True),
-                r["unit"],
+                r["unit"] if words.spaced(r["unit"]) else "",
                 words.number(r["start"], 5, typeset=True),
                 "" if r["pull"] is None else words.number(r["pull"], 2, typeset=True),
-                f"{words.number(fit.correlation[i, j], 2, typeset=True)} {fit.variables[j].name}" if j != i else "",
+                f"{words.fixed(fit.correlation[i, j], 2)} {fit.variables[j].name}" if j != i else "",
                 "at its bound" if r["at_bound"] else "",
             )
         )

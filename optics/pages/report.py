@@ -1197,7 +1197,7 @@ def _candidate(r: Mapping) -> dict:
         "survival": percent(as_float(r.get("survival")), 2),
         "p": pvalue(as_float(r.get("p_family"))),
         "confused": confused,
-        "flags": ", ".join(map(words, r.get("flags") or ())),
+        "flags": ", ".join(map(prose, r.get("flags") or ())),
         "verdict": prose(r.get("verdict")),
     }
     return {

@@ -57,7 +57,7 @@ def html(scene: Scene) -> str:
             for r in own
         ]
         table = words.html_table(("key", "value", "unit", "bounds", "meaning"), lines, left=(0, 2, 4))
-        title = f"{words.escaped(name)}: {words.escaped(part.kind)}, {len(own)} parameters"
+        title = f"{words.escaped(name)}: {words.escaped(part.kind)}, {len(own)} parameter{'' if len(own) == 1 else 's'}"
         blocks.append(f"<details><summary>{title}</summary>{table}</details>")
     size = " × ".join(map(str, scene.camera.resolution)) + " px, " if scene.camera is not None else ""
     return words.html_block(f"Scene: {scene.path.stem}", *blocks, note=f"{size}{len(scene.parts)} parts; {scene.path}")
