@@ -14,13 +14,17 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from optics.diagnosis import statistics as st
-from optics.diagnosis.verdict import Row
+from optics.diagnosis.result import Row
 from optics.errors import Underdetermined
 from optics.fit.model import Model, value_of
 from optics.scene.declare import Effect
 from optics.scene.parameter import Values, Variable
 
-Progress = Callable[[str, int, int], None]
+Progress = Callable[[str, int, int], None]  # (what, done, total)
+
+
+def silent(what: str, done: int, total: int) -> None:
+    """Progress that nobody watches."""
 
 
 def at_bound(variable: Variable, value: float) -> bool:
@@ -29,21 +33,31 @@ def at_bound(variable: Variable, value: float) -> bool:
 
 @dataclass
 class Candidate:
-    """An effect under test: its variables, where they start, and what was found."""
+    """An effect under test: its variables, where they start, and what was found.
+
+    sides       per variable: +1 may only rise, -1 may only fall, 0 either
+    plausible   per variable, in its unit
+    forms       'tangent' / 'secant' -> columns of the evidence that hold its images
+    broken      whether a derivative image was not finite
+    Set when it is scored (`optics.diagnosis.score`):
+    form        the form that explains most; columns, cone and linear (coefficients of the columns, see `change_of`) are
+                of it
+    raw         rms change of the images at the plausible strengths, over the mean signal, before any calibration
+    """
 
     effect: Effect
     variables: list[Variable]
     start: np.ndarray
-    sides: list[int]  # +1: may only rise, -1: may only fall, 0: either
+    sides: list[int]
     plausible: np.ndarray
-    forms: dict[str, list[int]] = field(default_factory=dict)  # 'tangent' / 'secant' -> columns
-    broken: bool = False  # a derivative image was not finite
+    forms: dict[str, list[int]] = field(default_factory=dict)
+    broken: bool = False
     form: str = ""
     columns: list[int] = field(default_factory=list)
-    cone: st.Cone | None = None
-    linear: np.ndarray | None = None  # coefficients of the columns; see `change_of`
-    row: Row | None = None
-    raw: float = 0.0  # rms change of the image at the plausible strengths, over the mean signal, before any calibration
+    cone: st.Cone = None  # type: ignore[assignment]
+    linear: np.ndarray = None  # type: ignore[assignment]
+    row: Row = None  # type: ignore[assignment]
+    raw: float = 0.0
 
     def contains(self, other: Candidate) -> bool:
         """Whether it frees all that another frees, and more: it fits as well by itself and rivals nothing."""
@@ -144,7 +158,7 @@ class Evidence:
     masked: float
     # of images to bin or to scale residuals by: binned by an image whose error is in them, residuals follow that error
     seed: int = 0
-    projected: st.Projected | None = None
+    projected: st.Projected = None  # type: ignore[assignment]
     candidates: list[Candidate] = field(default_factory=list)  # that were scored in it, best first
 
     @property

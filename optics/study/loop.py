@@ -22,7 +22,8 @@ from pathlib import Path
 import numpy as np
 
 from optics.captures import capture_set as capture_files
-from optics.diagnosis.verdict import AT_FAULT, FAR
+from optics.diagnosis.text import AT_FAULT
+from optics.diagnosis.thresholds import FAR
 from optics.errors import BadCapture, Underdetermined, UnknownKey
 from optics.fit import calibrate
 from optics.fit.compare import Comparison, Row, compare
@@ -526,7 +527,8 @@ def examine(
     """Diagnose the last step and write the diagnosis, with the best effects' fingerprints, into it; `advised`: where
     effects tie, also what to measure next, which is rendered shot by shot."""
     from optics.diagnosis.advice import advise
-    from optics.diagnosis.diagnose import USUALLY, diagnose
+    from optics.diagnosis.diagnose import diagnose
+    from optics.diagnosis.remarks import USUALLY
 
     fitted, held = split(model, setup)
     tested = candidates(model, study)
