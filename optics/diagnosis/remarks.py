@@ -29,7 +29,7 @@ USUALLY = "the same press at 0.4 of the exposure, and one deeper press, often te
 
 
 def write_limits(case: Case, claimed: Candidate | None, fits: Mapping[str, Fit], basis: Basis) -> None:
-    """Upper limits of every effect; after a claim, at the values with the claimed effect, which then misleads no other."""
+    """Upper limits of every effect; after a claim, at the values with the claimed effect, so that it misleads no other."""
     evidence, others, widen = case.evidence, case.table.order, math.sqrt(max(basis.phi, 1.0))
     if claimed is not None:
         values, refit = fits[claimed.effect.name].values, claimed.row.refitted
@@ -131,7 +131,7 @@ def warnings_of(
             if other and other != winner.effect.name:
                 texts.append(f"fragile: {what} the best effect is {other}, not {winner.effect.name}")
     moved = [s for s in shifts if s.warn]
-    if moved and word in NAMED:
+    if winner is not None and moved and word in NAMED:
         texts.append(
             f"with {winner.effect.name}, what had been calibrated moves by more than 3 sd or out of its prior: "
             + some([moved_by(s) for s in moved], 3)

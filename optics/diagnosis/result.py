@@ -20,7 +20,7 @@ import json
 import math
 import typing
 from dataclasses import asdict, dataclass, field, fields, is_dataclass
-from typing import Any
+from typing import Any, cast
 
 from optics.diagnosis.thresholds import EXCESS, MARGIN, TELLS, is_structured
 from optics.errors import Underdetermined
@@ -349,8 +349,9 @@ class Basis:
 
 @dataclass
 class Diagnosis:
-    """The verdict, the table of effects and everything behind them. `text`, `to_csv` and `to_json` are three views of the
-    same numbers.
+    """The verdict, the table of effects and everything behind them.
+
+    `text`, `to_csv` and `to_json` are three views of the same numbers.
 
     word        one of WORDS; sentence: the verdict in words; conditions: what decided it
     rows        one per tested effect, best first; not_tested: effect -> why
@@ -441,7 +442,7 @@ class Diagnosis:
 
 
 def _record(value: Any) -> Any:
-    if is_dataclass(value):
+    if is_dataclass(value) and not isinstance(value, type):
         return asdict(value)
     if isinstance(value, list):
         return [_record(v) for v in value]
@@ -454,7 +455,7 @@ def _restore(kind: Any, data: Any) -> Any:
         return math.nan if kind is float else None
     if is_dataclass(kind):
         hints = typing.get_type_hints(kind)
-        return kind(**{name: _restore(hints[name], value) for name, value in data.items()})
+        return cast(Any, kind)(**{name: _restore(hints[name], value) for name, value in data.items()})
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     if origin is list:
         return [_restore(arguments[0], value) for value in data]

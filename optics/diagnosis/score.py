@@ -123,8 +123,8 @@ def _require_convergence(evidence: Evidence, fit: Fit) -> None:
         how = "" if fit.converged else f" (it stopped: {fit.reason})"
         raise Underdetermined(
             f"diagnose: the base model is not calibrated to convergence{how}: moving its {rank} "
-            f"parameters would lower chi2 by {evidence.projected.absorbed:.3g}, {evidence.gradient:.3g} per parameter (most "
-            f"of all {some(_off(evidence))}); allowed: below {allowed:.3g}; calibrate again from there, without robust "
+            f"parameters would lower chi2 by {evidence.projected.absorbed:.3g}, {evidence.gradient:.3g} per parameter "
+            f"(most of all {some(_off(evidence))}); allowed: below {allowed:.3g}; calibrate again from there, without robust "
             "weights, or hold parameters that the captures hardly tell apart: leave them out of --free, or give them a "
             "--prior"
         )

@@ -20,13 +20,13 @@ from optics.diagnosis.result import (
     Row,
     Shift,
 )
-from optics.diagnosis.thresholds import CLEAR, CLUTTERED, EXCESS, LEVEL, MARGIN
+from optics.diagnosis.thresholds import CLEAR, CLUTTERED, LEVEL, MARGIN
 from optics.words import p_text, percent, spaced, table, with_sd
 
 # what to check where no effect brings the model near its images
 AT_FAULT = (
-    "units, LEDs that were off, black_level, and that images are linear (not encoded for viewing) and whole, with row 0 at "
-    "the top"
+    "units, LEDs that were off, black_level, and that images are linear (not encoded for viewing) and whole, with row 0 "
+    "at the top"
 )
 
 
@@ -132,11 +132,10 @@ def _nothing(f: Findings, tested: int) -> str:
 def _claim(
     f: Findings, row: Row, rows: Sequence[Row], levels: Sequence[Level], shifts: Sequence[Shift], basis: Basis
 ) -> str:
-    refit = row.refit
-    assert refit is not None
+    refit = row.refitted
     text = (
-        f"{row.name} is missing, strength {strength_text(refit.strength, refit.sd, row.units)}. Adding it lowers held-out "
-        f"misfit from {percent(levels[0].held_out)} to {percent(levels[-1].held_out)} (noise: {percent(basis.noise)}). "
+        f"{row.name} is missing, strength {strength_text(refit.strength, refit.sd, row.units)}. Adding it lowers "
+        f"held-out misfit from {percent(levels[0].held_out)} to {percent(levels[-1].held_out)} (noise: {percent(basis.noise)}). "
         "Its strength is the same in every part of the data."
     )
     others = [r for r in rows if r is not row and any(math.isfinite(u) for u in r.upper)]
@@ -148,8 +147,8 @@ def _claim(
     text += (
         " With it nothing is left to explain."
         if refit.complete
-        else f" With it an excess of {refit.excess_sd:.2g} sd and structure (p {p_text(refit.structure_p)}) are left: add it, "
-        "calibrate and diagnose again."
+        else f" With it an excess of {refit.excess_sd:.2g} sd and structure (p {p_text(refit.structure_p)}) are left: add "
+        "it, calibrate and diagnose again."
     )
     if "fragile" in row.flags:
         text += " Fragile: other weights or masks prefer another effect."
@@ -160,7 +159,7 @@ def _claim(
 
 
 def _ambiguous(members: Sequence[Row]) -> str:
-    names = ", ".join(f"{row.name} ({row.refit.fall:.3g})" for row in members if row.refit is not None)
+    names = ", ".join(f"{row.name} ({row.refitted.fall:.3g})" for row in members)
     if len(members) < 2:
         names += " and at least one that was not added"
     return f"these explain the residual about equally well (fall of chi2): {names}. The data cannot tell them apart."
@@ -189,8 +188,8 @@ def _unknown(f: Findings, curve: Fingerprint, basis: Basis) -> str:
     )
     if (beyond := math.sqrt(max(basis.misfit**2 - basis.noise**2, 0.0))) < CLUTTERED:
         text += (
-            f" It is faint: misfit beyond noise is {percent(beyond)} of the signal; mottle of a coating or a fixed pattern "
-            "of the sensor makes as much."
+            f" It is faint: misfit beyond noise is {percent(beyond)} of the signal; mottle of a coating or a fixed "
+            "pattern of the sensor makes as much."
         )
     return text
 
