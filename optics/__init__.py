@@ -16,7 +16,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from optics.diagnosis.verdict import Diagnosis
+    from optics.diagnosis.result import Diagnosis
     from optics.facade import Study, calibrate, compare, load
     from optics.fit.result import Fit
     from optics.scene.declare import Effect, Part
@@ -31,7 +31,7 @@ _HOME = {
     "compare": "optics.facade",
     "load": "optics.facade",
     "register": "optics.scene.mitsuba_parts",
-    "Diagnosis": "optics.diagnosis.verdict",
+    "Diagnosis": "optics.diagnosis.result",
     "Effect": "optics.scene.declare",
     "Fit": "optics.fit.result",
     "Parameter": "optics.scene.parameter",

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from optics import words
-from optics.diagnosis.verdict import Diagnosis
+from optics.diagnosis.result import Diagnosis
 from optics.fit.compare import Comparison
 from optics.fit.result import Fit
 from optics.fit.scene_model import SceneModel

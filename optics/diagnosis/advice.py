@@ -28,7 +28,8 @@ import numpy as np
 from optics.captures.noise import SATURATED
 from optics.diagnosis import statistics as st
 from optics.diagnosis.evidence import Candidate, Evidence, Progress, measure
-from optics.diagnosis.verdict import CLEAR, MARGIN, Advice, Apart, Diagnosis, Row
+from optics.diagnosis.result import Advice, Apart, Diagnosis, Row
+from optics.diagnosis.thresholds import CLEAR, MARGIN
 from optics.scene.parameter import Values, Variable
 from optics.words import spaced
 

@@ -16,8 +16,10 @@ from dataclasses import replace
 import numpy as np
 
 from optics.diagnosis import statistics as st
+from optics.diagnosis.decide import ordered
 from optics.diagnosis.evidence import Evidence, Progress
-from optics.diagnosis.verdict import AS_GOOD, EXCESS, MIMICS, SHARE, Family, Fingerprint, ordered
+from optics.diagnosis.result import Family, Fingerprint
+from optics.diagnosis.thresholds import AS_GOOD, EXCESS, MIMICS, SHARE
 from optics.fit.compare import UNITS, led_label
 from optics.fit.model import Model
 from optics.scene.parameter import Values

@@ -11,7 +11,7 @@ from optics import words
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from optics.diagnosis.verdict import Diagnosis, Row
+    from optics.diagnosis.result import Diagnosis, Row
 
 NOTABLE = 0.01  # family-wise p below which an effect is listed: the level of the test
 SHOWN_MOST = 14  # effects, and curves, in a chart or a notebook
@@ -27,7 +27,7 @@ def records(diagnosis: Diagnosis) -> list[dict[str, Any]]:
 
 
 def _record(row: Row) -> dict[str, Any]:
-    from optics.diagnosis.verdict import Refit
+    from optics.diagnosis.result import Refit
 
     def plain(value: Any) -> Any:
         return value[0] if isinstance(value, list) and len(value) == 1 else value

@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from optics.errors import Underdetermined, UnknownKey
-from optics.fit.descent import Descent, Normal, covariance_of, prior_terms, stacked, whiten
+from optics.fit.descent import Descent, Normal, Rows, covariance_of, prior_terms, stacked, whiten
 from optics.fit.model import Model, value_of
 from optics.fit.result import Fit, warnings_of
 from optics.scene.parameter import Values, Variable
@@ -218,8 +218,8 @@ def _require_data(descent: Descent, normal: Normal) -> None:
     if variables and not np.diag(normal.a).any():
         there = [f"{v.name} = {value:.4g}{spaced(v.parameter.unit)}" for v, value in zip(variables, descent.theta)]
         raise Underdetermined(
-            f"none of the {len(variables)} free parameters changes any frame: at {some(there)}; allowed: parameters that "
-            "some frame depends on; free others, or correct what the frames set"
+            f"none of the {len(variables)} free parameters changes any frame: at {some(there)}; allowed: parameters "
+            "that some frame depends on; free others, or correct what the frames set"
         )
 
 
@@ -257,7 +257,7 @@ def _fit_at(descent: Descent, history: list[float], reason: str, start: np.ndarr
 def extended(
     model: Model, base: Fit, extra: Sequence[Variable], secant: Mapping[str, float] | None = None, steps: int = 10
 ) -> Fit:
-    """Free further variables and calibrate everything again, by chord steps on the derivative images of a converged fit.
+    """Free further variables and calibrate everything again, by chord steps on a converged fit's derivative images.
 
     Each step costs one prediction, where `fit` would make all derivative images again: for ranking many effects. The
     extra variables' images are tangents at the base's values, or secants of the sizes in `secant`. The steps follow the
@@ -269,12 +269,13 @@ def extended(
     p, first = len(variables), len(base.variables)
     index_of = {v.name: i for i, v in enumerate(variables)}
     values = with_start(model, extra, base.values)
-    a, b, rows = np.zeros((p, p)), np.zeros(p), []
+    a, b = np.zeros((p, p)), np.zeros(p)
+    rows: list[Rows] = []
     a[:first, :first] = base.normal.a
     derivatives = model.derivatives(values, list(extra), base.frames, secant=secant or {})
     for frame, (where, j, scale), (prediction, images) in zip(base.frames, base.normal.rows, derivatives):
         new = stacked(images, scale)
-        there = [index_of[n] for n in images]
+        there = np.array([index_of[n] for n in images], int)
         whitened = whiten(model, frame, prediction, scale)
         a[np.ix_(there, there)] += (new @ new.T).astype(float)
         cross = (j @ new.T).astype(float)

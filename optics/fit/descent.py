@@ -32,6 +32,9 @@ MOST_DAMPING = 1e4  # leaves a ten-thousandth of the step along the gradient: a 
 HUBER = 3.0  # standard deviations beyond which a robust fit lowers the weight of a value
 
 
+Rows = tuple[np.ndarray, np.ndarray, np.ndarray]  # of a frame, see `Normal`
+
+
 @dataclass
 class Normal:
     """Normal equations at one point: A = J'WJ + priors, b = J'Wr + priors, chi2 of data and of priors.
@@ -46,7 +49,7 @@ class Normal:
     prior: float
     frame_chi2: list[float]
     frame_n: list[int]
-    rows: list[tuple[Sequence[int] | np.ndarray, np.ndarray, np.ndarray]]
+    rows: list[Rows]
 
     @property
     def total(self) -> float:
@@ -71,7 +74,9 @@ def normal_equations(
     p = len(variables)
     a, b = np.zeros((p, p)), np.zeros(p)
     index_of = {v.name: i for i, v in enumerate(variables)}
-    frame_chi2, frame_n, rows = [], [], []
+    frame_chi2: list[float] = []
+    frame_n: list[int] = []
+    rows: list[Rows] = []
     for frame, (prediction, images) in zip(frames, model.derivatives(values, variables, frames)):
         mask = model.usable(frame)
         scale = np.sqrt(mask / model.variance(values, frame, prediction)).astype(np.float32)
@@ -79,7 +84,7 @@ def normal_equations(
             scale *= np.sqrt(huber((model.frames[frame].image - prediction) * scale)).astype(np.float32)
         whitened = whiten(model, frame, prediction, scale)
         j = stacked(images, scale)
-        where = [index_of[n] for n in images]
+        where = np.array([index_of[n] for n in images], int)
         a[np.ix_(where, where)] += (j @ j.T).astype(float)
         b[where] += (j @ whitened).astype(float)
         frame_chi2.append(float(whitened.astype(float) @ whitened))
@@ -304,7 +309,9 @@ class Descent:
         worst   a step must gain more than this; negative where chi2 is rough, where any such step is accepted
         """
         best: tuple[tuple[np.ndarray, Values, Normal], float, float] | None = None
-        for tried in range(1, most + 1):
+        tried = 0
+        while tried < most:
+            tried += 1
             target, expected = self.step(self.damping)  # within reach, of which less may be expected
             found = self._at(target)
             if self.powers and not self.here.total - found[2].total > max(worst, GOOD * expected):

@@ -28,8 +28,8 @@ class Model(Protocol):
     shape        (H, W, C) of the frames
     noise        the camera's noise model
     captures     the files that the frames come from, None where there are none
-    driven       keys of light powers that frames set: the set value is a drive level, which multiplies the fitted power;
-                 None where what a frame sets is the power itself
+    driven       keys of light powers that frames set: the set value is a drive level, which multiplies the fitted
+                 power; None where what a frame sets is the power itself
     monte_carlo  whether predictions are Monte Carlo estimates, whose own error `variance` includes
     """
 

@@ -14,7 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
-from optics.diagnosis.verdict import CLEAR, Diagnosis, Row, close
+from optics.diagnosis.result import Diagnosis, Row
+from optics.diagnosis.thresholds import CLEAR, close
 from optics.files.output import write_text
 from optics.fit.compare import plain
 from optics.fit.model import value_of

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from optics.captures import capture_set as capture_files
-from optics.diagnosis.verdict import AT_FAULT, FAR
+from optics.diagnosis.text import AT_FAULT
+from optics.diagnosis.thresholds import FAR
 from optics.fit.compare import Row
 from optics.fit.model import value_of
 from optics.fit.result import Fit

@@ -30,7 +30,7 @@ from optics.diagnosis import advice as advise
 from optics.diagnosis import statistics as st
 from optics.diagnosis.advice import keys_named
 from optics.diagnosis.evidence import Candidate, Evidence, Progress, measure
-from optics.diagnosis.verdict import CLEAR, LEVEL
+from optics.diagnosis.thresholds import CLEAR, LEVEL
 from optics.errors import BadScene, Underdetermined
 from optics.files.output import new_folder, shipped
 from optics.scene.parameter import Parameter, Values

@@ -25,7 +25,7 @@ from pathlib import Path
 import numpy as np
 
 from optics.diagnosis.fingerprints import SIDE, family_of
-from optics.diagnosis.verdict import Diagnosis, Fingerprint
+from optics.diagnosis.result import Diagnosis, Fingerprint
 from optics.errors import OutputExists, UnknownKey
 from optics.scene import loader as scenes
 from optics.scene.declare import STAGES

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from optics.diagnosis.verdict import Diagnosis
+from optics.diagnosis.result import Diagnosis
 from optics.errors import BadCapture, UnknownKey
 from optics.fit import calibrate
 from optics.fit.compare import Comparison
@@ -185,7 +185,8 @@ def examine(
     advised     where effects tie, also advise what to measure next, which renders frames that nobody has taken yet
     """
     from optics.diagnosis.advice import advise
-    from optics.diagnosis.diagnose import USUALLY, diagnose
+    from optics.diagnosis.diagnose import diagnose
+    from optics.diagnosis.remarks import USUALLY
 
     fitted, held = split(model, setup)
     tested = candidates(model, record)

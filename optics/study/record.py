@@ -30,7 +30,7 @@ from typing import Any
 import numpy as np
 
 from optics import words
-from optics.diagnosis.verdict import Diagnosis
+from optics.diagnosis.result import Diagnosis
 from optics.errors import BadCapture, OutputExists
 from optics.files.output import file_hash, input_hashes, new_folder, replacing, versions, write_text
 from optics.fit.compare import Comparison, Row, plain

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from optics.diagnosis.verdict import Diagnosis
+from optics.diagnosis.result import Diagnosis
 from optics.fit.compare import led_label
 from optics.fit.result import Fit
 from optics.fit.scene_model import SceneModel

@@ -1310,7 +1310,7 @@ def along(name):
 def drafts(user_bench):
     """A bench with a draft along every coordinate that one can follow, each a gain that is linear in it; LED 1 alone is
     lit."""
-    from optics.diagnosis.verdict import Fingerprint
+    from optics.diagnosis.result import Fingerprint
     from optics.study import draft
 
     texts = {}

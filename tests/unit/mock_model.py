@@ -9,7 +9,7 @@ so exact."""
 from __future__ import annotations
 
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from optics.captures.capture_set import Frame
 from optics.captures.noise import Noise
 from optics.diagnosis.statistics import cosines
 from optics.errors import Underdetermined
+from optics.fit.result import Fit
 from optics.scene.declare import Effect
 from optics.scene.parameter import Parameter, Values, Variable
 
@@ -417,24 +418,6 @@ def strength_for(model: MockModel, name: str, change: float) -> float:
     return trial
 
 
-@dataclass
-class Fit:
-    values: Values
-    variables: list[Variable]
-    estimate: np.ndarray
-    covariance: np.ndarray
-    sd: np.ndarray
-    correlation: np.ndarray
-    chi2: float
-    dof: int
-    frame_chi2: list[float]
-    frame_n: list[int]
-    converged: bool
-    reason: str
-    history: list[float]
-    warnings: list[str]
-
-
 def mock_fit(
     model, variables, start: Values, frames=None, max_iterations: int = 40, progress=None, robust=False
 ) -> Fit:
@@ -511,20 +494,17 @@ def mock_fit(
     gram, score, square, counts, _ = system(values)
     scale = 1 / np.sqrt(np.maximum(np.diag(gram), 1e-300))
     covariance = np.linalg.pinv(gram * scale * scale[:, None], rcond=1e-10, hermitian=True) * scale * scale[:, None]
-    sd = np.sqrt(np.diag(covariance))
     return Fit(
         values,
         list(variables),
         read(values),
         covariance,
-        sd,
-        covariance / np.outer(sd, sd),
         sum(square),
         sum(counts) - len(variables),
+        frames,
         square,
         counts,
         converged,
         reason,
         history,
-        [],
     )

@@ -26,7 +26,7 @@ from optics.diagnosis.fingerprints import (
     unexplained,
 )
 from optics.diagnosis.statistics import Sweeps
-from optics.diagnosis.verdict import Basis, Family, Fingerprint
+from optics.diagnosis.result import Basis, Family, Fingerprint
 from optics.fit.geometry import lit_geometry
 from optics.errors import OutputExists, UnknownKey
 from optics.files.output import shipped
