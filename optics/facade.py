@@ -31,7 +31,7 @@ from optics.scene.parameter import Values
 from optics.study import loop
 from optics.study.fit_files import values_of
 from optics.study.record import Record
-from optics.study.setup import Setup, open_model, recorded, registry_of, setup_for, split
+from optics.study.setup import Setup, open_model, recorded, setup_for, split
 from optics.study.shown import Shown, shown_frames
 from optics.study.stages import comparison_of, held_out_values
 
@@ -279,7 +279,7 @@ class Study:
         Raises UnknownKey for an unknown effect, ValueError for one that the study has.
         """
         model = self.model
-        chosen = registry_of(model).find_effect(effect)
+        chosen = model.scene.registry.find_effect(effect)
         if self.record.has(chosen.key):
             raise ValueError(
                 f"{self.folder}: '{chosen.name}' is part of the study already; `optics diagnose {self.folder}` asks "

@@ -73,7 +73,7 @@ DERIVATIVES = {
 def _parameter_rows(scene: "Scene", keys: Sequence[str]) -> list[dict[str, Any]]:
     """What a scene knows of its parameters, as `optics params --json` gives it."""
     values = scene.values()
-    brought = {(e.part, name): e.name for e in scan(None).effects.values() for name in e.parameter_names}
+    brought = {(e.part, name): e.name for e in scene.registry.effects.values() for name in e.parameter_names}
     rows = []
     for key in keys:
         p = scene.parameters[key]
@@ -134,7 +134,7 @@ def _new_effect(name: str | None, plugins: Path | None, **given: Any) -> None:
             raise ValueError(
                 "--stage, --part: a draft acts where its coordinate is known; leave them out, or leave --from out"
             )
-        text, folder = draft.from_study(given["from"], given["along"], name, registry)
+        text, folder = draft.from_study(given["from"], given["along"], name, plugins)
     file = draft.write(text, given["o"] or folder, name)
     terminal.note(
         f"next: optics add {given['from']} '{name}', then put a formula in place of the table"

@@ -248,13 +248,10 @@ def load_scene(name: str, defines: Sequence[str] | None, plugins: Path | None, v
 
 
 def scan(plugins: Path | None) -> "Registry":
-    """The registry, with a further folder."""
-    from optics.scene.registry import registry
+    """The registry of the shipped plugins, with a further folder."""
+    from optics.scene.registry import known
 
-    found = registry()
-    if plugins is not None:
-        found.scan(plugins)
-    return found
+    return known(plugins)
 
 
 @app.callback(invoke_without_command=True)

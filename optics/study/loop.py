@@ -26,6 +26,7 @@ from optics.fit.result import Fit
 from optics.fit.scene_model import SceneModel
 from optics.scene.declare import Effect
 from optics.scene.parameter import Values, Variable
+from optics.scene.registry import Registry
 from optics.study import checks
 from optics.study.record import Record
 from optics.study.setup import (
@@ -34,7 +35,6 @@ from optics.study.setup import (
     effect_variables,
     open_model,
     recorded,
-    registry_of,
     split,
     variables_of_base,
 )
@@ -78,7 +78,7 @@ def begin(
         folder,
         scene=str(model.captures.scene),
         captures=str(setup.captures),
-        inputs=[setup.captures, model.scene.path, *registry_of(model).folders],
+        inputs=[setup.captures, model.scene.path, *model.scene.registry.folders],
         seed=setup.seed,
         command=command,
         title=title,
@@ -128,7 +128,7 @@ def kept(record: Record, model: SceneModel, index: int = -1) -> tuple[list[Varia
     variables = variables_of_base(model, setup, fitted)
     for step in steps:
         if step["effect"]:
-            variables += _of_fitted(effect_variables(model, registry_of(model).find_effect(step["effect"])), fitted)
+            variables += _of_fitted(effect_variables(model, model.scene.registry.find_effect(step["effect"])), fitted)
     return variables, values, fitted
 
 
@@ -147,17 +147,17 @@ def _of_fitted(variables: Sequence[Variable], fitted: Sequence[int]) -> list[Var
 # -- what can be added --------------------------------------------------------------------------------------------------
 
 
-def effects_of(record: Record, model: SceneModel) -> list[Effect]:
-    """The effects that the study has added so far."""
-    return [registry_of(model).find_effect(step["effect"]) for step in record.steps if step["effect"]]
+def effects_of(record: Record, registry: Registry) -> list[Effect]:
+    """The effects that the study has added so far, of the registry of its scene."""
+    return [registry.find_effect(step["effect"]) for step in record.steps if step["effect"]]
 
 
 def candidates(model: SceneModel, record: Record) -> list[Effect]:
     """Every effect that the scene can express and the study has not added."""
-    done = {e.key for e in effects_of(record, model)}
+    done = {e.key for e in effects_of(record, model.scene.registry)}
     return [
         e
-        for k, e in sorted(registry_of(model).effects.items())
+        for k, e in sorted(model.scene.registry.effects.items())
         if k not in done and model.scene.can_express(e) and not (e.mixes_pixels and model.captures.table is not None)
     ]
 

@@ -17,7 +17,6 @@ from optics.fit.scene_model import SceneModel
 from optics.scene import loader as scenes
 from optics.scene.declare import Effect
 from optics.scene.parameter import Values, Variable
-from optics.scene.registry import Registry, registry
 
 POSE = ("press_x", "press_y", "press_depth")  # solved for in every group of frames, unless the setup says otherwise
 POSE_SD = 0.05  # mm: how well a stage usually knows where it presses
@@ -82,11 +81,6 @@ def recorded(facts: dict) -> Setup:
 def plugins_of(setup: Setup) -> Path:
     """The plugin folder of a setup, which need not exist: the one it names, or `plugins` beside the captures."""
     return Path(setup.plugins) if setup.plugins else Path(setup.captures) / "plugins"
-
-
-def registry_of(model: SceneModel) -> Registry:
-    """The parts and effects that a model's scene can be made of."""
-    return registry()
 
 
 # -- the model ----------------------------------------------------------------------------------------------------------
