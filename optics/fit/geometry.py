@@ -31,7 +31,7 @@ def coordinates(model: SceneModel, values: Values, index: int, seed: int = 0) ->
         return {
             "intensity": np.broadcast_to(intensity, (count, 1)),
             "far": np.ones((count, 1), bool),
-            "reading": frame.rows[..., 0],
+            "reading": np.asarray(frame.rows)[..., 0],
             "frame": np.full((count, 1), float(index)),
             **{k: v[..., 0] for k, v in frame.readings.items()},
         }

@@ -6,7 +6,7 @@ fitted and diagnosed: the unit tests judge a sensor that is written in numpy."""
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -21,33 +21,55 @@ class Model(Protocol):
 
     Images are (H, W, C) in DN, row 0 on top; a sweep of N point readings is an image of shape (N, 1, C). `values` are
     parameter values in the units of their declarations; a frame is named by its index in `frames`.
-
-    frames       measured images and what was set in each
-    parameters   key -> declaration (unit, bounds, plausible size)
-    base         key -> value in every frame, before anything is fitted
-    shape        (H, W, C) of the frames
-    noise        the camera's noise model
-    captures     the files that the frames come from, None where there are none
-    driven       keys of light powers that frames set: the set value is a drive level, which multiplies the fitted
-                 power; None where what a frame sets is the power itself
-    monte_carlo  whether predictions are Monte Carlo estimates, whose own error `variance` includes
     """
 
-    frames: list[Frame]
-    parameters: dict[str, Parameter]
-    base: dict[str, float]
-    shape: tuple[int, int, int]
-    noise: Noise
-    captures: Captures | None
-    driven: set[str] | None
-    monte_carlo: bool
+    @property
+    def frames(self) -> list[Frame]:
+        """Measured images, and what was set in each; of a raw mosaic, the same image in all channels."""
+        ...
+
+    @property
+    def parameters(self) -> Mapping[str, Parameter]:
+        """Key -> declaration: unit, bounds, plausible size."""
+        ...
+
+    @property
+    def base(self) -> Mapping[str, Any]:
+        """Key -> value before anything is fitted, in the parameter's unit; a word for a choice."""
+        ...
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """(H, W, C) of the frames."""
+        ...
 
     @property
     def size(self) -> float:
         """Measured values per frame: pixels x channels, or the pixels of a raw mosaic."""
         ...
 
-    def at(self, values: Values, index: int) -> dict[str, float]:
+    @property
+    def noise(self) -> Noise:
+        """The camera's noise model."""
+        ...
+
+    @property
+    def captures(self) -> Captures | None:
+        """The capture set that the frames come from; None where there is none."""
+        ...
+
+    @property
+    def driven(self) -> set[str] | None:
+        """Keys of light powers that frames set as drive levels, which multiply the fitted power; None where what a
+        frame sets is the power itself."""
+        ...
+
+    @property
+    def monte_carlo(self) -> bool:
+        """Whether predictions are Monte Carlo estimates, whose own error `variance` includes."""
+        ...
+
+    def at(self, values: Values, index: int) -> dict[str, Any]:
         """Every parameter's value in a frame: base <- fitted in all frames <- set in this frame <- fitted in it."""
         ...
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -18,6 +19,9 @@ from optics.light.development import STEP, Developer
 from optics.light.renderer import POWERS
 from optics.scene.loader import Scene
 from optics.scene.parameter import Parameter, Values, Variable
+
+if TYPE_CHECKING:
+    from optics.light.monte_carlo import MonteCarloRenderer
 
 FLAT_FIELDS = ("multiplicative", "additive", "none")
 
@@ -44,7 +48,7 @@ class SceneModel:
                 f"{captures.folder}: no noise model; give [noise] in captures.toml or repeats to estimate it from"
             )
         if captures.table is not None:
-            captures = sweeps(captures, scene.parameters, scene.lights)
+            captures = sweeps(captures, scene.parameters, list(scene.lights))
         self.scene, self.captures, self.noise = scene, captures, noise
         self.mosaic, self.frames = None, captures.frames
         background = captures.flat_field
@@ -118,25 +122,25 @@ class SceneModel:
 
     # -- values -------------------------------------------------------------------------------------------------------
 
-    def at(self, values: Values, index: int) -> dict:
+    def at(self, values: Values, index: int) -> dict[str, Any]:
         """Every parameter's value in a frame: base <- fitted in all frames <- set in this frame <- fitted in this
         frame.
 
         The power of an LED that frames set is the product of the setting and of the fitted power.
         """
-        now = {**self.base, **values.common}
+        now: dict[str, Any] = {**self.base, **values.common}
         frame = self.frames[index]
         for key, value in (*frame.parameters.items(), *frame.readings.items()):
             now[key] = value * now[key] if key in self.driven else value
         now.update(values.frame.get(index, {}))
         return now
 
-    def _acts(self, variable: Variable, index: int) -> dict[str, float]:
+    def _acts(self, variable: Variable, index: int) -> dict[str, Any]:
         """The keys through which a variable acts in a frame, each with d key / d variable."""
-        own = {**self.frames[index].parameters, **self.frames[index].readings}
+        own: dict[str, Any] = {**self.frames[index].parameters, **self.frames[index].readings}
         if variable.frames is not None:
             return dict.fromkeys(variable.keys, 1.0)
-        return {k: own[k] if k in own else 1.0 for k in variable.keys if k not in own or k in self.driven}
+        return {k: own.get(k, 1.0) for k in variable.keys if k not in own or k in self.driven}
 
     def _companions(self) -> list[set[str]]:
         """For each frame the LEDs that are lit in any frame of the same press: they share its geometry."""
@@ -271,7 +275,8 @@ class SceneModel:
                 level = np.maximum(rest.image - black, 1e-6)
                 scale, share = flat / level, (linear.image - black) / level
                 prediction, gained = black + (linear.image - black) * scale, share
-        images = {}
+        images: dict[str, np.ndarray] = {}
+        image: Any
         for variable in variables:
             acts = self._acts(variable, index)
             if not acts:
@@ -319,7 +324,7 @@ class SceneModel:
             total = linear.of_parameter(camera) + (0 if total is None else total)
         return total
 
-    def _light_tangent(self, now: Mapping, key: str, factor: float, seed: int, at_rest: bool) -> np.ndarray | None:
+    def _light_tangent(self, now: Mapping, key: str, factor: Any, seed: int, at_rest: bool) -> np.ndarray | None:
         """factor times d radiance / d key in a frame."""
         name, parameter = key.rsplit(".", 1)
         kind = self.renderer.kind(key)
@@ -350,7 +355,7 @@ class SceneModel:
         if kind == "led" and name not in lit:
             return None
         if self.renderer.monte_carlo:
-            return factor * self.renderer.tangent(now, key, seed)
+            return factor * cast("MonteCarloRenderer", self.renderer).tangent(now, key, seed)
         if key in self.renderer.ambient_keys:
             return factor * self._difference_ambient(now, key)
         if self.parameters[key].how == "difference" and kind != "led":
@@ -362,7 +367,7 @@ class SceneModel:
                 else tangent(now, name, key)
             )
             return factor * lit[name] * image
-        total = sum((power * tangent(now, led, key) for led, power in lit.items()), 0.0)
+        total: Any = sum((power * tangent(now, led, key) for led, power in lit.items()), 0.0)
         if glows:
             total = total + self._difference_ambient(now, key)
         return factor * total
@@ -405,10 +410,11 @@ class SceneModel:
         move it."""
         if index not in self._edges_kept:
             now = self.at(Values(), index)
-            low = high = 0.0
+            low: Any = 0.0
+            high: Any = 0.0
             images = [(self.renderer.led(now, light), power) for light, power in self.lit(now).items()]
             for image, power in images + [(self.renderer.glow(now), 1.0)] * self.renderer.glows(now):
-                if not len(image.index):
+                if image.raw is None or not len(image.index):
                     continue
                 fine = image.raw[1] * self.renderer.weights(now, image)[1]
                 low, high = low + power * fine.min(1), high + power * fine.max(1)
@@ -444,9 +450,8 @@ class SceneModel:
         now = self.at(values, index)
         view = self.developer.view(now)
         full = (self.noise.saturation - self.noise.black_level) * np.abs(view.exposure * self.developer.gains(view))
-        return uniform_filter(
-            (self.renderer.error(now) ** 2 @ (self.developer.matrix**2).T) * full**2, (3, 3, 0), mode="nearest"
-        )
+        error = cast("MonteCarloRenderer", self.renderer).error(now)
+        return uniform_filter((error**2 @ (self.developer.matrix**2).T) * full**2, (3, 3, 0), mode="nearest")
 
     def chance(self, index: int = 0) -> float:
         """Error of the prediction itself over the camera's noise in a frame, rms; 0 where images are exact."""
