@@ -2,7 +2,7 @@
 
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -64,7 +64,7 @@ def import_(
     from optics.captures import importing
 
     terminal.quiet, terminal.debug = quiet, debug
-    options = {"leds": leds, "bin": bin, "every": every, "overwrite": force}
+    options: dict[str, Any] = {"leds": leds, "bin": bin, "every": every, "overwrite": force}
     if ball_radius is not None:
         options["ball_radius"] = ball_radius
     if mm_per_pixel is not None:

@@ -3,7 +3,7 @@
 import sys
 import time
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -66,7 +66,7 @@ def render(
             f"-o {output}: '{output.suffix}' is no image format of this command; allowed: a name ending in .exr"
         )
     record, preview = output.with_suffix(".json"), output.with_suffix(".png")
-    maps = tuple(output.with_suffix(f".{name}.png") for name in ("dolp", "aolp"))
+    maps = (output.with_suffix(".dolp.png"), output.with_suffix(".aolp.png"))
     files = [output, record, *([preview] if png else []), *(maps if stokes else ())]
     claim(files, force)
     loaded = load_scene(scene, define, plugins, variant)
@@ -81,8 +81,10 @@ def render(
     if stokes:
         from optics.light.polarimetry import write_maps
 
-        write_maps(maps, *image.stokes())
-    write_json(record, {**image.header["provenance"], "command": ["optics", *sys.argv[1:]]})
+        bands, vectors = image.stokes()
+        write_maps(maps, list(bands), vectors)
+    provenance: Any = image.header["provenance"]
+    write_json(record, {**provenance, "command": ["optics", *sys.argv[1:]]})
     image.write_exr(output)
     if as_json:
         return show(

@@ -27,6 +27,8 @@ from optics.words import number, spaced, table
 if TYPE_CHECKING:
     from optics.light.polarimetry import Sweep
 
+DEFAULT_BAND = 540.0  # nm, for a scene without bands: the middle of the visible range
+
 
 @command
 def mueller(
@@ -55,7 +57,8 @@ def mueller(
     loaded = load_scene(scene, define, plugins, variant)
     values = {**loaded.values(), **loaded.check(settings(sets), "--set")}
     u, v = polarimetry.pixel(loaded, at)
-    bands = wavelength or list(loaded.integrator.bands) or [540.0]
+    own = loaded.integrator.bands if loaded.integrator is not None else ()
+    bands = wavelength or list(own) or [DEFAULT_BAND]
     if not all(100 <= b <= 10000 for b in bands):
         raise ValueError(f"--wavelength {' '.join(f'{b:g}' for b in bands)}: allowed: 100 to 10000 nm")
     ray = polarimetry.follow(loaded, values, u, v)
@@ -69,7 +72,7 @@ def mueller(
     shown = [*zip(names, matrices), *([("product", whole)] if len(names) > 1 else [])]
     if as_json:
 
-        def record(own):
+        def record(own: Any) -> dict[str, Any]:
             return {"matrix": own.tolist(), "bands": [polarimetry.decompose(m).numbers() for m in own]}
 
         layers = [{"name": n, "kind": loaded.parts[n].kind, **record(own)} for n, own in zip(names, matrices)]
@@ -112,7 +115,7 @@ def _alike(own: Any, bands: Sequence[float]) -> list[tuple[str, Any]]:
 def _matrices(own: Any, bands: Sequence[float]) -> str:
     """Matrices (B, 4, 4) side by side, with their bands above."""
 
-    def entry(value):
+    def entry(value: float) -> str:
         return f"{value:9.5f}" if abs(value) >= 5e-7 else f"{'0':>9}"
 
     found = _alike(own, bands)
@@ -128,10 +131,10 @@ def _meanings(shown: Sequence[tuple[str, Any]], bands: Sequence[float]) -> str:
     """The decompositions of layers and of their product as a table."""
     from optics.light.polarimetry import decompose
 
-    def cell(value, digits=4, small=5e-7):
+    def cell(value: float, digits: int = 4, small: float = 5e-7) -> str:
         return "-" if math.isnan(value) else f"{0 if abs(value) < small else value:.{digits}g}"
 
-    def axis(angle, ellipticity):
+    def axis(angle: float, ellipticity: float) -> str:
         return cell(angle, 4, 1e-4) + (
             "" if math.isnan(ellipticity) or abs(ellipticity) < 0.05 else f" ({ellipticity:+.1f})"
         )
@@ -245,7 +248,7 @@ def sweep(
         found = polarimetry.sweep(
             loaded,
             key,
-            np.linspace(first, last, steps),
+            list(np.linspace(first, last, steps)),
             place,
             {**values, **chosen},
             radiance=radiance,

@@ -259,7 +259,7 @@ def _part_page(found: "Registry", kind: str, as_json: bool) -> None:
     """Show a part: its page, its own parameters, and the effects that act on it."""
     part = found.parts[kind]
     acting = sorted(k for k, e in found.effects.items() if e.part == kind)
-    rows = [
+    rows: list[dict[str, Any]] = [
         {
             "name": p.name,
             "unit": p.unit,

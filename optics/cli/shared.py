@@ -60,7 +60,7 @@ class Terminal:
             console=Console(stderr=True),
             transient=True,
         )
-        tasks: dict[str, int] = {}
+        tasks: dict[str, Any] = {}
 
         def show(what: str, done: int, total: int) -> None:
             if what not in tasks:
@@ -132,7 +132,8 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
         for name, kind in (("quiet", Quiet), ("debug", Debug))
     ]
     signature = inspect.signature(function)
-    run.__signature__ = signature.replace(parameters=[*signature.parameters.values(), *shared])
+    parameters = [*signature.parameters.values(), *shared]
+    run.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
     run.__annotations__ = {**function.__annotations__, "quiet": Quiet, "debug": Debug}
     return app.command()(run)
 
@@ -171,7 +172,7 @@ def _report(error: Exception) -> int:
     return 2
 
 
-def _usage(error: Exception) -> str:
+def _usage(error: Any) -> str:
     """Typer's message about a wrong option or argument, and where the right ones are listed."""
     context = getattr(error, "ctx", None)
     return error.format_message().rstrip(".") + (f"; see `{context.command_path} --help`" if context else "")

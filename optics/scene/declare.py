@@ -86,7 +86,7 @@ class Part:
     refracts: bool = False
     polarizes: bool = False
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if not self.role:
             object.__setattr__(self, "role", self.kind)
 

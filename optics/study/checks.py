@@ -44,10 +44,10 @@ def of_captures(model: SceneModel) -> list[str]:
     return list(dict.fromkeys(texts))
 
 
-def after_calibration(model: SceneModel, found: Fit, level: Row) -> list[str]:
+def after_calibration(model: SceneModel, found: Fit, level: Row | None) -> list[str]:
     """What no effect explains: a model nowhere near its images, or values that contradict their priors."""
     texts = []
-    if level.rms > FAR * level.signal:
+    if level is not None and level.rms > FAR * level.signal:
         texts.append(
             f"the model misses the images by {level.rms / max(level.signal, 1e-9):.0%} of its own mean, too far for a "
             f"missing effect: check {AT_FAULT}"
@@ -82,7 +82,7 @@ def _astray(model: SceneModel) -> list[str]:
     for axis, side in (("press_x", "width"), ("press_y", "length")):
         key, size = f"{gel.name}.{axis}", float(model.base[f"{gel.name}.{side}"])
         for f in model.frames:
-            if abs(f.parameters.get(key, 0.0)) > size / 2:
+            if abs(float(f.parameters.get(key, 0.0))) > size / 2:
                 return [
                     f"frame '{f.name}': {key} = {f.parameters[key]:g} mm lies beyond the gel, which is {size:g} mm "
                     "wide there: check units"

@@ -20,6 +20,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -33,6 +34,7 @@ from optics.diagnosis.evidence import Candidate, Evidence, Progress, measure
 from optics.diagnosis.thresholds import CLEAR, LEVEL
 from optics.errors import BadScene, Underdetermined
 from optics.files.output import new_folder, shipped
+from optics.scene.loader import Scene
 from optics.scene.parameter import Parameter, Values
 from optics.study.setup import Setup, effect_variables, variables_of_base
 from optics.words import spaced, table
@@ -135,7 +137,7 @@ class Plan:
             + f"every effect at {self.share:g} of its plausible strength",
             "",
         ]
-        rows = [
+        rows: list[tuple[str, ...]] = [
             ("", "group", "frame", "mean P(correct)"),
             *((str(i + 1), f.group, f.words, f"{w:.3f}") for i, (f, w) in enumerate(zip(self.frames, self.worth))),
         ]
@@ -223,7 +225,7 @@ def _places(parameters: dict[str, Parameter], base: dict) -> list[tuple[str, str
         wide = [0.3 * float(base.get(f"{gel}.{side}", 8.0)) for side in ("width", "length")]
         normal = 0.12 * float(base.get(f"{gel}.thickness", 4.0))
         spots = [(0.0, 0.0), *advise.places(np.zeros((1, 2)), np.array(wide), 5)]
-        found = []
+        found: list[tuple[str, str, dict]] = []
         for i, (x, y) in enumerate(spots):
             for to in (normal, 2 * normal) if i < 3 else (normal,):
                 found.append(
@@ -293,7 +295,7 @@ def _sweeps(parameters: dict, base: dict, lights: Sequence[str], exposures: Sequ
 
 
 def plan(
-    scene,
+    scene: Scene,
     frames: int,
     effects: Sequence | None = None,
     *,
@@ -342,9 +344,10 @@ def plan(
     values = Values() if values is None else Values(dict(values.common))
     base = {**scene.values(), **values.common}
     pool = candidates(scene.parameters, base, swept, fixed_exposure)
-    channels = 1 if len(scene.integrator.bands or (0,)) == 1 else 3
+    bands = scene.integrator.bands if scene.integrator is not None else ()
+    channels = 1 if len(bands or (0,)) == 1 else 3
     blank = np.zeros((height, width, channels), np.float32)
-    first = Frame("first", blank, parameters=pool[0].readings[0], file="design")
+    first = Frame("first", blank, parameters=dict(pool[0].readings[0]), file="design")
     table = Table("readings.csv", ["reading"]) if swept else None
     model = SceneModel(scene, Captures(Path("."), str(scene.path), [first], noise=noise, table=table), noise)
     model.frames = []
@@ -398,7 +401,8 @@ def plan(
         every = np.concatenate([gaps[np.isfinite(gaps)], alone])
         return float(np.mean(ndtr(np.sqrt(np.maximum(every, 0.0)) / 2)))
 
-    chosen, path = [], []
+    chosen: list[int] = []
+    path: list[float] = []
     for n in range(frames):
         say("choosing frames", n, frames)
         seen_places = {places[s] for s in chosen}
@@ -450,10 +454,11 @@ def session(
     file = scenes.find(subject)
     text, defines = file.read_text(encoding="utf-8"), dict(defines or {})
     sizes = {n: re.search(rf'<default name="{n}" value="(\d+)"', text) for n in ("width", "height")}
-    if all(sizes.values()) and "$width" in text and "$height" in text and not {"width", "height"} & set(defines):
-        longest = max(int(m[1]) for m in sizes.values())
+    usual = {n: int(m[1]) for n, m in sizes.items() if m is not None}
+    if len(usual) == 2 and "$width" in text and "$height" in text and not set(usual) & set(defines):
+        longest = max(usual.values())
         if longest > LONG_SIDE:
-            defines |= {n: str(max(round(int(m[1]) * LONG_SIDE / longest), 1)) for n, m in sizes.items()}
+            defines |= {n: str(max(round(size * LONG_SIDE / longest), 1)) for n, size in usual.items()}
     scene = scenes.load(file, defines, plugins=plugins)
     chosen = [scene.registry.find_effect(name) for name in effects]
     return plan(
@@ -476,7 +481,7 @@ def _require(frames: int, share: float) -> None:
         raise ValueError(f"design: strength of {share:g} plausible sizes; allowed: > 0, finite")
 
 
-def _expose(model, values: Values, pool: list[Choice], base: dict, say: Progress) -> list[Choice]:
+def _expose(model: Any, values: Values, pool: list[Choice], base: dict, say: Progress) -> list[Choice]:
     """Turn factors of the exposure into exposures that fill the camera's range, and put predictions in place of images.
 
     One exposure per light, the same at all places: what a session can do.
@@ -504,7 +509,7 @@ def _expose(model, values: Values, pool: list[Choice], base: dict, say: Progress
     return found
 
 
-def _brighter(model, values: Values, frame: int) -> float:
+def _brighter(model: Any, values: Values, frame: int) -> float:
     """Factor on a frame's exposure at which its brightest half per cent stands at FULL of full scale; 1 in the dark."""
     signal = model.predict(values, [frame])[0] - model.noise.black_level
     bright = float(np.quantile(signal, 0.995))
@@ -559,7 +564,18 @@ def _onset(c: Candidate, squares: np.ndarray) -> tuple[str, int]:
     return "secant", 1 if any(v.parameter.squared for v in c.variables) else 2
 
 
-def _report(scene, frames, path, seen, chosen, members, share, noise, count, unseen) -> Plan:
+def _report(
+    scene: Scene,
+    frames: Any,
+    path: Any,
+    seen: Any,
+    chosen: Any,
+    members: Any,
+    share: float,
+    noise: Noise,
+    count: int,
+    unseen: Any,
+) -> Plan:
     gaps, alone = seen.falls(chosen)
     information, rest = seen.information(chosen)
     names = [m.name for m in seen.members]
@@ -657,7 +673,7 @@ def write(planned: Plan, folder: str | Path) -> Path:
             tables.append(table)
     with new_folder(folder) as new:
         if planned.size == (1, 1):
-            rows = [(own, [""]) for f in planned.frames for own in f.readings]
+            rows: list[Any] = [(own, [""]) for f in planned.frames for own in f.readings]
             readings.write(new / "readings.csv", rows, ["reading"])
         else:
             (new / "frames").mkdir()

@@ -355,6 +355,14 @@ def _carrier(f: Fingerprint) -> Carrier | None:
     return CARRIERS.get(f.coordinate)
 
 
+def _carried(f: Fingerprint) -> Carrier:
+    """Where a curve acts, of one that `fingerprint_of` let through."""
+    carrier = _carrier(f)
+    if carrier is None:
+        raise ValueError(f"no draft along '{f.coordinate}': nothing of the model acts along it")
+    return carrier
+
+
 def _is_setting(coordinate: str) -> bool:
     return "." in coordinate and not coordinate.endswith(".distance")
 
@@ -378,7 +386,7 @@ def draft_effect(
     Raises ValueError or UnknownKey for a coordinate that no draft can carry.
     """
     f = fingerprint_of(diagnosis, along)
-    word, carrier, family = identifier(name), _carrier(f), f.family or family_of(f.coordinate)
+    word, carrier, family = identifier(name), _carried(f), f.family or family_of(f.coordinate)
     stage, part = carrier.stage, STAGES[carrier.stage]
     dark, exact = f.kind == "offset" and part == "camera", f.coordinate in CELLS
     full = saturation - black_level
@@ -421,7 +429,7 @@ def draft_effect(
         + remark,
         f"the diagnosis of {source or 'a study'}.",
         head=[
-            *([] if exact else [_table("AT", at)]),
+            *([] if exact else [_table("AT", list(at))]),
             _table("CURVE", [float(f"{v:.4g}") for v in values], f"+- {np.median(sd):.2g}, the median"),
         ],
         body=[
@@ -465,12 +473,13 @@ def from_study(folder: str | Path, along: str | None, name: str, further: str | 
         raise ValueError(f"{folder}: no diagnosis to draft from; run `optics diagnose {folder}` first")
     diagnosis = Diagnosis.from_json(json.dumps(study.diagnosis(index)))
     f = fingerprint_of(diagnosis, along)
-    part = STAGES[_carrier(f).stage]
+    part = STAGES[_carried(f).stage]
     plugins = plugins_of(recorded(study.ladder["facts"]["setup"]))
     registry = known(further, plugins if plugins.is_dir() else None)
     text = scenes.find(study.ladder["scene"]).read_text(encoding="utf-8")
     if part != "camera" and (f'type="{part}"' not in text or 'type="clear"' in text):
-        can = [g.coordinate for g in diagnosis.fingerprints if _carrier(g) and STAGES[_carrier(g).stage] == "camera"]
+        carriers = {g.coordinate: _carrier(g) for g in diagnosis.fingerprints}
+        can = [name for name, c in carriers.items() if c is not None and STAGES[c.stage] == "camera"]
         raise ValueError(
             f"no draft along '{f.coordinate}': light in the scene {study.ladder['scene']} "
             + (

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -21,7 +22,7 @@ def fit_record(fit: Fit | Mapping, frame_names: Sequence[str] = ()) -> dict:
     variables   name, keys, unit, value, sd, frames (names or None), prior, pull, neutral, plausible, at_bound
     pull        (value - prior mean) / prior sd: how far the data moved it from what was known
     """
-    blank = {
+    blank: dict[str, Any] = {
         "parameters": {},
         "frames": {},
         "variables": [],
@@ -89,7 +90,7 @@ def fit_toml(record: Mapping, name: str = "") -> str:
         )
     )
 
-    def table(values: Mapping):
+    def table(values: Mapping) -> Any:
         out = tomlkit.table()
         for key, value in values.items():
             out.add(key, value if isinstance(value, (str, bool)) else float(value))
@@ -97,7 +98,7 @@ def fit_toml(record: Mapping, name: str = "") -> str:
                 out[key].comment(unit[key])
         return out
 
-    def nested(frames: Mapping):
+    def nested(frames: Mapping) -> Any:
         out = tomlkit.table(is_super_table=True)
         for frame, values in frames.items():
             out.add(frame, table(values))
@@ -147,13 +148,13 @@ def values_of(model: SceneModel, file: str | Path | None, sets: Mapping[str, flo
     `Scene.check` raises.
     """
     if file is None:
-        return Values(model.scene.check(sets, "--set"))
+        return Values(dict(model.scene.check(sets, "--set")))
     data = read_fit(file)
     common = model.scene.check({**data["parameters"]}, f"{file}: [parameters]")
     names = {f.name: i for i, f in enumerate(model.frames)}
-    own = {}
+    own: dict[int, dict[str, Any]] = {}
     for name, values in data["frames"].items():
         if name not in names:
             raise UnknownKey(name, names, "frame", str(file), "the fit belongs to another set of captures")
-        own[names[name]] = model.scene.check(values, f"{file}: [frames.{name}]")
+        own[names[name]] = dict(model.scene.check(values, f"{file}: [frames.{name}]"))
     return Values({**common, **model.scene.check(sets, "--set")}, own)

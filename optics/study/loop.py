@@ -15,6 +15,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -202,12 +203,17 @@ def examine(
         seed=setup.seed,
         progress=progress,
     )
-    result.advice = advise(model, result, effect_variables, setup.seed, progress) if advised else []
+    result.advice = advise(model, result, _variables_of, setup.seed, progress) if advised else []
     if result.advice:
         result.hints = [hint for hint in result.hints if hint != USUALLY]
     worst = int(np.argmax(np.array(found.frame_chi2) / np.maximum(found.frame_n, 1)))
     record.put_diagnosis(len(record.steps) - 1, result, fingerprints_of(model, found, result, found.frames[worst]))
     return result
+
+
+def _variables_of(model: Any, effect: Effect) -> list[Variable]:
+    """What adding an effect frees, in a model of the scene or of frames imagined for it."""
+    return effect_variables(model, effect)
 
 
 class Refits:

@@ -226,8 +226,8 @@ class Record:
         folder = f"{index:02d}-{_slug(name)}"
         if not self.ladder["shown"]:
             self.ladder["shown"] = _choose(frames, comparison)
-        kept = {f.name: f for f in frames}
-        kept = [kept[n] for n in self.ladder["shown"] if n in kept]
+        given = {f.name: f for f in frames}
+        kept = [given[n] for n in self.ladder["shown"] if n in given]
         record = fit_record(fit, [f["frame"] for f in comparison.frames])
         diagnosis = _as_dict(diagnosis)
         entry = {
@@ -257,11 +257,11 @@ class Record:
             )
             if diagnosis is not None:
                 (new / "diagnosis.json").write_text(_dumps(diagnosis), encoding="utf-8")
-            for item, f in zip(entry["frames"], kept):
-                _write_frame(new / item["file"], f)
-            for item, f in zip(entry["fingerprints"], fingerprints):
-                np.savez_compressed(new / item["file"], image=_single(f.image), residual=_single(f.residual))
-            if comparison.rms_map is not None:
+            for item, shown in zip(entry["frames"], kept):
+                _write_frame(new / item["file"], shown)
+            for item, print_ in zip(entry["fingerprints"], fingerprints):
+                np.savez_compressed(new / item["file"], image=_single(print_.image), residual=_single(print_.residual))
+            if comparison.rms_map is not None and comparison.mean_map is not None:
                 np.savez_compressed(new / "images/maps.npz", rms=comparison.rms_map, mean=comparison.mean_map)
             (new / "step.json").write_text(_dumps(entry), encoding="utf-8")
         self.steps.append(entry)
@@ -374,14 +374,14 @@ def _fingerprint_entry(index: int, f: Fingerprint) -> dict[str, Any]:
 def _write_frame(file: Path, f: Shown) -> None:
     shape = np.shape(f.measured)
     use = np.asarray(f.usable, bool)
-    np.savez_compressed(
-        file,
-        measured=_single(f.measured),
-        predicted=_single(f.predicted),
-        sd=_single(np.broadcast_to(f.sd, shape)),
-        usable=np.broadcast_to(use[..., None] if use.ndim < len(shape) else use, shape),
+    arrays: dict[str, Any] = {
+        "measured": _single(f.measured),
+        "predicted": _single(f.predicted),
+        "sd": _single(np.broadcast_to(f.sd, shape)),
+        "usable": np.broadcast_to(use[..., None] if use.ndim < len(shape) else use, shape),
         **{SETTING + key: np.asarray(value) for key, value in f.settings.items()},
-    )
+    }
+    np.savez_compressed(file, **arrays)
 
 
 def _choose(frames: Sequence[Shown], comparison: Comparison) -> list[str]:
@@ -421,7 +421,7 @@ def _level(row: Row | None) -> dict | None:
 def _as_dict(record: Any) -> dict | None:
     """A mapping, an object with to_dict, or a dataclass, as a dictionary."""
     if record is None or isinstance(record, Mapping):
-        return record
+        return None if record is None else dict(record)
     return record.to_dict() if hasattr(record, "to_dict") else dataclasses.asdict(record)
 
 

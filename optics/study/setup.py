@@ -139,7 +139,8 @@ def split(model: SceneModel, setup: Setup) -> tuple[list[int], list[int]]:
 def default_free(model: SceneModel) -> list[str]:
     """Position, axis, lobe and power of every LED, reflectance and roughness of every membrane, power of every source."""
     patterns = []
-    spectral = len(model.scene.integrator.bands or (0,))
+    integrator = model.scene.integrator
+    spectral = len((integrator.bands if integrator is not None else ()) or (0,))
     for led in model.scene.leds:
         patterns += [f"{led}.{n}" for n in ("x", "y", "z", "pan", "tilt", "mu", "power")]
     for source in (n for n, part in model.scene.sources.items() if part.kind == "source"):

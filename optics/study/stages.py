@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -16,8 +17,8 @@ from optics.scene.parameter import Values, Variable
 Progress = Callable[[str, int, int], None]
 
 # Iterations and tolerances (chi2 per variable) of the stages: the first two only bring the last one close.
-COMMON = {"max_iterations": 12, "tolerance": 20.0}
-POSES = {"max_iterations": 6, "tolerance": 2.0}
+COMMON: dict[str, Any] = {"max_iterations": 12, "tolerance": 20.0}
+POSES: dict[str, Any] = {"max_iterations": 6, "tolerance": 2.0}
 TOGETHER = 0.05  # chi2 per variable: a twentieth of what noise alone makes of each
 OFF = 0.1  # plausible sizes off neutral from which an effect is followed
 
