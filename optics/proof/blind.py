@@ -14,11 +14,12 @@ from pathlib import Path
 
 import numpy as np
 
-from optics.diagnosis.evidence import value_of
-from optics.diagnosis.verdict import CLEAR, Diagnosis, Row, close
+from optics.diagnosis.result import Diagnosis, Row
+from optics.diagnosis.thresholds import CLEAR, close
+from optics.files.output import write_text
 from optics.fit.compare import plain
+from optics.fit.model import value_of
 from optics.proof.cells import Cell
-from optics.scene.registry import registry
 from optics.study import loop
 
 STEPS = 3  # effects that the loop may add where two are hidden
@@ -54,7 +55,7 @@ def run(rig, cell: Cell) -> dict:
                 record["steps"][-1]["added"] = added
                 for name in added:
                     start = diagnosis.fits[name].values if name in diagnosis.fits and len(added) == 1 else None
-                    fit, _ = loop.extend(study, model, setup, fit, registry().find_effect(name), start)
+                    fit, _ = loop.extend(study, model, setup, fit, model.scene.registry.find_effect(name), start)
         except (ValueError, KeyError, ArithmeticError, np.linalg.LinAlgError) as error:
             record["failed"] = f"{type(error).__name__}: {error}"
     record["seconds"] = time.perf_counter() - clock
@@ -141,9 +142,7 @@ def take_up(file: Path) -> dict | None:
 
 def keep(file: Path, record: dict) -> None:
     """Write a record whole or not at all."""
-    temporary = file.with_suffix(".part")
-    temporary.write_text(json.dumps(_finite(record), indent=1, allow_nan=False), encoding="utf-8")
-    temporary.rename(file)
+    write_text(file, json.dumps(_finite(record), indent=1, allow_nan=False))
 
 
 def _finite(value):

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from optics.captures import capture_set as capture_files
+from optics.fit.model import value_of
 from optics.proof.makers.grid import GridMaker
 from optics.scene import loader as scenes
-from optics.scene.registry import registry
+from optics.scene.registry import known
 from optics.study import loop
 
 SCENE = {"width": "32", "height": "24"}
@@ -121,14 +122,14 @@ def test_a_hidden_effect_is_found(case, tmp_path):
         assert diagnosis.word == "CLAIM" and diagnosis.missing == case, f"{diagnosis.word}: {diagnosis.sentence}"
     before = study.steps[-1]["held_out"]["chi2_per_dof"]
     start = diagnosis.fits[case].values if case in diagnosis.fits else None
-    fit = loop.extend(study, model, setup, fit, registry().find_effect(case), start)[0]
+    fit = loop.extend(study, model, setup, fit, known().find_effect(case), start)[0]
     held = study.steps[-1]["held_out"]["chi2_per_dof"]
     assert (
         held < before and fit.chi2 / fit.dof < 1.1 and held < 1.1
     )  # the noise floor; the maker's error adds two per cent
     for variable, sd in zip(fit.variables, fit.sd):
         if variable.name in truth:  # four standard deviations, and a twentieth: the model's error is not in sd
-            found = fit.values.get(variable, model.base)
+            found = value_of(model, fit.values, variable)
             assert abs(found - truth[variable.name]) < 4 * sd + 0.05 * truth[variable.name], (
                 f"{variable.name}: {found} +- {sd}"
             )

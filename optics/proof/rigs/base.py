@@ -13,7 +13,6 @@ import numpy as np
 from optics.captures import capture_set as capture_files
 from optics.captures.noise import Noise
 from optics.proof.cells import MISTAKES, Cell
-from optics.scene.registry import registry
 from optics.study import loop
 
 PATTERN = 0.005  # rms of a fixed gain per pixel of the sensor, at clutter 1
@@ -140,14 +139,14 @@ class ImageRig(Rig):
         raise NotImplementedError
 
     def keys(self, scene, effect: str) -> tuple[str, ...]:
-        return self.several.get(effect) or (next(iter(scene.keys_of(registry().find_effect(effect)).values()))[0],)
+        return self.several.get(effect) or (next(iter(scene.keys_of(scene.registry.find_effect(effect)).values()))[0],)
 
     def start(self, scene, key: str) -> float:
         """What strengths count from: the sensor's own value, without the effect."""
         return float(self.built(scene, 0).get(key, scene.values()[key]))
 
     def strength_of(self, effect: str, change: float) -> float:
-        from optics.fit.model import Model
+        from optics.fit.scene_model import SceneModel
         from optics.scene.parameter import Values
 
         captures = self.captures(Cell(self.name, "none", (), 0.0, 0.0, "same", "", 0), {}, {}, mean=True)
@@ -155,7 +154,7 @@ class ImageRig(Rig):
         scene = self.scene()  # after the captures, whose makers work in another variant
         built, keys = self.built(scene, 0), self.keys(scene, effect)
         start = {key: self.start(scene, key) for key in keys}  # a scene's values follow its predictions
-        model = Model(scene, captures, captures.noise)
+        model = SceneModel(scene, captures, captures.noise)
 
         def signal(s: float) -> np.ndarray:
             values = {**built, **{key: float(np.clip(start[key] + s, *scene.parameters[key].bounds)) for key in keys}}
