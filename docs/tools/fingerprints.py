@@ -260,13 +260,13 @@ def curves(key: str, view: View, shot: Shot, without: np.ndarray, image: np.ndar
 
 
 def main() -> None:
-    from optics.scene.registry import registry
+    from optics.scene.registry import known
 
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("effects", nargs="*", metavar="EFFECT", help="only these; without any: all")
     parser.add_argument("--missing", action="store_true", help="only those that have no figure yet")
     options = parser.parse_args()
-    reg = registry()
+    reg = known()
     record = json.loads(RECORD.read_text(encoding="utf-8")) if RECORD.is_file() else {}
     chosen = [reg.find_effect(name).key for name in options.effects] or sorted(reg.effects)
     for key in chosen:

@@ -204,7 +204,7 @@ def effect_page(effect, reg, record: dict) -> str:
     rows = [(p, "freed by the effect") for p in reg.effect_parameters(effect)]
     rows += [(p, "stays as it is") for p in brought if p.name not in effect.parameter_names]
     facts = [
-        ["part", f"[{effect.part}](../parts/{effect.part}.md)"],
+        ["part", " or ".join(f"[{kind}](../parts/{kind}.md)" for kind in reg.kinds(effect.part))],
         ["enters at", ", ".join(f"`{s}`" for s in effect.stages) or "the part itself"],
         [
             "one value for",
@@ -241,17 +241,17 @@ def part_page(part, reg) -> str:
     source = {
         p.name: f"[{e.name}](../effects/{e.key}.md)"
         for e in reg.effects.values()
-        if e.part == part.kind
+        if part.kind in reg.kinds(e.part)
         for p in (*e.parameters, *e.shape)
         if not isinstance(p, str)
     }
-    freed = {n: f"[{e.name}](../effects/{e.key}.md)" for e in reg.effects.values() if e.part == part.kind
+    freed = {n: f"[{e.name}](../effects/{e.key}.md)" for e in reg.effects.values() if part.kind in reg.kinds(e.part)
              for n in e.parameter_names}  # fmt: skip
     rows = [
         (p, f"effect {source[p.name]}" if p.name not in own else f"effect {freed[p.name]}" if p.name in freed else "")
         for p in reg.parameters_of(part.kind)
     ]
-    acting = sorted((e for e in reg.effects.values() if e.part == part.kind), key=lambda e: e.key)
+    acting = sorted((e for e in reg.effects.values() if part.kind in reg.kinds(e.part)), key=lambda e: e.key)
     known = attributes(part.doc)
     text = (
         f"# {escaped(title)}\n\n{escaped(sentence)}\n\n"
@@ -285,7 +285,8 @@ def effect_index(reg, record: dict) -> str:
         "figure is measured: a scene is rendered with the effect and without it (`python docs/tools/fingerprints.py`).",
     ]
     for kind in sorted({e.part for e in reg.effects.values()}, key=lambda k: (k != "camera", k)):
-        pieces.append(f"## {kind}\n\nOf the part [{kind}](../parts/{kind}.md).")
+        parts = " or ".join(f"[{k}](../parts/{k}.md)" for k in reg.kinds(kind))
+        pieces.append(f"## {kind}\n\nOf the part {parts}.")
         own = sorted((e for e in reg.effects.values() if e.part == kind), key=lambda e: e.name)
         pieces.append("\n".join(f"- [{escaped(e.name)}]({e.key}.md): {escaped(summary(e.doc)[1])}" for e in own))
     tree = "\n".join(sorted(reg.effects))
@@ -312,9 +313,9 @@ def put(file: Path, text: str) -> None:
 def write_pages(folder: Path) -> int:
     """Write all pages below a folder (`parts/`, `effects/`) and the files that they are made of (`sources/`), and
     remove those of plugins that are gone; their number."""
-    from optics.scene.registry import registry
+    from optics.scene.registry import known
 
-    reg = registry()
+    reg = known()
     record = json.loads((FIGURES / "figures.json").read_text(encoding="utf-8"))
     if lacking := sorted(set(reg.effects) - set(record)):
         raise LookupError(
