@@ -120,7 +120,7 @@ def asked(mitsuba):
             while frame is not None:
                 declares |= frame.f_code.co_name == "declare"
                 owner = frame.f_locals.get("self")
-                if getattr(owner, "kind", None) in known().parts:
+                if getattr(owner, "kind", None) in PARTS:
                     if not declares:
                         known = seen.setdefault(owner.kind, {})
                         known[key] = rest[0] if rest else known.get(key)
