@@ -20,6 +20,7 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
+from plugin_pages import formula_of
 
 FOLDER = Path(__file__).resolve().parent.parent / "fingerprints"
 RECORD = FOLDER / "figures.json"
@@ -206,6 +207,7 @@ def draw(effect, reg) -> dict:
         "strength": {k: float(f"{v:.6g}") for k, v in values.items()},
         "rms": float(f"{np.sqrt((change**2).mean()) / signal:.3g}"),
         "scale": float(f"{scale:.3g}"),
+        "formula": formula_of(effect),
     }
 
 

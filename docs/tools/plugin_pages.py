@@ -8,10 +8,15 @@ fingerprint figure. `make docs` calls `write_pages` before it builds the site; n
 
 from __future__ import annotations
 
+import hashlib
+import inspect
+import io
 import json
 import math
 import re
 import sys
+import textwrap
+import tokenize
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -28,6 +33,7 @@ DERIVATIVE = {
     "layer": "complex step through the Mueller matrices",
     "path": "lengths of the paths in clear bodies",
 }
+CODE = (tokenize.NAME, tokenize.NUMBER, tokenize.OP, tokenize.STRING)
 ELEMENT = {"bsdf": "bsdf", "emitter": "emitter", "sensor": "sensor", "shape": "shape", "integrator": "integrator"}
 
 
@@ -125,6 +131,15 @@ def span(p) -> str:
     if math.isinf(low) and math.isinf(high):
         return "any"
     return f"{number(low)} … {number(high)}"
+
+
+def formula_of(effect) -> str:
+    """A fingerprint of the code of an effect's functions, comments and layout aside: a figure is of this formula."""
+    words = []
+    for stage in sorted(effect.stages):
+        source = textwrap.dedent(inspect.getsource(effect.stages[stage]))
+        words += [t.string for t in tokenize.generate_tokens(io.StringIO(source).readline) if t.type in CODE]
+    return hashlib.sha256(" ".join(words).encode()).hexdigest()[:12]
 
 
 def table(head: list[str], rows: list[list[str]]) -> str:

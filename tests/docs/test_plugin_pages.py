@@ -41,6 +41,8 @@ def test_every_effect_has_a_fingerprint_figure_of_its_own_parameters(key, record
         p = known().parameter(effect.part, name)
         assert p.bounds[0] <= value <= p.bounds[1] and value != p.neutral
     assert own["rms"] > 0 and own["scale"] > 0
+    now = plugin_pages.formula_of(effect)
+    assert own["formula"] == now, f"the formula has changed: python docs/tools/fingerprints.py {key}, and look at it"
 
 
 def test_no_figure_is_left_of_an_effect_that_is_gone(record):
