@@ -33,7 +33,7 @@ DERIVATIVE = {
     "layer": "complex step through the Mueller matrices",
     "path": "lengths of the paths in clear bodies",
 }
-CODE = (tokenize.NAME, tokenize.NUMBER, tokenize.OP, tokenize.STRING)
+CODE = (tokenize.NAME, tokenize.NUMBER, tokenize.OP)  # docstrings and messages are no part of a formula
 ELEMENT = {"bsdf": "bsdf", "emitter": "emitter", "sensor": "sensor", "shape": "shape", "integrator": "integrator"}
 
 
