@@ -89,4 +89,4 @@ def build():
     return Interface
 
 
-part = Part("interface", "bsdf", PARAMETERS, build)
+part = Part("interface", "bsdf", PARAMETERS, build, refracts=True)

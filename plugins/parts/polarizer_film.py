@@ -148,4 +148,4 @@ def polarize(crossing, film):
     return film_matrix * film.inserted + absorber(1 - film.inserted)
 
 
-part = layer("polarizer_film", PARAMETERS, polarize)
+part = layer("polarizer_film", PARAMETERS, polarize, polarizes=True)
