@@ -3,7 +3,8 @@
 Definition
     T2 = leak                                                    every polarizer film alike, all bands alike
 so that crossed films transmit T1 T2, and Malus' curve stands on a floor: I = I0 ((T1^2 + T2^2)/2 cos(d)^2 + T1 T2
-sin(d)^2) for unpolarized light and the angle d between. A sheet sold as "99 %" has T2 = 0.005 T1. Fingerprint
+sin(d)^2) for unpolarized light and the angle d between. A sheet sold as "99 %" has T2 = 0.005 T1.
+Fingerprint
     the dark end is lifted and nothing else; the same in every channel. A background or a dark offset looks alike while
     source and exposure stay as they are: a dimmer source lowers the leak with it and leaves them.
 Validity

@@ -3,7 +3,8 @@
 Definition
     L' = L + s L_2,   L_2 the light after two reflections
 by Monte Carlo over the second direction; s = 1 is physics, and a fit that needs s far from 1 says that this is not the
-cause. Fingerprint
+cause.
+Fingerprint
     the inner flanks of a dent and its shadows brighten, with the square of the reflectance: colours get purer. A
     specular lobe brightens where a mirror would.
 Validity

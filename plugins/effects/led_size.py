@@ -3,7 +3,8 @@
 Definition
     L' = mean of L over a disc of area A across the LED's axis, with the shadows of each of its points
 16 points on two circles, with the mean square radius of the disc; the strength is the area, as the smooth part of the
-effect grows with the radius squared. Fingerprint
+effect grows with the radius squared.
+Fingerprint
     shadow rims widen with the distance between the edge and the face it shades; far from rims almost nothing. Lens blur
     softens all contours alike.
 Validity

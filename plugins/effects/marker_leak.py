@@ -4,7 +4,8 @@ Definition
     L = m <L_markers>                                            from the skin's face to the camera, the same everywhere
     on it
 with the share m and the mean radiance of the fluorescent markers in the image. Light that enters the skin under a
-marker beyond the critical angle is guided by total reflection until a flaw of the face lets it out. Fingerprint
+marker beyond the critical angle is guided by total reflection until a flaw of the face lets it out.
+Fingerprint
     a faint glow in the colour of the markers over the skin, between them; it is there at every angle of the analyser
     and goes with the ultraviolet lamps. A polarizer's leak has the colours of the background and is gone when that is
     dark.

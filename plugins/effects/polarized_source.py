@@ -3,7 +3,8 @@
 Definition
     S = L (1, q, u, 0)
 with q = `dop_q` = p cos(2a), u = `dop_u` = p sin(2a), p the degree of polarization, a its angle; mirrors, diffusers
-seen obliquely and liquid crystal screens do that. Fingerprint
+seen obliquely and liquid crystal screens do that.
+Fingerprint
     turning the first polarizer changes the brightness, with two cycles per turn; turning both together as well. With
     the first polarizer at rest it is a factor and cannot be seen.
 Validity

@@ -6,7 +6,8 @@ Definition
 An oblique ray sees what of the in-plane birefringence lies across it, over a longer path
 (optics.polarization.layers.Crossing.retardance). A wave plate is retard_0 = 90 (quarter) or 180 deg (half wave) and an
 `angle`; the two components, in place of retardance and axis, go through zero without a seam. Dispersion 0 is a
-birefringence that is the same at all wavelengths. Fingerprint
+birefringence that is the same at all wavelengths.
+Fingerprint
     between crossed polarizers, light returns as sin(delta/2)^2 sin(2 psi)^2, without first order: a faint retardance
     hides, and its sign does not show. Behind a quarter-wave plate it shows in first order, and with its sign.
 Validity

@@ -7,7 +7,8 @@ Definition
 A rectangle `width` x `length` around the world's z axis, `depth` below the untouched face at z = 0; it lies flat while
 the gel is not pressed. Its texture coordinates are those of the place at rest, u = x/width + 1/2, v = y/length + 1/2:
 the first direction runs along x at rest and turns with the sheet. Its normals look at the camera, towards -z. A layer
-on it (a polarizer film, a stressed plate) moves, tilts and turns with it. Fingerprint
+on it (a polarizer film, a stressed plate) moves, tilts and turns with it.
+Fingerprint
     a press tilts and shifts the sheet over about its depth around the contact; without a press nothing.
 Validity
     dents shallower than `depth`, small strains; effects of the face's shape other than the press are not carried. The

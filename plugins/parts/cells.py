@@ -7,7 +7,8 @@ with `wall` + `wall_error` for the wall. A cell that was not filled lacks the sh
 1 + (n - 1)(1 - u), absorption and scattering times (1 - u). Which cell is said by `unfilled_column`, `unfilled_row` and
 `unfilled_layer`, from 0 on, layers from the touched face. `skin` of wall material lies between the touched face at z =
 0 and the grid; walls of the thickness `wall` part the cells. The normals point out of the cells, into the walls. Where
-the scene has a `block` that gives way, its corners move with it. Fingerprint
+the scene has a `block` that gives way, its corners move with it.
+Fingerprint
     the grid's period and its walls' width, everywhere; a wrong wall moves all lines alike.
 Validity
     boxes with flat faces; deformed ones are flat in two triangles a side. Numbers of cells are structure (XML

@@ -8,7 +8,8 @@ Definition
     I exp(-alpha d)                                              Beer-Lambert along every stretch d inside (27-29)
 `index` and `absorption` hold at 540 nm; how they change with the wavelength are effects (`dispersion`, `coloured
 absorption`). The surface's normals point out of the body. `outside` (XML) names the clear material around it, as the
-wall around a cell's filling; without it that is air. Fingerprint
+wall around a cell's filling; without it that is air.
+Fingerprint
     walls show as bright and dark lines, totally reflecting where they are met at grazing incidence; absorption darkens
     long ways.
 Validity

@@ -6,7 +6,8 @@ Definition
     cap    base + height axis, radius r, facing the camera (-z)
 `columns` x `rows` of them (XML integers, 5 x 4) at pitch_x, pitch_y around the world's z axis. The cap moves as a rigid
 disc, the foot's rim stays on the face, and the wall runs straight between them, so that no light passes under a marker
-on a bent face. The foot is open: the skin is there. Fingerprint
+on a bent face. The foot is open: the skin is there.
+Fingerprint
     a press moves markers outwards and towards the camera and tilts them away from the contact.
 Validity
     markers as soft as the skin or small against the bend of its face; otherwise as for the part `carried`.

@@ -8,7 +8,8 @@ camera's ray passes flat interfaces (part `interface`) by Snell's law with the t
 sampled through null and index-matched surfaces; homogeneous media are followed analytically, exp(-sigma_a d) per
 segment; the gel's own effects (stages `segment` and `volume`) act on the path inside -thickness < z < 0. Every surface
 is lit by all point lights and by one of the others, drawn by Monte Carlo: to draw one of the LEDs would be most of the
-noise. Every bounce after the first is scaled by `interreflection`: 1 is physics, 0 is direct light only. Fingerprint
+noise. Every bounce after the first is scaled by `interreflection`: 1 is physics, 0 is direct light only.
+Fingerprint
     interreflection fills shadows and the inner flanks of a dent.
 Validity
     scattering media only to first order (effect "gel haze"); refraction of the light on its way from an LED to the

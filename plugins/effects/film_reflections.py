@@ -5,7 +5,8 @@ Definition
     faces of all films are summed as Mueller matrices (adding method), light from behind by reciprocity.
 A film's transmittances are those of the whole film, the faces' losses included. For two ideal films at the angle d the
 first order adds r^2 (5 cos(d)^2 + cos(d)^6) to the cos(d)^2 that passes: light that went through the absorber again was
-filtered again. Fingerprint
+filtered again.
+Fingerprint
     Malus' curve becomes a little narrower, by a cos^6 that no leak and no offset makes; 0.2 % at r = 0.04.
 Validity
     the prediction only: mi.render leaves it out. As at normal incidence; no interference (films thicker than the

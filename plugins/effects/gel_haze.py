@@ -3,7 +3,8 @@
 Definition
     L' = L exp(-h (d_light + d_view)) + h/(4 pi) int_0^d_view kappa(x) exp(-h (s + |x - S|)) ds
 with the scattering coefficient h, isotropic single scattering, kappa of (S2) without the cosine, and the integral along
-the camera's ray inside the gel by Gauss-Legendre quadrature with eight nodes. Fingerprint
+the camera's ray inside the gel by Gauss-Legendre quadrature with eight nodes.
+Fingerprint
     a veil that brightens towards the LEDs and fills shadows, without the structure of the face; grows with the gel's
     thickness. Veiling glare is flat; ambient light follows the reflectance.
 Validity

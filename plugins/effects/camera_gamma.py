@@ -4,7 +4,8 @@ Definition
     m' = m^(1 + g)                                               of the response m in units of full scale; below 0 as it
     is
 g < 0 lifts the middle tones; 0 and full scale stay. Cameras that write images for viewing have 1/2.2 and hide it from
-nobody; a photodiode's amplifier bends by a percent. Fingerprint
+nobody; a photodiode's amplifier bends by a percent.
+Fingerprint
     depends on the intensity of a pixel alone, and most in the dark, relatively: Malus' dark end is too bright or too
     dark, as by a leak, but by more at half the power. The residual response curve is symmetric about half scale; this
     is not.

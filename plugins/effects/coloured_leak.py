@@ -3,7 +3,8 @@
 Definition
     T2(lambda) = leak + leak_tilt (lambda - 540)/100, not below 0
 Dichroic films are darkest in the middle of the visible and leak in the blue or in the red, so that crossed films look
-violet. Fingerprint
+violet.
+Fingerprint
     the dark end has a colour that the bright end lacks.
 Validity
     a straight line over the bands.

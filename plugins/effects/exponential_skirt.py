@@ -3,7 +3,8 @@
 Definition
     D(x) = max over touched points p of D0(p) exp(-|x - p| / l)
 with the length l (`skirt`), before the smoothing of S1.6; l = 0 leaves D0. For a ball of radius R that touches up to
-the radius a, the slope falls from a/sqrt(R^2 - a^2) at the edge of contact by 1/e over every l. Fingerprint
+the radius a, the slope falls from a/sqrt(R^2 - a^2) at the edge of contact by 1/e over every l.
+Fingerprint
     a ring around every contact, about l wide, on the side that each LED lights; the real contact is smaller than the
     circle that the eye sees. Smoothing makes a shorter ring of Gaussian shape, gel bulge a wider one of opposite slope.
 Validity

@@ -3,7 +3,8 @@
 Definition
     L' = L + rho_c/pi G_c (1 - n_z)/2
 (1 - n_z)/2 is the share of its view that a facet, whose normal makes the angle arccos n_z with the camera's axis, gives
-to a wide bright plane below; G_c is the radiosity of that plane in the first three bands. Fingerprint
+to a wide bright plane below; G_c is the radiosity of that plane in the first three bands.
+Fingerprint
     every flank brightens alike, whichever way it faces, and with the square of its slope; flat parts stay. One bounce
     within the mesh (interreflection) is the same light with its true borders, and dearer to compute.
 Validity

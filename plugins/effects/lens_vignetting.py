@@ -3,7 +3,8 @@
 Definition
     I'(theta) = I(theta) cos(theta)^(4 v)
 theta the angle between the ray and the optical axis, v the strength: 0 none, 1 the natural cos^4 law of a thin lens,
-more with mechanical vignetting. Fingerprint
+more with mechanical vignetting.
+Fingerprint
     a smooth fall-off with the distance to the principal point, the same in every channel, LED and frame. A lobe
     exponent mu that is too large looks alike while all LEDs stand on one side; LEDs on all sides, or frames with one
     LED each, separate the two.

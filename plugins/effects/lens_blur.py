@@ -4,7 +4,8 @@ Definition
     I' = I * G,  G a Gaussian of variance V (px^2) along each axis
 computed in the cosine transform, exp(-V (pi k/N)^2 / 2), which mirrors the image at its borders and is exact for any V,
 also far below a pixel. The strength is the variance and not the width, so that its onset is linear; on sharp edges it
-is straight only up to 1/16 px^2, so the ranking tries a finite step as well. Fingerprint
+is straight only up to 1/16 px^2, so the ranking tries a finite step as well.
+Fingerprint
     acts where the image is curved: shadow rims, the rim of the contact. LED size blurs shadow rims only, smoothing of
     the gel only the dent.
 Validity
