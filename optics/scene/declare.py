@@ -63,6 +63,8 @@ class Part:
 
     build   called once per Mitsuba variant, returns the plugin class (a subclass of mi.BSDF, mi.Emitter, ...)
     checks  functions without arguments that raise AssertionError: the closed forms that the part must meet
+    random  f(rng) -> {parameter name: value}: plausible values of parameters whose default and `plausible` are not
+            enough (optics.scene.checking.draw)
     mueller of a layer: its Mueller matrix (optics.polarization.layers);   stokes   of a source: the Stokes vector that
     it sends
     """
@@ -76,6 +78,7 @@ class Part:
     file: str = ""
     mueller: Callable | None = None
     stokes: Callable | None = None
+    random: Callable | None = None
 
 
 @dataclass(frozen=True)
@@ -99,6 +102,7 @@ class Effect:
                 further parameters
                 that do nothing at neutral, found from the residual before the effect is scored or added
     checks      closed forms, as in Part
+    random      plausible values, as in Part
     """
 
     name: str
@@ -115,6 +119,7 @@ class Effect:
     needs: str = ""
     seek: Callable | None = None
     checks: tuple[Callable[[], None], ...] = ()
+    random: Callable | None = None
     doc: str = ""
     file: str = ""
 

@@ -112,9 +112,9 @@ def numbers_of(part) -> SimpleNamespace:
     )
 
 
-def layer(kind: str, parameters: tuple, mueller: Callable) -> Part:
-    """The declaration of a layer: its name in XML, its parameters, its Mueller matrix."""
-    return Part(kind, "bsdf", parameters, lambda: bsdf(kind, mueller), mueller=mueller)
+def layer(kind: str, parameters: tuple, mueller: Callable, checks: tuple = (), random: Callable | None = None) -> Part:
+    """The declaration of a layer: its name in XML, its parameters, its Mueller matrix, its checks and its sampler."""
+    return Part(kind, "bsdf", parameters, lambda: bsdf(kind, mueller), checks, mueller=mueller, random=random)
 
 
 def bsdf(kind: str, own: Callable) -> type:
