@@ -21,7 +21,9 @@ from optics.scene.declare import Effect
 def check_first_harmonic():
     """The Fourier components of the transmittance over a turn: T1/2, w_c T1/4 and w_s T1/4, and no second harmonic."""
     turn = np.arange(0.0, 360.0, 30.0)
-    level = [mueller("polarizer_film", transmittance=0.8, angle=a, wobble_c=0.02, wobble_s=-0.03)[0, 0, 0] for a in turn]
+    level = [
+        mueller("polarizer_film", transmittance=0.8, angle=a, wobble_c=0.02, wobble_s=-0.03)[0, 0, 0] for a in turn
+    ]
     component = [(level * np.exp(-1j * k * np.radians(turn))).mean() for k in (0, 1, 2)]
     agree(np.real(component), [0.4, 0.004, 0.0], 0, 1e-15)
     agree(np.imag(component), [0.0, 0.006, 0.0], 0, 1e-15)
