@@ -171,7 +171,9 @@ def run(
         say(study.table())
     page = report(study.folder, folder / "report.html", overwrite=True)
     last = study.steps[-1]["held_out"]
-    keys = {key for name in claimed for key in sum(model.scene.keys_of(model.scene.registry.find_effect(name)).values(), [])}
+    keys = {
+        key for name in claimed for key in sum(model.scene.keys_of(model.scene.registry.find_effect(name)).values(), [])
+    }
     strengths = {v["name"]: (v["value"], v["sd"]) for v in study.steps[-1]["variables"] if keys & set(v["keys"])}
     return {
         "hidden": hidden,

@@ -13,7 +13,8 @@ horizontal field of view, f_y = f_x aspect, the principal point (c_x, c_y) is gi
 image, L_b is the radiance in band b, and M the sensitivities of the channels in the bands (identity, or a measured
 camera of the colour-science library by its name). XML may give `fx`, `fy`, `cx`, `cy` (px) in place of the field of
 view. Frame: x right, y down, z forward (OpenCV); the transform `to_world` gives the nominal pose, `x` ... `roll` what
-departs from it. Fingerprint
+departs from it.
+Fingerprint
     principal point and pose shift the image; distortion grows with the third power of the radius; exposure scales all.
 Validity
     central projection; a fisheye needs another part. Monotone response: G'(m) > 0 on [0, 1].
@@ -23,6 +24,7 @@ References
 
 import math
 
+from optics.scene.checking import agree, made
 from optics.scene.declare import Part
 from optics.scene.mitsuba_parts import Declared
 from optics.scene.parameter import Parameter
@@ -239,4 +241,18 @@ def build():
     return Camera
 
 
-part = Part("camera", "sensor", PARAMETERS, build)
+def check_field_of_view():
+    """The middle of the image looks along z, its edges by half of the field of view to either side, at f = width/2 / tan
+    of that; roll turns right to down."""
+    import mitsuba as mi
+    import numpy as np
+
+    film = {"type": "hdrfilm", "width": 80, "height": 60}
+    for roll in (0.0, 90.0):
+        _, d = made("camera", x_fov=60.0, roll=roll, film=film).ray(mi.Float([0, 40, 80]), mi.Float(30.0))
+        x = np.array([-0.5, 0.0, 0.5])
+        z = np.sqrt(0.75) * np.array([1, 1 / np.sqrt(0.75), 1])
+        agree(np.array(d), [x, 0 * x, z] if roll == 0 else [0 * x, x, z], 0, 1e-6)
+
+
+part = Part("camera", "sensor", PARAMETERS, build, checks=(check_field_of_view,))

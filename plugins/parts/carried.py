@@ -7,7 +7,8 @@ Definition
 A rectangle `width` x `length` around the world's z axis, `depth` below the untouched face at z = 0; it lies flat while
 the gel is not pressed. Its texture coordinates are those of the place at rest, u = x/width + 1/2, v = y/length + 1/2:
 the first direction runs along x at rest and turns with the sheet. Its normals look at the camera, towards -z. A layer
-on it (a polarizer film, a stressed plate) moves, tilts and turns with it. Fingerprint
+on it (a polarizer film, a stressed plate) moves, tilts and turns with it.
+Fingerprint
     a press tilts and shifts the sheet over about its depth around the contact; without a press nothing.
 Validity
     dents shallower than `depth`, small strains; effects of the face's shape other than the press are not carried. The
@@ -17,6 +18,7 @@ References
     Vi2TaP (RA-L 2025), II.B: a film embedded in a silicone skin of 5 mm. Johnson, Contact Mechanics (1985), 3.2.
 """
 
+from optics.scene.checking import agree, made
 from optics.scene.declare import Part
 from optics.scene.mitsuba_parts import Declared
 from optics.scene.parameter import Parameter
@@ -79,4 +81,15 @@ def build():
     return Carried
 
 
-part = Part("carried", "shape", PARAMETERS, build)
+def check_flat_at_rest():
+    """Without a press the sheet is the rectangle at its depth, its first direction along x."""
+    import mitsuba as mi
+    import numpy as np
+
+    sheet = made("carried", width=8.0, length=6.0, depth=2.5, columns=3, rows=2, bsdf={"type": "sheet"})
+    found = np.array(mi.traverse(sheet)["vertex_positions"]).reshape(2, 3, 3)
+    x, y = np.meshgrid([-4.0, 0.0, 4.0], [-3.0, 3.0])
+    agree(found, np.stack([x, y, np.full_like(x, -2.5)], -1), 0, 1e-6)
+
+
+part = Part("carried", "shape", PARAMETERS, build, checks=(check_flat_at_rest,))

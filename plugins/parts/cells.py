@@ -7,7 +7,8 @@ with `wall` + `wall_error` for the wall. A cell that was not filled lacks the sh
 1 + (n - 1)(1 - u), absorption and scattering times (1 - u). Which cell is said by `unfilled_column`, `unfilled_row` and
 `unfilled_layer`, from 0 on, layers from the touched face. `skin` of wall material lies between the touched face at z =
 0 and the grid; walls of the thickness `wall` part the cells. The normals point out of the cells, into the walls. Where
-the scene has a `block` that gives way, its corners move with it. Fingerprint
+the scene has a `block` that gives way, its corners move with it.
+Fingerprint
     the grid's period and its walls' width, everywhere; a wrong wall moves all lines alike.
 Validity
     boxes with flat faces; deformed ones are flat in two triangles a side. Numbers of cells are structure (XML
@@ -16,6 +17,7 @@ References
     Fan, Li, Cong & Zhang, MagicGripper, III.A: cells of 0.6 to 1 mm, skins from 0.3 mm on.
 """
 
+from optics.scene.checking import agree, made
 from optics.scene.declare import Part
 from optics.scene.mitsuba_parts import Declared
 from optics.scene.parameter import Parameter
@@ -182,4 +184,20 @@ def build():
     return Cells
 
 
-part = Part("cells", "shape", PARAMETERS, build)
+def check_boxes():
+    """Cells of pitch - wall each way, the first layer's tops half a wall below the skin; their volumes."""
+    import numpy as np
+
+    grid = made("cells", columns=2, rows=1, layers=2, pitch=0.8, wall=0.2, skin=0.5, bsdf={"type": "clear"})
+    corners = grid.vertices()
+    agree(corners.max(1)[0], [-0.1, 0.3, -0.6], 0, 1e-6)
+    agree(corners.min((0, 1)), [-0.7, -0.3, -2.0], 0, 1e-6)
+    agree(grid.cells(1).volumes, np.full((4, 1), 0.6**3), 1e-5)
+
+
+def random(rng):
+    """A grid that a printer of droplets makes."""
+    return {"pitch": rng.uniform(0.6, 1.0), "wall": rng.uniform(0.1, 0.3), "skin": rng.uniform(0.3, 0.8)}
+
+
+part = Part("cells", "shape", PARAMETERS, build, checks=(check_boxes,), random=random)

@@ -6,7 +6,8 @@ Definition
     cap    base + height axis, radius r, facing the camera (-z)
 `columns` x `rows` of them (XML integers, 5 x 4) at pitch_x, pitch_y around the world's z axis. The cap moves as a rigid
 disc, the foot's rim stays on the face, and the wall runs straight between them, so that no light passes under a marker
-on a bent face. The foot is open: the skin is there. Fingerprint
+on a bent face. The foot is open: the skin is there.
+Fingerprint
     a press moves markers outwards and towards the camera and tilts them away from the contact.
 Validity
     markers as soft as the skin or small against the bend of its face; otherwise as for the part `carried`.
@@ -14,6 +15,7 @@ References
     Vi2TaP (RA-L 2025), II.B: 5 x 4 markers, 9.5 x 8.5 mm apart, cast in holes of 1.5 mm radius and 1 mm depth.
 """
 
+from optics.scene.checking import agree, made
 from optics.scene.declare import Part
 from optics.scene.mitsuba_parts import Declared
 from optics.scene.parameter import Parameter
@@ -118,4 +120,20 @@ def build():
     return Markers
 
 
-part = Part("markers", "shape", PARAMETERS, build)
+def check_rows_and_columns():
+    """Two by three caps, a height of 1 mm above the face that is 5 mm deep, at their pitches around the middle."""
+    import numpy as np
+
+    size = {"columns": 2, "rows": 3, "pitch_x": 6.0, "pitch_y": 4.0, "height": 1.0, "depth": 5.0}
+    caps = made("markers", **size, bsdf={"type": "fluorescent"}).centres()
+    x, y = np.meshgrid([-3.0, 3.0], [-4.0, 0.0, 4.0])
+    agree(caps, np.stack([x.ravel(), y.ravel(), np.full(6, -6.0)], -1), 0, 1e-6)
+
+
+def random(rng):
+    """Markers that leave at least half of the face free."""
+    pitch = rng.uniform(4, 12)
+    return {"pitch_x": pitch, "pitch_y": pitch, "radius": pitch * rng.uniform(0.1, 0.3)}
+
+
+part = Part("markers", "shape", PARAMETERS, build, checks=(check_rows_and_columns,), random=random)

@@ -6,7 +6,8 @@ Definition
 with the reflectance rho_c of each band (red, green, blue: the first three bands of the integrator, times an optional
 texture `reflectance`), the roughness sigma (rad) of the facets, alpha and beta the larger and the smaller of the angles
 to the normal. With s = wi.wo - cos_i cos_o the product cos(phi) sin(alpha) tan(beta) is s / max(cos_i, cos_o), which
-has no singularity (Oren & Nayar's qualitative model). Fingerprint
+has no singularity (Oren & Nayar's qualitative model).
+Fingerprint
     rho scales a band everywhere; sigma brightens grazing views of slopes that face the light and flattens the shading.
 Validity
     opaque coating, no lobe towards the mirror direction (the effect "specular lobe" adds one); depolarizes fully. The
@@ -16,6 +17,7 @@ References
     F-TAC Hand supplementary information, S1.4, eq. (S3); Oren & Nayar, IJCV 14, 227 (1995).
 """
 
+from optics.scene.checking import agree, made
 from optics.scene.declare import Part
 from optics.scene.parameter import Parameter
 from optics.scene.surfaces import matt
@@ -83,4 +85,26 @@ class Geometry:
         self.cos_view, self.cos_light, self.albedo = cos_view, cos_light, albedo
 
 
-part = Part("membrane", "bsdf", PARAMETERS, build)
+def check_lambert():
+    """rho cos/pi of a smooth face in every direction; a rough one, sigma = 0.5, is A rho/pi along the normal, whatever
+    the light's direction."""
+    import drjit as dr
+    import mitsuba as mi
+    import numpy as np
+
+    wi = np.array([[0.0, 0.0, 1.0], [0.6, 0.0, 0.8], [-0.8, 0.0, 0.6]])
+    si = dr.zeros(mi.SurfaceInteraction3f, 3)
+    si.t, si.wi = mi.Float(1), mi.Vector3f(*wi.T.astype("f"))
+    for sigma, towards, share in ((0.0, [0.6, 0.0, 0.8], 1.0), (0.5, [0.0, 0.0, 1.0], 1 - 0.125 / 0.58)):
+        face = made("membrane", rho_r=0.7, rho_g=0.5, rho_b=0.2, sigma=sigma)
+        found = face.eval(mi.BSDFContext(), si, mi.Vector3f(*towards), True)
+        expected = np.outer([0.7, 0.5, 0.2], [share * towards[2] / np.pi] * 3)
+        agree(np.array(mi.unpolarized_spectrum(found))[:3], expected, 1e-5)
+
+
+def random(rng):
+    """A coloured paint."""
+    return {"sigma": rng.uniform(0.05, 0.6), **{f"rho_{c}": rng.uniform(0.2, 0.9) for c in "rgb"}}
+
+
+part = Part("membrane", "bsdf", PARAMETERS, build, checks=(check_lambert,), random=random)

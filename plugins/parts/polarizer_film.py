@@ -9,7 +9,8 @@ with t across the ray and across the absorbing molecules, t = k x a: two crossed
 away from it, in a cross of dark arms. A sheet of the polarization ratio P lets T2 = T1 (1 - P)/(1 + P) through: 99 % is
 0.005 T1. The angle counts from the surface's x axis (the first edge of a rectangle) to its y axis: counterclockwise for
 a viewer at whom the surface's normal points. T1 and T2 are those of the whole sheet. With `face` > 0 both its faces
-reflect that share, and light that goes to and fro between them and the faces of other films is summed. Fingerprint
+reflect that share, and light that goes to and fro between them and the faces of other films is summed.
+Fingerprint
     two of them follow Malus, cos^2 of the angle between; a leak lifts the dark end, an offset shifts the curve, a
     wobble returns once per turn (Malus twice), a backlash splits the curves turned one way and the other.
 Validity
@@ -24,6 +25,7 @@ References
 import math
 
 from optics.polarization.mueller import absorber, cos, diattenuator, exp, real, sin, where
+from optics.scene.checking import agree, mueller
 from optics.scene.layer import layer
 from optics.scene.parameter import Parameter
 
@@ -148,4 +150,18 @@ def polarize(crossing, film):
     return film_matrix * film.inserted + absorber(1 - film.inserted)
 
 
-part = layer("polarizer_film", PARAMETERS, polarize, polarizes=True)
+def check_malus():
+    """cos(d)^2/2 of unpolarized light behind two ideal films; a film that was taken out does nothing."""
+    first = mueller("polarizer_film", transmittance=1.0, angle=20.0)
+    for angle in (20.0, 65.0, 80.0, 110.0):
+        pair = mueller("polarizer_film", transmittance=1.0, angle=angle) @ first
+        agree(pair[0, 0, 0], math.cos(math.radians(angle - 20)) ** 2 / 2, 1e-12, 1e-15)
+    agree(mueller("polarizer_film", inserted=0.0)[0], [[float(i == j) for j in range(4)] for i in range(4)])
+
+
+def random(rng):
+    """A sheet polarizer at any angle, with a leak of up to 5 %."""
+    return {"angle": rng.uniform(0, 180), "transmittance": rng.uniform(0.6, 0.9), "leak": rng.uniform(1e-4, 0.05)}
+
+
+part = layer("polarizer_film", PARAMETERS, polarize, polarizes=True, checks=(check_malus,), random=random)

@@ -8,7 +8,8 @@ camera's ray passes flat interfaces (part `interface`) by Snell's law with the t
 sampled through null and index-matched surfaces; homogeneous media are followed analytically, exp(-sigma_a d) per
 segment; the gel's own effects (stages `segment` and `volume`) act on the path inside -thickness < z < 0. Every surface
 is lit by all point lights and by one of the others, drawn by Monte Carlo: to draw one of the LEDs would be most of the
-noise. Every bounce after the first is scaled by `interreflection`: 1 is physics, 0 is direct light only. Fingerprint
+noise. Every bounce after the first is scaled by `interreflection`: 1 is physics, 0 is direct light only.
+Fingerprint
     interreflection fills shadows and the inner flanks of a dent.
 Validity
     scattering media only to first order (effect "gel haze"); refraction of the light on its way from an LED to the
@@ -20,6 +21,7 @@ References
 
 import math
 
+from optics.scene.checking import agree
 from optics.scene.declare import Part
 from optics.scene.mitsuba_parts import Declared
 from optics.scene.parameter import Parameter
@@ -400,4 +402,36 @@ def build():
     return Tactile
 
 
-part = Part("tactile", "integrator", PARAMETERS, build)
+def check_lit_plate():
+    """An LED far above a smooth white plate in a narrow field: rho/pi power/d^2 in every band, with its colour,
+    unpolarized."""
+    import mitsuba as mi
+    import numpy as np
+
+    led = {"type": "led", "position": [0.0, 0.0, -1000.0], "power": 1e6, "power_g": 0.5}
+    film = {"type": "hdrfilm", "width": 2, "height": 2, "rfilter": {"type": "box"}, "component_format": "float32"}
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "tactile", "bands": "610, 540, 460", "stokes": True},
+            "plate": {
+                "type": "rectangle",
+                "to_world": mi.ScalarTransform4f().rotate([1, 0, 0], 180),
+                "bsdf": {"type": "membrane", "rho_r": 0.5, "rho_g": 0.5, "rho_b": 0.5, "sigma": 0.0},
+            },
+            "led": led,
+            "camera": {
+                "type": "camera",
+                "x_fov": 1.0,
+                "to_world": mi.ScalarTransform4f().translate([0, 0, -20]),
+                "film": film,
+            },
+        },
+        optimize=False,
+    )
+    stokes = np.array(mi.render(scene, spp=1), float)[..., -16:].reshape(2, 2, 4, 4)  # S0 to S3 by band
+    agree(stokes[..., 0, :3], np.broadcast_to(0.5 / np.pi * np.array([1, 0.5, 1]), (2, 2, 3)), 1e-5)
+    agree(stokes[..., 1:, :], np.zeros((2, 2, 3, 4)), 0, 1e-7)
+
+
+part = Part("tactile", "integrator", PARAMETERS, build, checks=(check_lit_plate,))
