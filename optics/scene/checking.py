@@ -1,8 +1,8 @@
 """What plugin files use to check themselves, and the sampler of plausible values.
 
 A check is a function without arguments that raises AssertionError. It compares the plugin with a closed form: a number
-or a formula that a textbook gives. Checks stand in the plugin file (`checks=` of Part and Effect); `tests/contract` runs
-those of every plugin that a scan finds, with a Mitsuba variant set."""
+or a formula that a textbook gives. Checks are part of the plugin file (`checks=` of Part and Effect). `tests/contract`
+runs those of every plugin that a scan finds, with a Mitsuba variant set."""
 
 from __future__ import annotations
 
@@ -46,14 +46,15 @@ def made(kind: str, **values):
 
 
 def scene_of(*elements: str, bands: str = "620, 540, 460", width: int = 4, x_fov: float = 1.0):
-    """A small scene of these XML elements, seen by a camera at z = -20 that looks along z (an image of width x width)."""
+    """A small scene of these XML elements; its camera is at z = -20 and looks along z (an image of width x width)."""
     from optics.scene import loader
 
     xml = f"""<scene version="3.0.0">
         <integrator type="tactile" id="integrator"><string name="bands" value="{bands}"/></integrator>
         <sensor type="camera" id="camera">
             <film type="hdrfilm"><integer name="width" value="{width}"/><integer name="height" value="{width}"/></film>
-            <float name="x_fov" value="{x_fov}"/><transform name="to_world"><translate x="0.013" y="0.007" z="-20"/></transform>
+            <float name="x_fov" value="{x_fov}"/>
+            <transform name="to_world"><translate x="0.013" y="0.007" z="-20"/></transform>
         </sensor>
         {" ".join(elements)}
     </scene>"""

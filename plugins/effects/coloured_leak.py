@@ -25,9 +25,9 @@ def check_line_over_wavelengths():
 
 
 def random(rng):
-    """A leak that stays above 0 from 440 to 640 nm."""
+    """A leak that changes by half or less from 540 to 640 nm."""
     leak = rng.uniform(0.002, 0.02)
-    return {"leak": leak, "leak_tilt": leak * rng.uniform(-0.9, 0.9)}
+    return {"leak": leak, "leak_tilt": leak * rng.uniform(-0.5, 0.5)}
 
 
 effect = Effect(

@@ -25,8 +25,8 @@ def disperse(n, wavelengths, clear):
 
 
 def check_abbe_number():
-    """BK7 by Cauchy's A = 1.5046, B = 0.00420 um^2: n at the lines C, d, F (656.3, 587.6, 486.1 nm), and the Abbe number
-    (n_d - 1)/(n_F - n_C) = 64.3 that goes with these coefficients."""
+    """BK7 by Cauchy's A = 1.5046, B = 0.00420 um^2: n at the lines C, d, F (656.3, 587.6, 486.1 nm), and the Abbe
+    number (n_d - 1)/(n_F - n_C) = 64.4 of these coefficients."""
     a, b = 1.5046, 0.00420
     dispersion = b / 0.54**2  # in units of the index at 540 nm
     lines = np.array([656.3, 587.6, 486.1])

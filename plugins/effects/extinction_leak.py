@@ -5,8 +5,8 @@ Definition
 Crossed films transmit T1 T2, and Malus' curve has a floor: I = I0 ((T1^2 + T2^2)/2 cos(d)^2 + T1 T2 sin(d)^2) for
 unpolarized light and the angle d between the axes. A sheet sold as "99 %" has T2 = 0.005 T1.
 Fingerprint
-    the dark end is raised and nothing else changes; the same in every channel. A background or a dark offset looks alike
-    while source and exposure stay as they are: a dimmer source lowers the leak and leaves those unchanged.
+    the dark end is raised and nothing else changes; the same in every channel. A background or a dark offset looks
+    alike while source and exposure stay as they are: a dimmer source lowers the leak and leaves those unchanged.
 Validity
     small: the bright end loses as little as the dark end gains.
 References

@@ -1,5 +1,4 @@
-"""Frozen birefringence: residual stress of a print makes a dielectric body birefringent along the direction in which its
-layers were drawn.
+"""Frozen birefringence: residual stress of a print makes a dielectric body birefringent along its layers' direction.
 
 Definition
     delta = 2 pi dn sin^2(angle) d / lambda

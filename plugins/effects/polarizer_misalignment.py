@@ -18,7 +18,7 @@ from optics.scene.declare import Effect
 
 
 def check_shifted_malus():
-    """Behind a polarizer at 0, an analyser that is 3 degrees off passes sin(3)^2 of the most at 90 and nothing at 87."""
+    """Behind a polarizer at 0, an analyser that is 3 degrees off passes sin(3)^2 of the most at 90 and none at 87."""
     first = mueller("polarizer_film", transmittance=1.0)
     for angle, expected in ((90.0, np.sin(np.radians(3)) ** 2 / 2), (87.0, 0.0)):
         pair = mueller("polarizer_film", transmittance=1.0, angle=angle, offset=3.0) @ first

@@ -4,9 +4,9 @@ Definition
     delta(lambda) = delta_540 (540/lambda) (1 + retard_dispersion ((540/lambda)^2 - 1))
     delta_540 = sqrt(retard_0^2 + retard_45^2),  fast axis = atan2(retard_45, retard_0)/2 + angle of the sheet
 An oblique ray sees the part of the in-plane birefringence that lies across it, over a longer path
-(optics.polarization.layers.Crossing.retardance). A wave plate is retard_0 = 90 deg (quarter wave) or 180 deg (half wave)
-and an `angle`. The two components, in place of retardance and axis, pass through zero without a seam. Dispersion 0 means
-a birefringence that is the same at all wavelengths.
+(optics.polarization.layers.Crossing.retardance). A wave plate is retard_0 = 90 deg (quarter wave) or 180 deg (half
+wave) and an `angle`. The two components, in place of retardance and axis, pass through zero without a seam. Dispersion
+0 means a birefringence that is the same at all wavelengths.
 Fingerprint
     between crossed polarizers, light returns as sin(delta/2)^2 sin(2 psi)^2, without a first order: a faint retardance
     is hidden, and its sign does not show. Behind a quarter-wave plate it shows in first order, and with its sign.

@@ -28,8 +28,8 @@ from optics.scene.parameter import Parameter
 
 
 def check_shadowing():
-    """G1 = 1/(1 + Lambda) with Lambda = exp(-a^2)/(2 a sqrt(pi)) - erfc(a)/2, a = 1/(alpha tan(theta)) (Walter's eq. 26,
-    Smith's exact form), and a smooth face below 1e-4."""
+    """G1 = 1/(1 + Lambda) with Lambda = exp(-a^2)/(2 a sqrt(pi)) - erfc(a)/2, a = 1/(alpha tan(theta)) (Smith's exact
+    form, Walter's eq. 26), and a smooth face below 1e-4."""
     import mitsuba as mi
 
     from optics.light.transport import Run

@@ -32,8 +32,8 @@ def lobe(geometry, membrane):
 
 
 def check_lobe():
-    """k (e + 2)/(8 pi) in the mirror direction, whatever the incidence; cos(t/2)^e of it for light along the normal seen
-    at the angle t."""
+    """k (e + 2)/(8 pi) in the mirror direction, whatever the incidence; cos(t/2)^e of it for light along the normal
+    that is seen at the angle t."""
     import mitsuba as mi
 
     k, e = 0.2, 15.0

@@ -83,7 +83,8 @@ def check_material():
     grid = (
         '<shape type="cells" id="grid"><integer name="columns" value="2"/><integer name="rows" value="2"/>'
         '<integer name="layers" value="1"/><float name="unfilled" value="{}"/><float name="unfilled_column" value="1"/>'
-        '<bsdf type="clear" id="resin"><float name="index" value="1.5"/><float name="absorption" value="0.2"/></bsdf></shape>'
+        '<bsdf type="clear" id="resin"><float name="index" value="1.5"/><float name="absorption" value="0.2"/></bsdf>'
+        "</shape>"
     )
     lamp = '<shape type="rectangle"><emitter type="source" id="lamp"/></shape>'
     for share, index, absorption in ((0.5, 1.25, 0.1), (1.0, 1.0, 0.0)):

@@ -242,8 +242,8 @@ def build():
 
 
 def check_field_of_view():
-    """The middle of the image looks along z, its edges by half of the field of view to either side, at f = width/2 / tan
-    of that; roll turns right to down."""
+    """The middle of the image looks along z, its edges by half of the field of view to either side; roll turns right to
+    down."""
     import mitsuba as mi
     import numpy as np
 

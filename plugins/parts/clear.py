@@ -150,8 +150,8 @@ def build():
 
 
 def check_faces():
-    """Along the normal a face of the index 1.5 reflects 4 % from either side; beyond the critical angle it reflects all,
-    and transmits nothing."""
+    """Along the normal a face of the index 1.5 reflects 4 % from either side; beyond the critical angle it reflects all
+    light."""
     import drjit as dr
     import mitsuba as mi
     import numpy as np

@@ -83,7 +83,7 @@ def build():
 
 
 def check_photons():
-    """The radiance over all wavelengths, as photons: yield/pi times the photons absorbed, by numbers over the spectra."""
+    """The radiance over all wavelengths, as photons: yield/pi times the photons absorbed, summed over the spectra."""
     import drjit as dr
     import mitsuba as mi
     import numpy as np

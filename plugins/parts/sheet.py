@@ -76,8 +76,8 @@ def check_plate():
 
 
 def random(rng):
-    """A plate or a foil at any angle."""
-    return {"index": rng.uniform(1.0, 1.6), "transmittance": rng.uniform(0.5, 1), "angle": rng.uniform(0, 180)}
+    """A plate or a foil at any angle; its transmittance leaves room for a colour."""
+    return {"index": rng.uniform(1.0, 1.6), "transmittance": rng.uniform(0.5, 0.85), "angle": rng.uniform(0, 180)}
 
 
 part = layer("sheet", PARAMETERS, pass_sheet, checks=(check_plate,), random=random)
