@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from optics.errors import BadPlugin
+from optics.files.output import shipped
 from optics.light.renderer import POWERS
 from optics.scene import checking
 from optics.scene.declare import IMAGE_STAGES, Effect
@@ -176,11 +177,11 @@ def test_a_file_that_ships_has_the_name_of_what_it_declares(item):
     assert Path(item.file).stem == {"room": "source"}.get(name, name)
 
 
-def own_parameters(item):
+def own_parameters(item, registry=REGISTRY):
     """The parameters whose plausible values an item's sampler draws: an effect's with those that shape it."""
     if not isinstance(item, Effect):
         return item.parameters
-    return (*REGISTRY.effect_parameters(item), *item.shape)
+    return (*registry.effect_parameters(item), *item.shape)
 
 
 @pytest.mark.parametrize("item", ITEMS)
@@ -886,11 +887,11 @@ def test_image_functions_are_affine_or_act_pixel_by_pixel(key, stage, bench_of):
 
 def draw(rng, bench, chosen=None):
     """Plausible values about the working point, by the samplers of all parts and effects."""
-    values = {}
+    values, registry = {}, bench.scene.registry
     for name, part in bench.scene.parts.items():
         around = {p: bench.values[f"{name}.{p}"] for p in part.numbers}
-        for item in (REGISTRY.parts[part.kind], *(e for e in REGISTRY.effects.values() if e.part == part.kind)):
-            drawn = checking.draw(item, own_parameters(item), rng, around)
+        for item in (registry.parts[part.kind], *(e for e in registry.effects.values() if e.part == part.kind)):
+            drawn = checking.draw(item, own_parameters(item, registry), rng, around)
             values.update((f"{name}.{p}", value) for p, value in drawn.items())
     return {k: v for k, v in values.items() if k in bench.scene.parameters and (chosen is None or k in chosen)}
 
