@@ -30,7 +30,7 @@ from pathlib import Path
 import numpy as np
 
 from optics.captures import capture_set as capture_files
-from optics.diagnosis.verdict import Diagnosis
+from optics.diagnosis.result import Diagnosis
 from optics.proof import demo
 from optics.proof.makers.touch import Maker, presses
 from optics.scene import loader as scenes

@@ -1,7 +1,67 @@
 """Optical models of camera-based touch sensors that can be held against a measurement.
 
 A scene (Mitsuba XML) and captures (images with their settings) go in; a model that explains the captures comes out,
-with the record of which physical effects it took. Importing this package sets no Mitsuba variant and loads nothing
-heavy: each verb imports what it needs."""
+with the record of which physical effects it took:
+
+    study = optics.calibrate("captures", "study")
+    verdict = study.diagnose()
+    study.add("lens vignetting")
+    study.report()
+
+Importing this package sets no Mitsuba variant and loads nothing heavy: each name is imported when it is first used."""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from optics.diagnosis.result import Diagnosis
+    from optics.facade import Study, calibrate, compare, load
+    from optics.fit.result import Fit
+    from optics.scene.declare import Effect, Part
+    from optics.scene.loader import Scene
+    from optics.scene.mitsuba_parts import register
+    from optics.scene.parameter import Parameter
 
 __version__ = "0.1.0"
+
+_HOME = {
+    "calibrate": "optics.facade",
+    "compare": "optics.facade",
+    "load": "optics.facade",
+    "register": "optics.scene.mitsuba_parts",
+    "Diagnosis": "optics.diagnosis.result",
+    "Effect": "optics.scene.declare",
+    "Fit": "optics.fit.result",
+    "Parameter": "optics.scene.parameter",
+    "Part": "optics.scene.declare",
+    "Scene": "optics.scene.loader",
+    "Study": "optics.facade",
+}  # name -> module that holds it
+
+__all__ = [
+    "Diagnosis",
+    "Effect",
+    "Fit",
+    "Parameter",
+    "Part",
+    "Scene",
+    "Study",
+    "calibrate",
+    "compare",
+    "load",
+    "register",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module 'optics' has no attribute '{name}'; it has {', '.join(__all__)}")
+    value = getattr(importlib.import_module(_HOME[name]), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

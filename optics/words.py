@@ -1,15 +1,16 @@
-"""How names, numbers and tables read in a terminal."""
+"""How names, numbers and tables are written: in a terminal, on a page (`typeset`), in a notebook."""
 
 from __future__ import annotations
 
+import html
 import math
 import re
 from collections.abc import Collection, Sequence
+from typing import Any
 
 
 def table(rows: Sequence[Sequence[str]], left: Collection[int] | None = None) -> str:
-    """Aligned columns, two spaces apart; `left`: those that begin at the left (None: all), the others end at the
-    right."""
+    """Aligned columns, two spaces apart; `left`: columns that begin at the left (None: all), the others end at the right."""
     widths = [max(len(cell) for cell in column) for column in zip(*rows)]
     return "\n".join(
         "  ".join(
@@ -35,20 +36,111 @@ def spaced(unit: str) -> str:
     return "" if unit in ("", "1") else f" {unit}"
 
 
-def percent(x: float) -> str:
-    """0.0123 -> '1.23 %'; '-' for what is no number."""
-    return "-" if x is None or not math.isfinite(x) else f"{100 * x:.3g} %"
+def number(value: object, digits: int = 3, typeset: bool = False) -> str:
+    """0.012345 -> '0.0123'; a word stays as it is; '-' for what is missing.
+
+    typeset   a true minus, powers of ten, groups of thousands, a dash for what is missing
+    """
+    if isinstance(value, str) and not typeset:
+        return value
+    x = as_float(value)
+    if not typeset:
+        return "-" if math.isnan(x) else f"{x:.{digits}g}"
+    if not math.isfinite(x):
+        return "–" if math.isnan(x) else "∞" if x > 0 else "−∞"
+    size = abs(x)
+    if size and (size >= 1e6 or size < 1e-4):
+        mantissa, power = f"{x:.{max(digits - 2, 0)}e}".split("e")
+        text = f"{mantissa}·10{str(int(power)).translate(str.maketrans('-0123456789', '⁻⁰¹²³⁴⁵⁶⁷⁸⁹'))}"
+    elif round(size) >= 10**digits:  # 99.7 in two digits is 100
+        text = f"{x:,.0f}".replace(",", "\u202f")
+    else:
+        text = f"{x:.{digits}g}"
+    return text.replace("-", "−")
 
 
-def p_text(p: float) -> str:
+def figures(value: object, digits: int = 4) -> str:
+    """Like a typeset `number`, with closing zeros, so that a column lines up."""
+    x = as_float(value)
+    if not math.isfinite(x) or round(abs(x)) >= 10**digits or 0 < abs(x) < 1e-3:
+        return number(x, digits, typeset=True)
+    return f"{x:#.{digits}g}".rstrip(".").replace("-", "−")
+
+
+def fixed(value: object, places: int) -> str:
+    """A typeset number with so many decimal places."""
+    x = as_float(value)
+    return f"{x:.{places}f}".replace("-", "−") if math.isfinite(x) else number(x, typeset=True)
+
+
+def percent(value: object, digits: int = 3, typeset: bool = False) -> str:
+    """0.0123 -> '1.23 %'; '-' for what is no finite number."""
+    x = as_float(value)
+    if not math.isfinite(x):
+        return "–" if typeset else "-"
+    return f"{figures(100 * x, digits)}\u202f%" if typeset else f"{100 * x:.{digits}g} %"
+
+
+def p_text(p: object, typeset: bool = False) -> str:
     """A probability, in two digits."""
-    return "?" if math.isnan(p) else "<1e-9" if p < 1e-9 else f"{p:.1e}" if p < 1e-3 else f"{p:.2g}"
+    x = as_float(p)
+    if typeset:
+        return "< 10⁻⁹" if x < 1e-9 else number(x, 2, typeset=True)
+    return "?" if math.isnan(x) else "<1e-9" if x < 1e-9 else f"{x:.1e}" if x < 1e-3 else f"{x:.2g}"
 
 
-def with_sd(x: float, sd: float) -> str:
-    """0.3142, 0.0123 -> '0.314 +- 0.012': two digits of the standard deviation."""
-    if not (math.isfinite(sd) and sd > 0):
-        return f"{x:.3g}"
-    digits = max(0, 1 - math.floor(math.log10(sd)))
-    digits = min(digits, 12)
-    return f"{round(x, digits) + 0.0:.{digits}f} +- {sd:.{digits}f}"  # + 0.0: -0.0 reads 0.0
+def with_sd(value: object, sd: object, typeset: bool = False) -> str:
+    """0.3142, 0.0123 -> '0.314 +- 0.012': both rounded at the second digit of the standard deviation."""
+    x, s = as_float(value), as_float(sd)
+    if not (math.isfinite(s) and s > 0 and (math.isfinite(x) or not typeset)):
+        return number(x, 5, typeset=True) + (" ± ∞" if math.isinf(s) else "") if typeset else f"{x:.3g}"
+    places = max(0, 1 - math.floor(math.log10(s)))
+    if not typeset:
+        places = min(places, 12)
+        return f"{round(x, places) + 0.0:.{places}f} +- {s:.{places}f}"  # + 0.0: -0.0 reads 0.0
+    if places > 7 or s >= 1e5:
+        return f"{number(x, 4, typeset=True)} ± {number(s, 2, typeset=True)}"
+    return f"{round(x, places) + 0.0:.{places}f} ± {s:.{places}f}".replace("-", "−")
+
+
+def as_float(value: Any) -> float:
+    """A number as float; NaN for None and for what is no number. Infinities stay."""
+    try:
+        return math.nan if value is None else float(value)
+    except (TypeError, ValueError):
+        return math.nan
+
+
+# -- a notebook ---------------------------------------------------------------------------------------------------------
+
+SMALL = "font-size:90%;opacity:.75"
+
+
+def html_table(head: Sequence[str], rows: Sequence[Sequence[str]], left: Collection[int] = (0,)) -> str:
+    """A table for a notebook, escaped, without a style sheet; `left`: columns that begin at the left."""
+
+    def line(cells: Sequence[str], tag: str) -> str:
+        aligned = (
+            f'<{tag} style="text-align:{"left" if i in left else "right"};padding:1px 8px">{html.escape(str(c))}</{tag}>'
+            for i, c in enumerate(cells)
+        )
+        return f"<tr>{''.join(aligned)}</tr>"
+
+    body = "".join(line(row, "td") for row in rows)
+    return f'<table style="border-collapse:collapse">{line(head, "th")}{body}</table>'
+
+
+def html_block(title: str, *parts: str, note: str = "") -> str:
+    """A titled block for a notebook: `title` and `note` are escaped, `parts` are HTML already."""
+    below = f'<div style="{SMALL}">{html.escape(note)}</div>' if note else ""
+    return f"<div><b>{html.escape(title)}</b>{below}{''.join(parts)}</div>"
+
+
+def escaped(text: str) -> str:
+    """Text that may stand in HTML."""
+    return html.escape(text)
+
+
+def html_list(texts: Sequence[str]) -> str:
+    """Sentences as a list for a notebook, escaped; nothing for none."""
+    return f"<ul>{''.join(f'<li>{html.escape(t)}</li>' for t in texts)}</ul>" if texts else ""

@@ -63,13 +63,13 @@ class Bench:
     def __init__(self, scene, values, flat_field=None, mode=None):
         from optics.captures.capture_set import Captures, Frame
         from optics.captures.noise import Noise
-        from optics.fit.model import Model
+        from optics.fit.scene_model import SceneModel
 
         self.scene = scene
         width, height = scene.camera.resolution
         frame = Frame("bench", np.zeros((height, width, 3), np.float32))
         noise = Noise(system_gain=0.1, dark_noise=1.0, black_level=0.0, saturation=FULL_SCALE, prnu=0.0)
-        self.model = Model(
+        self.model = SceneModel(
             scene, Captures(Path("."), str(scene.path), [frame], noise=noise, flat_field=flat_field), flat_field=mode
         )
         self.renderer = self.model.renderer

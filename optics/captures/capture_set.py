@@ -9,8 +9,6 @@ from __future__ import annotations
 import math
 import os
 import re
-import shutil
-import uuid
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -22,6 +20,7 @@ from optics.captures.noise import DEMOSAICED, SATURATED, UNITS, Noise, step_of
 from optics.errors import BadCapture, OutputExists, UnknownKey
 from optics.files import toml_checks as checks
 from optics.files.images import SUFFIXES, read_image, read_mask, write_image
+from optics.files.output import new_folder
 from optics.scene.parameter import Parameter
 
 FILE = "captures.toml"
@@ -424,22 +423,8 @@ def write(captures: Captures, folder: str | Path, *, overwrite: bool = False, bi
                 f"{folder} holds more than a capture set written by this program and is never replaced; "
                 "choose another folder"
             )
-    temporary = folder.parent / f".{folder.name}.{uuid.uuid4().hex}"
-    try:
-        temporary.mkdir(parents=True)
+    with new_folder(folder, replace=overwrite) as temporary:
         _fill(captures, temporary, folder, bits)
-        old = temporary.with_name(temporary.name + ".old")
-        if folder.exists():
-            folder.rename(old)
-        try:
-            temporary.rename(folder)
-        except OSError:
-            if old.exists():
-                old.rename(folder)
-            raise
-        shutil.rmtree(old, ignore_errors=True)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
     return folder
 
 

@@ -25,8 +25,6 @@ import csv
 import json
 import math
 import os
-import shutil
-import uuid
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -38,7 +36,7 @@ from optics.captures.capture_set import Captures, Frame
 from optics.captures.noise import SATURATED, Noise, photon_transfer
 from optics.errors import BadCapture, OutputExists, UnknownKey
 from optics.files.images import SUFFIXES, read_image
-from optics.files.output import shipped
+from optics.files.output import new_folder, shipped
 
 COLUMNS = ("file", "center_x_px", "center_y_px", "contact_radius_px")
 FAR = 3.0  # circle radii beyond which a press leaves the image alone, but for a skirt of a few per mille
@@ -605,19 +603,13 @@ def _write(folder: Path, frames, noise, flat, xml: str, facts: dict, bits: int |
                 f"{folder} exists and is not empty; choose another folder"
                 + ("" if extra or overwrite else ", or allow to overwrite what an import left there")
             )
-    temporary = folder.parent / f".{folder.name}.{uuid.uuid4().hex}"
-    try:
+    with new_folder(folder, replace=overwrite) as temporary:
         flat = np.asarray(flat, np.float32)
         captures = Captures(temporary, str(temporary / "scene.xml"), frames, {}, noise, flat)
         capture_sets.write(captures, temporary, bits=bits)
         (temporary / "scene.xml").write_text(xml, encoding="utf-8")
         (temporary / "import.json").write_text(json.dumps(facts, indent=1), encoding="utf-8")
         (temporary / "README.txt").write_text(readme(facts), encoding="utf-8")
-        if folder.exists():
-            shutil.rmtree(folder)
-        temporary.rename(folder)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
     return folder
 
 

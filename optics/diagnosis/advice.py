@@ -25,12 +25,18 @@ from itertools import chain, zip_longest
 
 import numpy as np
 
+from optics.captures.capture_set import Frame
 from optics.captures.noise import SATURATED
 from optics.diagnosis import statistics as st
 from optics.diagnosis.evidence import Candidate, Evidence, Progress, measure
-from optics.diagnosis.verdict import CLEAR, MARGIN, Advice, Apart, Diagnosis, Row
+from optics.diagnosis.result import Advice, Apart, Diagnosis, Row
+from optics.diagnosis.thresholds import CLEAR, MARGIN, close
+from optics.fit.model import Model
+from optics.scene.declare import Effect
 from optics.scene.parameter import Values, Variable
 from optics.words import spaced
+
+VariablesOf = Callable[[Model, Effect], Sequence[Variable]]  # what adding an effect to this model frees
 
 EXPOSURES = (0.4, 0.15, 2.5)  # of the present one: far enough to bend a response, near enough to see something
 DEPTHS = (2.0, 0.5)  # of the present one: a new geometry costs ten times what another light costs, so few are tried
@@ -69,7 +75,7 @@ class Shot:
 # -- which shots a scene admits ---------------------------------------------------------------------------------------
 
 
-def families(model, values: Values, frames: Sequence[int]) -> list[Shot]:
+def families(model: Model, values: Values, frames: Sequence[int]) -> list[Shot]:
     """The shots to try, at most SHOTS, the families' first members first: found from the keys that the model has and
     frames turn.
 
@@ -98,11 +104,11 @@ def families(model, values: Values, frames: Sequence[int]) -> list[Shot]:
     return [shot for shot in chain(*zip_longest(*queues.values())) if shot is not None][:SHOTS]
 
 
-def _now(model, values: Values, frame: int) -> dict[str, float]:
+def _now(model: Model, values: Values, frame: int) -> dict[str, float]:
     """Numbers that hold in a frame, by key; of a sweep of readings what they share, and the middle of what they do
     not."""
     own = model.frames[frame]
-    swept = {k: float(np.median(v)) for k, v in getattr(own, "readings", {}).items()}
+    swept = {k: float(np.median(v)) for k, v in own.readings.items()}
     return {**model.base, **values.common, **own.parameters, **swept, **values.frame.get(frame, {})}
 
 
@@ -111,19 +117,22 @@ def keys_named(parameters: Iterable[str], name: str) -> list[str]:
     return [k for k in parameters if k.rpartition(".")[2] == name]
 
 
-def _press(model) -> tuple[str, str, str] | None:
+def _press(model: Model) -> tuple[str, str, str] | None:
     """Keys of place and depth of a press; None where nothing can be pressed."""
     depth = keys_named(model.parameters, "press_depth")
-    return tuple(depth[0].replace("press_depth", n) for n in ("press_x", "press_y", "press_depth")) if depth else None
+    if not depth:
+        return None
+    x, y = (depth[0].replace("press_depth", n) for n in ("press_x", "press_y"))
+    return x, y, depth[0]
 
 
-def _same(model, like: int) -> str:
-    if getattr(model.frames[like], "readings", None):
+def _same(model: Model, like: int) -> str:
+    if model.frames[like].readings:
         return f"{len(model.frames[like].image)} of the same readings"
     return "the same press" if _press(model) else "the same frame"
 
 
-def _typical(model, values: Values, frames: Sequence[int]) -> int:
+def _typical(model: Model, values: Values, frames: Sequence[int]) -> int:
     """The brightest frame that shows a press of middling depth: what the shots vary."""
     press = _press(model)
     if press is not None:
@@ -135,7 +144,7 @@ def _typical(model, values: Values, frames: Sequence[int]) -> int:
     return max(frames, key=lambda f: float(np.mean(model.frames[f].image)))
 
 
-def _exposures(model, now: Mapping, like: int) -> Iterator[Shot]:
+def _exposures(model: Model, now: Mapping, like: int) -> Iterator[Shot]:
     for key in keys_named(model.parameters, "exposure")[:1]:
         image, noise = np.asarray(model.frames[like].image, float), model.noise
         for factor in EXPOSURES:
@@ -149,7 +158,7 @@ def _exposures(model, now: Mapping, like: int) -> Iterator[Shot]:
                 )
 
 
-def _presses(model, values: Values, frames: Sequence[int], now: Mapping, like: int) -> Iterator[Shot]:
+def _presses(model: Model, values: Values, frames: Sequence[int], now: Mapping, like: int) -> Iterator[Shot]:
     keys = _press(model)
     if keys is None:
         return
@@ -192,7 +201,7 @@ def _presses(model, values: Values, frames: Sequence[int], now: Mapping, like: i
         yield Shot("no press", "nothing pressed, the same light", like, {keys[2]: 0.0}, press=UNTOUCHED)
 
 
-def _reaches(model, known: np.ndarray, now: Mapping, keys: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
+def _reaches(model: Model, known: np.ndarray, now: Mapping, keys: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
     """(2,), (2,) mm: how far from the middle presses may lie (as far as they did, or 0.3 of the gel's side where those
     were few), and how far out one still lies on the pad, as far as the scene says how large that is."""
     reach = np.abs(known[:, :2]).max(0)
@@ -219,9 +228,9 @@ def places(known: np.ndarray, reach: np.ndarray, count: int) -> list[tuple[float
     return found
 
 
-def _lights(model, values: Values, frames: Sequence[int], now: Mapping, like: int) -> Iterator[Shot]:
+def _lights(model: Model, values: Values, frames: Sequence[int], now: Mapping, like: int) -> Iterator[Shot]:
     keys = keys_named(model.parameters, "power")
-    driven = getattr(model, "driven", None)
+    driven = model.driven
     if not keys:
         return
 
@@ -253,7 +262,7 @@ def _lights(model, values: Values, frames: Sequence[int], now: Mapping, like: in
         yield Shot("dimmed light", f"{what} at {DIMMED:g} of the lights' power", like, {**pattern(here), **dimmed})
 
 
-def _films(model, now: Mapping, like: int) -> Iterator[Shot]:
+def _films(model: Model, now: Mapping, like: int) -> Iterator[Shot]:
     """Angles of polarizers and sheets, and films put in and taken out."""
     what = _same(model, like)
     for key in keys_named(model.parameters, "angle"):
@@ -274,7 +283,7 @@ def _films(model, now: Mapping, like: int) -> Iterator[Shot]:
             yield Shot("film taken out", f"{what} without {key.rpartition('.')[0]}", like, {inserted: 0.0})
 
 
-def _distances(model, now: Mapping, like: int) -> Iterator[Shot]:
+def _distances(model: Model, now: Mapping, like: int) -> Iterator[Shot]:
     for key in keys_named(model.parameters, "distance"):
         for factor in (0.5, 2.0, 0.25):
             if now[key] > 0:
@@ -282,7 +291,7 @@ def _distances(model, now: Mapping, like: int) -> Iterator[Shot]:
                 yield Shot("object distance", f"the object at {to:.3g} mm", like, {key: to}, press=f"distance-{to:.3g}")
 
 
-def _turned(model, frames: Sequence[int], now: Mapping, like: int) -> Iterator[Shot]:
+def _turned(model: Model, frames: Sequence[int], now: Mapping, like: int) -> Iterator[Shot]:
     """Settings that the frames turned and no family above knows: a value in the widest gap, and one beyond either
     end."""
     known = ("power", "exposure", "angle", "inserted", "distance", *CLOCKS)
@@ -290,7 +299,7 @@ def _turned(model, frames: Sequence[int], now: Mapping, like: int) -> Iterator[S
     turned: dict[str, set[float]] = {}
     for f in frames:
         own = model.frames[f]
-        for key, value in (*own.parameters.items(), *getattr(own, "readings", {}).items()):
+        for key, value in (*own.parameters.items(), *own.readings.items()):
             if key not in special and not isinstance(value, str):
                 turned.setdefault(key, set()).update(np.unique(value).tolist())
     for key, taken in turned.items():
@@ -330,15 +339,20 @@ class Member:
 
     def bring(self, shot: int, column: int, side: int, strength: float) -> None:
         """A strength that only this shot would show."""
-        for own, value in zip(self.more.setdefault(shot, ([], [], [])), (column, side, strength)):
-            own.append(value)
+        columns, sides, strengths = self.more.setdefault(shot, ([], [], []))
+        columns.append(column)
+        sides.append(side)
+        strengths.append(strength)
 
     def at(self, chosen: Sequence[int]) -> tuple[np.ndarray, list[int], np.ndarray]:
+        """(columns, sides, strength) with those that the chosen shots bring."""
         parts = [
             (self.columns, self.sides, self.strength),
             *(self.more[s] for s in dict.fromkeys(chosen) if s in self.more),
         ]
-        columns, sides, strength = ([x for part in parts for x in part[i]] for i in range(3))
+        columns = [column for own, _, _ in parts for column in own]
+        sides = [side for _, own, _ in parts for side in own]
+        strength = [s for _, _, own in parts for s in own]
         return np.array(columns, int), sides, np.array(strength, float)
 
 
@@ -445,13 +459,13 @@ class Outlook:
 
 
 def outlook(
-    model,
+    model: Model,
     values: Values,
     evidence: Evidence,
     members: Sequence[Candidate],
     strengths: Sequence[np.ndarray],
     shots: Sequence[Shot],
-    variables_of: Callable,
+    variables_of: VariablesOf,
     seed: int = 0,
     progress: Progress | None = None,
 ) -> Outlook:
@@ -500,7 +514,7 @@ def outlook(
         member = Member(c.effect.name, own, list(c.sides), [float(s) for s in strength])
         rms = float(np.sqrt(np.mean(np.square(strength)))) if len(strength) else 0.0
         for v, side, column in zip(twin_c.variables, twin_c.sides, twin_c.forms[c.form]):
-            if v.name not in shared:  # a strength of this frame alone, taken to be as large as the others are
+            if v.frames is not None and v.name not in shared:  # of this frame alone, taken to be as large as the others
                 shared[v.name], size = size, size + 1
                 member.bring(v.frames[0] - first, shared[v.name], side, -rms if side < 0 else rms)
             then[column] = shared[v.name]
@@ -541,11 +555,11 @@ def nested_in(members: Sequence[Candidate]) -> set[tuple[int, int]]:
     return {(i, j) for i, a in enumerate(members) for j, b in enumerate(members) if b.contains(a)}
 
 
-def imagined(model, values: Values, shots: Sequence[Shot]):
+def imagined(model: Model, values: Values, shots: Sequence[Shot]) -> tuple[Model, Values]:
     """(model, values) with the shots as further frames, whose images are what the model predicts."""
     first = len(model.frames)
     twin, values = model.imagine([_frame(model, shot, n) for n, shot in enumerate(shots)]), values.copy()
-    for key in getattr(twin, "driven", set()) - getattr(model, "driven", set()):
+    for key in (twin.driven or set()) - (model.driven or set()):
         values.common.setdefault(key, float(model.base[key]))  # what was the light's power is now its power at drive 1
     for n, shot in enumerate(shots, first):
         own = values.frame.get(shot.like, {})
@@ -556,26 +570,27 @@ def imagined(model, values: Values, shots: Sequence[Shot]):
     return twin, values
 
 
-def _frame(model, shot: Shot, number: int):
+def _frame(model: Model, shot: Shot, number: int) -> Frame:
     like = model.frames[shot.like]
-    readings = {k: v for k, v in getattr(like, "readings", {}).items() if k not in shot.settings}
+    readings = {k: v for k, v in like.readings.items() if k not in shot.settings}
     return replace(
         like,
         name=f"shot-{number + 1}",
         repeats=[],
         parameters={**like.parameters, **shot.settings},
         group=shot.press or like.group,
-        **({"readings": readings, "rows": None} if hasattr(like, "readings") else {}),
+        readings=readings,
+        rows=None,
     )
 
 
-def is_place(model, key: str) -> bool:
+def is_place(model: Model, key: str) -> bool:
     """Whether a parameter belongs to what is touched and not to the frame: all frames of a press share it."""
     return key.rpartition(".")[2].startswith("press_") or model.parameters[key].how == "difference"
 
 
 def _base_with_shots(
-    twin, evidence: Evidence, shots: Sequence[Shot], first: int
+    twin: Model, evidence: Evidence, shots: Sequence[Shot], first: int
 ) -> tuple[list[Variable], list[Variable]]:
     """The base's variables, which hold in the shots of their press as well, and the unknowns that shots bring."""
     base, fresh = [], []
@@ -612,11 +627,11 @@ def _unknown(v: Variable) -> str:
 
 
 def next_measurement(
-    model,
+    model: Model,
     values: Values,
     evidence: Evidence,
     members: Sequence[Candidate],
-    variables_of: Callable,
+    variables_of: VariablesOf,
     *,
     enough: float = ENOUGH,
     seed: int = 0,
@@ -718,16 +733,12 @@ def asked_for(diagnosis: Diagnosis) -> list[str]:
         return []
     net = {row.name: _net(row) for row in diagnosis.rows}
     best = max(net.values(), default=0.0)
-    close = [
-        name
-        for name in sorted(net, key=net.get, reverse=True)
-        if best > 0 and best - net[name] < max(CLEAR, MARGIN * best)
-    ]
-    return close[:MEMBERS] if len(close) > 1 else []
+    alike = [name for name in sorted(net, key=lambda n: net[n], reverse=True) if best > 0 and close(best, net[name])]
+    return alike[:MEMBERS] if len(alike) > 1 else []
 
 
 def advise(
-    model, diagnosis: Diagnosis, variables_of: Callable, seed: int = 0, progress: Progress | None = None
+    model: Model, diagnosis: Diagnosis, variables_of: VariablesOf, seed: int = 0, progress: Progress | None = None
 ) -> list[Advice]:
     """The next measurement after a diagnosis of this process; nothing where it does not hang on two effects that look
     alike."""

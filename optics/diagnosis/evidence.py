@@ -1,8 +1,7 @@
-"""What the data say: derivative images of a calibrated model and of candidate effects, whitened and summed, frame by
-frame.
+"""Evidence: derivative images of a calibrated model and of candidate effects, whitened and summed over the frames.
 
-Masks come from data and noise, never from the size of a residual; weights from the prediction. Normal equations take
-every usable pixel; curves, splits and alternative weights use a thinned lattice of pixels that is kept in memory.
+Masks come from data and noise, never from the size of a residual; weights come from the prediction. Normal equations
+take every usable pixel; curves, splits and alternative weights use a thinned lattice of pixels that is kept in memory.
 """
 
 from __future__ import annotations
@@ -13,77 +12,86 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from optics.captures.capture_set import Frame
 from optics.diagnosis import statistics as st
-from optics.diagnosis.verdict import Row
+from optics.diagnosis.result import Row
 from optics.errors import Underdetermined
+from optics.fit.model import Model, value_of
 from optics.scene.declare import Effect
 from optics.scene.parameter import Values, Variable
 
-Progress = Callable[[str, int, int], None]
+NOT_FINITE = 0.01  # of the usable values: more than stray pixels, such as a normal that no surface has
+SQUARE_ONSET = 1e-3  # plausible sizes from neutral below which a squared parameter counts as being there
+
+Progress = Callable[[str, int, int], None]  # (what, done, total)
 
 
-def value_of(model, values: Values, variable: Variable) -> float:
-    """The present value of a variable: fitted in a frame <- set in it <- fitted in all <- the scene's."""
-    key = variable.keys[0]
-    if variable.frames is not None:
-        frame = variable.frames[0]
-        own = {**model.frames[frame].parameters, **values.frame.get(frame, {})}
-        if key in own:
-            return float(own[key])
-    return float(values.common.get(key, model.base[key]))
+def silent(what: str, done: int, total: int) -> None:
+    """Progress that nobody watches."""
 
 
 def at_bound(variable: Variable, value: float) -> bool:
+    """Whether a variable stands at one of its bounds: it may move to one side only."""
     return variable.parameter.side(value) != 0
 
 
 @dataclass
 class Candidate:
-    """An effect under test: its variables, where they start, and what was found."""
+    """An effect under test: its variables, where they start, and what was found.
+
+    sides       per variable: +1 may only rise, -1 may only fall, 0 either
+    plausible   per variable, in its unit
+    forms       'tangent' / 'secant' -> columns of the evidence that hold its images
+    broken      whether a derivative image was not finite
+    Set when it is scored (`optics.diagnosis.score`):
+    form        the form that explains most; columns, cone and linear (coefficients of the columns, see `change_of`) are
+                of it
+    raw         rms change of the images at the plausible strengths, over the mean signal, before any calibration
+    """
 
     effect: Effect
     variables: list[Variable]
     start: np.ndarray
-    sides: list[int]  # +1: may only rise, -1: may only fall, 0: either
+    sides: list[int]
     plausible: np.ndarray
-    forms: dict[str, list[int]] = field(default_factory=dict)  # 'tangent' / 'secant' -> columns
-    broken: bool = False  # a derivative image was not finite
+    forms: dict[str, list[int]] = field(default_factory=dict)
+    broken: bool = False
     form: str = ""
     columns: list[int] = field(default_factory=list)
-    cone: st.Cone | None = None
-    linear: np.ndarray | None = None  # coefficients of the columns; see `change_of`
-    row: Row | None = None
-    raw: float = 0.0  # rms change of the image at the plausible strengths, over the mean signal, before any calibration
+    cone: st.Cone = None  # type: ignore[assignment]
+    linear: np.ndarray = None  # type: ignore[assignment]
+    row: Row = None  # type: ignore[assignment]
+    raw: float = 0.0
 
     def contains(self, other: Candidate) -> bool:
-        """Whether it frees all that another frees, and more: it fits as well by itself and rivals nothing."""
+        """Whether it frees everything that another frees, and more: it fits as well as that one in any case."""
         mine, others = ({(key, v.frames) for v in c.variables for key in v.keys} for c in (self, other))
         return mine > others
 
     @classmethod
-    def at(cls, model, values: Values, effect: Effect, variables: Sequence[Variable]) -> Candidate:
-        """An effect under test at the values: where its strengths start, and to which side they may go."""
+    def at(cls, model: Model, values: Values, effect: Effect, variables: Sequence[Variable]) -> Candidate:
+        """An effect under test at the values: its strengths start there, and move to the sides that are open."""
         start = np.array([value_of(model, values, v) for v in variables])
         sides = [v.parameter.side(value) for v, value in zip(variables, start)]
         return cls(effect, list(variables), start, sides, np.array([v.parameter.plausible for v in variables]))
 
     @property
     def usual(self) -> np.ndarray:
-        """Changes of plausible size, to the side that is open; of a strength that every frame has for itself up and
-        down in turn, as all of them together would be one scale, which a calibration takes up."""
+        """Changes of plausible size, to the side that is open. Per-frame strengths alternate in sign: all alike would be
+        one scale, which a calibration absorbs."""
         sides = np.array(self.sides)
         turn = np.where([v.frames is not None and i % 2 == 1 for i, v in enumerate(self.variables)], -1.0, 1.0)
         return self.plausible * np.where(sides == 0, turn, sides)
 
     @property
     def direction(self) -> np.ndarray:
-        """Coefficients to compare effects at: as found, or usual ones where nothing was found."""
+        """Coefficients at which effects are compared: as found, or of the usual size where nothing was found."""
         return self.linear if self.linear.any() else self.linear_of(self.usual)
 
     def _squares(self) -> np.ndarray:
-        """Variables whose effect grows with their square: a secant to the plausible size is linear in s^2/plausible."""
+        """Which variables act by their square: a secant to the plausible size is then linear in s^2/plausible."""
         own = [
-            v.parameter.squared and abs(start) < 1e-3 * v.parameter.plausible
+            v.parameter.squared and abs(start) < SQUARE_ONSET * v.parameter.plausible
             for v, start in zip(self.variables, self.start)
         ]
         return np.array(own) & (self.form == "secant")
@@ -108,10 +116,13 @@ class Candidate:
 
 @dataclass
 class Block:
-    """Pixels of one frame that are kept: whitened columns a (n, k) in the places `where`, residual r (n,).
+    """Values of one frame that are kept: whitened columns a (n, k) in the places `where`, residual r (n,).
 
-    prediction   of the seed `Evidence.seed`, not the residual's: where images are Monte Carlo estimates, its error is
-                 not that of r
+    b            a second render of the same columns where images are noisy, else None
+    prediction   (n,) DN, of the seed `Evidence.seed`, not of the residual's: where images are Monte Carlo estimates,
+                 its error is independent of r
+    index        (n,) into the flattened (H, W, C)
+    inner        (n,) bool: still used when the mask is widened by one pixel
     """
 
     frame: int
@@ -121,8 +132,8 @@ class Block:
     r: np.ndarray
     sigma: np.ndarray
     prediction: np.ndarray
-    index: np.ndarray  # (n,) into the flattened (H, W, C)
-    inner: np.ndarray  # (n,) bool: still used when the mask is dilated by one pixel
+    index: np.ndarray
+    inner: np.ndarray
 
     @property
     def middle(self) -> np.ndarray:
@@ -131,7 +142,19 @@ class Block:
 
 @dataclass
 class Evidence:
-    """Normal equations of all frames, the thinned pixels, and whitened residual images."""
+    """Normal equations of all frames, the thinned values, and whitened residual images.
+
+    columns          variable of each column; base, rest: columns of the base, and of candidates
+    values           at which the images were made
+    sigma, whitened, use   per frame (H, W, C): standard deviation in DN, residual in sigmas (0 outside the mask), mask
+    precision, pull  1/tau^2 and (mean - value)/tau^2 of the base's priors
+    thinning         k: every k-th value is kept in `blocks`
+    render_noise     variance between two seeds of the prediction, over that of the camera
+    signal           mean predicted signal, DN; noise: rms standard deviation over it; masked: share not used
+    seed             of images to bin or to scale residuals by: were they binned by an image whose error is in the
+                     residual, residuals would follow that error
+    projected        candidates projected off the base; candidates: those that were scored, best first
+    """
 
     columns: list[Variable]
     base: list[int]
@@ -141,7 +164,7 @@ class Evidence:
     blocks: list[Block]
     frames: list[int]
     sigma: list[np.ndarray]
-    whitened: list[np.ndarray]  # (H, W, C) float32, zero outside the mask
+    whitened: list[np.ndarray]
     use: list[np.ndarray]
     spectrum: st.Spectrum | st.Sweeps
     precision: np.ndarray
@@ -152,10 +175,9 @@ class Evidence:
     signal: float
     noise: float
     masked: float
-    # of images to bin or to scale residuals by: binned by an image whose error is in them, residuals follow that error
     seed: int = 0
-    projected: st.Projected | None = None
-    candidates: list[Candidate] = field(default_factory=list)  # that were scored in it, best first
+    projected: st.Projected = None  # type: ignore[assignment]
+    candidates: list[Candidate] = field(default_factory=list)
 
     @property
     def channels(self) -> int:
@@ -163,19 +185,21 @@ class Evidence:
 
     @property
     def gradient(self) -> float:
+        """|Q'r|^2 per parameter of the base: below 1 it is calibrated."""
         return self.projected.absorbed / max(self.projected.rank, 1)
 
     def inverse(self, base: Sequence[int]) -> np.ndarray:
-        """Of the Gram of base columns, with the priors of the first of them."""
+        """(p, p) inverse of the Gram matrix of base columns, with the priors of the first of them."""
         gram = self.normal.gram[np.ix_(base, base)] + np.diag(_padded(self.precision, base))
         return st.inverse(gram, self.normal.truncation(base))[0]
 
     def structure(self, whitened: Sequence[np.ndarray], base: Sequence[int]) -> st.Structure:
+        """Test of low-frequency structure in residual images, after a calibration of the columns `base`."""
         return self.spectrum.test(whitened, base, self.inverse(base))
 
-    def variance(self, model, frame: int, prediction: np.ndarray, values: Values | None = None) -> np.ndarray:
-        """Of a frame about its prediction, DN^2: where the model knows no error of its prediction, that between two
-        seeds is added."""
+    def variance(self, model: Model, frame: int, prediction: np.ndarray, values: Values | None = None) -> np.ndarray:
+        """(H, W, C) DN^2, of a frame about its prediction. Where the model does not state the error of its prediction, the
+        variance between two seeds is added."""
         known = model.variance(values or self.values, frame, prediction)
         return known if model.monte_carlo else known * (1 + self.render_noise)
 
@@ -210,8 +234,60 @@ def _padded(known: np.ndarray, base: Sequence[int]) -> np.ndarray:
     return np.concatenate([known, np.zeros(len(base) - len(known))])
 
 
+@dataclass
+class Layout:
+    """Which image each column of the evidence holds: tangents of the base, tangents and then secants of candidates.
+
+    steps   variable's name -> the step of its secant, its plausible size to the side that is open
+    """
+
+    tangent: list[Variable]
+    secant: list[Variable] = field(default_factory=list)
+    steps: dict[str, float] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, base: Sequence[Variable], candidates: Sequence[Candidate]) -> Layout:
+        """Give every candidate its columns (`Candidate.forms`) behind those of the base."""
+        layout = cls(list(base))
+        for c in candidates:
+            if c.effect.onset in ("tangent", "both"):
+                c.forms["tangent"] = [len(layout.tangent) + i for i in range(len(c.variables))]
+                layout.tangent += c.variables
+        for c in candidates:
+            if c.effect.onset in ("secant", "both"):
+                c.forms["secant"] = [len(layout.columns) + i for i in range(len(c.variables))]
+                layout.secant += c.variables
+                for v, side in zip(c.variables, c.sides):
+                    layout.steps[v.name] = v.parameter.plausible * (-1 if side < 0 else 1)
+        return layout
+
+    @property
+    def columns(self) -> list[Variable]:
+        return self.tangent + self.secant
+
+    def images(
+        self, model: Model, values: Values, frame: int, seed: int, wanted: set[int] | None = None
+    ) -> tuple[np.ndarray | None, dict[int, np.ndarray]]:
+        """(prediction, column -> derivative image (H, W, C)) of a frame; `wanted`: these columns only. The prediction is
+        None where no column acts in the frame."""
+        found: dict[int, np.ndarray] = {}
+        prediction = None
+        for first, variables, steps in ((0, self.tangent, None), (len(self.tangent), self.secant, self.steps)):
+            here: dict[str, list[int]] = {}  # two effects may free the same variable
+            for i, v in enumerate(variables):
+                if v.holds_in(frame) and (wanted is None or first + i in wanted):
+                    here.setdefault(v.name, []).append(first + i)
+            if not here:
+                continue
+            asked = list({v.name: v for v in variables if v.name in here}.values())
+            secant = None if steps is None else {v.name: steps[v.name] for v in asked}
+            prediction, named = next(iter(model.derivatives(values, asked, [frame], secant=secant, seed=seed)))
+            found.update({i: np.asarray(image) for name, image in named.items() for i in here.get(name, ())})
+        return prediction, found
+
+
 def measure(
-    model,
+    model: Model,
     values: Values,
     base: Sequence[Variable],
     candidates: Sequence[Candidate],
@@ -225,119 +301,92 @@ def measure(
 
     The residual comes from `model.predict`; derivative images have seeds of their own. Where a second seed changes an
     image of the first frame, that variable is rendered twice in every frame and products are taken across.
+
+    rows_max   values to keep for curves, splits and alternative weights;   what: the name of this pass in `say`
+    Raises Underdetermined when no value is usable, ValueError when more than NOT_FINITE of them are not finite.
     """
-    tangent, secant, steps = list(base), [], {}
-    for c in candidates:
-        if c.effect.onset in ("tangent", "both"):
-            c.forms["tangent"] = [len(tangent) + i for i in range(len(c.variables))]
-            tangent += c.variables
-    for c in candidates:
-        if c.effect.onset in ("secant", "both"):
-            c.forms["secant"] = [len(tangent) + len(secant) + i for i in range(len(c.variables))]
-            secant += c.variables
-            steps.update(
-                {v.name: v.parameter.plausible * (-1 if side < 0 else 1) for v, side in zip(c.variables, c.sides)}
-            )
-    columns = tangent + secant
-
-    def images(
-        frame: int, seed: int, wanted: set[int] | None = None
-    ) -> tuple[np.ndarray | None, dict[int, np.ndarray]]:
-        found, prediction = {}, None
-        for first, variables, step in ((0, tangent, None), (len(tangent), secant, steps)):
-            here: dict[str, list[int]] = {}  # two effects may free the same variable
-            for i, v in enumerate(variables):
-                if v.holds_in(frame) and (wanted is None or first + i in wanted):
-                    here.setdefault(v.name, []).append(first + i)
-            if not here:
-                continue
-            asked = list({v.name: v for v in variables if v.name in here}.values())
-            if step is None:
-                result = model.derivatives(values, asked, [frame], seed=seed)
-            else:
-                result = model.derivatives(
-                    values, asked, [frame], secant={v.name: step[v.name] for v in asked}, seed=seed
-                )
-            prediction, named = next(iter(result))
-            found.update({i: np.asarray(image) for name, image in named.items() for i in here.get(name, ())})
-        return prediction, found
-
-    seeds = (2 * seed + 1001, 2 * seed + 1002)
-    total, used = 0, 0
-    for frame in frames:
-        mask = model.usable(frame)
-        total, used = total + getattr(model, "size", mask.size), used + int(mask.sum())
-    k = st.thinning(used, rows_max)
-    sweeps = all(getattr(model.frames[f], "readings", None) for f in frames)
-    normal, spectrum = st.Normal(len(columns)), st.Sweeps() if sweeps else st.Spectrum(len(columns))
-    evidence = Evidence(
-        columns,
-        list(range(len(base))),
-        list(range(len(base), len(columns))),
-        values,
-        normal,
-        [],
-        list(frames),
-        [],
-        [],
-        [],
-        spectrum,
-        *_priors(model, values, base),
-        k,
-        0,
-        0.0,
-        0.0,
-        0.0,
-        0.0,
-        seeds[0],
-    )
+    layout = Layout.of(base, candidates)
+    seeds = (2 * seed + 1001, 2 * seed + 1002)  # apart from the seed of predictions, and for every seed another pair
+    evidence, total = _empty(model, values, layout, len(base), frames, rows_max, seeds[0])
     noisy: set[int] = set()
     signal = variance = 0.0
     for n, frame in enumerate(frames):
         say(what, n, len(frames))
         prediction = np.asarray(model.predict(values, [frame])[0], float)
-        own, first = images(frame, seeds[0])
+        own, first = layout.images(model, values, frame, seeds[0])
+        second: dict[int, np.ndarray] = {}
         if n == 0:
-            other, second = images(frame, seeds[1])
-            noisy = {c for c in first if c not in second or not np.array_equal(first[c], second[c], equal_nan=True)}
-            if own is not None and not np.array_equal(own, other):
+            other, again = layout.images(model, values, frame, seeds[1])
+            noisy = {c for c in first if c not in again or not np.array_equal(first[c], again[c], equal_nan=True)}
+            second = again if noisy else {}
+            if own is not None and other is not None and not np.array_equal(own, other):
                 usable = model.usable(frame)
                 sample = (np.asarray(own, float) - other)[usable] ** 2 / 2 / model.noise.variance(prediction)[usable]
                 evidence.render_noise = float(np.mean(sample[np.isfinite(sample)]))
         elif noisy:
-            _, second = images(frame, seeds[1], noisy)
-        _add_frame(
-            evidence,
-            model,
-            frame,
-            n,
-            prediction,
-            prediction if own is None else own,
-            first,
-            second if noisy else {},
-            noisy,
-            candidates,
-            len(base),
-        )
+            _, second = layout.images(model, values, frame, seeds[1], noisy)
+        binned = prediction if own is None else own
+        _add_frame(evidence, model, frame, n, prediction, binned, first, second, noisy, candidates, len(base))
         use, sigma = evidence.use[-1], evidence.sigma[-1]
         signal += float(prediction[use].sum())
         variance += float((sigma[use].astype(float) ** 2).sum())
     say(what, len(frames), len(frames))
-    if normal.count == 0:
-        raise Underdetermined("diagnose: no usable value in the fitted frames; check masks, saturation and exposure")
-    if evidence.not_finite > 0.01 * normal.count:
-        raise ValueError(
-            f"diagnose: prediction or derivative images of the base are not finite in {evidence.not_finite} of "
-            f"{normal.count + evidence.not_finite} usable values; a parameter may have left its physical range"
-        )
-    evidence.signal = signal / normal.count - float(model.noise.black_level)
-    evidence.noise = math.sqrt(variance / normal.count) / evidence.signal
-    evidence.masked = 1 - (normal.count / total)
-    evidence.projected = evidence.project(normal, evidence.base, evidence.rest, settled=bool(noisy))
+    _require_values(evidence)
+    count = evidence.normal.count
+    evidence.signal = signal / count - float(model.noise.black_level)
+    evidence.noise = math.sqrt(variance / count) / evidence.signal
+    evidence.masked = 1 - (count / total)
+    evidence.projected = evidence.project(evidence.normal, evidence.base, evidence.rest, settled=bool(noisy))
     return evidence
 
 
-def _priors(model, values: Values, base: Sequence[Variable]) -> tuple[np.ndarray, np.ndarray]:
+def _empty(
+    model: Model, values: Values, layout: Layout, base: int, frames: Sequence[int], rows_max: int, seed: int
+) -> tuple[Evidence, float]:
+    """(evidence without a frame yet, values that the frames hold); base: columns of the base."""
+    columns = layout.columns
+    total, used = 0.0, 0
+    for frame in frames:
+        total, used = total + model.size, used + int(model.usable(frame).sum())
+    sweeps = all(model.frames[f].readings for f in frames)
+    precision, pull = _priors(model, values, columns[:base])
+    evidence = Evidence(
+        columns=columns,
+        base=list(range(base)),
+        rest=list(range(base, len(columns))),
+        values=values,
+        normal=st.Normal(len(columns)),
+        blocks=[],
+        frames=list(frames),
+        sigma=[],
+        whitened=[],
+        use=[],
+        spectrum=st.Sweeps() if sweeps else st.Spectrum(len(columns)),
+        precision=precision,
+        pull=pull,
+        thinning=st.thinning(used, rows_max),
+        not_finite=0,
+        render_noise=0.0,
+        signal=0.0,
+        noise=0.0,
+        masked=0.0,
+        seed=seed,
+    )
+    return evidence, total
+
+
+def _require_values(evidence: Evidence) -> None:
+    count = evidence.normal.count
+    if count == 0:
+        raise Underdetermined("diagnose: no usable value in the fitted frames; check masks, saturation and exposure")
+    if evidence.not_finite > NOT_FINITE * count:
+        raise ValueError(
+            f"diagnose: prediction or derivative images of the base are not finite in {evidence.not_finite} of "
+            f"{count + evidence.not_finite} usable values; a parameter may have left its physical range"
+        )
+
+
+def _priors(model: Model, values: Values, base: Sequence[Variable]) -> tuple[np.ndarray, np.ndarray]:
     """(1/tau^2, (mean - value)/tau^2) of the base's priors, 0 where there is none."""
     precision, pull = np.zeros(len(base)), np.zeros(len(base))
     for i, v in enumerate(base):
@@ -349,23 +398,24 @@ def _priors(model, values: Values, base: Sequence[Variable]) -> tuple[np.ndarray
 
 def _add_frame(
     evidence: Evidence,
-    model,
+    model: Model,
     frame: int,
     n: int,
-    prediction,
-    other,
-    first: dict,
-    second: dict,
-    noisy: set,
+    prediction: np.ndarray,
+    other: np.ndarray,
+    first: dict[int, np.ndarray],
+    second: dict[int, np.ndarray],
+    noisy: set[int],
     candidates: Sequence[Candidate],
     p: int,
 ) -> None:
+    """Whiten a frame's images and add them; n: its place among the frames, p: number of base columns."""
     image = np.asarray(model.frames[frame].image, float)
     variance = evidence.variance(model, frame, prediction)
     mask = np.asarray(model.usable(frame), bool)
     good = mask & np.isfinite(prediction) & np.isfinite(image) & (variance > 0)
     where = np.array(sorted(first), int)
-    broken = set()  # columns of candidates with a value that is not finite: they are left out as a whole
+    broken: set[int] = set()  # columns of candidates with a value that is not finite: left out as a whole
     for c in where:
         for images in (first, second):
             if c in images and not np.isfinite(images[c][good]).all():
@@ -378,7 +428,7 @@ def _add_frame(
     evidence.not_finite += int(mask.sum() - good.sum())
     weight = np.where(good, 1 / np.sqrt(np.where(good, variance, 1.0)), 0.0)
 
-    def stack(images: dict) -> np.ndarray:
+    def stack(images: dict[int, np.ndarray]) -> np.ndarray:
         out = np.zeros((*image.shape, len(where)))
         for i, c in enumerate(where):
             if c not in broken:
@@ -412,20 +462,17 @@ def _add_frame(
     evidence.whitened.append(whitened.astype(np.float32))
 
 
-def _swept(sweep, prediction: np.ndarray) -> dict[str, np.ndarray]:
-    """What tells the readings of a sweep apart: when, how bright, and what was set, which may be the same within one
-    sweep."""
+def _swept(sweep: Frame, prediction: np.ndarray) -> dict[str, np.ndarray]:
+    """name -> value of each reading of a sweep: predicted signal, row of the table, and settings.
+
+    A simulated shot has one reading for all that are alike, and no row."""
     still = {k: np.full(1, v) for k, v in sweep.parameters.items() if isinstance(v, float)}
     turned = {
         k: v
         for k, v in (("reading", sweep.rows), *sweep.readings.items())
         if v is not None and len(v) == len(prediction)
     }
-    return {
-        "signal": prediction,
-        **still,
-        **turned,
-    }  # one reading of a shot that is only thought of stands for all that are alike
+    return {"signal": prediction, **still, **turned}
 
 
 def _dilated(mask: np.ndarray) -> np.ndarray:

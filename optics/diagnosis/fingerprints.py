@@ -16,9 +16,12 @@ from dataclasses import replace
 import numpy as np
 
 from optics.diagnosis import statistics as st
+from optics.diagnosis.decide import ordered
 from optics.diagnosis.evidence import Evidence, Progress
-from optics.diagnosis.verdict import AS_GOOD, EXCESS, MIMICS, SHARE, Family, Fingerprint, ordered
+from optics.diagnosis.result import Family, Fingerprint
+from optics.diagnosis.thresholds import AS_GOOD, EXCESS, MIMICS, SHARE
 from optics.fit.compare import UNITS, led_label
+from optics.fit.model import Model
 from optics.scene.parameter import Values
 
 SIDE = 4  # cells per side of the coordinate 'place': a finer map would fit any clutter and forbid every claim
@@ -30,7 +33,6 @@ LINES = (
 REPEATED = 3  # frames that show a pixel, for a pattern to be called fixed
 # of a curve's direction that calibration must leave for it to be drawn: the rest (a level, a slope) nobody can know
 SEEN = 0.01
-DISTANCES = 8  # LEDs up to which the distance to each is a coordinate of its own
 
 FAMILIES = {  # what a coordinate belongs to; a setting belongs to the family of the part that it is a setting of
     "camera": ("radius", "row", "column", "place", "channel", "signal", "gradient", "laplacian"),
@@ -84,12 +86,12 @@ def places(model, values: Values, evidence: Evidence) -> list[dict[str, np.ndarr
     turned = settings(model, evidence)
     lights = [led_label(model.frames[f].parameters) for f in evidence.frames]
     kinds = _lights(evidence, model)
-    table = getattr(model.captures, "table", None) is not None
+    table = model.captures is not None and model.captures.table is not None
     for block in evidence.blocks:
         shape = np.asarray(model.frames[block.frame].image).shape
         row, column, channel = np.unravel_index(block.index, shape)
         known = {"signal": block.prediction.astype(np.float32)}
-        planes = {**model.coordinates(values, block.frame, evidence.seed), **lit_geometry(model, values, block.frame)}
+        planes = {**model.coordinates(values, block.frame, evidence.seed), **model.lit_geometry(values, block.frame)}
         if min(shape[:2]) >= 2 * SIDE:
             planes.update(_texture(np.asarray(model.predict(values, [block.frame], evidence.seed)[0], float)))
         for name, plane in planes.items():
@@ -114,78 +116,6 @@ def places(model, values: Values, evidence: Evidence) -> list[dict[str, np.ndarr
             known["place"] = (row * SIDE // shape[0] * SIDE + column * SIDE // shape[1]).astype(np.float32)
         found.append(known)
     return found
-
-
-def lit_geometry(model, values: Values, frame: int) -> dict[str, np.ndarray]:
-    """(H, W) more of what a scene knows of its pixels: how the brightest LED stands to the surface, and how far each
-    LED is.
-
-    half_angle      deg, of the normal to the bisector of the ways to LED and camera: 0 where a mirror would glint
-    led_angle       deg, off the axis of the LED, as its lobe goes
-    light_azimuth   deg, between the way down the slope and the way to the LED, seen along z; NaN where the surface is
-                    flat to 1 deg
-    press_distance  mm, from the middle of the press along the skin; depth: mm, from the camera, where the scene has no
-                    gel
-    NAME.distance   mm, from the LED of this name, in frames where it is lit, in scenes of at most DISTANCES of them
-    """
-    renderer = getattr(model, "renderer", None)
-    if renderer is None or model.captures.table is not None:
-        return {}
-    now, scene = model.at(values, frame), model.scene
-    hits = renderer.hits(now)
-    p, n = hits.position, hits.normal
-    origin = np.array(hits.origin)
-    eye = (origin.T.reshape(p.shape) if origin.size == p.size else origin) - p
-    to_camera = _unit(eye)
-    found = {"depth": np.where(hits.valid, np.linalg.norm(eye, axis=-1), np.nan)} if scene.gel is None else {}
-    best, toward, axis = np.full(hits.shape, -1.0), np.zeros(p.shape), np.zeros(p.shape)
-    at = {led: np.array([float(now[f"{led}.{a}"]) for a in "xyz"]) for led in scene.leds}
-    on = model.lit(now)
-    for led, power in on.items():
-        if led not in at:
-            continue
-        strength = (power * renderer.image(now, led)).sum(-1)
-        brighter = strength > best
-        best = np.where(brighter, strength, best)
-        toward[brighter] = _unit(at[led] - p)[brighter]
-        axis[brighter] = _axis(scene.leds[led], now[f"{led}.pan"], now[f"{led}.tilt"])
-    lit = (best > 0) & hits.valid
-    slope = np.degrees(np.arccos(np.clip(-n[..., 2], -1, 1)))
-    # in a frame without light they are NaN, not left out: a coordinate that one frame lacks is no coordinate of the
-    # others either
-    found["half_angle"] = np.where(lit, _angle(n, _unit(toward + to_camera)), np.nan)
-    found["led_angle"] = np.where(lit, _angle(-toward, axis), np.nan)
-    found["light_azimuth"] = np.where(lit & (slope > 1), _angle(_flat(n), _flat(toward)), np.nan)
-    if scene.gel is not None and f"{scene.gel.name}.press_x" in now:
-        found["press_distance"] = np.hypot(
-            *(p[..., i] - float(now[f"{scene.gel.name}.press_{a}"]) for i, a in enumerate("xy"))
-        )
-    if 1 < len(at) <= DISTANCES:
-        found.update(
-            {
-                f"{led}.distance": np.where(hits.valid & (led in on), np.linalg.norm(place - p, axis=-1), np.nan)
-                for led, place in at.items()
-            }
-        )
-    return found
-
-
-def _axis(led, pan: float, tilt: float) -> np.ndarray:
-    """Unit vector along which an LED shines most (as the part `led` has it)."""
-    side, up, ahead = (np.array([float(c[0]) for c in axis]) for axis in led.frame)
-    return _unit(ahead + np.tan(np.radians(float(pan))) * side + np.tan(np.radians(float(tilt))) * up)
-
-
-def _unit(v: np.ndarray) -> np.ndarray:
-    return v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1e-12)
-
-
-def _flat(v: np.ndarray) -> np.ndarray:
-    return _unit(v * (1, 1, 0))
-
-
-def _angle(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return np.degrees(np.arccos(np.clip((a * b).sum(-1), -1, 1)))
 
 
 def _texture(prediction: np.ndarray) -> dict[str, np.ndarray]:
@@ -286,7 +216,7 @@ def fingerprints(model, evidence: Evidence, found: list[dict], reference: float,
                 curve.tolist(),
                 sd.tolist(),
                 _labels(evidence, model, name, centres),
-                family_of(name, _kind(model, name)),
+                family_of(name, model.part_kind(name)),
                 net / excess if weighed else math.nan,
                 _unit_of(model, name),
             )
@@ -295,14 +225,8 @@ def fingerprints(model, evidence: Evidence, found: list[dict], reference: float,
     return sorted(curves_of, key=lambda f: -f.net)
 
 
-def _kind(model, coordinate: str) -> str:
-    """The kind of the part that a setting is a setting of; '' for what is no setting."""
-    part = getattr(getattr(model, "scene", None), "parts", {}).get(coordinate.rpartition(".")[0])
-    return part.kind if part is not None else ""
-
-
-def _unit_of(model, coordinate: str) -> str:
-    if coordinate in getattr(model, "parameters", {}):
+def _unit_of(model: Model, coordinate: str) -> str:
+    if coordinate in model.parameters:
         return model.parameters[coordinate].unit
     return "mm" if coordinate.endswith(".distance") else UNITS.get(coordinate, "")
 
@@ -310,14 +234,11 @@ def _unit_of(model, coordinate: str) -> str:
 def _labels(evidence: Evidence, model, name: str, centres: Sequence[float]) -> list[str]:
     """Names of the bins of a coordinate that has no scale."""
     if name == "frame":
-        return [str(getattr(model.frames[f], "name", f)) for f in evidence.frames]
+        return [model.frames[f].name for f in evidence.frames]
     if name == "LED":
         return _lights(evidence, model)
     if name == "channel":
-        return [
-            f"{c} ({nm:.0f} nm)" if nm else c
-            for c, nm in zip(channel_names(evidence), _wavelengths(model, evidence.channels))
-        ]
+        return [f"{c} ({nm:.0f} nm)" if nm else c for c, nm in zip(channel_names(evidence), model.wavelengths())]
     if name in YES_NO and len(centres) == 2:
         return ["no", "yes"]
     if name == "place":
@@ -327,14 +248,6 @@ def _labels(evidence: Evidence, model, name: str, centres: Sequence[float]) -> l
 
 def _lights(evidence: Evidence, model) -> list[str]:
     return sorted({led_label(model.frames[f].parameters) for f in evidence.frames})
-
-
-def _wavelengths(model, channels: int) -> list[float]:
-    """nm that each channel sees on average, 0 where the scene names no bands."""
-    developer = getattr(model, "developer", None)
-    if developer is None or not any(developer.bands):
-        return [0.0] * channels
-    return list(developer.matrix @ np.array(developer.bands) / developer.matrix.sum(1))
 
 
 def channel_names(evidence: Evidence) -> list[str]:

@@ -14,9 +14,11 @@ import numpy as np
 
 from optics.diagnosis import fingerprints as prints
 from optics.diagnosis import statistics as st
-from optics.diagnosis.evidence import Block, Candidate, Evidence, Progress, at_bound, measure, value_of
-from optics.diagnosis.verdict import LEVEL, MAPS, UNEVEN, Pair, Refit, Split
+from optics.diagnosis.evidence import Block, Candidate, Evidence, Progress, at_bound, measure
+from optics.diagnosis.result import Pair, Refit, Split
+from optics.diagnosis.thresholds import LEVEL, MAPS, UNEVEN
 from optics.fit.compare import led_label
+from optics.fit.model import value_of
 from optics.scene.parameter import Variable
 
 EVEN = 0.05  # of the fall: what splitting may gain where clutter does not make it

@@ -14,7 +14,8 @@ import numpy as np
 
 from optics.diagnosis import statistics as st
 from optics.diagnosis.evidence import Candidate, Evidence
-from optics.diagnosis.verdict import CLEAR, HIDDEN, LEVEL, MARGIN, MIMICS, Fingerprint, Pair
+from optics.diagnosis.result import Fingerprint, Pair
+from optics.diagnosis.thresholds import CLEAR, HIDDEN, LEVEL, MARGIN, MIMICS
 
 CONSIDERED = 10  # effects, the best by themselves: 45 pairs
 REFITTED = 4  # pairs

@@ -27,7 +27,8 @@ import numpy as np
 
 from optics.captures import capture_set as capture_files
 from optics.diagnosis import statistics as st
-from optics.diagnosis.verdict import CLEAR, LEVEL, MARGIN
+from optics.diagnosis.score import score
+from optics.diagnosis.thresholds import CLEAR, LEVEL, MARGIN
 from optics.errors import BadCapture
 from optics.scene.parameter import Values
 from optics.words import percent, spaced, table
@@ -108,8 +109,6 @@ def rehearse(
 
     Raises ValueError for a change that is not positive, Underdetermined as a diagnosis does.
     """
-    from optics.diagnosis.diagnose import score
-
     if not change > 0:
         raise ValueError(f"change = {100 * change:g} %; allowed: above 0 % of the mean signal, such as 0.5 %")
     scored = score(model, fit, effects, variables_of, fitted, seed=seed, progress=progress)

@@ -27,6 +27,8 @@ from functools import cache
 
 import numpy as np
 
+Index = Sequence[int] | np.ndarray  # places of columns
+
 TRUNCATION = (
     1e-9  # of the largest eigenvalue of unit-length columns: below, a direction is not calibrated but undetermined
 )
@@ -54,7 +56,7 @@ class Normal:
         self.square = 0.0
         self.count = 0
 
-    def add(self, where: Sequence[int], a: np.ndarray, r: np.ndarray, b: np.ndarray | None = None) -> None:
+    def add(self, where: Index, a: np.ndarray, r: np.ndarray, b: np.ndarray | None = None) -> None:
         """Add pixels: a (n, k) in the columns `where`, r (n,); columns that are left out are zero in these pixels."""
         where = np.asarray(where, int)
         if b is None:
@@ -79,7 +81,7 @@ class Normal:
         signal = np.maximum(np.diag(self.gram), 1e-300)
         return np.sqrt(self.noise / signal)
 
-    def truncation(self, columns: Sequence[int]) -> float:
+    def truncation(self, columns: Index) -> float:
         """Eigenvalues of these columns that their noise can make: kappa^2/sqrt(n), times 5, and never below TRUNCATION.
 
         Only theirs: a candidate's noisy image says nothing about what the base can absorb, and a direction of the base
@@ -128,8 +130,8 @@ class Projected:
 
 def project(
     normal: Normal,
-    base: Sequence[int],
-    rest: Sequence[int],
+    base: Index,
+    rest: Index,
     precision: np.ndarray | None = None,
     pull: np.ndarray | None = None,
     truncation: float | None = None,
@@ -177,13 +179,13 @@ class Cone:
     """
 
     def __init__(self, information: np.ndarray, sides: Sequence[int], seed: int = 0, draws: int = 10_000):
-        sides = np.asarray(sides, int)
+        side = np.asarray(sides, int)
         self.information = np.asarray(information, float)
         diagonal = np.diag(self.information)
         self.live = np.flatnonzero(diagonal > 0)
-        sign = np.where(sides < 0, -1.0, 1.0)[self.live]
+        sign = np.where(side < 0, -1.0, 1.0)[self.live]
         v = self.information[np.ix_(self.live, self.live)] * sign * sign[:, None]
-        self.sign, self.free, self.bound = sign, np.flatnonzero(sides[self.live] == 0), np.flatnonzero(sides[self.live])
+        self.sign, self.free, self.bound = sign, np.flatnonzero(side[self.live] == 0), np.flatnonzero(side[self.live])
         across = v[np.ix_(self.bound, self.free)]
         self.free_inverse, self.free_rank = inverse(v[np.ix_(self.free, self.free)], VISIBLE)
         self.across = across @ self.free_inverse  # (bound, free)
@@ -314,7 +316,7 @@ class Family:
     def __init__(
         self,
         information: np.ndarray,
-        candidates: Sequence[tuple[Sequence[int], Cone]],
+        candidates: Sequence[tuple[Index, Cone]],
         seed: int = 0,
         draws: int = DRAWS,
     ):
@@ -339,7 +341,7 @@ class Family:
         return float(self.smallest[min(int(p * self.draws), self.draws - 1)])
 
 
-def gap(information: np.ndarray, a: Sequence[int], strength: np.ndarray, b: Sequence[int], rival: Cone) -> float:
+def gap(information: np.ndarray, a: Index, strength: np.ndarray, b: Index, rival: Cone) -> float:
     """D: expected chi2 by which the data prefer effect a, true with `strength`, over effect b at its best."""
     a, b = np.asarray(a, int), np.asarray(b, int)
     full = float(strength @ information[np.ix_(a, a)] @ strength)
@@ -387,7 +389,7 @@ def bin_edges(x: np.ndarray, bins: int = BINS) -> np.ndarray | None:
 
 def add_bins(
     normal: Normal,
-    where: Sequence[int],
+    where: Index,
     a: np.ndarray,
     r: np.ndarray,
     first: int,
@@ -463,7 +465,7 @@ def planes_of(use: np.ndarray) -> list[tuple]:
 
     A raw mosaic fills only some of the four positions of a 2 x 2 cell in a channel: each is a plane of its own.
     """
-    planes = []
+    planes: list[tuple] = []
     for c in range(use.shape[2]):
         cells = [(slice(i, None, 2), slice(j, None, 2), c) for i in (0, 1) for j in (0, 1)]
         filled = [use[cell].any() for cell in cells]
@@ -485,7 +487,7 @@ class Spectrum:
         self.planes: list[list[tuple]] = []
         self.trace = self.square = self.high_count = 0.0
 
-    def add(self, use: np.ndarray, where: Sequence[int], columns: np.ndarray) -> None:
+    def add(self, use: np.ndarray, where: Index, columns: np.ndarray) -> None:
         """Add a frame: use (H, W, C) bool; columns (H, W, C, k), whitened and zero outside, in the places `where`."""
         planes = [p for p in planes_of(use) if min(use[p].shape) >= 16 and use[p].mean() > 0.2]
         self.planes.append(planes)
@@ -503,9 +505,10 @@ class Spectrum:
 
     @staticmethod
     def _low(shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-        return tuple(cosines(n)[: min(NARROW, n // 4)] for n in shape)
+        rows, columns = (cosines(n)[: min(NARROW, n // 4)] for n in shape)
+        return rows, columns
 
-    def test(self, residuals: Sequence[np.ndarray], base: Sequence[int], inverse_gram: np.ndarray) -> Structure:
+    def test(self, residuals: Sequence[np.ndarray], base: Index, inverse_gram: np.ndarray) -> Structure:
         """F test of whitened residuals (H, W, C), zero outside the masks; base and (J'J)^-1 name what was
         calibrated."""
         from scipy.fft import dctn
@@ -540,7 +543,7 @@ class Sweeps:
     def __init__(self):
         self.parts: list[tuple] = []
 
-    def add(self, use: np.ndarray, where: Sequence[int], columns: np.ndarray, along: Mapping[str, np.ndarray]) -> None:
+    def add(self, use: np.ndarray, where: Index, columns: np.ndarray, along: Mapping[str, np.ndarray]) -> None:
         """Add a sweep: as in `Spectrum`, and along: {coordinate: value of each reading, (N, 1, 1)}."""
         self.parts.append(
             (
@@ -551,7 +554,7 @@ class Sweeps:
             )
         )
 
-    def test(self, residuals: Sequence[np.ndarray], base: Sequence[int], inverse_gram: np.ndarray) -> Structure:
+    def test(self, residuals: Sequence[np.ndarray], base: Index, inverse_gram: np.ndarray) -> Structure:
         """As of `Spectrum`; `high` is NaN: neighbours among readings share nothing that pixels do."""
         r = np.concatenate([residual[use] for residual, (use, *_) in zip(residuals, self.parts)]).astype(float)
         calibrated = np.zeros((len(r), len(base)))

@@ -108,7 +108,7 @@ def read(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, str | float
 
 def _narrowed(values: np.ndarray, dtype: type, where: str) -> np.ndarray:
     with np.errstate(over="ignore"):
-        narrow = np.ascontiguousarray(values, dtype)
+        narrow: np.ndarray = np.ascontiguousarray(values, dtype)
     if np.any(np.isinf(narrow) & np.isfinite(values)):
         raise ValueError(
             f"{where}: values up to {np.nanmax(np.abs(values)):g} do not fit {np.dtype(dtype).name} "
@@ -178,7 +178,7 @@ def preview_channels(bands_nm: Sequence[float], radiance: np.ndarray) -> dict[st
     Colour matching functions: Wyman, Sloan & Shirley, JCGT 2(2), 2013, multi-lobe fit; a preview, no colorimetry.
     """
 
-    def lobe(mean, low, high):  # nm
+    def lobe(mean: float, low: float, high: float) -> np.ndarray:  # nm
         return np.exp(-0.5 * ((bands - mean) / np.where(bands < mean, low, high)) ** 2)
 
     bands = np.asarray(bands_nm, float)

@@ -42,7 +42,7 @@ def read_image(file: Path, where: str) -> tuple[np.ndarray, int | None]:
 def read_mask(file: Path, shape: tuple[int, ...], where: str) -> np.ndarray:
     """(H, W) bool, True = use: where any channel of the file is not zero."""
     values = read_array(file, where)
-    values = values.any(axis=2) if values.ndim == 3 else values
+    values = np.asarray(values.any(axis=2)) if values.ndim == 3 else values
     if values.shape != shape[:2]:
         raise BadCapture(f"{where}: (H, W) = {values.shape} pixels; allowed: {shape[:2]}, as the image")
     if values.dtype.kind not in "biuf" or not np.isfinite(values).all():

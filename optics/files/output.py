@@ -1,5 +1,4 @@
-"""Files that are written whole or not at all, checks before any work that they can be, and what identifies them
-later."""
+"""Output that appears whole or not at all, checks before any work that it can be written, and what identifies it."""
 
 from __future__ import annotations
 
@@ -7,6 +6,7 @@ import hashlib
 import json
 import os
 import platform
+import shutil
 import uuid
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -20,8 +20,8 @@ PACKAGES = ("mitsuba", "drjit", "numpy", "scipy", "scikit-image")
 
 
 @contextmanager
-def replacing(path: Path) -> Iterator[Path]:
-    """A temporary file in the same folder that takes the place of `path` when the block ends without an error."""
+def replacing(path: str | Path) -> Iterator[Path]:
+    """A temporary file beside `path` that replaces it when the block ends without an error; removed otherwise."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.parent / f".{path.stem}.{uuid.uuid4().hex}{path.suffix}"
@@ -32,9 +32,51 @@ def replacing(path: Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
+def write_text(path: str | Path, text: str) -> Path:
+    """Write a UTF-8 text file, whole or not at all."""
+    with replacing(path) as file:
+        file.write_text(text, encoding="utf-8")
+    return Path(path)
+
+
+@contextmanager
+def new_folder(folder: str | Path, *, replace: bool = False) -> Iterator[Path]:
+    """A temporary folder beside `folder` that takes its place when the block ends without an error.
+
+    An empty folder gives way. One with content gives way only with `replace`: it is moved aside first, and back again
+    if the new one cannot take its place. Raises OutputExists, before anything is written.
+    """
+    folder = Path(os.path.abspath(folder))
+    if not replace:
+        check_new_folder(folder)
+    temporary = folder.parent / f".{folder.name}.{uuid.uuid4().hex}"
+    old = temporary.with_name(temporary.name + ".old")
+    temporary.mkdir(parents=True)
+    try:
+        yield temporary
+        if folder.exists():
+            folder.rename(old)
+        try:
+            temporary.rename(folder)
+        except OSError:
+            if old.exists():
+                old.rename(folder)
+            raise
+        shutil.rmtree(old, ignore_errors=True)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+def check_new_folder(folder: str | Path) -> None:
+    """Raises OutputExists where a folder holds something already, and what `check_folder` raises."""
+    folder = Path(folder)
+    check_folder(folder)
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise OutputExists(f"{folder} exists and is not empty; choose another folder")
+
+
 def claim(paths: Sequence[Path], force: bool = False) -> None:
-    """Make sure, before any work, that files can be written: none exists (unless `force`), every folder can take
-    them."""
+    """Check, before any work, that files can be written: none exists (unless `force`), and every folder is writable."""
     for path in map(Path, paths):
         if path.is_dir() or (path.exists() and not force):
             raise OutputExists(
@@ -44,7 +86,7 @@ def claim(paths: Sequence[Path], force: bool = False) -> None:
 
 
 def check_folder(folder: Path) -> None:
-    """Raises where a folder cannot be made or written to."""
+    """Raises NotADirectoryError or PermissionError where a folder cannot be made or written to."""
     folder = Path(folder).absolute()
     there = next(p for p in (folder, *folder.parents) if p.exists())
     if not there.is_dir():
@@ -53,10 +95,9 @@ def check_folder(folder: Path) -> None:
         raise PermissionError(f"{folder}: '{there}' cannot be written to; choose another place for the output")
 
 
-def write_json(path: Path, record: Mapping) -> Path:
-    with replacing(path) as file:
-        file.write_text(json.dumps(record, indent=1, sort_keys=True) + "\n", encoding="utf-8")
-    return path
+def write_json(path: str | Path, record: Mapping) -> Path:
+    """Write a JSON file with sorted keys, whole or not at all."""
+    return write_text(path, json.dumps(record, indent=1, sort_keys=True) + "\n")
 
 
 def shipped(folder: str) -> Path:
@@ -69,6 +110,7 @@ def shipped(folder: str) -> Path:
 
 
 def versions() -> dict[str, str]:
+    """Versions of this package, of Python, of the system and of the packages that results depend on."""
     found = {
         "optics": __version__,
         "python": platform.python_version(),
@@ -82,7 +124,8 @@ def versions() -> dict[str, str]:
     return found
 
 
-def file_hash(file: Path) -> str:
+def file_hash(file: str | Path) -> str:
+    """`sha256:` and the hexadecimal SHA-256 of a file."""
     digest = hashlib.sha256()
     with open(file, "rb") as f:
         while block := f.read(1 << 20):

@@ -8,6 +8,7 @@ import math
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from optics.errors import BadCapture, UnknownKey
 
@@ -60,7 +61,7 @@ def number(value: object, key: str, unit: str, where: str) -> float:
     return float(value)
 
 
-def settings(table: object, where: str) -> dict[str, float | str]:
+def settings(table: Any, where: str) -> dict[str, float | str]:
     """Parameters by key: finite numbers or texts."""
     keys(table, (), where)
     for key, value in table.items():

@@ -12,6 +12,7 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -208,24 +209,12 @@ class Comparison:
         return json.dumps(self.to_dict(), indent=1, allow_nan=False)
 
     @classmethod
-    def from_dict(cls, data: Mapping, rms_map=None, mean_map=None) -> Comparison:
-        rows = [
-            Row(**{k: v if k == "scope" else (int(v) if k == "n" else _number(v)) for k, v in r.items()})
-            for r in data["rows"]
-        ]
-        curves = [
-            Curve(
-                **{
-                    k: np.array([_number(x) for x in v], int if k == "n" else float)
-                    if k in ("centre", "mean", "se", "rms", "n")
-                    else tuple(v)
-                    if k == "labels" and v is not None
-                    else v
-                    for k, v in c.items()
-                }
-            )
-            for c in data["curves"]
-        ]
+    def from_dict(
+        cls, data: Mapping, rms_map: np.ndarray | None = None, mean_map: np.ndarray | None = None
+    ) -> Comparison:
+        """The inverse of `to_dict`; the maps are kept in files of their own."""
+        rows = [_row_from(r) for r in data["rows"]]
+        curves = [_curve_from(c) for c in data["curves"]]
         similarity = {k: (_number(v[0]), _number(v[1])) for k, v in data["similarity"].items()}
         return cls(
             rows,
@@ -300,7 +289,7 @@ def compare(
     shape = data[0][0].shape
     channels = list(channels or {1: ["L"], 3: ["R", "G", "B"]}.get(shape[2], [f"c{k}" for k in range(shape[2])]))
     varied = _varied(settings or [{}] * frames)
-    coordinates = [
+    planes = [
         _planes({**c, **v}, d[0].shape, i)
         for i, (c, v, d) in enumerate(zip(coordinates or [{}] * frames, varied, data))
     ]
@@ -311,8 +300,8 @@ def compare(
         "role": ["held out" if i in set(held_out) else "fitted" for i in range(frames)],
     }
 
-    regions = _region_names(coordinates)
-    sums = _sums(data, coordinates, regions, full_scale, black_level)
+    regions = _region_names(planes)
+    sums = _sums(data, planes, regions, full_scale, black_level)
     per_value = _parameters_per_value(sums["n"][:, 0].sum(1), info["role"], parameters, held_out_parameters)
     rows = [
         _row(scope, sums, keep, per_value, full_scale)
@@ -324,7 +313,7 @@ def compare(
 
     whitened = [np.where(use, (y - f) / np.where(use, s, 1.0), np.nan) for y, f, s, use in data]
     rms_map, mean_map = _maps(whitened)
-    curves = _curves(whitened, data, coordinates, info["frame"], channels, bins, {**UNITS, **(units or {})})
+    curves = _curves(whitened, data, planes, info["frame"], channels, bins, {**UNITS, **(units or {})})
     about = [{**{k: v[i] for k, v in info.items()}, "settings": varied[i]} for i in range(frames)]
     return Comparison(rows, curves, about, channels, similarity, float(full_scale), rms_map, mean_map)
 
@@ -359,7 +348,7 @@ def structural_similarity_map(measured: np.ndarray, predicted: np.ndarray, usabl
     return local, inner & usable
 
 
-# -- input --------------------------------------------------------------------------------------------------------------
+# -- input ------------------------------------------------------------------------------------------------------------
 
 
 def _same_length(frames: int, **lists) -> None:
@@ -389,7 +378,7 @@ def _frame(index: int, measured, predicted, sd, usable) -> tuple:
     return y, np.asarray(f, float), np.asarray(s, float), use
 
 
-def _planes(coordinates: Mapping[str, np.ndarray], shape: tuple, index: int) -> dict[str, np.ndarray]:
+def _planes(coordinates: Mapping[str, np.ndarray | float], shape: tuple, index: int) -> dict[str, np.ndarray]:
     planes = {}
     for name, value in coordinates.items():
         value = np.asarray(value)
@@ -406,8 +395,8 @@ def _varied(settings: Sequence[Mapping]) -> list[dict[str, float]]:
 
     Powers that are only switched are left out: the LED labels say it.
     """
-    keys = dict.fromkeys(k for s in settings for k, v in s.items() if not isinstance(v, (str, bool)))
-    keys = [k for k in keys if len({s.get(k) for s in settings}) > (2 if k.endswith(".power") else 1)]
+    every = dict.fromkeys(k for s in settings for k, v in s.items() if not isinstance(v, (str, bool)))
+    keys = [k for k in every if len({s.get(k) for s in settings}) > (2 if k.endswith(".power") else 1)]
     return [{k: float(s.get(k, math.nan)) for k in keys} for s in settings]
 
 
@@ -421,8 +410,7 @@ def _group_names(groups, frames: int) -> list[str]:
     return [f"{i:03d}" if g is None else str(g) for i, g in enumerate(groups)]
 
 
-# -- numbers
-# ------------------------------------------------------------------------------------------------------------
+# -- numbers ----------------------------------------------------------------------------------------------------------
 
 
 def _region_names(coordinates: list[dict]) -> list[str]:
@@ -503,7 +491,7 @@ def _parts(scope: tuple[str, ...], info: dict, regions: list[str], channels: lis
 
 
 def _product(choices: list[list[str]]) -> list[tuple[str, ...]]:
-    out = [()]
+    out: list[tuple[str, ...]] = [()]
     for options in choices:
         out = [head + (o,) for head in out for o in options]
     return out
@@ -534,15 +522,14 @@ def _row(scope: dict, sums: dict, keep: tuple, per_value: np.ndarray, full_scale
 
 
 def _mean_sd(values: list[float]) -> tuple[float, float]:
-    values = np.array(values, float)
-    values = values[np.isfinite(values)]
-    if not len(values):
+    known = np.array(values, float)
+    known = known[np.isfinite(known)]
+    if not len(known):
         return math.nan, math.nan
-    return float(values.mean()), float(values.std(ddof=1)) if len(values) > 1 else math.nan
+    return float(known.mean()), float(known.std(ddof=1)) if len(known) > 1 else math.nan
 
 
-# -- maps and curves
-# ----------------------------------------------------------------------------------------------------
+# -- maps and curves --------------------------------------------------------------------------------------------------
 
 
 def _maps(whitened: list[np.ndarray]) -> tuple[np.ndarray | None, np.ndarray | None]:
@@ -633,7 +620,7 @@ def _binned(name, unit, channel, x, z, edges, labels=None) -> Curve:
     return Curve(name, unit, channel, centre, mean, se, np.sqrt(square), n, labels)
 
 
-# -- views --------------------------------------------------------------------------------------------------------------
+# -- views ------------------------------------------------------------------------------------------------------------
 
 
 def _cells(row: Row) -> tuple[str, ...]:
@@ -653,7 +640,18 @@ def _cells(row: Row) -> tuple[str, ...]:
     )
 
 
-def plain(value):
+def _row_from(data: Mapping[str, Any]) -> Row:
+    numbers = {k: _number(v) for k, v in data.items() if k not in ("scope", "n")}
+    return Row(scope=data["scope"], n=int(data["n"]), **numbers)
+
+
+def _curve_from(data: Mapping[str, Any]) -> Curve:
+    arrays = {k: np.array([_number(x) for x in data[k]]) for k in ("centre", "mean", "se", "rms")}
+    labels = None if data.get("labels") is None else tuple(data["labels"])
+    return Curve(data["coordinate"], data["unit"], data["channel"], **arrays, n=np.array(data["n"], int), labels=labels)
+
+
+def plain(value: Any) -> Any:
     """JSON-ready copy: arrays become lists, NaN None, infinity 'inf'."""
     if isinstance(value, Mapping):
         return {str(k): plain(v) for k, v in value.items()}

@@ -19,11 +19,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
 from optics.captures.importing import POSE, PRIORS
 from optics.scene.parameter import Values
+
+if TYPE_CHECKING:
+    from optics.fit.scene_model import SceneModel
 
 NEAR = 2.0  # labelled radii
 STEPS = (0.02, 0.02, 0.02)  # mm, of the differences by which normals follow a pose
@@ -108,19 +112,19 @@ PHYSICAL = "physical"
 MEASURES = ("rms_near", "rms_whole", "l1_near", "l1_whole")
 
 
+def _mean(measure: str, values: Sequence[Sequence[float]], weights: Sequence[int]) -> list[float]:
+    """Weighted mean over folds, per channel: of squares for an rms."""
+    power = 2 if measure.startswith("rms") else 1
+    return (np.average(np.array(values) ** power, axis=0, weights=weights) ** (1 / power)).tolist()
+
+
 def pooled(tables: Sequence[NullTable]) -> NullTable:
     """One table of several folds: squares and sizes of errors averaged, each fold by its number of frames."""
     scores = []
     for first in tables[0].scores:
         parts = [t.of(first.model, first.split) for t in tables]
         weights = [len(t.held_out if first.split == "held out" else t.fitted) for t in tables]
-        mean = {
-            m: np.average(
-                [np.array(getattr(p, m)) ** (2 if m.startswith("rms") else 1) for p in parts], axis=0, weights=weights
-            )
-            for m in MEASURES
-        }
-        mean = {m: (np.sqrt(v) if m.startswith("rms") else v).tolist() for m, v in mean.items()}
+        mean = {m: _mean(m, [getattr(p, m) for p in parts], weights) for m in MEASURES}
         poses = parts[0].poses if len({p.poses for p in parts}) == 1 else "either"
         scores.append(Score(first.model, first.split, poses, **mean))
     return NullTable(
@@ -131,8 +135,21 @@ def pooled(tables: Sequence[NullTable]) -> NullTable:
     )
 
 
-# -- The nulls
-# ------------------------------------------------------------------------------------------------------------
+# -- the nulls --------------------------------------------------------------------------------------------------------
+
+
+class Null(Protocol):
+    """A model without physics: fitted to frames, it predicts others from their shapes."""
+
+    name: str
+
+    def fit(self, shapes: Sequence[Shape], rows: Sequence[tuple[np.ndarray, np.ndarray]]) -> Null:
+        """Fit to (image, weight) of frames with these shapes."""
+        ...
+
+    def predict(self, shape: Shape) -> np.ndarray:
+        """(H, W, C) DN."""
+        ...
 
 
 class Background:
@@ -140,10 +157,10 @@ class Background:
 
     name = "background"
 
-    def fit(self, shapes, rows):
+    def fit(self, shapes: Sequence[Shape], rows: Sequence[tuple[np.ndarray, np.ndarray]]) -> Null:
         return self
 
-    def predict(self, shape):
+    def predict(self, shape: Shape) -> np.ndarray:
         return shape.background
 
 
@@ -152,14 +169,15 @@ class Additive:
 
     name = "directional, additive"
 
-    def features(self, shape) -> np.ndarray:
+    def features(self, shape: Shape) -> np.ndarray:
         """(H W, F), without the background's factor."""
         return shape.tilt.reshape(-1, 3)
 
-    def fit(self, shapes, rows):
-        self.coefficients = []
+    def fit(self, shapes: Sequence[Shape], rows: Sequence[tuple[np.ndarray, np.ndarray]]) -> Null:
+        self.coefficients: list[np.ndarray] = []
         for c in range(rows[0][0].shape[-1]):
-            a = b = 0
+            a: Any = 0
+            b: Any = 0
             for shape, (image, weight) in zip(shapes, rows):
                 f, w = self.features(shape), weight[..., c].ravel()
                 a = a + (f.T * w) @ f
@@ -167,7 +185,7 @@ class Additive:
             self.coefficients.append(np.linalg.solve(a + 1e-9 * np.trace(a) / len(a) * np.eye(len(a)), b))
         return self
 
-    def predict(self, shape):
+    def predict(self, shape: Shape) -> np.ndarray:
         steps = self.features(shape) @ np.array(self.coefficients).T
         return shape.background + steps.reshape(shape.background.shape)
 
@@ -177,7 +195,7 @@ class Linear(Additive):
 
     name = "linear in the normal"
 
-    def features(self, shape):
+    def features(self, shape: Shape) -> np.ndarray:
         x, y = shape.x, shape.y
         place = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], -1)
         return (shape.tilt[..., :, None] * place[..., None, :]).reshape(-1, 18)
@@ -188,11 +206,12 @@ class Multiplicative:
 
     name = "directional, multiplicative"
 
-    def fit(self, shapes, rows):
-        self.coefficients = [np.zeros(2) for _ in range(rows[0][0].shape[-1])]
-        for c, start in enumerate(self.coefficients):
+    def fit(self, shapes: Sequence[Shape], rows: Sequence[tuple[np.ndarray, np.ndarray]]) -> Null:
+        self.coefficients: list[np.ndarray] = [np.zeros(2) for _ in range(rows[0][0].shape[-1])]
+        for c in range(rows[0][0].shape[-1]):
             for _ in range(4):
-                a = b = 0
+                a: Any = 0
+                b: Any = 0
                 for shape, (image, weight) in zip(shapes, rows):
                     n, flat = shape.tilt, shape.background[..., c]
                     lit = 1 + n[..., 2] + n[..., :2] @ self.coefficients[c] > 0
@@ -203,7 +222,7 @@ class Multiplicative:
                 self.coefficients[c] = np.linalg.solve(a + 1e-9 * np.eye(2), b)
         return self
 
-    def predict(self, shape):
+    def predict(self, shape: Shape) -> np.ndarray:
         n = shape.tilt
         return shape.background * np.maximum(1 + n[..., 2:] + n[..., :2] @ np.array(self.coefficients).T, 0)
 
@@ -221,21 +240,22 @@ class Shape:
 class Bench:
     """The frames of a model with their shapes for any pose; shapes are kept, as all nulls start from the same poses."""
 
-    def __init__(self, model, values: Values, circles: np.ndarray):
+    def __init__(self, model: SceneModel, values: Values, circles: np.ndarray):
         self.model, self.circles = model, circles
         self.base = values
-        self.kept: dict = {}
+        self.kept: dict[tuple, np.ndarray] = {}
+        self.start: dict[int, tuple[float, ...]] = {}  # poses of the physical model, and means of the poses' priors
         height, width = model.shape[:2]
         v, u = np.mgrid[:height, :width] + 0.5
         self.near = {i: np.hypot(u - x, v - y) < NEAR * r for i, (x, y, r) in enumerate(circles)}
         self.x, self.y = (u - width / 2) / (width / 2), (v - height / 2) / (width / 2)
-        self.rows = {}
+        self.rows: dict[int, tuple[np.ndarray, np.ndarray]] = {}
 
     def pose(self, index: int) -> tuple[float, ...]:
         now = self.model.at(self.base, index)
         return tuple(float(now[key]) for key in POSE)
 
-    def row(self, index: int):
+    def row(self, index: int) -> tuple[np.ndarray, np.ndarray]:
         """(image, weight 1/variance of usable pixels)."""
         if index not in self.rows:
             image = self.model.frames[index].image.astype(float)
@@ -250,20 +270,20 @@ class Bench:
             normal = hits.normal * np.array([1, 1, -1])  # towards the camera, which stands at -z
             tilt = np.where(hits.valid[..., None], normal - np.array([0, 0, 1]), 0)
             self.kept[index, pose] = tilt.astype(np.float32)
-            self.model.renderer._hits.clear()
+            self.model.renderer.forget_hits()
         now = self.model.at(self.base, index)
-        flat = self.model.noise.black_level + self.model.flat * self.model._gains(now)
+        flat = self.model.noise.black_level + self.model.flat * self.model.gains(now)
         return Shape(flat, self.kept[index, pose].astype(float), self.x, self.y)
 
-    def misfit(self, null, index: int, pose) -> float:
+    def misfit(self, null: Null, index: int, pose: Sequence[float]) -> float:
         image, weight = self.row(index)
         gap = sum(((p - q) / s) ** 2 for p, q, s in zip(pose, self.start[index], PRIOR_SD))
         return float((weight * (self.clip(null.predict(self.shape(index, pose))) - image) ** 2).sum()) + gap
 
-    def clip(self, image):
+    def clip(self, image: np.ndarray) -> np.ndarray:
         return np.clip(image, 0, self.model.noise.saturation)
 
-    def refined(self, null, index: int, pose) -> tuple[float, ...]:
+    def refined(self, null: Null, index: int, pose: Sequence[float]) -> tuple[float, ...]:
         """One Gauss-Newton step of the pose for a fitted null, halved until the misfit falls; else the pose as it
         was."""
         image, weight = self.row(index)
@@ -282,8 +302,10 @@ class Bench:
                 return moved
         return tuple(pose)
 
-    def score(self, name: str, split: str, poses: str, indices, predictions) -> Score:
-        parts = {m: [] for m in MEASURES}
+    def score(
+        self, name: str, split: str, poses: str, indices: Sequence[int], predictions: Sequence[np.ndarray]
+    ) -> Score:
+        parts: dict[str, list[np.ndarray]] = {m: [] for m in MEASURES}
         for index, prediction in zip(indices, predictions):
             left = self.clip(prediction) - self.model.frames[index].image
             usable = self.model.usable(index)
@@ -301,7 +323,7 @@ PRIOR_SD = (PRIORS["gel.press_[xy]"], PRIORS["gel.press_[xy]"], PRIORS["gel.pres
 
 
 def compare(
-    model,
+    model: SceneModel,
     values: Values,
     fitted: Sequence[int],
     held_out: Sequence[int],
@@ -333,7 +355,8 @@ def compare(
     ]
     rows = [bench.row(i) for i in fitted]
     found = {}
-    for done, kind in enumerate((Background, Additive, Multiplicative, Linear)):
+    kinds: tuple[type[Null], ...] = (Background, Additive, Multiplicative, Linear)
+    for done, kind in enumerate(kinds):
         options = {"physical": (dict(same), kind().fit([bench.shape(i, same[i]) for i in fitted], rows))}
         if kind is not Background and rounds:
             null, poses = options["physical"][1], dict(same)

@@ -147,6 +147,15 @@ class Renderer:
             self._hits.popitem(last=False)
         return hits
 
+    def forget_hits(self) -> None:
+        """Release the kept hits: a search over many geometries returns to none of them."""
+        self._hits.clear()
+
+    def contact_weight(self, values: Mapping, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """1 where the gel is touched at points (x, y) in mm of any shape, 0 elsewhere; between at the rim."""
+        self._apply(values)
+        return self.scene.gel.contact_weight(x, y)
+
     def _painted(self, hits: Hits) -> np.ndarray:
         """Pixels in whose neighbourhood the texture of a membrane's reflectance has an edge."""
         import drjit as dr

@@ -10,18 +10,21 @@ import base64
 import io
 import json
 import math
-import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
+from optics import words
 from optics.errors import OutputExists
+from optics.files.output import write_text
 from optics.fit.compare import UNITS, Comparison, Curve
-from optics.study.record import Fingerprint, Shown, Study
-from optics.words import some, spaced
+from optics.study.record import Record
+from optics.study.shown import Fingerprint, Shown
+from optics.words import as_float, figures, fixed, some, spaced
 
 BUDGET = 4_500_000  # bytes of embedded images; the page stays below 6 MB
 SIDE_MAX = 512  # px; larger frames are binned for display
@@ -46,6 +49,9 @@ MASKED = "#8a8a8a"
 NO_IMAGES = {"frames": [], "steps": [], "channels": [], "note": ""}
 FRAMES = {"frame": "frame", "frames": "frames", "data": "frames"}  # what the page calls the parts of the data
 SWEEPS = {"frame": "sweep", "frames": "sweeps", "data": "readings"}
+# the formats of a page: a true minus, powers of ten, a dash for what is missing
+number, percent = partial(words.number, typeset=True), partial(words.percent, typeset=True)
+measure, pvalue = partial(words.with_sd, typeset=True), partial(words.p_text, typeset=True)
 CHANNEL_STYLE = {"R": "red", "G": "green", "B": "blue"}
 
 
@@ -58,15 +64,10 @@ def report(study_folder: str | Path, out: str | Path, *, overwrite: bool = False
     out = out / "report.html" if out.is_dir() or not out.suffix else out
     if out.exists() and not overwrite:
         raise OutputExists(f"{out} exists; name another file, or --force to replace it")
-    html = render(Study.open(study_folder))
-    out.parent.mkdir(parents=True, exist_ok=True)
-    temporary = out.with_name(f".{out.name}.{os.getpid()}")
-    temporary.write_text(html, encoding="utf-8")
-    os.replace(temporary, out)
-    return out
+    return write_text(out, render(Record.open(study_folder)))
 
 
-def render(study: Study) -> str:
+def render(study: Record) -> str:
     """The page as text."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
@@ -90,7 +91,7 @@ def render(study: Study) -> str:
     nouns = FRAMES if points is None else SWEEPS
     verdicts = [verdict(told(study.diagnosis(i), points)) for i in range(len(study.steps))]
     return environment.get_template("report.html.j2").render(
-        study=study.record,
+        study=study.ladder,
         steps=study.steps,
         headline=headline(study, verdicts, nouns),
         verdicts=verdicts,
@@ -109,7 +110,7 @@ def render(study: Study) -> str:
         maps=map_images(comparisons, study.steps) if points is None else [],
         pages=residual_maps.pages(comparisons, shown, study.steps) if points is None else [],
         coordinates=[residual_maps.coordinates(told(study.diagnosis(i), points)) for i in range(len(study.steps))],
-        facts=facts(study.record["facts"], points),
+        facts=facts(study.ladder["facts"], points),
         numbers=number_tables(comparisons, nouns),
         nulls=null_table(study.metrics(len(study.steps) - 1)),
         background=study.metrics(len(study.steps) - 1).get("background") or {},
@@ -121,10 +122,10 @@ def render(study: Study) -> str:
 # -- words --------------------------------------------------------------------------------------------------------------
 
 
-def headline(study: Study, verdicts: list, nouns: Mapping[str, str]) -> dict:
+def headline(study: Record, verdicts: list, nouns: Mapping[str, str]) -> dict:
     """One sentence with the numbers that matter, and the last verdict."""
     first, last = _level(study.steps[0]), _level(study.steps[-1])
-    floor = study.record["noise_floor"]["chi2_per_dof"]
+    floor = study.ladder["noise_floor"]["chi2_per_dof"]
     where = f"on held-out {nouns['data']}" if study.steps[-1]["held_out"] else f"on the fitted {nouns['data']}"
     added = _and([s["name"] for s in study.steps[1:]])
     now = f"{percent(last['misfit'])} of the signal, where noise alone is {percent(last['noise'])}"
@@ -146,7 +147,7 @@ def headline(study: Study, verdicts: list, nouns: Mapping[str, str]) -> dict:
         "text": text,
         "rest": rest,
         "verdict": verdicts[-1],
-        "title": study.record["title"] or study.record["scene"],
+        "title": study.ladder["title"] or study.ladder["scene"],
     }
 
 
@@ -244,64 +245,15 @@ def _text(value: float, form: str) -> str:
     return form.format(value) if math.isfinite(value) else "–"
 
 
-def number(value, digits: int = 3) -> str:
-    """Digits that a reader can use; a true minus; a dash for what is missing."""
-    value = _finite(value)
-    if not math.isfinite(value):
-        return "–" if math.isnan(value) else "∞" if value > 0 else "−∞"
-    size = abs(value)
-    if size and (size >= 1e6 or size < 1e-4):
-        mantissa, power = f"{value:.{max(digits - 2, 0)}e}".split("e")
-        text = f"{mantissa}·10{str(int(power)).translate(str.maketrans('-0123456789', '⁻⁰¹²³⁴⁵⁶⁷⁸⁹'))}"
-    elif round(size) >= 10**digits:  # 99.7 in two digits is 100
-        text = f"{value:,.0f}".replace(",", "\u202f")
-    else:
-        text = f"{value:.{digits}g}"
-    return text.replace("-", "−")
-
-
-def figures(value, digits: int = 4) -> str:
-    """Like `number`, with closing zeros, so that a column lines up."""
-    value = _finite(value)
-    if not math.isfinite(value) or round(abs(value)) >= 10**digits or 0 < abs(value) < 1e-3:
-        return number(value, digits)
-    return f"{value:#.{digits}g}".rstrip(".").replace("-", "−")
-
-
-def fixed(value, places: int) -> str:
-    value = _finite(value)
-    return f"{value:.{places}f}".replace("-", "−") if math.isfinite(value) else number(value)
-
-
-def measure(value, sd) -> str:
-    """Value and standard deviation, rounded where the second digit of the deviation stands."""
-    value, sd = _finite(value), _finite(sd)
-    if not (math.isfinite(value) and math.isfinite(sd) and sd > 0):
-        return number(value, 5) + (" ± ∞" if math.isinf(sd) else "")
-    places = max(0, 1 - math.floor(math.log10(sd)))
-    if places > 7 or sd >= 1e5:
-        return f"{number(value, 4)} ± {number(sd, 2)}"
-    return f"{round(value, places) + 0.0:.{places}f} ± {sd:.{places}f}".replace("-", "−")
-
-
-def percent(value, digits: int = 3) -> str:
-    return "–" if not math.isfinite(_finite(value)) else f"{figures(100 * _finite(value), digits)}\u202f%"
-
-
-def pvalue(value) -> str:
-    value = _finite(value)
-    return "< 10⁻⁹" if value < 1e-9 else number(value, 2)
-
-
 # -- images -----------------------------------------------------------------------------------------------------------
 
 
-def pictures(study: Study, steps: list[list[Shown]]) -> dict:
+def pictures(study: Record, steps: list[list[Shown]]) -> dict:
     """What the viewer shows: measured once per frame, predicted and residual per frame and step.
 
     Fewer frames, then binned pixels, keep the page small; `note` says so.
     """
-    names = [n for n in study.record["shown"] if all(any(f.name == n for f in frames) for frames in steps)]
+    names = [n for n in study.ladder["shown"] if all(any(f.name == n for f in frames) for frames in steps)]
     if not names or max(steps[0][0].measured.shape[:2]) < SIDE_MIN:
         return NO_IMAGES
     table = [{f.name: f for f in frames} for frames in steps]
@@ -807,10 +759,10 @@ def _angles(low: float, high: float, unit: str) -> list[float]:
 # -- charts -------------------------------------------------------------------------------------------------------------
 
 
-def ladder_chart(study: Study, width: int, height: int, nouns: Mapping[str, str] = FRAMES) -> str:
+def ladder_chart(study: Record, width: int, height: int, nouns: Mapping[str, str] = FRAMES) -> str:
     """SVG: chi2/dof of every step, held out and fitted, over the noise floor, on a logarithmic scale."""
     steps = study.steps
-    floor = study.record["noise_floor"]["chi2_per_dof"]
+    floor = study.ladder["noise_floor"]["chi2_per_dof"]
     lines = [(key, [_value(s[key], "chi2_per_dof") for s in steps]) for key in ("fitted", "held_out")]
     values = [v for _, line in lines for v in line if math.isfinite(v) and v > 0] or [floor]
     low, high = 0.88 * min([floor, *values]), 1.3 * max([1.25 * floor, *values])
@@ -851,19 +803,19 @@ def ladder_chart(study: Study, width: int, height: int, nouns: Mapping[str, str]
             ]
     slot = (width - left - right) / max(len(steps), 1)
     for i, step in enumerate(steps):
-        for k, words in enumerate(_wrap(("+ " if i else "") + step["name"], max(8, int(slot / 6.6)))[:3]):
+        for k, label in enumerate(_wrap(("+ " if i else "") + step["name"], max(8, int(slot / 6.6)))[:3]):
             parts.append(
                 f'<text class="step" x="{x(i):.1f}" y="{height - bottom + 22 + 15 * k}" text-anchor="middle">'
-                f"{_escape(words)}</text>"
+                f"{_escape(label)}</text>"
             )
     parts.append(f'<text class="tick" x="{left}" y="14">χ²/dof</text>')
     legend = width - right
-    for key, words, wide in (("fitted", f"fitted {nouns['data']}", 92), ("held_out", f"held-out {nouns['data']}", 122)):
+    for key, label, wide in (("fitted", f"fitted {nouns['data']}", 92), ("held_out", f"held-out {nouns['data']}", 122)):
         if any(math.isfinite(v) for v in dict(lines)[key]):
             legend -= wide
             parts.append(
                 f'<circle class="dot {key}" cx="{legend:.0f}" cy="10" r="5"/>'
-                f'<text class="tick" x="{legend + 10:.0f}" y="14">{words}</text>'
+                f'<text class="tick" x="{legend + 10:.0f}" y="14">{label}</text>'
             )
     said = "; ".join(
         f"{step_name(s)}: held out {number(_value(s['held_out'], 'chi2_per_dof'))}, "
@@ -981,7 +933,7 @@ def reading_charts(comparisons: list[Comparison]) -> list[str]:
     keys = [k for k in (last.frames[0].get("settings") or {}) if len({f["settings"].get(k) for f in last.frames}) > 2]
     out = []
     for key in keys:
-        x = np.array([_finite(f["settings"].get(key)) for f in last.frames])
+        x = np.array([as_float(f["settings"].get(key)) for f in last.frames])
         order = [int(i) for i in np.argsort(x, kind="stable") if math.isfinite(x[i])]
         rows, before = last.by("frame"), first.by("frame")
         order = [i for i in order if rows[i].n]
@@ -1135,7 +1087,7 @@ def parameter_tables(steps: Sequence[Mapping]) -> dict:
         values = [variables.get(name) for variables in by_step]
         present = [v for v in values if v]
         first, last = present[0], present[-1]
-        moved, sd = math.nan, _finite(first.get("sd"))
+        moved, sd = math.nan, as_float(first.get("sd"))
         if len(present) > 1 and sd > 0:  # not where nothing determined it: infinite
             moved = (last["value"] - first["value"]) / sd
         row = {
@@ -1184,21 +1136,21 @@ def verdict(diagnosis: Mapping | None) -> dict | None:
         for key, title, left in COLUMNS
         if any(r["cells"][key] not in ("", "–") for r in shown)
     ]
-    curves = [f for f in d.get("fingerprints") or () if _finite(f.get("net")) > 0 and f.get("curve")]
+    curves = [f for f in d.get("fingerprints") or () if as_float(f.get("net")) > 0 and f.get("curve")]
     return {
         "word": str(d["word"]).replace("_", " "),
-        "sentence": (text := words(d.get("sentence")))[:1].upper() + text[1:],
+        "sentence": (text := prose(d.get("sentence")))[:1].upper() + text[1:],
         "conditions": [
-            {"name": words(c.get("name")), "holds": bool(c.get("holds")), "text": words(c.get("text"))}
+            {"name": prose(c.get("name")), "holds": bool(c.get("holds")), "text": prose(c.get("text"))}
             for c in d.get("conditions") or ()
         ],
-        "warnings": [words(w) for w in d.get("warnings") or ()],
-        "hints": [words(h) for h in d.get("hints") or ()],
+        "warnings": [prose(w) for w in d.get("warnings") or ()],
+        "hints": [prose(h) for h in d.get("hints") or ()],
         "ranking": shown,
         "columns": columns,
         "by_key": {_key(r["name"]): r for r in ranked},
         "limits": [f"{r['name']} {r['limit']}" for r in ranked if not r["evidence"] and r["limit"]],
-        "not_tested": [f"{name} ({words(why)})" for name, why in (d.get("not_tested") or {}).items()],
+        "not_tested": [f"{name} ({prose(why)})" for name, why in (d.get("not_tested") or {}).items()],
         "splits": [_split(s) for s in d.get("splits") or ()],
         "levels": list(d.get("levels") or ()),
         "shifts": [s for s in d.get("shifts") or ()][:8],
@@ -1227,26 +1179,26 @@ def _candidate(r: Mapping) -> dict:
     """A row of the ranking, its cells as text."""
     refit = r.get("refit") or {}
     strength = refit.get("strength") or [
-        _finite(a) + _finite(c) for a, c in zip(r.get("start") or (), r.get("change") or ())
+        as_float(a) + as_float(c) for a, c in zip(r.get("start") or (), r.get("change") or ())
     ]
     sd = refit.get("sd") or r.get("sd") or [None] * len(strength)
     unit = spaced((r.get("units") or [""])[0])
-    values = [measure(_finite(v), None if s is None else float(s)) + unit for v, s in zip(strength, sd)]
-    upper = [_finite(u) for u in r.get("upper") or () if math.isfinite(_finite(u))]
+    values = [measure(as_float(v), None if s is None else float(s)) + unit for v, s in zip(strength, sd)]
+    upper = [as_float(u) for u in r.get("upper") or () if math.isfinite(as_float(u))]
     limit = f"< {number(max(upper), 2)}{unit}" if upper else ""
-    confused = f"{r['confused_with']} ({number(_finite(r.get('cos')), 2)})" if r.get("confused_with") else ""
+    confused = f"{r['confused_with']} ({number(as_float(r.get('cos')), 2)})" if r.get("confused_with") else ""
     cells = {
-        "fall": number(_finite(r.get("fall")), 4),
-        "actual": number(_finite(refit.get("fall")), 4),
+        "fall": number(as_float(r.get("fall")), 4),
+        "actual": number(as_float(refit.get("fall")), 4),
         "strength": some(values, 3, "; "),
-        "plausible": number(_finite(r.get("of_plausible")), 2),
-        "image": percent(_finite(r.get("image")), 2),
-        "share": percent(_finite(r.get("share")), 2),
-        "survival": percent(_finite(r.get("survival")), 2),
-        "p": pvalue(_finite(r.get("p_family"))),
+        "plausible": number(as_float(r.get("of_plausible")), 2),
+        "image": percent(as_float(r.get("image")), 2),
+        "share": percent(as_float(r.get("share")), 2),
+        "survival": percent(as_float(r.get("survival")), 2),
+        "p": pvalue(as_float(r.get("p_family"))),
         "confused": confused,
-        "flags": ", ".join(map(words, r.get("flags") or ())),
-        "verdict": words(r.get("verdict")),
+        "flags": ", ".join(map(prose, r.get("flags") or ())),
+        "verdict": prose(r.get("verdict")),
     }
     return {
         "name": str(r.get("name", "")),
@@ -1256,24 +1208,24 @@ def _candidate(r: Mapping) -> dict:
         "actual": cells["actual"],
         "strength": cells["strength"],
         "verdict": cells["verdict"],
-        "evidence": bool(refit) or not _finite(r.get("p_family")) >= NAMED,
+        "evidence": bool(refit) or not as_float(r.get("p_family")) >= NAMED,
     }
 
 
 def _split(s: Mapping) -> dict:
     """One test of homogeneity: its parts as a strip of points with error bars about 1."""
-    strength, sd = [_finite(v) for v in s.get("strength") or ()], [_finite(v) for v in s.get("sd") or ()]
+    strength, sd = [as_float(v) for v in s.get("strength") or ()], [as_float(v) for v in s.get("sd") or ()]
     labels = [str(label) for label in s.get("labels") or ()]
     worst = max(range(len(strength)), key=lambda i: abs(np.nan_to_num(strength[i] - 1)), default=None)
     return {
         "effect": str(s.get("effect", "")),
-        "by": words(s.get("by")),
+        "by": prose(s.get("by")),
         "svg": strip(strength, sd, labels),
         "worst": "" if worst is None else f"{labels[worst]}: {measure(strength[worst], sd[worst])}",
         "parts": len(labels),
-        "h": number(_finite(s.get("h")), 2),
-        "p": pvalue(_finite(s.get("p"))),
-        "chance": pvalue(_finite(s.get("chance"))),
+        "h": number(as_float(s.get("h")), 2),
+        "p": pvalue(as_float(s.get("p"))),
+        "chance": pvalue(as_float(s.get("chance"))),
         "holds": bool(s.get("holds", True)),
     }
 
@@ -1303,7 +1255,7 @@ def strip(
 def _draft(f: Mapping) -> dict:
     """A curve along a coordinate that would explain the residual, as a chart; along 'place', as a map of cells."""
     name, gain = str(f.get("coordinate", "")), f.get("kind") == "gain"
-    centres, curve, sd = (np.array([_finite(v) for v in f.get(key) or ()]) for key in ("centres", "curve", "sd"))
+    centres, curve, sd = (np.array([as_float(v) for v in f.get(key) or ()]) for key in ("centres", "curve", "sd"))
     curve, sd = (100 * curve, 100 * sd) if gain else (curve, sd)
     what, image, chart = "relative gain, %" if gain else "offset, DN", "", ""
     side = math.isqrt(len(curve))
@@ -1317,14 +1269,14 @@ def _draft(f: Mapping) -> dict:
             Curve(name, f.get("unit") or UNITS.get(name, ""), "all", centres, curve, sd, one, one, labels)
         )
     return {
-        "name": words(name),
+        "name": prose(name),
         "family": str(f.get("family") or ""),
         "what": what,
         "image": image,
         "svg": chart,
         "dof": f.get("dof"),
-        "ratio": number(_finite(f.get("ratio")), 2),
-        "net": number(_finite(f.get("net"))),
+        "ratio": number(as_float(f.get("ratio")), 2),
+        "net": number(as_float(f.get("net"))),
     }
 
 
@@ -1336,7 +1288,7 @@ def _pairs(d: Mapping) -> dict | None:
         return None
     return {
         "names": [names[i] for i in keep],
-        "rows": [[percent(_finite(matrix[i][j]), 2) if i != j else "" for j in keep] for i in keep],
+        "rows": [[percent(as_float(matrix[i][j]), 2) if i != j else "" for j in keep] for i in keep],
     }
 
 
@@ -1354,32 +1306,25 @@ def _advice(d: Mapping) -> list[dict]:
         rows.append(
             {
                 "kind": kind,
-                "shot": words(a["shot"]),
+                "shot": prose(a["shot"]),
                 "pair": f"{p['effect']} / {p['rival']}",
                 "first": a["family"] != "together",
-                "before": number(_finite(p["before"]), 3),
-                "after": number(_finite(p["after"]), 3),
-                "correct": f"{_finite(p['correct_before']):.2f} → {_finite(p['correct_after']):.2f}",
+                "before": number(as_float(p["before"]), 3),
+                "after": number(as_float(p["after"]), 3),
+                "correct": f"{as_float(p['correct_before']):.2f} → {as_float(p['correct_after']):.2f}",
                 "share": ""
-                if math.isnan(after := _finite(p.get("share_after")))
-                else f"{percent(_finite(p['share_before']))} → {percent(after)}",
-                "brings": ", ".join(words(n) for n in a.get("nuisances") or ()),
+                if math.isnan(after := as_float(p.get("share_after")))
+                else f"{percent(as_float(p['share_before']))} → {percent(after)}",
+                "brings": ", ".join(prose(n) for n in a.get("nuisances") or ()),
             }
         )
     return sorted(rows, key=lambda r: r["first"])
 
 
-def words(text) -> str:
-    """Plain text of a terminal as it is printed: +- and minus signs, underscores in names."""
+def prose(text) -> str:
+    """Text made for a terminal, typeset for the page: ± for +-, arrows, χ²."""
     return str(text or "").replace("+-", "±").replace(" -> ", " → ").replace("chi2", "χ²")
 
 
 def _key(name: str) -> str:
     return "".join(c if c.isalnum() else "-" for c in name.lower())
-
-
-def _finite(value) -> float:
-    try:
-        return math.nan if value is None else float(value)
-    except (TypeError, ValueError):
-        return math.nan

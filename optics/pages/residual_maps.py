@@ -22,7 +22,7 @@ import numpy as np
 
 from optics.fit.compare import Comparison
 from optics.pages.report import DIVERGING, SEQUENTIAL, SIDE_MIN, coloured, combined, fixed, number, percent, step_name
-from optics.study.record import Shown
+from optics.study.shown import Shown
 
 CELLS = 16  # of a regional map along the longer side
 COMPONENTS = 3

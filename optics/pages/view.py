@@ -29,11 +29,13 @@ import numpy as np
 
 from optics.captures import capture_set as capture_files
 from optics.errors import UnknownKey
-from optics.fit import calibrate
+from optics.fit import calibrate, descent
 from optics.fit.compare import led_label
+from optics.fit.model import value_of
 from optics.pages.report import DIVERGING, MASKED, SIGMA_RANGE, colour_bar, ramp
 from optics.scene.parameter import Values, Variable
 from optics.study import loop
+from optics.study.setup import effect_variables
 from optics.words import spaced
 
 HOST = "127.0.0.1"
@@ -135,7 +137,7 @@ class View:
         self.clashes = {key: sorted(keys & taken) for key, keys in own.items() if key not in added and keys & taken}
         for key, e in self.effects.items():
             if key not in added and key not in self.clashes:
-                for v in loop.effect_variables(self.model, e):
+                for v in effect_variables(self.model, e):
                     self._slide(v, None, key)
         self.added, self._sought = added, set(added)
         self.comparison = self.study.comparison(self.step["index"])
@@ -143,7 +145,7 @@ class View:
     def _slide(self, variable: Variable, sd: float | None, effect: str) -> None:
         self.sliders[variable.name] = Slider(
             variable,
-            calibrate.start_of(self.model, variable, self.values),
+            value_of(self.model, self.values, variable),
             math.nan if sd is None else float(sd),
             effect,
         )
@@ -155,9 +157,9 @@ class View:
         """Everything but images: frames, sliders, effects, and how the study's own numbers stand."""
         rows = {row.scope["frame"]: row for row in self.comparison.by("frame")}
         return {
-            "title": self.study.record["title"] or Path(self.study.folder).resolve().name,
+            "title": self.study.ladder["title"] or Path(self.study.folder).resolve().name,
             "folder": str(self.study.folder),
-            "scene": Path(self.study.record["scene"]).stem,
+            "scene": Path(self.study.ladder["scene"]).stem,
             "step": self.step["index"],
             "steps": [s["name"] for s in self.study.steps],
             "shape": list(self.model.shape) if self.model.captures.table is None else None,
@@ -392,7 +394,7 @@ class View:
             return np.array([p.per_coordinate(v) if v or not p.squared else math.inf for p, v in zip(parameters, of)])
 
         k = len(sliders)  # a prior is one more measured value, linear in u like the images
-        pull, curvature, prior = calibrate.prior_terms(self.model, [s.variable for s in sliders], self.moved(there))
+        pull, curvature, prior = descent.prior_terms(self.model, [s.variable for s in sliders], self.moved(there))
         slope = np.nan_to_num(slopes([there.get(name, s.value) for name, s in zip(names, sliders)]), posinf=0.0)
         a[:k, :k] += np.diag(slope**2 * curvature)
         b[:k] += slope * pull
@@ -405,12 +407,12 @@ class View:
         low, high = (np.array([p.coordinate(p.bounds[side]) for p in parameters[:k]]) for side in (0, 1))
         held = x.copy()
         held[:k] = 0
-        free = calibrate.solve(a[:k, :k], (b - a @ held)[:k], low - at[:k], high - at[:k])
+        free = descent.solve(a[:k, :k], (b - a @ held)[:k], low - at[:k], high - at[:k])
         found = held.copy()
         found[:k] = free
         estimate = [float(np.clip(p.at_coordinate(u), *p.bounds)) for p, u in zip(parameters, (at + found)[:k])]
         with np.errstate(invalid="ignore"):
-            sd = np.sqrt(np.maximum(np.diag(calibrate.covariance_of(a[:k, :k])), 0)) * slopes(estimate)
+            sd = np.sqrt(np.maximum(np.diag(descent.covariance_of(a[:k, :k])), 0)) * slopes(estimate)
         return {
             "values": dict(zip(names[:k], estimate)),
             "sd": dict(zip(names[:k], sd.tolist())),

@@ -14,9 +14,11 @@ from pathlib import Path
 
 import numpy as np
 
-from optics.diagnosis.evidence import value_of
-from optics.diagnosis.verdict import CLEAR, Diagnosis, Row, close
+from optics.diagnosis.result import Diagnosis, Row
+from optics.diagnosis.thresholds import CLEAR, close
+from optics.files.output import write_text
 from optics.fit.compare import plain
+from optics.fit.model import value_of
 from optics.proof.cells import Cell
 from optics.study import loop
 
@@ -140,9 +142,7 @@ def take_up(file: Path) -> dict | None:
 
 def keep(file: Path, record: dict) -> None:
     """Write a record whole or not at all."""
-    temporary = file.with_suffix(".part")
-    temporary.write_text(json.dumps(_finite(record), indent=1, allow_nan=False), encoding="utf-8")
-    temporary.rename(file)
+    write_text(file, json.dumps(_finite(record), indent=1, allow_nan=False))
 
 
 def _finite(value):

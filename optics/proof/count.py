@@ -19,7 +19,7 @@ from dataclasses import asdict, dataclass, field
 
 import numpy as np
 
-from optics.diagnosis.verdict import CLEAR, LEVEL
+from optics.diagnosis.thresholds import CLEAR, LEVEL
 
 CLEAN = 0.0
 

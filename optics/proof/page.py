@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import io
 import json
-import os
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
+from optics.files.output import write_text
 from optics.proof.count import Count, Rate, _last, named
 
 INK, GOOD, BAD, SOFT = "#26323c", "#1d5fa6", "#b22f33", "#d9b36c"
@@ -59,9 +59,7 @@ def write(found: Count, records: Sequence[dict], file: Path) -> Path:
         tables=[("all", found), *(found.rigs.items() if len(found.rigs) > 1 else [])],
     )
     for path, text in ((file, html), (file.with_name("proof.json"), json.dumps(found.json(), indent=1))):
-        temporary = path.with_suffix(".part")
-        temporary.write_text(text, encoding="utf-8")
-        os.replace(temporary, path)
+        write_text(path, text)
     return file
 
 

@@ -89,7 +89,7 @@ class Part:
     polarizes: bool = False
     random: Callable | None = None
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if not self.role:
             object.__setattr__(self, "role", self.kind)
 

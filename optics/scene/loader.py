@@ -15,6 +15,7 @@ from pathlib import Path
 
 from optics.errors import BadScene, UnknownKey
 from optics.files.output import shipped
+from optics.scene import showing
 from optics.scene.declare import Effect, Part
 from optics.scene.mitsuba_parts import DEFAULT_VARIANT, Declared, is_part, loading, move, use_variant
 from optics.scene.parameter import Parameter, Variable
@@ -187,6 +188,13 @@ class Scene:
     def values(self) -> dict[str, float | str]:
         """The present value of every parameter."""
         return dict(self._now)
+
+    def records(self) -> list[dict]:
+        """One record per parameter (optics.scene.showing.records)."""
+        return showing.records(self)
+
+    def _repr_html_(self) -> str:
+        return showing.html(self)
 
     def _read(self) -> dict[str, float | str]:
         now = {}

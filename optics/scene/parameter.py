@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 from optics.errors import OutOfBounds, UnknownKey
 from optics.words import spaced
@@ -58,7 +59,7 @@ class Parameter:
     choices: tuple[str, ...] = ()
     files: tuple[str, ...] = ()
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if self.how not in HOW:
             raise ValueError(f"parameter {self.name}: how = {self.how!r} is none of {', '.join(HOW)}")
         if not self.choices and not self.bounds[0] <= float(self.default) <= self.bounds[1]:
@@ -115,7 +116,7 @@ class Parameter:
         step = self.step * self.plausible
         return max(value - step, self.bounds[0]), min(value + step, self.bounds[1])
 
-    def check(self, value, key: str, where: str = ""):
+    def check(self, value: Any, key: str, where: str = "") -> Any:
         """Return the value in its own type, or raise: not a number, not finite, out of bounds, not a choice."""
         if self.choices:
             if value not in self.choices and not (self.files and str(value).endswith(self.files)):
@@ -169,19 +170,12 @@ class Variable:
 class Values:
     """Values of parameters by key, for all frames and, above those, for single frames."""
 
-    common: dict[str, float] = field(default_factory=dict)
-    frame: dict[int, dict[str, float]] = field(default_factory=dict)
+    common: dict[str, Any] = field(default_factory=dict)  # numbers, and words of choices
+    frame: dict[int, dict[str, Any]] = field(default_factory=dict)
 
-    def at(self, frame: int, base: Mapping[str, float] | None = None) -> dict[str, float]:
+    def at(self, frame: int, base: Mapping[str, Any] | None = None) -> dict[str, Any]:
         """base <- common <- this frame's own."""
         return {**(base or {}), **self.common, **self.frame.get(frame, {})}
-
-    def get(self, variable: Variable, base: Mapping[str, float]) -> float:
-        if variable.frames is not None:
-            own = self.frame.get(variable.frames[0], {})
-            if variable.keys[0] in own:
-                return float(own[variable.keys[0]])
-        return float(self.common.get(variable.keys[0], base[variable.keys[0]]))
 
     def put(self, variable: Variable, value: float) -> None:
         if variable.frames is None:

@@ -43,7 +43,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 from optics.captures.noise import Noise
 from optics.errors import OutOfBounds, OutputExists, UnknownKey
 from optics.files import toml_checks as checks
-from optics.files.output import check_folder, file_hash, replacing
+from optics.files.output import check_folder, file_hash, replacing, write_text
 from optics.light.rendering import LAYERS, RenderJob
 from optics.scene import loader as scenes
 from optics.scene.mitsuba_parts import DEFAULT_VARIANT
@@ -372,7 +372,7 @@ def _open_folder(folder: Path, identity: Mapping) -> None:
     if folder.exists() and (not folder.is_dir() or any(not p.name.startswith(".") for p in folder.iterdir())):
         raise OutputExists(f"{folder} exists and holds no batch; choose another folder for `out`")
     (folder / "images").mkdir(parents=True, exist_ok=True)
-    _write_text(note, json.dumps(identity, indent=1, sort_keys=True) + "\n")
+    write_text(note, json.dumps(identity, indent=1, sort_keys=True) + "\n")
 
 
 def _changes(before, now, name: str = "") -> list[str]:
@@ -383,11 +383,6 @@ def _changes(before, now, name: str = "") -> list[str]:
             for c in _changes(before.get(key), now.get(key), f"{name}.{key}" if name else str(key))
         ]
     return [] if before == now else [name]
-
-
-def _write_text(path: Path, text: str) -> None:
-    with replacing(path) as file:
-        file.write_text(text, encoding="utf-8")
 
 
 @contextmanager
@@ -456,8 +451,8 @@ def _finish(folder: Path, job: Job) -> bool:
     for index in sorted(records):
         values = {**job.parameters, **records[index]["sample"]}
         writer.writerow([index, *(values[k] for k in keys), *(records[index]["files"][r]["file"] for r in roles)])
-    _write_text(folder / "manifest.jsonl", _text(records))
-    _write_text(folder / "manifest.csv", out.getvalue())
+    write_text(folder / "manifest.jsonl", _text(records))
+    write_text(folder / "manifest.csv", out.getvalue())
     for part in folder.glob("manifest-*-of-*.jsonl"):
         part.unlink(missing_ok=True)
     return True
@@ -541,7 +536,7 @@ def _remaining(folder: Path, shard: tuple[int, int], own: Sequence[int], progres
     for manifest in folder.glob("manifest*.jsonl") if bad else [_manifest(folder, shard)]:
         lines = {i: r for i, r in _lines(manifest).items() if i not in bad}
         if manifest.is_file() and manifest.read_text(encoding="utf-8") != _text(lines):
-            _write_text(manifest, _text(lines))
+            write_text(manifest, _text(lines))
     if bad:
         (folder / "manifest.csv").unlink(missing_ok=True)
     return [i for i in own if i not in known or i in bad]

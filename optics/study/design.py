@@ -20,6 +20,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -30,10 +31,12 @@ from optics.diagnosis import advice as advise
 from optics.diagnosis import statistics as st
 from optics.diagnosis.advice import keys_named
 from optics.diagnosis.evidence import Candidate, Evidence, Progress, measure
-from optics.diagnosis.verdict import CLEAR, LEVEL
-from optics.errors import BadScene, OutputExists, Underdetermined
-from optics.files.output import shipped
+from optics.diagnosis.thresholds import CLEAR, LEVEL
+from optics.errors import BadScene, Underdetermined
+from optics.files.output import new_folder, shipped
+from optics.scene.loader import Scene
 from optics.scene.parameter import Parameter, Values
+from optics.study.setup import Setup, effect_variables, variables_of_base
 from optics.words import spaced, table
 
 SHARE = 0.1  # of the plausible strength
@@ -134,7 +137,7 @@ class Plan:
             + f"every effect at {self.share:g} of its plausible strength",
             "",
         ]
-        rows = [
+        rows: list[tuple[str, ...]] = [
             ("", "group", "frame", "mean P(correct)"),
             *((str(i + 1), f.group, f.words, f"{w:.3f}") for i, (f, w) in enumerate(zip(self.frames, self.worth))),
         ]
@@ -222,7 +225,7 @@ def _places(parameters: dict[str, Parameter], base: dict) -> list[tuple[str, str
         wide = [0.3 * float(base.get(f"{gel}.{side}", 8.0)) for side in ("width", "length")]
         normal = 0.12 * float(base.get(f"{gel}.thickness", 4.0))
         spots = [(0.0, 0.0), *advise.places(np.zeros((1, 2)), np.array(wide), 5)]
-        found = []
+        found: list[tuple[str, str, dict]] = []
         for i, (x, y) in enumerate(spots):
             for to in (normal, 2 * normal) if i < 3 else (normal,):
                 found.append(
@@ -292,13 +295,13 @@ def _sweeps(parameters: dict, base: dict, lights: Sequence[str], exposures: Sequ
 
 
 def plan(
-    scene,
+    scene: Scene,
     frames: int,
     effects: Sequence | None = None,
     *,
     noise: Noise = NOISE,
     values: Values | None = None,
-    setup=None,
+    setup: Setup | None = None,
     added: Sequence = (),
     share: float = SHARE,
     fixed_exposure: bool = False,
@@ -308,7 +311,7 @@ def plan(
     """Choose `frames` frames of a scene (optics.scene.loader.Scene) that keep its effects apart.
 
     effects   that may be missing; None: all that the scene can express
-    values    of a calibration, in place of the scene's own; setup: what it solves for (optics.study.loop.Setup), added:
+    values    of a calibration, in place of the scene's own; setup: what it solves for (optics.study.setup.Setup), added:
               effects that it has
     share     of the plausible strength, at which effects are told apart
     fixed_exposure   leave the exposure as the scene has it
@@ -317,8 +320,7 @@ def plan(
     """
     from scipy.special import ndtr
 
-    from optics.fit.model import Model
-    from optics.study import loop
+    from optics.fit.scene_model import SceneModel
 
     say = progress or (lambda what, done, total: None)
     _require(frames, share)
@@ -338,15 +340,16 @@ def plan(
             raise BadScene(
                 f"{scene.path}: the scene cannot express the effect '{e.name}'; it can: {', '.join(k.key for k in known)}"
             )
-    setup = setup or loop.Setup(captures="")
+    setup = setup or Setup(captures="")
     values = Values() if values is None else Values(dict(values.common))
     base = {**scene.values(), **values.common}
     pool = candidates(scene.parameters, base, swept, fixed_exposure)
-    channels = 1 if len(scene.integrator.bands or (0,)) == 1 else 3
+    bands = scene.integrator.bands if scene.integrator is not None else ()
+    channels = 1 if len(bands or (0,)) == 1 else 3
     blank = np.zeros((height, width, channels), np.float32)
-    first = Frame("first", blank, parameters=pool[0].readings[0], file="design")
+    first = Frame("first", blank, parameters=dict(pool[0].readings[0]), file="design")
     table = Table("readings.csv", ["reading"]) if swept else None
-    model = Model(scene, Captures(Path("."), str(scene.path), [first], noise=noise, table=table), noise)
+    model = SceneModel(scene, Captures(Path("."), str(scene.path), [first], noise=noise, table=table), noise)
     model.frames = []
     model = model.imagine(
         [
@@ -371,12 +374,12 @@ def plan(
     }  # where nobody has to find a place
     solved = [
         v
-        for v in loop.variables_of_base(model, setup, range(len(pool)))
+        for v in variables_of_base(model, setup, range(len(pool)))
         if v.frames is None or not (advise.is_place(model, v.keys[0]) and untouched.issuperset(v.frames))
     ]
-    solved += [v for e in added for v in loop.effect_variables(model, e)]
+    solved += [v for e in added for v in effect_variables(model, e)]
     taken = {key for v in solved for key in v.keys}
-    members = [Candidate.at(model, values, e, loop.effect_variables(model, e)) for e in effects or known]
+    members = [Candidate.at(model, values, e, effect_variables(model, e)) for e in effects or known]
     members = [c for c in members if not any(k in taken for v in c.variables for k in v.keys)]
     if not members:
         raise Underdetermined(
@@ -398,7 +401,8 @@ def plan(
         every = np.concatenate([gaps[np.isfinite(gaps)], alone])
         return float(np.mean(ndtr(np.sqrt(np.maximum(every, 0.0)) / 2)))
 
-    chosen, path = [], []
+    chosen: list[int] = []
+    path: list[float] = []
     for n in range(frames):
         say("choosing frames", n, frames)
         seen_places = {places[s] for s in chosen}
@@ -450,10 +454,11 @@ def session(
     file = scenes.find(subject)
     text, defines = file.read_text(encoding="utf-8"), dict(defines or {})
     sizes = {n: re.search(rf'<default name="{n}" value="(\d+)"', text) for n in ("width", "height")}
-    if all(sizes.values()) and "$width" in text and "$height" in text and not {"width", "height"} & set(defines):
-        longest = max(int(m[1]) for m in sizes.values())
+    usual = {n: int(m[1]) for n, m in sizes.items() if m is not None}
+    if len(usual) == 2 and "$width" in text and "$height" in text and not set(usual) & set(defines):
+        longest = max(usual.values())
         if longest > LONG_SIDE:
-            defines |= {n: str(max(round(int(m[1]) * LONG_SIDE / longest), 1)) for n, m in sizes.items()}
+            defines |= {n: str(max(round(size * LONG_SIDE / longest), 1)) for n, size in usual.items()}
     scene = scenes.load(file, defines, plugins=plugins)
     chosen = [scene.registry.find_effect(name) for name in effects]
     return plan(
@@ -476,7 +481,7 @@ def _require(frames: int, share: float) -> None:
         raise ValueError(f"design: strength of {share:g} plausible sizes; allowed: > 0, finite")
 
 
-def _expose(model, values: Values, pool: list[Choice], base: dict, say: Progress) -> list[Choice]:
+def _expose(model: Any, values: Values, pool: list[Choice], base: dict, say: Progress) -> list[Choice]:
     """Turn factors of the exposure into exposures that fill the camera's range, and put predictions in place of images.
 
     One exposure per light, the same at all places: what a session can do.
@@ -504,7 +509,7 @@ def _expose(model, values: Values, pool: list[Choice], base: dict, say: Progress
     return found
 
 
-def _brighter(model, values: Values, frame: int) -> float:
+def _brighter(model: Any, values: Values, frame: int) -> float:
     """Factor on a frame's exposure at which its brightest half per cent stands at FULL of full scale; 1 in the dark."""
     signal = model.predict(values, [frame])[0] - model.noise.black_level
     bright = float(np.quantile(signal, 0.995))
@@ -559,7 +564,18 @@ def _onset(c: Candidate, squares: np.ndarray) -> tuple[str, int]:
     return "secant", 1 if any(v.parameter.squared for v in c.variables) else 2
 
 
-def _report(scene, frames, path, seen, chosen, members, share, noise, count, unseen) -> Plan:
+def _report(
+    scene: Scene,
+    frames: Any,
+    path: Any,
+    seen: Any,
+    chosen: Any,
+    members: Any,
+    share: float,
+    noise: Noise,
+    count: int,
+    unseen: Any,
+) -> Plan:
     gaps, alone = seen.falls(chosen)
     information, rest = seen.information(chosen)
     names = [m.name for m in seen.members]
@@ -628,12 +644,10 @@ def _report(scene, frames, path, seen, chosen, members, share, noise, count, uns
 
 
 def write(planned: Plan, folder: str | Path) -> Path:
-    """A folder with a captures.toml that names the frames to take, and no image yet. Raises OutputExists."""
+    """Write a folder with a captures.toml that lists the frames to take, without images. Raises OutputExists."""
     import tomlkit
 
     folder = Path(os.path.abspath(folder))
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise OutputExists(f"{folder} exists and is not empty; choose another folder")
     document = tomlkit.document()
     # not captures.MARK: once its images are in, the folder is a measured set, which no writing of captures may replace
     document.add(
@@ -657,12 +671,11 @@ def write(planned: Plan, folder: str | Path) -> Path:
                 table["group"] = f.group
             table["parameters"] = {k: float(v) for k, v in f.settings.items()}
             tables.append(table)
-    folder.mkdir(parents=True, exist_ok=True)
-    if planned.size == (1, 1):
-        readings.write(
-            folder / "readings.csv", [(own, [""]) for f in planned.frames for own in f.readings], ["reading"]
-        )
-    else:
-        (folder / "frames").mkdir(exist_ok=True)
-    (folder / FILE).write_text(tomlkit.dumps(document), encoding="utf-8")
+    with new_folder(folder) as new:
+        if planned.size == (1, 1):
+            rows: list[Any] = [(own, [""]) for f in planned.frames for own in f.readings]
+            readings.write(new / "readings.csv", rows, ["reading"])
+        else:
+            (new / "frames").mkdir()
+        (new / FILE).write_text(tomlkit.dumps(document), encoding="utf-8")
     return folder

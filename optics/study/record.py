@@ -1,17 +1,18 @@
-"""The record of a study: base model, + effect, + effect, each with its fit, its errors, its diagnosis and its images.
+"""The record of a study on disk: base model, + effect, + effect, each with its fit, errors, diagnosis and images.
 
-A study is a folder that a later run, a report or a reader without this program can use:
+A study is a folder that a later run, a report, or a reader without this program can use:
 
     STUDY/ladder.json                  inputs by hash, versions, seed, command, noise, and the list of steps
     STUDY/steps/00-base/step.json      the same entry as in ladder.json, which can be rebuilt from these
                         fit.toml       [parameters] to lay over the scene again, [uncertainty], [frames.NAME]
-                        metrics.json   optics.fit.compare, and null models where given
-                        diagnosis.json optics.diagnosis.diagnose
-                        images/*.npz   measured, predicted, sd, usable of the frames shown, and of a sweep of readings
-                                       the settings of each; fingerprints; maps
+                        metrics.json   optics.fit.compare, and null models where there are any
+                        diagnosis.json optics.diagnosis
+                        images/*.npz   measured, predicted, sd, usable of the frames shown, and the settings of a sweep of
+                                       readings; fingerprints; maps
     STUDY/steps/01-lens-vignetting/...
 
-A step is written beside its place and renamed into it, so it is whole or absent; nothing is ever overwritten.
+A step is written beside its place and renamed into it, so it is whole or absent. Nothing is ever overwritten, but for a
+diagnosis that is made again.
 """
 
 from __future__ import annotations
@@ -20,73 +21,36 @@ import contextlib
 import dataclasses
 import json
 import math
-import os
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from datetime import datetime, timezone
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from optics import words
+from optics.diagnosis.result import Diagnosis
 from optics.errors import BadCapture, OutputExists
-from optics.files.output import file_hash, input_hashes, versions
-from optics.fit.compare import Comparison, Row, led_label, plain
+from optics.files.output import file_hash, input_hashes, new_folder, replacing, versions, write_text
+from optics.fit.compare import Comparison, Row, plain
+from optics.fit.result import Fit
+from optics.study.fit_files import fit_record, fit_toml, read_fit
+from optics.study.shown import Fingerprint, Shown
 
 FORMAT = 1
-SHOWN_MAX = 8
-PACKAGES = ("mitsuba", "drjit", "numpy", "scipy", "scikit-image")
-CORRELATION_SHOWN = 0.9
+SHOWN_MAX = 8  # frames whose images a step keeps
 SETTING = "setting "  # begins the names of a sweep's settings in its file
 
 
-@dataclass(frozen=True)
-class Shown:
-    """A frame for the eye: (H, W, C) DN measured, predicted and sd, bool usable, and what was lit and pressed.
+class Record:
+    """A study on disk. `create` or `open` it; `add_step` appends a step; everything else reads.
 
-    settings  of a sweep of point readings, (N, 1, C): (N,) what was set at each, by parameter key; units: of these keys
+    ladder   the content of ladder.json; steps: its list of steps
     """
 
-    name: str
-    measured: np.ndarray
-    predicted: np.ndarray
-    sd: np.ndarray
-    usable: np.ndarray
-    led: str = ""
-    group: str = ""
-    held_out: bool = False
-    settings: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
-    units: Mapping[str, str] = dataclasses.field(default_factory=dict)
-
-    @property
-    def residual(self) -> np.ndarray:
-        """(H, W, C) measured minus predicted in sigmas, NaN where not usable."""
-        good = np.broadcast_to(self.usable if self.usable.ndim == 3 else self.usable[..., None], self.measured.shape)
-        good = good & (self.sd > 0)
-        return np.where(good, (self.measured - self.predicted) / np.where(good, self.sd, 1.0), np.nan)
-
-
-@dataclass(frozen=True)
-class Fingerprint:
-    """What an effect would add to a frame, and the residual that it is to explain; both (H, W, C) in sigmas.
-
-    image   what the calibration absorbs is taken out: a refit's change of the image (`fingerprints_of`), or strength *
-            projected derivative image
-    """
-
-    effect: str
-    frame: str
-    image: np.ndarray
-    residual: np.ndarray
-    strength: float = math.nan
-
-
-class Study:
-    """A ladder on disk. `create` or `open` it; `add_step` appends; everything else reads."""
-
-    def __init__(self, folder: Path, record: dict):
-        self.folder, self.record = Path(folder), record
+    def __init__(self, folder: Path, ladder: dict[str, Any]):
+        self.folder, self.ladder = Path(folder), ladder
 
     # -- life -------------------------------------------------------------------------------------------------------
 
@@ -101,13 +65,13 @@ class Study:
         seed: int = 0,
         command: Sequence[str] = (),
         title: str = "",
-        noise=None,
+        noise: Any = None,
         warnings: Sequence[str] = (),
         facts: Mapping | None = None,
         noise_floor: float = 1.0,
         noise_floor_source: str = "noise model",
         resume: bool = False,
-    ) -> Study:
+    ) -> Record:
         """Start a study in a folder that does not exist yet, or is empty.
 
         inputs       files and folders that the result depends on; each file is recorded by SHA-256
@@ -125,7 +89,7 @@ class Study:
                     f"{folder} holds a study already; choose another folder, or go on with it (--resume)"
                 )
             study = cls.open(folder, empty=True)
-            old = study.record
+            old = study.ladder
             changed = [k for k, new in (("scene", scene), ("seed", seed)) if old[k] != new]
             changed += sorted(k for k in hashes.keys() | old["inputs"].keys() if hashes.get(k) != old["inputs"].get(k))
             if changed:
@@ -161,16 +125,17 @@ class Study:
         return study
 
     @classmethod
-    def open(cls, folder: str | Path, empty: bool = False) -> Study:
-        """Read a study; steps that were written whole but not yet listed are taken in.
+    def open(cls, folder: str | Path, empty: bool = False) -> Record:
+        """Read a study. Steps that were written whole but not yet listed are included.
 
-        Raises FileNotFoundError without a ladder.json, ValueError when it cannot be read, or has no step and may not be
+        Raises FileNotFoundError without a ladder.json, ValueError where it cannot be read, or has no step and may not be
         `empty`."""
         folder = Path(folder)
         file = folder / "ladder.json"
         if not file.is_file():
             raise FileNotFoundError(
-                f"{folder} is no study: it has no ladder.json; name the folder that `optics calibrate CAPTURES -o STUDY` wrote"
+                f"{folder} is no study: it has no ladder.json; name the folder that `optics calibrate CAPTURES -o STUDY` "
+                "wrote"
             )
         try:
             record = json.loads(file.read_text(encoding="utf-8"))
@@ -191,8 +156,8 @@ class Study:
             record["shown"] = [f["name"] for f in record["steps"][0]["frames"]]
         if not record["steps"] and not empty:
             raise ValueError(
-                f"{folder}: the study has no step yet, its calibration was cut off; `optics calibrate {record['captures']} -o "
-                f"{folder} --resume` finishes it"
+                f"{folder}: the study has no step yet, its calibration was cut off; "
+                f"`optics calibrate {record['captures']} -o {folder} --resume` finishes it"
             )
         return cls(folder, record)
 
@@ -206,21 +171,21 @@ class Study:
 
     @property
     def steps(self) -> list[dict]:
-        return self.record["steps"]
+        return self.ladder["steps"]
 
     def has(self, effect: str | None) -> bool:
         return any(step["effect"] == effect for step in self.steps)
 
     def note_inputs(self, files: Sequence[str | Path]) -> None:
         """Record files that the next steps depend on besides the inputs that the study began with."""
-        self.record["inputs"] = {**input_hashes(files), **self.record["inputs"]}
+        self.ladder["inputs"] = {**input_hashes(files), **self.ladder["inputs"]}
         self._save()
 
     def changed_inputs(self) -> list[str]:
         """Input files that are gone or differ from the recorded hash."""
         return [
             path
-            for path, digest in self.record["inputs"].items()
+            for path, digest in self.ladder["inputs"].items()
             if not Path(path).is_file() or file_hash(Path(path)) != digest
         ]
 
@@ -230,9 +195,9 @@ class Study:
         self,
         name: str,
         effect: str | None,
-        fit,
+        fit: Fit | Mapping,
         comparison: Comparison,
-        diagnosis=None,
+        diagnosis: Diagnosis | Mapping | None = None,
         frames: Sequence[Shown] = (),
         fingerprints: Sequence[Fingerprint] = (),
         *,
@@ -245,9 +210,9 @@ class Study:
 
         name         as in a sentence: "base", "lens vignetting"; the folder becomes NN-lens-vignetting
         effect       key of the effect that was added; None for the base
-        fit          optics.fit.calibrate.Fit, or what `fit_record` makes of one
+        fit          optics.fit.Fit, or what `fit_record` makes of one
         comparison   of all frames, with held_out given where there are any
-        diagnosis    optics.diagnosis.diagnose.Diagnosis, or its dictionary
+        diagnosis    a Diagnosis, or its dictionary
         frames       all frames or some; at most 8 are kept: the worst of the first step, the same ones in every later
                      step, and at least one held-out frame where there is one; of sweeps of readings, every one
         nulls        optics.fit.null_models.NullTable.json(): errors of models without physics
@@ -259,10 +224,10 @@ class Study:
             raise OutputExists(f"{self.folder}: '{name}' has a step already; start another study to add it differently")
         index = len(self.steps)
         folder = f"{index:02d}-{_slug(name)}"
-        if not self.record["shown"]:
-            self.record["shown"] = _choose(frames, comparison)
-        kept = {f.name: f for f in frames}
-        kept = [kept[n] for n in self.record["shown"] if n in kept]
+        if not self.ladder["shown"]:
+            self.ladder["shown"] = _choose(frames, comparison)
+        given = {f.name: f for f in frames}
+        kept = [given[n] for n in self.ladder["shown"] if n in given]
         record = fit_record(fit, [f["frame"] for f in comparison.frames])
         diagnosis = _as_dict(diagnosis)
         entry = {
@@ -275,34 +240,16 @@ class Study:
             "fitted": _level(comparison.fitted),
             "held_out": _level(comparison.held_out),
             "total": _level(comparison.total),
-            "converged": record["converged"],
-            "reason": record["reason"],
-            "variables": record["variables"],
-            "correlations": record["correlations"],
+            **{key: record[key] for key in ("converged", "reason", "variables", "correlations")},
             "warnings": [*record["warnings"], *warnings],
-            "frames": [
-                {
-                    "file": f"images/frame-{i:02d}.npz",
-                    "name": f.name,
-                    "led": f.led,
-                    "group": f.group,
-                    "held_out": bool(f.held_out),
-                    **({"units": dict(f.units)} if f.settings else {}),
-                }
-                for i, f in enumerate(kept)
-            ],
-            "fingerprints": [
-                {
-                    "file": f"images/fingerprint-{i:02d}.npz",
-                    "effect": f.effect,
-                    "frame": f.frame,
-                    "strength": float(f.strength),
-                }
-                for i, f in enumerate(fingerprints)
-            ],
+            "frames": [_frame_entry(i, f) for i, f in enumerate(kept)],
+            "fingerprints": [_fingerprint_entry(i, f) for i, f in enumerate(fingerprints)],
         }
         entry = json.loads(_dumps(entry))
-        with self._new_folder(folder) as new:
+        path = self.folder / "steps" / folder
+        if path.exists():
+            raise OutputExists(f"{path} exists; open the study again to go on after its last step")
+        with new_folder(path) as new:
             (new / "images").mkdir()
             (new / "fit.toml").write_text(fit_toml(record, name), encoding="utf-8")
             (new / "metrics.json").write_text(
@@ -310,67 +257,33 @@ class Study:
             )
             if diagnosis is not None:
                 (new / "diagnosis.json").write_text(_dumps(diagnosis), encoding="utf-8")
-            for item, f in zip(entry["frames"], kept):
-                shape = np.shape(f.measured)
-                use = np.asarray(f.usable, bool)
-                use = np.broadcast_to(use[..., None] if use.ndim < len(shape) else use, shape)
-                np.savez_compressed(
-                    new / item["file"],
-                    measured=_single(f.measured),
-                    predicted=_single(f.predicted),
-                    sd=_single(np.broadcast_to(f.sd, shape)),
-                    usable=use,
-                    **{SETTING + key: np.asarray(value) for key, value in f.settings.items()},
-                )
-            for item, f in zip(entry["fingerprints"], fingerprints):
-                np.savez_compressed(new / item["file"], image=_single(f.image), residual=_single(f.residual))
-            if comparison.rms_map is not None:
+            for item, shown in zip(entry["frames"], kept):
+                _write_frame(new / item["file"], shown)
+            for item, print_ in zip(entry["fingerprints"], fingerprints):
+                np.savez_compressed(new / item["file"], image=_single(print_.image), residual=_single(print_.residual))
+            if comparison.rms_map is not None and comparison.mean_map is not None:
                 np.savez_compressed(new / "images/maps.npz", rms=comparison.rms_map, mean=comparison.mean_map)
             (new / "step.json").write_text(_dumps(entry), encoding="utf-8")
         self.steps.append(entry)
         self._save()
-        return self.folder / "steps" / folder
+        return path
 
-    def put_diagnosis(self, index: int, diagnosis, fingerprints: Sequence[Fingerprint] = ()) -> None:
-        """Add the diagnosis of a recorded step, and what its best effects would explain; a later one replaces it."""
+    def put_diagnosis(
+        self, index: int, diagnosis: Diagnosis | Mapping, fingerprints: Sequence[Fingerprint] = ()
+    ) -> None:
+        """Add a diagnosis to a recorded step, with what its best effects would explain. A later one replaces it."""
         folder, entry = self.path(index), self.steps[index]
-        items = [
-            {
-                "file": f"images/fingerprint-{i:02d}.npz",
-                "effect": f.effect,
-                "frame": f.frame,
-                "strength": float(f.strength),
-            }
-            for i, f in enumerate(fingerprints)
-        ]
+        items = [_fingerprint_entry(i, f) for i, f in enumerate(fingerprints)]
         for item, f in zip(items, fingerprints):
-            with replaced(folder / item["file"]) as new:
-                np.savez_compressed(new, image=_single(f.image), residual=_single(f.residual))
-        with replaced(folder / "diagnosis.json") as new:
-            new.write(_dumps(_as_dict(diagnosis)).encode())
+            with replacing(folder / item["file"]) as file:
+                np.savez_compressed(file, image=_single(f.image), residual=_single(f.residual))
+        write_text(folder / "diagnosis.json", _dumps(_as_dict(diagnosis)))
         entry.update(json.loads(_dumps({"fingerprints": items})))
-        with replaced(folder / "step.json") as new:
-            new.write(_dumps(entry).encode())
+        write_text(folder / "step.json", _dumps(entry))
         self._save()
 
-    @contextlib.contextmanager
-    def _new_folder(self, name: str) -> Iterator[Path]:
-        """A folder to fill, renamed into its place at the end and removed when something fails."""
-        final, temporary = self.folder / "steps" / name, self.folder / "steps" / f".{name}.{os.getpid()}"
-        if final.exists():
-            raise OutputExists(f"{final} exists; open the study again to go on after its last step")
-        shutil.rmtree(temporary, ignore_errors=True)
-        temporary.mkdir(parents=True)
-        try:
-            yield temporary
-            temporary.rename(final)
-        finally:
-            shutil.rmtree(temporary, ignore_errors=True)
-
     def _save(self) -> None:
-        temporary = self.folder / f".ladder.json.{os.getpid()}"
-        temporary.write_text(_dumps(self.record), encoding="utf-8")
-        os.replace(temporary, self.folder / "ladder.json")
+        write_text(self.folder / "ladder.json", _dumps(self.ladder))
 
     # -- reading ----------------------------------------------------------------------------------------------------
 
@@ -441,208 +354,38 @@ class Study:
                     "" if step["converged"] else f"not converged: {step['reason']}",
                 )
             )
-        floor = self.record["noise_floor"]
+        floor = self.ladder["noise_floor"]
         return "\n".join(
             [words.table(lines, left=(0, 6)), f"noise floor: chi2/dof {floor['chi2_per_dof']:.3f} ({floor['source']})"]
         )
 
 
-@contextlib.contextmanager
-def replaced(file: Path) -> Iterator:
-    """A binary file to write beside its place and rename into it at the end."""
-    temporary = file.with_name(f".{file.name}.{os.getpid()}")
-    try:
-        with open(temporary, "wb") as new:
-            yield new
-        os.replace(temporary, file)
-    finally:
-        temporary.unlink(missing_ok=True)
+def _frame_entry(index: int, f: Shown) -> dict[str, Any]:
+    """What a step says of a frame whose images it keeps."""
+    entry = {"file": f"images/frame-{index:02d}.npz", "name": f.name, "led": f.led, "group": f.group}
+    return {**entry, "held_out": bool(f.held_out), **({"units": dict(f.units)} if f.settings else {})}
 
 
-# -- images of a model
-# ---------------------------------------------------------------------------------------------------
+def _fingerprint_entry(index: int, f: Fingerprint) -> dict[str, Any]:
+    file = f"images/fingerprint-{index:02d}.npz"
+    return {"file": file, "effect": f.effect, "frame": f.frame, "strength": float(f.strength)}
 
 
-def shown_frames(model, values, held_out: Sequence[int] = (), frames: Sequence[int] | None = None) -> list[Shown]:
-    """All frames, or the given ones, of an optics.fit.model.Model with its predictions for `values`."""
-    indices = list(range(len(model.frames))) if frames is None else list(frames)
-    out = []
-    for i in indices:
-        f, prediction = model.frames[i], np.asarray(model.predict(values, [i])[0])
-        settings = (
-            {}
-            if model.captures.table is None
-            else {
-                key: np.broadcast_to(np.ravel(value), len(prediction))
-                for key, value in (*f.parameters.items(), *f.readings.items())
-            }
-        )
-        out.append(
-            Shown(
-                f.name,
-                np.asarray(f.image),
-                prediction,
-                np.sqrt(model.variance(values, i, prediction)),
-                model.usable(i),
-                led_label(f.parameters),
-                f.group or "",
-                i in set(held_out),
-                settings,
-                {key: model.parameters[key].unit for key in settings},
-            )
-        )
-    return out
-
-
-def fingerprints_of(model, fit, diagnosis, frame: int, count: int = 4) -> list[Fingerprint]:
-    """What the best effects of a diagnosis change in a frame when they are added and everything is calibrated again.
-
-    image = (prediction of the refit - prediction of the base) / sd, beside residual = (measured - base) / sd: a right
-    effect looks like the residual. Taken from the refits themselves, so it holds where the image is not linear as well.
-    """
-    base = np.asarray(model.predict(fit.values, [frame])[0])
-    use = model.usable(frame)
-    sd = np.sqrt(model.variance(fit.values, frame, base))
-    found = model.frames[frame]
-    residual = np.where(use, (np.asarray(found.image) - base) / sd, np.nan)
-    rows = [r for r in diagnosis.rows if r.name in diagnosis.fits][:count]
-    out = []
-    for row in rows:
-        image = (np.asarray(model.predict(diagnosis.fits[row.name].values, [frame])[0]) - base) / sd
-        strength = row.refit.strength[0] if row.refit is not None and len(row.refit.strength) == 1 else math.nan
-        out.append(Fingerprint(row.name, found.name, np.where(use, image, np.nan), residual, strength))
-    return out
-
-
-# -- fits ---------------------------------------------------------------------------------------------------------------
-
-
-def fit_record(fit, frame_names: Sequence[str] = ()) -> dict:
-    """An optics.fit.calibrate.Fit as plain data; a mapping of that form is completed and returned.
-
-    variables: name, keys, unit, value, sd, frames (names or None), prior, pull = (value - prior mean) / prior sd,
-    neutral, plausible, at_bound. `pull` is against the prior's own sd: it says how far the calibration had to leave it.
-    """
-    blank = {
-        "parameters": {},
-        "frames": {},
-        "variables": [],
-        "correlations": [],
-        "chi2": None,
-        "dof": None,
-        "converged": True,
-        "reason": "",
-        "warnings": [],
+def _write_frame(file: Path, f: Shown) -> None:
+    shape = np.shape(f.measured)
+    use = np.asarray(f.usable, bool)
+    arrays: dict[str, Any] = {
+        "measured": _single(f.measured),
+        "predicted": _single(f.predicted),
+        "sd": _single(np.broadcast_to(f.sd, shape)),
+        "usable": np.broadcast_to(use[..., None] if use.ndim < len(shape) else use, shape),
+        **{SETTING + key: np.asarray(value) for key, value in f.settings.items()},
     }
-    if isinstance(fit, Mapping):
-        return {**blank, **fit}
-
-    def name_of(index: int) -> str:
-        return frame_names[index] if index < len(frame_names) else f"{index:03d}"
-
-    variables = []
-    for v, value, sd in zip(fit.variables, np.asarray(fit.estimate, float), np.asarray(fit.sd, float)):
-        p = v.parameter
-        variables.append(
-            {
-                "name": v.name,
-                "keys": list(v.keys),
-                "unit": p.unit,
-                "value": float(value),
-                "sd": float(sd),
-                "frames": None if v.frames is None else [name_of(i) for i in v.frames],
-                "prior": None if v.prior is None else list(v.prior),
-                "pull": None if v.prior is None else (float(value) - v.prior[0]) / v.prior[1],
-                "neutral": p.neutral,
-                "plausible": p.plausible,
-                "at_bound": v.name in getattr(fit, "at_bound", ()),
-            }
-        )
-    pairs = []
-    if len(variables) > 1:
-        with np.errstate(invalid="ignore"):  # an undetermined variable has an infinite variance
-            r = np.nan_to_num(np.asarray(fit.correlation, float))
-        for i, j in zip(*np.nonzero(np.triu(np.abs(r) > CORRELATION_SHOWN, 1))):
-            pairs.append([variables[i]["name"], variables[j]["name"], float(r[i, j])])
-    return {
-        **blank,
-        "parameters": dict(fit.values.common),
-        "frames": {name_of(i): dict(own) for i, own in sorted(fit.values.frame.items()) if own},
-        "variables": variables,
-        "correlations": sorted(pairs, key=lambda p: -abs(p[2]))[:20],
-        "chi2": float(fit.chi2),
-        "dof": float(fit.dof),
-        "converged": bool(fit.converged),
-        "reason": str(fit.reason),
-        "warnings": list(getattr(fit, "warnings", ()) or ()),
-    }
-
-
-def fit_toml(record: Mapping, name: str = "") -> str:
-    """The values of a fit as TOML that can be laid over a scene again: [parameters] and [frames.NAME], key = value."""
-    import tomlkit
-
-    unit = {key: v["unit"] for v in record["variables"] for key in v["keys"]}
-    document = tomlkit.document()
-    document.add(
-        tomlkit.comment(
-            f"Calibrated values{f' of the step {chr(34)}{name}{chr(34)}' if name else ''}: lay them over "
-            "the scene with --values FILE."
-        )
-    )
-
-    def table(values: Mapping):
-        out = tomlkit.table()
-        for key, value in values.items():
-            out.add(key, value if isinstance(value, (str, bool)) else float(value))
-            if unit.get(key):
-                out[key].comment(unit[key])
-        return out
-
-    def nested(frames: Mapping):
-        out = tomlkit.table(is_super_table=True)
-        for frame, values in frames.items():
-            out.add(frame, table(values))
-        return out
-
-    document.add("parameters", table(record["parameters"]))
-    common = {key: v["sd"] for v in record["variables"] if v["frames"] is None for key in v["keys"]}
-    document.add("uncertainty", table(common))
-    document["uncertainty"].comment("one standard deviation")
-    if record["frames"]:
-        document.add("frames", nested(record["frames"]))
-        own: dict = {}
-        for v in record["variables"]:
-            for frame in v["frames"] or ():
-                own.setdefault(frame, {}).update(dict.fromkeys(v["keys"], v["sd"]))
-        if own:
-            document.add("frames_uncertainty", nested(own))
-    fit = tomlkit.table()
-    for key in ("chi2", "dof", "converged", "reason"):
-        if record[key] is not None:
-            fit.add(key, record[key])
-    document.add("fit", fit)
-    return tomlkit.dumps(document)
-
-
-def read_fit(file: str | Path) -> dict:
-    """fit.toml as plain dictionaries: parameters, uncertainty, frames, frames_uncertainty, fit."""
-    import tomlkit
-
-    data = tomlkit.parse(Path(file).read_text(encoding="utf-8")).unwrap()
-    return {key: data.get(key, {}) for key in ("parameters", "uncertainty", "frames", "frames_uncertainty", "fit")}
-
-
-# -- provenance
-# ---------------------------------------------------------------------------------------------------------
-
-# -- small things
-# -------------------------------------------------------------------------------------------------------
+    np.savez_compressed(file, **arrays)
 
 
 def _choose(frames: Sequence[Shown], comparison: Comparison) -> list[str]:
-    """At most SHOWN_MAX names, worst first, with a held-out one among them where there is one; every sweep of
-    readings."""
+    """Names of the frames to keep: at most SHOWN_MAX, worst first, one of them held out where any is; all sweeps."""
     given = {f.name: f for f in frames}
     if any(f.settings for f in frames):
         return list(given)
@@ -675,10 +418,10 @@ def _level(row: Row | None) -> dict | None:
     }
 
 
-def _as_dict(record) -> dict | None:
+def _as_dict(record: Any) -> dict | None:
     """A mapping, an object with to_dict, or a dataclass, as a dictionary."""
     if record is None or isinstance(record, Mapping):
-        return record
+        return None if record is None else dict(record)
     return record.to_dict() if hasattr(record, "to_dict") else dataclasses.asdict(record)
 
 
@@ -686,11 +429,11 @@ def _format(level: Mapping | None, key: str, form: str) -> str:
     return "-" if level is None or level[key] is None else form.format(level[key])
 
 
-def _dumps(value) -> str:
+def _dumps(value: object) -> str:
     return json.dumps(plain(value), indent=1, allow_nan=False) + "\n"
 
 
-def _single(array) -> np.ndarray:
+def _single(array: object) -> np.ndarray:
     return np.asarray(array, np.float32)
 
 

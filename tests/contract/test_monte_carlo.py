@@ -294,14 +294,14 @@ def test_the_model_differentiates_by_the_renderer(bench, tmp_path, monkeypatch):
     linearity. Faint rays are not thinned, which a difference would draw anew."""
     from optics.captures.capture_set import Captures, Frame
     from optics.captures.noise import Noise
-    from optics.fit.model import Model
+    from optics.fit.scene_model import SceneModel
     from optics.light import transport
     from optics.scene.parameter import Values, Variable
 
     monkeypatch.setattr(transport, "FAINT", 0.0)
     scene, _, values = bench
     frame = Frame("one", np.zeros((*scene.camera.resolution[::-1], 3), np.float32))
-    model = Model(scene, Captures(tmp_path, str(scene.path), [frame], noise=Noise(0.1, 1.0, 0.0, 255.0, 0.0)))
+    model = SceneModel(scene, Captures(tmp_path, str(scene.path), [frame], noise=Noise(0.1, 1.0, 0.0, 255.0, 0.0)))
     now = Values({**values, "camera.exposure": 4000.0})
     keys = ["filling.absorption", "walls.index", "led_red.power"]
     prediction, images = next(iter(model.derivatives(now, [Variable(k, (k,), scene.parameters[k]) for k in keys])))
@@ -323,8 +323,8 @@ def test_a_study_is_told_of_the_error_of_its_predictions(bench, tmp_path):
     """Four times the rays and packets halve it."""
     from optics.captures.capture_set import Captures, Frame
     from optics.captures.noise import Noise
-    from optics.fit.model import Model
-    from optics.study import loop
+    from optics.fit.scene_model import SceneModel
+    from optics.study import checks
 
     scene, _, values = bench
     frame = Frame(
@@ -337,9 +337,9 @@ def test_a_study_is_told_of_the_error_of_its_predictions(bench, tmp_path):
     try:
         for more in (1, 4):
             scene.integrator.rays, scene.integrator.packets = rays * more, packets * more
-            model = Model(scene, Captures(tmp_path, str(scene.path), [frame], noise=Noise(0.1, 0.05, 0.0, 255.0, 0.0)))
+            model = SceneModel(scene, Captures(tmp_path, str(scene.path), [frame], noise=Noise(0.1, 0.05, 0.0, 255.0, 0.0)))
             shares.append(model.chance())
     finally:
         scene.integrator.rays, scene.integrator.packets = rays, packets
-    assert 1.4 < shares[0] / shares[1] < 2.8 and shares[0] > loop.CHANCE
-    assert any("an estimate by Monte Carlo" in text for text in loop._warnings(model)) == (shares[1] > loop.CHANCE)
+    assert 1.4 < shares[0] / shares[1] < 2.8 and shares[0] > checks.CHANCE
+    assert any("an estimate by Monte Carlo" in text for text in checks.of_captures(model)) == (shares[1] > checks.CHANCE)

@@ -781,7 +781,7 @@ def test_derivatives_through_a_bent_response(bench):
 @pytest.mark.parametrize("mode", ["multiplicative", "additive"])
 def test_derivatives_with_a_flat_field(bench, mode):
     """The measured background and the prediction at rest take part in every derivative."""
-    from optics.fit.model import FLAT_FIELDS
+    from optics.fit.scene_model import FLAT_FIELDS
 
     assert mode in FLAT_FIELDS
     height, width = bench.model.shape[:2]
@@ -1352,7 +1352,7 @@ def along(name):
 def drafts(user_bench):
     """A bench with a draft along every coordinate that one can follow, each a gain that is linear in it; LED 1 alone is
     lit."""
-    from optics.diagnosis.verdict import Fingerprint
+    from optics.diagnosis.result import Fingerprint
     from optics.study import draft
 
     texts = {}
@@ -1382,7 +1382,7 @@ def test_drafts_act_along_the_coordinate_that_was_diagnosed(drafts):
     from optics.study import draft
 
     bench = drafts
-    known = {**bench.model.coordinates(bench.at(), 0), **fingerprints.lit_geometry(bench.model, bench.at(), 0)}
+    known = {**bench.model.coordinates(bench.at(), 0), **bench.model.lit_geometry(bench.at(), 0)}
     height, width = bench.model.shape[:2]
     v, u = np.mgrid[:height, :width]
     known.update(row=v, column=u, place=v * 4 // height * 4 + u * 4 // width)

@@ -9,13 +9,15 @@ so exact."""
 from __future__ import annotations
 
 from copy import copy
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 
+from optics.captures.capture_set import Frame
 from optics.captures.noise import Noise
 from optics.diagnosis.statistics import cosines
 from optics.errors import Underdetermined
+from optics.fit.result import Fit
 from optics.scene.declare import Effect
 from optics.scene.parameter import Parameter, Values, Variable
 
@@ -57,29 +59,45 @@ LIBRARY = (
 UNKNOWN = ("stain", "banding", "height_gain", "slope_gain", "red_drift")
 
 
-@dataclass
-class Frame:
-    name: str
-    image: np.ndarray
-    mask: np.ndarray | None = None
-    group: str | None = None
-    parameters: dict = field(default_factory=dict)
-    repeats: list = field(default_factory=list)
-    file: str = ""
-
-
 class Exact:
-    """A model whose predictions have no error of their own."""
+    """A model whose predictions have no error of their own, and no geometry: what the mocks of this folder share."""
 
     monte_carlo = False
+    captures = None
+    driven = None  # what a frame sets is a light's power itself
+
+    @property
+    def size(self) -> float:
+        return float(np.prod(self.shape))
+
+    def at(self, values: Values, index: int) -> dict[str, float]:
+        return {**self.base, **values.common, **self.frames[index].parameters, **values.frame.get(index, {})}
+
+    def linear_in(self, variable: Variable) -> bool:
+        return False
+
+    def usable(self, index: int) -> np.ndarray:
+        return np.ones(self.shape, bool)
+
+    def variance(self, values: Values, index: int, prediction: np.ndarray) -> np.ndarray:
+        return self.noise.variance(prediction)
+
+    def coordinates(self, values: Values, index: int, seed: int = 0) -> dict[str, np.ndarray]:
+        return {}
+
+    def lit_geometry(self, values: Values, index: int) -> dict[str, np.ndarray]:
+        return {}
+
+    def wavelengths(self) -> list[float]:
+        return [0.0] * self.shape[2]
+
+    def part_kind(self, key: str) -> str:
+        return ""
 
     def imagine(self, frames):
         twin = copy(self)
         twin.frames = [*self.frames, *frames]
         return twin
-
-    def variance(self, values, frame, prediction):
-        return self.noise.variance(prediction)
 
 
 class MockModel(Exact):
@@ -96,7 +114,6 @@ class MockModel(Exact):
         self.noise = noise or Noise(system_gain=0.02, dark_noise=1.0, black_level=64.0, saturation=1023.0, prnu=0.0)
         self.shape = (side, side, 3)
         self.unit, self.render_noise = unit or {}, render_noise
-        self.captures = None
         self.kept: dict = {}
         self.parameters: dict[str, Parameter] = {}
         self.base: dict[str, float] = {}
@@ -142,7 +159,8 @@ class MockModel(Exact):
         self.parameters[key], self.base[key] = parameter, float(parameter.default)
 
     def _at(self, values: Values, frame: int) -> dict:
-        now = {**self.base, **values.common, **self.frames[frame].parameters, **values.frame.get(frame, {})}
+        """Every parameter's value in a frame, in the units in which the physics is written."""
+        now = self.at(values, frame)
         return {k: v / self.unit.get(k, self.unit.get(k.split(".")[1], 1.0)) for k, v in now.items()}
 
     # -- the physics
@@ -247,13 +265,13 @@ class MockModel(Exact):
                 images[v.name] = image / u
             yield prediction, images
 
-    def usable(self, frame: int) -> np.ndarray:
-        mask = self.noise.usable(self.frames[frame].image)
-        own = self.frames[frame].mask
+    def usable(self, index: int) -> np.ndarray:
+        mask = self.noise.usable(self.frames[index].image)
+        own = self.frames[index].mask
         return mask if own is None else mask & own[..., None]
 
-    def coordinates(self, values: Values, frame: int, seed: int = 0) -> dict[str, np.ndarray]:
-        now = self._at(values, frame)
+    def coordinates(self, values: Values, index: int, seed: int = 0) -> dict[str, np.ndarray]:
+        now = self._at(values, index)
         h, sx, sy = self.surface(now)
         distance = np.hypot(self.x - now["gel.press_x"], self.y - now["gel.press_y"])
         return {
@@ -285,7 +303,7 @@ class MockModel(Exact):
 class PointModel(Exact):
     """A photodiode behind a turned polarizer: one reading per frame, a cos^2(angle) + leak + dark + second harmonic."""
 
-    shape, captures = (1, 1, 1), None
+    shape = (1, 1, 1)
     parameters = {
         "lamp.power": Parameter("power", "1", 1.0, (0.0, 10.0), plausible=0.1),
         "polarizer.angle": Parameter("angle", "deg", 0.0, (-90.0, 90.0), plausible=1.0),
@@ -328,12 +346,6 @@ class PointModel(Exact):
                 self._read(now, f),
                 {v.name: self._read({**now, v.keys[0]: now[v.keys[0]] + 1j * STEP}, f).imag / STEP for v in variables},
             )
-
-    def usable(self, frame):
-        return np.ones(self.shape, bool)
-
-    def coordinates(self, values, frame, seed=0):
-        return {}
 
     def variable(self, key):
         return Variable(key, (key,), self.parameters[key])
@@ -404,24 +416,6 @@ def strength_for(model: MockModel, name: str, change: float) -> float:
     for _ in range(6):
         trial *= change / max(raw_change(model, values, name, trial), 1e-12)
     return trial
-
-
-@dataclass
-class Fit:
-    values: Values
-    variables: list[Variable]
-    estimate: np.ndarray
-    covariance: np.ndarray
-    sd: np.ndarray
-    correlation: np.ndarray
-    chi2: float
-    dof: int
-    frame_chi2: list[float]
-    frame_n: list[int]
-    converged: bool
-    reason: str
-    history: list[float]
-    warnings: list[str]
 
 
 def mock_fit(
@@ -500,20 +494,17 @@ def mock_fit(
     gram, score, square, counts, _ = system(values)
     scale = 1 / np.sqrt(np.maximum(np.diag(gram), 1e-300))
     covariance = np.linalg.pinv(gram * scale * scale[:, None], rcond=1e-10, hermitian=True) * scale * scale[:, None]
-    sd = np.sqrt(np.diag(covariance))
     return Fit(
         values,
         list(variables),
         read(values),
         covariance,
-        sd,
-        covariance / np.outer(sd, sd),
         sum(square),
         sum(counts) - len(variables),
+        frames,
         square,
         counts,
         converged,
         reason,
         history,
-        [],
     )

@@ -16,7 +16,8 @@ from optics.diagnosis import advice as advise
 from optics.diagnosis import statistics
 from optics.diagnosis.diagnose import diagnose
 from optics.diagnosis.evidence import Candidate, measure
-from optics.diagnosis.verdict import CLEAR, MARGIN, Advice, Apart, Diagnosis
+from optics.diagnosis.result import Advice, Apart, Diagnosis
+from optics.diagnosis.thresholds import CLEAR, MARGIN
 from optics.scene.parameter import Parameter, Values
 from optics.study import design
 

@@ -1,6 +1,8 @@
 """The pieces of a calibration: bounded steps, coordinates in which a fit steps, and what is solved for in other
 frames."""
 
+import sys
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -8,8 +10,13 @@ import pytest
 
 from optics.captures.noise import Noise
 from optics.fit import calibrate
-from optics.fit.calibrate import Descent, Fit, Normal, extended, fit, for_frames, solve, warnings_of
+from optics.fit.calibrate import extended, fit, for_frames
+from optics.fit.descent import Descent, Normal, solve
+from optics.fit.result import Fit, warnings_of
 from optics.scene.parameter import Parameter, Values, Variable
+
+sys.path.insert(0, str(Path(__file__).parent))
+from mock_model import Exact, Frame
 
 
 def problem(rng, n, flat=0):
@@ -79,21 +86,22 @@ def test_a_step_to_a_bound_ends_on_it(side):
     sigma = Variable(
         "sigma", ("skin.sigma",), Parameter("sigma", "rad", 0.2, (0.0, 1.5), plausible=0.1, squared=True, saturates=0.3)
     )
-    model = SimpleNamespace(parameters={"skin.sigma": sigma.parameter}, base={"skin.sigma": 0.2}, frames=[])
+    model = Exact()
+    model.base = {"skin.sigma": 0.2}
     for start in np.linspace(0.01, 1.4, 40):
         descent = Descent(model, [sigma], Values({"sigma": start}), [])
         for push in (1e6, -1e-17):  # and stays there
             descent.take(Normal(np.eye(1), np.array([side * push]), 0.0, 0.0, [], [], []))
-            descent.theta = descent._step(0.0)[0]
+            descent.theta = descent.step(0.0)[0]
             assert descent.theta == (descent.low if side < 0 else descent.high)
 
 
-class Twice:
+class Twice(Exact):
     """Three lights, one image each, on a face that sends light on once and, to a share of 3e-3, twice: with the
     reflectances rho_c L_fc = P_f m_fc (rho_c + 3e-3 rho_c^2 w_c) / (1 + ((x - x_f)/5)^2). A vignetting, 1 % if not told
     otherwise, is in the images alone."""
 
-    shape, captures = (100, 100, 3), None
+    shape = (100, 100, 3)
     parameters = {
         f"{part}{name}": Parameter(name, unit, start, bounds, plausible=0.1, linear=unit == "1")
         for i in range(3)
@@ -107,15 +115,15 @@ class Twice:
     def __init__(self, rng, vignetting=0.01):
         self.noise = Noise(system_gain=0.02, dark_noise=1.0, black_level=0.0, saturation=4095.0, prnu=0.0)
         self.base = {key: p.default for key, p in self.parameters.items()}
-        self.frames = [SimpleNamespace(name=f"f{i}", parameters={}, repeats=[]) for i in range(3)]
-        self.at, self.mixed, self.w = (
+        self.frames = [Frame(f"f{i}", np.zeros(self.shape)) for i in range(3)]
+        self.across, self.mixed, self.w = (
             np.linspace(-4, 4, 100),
             np.eye(3) + 0.02 * rng.uniform(size=(3, 3)),
             rng.uniform(0.5, 1, self.shape),
         )
         self.true = {f"led_{i}.x": 0.4 * i - 0.3 for i in range(3)} | {f"face.rho_{i}": 0.5 + 0.2 * i for i in range(3)}
         for frame, light in zip(self.frames, self.predict(Values(self.true))):
-            light = light * (1 - vignetting * np.add.outer(self.at**2, self.at**2) / 16)[..., None]
+            light = light * (1 - vignetting * np.add.outer(self.across**2, self.across**2) / 16)[..., None]
             frame.image = light + self.noise.sd(light) * rng.standard_normal(self.shape)
 
     def _lit(self, now, f):
@@ -127,7 +135,7 @@ class Twice:
             * now[f"led_{f}.power"]
             * self.mixed[f]
             * (rho + 3e-3 * rho**2 * self.w)
-            / (1 + ((self.at - now[f"led_{f}.x"]) / 5) ** 2)[:, None]
+            / (1 + ((self.across - now[f"led_{f}.x"]) / 5) ** 2)[:, None]
         )
 
     def predict(self, values, frames=None, seed=0):
@@ -147,12 +155,6 @@ class Twice:
 
     def linear_in(self, variable):
         return variable.name.endswith("power")
-
-    def usable(self, frame):
-        return np.ones(self.shape, bool)
-
-    def variance(self, values, frame, prediction):
-        return self.noise.variance(prediction)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -186,14 +188,14 @@ def test_where_much_is_missing_the_last_of_chi2_is_not_waited_for(seed, monkeypa
     assert 0 < soon.chi2 - late.chi2 < 2e-3 * excess
 
 
-class Bend:
+class Bend(Exact):
     """One pixel, 100 arctan(x): from x = 1.39 a full step leads as far to the other side, and brings nothing of what it
     promises."""
 
-    shape, captures = (1, 1, 1), None
+    shape = (1, 1, 1)
     parameters = {"led.x": Parameter("x", "mm", 1.0, (-50.0, 50.0), plausible=1.0)}
     base = {"led.x": 1.0}
-    frames = [SimpleNamespace(name="one", parameters={}, repeats=[], image=np.zeros((1, 1, 1)))]
+    frames = [Frame("one", np.zeros((1, 1, 1)))]
 
     def predict(self, values, frames=None, seed=0):
         return [np.full(self.shape, 100 * np.arctan(values.common["led.x"]))]
@@ -201,10 +203,7 @@ class Bend:
     def derivatives(self, values, variables, frames=None, secant=None, seed=0):
         yield self.predict(values)[0], {"led.x": np.full(self.shape, 100 / (1 + values.common["led.x"] ** 2))}
 
-    def usable(self, frame):
-        return np.ones(self.shape, bool)
-
-    def variance(self, values, frame, prediction):
+    def variance(self, values, index, prediction):
         return np.ones(self.shape)
 
 
@@ -220,23 +219,18 @@ def test_a_step_that_brings_a_hundredth_of_its_promise_is_shortened(start):
 def test_far_from_the_best_a_factor_moves_straight():
     """By its logarithm a light that turns away would grow without measure."""
     power = Variable("power", ("led.power",), Parameter("power", "1", 1.0, (0.0, 1e6), linear=True))
-    descent = Descent(
-        SimpleNamespace(parameters={"led.power": power.parameter}, base={"led.power": 1.0}, frames=[]),
-        [power],
-        Values(),
-        [],
-    )
+    model = Exact()
+    model.base = {"led.power": 1.0}
+    descent = Descent(model, [power], Values(), [])
     descent.take(Normal(np.eye(1), np.array([0.5]), 0.0, 0.0, [], [], []))
-    assert descent._step(0.0)[0] == pytest.approx(1.5)
+    assert descent.step(0.0)[0] == pytest.approx(1.5)
     descent.creep()
-    assert descent._step(0.0)[0] == pytest.approx(np.exp(0.5))
+    assert descent.step(0.0)[0] == pytest.approx(np.exp(0.5))
 
 
 def test_an_effect_may_do_nothing_in_a_dark_frame():
     model = Twice(np.random.default_rng(0))
-    model.frames.append(
-        SimpleNamespace(name="dark", parameters={}, repeats=[], image=model.noise.sd(0.0) * np.ones(model.shape))
-    )
+    model.frames.append(Frame("dark", model.noise.sd(0.0) * np.ones(model.shape)))
     power, x = [
         [Variable(f"led_{i}.{name}", (f"led_{i}.{name}",), model.parameters[f"led_{i}.{name}"]) for i in range(3)]
         for name in ("power", "x")
@@ -247,11 +241,12 @@ def test_an_effect_may_do_nothing_in_a_dark_frame():
 
 
 def test_priors_go_along_to_other_frames_where_they_say_something_about_them():
-    frames = [
-        SimpleNamespace(name=f"f{i}", group=f"press-{i // 2}", parameters={"gel.press_x": float(i // 2)})
+    model = Exact()
+    model.frames = [
+        Frame(f"f{i}", np.zeros((1, 1, 1)), group=f"press-{i // 2}", parameters={"gel.press_x": float(i // 2)})
         for i in range(6)
     ]
-    model = SimpleNamespace(frames=frames, base={"gel.press_x": 0.0, "camera.gain": 1.0})
+    model.base = {"gel.press_x": 0.0, "camera.gain": 1.0}
     x, gain = Parameter("press_x", "mm", 0.0), Parameter("gain", "1", 1.0)
 
     def fitted(*priors):

@@ -12,6 +12,7 @@ from PIL import Image
 from optics import cli
 from optics.captures import capture_set as capture_files
 from optics.captures.noise import Noise
+from optics.cli import shared
 from optics.files import exr
 from optics.light.rendering import RenderJob
 from optics.scene import loader as scene
@@ -181,7 +182,7 @@ def test_doctor(optics):
 
 
 def test_priors():
-    assert cli.priors(["led_*.x=11+-0.5", "gel.press_*=+-0.05", "a=-1e-3±2", "b=1 +/- .1"]) == {
+    assert shared.priors(["led_*.x=11+-0.5", "gel.press_*=+-0.05", "a=-1e-3±2", "b=1 +/- .1"]) == {
         "led_*.x": (11.0, 0.5),
         "gel.press_*": (None, 0.05),
         "a": (-1e-3, 2.0),
@@ -192,7 +193,7 @@ def test_priors():
 @pytest.mark.parametrize("text", ["a=1", "a=1+-", "a=1+-0", "a=1+--2", "a", "=1+-1", "a=x+-1", "a=+-nan"])
 def test_bad_priors(text):
     with pytest.raises(ValueError, match="--prior"):
-        cli.priors([text])
+        shared.priors([text])
 
 
 def test_debug_shows_where_an_error_came_from(optics):
@@ -236,7 +237,7 @@ def test_quiet_says_nothing_but_results(optics, tmp_path):
     assert optics("render", "gelsight", *SIZE, "-o", tmp_path / "b.exr", "--quiet")[2] == ""
 
 
-# -- render ---------------------------------------------------------------------------------------------------------------
+# -- render ---------------------------------------------------------------------------------------------------------
 
 
 def test_a_image_of_a_sensor(optics, tmp_path):
@@ -414,12 +415,12 @@ def test_calibrate_writes_a_study_that_compare_can_use(optics, measured, tmp_pat
     )
     assert code == 0, err
     assert out.splitlines()[-1] == str(study) and "warning: 8 bit" in err
-    from optics.study.record import Study
+    from optics.study.record import Record
 
-    found = {v["name"]: v for v in Study.open(study).steps[0]["variables"]}
+    found = {v["name"]: v for v in Record.open(study).steps[0]["variables"]}
     for name in ("led_1.power", "led_3.power"):
         assert abs(found[name]["value"] - 1.25) < 4 * found[name]["sd"] < 0.05
-    step = Study.open(study).steps[0]
+    step = Record.open(study).steps[0]
     assert step["held_out"]["chi2_per_dof"] == pytest.approx(1, abs=0.06)  # 10368 values: sd 0.014
     rows = json.loads(optics("compare", measured, "--json", "--fit", study / "steps" / "00-base" / "fit.toml")[1])[
         "rows"
@@ -431,9 +432,10 @@ def test_calibrate_writes_a_study_that_compare_can_use(optics, measured, tmp_pat
 
 
 def test_values_of_a_fit_hold_for_their_frames(measured, tmp_path):
-    from optics.study import loop
+    from optics.study.fit_files import values_of
+    from optics.study.setup import Setup, open_model
 
     (tmp_path / "fit.toml").write_text('[parameters]\n"led_1.x" = 10.5\n[frames.p1-led_3]\n"gel.press_x" = 1.5\n')
-    model = loop.open_model(loop.Setup(captures=str(measured)))
-    values = cli.values_of(model, tmp_path / "fit.toml", {"led_3.mu": 2.0})
+    model = open_model(Setup(captures=str(measured)))
+    values = values_of(model, tmp_path / "fit.toml", {"led_3.mu": 2.0})
     assert values == Values({"led_1.x": 10.5, "led_3.mu": 2.0}, {3: {"gel.press_x": 1.5}})

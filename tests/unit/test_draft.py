@@ -22,12 +22,12 @@ from optics.diagnosis.fingerprints import (
     fixed_pattern,
     fixed_text,
     goes_with,
-    lit_geometry,
     places,
     unexplained,
 )
 from optics.diagnosis.statistics import Sweeps
-from optics.diagnosis.verdict import Basis, Family, Fingerprint
+from optics.diagnosis.result import Basis, Family, Fingerprint
+from optics.fit.geometry import lit_geometry
 from optics.errors import OutputExists, UnknownKey
 from optics.lookup import lookup
 from optics.scene.registry import declared, known

@@ -27,7 +27,7 @@ KEYS = {
 
 @pytest.fixture(scope="module")
 def models(mitsuba):
-    from optics.fit.model import Model
+    from optics.fit.scene_model import SceneModel
     from optics.scene import loader as scene
 
     loaded = scene.load("gelsight", {"width": WIDTH, "height": HEIGHT})
@@ -36,16 +36,16 @@ def models(mitsuba):
         np.float32
     )
     captures = Captures(Path("."), str(loaded.path), [frame], noise=Noise(0.1, 1.0, 2.0, 255.0, 0.0), flat_field=flat)
-    return {mode: Model(loaded, captures, flat_field=mode) for mode in ("multiplicative", "additive", None)}
+    return {mode: SceneModel(loaded, captures, flat_field=mode) for mode in ("multiplicative", "additive", None)}
 
 
 def test_modes_are_named_and_others_refused(models):
-    from optics.fit.model import Model
+    from optics.fit.scene_model import SceneModel
 
     model = models["additive"]
-    assert Model(model.scene, model.captures).flat_field == "multiplicative" and models[None].flat is None
+    assert SceneModel(model.scene, model.captures).flat_field == "multiplicative" and models[None].flat is None
     with pytest.raises(UnknownKey, match="did you mean 'additive'"):
-        Model(model.scene, model.captures, flat_field="aditive")
+        SceneModel(model.scene, model.captures, flat_field="aditive")
 
 
 @pytest.mark.parametrize("mode", ["multiplicative", "additive"])

@@ -7,7 +7,7 @@ import pytest
 
 from optics.captures.capture_set import Captures, Frame, cfa_channel
 from optics.captures.noise import Noise
-from optics.fit.model import Model
+from optics.fit.scene_model import SceneModel
 from optics.scene import loader as scene
 from optics.scene.parameter import Values, Variable
 
@@ -20,12 +20,12 @@ def models(mitsuba):
     settings = {"camera.exposure": 20.0, "gel.press_depth": 0.5}
     dark = Frame("a", np.zeros((20, 24, 3), np.float32), parameters=settings)
     noise = Noise(0.04, 0.8, 8.0, 255.0, 0.0)
-    full = Model(sensor, Captures(Path("."), "gelsight", [dark], noise=noise))
+    full = SceneModel(sensor, Captures(Path("."), "gelsight", [dark], noise=noise))
     rng = np.random.default_rng(3)
     image = noise.expose(full.predict(Values())[0], rng).astype(np.float32)
     channel = cfa_channel(image.shape, PATTERN)[..., None]
     raw = Frame("a", np.take_along_axis(image, channel, 2), parameters=settings)
-    return full, Model(sensor, Captures(Path("."), "gelsight", [raw], noise=noise, cfa=PATTERN)), channel
+    return full, SceneModel(sensor, Captures(Path("."), "gelsight", [raw], noise=noise, cfa=PATTERN)), channel
 
 
 def test_every_pixel_counts_once_in_the_channel_of_its_filter(models):

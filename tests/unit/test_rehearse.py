@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from optics.diagnosis.diagnose import score
+from optics.diagnosis.score import score
 from optics.diagnosis.rehearse import rehearse
 
 sys.path.insert(0, str(Path(__file__).parent))

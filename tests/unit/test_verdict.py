@@ -15,12 +15,17 @@ import pytest
 
 from optics.captures.noise import Noise
 from optics.diagnosis import fingerprints, pairs
-from optics.diagnosis import homogeneity as evenness
+from optics.diagnosis import homogeneity
 from optics.diagnosis import statistics as st
-from optics.diagnosis.diagnose import _refuted, diagnose, score
+from optics.diagnosis.diagnose import diagnose
 from optics.diagnosis.evidence import Candidate, measure
-from optics.diagnosis.verdict import CLEAR, CLUTTERED, MARGIN, WORDS, Diagnosis, Findings, Pair, decide
+from optics.diagnosis.findings import refuted
+from optics.diagnosis.score import score
+from optics.diagnosis.decide import Findings, decide
+from optics.diagnosis.result import WORDS, Diagnosis, Pair
+from optics.diagnosis.thresholds import CLEAR, CLUTTERED, MARGIN
 from optics.errors import Underdetermined
+from optics.fit.model import value_of
 from optics.scene.declare import Effect
 from optics.scene.parameter import Parameter, Values, Variable
 
@@ -350,7 +355,7 @@ def test_a_strength_is_held_against_what_neighbours_share():
         own = measure(model, fit.values, variables, [], [0], 10**6, 0, lambda *a: None)
         own.precision, own.pull = own.precision[:1], own.pull[:1]  # the slope stands behind the base
         slope = fit.values.common["lamp.slope"]
-        p, clutter = evenness.scatter(own, [0], [1], np.array([slope]), [{"place": place}])
+        p, clutter = homogeneity.scatter(own, [0], [1], np.array([slope]), [{"place": place}])
         ps.append(p)
         pulls.append(slope / math.sqrt(fit.sd[1] ** 2 + max(clutter[0, 0], 0.0)))
         naive.append((slope / fit.sd[1]) ** 2 > 6.63)
@@ -378,7 +383,9 @@ def test_a_lamp_that_wanders_does_not_pass_for_a_tone_of_the_session():
         left = y - tone @ score / power
         noise.append(score[0] ** 2 / power > 6.63)
         ps.append(
-            evenness.by_clutter(score, np.array([[power]]), evenness.variances([tone], [left], [{"reading": order}]))
+            homogeneity.by_clutter(
+                score, np.array([[power]]), homogeneity.variances([tone], [left], [{"reading": order}])
+            )
         )
     assert np.mean(noise) > 0.6 and np.mean(np.array(ps) < 0.01) < 0.055
 
@@ -397,8 +404,8 @@ def test_as_many_strengths_as_parts_are_held_against_clutter(count):
         parts = (parts - parts.mean(0)) * math.sqrt(16 / 15)
         score = rng.standard_normal(count) * np.sqrt(variance)
         found = [(parts.T @ parts, 16)]
-        none.append(evenness.by_clutter(score, information, found))
-        some.append(evenness.by_clutter(score + 10 * np.sqrt(variance), information, found))
+        none.append(homogeneity.by_clutter(score, information, found))
+        some.append(homogeneity.by_clutter(score + 10 * np.sqrt(variance), information, found))
     assert np.mean(np.array(none) < 0.05) < 0.05 + 0.03 and np.mean(np.array(none) < 0.01) < 0.01 + 0.014
     assert np.mean(np.array(some) < 0.01) > 0.9
 
@@ -411,7 +418,7 @@ def test_a_combination_that_nothing_tells_is_no_clutter():
     others = np.eye(count) - common
     parts = rng.standard_normal((16, count)) @ others
     score = 100 * rng.standard_normal(count) @ others
-    assert evenness.by_clutter(score, others + 1e-7 * common, [(parts.T @ parts / 16 + 1e-3 * common, 16)]) < 1e-9
+    assert homogeneity.by_clutter(score, others + 1e-7 * common, [(parts.T @ parts / 16 + 1e-3 * common, 16)]) < 1e-9
 
 
 def test_a_fit_that_stopped_short_is_no_clutter():
@@ -421,7 +428,7 @@ def test_a_fit_that_stopped_short_is_no_clutter():
     image = np.where(part == 4, 1.0, 0.026)[:, None] * (1 + 0.1 * rng.standard_normal((800, 1)))
     left = rng.standard_normal(800)
     short = left + 2 * image[:, 0] / math.sqrt(np.sum(image**2))
-    (b, parts), (same, _) = (evenness.variances([image], [r], [{"place": part}])[0] for r in (left, short))
+    (b, parts), (same, _) = (homogeneity.variances([image], [r], [{"place": part}])[0] for r in (left, short))
     np.testing.assert_allclose(same, b, rtol=1e-9)
     assert parts == 16
 
@@ -447,7 +454,7 @@ def test_what_splits_a_strength_is_held_against_clutter_too(proxy):
         left = SimpleNamespace(complete=False, excess_sd=100.0)
         places = [{"place": place, "quadrant": quadrant, "channel": np.zeros(1024)}]
         fall = (fit.values.common["lamp.slope"] / fit.sd[1]) ** 2
-        splits, _, _ = evenness.split(model, base, places, 10**6, 0, lambda *a: None, c, fit, left, fall)
+        splits, _, _ = homogeneity.split(model, base, places, 10**6, 0, lambda *a: None, c, fit, left, fall)
         own = next(s for s in splits if s.by == "quadrant")
         uneven.append(own.chance < 0.01)
         naive.append(own.p < 0.01)
@@ -487,7 +494,7 @@ def two_effects(apart, hidden, sets=4000, count=600):
             ]
             for fall in falls
         ]
-        told.append(np.mean([_refuted(winner, rival, count) for winner, rival in zip(*rows)]))
+        told.append(np.mean([refuted(winner, rival, count) for winner, rival in zip(*rows)]))
     return told
 
 
@@ -620,7 +627,7 @@ def test_one_sided_effects_are_never_found_below_their_bound():
 def test_a_base_parameter_at_its_bound_is_taken_as_known():
     model, fit = calibrated()
     low, high = model.parameters["led1.z"].bounds
-    edge = fit.values.get(model.variable("led1.z"), model.base)
+    edge = value_of(model, fit.values, model.variable("led1.z"))
     model.parameters["led1.z"] = replace(model.parameters["led1.z"], default=edge, bounds=(low, edge))
     fit.variables = [model.variable(v.name) if v.name == "led1.z" else v for v in fit.variables]
     d = judge(model, fit, library("glare"))

@@ -11,6 +11,7 @@ import pytest
 
 from optics.captures import capture_set as capture_files
 from optics.captures.noise import Noise
+from optics.fit.model import value_of
 from optics.proof.makers import bench as jones
 from optics.proof.makers.bench import Photodiode, Polarizer, Sample, Source, Truth
 from optics.study import loop
@@ -175,7 +176,7 @@ def test_a_hidden_effect_is_found(name, tmp_path):
     assert at_the_noise(held["chi2_per_dof"], READINGS / 4), held
     for variable, sd in zip(fit.variables, fit.sd):
         if variable.name in case.strengths:  # within four standard deviations
-            found = fit.values.get(variable, model.base)
+            found = value_of(model, fit.values, variable)
             assert abs(found - case.strengths[variable.name]) < 4 * sd, f"{variable.name}: {found} +- {sd}"
     assert loop.examine(study, model, setup, fit).word == "NOTHING"
 
@@ -185,7 +186,7 @@ def test_a_perfect_bench_lacks_nothing(seed, tmp_path):
     setup, study, model, fit = study_of(Case(Truth(**lamp()), ()), tmp_path, seed)
     assert loop.examine(study, model, setup, fit).word == "NOTHING"
     power = next(v for v in fit.variables if v.name == "source.power")
-    assert abs(fit.values.get(power, model.base) - 2.2) < 4 * fit.sd[0]  # four standard deviations: the diode's gain
+    assert abs(value_of(model, fit.values, power) - 2.2) < 4 * fit.sd[0]  # four standard deviations: the diode's gain
 
 
 def test_what_goes_with_a_setting_is_drafted_then_claimed_as_a_formula(tmp_path):

@@ -7,7 +7,7 @@ import pytest
 
 from optics.errors import Underdetermined, UnknownKey
 from optics.fit import calibrate
-from optics.fit.model import Model
+from optics.fit.scene_model import SceneModel
 from optics.proof.makers import touch as synthetic
 from optics.scene import loader as scene
 from optics.scene.parameter import Values
@@ -49,7 +49,7 @@ def solved():
     truth = {**truth_of(sensor, rng), "camera.exposure": 150.0}
     captures = synthetic.Maker(sensor, truth, seed=5).captures(synthetic.presses(4, 1))
     captures.parameters["camera.exposure"] = 150.0
-    model = Model(sensor, captures)
+    model = SceneModel(sensor, captures)
     return model, truth, calibrate.fit(model, calibrate.variables_from(model, FREE), displaced(truth, rng))
 
 
@@ -124,7 +124,7 @@ def test_pulls_of_twenty_repeats_at_full_size():
         maker.seed = 100 + repeat
         captures = maker.captures(synthetic.presses(4, 1))
         captures.parameters["camera.exposure"] = 150.0
-        model = Model(sensor, captures)
+        model = SceneModel(sensor, captures)
         clock = time.perf_counter()
         fit = calibrate.fit(model, calibrate.variables_from(model, FREE), displaced(truth, rng))
         seconds.append(time.perf_counter() - clock)

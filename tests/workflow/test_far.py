@@ -10,7 +10,7 @@ from optics.captures import capture_set as capture_files
 from optics.captures.noise import Noise
 from optics.proof.makers import bench as jones
 from optics.scene.parameter import Parameter, Values, Variable
-from optics.study import loop
+from optics.study import checks, loop
 
 NOISE = Noise(system_gain=0.05, dark_noise=2.0, black_level=64.0, saturation=4095.0, prnu=0.0)
 
@@ -32,19 +32,20 @@ def test_angles_in_radians_are_no_matter_of_effects(wrong, tmp_path):
         ]
         file.write_text("\n".join(",".join(row) for row in [head, *turned]) + "\n")
     _, _, fit = loop.begin(loop.Setup(captures=str(folder)), tmp_path / "study")
-    assert any("no matter of effects: check units" in w for w in fit.warnings) == wrong
+    assert any("too far for a missing effect: check units" in w for w in fit.warnings) == wrong
 
 
 def test_a_value_far_from_what_is_known_of_it_is_named():
     depth = Parameter("press_depth", "mm", 0.2, (0.0, 1.0), plausible=0.1)
     variables = [Variable(f"gel.press_depth[{i}]", ("gel.press_depth",), depth, (i,), (0.2, 0.05)) for i in range(3)]
-    model, near = SimpleNamespace(base={"gel.press_depth": 0.2}), SimpleNamespace(rms=1.0, signal=100.0)
+    model = SimpleNamespace(at=lambda values, i: {"gel.press_depth": 0.2, **values.frame[i]})
+    near = SimpleNamespace(rms=1.0, signal=100.0)
 
     def told(*depths):
         fit = SimpleNamespace(
             variables=variables, values=Values(frame={i: {"gel.press_depth": d} for i, d in enumerate(depths)})
         )
-        return loop._far(model, fit, near)
+        return checks.after_calibration(model, fit, near)
 
     assert told(0.2, 0.34, 0.06) == []
     assert (
@@ -68,7 +69,7 @@ def test_lights_named_in_some_frames_only(frames, key):
         scene=SimpleNamespace(lights=["led_1", "led_2", "led_3"]),
         base={f"led_{k}.power": 1.0 for k in (1, 2, 3)},
     )
-    texts = loop._unnamed(model)
+    texts = checks._unnamed(model)
     assert (key is None) == (texts == [])
     assert key is None or texts[0].startswith(f"{key}: set in some frames and not in others") and "write 0" in texts[0]
 
@@ -81,7 +82,7 @@ def test_a_press_beyond_the_gel_is_named(x, warned):
         base={"gel.width": 18.8, "gel.length": 14.0},
         frames=[SimpleNamespace(name="a", parameters={}), SimpleNamespace(name="b", parameters={"gel.press_x": x})],
     )
-    texts = loop._astray(model)
+    texts = checks._astray(model)
     assert bool(texts) == warned
     assert not warned or f"frame 'b': gel.press_x = {x:g} mm lies beyond the gel, which is 18.8 mm wide" in texts[0]
 
@@ -93,7 +94,7 @@ def test_a_press_beyond_the_gel_is_named(x, warned):
 def test_a_set_of_which_nothing_is_held_out_says_so(groups, held, asked, warned):
     frames = [SimpleNamespace(name=f"f{i}", group=f"g{i}") for i in range(groups)]
     model = SimpleNamespace(captures=SimpleNamespace(frames=frames))
-    texts = loop._unverified(model, loop.Setup(captures="c", held_out=asked), held)
+    texts = checks._unverified(model, loop.Setup(captures="c", held_out=asked), held)
     assert bool(texts) == warned and (not warned or texts[0].startswith("3 groups of frames: none is held out"))
 
 
@@ -106,14 +107,14 @@ def test_an_effect_that_does_not_predict_is_said_to_be_no_cause(monkeypatch):
 
     monkeypatch.setattr(loop, "split", lambda model, setup: ([0], [1]))
     monkeypatch.setattr(loop, "effect_variables", lambda model, effect: [])
-    monkeypatch.setattr(loop, "record", record)
+    monkeypatch.setattr(loop, "write_step", record)
     monkeypatch.setattr(loop.calibrate, "fit", lambda *_, **__: SimpleNamespace(warnings=[]))
     model = SimpleNamespace(scene=SimpleNamespace(can_express=lambda effect: True))
     effect = SimpleNamespace(name="row curve", file="")
     found, _ = loop.extend(study, model, SimpleNamespace(robust=False), SimpleNamespace(variables=[]), effect, Values())
     assert found.warnings == [
-        "held-out chi2/dof rises from 1.5 to 1.6 with row curve: it does not predict what it was not fitted to, and is "
-        "not the cause, or not by itself"
+        "held-out chi2/dof rises from 1.5 to 1.6 with row curve: it does not predict the frames that "
+        "it was not fitted to, so it is not the cause, or not by itself"
     ]
 
 
@@ -125,7 +126,7 @@ def test_cut_and_turned_images_are_noticed(size, warned, tmp_path):
         capture_files.Captures(tmp_path, "gelsight", frames, noise=Noise(0.05, 1.0, 8.0, 255.0, 0.0)), tmp_path / "set"
     )
     model = loop.open_model(loop.Setup(captures=str(folder)))
-    assert any("the scene's own are 320 x 240" in w for w in loop._warnings(model)) == warned
+    assert any("the scene's own are 320 x 240" in w for w in checks.of_captures(model)) == warned
 
 
 def test_a_gel_that_nothing_presses_has_no_press_to_solve_for(tmp_path):

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from optics.captures import capture_set as capture_files
+from optics.fit.model import value_of
 from optics.proof.makers.finger import FingerMaker
 from optics.scene import loader as scenes
 from optics.scene.registry import known
@@ -78,12 +79,12 @@ def study_of(folder, effects, seed=5, built=None, views=SCENES, **defines):
 
 def test_the_maker_and_the_model_are_two_accounts_of_one_finger():
     """At the true values, without a fit: what differs is noise, and two per cent of its variance for the edges."""
-    from optics.fit.model import Model
+    from optics.fit.scene_model import SceneModel
     from optics.scene.parameter import Values
 
     maker = FingerMaker(scenes.load("vi2tap", DEFINES), BUILT, {}, spp=64, seed=2)
     captures = maker.captures(SCENES[1:2], [0.0, 90.0])
-    model = Model(scenes.load("vi2tap", DEFINES), captures)
+    model = SceneModel(scenes.load("vi2tap", DEFINES), captures)
     for index, predicted in enumerate(
         model.predict(Values({k: v for k, v in BUILT.items() if k != "camera.exposure"}))
     ):
@@ -127,7 +128,7 @@ def test_a_hidden_effect_is_found(case, tmp_path):
         if (
             variable.name in truth
         ):  # four standard deviations, and a fiftieth for what the two accounts differ by at edges
-            found = fit.values.get(variable, model.base)
+            found = value_of(model, fit.values, variable)
             if mirrored and "retard" in variable.name:
                 found = -found
             assert abs(found - truth[variable.name]) < 4 * sd + 0.02 * truth[variable.name], (

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from optics.captures import capture_set as capture_files
+from optics.fit.model import value_of
 from optics.proof.makers.grid import GridMaker
 from optics.scene import loader as scenes
 from optics.scene.registry import known
@@ -128,7 +129,7 @@ def test_a_hidden_effect_is_found(case, tmp_path):
     )  # the noise floor; the maker's error adds two per cent
     for variable, sd in zip(fit.variables, fit.sd):
         if variable.name in truth:  # four standard deviations, and a twentieth: the model's error is not in sd
-            found = fit.values.get(variable, model.base)
+            found = value_of(model, fit.values, variable)
             assert abs(found - truth[variable.name]) < 4 * sd + 0.05 * truth[variable.name], (
                 f"{variable.name}: {found} +- {sd}"
             )

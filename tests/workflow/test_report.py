@@ -20,7 +20,7 @@ from optics.fit.compare import compare
 from optics.fit.null_models import PHYSICAL, NullTable, Score
 from optics.pages.report import ladder_chart, number, percent, report
 from optics.scene.parameter import Parameter, Values, Variable
-from optics.study.record import Fingerprint, Shown, Study, read_fit
+from optics.study.record import Fingerprint, Record, Shown, read_fit
 
 LEDS = {"led_red": (0.95, -0.31), "led_green": (-0.2, 0.98), "led_blue": (-0.75, -0.66)}
 TRUTH = {"camera.vignetting": 0.31, "gel.absorption": 0.06}
@@ -64,7 +64,7 @@ def shading(h, w, place, depth, lit, powers, vignetting=0.0, absorption=0.0):
     return BLACK + 175 * image, known
 
 
-def demo(folder: Path, height=72, width=96, presses=4, seed=3, steps=3) -> Study:
+def demo(folder: Path, height=72, width=96, presses=4, seed=3, steps=3) -> Record:
     """A study with the steps base, + lens vignetting, + gel absorption, six or more frames, the last press held out."""
     rng = np.random.default_rng(seed)
     combinations = [tuple(LEDS), ("led_red",), ("led_green",), ("led_blue",)]
@@ -93,7 +93,7 @@ def demo(folder: Path, height=72, width=96, presses=4, seed=3, steps=3) -> Study
     capture_file = folder.parent / "captures.toml"
     capture_file.parent.mkdir(parents=True, exist_ok=True)
     capture_file.write_text('scene = "gelsight"\n')
-    study = Study.create(
+    study = Record.create(
         folder,
         scene="gelsight",
         captures=str(capture_file.parent),
@@ -461,7 +461,7 @@ def test_the_noise_band_of_few_readings_stays_within_its_chart():
             "held_out": {"chi2_per_dof": 1.7, "dof": 6},
         }
     ]
-    study = SimpleNamespace(steps=steps, record={"noise_floor": {"chi2_per_dof": 1.0}})
+    study = SimpleNamespace(steps=steps, ladder={"noise_floor": {"chi2_per_dof": 1.0}})
     top, height = map(
         float, re.search(r'floorband".*? y="([\d.]+)" height="([\d.]+)"', ladder_chart(study, 900, 340)).groups()
     )
@@ -494,7 +494,7 @@ def test_every_step_shows_the_same_frames_with_one_held_out(studied):
 def test_nothing_is_overwritten(studied, tmp_path):
     study, _ = studied
     with pytest.raises(OutputExists, match="holds a study already"):
-        Study.create(study.folder, scene="x", captures="y")
+        Record.create(study.folder, scene="x", captures="y")
     with pytest.raises(OutputExists, match="has a step already"):
         study.add_step("base", None, {}, study.comparison(0))
     (tmp_path / "taken.html").write_text("mine")
@@ -504,10 +504,10 @@ def test_nothing_is_overwritten(studied, tmp_path):
     (tmp_path / "notes").mkdir()
     (tmp_path / "notes" / "a.txt").write_text("mine")
     with pytest.raises(OutputExists, match="holds no study"):
-        Study.create(tmp_path / "notes", scene="x", captures="y")
+        Record.create(tmp_path / "notes", scene="x", captures="y")
 
 
-def small(folder, channels=1, size=(16, 20), count=3, **more) -> Study:
+def small(folder, channels=1, size=(16, 20), count=3, **more) -> Record:
     """A study of one step without held-out frames, diagnosis or nulls."""
     rng = np.random.default_rng(1)
     predicted = [50 + 40 * rng.random((*size, channels)) for _ in range(count)]
@@ -515,7 +515,7 @@ def small(folder, channels=1, size=(16, 20), count=3, **more) -> Study:
     sd, use = [np.ones_like(p) for p in predicted], [np.ones(size, bool)] * count
     settings = [{"analyzer.angle": 10.0 * i} for i in range(count)]
     found = compare(measured, predicted, sd, use, settings=settings)
-    study = Study.create(folder, scene="bench", captures="captures")
+    study = Record.create(folder, scene="bench", captures="captures")
     frames = [Shown(f["frame"], *four) for f, four in zip(found.frames, zip(measured, predicted, sd, use))]
     study.add_step("base", None, {"parameters": {"led.power": 1.0}}, found, frames=frames, **more)
     return study
@@ -532,34 +532,34 @@ def test_a_crash_leaves_the_study_whole_and_it_goes_on(tmp_path, monkeypatch):
     record = json.loads((tmp_path / "study" / "ladder.json").read_text())
     record["steps"] = record["steps"][:1]  # as if it had stopped between the two renames
     (tmp_path / "study" / "ladder.json").write_text(json.dumps(record))
-    again = Study.open(tmp_path / "study")
+    again = Record.open(tmp_path / "study")
     assert [s["name"] for s in again.steps] == ["base", "glare"] and again.has("glare") and not again.has("haze")
 
 
 def test_resuming_asks_for_the_same_inputs(tmp_path):
     file = tmp_path / "captures.toml"
     file.write_text("one")
-    Study.create(tmp_path / "s", scene="x", captures="c", inputs=[tmp_path / "captures.toml"], seed=1)
-    again = Study.create(tmp_path / "s", scene="x", captures="c", inputs=[file], seed=1, resume=True)
+    Record.create(tmp_path / "s", scene="x", captures="c", inputs=[tmp_path / "captures.toml"], seed=1)
+    again = Record.create(tmp_path / "s", scene="x", captures="c", inputs=[file], seed=1, resume=True)
     assert again.changed_inputs() == []
     file.write_text("two")
     assert again.changed_inputs() == [str(file)]
     with pytest.raises(BadCapture, match="changed since the study began: .*captures.toml"):
-        Study.create(tmp_path / "s", scene="x", captures="c", inputs=[file], seed=1, resume=True)
+        Record.create(tmp_path / "s", scene="x", captures="c", inputs=[file], seed=1, resume=True)
     with pytest.raises(FileNotFoundError, match="no such input"):
-        Study.create(tmp_path / "t", scene="x", captures="c", inputs=[tmp_path / "missing"])
+        Record.create(tmp_path / "t", scene="x", captures="c", inputs=[tmp_path / "missing"])
 
 
 def test_a_damaged_or_missing_study_is_refused_in_words(tmp_path):
     with pytest.raises(FileNotFoundError, match="has no ladder.json"):
-        Study.open(tmp_path)
-    empty = Study.create(tmp_path / "empty", scene="x", captures="c")
+        Record.open(tmp_path)
+    empty = Record.create(tmp_path / "empty", scene="x", captures="c")
     with pytest.raises(ValueError, match="no step yet"):
         report(empty.folder, tmp_path / "r.html")
     small(tmp_path / "study")
     (tmp_path / "study" / "ladder.json").write_text("{")
     with pytest.raises(ValueError, match="not a readable study"):
-        Study.open(tmp_path / "study")
+        Record.open(tmp_path / "study")
 
 
 @pytest.mark.parametrize("channels, shown", [(1, ["L"]), (2, ["all"]), (3, ["R", "G", "B"]), (4, ["all"])])
@@ -612,7 +612,7 @@ def panels_in(html: str) -> list[list[str]]:
 
 def test_a_sweep_keeps_the_settings_of_its_readings(swept):
     study, model, _ = swept
-    frames = Study.open(study.folder).frames(1)
+    frames = Record.open(study.folder).frames(1)
     assert len(frames) == len(model.frames) and any(f.held_out for f in frames)
     for f, g in zip(frames, model.frames):
         assert f.name == g.name and f.units["analyzer.angle"] == "deg"
@@ -645,7 +645,7 @@ def test_sweeps_are_drawn_as_curves_with_residuals(swept):
 
 def test_the_page_speaks_of_readings(swept):
     _, _, html = swept
-    page = re.sub(r"<style>.*?</style>", "", html, flags=re.S)
+    page = re.sub(r"<style>.*?</style>", "", html, flags=re.S).replace("scikit-image", "")  # a package's name
     assert "on held-out readings" in page and "96 readings in 8 sweeps" in page
     for word in ("frames", "pixel", "image"):
         assert word not in page, word
@@ -707,7 +707,7 @@ def test_names_cannot_break_out_of_the_page(tmp_path):
         "rows": [{"name": "<b>x</b>", "p_family": 0.0, "fall": None, "refit": {"fall": "inf"}}],
     }
     study = small(tmp_path / "study", diagnosis=diagnosis)
-    study.record["title"] = "</script><b>"
+    study.ladder["title"] = "</script><b>"
     study._save()
     html = report(study.folder, tmp_path / "r.html").read_text(encoding="utf-8")
     assert "<img src=x>" not in html and "<b>x</b>" not in html and "</script><b>" not in html
@@ -745,7 +745,7 @@ def test_what_the_page_reads_is_what_a_diagnosis_writes():
 
 def test_images_of_a_model_become_frames_and_fingerprints():
     """A refit that adds 2 DN shows as 2 sigmas beside a residual of 2 sigmas."""
-    from optics.study.record import fingerprints_of, shown_frames
+    from optics.study.shown import fingerprints_of, shown_frames
 
     class Model:
         captures = SimpleNamespace(table=None)

@@ -65,7 +65,7 @@ def test_a_curve_along_geometry_becomes_an_effect_as_well(mitsuba, tmp_path, opt
     from optics.proof import demo
     from optics.proof.makers.touch import Maker, presses
     from optics.scene import loader as scenes
-    from optics.study.record import Study
+    from optics.study.record import Record
 
     class Tilted(Maker):
         def light(self, press):
@@ -95,7 +95,7 @@ def test_a_curve_along_geometry_becomes_an_effect_as_well(mitsuba, tmp_path, opt
     ]
     assert optics("calibrate", tmp_path / "captures", "-o", study, "--per-group", "none", *free)[0] == 0
     assert optics("diagnose", study)[0] == 1
-    told = Study.open(study).diagnosis(0)
+    told = Record.open(study).diagnosis(0)
     assert told["word"] == "UNKNOWN" and told["families"][0]["family"] == "geometry"
     slope = next(f for f in told["fingerprints"] if f["coordinate"] == "slope")
     assert slope["share"] > 0.9
@@ -103,7 +103,7 @@ def test_a_curve_along_geometry_becomes_an_effect_as_well(mitsuba, tmp_path, opt
     assert steps[0] == pytest.approx(0.006, rel=0.3)  # per degree; calibration absorbs a part
     assert optics("effects", "new", "tilt shade", "--from", study, "--along", "slope")[0] == 0
     assert optics("add", study, "tilt shade")[0] == 0
-    base, drafted = Study.open(study).steps
+    base, drafted = Record.open(study).steps
     strength = next(v["value"] for v in drafted["variables"] if v["keys"] == ["gel.tilt_shade"])
     assert 0.8 < strength < 1.3  # about the curve as it was found
     for role in ("fitted", "held_out"):

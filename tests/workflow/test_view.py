@@ -28,7 +28,7 @@ from optics.light.rendering import RenderJob
 from optics.pages.view import Kept, Server, View
 from optics.scene import loader as scene
 from optics.study import loop
-from optics.study.record import Study, read_fit
+from optics.study.record import Record, read_fit
 
 HIDDEN = 0.4  # camera.vignetting
 VIGNETTING, SIZE, POSE, ROUGHNESS = "camera.vignetting", "led.area", "gel.press_x[press-0]", "membrane.sigma"
@@ -150,7 +150,7 @@ def busy(view):
 
 def test_the_record_names_frames_sliders_and_effects(ask, study):
     status, body, headers = ask("/study", "GET")
-    record, step = json.loads(body), Study.open(study).steps[0]
+    record, step = json.loads(body), Record.open(study).steps[0]
     assert status == 200 and record["shape"] == [36, 48, 3] and record["channels"] == ["R", "G", "B"]
     assert [f["name"] for f in record["frames"] if f["held_out"]] == ["p2-led_1", "p2-led_3"]
     assert sum(f["chi2"] for f in record["frames"]) == pytest.approx(step["total"]["chi2"])
@@ -411,8 +411,8 @@ def test_a_frames_name_survives_in_the_file(view, monkeypatch, tmp_path):
 
 
 def test_what_is_no_study_is_refused_in_a_line(optics, study, tmp_path):
-    Study.create(
-        tmp_path / "empty", scene="gelsight", captures="x", facts={"setup": Study.open(study).record["facts"]["setup"]}
+    Record.create(
+        tmp_path / "empty", scene="gelsight", captures="x", facts={"setup": Record.open(study).ladder["facts"]["setup"]}
     )
     with contextlib.closing(socket.create_server(("127.0.0.1", 0))) as taken:
         port = taken.getsockname()[1]

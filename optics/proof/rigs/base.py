@@ -146,7 +146,7 @@ class ImageRig(Rig):
         return float(self.built(scene, 0).get(key, scene.values()[key]))
 
     def strength_of(self, effect: str, change: float) -> float:
-        from optics.fit.model import Model
+        from optics.fit.scene_model import SceneModel
         from optics.scene.parameter import Values
 
         captures = self.captures(Cell(self.name, "none", (), 0.0, 0.0, "same", "", 0), {}, {}, mean=True)
@@ -154,7 +154,7 @@ class ImageRig(Rig):
         scene = self.scene()  # after the captures, whose makers work in another variant
         built, keys = self.built(scene, 0), self.keys(scene, effect)
         start = {key: self.start(scene, key) for key in keys}  # a scene's values follow its predictions
-        model = Model(scene, captures, captures.noise)
+        model = SceneModel(scene, captures, captures.noise)
 
         def signal(s: float) -> np.ndarray:
             values = {**built, **{key: float(np.clip(start[key] + s, *scene.parameters[key].bounds)) for key in keys}}

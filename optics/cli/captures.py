@@ -1,0 +1,206 @@
+"""Commands about captures: import a measured set, plan a session, hold a scene against captures."""
+
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from optics.cli.shared import (
+    AsJson,
+    CaptureSet,
+    Debug,
+    Defines,
+    FlatField,
+    Force,
+    Plugins,
+    Quiet,
+    Settings,
+    app,
+    command,
+    one_line,
+    pairs,
+    settings,
+    show,
+    terminal,
+)
+
+if TYPE_CHECKING:
+    from optics.study.shown import Shown
+
+
+@app.command(
+    "import", help="Read a measured data set of ball presses into a capture folder, with a scene to start from."
+)
+def import_(
+    source: Annotated[Path, typer.Argument(metavar="SOURCE", help="An .npz calibration pack, or a folder of images.")],
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="CAPTURES", help="Folder of the new capture set.")],
+    circles: Annotated[
+        Path | None,
+        typer.Option(
+            "--circles", metavar="CSV", help="For a folder: file, center_x_px, center_y_px, contact_radius_px."
+        ),
+    ] = None,
+    ball_radius: Annotated[float | None, typer.Option("--ball-radius", help="mm")] = None,
+    mm_per_pixel: Annotated[
+        float | None, typer.Option("--mm-per-pixel", help="Scale of the images as they are.")
+    ] = None,
+    untouched: Annotated[
+        Path | None,
+        typer.Option(
+            "--untouched",
+            metavar="IMAGE",
+            help="For a folder: the sensor without contact; without it the median of the presses.",
+        ),
+    ] = None,
+    leds: Annotated[int, typer.Option("--leds", help="LEDs of the scene to start from: 3 or 6.")] = 3,
+    bin: Annotated[int, typer.Option("--bin", min=1, help="Average this many pixels each way.")] = 1,
+    every: Annotated[int, typer.Option("--every", min=1, help="Take every n-th press.")] = 1,
+    force: Force = False,
+    quiet: Quiet = False,
+    debug: Debug = False,
+) -> None:
+    """Read presses; write captures.toml, a scene, and a report of contradictions between labels, scale and images."""
+    from optics.captures import importing
+
+    terminal.quiet, terminal.debug = quiet, debug
+    options: dict[str, Any] = {"leds": leds, "bin": bin, "every": every, "overwrite": force}
+    if ball_radius is not None:
+        options["ball_radius"] = ball_radius
+    if mm_per_pixel is not None:
+        options["mm_per_pixel"] = mm_per_pixel
+    if source.suffix == ".npz":
+        found = importing.import_taxim(source, output, **options)
+    else:
+        if circles is None:
+            raise ValueError(
+                f"{source}: a folder of images needs --circles CSV with the columns file, center_x_px, center_y_px, "
+                "contact_radius_px"
+            )
+        missing = [n for n, v in (("--ball-radius", ball_radius), ("--mm-per-pixel", mm_per_pixel)) if v is None]
+        if missing:
+            raise ValueError(
+                f"{source}: {' and '.join(missing)} missing: the size of the ball and of a pixel cannot be read off "
+                "circles"
+            )
+        found = importing.import_circles(source, circles, output, untouched=untouched, **options)
+    for text in found.warnings:
+        terminal.note(f"warning: {one_line(text)}")
+    print(found.folder)
+
+
+@command
+def design(
+    subject: Annotated[
+        str, typer.Argument(metavar="SCENE|STUDY", help="A scene, or a study whose values and noise are taken.")
+    ],
+    frames: Annotated[int, typer.Option("--frames", "-n", metavar="N", help="How many frames to take.")] = 12,
+    effects: Annotated[
+        str | None,
+        typer.Option(
+            "--effects", metavar="A,B,...", help="Which may be missing.", show_default="all that the scene can express"
+        ),
+    ] = None,
+    strength: Annotated[
+        float, typer.Option("--strength", metavar="X", help="Of every effect, in plausible sizes.")
+    ] = 0.1,
+    fixed_exposure: Annotated[
+        bool, typer.Option("--fixed-exposure", help="Leave the exposure as the scene has it.")
+    ] = False,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", metavar="DIR", help="Write a captures.toml to fill in.")
+    ] = None,
+    defines: Defines = None,
+    plugins: Plugins = None,
+    system_gain: Annotated[float | None, typer.Option(help="DN per electron.", show_default="0.04")] = None,
+    dark_noise: Annotated[float | None, typer.Option(help="DN, rms.", show_default="0.8")] = None,
+    black_level: Annotated[float | None, typer.Option(help="DN.", show_default="8")] = None,
+    saturation: Annotated[float | None, typer.Option(help="DN.", show_default="255")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Plan a capture session: the frames that tell a scene's effects apart, and the effects that no frames can."""
+    from optics.files.output import check_new_folder
+    from optics.study import design as planning
+
+    given = {"system_gain": system_gain, "dark_noise": dark_noise, "black_level": black_level, "saturation": saturation}
+    if output is not None:
+        check_new_folder(output)
+    with terminal.progress() as progress:
+        result = planning.session(
+            subject,
+            frames,
+            [e.strip() for e in (effects or "").split(",") if e.strip()],
+            pairs(defines, "-D"),
+            plugins,
+            {k: v for k, v in given.items() if v is not None},
+            strength,
+            fixed_exposure,
+            progress,
+        )
+    if output is not None:
+        terminal.note(f"to fill in: {planning.write(result, output) / 'captures.toml'}")
+    show(result.json()) if as_json else print(result.text())
+
+
+@command
+def compare(
+    captures: CaptureSet,
+    fit: Annotated[
+        Path | None, typer.Option("--fit", metavar="FIT.toml", help="Calibrated values, from a study.")
+    ] = None,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", metavar="DIR", help="Write numbers and images here.")
+    ] = None,
+    hold_out: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--hold-out",
+            metavar="GROUP",
+            help="Groups of frames that the fit has not seen, reported apart. Repeatable.",
+        ),
+    ] = None,
+    define: Defines = None,
+    sets: Settings = None,
+    flat_field: FlatField = None,
+    plugins: Plugins = None,
+    as_json: AsJson = False,
+) -> None:
+    """Compare a scene with captures: misfit by frame, LED, region and channel."""
+    from optics import facade
+    from optics.files.output import check_new_folder, new_folder
+    from optics.study.record import SHOWN_MAX
+
+    if output is not None:
+        check_new_folder(output)
+    found = facade.compare(
+        captures,
+        fit,
+        values=settings(sets),
+        held_out=hold_out or (),
+        defines=pairs(define, "-D"),
+        plugins=plugins,
+        flat_field=flat_field,
+    )
+    comparison = found.comparison
+    if output is not None:
+        with new_folder(output) as folder:
+            (folder / "comparison.txt").write_text(comparison.text() + "\n", encoding="utf-8")
+            (folder / "comparison.csv").write_text(comparison.to_csv(), encoding="utf-8")
+            (folder / "comparison.json").write_text(comparison.to_json() + "\n", encoding="utf-8")
+            for shown in found.frames(comparison.worst()[:SHOWN_MAX]):
+                _write_frame(folder, shown, found.model.noise.saturation)
+    print(comparison.to_json() if as_json else comparison.text())
+    if output is not None:
+        terminal.note(f"{output}: the same numbers as text, CSV and JSON, and the worst frames")
+
+
+def _write_frame(folder: Path, shown: "Shown", saturation: float) -> None:
+    """Write measured | predicted | residual of a frame side by side; gray: no residual, black and white: 5 sigmas."""
+    import numpy as np
+
+    from optics.files.exr import write_png
+
+    residual = np.nan_to_num(shown.residual) / 10 + 0.5
+    images = [shown.measured / saturation, shown.predicted / saturation, residual]
+    name = re.sub(r"[^\w.+-]+", "_", shown.name)
+    write_png(folder / "images" / f"{name}.png", np.concatenate(images, 1), tone="linear")

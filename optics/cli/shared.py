@@ -1,0 +1,264 @@
+"""What every command shares: the terminal, common options, reading arguments, and how errors are reported."""
+
+import functools
+import inspect
+import json
+import math
+import os
+import re
+import sys
+import traceback
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from optics import __version__
+
+if TYPE_CHECKING:
+    from optics.scene.loader import Scene
+    from optics.scene.registry import Registry
+
+INTERRUPTED = 130  # 128 and the number of SIGINT, as shells count
+
+app = typer.Typer(
+    add_completion=False,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110},
+    help="Optical models of camera-based touch sensors that can be held against a measurement.",
+)
+
+
+class Terminal:
+    """The terminal of a command: `note` writes remarks to stderr, `progress` draws a bar there. Results are printed."""
+
+    quiet = False
+    debug = False
+
+    def note(self, text: str) -> None:
+        if not self.quiet:
+            print(text, file=sys.stderr)
+
+    @contextmanager
+    def progress(self) -> Iterator[Callable[[str, int, int], None] | None]:
+        """A function (what, done, total) that draws a bar; None where stderr is no terminal, or with --quiet."""
+        if self.quiet or not sys.stderr.isatty():
+            yield None
+            return
+        from rich.console import Console
+        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+        bars = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeRemainingColumn(),
+            console=Console(stderr=True),
+            transient=True,
+        )
+        tasks: dict[str, Any] = {}
+
+        def show(what: str, done: int, total: int) -> None:
+            if what not in tasks:
+                tasks[what] = bars.add_task(what, total=total)
+            bars.update(tasks[what], completed=done, total=total)
+
+        with bars:
+            yield show
+
+
+terminal = Terminal()
+
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no remarks.")]
+Debug = Annotated[bool, typer.Option("--debug", help="Show where in the program an error came from.")]
+AsJson = Annotated[bool, typer.Option("--json", help="The result for programs.")]
+SceneName = Annotated[
+    str, typer.Argument(metavar="SCENE", help="A shipped scene's name (`optics scenes`) or an XML file.")
+]
+CaptureSet = Annotated[str, typer.Argument(metavar="CAPTURES", help="Folder with captures.toml.")]
+StudyFolder = Annotated[Path, typer.Argument(metavar="STUDY", help="Folder that `optics calibrate` made.")]
+Defines = Annotated[
+    list[str] | None,
+    typer.Option("-D", "--define", metavar="NAME=VALUE", help="Replace a <default> of the scene's XML. Repeatable."),
+]
+Settings = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="KEY=VALUE", help="Set a parameter (`optics params SCENE` lists them). Repeatable."),
+]
+Plugins = Annotated[Path | None, typer.Option("--plugins", metavar="DIR", help="A further folder of plugins.")]
+Variant = Annotated[str | None, typer.Option("--variant", help="Mitsuba variant.", show_default=False)]
+Force = Annotated[bool, typer.Option("--force", help="Replace existing files.")]
+At = Annotated[
+    str | None,
+    typer.Option(
+        "--at",
+        metavar="U,V",
+        help="Pixel position, u right and v down from the top left.",
+        show_default="the image's centre",
+    ),
+]
+FlatField = Annotated[
+    str | None,
+    typer.Option(
+        "--flat-field", metavar="MODE", help="How a background image enters: multiplicative, additive or none."
+    ),
+]
+
+
+def command(function: Callable[..., None]) -> Callable[..., None]:
+    """Register a command, with the options that every command has."""
+
+    @functools.wraps(function)
+    def run(*args: Any, quiet: bool = False, debug: bool = False, **options: Any) -> None:
+        terminal.quiet, terminal.debug = quiet, debug
+        try:
+            function(*args, **options)
+            sys.stdout.flush()
+        except BrokenPipeError:  # whoever read our output has seen enough
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        except (Exception, KeyboardInterrupt) as error:
+            stopped = _ctrl_c(error)  # typer would end silently
+            if stopped is None:
+                raise
+            print(": ".join(["interrupted", *map(str, stopped.args)]), file=sys.stderr)
+            raise typer.Exit(INTERRUPTED) from None
+
+    shared = [
+        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=False, annotation=kind)
+        for name, kind in (("quiet", Quiet), ("debug", Debug))
+    ]
+    signature = inspect.signature(function)
+    parameters = [*signature.parameters.values(), *shared]
+    run.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
+    run.__annotations__ = {**function.__annotations__, "quiet": Quiet, "debug": Debug}
+    return app.command()(run)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a command line and return its exit code."""
+    arguments = list(sys.argv[1:] if arguments is None else arguments) or ["--help"]
+    terminal.quiet, terminal.debug = False, "--debug" in arguments
+    with warnings.catch_warnings():
+        warnings.showwarning = lambda text, *_: terminal.note(f"warning: {one_line(text)}")
+        try:
+            return int(app(args=arguments, prog_name="optics", standalone_mode=False) or 0)
+        except Exception as error:
+            return _report(error)
+
+
+def _ctrl_c(error: BaseException | None) -> KeyboardInterrupt | None:
+    """The Ctrl-C behind an error: within a render, Dr.Jit wraps it in an error of its own."""
+    return (
+        error
+        if error is None or isinstance(error, KeyboardInterrupt)
+        else _ctrl_c(error.__cause__ or error.__context__)
+    )
+
+
+def _report(error: Exception) -> int:
+    """Report an error in one line; a bug with its traceback."""
+    expected = isinstance(error, (ValueError, LookupError, OSError, RuntimeError)) or hasattr(error, "format_message")
+    if terminal.debug or not expected:
+        traceback.print_exception(error, file=sys.stderr)
+    text = _usage(error) if hasattr(error, "format_message") else _text(error)
+    print(
+        f"error: {one_line(text)}" + ("" if expected else " (a bug: please report it with the lines above)"),
+        file=sys.stderr,
+    )
+    return 2
+
+
+def _usage(error: Any) -> str:
+    """Typer's message about a wrong option or argument, and where the right ones are listed."""
+    context = getattr(error, "ctx", None)
+    return error.format_message().rstrip(".") + (f"; see `{context.command_path} --help`" if context else "")
+
+
+def _text(error: Exception) -> str:
+    if isinstance(error, OSError) and error.strerror:
+        return f"{error.filename}: {error.strerror}" if error.filename else error.strerror
+    if type(error) is KeyError:
+        return f"no entry {error}"
+    return str(error) or type(error).__name__
+
+
+def one_line(text: object) -> str:
+    return " ".join(str(text).split())
+
+
+def show(result: object) -> None:
+    """Print a result for programs."""
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, Mapping):
+            return {str(k): plain(v) for k, v in value.items()}
+        if isinstance(value, (list, tuple)):
+            return [plain(v) for v in value]
+        return None if isinstance(value, float) and not math.isfinite(value) else value
+
+    print(json.dumps(plain(result), indent=1, allow_nan=False, default=str))
+
+
+def pairs(items: Sequence[str] | None, option: str) -> dict[str, str]:
+    """{name: text} of NAME=TEXT arguments."""
+    found = {}
+    for item in items or ():
+        name, equals, text = item.partition("=")
+        if not equals or not name.strip():
+            raise ValueError(f"{option} {item}: no '='; allowed: {option} NAME=VALUE")
+        found[name.strip()] = text.strip()
+    return found
+
+
+def settings(items: Sequence[str] | None) -> dict[str, float | str]:
+    """{key: number or word} of --set arguments."""
+
+    def value(text: str) -> float | str:
+        try:
+            return float(text)
+        except ValueError:
+            return text
+
+    return {key: value(text) for key, text in pairs(items, "--set").items()}
+
+
+def priors(items: Sequence[str] | None) -> dict[str, tuple[float | None, float]]:
+    """{pattern: (mean, sd)} of PATTERN=MEAN+-SD arguments; without a mean (PATTERN=+-SD) it is the present value."""
+    found = {}
+    for pattern, text in pairs(items, "--prior").items():
+        number = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+        match = re.fullmatch(rf"({number})?\s*(?:\+-|\+/-|±)\s*({number})", text)
+        if match is None or not float(match[2]) > 0:
+            raise ValueError(
+                f"--prior {pattern}={text}: allowed: PATTERN=MEAN+-SD with SD above 0, such as "
+                "'led_*.x=11+-0.5', or PATTERN=+-SD about the present value"
+            )
+        found[pattern] = (float(match[1]) if match[1] else None, float(match[2]))
+    return found
+
+
+def load_scene(name: str, defines: Sequence[str] | None, plugins: Path | None, variant: str | None = None) -> "Scene":
+    """The scene of a command line."""
+    from optics import facade
+
+    return facade.load(name, pairs(defines, "-D"), variant=variant or facade.DEFAULT_VARIANT, plugins=plugins)
+
+
+def scan(plugins: Path | None) -> "Registry":
+    """The registry of the shipped plugins, with a further folder."""
+    from optics.scene.registry import known
+
+    return known(plugins)
+
+
+@app.callback(invoke_without_command=True)
+def optics(
+    version: Annotated[bool, typer.Option("--version", help="Print the version.", is_eager=True)] = False,
+) -> None:
+    if version:
+        print(f"optics {__version__}")
+        raise typer.Exit()

@@ -1,0 +1,244 @@
+"""Commands about studies: calibrate, diagnose, add an effect, rehearse, and look at the result."""
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from optics.cli.shared import (
+    AsJson,
+    CaptureSet,
+    Defines,
+    FlatField,
+    Force,
+    Plugins,
+    Settings,
+    StudyFolder,
+    command,
+    one_line,
+    pairs,
+    priors,
+    settings,
+    show,
+    terminal,
+)
+
+if TYPE_CHECKING:
+    from optics.facade import Study
+
+
+@command
+def calibrate(
+    captures: CaptureSet,
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="STUDY", help="Folder of the new study.")],
+    free: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--free",
+            metavar="PATTERN",
+            help="Parameters to solve for, such as 'led_*.x'. Repeatable. Without it: every "
+            "LED's position, axis, lobe and power, every membrane's reflectance and roughness.",
+        ),
+    ] = None,
+    per_group: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--per-group",
+            metavar="PATTERN",
+            help="Parameters with a value per group of frames. Repeatable. Without it: place and depth of each press. "
+            "'none': none.",
+        ),
+    ] = None,
+    prior: Annotated[
+        list[str] | None,
+        typer.Option("--prior", metavar="PATTERN=MEAN+-SD", help="What is known beforehand. Repeatable."),
+    ] = None,
+    hold_out: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--hold-out",
+            metavar="GROUP",
+            help="Groups of frames to test on and not to fit. Repeatable. Without it: one in four. 'none': none.",
+        ),
+    ] = None,
+    define: Defines = None,
+    sets: Settings = None,
+    flat_field: FlatField = None,
+    plugins: Plugins = None,
+    robust: Annotated[
+        bool, typer.Option("--robust", help="Let residuals beyond three sigmas count less (Huber).")
+    ] = False,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Of everything random.")] = 0,
+    title: Annotated[str, typer.Option("--title", help="Of the study's report.")] = "",
+    resume: Annotated[bool, typer.Option("--resume", help="Continue this study.")] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Start a study: solve for the free parameters of the base model, and test it on frames that were held out."""
+    from optics import facade
+
+    with terminal.progress() as progress:
+        study = facade.calibrate(
+            captures,
+            output,
+            free=free or (),
+            per_group=_unless_none(per_group),
+            priors=priors(prior),
+            held_out=_unless_none(hold_out),
+            values=settings(sets),
+            defines=pairs(define, "-D"),
+            plugins=plugins,
+            flat_field=flat_field,
+            robust=robust,
+            seed=seed,
+            title=title,
+            command=["optics", *sys.argv[1:]],
+            resume=resume,
+            progress=progress,
+        )
+    for text in study.warnings:
+        terminal.note(f"warning: {one_line(text)}")
+    show({"study": str(study.folder), **study.record.steps[0]}) if as_json else print(
+        f"{study.fit.table()}\n\n{study.table()}\n{null_text(study)}{study.folder}"
+    )
+    if not study.fit.converged:
+        raise typer.Exit(1)
+
+
+def _unless_none(names: list[str] | None) -> list[str] | None:
+    """The names of a repeated option; the single word 'none' stands for an empty list."""
+    return [] if names == ["none"] else names
+
+
+def null_text(study: "Study") -> str:
+    """The last step beside models without physics, and the share of the background that the scene explains; '' without
+    either."""
+    from optics.fit.null_models import NullTable
+
+    metrics, text = study.record.metrics(len(study.record.steps) - 1), ""
+    if metrics.get("nulls"):
+        text += f"\n{NullTable.from_json(metrics['nulls']).text()}\n"
+    if metrics.get("background"):
+        shares = " / ".join(f"{max(c['share'], 0):.0%}" for c in metrics["background"]["channels"])
+        text += (
+            f"\nof the background's structure the scene explains {shares} by itself; the flat field is "
+            f"{metrics['background']['mode']}\n"
+        )
+    return text
+
+
+@command
+def diagnose(
+    study: StudyFolder,
+    as_json: AsJson = False,
+    csv: Annotated[Path | None, typer.Option("--csv", metavar="FILE", help="Write the table of effects here.")] = None,
+) -> None:
+    """Ask what the last step of a study lacks: every effect is scored, the best ones are added and refitted, and one of
+    six verdicts is given.
+
+    The exit code is 1 where the verdict is UNKNOWN or CANNOT TELL, else 0.
+    """
+    from optics.facade import Study
+    from optics.files.output import write_text
+
+    found = Study.open(study)
+    with terminal.progress() as progress:
+        result = found.diagnose(progress=progress)
+    if csv is not None:
+        write_text(csv, result.to_csv())
+    print(result.to_json() if as_json else result.text())
+    if result.word in ("UNKNOWN", "CANNOT_TELL"):
+        raise typer.Exit(1)
+
+
+@command
+def add(
+    study: StudyFolder,
+    effect: Annotated[str, typer.Argument(metavar="EFFECT", help="Its name (`optics effects`).")],
+    as_json: AsJson = False,
+) -> None:
+    """Free an effect, calibrate everything again, and record it as the next step of the study."""
+    from optics.facade import Study
+
+    found = Study.open(study)
+    with terminal.progress() as progress:
+        fit = found.add(effect, progress=progress)
+    show(found.record.steps[-1]) if as_json else print(f"{fit.table()}\n\n{found.table()}{null_text(found)}")
+
+
+@command
+def report(
+    study: StudyFolder,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", metavar="PAGE.html", help="Default: STUDY/report.html.")
+    ] = None,
+    force: Force = False,
+) -> None:
+    """Write a study as one HTML page: images, ranking, ladder."""
+    from optics.facade import Study
+
+    print(Study.open(study).report(output, overwrite=force))
+
+
+@command
+def view(
+    study: StudyFolder,
+    step: Annotated[
+        int | None, typer.Option("--step", metavar="N", help="Begin from this step.", show_default="the last one")
+    ] = None,
+    port: Annotated[
+        int, typer.Option("--port", min=0, max=65535, help="Of the page, on this machine alone.", show_default="any")
+    ] = 0,
+    browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the page in the browser.")] = True,
+) -> None:
+    """Open a page to switch effects and slide parameters, while prediction, residual and misfit follow. Ctrl-C ends
+    it."""
+    from optics.facade import Study
+
+    def ready(url: str) -> None:
+        print(url, flush=True)
+        terminal.note("Ctrl-C ends it")
+        if browser:
+            import webbrowser
+
+            webbrowser.open(url)
+
+    Study.open(study).view(step, port=port, ready=ready)
+
+
+@command
+def rehearse(
+    study: StudyFolder,
+    change: Annotated[
+        float,
+        typer.Option(
+            metavar="PERCENT",
+            help="How much each hidden effect changes the images: rms over the mean signal, before any calibration.",
+        ),
+    ] = 0.5,
+    as_json: AsJson = False,
+) -> None:
+    """Report which effects would be found if they were hidden in these captures, and what each would be taken for."""
+    from optics.facade import Study
+
+    found = Study.open(study)
+    with terminal.progress() as progress:
+        result = found.rehearse(change / 100, progress=progress)
+    print(result.to_json() if as_json else result.text(), end="")
+
+
+@command
+def imitate(
+    study: StudyFolder,
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="A new capture folder.")],
+    sets: Settings = None,
+    seed: Annotated[int, typer.Option(help="Of the noise.")] = 1,
+) -> None:
+    """Write captures as the study's model would take them, with an effect put in: --set camera.vignetting=0.3 shows
+    what that would look like."""
+    from optics.facade import Study
+    from optics.files.output import check_new_folder
+
+    check_new_folder(output)
+    folder = Study.open(study).imitate(output, settings(sets), seed=seed)
+    print(f"{folder}: optics calibrate {output} -o ANOTHER_STUDY")

@@ -1,0 +1,282 @@
+"""Refits: an effect is added, everything is calibrated again, and what comes of it is compared with its score."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from optics.diagnosis import statistics as st
+from optics.diagnosis.evidence import Candidate, Evidence, Progress, at_bound
+from optics.diagnosis.result import Pair, Refit, Split
+from optics.diagnosis.score import Table
+from optics.diagnosis.thresholds import CLEAR, LEVEL
+from optics.fit.model import Model, value_of
+from optics.fit.result import Fit
+from optics.scene.declare import Effect
+from optics.scene.parameter import Values, Variable
+
+START = 0.7  # of the expected change, to begin a refit from: the linear estimate overshoots more often than not
+LOW_START = 0.1  # of the expected change: a second start, for effects whose images bend
+ENOUGH = 0.5  # of the predicted fall: a refit that brings it needs no second start
+IMPLAUSIBLE = 10.0  # times the plausible strength: flagged
+NONLINEAR = 2.0  # factor between the fall and its prediction, beyond which an effect is flagged
+ROOM = 0.9  # of the way to a bound that a start may go: at a bound, one-sided derivatives vanish
+LEFT = 0.1  # of the way to a bound that the base keeps from it, for the same reason
+GUIDED = 3.0  # plausible sizes that a start moves the base: beyond, the linearisation is no guide
+LOOKS = 3  # at an effect's image, to find the strength at which it was taken
+SEEN_AT = 0.25  # relative change of the strength below which its image needs no further look
+FAILURES = (ValueError, ArithmeticError, np.linalg.LinAlgError)  # by which a refit says that it has no result
+
+
+@dataclass
+class Case:
+    """A calibrated model under diagnosis; the arguments are those of `optics.diagnosis.diagnose.diagnose`."""
+
+    model: Model
+    fit: Fit
+    evidence: Evidence
+    table: Table
+    refit: Callable[..., Fit]
+    fitted: list[int]
+    held_out: list[int]
+    variables_of: Callable[[Effect], Sequence[Variable]]
+    rows_max: int
+    seed: int
+    say: Progress
+
+    @property
+    def base(self) -> list[Variable]:
+        """The variables of the fit that act in the fitted frames."""
+        return [v for v in self.fit.variables if v.frames is None or set(v.frames) & set(self.fitted)]
+
+    @property
+    def before(self) -> float:
+        """chi2 of the base, with its priors."""
+        return self.evidence.normal.square + self.prior_chi2(self.fit.values)
+
+    def prior_chi2(self, values: Values) -> float:
+        """What the base's priors add to chi2."""
+        return sum(
+            ((value_of(self.model, values, v) - v.prior[0]) / v.prior[1]) ** 2
+            for v in self.fit.variables
+            if v.prior is not None
+        )
+
+
+@dataclass
+class Attempt:
+    """A refit that had a result.
+
+    fall, after   of chi2 with the base's weights, priors included; expected: `after` if the model were true
+    images        whitened residuals (H, W, C) of each frame
+    """
+
+    fit: Fit
+    fall: float
+    after: float
+    expected: float
+    images: list[np.ndarray]
+
+
+def refit_each(case: Case, chosen: Sequence[Candidate]) -> dict[str, Fit]:
+    """Refit with each chosen effect and write the result into its row; {effect: fit} of those that had one."""
+    fits = {}
+    for n, c in enumerate(chosen):
+        case.say("refit", n, len(chosen))
+        predicted, linear = _look_again(case, c)
+        best = _best_attempt(case, c, predicted, linear)
+        if best is None:
+            c.row.flags.append("refit without a result")
+            continue
+        fits[c.effect.name] = best.fit
+        _write(case, c, best, predicted)
+    case.say("refit", len(chosen), len(chosen))
+    return fits
+
+
+def _best_attempt(case: Case, c: Candidate, predicted: float, linear: np.ndarray) -> Attempt | None:
+    """The refit with the largest fall; None where none had a result.
+
+    Where an image is not proportional to its strength, other minima lie between a weak effect and a strong one: such an
+    effect starts from its full strength as well, and any effect from a weak one, until a start brings ENOUGH."""
+    best = None
+    starts = [(START, 0.0), *([(1.0, ENOUGH)] if c.form == "secant" else []), (LOW_START, ENOUGH)]
+    for fraction, enough in starts:
+        if enough and (predicted < CLEAR or best is not None and best.fall > enough * predicted):
+            break
+        try:
+            refitted = _with_effects(case, [(c, linear)], fraction)
+        except FAILURES as error:
+            c.row.flags.append(f"refit failed: {error}")
+            continue
+        found = _weighed(case, refitted)
+        if math.isfinite(found.after) and (best is None or found.fall > best.fall):
+            best = found
+    return best
+
+
+def _with_effects(case: Case, effects: Sequence[tuple[Candidate, np.ndarray]], fraction: float) -> Fit:
+    """Refit with effects, from a fraction of their expected change; raises one of FAILURES without a result."""
+    variables = [*case.base, *(v for c, _ in effects for v in c.variables)]
+    return case.refit(case.model, variables, _start(case, effects, fraction), frames=list(case.fitted))
+
+
+def _weighed(case: Case, found: Fit) -> Attempt:
+    """A refit with what it leaves, by the base's weights."""
+    after, expected, images = chi2(case, found.values)
+    after += case.prior_chi2(found.values)
+    return Attempt(found, case.before - after, after, expected, images)
+
+
+def _write(case: Case, c: Candidate, best: Attempt, predicted: float) -> None:
+    """Write a refit into the row of its effect, with flags for what is unusual."""
+    found, evidence = best.fit, case.evidence
+    strength = [value_of(case.model, found.values, v) for v in c.variables]
+    sd = {v.name: float(s) for v, s in zip(found.variables, found.sd)}
+    ended = [v.name for v, s, at in zip(c.variables, strength, c.start) if at_bound(v, s) and abs(s - at) > 0]
+    ratio = best.fall / predicted if predicted > 0 else math.nan
+    c.row.refit = Refit(
+        fall=best.fall,
+        predicted=predicted,
+        ratio=ratio,
+        chi2_before=case.before,
+        chi2_after=best.after,
+        strength=strength,
+        sd=[sd.get(v.name, math.nan) for v in c.variables],
+        at_bound=ended,
+        excess_sd=_excess(evidence, best.after, best.expected, [c]),
+        structure_p=evidence.structure(best.images, [*evidence.base, *c.columns]).p,
+        converged=bool(found.converged),
+        reason=str(found.reason),
+        clear=clear(found, c, strength),
+    )
+    if not 1 / NONLINEAR <= ratio <= NONLINEAR and predicted > CLEAR:
+        c.row.flags.append("nonlinear")
+    if ended:
+        c.row.flags.append("at a bound")
+    size = np.abs(np.array(strength) - c.start) / c.plausible
+    if size.max() > IMPLAUSIBLE and best.fall > CLEAR:
+        c.row.flags.append(f"{size.max():.2g} times the plausible strength")
+
+
+def clear(found: Fit, c: Candidate, strength: Sequence[float]) -> float:
+    """sqrt(d' C^-1 d) of the strengths' change d and their covariance C: standard deviations from none. NaN where C is
+    unknown."""
+    names = [v.name for v in found.variables]
+    own = [names.index(v.name) for v in c.variables if v.name in names]
+    covariance = np.asarray(found.covariance, float)[np.ix_(own, own)]
+    if len(own) < len(c.variables) or not np.isfinite(covariance).all():
+        return math.nan
+    change = np.array(strength) - c.start
+    inverse, rank = st.inverse(covariance)
+    return math.sqrt(max(float(change @ inverse @ change), 0.0)) if rank else math.nan
+
+
+def add_both(
+    case: Case, both: list[Candidate], split: Callable[..., tuple[list[Split], float, np.ndarray]]
+) -> Pair | None:
+    """Refit with two effects together; None without a result. `split` is `optics.diagnosis.homogeneity.split`."""
+    try:
+        refitted = _with_effects(case, [(c, c.linear) for c in both], START)
+    except FAILURES:
+        return None
+    found = _weighed(case, refitted)
+    columns = [*case.evidence.base, *(i for c in both for i in c.columns)]
+    pair = Pair(
+        [c.effect.name for c in both],
+        found.fall,
+        _excess(case.evidence, found.after, found.expected, both),
+        case.evidence.structure(found.images, columns).p,
+    )
+    if not pair.complete:
+        return pair
+    for c, other in (both, both[::-1]):  # a second effect may absorb clutter, or an error of the first
+        strength = [value_of(case.model, found.fit.values, v) for v in c.variables]
+        alone = clear(found.fit, c, strength) ** 2
+        own, chance, _ = split(c, found.fit, pair, found.fall if math.isnan(alone) else alone, other.variables)
+        uneven = [s.by for s in own if not s.holds]
+        if uneven or case.table.family.p(chance) >= LEVEL:
+            how = f"then differs by {uneven[0]}" if uneven else "is no more than its scatter between parts of the data"
+            return replace(pair, but=f"{c.effect.name}'s strength {how}")
+    return pair
+
+
+def _look_again(case: Case, c: Candidate) -> tuple[float, np.ndarray]:
+    """(predicted fall of a refit, coefficients) of an effect by its image at the strength that was found, not at the
+    plausible one.
+
+    A secant to the plausible strength is the wrong image where a weak effect has another shape than a strong one: leaks
+    that add in amplitude, two components of one retardance. Scores and tests keep their values."""
+    model, evidence, values = case.model, case.evidence, case.fit.values
+    fall, linear, first = c.row.fall, c.linear, len(evidence.columns)
+    if c.form != "secant" or not linear.any():
+        return fall, linear
+    plain, k = evidence.thinned(extra=1), evidence.thinning
+    before = model.predict(values, evidence.frames, evidence.seed)
+    for _ in range(LOOKS):
+        there, normal = values.copy(), plain.copy()
+        for v, start, step in zip(c.variables, c.start, c.change_of(linear)):
+            there.put(v, float(np.clip(start + step, *v.parameter.bounds)))
+        for block, old, new in zip(evidence.blocks, before, model.predict(there, evidence.frames, evidence.seed)):
+            image = (np.asarray(new, float) - old).reshape(-1)[block.index] / block.sigma
+            st.add_bins(normal, block.where, block.middle, block.r, first, np.zeros(len(block.r), int), 1, [image])
+        projected = evidence.project(normal, evidence.base, [first], k)
+        information, score = projected.information[0, 0], projected.score[0]
+        if not (math.isfinite(score) and projected.survival[0] > st.VISIBLE and score > 0):
+            return c.row.fall, c.linear
+        fall, times = k * score**2 / information, score / information
+        if abs(times - 1) < SEEN_AT:
+            break
+        linear = linear * min(max(times, 0.1), 10.0)  # one look trusts a linearisation over one decade
+    return float(fall), linear
+
+
+def _start(case: Case, effects: Sequence[tuple[Candidate, np.ndarray]], fraction: float) -> Values:
+    """Effects at a fraction of their expected change, and the base where it would move to make room for them."""
+    evidence, first = case.evidence, len(case.evidence.base)
+    values, moves = case.fit.values.copy(), np.zeros(first)
+    for c, linear in effects:
+        linear = linear * fraction
+        for v, start, step in zip(c.variables, c.start, c.change_of(linear)):
+            low, high = v.parameter.bounds
+            lowest = start + ROOM * (low - start) if math.isfinite(low) else -math.inf
+            highest = start + ROOM * (high - start) if math.isfinite(high) else math.inf
+            values.put(v, float(np.clip(start + step, lowest, highest)))
+        moves = moves + evidence.projected.response[:, np.array(c.columns) - first] @ linear
+    for i, move in zip(evidence.base, moves):
+        v = evidence.columns[i]
+        here = value_of(case.model, case.fit.values, v)
+        limit = GUIDED * abs(v.parameter.plausible)
+        to = here + float(np.clip(move, -limit, limit))
+        low, high = v.parameter.bounds
+        lowest = low + LEFT * (here - low) if math.isfinite(low) else to
+        highest = high - LEFT * (high - here) if math.isfinite(high) else to
+        values.put(v, float(np.clip(to, lowest, highest)))
+    return values
+
+
+def chi2(case: Case, values: Values) -> tuple[float, float, list[np.ndarray]]:
+    """chi2 of other values with the base's pixels and weights, its expectation if they were true, and the whitened
+    residual images (H, W, C).
+
+    Brighter pixels are noisier: with the base's weights, chi2 of the truth is sum of variance/sigma^2, not the number
+    of values."""
+    total, expected, images = 0.0, 0.0, []
+    evidence, model = case.evidence, case.model
+    predicted = model.predict(values, evidence.frames)
+    for frame, prediction, sigma, use in zip(evidence.frames, predicted, evidence.sigma, evidence.use):
+        image = np.where(use, (np.asarray(model.frames[frame].image, float) - prediction) / sigma, 0.0)
+        total += float(np.sum(image**2))
+        variance = evidence.variance(model, frame, np.asarray(prediction, float), values)
+        expected += float(np.sum(np.where(use, variance, 0.0) / sigma.astype(float) ** 2))
+        images.append(image)
+    return total, expected, images
+
+
+def _excess(evidence: Evidence, after: float, expected: float, added: Sequence[Candidate]) -> float:
+    """Standard deviations by which chi2 with these effects exceeds its expectation if nothing else were missing."""
+    free = evidence.projected.rank + sum(len(c.cone.live) for c in added)
+    return (after - expected + free) / math.sqrt(2 * max(evidence.normal.count - free, 1))

@@ -1,0 +1,201 @@
+"""Beside the verdict: upper limits, a word for each effect, warnings, and hints what to measure next."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from optics.captures import noise as camera_noise
+from optics.diagnosis import statistics as st
+from optics.diagnosis.decide import CURVE
+from optics.diagnosis.evidence import Candidate, Evidence, at_bound, measure
+from optics.diagnosis.refit import Case
+from optics.diagnosis.result import NAMED, Basis, Condition, Shift, Split
+from optics.diagnosis.score import KAPPA, Table
+from optics.diagnosis.text import AT_FAULT, moved_by
+from optics.diagnosis.thresholds import CLEAR, EXCESS, LEVEL
+from optics.fit.model import value_of
+from optics.fit.result import Fit
+from optics.words import some
+
+RENDER_NOISE = 0.01  # of the camera's variance: Monte Carlo noise above it weakens every test
+SMOOTH = 0.7  # of the noise expected in fine detail: below, neighbouring pixels share their noise
+REPEATABLE = 1000  # times as many frames: above, repeats are no advice
+# where no shot was simulated
+USUALLY = "the same press at 0.4 of the exposure, and one deeper press, often tell more than repeats"
+
+
+def write_limits(case: Case, claimed: Candidate | None, fits: Mapping[str, Fit], basis: Basis) -> None:
+    """Upper limits of every effect; after a claim, at the values with the claimed effect, so that it misleads no other."""
+    evidence, others, widen = case.evidence, case.table.order, math.sqrt(max(basis.phi, 1.0))
+    if claimed is not None:
+        values, refit = fits[claimed.effect.name].values, claimed.row.refitted
+        base = [
+            v
+            for v in [*(evidence.columns[i] for i in evidence.base), *claimed.variables]
+            if not at_bound(v, value_of(case.model, values, v))
+        ]
+        others = [replace(c, forms={}, broken=False) for c in others if c is not claimed]
+        evidence = measure(
+            case.model, values, base, others, evidence.frames, case.rows_max, case.seed, case.say, "upper limits"
+        )
+        widen = math.sqrt(max(1 + refit.excess_sd * math.sqrt(2 / basis.dof), 1.0))
+    for c in others:
+        _write_limit(evidence, c, list(c.forms) if claimed is not None else [c.form], widen)
+
+
+def _write_limit(evidence: Evidence, c: Candidate, forms: Sequence[str], widen: float) -> None:
+    """|change| + 2 sd of each strength, by the form of the effect's image that explains most; the sd times `widen`."""
+    projected, first, best = evidence.projected, len(evidence.base), -math.inf
+    for form in forms:
+        columns = c.forms[form]
+        seen = [j for j, i in enumerate(columns) if projected.survival[i - first] > st.VISIBLE]
+        if not seen or c.broken:
+            continue
+        own = [columns[j] - first for j in seen]
+        cone = st.Cone(projected.information[np.ix_(own, own)], [c.sides[j] for j in seen], draws=1000)
+        fall, found = cone.solve(projected.score[own])
+        if fall - cone.expectation > best:
+            best = fall - cone.expectation
+            linear = np.full(len(c.variables), math.nan)
+            linear[seen] = np.abs(found) + 2 * widen * cone.sd
+            c.form = form
+            c.row.upper = c.change_of(linear).tolist()
+
+
+def write_verdicts(
+    table: Table, word: str, winner: Candidate | None, members: Sequence[Candidate], splits: Sequence[Split]
+) -> None:
+    """Each effect's own verdict and the flags that come of splits and of other weights."""
+    for c in table.order:
+        mine = [s for s in splits if s.effect == c.effect.name]
+        if mine and not all(s.holds for s in mine):
+            c.row.flags.append("uneven")
+        if c.row.refit is None and c.row.net <= 0 or c.row.p_family >= LEVEL:
+            c.row.verdict = "nothing visible" if "nothing visible" in c.row.flags else "no evidence"
+        elif word == "CLAIM" and c is winner:
+            c.row.verdict = "MISSING"
+        elif word == "AMBIGUOUS" and c in members:
+            c.row.verdict = "possible"
+        elif word == "PARTIAL" and c is winner:
+            c.row.verdict = "partial"
+        if c is winner and table.p_best < LEVEL and {table.winner_uniform, table.winner_dilated} - {c.effect.name}:
+            c.row.flags.append("fragile")
+
+
+def warnings_of(
+    case: Case,
+    word: str,
+    winner: Candidate | None,
+    shifts: Sequence[Shift],
+    dropped: Sequence[str],
+    basis: Basis,
+) -> list[str]:
+    """What weakens the verdict, in sentences."""
+    model, evidence, table = case.model, case.evidence, case.table
+    texts = [] if case.fit.converged else [f"the base stopped before it converged: {case.fit.reason}"]
+    if model.captures is not None:
+        texts += [w for w in camera_noise.warnings_of(model.noise, model.captures) if w not in texts]
+    if dropped:
+        texts.append(f"at a bound and taken as known: {', '.join(dropped)}")
+    if evidence.not_finite:
+        texts.append(f"{evidence.not_finite} values left out because prediction or derivative is not finite")
+    if evidence.render_noise > RENDER_NOISE:
+        texts.append(
+            f"Monte Carlo noise of the prediction adds {evidence.render_noise:.1%} to the variance; render with more "
+            "samples"
+        )
+    noisy = [c.effect.name for c in table.order if c.row.kappa > KAPPA]
+    if noisy:
+        texts.append(
+            f"derivative images are noisy (kappa above {KAPPA:g}): {', '.join(noisy)}; render with more samples"
+        )
+    if basis.high_frequency < SMOOTH:
+        texts.append(
+            f"fine detail of the residual has {basis.high_frequency:.2f} of the noise expected: the images look interpolated "
+            "or filtered, or the noise is overstated; neighbouring pixels then share their noise and p is too small"
+        )
+    if abs(basis.excess_sd) > EXCESS and basis.structure_p >= LEVEL:
+        texts.append(
+            f"chi2 is {basis.phi:.3g} per degree of freedom without structure: the noise model (gain, PRNU) is off "
+            "rather than the physics"
+        )
+    if winner is not None and table.p_best < LEVEL:
+        for other, what in (
+            (table.winner_uniform, "with uniform weights"),
+            (table.winner_dilated, "with masks one pixel wider"),
+        ):
+            if other and other != winner.effect.name:
+                texts.append(f"fragile: {what} the best effect is {other}, not {winner.effect.name}")
+    moved = [s for s in shifts if s.warn]
+    if winner is not None and moved and word in NAMED:
+        texts.append(
+            f"with {winner.effect.name}, what had been calibrated moves by more than 3 sd or out of its prior: "
+            + some([moved_by(s) for s in moved], 3)
+        )
+    return texts
+
+
+def hints_of(
+    word: str,
+    conditions: Sequence[Condition],
+    members: Sequence[Candidate],
+    gaps: Sequence[Sequence[float]],
+    names: Sequence[str],
+) -> list[str]:
+    """What to measure next, in words: from D between the effects and from what they declare, without simulated shots.
+
+    gaps   D[i][j] between the refitted effects `names`
+    """
+    failed = {c.name for c in conditions if not c.holds}
+    hints = _for_a_tie(members, gaps, names) if word == "AMBIGUOUS" and len(members) > 1 else []
+    if "held out" in failed and word != "NOTHING":
+        hints.append(
+            "hold out frames that the fit has not seen (other presses or places), or find why they do not improve"
+        )
+    if "near" in failed:
+        hints.append(f"no effect brings the model near its images: check {AT_FAULT}")
+    if CURVE in failed:
+        hints.append(
+            "check [noise]: repeats of one frame tell system_gain and dark_noise, a flat_field takes the sensor's own pattern out"
+        )
+    if word == "UNKNOWN":
+        hints.append(
+            "draft an effect from the curve (optics effects new NAME --from STUDY), add it, and diagnose again"
+        )
+    return hints
+
+
+def _for_a_tie(members: Sequence[Candidate], gaps: Sequence[Sequence[float]], names: Sequence[str]) -> list[str]:
+    """What tells the effects of an ambiguous set apart, above all the pair that is hardest to tell apart."""
+
+    def least(a: Candidate, b: Candidate) -> float:
+        i, j = names.index(a.effect.name), names.index(b.effect.name)
+        return min(gaps[i][j], gaps[j][i])
+
+    pairs = [(least(a, b), a, b) for i, a in enumerate(members) for b in members[i + 1 :]]
+    d, a, b = min(pairs, key=lambda pair: pair[0])
+    pair = (
+        f"hardest pair: {a.effect.name} / {b.effect.name}, expected chi2 between them D = {d:.3g}, "
+        f"P(correct) = {st.probability_correct(d):.2f} in noise alone; "
+    )
+    more = math.ceil(CLEAR / d) if d > 0 else 0
+    if d >= CLEAR:
+        hints = [
+            pair + "noise would allow a decision, but not the misfit that both leave",
+            "add each of them in a copy of the study, diagnose again, and keep the one that leaves the least: further "
+            "missing effects hide which of them it is",
+        ]
+    elif 0 < more < REPEATABLE:
+        hints = [pair + f"{more} times as many frames of the same kind would decide in 95 % of cases"]
+    else:
+        hints = [pair + "more frames of the same kind will not decide"]
+    for one, other in ((a, b), (b, a)):
+        alone = [x for x in one.effect.acts if x not in other.effect.acts]
+        if alone:
+            hints.append(f"only {one.effect.name} acts through {', '.join(alone)}: vary that and keep the rest")
+    hints += [f"{c.effect.name} needs: {c.effect.needs}" for c in members if c.effect.needs]
+    return [*hints, USUALLY]

@@ -1,0 +1,290 @@
+"""Scores of all effects against a calibrated model: how far chi2 would fall, how surely, and which effects are alike.
+
+Nothing is added to the model yet: derivative images, projection and ranking. The algebra is in
+`optics.diagnosis.statistics`, the sums over pixels in `optics.diagnosis.evidence`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from optics.diagnosis import statistics as st
+from optics.diagnosis.evidence import Candidate, Evidence, Progress, at_bound, measure, silent
+from optics.diagnosis.result import Row
+from optics.diagnosis.thresholds import EXCESS, LEVEL
+from optics.errors import Underdetermined
+from optics.fit.model import Model, value_of
+from optics.fit.result import Fit
+from optics.scene.declare import Effect
+from optics.scene.parameter import Variable
+from optics.words import some
+
+SETTLED = 0.01  # of the excess of chi2 per parameter: what a calibrated base may still absorb. Derivative images of
+# moving edges are finite samples, which no calibration makes orthogonal to a residual with structure
+KAPPA = 0.1  # noise per pixel of derivative images over their signal, above which strengths are biased
+FAINT = 10  # the power of the test is stated for the plausible strength over this
+
+
+@dataclass
+class Scored:
+    """Every effect scored against a calibrated model.
+
+    dropped      names of base variables that stand at a bound, and are taken as known there
+    not_tested   effect -> why
+    """
+
+    evidence: Evidence
+    table: Table
+    dropped: list[str]
+    not_tested: dict[str, str]
+
+
+def score(
+    model: Model,
+    fit: Fit,
+    effects: Sequence[Effect],
+    variables_of: Callable[[Effect], Sequence[Variable]],
+    fitted: Sequence[int],
+    *,
+    rows_max: int = 400_000,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> Scored:
+    """Score and rank the effects; arguments and errors as of `optics.diagnosis.diagnose.diagnose`."""
+    fitted = [int(i) for i in fitted]
+    if not fitted:
+        raise ValueError("diagnose: no fitted frames given; name the frames that the base was calibrated on")
+    _require_noise(model)
+    base, dropped = _base_variables(model, fit, fitted)
+    candidates, not_tested = _candidates(model, fit, effects, variables_of, fitted)
+    evidence = measure(model, fit.values, base, candidates, fitted, rows_max, seed, progress or silent)
+    _require_convergence(evidence, fit)
+    return Scored(evidence, _rank(evidence, candidates, seed), dropped, not_tested)
+
+
+# -- what must hold before any score ----------------------------------------------------------------------------------
+
+
+def _require_noise(model: Model) -> None:
+    """Refuse images of unknown saturation or black level: both fake effects at any significance."""
+    for name, cost in (
+        ("saturation", "unmasked saturation makes the right effect lose in four of five cases"),
+        ("black_level", "half a DN of black level looks like glare"),
+    ):
+        value = getattr(model.noise, name, None)
+        if value is None or not math.isfinite(value):
+            raise Underdetermined(
+                f"diagnose: the camera's {name} is unknown, and {cost}; give it under [noise] in "
+                "captures.toml, or estimate the noise from dark and repeated frames"
+            )
+
+
+def _base_variables(model: Model, fit: Fit, fitted: Sequence[int]) -> tuple[list[Variable], list[str]]:
+    """The variables that the base may move in the fitted frames, and names of those at a bound."""
+    present = [v for v in fit.variables if v.frames is None or set(v.frames) & set(fitted)]
+    bound = [v.name for v in present if v.name in fit.at_bound or at_bound(v, value_of(model, fit.values, v))]
+    return [v for v in present if v.name not in bound], bound
+
+
+def _candidates(
+    model: Model,
+    fit: Fit,
+    effects: Sequence[Effect],
+    variables_of: Callable[[Effect], Sequence[Variable]],
+    fitted: Sequence[int],
+) -> tuple[list[Candidate], dict[str, str]]:
+    """The effects that can be tested, at the values of the fit; {effect: why not} for the others."""
+    taken = {key for v in fit.variables for key in v.keys}
+    found: list[Candidate] = []
+    not_tested = {}
+    for effect in effects:
+        variables = [v for v in variables_of(effect) if v.frames is None or set(v.frames) & set(fitted)]
+        if not variables:
+            not_tested[effect.name] = "the scene has no part that carries it"
+            continue
+        if any(key in taken for v in variables for key in v.keys):
+            not_tested[effect.name] = "in the model already"
+            continue
+        found.append(Candidate.at(model, fit.values, effect, variables))
+    return found, not_tested
+
+
+def _require_convergence(evidence: Evidence, fit: Fit) -> None:
+    """Refuse a base that is not calibrated: |Q'r|^2 would be chi2 of a parameter, not of a missing effect.
+
+    Allowed is 1 per parameter or, where the misfit exceeds noise, SETTLED of that excess."""
+    rank = max(evidence.projected.rank, 1)
+    excess = max(evidence.projected.chi2 - (evidence.normal.count - rank), 0.0)
+    allowed = max(1.0, SETTLED * excess / rank)
+    if evidence.gradient >= allowed:
+        how = "" if fit.converged else f" (it stopped: {fit.reason})"
+        raise Underdetermined(
+            f"diagnose: the base model is not calibrated to convergence{how}: moving its {rank} "
+            f"parameters would lower chi2 by {evidence.projected.absorbed:.3g}, {evidence.gradient:.3g} per parameter "
+            f"(most of all {some(_off(evidence))}); allowed: below {allowed:.3g}; calibrate again from there, without robust "
+            "weights, or hold parameters that the captures hardly tell apart: leave them out of --free, or give them a "
+            "--prior"
+        )
+
+
+def _off(evidence: Evidence) -> list[str]:
+    """The variables of the base whose images change most in the step that would calibrate it."""
+    step = evidence.inverse(evidence.base) @ (evidence.normal.score[evidence.base] + evidence.pull)
+    change = np.abs(step) * np.sqrt(np.maximum(np.diag(evidence.normal.gram)[evidence.base], 0))
+    return [evidence.columns[evidence.base[i]].name for i in np.argsort(-change)[:3] if change[i] > 0.3 * change.max()]
+
+
+# -- ranking ----------------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class Table:
+    """All candidates, best first, and the family-wise test that they share.
+
+    information   (k, k) V of all columns of candidates, zero where nothing is visible
+    p_best        the smallest family-wise p
+    winner_uniform, winner_dilated   the best effect with uniform weights, and with masks one pixel wider
+    """
+
+    order: list[Candidate]
+    information: np.ndarray
+    family: st.Family
+    p_best: float
+    winner_uniform: str
+    winner_dilated: str
+
+
+def _rank(evidence: Evidence, candidates: list[Candidate], seed: int) -> Table:
+    """Score every candidate in its best form, and write its row."""
+    projected, first = evidence.projected, len(evidence.base)
+    # Where the noise of a derivative image exceeds what survives of it, products of two such images are random, and may
+    # be next to nothing.
+    visible = (projected.survival > st.VISIBLE) & (
+        np.diag(projected.information) > evidence.normal.noise[evidence.rest]
+    )
+    for c in candidates:
+        if c.broken:
+            visible[[i - first for columns in c.forms.values() for i in columns]] = False
+    information = projected.information * np.outer(visible, visible)
+    score = projected.score * visible
+    shared: list[tuple[np.ndarray, st.Cone]] = []
+    for c in candidates:
+        forms = []
+        for form, columns in c.forms.items():
+            own = np.array(columns) - first
+            cone = st.Cone(information[np.ix_(own, own)], c.sides, seed)
+            shared.append((own, cone))
+            forms.append((form, own, cone, *cone.solve(score[own])))
+        c.form, own, c.cone, fall, c.linear = max(forms, key=lambda t: t[3] - t[2].expectation)
+        c.columns = [int(i) + first for i in own]
+        c.row = _row(evidence, c, own, fall)
+    family = st.Family(information, shared, seed)
+    uniform_gram = evidence.thinned(lambda block: block.sigma)
+    for c in candidates:
+        _write_row(evidence, c, candidates, information, family, uniform_gram)
+    order = sorted(candidates, key=lambda c: (not len(c.cone.live), -c.row.net, c.effect.name))
+    p_best = min((c.row.p_family for c in candidates), default=1.0)
+    uniform = _winner(evidence, uniform_gram, candidates)
+    dilated = _winner(evidence, evidence.thinned(lambda block: block.inner.astype(float)), candidates)
+    return Table(order, information, family, p_best, uniform, dilated)
+
+
+def _write_row(
+    evidence: Evidence,
+    c: Candidate,
+    candidates: Sequence[Candidate],
+    information: np.ndarray,
+    family: st.Family,
+    uniform: st.Normal,
+) -> None:
+    """Complete the row of a scored candidate: what needs the other candidates, or images in DN (`uniform`)."""
+    row, chi2 = c.row, evidence.projected.chi2
+    dof = max(evidence.normal.count - evidence.projected.rank, 1)
+    row.p_family = family.p(row.p)
+    row.power = c.cone.power(c.linear_of(c.usual / FAINT), c.cone.critical(family.critical(LEVEL)))
+    raw = uniform.gram[np.ix_(c.columns, c.columns)]
+    usual = c.linear_of(c.usual)
+    c.raw = math.sqrt(max(usual @ raw @ usual, 0.0) / max(uniform.count, 1)) / evidence.signal
+    row.image = math.sqrt(max(c.linear @ raw @ c.linear, 0.0) / max(uniform.count, 1)) / evidence.signal
+    row.misfit_after = evidence.noise * math.sqrt(max(chi2 - row.fall, 0.0) / dof)
+    excess = chi2 - dof
+    row.share = row.net / excess if excess > EXCESS * math.sqrt(2 * dof) else math.nan
+    row.confused_with, row.cos = _confused(information, c, candidates, len(evidence.base))
+    if row.survival <= st.VISIBLE or not len(c.cone.live):
+        row.flags.append("a derivative image is not finite" if c.broken else "nothing visible")
+    if row.kappa > KAPPA:
+        row.flags.append("noisy derivative")
+    if any(
+        v.parameter.neutral is not None and abs(value - v.parameter.neutral) > 1e-9 * abs(v.parameter.plausible)
+        for v, value in zip(c.variables, c.start)
+    ):
+        row.flags.append("not at neutral: tests a change of the value assumed")
+
+
+def _row(evidence: Evidence, c: Candidate, own: np.ndarray, fall: float) -> Row:
+    """The row of a candidate by itself; own: places of its columns among those that were projected."""
+    raw = np.diag(evidence.normal.gram)[c.columns] * c.plausible**2
+    survival = float(evidence.projected.survival[own] @ raw / raw.sum()) if raw.sum() > 0 else 0.0
+    kappa = evidence.normal.kappa()[c.columns]
+    seen = c.cone.live
+    change = c.change_of(c.linear)
+    return Row(
+        name=c.effect.name,
+        variables=[v.name for v in c.variables],
+        units=[v.parameter.unit for v in c.variables],
+        form=c.form,
+        fall=fall,
+        expected=c.cone.expectation,
+        p=float(c.cone.p(fall)),
+        p_family=1.0,
+        start=c.start.tolist(),
+        change=change.tolist(),
+        sd=c.sd_of(c.cone.sd).tolist(),
+        of_plausible=float(np.max(np.abs(change) / c.plausible)),
+        image=math.nan,
+        misfit_after=math.nan,
+        share=math.nan,
+        survival=survival,
+        power=0.0,
+        kappa=float(kappa[seen].max(initial=0.0)),
+        confused_with="",
+        cos=0.0,
+        upper=[math.nan] * len(c.variables),
+    )
+
+
+def _confused(information: np.ndarray, c: Candidate, candidates: Sequence[Candidate], first: int) -> tuple[str, float]:
+    """The effect that mimics this one best, and |cos| of the angle between what survives of both."""
+    own = np.array(c.columns) - first
+    strength = c.direction
+    full = float(strength @ information[np.ix_(own, own)] @ strength)
+    best = ("", 0.0)
+    for other in candidates:
+        if other is c or not full > 0 or not other.columns or not len(other.cone.live):
+            continue
+        gap = st.gap(information, own, strength, np.array(other.columns) - first, other.cone)
+        cos = math.sqrt(max(1 - gap / full, 0.0))
+        if cos > best[1]:
+            best = (other.effect.name, cos)
+    return best
+
+
+def _winner(evidence: Evidence, normal: st.Normal, candidates: Sequence[Candidate]) -> str:
+    """Name of the best effect with other weights; only their proportions matter to an order."""
+    if not candidates:
+        return ""
+    projected = evidence.project(normal, evidence.base, evidence.rest, evidence.thinning)
+    first = len(evidence.base)
+    scale = projected.chi2 / max(normal.count - projected.rank, 1)
+    net: dict[str, float] = {}
+    for c in candidates:
+        if not len(c.cone.live):
+            continue
+        own = np.array(c.columns) - first
+        seen = (projected.survival[own] > st.VISIBLE).astype(float)
+        cone = st.Cone(projected.information[np.ix_(own, own)] * np.outer(seen, seen), c.sides, draws=1000)
+        net[c.effect.name] = cone.solve(projected.score[own] * seen)[0] / scale - cone.expectation
+    return max(net, key=lambda name: net[name], default="")

@@ -1,0 +1,339 @@
+"""How a verdict reads: the sentence with the numbers that decided it, and the report for a terminal."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from optics.diagnosis.decide import CURVE, Findings
+from optics.diagnosis.result import (
+    NAMED,
+    PLANS,
+    Advice,
+    Basis,
+    Condition,
+    Diagnosis,
+    Fingerprint,
+    Level,
+    Row,
+    Shift,
+)
+from optics.diagnosis.thresholds import CLEAR, CLUTTERED, LEVEL, MARGIN
+from optics.words import p_text, percent, spaced, table, with_sd
+
+# what to check where no effect brings the model near its images
+AT_FAULT = (
+    "units, LEDs that were off, black_level, and that images are linear (not encoded for viewing) and whole, with row 0 "
+    "at the top"
+)
+
+
+def strength_text(values: Sequence[float], sds: Sequence[float], units: Sequence[str]) -> str:
+    """Strengths with their standard deviations: all of them up to three, else the largest."""
+    unit = spaced(units[0] if units else "")
+    if len(values) == 1:
+        return with_sd(values[0], sds[0]) + unit
+    if len(values) <= 3:
+        return ", ".join(with_sd(v, s) for v, s in zip(values, sds)) + unit
+    biggest = int(np.argmax(np.abs(values)))
+    return f"{len(values)} values up to {with_sd(values[biggest], sds[biggest])}{unit}"
+
+
+def limit_text(row: Row) -> str:
+    """The upper limit of an effect: of its strengths, the largest."""
+    limits = [u for u in row.upper if math.isfinite(u)]
+    return f"{row.name} < {max(limits):.2g}{spaced(row.units[0])}" if limits else f"{row.name}: nothing visible"
+
+
+def moved_by(s: Shift) -> str:
+    """How far a calibrated parameter moved when the effect was added."""
+    return f"{s.variable} by {abs(s.after - s.before):.2g}{spaced(s.unit)}"
+
+
+def advice_text(a: Advice) -> str:
+    """What a shot would tell apart, by how much."""
+    p = a.hardest
+    return (
+        f"{a.shot}: {'tells' if p.told else 'hardly tells'} {p.effect} from {p.rival}, D {p.before:.3g} "
+        f"-> {p.after:.3g}, P(correct) {p.correct_before:.2f} -> {p.correct_after:.2f}"
+        + (
+            ""
+            if math.isnan(p.share_after)
+            else f", D over the fall {percent(p.share_before)} -> {percent(p.share_after)} "
+            f"({percent(MARGIN)} needed while misfit is left)"
+        )
+        + (f"; the closest two then have D {a.least:.3g}" if a.least < min(0.9 * p.after, 4 * CLEAR) else "")
+    )
+
+
+def advice_lines(advice: Sequence[Advice]) -> list[str]:
+    """The best plan, as many further presses for comparison, and up to four single shots that make a difference."""
+    plans = {a.family: a for a in advice if a.family in PLANS}
+    singles = [a for a in advice if a.family not in PLANS]
+    lines = [f"next: {advice_text(plans['together'])}"] if "together" in plans else []
+    if "more of the same" in plans:
+        lines.append(f"      (more of the same instead: {advice_text(plans['more of the same'])})")
+    known = {a.shot for a in plans.values()}
+    return (
+        lines + [f"next, or by itself: {advice_text(a)}" for a in singles if a.shot not in known and a.hardest.told][:4]
+    )
+
+
+def sentence(
+    word: str,
+    conditions: Sequence[Condition],
+    f: Findings,
+    rows: Sequence[Row],
+    members: Sequence[Row],
+    fingerprints: Sequence[Fingerprint],
+    levels: Sequence[Level],
+    shifts: Sequence[Shift],
+    basis: Basis,
+) -> str:
+    """The verdict in words, with the numbers that decided it.
+
+    rows      all effects; members: those that explain the residual about equally well, the winner first
+    levels    misfit without and with the winner; shifts: what moved when it was added
+    """
+    failing = [c for c in conditions if not c.holds and c.name != "structure is left"]
+    if word == "NOTHING":
+        return _nothing(f, len(rows))
+    if word == "AMBIGUOUS":
+        return _ambiguous(members)
+    if word == "UNKNOWN":
+        return _unknown(f, next(c for c in fingerprints if c.coordinate == f.coordinate), basis)
+    if word == "CANNOT_TELL":
+        last = [c for c in failing if c.name == CURVE]  # says more than all others together
+        reasons = "; ".join(f"{c.name}: {c.text}" for c in last or failing) or "; ".join(c.text for c in conditions)
+        return f"misfit is left, but no verdict holds ({reasons})."
+    winner = next(row for row in rows if row.name == f.winner)
+    if word == "CLAIM":
+        return _claim(f, winner, rows, levels, shifts, basis)
+    return _partial(f, winner, failing)
+
+
+def _nothing(f: Findings, tested: int) -> str:
+    if not f.p_family < LEVEL:
+        how = f"family-wise p {p_text(f.p_family)}"
+    elif not f.p_winner < LEVEL:
+        how = f"after refit, family-wise p {p_text(f.p_winner)}"
+    else:
+        how = f"after refit, the best, {f.winner}, has a strength of {f.clear:.2g} sd"
+    tail = (
+        f"no excess misfit is left ({f.excess_sd:.2g} sd)"
+        if math.isnan(f.structure_p)
+        else f"no low-frequency structure is left (p {p_text(f.structure_p)})"
+    )
+    return f"none of {tested} effects stands out ({how}) and {tail}. The upper limits say what can still hide."
+
+
+def _claim(
+    f: Findings, row: Row, rows: Sequence[Row], levels: Sequence[Level], shifts: Sequence[Shift], basis: Basis
+) -> str:
+    refit = row.refitted
+    text = (
+        f"{row.name} is missing, strength {strength_text(refit.strength, refit.sd, row.units)}. Adding it lowers "
+        f"held-out misfit from {percent(levels[0].held_out)} to {percent(levels[-1].held_out)} (noise: {percent(basis.noise)}). "
+        "Its strength is the same in every part of the data."
+    )
+    others = [r for r in rows if r is not row and any(math.isfinite(u) for u in r.upper)]
+    if others:
+        text += " Not " + ", not ".join(limit_text(r) for r in others[:3]) + "."
+    moved = [s for s in shifts if s.warn][:2]
+    if moved:
+        text += " Without it, " + " and ".join(moved_by(s).replace(" by ", " was off by ", 1) for s in moved) + "."
+    text += (
+        " With it nothing is left to explain."
+        if refit.complete
+        else f" With it an excess of {refit.excess_sd:.2g} sd and structure (p {p_text(refit.structure_p)}) are left: add "
+        "it, calibrate and diagnose again."
+    )
+    if "fragile" in row.flags:
+        text += " Fragile: other weights or masks prefer another effect."
+    return text + (
+        " Falling held-out error verifies the prediction, not the identity; the identity rests on the margin "
+        f"({f.fall - f.runner_up:.3g} in chi2), the homogeneity and the absence of a better curve."
+    )
+
+
+def _ambiguous(members: Sequence[Row]) -> str:
+    names = ", ".join(f"{row.name} ({row.refitted.fall:.3g})" for row in members)
+    if len(members) < 2:
+        names += " and at least one that was not added"
+    return f"these explain the residual about equally well (fall of chi2): {names}. The data cannot tell them apart."
+
+
+def _partial(f: Findings, winner: Row, failing: Sequence[Condition]) -> str:
+    uneven = next((c for c in failing if c.name == "even"), None)
+    if uneven is None:
+        return f"{winner.name} explains {f.share:.0%} of the excess misfit, {1 - f.share:.0%} has another cause."
+    part = f"{f.share:.0%} of the excess" if f.weighed else "part of the residual"
+    return (
+        f"{winner.name} would explain {part}, but not with one strength ({uneven.text}): it stands in for "
+        "another cause, or comes with one."
+    )
+
+
+def _unknown(f: Findings, curve: Fingerprint, basis: Basis) -> str:
+    best = f"{f.ratio:.3g} times as much as the best effect" if f.winner else "what no effect does"
+    i = int(np.argmax(np.abs(curve.curve)))
+    size = percent(curve.curve[i]) if curve.kind == "gain" else f"{curve.curve[i]:.2g} DN"
+    where = curve.labels[i] if curve.labels else f"{curve.coordinate} {curve.centres[i]:.3g}{spaced(curve.unit)}"
+    text = (
+        f"structure is left that depends on '{curve.coordinate}': a curve along it explains {best}. "
+        f"As {'a gain' if curve.kind == 'gain' else 'an offset'}, it is largest at {where}: {size}. "
+        "No effect of the library has this shape."
+    )
+    if (beyond := math.sqrt(max(basis.misfit**2 - basis.noise**2, 0.0))) < CLUTTERED:
+        text += (
+            f" It is faint: misfit beyond noise is {percent(beyond)} of the signal; mottle of a coating or a fixed "
+            "pattern of the sensor makes as much."
+        )
+    return text
+
+
+# -- the report -------------------------------------------------------------------------------------------------------
+
+
+def report(d: Diagnosis) -> str:
+    """Everything that a diagnosis says, for a terminal; blocks without content are left out."""
+    lines = [
+        *_data_lines(d),
+        f"{d.word.replace('_', ' ')}: {d.sentence}",
+        "",
+        *_effect_lines(d),
+        "",
+        "decided by: " + "; ".join(f"{c.name} {'yes' if c.holds else 'no'} ({c.text})" for c in d.conditions),
+        *_split_lines(d),
+        *_level_lines(d),
+        *_curve_lines(d),
+        *_shift_lines(d),
+        *advice_lines(d.advice),
+        *(f"next: {hint}" for hint in d.hints),
+        *(f"warning: {w}" for w in d.warnings),
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _data_lines(d: Diagnosis) -> list[str]:
+    b = d.basis
+    values = f"{b.values:,}".replace(",", " ")
+    thinned = f"; 1 in {b.thinning} pixels for curves and splits" if b.thinning > 1 else ""
+    return [
+        f"diagnose: {b.frames} frames, {values} values used ({percent(b.masked)} masked{thinned}), noise "
+        f"{percent(b.noise)}, misfit {percent(b.misfit)}, excess {b.excess_sd:.3g} sd"
+    ]
+
+
+def _effect_lines(d: Diagnosis) -> list[str]:
+    """The table of effects that are significant or were refitted, the upper limits of all others, and the untested."""
+    lines = []
+    shown = [r for r in d.rows if r.p_family < LEVEL or r.refit is not None]
+    if shown:
+        head = (
+            "effect",
+            "T",
+            "p_fam",
+            "strength (1 sd)",
+            "of plausible",
+            "image",
+            "misfit->",
+            "explains",
+            "visible",
+            "refit T",
+            "confused with",
+            "verdict",
+        )
+        lines.append(table([head, *(_cells(r, d) for r in shown)], left=(0, 3, 10, 11)))
+    rest = [r for r in d.rows if r.p_family >= LEVEL]
+    if rest:
+        lines.append("no evidence; upper limits: " + ", ".join(limit_text(r) for r in rest))
+    if d.not_tested:
+        lines.append("not tested: " + ", ".join(f"{name} ({why})" for name, why in d.not_tested.items()))
+    return lines
+
+
+def _cells(r: Row, d: Diagnosis) -> tuple[str, ...]:
+    now, sd = (r.refit.strength, r.refit.sd) if r.refit else ([a + c for a, c in zip(r.start, r.change)], r.sd)
+    note = ", ".join([x for x in (r.verdict, *r.flags) if x])
+    if r.verdict == "MISSING":
+        note += f" (even: yes, held out: {'yes' if d.levels[-1].fall > 0 else 'no'})"
+    return (
+        r.name,
+        f"{r.fall:.4g}",
+        p_text(r.p_family),
+        strength_text(now, sd, r.units),
+        f"{r.of_plausible:.2g}",
+        percent(r.image),
+        percent(r.misfit_after),
+        "-" if math.isnan(r.share) else f"{r.share:.0%}",
+        percent(r.survival),
+        f"{r.refit.fall:.4g}" if r.refit else "-",
+        f"{r.confused_with} (.{min(int(100 * r.cos), 99):02d})" if r.confused_with else "-",
+        note,
+    )
+
+
+def _split_lines(d: Diagnosis) -> list[str]:
+    if not d.splits:
+        return []
+    lines = [
+        "",
+        "homogeneity (strength relative to the whole; h = gain by splitting over the fall; p by noise / by the scatter "
+        "between parts)",
+    ]
+    for s in d.splits:
+        parts = ", ".join(f"{label} {with_sd(x, sd)}" for label, x, sd in zip(s.labels[:8], s.strength, s.sd))
+        lines.append(
+            f"  {s.effect} by {s.by}: h {s.h:.3f}, p {p_text(s.p)} / {p_text(s.chance)}"
+            f"{'' if s.holds else '  UNEVEN'}: {parts}"
+        )
+    return lines
+
+
+def _level_lines(d: Diagnosis) -> list[str]:
+    if not d.levels:
+        return []
+    lines = [
+        "",
+        f"misfit                 fitted   held out   (noise {percent(d.basis.noise)}; only per-frame variables fitted "
+        "on held-out frames)",
+    ]
+    for level in d.levels:
+        fall = (
+            ""
+            if math.isnan(level.fall)
+            else f"   chi2 falls by {level.fall:.4g}, {level.frames_better} of {level.frames} frames better"
+        )
+        lines.append(f"  {level.model:<20} {percent(level.fitted):>7}   {percent(level.held_out):>8}{fall}")
+    if len(d.levels) > 1 and not math.isnan(d.levels[-1].fall):
+        lines.append("  (a falling held-out misfit verifies prediction; it does not prove the identity of the cause)")
+    return lines
+
+
+def _curve_lines(d: Diagnosis) -> list[str]:
+    if not d.fingerprints:
+        return []
+    lines = ["", "curves along coordinates (fall of chi2 less its number of bins; R = over the best effect)"]
+    lines += [
+        f"  {f.coordinate:<18} {f.net:10.4g}  R {f.ratio:8.3g}  p {p_text(f.p)}"
+        + (f"  {f.family:<8}" if f.family else "")
+        + (f"  {f.share:.0%} of the excess" if math.isfinite(f.share) else "")
+        for f in d.fingerprints[:8]
+    ]
+    if d.families:
+        best = ", ".join(f"{f.family} {f.coordinate} {f.of_best:.2f}" for f in d.families)
+        lines.append(f"  best of each family: {best}")
+    return lines
+
+
+def _shift_lines(d: Diagnosis) -> list[str]:
+    if not d.shifts or d.word not in NAMED:
+        return []
+    return [
+        "",
+        "calibrated parameters had moved to hide it:",
+        *(f"  {s.variable:<24} {s.before:.5g} -> {s.after:.5g} {s.unit} ({s.in_sd:+.1f} sd)" for s in d.shifts[:6]),
+    ]

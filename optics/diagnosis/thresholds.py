@@ -1,0 +1,43 @@
+"""The numbers that verdicts hang on, each with its reason. Fractions are fractions (0.01 is 1 %); falls are of chi2."""
+
+from __future__ import annotations
+
+import math
+
+LEVEL = 0.01  # nominal level of the family-wise test and of the structure test
+CLEAR = 10.8  # fall of chi2 between two effects at which the right one wins in 95 % of cases: Phi(sqrt(10.8)/2)
+MARGIN = 0.2  # of the best effect's fall: with real misfit, smaller differences of chi2 decide nothing
+# A map of the sensor or of the session that explains this much more than the best effect: the effect is not the cause.
+RIVAL = 1.5
+# The same for a curve along one coordinate. With a true effect it gains only what clutter adds: 1.02 was measured, and
+# 1.2 with a false one.
+RIVAL_CURVE = 1.12
+SHARE = 0.05  # of the excess misfit that a claimed effect must explain ...
+EXCESS = 5.0  # ... where the excess is more than this many standard deviations
+UNEVEN = 0.1  # of the fall: what splitting the strength by channel, frame, ... may still gain
+STRENGTH = 2.0  # standard deviations of a claimed strength from none: a fall without it has another cause
+FAR = 0.3  # misfit over the mean signal: more than the effects of a sensor leave
+# Misfit over the mean signal of the fixed pattern alone in a good sensor (optics.proof, clutter 1), whose coating adds
+# 1 % of mottle.
+CLUTTERED = 0.005
+HIDDEN = 2.0  # standard deviations of excess misfit that may hide beside an effect which seems to leave none
+AS_GOOD = 0.8  # of the best curve's fall: curves above are not told apart from it
+MAX_SPLIT = 4  # members of an ambiguous set whose homogeneity is tested: each costs the images of a diagnosis
+TELLS = 0.02  # gain of P(correct) below which a shot is not worth a line
+MAPS = ("place", "reading")  # where, or when, whatever the cause: a fine map mimics every curve that does not move
+MIMICS = (*MAPS, "frame")  # coordinates whose curves can mimic others: 'frame' mimics every setting
+
+
+def is_structured(structure_p: float, excess_sd: float) -> bool:
+    """Whether misfit is left: low-frequency structure; an excess, where images are too small to show it (p is NaN)."""
+    return excess_sd > EXCESS if math.isnan(structure_p) else structure_p < LEVEL
+
+
+def close(best: float, other: float) -> bool:
+    """Whether two falls of chi2 are too close to tell the effects apart."""
+    return best - other < max(CLEAR, MARGIN * best)
+
+
+def allowed(coordinate: str) -> float:
+    """How many times the best effect's fall a curve along this coordinate may explain."""
+    return RIVAL if coordinate in MAPS else RIVAL_CURVE

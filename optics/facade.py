@@ -1,0 +1,413 @@
+"""What scripts and the command line call: load a scene, calibrate, ask what is missing, add it, report.
+
+    import optics
+
+    study = optics.calibrate("captures", "study")     # base model; every fourth group of frames is held out
+    verdict = study.diagnose()                        # which effect is missing? one of six verdicts
+    verdict.plot()
+    study.add("lens vignetting")                      # free it, calibrate everything again
+    study.report()                                    # one HTML page
+
+Nothing is printed and no window is opened. Results are values that show themselves in a notebook; `records()` gives
+tables as lists of dictionaries, and `plot()` a matplotlib Figure."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from optics import words
+from optics.diagnosis.result import Diagnosis
+from optics.fit.compare import Comparison
+from optics.fit.result import Fit
+from optics.fit.scene_model import SceneModel
+from optics.scene.declare import Effect
+from optics.scene.loader import Scene
+from optics.scene.mitsuba_parts import DEFAULT_VARIANT
+from optics.scene.parameter import Values
+from optics.study import loop
+from optics.study.fit_files import values_of
+from optics.study.record import Record
+from optics.study.setup import Setup, open_model, recorded, setup_for, split
+from optics.study.shown import Shown, shown_frames
+from optics.study.stages import comparison_of, held_out_values
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from optics.diagnosis.rehearse import Rehearsal
+
+Progress = Callable[[str, int, int], None]  # (what, done, total)
+Prior = tuple[float | None, float]  # (mean, standard deviation); a mean of None is the present value
+
+
+def load(
+    scene: str | Path,
+    defines: Mapping[str, object] | None = None,
+    *,
+    variant: str = DEFAULT_VARIANT,
+    plugins: str | Path | None = None,
+) -> Scene:
+    """A scene by its shipped name or the path of its XML.
+
+    defines   replace the XML's <default>s, such as {"depth": 0.5}
+    variant   of Mitsuba, which is set; plugins: a further folder of plugins
+
+    Raises UnknownKey for an unknown name or definition, BadScene for what cannot be loaded.
+    """
+    from optics.scene import loader
+
+    given = {name: str(value) for name, value in (defines or {}).items()}
+    return loader.load(scene, given, variant, None if plugins is None else Path(plugins))
+
+
+def calibrate(
+    captures: str | Path,
+    folder: str | Path,
+    *,
+    free: Sequence[str] = (),
+    per_group: Sequence[str] | None = None,
+    priors: Mapping[str, Prior] | None = None,
+    held_out: Sequence[str] | None = None,
+    values: Mapping[str, float | str] | None = None,
+    defines: Mapping[str, object] | None = None,
+    plugins: str | Path | None = None,
+    flat_field: str | None = None,
+    robust: bool = False,
+    seed: int = 0,
+    title: str = "",
+    command: Sequence[str] = (),
+    resume: bool = False,
+    progress: Progress | None = None,
+) -> Study:
+    """Start a study: solve for the base model's free parameters in three stages, and test it on held-out frames.
+
+    captures    folder with captures.toml; folder: of the new study, which appears with its first step
+    free        key patterns with one value for all frames, such as "led_*.x". Empty: position, axis, lobe and power of
+                every LED, reflectance and roughness of every membrane, and a prior of 30 % on powers
+    per_group   key patterns with a value per group of frames. None: place and depth of each press, with a prior of
+                0.05 mm about what the stage said; []: none
+    priors      pattern -> (mean, standard deviation)
+    held_out    groups of frames to test on and not to fit. None: every fourth, where there are four or more; []: none
+    values      start values, by key;   defines, plugins: as in `load`
+    flat_field  how a background image enters: "multiplicative", "additive" or "none"; None: as the captures ask
+    robust      residuals beyond three sigmas count less (Huber)
+    resume      continue the study in `folder`, if its inputs are the same
+    command     what a report says the study was made by
+
+    What an imported capture set advises (import.json) stands for what is not given. Raises BadCapture, BadScene,
+    UnknownKey or Underdetermined before anything is rendered, OutputExists for a folder that holds a study.
+    """
+    from optics.files.output import check_folder
+
+    check_folder(Path(folder))
+    setup = setup_of(
+        captures,
+        free=_listed(free) or [],
+        per_group=_listed(per_group),
+        priors=dict(priors or {}),
+        held_out=_listed(held_out),
+        values=dict(values or {}),
+        defines=defines,
+        plugins=plugins,
+        flat_field=flat_field,
+        robust=robust,
+        seed=seed,
+    )
+    record, model, fit = loop.begin(setup, folder, title=title, command=command, resume=resume, progress=progress)
+    return Study(record, model, fit)
+
+
+def compare(
+    captures: str | Path,
+    fit: str | Path | None = None,
+    *,
+    values: Mapping[str, float | str] | None = None,
+    held_out: Sequence[str] = (),
+    defines: Mapping[str, object] | None = None,
+    plugins: str | Path | None = None,
+    flat_field: str | None = None,
+) -> Compared:
+    """Captures measured against a scene's predictions, without fitting anything.
+
+    fit      a study's fit.toml; values, by key, stand above it; held_out: groups that the fit has not seen
+    """
+    setup = setup_of(
+        captures,
+        values=dict(values or {}),
+        held_out=_listed(held_out),
+        defines=defines,
+        plugins=plugins,
+        flat_field=flat_field,
+    )
+    model = open_model(setup)
+    present = values_of(model, fit, setup.values)
+    return Compared(model, present, comparison_of(model, present, split(model, setup)[1]))
+
+
+def setup_of(
+    captures: str | Path, *, defines: Mapping[str, object] | None, plugins: str | Path | None, **more: Any
+) -> Setup:
+    """The setup of a study; its paths are absolute, so that it can be continued from any folder."""
+    return setup_for(
+        os.path.abspath(captures),
+        defines={name: str(value) for name, value in (defines or {}).items()},
+        plugins=os.path.abspath(plugins) if plugins else None,
+        **more,
+    )
+
+
+def _listed(names: Sequence[str] | None) -> list[str] | None:
+    """A list of names, of one name too."""
+    return None if names is None else [names] if isinstance(names, str) else list(names)
+
+
+class Compared:
+    """A comparison, with the model and the values that it is of.
+
+    comparison   optics.fit.compare.Comparison: misfit by frame, LED, region and channel
+    """
+
+    def __init__(self, model: SceneModel, values: Values, comparison: Comparison):
+        self.model, self.values, self.comparison = model, values, comparison
+
+    def frames(self, indices: Sequence[int] | None = None) -> list[Shown]:
+        """Measured, predicted and residual of frames; None: of all."""
+        return shown_frames(self.model, self.values, frames=indices)
+
+
+class Study:
+    """A study: captures, a model of them, and the ladder of effects that it took to explain them.
+
+    `optics.calibrate` starts one and `Study.open` opens one. Each step is on disk when a method returns, so another
+    process, or the command line, can continue the study.
+
+    folder   of the study;   record: its files (optics.study.record);   setup: what it started from
+    """
+
+    def __init__(self, record: Record, model: SceneModel | None = None, fit: Fit | None = None):
+        self.record = record
+        self.setup = recorded(record.ladder["facts"]["setup"]) if "setup" in record.ladder["facts"] else Setup("")
+        self._model, self._fit = model, fit
+        self._verdict: Diagnosis | None = None  # of the last step, with its refits
+
+    @classmethod
+    def open(cls, folder: str | Path) -> Study:
+        """An existing study. Raises FileNotFoundError, or ValueError where it cannot be read."""
+        return cls(Record.open(folder))
+
+    # -- what it holds ----------------------------------------------------------------------------------------------
+
+    @property
+    def folder(self) -> Path:
+        return self.record.folder
+
+    @property
+    def title(self) -> str:
+        return self.record.ladder["title"] or self.folder.name
+
+    @property
+    def warnings(self) -> list[str]:
+        """What is doubtful about the captures and the noise."""
+        return list(self.record.ladder["warnings"])
+
+    @property
+    def effects(self) -> list[str]:
+        """Names of the effects that were added, in their order."""
+        return [step["name"] for step in self.record.steps if step["effect"]]
+
+    @property
+    def model(self) -> SceneModel:
+        """The scene with its captures; loaded when first asked for. Raises BadCapture where an input has changed."""
+        if self._model is None:
+            self.record, self._model, self.setup = loop.take_up(self.folder)
+        return self._model
+
+    @property
+    def fit(self) -> Fit:
+        """The last step's fit; of an opened study it is restored: same values, with errors computed anew."""
+        if self._fit is None:
+            self._fit = loop.restore(self.record, self.model)
+        return self._fit
+
+    @property
+    def diagnosis(self) -> Diagnosis | None:
+        """The last step's diagnosis as recorded; None where none was made."""
+        found = self.record.diagnosis(len(self.record.steps) - 1) if self.record.steps else None
+        return None if found is None else Diagnosis.from_json(json.dumps(found))
+
+    def comparison(self, step: int = -1) -> Comparison:
+        """Measured against predicted at a step: misfit by frame, LED, region and channel."""
+        return self.record.comparison(self._index(step))
+
+    def frames(self, step: int = -1) -> list[Shown]:
+        """The frames whose images a step keeps: measured, predicted, residual in sigmas."""
+        return self.record.frames(self._index(step))
+
+    def candidates(self) -> list[Effect]:
+        """The effects that the scene can express and the study has not added."""
+        return loop.candidates(self.model, self.record)
+
+    def _index(self, step: int) -> int:
+        count = len(self.record.steps)
+        if not -count <= step < count:
+            names = ", ".join(f"{i} ({s['name']})" for i, s in enumerate(self.record.steps))
+            raise IndexError(f"{self.folder}: no step {step}; there are {names}")
+        return step % count
+
+    # -- verbs ------------------------------------------------------------------------------------------------------
+
+    def diagnose(self, *, advised: bool = True, progress: Progress | None = None) -> Diagnosis:
+        """Ask what the last step lacks: every effect scored, the best added and refitted, one of six verdicts.
+
+        advised   where effects tie, simulate further frames and say which would tell them apart
+        """
+        model, fit = self.model, self.fit
+        self._verdict = loop.examine(self.record, model, self.setup, fit, progress, advised)
+        return self._verdict
+
+    def add(self, effect: str, *, start: Values | None = None, progress: Progress | None = None) -> Fit:
+        """Free an effect, calibrate everything again, and record it as the next step.
+
+        effect   its name or key, as `optics effects` lists them
+        start    values to begin from; None: those of the diagnosis's refit, if this object has diagnosed the last step,
+                 else the present values with the effect a little off neutral
+
+        Raises UnknownKey for an unknown effect, ValueError for one that the study has.
+        """
+        model = self.model
+        chosen = model.scene.registry.find_effect(effect)
+        if self.record.has(chosen.key):
+            raise ValueError(
+                f"{self.folder}: '{chosen.name}' is part of the study already; `optics diagnose {self.folder}` asks "
+                "what else is missing"
+            )
+        if start is None and self._verdict is not None and chosen.name in self._verdict.fits:
+            start = self._verdict.fits[chosen.name].values
+        self._fit, _ = loop.extend(self.record, model, self.setup, self.fit, chosen, start, progress)
+        self._verdict = None
+        return self._fit
+
+    def rehearse(self, change: float = 0.005, *, progress: Progress | None = None) -> Rehearsal:
+        """Which effects would be found in these captures, were they hidden in them, and what each would be taken for.
+
+        change   rms over the mean signal by which each hidden effect changes the images, before any calibration
+        """
+        from optics.diagnosis.rehearse import rehearse
+        from optics.study.setup import effect_variables
+
+        model, fit = self.model, self.fit
+        fitted, _ = split(model, self.setup)
+        return rehearse(
+            model,
+            fit,
+            self.candidates(),
+            lambda e: effect_variables(model, e),
+            fitted,
+            change=change,
+            seed=self.setup.seed,
+            progress=progress,
+        )
+
+    def imitate(self, folder: str | Path, values: Mapping[str, float | str] | None = None, *, seed: int = 1) -> Path:
+        """Write captures as the study's model would take them, with `values` put in; returns the folder."""
+        from optics.diagnosis.rehearse import imitate
+
+        model = self.model
+        present, _ = held_out_values(model, self.fit, split(model, self.setup)[1])
+        present.common.update(model.scene.check(values or {}, "values"))
+        return imitate(model, present, folder, seed)
+
+    def report(self, file: str | Path | None = None, *, overwrite: bool = False) -> Path:
+        """Write the study as one HTML page; returns its path (None: report.html in the study's folder)."""
+        from optics.pages.report import report
+
+        return report(self.folder, file or self.folder / "report.html", overwrite=overwrite)
+
+    def view(self, step: int | None = None, *, port: int = 0, ready: Callable[[str], None] = lambda url: None) -> None:
+        """Serve the live page of a step (None: the last) on this machine until Ctrl-C; `ready` is told its address."""
+        from optics.pages import view
+
+        view.serve(self.folder, port, step, ready)
+
+    # -- the ladder -------------------------------------------------------------------------------------------------
+
+    def records(self) -> list[dict[str, Any]]:
+        """One record per step: index, name, effect, converged, reason, seconds, parameters, and for fitted_ and
+        held_out_ each chi2_per_dof, misfit and noise (of the mean signal), n. None where nothing is held out."""
+        out = []
+        for step in self.record.steps:
+            row = {key: step[key] for key in ("index", "name", "effect", "converged", "reason", "seconds")}
+            row["parameters"] = len(step["variables"])
+            for part in ("fitted", "held_out"):
+                level = step[part] or {}
+                row |= {f"{part}_{key}": level.get(key) for key in ("chi2_per_dof", "misfit", "noise", "n")}
+            out.append(row)
+        return out
+
+    def table(self) -> str:
+        """The ladder as aligned text."""
+        return self.record.table()
+
+    def plot(self) -> Figure:
+        """The ladder: chi2 per degree of freedom of each step, on fitted and on held-out frames, and the noise floor."""
+        from optics.files.charts import BLUE, GREY, ORANGE, RED, chart
+
+        rows = self.records()
+        names = [("+ " if r["index"] else "") + r["name"] for r in rows]
+        figure, axis = chart(max(4.5, 1.6 * len(rows) + 2), 3.4)
+        highest = 1.0
+        for part, label, colour, line in (("held_out", "held out", BLUE, "o-"), ("fitted", "fitted", ORANGE, "s--")):
+            points = [(i, v) for i, r in enumerate(rows) if (v := r[f"{part}_chi2_per_dof"]) is not None]
+            if not points:
+                continue
+            axis.plot(*zip(*points), line, ms=5, color=colour, label=label)
+            highest = max(highest, *(v for _, v in points))
+            if part == "held_out":
+                for at in points:
+                    axis.annotate(f"{at[1]:.3g}", at, xytext=(6, 6), textcoords="offset points", fontsize=9)
+        axis.axhline(self.record.ladder["noise_floor"]["chi2_per_dof"], color=RED, lw=1, label="noise floor")
+        axis.set_xticks(range(len(names)), names)
+        axis.set(ylabel="chi2 per degree of freedom", xlim=(-0.4, len(names) - 0.4))
+        if highest > 5:
+            axis.set_yscale("log")
+        axis.margins(y=0.2)
+        axis.grid(axis="y", color=GREY, alpha=0.2)
+        axis.legend(fontsize=9)
+        axis.set_title(self.title, fontsize=11)
+        return figure
+
+    def __repr__(self) -> str:
+        steps = " + ".join(step["name"] for step in self.record.steps)
+        return f"Study({str(self.folder)!r}: {steps or 'no step yet'})"
+
+    def _repr_html_(self) -> str:
+        lines = [
+            (
+                ("+ " if r["index"] else "") + r["name"],
+                words.figures(r["fitted_chi2_per_dof"]),
+                words.figures(r["held_out_chi2_per_dof"]),
+                words.percent(r["held_out_misfit"], typeset=True),
+                words.percent(r["held_out_noise"], typeset=True),
+                str(r["parameters"]),
+                "" if r["converged"] else f"not converged: {r['reason']}",
+            )
+            for r in self.records()
+        ]
+        head = ("step", "fitted χ²/dof", "held-out χ²/dof", "held-out misfit", "noise", "parameters", "")
+        ladder, verdict = self.record.ladder, self.diagnosis
+        said = (
+            f"<p>{words.escaped(verdict.word.replace('_', ' '))}: {words.escaped(verdict.sentence)}</p>"
+            if verdict
+            else ""
+        )
+        return words.html_block(
+            f"Study: {self.title}",
+            words.html_table(head, lines, left=(0, 6)),
+            said,
+            words.html_list([f"warning: {w}" for w in self.warnings]),
+            note=f"{ladder['captures']} with the scene {ladder['scene']}; in {self.folder}",
+        )

@@ -1,0 +1,155 @@
+"""What a calibration found: `Fit`, its table, and warnings about what the captures do not determine."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy.sparse.csgraph import connected_components
+
+from optics.fit import showing
+from optics.fit.descent import Normal, scaled_eigen
+from optics.scene.parameter import Values, Variable
+from optics.words import some
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+ALIKE = 0.995  # correlation beyond which two variables are reported as not told apart: 1/sqrt(1 - r^2) = 10 times the
+# error that either would have alone
+DEGENERATE = (
+    1e-7  # eigenvalue of the scaled normal matrix, over the largest, of a degenerate mode: 3000 times the error
+)
+MEMBER = 0.15  # component in a degenerate mode above which a variable is named with it: 2 % of the mode's square
+
+
+@dataclass
+class Fit:
+    """What a calibration found.
+
+    values       the start values with the estimates put in
+    estimate     (p,) in the order of `variables`; covariance (p, p) from the noise model and the priors
+    chi2, dof    of the data, without priors; per frame in frame_chi2, frame_n
+    converged    whether the fall of chi2 that is still predicted is below 1 per variable, or below a thousandth of the
+                 chi2 that noise does not explain; `reason` says why the fit stopped
+    warnings     sentences: degenerate modes, variables without effect, variables at a bound
+    normal       the last linearisation, for `optics.fit.calibrate.extended`
+    """
+
+    values: Values
+    variables: list[Variable]
+    estimate: np.ndarray
+    covariance: np.ndarray
+    chi2: float
+    dof: int
+    frames: list[int]
+    frame_chi2: list[float]
+    frame_n: list[int]
+    converged: bool
+    reason: str
+    history: list[float] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+    start: np.ndarray | None = None
+    at_bound: list[str] = field(default_factory=list)
+    normal: Normal | None = None
+
+    @property
+    def sd(self) -> np.ndarray:
+        """(p,) standard deviation of each estimate, in the variable's unit; infinite where undetermined."""
+        return np.sqrt(np.maximum(np.diag(self.covariance), 0))
+
+    @property
+    def correlation(self) -> np.ndarray:
+        """(p, p), -1..1."""
+        sd = np.where((self.sd > 0) & np.isfinite(self.sd), self.sd, 1)
+        return self.covariance / np.outer(sd, sd)
+
+    @property
+    def chi2_per_dof(self) -> float:
+        return self.chi2 / max(self.dof, 1)
+
+    def table(self) -> str:
+        """One line per variable: estimate, standard deviation, unit, start, and the strongest correlation."""
+        lines = [f"{'variable':<28}{'estimate':>12}{'+- sd':>11}  {'unit':<6}{'start':>11}   strongest correlation"]
+        correlation = np.abs(self.correlation - np.eye(len(self.variables)))
+        for i, variable in enumerate(self.variables):
+            j = int(np.argmax(correlation[i])) if len(self.variables) > 1 else i
+            other = f"{self.correlation[i, j]:+.2f} {self.variables[j].name}" if j != i else ""
+            start = "" if self.start is None else f"{self.start[i]:11.5g}"
+            bound = "  at its bound" if variable.name in self.at_bound else ""
+            lines.append(
+                f"{variable.name:<28}{self.estimate[i]:12.5g}{self.sd[i]:11.2g}  {variable.parameter.unit:<6}"
+                f"{start}   {other}{bound}"
+            )
+        lines.append(
+            f"chi2 per degree of freedom {self.chi2_per_dof:.4f} ({self.dof} degrees of freedom); {self.reason}"
+        )
+        return "\n".join([*lines, *(f"warning: {w}" for w in self.warnings)])
+
+    def records(self) -> list[dict[str, Any]]:
+        """One record per variable (optics.fit.showing.records)."""
+        return showing.records(self)
+
+    def plot(self) -> Figure:
+        """A chart of changes, pulls and misfit by frame (optics.fit.showing.plot)."""
+        return showing.plot(self)
+
+    def _repr_html_(self) -> str:
+        return showing.html(self)
+
+
+def warnings_of(result: Fit, a: np.ndarray) -> list[str]:
+    """Sentences about variables that cannot be told apart, that do nothing, or that stand at a bound.
+
+    a   (p, p) normal matrix at the estimate
+    """
+    names = [v.name for v in result.variables]
+    silent = [n for n, d in zip(names, np.diag(a)) if d == 0]
+    texts = [f"nothing in the frames depends on {some(silent, 8)}"] if silent else []
+    modes = _degenerate_modes(names, a, silent)
+    for mode in modes:
+        texts.append(
+            f"the captures cannot tell apart {some(mode, 8)}: only a combination is determined; hold one of "
+            "them, or give it a prior"
+        )
+    texts += _correlated(result, names, [set(), *map(set, modes)])
+    texts += [f"{n} ended at its bound" for n in result.at_bound]
+    if not result.converged:
+        texts.append(result.reason)
+    return texts
+
+
+def _degenerate_modes(names: list[str], a: np.ndarray, silent: list[str]) -> list[list[str]]:
+    """The variables of each direction that the data do not determine."""
+    if not len(a):
+        return []
+    _, eigen, vectors = scaled_eigen(a)
+    modes = [
+        [n for n, c in zip(names, vector) if abs(c) > MEMBER and n not in silent]
+        for value, vector in zip(eigen, vectors.T)
+        if value < DEGENERATE * eigen.max()
+    ]
+    return [mode for mode in modes if len(mode) > 1]
+
+
+def _correlated(result: Fit, names: list[str], told: list[set[str]]) -> list[str]:
+    """One sentence for each set of variables that are correlated beyond ALIKE, directly or through others; sets within
+    one of `told` are left out."""
+    if not names:
+        return []
+    texts = []
+    correlation = np.nan_to_num(result.correlation, posinf=0.0, neginf=0.0) * (1 - np.eye(len(names)))
+    count, member = connected_components(np.abs(correlation) > ALIKE)
+    for one in (np.flatnonzero(member == k) for k in range(count)):
+        if len(one) < 2 or any({names[i] for i in one} <= part for part in told):
+            continue
+        if len(one) == 2:
+            texts.append(f"{names[one[0]]} and {names[one[1]]} are correlated to {correlation[one[0], one[1]]:+.4f}")
+        else:
+            most = np.abs(correlation[np.ix_(one, one)]).max()
+            texts.append(
+                f"{some([names[i] for i in one])} are correlated among each other, to {most:.4f} at most: the captures "
+                "determine little more than one combination of them; hold one of them, or give it a prior"
+            )
+    return texts

@@ -1,0 +1,479 @@
+"""The model: a scene held against a capture set. Predictions, derivative images, masks and coordinates, frame by
+frame."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+
+from optics.captures.capture_set import Captures, Frame, cfa_channel, sweeps
+from optics.captures.noise import Noise
+from optics.errors import BadScene, UnknownKey
+from optics.fit import geometry
+from optics.fit.model import value_of
+from optics.light.development import STEP, Developer
+from optics.light.renderer import POWERS
+from optics.scene.loader import Scene
+from optics.scene.parameter import Parameter, Values, Variable
+
+if TYPE_CHECKING:
+    from optics.light.monte_carlo import MonteCarloRenderer
+
+FLAT_FIELDS = ("multiplicative", "additive", "none")
+
+
+class SceneModel:
+    """A scene held against a capture set: predictions, derivative images, masks and coordinates, frame by frame.
+
+    frames       of the captures; a raw mosaic stands in all three channels, and `usable` takes each pixel in its own
+    base         scene values overlaid with what holds in every frame, by key
+    parameters   key -> Parameter
+    shape        (H, W, C)
+    flat_field   how the measured background B of the untouched sensor enters: "multiplicative" (True), what the scene
+                 does not know of the background is a gain; "additive", it is light that a press leaves as it is; None
+    """
+
+    def __init__(
+        self, scene: Scene, captures: Captures, noise: Noise | None = None, flat_field: bool | str | None = True
+    ):
+        from optics.light.monte_carlo import renderer_of
+
+        noise = noise or captures.noise
+        if noise is None:
+            raise BadScene(
+                f"{captures.folder}: no noise model; give [noise] in captures.toml or repeats to estimate it from"
+            )
+        if captures.table is not None:
+            captures = sweeps(captures, scene.parameters, list(scene.lights))
+        self.scene, self.captures, self.noise = scene, captures, noise
+        self.mosaic, self.frames = None, captures.frames
+        background = captures.flat_field
+        if captures.cfa is not None:
+            self.mosaic = cfa_channel(captures.frames[0].image.shape, captures.cfa)[..., None] == np.arange(3)
+            self.frames = [replace(f, image=np.repeat(f.image, 3, axis=2)) for f in captures.frames]
+            background = None if background is None else np.repeat(background, 3, axis=2)
+        self.renderer = renderer_of(scene)
+        self.monte_carlo = (
+            self.renderer.monte_carlo
+        )  # whether predictions are Monte Carlo estimates, whose error `variance` holds
+        self._edges_kept: dict[int, np.ndarray] = {}
+        self.parameters: dict[str, Parameter] = scene.parameters
+        self.base = {
+            **scene.values(),
+            **scene.check(captures.parameters, f"{captures.folder}/captures.toml [parameters]"),
+        }
+        for frame in self.frames:
+            scene.check(frame.parameters, f"{frame.file or captures.folder}: frame {frame.name}")
+        self.companions = self._companions()
+        # A power that frames set is a drive level: what a calibration finds is the LED's power at drive 1.
+        self.driven = {f"{n}.power" for n in scene.lights} & {
+            k for f in self.frames for k in (*f.parameters, *f.readings)
+        }
+        self.base.update(dict.fromkeys(self.driven, 1.0))
+        self.shape = self.frames[0].image.shape
+        height, width = self.shape[:2] if captures.table is None else (1, 1)
+        if (width, height) != scene.camera.resolution:
+            raise BadScene(
+                f"{captures.folder}: images of {width} x {height} px, but the scene's camera has "
+                f"{scene.camera.resolution[0]} x {scene.camera.resolution[1]} px; load the scene with "
+                f"-D width={width} -D height={height}"
+            )
+        self.developer = Developer(scene.camera, scene.integrator.bands or (0.0,), noise.black_level, noise.saturation)
+        if self.developer.matrix.shape[0] != self.shape[2]:
+            channels, wanted, first = self.shape[2], self.developer.matrix.shape[0], captures.frames[0].file
+            raise BadScene(
+                f"{captures.folder / 'captures.toml'}: '{first}' has channels: {channels}, the camera of the scene '{captures.scene}' has "
+                f"{wanted}; allowed: {wanted}, "
+                + (
+                    "a column of `values` for each"
+                    if captures.table is not None
+                    else 'or one with cfa = "RGGB" (or its like) if it is a raw mosaic; or take a scene whose integrator names one band'
+                    if channels == 1
+                    else "one for each band of the scene's integrator"
+                )
+            )
+        if flat_field not in (True, False, None, *FLAT_FIELDS):
+            raise UnknownKey(str(flat_field), FLAT_FIELDS, "flat-field mode")
+        self.flat_field = {True: FLAT_FIELDS[0], False: None, "none": None}.get(flat_field, flat_field)
+        self.flat = None  # the measured background above black, a declared nuisance; see `predict`
+        if self.flat_field and background is not None and scene.gel is None:
+            raise BadScene(
+                f"{captures.folder}: the set has a background, and the scene no gel that could be at rest in it; allowed: "
+                "--flat-field none"
+            )
+        if self.flat_field and background is not None:
+            self.flat = np.maximum(np.asarray(background, float) - self.noise.black_level, 1e-3)
+
+    def imagine(self, frames: Sequence[Frame]) -> SceneModel:
+        """The same model, with the same renderer, with further frames: what `optics.diagnosis.advice` could have
+        somebody measure."""
+        twin = copy.copy(self)
+        twin.frames = [*self.frames, *frames]
+        twin.driven = self.driven | (
+            {f"{n}.power" for n in self.scene.lights} & {k for f in frames for k in (*f.parameters, *f.readings)}
+        )
+        twin.base = {**self.base, **dict.fromkeys(twin.driven - self.driven, 1.0)}
+        twin.companions, twin._edges_kept = twin._companions(), dict(self._edges_kept)
+        return twin
+
+    # -- values -------------------------------------------------------------------------------------------------------
+
+    def at(self, values: Values, index: int) -> dict[str, Any]:
+        """Every parameter's value in a frame: base <- fitted in all frames <- set in this frame <- fitted in this
+        frame.
+
+        The power of an LED that frames set is the product of the setting and of the fitted power.
+        """
+        now: dict[str, Any] = {**self.base, **values.common}
+        frame = self.frames[index]
+        for key, value in (*frame.parameters.items(), *frame.readings.items()):
+            now[key] = value * now[key] if key in self.driven else value
+        now.update(values.frame.get(index, {}))
+        return now
+
+    def _acts(self, variable: Variable, index: int) -> dict[str, Any]:
+        """The keys through which a variable acts in a frame, each with d key / d variable."""
+        own: dict[str, Any] = {**self.frames[index].parameters, **self.frames[index].readings}
+        if variable.frames is not None:
+            return dict.fromkeys(variable.keys, 1.0)
+        return {k: own.get(k, 1.0) for k in variable.keys if k not in own or k in self.driven}
+
+    def _companions(self) -> list[set[str]]:
+        """For each frame the LEDs that are lit in any frame of the same press: they share its geometry."""
+        presses: dict[tuple, set[str]] = {}
+        keys = []
+        for frame in self.frames:
+            own = {**self.base, **frame.parameters, **frame.readings}
+            key = (frame.group, *(own[k] for k in self.renderer.geometry_keys))
+            presses.setdefault(key, set()).update(n for n in self.scene.lights if np.any(own[f"{n}.power"] != 0))
+            keys.append(key)
+        return [presses[key] for key in keys]
+
+    def linear_in(self, variable: Variable) -> bool:
+        """Whether predictions are linear in a variable together with all others of which this holds: the LEDs'
+        powers."""
+        return all(self._is_power(k) for k in variable.keys)
+
+    def _is_power(self, key: str) -> bool:
+        name, _, parameter = key.rpartition(".")
+        return name in self.scene.lights and parameter in POWERS
+
+    def check_variables(self, variables: Sequence[Variable]) -> None:
+        for variable in variables:
+            for key in variable.keys:
+                if key not in self.parameters:
+                    raise UnknownKey(key, self.parameters, "parameter", hint="`optics params SCENE` lists them")
+
+    def lit(self, now: Mapping) -> dict[str, np.ndarray]:
+        """The lights that are on and their powers per band (B,), or (N, 1, B) of readings."""
+        return {n: self.renderer.powers(now, n) for n in self.renderer.lit(now)}
+
+    # -- prediction ---------------------------------------------------------------------------------------------------
+
+    def radiance(self, now: Mapping, seed: int = 0) -> np.ndarray:
+        """(H, W, B): linear image of a frame."""
+        return self.renderer.radiance(now, seed)
+
+    def untouched(self, now: Mapping) -> dict:
+        """The same frame with the gel at rest."""
+        gel = self.scene.gel.name
+        return {**now, **dict.fromkeys((f"{gel}.press_x", f"{gel}.press_y", f"{gel}.press_depth"), 0.0)}
+
+    def _rests(self, key: str) -> bool:
+        """Whether a parameter does nothing while the gel is untouched."""
+        name, _, parameter = key.rpartition(".")
+        return self.renderer.kind(key) == "gel" and parameter in self.scene.gel.pressing
+
+    def predict(self, values: Values, frames: Sequence[int] | None = None, seed: int = 0) -> list[np.ndarray]:
+        """Noise-free DN (H, W, C) of each frame.
+
+        With a flat field B (the measured background of the untouched sensor), P0 the prediction for the gel at rest in
+        the same frame, and the frame's gain g per channel:
+            multiplicative   black + g (B - black) (P - black)/(P0 - black)
+            additive         black + g (B - black) + P - P0             (light adds up: exact for a linear response)
+        """
+        return [self._predict(self._turn_to(values, i), seed) for i in self._indices(frames)]
+
+    def _turn_to(self, values: Values, index: int) -> dict:
+        """A frame's values, and word to the renderer of what else is wanted of its geometry."""
+        self.renderer.together = self.companions[index]
+        return self.at(values, index)
+
+    def _develop(self, now: Mapping, seed: int) -> np.ndarray:
+        return self.developer.develop(self.radiance(now, seed), now)
+
+    def _predict(self, now: Mapping, seed: int = 0) -> np.ndarray:
+        image = self._develop(now, seed)
+        if self.flat is None:
+            return image
+        black = self.noise.black_level
+        flat = self.flat * self.gains(now)
+        rest = self._develop(self.untouched(now), seed)
+        if self.flat_field == "additive":
+            return black + flat + image - rest
+        return black + (image - black) * flat / np.maximum(rest - black, 1e-6)
+
+    def gains(self, now: Mapping) -> np.ndarray:
+        """(C,) gain of a frame by which its background is scaled."""
+        return self.developer.gains(self.developer.view(now))
+
+    def background_share(self, values: Values | None = None, index: int = 0) -> list[dict[str, float]]:
+        """How much of the flat field the scene explains by itself, per channel: rms of the flat field's structure about
+        its mean, rms of what is left of it after the predicted background, both in DN, and the share 1 -
+        (left/structure)^2.
+
+        A multiplicative flat field divides what is left out, an additive one adds it; either way it is not explained.
+        """
+        if self.flat is None:
+            raise BadScene(f"{self.captures.folder}: no flat field in use")
+        rest = self._develop(self.untouched(self.at(values or Values(), index)), 0) - self.noise.black_level
+        found = []
+        for c in range(self.shape[2]):
+            structure, left = np.std(self.flat[..., c]), np.sqrt(np.mean((self.flat - rest)[..., c] ** 2))
+            found.append(
+                {"structure": float(structure), "left": float(left), "share": float(1 - (left / structure) ** 2)}
+            )
+        return found
+
+    def _indices(self, frames) -> list[int]:
+        return list(range(len(self.frames))) if frames is None else list(frames)
+
+    def derivatives(
+        self,
+        values: Values,
+        variables: Sequence[Variable],
+        frames: Sequence[int] | None = None,
+        secant: Mapping[str, float] | None = None,
+        seed: int = 0,
+    ) -> Iterator[tuple[np.ndarray, dict[str, np.ndarray]]]:
+        """Per frame: prediction (H, W, C) in DN and {variable's name: d prediction / d value}, float32.
+
+        `secant` gives, by name, a finite step to take from the present value in place of the tangent. Variables that do
+        nothing in a frame are left out of its dictionary."""
+        self.check_variables(variables)
+        for index in self._indices(frames):
+            yield self._differentiate(values, [v for v in variables if v.holds_in(index)], secant or {}, seed, index)
+
+    def _differentiate(
+        self, values: Values, variables: Sequence[Variable], secant: Mapping[str, float], seed: int, index: int
+    ):
+        now = self._turn_to(values, index)
+        black = self.noise.black_level
+        linear = self.developer.linearise(self.radiance(now, seed), now)
+        prediction = linear.image
+        if self.flat is not None:
+            at_rest = self.untouched(now)
+            rest = self.developer.linearise(self.radiance(at_rest, seed), at_rest)
+            flat = self.flat * self.gains(now)
+            if self.flat_field == "additive":
+                prediction, scale, share, gained = black + flat + linear.image - rest.image, 1.0, 1.0, 1.0
+            else:
+                level = np.maximum(rest.image - black, 1e-6)
+                scale, share = flat / level, (linear.image - black) / level
+                prediction, gained = black + (linear.image - black) * scale, share
+        images: dict[str, np.ndarray] = {}
+        image: Any
+        for variable in variables:
+            acts = self._acts(variable, index)
+            if not acts:
+                continue
+            if variable.name in secant:
+                image = self._secant(values, variable, index, secant[variable.name], prediction, seed)
+            else:
+                image = self._tangent(linear, now, acts, seed)
+                if self.flat is not None:
+                    still = self._tangent(
+                        rest, at_rest, {k: f for k, f in acts.items() if not self._rests(k)}, seed, True
+                    )
+                    if image is not None or still is not None:
+                        image = scale * ((0 if image is None else image) - share * (0 if still is None else still))
+                        if any(self.parameters[k].how == "image" for k in acts):
+                            stepped = {**now, **{k: now[k] + 1j * STEP for k in acts}}
+                            image = image + gained * self.flat * (self.gains(stepped).imag / STEP)
+            if image is not None:
+                images[variable.name] = image.astype(np.float32)
+        return prediction, images
+
+    def _secant(self, values: Values, variable: Variable, index: int, step: float, prediction, seed: int) -> np.ndarray:
+        """[f(value + step) - f(value)] / step of the whole prediction; the step turns round at a bound."""
+        value = value_of(self, values, variable)
+        if not variable.parameter.bounds[0] <= value + step <= variable.parameter.bounds[1]:
+            step = -step
+        moved = values.copy()
+        moved.put(variable, value + step)
+        return (self._predict(self.at(moved, index), seed) - prediction) / step
+
+    def _tangent(
+        self, linear, now: Mapping, acts: Mapping[str, float], seed: int, at_rest: bool = False
+    ) -> np.ndarray | None:
+        """d DN / d value in a frame for keys that share one value; None where nothing depends on them."""
+        camera = tuple(k for k in acts if self.parameters[k].how == "image")
+        light = None
+        for key, factor in acts.items():
+            if key in camera:
+                continue
+            change = self._light_tangent(now, key, factor, seed, at_rest)
+            if change is not None:
+                light = change if light is None else light + change
+        total = None if light is None else linear.of_image(light)
+        if camera:
+            total = linear.of_parameter(camera) + (0 if total is None else total)
+        return total
+
+    def _light_tangent(self, now: Mapping, key: str, factor: Any, seed: int, at_rest: bool) -> np.ndarray | None:
+        """factor times d radiance / d key in a frame."""
+        name, parameter = key.rsplit(".", 1)
+        kind = self.renderer.kind(key)
+        lit = self.lit(now)
+        tangent = self.renderer.led_tangent_at_rest if at_rest else self.renderer.led_tangent
+        glows = self.renderer.glows(now)
+        if not lit and not glows and key not in self.renderer.ambient_keys and self.parameters[key].how != "difference":
+            return None  # a dark frame
+        if self.parameters[key].how == "layer":
+            return factor * (np.imag(self.radiance({**now, key: now[key] + 1j * STEP}, seed)) / STEP)
+        if key == self.renderer.bounce_key:
+            return (
+                factor * sum(power * self.renderer.bounced(now, led, seed) for led, power in lit.items())
+                if lit
+                else None
+            )
+        if self._is_power(key):
+            if np.all(factor == 0):
+                return None
+            # the power is a product of four: the derivative by one of them is the product of the others
+            others = self.renderer.powers({**now, key: 1.0}, name)
+            if parameter != "power":
+                others = np.where(np.arange(self.renderer.bands) == POWERS.index(parameter) - 1, others, 0.0)
+            factor = factor * others
+            if not np.any(factor):
+                return None
+            return factor * self.renderer.light({**now, **{f"{name}.{p}": 1.0 for p in POWERS}}, name, seed)
+        if kind == "led" and name not in lit:
+            return None
+        if self.renderer.monte_carlo:
+            return factor * cast("MonteCarloRenderer", self.renderer).tangent(now, key, seed)
+        if key in self.renderer.ambient_keys:
+            return factor * self._difference_ambient(now, key)
+        if self.parameters[key].how == "difference" and kind != "led":
+            return factor * self._difference(now, key, seed)
+        if kind == "led":
+            image = (
+                self._difference_led(now, name, key)
+                if self.parameters[key].how == "difference"
+                else tangent(now, name, key)
+            )
+            return factor * lit[name] * image
+        total: Any = sum((power * tangent(now, led, key) for led, power in lit.items()), 0.0)
+        if glows:
+            total = total + self._difference_ambient(now, key)
+        return factor * total
+
+    def _difference(self, now: Mapping, key: str, seed: int) -> np.ndarray:
+        """Central difference of the linear image, one-sided at a bound; common samples."""
+        low, high = self.parameters[key].sides(now[key])
+        return (self.radiance({**now, key: high}, seed) - self.radiance({**now, key: low}, seed)) / (high - low)
+
+    def _difference_led(self, now: Mapping, led: str, key: str) -> np.ndarray:
+        low, high = self.parameters[key].sides(now[key])
+        return (self.renderer.image({**now, key: high}, led) - self.renderer.image({**now, key: low}, led)) / (
+            high - low
+        )
+
+    def _difference_ambient(self, now: Mapping, key: str) -> np.ndarray:
+        low, high = self.parameters[key].sides(now[key])
+        return (self.renderer.ambient({**now, key: high}) - self.renderer.ambient({**now, key: low})) / (high - low)
+
+    # -- what a fit and a diagnosis need of the data
+    # --------------------------------------------------------------------
+
+    def usable(self, index: int) -> np.ndarray:
+        """(H, W, C) pixels to use: not saturated, not clipped at black, not masked by the user, of a mosaic's own
+        channel."""
+        frame = self.frames[index]
+        mask = self.noise.usable(frame.image)
+        mask = np.broadcast_to(mask if mask.ndim == 3 else mask[..., None], frame.image.shape).copy()
+        if frame.mask is not None:
+            mask &= np.asarray(frame.mask, bool)[..., None]
+        if self.mosaic is not None:
+            mask &= self.mosaic
+        if self.renderer.layered and self.captures.table is None:
+            mask &= self._resolved(index)
+        return mask
+
+    def _resolved(self, index: int) -> np.ndarray:
+        """(H, W, C) False at sharp edges that the finer samples resolve worse than the noise: where the step across a
+        pixel, over the number of samples, is more than a sixth of the noise. At the base's values, so that a fit cannot
+        move it."""
+        if index not in self._edges_kept:
+            now = self.at(Values(), index)
+            low: Any = 0.0
+            high: Any = 0.0
+            images = [(self.renderer.led(now, light), power) for light, power in self.lit(now).items()]
+            for image, power in images + [(self.renderer.glow(now), 1.0)] * self.renderer.glows(now):
+                if image.raw is None or not len(image.index):
+                    continue
+                fine = image.raw[1] * self.renderer.weights(now, image)[1]
+                low, high = low + power * fine.min(1), high + power * fine.max(1)
+            known = np.ones(self.shape, bool)
+            if np.ndim(high):
+                view = self.developer.view(now)
+                full = self.noise.saturation - self.noise.black_level
+                step = (
+                    ((high - low) @ self.developer.matrix.T) * np.abs(view.exposure * self.developer.gains(view)) * full
+                )
+                level = self.predict(Values(), [index])[0].reshape(-1, self.shape[2])[image.index]
+                known.reshape(-1, self.shape[2])[image.index] = (
+                    step / self.renderer.rim_samples < self.noise.sd(level) / 6
+                )
+            self._edges_kept[index] = known
+        return self._edges_kept[index]
+
+    @property
+    def size(self) -> float:
+        """Values that a frame holds (on average, of readings): pixels x channels, or the pixels of a mosaic."""
+        return float(np.mean([f.image.size for f in self.frames])) / (3 if self.mosaic is not None else 1)
+
+    def variance(self, values: Values, index: int, prediction: np.ndarray) -> np.ndarray:
+        """(H, W, C) in DN^2, of a frame about its prediction: the camera's noise, and the prediction's own error where
+        images are Monte Carlo estimates, averaged over 3 x 3 pixels (the error itself is known to a quarter)."""
+        noise = self.noise.variance(prediction)
+        return noise + self._error(values, index) if self.monte_carlo else noise
+
+    def _error(self, values: Values, index: int) -> np.ndarray:
+        """(H, W, C) variance of a Monte Carlo prediction, DN^2."""
+        from scipy.ndimage import uniform_filter
+
+        now = self.at(values, index)
+        view = self.developer.view(now)
+        full = (self.noise.saturation - self.noise.black_level) * np.abs(view.exposure * self.developer.gains(view))
+        error = cast("MonteCarloRenderer", self.renderer).error(now)
+        return uniform_filter((error**2 @ (self.developer.matrix**2).T) * full**2, (3, 3, 0), mode="nearest")
+
+    def chance(self, index: int = 0) -> float:
+        """Error of the prediction itself over the camera's noise in a frame, rms; 0 where images are exact."""
+        if not self.monte_carlo:
+            return 0.0
+        prediction = self.predict(Values(), [index])[0]
+        return float(np.sqrt(np.mean(self._error(Values(), index) / self.noise.variance(prediction))))
+
+    def coordinates(self, values: Values, index: int, seed: int = 0) -> dict[str, np.ndarray]:
+        return geometry.coordinates(self, values, index, seed)
+
+    def lit_geometry(self, values: Values, index: int) -> dict[str, np.ndarray]:
+        return geometry.lit_geometry(self, values, index)
+
+    def wavelengths(self) -> list[float]:
+        """Mean wavelength of each channel, nm; 0 where the scene names no bands."""
+        bands, matrix = self.developer.bands, self.developer.matrix
+        if not any(bands):
+            return [0.0] * self.shape[2]
+        return list(matrix @ np.array(bands) / matrix.sum(1))
+
+    def part_kind(self, key: str) -> str:
+        """Kind of the part that a parameter key belongs to; '' for any other name."""
+        part = self.scene.parts.get(key.rpartition(".")[0])
+        return part.kind if part is not None else ""

@@ -1,0 +1,109 @@
+"""What is doubtful about captures and their calibration, in sentences that say what to check."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from optics.captures import capture_set as capture_files
+from optics.diagnosis.text import AT_FAULT
+from optics.diagnosis.thresholds import FAR
+from optics.fit.compare import Row
+from optics.fit.model import value_of
+from optics.fit.result import Fit
+from optics.fit.scene_model import SceneModel
+from optics.scene.parameter import Values
+from optics.study.setup import GROUPS, Setup
+from optics.words import some, spaced
+
+# of the noise: Monte Carlo error of a prediction below which it adds less than 5 % to the noise (in quadrature)
+CHANCE = 0.3
+SURPRISING = 3.0  # standard deviations of a prior, beyond which a calibrated value contradicts it
+
+
+def before_calibration(model: SceneModel, setup: Setup, held: Sequence[int]) -> list[str]:
+    """Doubts about captures and scene, each once."""
+    return [*of_captures(model), *_unverified(model, setup, held)]
+
+
+def of_captures(model: SceneModel) -> list[str]:
+    """Doubts about the captures, their noise, and what the model can predict of them."""
+    from optics.captures.noise import warnings_of
+    from optics.light.rendering import veiled
+
+    texts = [*model.captures.warnings, *warnings_of(model.noise, model.captures), *_unnamed(model), *_astray(model)]
+    images_through_layers = model.renderer.layered and model.captures.table is None
+    if images_through_layers and (what := veiled(model.renderer, model.at(Values(), 0))):
+        texts.append(f"the model leaves out light that comes through layers: {what}")
+    if model.monte_carlo and (share := model.chance()) > CHANCE:
+        texts.append(
+            "the prediction of dielectric bodies is an estimate by Monte Carlo; its error is "
+            f"{share:.2g} of the noise in the first frame. It is added to the noise, pixel by pixel, but frames of the "
+            "same geometry share it: raise `rays` and `packets` of the scene's integrator until it is below "
+            f"{CHANCE:g}"
+        )
+    return list(dict.fromkeys(texts))
+
+
+def after_calibration(model: SceneModel, found: Fit, level: Row | None) -> list[str]:
+    """What no effect explains: a model nowhere near its images, or values that contradict their priors."""
+    texts = []
+    if level is not None and level.rms > FAR * level.signal:
+        texts.append(
+            f"the model misses the images by {level.rms / max(level.signal, 1e-9):.0%} of its own mean, too far for a "
+            f"missing effect: check {AT_FAULT}"
+        )
+    known = [(v, value_of(model, found.values, v), v.prior) for v in found.variables if v.prior is not None]
+    moved = [(v, value, prior) for v, value, prior in known if abs(value - prior[0]) > SURPRISING * prior[1]]
+    if moved:
+        v, value, prior = max(moved, key=lambda t: abs(t[1] - t[2][0]) / t[2][1])
+        texts.append(
+            f"{some([v.name for v, _, _ in moved], 4)}: calibrated to more than {SURPRISING:g} sd from the prior, most "
+            f"{v.name}: {value:.4g}{spaced(v.parameter.unit)} for {prior[0]:.4g} +- {prior[1]:g}; check {AT_FAULT}"
+        )
+    return texts
+
+
+def _unverified(model: SceneModel, setup: Setup, held: Sequence[int]) -> list[str]:
+    """Several groups of frames, of which none is held out because there are too few."""
+    groups = len(capture_files.groups(model.captures))
+    if held or setup.held_out is not None or groups < 2:
+        return []
+    return [
+        f"{groups} groups of frames: none is held out, so nothing verifies what is found; take {GROUPS} or more, or "
+        "name one to hold out (--hold-out)"
+    ]
+
+
+def _astray(model: SceneModel) -> list[str]:
+    """Presses that lie beyond the gel."""
+    gel = model.scene.gel
+    if gel is None:
+        return []
+    for axis, side in (("press_x", "width"), ("press_y", "length")):
+        key, size = f"{gel.name}.{axis}", float(model.base[f"{gel.name}.{side}"])
+        for f in model.frames:
+            if abs(float(f.parameters.get(key, 0.0))) > size / 2:
+                return [
+                    f"frame '{f.name}': {key} = {f.parameters[key]:g} mm lies beyond the gel, which is {size:g} mm "
+                    "wide there: check units"
+                ]
+    return []
+
+
+def _unnamed(model: SceneModel) -> list[str]:
+    """Lights that some frames set and others leave to the scene, which has them on."""
+    own = [{*f.parameters, *f.readings} for f in model.frames]
+    left = {
+        key: i
+        for key in (f"{n}.power" for n in model.scene.lights)
+        if model.base[key] and any(key in keys for keys in own)
+        for i, keys in enumerate(own)
+        if key not in keys
+    }
+    if not left:
+        return []
+    key, frame = next(iter(left.items()))
+    return [
+        f"{', '.join(left)}: set in some frames and not in others, such as '{model.frames[frame].name}', where {key} "
+        f"is the scene's {model.base[key]:g}; write 0 where a light was off"
+    ]

@@ -1,0 +1,160 @@
+"""A fit on disk: `fit.toml`, whose values can be laid over a scene again, and the table of variables in `step.json`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from optics.errors import UnknownKey
+from optics.fit.result import Fit
+from optics.fit.scene_model import SceneModel
+from optics.scene.parameter import Values
+
+CORRELATION_SHOWN = 0.9  # absolute correlation beyond which a pair of variables is listed
+
+
+def fit_record(fit: Fit | Mapping, frame_names: Sequence[str] = ()) -> dict:
+    """A fit as plain data; a mapping of that form is completed and returned.
+
+    variables   name, keys, unit, value, sd, frames (names or None), prior, pull, neutral, plausible, at_bound
+    pull        (value - prior mean) / prior sd: how far the data moved it from what was known
+    """
+    blank: dict[str, Any] = {
+        "parameters": {},
+        "frames": {},
+        "variables": [],
+        "correlations": [],
+        "chi2": None,
+        "dof": None,
+        "converged": True,
+        "reason": "",
+        "warnings": [],
+    }
+    if isinstance(fit, Mapping):
+        return {**blank, **fit}
+
+    def name_of(index: int) -> str:
+        return frame_names[index] if index < len(frame_names) else f"{index:03d}"
+
+    variables = []
+    for v, value, sd in zip(fit.variables, np.asarray(fit.estimate, float), np.asarray(fit.sd, float)):
+        p = v.parameter
+        variables.append(
+            {
+                "name": v.name,
+                "keys": list(v.keys),
+                "unit": p.unit,
+                "value": float(value),
+                "sd": float(sd),
+                "frames": None if v.frames is None else [name_of(i) for i in v.frames],
+                "prior": None if v.prior is None else list(v.prior),
+                "pull": None if v.prior is None else (float(value) - v.prior[0]) / v.prior[1],
+                "neutral": p.neutral,
+                "plausible": p.plausible,
+                "at_bound": v.name in getattr(fit, "at_bound", ()),
+            }
+        )
+    pairs = []
+    if len(variables) > 1:
+        with np.errstate(invalid="ignore"):  # an undetermined variable has an infinite variance
+            r = np.nan_to_num(np.asarray(fit.correlation, float))
+        for i, j in zip(*np.nonzero(np.triu(np.abs(r) > CORRELATION_SHOWN, 1))):
+            pairs.append([variables[i]["name"], variables[j]["name"], float(r[i, j])])
+    return {
+        **blank,
+        "parameters": dict(fit.values.common),
+        "frames": {name_of(i): dict(own) for i, own in sorted(fit.values.frame.items()) if own},
+        "variables": variables,
+        "correlations": sorted(pairs, key=lambda p: -abs(p[2]))[:20],
+        "chi2": float(fit.chi2),
+        "dof": float(fit.dof),
+        "converged": bool(fit.converged),
+        "reason": str(fit.reason),
+        "warnings": list(getattr(fit, "warnings", ()) or ()),
+    }
+
+
+def fit_toml(record: Mapping, name: str = "") -> str:
+    """The values of a fit as TOML that can be laid over a scene again: [parameters] and [frames.NAME], key = value."""
+    import tomlkit
+
+    unit = {key: v["unit"] for v in record["variables"] for key in v["keys"]}
+    document = tomlkit.document()
+    document.add(
+        tomlkit.comment(
+            f"Calibrated values{f' of the step {chr(34)}{name}{chr(34)}' if name else ''}: lay them over "
+            "the scene with --values FILE."
+        )
+    )
+
+    def table(values: Mapping) -> Any:
+        out = tomlkit.table()
+        for key, value in values.items():
+            out.add(key, value if isinstance(value, (str, bool)) else float(value))
+            if unit.get(key):
+                out[key].comment(unit[key])
+        return out
+
+    def nested(frames: Mapping) -> Any:
+        out = tomlkit.table(is_super_table=True)
+        for frame, values in frames.items():
+            out.add(frame, table(values))
+        return out
+
+    document.add("parameters", table(record["parameters"]))
+    common = {key: v["sd"] for v in record["variables"] if v["frames"] is None for key in v["keys"]}
+    document.add("uncertainty", table(common))
+    document["uncertainty"].comment("one standard deviation")
+    if record["frames"]:
+        document.add("frames", nested(record["frames"]))
+        own: dict = {}
+        for v in record["variables"]:
+            for frame in v["frames"] or ():
+                own.setdefault(frame, {}).update(dict.fromkeys(v["keys"], v["sd"]))
+        if own:
+            document.add("frames_uncertainty", nested(own))
+    fit = tomlkit.table()
+    for key in ("chi2", "dof", "converged", "reason"):
+        if record[key] is not None:
+            fit.add(key, record[key])
+    document.add("fit", fit)
+    return tomlkit.dumps(document)
+
+
+def read_fit(file: str | Path) -> dict[str, dict]:
+    """fit.toml as plain dictionaries: parameters, uncertainty, frames, frames_uncertainty, fit.
+
+    Raises FileNotFoundError, and ValueError for what is not TOML.
+    """
+    import tomlkit
+
+    file = Path(file)
+    if not file.is_file():
+        raise FileNotFoundError(f"{file}: no such file; a study writes one to STUDY/steps/NN-name/fit.toml")
+    try:
+        data = tomlkit.parse(file.read_text(encoding="utf-8")).unwrap()
+    except ValueError as error:
+        raise ValueError(f"{file}: not valid TOML: {error}") from error
+    return {key: data.get(key, {}) for key in ("parameters", "uncertainty", "frames", "frames_uncertainty", "fit")}
+
+
+def values_of(model: SceneModel, file: str | Path | None, sets: Mapping[str, float | str]) -> Values:
+    """The values of a fit.toml (None: none), and above them those of `sets`.
+
+    Raises UnknownKey for a frame that the model's captures do not have, ValueError for what is not TOML, and what
+    `Scene.check` raises.
+    """
+    if file is None:
+        return Values(dict(model.scene.check(sets, "--set")))
+    data = read_fit(file)
+    common = model.scene.check({**data["parameters"]}, f"{file}: [parameters]")
+    names = {f.name: i for i, f in enumerate(model.frames)}
+    own: dict[int, dict[str, Any]] = {}
+    for name, values in data["frames"].items():
+        if name not in names:
+            raise UnknownKey(name, names, "frame", str(file), "the fit belongs to another set of captures")
+        own[names[name]] = dict(model.scene.check(values, f"{file}: [frames.{name}]"))
+    return Values({**common, **model.scene.check(sets, "--set")}, own)

@@ -1,0 +1,202 @@
+"""What a study starts from: captures, scene and choices; the model they give; what is free in it; what is held out."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from fnmatch import fnmatch
+from pathlib import Path
+
+from optics.captures import capture_set as capture_files
+from optics.errors import Underdetermined, UnknownKey
+from optics.fit import calibrate
+from optics.fit.model import value_of
+from optics.fit.scene_model import SceneModel
+from optics.scene import loader as scenes
+from optics.scene.declare import Effect
+from optics.scene.parameter import Values, Variable
+
+POSE = ("press_x", "press_y", "press_depth")  # solved for in every group of frames, unless the setup says otherwise
+POSE_SD = 0.05  # mm: how well a stage usually knows where it presses
+POWER_SD = 0.3  # of an LED's power: the lambda term of S4. Powers and reflectances are determined only as a product
+ASPECT = 0.02  # relative difference of aspect ratio between images and scene beyond which they are said to be cut
+GROUPS = 4  # with at least this many groups of frames, every fourth is held out
+GAUGE = 10.0  # plausible sizes: standard deviation of the prior that keeps a degenerate mode near the scene's value
+
+
+@dataclass
+class Setup:
+    """What a study starts from. Its record keeps it, so that another process can continue.
+
+    captures    folder of the capture set
+    defines     -D of the scene; the size of the images is added where the scene names width and height
+    plugins     a further folder of plugins; None: `plugins` beside the captures, where there is one
+    free        key patterns of the parameters to solve for, one value for all frames; empty: position, axis, lobe and
+                power of every LED, reflectance and roughness of every membrane, power of every source
+    per_group   key patterns of parameters with a value per group of frames; None: the press, where groups are given
+    priors      pattern -> (mean, standard deviation); a mean of None is the present value
+    held_out    names of groups that the calibration does not see; None: every fourth of four or more
+    values      start values, by key
+    flat_field  how a background image enters, see `optics.fit.model.Model`
+    robust      residuals beyond three sigmas count less (Huber), for dirt and glints; a diagnosis weighs all alike
+    seed        of everything random
+    """
+
+    captures: str
+    defines: dict[str, str] = field(default_factory=dict)
+    plugins: str | None = None
+    free: list[str] = field(default_factory=list)
+    per_group: list[str] | None = None
+    priors: dict[str, tuple[float | None, float]] = field(default_factory=dict)
+    held_out: list[str] | None = None
+    values: dict[str, float | str] = field(default_factory=dict)
+    flat_field: str | None = None
+    robust: bool = False
+    seed: int = 0
+
+
+def setup_for(captures: str | Path, **given: object) -> Setup:
+    """The setup of the given fields (None and empty count as not given); those that an imported set advises fill the rest.
+
+    An importer writes its advice to import.json. Where `free` or `per_group` is given, the advised priors belong to
+    other parameters and are left out.
+    """
+    note = Path(captures) / "import.json"
+    advised = json.loads(note.read_text(encoding="utf-8")).get("setup", {}) if note.is_file() else {}
+    own = {name: value for name, value in given.items() if value or (value == [] and name in ("per_group", "held_out"))}
+    if {"free", "per_group"} & set(own):
+        advised = {name: value for name, value in advised.items() if name == "flat_field"}
+    return recorded({**advised, **own, "captures": str(captures)})
+
+
+def recorded(facts: dict) -> Setup:
+    """The setup of a study's record, which keeps pairs as lists."""
+    setup = Setup(**facts)
+    setup.priors = {pattern: (prior[0], prior[1]) for pattern, prior in setup.priors.items()}
+    return setup
+
+
+def plugins_of(setup: Setup) -> Path:
+    """The plugin folder of a setup, which need not exist: the one it names, or `plugins` beside the captures."""
+    return Path(setup.plugins) if setup.plugins else Path(setup.captures) / "plugins"
+
+
+# -- the model ----------------------------------------------------------------------------------------------------------
+
+
+def open_model(setup: Setup, model_class: type = SceneModel) -> SceneModel:
+    """Captures and scene of a setup as a model; raises, before anything is rendered, where they contradict each other."""
+    found = capture_files.load(setup.captures)
+    path = scenes.find(found.scene)
+    defines = dict(setup.defines)
+    height, width = found.frames[0].image.shape[:2]
+    usual = dict(re.findall(r'<default name="(width|height)" value="(\d+)"', path.read_text(encoding="utf-8")))
+    for name, size in (("width", width), ("height", height)):
+        if name in usual:
+            defines.setdefault(name, str(size))
+    if found.table is None and len(usual) == 2:
+        own_width, own_height = int(usual["width"]), int(usual["height"])
+        if abs(width * own_height / (height * own_width) - 1) > ASPECT:
+            found.warnings.append(
+                f"the images are {width} x {height} px, the scene's own are {own_width} x {own_height}: cropped or "
+                "turned images show another part of the sensor than the scene's camera; give them whole, row 0 at the "
+                "top, or correct x_fov and the principal point in the scene"
+            )
+    plugins = plugins_of(setup)
+    loaded = scenes.load(path, defines, plugins=plugins if setup.plugins or plugins.is_dir() else None)
+    capture_files.check(found, loaded.parameters)
+    noise = found.noise
+    if noise is None:
+        from optics.captures.noise import estimate
+
+        noise = estimate(found)
+    options = {} if setup.flat_field is None else {"flat_field": setup.flat_field}
+    return model_class(loaded, found, noise, **options)
+
+
+def split(model: SceneModel, setup: Setup) -> tuple[list[int], list[int]]:
+    """Indices of fitted and of held-out frames. Raises UnknownKey for a group that does not exist."""
+    groups = capture_files.groups(model.captures)
+    names = list(groups)
+    held = setup.held_out
+    if held is None:
+        held = names[1::GROUPS] if len(names) >= GROUPS else []
+    for name in held:
+        if name not in groups:
+            raise UnknownKey(name, names, "group of frames", setup.captures)
+    out = sorted(i for name in held for i in groups[name])
+    fitted = [i for i in range(len(model.frames)) if i not in set(out)]
+    if not fitted:
+        raise Underdetermined(f"{setup.captures}: every group is held out; leave some to calibrate on")
+    return fitted, out
+
+
+# -- what is free -------------------------------------------------------------------------------------------------------
+
+
+def default_free(model: SceneModel) -> list[str]:
+    """Position, axis, lobe and power of every LED, reflectance and roughness of every membrane, power of every source."""
+    patterns = []
+    integrator = model.scene.integrator
+    spectral = len((integrator.bands if integrator is not None else ()) or (0,))
+    for led in model.scene.leds:
+        patterns += [f"{led}.{n}" for n in ("x", "y", "z", "pan", "tilt", "mu", "power")]
+    for source in (n for n, part in model.scene.sources.items() if part.kind == "source"):
+        patterns += [f"{source}.power"] if spectral == 1 else [f"{source}.power_{c}" for c in "rgb"[:spectral]]
+    for membrane in model.scene.membranes:
+        patterns += [f"{membrane}.rho_{c}" for c in "rgb"[:spectral]] + [f"{membrane}.sigma"]
+    return patterns
+
+
+def variables_of_base(model: SceneModel, setup: Setup, frames: Sequence[int]) -> list[Variable]:
+    """The base model's variables in these frames: those of all frames, then those of each group."""
+    priors = dict(setup.priors)
+    if not setup.free:
+        priors = {**{f"{led}.power": (None, POWER_SD) for led in model.scene.leds}, **priors}
+    per_group = setup.per_group
+    if per_group is None:
+        per_group = []
+        if any(f.group for f in model.frames) and model.scene.gel is not None:
+            per_group = [f"{model.scene.gel.name}.{n}" for n in POSE]
+            priors = {**{f"{p}*": (None, POSE_SD) for p in per_group}, **priors}
+    variables = calibrate.variables_from(model, setup.free or default_free(model), per_group, None, frames)
+    if setup.per_group is None:
+        variables = [v for v in variables if v.frames is None or not _untouched(model, v.frames)]
+    for pattern, prior in priors.items():
+        variables = [_with_prior(model, v, pattern, prior) for v in variables]
+    return variables
+
+
+def check_priors(model: SceneModel, setup: Setup) -> None:
+    """Raises UnknownKey for a prior on something that the setup does not solve for."""
+    everywhere = variables_of_base(model, setup, range(len(model.frames)))
+    for pattern in setup.priors:
+        if not any(fnmatch(name, pattern) for v in everywhere for name in (v.keys[0], v.name)):
+            raise UnknownKey(pattern, [v.name for v in everywhere], "free parameter for a prior")
+
+
+def effect_variables(model: SceneModel, effect: Effect) -> list[Variable]:
+    """What adding an effect frees.
+
+    Of several strengths a common mode may be degenerate, such as a gain that all frames share. A prior of GAUGE
+    plausible sizes holds it at the scene's value, and data that determine it outweigh the prior.
+    """
+    found = model.scene.variables_of(effect, len(model.frames))
+    if len(found) < 2:
+        return list(found)
+    return [_with_prior(model, v, "*", (None, GAUGE * v.parameter.plausible)) for v in found]
+
+
+def _untouched(model: SceneModel, frames: Sequence[int]) -> bool:
+    """Whether frames say that nothing presses the gel, so that there is no place of a press to solve for."""
+    key = f"{model.scene.gel.name}.press_depth"
+    return all(model.frames[i].parameters.get(key) == 0 for i in frames)
+
+
+def _with_prior(model: SceneModel, variable: Variable, pattern: str, prior: tuple[float | None, float]) -> Variable:
+    if not (fnmatch(variable.keys[0], pattern) or fnmatch(variable.name, pattern)):
+        return variable
+    mean = value_of(model, Values(), variable) if prior[0] is None else prior[0]
+    return variable.with_prior(mean, prior[1])

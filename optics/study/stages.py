@@ -1,0 +1,108 @@
+"""The staged calibration, and how its result is tested on frames that it has not seen."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from optics.fit import calibrate
+from optics.fit.compare import Comparison, compare
+from optics.fit.model import value_of
+from optics.fit.result import Fit
+from optics.fit.scene_model import SceneModel
+from optics.scene.parameter import Values, Variable
+
+Progress = Callable[[str, int, int], None]
+
+# Iterations and tolerances (chi2 per variable) of the stages: the first two only bring the last one close.
+COMMON: dict[str, Any] = {"max_iterations": 12, "tolerance": 20.0}
+POSES: dict[str, Any] = {"max_iterations": 6, "tolerance": 2.0}
+TOGETHER = 0.05  # chi2 per variable: a twentieth of what noise alone makes of each
+OFF = 0.1  # plausible sizes off neutral from which an effect is followed
+
+
+def fit_base(
+    model: SceneModel,
+    variables: Sequence[Variable],
+    fitted: Sequence[int],
+    start: Values,
+    progress: Progress | None = None,
+    tolerance: float = TOGETHER,
+    robust: bool = False,
+) -> Fit:
+    """Calibrate in three stages: what all frames share, then the poses of one press at a time, then everything together."""
+    variables = list(variables)
+    begun = np.array([value_of(model, start, v) for v in variables])  # where the first stage starts
+    common = [v for v in variables if v.frames is None]
+    if len(common) < len(variables):
+        values = start
+        if common:
+            values = calibrate.fit(model, common, start, fitted, **COMMON, robust=robust, progress=progress).values
+        start = values.copy()
+        groups: dict[tuple[int, ...], list[Variable]] = {}
+        for v in variables:
+            if v.frames is not None:
+                groups.setdefault(v.frames, []).append(v)
+        for frames, own in groups.items():
+            found = calibrate.fit(model, own, values, frames, **POSES, robust=robust, progress=progress)
+            for index in frames:
+                start.frame.setdefault(index, {}).update(found.values.frame[index])
+    found = calibrate.fit(model, variables, start, fitted, tolerance=tolerance, robust=robust, progress=progress)
+    found.start = begun
+    return found
+
+
+def off_neutral(model: SceneModel, values: Values, variables: Sequence[Variable]) -> Values:
+    """Values with variables a tenth of their plausible size off: at a bound a one-sided onset has no slope to follow."""
+    moved = values.copy()
+    for v in variables:
+        moved.put(v, value_of(model, moved, v) + OFF * v.parameter.plausible)
+    return moved
+
+
+def held_out_values(model: SceneModel, found: Fit, held: Sequence[int]) -> tuple[Values, int]:
+    """Values for all frames, and the number of variables fitted for it: on held-out frames only those with a value per
+    frame or group are fitted."""
+    own = calibrate.for_frames(model, found.variables, held)
+    return (calibrate.fit(model, own, found.values, held).values if own else found.values), len(own)
+
+
+def comparison_of(
+    model: SceneModel, values: Values, held: Sequence[int] = (), parameters: int = 0, held_parameters: int = 0
+) -> Comparison:
+    """All frames, measured against predicted; `parameters` were fitted to the frames that are not held out,
+    `held_parameters` to the held-out ones."""
+    predicted = model.predict(values)
+    return compare(
+        [f.image for f in model.frames],
+        predicted,
+        [np.sqrt(model.variance(values, i, p)) for i, p in enumerate(predicted)],
+        [model.usable(i) for i in range(len(model.frames))],
+        [model.coordinates(values, i) for i in range(len(model.frames))],
+        [f.parameters for f in model.frames],
+        [f.group or f.name for f in model.frames],
+        names=[f.name for f in model.frames],
+        full_scale=model.noise.saturation - model.noise.black_level,
+        black_level=model.noise.black_level,
+        held_out=held,
+        parameters=parameters,
+        held_out_parameters=held_parameters,
+    )
+
+
+def null_models(model: SceneModel, values: Values, fitted: Sequence[int], held: Sequence[int]) -> dict | None:
+    """An imported set's model beside models without physics (optics.fit.null_models); None without held-out frames or a
+    background."""
+    from optics.captures import importing
+    from optics.fit import null_models as nulls
+
+    if model.flat is None or not held or not (model.captures.folder / "import.json").is_file():
+        return None
+    return nulls.compare(model, values, fitted, held, importing.circles_of(model.captures)).json()
+
+
+def background_of(model: SceneModel, values: Values) -> dict | None:
+    """The flat field's mode, and how much of the background the scene explains without it, per channel."""
+    return None if model.flat is None else {"mode": model.flat_field, "channels": model.background_share(values)}
