@@ -5,10 +5,15 @@ folder of plugins, which then has to meet the same contract as those that ship."
 
 from __future__ import annotations
 
+import os
 import re
 from functools import lru_cache
 from pathlib import Path
 from types import SimpleNamespace
+
+# Before numpy is imported. The matrices of the tests are small: a second thread of BLAS only waits, and takes the core
+# from Dr.Jit or from the other worker (test_lattice.py: 13 s of processor time in place of 24).
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 import pytest
@@ -99,7 +104,7 @@ class Bench:
 
 
 # A dent off the middle, a coloured membrane, three LEDs of unequal power, one of them coloured: nothing is symmetric,
-# so that no derivative vanishes by Monte Carlo. The other LEDs are off to save time. Highlights reach half of full
+# so that no derivative vanishes by accident. The other LEDs are off to save time. Highlights reach half of full
 # scale.
 WORKING_POINT = {
     "gel.press_x": 1.5,

@@ -883,7 +883,9 @@ def draw(rng, bench, chosen=None):
     values = {}
     for name, part in bench.scene.parts.items():
         around = {p: bench.values[f"{name}.{p}"] for p in part.numbers}
-        for item in (registry().parts[part.kind], *(e for e in registry().effects.values() if e.part == part.kind)):
+        effects = [e for e in registry().effects.values() if e.part == part.kind]
+        # what draws several parameters comes last: its values belong together
+        for item in (registry().parts[part.kind], *sorted(effects, key=lambda e: len(e.parameter_names))):
             drawn = checking.draw(item, own_parameters(item), rng, around)
             values.update((f"{name}.{p}", value) for p, value in drawn.items())
     return {k: v for k, v in values.items() if k in bench.scene.parameters and (chosen is None or k in chosen)}
@@ -935,9 +937,9 @@ def test_all_layers_drawn_at_once_give_derivatives(kind, seed, bench_of):
     numbers = sorted(k for k in bench.renderer.layer_keys if bench.scene.parameters[k].is_number)
     for key in rng.choice(numbers, 20 if kind == "source" else 5, replace=False):
         p = bench.scene.parameters[key]
-        # near a bound, where a film without a leak goes as a square root, a hundredth of the distance to it
+        # near a bound, where a film without a leak goes as a square root, a thousandth of the distance to it
         room = min(abs(values[key] - bound) for bound in p.bounds)
-        step = min(3e-3 * p.plausible, 1e-2 * room) if room > p.near else 3e-3 * p.plausible
+        step = min(3e-3 * p.plausible, 1e-3 * room) if room > p.near else 3e-3 * p.plausible
         reference, _ = differences(lambda v: bench.image({**values, key: v}), values[key], step, p.bounds)
         off = np.linalg.norm(bench.derivative(key, values) - reference)
         assert off <= 1e-5 * np.linalg.norm(reference) + 1e-7 * np.linalg.norm(image) / p.plausible, (

@@ -673,7 +673,6 @@ def test_the_view_has_the_tangent_of_the_field_angle(view):
     assert np.abs(view.tan - np.sqrt(x * x + y * y)).max() < 1e-12
 
 
-
 def test_bend_and_the_chain_to_digital_numbers(bench):
     """DN = black + (saturation - black) m, m = G^-1(exposure gain M L) + bend m (1 - m)."""
     from optics.light.development import Developer, inverse_cubic
