@@ -34,6 +34,21 @@ def pytest_configure(config):
         registry().scan(Path(folder))
 
 
+def is_worker():
+    """Whether this process is one of several that pytest-xdist runs (`make test`)."""
+    return "PYTEST_XDIST_WORKER" in os.environ
+
+
+# The files that take the longest, the longest first: workers that begin with them end at about the same time.
+LONGEST = ("test_demo", "test_plugins", "test_tactile", "test_calibration", "test_bench", "test_proof", "test_transport")
+
+
+def pytest_collection_modifyitems(items):
+    if is_worker():
+        place = {name: number for number, name in enumerate(LONGEST)}
+        items.sort(key=lambda item: place.get(item.path.stem, len(LONGEST)))  # stable: the others keep their order
+
+
 @pytest.fixture(scope="session")
 def mitsuba():
     """Mitsuba in the default variant, on an LLVM that works."""
@@ -45,6 +60,10 @@ def mitsuba():
     use_variant()
     import mitsuba
 
+    if is_worker():
+        import drjit
+
+        drjit.set_thread_count(1)  # there is a worker for each core
     return mitsuba
 
 
