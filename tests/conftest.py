@@ -40,7 +40,15 @@ def is_worker():
 
 
 # The files that take the longest, the longest first: workers that begin with them end at about the same time.
-LONGEST = ("test_demo", "test_plugins", "test_tactile", "test_calibration", "test_bench", "test_proof", "test_transport")
+LONGEST = (
+    "test_demo",
+    "test_plugins",
+    "test_tactile",
+    "test_calibration",
+    "test_bench",
+    "test_proof",
+    "test_transport",
+)
 
 
 def pytest_collection_modifyitems(items):

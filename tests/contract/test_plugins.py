@@ -62,7 +62,7 @@ SURROUNDINGS = {  # parameter: what has to stand about it for it to be seen, and
 
 
 def ways(how):
-    """Parameters by the way of their derivative."""
+    """Parameters whose derivative is made in one way."""
     return [
         pytest.param(kind, name, id=f"{kind}.{name}")
         for kind, name in NUMBERS
@@ -204,8 +204,8 @@ def test_samplers_draw_plausible_values(item):
 
 
 class Material:
-    """A material alone, as a bench, for what only mi.render can pass: a smooth world that it reflects (left) and lets
-    through.
+    """A material alone, as a bench, for materials that only mi.render can pass: it reflects (left) and transmits a smooth
+    world.
 
     Rows of the image are directions of sight, channels S0, S1 and S3; the mean over a grid of sampled directions has no
     noise."""
@@ -252,7 +252,7 @@ class Material:
         return np.stack([np.array(c, float).reshape(4, -1).mean(1) for c in channels], -1)
 
     def derivative(self, key, values=None):
-        """As the model makes it of what is declared 'difference'."""
+        """By differences, as the model takes it of parameters that declare 'difference'."""
         p, now = self.scene.parameters[key], {**self.values, **(values or {})}
         return differences(lambda v: self.image({**now, key: v}), now[key], p.step * p.plausible, p.bounds)[0]
 
@@ -297,7 +297,7 @@ def key_of(bench, kind, name):
 
 
 def about(bench, key):
-    """The bench's values with what a parameter needs about it to be seen."""
+    """The bench's values, with the values of other parameters that make this one visible."""
     kind, name = bench.renderer.kind(key), key.rsplit(".", 1)[1]
     return {**bench.values, **companions(bench, kind, name), **surroundings(bench, kind, name)}
 
@@ -347,8 +347,7 @@ def differences(f, value, step, bounds):
 
 
 def calm(bench, key, values, base):
-    """Pixels that are no rim (of a shadow or of the face) under any of the values: elsewhere an edge moves through the
-    samples."""
+    """Pixels that contain no rim (of a shadow or of the face) at any of the values: elsewhere an edge crosses samples."""
     rim = np.zeros(bench.model.shape[:2], bool)
     for value in values:
         now = {**base, key: value}
@@ -372,7 +371,7 @@ def moves(bench, key):
 
 
 def beside(p):
-    """A value next to neutral, at which functions are evaluated: at neutral itself the program leaves them out."""
+    """A value next to neutral. Functions are evaluated there; at neutral itself the program skips them."""
     return inward(p, p.neutral, 1e-30 if p.neutral == 0 else 4e-16 * abs(p.neutral))
 
 
@@ -394,7 +393,7 @@ def check_identity(bench, effect):
 
 
 def at_rest(bench, effect, p):
-    """The bench's values with an effect at neutral, and with what one of its parameters needs about it."""
+    """The bench's values with an effect at neutral, and with what makes one of its parameters visible."""
     return {**bench.values, **at(bench, effect, lambda q: q.neutral), **surroundings(bench, effect.part, p.name)}
 
 
@@ -511,7 +510,7 @@ def test_a_sheet_at_rest_and_a_film_taken_out_are_not_there(benches, tmp_path):
 
 
 def test_a_rough_boundary_of_index_1_is_not_there_in_a_render(benches, tmp_path):
-    """mi.render with and without it in the sample slot, rough as it is."""
+    """mi.render with and without it in the sample slot, at the roughness of the working point."""
     from optics.light.rendering import RenderJob
     from optics.scene import loader as scene
 
@@ -531,7 +530,7 @@ def test_a_rough_boundary_of_index_1_is_not_there_in_a_render(benches, tmp_path)
 
 
 def compare(found, reference, image, step, tolerance, keep=True, what=""):
-    """|found - reference| <= tolerance |reference| + what rounding of float32 makes of a difference over the step."""
+    """|found - reference| <= tolerance |reference| + the rounding of float32 in a difference over the step."""
     keep = np.broadcast_to(np.asarray(keep)[..., None] if np.ndim(keep) else True, found.shape)
     off, size = np.linalg.norm((found - reference)[keep]), np.linalg.norm(reference[keep])
     rounding = FLOAT * np.linalg.norm(image) / step
@@ -692,7 +691,7 @@ def test_derivatives_behind_layers(key, bench_of):
     ),
 )
 def test_derivatives_of_light_that_no_lamp_made(key, bench_of, monkeypatch):
-    """With every lamp off, what the paints shine by themselves is still seen through the layers."""
+    """With every lamp off, the ambient light of the paints is still seen through the layers."""
     bench = bench_of("fluorescent")
     for light in bench.scene.lights:
         monkeypatch.setitem(bench.values, f"{light}.power", 0.0)
@@ -701,7 +700,7 @@ def test_derivatives_of_light_that_no_lamp_made(key, bench_of, monkeypatch):
 
 
 def test_an_image_does_not_depend_on_those_before_it(bench):
-    """Values of stock plugins take hold whatever geometry is at hand, light of the room included."""
+    """Values of stock plugins act whatever geometry is in use, also in light of the room."""
     key, room = (
         "membrane.reflectance.value",
         {"membrane.ambient": 0.01, **{f"{n}.power": 0.0 for n in bench.scene.leds}},
@@ -892,7 +891,7 @@ def draw(rng, bench, chosen=None):
 
 
 def check_random_values(bench, effect, seed):
-    """Two draws of an effect's own parameters: finite images, no darker than darkness, within bounds of the scene."""
+    """Two draws of an effect's own parameters: finite images within bounds."""
     rng = np.random.default_rng(seed)
     own = [*registry().effect_parameters(effect), *effect.shape]
     chosen = {k for p in own for k in keys(bench, effect.part, p.name)}
@@ -989,7 +988,7 @@ def test_bounds_are_kept(kind, name, bench_of):
 
 
 def crossings(rng, count, bands=(620.0, 540.0, 460.0), steepest=60.0):
-    """Light that passes a layer from either side, anyhow, anywhere, in any axes; (count, 1) against the bands."""
+    """Random crossings: either side, any direction, place and axes; (count, 1) against the bands."""
     from optics.polarization.layers import Crossing
 
     theta, phi, turn = np.radians([steepest, 360, 360])[:, None] * rng.uniform(0, 1, (3, count))
@@ -1031,7 +1030,7 @@ def check_realisable(bench, kind, seed):
 
 
 def check_emission(bench, kind, seed):
-    """A source sends no more polarized light than light."""
+    """The degree of polarization of a source is 1 or less."""
     rng = np.random.default_rng(seed)
     for _ in range(5):
         source = layer_of(bench, kind, {**bench.values, **draw(rng, bench)})
@@ -1043,7 +1042,7 @@ def check_emission(bench, kind, seed):
 
 
 def check_readings(bench, kind):
-    """Settings of many readings at once, an array along the first axis, make what they make one by one."""
+    """Settings of many readings in one array (first axis) give what they give one by one."""
     from optics.light import paths
 
     scene, bands = bench.scene, bench.renderer.wavelengths
@@ -1073,7 +1072,7 @@ def check_readings(bench, kind):
 
 
 def check_both_arithmetics(mi, bench, kind):
-    """What mi.render meets, in Dr.Jit, is what the prediction multiplies, in numpy."""
+    """The matrices that mi.render evaluates in Dr.Jit are those that the prediction multiplies in numpy."""
     from optics.polarization.layers import Crossing, evaluate
     from optics.scene.layer import numbers_of
 
@@ -1439,7 +1438,7 @@ def test_derivatives_go_through_a_draft(name, key, tolerance, drafts):
     assert check_model_derivative(drafts, key, tolerance) > 1e-4
 
 
-def test_a_layers_effect_of_what_is_no_layer_is_refused(user_bench):
+def test_an_effect_at_the_stage_layer_of_another_part_is_refused(user_bench):
     with pytest.raises(BadPlugin, match="'led' is not"):
         user_bench(spoil(CELL, [('part="sugar_cell", stages', 'part="led", stages')]), "polarizer_bench", "sugar_cell")
 
