@@ -20,10 +20,10 @@ endif
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test bench proof lock clean
+.PHONY: help setup demo test test-all bench proof lock clean
 
 help:  ## list these targets
-	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /  make \1\t/' | expand -t 16
+	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /  make \1\t/' | expand -t 16
 
 setup: $(READY)  ## make .venv from requirements.lock and find LLVM (installs it where apt-get can)
 
@@ -40,8 +40,14 @@ $(READY): requirements.lock pyproject.toml setup.py
 demo: setup  ## run the demonstration
 	@$(BIN)/optics demo $(ARGS)
 
-test: setup  ## run the tests, but for the slow ones
-	@$(BIN)/pytest -q -m "not slow" $(ARGS)
+# One worker for each core, at most four: each takes 2 GB. A file stays with one worker, and so do its fixtures.
+PYTEST := $(BIN)/pytest -q -n auto --maxprocesses 4 --dist loadfile
+
+test: setup  ## run the tests, but for the slow ones (ARGS="-n 0": in one process)
+	@$(PYTEST) -m "not slow" $(ARGS)
+
+test-all: setup  ## run all tests, the slow ones too
+	@$(PYTEST) $(ARGS)
 
 bench: setup  ## measure the speed
 	@$(BIN)/python -m optics.proof.speed $(ARGS)

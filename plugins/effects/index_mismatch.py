@@ -30,6 +30,7 @@ def check_reflectance_of_a_wall():
     """Between materials of the index 1.5 that differ by 0.02, a wall reflects (0.02/3.02)^2 along its normal, in every
     band."""
     one, other = (shift(np.full(3, 1.5), 0, SimpleNamespace(index_offset=offset)) for offset in (0.0, 0.02))
+    agree(one, [1.5] * 3)
     for reflectance in fresnel(np.ones(3), other / one)[:2]:
         agree(reflectance, [(0.02 / 3.02) ** 2] * 3, 1e-9)
 

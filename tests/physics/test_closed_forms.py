@@ -407,7 +407,7 @@ def test_haze_is_the_single_scattering_integral(bench):
     close(found, expected)
 
 
-def test_light_from_everywhere_meets_the_facets_that_light_of_leds_meets(bench):
+def test_ambient_light_meets_the_facets_that_light_of_leds_meets(bench):
     """Ambient light on a rough face: rho E/pi times the integral of Oren and Nayar's qualitative model over the
     hemisphere, by numbers."""
     sigma, values = 0.4, {**bench.values, "membrane.sigma": 0.4, "membrane.ambient": 0.3, "gel.press_depth": 0.6}
@@ -436,7 +436,7 @@ def test_light_from_everywhere_meets_the_facets_that_light_of_leds_meets(bench):
     assert np.abs(found - np.interp(view, at, share)).max() < 2e-3  # straight lines between twelve angles
 
 
-def test_height_fall_off_and_light_of_no_led(bench):
+def test_height_fall_off_and_ambient_light(bench):
     """exp(-c h) with the height of the face; rho E/pi everywhere on a smooth one; rho G/pi (1 - n_z)/2 with n_z towards
     the camera."""
     values = {**bench.values, "gel.press_depth": 0.8}
