@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from optics.captures import capture_set as capture_files
+from optics.captures.noise import Noise
 from optics.errors import OutputExists, UnknownKey
 from optics.proof.makers import touch as synthetic
 from optics.scene import loader as scenes
@@ -24,7 +25,7 @@ from optics.study import loop
 # Not here: interreflection, 0.2 % of the light under a dent this shallow. White LEDs cannot show colour crosstalk: it
 # is to be had on request, with the coloured ones of digit.
 SECRETS = {
-    "lens vignetting": 0.8,
+    "lens vignetting": 0.9,
     "veiling glare": 0.03,
     "ambient light": 1e-4,
     "lens blur": 0.6,
@@ -54,6 +55,10 @@ BENCH_SECRETS = {
     "polarized source": 0.02,
     "extinction leak": 0.004,
 }
+CAMERA = Noise(  # of one frame: 12 bits raw, 20 000 electrons; its pattern is taken to be divided out
+    system_gain=0.2, dark_noise=2.0, black_level=64.0, saturation=4095.0, prnu=0.0
+)
+FRAMES = 16  # are summed to an image: 16 times 12 bits fill the 16 bits of the file
 PRESSES = 4
 STEPS = 3  # effects that the loop may add before it must stop
 
@@ -96,19 +101,18 @@ def make(
     (width, height), exposure = SENSORS[sensor]
     scene = scenes.load(sensor, {"width": str(width), "height": str(height)})
     built = {**truth(scene, seed), "camera.exposure": exposure}
-    maker = synthetic.Maker(scene, built, {effect: strength}, seed=seed + 1000)
+    maker = synthetic.Maker(scene, built, {effect: strength}, CAMERA, seed + 1000, frames=FRAMES)
     # each LED alone, and none: the dark frame tells light from outside from light that the camera scatters
     drives = [*({led: 1.0} for led in scene.leds), {}]
     found = maker.captures(synthetic.presses(PRESSES, seed), drives, progress=progress, scene_name=sensor)
     found.parameters["camera.exposure"] = exposure
-    capture_files.write(found, folder, bits=8)
+    capture_files.write(found, folder, bits=16)
     return effect, strength
 
 
 def make_bench(folder: Path, seed: int, effect: str, strength: float) -> None:
     """Readings of the polarizer bench with one effect: P1 at five angles, the analyser round and back, two powers of
     the lamp."""
-    from optics.captures.noise import Noise
     from optics.proof.makers.bench import malus_sweep, with_effects, write
 
     settings = malus_sweep(1000, polarizer_angles=(0.0, 60.0, 100.0, 190.0, 250.0))

@@ -56,7 +56,9 @@ class Maker:
     """Makes frames of a scene's values with one hidden effect or none.
 
     effects   {name of a known effect: strength}, in the units of the effect's own parameters
+    noise     of one frame
     spp       samples per pixel; their noise is far below the photons'
+    frames    exposed one after the other and summed to one image; the captures state the noise of the sum
     """
 
     def __init__(
@@ -67,6 +69,7 @@ class Maker:
         noise: Noise = CAMERA,
         seed: int = 0,
         spp: int = 64,
+        frames: int = 1,
     ):
         self.values = {**scene.values(), **(values or {})}
         self.leds = list(scene.leds)
@@ -79,7 +82,7 @@ class Maker:
         unknown = set(self.effects) - set(MAKERS)
         if unknown:
             raise ValueError(f"no independent way to make {', '.join(sorted(unknown))}; known: {', '.join(MAKERS)}")
-        self.noise, self.seed, self.spp = noise, seed, spp
+        self.noise, self.seed, self.spp, self.frames_summed = noise, seed, spp, frames
         self.count = 0
         self.camera_z = float(scene.camera.columns[3].z[0])
         self.bands = np.array(scene.integrator.bands)
@@ -354,7 +357,8 @@ class Maker:
         if "residual response curve" in e:
             signal = signal + e["residual response curve"] * signal * (1 - signal)
         n = self.noise
-        return n.expose(n.black_level + (n.saturation - n.black_level) * signal + e.get("dark offset", 0.0), rng)
+        mean = n.black_level + (n.saturation - n.black_level) * signal + e.get("dark offset", 0.0)
+        return sum(n.expose(mean, rng) for _ in range(self.frames_summed))
 
     def captures(
         self,
@@ -411,7 +415,7 @@ class Maker:
             scene=scene_name,
             frames=frames,
             parameters={},
-            noise=self.noise,
+            noise=self.noise if self.frames_summed == 1 else self.noise.summed(self.frames_summed),
             flat_field=None,
             cfa=cfa,
             values_are="DN",
