@@ -239,8 +239,11 @@ def normal_equations(
             else np.zeros((0, whitened.size), np.float32)
         )
         where = [index_of[n] for n in images]
-        a[np.ix_(where, where)] += (j @ j.T).astype(float)
-        b[where] += (j @ whitened).astype(float)
+        # sums in double precision: of powers and reflectances only priors hold the common factor, and single precision
+        # loses a prior beside precise data
+        images64 = j.astype(float)
+        a[np.ix_(where, where)] += images64 @ images64.T
+        b[where] += images64 @ whitened
         frame_chi2.append(float(whitened.astype(float) @ whitened))
         frame_n.append(int(mask.sum()))
         rows.append((where, j, scale))
@@ -273,7 +276,7 @@ def again(model, variables: Sequence[Variable], values: Values, frames: Sequence
     b, frame_chi2 = np.zeros(len(variables)), []
     for frame, prediction, (where, j, scale) in zip(frames, model.predict(values, frames), normal.rows):
         whitened = whiten(model, frame, prediction, scale)
-        b[where] += (j @ whitened).astype(float)
+        b[where] += j.astype(float) @ whitened
         frame_chi2.append(float(whitened.astype(float) @ whitened))
     pull, _, prior = prior_terms(model, variables, values)
     return Normal(normal.a, b + pull, sum(frame_chi2), prior, frame_chi2, normal.frame_n, normal.rows)
@@ -576,12 +579,13 @@ def extended(
         )
         there = [index_of[n] for n in images]
         whitened = whiten(model, frame, prediction, scale)
-        a[np.ix_(there, there)] += (new @ new.T).astype(float)
-        cross = (j @ new.T).astype(float)
+        added = new.astype(float)
+        a[np.ix_(there, there)] += added @ added.T
+        cross = j.astype(float) @ added.T
         a[np.ix_(where, there)] += cross
         a[np.ix_(there, where)] += cross.T
         rows.append((np.array([*where, *there], int), np.concatenate([j, new]), scale))
-        b[rows[-1][0]] += (rows[-1][1] @ whitened).astype(float)
+        b[rows[-1][0]] += rows[-1][1].astype(float) @ whitened
     pull, curvature, prior = prior_terms(model, variables, values)
     a[first:, first:] += np.diag(curvature[first:])
     descent = Descent(model, variables, values, base.frames, damping=1e-6)
