@@ -187,14 +187,14 @@ def _read_frames(captures: Captures, tables: object, where: str) -> None:
     for (here, image, files, mask, group, settings), stem in zip(specs, stems):
         name = stem if stems.count(stem) == 1 else image
         for file in files:
-            picture, bits = read_image(file, f"{here}: {file.name}")
+            image_read, bits = read_image(file, f"{here}: {file.name}")
             depths.setdefault(bits, file.name)
             if file is files[0]:
-                frame = Frame(name, picture, None, group, settings, [], image)
+                frame = Frame(name, image_read, None, group, settings, [], image)
                 captures.frames.append(frame)
             else:
-                frame.repeats.append(picture)
-            _same_size(picture, captures, f"{here}: {file.name}")
+                frame.repeats.append(image_read)
+            _same_size(image_read, captures, f"{here}: {file.name}")
         if mask is not None:
             frame.mask = read_mask(mask, frame.image.shape, f"{here}: mask '{mask.name}'")
     if len(depths) > 1:

@@ -127,9 +127,7 @@ def step_of(images: Sequence[np.ndarray]) -> float:
     )  # a sample will do
     if np.any(levels != np.round(levels)):
         return 0.0
-    return (
-        float(np.gcd.reduce(levels.astype(np.int64))) if len(levels) >= 32 else 1.0
-    )  # few levels share one by Monte Carlo
+    return float(np.gcd.reduce(levels.astype(np.int64))) if len(levels) >= 32 else 1.0  # few levels share one by chance
 
 
 def estimate(captures: Captures, black_level: float | None = None, saturation: float | None = None) -> Noise:

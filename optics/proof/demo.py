@@ -1,10 +1,10 @@
 """The demonstration: a sensor with a hidden effect, and the loop that finds it.
 
 An independent path makes the captures of a shipped sensor (`optics.proof.makers.touch`: stock Mitsuba, a denser mesh,
-photons, read noise, 12 bits), with one effect that the base model lacks, chosen by the seed. They are taken as a careful
-laboratory takes them: raw, near full scale, many frames summed, and the noise of the sum written down. Then the loop
-runs blind: calibrate, compare, name the missing effect, add it, and see the error on held-out presses fall to the
-noise. A report tells the story."""
+photons, read noise, 12 bits), with one effect that the base model lacks, chosen by the seed. They are taken with care:
+raw, near full scale, many frames summed, and the noise of the sum written down. Then the loop runs blind: calibrate,
+compare, name the missing effect, add it, and see the error on held-out presses fall to the noise. A report shows every
+step."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from optics.scene import loader as scenes
 from optics.scene.registry import registry
 from optics.study import loop
 
-# Hidden strengths, in the units of the effects' own parameters: they change the image by up to a few tens of percent, as
-# in real sensors; calibration absorbs most of that. Interreflection is left out: 0.2 % of the light under a dent so
-# shallow. White LEDs cannot show colour crosstalk: ask for it with the coloured LEDs of digit.
+# Hidden strengths, in the units of the effects' own parameters: of a size that real sensors have. Calibration absorbs
+# most of what they change. Interreflection is left out: 0.2 % of the light under a dent so shallow. White LEDs cannot
+# show colour crosstalk: ask for it with the coloured LEDs of digit.
 SECRETS = {
     "lens vignetting": 0.9,  # of 1, the natural fall-off cos^4
     "veiling glare": 0.03,
@@ -56,8 +56,8 @@ BENCH_SECRETS = {
     "polarized source": 0.02,
     "extinction leak": 0.004,
 }
-# One frame: 12 bits raw, 20 000 electrons at full scale, as machine-vision cameras have it. No fixed pattern: a flat field
-# has divided it out.
+# One frame: 12 bits raw, 20 000 electrons at full scale, as machine-vision cameras have them. No fixed pattern: a flat
+# field has divided it out.
 CAMERA = Noise(system_gain=0.2, dark_noise=2.0, black_level=64.0, saturation=4095.0, prnu=0.0)
 FRAMES = 16  # summed to one image: their 12 bits fill the 16 bits of a file
 PHOTODIODE = Noise(system_gain=0.01, dark_noise=1.0, black_level=64.0, saturation=4095.0, prnu=0.0)
@@ -66,8 +66,8 @@ STEPS = 3  # effects that the loop may add before it must stop
 
 
 def truth(scene, seed: int) -> dict[str, float]:
-    """Values of a sensor as built, which differ from its drawing: LEDs are up to half a millimetre and some degrees off,
-    their powers up to a tenth."""
+    """Values of a sensor as built: its LEDs are up to half a millimetre and some degrees off the drawing, their powers
+    up to a tenth."""
     rng = np.random.default_rng([seed, 1])
     drawn, built = scene.values(), {}
     for led in scene.leds:
@@ -130,14 +130,14 @@ def _opening(sensor: str) -> str:
     """What the captures are, before anything is found."""
     if sensor == BENCH:
         return (
-            "1000 readings of a photodiode behind two polarizers. They were computed from coherency matrices, not by the "
-            "model, and hold one effect that the base model lacks."
+            "1000 readings of a photodiode behind two polarizers. They were computed from coherency matrices, not by "
+            "the model, and hold one effect that the base model lacks."
         )
     (width, height), _ = SENSORS[sensor]
     return (
-        f"{PRESSES} presses on {sensor}, each under one LED at a time and in the dark: images of {width} x {height} pixels, "
-        f"each the sum of {FRAMES} raw frames of 12 bits. Stock Mitsuba made them, not the model, and they hold one effect "
-        "that the base model lacks."
+        f"{PRESSES} presses on {sensor}, each under one LED at a time and in the dark: images of {width} x {height} "
+        f"pixels, each the sum of {FRAMES} raw frames of 12 bits. Stock Mitsuba made them, not the model, and they hold "
+        "one effect that the base model lacks."
     )
 
 

@@ -159,8 +159,8 @@ class References:
     def share(self) -> np.ndarray:
         """(3,) share a of the image that the grid's mask covers, by channel: near 0 or 1 it shows no grid.
 
-        Also the similarity by Monte Carlo, of a mask of the same share that has nothing to do with it; and none of that
-        share comes below 2 - 1/a."""
+        It is also the similarity that an unrelated mask of the same share has by chance; no mask of that share comes
+        below 2 - 1/a."""
         return np.asarray(self.grid).mean(axis=(0, 1))
 
     def map(self, image: np.ndarray) -> np.ndarray:

@@ -1,11 +1,10 @@
-"""Sensors that see a pressed gel lit by LEDs: `digit` and `gelsight`, by stock Mitsuba's path tracer on meshes of its
-own.
+"""Sensors that see a pressed gel lit by LEDs: `digit` and `gelsight`, made by stock Mitsuba's path tracer.
 
-`Wild` is `optics.proof.makers.touch.Maker` as it comes from a workshop, with
+`Wild` is `optics.proof.makers.touch.Maker` with the imperfections of a built sensor:
 
     clutter    c = 1: fixed pattern of the sensor 0.5 % rms, mottle of the coating 1 % rms (0.4 mm), wrinkles of the
                skin of 0.3 deg rms,
-               the same in every frame; of these no effect of the library knows (diagnosis laboratory, 3.4)
+               the same in every frame; no effect of the library describes these
     shape      "other": effects with the same cause and size as the library's, but another law, as in OTHER
     unknown    what the library does not have, as in UNKNOWN
 """
