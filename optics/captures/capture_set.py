@@ -81,8 +81,7 @@ class Captures:
     bits: int | None = None
 
 
-# -- Loading
-# ------------------------------------------------------------------------------------------------------------
+# -- Loading -----------------------------------------------------------------------------------------------------------
 
 
 def load(path: str | Path) -> Captures:
@@ -301,7 +300,7 @@ def _read_table(folder: Path, data: object, where: str) -> tuple[Table, list[Fra
     return Table(name, values, rename, scale), frames
 
 
-# -- Using --------------------------------------------------------------------------------------------------------------
+# -- Using -------------------------------------------------------------------------------------------------------------
 
 
 def check(captures: Captures, parameters: Mapping[str, Parameter]) -> None:
@@ -396,8 +395,7 @@ def cfa_channel(shape: Sequence[int], pattern: str) -> np.ndarray:
     return cell[np.ix_(np.arange(shape[0]) % 2, np.arange(shape[1]) % 2)]
 
 
-# -- Writing
-# ------------------------------------------------------------------------------------------------------------
+# -- Writing -----------------------------------------------------------------------------------------------------------
 
 
 def write(captures: Captures, folder: str | Path, *, overwrite: bool = False, bits: int | None = None) -> Path:

@@ -135,8 +135,7 @@ def import_circles(
     return import_presses(presses, folder, ball_radius=ball_radius, mm_per_pixel=mm_per_pixel, **options)
 
 
-# -- Reading
-# --------------------------------------------------------------------------------------------------------------
+# -- Reading -----------------------------------------------------------------------------------------------------------
 
 
 def read_taxim(pack: str | Path) -> Presses:
@@ -235,8 +234,7 @@ def _colour_image(file: Path, where: str, shape: tuple | None) -> np.ndarray:
     return image.astype(np.float64)
 
 
-# -- Importing
-# ------------------------------------------------------------------------------------------------------------
+# -- Importing ---------------------------------------------------------------------------------------------------------
 
 
 def import_presses(

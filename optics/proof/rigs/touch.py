@@ -113,8 +113,7 @@ class Wild(Workshop, synthetic.Maker):
         y, x = np.mgrid[:height, :width] + 0.5
         return (x - width / 2) / focal, (y - height / 2) / focal
 
-    # -- the face
-    # -------------------------------------------------------------------------------------------------------
+    # -- the face ------------------------------------------------------------------------------------------------------
 
     def mesh(self, press: Sequence[float], pitch: float = 0.02):
         import mitsuba as mi
@@ -164,7 +163,7 @@ class Wild(Workshop, synthetic.Maker):
         size = self.clutter * np.tan(np.radians(WRINKLE)) / np.sqrt((gx**2 + gy**2).mean())
         return size * rise, size * slope_x, size * slope_y
 
-    # -- light ----------------------------------------------------------------------------------------------------------
+    # -- light ---------------------------------------------------------------------------------------------------------
 
     def light(self, press: Sequence[float]) -> dict[str, np.ndarray]:
         key = (
@@ -233,7 +232,7 @@ class Wild(Workshop, synthetic.Maker):
             out = clear + (out - clear) * phase[..., None]
         return out
 
-    # -- camera ---------------------------------------------------------------------------------------------------------
+    # -- camera --------------------------------------------------------------------------------------------------------
 
     def photograph(self, radiance, rng, frame, press=None, exposure: float = 1.0):
         values, key = self.values, f"{self.camera}.exposure"
@@ -345,8 +344,7 @@ def _disc(radius: float) -> np.ndarray:
     return kernel / kernel.sum()
 
 
-# -- the sensors
-# --------------------------------------------------------------------------------------------------------
+# -- the sensors -------------------------------------------------------------------------------------------------------
 
 
 class Touch(ImageRig):
