@@ -14,6 +14,9 @@ Validity
     (lattice.grid_material). The whole touched area is in contact: no rough gap.
 References
     Fan, Li, Cong & Zhang, MagicGripper, supplementary VII-A, eqs. (4)-(17); physics of the contact: III.B and Fig. 4.
+XML
+    layers integer, 7: cubes of the lattice through the thickness
+    pitch float, 0.1: mm, of the mesh of the faces
 """
 
 from optics.scene.checking import agree, made

@@ -20,6 +20,14 @@ Validity
     central projection; a fisheye needs another part. Monotone response: G'(m) > 0 on [0, 1].
 References
     F-TAC Hand supplementary information, S1.1, eq. (S1); Mitsunaga & Nayar, CVPR 1999.
+XML
+    to_world transform, identity: nominal pose
+    fx float: focal length in px, in place of `x_fov`
+    fy float, fx: focal length in px along y, in place of `aspect`; read where `fx` is given, as are cx and cy
+    cx float, half the width: principal point, px, in place of `principal_x`
+    cy float, half the height: principal point, px, in place of `principal_y`
+    sensitivity string, identity: sensitivities of the channels: a camera of the colour-science library by its name, or
+        one channel per band
 """
 
 import math

@@ -16,6 +16,9 @@ Validity
     (XML integers, 121 x 109) heights are linear and the first direction is constant in each triangle.
 References
     Vi2TaP (RA-L 2025), II.B: a film embedded in a silicone skin of 5 mm. Johnson, Contact Mechanics (1985), 3.2.
+XML
+    columns integer, 121: vertices of the mesh along x
+    rows integer, 109: vertices of the mesh along y
 """
 
 from optics.scene.checking import agree, made

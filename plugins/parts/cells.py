@@ -15,6 +15,10 @@ Validity
     integers).
 References
     Fan, Li, Cong & Zhang, MagicGripper, III.A: cells of 0.6 to 1 mm, skins from 0.3 mm on.
+XML
+    columns integer, 20: cells along x
+    rows integer, 20: cells along y
+    layers integer, 6: cells along z
 """
 
 from optics.scene.checking import agree, made

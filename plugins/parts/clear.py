@@ -17,6 +17,8 @@ Validity
     walls`.
 References
     Fan, Li, Cong & Zhang, MagicGripper, supplementary VII-A, eqs. (18)-(29); Born & Wolf, Principles of Optics, 1.5.
+XML
+    outside string: id of the clear material around the body; without it, air
 """
 
 from optics.scene.checking import agree, made

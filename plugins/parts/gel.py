@@ -18,6 +18,12 @@ Validity
     quasi-static presses; the skirt is a smoothing, not elasticity. The gel's far side rests on a rigid window.
 References
     F-TAC Hand supplementary information, S1.2 and S1.6.
+XML
+    pitch float, 0.06: mm, of the fine part of the mesh
+    map_pitch float, 0.03: mm, of the maps that hold the dent's shape
+    extent float, 3.0: mm, half width of the fine part of the mesh and of those maps
+    columns integer, 181: vertices of the mesh along x
+    rows integer, 161: vertices of the mesh along y
 """
 
 from optics.scene.checking import agree, made

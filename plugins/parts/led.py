@@ -19,6 +19,9 @@ Validity
     distances much larger than the die; no colour change over the lobe.
 References
     F-TAC Hand supplementary information, S1.3, eq. (S2).
+XML
+    position point: where it stands, mm, in place of `x`, `y`, `z`
+    target point, (0, 0, 0): what the axis looks at, mm: its nominal direction is from the position to here
 """
 
 import math

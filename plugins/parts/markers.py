@@ -13,6 +13,9 @@ Validity
     markers as soft as the skin or small against the bend of its face; otherwise as for the part `carried`.
 References
     Vi2TaP (RA-L 2025), II.B: 5 x 4 markers, 9.5 x 8.5 mm apart, cast in holes of 1.5 mm radius and 1 mm depth.
+XML
+    columns integer, 5: markers along x
+    rows integer, 4: markers along y
 """
 
 from optics.scene.checking import agree, made

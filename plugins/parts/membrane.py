@@ -15,6 +15,8 @@ Validity
     all directions less.
 References
     F-TAC Hand supplementary information, S1.4, eq. (S3); Oren & Nayar, IJCV 14, 227 (1995).
+XML
+    reflectance texture, 1.0: a factor of the reflectance that varies over the surface
 """
 
 from optics.scene.checking import agree, made

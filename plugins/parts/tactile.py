@@ -17,6 +17,14 @@ Validity
 References
     F-TAC Hand supplementary information, S1.4-S1.5, eq. (S5); Veach, thesis (1997), ch. 8, for the direct-light
     estimator.
+XML
+    bands string: wavelengths of the camera's bands, nm, red first, at most four: "610, 540, 460"
+    stokes boolean, False: whether S1 to S3 are rendered as further channels
+    max_depth integer, 2: edges of a path between scattering surfaces; 2 is direct light
+    max_null integer, 8: flat or index-matched faces that a path may pass beyond that
+    rays integer, 64: camera rays per pixel through clear bodies
+    packets integer, 100000: packets of light that each lamp sends through clear bodies
+    rr_depth integer, 5: read by the base class of Mitsuba's integrators; paths are not ended at random here
 """
 
 from optics.scene.checking import agree
