@@ -638,8 +638,8 @@ def next_measurement(
     many as bring D to `enough`; and for comparison TAKEN more presses (or repeats, where nothing is pressed).
 
     Ranked by the smallest D between any two members or, where no effect explains all, by `Outlook.worth`. A member
-    whose fall of chi2 is far below the best's counts as a rival only. Empty for fewer than two members. Costs the derivative
-    images of the base and the members in as many frames as there are shots; new presses cost most."""
+    whose fall of chi2 is far below the best's counts as a rival only. Empty for fewer than two members. Costs the
+    derivative images of the base and the members in as many frames as there are shots; new presses cost most."""
     if len(members) < 2:
         return []
     shots = families(model, values, evidence.frames)

@@ -168,8 +168,8 @@ def rehearse(
 def imitate(model: SceneModel, values: Values, folder: str | Path, seed: int = 0) -> Path:
     """Write captures as this model predicts them at these values, with its camera's noise and its frames' settings.
 
-    They show what a residual would look like, and what the loop says of it. They prove nothing about the model, which
-    made them. Raises BadCapture for readings in a table, and as `optics.captures.capture_set.write`."""
+    They show what a residual would look like, and what the loop concludes from it. They prove nothing about the model,
+    which made them. Raises BadCapture for readings in a table, and as `optics.captures.capture_set.write`."""
     captures = model.captures
     if captures.table is not None:
         raise BadCapture(

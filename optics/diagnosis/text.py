@@ -171,8 +171,8 @@ def _partial(f: Findings, winner: Row, failing: Sequence[Condition]) -> str:
         return f"{winner.name} explains {f.share:.0%} of the excess misfit, {1 - f.share:.0%} has another cause."
     part = f"{f.share:.0%} of the excess" if f.weighed else "part of the residual"
     return (
-        f"{winner.name} would explain {part}, but not with one strength ({uneven.text}): it stands in for "
-        "another cause, or comes with one."
+        f"{winner.name} would explain {part}, but not with one strength ({uneven.text}): another "
+        "cause makes it up, or acts besides."
     )
 
 
