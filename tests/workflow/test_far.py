@@ -38,7 +38,8 @@ def test_angles_in_radians_are_no_matter_of_effects(wrong, tmp_path):
 def test_a_value_far_from_what_is_known_of_it_is_named():
     depth = Parameter("press_depth", "mm", 0.2, (0.0, 1.0), plausible=0.1)
     variables = [Variable(f"gel.press_depth[{i}]", ("gel.press_depth",), depth, (i,), (0.2, 0.05)) for i in range(3)]
-    model, near = SimpleNamespace(base={"gel.press_depth": 0.2}), SimpleNamespace(rms=1.0, signal=100.0)
+    model = SimpleNamespace(at=lambda values, i: {"gel.press_depth": 0.2, **values.frame.get(i, {})})
+    near = SimpleNamespace(rms=1.0, signal=100.0)
 
     def told(*depths):
         fit = SimpleNamespace(
