@@ -22,19 +22,18 @@ OUTPUT gets the captures, both studies with a report each, the images, and `inde
 """
 
 import html
-import json
 import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 
+from optics import Study
 from optics.captures import capture_set as capture_files
 from optics.diagnosis.result import Diagnosis
 from optics.proof import demo
 from optics.proof.makers.touch import Maker, presses
 from optics.scene import loader as scenes
-from optics.study.record import Study
 
 WIDTH, HEIGHT = 64, 48  # px
 EXPOSURE = 200.0  # one LED at a time is near full scale
@@ -98,15 +97,14 @@ def optics(*words: str, ends: tuple[int, ...] = (0,)) -> str:
 def told(study: Path) -> Diagnosis:
     """The diagnosis of a study's last step, printed in short."""
     optics("diagnose", str(study), ends=(0, 1))
-    record = Study.open(study)
-    found = Diagnosis.from_json(json.dumps(record.diagnosis(len(record.steps) - 1)))
+    found = Study.open(study).diagnosis
     print(f"{found.word}: {found.sentence}")
     return found
 
 
 def held_out(study: Path) -> list[float]:
     """chi2 per degree of freedom on the held-out press, step by step."""
-    return [step["held_out"]["chi2_per_dof"] for step in Study.open(study).steps]
+    return [step["held_out_chi2_per_dof"] for step in Study.open(study).records()]
 
 
 def phase_of(rows: np.ndarray, curve: np.ndarray, period: float) -> tuple[float, float]:
@@ -143,7 +141,8 @@ def show_frame(file: Path, study: Path, title: str) -> None:
     from matplotlib.figure import Figure
 
     record = Study.open(study)
-    steps = [0] if len(record.steps) == 1 else [0, len(record.steps) - 1]
+    rungs = record.records()
+    steps = [0] if len(rungs) == 1 else [0, len(rungs) - 1]
     figure = Figure(figsize=(10, 2.6 * len(steps)), layout="constrained")
     axes = figure.subplots(len(steps), 3, squeeze=False)
     for line, step in zip(axes, steps):
@@ -154,7 +153,7 @@ def show_frame(file: Path, study: Path, title: str) -> None:
             (frame.measured / white, frame.predicted / white, frame.residual.mean(2)),
             (
                 f"measured, {frame.name}",
-                f"predicted: {record.steps[step]['name']}",
+                f"predicted: {rungs[step]['name']}",
                 "measured - predicted, in sigmas, mean of channels",
             ),
         ):
@@ -300,7 +299,7 @@ def main(output: Path) -> dict:
     second = told(Path(answer))
     optics("add", answer, "shutter ripple")
     with_formula = held_out(Path(answer))[-1]
-    last = Study.open(answer).steps[-1]
+    last = Study.open(answer).record.steps[-1]
     strength = next((v["value"], v["sd"]) for v in last["variables"] if v["keys"] == ["camera.shutter_ripple"])
     expected = RIPPLE * np.sinc(HERTZ * OPEN)
     print(
