@@ -111,9 +111,27 @@ def numbers_of(part) -> SimpleNamespace:
     )
 
 
-def layer(kind: str, parameters: tuple, mueller: Callable, polarizes: bool = False) -> Part:
-    """The declaration of a layer: its name in XML, its parameters, its Mueller matrix, whether it polarizes light."""
-    return Part(kind, "bsdf", parameters, lambda: bsdf(kind, mueller), mueller=mueller, polarizes=polarizes)
+def layer(
+    kind: str,
+    parameters: tuple,
+    mueller: Callable,
+    *,
+    polarizes: bool = False,
+    checks: tuple = (),
+    random: Callable | None = None,
+) -> Part:
+    """The declaration of a layer: its name in XML, its parameters, its Mueller matrix, whether it polarizes light, its
+    checks and its sampler."""
+    return Part(
+        kind,
+        "bsdf",
+        parameters,
+        lambda: bsdf(kind, mueller),
+        checks,
+        mueller=mueller,
+        polarizes=polarizes,
+        random=random,
+    )
 
 
 def bsdf(kind: str, own: Callable) -> type:

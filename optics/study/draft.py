@@ -115,8 +115,8 @@ ELSEWHERE = {  # what carries no table, and what to do in its place
     "frame": "a number per frame says nothing of the next frame; 'gain drift' frees a gain per frame",
     "reading": "the row of a table is no setting; write when each reading was taken into a column `source.time`, or what else changed into one",
     "LED": "an LED's own level is its power, which a calibration solves for; draft along 'led_distance' or 'led_angle'",
-    "gradient": "a change that goes with edges mixes pixels: write it at the stage 'lens' (plugins/effects/blur.py)",
-    "laplacian": "a change that goes with edges mixes pixels: write it at the stage 'lens' (plugins/effects/blur.py)",
+    "gradient": "a change that goes with edges mixes pixels: write it at the stage 'lens' (plugins/effects/lens_blur.py)",
+    "laplacian": "a change that goes with edges mixes pixels: write it at the stage 'lens' (plugins/effects/lens_blur.py)",
 }
 
 VIEWS = {  # stage: (the function's arguments, the line that applies a curve, of the variable `curve`)

@@ -20,10 +20,19 @@ Validity
     central projection; a fisheye needs another part. Monotone response: G'(m) > 0 on [0, 1].
 References
     F-TAC Hand supplementary information, S1.1, eq. (S1); Mitsunaga & Nayar, CVPR 1999.
+XML
+    to_world transform, identity: nominal pose
+    fx float: focal length in px, in place of `x_fov`
+    fy float, fx: focal length in px along y, in place of `aspect`; read where `fx` is given, as are cx and cy
+    cx float, half the width: principal point, px, in place of `principal_x`
+    cy float, half the height: principal point, px, in place of `principal_y`
+    sensitivity string, identity: sensitivities of the channels: a camera of the colour-science library by its name, or
+        one channel per band
 """
 
 import math
 
+from optics.scene.checking import agree, made
 from optics.scene.declare import Part
 from optics.scene.mitsuba_parts import Declared
 from optics.scene.parameter import Parameter
@@ -240,4 +249,18 @@ def build():
     return Camera
 
 
-part = Part("camera", "sensor", PARAMETERS, build)
+def check_field_of_view():
+    """The middle of the image looks along z, its edges by half of the field of view to either side; roll turns right to
+    down."""
+    import mitsuba as mi
+    import numpy as np
+
+    film = {"type": "hdrfilm", "width": 80, "height": 60}
+    for roll in (0.0, 90.0):
+        _, d = made("camera", x_fov=60.0, roll=roll, film=film).ray(mi.Float([0, 40, 80]), mi.Float(30.0))
+        x = np.array([-0.5, 0.0, 0.5])
+        z = np.sqrt(0.75) * np.array([1, 1 / np.sqrt(0.75), 1])
+        agree(np.array(d), [x, 0 * x, z] if roll == 0 else [0 * x, x, z], 0, 1e-6)
+
+
+part = Part("camera", "sensor", PARAMETERS, build, checks=(check_field_of_view,))

@@ -16,8 +16,12 @@ Validity
     (XML integers, 121 x 109) heights are linear and the first direction is constant in each triangle.
 References
     Vi2TaP (RA-L 2025), II.B: a film embedded in a silicone skin of 5 mm. Johnson, Contact Mechanics (1985), 3.2.
+XML
+    columns integer, 121: vertices of the mesh along x
+    rows integer, 109: vertices of the mesh along y
 """
 
+from optics.scene.checking import agree, made
 from optics.scene.declare import Part
 from optics.scene.mitsuba_parts import Declared
 from optics.scene.parameter import Parameter
@@ -80,4 +84,15 @@ def build():
     return Carried
 
 
-part = Part("carried", "shape", PARAMETERS, build)
+def check_flat_at_rest():
+    """Without a press the sheet is the rectangle at its depth, its first direction along x."""
+    import mitsuba as mi
+    import numpy as np
+
+    sheet = made("carried", width=8.0, length=6.0, depth=2.5, columns=3, rows=2, bsdf={"type": "sheet"})
+    found = np.array(mi.traverse(sheet)["vertex_positions"]).reshape(2, 3, 3)
+    x, y = np.meshgrid([-4.0, 0.0, 4.0], [-3.0, 3.0])
+    agree(found, np.stack([x, y, np.full_like(x, -2.5)], -1), 0, 1e-6)
+
+
+part = Part("carried", "shape", PARAMETERS, build, checks=(check_flat_at_rest,))

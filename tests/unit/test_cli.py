@@ -273,7 +273,7 @@ def test_a_image_of_a_sensor(optics, tmp_path):
     assert column + 0.5 == pytest.approx(24 + focal * 1 / 17.6, abs=0.5) and row + 0.5 == pytest.approx(32, abs=0.5)
     record = json.loads(header["provenance"])
     assert record["parameters"]["gel.press_x"] == 1 and record["scene"]["defines"]["depth"] == "0.5"
-    assert record["scene"]["hash"].startswith("sha256:") and "effects/vignetting.py" in record["plugins"]
+    assert record["scene"]["hash"].startswith("sha256:") and "effects/lens_vignetting.py" in record["plugins"]
     assert {**json.loads(file.with_suffix(".json").read_text()), "command": 0} == {**record, "command": 0}
 
     again = scene.load("digit", record["scene"]["defines"])  # the record is enough to make it again

@@ -14,15 +14,14 @@ import numpy as np
 import pytest
 
 from optics.captures.noise import Noise
-from optics.diagnosis import fingerprints, pairs
-from optics.diagnosis import homogeneity
+from optics.diagnosis import fingerprints, homogeneity, pairs
 from optics.diagnosis import statistics as st
+from optics.diagnosis.decide import Findings, decide
 from optics.diagnosis.diagnose import diagnose
 from optics.diagnosis.evidence import Candidate, measure
 from optics.diagnosis.findings import refuted
-from optics.diagnosis.score import score
-from optics.diagnosis.decide import Findings, decide
 from optics.diagnosis.result import WORDS, Diagnosis, Pair
+from optics.diagnosis.score import score
 from optics.diagnosis.thresholds import CLEAR, CLUTTERED, MARGIN
 from optics.errors import Underdetermined
 from optics.fit.model import value_of
