@@ -53,7 +53,7 @@ FREE = [
     "membrane.sigma",
 ]
 
-FORMULA = '''PERIOD = 1 / ({hertz:g} * {line:g})  # rows: ripple of the LEDs' supply, Hz, and time from one row to the next, s; from the data sheets
+FORMULA = '''PERIOD = 1 / ({hertz:g} * {line:g})  # rows: the supply's ripple, Hz, and the line time, s
 PHASE = {phase:.3f}  # rad, at the first row: read off the curve
 
 
@@ -279,7 +279,8 @@ def main(output: Path) -> dict:
         (
             "The curve as an effect",
             f"optics effects new 'row curve' --from study wrote the curve into {Path(drafted).name} as a "
-            f"table; added, the held-out chi2/dof falls from {base:.3f} to {with_draft:.3f}. The coordinate is right. A table of "
+            f"table; added, the held-out chi2/dof falls from {base:.3f} to {with_draft:.3f}. The coordinate is "
+            "right. A table of "
             f"{len(best.curve)} numbers is no cause.",
             "3-draft.png",
         )
@@ -288,7 +289,8 @@ def main(output: Path) -> dict:
     period = 1 / (HERTZ * LINE)
     phase, size = phase_of(np.array(best.centres), np.array(best.curve), period)
     print(
-        f"a gain by rows, alike in all frames, channels and LEDs; a supply that ripples at {HERTZ:g} Hz and rows {1e6 * LINE:g} us apart give "
+        f"a gain by rows, alike in all frames, channels and LEDs; a supply that ripples at {HERTZ:g} Hz and rows "
+        f"{1e6 * LINE:g} us apart give "
         f"a period of {period:.2f} rows; the curve then has a phase of {phase:.2f} rad and an amplitude of {size:.2%}"
     )
     Path(drafted).unlink()  # the formula takes its place
@@ -303,7 +305,8 @@ def main(output: Path) -> dict:
     strength = next((v["value"], v["sd"]) for v in last["variables"] if v["keys"] == ["camera.shutter_ripple"])
     expected = RIPPLE * np.sinc(HERTZ * OPEN)
     print(
-        f"with the formula: chi2/dof {with_formula:.3f} on the held-out press; ripple {strength[0]:.2%} +- {strength[1]:.2%}, "
+        f"with the formula: chi2/dof {with_formula:.3f} on the held-out press; ripple {strength[0]:.2%} +- "
+        f"{strength[1]:.2%}, "
         f"made with {expected:.2%}"
     )
     show_formula(output / "4-formula.png", first, phase, strength)
@@ -347,11 +350,13 @@ def write_page(file: Path, page: list[tuple[str, str, str]]) -> None:
         f"<h2>{html.escape(h)}</h2><p>{html.escape(t)}</p><img src='{p}' alt='{html.escape(h)}'>" for h, t, p in page
     ]
     file.write_text(
-        "<!doctype html><meta charset='utf-8'><meta name='viewport' content='width=device-width'><title>An unknown effect</title>"
+        "<!doctype html><meta charset='utf-8'><meta name='viewport' content='width=device-width'><title>An unknown "
+        "effect</title>"
         "<style>body{max-width:900px;margin:2em auto;padding:0 1em;font:16px/1.5 sans-serif}img{max-width:100%}</style>"
         "<h1>An effect that the library lacks</h1>"
         + "".join(parts)
-        + "<p>Reports: <a href='study/report.html'>with the table</a>, <a href='answer/report.html'>with the formula</a>.</p>\n",
+        + "<p>Reports: <a href='study/report.html'>with the table</a>, "
+        "<a href='answer/report.html'>with the formula</a>.</p>\n",
         encoding="utf-8",
     )
 
