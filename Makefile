@@ -65,7 +65,7 @@ proof: setup  ## hide effects, run the loop blind on each, count what it said (h
 
 lock:  ## resolve requirements.lock again from pyproject.toml (newest versions: make lock ARGS=--upgrade)
 	@command -v uv >/dev/null || { echo "make lock needs uv: pip install uv" >&2; exit 1; }
-	uv pip compile pyproject.toml --extra test --extra docs --group build --universal --python-version 3.10 --generate-hashes \
+	uv pip compile pyproject.toml --extra test --extra lint --extra docs --group build --universal --python-version 3.10 --generate-hashes \
 	    --no-annotate --no-emit-index-url --no-emit-find-links --custom-compile-command "make lock" --quiet \
 	    --output-file requirements.lock $(ARGS)
 
