@@ -87,7 +87,7 @@ def render(study: Record) -> str:
     comparisons = [study.comparison(i) for i in range(len(study.steps))]
     shown = [study.frames(i) for i in range(len(study.steps))]
     points = Readings.of(shown)
-    viewer = pictures(study, shown) if points is None else NO_IMAGES
+    viewer = viewer_images(study, shown) if points is None else NO_IMAGES
     nouns = FRAMES if points is None else SWEEPS
     verdicts = [verdict(told(study.diagnosis(i), points)) for i in range(len(study.steps))]
     return environment.get_template("report.html.j2").render(
@@ -248,7 +248,7 @@ def _text(value: float, form: str) -> str:
 # -- images -----------------------------------------------------------------------------------------------------------
 
 
-def pictures(study: Record, steps: list[list[Shown]]) -> dict:
+def viewer_images(study: Record, steps: list[list[Shown]]) -> dict:
     """What the viewer shows: measured once per frame, predicted and residual per frame and step.
 
     Fewer frames, then binned pixels, keep the page small; `note` says so.
@@ -375,9 +375,9 @@ def webp(image: np.ndarray) -> str:
     """Lossless image as a data URI. image: (H, W, 1 or 3) uint8."""
     from PIL import Image
 
-    picture = Image.fromarray(image[..., 0] if image.shape[2] == 1 else image).convert("RGB")
+    shown = Image.fromarray(image[..., 0] if image.shape[2] == 1 else image).convert("RGB")
     out = io.BytesIO()
-    picture.save(out, "WEBP", lossless=True, quality=60, method=3, exact=True)
+    shown.save(out, "WEBP", lossless=True, quality=60, method=3, exact=True)
     return "data:image/webp;base64," + base64.b64encode(out.getvalue()).decode()
 
 

@@ -383,7 +383,7 @@ def draft_effect(
 ) -> str:
     """The text of a plugin file that carries the curve of a diagnosis as a table.
 
-    along                    a coordinate of the diagnosis's fingerprints; None: the one that the residual goes with
+    along                    a coordinate of the diagnosis's fingerprints; None: the one that explains the residual
                              best
     black_level, saturation  DN, of the captures
     source                   where the diagnosis is, for the file's References
