@@ -333,7 +333,8 @@ STOCK = """<scene version="3.0.0"><integrator type="path"/>
   <film type="hdrfilm"><integer name="width" value="32"/><integer name="height" value="24"/></film>
   <sampler type="independent"><integer name="sample_count" value="16"/></sampler></sensor>
 <shape type="obj"><string name="filename" value="block.obj"/>
-  <bsdf type="diffuse"><texture type="bitmap" name="reflectance"><string name="filename" value="check.png"/></texture></bsdf></shape>
+  <bsdf type="diffuse"><texture type="bitmap" name="reflectance">
+    <string name="filename" value="check.png"/></texture></bsdf></shape>
 <shape type="ply"><string name="filename" value="ball.ply"/><bsdf type="roughconductor"/></shape>
 <emitter type="constant"/></scene>"""
 
