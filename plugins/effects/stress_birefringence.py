@@ -9,7 +9,7 @@ The pattern turns with the sheet's `angle`, except that of the skin. The compone
     disc    a disc of the diameter `stress_size` pressed along its y axis: s_ij of the two point loads, in units of
             2P/(pi D d)
     bend    a bar along x, bent: (2 y/size, 0)
-    gel     of the skin that the present press deforms (set by the scene), stress in units of its shear modulus,
+    gel     of the skin that the present press deforms (see `field`), stress in units of its shear modulus,
             thickness included
     a file  an image (H, W, 2 or more) in NPY or EXR: P_q and P_u over the square of `stress_size`, row 0 on top
 Fingerprint
@@ -26,10 +26,13 @@ import math
 
 import numpy as np
 
+from optics.errors import BadScene
 from optics.polarization.mueller import cos, real, retarder, sin, where
 from optics.scene.checking import agree, mueller, ray
 from optics.scene.declare import Effect
+from optics.scene.layer import PatternImage
 from optics.scene.parameter import Parameter
+from optics.skin.halfspace import SkinStress
 
 
 def strain(crossing, sheet):
@@ -62,6 +65,22 @@ def disc(x, y, radius):
     return where(inside, q, 0.0 * q), where(inside, u, 0.0 * u)
 
 
+def field(sheet):
+    """The pattern that a file holds, or the present press's stress in the skin, from the sheet's depth on both sides
+    alike up to the skin's inner face."""
+    pattern = sheet.stress_pattern
+    if pattern.endswith((".npy", ".exr")):
+        return PatternImage(sheet.find_file(pattern))
+    if pattern != "gel":
+        return None
+    if sheet.skin is None or sheet.carrier is None:
+        raise BadScene(
+            f"'{sheet.name}': stress_pattern = 'gel' needs a sheet in the skin, a shape of the type 'carried'"
+        )
+    thickness = sheet.skin.number("thickness")
+    return SkinStress(sheet.skin, max(2 * sheet.carrier.number("depth") - thickness, 0.0), thickness)
+
+
 def check_stress_optic_law():
     """2 MPa in 3 mm of C = 5 Brewster retard 540 nm by 2 pi 5e-12 2e6 3e-3/540e-9 = 0.34907, by the ratio of the
     wavelengths in other bands; crossed polarizers at 45 degrees pass sin(delta/2)^2/2."""
@@ -89,6 +108,7 @@ def random(rng):
 
 effect = Effect(
     name="stress birefringence",
+    field=field,
     part="sheet",
     stages={"layer": strain},
     onset="both",

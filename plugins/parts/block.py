@@ -59,7 +59,8 @@ def build():
 
     class Block(Declared.on_mesh()):
         kind = "block"
-        target = None  # what presses it, set by the scene
+        moved_by = "target"
+        target = None
 
         def __init__(self, props):
             self.layers = int(props.get("layers", 7))  # of the lattice
@@ -77,6 +78,10 @@ def build():
             params = mi.traverse(self)
             params["faces"] = mi.UInt32(faces.astype(np.uint32).ravel())
             self.rebuild(params)
+
+        def wire(self, scene):
+            self.target = scene.one("target")
+            self.follow(self.target)
 
         def faces(self):
             """Triangles of the six sides, and the number of vertices: a grid on each, of (columns, rows) or along z."""

@@ -47,7 +47,8 @@ def build():
 
     class Carried(Declared.on_mesh()):
         kind = "carried"
-        rides = "gel"  # role of the part that carries it
+        moved_by = "gel"
+        carrier = None
 
         def __init__(self, props):
             self.columns, self.rows = int(props.get("columns", 121)), int(props.get("rows", 109))
@@ -56,7 +57,6 @@ def build():
             faces = np.stack([a, d, c, a, c, b], -1)  # normals towards the camera (-z)
             mi.Mesh.__init__(self, "carried", index.size, faces.size // 3, props, True, True)
             self.declare(props)
-            self.carrier = None
             self.u, self.v = np.linspace(0, 1, self.columns)[None, :], np.linspace(0, 1, self.rows)[:, None]
             params = mi.traverse(self)
             params["faces"] = mi.UInt32(faces.astype(np.uint32).ravel())
@@ -64,10 +64,9 @@ def build():
             params["vertex_texcoords"] = mi.Float(uv.astype(np.float32).ravel())
             self.rebuild(params)
 
-        def carry(self, gel):
-            """Move with the present dent of a gel, from now on."""
-            self.carrier = gel
-            self.rebuild(mi.traverse(self))
+        def wire(self, scene):
+            self.carrier = scene.one("gel")
+            self.follow(self.carrier)
 
         def rebuild(self, params):
             """Vertices for the present parameters and dent."""

@@ -83,7 +83,8 @@ def build():
 
     class Cells(Declared.on_mesh()):
         kind = "cells"
-        rides = "block"  # role of the part that carries it
+        moved_by = "block"
+        block = None
 
         def __init__(self, props):
             self.counts = tuple(int(props.get(n, d)) for n, d in (("columns", 20), ("rows", 20), ("layers", 6)))
@@ -118,15 +119,16 @@ def build():
             )
             return low[:, None] + corners * (pitch - wall)
 
-        def carry(self, block):
-            """Place the cells as the present press of the block moves them."""
-            self.rebuild(mi.traverse(self), block)
+        def wire(self, scene):
+            self.block = scene.one("block")
+            self.follow(self.block)
 
-        def rebuild(self, params, block=None):
+        def rebuild(self, params):
+            """Vertices for the present parameters, moved as the present press moves the block."""
             self.placed = self.vertices()
-            self.moved = block is not None and block.press() is not None
+            self.moved = self.block is not None and self.block.press() is not None
             if self.moved:
-                self.placed = self.placed + block.displacement(self.placed)
+                self.placed = self.placed + self.block.displacement(self.placed)
             params["vertex_positions"] = mi.Float(self.placed.astype(np.float32).ravel())
             params.update()
 

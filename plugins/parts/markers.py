@@ -49,7 +49,8 @@ def build():
 
     class Markers(Declared.on_mesh()):
         kind = "markers"
-        rides = "gel"  # role of the part that carries it
+        moved_by = "gel"
+        carrier = None
 
         def __init__(self, props):
             self.columns, self.rows = int(props.get("columns", 5)), int(props.get("rows", 4))
@@ -72,17 +73,15 @@ def build():
             faces = faces + (middle + 1) * np.arange(count)[:, None, None]
             mi.Mesh.__init__(self, "markers", (middle + 1) * count, faces.size // 3, props, True, False)
             self.declare(props)
-            self.carrier = None
             angle = 2 * np.pi / SEGMENTS * i
             self.circle = np.stack([np.cos(angle), -np.sin(angle)], -1)  # counterclockwise as the camera sees it
             params = mi.traverse(self)
             params["faces"] = mi.UInt32(faces.astype(np.uint32).ravel())
             self.rebuild(params)
 
-        def carry(self, gel):
-            """Move with the present dent of a gel, from now on."""
-            self.carrier = gel
-            self.rebuild(mi.traverse(self))
+        def wire(self, scene):
+            self.carrier = scene.one("gel")
+            self.follow(self.carrier)
 
         def rest(self):
             """(N, 2) places (x, y) of the feet's middles at rest, mm: row by row, from low y to high and from low x to

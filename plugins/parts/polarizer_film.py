@@ -164,4 +164,4 @@ def random(rng):
     return {"angle": rng.uniform(0, 180), "transmittance": rng.uniform(0.6, 0.9), "leak": rng.uniform(1e-4, 0.05)}
 
 
-part = layer("polarizer_film", PARAMETERS, polarize, checks=(check_malus,), random=random)
+part = layer("polarizer_film", PARAMETERS, polarize, polarizes=True, checks=(check_malus,), random=random)

@@ -25,6 +25,7 @@ from optics.scene.checking import agree
 from optics.scene.declare import Part
 from optics.scene.mitsuba_parts import Declared
 from optics.scene.parameter import Parameter
+from optics.scene.wiring import ensure_wired
 
 PARAMETERS = (
     Parameter(
@@ -209,6 +210,7 @@ def build():
             return [f"S{i}.{j}" for i in range(4) for j in range(self.lanes)] if self.stokes and mi.is_polarized else []
 
         def sample_rays(self, scene, sensor, sampler, *args, **kwargs):
+            ensure_wired(scene, self)
             ray, weight, position = super().sample_rays(scene, sensor, sampler, *args, **kwargs)
             down = mi.Vector3f(
                 0, 1, 0
