@@ -16,7 +16,7 @@ import numpy as np
 from optics.polarization.layers import Crossing, evaluate
 from optics.scene.declare import Effect, Part
 from optics.scene.parameter import Parameter
-from optics.scene.registry import default
+from optics.scene.registry import known
 
 
 def agree(found, expected, relative: float = 1e-12, absolute: float = 0.0) -> None:
@@ -32,7 +32,7 @@ def agree(found, expected, relative: float = 1e-12, absolute: float = 0.0) -> No
 
 def numbers(kind: str, **changed) -> SimpleNamespace:
     """A part's parameters at their defaults, some of them changed, as the functions of effects read them."""
-    declared = {p.name: p.default for p in default().parameters_of(kind)}
+    declared = {p.name: p.default for p in known().parameters_of(kind)}
     unknown = changed.keys() - declared.keys()
     assert not unknown, f"{kind} has no parameter {', '.join(sorted(unknown))}"
     return SimpleNamespace(name=kind, field=None, **{**declared, **changed})
@@ -84,17 +84,17 @@ def ray(theta: float = 0.0, phi: float = 0.0, wavelengths=(540.0,), u: float = 0
 def mueller(kind: str, crossing: Crossing | None = None, **changed) -> np.ndarray:
     """(B, 4, 4) Mueller matrix of a layer with its effects, at the parameters' defaults but for those changed."""
     crossing, layer = crossing or ray(), numbers(kind, **changed)
-    effects = default().at_stage(kind, "layer")
-    neutral = {p.name: p.neutral for p in default().parameters_of(kind)}
+    effects = known().at_stage(kind, "layer")
+    neutral = {p.name: p.neutral for p in known().parameters_of(kind)}
     active = [e for e in effects if any(getattr(layer, n) != neutral[n] for n in e.parameter_names)]
-    matrix = evaluate(default().parts[kind].mueller, crossing, layer, active).numpy()
+    matrix = evaluate(known().parts[kind].mueller, crossing, layer, active).numpy()
     return np.broadcast_to(matrix, (1, len(crossing.wavelengths), 4, 4))[0]
 
 
 def stokes(kind: str, crossing: Crossing | None = None, **changed) -> np.ndarray:
     """(B, 4) Stokes vector that a source sends at power 1."""
     crossing = crossing or ray()
-    vector = default().parts[kind].stokes(crossing, numbers(kind, **changed))
+    vector = known().parts[kind].stokes(crossing, numbers(kind, **changed))
     shape = (1, len(crossing.wavelengths))
     return np.stack([np.broadcast_to(np.asarray(c, float), shape)[0] for c in vector], -1)
 

@@ -112,4 +112,4 @@ def random(rng):
     return {"index": rng.uniform(1.35, 1.6)}
 
 
-part = Part("interface", "bsdf", PARAMETERS, build, checks=(check_brewster,), random=random, refracts=True)
+part = Part("interface", "bsdf", PARAMETERS, build, checks=(check_brewster,), refracts=True, random=random)

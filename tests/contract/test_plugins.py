@@ -187,7 +187,8 @@ def own_parameters(item, registry=REGISTRY):
 @pytest.mark.parametrize("item", ITEMS)
 def test_samplers_draw_plausible_values(item):
     """Values of its own numbers alone, within bounds and not all the same; the same ones from the same generator."""
-    own = {p.name: p for kind in [getattr(item, "part", None) or item.kind] for p in REGISTRY.parameters_of(kind)}
+    kinds = REGISTRY.kinds(item.part if isinstance(item, Effect) else item.kind)
+    own = {p.name: p for kind in kinds for p in REGISTRY.parameters_of(kind)}
     draws = [checking.draw(item, own_parameters(item), np.random.default_rng(seed)) for seed in (1, 1, 2)]
     for values in draws:
         for name, value in values.items():
@@ -889,7 +890,7 @@ def draw(rng, bench, chosen=None):
     values, registry = {}, bench.scene.registry
     for name, part in bench.scene.parts.items():
         around = {p: bench.values[f"{name}.{p}"] for p in part.numbers}
-        effects = [e for e in registry.effects.values() if e.part == part.kind]
+        effects = [e for e in registry.effects.values() if part.kind in registry.kinds(e.part)]
         # what draws several parameters comes last: its values belong together
         for item in (registry.parts[part.kind], *sorted(effects, key=lambda e: len(e.parameter_names))):
             drawn = checking.draw(item, own_parameters(item, registry), rng, around)
@@ -1169,8 +1170,8 @@ References
 import math
 
 from optics.effect import Effect
-from optics.scene.layer import layer
-from optics.polarization.mueller import cos, depolarizer, real, rotation, sin, where
+from optics.layers import layer
+from optics.mueller import cos, depolarizer, real, rotation, sin, where
 from optics.parameter import Parameter
 
 

@@ -36,7 +36,10 @@ def test_no_modules_import_one_another():
     )
     import networkx
 
-    graph, packages = networkx.DiGraph(), grimp.build_graph("optics", exclude_type_checking_imports=True, cache_dir=None)
+    graph, packages = (
+        networkx.DiGraph(),
+        grimp.build_graph("optics", exclude_type_checking_imports=True, cache_dir=None),
+    )
     for module in packages.modules:
         graph.add_edges_from((module, other) for other in packages.find_modules_directly_imported_by(module))
     assert [sorted(circle) for circle in networkx.strongly_connected_components(graph) if len(circle) > 1] == []
