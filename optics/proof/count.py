@@ -95,8 +95,8 @@ class Count:
     def text(self) -> str:
         """For a terminal."""
         lines = [
-            f"proof: {self.done} of {self.planned} cells ({self.unreachable} cannot be made that strong, {len(self.failed)} failed), "
-            f"{self.seconds / max(self.done, 1):.0f} s each"
+            f"proof: {self.done} of {self.planned} cells run, {self.seconds / max(self.done, 1):.0f} s each; "
+            f"{self.unreachable} skipped because the effect cannot be made so strong, {len(self.failed)} failed"
         ]
         for name, one in {"": self, **self.rigs}.items():
             if name and len(self.rigs) < 2:
@@ -111,25 +111,27 @@ class Count:
                 lines.append(
                     f"  {r.name:<52}{r.value:>7.3f}{r.n:>6}   {lo:.3f}-{hi:.3f}   {r.first:>5g} {r.ambitious:>7g}  {r.verdict}"
                 )
-            lines += [f"  ties declared {one.ties[1]}, with the hidden effect among them {one.ties[0]}"]
+            lines += [f"  ambiguous verdicts: {one.ties[1]}; {one.ties[0]} of them list the hidden effect"]
             if one.set_size is not None:
-                lines += [f"  effects in the set at 0.2 %, on average: {one.set_size:.2f} (to be: 2 at most)"]
+                lines += [f"  mean number of effects in the set at 0.2 %: {one.set_size:.2f} (target: at most 2)"]
             for law, values in one.pulls.items():
                 if len(values) > 1:
                     lines.append(
-                        f"  pulls of strengths ({law}): n {len(values)}, mean {np.mean(values):+.2f}, sd {np.std(values, ddof=1):.2f}"
+                        f"  pulls of strengths ({law}): n {len(values)}, mean {np.mean(values):+.2f}, "
+                        f"sd {np.std(values, ddof=1):.2f}"
                     )
             if one.falls:
                 q = np.percentile(one.falls, [10, 50, 90])
                 lines.append(
-                    f"  fall of chi2 over its prediction: {q[1]:.2f} ({q[0]:.2f} to {q[2]:.2f}), n {len(one.falls)}"
+                    f"  fall of chi2 over its prediction: median {q[1]:.2f}, 10 % to 90 % {q[0]:.2f} to {q[2]:.2f}, "
+                    f"n {len(one.falls)}"
                 )
             if len(one.null_p) > 4:
                 from scipy.stats import kstest
 
                 lines.append(
-                    f"  family-wise p of {len(one.null_p)} clean null sets, uniform with p {kstest(one.null_p, 'uniform').pvalue:.2g} "
-                    "(Kolmogorov-Smirnov)"
+                    f"  family-wise p of {len(one.null_p)} sets without a hidden effect or clutter: uniform with "
+                    f"p = {kstest(one.null_p, 'uniform').pvalue:.2g} (Kolmogorov-Smirnov)"
                 )
             if one.held_out:
                 lines.append(f"  held-out chi2 per value after a right claim: median {np.median(one.held_out):.3f}")

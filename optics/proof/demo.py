@@ -136,8 +136,8 @@ def _opening(sensor: str) -> str:
     (width, height), _ = SENSORS[sensor]
     return (
         f"{PRESSES} presses on {sensor}, each under one LED at a time and in the dark. Every image has "
-        f"{width} x {height} pixels and sums {FRAMES} raw frames of 12 bits. Stock Mitsuba made them, not the model, and "
-        "they hold one effect that the base model lacks."
+        f"{width} x {height} pixels and sums {FRAMES} raw frames of 12 bits. Stock Mitsuba made them, not the model, "
+        "and they hold one effect that the base model lacks."
     )
 
 
