@@ -26,6 +26,7 @@ extensions = ["myst_parser", "sphinx.ext.autodoc"]
 myst_enable_extensions = ["colon_fence", "dollarmath", "deflist"]
 myst_heading_anchors = 3
 exclude_patterns = ["tools", "_static", "fingerprints", "images", "generated/front_door.rst"]
+smartquotes = False  # "--set" is an option
 nitpicky = False  # signatures name types of numpy and Mitsuba, which have no pages here
 
 html_theme = "furo"

@@ -20,6 +20,7 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
+from plugin_pages import formula_of
 
 FOLDER = Path(__file__).resolve().parent.parent / "fingerprints"
 RECORD = FOLDER / "figures.json"
@@ -206,6 +207,7 @@ def draw(effect, reg) -> dict:
         "strength": {k: float(f"{v:.6g}") for k, v in values.items()},
         "rms": float(f"{np.sqrt((change**2).mean()) / signal:.3g}"),
         "scale": float(f"{scale:.3g}"),
+        "formula": formula_of(effect),
     }
 
 
@@ -260,13 +262,13 @@ def curves(key: str, view: View, shot: Shot, without: np.ndarray, image: np.ndar
 
 
 def main() -> None:
-    from optics.scene.registry import registry
+    from optics.scene.registry import known
 
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("effects", nargs="*", metavar="EFFECT", help="only these; without any: all")
     parser.add_argument("--missing", action="store_true", help="only those that have no figure yet")
     options = parser.parse_args()
-    reg = registry()
+    reg = known()
     record = json.loads(RECORD.read_text(encoding="utf-8")) if RECORD.is_file() else {}
     chosen = [reg.find_effect(name).key for name in options.effects] or sorted(reg.effects)
     for key in chosen:

@@ -8,10 +8,15 @@ fingerprint figure. `make docs` calls `write_pages` before it builds the site; n
 
 from __future__ import annotations
 
+import hashlib
+import inspect
+import io
 import json
 import math
 import re
 import sys
+import textwrap
+import tokenize
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -28,6 +33,7 @@ DERIVATIVE = {
     "layer": "complex step through the Mueller matrices",
     "path": "lengths of the paths in clear bodies",
 }
+CODE = (tokenize.NAME, tokenize.NUMBER, tokenize.OP)  # docstrings and messages are no part of a formula
 ELEMENT = {"bsdf": "bsdf", "emitter": "emitter", "sensor": "sensor", "shape": "shape", "integrator": "integrator"}
 
 
@@ -127,6 +133,15 @@ def span(p) -> str:
     return f"{number(low)} … {number(high)}"
 
 
+def formula_of(effect) -> str:
+    """A fingerprint of the code of an effect's functions, comments and layout aside: a figure is of this formula."""
+    words = []
+    for stage in sorted(effect.stages):
+        source = textwrap.dedent(inspect.getsource(effect.stages[stage]))
+        words += [t.string for t in tokenize.generate_tokens(io.StringIO(source).readline) if t.type in CODE]
+    return hashlib.sha256(" ".join(words).encode()).hexdigest()[:12]
+
+
 def table(head: list[str], rows: list[list[str]]) -> str:
     lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head), *("| " + " | ".join(r) + " |" for r in rows)]
     return ":::{container} wide\n" + "\n".join(lines) + "\n:::"
@@ -204,7 +219,7 @@ def effect_page(effect, reg, record: dict) -> str:
     rows = [(p, "freed by the effect") for p in reg.effect_parameters(effect)]
     rows += [(p, "stays as it is") for p in brought if p.name not in effect.parameter_names]
     facts = [
-        ["part", f"[{effect.part}](../parts/{effect.part}.md)"],
+        ["part", " or ".join(f"[{kind}](../parts/{kind}.md)" for kind in reg.kinds(effect.part))],
         ["enters at", ", ".join(f"`{s}`" for s in effect.stages) or "the part itself"],
         [
             "one value for",
@@ -241,17 +256,17 @@ def part_page(part, reg) -> str:
     source = {
         p.name: f"[{e.name}](../effects/{e.key}.md)"
         for e in reg.effects.values()
-        if e.part == part.kind
+        if part.kind in reg.kinds(e.part)
         for p in (*e.parameters, *e.shape)
         if not isinstance(p, str)
     }
-    freed = {n: f"[{e.name}](../effects/{e.key}.md)" for e in reg.effects.values() if e.part == part.kind
+    freed = {n: f"[{e.name}](../effects/{e.key}.md)" for e in reg.effects.values() if part.kind in reg.kinds(e.part)
              for n in e.parameter_names}  # fmt: skip
     rows = [
         (p, f"effect {source[p.name]}" if p.name not in own else f"effect {freed[p.name]}" if p.name in freed else "")
         for p in reg.parameters_of(part.kind)
     ]
-    acting = sorted((e for e in reg.effects.values() if e.part == part.kind), key=lambda e: e.key)
+    acting = sorted((e for e in reg.effects.values() if part.kind in reg.kinds(e.part)), key=lambda e: e.key)
     known = attributes(part.doc)
     text = (
         f"# {escaped(title)}\n\n{escaped(sentence)}\n\n"
@@ -285,7 +300,8 @@ def effect_index(reg, record: dict) -> str:
         "figure is measured: a scene is rendered with the effect and without it (`python docs/tools/fingerprints.py`).",
     ]
     for kind in sorted({e.part for e in reg.effects.values()}, key=lambda k: (k != "camera", k)):
-        pieces.append(f"## {kind}\n\nOf the part [{kind}](../parts/{kind}.md).")
+        parts = " or ".join(f"[{k}](../parts/{k}.md)" for k in reg.kinds(kind))
+        pieces.append(f"## {kind}\n\nOf the part {parts}.")
         own = sorted((e for e in reg.effects.values() if e.part == kind), key=lambda e: e.name)
         pieces.append("\n".join(f"- [{escaped(e.name)}]({e.key}.md): {escaped(summary(e.doc)[1])}" for e in own))
     tree = "\n".join(sorted(reg.effects))
@@ -312,9 +328,9 @@ def put(file: Path, text: str) -> None:
 def write_pages(folder: Path) -> int:
     """Write all pages below a folder (`parts/`, `effects/`) and the files that they are made of (`sources/`), and
     remove those of plugins that are gone; their number."""
-    from optics.scene.registry import registry
+    from optics.scene.registry import known
 
-    reg = registry()
+    reg = known()
     record = json.loads((FIGURES / "figures.json").read_text(encoding="utf-8"))
     if lacking := sorted(set(reg.effects) - set(record)):
         raise LookupError(

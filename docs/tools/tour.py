@@ -63,8 +63,8 @@ def run(command: list[str]) -> str:
     if command[0] != "optics":
         raise ValueError(f"{shlex.join(command)}: the tour runs `optics` only")
     out = io.StringIO()
-    with contextlib.redirect_stdout(out):
-        code = main([*command[1:], "--quiet"])
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(out):  # a terminal shows both
+        code = main(command[1:])
     if code == 2:
         raise RuntimeError(f"{shlex.join(command)}: exit code 2")
     return out.getvalue()

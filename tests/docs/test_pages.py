@@ -83,7 +83,7 @@ def test_the_words_are_the_programs(name):
 
 
 def test_the_limits_of_the_method_page_are_the_programs():
-    from optics.diagnosis import verdict as v
+    from optics.diagnosis import thresholds as v
 
     text = " ".join(page("method").split())
     for sentence in (

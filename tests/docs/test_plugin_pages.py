@@ -10,10 +10,10 @@ from pathlib import Path
 import plugin_pages
 import pytest
 
-from optics.scene.registry import registry
+from optics.scene.registry import known
 
-PARTS = sorted(registry().parts)
-EFFECTS = sorted(registry().effects)
+PARTS = sorted(known().parts)
+EFFECTS = sorted(known().effects)
 BY_THE_BASE = {"rr_depth"}  # read by a base class of Mitsuba, not by the part's own file
 READERS = ("get", "get_texture", "__getitem__", "__contains__")  # of mi.Properties
 
@@ -30,7 +30,7 @@ def record():
 def test_every_effect_has_a_fingerprint_figure_of_its_own_parameters(key, record):
     from PIL import Image
 
-    effect = registry().effects[key]
+    effect = known().effects[key]
     assert key in record, f"python docs/tools/fingerprints.py {key} draws it"
     own = record[key]
     with Image.open(plugin_pages.FIGURES / f"{key}.webp") as image:
@@ -38,9 +38,11 @@ def test_every_effect_has_a_fingerprint_figure_of_its_own_parameters(key, record
     names = {k.rsplit(".", 1)[1] for k in own["strength"]}
     assert names == set(effect.parameter_names)
     for name, value in ((k.rsplit(".", 1)[1], v) for k, v in own["strength"].items()):
-        p = registry().parameter(effect.part, name)
+        p = known().parameter(effect.part, name)
         assert p.bounds[0] <= value <= p.bounds[1] and value != p.neutral
     assert own["rms"] > 0 and own["scale"] > 0
+    now = plugin_pages.formula_of(effect)
+    assert own["formula"] == now, f"the formula has changed: python docs/tools/fingerprints.py {key}, and look at it"
 
 
 def test_no_figure_is_left_of_an_effect_that_is_gone(record):
@@ -54,20 +56,20 @@ def test_no_figure_is_left_of_an_effect_that_is_gone(record):
 @pytest.mark.parametrize("kind", PARTS)
 def test_a_parts_page_lists_every_xml_parameter_and_attribute(kind, generated):
     page = (generated / "parts" / f"{kind}.md").read_text(encoding="utf-8")
-    for p in registry().parameters_of(kind):
+    for p in known().parameters_of(kind):
         row = next((line for line in page.splitlines() if line.startswith(f"| `{p.name}` |")), None)
         assert row is not None, f"{kind}: no row for {p.name}"
         if p.is_number:
             assert f"| {p.default:g} |" in row and (p.unit in ("1", "-") or f"| {p.unit} |" in row)
         else:
             assert all(f"`{choice}`" in row for choice in p.choices)
-    for a in plugin_pages.attributes(registry().parts[kind].doc):
+    for a in plugin_pages.attributes(known().parts[kind].doc):
         assert f"| `{a.name}` |" in page and a.meaning
 
 
 @pytest.mark.parametrize("key", EFFECTS)
 def test_an_effects_page_shows_formula_figure_and_parameters(key, generated):
-    effect = registry().effects[key]
+    effect = known().effects[key]
     page = (generated / "effects" / f"{key}.md").read_text(encoding="utf-8")
     for section in ("## Definition", "## Fingerprint", "## Validity", "## References", "## Parameters"):
         assert page.count(section) == 1, section
@@ -90,7 +92,7 @@ def test_a_docstrings_sections_are_found_wherever_their_headings_stand():
 
 def read_by_the_file(kind: str) -> set[str]:
     """Names that a part's file asks `props` for, by its source: also those that no shipped scene makes it ask for."""
-    tree = ast.parse(Path(registry().parts[kind].file).read_text(encoding="utf-8"))
+    tree = ast.parse(Path(known().parts[kind].file).read_text(encoding="utf-8"))
     names = set()
     for node in ast.walk(tree):
         if (
@@ -120,7 +122,7 @@ def asked(mitsuba):
             while frame is not None:
                 declares |= frame.f_code.co_name == "declare"
                 owner = frame.f_locals.get("self")
-                if getattr(owner, "kind", None) in registry().parts:
+                if getattr(owner, "kind", None) in PARTS:
                     if not declares:
                         known = seen.setdefault(owner.kind, {})
                         known[key] = rest[0] if rest else known.get(key)
@@ -144,8 +146,8 @@ def asked(mitsuba):
 @pytest.mark.parametrize("kind", PARTS)
 def test_every_attribute_that_a_part_reads_is_on_its_page(kind, asked):
     """A part that asks its XML for something that is neither a parameter nor listed under `XML` has a secret."""
-    parameters = {p.name for p in registry().parameters_of(kind)}
-    listed = {a.name: a for a in plugin_pages.attributes(registry().parts[kind].doc)}
+    parameters = {p.name for p in known().parameters_of(kind)}
+    listed = {a.name: a for a in plugin_pages.attributes(known().parts[kind].doc)}
     read = (set(asked.get(kind, {})) | read_by_the_file(kind)) - parameters
     assert read == set(listed), f"{kind}: read {sorted(read)}, listed under XML {sorted(listed)}"
     for name, default in asked.get(kind, {}).items():
