@@ -14,7 +14,6 @@ from pathlib import Path
 from optics.captures import importing
 from optics.fit.null_models import NullTable
 from optics.pages.report import report
-from optics.scene.registry import registry
 from optics.study import loop
 
 TAXIM = dict(bin=2, every=2, leds=6, camera_distance=40.0, skirt=0.88, contact_share=0.79)
@@ -39,7 +38,7 @@ def study(captures: Path, folder: Path, added: Sequence[str], held_out: list[str
     setup = loop.setup_for(captures, held_out=held_out)
     record, model, fit = loop.begin(setup, folder)
     for name in added:
-        fit, _ = loop.extend(record, model, setup, fit, registry().find_effect(name))
+        fit, _ = loop.extend(record, model, setup, fit, model.scene.registry.find_effect(name))
     print(fit.table(), record.table(), sep="\n\n")
     return [NullTable.from_json(record.metrics(i)["nulls"]) for i in range(len(record.steps))]
 

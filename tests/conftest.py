@@ -24,9 +24,9 @@ def pytest_addoption(parser):
 def pytest_configure(config):
     folder = config.getoption("--plugin-folder", default=None)
     if folder:
-        from optics.scene.registry import registry
+        from optics.scene.registry import include
 
-        registry().scan(Path(folder))
+        include(folder)
 
 
 @pytest.fixture(scope="session")

@@ -270,12 +270,9 @@ def setup_of(captures: str, defines: Sequence[str] | None, plugins: Path | None,
 
 def scan(plugins: Path | None):
     """The registry, with a further folder."""
-    from optics.scene.registry import registry
+    from optics.scene.registry import known
 
-    found = registry()
-    if plugins is not None:
-        found.scan(plugins)
-    return found
+    return known(plugins)
 
 
 @app.callback(invoke_without_command=True)
@@ -318,7 +315,6 @@ def params(
 ) -> None:
     """List the parameters of a scene: value, unit, bounds, neutral value, derivative, meaning."""
     from optics.errors import UnknownKey
-    from optics.scene.registry import registry
 
     loaded = load_scene(scene, define, plugins, variant)
     values = loaded.values()
@@ -326,7 +322,7 @@ def params(
     for pattern in patterns or ():
         if not any(fnmatchcase(key, pattern) for key in keys):
             raise UnknownKey(pattern, keys, "parameter", str(loaded.path), "(* and ? match)")
-    brought = {(e.part, name): e.name for e in registry().effects.values() for name in e.parameter_names}
+    brought = {(e.part, name): e.name for e in loaded.registry.effects.values() for name in e.parameter_names}
     rows = []
     for key in keys:
         if patterns and not any(fnmatchcase(key, pattern) for pattern in patterns):
@@ -410,7 +406,7 @@ def _new_effect(name: str | None, plugins: Path | None, **given) -> None:
             raise ValueError(
                 "--stage, --part: a draft acts where its coordinate is known; leave them out, or leave --from out"
             )
-        text, folder = draft.from_study(given["from"], given["along"], name, registry)
+        text, folder = draft.from_study(given["from"], given["along"], name, plugins)
     file = draft.write(text, given["o"] or folder, name)
     terminal.note(
         f"next: optics add {given['from']} '{name}', then put a formula in place of the table"
@@ -1394,11 +1390,10 @@ def add(
     as_json: AsJson = False,
 ) -> None:
     """Free an effect, calibrate everything again, and record it as the next step of the study."""
-    from optics.scene.registry import registry
     from optics.study import loop
 
     found, model, setup = loop.take_up(study)
-    chosen = registry().find_effect(effect)
+    chosen = model.scene.registry.find_effect(effect)
     if found.has(chosen.key):
         raise ValueError(
             f"{study}: '{chosen.name}' is part of the study already; `optics diagnose {study}` asks what else is missing"

@@ -17,7 +17,6 @@ from types import SimpleNamespace
 import numpy as np
 
 from optics.scene.declare import IMAGE_STAGES
-from optics.scene.registry import registry
 
 STEP = 1e-30  # of the complex step; far below rounding, far above underflow
 
@@ -54,7 +53,7 @@ class Developer:
         self.black, self.saturation = float(black), float(saturation)
         self.names = tuple(camera.numbers)
         self.neutral = {n: p.neutral for n, p in camera.numbers.items()}
-        self.effects = {stage: registry().at_stage("camera", stage) for stage in IMAGE_STAGES}
+        self.effects = {stage: camera.registry.at_stage(camera.kind, stage) for stage in IMAGE_STAGES}
         self.v, self.u = np.mgrid[: self.height, : self.width] + 0.5
 
     def view(self, values: Mapping[str, complex]) -> SimpleNamespace:

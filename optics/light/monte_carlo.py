@@ -93,7 +93,9 @@ class MonteCarloRenderer(Renderer):
         name = key.rsplit(".", 1)[0]
         if self.scene.parameters[key].how == "path":
             own = paths.part_values(self.scene, name, {**values, key: values[key] + 1j * STEP}, {})
-            slope = np.imag(coefficient(own, "absorption", self.wavelengths)) / STEP  # of the coefficient, per band
+            functions = self.scene.registry.functions(self.scene.parts[name].kind, "absorption")
+            stepped = coefficient(own, "absorption", self.wavelengths, functions)
+            slope = np.imag(stepped) / STEP  # of the coefficient, per band
             found = self.estimate(values, seed, slopes=True)
             return slope * self._sum(
                 self.powers(values, n) * found.slopes[name][found.lights.index(n)] for n in self.lit(values)

@@ -20,7 +20,7 @@ from optics.errors import BadScene
 from optics.polarization.layers import Crossing, evaluate
 from optics.polarization.mueller import Mueller, Slab, diattenuator, face, fresnel
 from optics.scene.layer import active_effects
-from optics.scene.registry import registry
+from optics.scene.mitsuba_parts import is_part
 
 STEPS = 24  # surfaces that a ray may pass
 GRAZE = 1e-4  # mm per mm of the coordinates: how far beyond a surface a ray goes on
@@ -84,13 +84,13 @@ class Path:
 
 def layered(scene) -> bool:
     """Whether a scene has layers, or sources that may be polarized."""
-    return bool(scene.sources) or any(registry().parts[p.kind].mueller is not None for p in scene.parts.values())
+    return bool(scene.sources) or any(scene.declaration(n).mueller is not None for n in scene.parts)
 
 
 def passable(scene) -> list[str]:
     """Names of the parts that a camera ray passes: layers and clear boundaries."""
-    parts = registry().parts
-    return [n for n, p in scene.parts.items() if parts[p.kind].mueller is not None or p.kind == "interface"]
+    declared = {n: scene.declaration(n) for n in scene.parts}
+    return [n for n, part in declared.items() if part.mueller is not None or part.refracts]
 
 
 def trace(scene, u: np.ndarray, v: np.ndarray) -> Path:
@@ -129,7 +129,7 @@ def trace(scene, u: np.ndarray, v: np.ndarray) -> Path:
         on = part >= 0
         p = np.array(si.p, float).T
         for index, name in enumerate(names):
-            if scene.parts[name].kind == "interface":
+            if scene.declaration(name).refracts:
                 here = on & (part == index)
                 direction, x, total = _refract(here, direction, x, frame[2], scene.parts[name].number("index"))
                 lost |= total
@@ -235,15 +235,15 @@ def layer_matrix(
     """Mueller matrix of one part for light that crosses it towards the camera."""
     part = scene.parts[name]
     own = part_values(scene, name, values, fields)
-    if part.kind == "interface":
+    if scene.declaration(name).refracts:
         # the camera's side is the one that the normal points to: seen from there the relative index is `index`
         front = crossing.k[2] > 0
         n = np.where(front, own.index, 1 / own.index)
         # cos of the ray beyond the boundary, from which the light comes; the same transmittance both ways
         r_s, r_p, _ = fresnel(np.abs(crossing.k[2]), n)
         return diattenuator(*crossing.plane(), 1 - r_s, 1 - r_p) * (1 / n**2)
-    active = active_effects(part.kind, {n: getattr(own, n) for n in part.numbers})
-    return evaluate(registry().parts[part.kind].mueller, crossing, own, active)
+    active = active_effects(scene.registry, part.kind, {n: getattr(own, n) for n in part.numbers})
+    return evaluate(scene.declaration(name).mueller, crossing, own, active)
 
 
 def slab(name: str, matrix: Mueller, values: Mapping) -> Slab:
@@ -290,7 +290,7 @@ def transmission(scene, path: Path, values: Mapping, bands: np.ndarray, componen
         if any(np.any(np.asarray(values.get(f"{name}.face", 0.0)) != 0) for name, _ in names):
             stack = None
             for (name, step), matrix in reversed(list(zip(names, matrices))):  # light meets the farthest first
-                if scene.parts[name].kind == "interface":  # a radiance grows by n^2 one way and shrinks by it the other
+                if scene.declaration(name).refracts:  # a radiance grows by n^2 one way and shrinks by it the other
                     index = values[f"{name}.index"]
                     back = np.where(step.k[rays][:, 2:] > 0, index, 1 / index) ** 4
                     own = Slab(matrix, t_back=matrix.reversed * back)
@@ -315,19 +315,17 @@ def emitted(scene, name: str, path: Path, values: Mapping, bands: np.ndarray) ->
 
     source = scene.parts[name]
     on = np.array(path.si.emitter(scene.mitsuba) == mi.EmitterPtr(source)) & (path.end.k[:, 2] > 0)
-    vector = (
-        registry()
-        .parts[source.kind]
-        .stokes(crossing_at(path.end, slice(None), bands), part_values(scene, name, values, {}))
-    )
+    crossing = crossing_at(path.end, slice(None), bands)
+    vector = scene.declaration(name).stokes(crossing, part_values(scene, name, values, {}))
     return tuple(0 if isinstance(c, int) else c * on[:, None] for c in vector)
 
 
 def check(scene) -> None:
     """Refuse layers on shapes whose first direction turns with the place."""
     for shape in scene.mitsuba.shapes():
-        kind = getattr(shape.bsdf(), "kind", "")
-        if kind and registry().parts[kind].mueller is not None and str(shape).startswith("Disk"):
+        material = shape.bsdf()
+        layer = is_part(material) and scene.declaration(material.name).mueller is not None
+        if layer and str(shape).startswith("Disk"):
             raise BadScene(
                 f"{scene.path}: '{shape.bsdf().name}' stands on a disk, whose first direction runs outwards and would "
                 "turn with the place; allowed: a rectangle or a mesh with texture coordinates"

@@ -19,7 +19,6 @@ from optics.errors import BadScene
 from optics.light import paths
 from optics.scene.loader import Scene
 from optics.scene.mitsuba_parts import DEFAULT_VARIANT
-from optics.scene.registry import registry
 
 # per pixel at rims; a power of two. Of an image 36 px wide, chi2 misses a path tracer by 10 to 60 with 64, by 5 to 20
 # with 128
@@ -66,20 +65,20 @@ class Renderer:
         image_keys = {k for k, p in scene.parameters.items() if p.how == "image"}
         self.layer_keys = {k for k, p in scene.parameters.items() if p.how == "layer"}
         words = {
-            f"{n}.{w}" for n, p in scene.parts.items() if registry().parts[p.kind].mueller is not None for w in p.words
+            f"{n}.{w}" for n, p in scene.parts.items() if scene.declaration(n).mueller is not None for w in p.words
         }
         self.layer_order = sorted(self.layer_keys | words)  # what the layers' matrices depend on
         led_keys = {k for k in scene.parameters if k.rsplit(".", 1)[0] in scene.lights} - self.layer_keys
         own = [k for k in scene.parameters if k not in image_keys and k not in led_keys and k not in self.layer_keys]
         self.bounce_key = f"{scene.integrator.name}.interreflection"
-        self.geometry_keys = [
-            k
-            for k in own
-            if self.kind(k) in ("camera", "interface", "", *scene.MOVED)
-            or (self.kind(k) == "gel" and k.rsplit(".", 1)[1] in scene.shaping)
-        ]
-        ambient = {n for e in registry().at_stage("membrane", "ambient") for n in e.parameter_names}
-        self.ambient_keys = [k for k in own if self.kind(k) == "membrane" and k.rsplit(".", 1)[1] in ambient]
+        self.geometry_keys = [k for k in own if scene.moves(k)]
+        ambient = {
+            f"{n}.{parameter}"
+            for n, m in scene.membranes.items()
+            for e in scene.registry.at_stage(m.kind, "ambient")
+            for parameter in e.parameter_names
+        }
+        self.ambient_keys = [k for k in own if k in ambient]
         self.shading_keys = [
             k for k in own if k not in self.geometry_keys and k != self.bounce_key and k not in self.ambient_keys
         ]
@@ -259,11 +258,9 @@ class Renderer:
     def _glows(self, values: Mapping, image: LedImage, component: int) -> Iterator[tuple]:
         """What boundaries send to the camera by themselves while one light is on (stage `glow`): at centres, at finer
         samples."""
-        effects = registry().at_stage("interface", "glow")
-        names = (
-            [n for n, p in self.scene.parts.items() if p.kind == "interface"] if image.led in self.scene.leds else []
-        )
+        names = [n for n in self.scene.parts if self.scene.declaration(n).refracts and image.led in self.scene.leds]
         for name in names:
+            effects = self.scene.registry.at_stage(self.scene.parts[name].kind, "glow")
             own = paths.part_values(self.scene, name, values, {})
             functions = [
                 e.stages["glow"]
@@ -272,9 +269,7 @@ class Renderer:
             ]
             if not functions:
                 continue
-            shines = [
-                i for i, s in enumerate(self.scene.mitsuba.shapes()) if getattr(s.bsdf(), "kind", "") == "fluorescent"
-            ]
+            shines = [i for i, s in enumerate(self.scene.mitsuba.shapes()) if hasattr(s.bsdf(), "fluorescence")]
             marked = np.isin(image.hits.path.shape, shines)
             glow = SimpleNamespace(
                 markers=image.raw[0][marked].mean(0, dtype=float) if marked.any() else np.zeros(self.bands),

@@ -35,7 +35,7 @@ from optics.light.monte_carlo import renderer_of
 from optics.light.renderer import POWERS, Hits, Renderer, Sample
 from optics.scene.loader import Scene
 from optics.scene.mitsuba_parts import is_part
-from optics.scene.registry import registry
+from optics.scene.registry import Registry
 
 UNITS = "W.mm^-2.sr^-1"  # of S0, for LED powers in W/sr
 PASSES = 8  # of a Monte Carlo render: their scatter is its variance
@@ -138,7 +138,7 @@ class RenderJob:
             self.developer = Developer(scene.camera, self.bands or (0.0,), black, saturation)
         self.record = {
             "scene": scene_record(scene),
-            "plugins": plugins_record(),
+            "plugins": plugins_record(scene.registry),
             "variant": scene.variant,
             "method": self.method,
             "versions": versions(),
@@ -331,9 +331,10 @@ def obstacle(scene: Scene, chance: bool = False) -> str:
         bsdf = shape.bsdf()
         if shape.is_medium_transition():
             return "it has a medium"
-        kind = getattr(bsdf, "kind", "")
-        if kind == "interface" or kind == "clear" and chance or kind and registry().parts[kind].mueller is not None:
-            continue
+        if is_part(bsdf):
+            declared = scene.registry.parts[bsdf.kind]
+            if declared.refracts or declared.mueller is not None or declared.role == "clear" and chance:
+                continue
         if mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta | mi.BSDFFlags.Null):
             return "it has mirrors or clear surfaces that are no 'interface'"
         if paths.layered(scene) and polarizes(bsdf):
@@ -432,11 +433,11 @@ def scene_record(scene: Scene) -> dict:
     }
 
 
-def plugins_record() -> dict[str, str]:
+def plugins_record(registry: Registry) -> dict[str, str]:
     """Plugin file, relative to its folder, -> hash."""
     return {
         file.relative_to(folder).as_posix(): file_hash(file)
-        for folder in registry().folders
+        for folder in registry.folders
         for file in sorted(folder.rglob("*.py"))
         if not file.name.startswith("_")
     }

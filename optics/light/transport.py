@@ -40,7 +40,6 @@ from optics.errors import BadScene
 from optics.light.paths import part_values
 from optics.light.solid_angle import Rectangle
 from optics.polarization.mueller import diattenuator, fresnel, fresnel_reflection, retarder, rotation
-from optics.scene.registry import registry
 
 DEPTH = 512  # faces that a ray may meet; of the scene magictac's, 6e-5 would meet more
 FAINT = 0.3  # below this share of its start, half of the packets go on with twice the weight
@@ -895,8 +894,10 @@ def materials(scene, bands: np.ndarray) -> list[Material]:
             found.append(
                 Material(
                     name,
-                    coefficient(own, "index", bands),
-                    coefficient(own, "absorption", bands),
+                    *(
+                        coefficient(own, s, bands, scene.registry.functions(part.kind, s))
+                        for s in ("index", "absorption")
+                    ),
                     np.full(len(bands), own.scattering),
                     own.roughness,
                     own.birefringence,
@@ -905,10 +906,10 @@ def materials(scene, bands: np.ndarray) -> list[Material]:
     return found
 
 
-def coefficient(clear, stage: str, wavelengths, functions: Sequence[Callable] | None = None):
-    """`index` or `absorption` (1/mm) of a clear material per band, with what effects of that stage make of it
-    (`functions`: those that act; None: all); for numpy, complex numbers among them, and for Dr.Jit."""
+def coefficient(clear, stage: str, wavelengths, functions: Sequence[Callable]):
+    """`index` or `absorption` (1/mm) of a clear material per band, with what the functions of effects of that stage
+    make of it; for numpy, complex numbers among them, and for Dr.Jit."""
     value = getattr(clear, stage) + 0 * wavelengths
-    for function in registry().functions("clear", stage) if functions is None else functions:
+    for function in functions:
         value = function(value, wavelengths, clear)
     return value

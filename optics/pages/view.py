@@ -122,7 +122,7 @@ class View:
         self.held = sorted(set(range(len(self.model.frames))) - set(self.fitted))
         sd = {v["name"]: v["sd"] for v in self.step["variables"]}
         added = [s["effect"] for s in self.study.steps[: self.step["index"] + 1] if s["effect"]]
-        known = (*loop.candidates(self.model, self.study), *loop.effects_of(self.study))
+        known = (*loop.candidates(self.model, self.study), *loop.effects_of(self.study, self.model.scene.registry))
         self.effects = {e.key: e for e in sorted(known, key=lambda e: e.key)}
         own = {
             key: {k for keys in self.model.scene.keys_of(e).values() for k in keys} for key, e in self.effects.items()

@@ -18,7 +18,6 @@ from optics.diagnosis.evidence import value_of
 from optics.diagnosis.verdict import CLEAR, Diagnosis, Row, close
 from optics.fit.compare import plain
 from optics.proof.cells import Cell
-from optics.scene.registry import registry
 from optics.study import loop
 
 STEPS = 3  # effects that the loop may add where two are hidden
@@ -54,7 +53,7 @@ def run(rig, cell: Cell) -> dict:
                 record["steps"][-1]["added"] = added
                 for name in added:
                     start = diagnosis.fits[name].values if name in diagnosis.fits and len(added) == 1 else None
-                    fit, _ = loop.extend(study, model, setup, fit, registry().find_effect(name), start)
+                    fit, _ = loop.extend(study, model, setup, fit, model.scene.registry.find_effect(name), start)
         except (ValueError, KeyError, ArithmeticError, np.linalg.LinAlgError) as error:
             record["failed"] = f"{type(error).__name__}: {error}"
     record["seconds"] = time.perf_counter() - clock

@@ -17,7 +17,7 @@ from optics.captures import capture_set as capture_files
 from optics.errors import OutputExists, UnknownKey
 from optics.proof.makers import touch as synthetic
 from optics.scene import loader as scenes
-from optics.scene.registry import registry
+from optics.scene.registry import known
 from optics.study import loop
 
 # Hidden strengths, in the units of the effects' own parameters: a few percent of the image, as real sensors have it.
@@ -78,11 +78,11 @@ def secret(seed: int, name: str | None = None, sensor: str = "gelsight") -> tupl
     choices = BENCH_SECRETS if sensor == BENCH else SECRETS
     names = sorted(choices)
     name = name or names[int(np.random.default_rng([seed, 2]).integers(len(names)))]
-    known = choices if sensor == BENCH else {**SECRETS, "colour crosstalk": 0.03}
-    effect = registry().find_effect(name).name
-    if effect not in known:
-        raise UnknownKey(effect, known, "secret", hint="the demonstration knows no independent way to make it")
-    return effect, known[effect]
+    secrets = choices if sensor == BENCH else {**SECRETS, "colour crosstalk": 0.03}
+    effect = known().find_effect(name).name
+    if effect not in secrets:
+        raise UnknownKey(effect, secrets, "secret", hint="the demonstration knows no independent way to make it")
+    return effect, secrets[effect]
 
 
 def make(
@@ -141,7 +141,7 @@ def run(
         name, strength = make(folder / "captures", seed, effect, progress, sensor)
         note.write_text(json.dumps({"effect": name, "strength": strength, "seed": seed, "sensor": sensor}))
     hidden = json.loads(note.read_text())
-    asked = (seed, sensor, registry().find_effect(effect).name if effect else hidden["effect"])
+    asked = (seed, sensor, known().find_effect(effect).name if effect else hidden["effect"])
     if asked != (hidden["seed"], hidden["sensor"], hidden["effect"]):
         raise OutputExists(
             f"{folder} holds the demonstration of {hidden['sensor']}, seed {hidden['seed']}, with a secret of its "
@@ -157,7 +157,7 @@ def run(
     setup = loop.Setup(captures=str(folder / "captures"), per_group=[], seed=seed)
     study, model, fit = loop.begin(setup, folder / "study", title="Demonstration", resume=True, progress=progress)
     say(study.table())
-    claimed = [e.name for e in loop.effects_of(study)]
+    claimed = [e.name for e in loop.effects_of(study, model.scene.registry)]
     diagnosis = None
     for _ in range(STEPS + 1):
         diagnosis = loop.examine(study, model, setup, fit, progress)
@@ -166,12 +166,12 @@ def run(
             break
         name = diagnosis.missing
         start = diagnosis.fits[name].values if name in diagnosis.fits else None
-        fit, _ = loop.extend(study, model, setup, fit, registry().find_effect(name), start, progress)
+        fit, _ = loop.extend(study, model, setup, fit, model.scene.registry.find_effect(name), start, progress)
         claimed.append(name)
         say(study.table())
     page = report(study.folder, folder / "report.html", overwrite=True)
     last = study.steps[-1]["held_out"]
-    keys = {key for name in claimed for key in sum(model.scene.keys_of(registry().find_effect(name)).values(), [])}
+    keys = {key for name in claimed for key in sum(model.scene.keys_of(model.scene.registry.find_effect(name)).values(), [])}
     strengths = {v["name"]: (v["value"], v["sd"]) for v in study.steps[-1]["variables"] if keys & set(v["keys"])}
     return {
         "hidden": hidden,

@@ -225,9 +225,7 @@ def main() -> int:
         fit = loop.fit_base(
             model, loop.variables_of_base(model, setup, range(16)), list(range(16)), Values(demo.truth(small, 1))
         )
-        from optics.scene.registry import registry
-
-        effects = [e for e in registry().effects.values() if model.scene.can_express(e)]
+        effects = [e for e in model.scene.registry.effects.values() if model.scene.can_express(e)]
         start = time.perf_counter()
         diagnosis.diagnose(
             model, fit, effects, lambda e: loop.effect_variables(model, e), fitted=list(range(16)), top=0

@@ -33,12 +33,13 @@ functions frees parameters that its part has."""
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from dataclasses import field as dataclass_field
 
 from optics.scene.parameter import Parameter
 from optics.words import key_of
 
-STAGES = {
+STAGES = {  # stage -> the role of the parts that it belongs to
     "surface": "gel",
     "emission": "led",
     "segment": "gel",
@@ -63,8 +64,13 @@ class Part:
 
     build   called once per Mitsuba variant, returns the plugin class (a subclass of mi.BSDF, mi.Emitter, ...)
     checks  functions without arguments that raise AssertionError: the closed forms that the part must meet
-    mueller of a layer: its Mueller matrix (optics.polarization.layers);   stokes   of a source: the Stokes vector that
-    it sends
+    mueller of a layer: its Mueller matrix (optics.polarization.layers)
+    stokes  of a luminous area: the Stokes vector that it sends; an emitter without one is a point light, which images
+            are made of one by one
+    role    what it is to the other parts and to effects; the kind itself, unless it stands in for another kind: a
+            second camera says role="camera", and every effect of cameras whose parameters it has is one of its own
+    refracts   True of a boundary that camera rays pass, bent by its parameter `index`
+    polarizes  True of what makes polarized light of unpolarized light
     """
 
     kind: str
@@ -76,6 +82,13 @@ class Part:
     file: str = ""
     mueller: Callable | None = None
     stokes: Callable | None = None
+    role: str = ""
+    refracts: bool = False
+    polarizes: bool = False
+
+    def __post_init__(self):
+        if not self.role:
+            object.__setattr__(self, "role", self.kind)
 
 
 @dataclass(frozen=True)
@@ -83,9 +96,11 @@ class Effect:
     """A physical effect: parameters that rest at neutral until somebody adds them.
 
     name        words, as in a sentence: "lens vignetting"
-    part        kind of the part that carries it
+    part        kind of the part that carries it, or a role that several kinds play
     parameters  new ones (declared here) or names of parameters that the part already has
     stages      stage -> function: where the physics enters, see the module's text; empty: the part itself does it
+    field       of a layer's effect: f(layer) -> what its function reads as `layer.field`, made anew whenever the layer's
+                words, its shape or the skin around it change
     shape       further parameters that the functions use and that stay as they are (a width, an exponent)
     onset       'tangent' (linear at neutral), 'secant' (the derivative at neutral says nothing: a finite step to
                 `plausible` is used) or 'both'
@@ -104,7 +119,7 @@ class Effect:
     name: str
     part: str
     parameters: tuple[Parameter | str, ...]
-    stages: Mapping[str, Callable] = field(default_factory=dict)
+    stages: Mapping[str, Callable] = dataclass_field(default_factory=dict)
     shape: tuple[Parameter, ...] = ()
     onset: str = "tangent"
     scope: str = "common"
@@ -114,6 +129,7 @@ class Effect:
     acts: tuple[str, ...] = ()
     needs: str = ""
     seek: Callable | None = None
+    field: Callable | None = None
     checks: tuple[Callable[[], None], ...] = ()
     doc: str = ""
     file: str = ""

@@ -6,24 +6,25 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from types import SimpleNamespace
 
+from optics.errors import BadScene
 from optics.polarization.layers import Crossing, Texture, evaluate
 from optics.polarization.mueller import real, where
 from optics.scene.declare import Part
-from optics.scene.registry import registry
+from optics.scene.registry import Registry
 from optics.scene.surfaces import passing
 
 MONO = 540.0  # nm: the wavelength of variants that know none
 
 
-def active_effects(kind: str, values: Mapping) -> list:
+def active_effects(registry: Registry, kind: str, values: Mapping) -> list:
     """Effects of the stage `layer` that do not rest at neutral, for values by parameter name (numbers, arrays,
     complex)."""
     import numpy as np
 
-    neutral = {p.name: p.neutral for p in registry().parameters_of(kind)}
+    neutral = {p.name: p.neutral for p in registry.parameters_of(kind)}
     return [
         e
-        for e in registry().at_stage(kind, "layer")
+        for e in registry.at_stage(kind, "layer")
         if any(np.any(np.asarray(values[n]) != neutral[n]) for n in e.parameter_names)
     ]
 
@@ -37,8 +38,6 @@ class PatternImage:
         from pathlib import Path
 
         import numpy as np
-
-        from optics.errors import BadScene
 
         path = Path(path)
         if not path.is_file():
@@ -112,9 +111,9 @@ def numbers_of(part) -> SimpleNamespace:
     )
 
 
-def layer(kind: str, parameters: tuple, mueller: Callable) -> Part:
-    """The declaration of a layer: its name in XML, its parameters, its Mueller matrix."""
-    return Part(kind, "bsdf", parameters, lambda: bsdf(kind, mueller), mueller=mueller)
+def layer(kind: str, parameters: tuple, mueller: Callable, polarizes: bool = False) -> Part:
+    """The declaration of a layer: its name in XML, its parameters, its Mueller matrix, whether it polarizes light."""
+    return Part(kind, "bsdf", parameters, lambda: bsdf(kind, mueller), mueller=mueller, polarizes=polarizes)
 
 
 def bsdf(kind: str, own: Callable) -> type:
@@ -124,13 +123,33 @@ def bsdf(kind: str, own: Callable) -> type:
 
     class Layer(passing(mi.BSDFFlags.Null)):
         carrier = None  # the stretching shape that it lies on, if it does
+        skin = None  # the gel of the scene
+        field = None  # what an effect makes of both (optics.scene.declare.Effect.field)
+
+        def wire(self, scene):
+            shapes = scene.shapes_of(self)
+            carriers = [shape for shape in shapes if hasattr(shape, "carrier") and "width" in shape.numbers]
+            if carriers and len(shapes) > 1:
+                raise BadScene(
+                    f"'{self.name}' lies on {len(shapes)} shapes ({', '.join(repr(s.id()) for s in shapes)}), but a "
+                    "layer that stretches needs a material of its own; where the XML gives each its own, load it with "
+                    "optimize=False, as Mitsuba makes one of equal materials"
+                )
+            self.carrier, self.skin = carriers[0] if carriers else None, scene.one("gel")
+            self.follow(self.carrier, self.skin)
+            if not self._leaders:
+                self.place()
+
+        def place(self):
+            fields = [e.field(self) for e in self.registry.at_stage(kind, "layer") if e.field is not None]
+            self.field = next((found for found in fields if found is not None), None)
 
         def extent(self):
             return None if self.carrier is None else (self.carrier.number("width"), self.carrier.number("length"))
 
         def matrix(self, si):
             """What light that leaves towards si.wi went through, in Mitsuba's implicit axes."""
-            stages = [e for e in registry().at_stage(kind, "layer") if e.stages["layer"] in self.functions("layer")]
+            stages = [e for e in self.registry.at_stage(kind, "layer") if e.stages["layer"] in self.functions("layer")]
             return evaluate(own, crossing_of(si, self.band, self.extent()), numbers_of(self), stages)
 
         def weight(self, si, active):

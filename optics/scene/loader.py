@@ -10,15 +10,16 @@ import difflib
 import re
 import warnings
 from collections.abc import Mapping
+from contextlib import contextmanager
 from pathlib import Path
 
 from optics.errors import BadScene, UnknownKey
 from optics.files.output import shipped
-from optics.scene.declare import Effect
-from optics.scene.layer import PatternImage
-from optics.scene.mitsuba_parts import DEFAULT_VARIANT, Declared, collecting, is_part, use_variant
+from optics.scene.declare import Effect, Part
+from optics.scene.mitsuba_parts import DEFAULT_VARIANT, Declared, is_part, loading, move, use_variant
 from optics.scene.parameter import Parameter, Variable
-from optics.scene.registry import registry
+from optics.scene.registry import Registry, known
+from optics.scene.wiring import wire
 
 LED_BY_LED = {
     "emission",
@@ -69,10 +70,8 @@ def load(
     A folder `plugins` beside the user's scene is scanned as well.
     """
     path = find(name)
-    for folder in (plugins, path.parent / "plugins"):
-        if folder is not None and (folder == plugins or folder.is_dir()):
-            registry().scan(Path(folder))
-    return Scene(path, dict(defines or {}), variant)
+    beside = path.parent / "plugins"
+    return Scene(path, dict(defines or {}), variant, known(plugins, beside if beside.is_dir() else None))
 
 
 class Scene:
@@ -83,71 +82,70 @@ class Scene:
     camera, integrator, gel, block, leds, membranes    the parts by role (None or empty where the scene has none)
     """
 
-    MOVED = (
-        "carried",
-        "markers",
-        "target",
-        "block",
-        "cells",
-    )  # kinds of shapes besides the gel whose parameters move geometry
-
-    def __init__(self, path: Path, defines: Mapping[str, str], variant: str = DEFAULT_VARIANT):
+    def __init__(
+        self, path: Path, defines: Mapping[str, str], variant: str = DEFAULT_VARIANT, registry: Registry | None = None
+    ):
         self.path, self.defines, self.variant = Path(path), dict(defines), variant
+        self.registry = registry or known()
         text = self.path.read_text(encoding="utf-8")
-        known = re.findall(r'<default\s+name="([^"]+)"', text)
+        named = re.findall(r'<default\s+name="([^"]+)"', text)
         for key in self.defines:
-            if key not in known:
-                raise UnknownKey(key, known, "definition", str(self.path), "-D sets what the XML names in <default>")
-        use_variant(variant)
+            if key not in named:
+                raise UnknownKey(key, named, "definition", str(self.path), "-D sets what the XML names in <default>")
+        use_variant(variant, self.registry)
         import mitsuba as mi
 
-        with collecting() as created:
+        with loading(self.registry):
             try:
                 # one by one: in parallel the parts are made, and then listed, in an order that changes from run to run
                 self.mitsuba = mi.load_file(
                     str(self.path), parallel=False, optimize=False, **{k: str(v) for k, v in self.defines.items()}
                 )
             except (RuntimeError, ValueError, TypeError, KeyError) as error:
-                raise BadScene(f"{self.path}: {_reason(error, self.path)}") from error
+                raise BadScene(f"{self.path}: {_reason(error, self.path, self.registry)}") from error
+        with self._named():
+            self.neighbours = wire(self.mitsuba)
         self.parts: dict[str, Declared] = {}
-        for part in created:
-            name = part.name
-            if not name or re.fullmatch(r"object_\d+|_.*|plugin", name):
-                name = part.kind
-            if name in self.parts:
-                raise BadScene(f"{self.path}: two parts have the id '{name}'; give every part its own id=\"...\"")
-            part.name = name
-            self.parts[name] = part
-        self.camera = self._one("camera")
-        self.integrator = self._one("tactile")
-        self._nest()
-        self.gel, self.block = self._one("gel"), self._one("block")
-        if self.block is not None:
-            self.block.target = self._one("target")
-        if self.integrator is not None and self.integrator.lanes == 1 and len(self.integrator.bands) == 1:
-            for part in self.parts.values():
-                part.band = self.integrator.bands[0]
-        self.leds = {n: p for n, p in self.parts.items() if p.kind == "led"}
-        self.sources = {n: p for n, p in self.parts.items() if p.kind in ("source", "room")}
+        for part in self.neighbours.parts:
+            if part.name in self.parts:
+                raise BadScene(f"{self.path}: two parts have the id '{part.name}'; give every part its own id=\"...\"")
+            self.parts[part.name] = part
+        with self._named():
+            self.camera, self.gel, self.block = (self.neighbours.one(role) for role in ("camera", "gel", "block"))
+        integrator = self.neighbours.integrator
+        self.integrator = integrator if is_part(integrator) else None
+        declared = {n: self.registry.parts[p.kind] for n, p in self.parts.items()}
+        lights = {n: p for n, p in self.parts.items() if declared[n].category == "emitter"}
+        self.leds = {n: p for n, p in lights.items() if declared[n].stokes is None}
+        self.sources = {n: p for n, p in lights.items() if n not in self.leds}
         self.lights = {**self.leds, **self.sources}
-        self.membranes = {n: p for n, p in self.parts.items() if p.kind == "membrane"}
+        self.membranes = {n: p for n, p in self.parts.items() if hasattr(p, "ambient_radiance")}
+        self.monte_carlo = any(p.role == "clear" for p in self.parts.values())
         self.parameters: dict[str, Parameter] = {}
         for name, part in self.parts.items():
-            for p in registry().parameters_of(part.kind):
+            for p in self.registry.parameters_of(part.kind):
                 self.parameters[f"{name}.{p.name}"] = p
-        self._strain()
-        if carried := [p for p in self.parts.values() if hasattr(p, "carry") or p is self.block]:
-            self._place(carried)
-            self.mitsuba.parameters_changed([])
         self._stock = self._stock_parameters()
         self.parameters.update({k: p for k, (p, _) in self._stock.items() if k not in self.parameters})
         self._now = self._read()
         self._warn_of_depolarizers()
 
+    @contextmanager
+    def _named(self):
+        """What is wrong with the scene is said with its file."""
+        try:
+            yield
+        except BadScene as error:
+            raise BadScene(f"{self.path}: {error}") from error
+
+    def declaration(self, name: str) -> Part:
+        """What the plugin file says of a part of the scene."""
+        return self.registry.parts[self.parts[name].kind]
+
     def _warn_of_depolarizers(self) -> None:
         """Say which stock materials lose all polarization, and nobody says so, in a scene with polarizers."""
         shapes = self.mitsuba.shapes()
-        if not any(p.kind == "polarizer_film" for p in self.parts.values()) and not any(
+        if not any(self.declaration(n).polarizes for n in self.parts) and not any(
             "LinearPolarizer[" in str(s.bsdf()) for s in shapes
         ):
             return
@@ -159,28 +157,6 @@ class Scene:
                         f"light that it lets through or reflects, whatever the physics; {advice}",
                         stacklevel=2,
                     )
-
-    def _nest(self) -> None:
-        """Tell each dielectric body which clear material is around it."""
-        clear = {n: p for n, p in self.parts.items() if p.kind == "clear"}
-        self.monte_carlo = bool(clear)
-        for shape in self.mitsuba.shapes():
-            if getattr(shape, "kind", "") == "cells" and getattr(shape.bsdf(), "kind", "") == "clear":
-                shape.bsdf().fills_cells = True
-        for name, part in clear.items():
-            if part.outside and part.outside not in clear:
-                raise BadScene(
-                    f"{self.path}: '{name}': outside = '{part.outside}'; allowed: the id of a clear material ("
-                    f"{', '.join(n for n in clear if n != name) or 'there is no other'}), or nothing for air"
-                )
-            part.around = clear.get(part.outside)
-            part.bands = len(self.integrator.bands) if self.integrator is not None else part.bands
-
-    def _one(self, kind: str):
-        found = [p for p in self.parts.values() if p.kind == kind]
-        if len(found) > 1:
-            raise BadScene(f"{self.path}: {len(found)} parts of the kind '{kind}'; one is allowed")
-        return found[0] if found else None
 
     def _stock_parameters(self) -> dict[str, tuple[Parameter, str]]:
         """Scalar parameters of stock plugins, under Mitsuba's own keys."""
@@ -234,7 +210,7 @@ class Scene:
         import mitsuba as mi
 
         changed = {k: v for k, v in self.check(values, where).items() if self._now[k] != v}
-        rebuild, strained, moved, stock = False, False, set(), False
+        moved, stock = set(), False
         for key, value in changed.items():
             if key in self._stock:
                 self._traversed[self._stock[key][1]] = mi.Float(value)
@@ -244,85 +220,50 @@ class Scene:
             part = self.parts[name]
             if parameter in part.words:
                 setattr(part, parameter, value)
-                strained |= parameter == "stress_pattern"
             else:
                 part.hold(parameter, value)
-            rebuild |= part.kind == "gel" and parameter in self.shaping
-            if part.kind in self.MOVED:
+            if part.placed_by([parameter]):
                 moved.add(name)
         self._now.update(changed)
         if stock:
             self._traversed.update()
-        if rebuild:
-            self.gel.rebuild(mi.traverse(self.gel))
-            moved.update(n for n, p in self.parts.items() if hasattr(p, "carry"))
-        if self.block is not None and any(self.parts[n] in (self.block, self.block.target) for n in moved):
-            moved.update(n for n, p in self.parts.items() if p.kind in ("block", "cells"))
-        if rebuild or strained:
-            self._strain()
-        self._place([self.parts[n] for n in moved])
-        if rebuild or moved:
-            self.mitsuba.parameters_changed([])
+        with self._named():
+            if move([self.parts[n] for n in moved]):
+                self.mitsuba.parameters_changed([])
 
-    def _place(self, shapes: list) -> None:
-        """Rebuild shapes besides the gel; those in a body that gives way where its present dent carries them."""
-        import mitsuba as mi
-
-        for part in sorted(shapes, key=lambda p: self.MOVED.index(p.kind)):
-            carrier = getattr(self, getattr(part, "rides", ""), None)
-            if carrier is not None:
-                part.carry(carrier)
-            else:
-                part.rebuild(mi.traverse(part))
-
-    def _strain(self) -> None:
-        """Hand the sheets their stress patterns: from a file, or the present press's stress in the skin, from their
-        depth on both sides alike up to the skin's inner face."""
-        from optics.skin.halfspace import SkinStress
-
-        for shape in self.mitsuba.shapes():
-            sheet = shape.bsdf()
-            if hasattr(shape, "carry") and hasattr(sheet, "carrier"):
-                sheet.carrier = shape
-            pattern = getattr(sheet, "stress_pattern", "")
-            if pattern.endswith((".npy", ".exr")):
-                sheet.field = PatternImage(self.path.parent / pattern)
-            if pattern == "gel":
-                if self.gel is None or not hasattr(shape, "carry"):
-                    raise BadScene(
-                        f"{self.path}: '{sheet.name}': stress_pattern = 'gel' needs a sheet in the skin, a shape of the "
-                        "type 'carried'"
-                    )
-                thickness = self.gel.number("thickness")
-                near = max(2 * shape.number("depth") - thickness, 0.0)
-                sheet.field = SkinStress(self.gel, near, thickness)
-
-    @property
-    def shaping(self) -> set[str]:
-        """Names of gel parameters that move its surface."""
-        effects = registry().effects.values()
-        return {p.name for p in registry().parts["gel"].parameters} | {
-            n for e in effects if "surface" in e.stages for n in (*e.parameter_names, *(p.name for p in e.shape))
-        }
+    def moves(self, key: str) -> bool:
+        """Whether a parameter moves geometry, or camera rays: then the places that they meet are found anew."""
+        name, _, parameter = key.rpartition(".")
+        if name not in self.parts:
+            return True  # a stock plugin's may do anything
+        declared = self.declaration(name)
+        if declared.category == "sensor" or declared.refracts:
+            return True
+        return parameter in self.registry.shaping(declared.kind)
 
     def keys_of(self, effect: Effect) -> dict[str, list[str]]:
         """The effect's parameter names, each with the keys it has in this scene (empty where the scene lacks the
         part)."""
-        holders = {n: p for n, p in self.parts.items() if p.kind == effect.part}
-        return {name: [f"{n}.{name}" for n, p in holders.items() if p.takes(name)] for name in effect.parameter_names}
+        kinds = self.registry.kinds(effect.part)
+        holders = {n: p for n, p in self.parts.items() if p.kind in kinds}
+        return {
+            name: [f"{n}.{name}" for n, p in holders.items() if f"{n}.{name}" in self.parameters and p.takes(name)]
+            for name in effect.parameter_names
+        }
 
     def can_express(self, effect: Effect) -> bool:
-        kinds = {p.kind for p in self.parts.values()}
-        layered = any(p.how == "layer" for p in registry().effect_parameters(effect))
-        if self.monte_carlo and (set(effect.stages) & LED_BY_LED or effect.part == "tactile" or layered):
+        present = {name for p in self.parts.values() for name in (p.kind, p.role)}
+        layered = any(p.how == "layer" for p in self.registry.effect_parameters(effect))
+        scales_light = any(self.registry.parts[k].category == "integrator" for k in self.registry.kinds(effect.part))
+        if self.monte_carlo and (set(effect.stages) & LED_BY_LED or scales_light or layered):
             return False
-        return all(self.keys_of(effect).values()) and kinds.issuperset(effect.requires)
+        return all(self.keys_of(effect).values()) and present.issuperset(effect.requires)
 
     def variables_of(self, effect: Effect, frames: int = 0) -> list[Variable]:
         """What a calibration frees to add the effect: shared or per part, for all frames or for each."""
         variables = []
         for name, keys in self.keys_of(effect).items():
-            parameter = registry().parameter(effect.part, name)
+            parameter = self.registry.parameter(effect.part, name)
             groups = (
                 [(f"{effect.part}.{name}" if len(keys) > 1 else keys[0], tuple(keys))]
                 if effect.per == "kind"
@@ -336,7 +277,7 @@ class Scene:
         return variables
 
 
-def _reason(error: Exception, path: Path) -> str:
+def _reason(error: Exception, path: Path, registry: Registry) -> str:
     """Mitsuba's message in one line: what a part raised without its traceback, and the nearest name that exists."""
     text = str(error)
     if "Traceback (most recent call last)" in text:
@@ -345,7 +286,7 @@ def _reason(error: Exception, path: Path) -> str:
         text = before + (raised[-1] if raised else trace)
     text = re.sub(r"(^|[:;] )(\[[^\]]*\]\s*)+", r"\1", " ".join(text.split()))
     text = re.sub(rf'(At|(?:Error w|W)hile loading) "?{re.escape(str(path))}"? \((line[^)]*)\)', r"\2", text)
-    parts = registry().parts
+    parts = registry.parts
     if (unknown := re.search(r'Plugin "([^"]+)" not found', text)) is not None:
         near = difflib.get_close_matches(unknown[1], parts, n=1)
         text += (
@@ -355,6 +296,6 @@ def _reason(error: Exception, path: Path) -> str:
         )
     unused = re.search(r'unreferenced propert.* plugin of type "([^"]+)": - \w+ "([^"]+)"', text)
     if unused is not None and unused[1] in parts:
-        near = difflib.get_close_matches(unused[2], [p.name for p in registry().parameters_of(unused[1])], n=1)
+        near = difflib.get_close_matches(unused[2], [p.name for p in registry.parameters_of(unused[1])], n=1)
         text += f"; did you mean '{near[0]}'?" if near else "; `optics params SCENE` lists what it has"
     return text

@@ -3,26 +3,33 @@ parameters."""
 
 from __future__ import annotations
 
+import itertools
+import weakref
 from collections.abc import Callable
+from contextvars import ContextVar
+from functools import wraps
+from pathlib import Path
 
-from optics.errors import BadPlugin, UnknownKey
+from optics.errors import BadPlugin, BadScene, UnknownKey
 from optics.scene.declare import Part
 from optics.scene.parameter import Parameter
-from optics.scene.registry import Registry, registry
+from optics.scene.registry import Registry, default, include
 
 DEFAULT_VARIANT = "llvm_ad_spectral_polarized"
+_loading: ContextVar[Registry | None] = ContextVar("registry", default=None)  # of the scene that is being loaded
+_registered: dict[str, dict[str, str]] = {}  # variant -> kind -> category that Mitsuba knows it in
+_watching = False  # whether Mitsuba tells us when its variant changes
+_made = itertools.count()  # numbers the parts in the order in which they were made
 
 
-def use_variant(variant: str = DEFAULT_VARIANT) -> None:
-    """Set the Mitsuba variant and register the plugin classes for it.
+def use_variant(variant: str = DEFAULT_VARIANT, registry: Registry | None = None) -> None:
+    """Set the Mitsuba variant and register the plugins of a registry for it (None: those that every scene knows).
 
-    Classes belong to the variant that they were built under, so they are built once per variant and registered again
-    whenever it is set. Scalar variants are refused: Python plugins run 30-120 times slower in them and emitters fail.
+    Scalar variants are refused: Python plugins run 30-120 times slower in them and emitters fail.
     """
     from optics.doctor import require_llvm
 
-    if variant.startswith("scalar"):
-        raise ValueError(f"variant {variant}: scalar variants are not supported; use {DEFAULT_VARIANT}")
+    _refuse_scalar(variant)
     if variant.startswith("llvm"):
         require_llvm()
     import mitsuba as mi
@@ -32,21 +39,102 @@ def use_variant(variant: str = DEFAULT_VARIANT) -> None:
     if mi.variant() != variant:
         mi.set_variant(variant)
         mi.set_log_level(mi.LogLevel.Error)
-    reg = registry()
-    if variant in reg.classes:
-        return
-    classes = {kind: _built(reg, part) for kind, part in reg.parts.items()}
-    for kind, cls in classes.items():
-        getattr(mi, f"register_{reg.parts[kind].category}")(kind, lambda props, cls=cls: cls(props))
-    reg.classes[variant] = classes
+    _prepare(registry or default(), variant)
 
 
-def _built(reg: Registry, part: Part) -> type:
+def register(plugins: str | Path | list[str | Path] | None = None) -> None:
+    """Make the parts known to plain Mitsuba, in the present variant and in every one that is set later.
+
+    plugins   a folder of your own plugins, or several, that all scenes of this process know from now on
+
+    Edited plugin files are taken up. Raises RuntimeError where no variant is set yet, ValueError in a scalar one.
+    """
+    import mitsuba as mi
+
+    global _watching
+    variant = mi.variant()
+    if variant is None:
+        raise RuntimeError(
+            f'no Mitsuba variant is set; call mitsuba.set_variant("{DEFAULT_VARIANT}") before optics.register()'
+        )
+    _refuse_scalar(variant)
+    registry = include(*([] if plugins is None else [plugins] if isinstance(plugins, (str, Path)) else plugins))
+    _prepare(registry, variant)
+    if not _watching:
+        mi.detail.add_variant_callback(_follow_variant)
+        _watching = True
+
+
+def _follow_variant(old: str | None, new: str) -> None:
+    """After mi.set_variant: Mitsuba's plugins belong to a variant."""
+    if not new.startswith("scalar"):
+        _prepare(default(), new)
+
+
+def _refuse_scalar(variant: str) -> None:
+    if variant.startswith("scalar"):
+        raise ValueError(f"variant {variant}: scalar variants are not supported; use {DEFAULT_VARIANT}")
+
+
+def _prepare(registry: Registry, variant: str) -> None:
+    """Build a registry's classes for the present variant, and have Mitsuba ask for them by the names of their kinds.
+
+    Mitsuba's names are global: each kind is registered once per variant, with a constructor that asks which registry
+    is meant."""
+    import mitsuba as mi
+
+    if variant not in registry.classes:
+        registry.classes[variant] = {kind: _built(registry, part) for kind, part in registry.parts.items()}
+    names = _registered.setdefault(variant, {})
+    for kind, part in registry.parts.items():
+        if names.get(kind) != part.category:
+            getattr(mi, f"register_{part.category}")(kind, _constructor(kind, variant))
+            names[kind] = part.category
+
+
+def _constructor(kind: str, variant: str) -> Callable:
+    def construct(props):
+        registry = _loading.get() or default()
+        if kind not in registry.parts:
+            raise BadScene(
+                f"the type '{kind}' is of another scene's plugins; load this scene with the folder that holds it, or "
+                "name the folder in optics.register(plugins=...)"
+            )
+        if variant not in registry.classes:
+            _prepare(registry, variant)
+        return registry.classes[variant][kind](props)
+
+    return construct
+
+
+class loading:
+    """Context in which Mitsuba makes the parts of one registry."""
+
+    def __init__(self, registry: Registry):
+        self.registry = registry
+
+    def __enter__(self):
+        self.token = _loading.set(self.registry)
+
+    def __exit__(self, *_):
+        _loading.reset(self.token)
+
+
+def _built(registry: Registry, part: Part) -> type:
     """The Mitsuba class of a part, which parameters must not hide anything of."""
     cls = part.build()
-    for p in reg.parameters_of(part.kind):
+    cls.registry, cls.role = registry, part.role
+    if part.category == "bsdf":
+        for name in ("sample", "eval", "pdf", "eval_pdf", "eval_null_transmission"):
+            if name in dir(cls):
+                setattr(cls, name, _once_wired(getattr(cls, name)))
+    for p in registry.parameters_of(part.kind):
         if is_taken(p.name, cls):
-            files = [e.file for e in reg.effects.values() if e.part == part.kind and p in (*e.parameters, *e.shape)]
+            files = [
+                e.file
+                for e in registry.effects.values()
+                if part.kind in registry.kinds(e.part) and p in (*e.parameters, *e.shape)
+            ]
             raise BadPlugin(
                 f"{files[0] if files else part.file}: parameter '{p.name}' has the name of something else that the part "
                 f"'{part.kind}' has; choose another name"
@@ -54,30 +142,36 @@ def _built(reg: Registry, part: Part) -> type:
     return cls
 
 
-_created: list | None = None  # parts made while a scene is being loaded
+def _once_wired(method: Callable) -> Callable:
+    """A method of a material that must not be asked before the material knows its neighbours."""
 
+    @wraps(method)
+    def asked(self, *given, **more):
+        if self._waits:
+            raise BadScene(
+                f"{self._waits}, and this scene's parts have not been told of one another; the integrator 'tactile' does "
+                "that at its first image; call optics.wire(scene) before you render with another integrator"
+            )
+        return method(self, *given, **more)
 
-class collecting:
-    """Context in which the parts that Mitsuba creates are listed, in the order of creation."""
-
-    def __enter__(self) -> list:
-        global _created
-        self.outer, _created = _created, []
-        return _created
-
-    def __exit__(self, *_):
-        global _created
-        _created = self.outer
+    return asked
 
 
 class Declared:
-    """What every part can do: read its declared parameters from XML, expose them, know its effects.
+    """What every part can do: read its declared parameters from XML, expose them, know its effects and its neighbours.
 
     A plugin class derives from `Declared.on(mi.BSDF)` and names its `kind` (Mitsuba's classes allow one base only).
+    A part that depends on others of its scene says so in `wire`, and follows them in `place`.
     """
 
     kind: str
+    registry: Registry  # that it was built for
+    role: str
     band: float | None = None  # nm: what a mono variant renders, where the scene's integrator names one band
+    _wired = False
+    _waits = ""  # of a material: why it cannot be asked before its scene is wired
+    _leaders = ()
+    _followers = ()
 
     @staticmethod
     def on(base: type) -> type:
@@ -85,20 +179,25 @@ class Declared:
         return type(
             f"Declared{base.__name__}",
             (base,),
-            {
-                n: f
-                for n, f in vars(Declared).items()
-                if (callable(f) or n == "band") and not n.startswith("__") and n not in ("on", "on_mesh")
-            },
+            {n: f for n, f in vars(Declared).items() if not n.startswith("__") and n not in ("on", "on_mesh")},
         )
 
     @staticmethod
     def on_mesh() -> type:
         """`on(mi.Mesh)` for a shape that makes its own vertices: `rebuild(params)` follows every change of its
-        parameters."""
+        parameters, and of the parts that it follows."""
         import mitsuba as mi
 
         class DeclaredMesh(Declared.on(mi.Mesh)):
+            moved_by = ""  # role of the part that it moves with
+
+            def declare(self, props):
+                super().declare(props)
+                if self.moved_by and is_part(self.bsdf()):
+                    self.bsdf()._waits = f"'{self.name}' moves with the part '{self.moved_by}'"
+                if _loading.get() is None:  # Mitsuba's own loader merges meshes of one material, which then do not move
+                    self.add_attribute("face_own", 1, [0.0] * self.face_count())
+
             def traverse(self, cb):
                 mi.Mesh.traverse(self, cb)
                 self.put_parameters(cb)
@@ -106,19 +205,27 @@ class Declared:
             def parameters_changed(self, keys=()):
                 if any(key in self.numbers for key in keys) or not keys:
                     self.reread(keys)
-                    self.rebuild(mi.traverse(self))
+                    if self.placed_by(keys):
+                        move([self])
                 else:
                     mi.Mesh.parameters_changed(self, list(keys))
+
+            def place(self):
+                self.rebuild(mi.traverse(self))
 
         return DeclaredMesh
 
     def declare(self, props) -> None:
         """Read every declared parameter from `props` (unknown ones stay for Mitsuba to complain about)."""
+        import mitsuba as mi
+
         self.name = props.id()
         self.numbers: dict[str, Parameter] = {}
         self.words: dict[str, Parameter] = {}
         self.held: dict[str, float] = {}  # the numbers as Python floats, to ask without waiting for the device
-        for p in registry().parameters_of(self.kind):
+        self._order = next(_made)
+        self._folders = tuple(str(folder) for folder in mi.file_resolver())
+        for p in self.registry.parameters_of(self.kind):
             value = p.check(props.get(p.name, p.default), f"{self.name}.{p.name}", "scene")
             if p.is_number:
                 self.numbers[p.name] = p
@@ -126,8 +233,33 @@ class Declared:
             else:
                 self.words[p.name] = p
                 setattr(self, p.name, value)
-        if _created is not None:
-            _created.append(self)
+
+    def find_file(self, name: str) -> Path:
+        """A file that the scene names, beside the scene's file or where Mitsuba looks for files."""
+        places = [Path(folder) / name for folder in self._folders]
+        return next((place for place in places if place.is_file()), places[0])
+
+    # -- neighbours -------------------------------------------------------------------------------------------------
+
+    def wire(self, scene) -> None:
+        """Find the neighbours that the part depends on (optics.scene.wiring.Neighbours); called once a scene."""
+
+    def place(self) -> None:
+        """Take up what the parts that this one follows have become."""
+
+    def follow(self, *leaders) -> None:
+        """Be placed anew whenever one of these parts changes (None and Mitsuba's own objects never do)."""
+        self._leaders = tuple(leader for leader in leaders if is_part(leader))
+        for leader in self._leaders:
+            if all(known() is not self for known in leader._followers):
+                leader._followers = (*leader._followers, weakref.ref(self))
+
+    def placed_by(self, names=()) -> bool:
+        """Whether a change of these parameters (none: of any) moves the part or those that follow it."""
+        shaping = self.registry.shaping(self.kind) or self.words
+        return any(name in shaping for name in names or (*self.numbers, *self.words))
+
+    # -- parameters -------------------------------------------------------------------------------------------------
 
     def traverse(self, cb) -> None:
         self.put_parameters(cb)
@@ -166,12 +298,12 @@ class Declared:
         """The functions of effects at a stage, but for those that rest at neutral and carry no derivative.
 
         Leaving them out saves time and changes nothing: the contract tests hold every effect to the identity at
-        neutral. A part of an earlier scene knows no effect that was scanned since."""
+        neutral."""
         import drjit as dr
 
         return tuple(
             e.stages[stage]
-            for e in registry().at_stage(self.kind, stage)
+            for e in self.registry.at_stage(self.kind, stage)
             if any(
                 n in self.held and (self.held[n] != self.numbers[n].neutral or dr.grad_enabled(getattr(self, n)))
                 for n in e.parameter_names
@@ -179,7 +311,7 @@ class Declared:
         )
 
 
-HELD = ("name", "numbers", "words", "held")  # what every part holds beside its parameters
+HELD = ("name", "numbers", "words", "held", "registry", "role")  # what every part holds beside its parameters
 
 
 def is_taken(word: str, cls: type = Declared) -> bool:
@@ -190,3 +322,23 @@ def is_taken(word: str, cls: type = Declared) -> bool:
 def is_part(thing) -> bool:
     """Whether a Mitsuba object is a part of ours."""
     return hasattr(type(thing), "put_parameters")
+
+
+def move(parts) -> bool:
+    """Place parts and all that follow them, each once and after those that it follows; whether a shape was among
+    them."""
+    waiting, wanted = list(parts), []
+    while waiting:
+        part = waiting.pop()
+        if part not in wanted:
+            wanted.append(part)
+            waiting += [follower for known in part._followers if (follower := known()) is not None]
+    wanted.sort(key=lambda part: part._order)
+    placed: list = []
+    while wanted:
+        ready = [p for p in wanted if not any(leader in wanted for leader in p._leaders)]
+        for part in ready:
+            part.place()
+        placed += ready
+        wanted = [p for p in wanted if p not in ready]
+    return any(hasattr(part, "rebuild") for part in placed)

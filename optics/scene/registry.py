@@ -1,14 +1,24 @@
-"""The registry: all parts and effects that were found in the folders of plugins, by kind and by key."""
+"""The registry: all parts and effects of some folders of plugins, by kind and by key; built whole or not at all.
+
+    Registry.of(folders)   the registry of exactly these folders, the same object until one of their files changes
+    known(*folders)        of the shipped plugins, of what `include` named, and of these folders
+    default()              `known()`, as it was when Mitsuba's plugins were last registered
+
+A registry never changes. A scene owns the one that it was loaded with (`Scene.registry`), so that two scenes with
+different plugins live in one process."""
 
 from __future__ import annotations
 
+import hashlib
+import importlib
 import importlib.util
 import re
 import sys
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
-from types import ModuleType
+from types import MappingProxyType, ModuleType
 
 from optics.errors import BadPlugin, UnknownKey
 from optics.files.output import shipped
@@ -16,33 +26,89 @@ from optics.scene.declare import CATEGORIES, STAGES, Effect, Part
 from optics.scene.parameter import Parameter
 from optics.words import key_of
 
+EARLIER = {  # names that modules once had, which plugin files may still import
+    "optics.effect": "optics.plugin",
+    "optics.parameter": "optics.plugin",
+    "optics.layers": "optics.plugin",
+    "optics.mueller": "optics.polarization.mueller",
+    "optics.bsdf": "optics.scene.surfaces",
+    "optics.gel": "optics.skin",
+    "optics.gel.contact": "optics.skin.contact",
+    "optics.gel.lattice": "optics.skin.lattice",
+    "optics.gel.halfspace": "optics.skin.halfspace",
+}
 
-@dataclass
+
+@dataclass(frozen=True, eq=False)
 class Registry:
-    """All parts and effects that were found, by kind and by key."""
+    """All parts and effects of some folders, by kind and by key. Two registries are equal if they are the same."""
 
-    parts: dict[str, Part] = field(default_factory=dict)
-    effects: dict[str, Effect] = field(default_factory=dict)
-    folders: list[Path] = field(default_factory=list)
-    classes: dict[str, dict[str, type]] = field(default_factory=dict)  # variant -> kind -> class
+    parts: Mapping[str, Part]
+    effects: Mapping[str, Effect]
+    folders: tuple[Path, ...] = ()
+    classes: dict = field(default_factory=dict, repr=False)  # variant -> kind -> class, built when first needed
+
+    @classmethod
+    def of(cls, folders: Iterable[str | Path]) -> Registry:
+        """The registry of the plugin files in these folders and their subfolders; raises BadPlugin and leaves nothing
+        behind.
+
+        Names that start with _ or . are passed over. The same folders with the same contents give the same registry.
+        """
+        folders = tuple(dict.fromkeys(Path(folder).resolve() for folder in folders))
+        files = tuple((file, _content(file)) for folder in folders for file in _files(folder))
+        known = _registries.get(folders)
+        if known is not None and known[0] == files:
+            return known[1]
+        items = [(file, item) for file, content in files for item in declared(file, content)]
+        made = cls.holding(items, folders)
+        _registries[folders] = files, made
+        return made
+
+    @classmethod
+    def holding(cls, items: Iterable[tuple[Path | str, Part | Effect]], folders: Sequence[Path] = ()) -> Registry:
+        """The registry of declarations, each with the file that messages name."""
+        parts: dict[str, Part] = {}
+        effects: dict[str, Effect] = {}
+        for file, item in items:
+            _add(parts, effects, item, str(file))
+        made = cls(MappingProxyType(parts), MappingProxyType(effects), tuple(folders))
+        made.check()
+        return made
+
+    def kinds(self, part: str) -> tuple[str, ...]:
+        """The kinds that a name stands for: the part of that kind, and all that play that role."""
+        return self._kinds.get(part, ())
+
+    @cached_property
+    def _kinds(self) -> dict[str, tuple[str, ...]]:
+        names = {name for part in self.parts.values() for name in (part.kind, part.role)}
+        return {n: tuple(k for k, part in self.parts.items() if n in (k, part.role)) for n in names}
 
     def parameters_of(self, kind: str) -> tuple[Parameter, ...]:
         """A part's own parameters and those that effects bring to it."""
-        own = self.parts[kind].parameters
-        brought = [
-            p
-            for e in self.effects.values()
-            if e.part == kind
-            for p in (*e.parameters, *e.shape)
-            if not isinstance(p, str)
-        ]
-        return own + tuple(brought)
+        if kind not in self._parameters:
+            brought = [
+                p
+                for e in self.effects.values()
+                if kind in self.kinds(e.part)
+                for p in (*e.parameters, *e.shape)
+                if not isinstance(p, str)
+            ]
+            self._parameters[kind] = self.parts[kind].parameters + tuple(brought)
+        return self._parameters[kind]
 
-    def parameter(self, kind: str, name: str) -> Parameter:
-        for p in self.parameters_of(kind):
+    @cached_property
+    def _parameters(self) -> dict[str, tuple[Parameter, ...]]:
+        return {}
+
+    def parameter(self, part: str, name: str) -> Parameter:
+        """The declaration of a parameter of a kind, or of the first kind that plays a role and has it."""
+        found = [p for kind in self.kinds(part) for p in self.parameters_of(kind)]
+        for p in found:
             if p.name == name:
                 return p
-        raise UnknownKey(name, [p.name for p in self.parameters_of(kind)], "parameter", kind)
+        raise UnknownKey(name, [p.name for p in found], "parameter", part)
 
     def effect_parameters(self, effect: Effect) -> tuple[Parameter, ...]:
         return tuple(self.parameter(effect.part, name) for name in effect.parameter_names)
@@ -53,11 +119,25 @@ class Registry:
 
     def at_stage(self, kind: str, stage: str) -> tuple[Effect, ...]:
         """The effects that act on a part at a stage, in a fixed order (by key)."""
-        return tuple(
-            self.effects[k]
-            for k in sorted(self.effects)
-            if self.effects[k].part == kind and stage in self.effects[k].stages
-        )
+        if (kind, stage) not in self._stages:
+            self._stages[kind, stage] = tuple(
+                self.effects[k]
+                for k in sorted(self.effects)
+                if kind in self.kinds(self.effects[k].part) and stage in self.effects[k].stages
+            )
+        return self._stages[kind, stage]
+
+    @cached_property
+    def _stages(self) -> dict[tuple[str, str], tuple[Effect, ...]]:
+        return {}
+
+    def shaping(self, kind: str) -> frozenset[str]:
+        """Names of a shape's parameters that move its surface: its own, and those of effects of the stage `surface`.
+        Empty for what is no shape."""
+        if self.parts[kind].category != "shape":
+            return frozenset()
+        brought = (n for e in self.at_stage(kind, "surface") for n in (*e.parameter_names, *(p.name for p in e.shape)))
+        return frozenset((*(p.name for p in self.parts[kind].parameters), *brought))
 
     def find_effect(self, name: str) -> Effect:
         key = key_of(name)
@@ -65,41 +145,18 @@ class Registry:
             raise UnknownKey(name, self.effects, "effect", hint="`optics effects` lists them")
         return self.effects[key]
 
-    # -- adding -----------------------------------------------------------------------------------------------------
-
-    def add(self, item: Part | Effect, file: str) -> None:
-        if isinstance(item, Part):
-            if item.category not in CATEGORIES:
-                raise BadPlugin(f"{file}: category {item.category!r} is none of {', '.join(CATEGORIES)}")
-            if item.kind in self.parts:
-                raise BadPlugin(f"{file}: a part of the kind '{item.kind}' exists already; choose another kind")
-            self.parts[item.kind] = item
-            return
-        if item.key == "new":
-            raise BadPlugin(
-                f"{file}: an effect cannot be called 'new', which is the word for writing one; choose another name"
-            )
-        if item.key in self.effects:
-            raise BadPlugin(f"{file}: the effect '{item.name}' exists already ({self.effects[item.key].file})")
-        for stage in item.stages:
-            if stage not in STAGES:
-                raise BadPlugin(f"{file}: stage {stage!r} is none of {', '.join(STAGES)}")
-            if STAGES[stage] not in ("", item.part):
-                raise BadPlugin(f"{file}: stage '{stage}' belongs to the part '{STAGES[stage]}', not to '{item.part}'")
-        if item.onset not in ("tangent", "secant", "both"):
-            raise BadPlugin(f"{file}: onset {item.onset!r} is none of tangent, secant, both")
-        for p in item.parameters:
-            if isinstance(p, Parameter) and p.neutral is None:
-                raise BadPlugin(f"{file}: parameter '{p.name}' of the effect '{item.name}' declares no neutral value")
-        self.effects[item.key] = item
-
     def check(self) -> None:
-        """After a scan: every effect's part exists, and no two declare the same parameter."""
+        """Every effect's part exists and has what the effect needs, and no two declare the same parameter."""
         for effect in self.effects.values():
-            for kind in (effect.part, *effect.requires):
-                if kind not in self.parts:
-                    raise BadPlugin(f"{effect.file}: part '{kind}' is none of {', '.join(sorted(self.parts))}")
-            if "layer" in effect.stages and self.parts[effect.part].mueller is None:
+            for name in (effect.part, *effect.requires):
+                if not self.kinds(name):
+                    raise BadPlugin(f"{effect.file}: part '{name}' is none of {', '.join(sorted(self.parts))}")
+            for stage in effect.stages:
+                if not set(self.kinds(effect.part)) <= set(self.kinds(STAGES[stage]) or self.parts):
+                    raise BadPlugin(
+                        f"{effect.file}: stage '{stage}' belongs to the part '{STAGES[stage]}', not to '{effect.part}'"
+                    )
+            if "layer" in effect.stages and any(self.parts[k].mueller is None for k in self.kinds(effect.part)):
                 raise BadPlugin(
                     f"{effect.file}: stage 'layer' belongs to a layer (a part with a Mueller matrix), which "
                     f"'{effect.part}' is not"
@@ -113,51 +170,112 @@ class Registry:
             if twice:
                 raise BadPlugin(f"part '{kind}': parameter {', '.join(sorted(twice))} is declared twice")
 
-    def scan(self, folder: Path) -> None:
-        """Load every plugin file of a folder and its subfolders (names starting with _ or . are passed over)."""
-        folder = Path(folder).resolve()
-        if folder in self.folders:
-            return
-        if not folder.is_dir():
-            raise BadPlugin(f"{folder}: no such folder of plugins")
-        for file in sorted(folder.rglob("*.py")):
-            if any(piece.startswith(("_", ".")) for piece in file.relative_to(folder).parts):
-                continue
-            for item in declared(file):
-                self.add(item, str(file))
-        self.folders.append(folder)
-        self.check()
-        self.classes.clear()  # effects may bring parameters to classes that are built already
+
+def _add(parts: dict[str, Part], effects: dict[str, Effect], item: Part | Effect, file: str) -> None:
+    """Take one declaration in, or say what is wrong with it by itself."""
+    if isinstance(item, Part):
+        if item.category not in CATEGORIES:
+            raise BadPlugin(f"{file}: category {item.category!r} is none of {', '.join(CATEGORIES)}")
+        if item.kind in parts:
+            raise BadPlugin(f"{file}: a part of the kind '{item.kind}' exists already; choose another kind")
+        parts[item.kind] = item
+        return
+    if item.key == "new":
+        raise BadPlugin(
+            f"{file}: an effect cannot be called 'new', which is the word for writing one; choose another name"
+        )
+    if item.key in effects:
+        raise BadPlugin(f"{file}: the effect '{item.name}' exists already ({effects[item.key].file})")
+    for stage in item.stages:
+        if stage not in STAGES:
+            raise BadPlugin(f"{file}: stage {stage!r} is none of {', '.join(STAGES)}")
+    if item.onset not in ("tangent", "secant", "both"):
+        raise BadPlugin(f"{file}: onset {item.onset!r} is none of tangent, secant, both")
+    for p in item.parameters:
+        if isinstance(p, Parameter) and p.neutral is None:
+            raise BadPlugin(f"{file}: parameter '{p.name}' of the effect '{item.name}' declares no neutral value")
+    effects[item.key] = item
 
 
-def declared(file: Path) -> Iterator[Part | Effect]:
-    """Execute a plugin file and yield what it declares, with the file's docstring as documentation."""
-    name = "optics_plugin_" + re.sub(r"\W", "_", str(file.resolve()))
+# -- which plugins there are
+# --------------------------------------------------------------------------------------------
+
+_registries: dict[tuple[Path, ...], tuple[tuple, Registry]] = {}  # folders -> their files, and what they hold
+_included: tuple[Path, ...] = ()  # folders that every scene of this process knows beside the shipped ones
+_default: Registry | None = None
+
+
+def known(*folders: str | Path | None) -> Registry:
+    """The registry of the shipped plugins, of the folders that were included, and of these."""
+    return Registry.of((shipped("plugins"), *_included, *(f for f in folders if f is not None)))
+
+
+def include(*folders: str | Path) -> Registry:
+    """Make folders known to every scene that is loaded from now on; returns `default()`."""
+    global _included, _default
+    more = tuple(Path(folder).resolve() for folder in folders)
+    _default = known(*more)  # raises before anything is taken over
+    _included = tuple(dict.fromkeys((*_included, *more)))
+    return _default
+
+
+def default() -> Registry:
+    """What `mi.load_file` knows: the shipped plugins and the included folders, as they were at the last `include`."""
+    global _default
+    if _default is None:
+        _default = known()
+    return _default
+
+
+# -- one file
+# ------------------------------------------------------------------------------------------------------------
+
+
+def _files(folder: Path) -> list[Path]:
+    """The plugin files of a folder and its subfolders, in order."""
+    if not folder.is_dir():
+        raise BadPlugin(f"{folder}: no such folder of plugins")
+    return [
+        file
+        for file in sorted(folder.rglob("*.py"))
+        if not any(piece.startswith(("_", ".")) for piece in file.relative_to(folder).parts)
+    ]
+
+
+def _content(file: Path) -> str:
+    return hashlib.sha256(file.read_bytes()).hexdigest()
+
+
+_declared: dict[Path, tuple[str, tuple[Part | Effect, ...]]] = {}  # file -> its hash, and what it declares
+
+
+def declared(file: Path, content: str | None = None) -> tuple[Part | Effect, ...]:
+    """Execute a plugin file and return what it declares, with the file's docstring as documentation.
+
+    A file is executed again when its content (a hash) has changed."""
+    file = Path(file).resolve()
+    content = content or _content(file)
+    if file in _declared and _declared[file][0] == content:
+        return _declared[file][1]
+    for name, now in EARLIER.items():
+        sys.modules.setdefault(name, importlib.import_module(now))
+    name = "optics_plugin_" + re.sub(r"\W", "_", str(file))
     spec = importlib.util.spec_from_file_location(name, file)
     module: ModuleType = importlib.util.module_from_spec(spec)
+    before = sys.modules.get(name)
     sys.modules[name] = module
     try:
-        spec.loader.exec_module(module)
+        # compiled here: the interpreter's own cache tells versions of a file apart by whole seconds and its size
+        exec(compile(file.read_text(encoding="utf-8"), str(file), "exec", dont_inherit=True), vars(module))
     except Exception as error:
-        del sys.modules[name]
+        if before is None:
+            del sys.modules[name]
+        else:
+            sys.modules[name] = before
         raise BadPlugin(f"{file}: {type(error).__name__}: {error}") from error
     found = [v for k, v in vars(module).items() if isinstance(v, (Part, Effect)) and not k.startswith("_")]
     if not found:
         raise BadPlugin(f"{file}: declares neither a part nor an effect; files that only help begin with '_'")
-    for item in found:
-        object.__setattr__(item, "doc", module.__doc__ or "")
-        object.__setattr__(item, "file", str(file))
-        yield item
-
-
-_registry: Registry | None = None
-
-
-def registry() -> Registry:
-    """The registry of this process; the shipped plugins are scanned at the first call."""
-    global _registry
-    if _registry is None:
-        fresh = Registry()
-        fresh.scan(shipped("plugins"))
-        _registry = fresh
-    return _registry
+    items = tuple(replace(item, doc=module.__doc__ or "", file=str(file)) for item in found)
+    _declared[file] = content, items
+    return items

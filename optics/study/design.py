@@ -318,7 +318,6 @@ def plan(
     from scipy.special import ndtr
 
     from optics.fit.model import Model
-    from optics.scene.registry import registry
     from optics.study import loop
 
     say = progress or (lambda what, done, total: None)
@@ -331,7 +330,7 @@ def plan(
     width, height = scene.camera.resolution
     swept = width * height == 1
     known = [
-        e for _, e in sorted(registry().effects.items()) if scene.can_express(e) and not (swept and e.mixes_pixels)
+        e for _, e in sorted(scene.registry.effects.items()) if scene.can_express(e) and not (swept and e.mixes_pixels)
     ]
     effects = list({e.key: e for e in effects or ()}.values())  # an effect named twice would be its own rival
     for e in effects:
@@ -427,23 +426,22 @@ def session(
     Raises as `plan`, and UnknownKey for an effect that nobody knows.
     """
     from optics.scene import loader as scenes
-    from optics.scene.registry import registry
     from optics.study import loop
 
     _require(frames, share)  # before anything is loaded
     path = Path(subject)
     if (path / "ladder.json").is_file():
         study, model, setup = loop.take_up(path)
-        chosen = [registry().find_effect(name) for name in effects] or loop.candidates(model, study)
         scene = scenes.load(model.scene.path, {**model.scene.defines, **(defines or {})}, plugins=plugins)
         scene.set(model.captures.parameters)  # what was set in all frames stays so
+        chosen = [scene.registry.find_effect(name) for name in effects] or loop.candidates(model, study)
         return plan(
             scene,
             frames,
             chosen,
             noise=replace(model.noise, **(noise or {})),
             setup=setup,
-            added=loop.effects_of(study),
+            added=loop.effects_of(study, scene.registry),
             values=Values(dict(study.fit(len(study.steps) - 1)["parameters"])),
             share=share,
             fixed_exposure=fixed_exposure,
@@ -457,7 +455,7 @@ def session(
         if longest > LONG_SIDE:
             defines |= {n: str(max(round(int(m[1]) * LONG_SIDE / longest), 1)) for n, m in sizes.items()}
     scene = scenes.load(file, defines, plugins=plugins)
-    chosen = [registry().find_effect(name) for name in effects]
+    chosen = [scene.registry.find_effect(name) for name in effects]
     return plan(
         scene,
         frames,

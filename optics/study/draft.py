@@ -30,7 +30,7 @@ from optics.errors import OutputExists, UnknownKey
 from optics.scene import loader as scenes
 from optics.scene.declare import STAGES
 from optics.scene.mitsuba_parts import is_taken
-from optics.scene.registry import Registry
+from optics.scene.registry import Registry, known
 from optics.study import loop
 from optics.study.record import Study
 
@@ -452,8 +452,10 @@ def draft_effect(
     )
 
 
-def from_study(folder: str | Path, along: str | None, name: str, registry: Registry) -> tuple[str, Path]:
+def from_study(folder: str | Path, along: str | None, name: str, further: str | Path | None = None) -> tuple[str, Path]:
     """The text of a draft from the last diagnosis of a study, and the folder of plugins where the study will find it.
+
+    further   a folder of plugins that the name must not clash with, besides the study's own
 
     Raises ValueError where there is no diagnosis, or where the scene cannot carry the draft.
     """
@@ -465,8 +467,7 @@ def from_study(folder: str | Path, along: str | None, name: str, registry: Regis
     f = fingerprint_of(diagnosis, along)
     part = STAGES[_carrier(f).stage]
     plugins = loop.plugins_of(loop.Setup(**study.record["facts"]["setup"]))
-    if plugins.is_dir():
-        registry.scan(plugins)
+    registry = known(further, plugins if plugins.is_dir() else None)
     text = scenes.find(study.record["scene"]).read_text(encoding="utf-8")
     if part != "camera" and (f'type="{part}"' not in text or 'type="clear"' in text):
         can = [g.coordinate for g in diagnosis.fingerprints if _carrier(g) and STAGES[_carrier(g).stage] == "camera"]

@@ -30,7 +30,7 @@ from optics.fit.model import Model
 from optics.scene import loader as scenes
 from optics.scene.declare import Effect
 from optics.scene.parameter import Values, Variable
-from optics.scene.registry import registry
+from optics.scene.registry import Registry
 from optics.study import record as ladder
 from optics.study.record import Study
 from optics.words import some, spaced
@@ -193,9 +193,9 @@ def _with_prior(model, variable: Variable, pattern: str, prior) -> Variable:
     return variable.with_prior(mean, prior[1])
 
 
-def effects_of(study: Study) -> list[Effect]:
-    """The effects that the study has added so far."""
-    return [registry().find_effect(step["effect"]) for step in study.steps if step["effect"]]
+def effects_of(study: Study, registry: Registry) -> list[Effect]:
+    """The effects that the study has added so far, of the registry of its scene."""
+    return [registry.find_effect(step["effect"]) for step in study.steps if step["effect"]]
 
 
 def effect_variables(model: Model, effect: Effect) -> list[Variable]:
@@ -304,7 +304,7 @@ def begin(
         folder,
         scene=str(model.captures.scene),
         captures=str(setup.captures),
-        inputs=[setup.captures, model.scene.path, *registry().folders],
+        inputs=[setup.captures, model.scene.path, *model.scene.registry.folders],
         seed=setup.seed,
         command=command,
         title=title,
@@ -485,7 +485,7 @@ def kept(study: Study, model: Model, index: int = -1) -> tuple[list[Variable], V
         if step["effect"]:
             variables += [
                 v
-                for v in effect_variables(model, registry().find_effect(step["effect"]))
+                for v in effect_variables(model, model.scene.registry.find_effect(step["effect"]))
                 if v.frames is None or set(v.frames) <= set(fitted)
             ]
     return variables, values, fitted
@@ -499,10 +499,10 @@ def restore(study: Study, model: Model, index: int = -1) -> calibrate.Fit:
 
 def candidates(model: Model, study: Study) -> list[Effect]:
     """Every effect that the scene can express and the study has not added."""
-    done = {e.key for e in effects_of(study)}
+    done = {e.key for e in effects_of(study, model.scene.registry)}
     return [
         e
-        for k, e in sorted(registry().effects.items())
+        for k, e in sorted(model.scene.registry.effects.items())
         if k not in done and model.scene.can_express(e) and not (e.mixes_pixels and model.captures.table is not None)
     ]
 

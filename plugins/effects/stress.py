@@ -9,7 +9,7 @@ P_u), with the coefficient C = `stress_optic` (C > 0: the larger tension is the 
     disc    a disc of the diameter `stress_size` pressed along its y axis: s_ij of the two point loads, in units of
             2P/(pi D d)
     bend    a bar along x, bent: (2 y/size, 0)
-    gel     of the skin that the present press deforms (set by the scene), stress in units of its shear modulus,
+    gel     of the skin that the present press deforms (see `field`), stress in units of its shear modulus,
             thickness included
     a file  an image (H, W, 2 or more) in NPY or EXR: P_q and P_u over the square of `stress_size`, row 0 on top
 Fingerprint
@@ -24,9 +24,12 @@ References
 
 import math
 
+from optics.errors import BadScene
 from optics.polarization.mueller import cos, real, retarder, sin, where
 from optics.scene.declare import Effect
+from optics.scene.layer import PatternImage
 from optics.scene.parameter import Parameter
+from optics.skin.halfspace import SkinStress
 
 
 def strain(crossing, sheet):
@@ -59,8 +62,25 @@ def disc(x, y, radius):
     return where(inside, q, 0.0 * q), where(inside, u, 0.0 * u)
 
 
+def field(sheet):
+    """The pattern that a file holds, or the present press's stress in the skin, from the sheet's depth on both sides
+    alike up to the skin's inner face."""
+    pattern = sheet.stress_pattern
+    if pattern.endswith((".npy", ".exr")):
+        return PatternImage(sheet.find_file(pattern))
+    if pattern != "gel":
+        return None
+    if sheet.skin is None or sheet.carrier is None:
+        raise BadScene(
+            f"'{sheet.name}': stress_pattern = 'gel' needs a sheet in the skin, a shape of the type 'carried'"
+        )
+    thickness = sheet.skin.number("thickness")
+    return SkinStress(sheet.skin, max(2 * sheet.carrier.number("depth") - thickness, 0.0), thickness)
+
+
 effect = Effect(
     name="stress birefringence",
+    field=field,
     part="sheet",
     stages={"layer": strain},
     onset="both",

@@ -5,7 +5,8 @@ Definition
 A `target` in the scene with distance < 0 is pressed -distance into the face at z = 0. How the body gives way is that of
 springs between the corners of cubes (D3Q14, optics.skin.lattice), between them a cubic spline; the cells of a grid are
 carried along. Where the target touches, it is in optical contact: its surface lies inside the body, by 5 micrometres,
-so that light that would be totally reflected meets it instead. Fingerprint
+so that light that would be totally reflected meets it instead.
+Fingerprint
     the touched cells change from what total reflection shows to the colour of what touches, lit through the walls;
     around it the walls' lines bend, the wider the deeper.
 Validity
@@ -57,7 +58,8 @@ def build():
 
     class Block(Declared.on_mesh()):
         kind = "block"
-        target = None  # what presses it, set by the scene
+        moved_by = "target"
+        target = None
 
         def __init__(self, props):
             self.layers = int(props.get("layers", 7))  # of the lattice
@@ -75,6 +77,10 @@ def build():
             params = mi.traverse(self)
             params["faces"] = mi.UInt32(faces.astype(np.uint32).ravel())
             self.rebuild(params)
+
+        def wire(self, scene):
+            self.target = scene.one("target")
+            self.follow(self.target)
 
         def faces(self):
             """Triangles of the six sides, and the number of vertices: a grid on each, of (columns, rows) or along z."""

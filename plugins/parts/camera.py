@@ -13,7 +13,8 @@ horizontal field of view, f_y = f_x aspect, the principal point (c_x, c_y) is gi
 image, L_b is the radiance in band b, and M the sensitivities of the channels in the bands (identity, or a measured
 camera of the colour-science library by its name). XML may give `fx`, `fy`, `cx`, `cy` (px) in place of the field of
 view. Frame: x right, y down, z forward (OpenCV); the transform `to_world` gives the nominal pose, `x` ... `roll` what
-departs from it. Fingerprint
+departs from it.
+Fingerprint
     principal point and pose shift the image; distortion grows with the third power of the radius; exposure scales all.
 Validity
     central projection; a fisheye needs another part. Monotone response: G'(m) > 0 on [0, 1].

@@ -7,7 +7,8 @@ Definition
 A rectangle `width` x `length` around the world's z axis, `depth` below the untouched face at z = 0; it lies flat while
 the gel is not pressed. Its texture coordinates are those of the place at rest, u = x/width + 1/2, v = y/length + 1/2:
 the first direction runs along x at rest and turns with the sheet. Its normals look at the camera, towards -z. A layer
-on it (a polarizer film, a stressed plate) moves, tilts and turns with it. Fingerprint
+on it (a polarizer film, a stressed plate) moves, tilts and turns with it.
+Fingerprint
     a press tilts and shifts the sheet over about its depth around the contact; without a press nothing.
 Validity
     dents shallower than `depth`, small strains; effects of the face's shape other than the press are not carried. The
@@ -45,7 +46,8 @@ def build():
 
     class Carried(Declared.on_mesh()):
         kind = "carried"
-        rides = "gel"  # role of the part that carries it
+        moved_by = "gel"
+        carrier = None
 
         def __init__(self, props):
             self.columns, self.rows = int(props.get("columns", 121)), int(props.get("rows", 109))
@@ -54,7 +56,6 @@ def build():
             faces = np.stack([a, d, c, a, c, b], -1)  # normals towards the camera (-z)
             mi.Mesh.__init__(self, "carried", index.size, faces.size // 3, props, True, True)
             self.declare(props)
-            self.carrier = None
             self.u, self.v = np.linspace(0, 1, self.columns)[None, :], np.linspace(0, 1, self.rows)[:, None]
             params = mi.traverse(self)
             params["faces"] = mi.UInt32(faces.astype(np.uint32).ravel())
@@ -62,10 +63,9 @@ def build():
             params["vertex_texcoords"] = mi.Float(uv.astype(np.float32).ravel())
             self.rebuild(params)
 
-        def carry(self, gel):
-            """Move with the present dent of a gel, from now on."""
-            self.carrier = gel
-            self.rebuild(mi.traverse(self))
+        def wire(self, scene):
+            self.carrier = scene.one("gel")
+            self.follow(self.carrier)
 
         def rebuild(self, params):
             """Vertices for the present parameters and dent."""

@@ -7,7 +7,8 @@ with `wall` + `wall_error` for the wall. A cell that was not filled lacks the sh
 1 + (n - 1)(1 - u), absorption and scattering times (1 - u). Which cell is said by `unfilled_column`, `unfilled_row` and
 `unfilled_layer`, from 0 on, layers from the touched face. `skin` of wall material lies between the touched face at z =
 0 and the grid; walls of the thickness `wall` part the cells. The normals point out of the cells, into the walls. Where
-the scene has a `block` that gives way, its corners move with it. Fingerprint
+the scene has a `block` that gives way, its corners move with it.
+Fingerprint
     the grid's period and its walls' width, everywhere; a wrong wall moves all lines alike.
 Validity
     boxes with flat faces; deformed ones are flat in two triangles a side. Numbers of cells are structure (XML
@@ -81,7 +82,8 @@ def build():
 
     class Cells(Declared.on_mesh()):
         kind = "cells"
-        rides = "block"  # role of the part that carries it
+        moved_by = "block"
+        block = None
 
         def __init__(self, props):
             self.counts = tuple(int(props.get(n, d)) for n, d in (("columns", 20), ("rows", 20), ("layers", 6)))
@@ -116,15 +118,16 @@ def build():
             )
             return low[:, None] + corners * (pitch - wall)
 
-        def carry(self, block):
-            """Place the cells as the present press of the block moves them."""
-            self.rebuild(mi.traverse(self), block)
+        def wire(self, scene):
+            self.block = scene.one("block")
+            self.follow(self.block)
 
-        def rebuild(self, params, block=None):
+        def rebuild(self, params):
+            """Vertices for the present parameters, moved as the present press moves the block."""
             self.placed = self.vertices()
-            self.moved = block is not None and block.press() is not None
+            self.moved = self.block is not None and self.block.press() is not None
             if self.moved:
-                self.placed = self.placed + block.displacement(self.placed)
+                self.placed = self.placed + self.block.displacement(self.placed)
             params["vertex_positions"] = mi.Float(self.placed.astype(np.float32).ravel())
             params.update()
 

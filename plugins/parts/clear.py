@@ -8,7 +8,8 @@ Definition
     I exp(-alpha d)                                              Beer-Lambert along every stretch d inside (27-29)
 `index` and `absorption` hold at 540 nm; how they change with the wavelength are effects (`dispersion`, `coloured
 absorption`). The surface's normals point out of the body. `outside` (XML) names the clear material around it, as the
-wall around a cell's filling; without it that is air. Fingerprint
+wall around a cell's filling; without it that is air.
+Fingerprint
     walls show as bright and dark lines, totally reflecting where they are met at grazing incidence; absorption darkens
     long ways.
 Validity
@@ -41,24 +42,38 @@ def build():
     import drjit as dr
     import mitsuba as mi
 
+    from optics.errors import BadScene
     from optics.light.transport import coefficient
     from optics.polarization.mueller import diattenuator, fresnel, fresnel_reflection
 
     class Clear(passing(mi.BSDFFlags.DeltaTransmission)):
         kind = "clear"
-        around = None  # the clear material outside, set by the scene; None is air
-        fills_cells = False  # set by the scene as well: what light is scattered is known in cells only
+        around = None  # the clear material outside; None is air
+        fills_cells = False  # what light is scattered is known in cells only
         bands = 3  # of the scene
 
         def __init__(self, props):
             self.outside = str(props.get("outside", ""))
             super().__init__(props)
+            if self.outside:
+                self._waits = f"'{self.name}' lies inside '{self.outside}'"
             sides = mi.BSDFFlags.FrontSide | mi.BSDFFlags.BackSide
             self.m_components = [
                 mi.BSDFFlags.DeltaReflection | sides,
                 mi.BSDFFlags.DeltaTransmission | mi.BSDFFlags.NonSymmetric | sides,
             ]
             self.m_flags = self.m_components[0] | self.m_components[1]
+
+        def wire(self, scene):
+            self.fills_cells = any(hasattr(shape, "cells") for shape in scene.shapes_of(self))
+            self.bands = len(getattr(scene.integrator, "bands", range(self.bands)))
+            self.around = scene.named(self.outside) if self.outside else None
+            if self.outside and getattr(self.around, "role", "") != self.role:
+                others = ", ".join(p.name for p in scene.parts if p.role == self.role and p is not self)
+                raise BadScene(
+                    f"'{self.name}': outside = '{self.outside}'; allowed: the id of a clear material ("
+                    f"{others or 'there is no other'}), or nothing for air"
+                )
 
         def takes(self, name):
             if name in ("dispersion", "absorption_slope"):  # of one band they say no more than the coefficient itself

@@ -6,7 +6,8 @@ Definition
     L1 = T L2 / n^2                                              radiance seen from the side of medium 1
 with c = cos(theta), n = index; medium 1 is on the side that the surface's normal points to (the camera's side). Light
 is always transmitted; the reflected share is lost (its weight is the transmitted one), so that a ray never branches and
-the index never enters a sampling probability. Two of them make a window: air to acrylic, acrylic to gel. Fingerprint
+the index never enters a sampling probability. Two of them make a window: air to acrylic, acrylic to gel.
+Fingerprint
     the image shrinks towards the axis, more with depth; a small fall-off towards the corners.
 Validity
     no reflection from the window; flat and parallel to itself. At index 1 the interface is not there.
@@ -89,4 +90,4 @@ def build():
     return Interface
 
 
-part = Part("interface", "bsdf", PARAMETERS, build)
+part = Part("interface", "bsdf", PARAMETERS, build, refracts=True)

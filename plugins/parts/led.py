@@ -12,7 +12,8 @@ spectrum: a Gaussian of the given peak wavelength and full width at half maximum
 is 0 (a white LED). power_b is `power_r`, `power_g`, `power_b` in the first three bands, 1 in a fourth: what an LED of
 unknown spectrum is calibrated by. They share a scale with `power` and, over all LEDs of a band, with the membrane's
 rho: hold one of them. With an emitting area A > 0 the source is a disc across the axis, of radius sqrt(A/pi): shadows
-get a penumbra. Fingerprint
+get a penumbra.
+Fingerprint
     position and power shape the field of every frame in which the LED is lit; mu shows far from the axis.
 Validity
     distances much larger than the die; no colour change over the lobe.

@@ -6,7 +6,8 @@ Definition
     cap    base + height axis, radius r, facing the camera (-z)
 `columns` x `rows` of them (XML integers, 5 x 4) at pitch_x, pitch_y around the world's z axis. The cap moves as a rigid
 disc, the foot's rim stays on the face, and the wall runs straight between them, so that no light passes under a marker
-on a bent face. The foot is open: the skin is there. Fingerprint
+on a bent face. The foot is open: the skin is there.
+Fingerprint
     a press moves markers outwards and towards the camera and tilts them away from the contact.
 Validity
     markers as soft as the skin or small against the bend of its face; otherwise as for the part `carried`.
@@ -47,7 +48,8 @@ def build():
 
     class Markers(Declared.on_mesh()):
         kind = "markers"
-        rides = "gel"  # role of the part that carries it
+        moved_by = "gel"
+        carrier = None
 
         def __init__(self, props):
             self.columns, self.rows = int(props.get("columns", 5)), int(props.get("rows", 4))
@@ -70,17 +72,15 @@ def build():
             faces = faces + (middle + 1) * np.arange(count)[:, None, None]
             mi.Mesh.__init__(self, "markers", (middle + 1) * count, faces.size // 3, props, True, False)
             self.declare(props)
-            self.carrier = None
             angle = 2 * np.pi / SEGMENTS * i
             self.circle = np.stack([np.cos(angle), -np.sin(angle)], -1)  # counterclockwise as the camera sees it
             params = mi.traverse(self)
             params["faces"] = mi.UInt32(faces.astype(np.uint32).ravel())
             self.rebuild(params)
 
-        def carry(self, gel):
-            """Move with the present dent of a gel, from now on."""
-            self.carrier = gel
-            self.rebuild(mi.traverse(self))
+        def wire(self, scene):
+            self.carrier = scene.one("gel")
+            self.follow(self.carrier)
 
         def rest(self):
             """(N, 2) places (x, y) of the feet's middles at rest, mm: row by row, from low y to high and from low x to

@@ -6,7 +6,8 @@ Definition
 with the reflectance rho_c of each band (red, green, blue: the first three bands of the integrator, times an optional
 texture `reflectance`), the roughness sigma (rad) of the facets, alpha and beta the larger and the smaller of the angles
 to the normal. With s = wi.wo - cos_i cos_o the product cos(phi) sin(alpha) tan(beta) is s / max(cos_i, cos_o), which
-has no singularity (Oren & Nayar's qualitative model). Fingerprint
+has no singularity (Oren & Nayar's qualitative model).
+Fingerprint
     rho scales a band everywhere; sigma brightens grazing views of slopes that face the light and flattens the shading.
 Validity
     opaque coating, no lobe towards the mirror direction (the effect "specular lobe" adds one); depolarizes fully. The

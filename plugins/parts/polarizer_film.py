@@ -9,7 +9,8 @@ with t across the ray and across the absorbing molecules, t = k x a: two crossed
 away from it, in a cross of dark arms. A sheet of the polarization ratio P lets T2 = T1 (1 - P)/(1 + P) through: 99 % is
 0.005 T1. The angle counts from the surface's x axis (the first edge of a rectangle) to its y axis: counterclockwise for
 a viewer at whom the surface's normal points. T1 and T2 are those of the whole sheet. With `face` > 0 both its faces
-reflect that share, and light that goes to and fro between them and the faces of other films is summed. Fingerprint
+reflect that share, and light that goes to and fro between them and the faces of other films is summed.
+Fingerprint
     two of them follow Malus, cos^2 of the angle between; a leak lifts the dark end, an offset shifts the curve, a
     wobble returns once per turn (Malus twice), a backlash splits the curves turned one way and the other.
 Validity
@@ -148,4 +149,4 @@ def polarize(crossing, film):
     return film_matrix * film.inserted + absorber(1 - film.inserted)
 
 
-part = layer("polarizer_film", PARAMETERS, polarize)
+part = layer("polarizer_film", PARAMETERS, polarize, polarizes=True)

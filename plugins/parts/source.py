@@ -6,7 +6,8 @@ Definition
 with the power (radiance, relative), the shares of the first three bands, the spectrum w of an LED (a Gaussian; 1 in
 every band when `wavelength` is 0), and the linear polarization q = `dop_q` = p cos(2a), u = `dop_u` = p sin(2a) of the
 degree p along the angle a, from the surface's x axis to its y axis. `time` is the experimenter's clock, a setting of a
-frame or a reading. Fingerprint
+frame or a reading.
+Fingerprint
     power scales a reading; polarized light makes the first polarizer's own angle count; a drift grows with time,
     whatever is set.
 Validity

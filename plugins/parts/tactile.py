@@ -8,7 +8,8 @@ camera's ray passes flat interfaces (part `interface`) by Snell's law with the t
 sampled through null and index-matched surfaces; homogeneous media are followed analytically, exp(-sigma_a d) per
 segment; the gel's own effects (stages `segment` and `volume`) act on the path inside -thickness < z < 0. Every surface
 is lit by all point lights and by one of the others, drawn by Monte Carlo: to draw one of the LEDs would be most of the
-noise. Every bounce after the first is scaled by `interreflection`: 1 is physics, 0 is direct light only. Fingerprint
+noise. Every bounce after the first is scaled by `interreflection`: 1 is physics, 0 is direct light only.
+Fingerprint
     interreflection fills shadows and the inner flanks of a dent.
 Validity
     scattering media only to first order (effect "gel haze"); refraction of the light on its way from an LED to the
@@ -21,6 +22,7 @@ References
 from optics.scene.declare import Part
 from optics.scene.mitsuba_parts import Declared
 from optics.scene.parameter import Parameter
+from optics.scene.wiring import ensure_wired
 
 PARAMETERS = (
     Parameter(
@@ -94,6 +96,7 @@ def build():
             return [f"S{i}.{j}" for i in range(4) for j in range(self.lanes)] if self.stokes and mi.is_polarized else []
 
         def sample_rays(self, scene, sensor, sampler, *args, **kwargs):
+            ensure_wired(scene, self)
             ray, weight, position = super().sample_rays(scene, sensor, sampler, *args, **kwargs)
             # of our camera's frame; up in a stock one's, which is the same for Stokes vectors
             down = mi.Vector3f(0, 1, 0)

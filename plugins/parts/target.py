@@ -7,7 +7,8 @@ Definition
                       + length
     stance ball       a ball of the diameter, its middle at (x, y, distance + diameter/2)
 The nearest point stands `distance` before the untouched face at z = 0; a negative distance is that of an object that
-presses it: a `block` gives way to it, a `gel` has a press of its own. Fingerprint
+presses it: a `block` gives way to it, a `gel` has a press of its own.
+Fingerprint
     its image shrinks with the distance, as 1/(distance + camera's distance from the face).
 Validity
     circles are polygons of 256 sides, inside them by 8e-5 of the radius. Coordinates (u, v) on it, for maps of light

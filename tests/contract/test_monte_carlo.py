@@ -7,10 +7,10 @@ units of their own standard errors."""
 import numpy as np
 import pytest
 
-from optics.scene.registry import registry
+from optics.scene.registry import known
 
 KINDS = ("clear", "cells", "block", "room")
-EFFECTS = sorted(k for k, e in registry().effects.items() if e.part in KINDS and e.part != "room")  # a light of its own
+EFFECTS = sorted(k for k, e in known().effects.items() if e.part in KINDS and e.part != "room")  # a light of its own
 SEEDS = 4
 DEFINES = {
     "width": 8,
@@ -53,7 +53,7 @@ KEYS = [
     *(
         f"{part}.{p.name}"
         for part, kind in (("walls", "clear"), ("filling", "clear"), ("grid", "cells"))
-        for p in registry().parameters_of(kind)
+        for p in known().parameters_of(kind)
         if p.name not in BENT and not p.name.startswith("unfilled") and f"{part}.{p.name}" != "walls.scattering"
     ),
 ]
@@ -98,12 +98,12 @@ def beside(p):
 def test_an_effect_at_neutral_is_not_there(key, bench):
     """Its functions, evaluated next to neutral, leave the image as it is, with the same random numbers."""
     scene, renderer, values = bench
-    effect = registry().effects[key]
+    effect = known().effects[key]
     own = {
         f"{n}.{p.name}": p
         for n, part in scene.parts.items()
         if part.kind == effect.part
-        for p in registry().effect_parameters(effect)
+        for p in known().effect_parameters(effect)
     }
     one, other = (
         renderer.estimate({**values, **{k: f(p) for k, p in own.items()}}).radiance
@@ -231,7 +231,7 @@ def test_effects_are_offered_where_they_act(bench):
     from optics.errors import BadScene
 
     scene, renderer, values = bench
-    effects = registry().effects
+    effects = known().effects
     assert scene.keys_of(effects["volume-scattering"]) == {"scattering": ["filling.scattering"]}
     assert set(scene.keys_of(effects["dispersion"])["dispersion"]) == {
         f"{n}.dispersion" for n in ("window", "walls", "filling")

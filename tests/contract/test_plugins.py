@@ -14,23 +14,21 @@ import numpy as np
 import pytest
 
 from optics.errors import BadPlugin
-from optics.files.output import shipped
 from optics.light.renderer import POWERS
 from optics.scene.declare import IMAGE_STAGES, Effect
-from optics.scene.registry import Registry, registry
+from optics.scene.registry import Registry, known
 
-PARTS = sorted(registry().parts)
+REGISTRY = known()
+PARTS = sorted(REGISTRY.parts)
 CHANCE = (
     "clear",
     "cells",
     "block",
     "room",
 )  # parts that light is followed through by Monte Carlo: their contract stands in test_by_chance.py
-EFFECTS = sorted(k for k, e in registry().effects.items() if e.part not in CHANCE)
-NUMBERS = [
-    (kind, p.name) for kind in PARTS if kind not in CHANCE for p in registry().parameters_of(kind) if p.is_number
-]
-LAYERS = [kind for kind in PARTS if registry().parts[kind].mueller is not None]
+EFFECTS = sorted(k for k, e in REGISTRY.effects.items() if e.part not in CHANCE)
+NUMBERS = [(kind, p.name) for kind in PARTS if kind not in CHANCE for p in REGISTRY.parameters_of(kind) if p.is_number]
+LAYERS = [kind for kind in PARTS if REGISTRY.parts[kind].mueller is not None]
 MOVED = ("carried", "markers", "target")  # kinds of shapes that a scene moves besides the gel
 LAYERED = ("layer", "glow")  # stages whose functions are differentiated by complex step
 SECTIONS = ("Definition", "Fingerprint", "Validity", "References")
@@ -68,19 +66,19 @@ def ways(how):
     return [
         pytest.param(kind, name, id=f"{kind}.{name}")
         for kind, name in NUMBERS
-        if registry().parameter(kind, name).how == how
+        if REGISTRY.parameter(kind, name).how == how
     ]
 
 
 def settling():
     """Every effect, and every parameter with a neutral value that none frees, as an effect of its own."""
-    freed = {(e.part, name) for e in registry().effects.values() for name in e.parameter_names}
+    freed = {(e.part, name) for e in REGISTRY.effects.values() for name in e.parameter_names}
     alone = [
         Effect(f"{kind} {name}", kind, (name,))
         for kind, name in NUMBERS
-        if registry().parameter(kind, name).neutral is not None and (kind, name) not in freed
+        if REGISTRY.parameter(kind, name).neutral is not None and (kind, name) not in freed
     ]
-    return [pytest.param(e, id=e.key) for e in (*(registry().effects[k] for k in EFFECTS), *alone)]
+    return [pytest.param(e, id=e.key) for e in (*(REGISTRY.effects[k] for k in EFFECTS), *alone)]
 
 
 # -- what a plugin says about itself
@@ -137,12 +135,12 @@ def check_effect_declaration(effect, reg):
 
 @pytest.mark.parametrize("kind", PARTS)
 def test_parts_document_and_declare_themselves(kind, mitsuba):
-    part = registry().parts[kind]
+    part = REGISTRY.parts[kind]
     check_documentation(part)
-    for p in registry().parameters_of(kind):
+    for p in REGISTRY.parameters_of(kind):
         check_declaration(p)
     if part.mueller is not None or part.stokes is not None:
-        for p in registry().parameters_of(kind):
+        for p in REGISTRY.parameters_of(kind):
             assert not p.is_number or p.how == ("ad" if part.stokes and p.name in POWERS else "layer"), (
                 f"{kind}.{p.name}: {p.how}"
             )
@@ -150,11 +148,11 @@ def test_parts_document_and_declare_themselves(kind, mitsuba):
         check()
 
 
-@pytest.mark.parametrize("key", sorted(registry().effects))
+@pytest.mark.parametrize("key", sorted(REGISTRY.effects))
 def test_effects_document_and_declare_themselves(key, mitsuba):
-    effect = registry().effects[key]
+    effect = REGISTRY.effects[key]
     check_documentation(effect)
-    check_effect_declaration(effect, registry())
+    check_effect_declaration(effect, REGISTRY)
     for check in effect.checks:
         check()
 
@@ -226,8 +224,8 @@ def bench_of(benches, mitsuba):
 
     def find(thing, name=""):
         kinds = (thing.part, *thing.requires) if isinstance(thing, Effect) else (thing,)
-        part = registry().parts[kinds[0]]
-        for effect in registry().effects.values():  # what an effect brings to a part is seen where the effect is
+        part = REGISTRY.parts[kinds[0]]
+        for effect in REGISTRY.effects.values():  # what an effect brings to a part is seen where the effect is
             brought = [p.name for p in (*effect.parameters, *effect.shape) if not isinstance(p, str)]
             if effect.part == part.kind and name in brought:
                 kinds += effect.requires
@@ -269,9 +267,9 @@ def surroundings(bench, kind, name):
 def companions(bench, kind, name):
     """Other parameters of the same effect at a plausible value: an exponent shows only where its lobe is there."""
     values = {}
-    for effect in registry().effects.values():
+    for effect in bench.scene.registry.effects.values():
         if effect.part == kind and name in (p.name for p in effect.shape):
-            for p in registry().effect_parameters(effect):
+            for p in bench.scene.registry.effect_parameters(effect):
                 for holder in (n for n, part in bench.scene.parts.items() if part.kind == kind):
                     values[f"{holder}.{p.name}"] = inward(p, p.neutral, p.plausible)
     return values
@@ -290,7 +288,11 @@ def places(bench, key, p, base):
     """
     kind, here = bench.renderer.kind(key), base[key] if p.neutral is None else p.neutral
     away = inward(p, here, 0.7 * p.plausible)
-    if any(e.onset == "secant" for e in registry().effects.values() if e.part == kind and p.name in e.parameter_names):
+    if any(
+        e.onset == "secant"
+        for e in bench.scene.registry.effects.values()
+        if e.part == kind and p.name in e.parameter_names
+    ):
         return (away,)
     if p.how == "difference":  # on one side of 0 a difference does not know that the slope of a square is 0
         return (away,) if p.squared else (here,)
@@ -338,7 +340,9 @@ def beside(p):
 
 def at(bench, effect, value):
     """Values of an effect's own parameters in all parts that have them: value(p)."""
-    return {k: value(p) for p in registry().effect_parameters(effect) for k in keys(bench, effect.part, p.name)}
+    return {
+        k: value(p) for p in bench.scene.registry.effect_parameters(effect) for k in keys(bench, effect.part, p.name)
+    }
 
 
 def check_identity(bench, effect):
@@ -372,7 +376,7 @@ def directions(p):
 def check_continuity(bench, effect):
     """A ten-thousandth of a plausible strength changes the image by about as little of what the plausible one
     changes."""
-    for p in registry().effect_parameters(effect):
+    for p in bench.scene.registry.effect_parameters(effect):
         rest = bench.image(at_rest(bench, effect, p))
         for sign in directions(p):
             whole = np.abs(moved(bench, effect, p, sign * p.plausible) - rest).mean()
@@ -388,7 +392,7 @@ def check_onset(bench, effect):
     declared."""
     if effect.onset == "secant":
         return
-    for p in registry().effect_parameters(effect):
+    for p in bench.scene.registry.effect_parameters(effect):
         rest = bench.image(at_rest(bench, effect, p))
         sign, *back = directions(p)
         steps = [sign * p.plausible / n for n in (32, 64, 128)] + [-sign * p.plausible / 128] * len(back)
@@ -409,7 +413,7 @@ def check_onset(bench, effect):
 
 @pytest.mark.parametrize("key", EFFECTS)
 def test_an_effect_at_neutral_is_not_there(key, bench_of):
-    effect = registry().effects[key]
+    effect = REGISTRY.effects[key]
     check_identity(bench_of(effect), effect)
 
 
@@ -420,7 +424,7 @@ def test_what_has_a_neutral_value_sets_in_continuously(effect, bench_of):
 
 @pytest.mark.parametrize("key", EFFECTS)
 def test_an_effect_sets_in_linearly_or_says_that_it_does_not(key, bench_of):
-    effect = registry().effects[key]
+    effect = REGISTRY.effects[key]
     check_onset(bench_of(effect), effect)
 
 
@@ -463,7 +467,7 @@ def test_a_sheet_at_rest_and_a_film_taken_out_are_not_there(benches, tmp_path):
     values = {
         **bench.values,
         "middle.inserted": 0.0,
-        **{f"sample.{p.name}": p.neutral for p in registry().parameters_of("sheet") if p.neutral is not None},
+        **{f"sample.{p.name}": p.neutral for p in bench.scene.registry.parameters_of("sheet") if p.neutral is not None},
     }
     defines = {k: v for k, v in bench.scene.defines.items() if k not in ("middle", "pattern")}
     bare = type(bench)(scene.load(file, defines), values)
@@ -691,7 +695,7 @@ def check_linear(bench, key):
     [
         pytest.param(k, n, id=f"{k}.{n}")
         for k, n in NUMBERS
-        if registry().parameter(k, n).linear or registry().parameter(k, n).squared
+        if REGISTRY.parameter(k, n).linear or REGISTRY.parameter(k, n).squared
     ],
 )
 def test_declared_linear_or_squared_is_true(kind, name, bench_of):
@@ -804,7 +808,7 @@ def check_image_function(effect, stage, bench):
             **bench.values,
             **{
                 k: inward(p, p.neutral, p.plausible)
-                for p in registry().effect_parameters(effect)
+                for p in bench.scene.registry.effect_parameters(effect)
                 for k in keys(bench, effect.part, p.name)
             },
         }
@@ -831,10 +835,10 @@ def check_image_function(effect, stage, bench):
 
 
 @pytest.mark.parametrize(
-    "key, stage", [(k, s) for k in EFFECTS for s in registry().effects[k].stages if s in IMAGE_STAGES]
+    "key, stage", [(k, s) for k in EFFECTS for s in REGISTRY.effects[k].stages if s in IMAGE_STAGES]
 )
 def test_image_functions_are_affine_or_act_pixel_by_pixel(key, stage, bench_of):
-    effect = registry().effects[key]
+    effect = REGISTRY.effects[key]
     check_image_function(effect, stage, bench_of(effect))
 
 
@@ -850,7 +854,7 @@ def draw(rng, bench, chosen=None):
 def check_random_values(bench, effect, seed):
     """Two draws of an effect's own parameters: finite images, no darker than darkness, within bounds of the scene."""
     rng = np.random.default_rng(seed)
-    own = [*registry().effect_parameters(effect), *effect.shape]
+    own = [*bench.scene.registry.effect_parameters(effect), *effect.shape]
     chosen = {k for p in own for k in keys(bench, effect.part, p.name)}
     for _ in range(2):
         image = bench.image(draw(rng, bench, chosen))
@@ -860,7 +864,7 @@ def check_random_values(bench, effect, seed):
 
 @pytest.mark.parametrize("key", EFFECTS)
 def test_random_strengths_give_images(key, bench_of):
-    effect = registry().effects[key]
+    effect = REGISTRY.effects[key]
     check_random_values(bench_of(effect), effect, seed=EFFECTS.index(key))
 
 
@@ -906,7 +910,7 @@ def test_no_light_no_image(key, bench_of):
 
     A camera that adds to the signal does so at every pixel alike, unless the effect says that it acts through the dark
     signal."""
-    effect = registry().effects[key]
+    effect = REGISTRY.effects[key]
     bench = bench_of(effect)
     dark = {
         **bench.values,
@@ -969,12 +973,12 @@ def check_realisable(bench, kind, seed):
     from optics.polarization.mueller import gain, physical
 
     rng = np.random.default_rng(seed)
-    effects = registry().at_stage(kind, "layer")
+    effects = bench.scene.registry.at_stage(kind, "layer")
     for _ in range(5):
         layer = layer_of(bench, kind, {**bench.values, **draw(rng, bench)})
         crossing = crossings(rng, 40)
         matrices = [e.stages["layer"](crossing, layer) for e in effects] + [
-            registry().parts[kind].mueller(crossing, layer)
+            bench.scene.registry.parts[kind].mueller(crossing, layer)
         ]
         for name, matrix in zip([*(e.name for e in effects), kind], matrices):
             m = matrix.numpy()
@@ -988,7 +992,7 @@ def check_emission(bench, kind, seed):
     rng = np.random.default_rng(seed)
     for _ in range(5):
         source = layer_of(bench, kind, {**bench.values, **draw(rng, bench)})
-        vector = np.stack(np.broadcast_arrays(*registry().parts[kind].stokes(crossings(rng, 40), source)), -1)
+        vector = np.stack(np.broadcast_arrays(*bench.scene.registry.parts[kind].stokes(crossings(rng, 40), source)), -1)
         assert np.isfinite(vector).all()
         assert (np.linalg.norm(vector[..., 1:], axis=-1) <= vector[..., 0] * (1 + 1e-12)).all(), (
             f"{kind}: polarized beyond 1"
@@ -1030,7 +1034,7 @@ def check_both_arithmetics(mi, bench, kind):
     from optics.polarization.layers import Crossing, evaluate
     from optics.scene.layer import numbers_of
 
-    part, bands = registry().parts[kind], (620.0, 540.0, 460.0)
+    part, bands = bench.scene.registry.parts[kind], (620.0, 540.0, 460.0)
     bench.scene.set(bench.values)
     here = crossings(np.random.default_rng(3), 30, bands)
     there = Crossing(
@@ -1040,7 +1044,7 @@ def check_both_arithmetics(mi, bench, kind):
     )
     own = next(p for p in bench.scene.parts.values() if p.kind == kind)
     found, expected = (
-        [e for row in evaluate(part.mueller, c, layer, registry().at_stage(kind, "layer")).rows for e in row]
+        [e for row in evaluate(part.mueller, c, layer, bench.scene.registry.at_stage(kind, "layer")).rows for e in row]
         if part.mueller is not None
         else part.stokes(c, layer)
         for c, layer in ((there, numbers_of(own)), (here, layer_of(bench, kind, bench.values)))
@@ -1058,7 +1062,7 @@ def test_layers_are_physical(kind, bench_of):
     check_realisable(bench_of(kind), kind, LAYERS.index(kind))
 
 
-SOURCES = [kind for kind in PARTS if registry().parts[kind].stokes is not None and kind not in CHANCE]
+SOURCES = [kind for kind in PARTS if REGISTRY.parts[kind].stokes is not None and kind not in CHANCE]
 
 
 @pytest.mark.parametrize("kind", SOURCES)
@@ -1185,37 +1189,27 @@ BAD_LAYER = {
 
 
 @pytest.fixture
-def user_bench(tmp_path, load_bench, monkeypatch):
+def user_bench(tmp_path, load_bench):
     """Writes a plugin, or several by the names of their files, into a user's folder and loads a shipped scene with it
     as a bench, in a registry of its own."""
-    import optics.scene.registry as declarations
-
-    usual = declarations.registry()
 
     def load(text, name="gelsight", slot=None):
         folder = tmp_path / "plugins"
         folder.mkdir()
         for file, own in ({"own": text} if isinstance(text, str) else text).items():
             (folder / f"{file}.py").write_text(own, encoding="utf-8")
-        fresh = Registry()
-        fresh.scan(shipped("plugins"))
-        fresh.scan(folder)
-        monkeypatch.setattr(declarations, "_registry", fresh)
         return load_bench(name, slot, folder)
 
-    yield load
-    monkeypatch.undo()
-    usual.classes.clear()  # Mitsuba knows the user's classes by now: the usual ones are registered again
-    declarations.use_variant()
+    return load
 
 
 def test_a_users_folder_meets_the_same_contract(user_bench):
     bench = user_bench(GOOD)
-    effect = registry().find_effect("LED halo")
+    effect = bench.scene.registry.find_effect("LED halo")
     assert "led_3.halo" in bench.scene.parameters
     check_documentation(effect)
-    check_effect_declaration(effect, registry())
-    check_declaration(registry().parameter("led", "halo"))
+    check_effect_declaration(effect, bench.scene.registry)
+    check_declaration(bench.scene.registry.parameter("led", "halo"))
     check_identity(bench, effect)
     check_continuity(bench, effect)
     check_onset(bench, effect)
@@ -1226,10 +1220,10 @@ def test_a_users_folder_meets_the_same_contract(user_bench):
 
 def test_a_users_layer_meets_the_same_contract(user_bench, mitsuba):
     bench = user_bench(CELL, "polarizer_bench", "sugar_cell")
-    effect = registry().find_effect("cloudy cell")
-    check_documentation(registry().parts["sugar_cell"])
-    check_effect_declaration(effect, registry())
-    for p in registry().parameters_of("sugar_cell"):
+    effect = bench.scene.registry.find_effect("cloudy cell")
+    check_documentation(bench.scene.registry.parts["sugar_cell"])
+    check_effect_declaration(effect, bench.scene.registry)
+    for p in bench.scene.registry.parameters_of("sugar_cell"):
         check_declaration(p)
         assert check_layer_step(bench, f"sample.{p.name}") > 1e-3
         check_linear(bench, f"sample.{p.name}")
@@ -1253,7 +1247,7 @@ def spoil(text, replacements):
 def test_the_contract_notices(fault, user_bench):
     replacements, check = BAD[fault]
     bench = user_bench(spoil(GOOD, replacements))
-    effect = registry().find_effect("LED halo")
+    effect = bench.scene.registry.find_effect("LED halo")
     arguments = {check_forward_mode: (bench, "led_1.halo"), check_documentation: (effect,)}.get(check, (bench, effect))
     with pytest.raises(AssertionError):
         check(*arguments)
@@ -1263,14 +1257,14 @@ def test_the_contract_notices(fault, user_bench):
 def test_the_contract_notices_in_layers(fault, user_bench, mitsuba):
     replacements, check = BAD_LAYER[fault]
     bench = user_bench(spoil(CELL, replacements), "polarizer_bench", "sugar_cell")
-    effect = registry().find_effect("cloudy cell")
+    effect = bench.scene.registry.find_effect("cloudy cell")
     arguments = {
         check_layer_step: (bench, "sample.cloud"),
         check_linear: (bench, "sample.transmittance"),
         check_realisable: (bench, "sugar_cell", 1),
         check_readings: (bench, "sugar_cell"),
         check_both_arithmetics: (mitsuba, bench, "sugar_cell"),
-        check_effect_declaration: (effect, registry()),
+        check_effect_declaration: (effect, bench.scene.registry),
     }.get(check, (bench, effect))
     with pytest.raises((AssertionError, ValueError)):  # an array that is asked for its truth raises by itself
         check(*arguments)
@@ -1281,10 +1275,10 @@ def test_stubs_of_new_effects_meet_the_contract(user_bench):
 
     bench = user_bench({f"my_{stage}": draft.new_effect(f"my {stage}", stage) for stage in draft.STUBS})
     for stage in draft.STUBS:
-        effect = registry().find_effect(f"my {stage}")
+        effect = bench.scene.registry.find_effect(f"my {stage}")
         check_documentation(effect)
-        check_effect_declaration(effect, registry())
-        check_declaration(registry().effect_parameters(effect)[0])
+        check_effect_declaration(effect, bench.scene.registry)
+        check_declaration(bench.scene.registry.effect_parameters(effect)[0])
         check_identity(bench, effect)
         check_continuity(bench, effect)
         check_onset(bench, effect)
@@ -1328,8 +1322,8 @@ def drafts(user_bench):
     return bench
 
 
-def draft_key(name):
-    effect = registry().find_effect(f"along {name}")
+def draft_key(bench, name):
+    effect = bench.scene.registry.find_effect(f"along {name}")
     return f"{ {'gel': 'gel', 'led': 'led_1', 'camera': 'camera'}[effect.part] }.{effect.parameter_names[0]}"
 
 
@@ -1351,11 +1345,11 @@ def test_drafts_act_along_the_coordinate_that_was_diagnosed(drafts):
     lit = (rest.min(-1) > 1e-3) & ~known["rim"] & ~known["shadow"] & ~bent
     assert lit.mean() > 0.6
     for name in draft.CARRIERS:
-        effect = registry().find_effect(f"along {name}")
+        effect = bench.scene.registry.find_effect(f"along {name}")
         check_documentation(effect)
-        check_effect_declaration(effect, registry())
+        check_effect_declaration(effect, bench.scene.registry)
         strength = 0.3
-        gain = bench.image({draft_key(name): strength}) / np.maximum(rest, 1e-6) - 1
+        gain = bench.image({draft_key(bench, name): strength}) / np.maximum(rest, 1e-6) - 1
         expected = {"channel": np.arange(3.0), "signal": rest * 255}.get(name)
         expected = known[name][..., None] if expected is None else expected
         off = np.abs(gain / (along(name) * strength) - expected)[lit]
@@ -1384,7 +1378,7 @@ def test_drafts_act_along_the_coordinate_that_was_diagnosed(drafts):
 def test_derivatives_go_through_a_draft(name, key, tolerance, drafts):
     """Of what moves the coordinate itself, with the draft at a strength at which it matters; tolerances as without
     drafts."""
-    strong = {draft_key(name): 8.0}
+    strong = {draft_key(drafts, name): 8.0}
     before = drafts.derivative(key)
     drafts.values.update(strong)
     assert np.abs(drafts.derivative(key) - before).max() > 0.05 * np.abs(before).max()
@@ -1397,20 +1391,23 @@ def test_a_layers_effect_of_what_is_no_layer_is_refused(user_bench):
 
 
 def test_the_contract_notices_light_polarized_beyond_itself(benches, monkeypatch):
-    part = registry().parts["source"]
+    bench = benches("polarizer_bench")
+    part = bench.scene.registry.parts["source"]
 
     def stokes(crossing, source):
         level, q, u, v = part.stokes(crossing, source)
         return level, 8 * q, 8 * u, v
 
-    monkeypatch.setitem(registry().parts, "source", replace(part, stokes=stokes))
+    parts = {**bench.scene.registry.parts, "source": replace(part, stokes=stokes)}
+    faulty = Registry.holding((item.file, item) for item in (*parts.values(), *bench.scene.registry.effects.values()))
+    monkeypatch.setattr(bench.scene, "registry", faulty)
     with pytest.raises(AssertionError, match="polarized beyond 1"):
-        check_emission(benches("polarizer_bench"), "source", 4)
+        check_emission(bench, "source", 4)
 
 
 def test_the_contract_notices_pixels_that_mix(benches):
     with pytest.raises(AssertionError, match="pixels mix"):
-        check_image_function(replace(registry().effects["lens-blur"], mixes_pixels=False), "lens", benches("gelsight"))
+        check_image_function(replace(REGISTRY.effects["lens-blur"], mixes_pixels=False), "lens", benches("gelsight"))
 
 
 def test_the_contract_notices_glow_without_a_derivative(benches, monkeypatch):

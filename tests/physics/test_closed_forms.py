@@ -707,9 +707,9 @@ def test_vignetting_is_cos_to_the_fourth(bench, view):
 
 
 def effects():
-    from optics.scene.registry import registry
+    from optics.scene.registry import known
 
-    return registry().effects
+    return known().effects
 
 
 def test_blur_spreads_a_point_by_its_variance(view):

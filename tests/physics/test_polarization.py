@@ -18,7 +18,7 @@ from optics.light import paths
 from optics.light.development import STEP
 from optics.polarization import mueller
 from optics.polarization.layers import Crossing, evaluate
-from optics.scene.registry import registry
+from optics.scene.registry import known
 
 RNG = np.random.default_rng  # every test seeds its own
 MONO, SPECTRAL = "llvm_ad_mono_polarized", "llvm_ad_spectral_polarized"
@@ -920,7 +920,7 @@ def settings(rng, kind, count):
     """Values of every parameter anywhere within its bounds (angles within two turns), each neutral in a quarter of the
     draws."""
     own = {}
-    for p in registry().parameters_of(kind):
+    for p in known().parameters_of(kind):
         if not p.is_number:
             own[p.name] = p.default
             continue
@@ -942,7 +942,7 @@ def largest_transmittance(kind, own, crossing):
     return high
 
 
-@pytest.mark.parametrize("kind", sorted(kind for kind, part in registry().parts.items() if part.mueller is not None))
+@pytest.mark.parametrize("kind", sorted(kind for kind, part in known().parts.items() if part.mueller is not None))
 def test_layers_are_physical_for_all_settings_and_directions(mitsuba, kind):
     """Cloude's eigenvalues are >= 0 for every setting within bounds, a leak above the transmittance and huge
     retardances too.
@@ -956,7 +956,7 @@ def test_layers_are_physical_for_all_settings_and_directions(mitsuba, kind):
             own["stress_pattern"] = pattern
         own = {"name": kind, "field": None, **own}
         found = evaluate(
-            registry().parts[kind].mueller, crossing, SimpleNamespace(**own), registry().at_stage(kind, "layer")
+            known().parts[kind].mueller, crossing, SimpleNamespace(**own), known().at_stage(kind, "layer")
         ).numpy()
         assert np.isfinite(found).all()
         dark = found[..., 0, 0] < 1e-12  # of a film that lets nothing through eigenvalues are rounding
@@ -1006,10 +1006,10 @@ def test_slabs_with_reflecting_faces_keep_the_energy(mitsuba):
                 leak_oblique=own["leak_oblique"] * faces,
             )
         matrices = evaluate(
-            registry().parts[kind].mueller,
+            known().parts[kind].mueller,
             crossing,
             SimpleNamespace(name=kind, field=None, **own),
-            registry().at_stage(kind, "layer"),
+            known().at_stage(kind, "layer"),
         )
         slab = mueller.Slab(matrices)
         if kind == "polarizer_film":

@@ -144,9 +144,9 @@ def test_effects_and_their_pages(optics):
 
 
 def test_parts_have_pages_too(optics):
-    from optics.scene.registry import registry
+    from optics.scene.registry import known
 
-    found, (_, text, _) = registry(), optics("effects")
+    found, (_, text, _) = known(), optics("effects")
     assert not set(found.parts) & set(found.effects) and text.splitlines()[-1].endswith(", ".join(sorted(found.parts)))
     for kind, part in found.parts.items():
         code, page, _ = optics("effects", kind.replace("_", "-"))
@@ -159,10 +159,7 @@ def test_parts_have_pages_too(optics):
     assert {p["name"]: p["unit"] for p in record["parameters"]}["x"] == "mm"
 
 
-def test_a_users_plugin_is_listed_beside_the_shipped_ones(optics, tmp_path, monkeypatch):
-    from optics.scene import registry as effect
-
-    monkeypatch.setattr(effect, "_registry", None)
+def test_a_users_plugin_is_listed_beside_the_shipped_ones(optics, tmp_path):
     (tmp_path / "rust.py").write_text(
         '"""Rust: reddens."""\nfrom optics.scene.declare import Effect\nfrom optics.parameter import '
         'Parameter\neffect = Effect("rust", "membrane", (Parameter("rust", "1", 0.0, neutral=0.0),))\n'

@@ -29,9 +29,8 @@ from optics.diagnosis.fingerprints import (
 from optics.diagnosis.statistics import Sweeps
 from optics.diagnosis.verdict import Basis, Family, Fingerprint
 from optics.errors import OutputExists, UnknownKey
-from optics.files.output import shipped
 from optics.lookup import lookup
-from optics.scene.registry import Registry, declared
+from optics.scene.registry import declared, known
 from optics.study import draft
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -260,7 +259,7 @@ def diagnosis(*found, named=None):
 
 def load(text, folder, name):
     """The effect that a text declares; its checks are run."""
-    effect = next(declared(draft.write(text, folder, name)))
+    effect = declared(draft.write(text, folder, name))[0]
     for check in effect.checks:
         check()
     return effect
@@ -495,17 +494,7 @@ def study(tmp_path):
     return folder
 
 
-@pytest.fixture
-def own_registry(monkeypatch):
-    import optics.scene.registry as declarations
-
-    fresh = Registry()
-    fresh.scan(shipped("plugins"))
-    monkeypatch.setattr(declarations, "_registry", fresh)
-    return fresh
-
-
-def test_effects_new_writes_a_draft_beside_the_captures_and_never_twice(study, own_registry, optics):
+def test_effects_new_writes_a_draft_beside_the_captures_and_never_twice(study, optics):
     code, said, noted = optics("effects", "new", "Row bands", "--from", study)
     file = study.parent / "captures" / "plugins" / "row_bands.py"
     assert code == 0 and said.strip() == str(file) and f"optics add {study}" in noted
@@ -514,11 +503,11 @@ def test_effects_new_writes_a_draft_beside_the_captures_and_never_twice(study, o
     assert code == 2 and "an effect 'row bands' exists already" in error and file.read_text() == text
     with pytest.raises(OutputExists, match="row_bands.py exists"):
         draft.write("", file.parent, "row bands")
-    code, page, _ = optics("effects", "row-bands")
+    code, page, _ = optics("effects", "row-bands", "--plugins", file.parent)
     assert code == 0 and "REPLACE the table" in page and "row_bands.py" in page
 
 
-def test_a_draft_is_of_the_last_diagnosis_and_goes_where_the_study_looks(study, own_registry, optics):
+def test_a_draft_is_of_the_last_diagnosis_and_goes_where_the_study_looks(study, optics):
     record = json.loads((study / "ladder.json").read_text())
     record["facts"]["setup"]["plugins"] = str(study.parent / "own")
     (study / "ladder.json").write_text(json.dumps(record))
@@ -537,7 +526,7 @@ def test_a_draft_is_of_the_last_diagnosis_and_goes_where_the_study_looks(study, 
     assert "along 'column'" in Path(said.strip()).read_text() and "step 'more'" in Path(said.strip()).read_text()
 
 
-def test_effects_new_writes_a_stub(tmp_path, own_registry, optics):
+def test_effects_new_writes_a_stub(tmp_path, optics):
     code, said, _ = optics("effects", "new", "soft edge", "--part", "led", "-o", tmp_path / "mine")
     assert code == 0 and Path(said.strip()) == tmp_path / "mine" / "soft_edge.py"
     code, page, _ = optics("effects", "soft edge", "--plugins", tmp_path / "mine")
@@ -567,7 +556,7 @@ def test_effects_new_writes_a_stub(tmp_path, own_registry, optics):
         (("new", "a", "--from", "STUDY", "--stage", "lens"), "leave them out"),
     ],
 )
-def test_errors_of_effects_new(words, error, study, tmp_path, own_registry, optics, monkeypatch):
+def test_errors_of_effects_new(words, error, study, tmp_path, optics, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "file").touch()
     code, said, noted = optics("effects", *(study if w == "STUDY" else w for w in words))
@@ -575,7 +564,7 @@ def test_errors_of_effects_new(words, error, study, tmp_path, own_registry, opti
     assert not (tmp_path / "plugins").exists()
 
 
-def test_a_study_without_a_diagnosis_or_without_a_gel(study, own_registry, optics):
+def test_a_study_without_a_diagnosis_or_without_a_gel(study, optics):
     record = json.loads((study / "ladder.json").read_text())
     (study / "ladder.json").write_text(json.dumps({**record, "scene": "polarizer_bench"}))
     code, _, error = optics("effects", "new", "a", "--from", study, "--along", "height")
@@ -594,6 +583,8 @@ def test_names_that_functions_of_a_camera_see_are_those_that_no_effect_may_take(
     own = {"x_fov": 40.0, "principal_x": 0.0, "principal_y": 0.0, "aspect": 1.0}
     camera = SimpleNamespace(
         name="camera",
+        kind="camera",
+        registry=known(),
         resolution=(4, 3),
         sensitivity="identity",
         numbers={n: SimpleNamespace(neutral=None) for n in own},
@@ -602,16 +593,16 @@ def test_names_that_functions_of_a_camera_see_are_those_that_no_effect_may_take(
     assert set(vars(view)) - set(own) == set(draft.VIEW)
 
 
-def test_no_effect_is_called_new(tmp_path, own_registry):
+def test_no_effect_is_called_new(tmp_path):
     from optics.errors import BadPlugin
 
     (tmp_path / "new.py").write_text(draft.new_effect("old").replace('name="old"', 'name="new"'))
     with pytest.raises(BadPlugin, match="cannot be called 'new'"):
-        own_registry.scan(tmp_path)
+        known(tmp_path)
 
 
 @pytest.mark.parametrize("word", ["takes", "held", "eval"])  # of every part, of an instance, of Mitsuba's own classes
-def test_no_parameter_hides_what_its_part_has(word, tmp_path, own_registry):
+def test_no_parameter_hides_what_its_part_has(word, tmp_path):
     from optics.errors import BadPlugin
     from optics.scene.mitsuba_parts import use_variant
 
@@ -619,9 +610,8 @@ def test_no_parameter_hides_what_its_part_has(word, tmp_path, own_registry):
         "from optics.scene.declare import Effect\nfrom optics.scene.parameter import Parameter\n\n"
         f"GLINT = Effect(name='glint', part='membrane', parameters=(Parameter('{word}', '1', 0.0, neutral=0.0),))\n"
     )
-    own_registry.scan(tmp_path)
     with pytest.raises(BadPlugin, match=f"glint.py: parameter '{word}' has the name of something else"):
-        use_variant()
+        use_variant(registry=known(tmp_path))
 
 
 # -- residuals in a report

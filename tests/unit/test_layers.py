@@ -9,7 +9,7 @@ from optics.errors import BadScene, UnknownKey
 from optics.light.renderer import Renderer
 from optics.scene import loader as scenes
 from optics.scene.layer import PatternImage
-from optics.scene.registry import registry
+from optics.scene.registry import known
 
 CAMERA = {"width": "24", "height": "24", "x_fov": "6", "analyzer": "90"}
 
@@ -27,7 +27,7 @@ def picture(scene, **values):
 
 def test_a_pattern_from_a_file_is_the_formula_that_it_was_made_from(tmp_path):
     disc = (
-        next(e for e in registry().effects.values() if e.name == "stress birefringence")
+        next(e for e in known().effects.values() if e.name == "stress birefringence")
         .stages["layer"]
         .__globals__["disc"]
     )

@@ -14,7 +14,7 @@ from optics.captures.noise import Noise
 from optics.cli import main
 from optics.errors import BadScene, OutputExists, Underdetermined
 from optics.scene import loader as scenes
-from optics.scene.registry import registry
+from optics.scene.registry import known
 from optics.study import design, loop
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "next_measurement.py"
@@ -80,7 +80,7 @@ def test_the_other_cause_is_named_where_it_is_the_other(example, hidden, tmp_pat
 @pytest.fixture(scope="module")
 def bench():
     """A plan for three effects of the bench, two of which only an exposure tells apart."""
-    effects = [registry().find_effect(n) for n in ("stray light", "dark offset", "extinction leak")]
+    effects = [known().find_effect(n) for n in ("stray light", "dark offset", "extinction leak")]
     return design.plan(scenes.load("polarizer_bench"), 6, effects, noise=NOISE, share=1.0)
 
 
@@ -97,7 +97,7 @@ def test_a_planned_session_keeps_effects_apart(bench):
 
 def test_what_a_single_exposure_cannot_tell_is_said():
     """At one exposure nothing parts stray light from an offset: the plan says so."""
-    effects = [registry().find_effect(n) for n in ("stray light", "dark offset")]
+    effects = [known().find_effect(n) for n in ("stray light", "dark offset")]
     found = design.plan(scenes.load("polarizer_bench"), 4, effects, noise=NOISE, share=1.0, fixed_exposure=True)
     assert not any("camera.exposure" in f.settings for f in found.frames)
     assert {(c["effect"], c["rival"]) for c in found.confused} == {
@@ -137,7 +137,7 @@ def test_a_session_for_a_scene_of_ones_own(tmp_path):
     path = tmp_path / "scenes" / "polarizer_bench.xml"
     path.parent.mkdir()
     path.write_text(scenes.find("polarizer_bench").read_text(encoding="utf-8"), encoding="utf-8")
-    found = design.plan(scenes.load(path), 2, [registry().find_effect("stray light")] * 2, noise=NOISE)
+    found = design.plan(scenes.load(path), 2, [known().find_effect("stray light")] * 2, noise=NOISE)
     assert found.scene == str(path) and [e.effect for e in found.effects] == ["stray light"] and not found.confused
     folder = design.write(found, tmp_path / "set")
     table = folder / "readings.csv"
@@ -218,8 +218,8 @@ def test_nothing_is_planned_for_effects_that_are_solved_for_already(tmp_path):
         design.plan(
             scenes.load("gelsight", SMALL),
             4,
-            [registry().find_effect("gain drift")],
+            [known().find_effect("gain drift")],
             setup=loop.Setup(captures="", free=["camera.gain"]),
         )
     with pytest.raises(BadScene, match="cannot express"):
-        design.plan(scenes.load("gelsight", SMALL), 4, [registry().find_effect("extinction leak")])
+        design.plan(scenes.load("gelsight", SMALL), 4, [known().find_effect("extinction leak")])

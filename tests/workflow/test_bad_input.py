@@ -14,7 +14,6 @@ from PIL import Image
 
 from optics.cli import main
 from optics.scene import loader as scene
-from optics.scene import registry as effect
 
 NOISE = "[noise]\nsystem_gain = 0.05\ndark_noise = 1.0\nblack_level = 8.0\nsaturation = 255.0\nprnu = 0.0\n"
 JOB = 'scene = "small.xml"\nout = "{out}"\ncount = 2\n'
@@ -219,13 +218,6 @@ def place(tmp_path_factory):
     (folder / "fit_frame.toml").write_text('[parameters]\n[frames.z]\n"gel.press_x" = 1.0\n')
     (folder / "fit_torn.toml").write_text("[parameters\n")
     return folder
-
-
-@pytest.fixture(autouse=True)
-def own_registry(monkeypatch, request):
-    """A plugin that is refused must not stay behind in the registry of the tests that follow."""
-    if "--plugins" in getattr(request.node, "callspec", request.node).params.get("arguments", ""):
-        monkeypatch.setattr(effect, "_registry", None)
 
 
 def standing(folder):

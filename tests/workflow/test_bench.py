@@ -13,7 +13,6 @@ from optics.captures import capture_set as capture_files
 from optics.captures.noise import Noise
 from optics.proof.makers import bench as jones
 from optics.proof.makers.bench import Photodiode, Polarizer, Sample, Source, Truth
-from optics.scene.registry import registry
 from optics.study import loop
 
 NOISE = Noise(system_gain=0.05, dark_noise=2.0, black_level=64.0, saturation=4095.0, prnu=0.0)
@@ -158,7 +157,7 @@ def test_a_hidden_effect_is_found(name, tmp_path):
     elif diagnosis.word == "AMBIGUOUS":
         assert case.effects[0] in diagnosis.ambiguous and set(diagnosis.ambiguous) <= known, diagnosis.sentence
         assert case.alike, diagnosis.sentence
-        needs = registry().find_effect(case.effects[0]).needs
+        needs = model.scene.registry.find_effect(case.effects[0]).needs
         assert any(needs in hint for hint in diagnosis.hints), (
             "no word about the measurement that would tell them apart"
         )
@@ -168,7 +167,7 @@ def test_a_hidden_effect_is_found(name, tmp_path):
         assert set(case.effects) in whole and all(pair <= known for pair in whole), diagnosis.sentence
     for effect in case.effects:
         start = diagnosis.fits[effect].values if effect in diagnosis.fits else None
-        fit, comparison = loop.extend(study, model, setup, fit, registry().find_effect(effect), start)
+        fit, comparison = loop.extend(study, model, setup, fit, model.scene.registry.find_effect(effect), start)
     # the error falls to the noise floor, on readings that were not fitted as well
     held = study.steps[-1]["held_out"]
     assert at_the_noise(fit.chi2 / fit.dof, fit.dof), fit.chi2 / fit.dof
@@ -189,26 +188,22 @@ def test_a_perfect_bench_lacks_nothing(seed, tmp_path):
     assert abs(fit.values.get(power, model.base) - 2.2) < 4 * fit.sd[0]  # four standard deviations: the diode's gain
 
 
-def test_what_goes_with_a_setting_is_drafted_then_claimed_as_a_formula(tmp_path, monkeypatch):
+def test_what_goes_with_a_setting_is_drafted_then_claimed_as_a_formula(tmp_path):
     """A lamp that warms up as exp(-t/4 min), which no effect has: the curve along its clock, as a table, then as a
     formula."""
-    import optics.scene.registry as declarations
     from optics.proof.rigs.bench import Bench, sweep
     from optics.study import draft
 
-    fresh = declarations.Registry()
-    fresh.scan(declarations.shipped("plugins"))
-    monkeypatch.setattr(declarations, "_registry", fresh)
     rig = Bench()
     capture_files.write(sweep(rig.light({}), rig.settings(), 5, {"warm-up": 0.1}), tmp_path / "captures")
     setup = rig.setup(tmp_path / "captures", 5)
     study, model, fit = loop.begin(setup, tmp_path / "study")
     diagnosis = loop.examine(study, model, setup, fit, advised=False)
     assert diagnosis.word == "UNKNOWN" and diagnosis.families[0].coordinate == "source.time", diagnosis.sentence
-    text, plugins = draft.from_study(study.folder, None, "warm up", fresh)
+    text, plugins = draft.from_study(study.folder, None, "warm up")
     file = draft.write(text, plugins, "warm up")
     study, model, setup = loop.take_up(study.folder)
-    table, _ = loop.extend(study, model, setup, loop.restore(study, model), fresh.find_effect("warm-up"))
+    table, _ = loop.extend(study, model, setup, loop.restore(study, model), model.scene.registry.find_effect("warm-up"))
     assert table.chi2 - table.dof < 0.4 * (
         fit.chi2 - fit.dof
     )  # straight lines between few points, where the lamp is steepest
@@ -217,12 +212,12 @@ def test_what_goes_with_a_setting_is_drafted_then_claimed_as_a_formula(tmp_path,
         "import numpy as np\n"
         + text.replace("lookup(x, AT, CURVE)", "-np.exp(-np.asarray(x) / 4.0)").replace("checks=(meets_its_table,)", "")
     )
-    fresh.effects.pop("warm-up")
-    fresh.folders.remove(plugins.resolve())
-    study, model, fit = loop.begin(setup, tmp_path / "formula")
+    study, model, fit = loop.begin(setup, tmp_path / "formula")  # the edited file is taken up
     diagnosis = loop.examine(study, model, setup, fit, advised=False)
     assert diagnosis.missing == "warm up"
     assert abs(diagnosis.row("warm up").refit.strength[0] - 0.1) < 4 * diagnosis.row("warm up").refit.sd[0]
-    fit, _ = loop.extend(study, model, setup, fit, fresh.find_effect("warm-up"), diagnosis.fits["warm up"].values)
+    fit, _ = loop.extend(
+        study, model, setup, fit, model.scene.registry.find_effect("warm-up"), diagnosis.fits["warm up"].values
+    )
     assert at_the_noise(study.steps[-1]["held_out"]["chi2_per_dof"], 150)
     assert loop.examine(study, model, setup, fit, advised=False).word == "NOTHING"

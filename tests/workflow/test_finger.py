@@ -10,7 +10,7 @@ import pytest
 from optics.captures import capture_set as capture_files
 from optics.proof.makers.finger import FingerMaker
 from optics.scene import loader as scenes
-from optics.scene.registry import registry
+from optics.scene.registry import known
 from optics.study import loop
 
 DEFINES = {
@@ -104,7 +104,7 @@ def test_a_hidden_effect_is_found(case, tmp_path):
     def add(fit, name):
         start = diagnosis.fits[name].values if name in diagnosis.fits else None
         left.remove(name)
-        return loop.extend(study, model, setup, fit, registry().find_effect(name), start)[0]
+        return loop.extend(study, model, setup, fit, known().find_effect(name), start)[0]
 
     if len(left) > 1 and diagnosis.word == "CLAIM":  # the stronger one is named, and that something is left
         assert diagnosis.missing in left and not diagnosis.row(diagnosis.missing).refit.complete, diagnosis.sentence

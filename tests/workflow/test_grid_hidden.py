@@ -10,7 +10,7 @@ import pytest
 from optics.captures import capture_set as capture_files
 from optics.proof.makers.grid import GridMaker
 from optics.scene import loader as scenes
-from optics.scene.registry import registry
+from optics.scene.registry import known
 from optics.study import loop
 
 SCENE = {"width": "32", "height": "24"}
@@ -121,7 +121,7 @@ def test_a_hidden_effect_is_found(case, tmp_path):
         assert diagnosis.word == "CLAIM" and diagnosis.missing == case, f"{diagnosis.word}: {diagnosis.sentence}"
     before = study.steps[-1]["held_out"]["chi2_per_dof"]
     start = diagnosis.fits[case].values if case in diagnosis.fits else None
-    fit = loop.extend(study, model, setup, fit, registry().find_effect(case), start)[0]
+    fit = loop.extend(study, model, setup, fit, known().find_effect(case), start)[0]
     held = study.steps[-1]["held_out"]["chi2_per_dof"]
     assert (
         held < before and fit.chi2 / fit.dof < 1.1 and held < 1.1

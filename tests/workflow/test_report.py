@@ -581,7 +581,7 @@ def swept(tmp_path_factory):
     """A study of 96 readings of a leaky polarizer bench, the leak found in a second step; and its page."""
     from optics.captures.noise import Noise
     from optics.proof.makers import bench as jones
-    from optics.scene.registry import registry
+    from optics.scene.registry import known
     from optics.study import loop
 
     folder = tmp_path_factory.mktemp("swept")
@@ -597,7 +597,7 @@ def swept(tmp_path_factory):
     jones.write(folder / "captures", truth, settings, Noise(0.05, 2.0, 64.0, 4095.0, 0.0), 3)
     setup = loop.Setup(captures=str(folder / "captures"))
     study, model, fit = loop.begin(setup, folder / "study")
-    loop.extend(study, model, setup, fit, registry().find_effect("extinction leak"), None)
+    loop.extend(study, model, setup, fit, known().find_effect("extinction leak"), None)
     return study, model, report(study.folder, folder / "report.html").read_text(encoding="utf-8")
 
 

@@ -28,7 +28,7 @@ def test_the_formula_is_what_the_maker_does_to_rows(tmp_path):
     phase, amplitude = story["phase_of"](np.arange(height), rows, period)
     assert amplitude == pytest.approx(story["RIPPLE"] * np.sinc(story["HERTZ"] * story["OPEN"]), rel=1e-3)
     file = write(story["filled_in"](new_effect("shutter ripple", "lens"), phase), tmp_path, "shutter ripple")
-    effect = next(declared(file))
+    effect = declared(file)[0]
     for check in effect.checks:
         check()
     v, u = np.mgrid[:height, :width] + 0.5
@@ -57,22 +57,8 @@ def test_the_tutorial_goes_from_a_puzzling_residual_to_the_noise_floor(mitsuba, 
         story["main"](tmp_path / "story")
 
 
-@pytest.fixture
-def own_registry(mitsuba, monkeypatch):
-    """A registry of its own, so that what a study's folder adds is gone afterwards."""
-    import optics.scene.registry as declarations
-
-    usual, fresh = declarations.registry(), declarations.Registry()
-    fresh.scan(declarations.shipped("plugins"))
-    monkeypatch.setattr(declarations, "_registry", fresh)
-    yield
-    monkeypatch.undo()
-    usual.classes.clear()  # Mitsuba knows the study's classes by now: the usual ones are registered again
-    declarations.use_variant()
-
-
 @pytest.mark.slow
-def test_a_curve_along_geometry_becomes_an_effect_as_well(own_registry, tmp_path, optics):
+def test_a_curve_along_geometry_becomes_an_effect_as_well(mitsuba, tmp_path, optics):
     """A coating that shines the brighter the steeper it stands, by 0.6 % per degree, which no effect of the library
     does."""
     from optics.captures import capture_set as captures

@@ -13,7 +13,6 @@ import numpy as np
 from optics.captures import capture_set as capture_files
 from optics.captures.noise import Noise
 from optics.proof.cells import MISTAKES, Cell
-from optics.scene.registry import registry
 from optics.study import loop
 
 PATTERN = 0.005  # rms of a fixed gain per pixel of the sensor, at clutter 1
@@ -140,7 +139,7 @@ class ImageRig(Rig):
         raise NotImplementedError
 
     def keys(self, scene, effect: str) -> tuple[str, ...]:
-        return self.several.get(effect) or (next(iter(scene.keys_of(registry().find_effect(effect)).values()))[0],)
+        return self.several.get(effect) or (next(iter(scene.keys_of(scene.registry.find_effect(effect)).values()))[0],)
 
     def start(self, scene, key: str) -> float:
         """What strengths count from: the sensor's own value, without the effect."""

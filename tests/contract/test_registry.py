@@ -1,0 +1,221 @@
+"""The registry of plugins: built whole or not at all, by folders, with no trace of one scene's plugins in another's."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from optics.errors import BadPlugin, UnknownKey
+from optics.files.output import shipped
+from optics.scene import registry as registries
+from optics.scene.registry import Registry, known
+
+CURVE = '''"""Row curve: {slope} of the signal per row."""
+from optics.plugin import Effect, Parameter
+
+effect = Effect(
+    "row curve",
+    "camera",
+    (Parameter("row_curve", "1", 0.0, neutral=0.0, plausible=0.1, how="image"),),
+    stages={{"sensor": lambda image, camera: image * (1 + camera.row_curve * {slope} * camera.v[..., None])}},
+)
+'''
+
+
+def written(folder: Path, **files) -> Path:
+    folder.mkdir(exist_ok=True)
+    for name, text in files.items():
+        (folder / f"{name}.py").write_text(text, encoding="utf-8")
+    return folder
+
+
+@pytest.fixture
+def kept(monkeypatch):
+    """What a test includes for all scenes is forgotten after it."""
+    monkeypatch.setattr(registries, "_included", registries._included)
+    monkeypatch.setattr(registries, "_default", None)
+
+
+def test_two_folders_may_draft_the_same_effect(tmp_path, mitsuba, load_bench):
+    benches = {}
+    for name, slope in (("one", 0.01), ("two", 0.02)):
+        folder = written(tmp_path / name, row_curve=CURVE.format(slope=slope))
+        benches[slope] = load_bench("gelsight", plugins=folder)
+    usual = load_bench("gelsight")
+    assert "row-curve" not in usual.scene.registry.effects and "camera.row_curve" not in usual.scene.parameters
+    rows = np.arange(usual.model.shape[0])[:, None, None] + 0.5
+    for slope, bench in benches.items():  # each as its own file has it, whichever was loaded last
+        gain = bench.image({"camera.row_curve": 0.1}) / np.maximum(bench.image(), 1e-6)
+        assert np.allclose(gain, 1 + 0.1 * slope * rows, atol=1e-6)
+
+
+def test_one_scenes_effects_are_no_candidates_of_anothers(tmp_path, load_bench):
+    own = load_bench("gelsight", plugins=written(tmp_path / "own", row_curve=CURVE.format(slope=0.01)))
+    usual = load_bench("gelsight")
+    assert own.scene.can_express(own.scene.registry.find_effect("row curve"))
+    with pytest.raises(UnknownKey, match="row curve"):
+        usual.scene.registry.find_effect("row curve")
+    assert set(own.scene.registry.effects) - set(usual.scene.registry.effects) == {"row-curve"}
+
+
+def test_a_failed_scan_leaves_nothing_behind(tmp_path, kept):
+    folder = written(tmp_path / "own", row_curve=CURVE.format(slope=0.01), torn="raise RuntimeError('torn')")
+    before = known()
+    modules = set(sys.modules)
+    for build in (known, registries.include):
+        with pytest.raises(BadPlugin, match=r"torn\.py: RuntimeError: torn"):
+            build(folder)
+        assert known() is before and "row-curve" not in known().effects
+    assert not [name for name in set(sys.modules) - modules if "torn" in name]
+    (folder / "torn.py").unlink()
+    assert "row-curve" in known(folder).effects
+
+
+def test_an_edited_file_is_taken_up_and_only_then(tmp_path):
+    folder = written(tmp_path / "own", row_curve=CURVE.format(slope=0.01))
+    first = known(folder)
+    assert known(folder) is first
+    written(folder, row_curve=CURVE.format(slope=0.02))  # as long as before, and within the same second
+    second = known(folder)
+    assert second is not first
+    assert [r.effects["row-curve"].doc[:15] for r in (first, second)] == ["Row curve: 0.01", "Row curve: 0.02"]
+    assert second.parts["led"] is first.parts["led"]  # files that did not change are not executed again
+    (folder / "row_curve.py").unlink()
+    assert "row-curve" not in known(folder).effects
+
+
+def test_a_registry_does_not_change(tmp_path):
+    found = Registry.of([shipped("plugins")])
+    for change in (
+        lambda: found.parts.__setitem__("led", None),
+        lambda: found.effects.pop("led-size"),
+        lambda: setattr(found, "parts", {}),
+    ):
+        with pytest.raises((TypeError, AttributeError)):
+            change()
+    assert isinstance(found.folders, tuple)
+
+
+def test_an_effect_twice_in_one_set_of_folders_is_refused(tmp_path):
+    folders = [written(tmp_path / name, row_curve=CURVE.format(slope=0.01)) for name in ("one", "two")]
+    with pytest.raises(BadPlugin, match="'row curve' exists already"):
+        known(*folders)
+
+
+EARLIER = '''"""Ring: darker towards the rim, written against names that modules had before."""
+from optics.bsdf import matt, passing
+from optics.effect import Declared, Effect, Part
+from optics.layers import crossing_of, layer
+from optics.lookup import lookup
+from optics.mueller import diattenuator
+from optics.parameter import Parameter
+
+PARAMETERS = (Parameter("strength", "1", 0.5, (0.0, 1.0), "share that passes", plausible=0.1, how="layer"),)
+
+
+def weigh(crossing, own):
+    from optics.mueller import absorber  # once a scene is rendered
+
+    return absorber(own.strength + 0.0 * crossing.u)
+
+
+part = layer("old_cell", PARAMETERS, weigh)
+effect = Effect(
+    "ring",
+    "camera",
+    (Parameter("ring", "1", 0.0, neutral=0.0, plausible=0.1, how="image"),),
+    stages={"sensor": lambda image, camera: image * (1 - camera.ring * camera.tan[..., None] ** 2)},
+)
+'''
+
+
+def test_files_written_against_earlier_module_names_load(tmp_path, load_bench):
+    bench = load_bench("polarizer_bench", slot="old_cell", plugins=written(tmp_path / "own", ring=EARLIER))
+    full, half = (bench.image({"sample.strength": s}) for s in (1.0, 0.5))
+    assert full.max() > 0 and np.allclose(half, full / 2, rtol=1e-6)
+    assert "ring" in bench.scene.registry.effects
+
+
+CAMERA = '''"""Fisheye: an equidistant camera, r = f theta.
+
+Definition
+    r = f theta, f = width/(x_fov in rad), about the image's middle
+Fingerprint
+    straight lines bow outwards.
+Validity
+    half angles below 90 deg.
+References
+    Kannala & Brandt, IEEE TPAMI 28, 1335 (2006), with k_i = 0.
+"""
+from optics.plugin import Declared, Parameter, Part
+from optics.scene.registry import known
+
+_CAMERA = known().parts["camera"]
+
+
+def build():
+    import drjit as dr
+    import mitsuba as mi
+
+    class Fisheye(_CAMERA.build()):
+        kind = "fisheye"
+
+        def ray(self, u, v):
+            width, height = self.resolution
+            f = width / dr.deg2rad(self.x_fov)
+            x, y = (u - width / 2) / f, (v - height / 2) / f
+            theta = dr.norm(mi.Vector2f(x, y))
+            share = dr.select(theta > 1e-6, dr.sin(theta) / dr.maximum(theta, 1e-6), 1.0)
+            origin = self.columns[3] + self.to_world(mi.Vector3f(self.x, self.y, self.z))
+            direction = self.turned(mi.Vector3f(x * share, y * share, dr.cos(theta)))
+            return mi.Point3f(origin) + dr.zeros(mi.Point3f, dr.width(u)), direction
+
+    return Fisheye
+
+
+part = Part("fisheye", "sensor", _CAMERA.parameters, build, role="camera")
+'''
+
+
+def test_a_second_camera_is_one_new_file(tmp_path, mitsuba):
+    """It renders, predicts, has its derivatives, and takes part in every effect of cameras."""
+    from optics.light.rendering import RenderJob
+    from optics.scene import loader
+
+    folder = written(tmp_path / "own", fisheye=CAMERA)
+    text = loader.find("gelsight").read_text(encoding="utf-8")
+    assert 'type="camera"' in text
+    path = tmp_path / "fisheye.xml"
+    path.write_text(text.replace('<sensor type="camera"', '<sensor type="fisheye"'), encoding="utf-8")
+    small = {"width": "32", "height": "24"}
+    scene, usual = loader.load(path, small, plugins=folder), loader.load("gelsight", small)
+    assert scene.camera.kind == "fisheye" and scene.camera.role == "camera"
+    assert [e.key for e in scene.registry.effects.values() if scene.can_express(e)] == [
+        e.key for e in usual.registry.effects.values() if usual.can_express(e)
+    ]
+    with pytest.raises(BadPlugin, match="belongs to the part 'gel'"):
+        known(folder, written(tmp_path / "bad", row_curve=CURVE.format(slope=1).replace('"sensor"', '"surface"')))
+    image = RenderJob(scene).take({"camera.exposure": 150.0}).camera
+    straight = RenderJob(usual).take({"camera.exposure": 150.0}).camera
+    assert image.max() > 20 and np.abs(image - straight).max() > 1  # DN: the same sensor through another lens
+    shaded = RenderJob(scene).take({"camera.exposure": 150.0, "camera.vignetting": 1.0}).camera
+    assert shaded[0, 0, 0] < image[0, 0, 0] and np.allclose(shaded[12, 16], image[12, 16], rtol=0.02)
+
+    from optics.captures.capture_set import Captures, Frame
+    from optics.captures.noise import Noise
+    from optics.fit.model import Model
+    from optics.scene.parameter import Values, Variable
+
+    frame = Frame("one", np.zeros((24, 32, 3), np.float32))
+    noise = Noise(system_gain=0.1, dark_noise=1.0, black_level=0.0, saturation=255.0, prnu=0.0)
+    model = Model(scene, Captures(tmp_path, str(path), [frame], noise=noise))
+    # the step of the first is the model's own, as rims jump with a step; shading is linear in the second
+    for key, here, step in (("camera.x_fov", model.base["camera.x_fov"], 0.4), ("camera.vignetting", 0.5, 0.01)):
+        variable = Variable(key, (key,), scene.parameters[key])
+        at = Values({"camera.exposure": 150.0, "camera.vignetting": 0.0, key: here})
+        _, slopes = next(iter(model.derivatives(at, [variable])))
+        low, high = (model.predict(Values({**at.common, key: here + s * step}))[0] for s in (-1.0, 1.0))
+        difference = (high - low) / (2 * step)
+        # rounding: 1e-6 of 255 DN over twice the step
+        assert np.abs(slopes[key] - difference).max() < 0.02 and np.abs(difference).max() > 1, key
