@@ -5,3 +5,10 @@ with the record of which physical effects it took. Importing this package sets n
 heavy: each verb imports what it needs."""
 
 __version__ = "0.1.0"
+
+
+def register(plugins=None) -> None:
+    """Make the parts known to plain Mitsuba, see `optics.scene.mitsuba_parts.register`."""
+    from optics.scene.mitsuba_parts import register
+
+    register(plugins)
