@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from optics.scene.loader import Scene
     from optics.scene.mitsuba_parts import register
     from optics.scene.parameter import Parameter
+    from optics.scene.wiring import wire
 
 _HOME = {
     "calibrate": "optics.facade",
@@ -38,6 +39,7 @@ _HOME = {
     "Part": "optics.scene.declare",
     "Scene": "optics.scene.loader",
     "Study": "optics.facade",
+    "wire": "optics.scene.wiring",
 }  # name -> module that holds it
 
 __all__ = [
@@ -53,6 +55,7 @@ __all__ = [
     "compare",
     "load",
     "register",
+    "wire",
 ]
 
 

@@ -1,7 +1,8 @@
 """Walk: what a ray of the camera gathers on its way through any scene, one surface after another.
 
 A state holds a wavefront of rays between two surfaces (`start`); `event` takes every ray to its next surface, adds the
-light that is hit and the light that is sampled there, and sends the ray on. `walk` repeats `event` until no ray is left.
+light that is hit and the light that is sampled there, and sends the ray on. `walk` repeats `event` until no ray is
+left.
 The methods of `Walk` become methods of the integrator `tactile`. The classes of Mitsuba that they use are those of the
 present variant, so this module is imported where a part is built, after a variant is set."""
 
