@@ -4,6 +4,8 @@ parameters."""
 from __future__ import annotations
 
 import itertools
+import math
+import sys
 import weakref
 from collections.abc import Callable
 from contextvars import ContextVar
@@ -147,14 +149,47 @@ def _once_wired(method: Callable) -> Callable:
 
     @wraps(method)
     def asked(self, *given, **more):
-        if self._waits:
+        answer = method(self, *given, **more)
+        if not self._waits:
+            return answer
+        scene = _rendered()
+        if scene is None:
+            return _nan(answer)
+        if any(shape.bsdf() is self for shape in scene.shapes()):
             raise BadScene(
                 f"{self._waits}, and this scene's parts have not been told of one another; the integrator 'tactile' does "
                 "that at its first image; call optics.wire(scene) before you render with another integrator"
             )
-        return method(self, *given, **more)
+        return answer  # Dr.Jit traces every material alive, those of other scenes as well
 
     return asked
+
+
+def _rendered():
+    """The scene that is being rendered: what a caller of Mitsuba, such as mi.render, has as `scene`; None if unknown.
+    A material knows neither its scene nor who asks."""
+    import mitsuba as mi
+
+    frame = sys._getframe(2)
+    while frame is not None:
+        scene = frame.f_locals.get("scene")
+        if isinstance(scene, mi.Scene):
+            return scene
+        frame = frame.f_back
+    return None
+
+
+def _nan(answer):
+    """A material's answer with its weights made NaN: better no image than a wrong one."""
+    if isinstance(answer, tuple):  # (sample, weight) or (value, density): the weight is the spectrum
+        return tuple(_nan(part) if _is_weight(part) else part for part in answer)
+    return answer * math.nan
+
+
+def _is_weight(thing) -> bool:
+    import mitsuba as mi
+
+    return isinstance(thing, mi.Spectrum)
 
 
 class Declared:
@@ -193,7 +228,7 @@ class Declared:
 
             def declare(self, props):
                 super().declare(props)
-                if self.moved_by and is_part(self.bsdf()):
+                if self.moved_by and is_part(self.bsdf()) and not self.bsdf()._waits:
                     self.bsdf()._waits = f"'{self.name}' moves with the part '{self.moved_by}'"
                 if _loading.get() is None:  # Mitsuba's own loader merges meshes of one material, which then do not move
                     self.add_attribute("face_own", 1, [0.0] * self.face_count())
