@@ -222,7 +222,7 @@ class Material:
         parameters = {f"sample.{name}": p for name, p in self.bsdf.numbers.items()}
         self.values = {key: p.default for key, p in parameters.items()}
         self.values.update({k: v for k, v in {"sample.index": 1.3, "sample.alpha": 0.2}.items() if k in parameters})
-        self.scene = SimpleNamespace(parts={"sample": self.bsdf}, parameters=parameters, gel=None)
+        self.scene = SimpleNamespace(registry=REGISTRY, parts={"sample": self.bsdf}, parameters=parameters, gel=None)
         self.scene.check = lambda values: scene.Scene.check(self.scene, values)
         self.scene.set = lambda values: None
         self.renderer = SimpleNamespace(kind=lambda key: kind, bounce_key="")
@@ -915,7 +915,8 @@ def test_random_strengths_give_images(key, bench_of):
     check_random_values(bench_of(effect), effect, seed=EFFECTS.index(key))
 
 
-@pytest.mark.parametrize("seed", (2, 5))  # 5: interreflection, haze and gloss are on; 2: they are off
+# 5: interreflection, haze, absorption, gloss and the size of LEDs are on; 2: absorption and sizes alone
+@pytest.mark.parametrize("seed", [pytest.param(2, marks=pytest.mark.slow), 5])
 def test_everything_drawn_at_once_gives_images(seed, bench):
     """All parameters of the sensor within a plausible change, all effects on; and derivatives at that point are
     finite."""
