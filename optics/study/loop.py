@@ -314,7 +314,8 @@ def write_step(
     values, extra = held_out_values(model, found, held)
     comparison = comparison_of(model, values, held, len(found.variables), extra)
     found.warnings += checks.after_calibration(model, found, comparison.fitted)
-    everywhere = Values(dict(found.values.common), {**values.frame, **found.values.frame})
+    # A study that was taken up again brings the held-out poses of the step before: those found now replace them.
+    everywhere = Values(dict(found.values.common), {**found.values.frame, **values.frame})
     record.add_step(
         name,
         effect.key if effect else None,
