@@ -15,6 +15,8 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from optics.version import __version__
+
 if TYPE_CHECKING:
     from optics.diagnosis.result import Diagnosis
     from optics.facade import Study, calibrate, compare, load
@@ -23,8 +25,6 @@ if TYPE_CHECKING:
     from optics.scene.loader import Scene
     from optics.scene.mitsuba_parts import register
     from optics.scene.parameter import Parameter
-
-__version__ = "0.1.0"
 
 _HOME = {
     "calibrate": "optics.facade",
@@ -48,6 +48,7 @@ __all__ = [
     "Part",
     "Scene",
     "Study",
+    "__version__",
     "calibrate",
     "compare",
     "load",

@@ -22,8 +22,8 @@ from optics.fit.result import Fit
 from optics.scene.parameter import Variable
 
 EVEN = 0.05  # of the fall: what splitting may gain where the scatter of clutter does not explain it
-# Of what an effect leaves: if splitting its own strength takes more, the rest lies where the effect acts, and the effect
-# is not its cause.
+# Of what an effect leaves: if splitting its strength takes more, the rest lies where the effect acts, and the effect is
+# not its cause.
 SAME_PLACE = 0.5
 HAIR = 0.01  # of the fall: a split that gains less says nothing about what the effect is
 PARTS = 16  # of the sensor or session: wider than clutter is correlated, enough for a variance
@@ -187,8 +187,8 @@ def scatter(
     """(p, covariance) of a strength by its scatter between parts of the sensor or session.
 
     p          does not assume independent noise, as neighbours share clutter (`by_clutter`); NaN for too few parts
-    covariance (k, k) V^-1 (B - V) V^-1 that clutter adds to that of noise, with B of `variances`, of the map in which it
-               is larger; zero for too few parts
+    covariance (k, k) V^-1 (B - V) V^-1 that clutter adds to that of noise, with B of `variances`, of the map in which
+               it is larger; zero for too few parts
     """
     projected, clutter = own.project(own.thinned(), calibrated, effect, own.thinning), np.zeros((len(effect),) * 2)
     white = st.root(projected.information, st.VISIBLE)
@@ -260,7 +260,7 @@ def variances(
 
 
 def by_clutter(score: np.ndarray, information: np.ndarray, variances: Sequence[tuple[np.ndarray, int]]) -> float:
-    """p of a score u (k,) of information V by its variance B between G parts: the larger p of the maps, NaN without one.
+    """p of a score u (k,) of information V by its variance B between G parts: the largest p of all maps, NaN without.
 
     Where G >= 2 k: T2 = u' B^-1 u, T2 (G - k)/(k (G - 1)) ~ F(k, G - k). Fewer parts determine too little of B's
     directions (15 strengths and 16 parts would need T2 = 1.4e6), but its trace: with M = V^-1/2 B V^-1/2, F = u' V^-1 u

@@ -1,4 +1,4 @@
-"""What a rehearsal says of hidden effects, against the closed form for two rivals and against a diagnosis of what was
+"""What a rehearsal predicts for hidden effects, against the closed form for two rivals and against a diagnosis of what was
 really hidden."""
 
 import sys

@@ -38,7 +38,7 @@ def test_angles_in_radians_are_reported_and_no_effect_is_claimed(wrong, tmp_path
 def test_a_value_far_from_its_prior_is_named():
     depth = Parameter("press_depth", "mm", 0.2, (0.0, 1.0), plausible=0.1)
     variables = [Variable(f"gel.press_depth[{i}]", ("gel.press_depth",), depth, (i,), (0.2, 0.05)) for i in range(3)]
-    model = SimpleNamespace(at=lambda values, i: {"gel.press_depth": 0.2, **values.frame[i]})
+    model = SimpleNamespace(at=lambda values, i: {"gel.press_depth": 0.2, **values.frame.get(i, {})})
     near = SimpleNamespace(rms=1.0, signal=100.0)
 
     def told(*depths):
