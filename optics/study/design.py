@@ -34,6 +34,7 @@ from optics.diagnosis.evidence import Candidate, Evidence, Progress, measure
 from optics.diagnosis.thresholds import CLEAR, LEVEL
 from optics.errors import BadScene, Underdetermined
 from optics.files.output import new_folder, shipped
+from optics.fit.scene_model import SceneModel
 from optics.scene.loader import Scene
 from optics.scene.parameter import Parameter, Values
 from optics.study.setup import Setup, effect_variables, variables_of_base
@@ -296,6 +297,54 @@ def _sweeps(parameters: dict, base: dict, lights: Sequence[str], exposures: Sequ
 # -----------------------------------------------------------------------------------------------------------
 
 
+def _checked(scene: Scene, effects: Sequence | None) -> tuple[list, list]:
+    """(every effect that the scene can express, those that were asked for); raises BadScene."""
+    for part, kind, tag in ((scene.camera, "camera", "sensor"), (scene.integrator, "tactile", "integrator")):
+        if part is None:
+            raise BadScene(
+                f"{scene.path}: no part of the type '{kind}'; a capture session needs one: add a <{tag} "
+                f'type="{kind}">'
+            )
+    swept = math.prod(scene.camera.resolution) == 1  # readings of a photodiode
+    known = [
+        e for _, e in sorted(scene.registry.effects.items()) if scene.can_express(e) and not (swept and e.mixes_pixels)
+    ]
+    effects = list({e.key: e for e in effects or ()}.values())  # an effect named twice would be its own rival
+    for e in effects:
+        if e not in known:
+            raise BadScene(
+                f"{scene.path}: the scene cannot express the effect '{e.name}'; it can: "
+                f"{', '.join(k.key for k in known)}"
+            )
+    return known, effects
+
+
+def _imagined(scene: Scene, pool: Sequence[Choice], noise: Noise) -> SceneModel:
+    """A model of the candidates: their settings, and black images that predictions will replace."""
+    width, height = scene.camera.resolution
+    swept = width * height == 1
+    bands = scene.integrator.bands if scene.integrator is not None else ()
+    channels = 1 if len(bands or (0,)) == 1 else 3
+    blank = np.zeros((height, width, channels), np.float32)
+    first = Frame("first", blank, parameters=dict(pool[0].readings[0]), file="design")
+    table = Table("readings.csv", ["reading"]) if swept else None
+    model = SceneModel(scene, Captures(Path("."), str(scene.path), [first], noise=noise, table=table), noise)
+    model.frames = []
+    return model.imagine(
+        [
+            Frame(
+                f"candidate-{i}",
+                np.repeat(blank, len(c.readings), 0) if c.swept else blank,
+                group=c.group or None,
+                parameters=dict(c.settings),
+                file="design",
+                readings={k: np.array(v).reshape(-1, 1, 1) for k, v in c.swept.items()},
+            )
+            for i, c in enumerate(pool)
+        ]
+    )
+
+
 def plan(
     scene: Scene,
     frames: int,
@@ -322,52 +371,14 @@ def plan(
     """
     from scipy.special import ndtr
 
-    from optics.fit.scene_model import SceneModel
-
     say = progress or (lambda what, done, total: None)
     _require(frames, share)
-    for part, kind, tag in ((scene.camera, "camera", "sensor"), (scene.integrator, "tactile", "integrator")):
-        if part is None:
-            raise BadScene(
-                f"{scene.path}: no part of the type '{kind}'; a capture session needs one: add a <{tag} "
-                f'type="{kind}">'
-            )
-    width, height = scene.camera.resolution
-    swept = width * height == 1
-    known = [
-        e for _, e in sorted(scene.registry.effects.items()) if scene.can_express(e) and not (swept and e.mixes_pixels)
-    ]
-    effects = list({e.key: e for e in effects or ()}.values())  # an effect named twice would be its own rival
-    for e in effects:
-        if e not in known:
-            raise BadScene(
-                f"{scene.path}: the scene cannot express the effect '{e.name}'; it can: "
-                f"{', '.join(k.key for k in known)}"
-            )
+    known, effects = _checked(scene, effects)
     setup = setup or Setup(captures="")
     values = Values() if values is None else Values(dict(values.common))
     base = {**scene.values(), **values.common}
-    pool = candidates(scene.parameters, base, swept, fixed_exposure)
-    bands = scene.integrator.bands if scene.integrator is not None else ()
-    channels = 1 if len(bands or (0,)) == 1 else 3
-    blank = np.zeros((height, width, channels), np.float32)
-    first = Frame("first", blank, parameters=dict(pool[0].readings[0]), file="design")
-    table = Table("readings.csv", ["reading"]) if swept else None
-    model = SceneModel(scene, Captures(Path("."), str(scene.path), [first], noise=noise, table=table), noise)
-    model.frames = []
-    model = model.imagine(
-        [
-            Frame(
-                f"candidate-{i}",
-                np.repeat(blank, len(c.readings), 0) if c.swept else blank,
-                group=c.group or None,
-                parameters=dict(c.settings),
-                file="design",
-                readings={k: np.array(v).reshape(-1, 1, 1) for k, v in c.swept.items()},
-            )
-            for i, c in enumerate(pool)
-        ]
-    )
+    pool = candidates(scene.parameters, base, math.prod(scene.camera.resolution) == 1, fixed_exposure)
+    model = _imagined(scene, pool, noise)
     for key in model.driven:
         values.common.setdefault(key, float(base[key]))
     pool = _expose(model, values, pool, base, say)
