@@ -179,6 +179,7 @@ class Walk:
             ds, weight = scene.sample_emitter_direction(si, sample, False, lit)
             one = lit & (ds.pdf != 0) & ~mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.DeltaPosition)
             if dr.grad_enabled(si):  # from within the plane of a luminous area, the weight has no derivative
+                one = one & dr.isfinite(ds.pdf) & (mi.unpolarized_spectrum(weight)[0] != 0)
                 si = held(one, si)
                 ds, weight = scene.sample_emitter_direction(si, sample, False, lit)
             sent, met = self.sent(scene, si, ray.o, medium, ds, weight, one, times)

@@ -122,6 +122,7 @@ def bsdf(kind: str, own: Callable) -> type:
     import mitsuba as mi
 
     class Layer(passing(mi.BSDFFlags.Null)):
+        unrendered = {"face": "mi.render leaves out what layers reflect to one another"}
         carrier = None  # the stretching shape that it lies on, if it does
         skin = None  # the gel of the scene
         field = None  # what an effect makes of both (optics.scene.declare.Effect.field)

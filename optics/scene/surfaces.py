@@ -111,21 +111,18 @@ def axis_rotation(forward, current, target):
     import mitsuba as mi
 
     c, s = dr.dot(current, target), dr.dot(forward, dr.cross(current, target))
-    c, s = c * c - s * s, 2 * c * s
+    c, s = mi.UnpolarizedSpectrum(c * c - s * s), mi.UnpolarizedSpectrum(2 * c * s)
     return mi.Spectrum(1, 0, 0, 0, 0, c, s, 0, 0, -s, c, 0, 0, 0, 0, 1)
 
 
 def _between(si, matrix, forward_in, forward_out, to):
     """A Mueller matrix in the axes that Mitsuba implies for two directions, as one in those of the turned
     directions."""
-    import drjit as dr
     import mitsuba as mi
 
-    turns = []
-    for forward in (forward_in, forward_out):
-        there = to(forward)
-        turns.append(axis_rotation(there, to(mi.mueller.stokes_basis(forward)), mi.mueller.stokes_basis(there)))
-    return turns[1] @ matrix @ dr.transpose(turns[0])
+    basis, into, out = mi.mueller.stokes_basis, to(forward_in), to(forward_out)
+    first = axis_rotation(into, basis(into), to(basis(forward_in)))
+    return axis_rotation(out, to(basis(forward_out)), basis(out)) @ matrix @ first
 
 
 def to_world_mueller(si, matrix, forward_in, forward_out):
