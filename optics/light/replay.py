@@ -170,9 +170,6 @@ class Replay:
                     dr.set_grad(value, state[name])
                 dr.forward_to([v for v in results if dr.grad_enabled(v)], flags=KEEP_INPUTS)
                 light, throughput, o, d = (dr.grad(v) for v in results)
-                light = dr.select(
-                    dr.isfinite(light), light, 0.0
-                )  # 0 times infinity, where a luminous area lights itself
             after.update({name: dr.detach(after[name]) for name in ("light", "throughput", "ray", "previous")})
             found = {"throughput": throughput, "o": mi.Vector3f(o), "d": mi.Vector3f(d)}
             return ({"way": after, "light": state["light"] + light, **found},)
