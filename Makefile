@@ -20,10 +20,10 @@ endif
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test docs bench proof lock clean
+.PHONY: help setup demo test test-all lint docs bench proof lock clean
 
 help:  ## list these targets
-	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /  make \1\t/' | expand -t 16
+	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /  make \1\t/' | expand -t 16
 
 setup: $(READY)  ## make .venv from requirements.lock and find LLVM (installs it where apt-get can)
 
@@ -40,8 +40,17 @@ $(READY): requirements.lock pyproject.toml setup.py
 demo: setup  ## run the demonstration
 	@$(BIN)/optics demo $(ARGS)
 
-test: setup  ## run the tests, but for the slow ones
-	@$(BIN)/pytest -q -m "not slow" $(ARGS)
+# One worker for each core, at most four: each takes 2 GB. A file stays with one worker, and so do its fixtures.
+PYTEST := $(BIN)/pytest -q -n auto --maxprocesses 4 --dist loadfile
+
+test: setup  ## run the tests, but for the slow ones (ARGS="-n 0": in one process)
+	@$(PYTEST) -m "not slow" $(ARGS)
+
+test-all: setup  ## run all tests, the slow ones too
+	@$(PYTEST) $(ARGS)
+
+lint: setup  ## check format, style, types, and that imports run one way
+	@$(BIN)/ruff format --check -q . && $(BIN)/ruff check -q . && $(BIN)/mypy && $(BIN)/lint-imports --no-cache >/dev/null
 
 docs: setup  ## build the documentation into build/docs
 	@$(BIN)/python -m sphinx -q -W --keep-going -d build/doctrees docs build/docs $(ARGS)
@@ -56,7 +65,7 @@ proof: setup  ## hide effects, run the loop blind on each, count what it said (h
 
 lock:  ## resolve requirements.lock again from pyproject.toml (newest versions: make lock ARGS=--upgrade)
 	@command -v uv >/dev/null || { echo "make lock needs uv: pip install uv" >&2; exit 1; }
-	uv pip compile pyproject.toml --extra test --extra docs --group build --universal --python-version 3.10 --generate-hashes \
+	uv pip compile pyproject.toml --extra test --extra lint --extra docs --group build --universal --python-version 3.10 --generate-hashes \
 	    --no-annotate --no-emit-index-url --no-emit-find-links --custom-compile-command "make lock" --quiet \
 	    --output-file requirements.lock $(ARGS)
 

@@ -1,29 +1,30 @@
-"""Calibrate a GelSight-type sensor from captured images, in a few lines, and see what the model lacks.
+"""Calibrate a GelSight-type sensor from captured images, and find which physical effect its model lacks.
 
-    python examples/calibrate_gelsight.py CAPTURES
+    python examples/calibrate_gelsight.py CAPTURES STUDY
 
-CAPTURES is a folder with a captures.toml (see the README); `optics demo` makes one in renders/demo/captures.
+CAPTURES is a folder with a captures.toml (see the README); `optics demo` makes one in renders/demo/captures. STUDY is
+the folder of the new study, in which a report and the charts are written as well.
 """
 
 import sys
 
-from optics.fit import calibrate
-from optics.scene.parameter import Values
-from optics.study import loop
+import optics
 
-setup = loop.Setup(captures=sys.argv[1])
-model = loop.open_model(setup)  # scene and captures, checked against each other
-fitted, held_out = loop.split(model, setup)  # one press in four is kept back
+captures, folder = sys.argv[1:3]
 
-variables = calibrate.variables_from(
-    model,
-    free=["led_*.[xyz]", "led_*.pan", "led_*.tilt", "led_*.mu", "led_*.power", "membrane.rho_*", "membrane.sigma"],
-    per_group=["gel.press_[xy]", "gel.press_depth"],  # one value per press
-    priors={"led_*.power": (1.0, 0.3), "gel.press_*": (None, 0.05)},  # the lambda term of S4; what the stage knows, mm
-    frames=fitted,
-)
-fit = calibrate.fit(model, variables, Values(), fitted)
-print(fit.table())
+# Three stages: LEDs and membrane, then the place and depth of each press, then everything together. A prior of 30 % on
+# the LEDs' powers holds the product of powers and reflectances together (the lambda term of S4), one of 0.05 mm on
+# presses says what the stage knew. Every fourth press is held out: on it only the press itself is fitted.
+study = optics.calibrate(captures, folder)
+print(study.fit.table())
+study.fit.plot().savefig(study.folder / "fit.png")
 
-comparison = loop.comparison_of(model, loop.held_out_values(model, fit, held_out)[0], held_out, len(variables), 0)
-print(comparison.text())
+verdict = study.diagnose()
+print(verdict.text())
+verdict.plot().savefig(study.folder / "verdict.png")
+
+if verdict.word == "CLAIM":
+    study.add(verdict.missing)
+print(study.table())
+study.plot().savefig(study.folder / "ladder.png")
+print(study.report())

@@ -1,4 +1,4 @@
-"""Two causes that look the same, the measurement that tells them apart, and the verdict after it was taken.
+"""Two causes that look alike, the measurement that tells them apart, and the verdict after it was taken.
 
     python examples/next_measurement.py [leak|depolarization|stray|offset] [FOLDER]
 
@@ -14,12 +14,12 @@ from pathlib import Path
 
 import numpy as np
 
+import optics
 from optics.captures import capture_set as captures
 from optics.captures.noise import Noise
 from optics.errors import UnknownKey
 from optics.proof.makers import bench as jones
 from optics.proof.makers.bench import Photodiode, Polarizer, Sample, Truth
-from optics.study import loop
 
 NOISE = Noise(system_gain=0.05, dark_noise=2.0, black_level=64.0, saturation=4095.0, prnu=0.0)
 GAIN = 2.2
@@ -73,9 +73,7 @@ def diagnosed(folder, frames):
     """Captures of these readings, calibrated and diagnosed."""
     table = captures.Table("readings.csv", ["reading"])
     captures.write(captures.Captures(folder, "polarizer_bench", frames, noise=NOISE, table=table), folder / "captures")
-    setup = loop.Setup(captures=str(folder / "captures"))
-    study, model, fit = loop.begin(setup, folder / "study")
-    return loop.examine(study, model, setup, fit)
+    return optics.calibrate(folder / "captures", folder / "study").diagnose()
 
 
 def main(hidden="leak", folder=None):

@@ -75,7 +75,8 @@ def main(image_file: str = "renders/proximity.png") -> None:
         agree = proximity.reliable_range(DISTANCES, {f"D{d:g}": curve for d, curve in r.items()}, 0.15)
         read = {d: float(proximity.distance(r[d][-1], reference, at)) for d in DIAMETERS[1:]}
         print(
-            f"r rises at every step: {'yes' if rising else 'no'}; curves agree within 15 % up to {agree:.0f} mm; where the "
+            f"r rises at every step: {'yes' if rising else 'no'}; curves agree within 15 % up to {agree:.0f} mm; "
+            "where the "
             f"cylinders stand at {DISTANCES[-1]:g} mm the reference's curve reads "
             + ", ".join(f"{v:.2f} mm for D{d:g}" for d, v in read.items())
             + "\n"

@@ -11,22 +11,21 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+import optics
 from optics.captures import importing
 from optics.fit.null_models import NullTable
-from optics.pages.report import report
-from optics.study import loop
 
-TAXIM = dict(bin=2, every=2, leds=6, camera_distance=40.0, skirt=0.88, contact_share=0.79)
-DIGIT = dict(
-    bin=4,
-    camera_distance=28.0,
-    skirt=0.81,
-    contact_share=0.85,
-    gel_thickness=4.6,
-    leds=6,
-    ball_radius=3.0,
-    mm_per_pixel=1 / 17.15,
-)
+TAXIM = {"bin": 2, "every": 2, "leds": 6, "camera_distance": 40.0, "skirt": 0.88, "contact_share": 0.79}
+DIGIT = {
+    "bin": 4,
+    "camera_distance": 28.0,
+    "skirt": 0.81,
+    "contact_share": 0.85,
+    "gel_thickness": 4.6,
+    "leds": 6,
+    "ball_radius": 3.0,
+    "mm_per_pixel": 1 / 17.15,
+}
 ADDED = {
     "gelsight": (),
     "digit": ("lens blur", "light from the surrounding face", "height fall-off"),
@@ -34,13 +33,12 @@ ADDED = {
 
 
 def study(captures: Path, folder: Path, added: Sequence[str], held_out: list[str] | None = None) -> list[NullTable]:
-    """Calibrate an imported set and add effects one by one; the null models' table after every step."""
-    setup = loop.setup_for(captures, held_out=held_out)
-    record, model, fit = loop.begin(setup, folder)
+    """Calibrate an imported set and add effects one by one; returns the null models' table after every step."""
+    found = optics.calibrate(captures, folder, held_out=held_out)
     for name in added:
-        fit, _ = loop.extend(record, model, setup, fit, model.scene.registry.find_effect(name))
-    print(fit.table(), record.table(), sep="\n\n")
-    return [NullTable.from_json(record.metrics(i)["nulls"]) for i in range(len(record.steps))]
+        found.add(name)
+    print(found.fit.table(), found.table(), sep="\n\n")
+    return [NullTable.from_json(found.record.metrics(i)["nulls"]) for i in range(len(found.records()))]
 
 
 def main(taxim: Path, digit: Path, output: Path) -> None:
@@ -51,9 +49,9 @@ def main(taxim: Path, digit: Path, output: Path) -> None:
         print(f"\n{name}: contradictions in the data", *found.warnings, sep="\n- ")
         folder = output / f"{name}-study"
         print(study(found.folder, folder, ADDED[name])[-1].text())
-        record, model, setup = loop.take_up(folder)
-        print("\nwhat remains above the noise:", loop.examine(record, model, setup, loop.restore(record, model)).text())
-        print(report(folder, folder / "report.html"))
+        calibrated = optics.Study.open(folder)
+        print("\nwhat remains above the noise:", calibrated.diagnose().text())
+        print(calibrated.report())
 
 
 if __name__ == "__main__":

@@ -97,17 +97,20 @@ def main(image_file: str = "renders/states.png") -> None:
     made = images()
     frames, rows, wide = readings(made)
     print(
-        f"thresholds {grid.BINARY:g} DN, E {grid.ENTROPY:g} bit, C {grid.CORRELATION:g}, S {grid.SIMILARITY:g}; still frame {MEAN:g} DN in the mean"
+        f"thresholds {grid.BINARY:g} DN, E {grid.ENTROPY:g} bit, C {grid.CORRELATION:g}, S {grid.SIMILARITY:g}; "
+        f"still frame {MEAN:g} DN in the mean"
     )
     print(f"{'':26}{'exposure fixed':^46}  {'the mean held':^28}")
     print(
-        "state       set to           E     C     S     bright  Algorithm 2  Algorithm 3  S     walls' S  Algorithm 3  published"
+        "state       set to           E     C     S     bright  Algorithm 2  Algorithm 3  S     walls' S  "
+        "Algorithm 3  published"
     )
     for k, (state, what, _) in enumerate(made):
         a, b, walls = rows["fixed"][0][k], rows["holds its mean"][0][k], rows["holds its mean"][1][k]
         said = PUBLISHED[state] if k == 0 or made[k - 1][0] != state else ""
         print(
-            f"{state:<11} {what:<14} {a.entropy:5.2f} {a.correlation:5.2f}  {a.similarity:4.2f}  {wide[k]:7.1%}  {a.proximity:<11}  {a.contact:<11}  "
+            f"{state:<11} {what:<14} {a.entropy:5.2f} {a.correlation:5.2f}  {a.similarity:4.2f}  {wide[k]:7.1%}  "
+            f"{a.proximity:<11}  {a.contact:<11}  "
             f"{b.similarity:4.2f}  {walls.similarity:8.2f}  {b.contact:<11}  {said}".rstrip()
         )
 

@@ -22,19 +22,18 @@ OUTPUT gets the captures, both studies with a report each, the images, and `inde
 """
 
 import html
-import json
 import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 
+from optics import Study
 from optics.captures import capture_set as capture_files
 from optics.diagnosis.result import Diagnosis
 from optics.proof import demo
 from optics.proof.makers.touch import Maker, presses
 from optics.scene import loader as scenes
-from optics.study.record import Study
 
 WIDTH, HEIGHT = 64, 48  # px
 EXPOSURE = 200.0  # one LED at a time is near full scale
@@ -54,7 +53,7 @@ FREE = [
     "membrane.sigma",
 ]
 
-FORMULA = '''PERIOD = 1 / ({hertz:g} * {line:g})  # rows: ripple of the LEDs' supply, Hz, and time from one row to the next, s; from the data sheets
+FORMULA = '''PERIOD = 1 / ({hertz:g} * {line:g})  # rows: the supply's ripple, Hz, and the line time, s
 PHASE = {phase:.3f}  # rad, at the first row: read off the curve
 
 
@@ -98,15 +97,14 @@ def optics(*words: str, ends: tuple[int, ...] = (0,)) -> str:
 def told(study: Path) -> Diagnosis:
     """The diagnosis of a study's last step, printed in short."""
     optics("diagnose", str(study), ends=(0, 1))
-    record = Study.open(study)
-    found = Diagnosis.from_json(json.dumps(record.diagnosis(len(record.steps) - 1)))
+    found = Study.open(study).diagnosis
     print(f"{found.word}: {found.sentence}")
     return found
 
 
 def held_out(study: Path) -> list[float]:
     """chi2 per degree of freedom on the held-out press, step by step."""
-    return [step["held_out"]["chi2_per_dof"] for step in Study.open(study).steps]
+    return [step["held_out_chi2_per_dof"] for step in Study.open(study).records()]
 
 
 def phase_of(rows: np.ndarray, curve: np.ndarray, period: float) -> tuple[float, float]:
@@ -143,7 +141,8 @@ def show_frame(file: Path, study: Path, title: str) -> None:
     from matplotlib.figure import Figure
 
     record = Study.open(study)
-    steps = [0] if len(record.steps) == 1 else [0, len(record.steps) - 1]
+    rungs = record.records()
+    steps = [0] if len(rungs) == 1 else [0, len(rungs) - 1]
     figure = Figure(figsize=(10, 2.6 * len(steps)), layout="constrained")
     axes = figure.subplots(len(steps), 3, squeeze=False)
     for line, step in zip(axes, steps):
@@ -154,7 +153,7 @@ def show_frame(file: Path, study: Path, title: str) -> None:
             (frame.measured / white, frame.predicted / white, frame.residual.mean(2)),
             (
                 f"measured, {frame.name}",
-                f"predicted: {record.steps[step]['name']}",
+                f"predicted: {rungs[step]['name']}",
                 "measured - predicted, in sigmas, mean of channels",
             ),
         ):
@@ -280,7 +279,8 @@ def main(output: Path) -> dict:
         (
             "The curve as an effect",
             f"optics effects new 'row curve' --from study wrote the curve into {Path(drafted).name} as a "
-            f"table; added, the held-out chi2/dof falls from {base:.3f} to {with_draft:.3f}. The coordinate is right. A table of "
+            f"table; added, the held-out chi2/dof falls from {base:.3f} to {with_draft:.3f}. The coordinate is "
+            "right. A table of "
             f"{len(best.curve)} numbers is no cause.",
             "3-draft.png",
         )
@@ -289,7 +289,8 @@ def main(output: Path) -> dict:
     period = 1 / (HERTZ * LINE)
     phase, size = phase_of(np.array(best.centres), np.array(best.curve), period)
     print(
-        f"a gain by rows, alike in all frames, channels and LEDs; a supply that ripples at {HERTZ:g} Hz and rows {1e6 * LINE:g} us apart give "
+        f"a gain by rows, alike in all frames, channels and LEDs; a supply that ripples at {HERTZ:g} Hz and rows "
+        f"{1e6 * LINE:g} us apart give "
         f"a period of {period:.2f} rows; the curve then has a phase of {phase:.2f} rad and an amplitude of {size:.2%}"
     )
     Path(drafted).unlink()  # the formula takes its place
@@ -300,11 +301,12 @@ def main(output: Path) -> dict:
     second = told(Path(answer))
     optics("add", answer, "shutter ripple")
     with_formula = held_out(Path(answer))[-1]
-    last = Study.open(answer).steps[-1]
+    last = Study.open(answer).record.steps[-1]
     strength = next((v["value"], v["sd"]) for v in last["variables"] if v["keys"] == ["camera.shutter_ripple"])
     expected = RIPPLE * np.sinc(HERTZ * OPEN)
     print(
-        f"with the formula: chi2/dof {with_formula:.3f} on the held-out press; ripple {strength[0]:.2%} +- {strength[1]:.2%}, "
+        f"with the formula: chi2/dof {with_formula:.3f} on the held-out press; ripple {strength[0]:.2%} +- "
+        f"{strength[1]:.2%}, "
         f"made with {expected:.2%}"
     )
     show_formula(output / "4-formula.png", first, phase, strength)
@@ -348,11 +350,13 @@ def write_page(file: Path, page: list[tuple[str, str, str]]) -> None:
         f"<h2>{html.escape(h)}</h2><p>{html.escape(t)}</p><img src='{p}' alt='{html.escape(h)}'>" for h, t, p in page
     ]
     file.write_text(
-        "<!doctype html><meta charset='utf-8'><meta name='viewport' content='width=device-width'><title>An unknown effect</title>"
+        "<!doctype html><meta charset='utf-8'><meta name='viewport' content='width=device-width'><title>An unknown "
+        "effect</title>"
         "<style>body{max-width:900px;margin:2em auto;padding:0 1em;font:16px/1.5 sans-serif}img{max-width:100%}</style>"
         "<h1>An effect that the library lacks</h1>"
         + "".join(parts)
-        + "<p>Reports: <a href='study/report.html'>with the table</a>, <a href='answer/report.html'>with the formula</a>.</p>\n",
+        + "<p>Reports: <a href='study/report.html'>with the table</a>, "
+        "<a href='answer/report.html'>with the formula</a>.</p>\n",
         encoding="utf-8",
     )
 

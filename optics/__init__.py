@@ -15,6 +15,8 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from optics.version import __version__
+
 if TYPE_CHECKING:
     from optics.diagnosis.result import Diagnosis
     from optics.facade import Study, calibrate, compare, load
@@ -23,8 +25,7 @@ if TYPE_CHECKING:
     from optics.scene.loader import Scene
     from optics.scene.mitsuba_parts import register
     from optics.scene.parameter import Parameter
-
-__version__ = "0.1.0"
+    from optics.scene.wiring import wire
 
 _HOME = {
     "calibrate": "optics.facade",
@@ -38,6 +39,7 @@ _HOME = {
     "Part": "optics.scene.declare",
     "Scene": "optics.scene.loader",
     "Study": "optics.facade",
+    "wire": "optics.scene.wiring",
 }  # name -> module that holds it
 
 __all__ = [
@@ -48,10 +50,12 @@ __all__ = [
     "Part",
     "Scene",
     "Study",
+    "__version__",
     "calibrate",
     "compare",
     "load",
     "register",
+    "wire",
 ]
 
 

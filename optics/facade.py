@@ -353,7 +353,8 @@ class Study:
         return self.record.table()
 
     def plot(self) -> Figure:
-        """The ladder: chi2 per degree of freedom of each step, on fitted and on held-out frames, and the noise floor."""
+        """The ladder: chi2 per degree of freedom of each step, on fitted and on held-out frames, and the noise
+        floor."""
         from optics.files.charts import BLUE, GREY, ORANGE, RED, chart
 
         rows = self.records()

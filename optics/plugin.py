@@ -11,7 +11,7 @@ from optics.scene.mitsuba_parts import Declared
 from optics.scene.parameter import Parameter, Values, Variable
 from optics.scene.registry import BadPlugin
 from optics.scene.surfaces import matt, passing, unpolarized
-from optics.scene.wiring import wire
+from optics.scene.wiring import ensure_wired
 
 __all__ = [
     "BadPlugin",
@@ -25,6 +25,7 @@ __all__ = [
     "Values",
     "Variable",
     "crossing_of",
+    "ensure_wired",
     "evaluate",
     "layer",
     "lookup",
@@ -32,5 +33,4 @@ __all__ = [
     "numbers_of",
     "passing",
     "unpolarized",
-    "wire",
 ]

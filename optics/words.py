@@ -10,7 +10,8 @@ from typing import Any
 
 
 def table(rows: Sequence[Sequence[str]], left: Collection[int] | None = None) -> str:
-    """Aligned columns, two spaces apart; `left`: columns that begin at the left (None: all), the others end at the right."""
+    """Aligned columns, two spaces apart; `left`: columns that begin at the left (None: all), the others end at the
+    right."""
     widths = [max(len(cell) for cell in column) for column in zip(*rows)]
     return "\n".join(
         "  ".join(
@@ -111,7 +112,7 @@ def as_float(value: Any) -> float:
         return math.nan
 
 
-# -- a notebook ---------------------------------------------------------------------------------------------------------
+# -- a notebook --------------------------------------------------------------------------------------------------------
 
 SMALL = "font-size:90%;opacity:.75"
 
@@ -120,9 +121,10 @@ def html_table(head: Sequence[str], rows: Sequence[Sequence[str]], left: Collect
     """A table for a notebook, escaped, without a style sheet; `left`: columns that begin at the left."""
 
     def line(cells: Sequence[str], tag: str) -> str:
+        sides = ["left" if i in left else "right" for i in range(len(cells))]
         aligned = (
-            f'<{tag} style="text-align:{"left" if i in left else "right"};padding:1px 8px">{html.escape(str(c))}</{tag}>'
-            for i, c in enumerate(cells)
+            f'<{tag} style="text-align:{side};padding:1px 8px">{html.escape(str(cell))}</{tag}>'
+            for side, cell in zip(sides, cells)
         )
         return f"<tr>{''.join(aligned)}</tr>"
 

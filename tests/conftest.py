@@ -5,10 +5,15 @@ folder of plugins, which then has to meet the same contract as those that ship."
 
 from __future__ import annotations
 
+import os
 import re
 from functools import lru_cache
 from pathlib import Path
 from types import SimpleNamespace
+
+# Before numpy is imported. The matrices of the tests are small: a second thread of BLAS only waits, and takes the core
+# from Dr.Jit or from the other worker (test_lattice.py: 13 s of processor time in place of 24).
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 import pytest
@@ -29,6 +34,29 @@ def pytest_configure(config):
         include(folder)
 
 
+def is_worker():
+    """Whether this process is one of several that pytest-xdist runs (`make test`)."""
+    return "PYTEST_XDIST_WORKER" in os.environ
+
+
+# The files that take the longest, the longest first: workers that begin with them end at about the same time.
+LONGEST = (
+    "test_demo",
+    "test_plugins",
+    "test_tactile",
+    "test_calibration",
+    "test_bench",
+    "test_proof",
+    "test_transport",
+)
+
+
+def pytest_collection_modifyitems(items):
+    if is_worker():
+        place = {name: number for number, name in enumerate(LONGEST)}
+        items.sort(key=lambda item: place.get(item.path.stem, len(LONGEST)))  # stable: the others keep their order
+
+
 @pytest.fixture(scope="session")
 def mitsuba():
     """Mitsuba in the default variant, on an LLVM that works."""
@@ -40,6 +68,10 @@ def mitsuba():
     use_variant()
     import mitsuba
 
+    if is_worker():
+        import drjit
+
+        drjit.set_thread_count(1)  # there is a worker for each core
     return mitsuba
 
 
@@ -99,7 +131,7 @@ class Bench:
 
 
 # A dent off the middle, a coloured membrane, three LEDs of unequal power, one of them coloured: nothing is symmetric,
-# so that no derivative vanishes by Monte Carlo. The other LEDs are off to save time. Highlights reach half of full
+# so that no derivative vanishes by accident. The other LEDs are off to save time. Highlights reach half of full
 # scale.
 WORKING_POINT = {
     "gel.press_x": 1.5,

@@ -80,8 +80,7 @@ class Captures:
     bits: int | None = None
 
 
-# -- Loading
-# ------------------------------------------------------------------------------------------------------------
+# -- Loading -----------------------------------------------------------------------------------------------------------
 
 
 def load(path: str | Path) -> Captures:
@@ -186,14 +185,14 @@ def _read_frames(captures: Captures, tables: object, where: str) -> None:
     for (here, image, files, mask, group, settings), stem in zip(specs, stems):
         name = stem if stems.count(stem) == 1 else image
         for file in files:
-            picture, bits = read_image(file, f"{here}: {file.name}")
+            image_read, bits = read_image(file, f"{here}: {file.name}")
             depths.setdefault(bits, file.name)
             if file is files[0]:
-                frame = Frame(name, picture, None, group, settings, [], image)
+                frame = Frame(name, image_read, None, group, settings, [], image)
                 captures.frames.append(frame)
             else:
-                frame.repeats.append(picture)
-            _same_size(picture, captures, f"{here}: {file.name}")
+                frame.repeats.append(image_read)
+            _same_size(image_read, captures, f"{here}: {file.name}")
         if mask is not None:
             frame.mask = read_mask(mask, frame.image.shape, f"{here}: mask '{mask.name}'")
     if len(depths) > 1:
@@ -300,7 +299,7 @@ def _read_table(folder: Path, data: object, where: str) -> tuple[Table, list[Fra
     return Table(name, values, rename, scale), frames
 
 
-# -- Using --------------------------------------------------------------------------------------------------------------
+# -- Using -------------------------------------------------------------------------------------------------------------
 
 
 def check(captures: Captures, parameters: Mapping[str, Parameter]) -> None:
@@ -395,8 +394,7 @@ def cfa_channel(shape: Sequence[int], pattern: str) -> np.ndarray:
     return cell[np.ix_(np.arange(shape[0]) % 2, np.arange(shape[1]) % 2)]
 
 
-# -- Writing
-# ------------------------------------------------------------------------------------------------------------
+# -- Writing -----------------------------------------------------------------------------------------------------------
 
 
 def write(captures: Captures, folder: str | Path, *, overwrite: bool = False, bits: int | None = None) -> Path:

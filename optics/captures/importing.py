@@ -41,6 +41,9 @@ from optics.files.output import new_folder, shipped
 COLUMNS = ("file", "center_x_px", "center_y_px", "contact_radius_px")
 FAR = 3.0  # circle radii beyond which a press leaves the image alone, but for a skirt of a few per mille
 LED_DISTANCE = 16.0  # mm from the middle of the face, where no better is known
+STEEPEST = 0.93  # of the ball's radius: largest touched radius, where the flank is 68 deg steep and the depth finite
+MEDIAN_OF = 5  # presses, from which on a per-pixel median is free of the ones that cover a pixel
+GEL_MARGIN = 1.15  # of the view: size of the gel, so that its edge is never seen
 POSE = ("gel.press_x", "gel.press_y", "gel.press_depth")
 LIGHTS = ("led_*.[xyz]", "led_*.pan", "led_*.tilt", "led_*.mu")
 PRIORS = {
@@ -125,13 +128,12 @@ def import_circles(
     """
     presses = read_circles(images, circles)
     if untouched is not None:
-        presses.given = _picture(Path(untouched), f"{untouched}", presses.images.shape[1:])
+        presses.given = _colour_image(Path(untouched), f"{untouched}", presses.images.shape[1:])
         options.setdefault("background", "given")
     return import_presses(presses, folder, ball_radius=ball_radius, mm_per_pixel=mm_per_pixel, **options)
 
 
-# -- Reading
-# --------------------------------------------------------------------------------------------------------------
+# -- Reading -----------------------------------------------------------------------------------------------------------
 
 
 def read_taxim(pack: str | Path) -> Presses:
@@ -197,7 +199,7 @@ def read_circles(images: str | Path, circles: str | Path) -> Presses:
             raise BadCapture(str(UnknownKey(column, known, "column", str(table), f"needed: {', '.join(COLUMNS)}")))
     if not rows:
         raise BadCapture(f"{table}: zero rows; needed: one per image")
-    names, pictures, found, seen = [], [], [], {}
+    names, images_read, found, seen = [], [], [], {}
     for line, row in enumerate(rows, 2):
         where = f"{table}: line {line}"
         name = (row["file"] or "").strip()
@@ -215,13 +217,13 @@ def read_circles(images: str | Path, circles: str | Path) -> Presses:
             raise BadCapture(
                 f"{where}: no image '{name}' in {folder}; allowed: {', '.join(SUFFIXES)} files of that folder"
             )
-        pictures.append(_picture(file, f"{where}: {name}", pictures[0].shape if pictures else None))
+        images_read.append(_colour_image(file, f"{where}: {name}", images_read[0].shape if images_read else None))
         names.append(Path(name).stem)
         found.append(numbers)
-    return Presses(f"{folder} with {table}", names, np.stack(pictures), np.array(found))
+    return Presses(f"{folder} with {table}", names, np.stack(images_read), np.array(found))
 
 
-def _picture(file: Path, where: str, shape: tuple | None) -> np.ndarray:
+def _colour_image(file: Path, where: str, shape: tuple | None) -> np.ndarray:
     image, _ = read_image(file, where)
     if image.shape[-1] != 3 or (shape is not None and image.shape != shape):
         raise BadCapture(
@@ -230,8 +232,7 @@ def _picture(file: Path, where: str, shape: tuple | None) -> np.ndarray:
     return image.astype(np.float64)
 
 
-# -- Importing
-# ------------------------------------------------------------------------------------------------------------
+# -- Importing ---------------------------------------------------------------------------------------------------------
 
 
 def import_presses(
@@ -265,14 +266,63 @@ def import_presses(
     every               take every n-th press; background and noise come from all of them
     Raises BadCapture, OutputExists.
     """
-    for name, value in {
+    lengths = {
         "ball_radius": ball_radius,
         "mm_per_pixel": mm_per_pixel,
         "camera_distance": camera_distance,
         "gel_thickness": gel_thickness,
         "contact_share": contact_share,
         "saturation": saturation,
-    }.items():
+    }
+    _check_options(presses, lengths, background, every, leds)
+    _check(presses, bin)
+    tick = progress or (lambda *_: None)
+    tick("import", 0, 4)
+    scale = mm_per_pixel * bin
+    images, given, circles = _binned_presses(presses, bin, saturation)
+    median = np.median(images, 0)
+    flat = median if background == "median" else given
+    far = _distances(images.shape[1:3], circles) > FAR
+    gains = np.array([_gain(image, flat, beyond) for image, beyond in zip(images, far)])
+    tick("import", 1, 4)
+    noise, levels = far_noise(images / gains[:, None, None], far, saturation)
+    tick("import", 2, 4)
+    touched = np.minimum(contact_share * circles[:, 2] * scale, STEEPEST * ball_radius)
+    taken = slice(None, None, every)
+    depths = [depth_of(a, ball_radius, skirt) for a in touched[taken]]
+    frames = _frames(presses.names[taken], images[taken], circles[taken], gains[taken], depths, scale)
+    directions = light_directions(images, flat * gains[:, None, None], circles, ball_radius / scale)
+    facts = {
+        "source": presses.source,
+        "presses": len(frames),
+        "every": every,
+        "size_px": list(images.shape[1:3]),
+        "bin": bin,
+        "ball_radius_mm": ball_radius,
+        "mm_per_pixel": mm_per_pixel,
+        "mm_per_pixel_after_binning": scale,
+        "camera_distance_mm": camera_distance,
+        "x_fov_deg": math.degrees(2 * math.atan(images.shape[2] * scale / 2 / camera_distance)),
+        "skirt_mm": skirt,
+        "contact_share": contact_share,
+        "background": background,
+        **_derived(circles[:, 2] * scale, circles[taken], gains, noise, levels, directions),
+        # ball, scale or labels are wrong where a circle is larger than the ball: the images decide
+        "setup": _setup(leds, free_ball=bool(np.any(circles[taken, 2] * scale > ball_radius))),
+    }
+    facts["warnings"] = contradictions(
+        presses, facts, images, median, given, gains, noise, saturation, mm_per_pixel_check
+    )
+    tick("import", 3, 4)
+    xml = _scene_xml(facts, gel_thickness, touched.max() + 5 * skirt, led_elements(directions, leds, flat.mean((0, 1))))
+    path = _write(Path(folder), frames, noise, flat, xml, facts, bits=8 if bin == 1 else None, overwrite=overwrite)
+    tick("import", 4, 4)
+    return Imported(path, facts["warnings"], facts)
+
+
+def _check_options(presses: Presses, lengths: dict[str, float], background: str, every: int, leds: int) -> None:
+    """Raises BadCapture, or UnknownKey, for an option that is out of range or contradicts the presses."""
+    for name, value in lengths.items():
         if not (math.isfinite(value) and value > 0):
             raise BadCapture(f"{presses.source}: {name} = {value:g}; allowed: above 0")
     if background not in BACKGROUNDS:
@@ -287,61 +337,36 @@ def import_presses(
         )
     if leds not in (3, 6):
         raise BadCapture(f"{presses.source}: leds = {leds}; allowed: 3 (one per channel) or 6 (shared)")
-    _check(presses, bin)
-    if background == "median" and len(presses.images) < 5:
+    if background == "median" and len(presses.images) < MEDIAN_OF:
         raise BadCapture(
-            f"{presses.source}: {len(presses.images)} presses; a per-pixel median needs 5 or more, else give a "
-            "image of the untouched sensor"
+            f"{presses.source}: {len(presses.images)} presses; a per-pixel median needs {MEDIAN_OF} or more, else give "
+            "an image of the untouched sensor"
         )
-    tick = progress or (lambda *_: None)
-    tick("import", 0, 4)
-    scale = mm_per_pixel * bin
-    images = np.stack([binned(i, bin, saturation) for i in presses.images])
-    given = None if presses.given is None else binned(presses.given, bin, saturation)
-    circles = np.column_stack([(presses.circles[:, :2] + 0.5) / bin, presses.circles[:, 2] / bin])
-    median = np.median(images, 0)
-    flat = median if background == "median" else given
-    distances = _distances(images.shape[1:3], circles)
-    far = distances > FAR
-    gains = np.array([_gain(image, flat, beyond) for image, beyond in zip(images, far)])
-    tick("import", 1, 4)
-    noise, levels = far_noise(images / gains[:, None, None], far, saturation)
-    tick("import", 2, 4)
+
+
+def _frames(names, images, circles, gains, depths, scale: float) -> list[Frame]:
+    """Frames with the press (mm) that their circles (px) tell, and with their gains."""
     height, width = images.shape[1:3]
-    fov = math.degrees(2 * math.atan(width * scale / 2 / camera_distance))
     middle = np.array([width / 2, height / 2])
-    frames, touched = [], np.minimum(contact_share * circles[:, 2] * scale, 0.93 * ball_radius)
-    taken = slice(None, None, every)
-    for name, image, circle, gain, a in zip(*(v[taken] for v in (presses.names, images, circles, gains, touched))):
+    frames = []
+    for name, image, circle, gain, depth in zip(names, images, circles, gains, depths):
         x, y = (circle[:2] - middle) * scale
         settings = {
             "gel.press_x": x,
             "gel.press_y": y,
-            "gel.press_depth": depth_of(a, ball_radius, skirt),
+            "gel.press_depth": depth,
             **{f"camera.gain_{c}": g for c, g in zip("rgb", gain)},
         }
         settings = {key: round(float(value), 6) for key, value in settings.items()}
         frames.append(Frame(name, image.astype(np.float32), None, name, settings))
-    free = ["led_*.power_?" if leds > 3 else "led_*.power", *LIGHTS, "gel.skirt"]
-    if np.any(circles[taken, 2] * scale > ball_radius):  # ball, scale or labels are wrong: the images decide
-        free.append("gel.indenter_size")
-    directions = light_directions(images, flat * gains[:, None, None], circles, ball_radius / scale)
-    facts = {
-        "source": presses.source,
-        "presses": len(frames),
-        "every": every,
-        "size_px": [height, width],
-        "bin": bin,
-        "ball_radius_mm": ball_radius,
-        "mm_per_pixel": mm_per_pixel,
-        "mm_per_pixel_after_binning": scale,
-        "camera_distance_mm": camera_distance,
-        "x_fov_deg": fov,
-        "skirt_mm": skirt,
-        "contact_share": contact_share,
-        "background": background,
-        "labelled_radius_mm": _span(circles[:, 2] * scale),
-        "circles_px": circles[taken].round(4).tolist(),
+    return frames
+
+
+def _derived(radii, circles, gains, noise: Noise, levels: list[dict], directions) -> dict:
+    """What was read off the images, for import.json. radii: mm, of all labels; circles: px, of the presses taken."""
+    return {
+        "labelled_radius_mm": _span(radii),
+        "circles_px": circles.round(4).tolist(),
         "frame_gain_sd": gains.std(0).tolist(),
         "frame_gain": gains.round(5).tolist(),
         "noise": {
@@ -351,42 +376,46 @@ def import_presses(
             "how": "half the squared differences of successive frames beyond three circle radii, after their gains: "
             "temporal noise, banding and drift together",
         },
-        "light_directions": {c: d for c, d in zip("rgb", directions)},
-        "setup": {
-            "free": free,
-            "per_group": list(POSE),
-            "flat_field": "additive",
-            "priors": {
-                pattern: [None, sd]
-                for pattern, sd in PRIORS.items()
-                if pattern in free or pattern != "gel.indenter_size"
-            },
+        "light_directions": dict(zip("rgb", directions)),
+    }
+
+
+def _setup(leds: int, free_ball: bool) -> dict:
+    """What a calibration of the imported set is advised to solve for; see `optics.study.loop.setup_for`."""
+    free = ["led_*.power_?" if leds > 3 else "led_*.power", *LIGHTS, "gel.skirt"]
+    if free_ball:
+        free.append("gel.indenter_size")
+    return {
+        "free": free,
+        "per_group": list(POSE),
+        "flat_field": "additive",
+        "priors": {
+            pattern: [None, sd] for pattern, sd in PRIORS.items() if pattern in free or pattern != "gel.indenter_size"
         },
     }
-    warnings = contradictions(presses, facts, images, median, given, far, gains, noise, saturation, mm_per_pixel_check)
-    facts["warnings"] = warnings
-    tick("import", 3, 4)
+
+
+def _scene_xml(facts: dict, gel_thickness: float, extent: float, leds: str) -> str:
+    """The template of a scene with the facts filled in; extent: mm, how far the dent reaches; leds: XML elements."""
     template = (shipped("scenes") / "templates" / "ball_presses.xml").read_text(encoding="utf-8")
-    xml = template.format(
-        source=_comment(presses.source),
+    (height, width), scale = facts["size_px"], facts["mm_per_pixel_after_binning"]
+    return template.format(
+        source=_comment(facts["source"]),
         width=width,
         height=height,
-        x_fov=f"{fov:.5g}",
-        distance=f"{camera_distance:g}",
-        ball=f"{ball_radius:g}",
+        x_fov=f"{facts['x_fov_deg']:.5g}",
+        distance=f"{facts['camera_distance_mm']:g}",
+        ball=f"{facts['ball_radius_mm']:g}",
         scale=f"{scale:.6g}",
-        skirt=f"{skirt:g}",
+        skirt=f"{facts['skirt_mm']:g}",
         thickness=f"{gel_thickness:g}",
-        gel_width=f"{1.15 * width * scale:.4g}",
-        gel_length=f"{1.15 * height * scale:.4g}",
-        extent=f"{touched.max() + 5 * skirt:.3g}",
-        leds=led_elements(directions, leds, flat.mean((0, 1))),
+        gel_width=f"{GEL_MARGIN * width * scale:.4g}",
+        gel_length=f"{GEL_MARGIN * height * scale:.4g}",
+        extent=f"{extent:.3g}",
+        leds=leds,
         circle_low=f"{facts['labelled_radius_mm'][0]:.3g}",
         circle_high=f"{facts['labelled_radius_mm'][1]:.3g}",
     )
-    path = _write(Path(folder), frames, noise, flat, xml, facts, bits=8 if bin == 1 else None, overwrite=overwrite)
-    tick("import", 4, 4)
-    return Imported(path, warnings, facts)
 
 
 def _check(presses: Presses, bin: int) -> None:
@@ -414,6 +443,13 @@ def binned(image: np.ndarray, bin: int, saturation: float = 255.0) -> np.ndarray
     blocks = np.asarray(image, np.float64).reshape(height // bin, bin, width // bin, bin, channels)
     top = blocks.max((1, 3))
     return np.where(top >= SATURATED * saturation, top, blocks.mean((1, 3)))
+
+
+def _binned_presses(presses: Presses, bin: int, saturation: float) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
+    """Images, the image of the untouched sensor or None, and circles, in binned pixels whose centres are at +0.5."""
+    images = np.stack([binned(i, bin, saturation) for i in presses.images])
+    given = None if presses.given is None else binned(presses.given, bin, saturation)
+    return images, given, np.column_stack([(presses.circles[:, :2] + 0.5) / bin, presses.circles[:, 2] / bin])
 
 
 def depth_of(touched: float, ball_radius: float, skirt: float) -> float:
@@ -520,9 +556,9 @@ def _span(values: np.ndarray) -> list[float]:
 
 
 def contradictions(
-    presses: Presses, facts: dict, images, median, given, far, gains, noise, saturation, second: float | None
+    presses: Presses, facts: dict, images, median, given, gains, noise, saturation, second: float | None
 ) -> list[str]:
-    """What the labels, the scale and the images say against each other, in sentences with numbers."""
+    """Contradictions between labels, scale and images, in sentences with numbers."""
     texts, ball = [], facts["ball_radius_mm"]
     low, high = facts["labelled_radius_mm"]
     count = int((presses.circles[:, 2] * facts["mm_per_pixel"] > ball).sum())

@@ -74,6 +74,18 @@ class Noise:
         """Standard deviation in DN: the root of `variance`."""
         return np.sqrt(self.variance(signal, frames_averaged))
 
+    def summed(self, frames: int) -> Noise:
+        """Noise of the sum of `frames` frames (DN add up), stated as that of one frame, as [noise] asks for.
+
+        The gain in DN per electron stays, the quantisation of all frames but one is counted as dark noise.
+        """
+        return replace(
+            self,
+            dark_noise=math.sqrt(frames * self.dark_noise**2 + (frames - 1) * self.quantisation**2 / 12),
+            black_level=frames * self.black_level,
+            saturation=frames * self.saturation,
+        )
+
     def fixed_pattern(self, shape: Sequence[int], rng: np.random.Generator) -> np.ndarray:
         """A gain per pixel, relative, of rms `prnu`; make it once per camera and hand it to every `expose`."""
         return self.prnu * rng.standard_normal(shape)
@@ -115,9 +127,7 @@ def step_of(images: Sequence[np.ndarray]) -> float:
     )  # a sample will do
     if np.any(levels != np.round(levels)):
         return 0.0
-    return (
-        float(np.gcd.reduce(levels.astype(np.int64))) if len(levels) >= 32 else 1.0
-    )  # few levels share one by Monte Carlo
+    return float(np.gcd.reduce(levels.astype(np.int64))) if len(levels) >= 32 else 1.0  # few levels share one by chance
 
 
 def estimate(captures: Captures, black_level: float | None = None, saturation: float | None = None) -> Noise:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from optics import __version__
+from optics.version import __version__
 
 if TYPE_CHECKING:
     from optics.scene.loader import Scene

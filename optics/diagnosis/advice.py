@@ -1,17 +1,16 @@
-"""The next measurement: which frame would tell effects apart that the present frames cannot, by how much, before it is
-taken.
+"""The next measurement: which frame, not yet taken, would tell effects apart that the present frames cannot.
 
 A shot is rendered at the study's values with hypothetical settings (another exposure, a deeper press, other lights, a
-turned polarizer); its derivative images say what it would add. With G_A, G_B what is left of two effects' images, in
-units of the noise, after everything that a calibration solves for is projected off, and effect A true with the strength
-s that was found for it,
+turned polarizer); its derivative images determine what it would add. Let G_A, G_B be two effects' images in units of
+the noise, after projecting off everything that a calibration solves for, and effect A be true with the strength s that
+was found for it. Then
 
     D_AB = s^2 (|G_A|^2 - (G_A.G_B)^2/|G_B|^2)         expected chi2 by which the data prefer A over B at its best
     P(A beats B) = Phi(sqrt(D_AB)/2)
 
 (T-optimality: Atkinson & Fedorov, Biometrika 62, 57 (1975); several and one-sided strengths:
 `optics.diagnosis.statistics.gap`). Informations of frames add up, so that a choice among shots costs algebra only. A
-new press brings unknowns of its own, its place and depth with what the stage knows of them; every frame brings what the
+new press brings nuisance parameters: its place and depth, with the stage's priors; every frame brings those that the
 study solves for in each frame. Saturated pixels of a shot do not count."""
 
 from __future__ import annotations
@@ -48,21 +47,21 @@ PLACES = 3  # other places that are tried: as many as a plan of "more presses" t
 TAKEN = 3  # shots of a plan
 SHOTS = 20  # that are simulated: each costs the derivative images of one frame
 ROWS = 300_000  # values that all shots together may keep: informations of thinned pixels, scaled up
-ENOUGH = 4 * CLEAR  # D at which the right one wins in 99.95 % of cases; more is not asked of a plan
+ENOUGH = 4 * CLEAR  # D at which the right one wins in 99.95 % of cases; a plan needs no more
 MEMBERS = 5  # effects that are told apart at once
 # of chi2 below the best: 20 times less likely the cause in noise alone; a rival still, but not taken to be true
 LIKELY = 6.0
 CLOCKS = ("time", "approach")  # settings that tell when and from where, not what
-UNTOUCHED = "untouched"  # the press that is none: its place is not unknown
+UNTOUCHED = "untouched"  # the name of no press: it has no place to solve for
 
 
 @dataclass(frozen=True)
 class Shot:
-    """A frame that could be taken: frame `like` again, but for the settings.
+    """A frame that could be taken: frame `like` again, except for the settings.
 
-    family    what kind of change it is; words: what to do
+    family    the kind of change; words: what to do
     settings  key -> value that differs from the frame `like`
-    press     name of the new press that it shows; '': the press of `like`, whose place is known as well as it is
+    press     name of the new press that it shows; '' for the press of `like`, which shares its place
     """
 
     family: str
@@ -76,12 +75,11 @@ class Shot:
 
 
 def families(model: Model, values: Values, frames: Sequence[int]) -> list[Shot]:
-    """The shots to try, at most SHOTS, the families' first members first: found from the keys that the model has and
-    frames turn.
+    """The shots to try, at most SHOTS, in turn from each family: by the keys that the model has and that frames turn.
 
-    Places and depths where there is a press, exposure where there is a camera with one, single lights, darkness and
-    dimmed light where there are lights, turned and removed films, an object nearer and farther, and for every other
-    setting that the frames turned a value between and one beyond either end."""
+    Places and depths of a press, the camera's exposure, single lights, darkness and dimmed light, turned and removed
+    films, a nearer and a farther object; for every other setting that the frames turned, a value between and one beyond
+    either end."""
     like = _typical(model, values, frames)
     now = _now(model, values, like)
     found = [
@@ -105,8 +103,7 @@ def families(model: Model, values: Values, frames: Sequence[int]) -> list[Shot]:
 
 
 def _now(model: Model, values: Values, frame: int) -> dict[str, float]:
-    """Numbers that hold in a frame, by key; of a sweep of readings what they share, and the middle of what they do
-    not."""
+    """Numbers that hold in a frame, by key; of a sweep of readings, the median of each setting that it turns."""
     own = model.frames[frame]
     swept = {k: float(np.median(v)) for k, v in own.readings.items()}
     return {**model.base, **values.common, **own.parameters, **swept, **values.frame.get(frame, {})}
@@ -133,7 +130,7 @@ def _same(model: Model, like: int) -> str:
 
 
 def _typical(model: Model, values: Values, frames: Sequence[int]) -> int:
-    """The brightest frame that shows a press of middling depth: what the shots vary."""
+    """The brightest frame that shows a press of median depth: the shots vary it."""
     press = _press(model)
     if press is not None:
         depths = {f: abs(_now(model, values, f)[press[2]]) for f in frames}
@@ -202,8 +199,8 @@ def _presses(model: Model, values: Values, frames: Sequence[int], now: Mapping, 
 
 
 def _reaches(model: Model, known: np.ndarray, now: Mapping, keys: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
-    """(2,), (2,) mm: how far from the middle presses may lie (as far as they did, or 0.3 of the gel's side where those
-    were few), and how far out one still lies on the pad, as far as the scene says how large that is."""
+    """(2,), (2,) mm from the middle: how far other presses may lie (as far as the present ones, or 0.3 of the gel's
+    side where these are few), and how far out one still lies on the pad, if the scene states its size."""
     reach = np.abs(known[:, :2]).max(0)
     sides = [now.get(f"{key.rpartition('.')[0]}.{name}") for key, name in zip(keys, ("width", "length"))]
     least = np.array([1.0 if side is None else 0.3 * float(side) for side in sides])
@@ -215,7 +212,7 @@ def _reaches(model: Model, known: np.ndarray, now: Mapping, keys: Sequence[str])
 
 
 def places(known: np.ndarray, reach: np.ndarray, count: int) -> list[tuple[float, float]]:
-    """`count` places within +-reach (2,), each as far as can be from all (n, 2) that are known and from each other."""
+    """`count` places within +-reach (2,), each as far as possible from all known ones (n, 2) and from each other."""
     grid = np.stack(np.meshgrid(*(np.linspace(-r, r, 7) for r in reach)), -1).reshape(-1, 2)
     taken = list(np.asarray(known, float).reshape(-1, 2))
     found = []
@@ -235,7 +232,7 @@ def _lights(model: Model, values: Values, frames: Sequence[int], now: Mapping, l
         return
 
     def pattern(on: Sequence[str]) -> dict[str, float]:
-        """What a frame sets: drive levels; where levels are no setting of this model, only what is dark is said."""
+        """What a frame sets: drive levels, or only which lights are dark where this model has no drive levels."""
         return {k: float(k in on) for k in keys if driven is not None or k not in on}
 
     def lit(frame: int) -> tuple[str, ...]:
@@ -292,7 +289,7 @@ def _distances(model: Model, now: Mapping, like: int) -> Iterator[Shot]:
 
 
 def _turned(model: Model, frames: Sequence[int], now: Mapping, like: int) -> Iterator[Shot]:
-    """Settings that the frames turned and no family above knows: a value in the widest gap, and one beyond either
+    """Settings that the frames turned and that no family above covers: a value in the widest gap, and one beyond either
     end."""
     known = ("power", "exposure", "angle", "inserted", "distance", *CLOCKS)
     special = {*(_press(model) or ()), *(k for name in known for k in keys_named(model.parameters, name))}
@@ -324,10 +321,10 @@ def _turned(model: Model, frames: Sequence[int], now: Mapping, like: int) -> Ite
 
 @dataclass
 class Member:
-    """An effect in the information matrix: columns that the present frames see, and those that a shot brings (by shot).
+    """An effect in the information matrix: its columns in the present frames, and those that each shot brings (`more`).
 
-    strength  coefficients of the columns at which the effect is taken to be true
-    likely    whether it is taken to be true at all; else it is a rival only
+    strength  coefficients of the columns at which the effect is assumed true
+    likely    whether it is assumed true at all; otherwise it is only a rival
     """
 
     name: str
@@ -338,7 +335,7 @@ class Member:
     more: dict[int, tuple[list[int], list[int], list[float]]] = field(default_factory=dict)
 
     def bring(self, shot: int, column: int, side: int, strength: float) -> None:
-        """A strength that only this shot would show."""
+        """Add a strength that acts in this shot only."""
         columns, sides, strengths = self.more.setdefault(shot, ([], [], []))
         columns.append(column)
         sides.append(side)
@@ -358,13 +355,14 @@ class Member:
 
 @dataclass
 class Outlook:
-    """Informations of the present frames and of each shot, on the same columns: the base, unknowns of the shots, the
-    effects.
+    """Informations of the present frames and of each shot, on the same columns: the base, nuisance parameters of the
+    shots, the effects.
 
     present     (m, m);   shots: [(m, m)]
     base        columns that a calibration solves for, with 1/sd^2 of their priors in `precision`
-    nuisances   unknowns that each shot brings, in words
-    nested      pairs (i, j) of members where j can do all that i can
+    nuisances   nuisance parameters that each shot brings, in words
+    truncation  of the base's eigenvalues, see `optics.diagnosis.statistics.Normal.truncation`
+    nested      pairs (i, j) of members where j contains i
     """
 
     present: np.ndarray
@@ -377,12 +375,11 @@ class Outlook:
     nested: set[tuple[int, int]] = field(default_factory=set)
 
     def information(self, chosen: Sequence[int]) -> tuple[np.ndarray, list[int]]:
-        """(V, columns): what the present frames and the chosen shots would say of the effects, everything else
-        projected off.
+        """(V, columns): information of the present frames and the chosen shots on the effects, all else projected off.
 
         As `optics.diagnosis.statistics.project`, with a ridge of the size of its truncation in place of eigenvectors: a
-        choice takes hundreds of these, and threads that wait for each other make an eigenvector problem of this size
-        fifty times as slow as a solution."""
+        choice takes hundreds of these, and an eigenvector problem of this size takes fifty times as long as a linear
+        solve, as its threads wait for each other."""
         gram = sum((self.shots[s] for s in chosen), self.present)
         rest = list(dict.fromkeys(i for m in self.members for i in m.at(chosen)[0]))
         raw = np.diag(gram)
@@ -396,8 +393,8 @@ class Outlook:
         return (v + v.T) / 2 * np.outer(seen, seen), rest
 
     def gaps(self, chosen: Sequence[int] = ()) -> np.ndarray:
-        """(n, n) D[a, b], a true as found; infinite where there is nothing to tell: a itself, what contains a, a not
-        likely."""
+        """(n, n) D[a, b], a true as found; infinite where nothing needs telling apart: for a itself, for what contains
+        a, and where a is not likely."""
         return self.falls(chosen)[0]
 
     def falls(self, chosen: Sequence[int] = ()) -> tuple[np.ndarray, np.ndarray]:
@@ -431,14 +428,14 @@ class Outlook:
         return float(self.gaps(chosen).min(initial=np.inf))
 
     def worth(self, chosen: Sequence[int] = ()) -> float:
-        """The smallest D between any two, discounted where it is less than MARGIN of the fall itself: with misfit a
-        verdict asks for both."""
+        """The smallest D between any two, discounted where it is less than MARGIN of the effect's own fall: where
+        misfit is left, a verdict requires both."""
         gaps, full = self.falls(chosen)
         share = gaps / np.where(full > 0, MARGIN * full, 1.0)[:, None]
         return float((gaps * np.minimum(share, 1.0)).min(initial=np.inf))
 
     def choose(self, count: int, worth: Callable[[Sequence[int]], float], enough: float = math.inf) -> list[int]:
-        """Up to `count` shots (one may be taken twice) until they are worth enough: one after the other, each exchanged
+        """Up to `count` shots (one may be taken twice) until they are worth `enough`: greedily, each then exchanged
         while that helps."""
         known = cache(worth)  # exchanges come back to the same shots again and again
 
@@ -469,10 +466,10 @@ def outlook(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> Outlook:
-    """Render every shot once at the values, and sum up what it would say; no data are needed.
+    """Render every shot once at the values, and sum up its information; this needs no data.
 
     evidence   of the present frames, in which the members were scored (`columns`, `form`)
-    strengths  coefficients of each member's columns at which it is taken to be true
+    strengths  coefficients of each member's columns at which it is assumed true
     variables_of(model, effect)  as in `optics.diagnosis.diagnose`, for a model that has the shots as frames
     """
     say = progress or (lambda what, done, total: None)
@@ -534,7 +531,7 @@ def outlook(
 
 
 def informations(evidence: Evidence) -> list[np.ndarray]:
-    """(m, m) of each frame, on all columns: from the pixels that were kept, scaled up to those that there are."""
+    """(m, m) of each frame, on all columns: from the values that were kept, scaled up to all values."""
     found = []
     for block in evidence.blocks:
         normal = st.Normal(len(evidence.columns))
@@ -544,19 +541,19 @@ def informations(evidence: Evidence) -> list[np.ndarray]:
 
 
 def _placed(gram: np.ndarray, to: Mapping[int, int], size: int) -> np.ndarray:
-    """(size, size) with the columns of a matrix at the places that they have there; those without one are left out."""
+    """(size, size): the columns of a matrix moved to their places `to`; those without a place are left out."""
     found = np.zeros((size, size))
     found[np.ix_(list(to.values()), list(to.values()))] = gram[np.ix_(list(to), list(to))]
     return found
 
 
 def nested_in(members: Sequence[Candidate]) -> set[tuple[int, int]]:
-    """Pairs (i, j) of which j can do all that i can."""
+    """Pairs (i, j) of which j contains i."""
     return {(i, j) for i, a in enumerate(members) for j, b in enumerate(members) if b.contains(a)}
 
 
 def imagined(model: Model, values: Values, shots: Sequence[Shot]) -> tuple[Model, Values]:
-    """(model, values) with the shots as further frames, whose images are what the model predicts."""
+    """(model, values) with the shots as further frames, whose images are the model's predictions."""
     first = len(model.frames)
     twin, values = model.imagine([_frame(model, shot, n) for n, shot in enumerate(shots)]), values.copy()
     for key in (twin.driven or set()) - (model.driven or set()):
@@ -585,14 +582,14 @@ def _frame(model: Model, shot: Shot, number: int) -> Frame:
 
 
 def is_place(model: Model, key: str) -> bool:
-    """Whether a parameter belongs to what is touched and not to the frame: all frames of a press share it."""
+    """Whether a parameter belongs to the touched object and not to the frame: all frames of a press share it."""
     return key.rpartition(".")[2].startswith("press_") or model.parameters[key].how == "difference"
 
 
 def _base_with_shots(
     twin: Model, evidence: Evidence, shots: Sequence[Shot], first: int
 ) -> tuple[list[Variable], list[Variable]]:
-    """The base's variables, which hold in the shots of their press as well, and the unknowns that shots bring."""
+    """The base's variables, extended to the shots of their press, and the nuisance parameters that shots bring."""
     base, fresh = [], []
     kinds: dict[tuple, Variable] = {}  # the first of each kind that frames have for themselves
     for v in (evidence.columns[i] for i in evidence.base):
@@ -637,13 +634,12 @@ def next_measurement(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> list[Advice]:
-    """Shots that tell the members apart, the best of each family, best first; then the best up to TAKEN together, no
-    more of them than bring D to `enough`; and for comparison TAKEN more presses (or repeats, where nothing is pressed).
+    """Shots that tell the members apart: the best of each family, best first; then the best up to TAKEN together, as
+    many as bring D to `enough`; and for comparison TAKEN more presses (or repeats, where nothing is pressed).
 
-    Ranked by the smallest D between any two members; where no effect explains all, as `Outlook.worth` has it. A member
-    whose fall of chi2 is far below the best's counts as a rival and is not taken to be true. Nothing is returned for
-    fewer than two members. Costs the derivative images of as many frames as there are shots, of the base and of the
-    members; a new press is the dear part."""
+    Ranked by the smallest D between any two members or, where no effect explains all, by `Outlook.worth`. A member
+    whose fall of chi2 is far below the best's counts as a rival only. Empty for fewer than two members. Costs the
+    derivative images of the base and the members in as many frames as there are shots; new presses cost most."""
     if len(members) < 2:
         return []
     shots = families(model, values, evidence.frames)
@@ -671,13 +667,13 @@ def next_measurement(
 
 
 def _net(row: Row) -> float:
-    """Fall beyond what chance gives, of the refit where there was one."""
+    """Fall less its mean when the effect is absent, of the refit where there was one."""
     return row.net if row.refit is None else row.net_refit
 
 
 def strength_of(c: Candidate) -> np.ndarray:
-    """Coefficients at which a member is taken to be true: as the refit found it, else as the score expects it, else
-    plausible."""
+    """Coefficients at which a member is assumed true: as the refit found it, else as the score expects it, else of
+    plausible size."""
     if c.row.refit is not None:
         change = np.array(c.row.refit.strength) - c.start
         if np.isfinite(change).all() and change.any():
@@ -725,7 +721,7 @@ def _advice(
 
 
 def asked_for(diagnosis: Diagnosis) -> list[str]:
-    """Names of the effects that a next measurement has to tell apart; none where the verdict does not hang on that."""
+    """Names of the effects that a next measurement has to tell apart; none where the verdict does not depend on it."""
     failed = {c.name for c in diagnosis.conditions if not c.holds}
     if diagnosis.word == "AMBIGUOUS" and len(diagnosis.ambiguous) > 1:
         return diagnosis.ambiguous[:MEMBERS]
@@ -740,8 +736,8 @@ def asked_for(diagnosis: Diagnosis) -> list[str]:
 def advise(
     model: Model, diagnosis: Diagnosis, variables_of: VariablesOf, seed: int = 0, progress: Progress | None = None
 ) -> list[Advice]:
-    """The next measurement after a diagnosis of this process; nothing where it does not hang on two effects that look
-    alike."""
+    """The next measurement after a diagnosis in this process (its evidence is in memory); empty where the verdict does
+    not depend on telling two effects apart."""
     evidence, names = diagnosis.evidence, asked_for(diagnosis)
     if evidence is None or len(names) < 2:
         return []

@@ -27,7 +27,7 @@ Progress = Callable[[str, int, int], None]  # (what, done, total)
 
 
 def silent(what: str, done: int, total: int) -> None:
-    """Progress that nobody watches."""
+    """Progress that is not reported."""
 
 
 def at_bound(variable: Variable, value: float) -> bool:
@@ -77,8 +77,8 @@ class Candidate:
 
     @property
     def usual(self) -> np.ndarray:
-        """Changes of plausible size, to the side that is open. Per-frame strengths alternate in sign: all alike would be
-        one scale, which a calibration absorbs."""
+        """Changes of plausible size, to the side that is open. Per-frame strengths alternate in sign: all alike would
+        be one scale, which a calibration absorbs."""
         sides = np.array(self.sides)
         turn = np.where([v.frames is not None and i % 2 == 1 for i, v in enumerate(self.variables)], -1.0, 1.0)
         return self.plausible * np.where(sides == 0, turn, sides)
@@ -198,8 +198,8 @@ class Evidence:
         return self.spectrum.test(whitened, base, self.inverse(base))
 
     def variance(self, model: Model, frame: int, prediction: np.ndarray, values: Values | None = None) -> np.ndarray:
-        """(H, W, C) DN^2, of a frame about its prediction. Where the model does not state the error of its prediction, the
-        variance between two seeds is added."""
+        """(H, W, C) DN^2, of a frame about its prediction. Where the model does not state the error of its prediction,
+        the variance between two seeds is added."""
         known = model.variance(values or self.values, frame, prediction)
         return known if model.monte_carlo else known * (1 + self.render_noise)
 
@@ -268,8 +268,8 @@ class Layout:
     def images(
         self, model: Model, values: Values, frame: int, seed: int, wanted: set[int] | None = None
     ) -> tuple[np.ndarray | None, dict[int, np.ndarray]]:
-        """(prediction, column -> derivative image (H, W, C)) of a frame; `wanted`: these columns only. The prediction is
-        None where no column acts in the frame."""
+        """(prediction, column -> derivative image (H, W, C)) of a frame; `wanted`: these columns only. The prediction
+        is None where no column acts in the frame."""
         found: dict[int, np.ndarray] = {}
         prediction = None
         for first, variables, steps in ((0, self.tangent, None), (len(self.tangent), self.secant, self.steps)):

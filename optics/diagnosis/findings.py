@@ -65,8 +65,8 @@ def refuted(winner: Candidate, other: Candidate, dof: int) -> bool:
     beside the winner could fake.
 
     For the wrong one of two to lead by L in chi2, sqrt(L) or more must lie along the one direction in which their
-    images differ. Noise has a variance of 1 there, and of misfit of which H is hidden, a share ALONG lies there: the right one
-    leads if L > CLEAR (1 + ALONG H)."""
+    images differ. Noise has a variance of 1 there, and of misfit of which H is hidden, a share ALONG lies there: the
+    right one leads if L > CLEAR (1 + ALONG H)."""
     own, left = winner.row.refit, other.row.refit
     if own is None or other is winner or not own.complete or left is None or not left.converged:
         return False

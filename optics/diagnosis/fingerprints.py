@@ -1,11 +1,10 @@
-"""Fingerprints: a residual that no effect explains, along everything that the scene knows of a pixel, and what that
-leads to.
+"""Fingerprints: a residual as curves along everything that is known of a pixel.
 
-`places` gathers the covariates of every kept value: those of the model (`optics.fit.model.Model.coordinates`), those
-that any image has (row, column, channel, frame, a map of cells), those of the prediction (signal, its gradient, its
-Laplacian) and the settings that the experimenter turned. `fingerprints` fits a gain and an offset per bin of each, what
-calibration absorbs taken out, and ranks them by the fall of chi2. `families` says whether the residual goes with the
-camera, with light, with geometry or with time."""
+`places` gathers the coordinates of every kept value: those of the model (`optics.fit.model.Model`), those of any image
+(row, column, channel, frame, a map of cells), those of the prediction (signal, its gradient, its Laplacian) and the
+settings that the experimenter turned. `fingerprints` fits a gain and an offset per bin of each, after projecting off
+what a calibration absorbs, and ranks them by the fall of chi2. `families` says whether the residual depends on the
+camera, on light, on geometry or on time."""
 
 from __future__ import annotations
 
@@ -27,11 +26,9 @@ from optics.scene.parameter import Values
 SIDE = 4  # cells per side of the coordinate 'place': a finer map would fit any clutter and forbid every claim
 NOT_A_COORDINATE = {"far", "quadrant"}  # regions that others make up
 YES_NO = ("contact", "shadow", "rim")
-LINES = (
-    64  # bins of 'row', 'column' and 'reading': what a shutter, a read-out or a restless lamp does goes by single rows
-)
+LINES = 64  # bins of 'row', 'column' and 'reading': a shutter, a read-out or an unsteady lamp acts on single rows
 REPEATED = 3  # frames that show a pixel, for a pattern to be called fixed
-# of a curve's direction that calibration must leave for it to be drawn: the rest (a level, a slope) nobody can know
+# Share of a curve's direction that calibration must leave for it to be drawn; the rest (a level, a slope) is unknown.
 SEEN = 0.01
 
 FAMILIES = {  # what a coordinate belongs to; a setting belongs to the family of the part that it is a setting of
@@ -78,9 +75,8 @@ def family_of(coordinate: str, kind: str = "") -> str:
 # -- covariates -------------------------------------------------------------------------------------------------------
 
 
-def places(model, values: Values, evidence: Evidence) -> list[dict[str, np.ndarray]]:
-    """Per block, the covariates of every kept value (n,): those of the model, of the prediction, of any image, and the
-    settings."""
+def places(model: Model, values: Values, evidence: Evidence) -> list[dict[str, np.ndarray]]:
+    """Per block, {coordinate: (n,) of its values}: of the model, of the prediction, of any image, and settings."""
     found = []
     order = {frame: i for i, frame in enumerate(evidence.frames)}
     turned = settings(model, evidence)
@@ -119,8 +115,7 @@ def places(model, values: Values, evidence: Evidence) -> list[dict[str, np.ndarr
 
 
 def _texture(prediction: np.ndarray) -> dict[str, np.ndarray]:
-    """(H, W, C) DN/px and DN/px^2: how steep and how bent a predicted image is; what a blur takes from, and a
-    sharpening adds to."""
+    """(H, W, C) gradient in DN/px and Laplacian in DN/px^2 of a predicted image: where blur and sharpening act."""
     from scipy.ndimage import laplace
 
     steep = np.hypot(*np.gradient(prediction, axis=(0, 1)))
@@ -130,7 +125,7 @@ def _texture(prediction: np.ndarray) -> dict[str, np.ndarray]:
     }
 
 
-def settings(model, evidence: Evidence) -> dict[str, list[float]]:
+def settings(model: Model, evidence: Evidence) -> dict[str, list[float]]:
     """key -> value per fitted frame of the numbers that the experimenter turned, other than which LED was on."""
     turned: dict[str, list[float]] = {}
     frames = [model.frames[f] for f in evidence.frames]
@@ -145,11 +140,13 @@ def settings(model, evidence: Evidence) -> dict[str, list[float]]:
 # -- curves -----------------------------------------------------------------------------------------------------------
 
 
-def fingerprints(model, evidence: Evidence, found: list[dict], reference: float, say: Progress) -> list[Fingerprint]:
+def fingerprints(
+    model: Model, evidence: Evidence, found: list[dict], reference: float, say: Progress
+) -> list[Fingerprint]:
     """The residual along every coordinate: bins of gain and offset, projected like effects; best first.
 
-    Falls of chi2 count every direction that is left; a curve is drawn (and drafted) without those of which calibration
-    leaves less than SEEN, such as a level, which powers of LEDs absorb: they would be large, and noise.
+    Falls of chi2 count every direction that is left. A curve is drawn (and drafted) without directions of which
+    calibration leaves less than SEEN, such as a level, which LED powers absorb: these would be large, and only noise.
 
     found      what `places` returns
     reference  net fall of chi2 of the best effect, which the curves' ratios refer to
@@ -231,7 +228,7 @@ def _unit_of(model: Model, coordinate: str) -> str:
     return "mm" if coordinate.endswith(".distance") else UNITS.get(coordinate, "")
 
 
-def _labels(evidence: Evidence, model, name: str, centres: Sequence[float]) -> list[str]:
+def _labels(evidence: Evidence, model: Model, name: str, centres: Sequence[float]) -> list[str]:
     """Names of the bins of a coordinate that has no scale."""
     if name == "frame":
         return [model.frames[f].name for f in evidence.frames]
@@ -246,7 +243,7 @@ def _labels(evidence: Evidence, model, name: str, centres: Sequence[float]) -> l
     return []
 
 
-def _lights(evidence: Evidence, model) -> list[str]:
+def _lights(evidence: Evidence, model: Model) -> list[str]:
     return sorted({led_label(model.frames[f].parameters) for f in evidence.frames})
 
 
@@ -254,14 +251,14 @@ def channel_names(evidence: Evidence) -> list[str]:
     return ["R", "G", "B"] if evidence.channels == 3 else [str(i) for i in range(evidence.channels)]
 
 
-# -- what it goes with ------------------------------------------------------------------------------------------------
+# -- families of coordinates ------------------------------------------------------------------------------------------
 
 
 def families(found: Sequence[Fingerprint]) -> list[Family]:
-    """The best curve of each family, the family that the residual goes with first.
+    """The best curve of each family; the family that the residual depends on most comes first.
 
-    A map of the sensor mimics every curve that does not move, and a number per frame every setting: either stands for
-    its family, and its family comes first, only where no other curve is nearly as good."""
+    A map of the sensor mimics every curve that does not move, and a number per frame every setting: such a curve stands
+    for its family, and its family comes first, only where no other curve is nearly as good."""
     own: dict[str, list[Fingerprint]] = {}
     for f in found:
         own.setdefault(f.family, []).append(f)
@@ -272,8 +269,7 @@ def families(found: Sequence[Fingerprint]) -> list[Family]:
 
 
 def goes_with(found: Sequence[Family]) -> str:
-    """One sentence: with what the residual goes, and what it goes with less; '' without a curve that explains
-    anything."""
+    """One sentence: what the residual depends on, and on what less; '' without a curve that explains anything."""
     if not found or found[0].net <= 0:
         return ""
 
@@ -300,12 +296,12 @@ def goes_with(found: Sequence[Family]) -> str:
     return f"{text}; in brackets the best coordinate of each and how much {how}."
 
 
-def fixed_pattern(model, evidence: Evidence, excess: float) -> float:
-    """Share of the excess misfit that one gain for each pixel explains, the same in all frames: dirt, scratches, a
+def fixed_pattern(model: Model, evidence: Evidence, excess: float) -> float:
+    """Share of the excess misfit that one gain for each pixel, the same in all frames, explains: dirt, scratches, the
     sensor's own pattern.
 
-    Of pixels that REPEATED frames or more show, beyond what as many gains explain by Monte Carlo; NaN where there are
-    none, no excess, or readings of a table.
+    Of pixels that REPEATED frames or more show, less the number of gains, which noise explains; NaN where there are no
+    such pixels, no excess, or readings of a table.
     excess   chi2 less its degrees of freedom
     """
     if isinstance(evidence.spectrum, st.Sweeps):
@@ -331,8 +327,8 @@ def fixed_text(share: float, best: float) -> str:
     if not share > max(SHARE, 2 * best):
         return ""
     return (
-        f"one gain for each pixel, the same in every frame, explains {min(share, 1.0):.0%} of the excess: dirt, a scratch or the sensor's own "
-        "pattern lies fixed in the image, whatever curve it leans to."
+        f"one gain for each pixel, the same in every frame, explains {min(share, 1.0):.0%} of the excess: dirt, "
+        "a scratch or the sensor's own pattern lies fixed in the image, whatever curve it resembles."
     )
 
 
@@ -345,6 +341,7 @@ def unexplained(found: Sequence[Fingerprint], best_effect: float, excess: float)
         return ""
     effect, curve = (min(max(x / excess, 0.0), 1.0) for x in (best_effect, found[0].net))
     return (
-        f"Of the excess misfit the best effect explains {effect:.0%}, so {1 - effect:.0%} is unexplained by the library; the best curve, "
-        f"along '{found[0].coordinate}', explains {curve:.0%}; {1 - max(effect, curve):.0%} neither does."
+        f"Of the excess misfit the best effect explains {effect:.0%}, so {1 - effect:.0%} is unexplained by the "
+        f"library; the best curve, along '{found[0].coordinate}', explains {curve:.0%}; "
+        f"{1 - max(effect, curve):.0%} neither does."
     )

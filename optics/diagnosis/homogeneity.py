@@ -1,14 +1,13 @@
-"""Whether a strength is the same everywhere, and whether it is more than clutter makes.
+"""Homogeneity: whether a strength is the same in all parts of the data, and whether it is more than clutter makes.
 
-Noise is independent from pixel to pixel, clutter is not: mottle, a fixed pattern, a lamp that wanders are shared by
-neighbours. So what a strength scatters between parts of the sensor, or of a session, is held against it, beside the
-noise."""
+Noise is independent from pixel to pixel; clutter is not: neighbours share mottle, a fixed pattern, a drifting lamp. A
+strength is therefore compared with its scatter between parts of the sensor, or of the session, besides its noise."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -18,40 +17,93 @@ from optics.diagnosis.evidence import Block, Candidate, Evidence, Progress, at_b
 from optics.diagnosis.result import Pair, Refit, Split
 from optics.diagnosis.thresholds import LEVEL, MAPS, UNEVEN
 from optics.fit.compare import led_label
-from optics.fit.model import value_of
+from optics.fit.model import Model, value_of
+from optics.fit.result import Fit
 from optics.scene.parameter import Variable
 
-EVEN = 0.05  # of the fall: what splitting may gain where clutter does not make it
-# of what an effect leaves: if its own strength, split, takes more than this, the rest is where the effect is, and it is
-# not it
+EVEN = 0.05  # of the fall: what splitting may gain where the scatter of clutter does not explain it
+# Of what an effect leaves: if splitting its strength takes more, the rest lies where the effect acts, and the effect is
+# not its cause.
 SAME_PLACE = 0.5
 HAIR = 0.01  # of the fall: a split that gains less says nothing about what the effect is
-PARTS = 16  # of the sensor or session, wider than what clutter shares
+PARTS = 16  # of the sensor or session: wider than clutter is correlated, enough for a variance
+
+
+@dataclass
+class Added:
+    """A fitted effect with the evidence at its values.
+
+    own         columns of the base, of what was added beside, and of the effect
+    calibrated  those but the effect's; effect: the effect's
+    change      (k,) of its strengths from where they started
+    images      per block, the whitened difference (n,) that the effect makes
+    net         fall of chi2 with it
+    """
+
+    name: str
+    own: Evidence
+    calibrated: list[int]
+    effect: list[int]
+    change: np.ndarray
+    images: list[np.ndarray]
+    net: float
 
 
 def split(
-    model,
+    model: Model,
     evidence: Evidence,
     places: list[dict],
     rows_max: int,
     seed: int,
     say: Progress,
     c: Candidate,
-    found,
+    found: Fit,
     left: Refit | Pair,
     net: float,
     beside: Sequence[Variable] = (),
 ) -> tuple[list[Split], float, np.ndarray]:
     """Whether a fitted effect has the same strength in every part of the data, and `scatter` of its strength.
 
-    With the effect in the base, e, by which its image differs from the one without it, is cut into parts e 1{part} and
-    these are scored: a true effect gains nothing by being cut, a proxy does.
+    With the effect in the base, the image e by which it differs from the model without it is cut into parts e 1{part},
+    and these are scored: a true effect gains nothing by being cut, a proxy does.
 
-    found   the fit with it;   left: what is left with that;   net: its fall;   beside: variables of what was added with
-            it
+    places   coordinates of every kept value (`optics.diagnosis.fingerprints.places`)
+    found    the fit with the effect; left: what is left with it; net: its fall
+    beside   variables of what was added together with it
     """
-    from scipy.special import chdtrc
+    added = _added(model, evidence, rows_max, seed, say, c, found, net, beside)
+    own = added.own
+    parts = _parts(model, own, places)
+    plain_normal = own.thinned(extra=max([len(labels) for labels, _ in parts.values()], default=0))
+    cuts = [_cut(added, by, labels, bins, plain_normal, places) for by, (labels, bins) in parts.items()]
+    results = [cut for cut in cuts if cut is not None]
+    level = LEVEL / max(len(results), 1)  # Bonferroni
+    excess = left.excess_sd * math.sqrt(2 * max(evidence.normal.count - evidence.projected.rank, 1))
 
+    def most(s: Split) -> float:
+        """The h that is allowed."""
+        if s.p >= level:
+            return max(s.h, UNEVEN)
+        if left.complete:  # only noise is left, and p is what it says
+            return HAIR
+        return min(EVEN if s.chance < LEVEL else UNEVEN, SAME_PLACE * excess / max(net, 1e-9))
+
+    results = [replace(s, limit=most(s), holds=s.h <= most(s)) for s in results]
+    return results, *scatter(own, added.calibrated, added.effect, added.change, places)
+
+
+def _added(
+    model: Model,
+    evidence: Evidence,
+    rows_max: int,
+    seed: int,
+    say: Progress,
+    c: Candidate,
+    found: Fit,
+    net: float,
+    beside: Sequence[Variable],
+) -> Added:
+    """Measure again at the values with the effect."""
     base = [
         v
         for v in [*(evidence.columns[i] for i in evidence.base), *beside, *c.variables]
@@ -72,60 +124,53 @@ def split(
         (np.asarray(new, float) - old).reshape(-1)[block.index] / block.sigma
         for block, (new, old) in zip(own.blocks, changes)
     ]
-    parts, residuals = _parts(model, own, places), [block.r for block in own.blocks]
-    plain_normal = own.thinned(extra=max([len(labels) for labels, _ in parts.values()], default=0))
-    results = []
-    for by, (labels, bins) in parts.items():
-        count, first = len(labels), len(base)
-        normal = plain_normal.copy()
-        for block, image, index in zip(own.blocks, images, bins):
-            st.add_bins(normal, block.where, block.middle, block.r, first, index, count, [image])
-        rest = list(range(first, first + count))
-        lengths = np.diag(normal.gram)[rest]
-        k = own.thinning
-        projected = own.project(normal, calibrated + effect, rest, k)
-        fall, dof, *_ = st.joint(projected, lengths)
-        if dof == 0:
-            continue
-        _, _, delta, sd = st.joint(own.project(normal, calibrated, rest, k), lengths)
-        h = max(fall - dof, 0.0) * k / max(net, 1e-9)
-        cut = [image[:, None] * (index[:, None] == np.arange(count)) for image, index in zip(images, bins)]
-        cut = _off_base(own, cut, projected, calibrated + effect)
-        results.append(
-            Split(
-                c.effect.name,
-                by,
-                labels,
-                (1 + delta).tolist(),
-                sd.tolist(),
-                fall * k,
-                dof,
-                float(chdtrc(dof, fall)),
-                h,
-                by_clutter(projected.score, projected.information, variances(cut, residuals, places)),
-                UNEVEN,
-                True,
-            )
-        )
-    level, excess = (
-        LEVEL / max(len(results), 1),
-        left.excess_sd * math.sqrt(2 * max(evidence.normal.count - evidence.projected.rank, 1)),
+    return Added(c.effect.name, own, calibrated, effect, change, images, net)
+
+
+def _cut(
+    added: Added, by: str, labels: list[str], bins: list[np.ndarray], plain: st.Normal, places: list[dict]
+) -> Split | None:
+    """The split of an effect's image into named parts, its limit still open; None where calibration absorbs all parts.
+
+    bins    per block, the part (n,) of each value
+    plain   normal equations of the kept values, with room for the parts
+    """
+    from scipy.special import chdtrc
+
+    own, calibrated, effect = added.own, added.calibrated, added.effect
+    count, first, k = len(labels), len(own.columns), own.thinning
+    normal = plain.copy()
+    for block, image, index in zip(own.blocks, added.images, bins):
+        st.add_bins(normal, block.where, block.middle, block.r, first, index, count, [image])
+    rest = list(range(first, first + count))
+    lengths = np.diag(normal.gram)[rest]
+    projected = own.project(normal, calibrated + effect, rest, k)
+    fall, dof, *_ = st.joint(projected, lengths)
+    if dof == 0:
+        return None
+    _, _, delta, sd = st.joint(own.project(normal, calibrated, rest, k), lengths)
+    cut = [image[:, None] * (index[:, None] == np.arange(count)) for image, index in zip(added.images, bins)]
+    cut = _off_base(own, cut, projected, calibrated + effect)
+    found = variances(cut, [block.r for block in own.blocks], places)
+    return Split(
+        effect=added.name,
+        by=by,
+        labels=labels,
+        strength=(1 + delta).tolist(),
+        sd=sd.tolist(),
+        fall=fall * k,
+        dof=dof,
+        p=float(chdtrc(dof, fall)),
+        h=max(fall - dof, 0.0) * k / max(added.net, 1e-9),
+        chance=by_clutter(projected.score, projected.information, found),
+        limit=UNEVEN,
+        holds=True,
     )
-
-    def most(s: Split) -> float:
-        if s.p >= level:
-            return max(s.h, UNEVEN)
-        if left.complete:  # nothing but noise is left, so that p means what it says
-            return HAIR
-        return min(EVEN if s.chance < LEVEL else UNEVEN, SAME_PLACE * excess / max(net, 1e-9))
-
-    results = [replace(s, limit=most(s), holds=s.h <= most(s)) for s in results]
-    return results, *scatter(own, calibrated, effect, change, places)
 
 
 def scattered(refit: Refit, chance: float, clutter: np.ndarray) -> Refit:
-    """A refit with what the scatter of its strength says; where nothing is left but noise, its errors are those of
-    noise."""
+    """A refit with the p of its strength by scatter, and that scatter added to its errors; where only noise is left,
+    its errors are those of noise."""
     if refit.complete:
         return replace(refit, chance=chance)
     return replace(
@@ -139,9 +184,12 @@ def scattered(refit: Refit, chance: float, clutter: np.ndarray) -> Refit:
 def scatter(
     own: Evidence, calibrated: Sequence[int], effect: Sequence[int], change: np.ndarray, places: list[dict]
 ) -> tuple[float, np.ndarray]:
-    """p of a strength that asks for no independent noise, by its scatter between parts of the sensor or session, as
-    neighbours share clutter (`by_clutter`); and the covariance V^-1 (B - V) V^-1 that clutter adds to that of noise,
-    with B of `variances`. The larger of what the maps say; NaN and zero where there are too few parts."""
+    """(p, covariance) of a strength by its scatter between parts of the sensor or session.
+
+    p          does not assume independent noise, as neighbours share clutter (`by_clutter`); NaN for too few parts
+    covariance (k, k) V^-1 (B - V) V^-1 that clutter adds to that of noise, with B of `variances`, of the map in which
+               it is larger; zero for too few parts
+    """
     projected, clutter = own.project(own.thinned(), calibrated, effect, own.thinning), np.zeros((len(effect),) * 2)
     white = st.root(projected.information, st.VISIBLE)
     covariance = white.T @ white
@@ -169,7 +217,7 @@ def _columns(block: Block, columns: Sequence[int]) -> np.ndarray:
 def _off_base(
     own: Evidence, images: Sequence[np.ndarray], projected: st.Projected, base: Sequence[int]
 ) -> list[np.ndarray]:
-    """Images of each block with what the base makes up for taken out."""
+    """Images of each block after projecting off what the base absorbs."""
     return [image + _columns(block, base) @ projected.response for block, image in zip(own.blocks, images)]
 
 
@@ -178,10 +226,10 @@ def variances(
 ) -> list[tuple[np.ndarray, int]]:
     """(B, G) for each of MAPS that there is: the variance of the score x'r of images x, by its scatter between G parts.
 
-    B = sum of w w' with w = (1 - V_g/V)^(-1/2) u_g, u_g = sum of x r over part g, V_g of x x', where r is what is left
-    at the optimum, whose fit has taken a share V_g/V of part g along: without clutter the mean of B is V. What is
-    `left` where a fit stopped short of it, or followed other images than these, is brought there first: a part that
-    knows nearly all would show that rest many times over.
+    B = sum of w w' with w = (1 - V_g/V)^(-1/2) u_g, u_g = sum of x r over part g, V_g of x x', where r is the residual
+    at the optimum. The fit has absorbed a share V_g/V of part g, so that without clutter the mean of B is V. Where a
+    fit stopped short of the optimum, or followed other images than these, the residuals `left` are brought there first:
+    a part with nearly all information would otherwise show that rest many times over.
 
     Source: Liang & Zeger, Longitudinal data analysis using generalized linear models, Biometrika 73, 13 (1986), the
     robust variance; Bell & McCaffrey, Bias reduction in standard errors for linear regression with multi-stage samples,
@@ -203,9 +251,8 @@ def variances(
                 continue
             score = own.T @ np.concatenate([r[part == g] for r, part in zip(left, bins)])
             share, vectors = np.linalg.eigh(root @ (own.T @ own) @ root.T)
-            free = np.where(
-                share < 1 - 1e-6, np.maximum(1 - share, 1e-6) ** -0.5, 0.0
-            )  # what one part alone knows has no scatter
+            # a direction that one part alone determines has no scatter
+            free = np.where(share < 1 - 1e-6, np.maximum(1 - share, 1e-6) ** -0.5, 0.0)
             w = back @ (vectors * free) @ (vectors.T @ (root @ score))
             b, parts = b + np.outer(w, w), parts + 1
         found.append((b, parts))
@@ -213,13 +260,12 @@ def variances(
 
 
 def by_clutter(score: np.ndarray, information: np.ndarray, variances: Sequence[tuple[np.ndarray, int]]) -> float:
-    """p of a score u (k,) of information V by its variance B between G parts; the larger of what the maps say, NaN
-    where these know none.
+    """p of a score u (k,) of information V by its variance B between G parts: the largest p of all maps, NaN without.
 
-    T2 = u' B^-1 u, T2 (G - k)/(k (G - 1)) ~ F(k, G - k), where G >= 2 k: fewer parts know too little of B's directions
-    (15 strengths and 16 parts would ask 1.4e6 of T2). They know its trace: with M = V^-1/2 B V^-1/2, F = u' V^-1 u / tr
-    M ~ F(h, h (G - 1)), h = (tr M)^2 / tr M^2. Combinations of strengths of which V holds no more than rounding
-    (VISIBLE), as a gain common to all frames beside lights, have no part.
+    Where G >= 2 k: T2 = u' B^-1 u, T2 (G - k)/(k (G - 1)) ~ F(k, G - k). Fewer parts determine too little of B's
+    directions (15 strengths and 16 parts would need T2 = 1.4e6), but its trace: with M = V^-1/2 B V^-1/2, F = u' V^-1 u
+    / tr M ~ F(h, h (G - 1)), h = (tr M)^2 / tr M^2. Combinations of strengths of which V holds only rounding (VISIBLE),
+    such as a gain common to all frames beside lights, are left out.
 
     Source: Brunner, Dette & Munk, Box-type approximations in nonparametric factorial designs, J. Am. Stat. Assoc. 92,
     1494 (1997)."""
@@ -240,18 +286,18 @@ def by_clutter(score: np.ndarray, information: np.ndarray, variances: Sequence[t
     return max(ps, default=math.nan)
 
 
-def _parts(model, evidence: Evidence, places: list[dict]) -> dict[str, tuple[list[str], list[np.ndarray]]]:
+def _parts(model: Model, evidence: Evidence, places: list[dict]) -> dict[str, tuple[list[str], list[np.ndarray]]]:
     """name -> (labels, per block the part of each value): channel, frame, LED, group, settings, contact, quadrant."""
     frames = [model.frames[f] for f in evidence.frames]
-    names = [getattr(f, "name", str(i)) for i, f in enumerate(frames)]
+    names = [f.name for f in frames]
     parts: dict[str, tuple[list[str], list[np.ndarray]]] = {}
     seen: list[list[int]] = []
 
-    def of_coordinate(by, coordinate, labels):
+    def of_coordinate(by: str, coordinate: str, labels: list[str]) -> None:
         if all(coordinate in p for p in places):
             parts[by] = (labels, [np.nan_to_num(p[coordinate]).astype(int) for p in places])
 
-    def of_frame(by, labels):
+    def of_frame(by: str, labels: list[str]) -> None:
         kinds = list(dict.fromkeys(labels))  # by first occurrence, so that equal partitions have equal numbers
         numbers = [kinds.index(label) for label in labels]
         if len(kinds) >= 2 and numbers not in seen:
@@ -261,13 +307,12 @@ def _parts(model, evidence: Evidence, places: list[dict]) -> dict[str, tuple[lis
     of_coordinate("channel", "channel", prints.channel_names(evidence))
     of_frame("frame", names)
     of_frame("LED", [led_label(f.parameters) for f in frames])
-    of_frame("group", [getattr(f, "group", None) or name for f, name in zip(frames, names)])
+    of_frame("group", [f.group or f.name for f in frames])
     for key, numbers in prints.settings(model, evidence).items():
         if len(set(numbers)) <= 8:
             of_frame(key, [f"{v:g}" for v in numbers])
-    for key in sorted(
-        set.intersection(*[set(p) for p in places]) - set(parts)
-    ):  # what a sweep turns from reading to reading
+    # settings that a sweep changes from reading to reading
+    for key in sorted(set.intersection(*[set(p) for p in places]) - set(parts)):
         if "." in key:
             found = np.unique(np.concatenate([p[key] for p in places]))
             if 2 <= len(found) <= 8 and np.isfinite(found).all():

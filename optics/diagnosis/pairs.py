@@ -1,7 +1,7 @@
-"""Two effects at once: where no single one explains a residual, the pairs that leave nothing of it.
+"""Pairs of effects: where no single effect explains a residual, two that leave nothing of it.
 
 Pairs are ranked by the linear fall of chi2, T = u' V^-1 u over the columns of both, and the best are refitted together
-with everything else. Only a pair after which nothing is left counts: two more numbers cannot do that by luck."""
+with everything else. Only a pair that leaves nothing counts: two more parameters do not do that by accident."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from optics.diagnosis.result import Fingerprint, Pair
 from optics.diagnosis.thresholds import CLEAR, HIDDEN, LEVEL, MARGIN, MIMICS
 
 CONSIDERED = 10  # effects, the best by themselves: 45 pairs
-REFITTED = 4  # pairs
-LEAD = (
-    MARGIN / 4
-)  # of the fall, by which two effects must do better than one, and than one curve where they leave misfit
+REFITTED = 4  # pairs: each costs a calibration
+# Of the fall: by how much two effects must do better than one, and than one curve where they leave misfit. Smaller than
+# the MARGIN between single effects, as each of a pair must besides leave nothing and pass its own tests.
+LEAD = MARGIN / 4
 
 
 def ranked(evidence: Evidence, candidates: Sequence[Candidate]) -> list[tuple[float, Candidate, Candidate, np.ndarray]]:
@@ -29,19 +29,19 @@ def ranked(evidence: Evidence, candidates: Sequence[Candidate]) -> list[tuple[fl
     projected, first, found = evidence.projected, len(evidence.base), []
     for a, b in combinations(candidates, 2):
         if any(c.contains(d) for c in (a, b) for d in candidates):
-            continue  # its simpler part is tried
+            continue  # the effect within it is tried
         if {key for v in a.variables for key in v.keys} & {key for v in b.variables for key in v.keys}:
             continue
         own, live = (
             np.array([*a.columns, *b.columns]) - first,
             np.array([*a.cone.live, *(len(a.columns) + b.cone.live)]),
         )
-        seen = own[live]  # of what the projection left no more than rounding, nothing is expected
+        seen = own[live]  # where the projection left only rounding, no fall is expected
         inverse, rank = st.inverse(projected.information[np.ix_(seen, seen)], st.VISIBLE)
         linear = np.zeros(len(own))
         linear[live] = inverse @ projected.score[seen]
         signs = [s * x >= 0 for s, x in zip([*a.sides, *b.sides], linear) if s]
-        if all(signs):  # no effect below its neutral value, where that is a bound
+        if all(signs):  # no strength beyond a bound
             found.append((float(projected.score[own] @ linear) - rank, a, b, linear))
     return sorted(found, key=lambda t: -t[0])
 
@@ -49,9 +49,10 @@ def ranked(evidence: Evidence, candidates: Sequence[Candidate]) -> list[tuple[fl
 def search(
     evidence: Evidence, order: Sequence[Candidate], alone: float, add: Callable[[list[Candidate]], Pair | None]
 ) -> list[Pair]:
-    """The best pairs, refitted; `alone` is the best single effect's net fall.
+    """The best pairs, refitted, best first.
 
-    add   effects with their `linear` set -> what comes of them after a refit, or None
+    order   effects, best first; alone: the best single effect's net fall
+    add     refits effects whose `linear` is set; None without a result
     """
     live = [c for c in order if c.row.p_family < LEVEL and len(c.cone.live) and not c.broken][:CONSIDERED]
     best = [t for t in ranked(evidence, live) if t[0] - alone > max(CLEAR, LEAD * alone)]
@@ -71,9 +72,9 @@ def search(
 def beside_curves(
     pairs: Sequence[Pair], fingerprints: Sequence[Fingerprint], chance: Mapping[str, float]
 ) -> list[Pair]:
-    """The pairs, with a `but` where one curve does as well: that is rather one cause, which the library lacks.
+    """The pairs, with a `but` where one curve does as well: one cause that the library lacks is then more likely.
 
-    chance   effect -> fall that chance gives
+    chance   effect -> mean fall when it is absent
     """
     curve = max((f for f in fingerprints if f.coordinate not in MIMICS), key=lambda f: f.net, default=None)
 
@@ -90,21 +91,21 @@ def beside_curves(
 
 
 def words(pairs: Sequence[Pair], share: dict[str, float]) -> str:
-    """The pairs that leave nothing, in a sentence; `share` of the excess that each effect explains alone."""
+    """The pairs that leave nothing, in a sentence; share: of the excess, what each effect explains alone."""
     complete = [p for p in pairs if p.complete]
     common = [n for n in complete[0].effects if all(n in p.effects for p in complete)]
     if not common:
         named = ", or ".join(" with ".join(p.effects) for p in complete)
-        return f"no one effect explains the residual, two do and leave nothing: {named}."
+        return f"no single effect explains the residual; two together leave nothing: {named}."
     one = max(common, key=lambda n: share.get(n, 0.0))
     others = [next(n for n in p.effects if n != one) for p in complete]
     part = f" {one} alone explains {share[one]:.0%}." if math.isfinite(share.get(one, math.nan)) else ""
     return (
-        f"no one effect explains the residual, but {one} together with {' or with '.join(others)} leaves nothing.{part} "
-        f"Add {one}, calibrate and diagnose again."
+        f"no single effect explains the residual, but {one} together with {' or with '.join(others)} leaves nothing."
+        f"{part} Add {one}, calibrate and diagnose again."
     )
 
 
 def doubt(pairs: Sequence[Pair]) -> str:
-    """Why two effects that would leave nothing are not named; empty where there are none."""
+    """Why two effects that would leave nothing are not named; '' where there are none."""
     return next((f" {' with '.join(p.effects)} would leave nothing, but {p.but}." for p in pairs if p.but), "")

@@ -1,19 +1,18 @@
-"""Rehearsal: were an effect hidden in these captures, would a diagnosis name it? From derivative images alone, before
-anybody hides one.
+"""Rehearsal: if an effect were hidden in these captures, would a diagnosis name it? From derivative images alone.
 
-Scores of a hidden effect with the strengths s are u = V s + z, z ~ N(0, V), with the information V that calibration
-leaves (as in `optics.diagnosis.statistics`); from thousands of such u the falls of chi2 of all candidates follow, and
-who comes first, by how much:
+The scores of a hidden effect with strengths s are u = V s + z, z ~ N(0, V), with the information V that calibration
+leaves (as in `optics.diagnosis.statistics`). Thousands of such u give the falls of chi2 of all candidates, hence which
+one comes first, and by how much:
 
     noticed   the best candidate is significant among all of them (family-wise, 1 %)
     first     the hidden effect has the largest fall
-    named     it leads by what a claim asks for
-    as        who comes first most often where it does not
+    named     it leads by what a claim requires
+    as        the effect that comes first most often where the hidden one does not
 
-Linear in the effect and in the base, with the camera's noise and nothing else: clutter, and effects that bend, do
-worse. For the whole loop on imitated captures see `imitate`.
+Linear in the effect and in the base, with the camera's noise only: clutter and nonlinear effects do worse. `imitate`
+makes captures for the whole loop.
 
-Source: diagnosis.md, section 2; mrcal, "make_perfect_observations", for the idea.
+Source: the idea is that of "make_perfect_observations" in mrcal.
 """
 
 from __future__ import annotations
@@ -22,22 +21,32 @@ import json
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from optics.captures import capture_set as capture_files
 from optics.diagnosis import statistics as st
+from optics.diagnosis.evidence import Progress
 from optics.diagnosis.score import score
 from optics.diagnosis.thresholds import CLEAR, LEVEL, MARGIN
 from optics.errors import BadCapture
-from optics.scene.parameter import Values
+from optics.fit.model import Model
+from optics.fit.result import Fit
+from optics.scene.declare import Effect
+from optics.scene.parameter import Values, Variable
 from optics.words import percent, spaced, table
+
+if TYPE_CHECKING:
+    from optics.fit.scene_model import SceneModel
+
+
+NEVER = 0.01  # of the draws: an effect that is named more rarely counts as never named
 
 
 @dataclass(frozen=True)
 class Rehearsed:
-    """One effect, hidden: its strengths (largest first in size), and shares of the draws. `change` is infinite where no
-    image is left."""
+    """One hidden effect: its largest strength (over the plausible size), in `unit`, and shares of the draws."""
 
     effect: str
     strength: float
@@ -51,7 +60,11 @@ class Rehearsed:
 
 @dataclass(frozen=True)
 class Rehearsal:
-    """All effects at one change of the images (rms over mean signal, before any calibration)."""
+    """All effects, each at the strength that makes one change of the images.
+
+    change   rms change over the mean signal, before any calibration
+    unseen   effects whose images calibration absorbs altogether
+    """
 
     change: float
     frames: int
@@ -60,8 +73,8 @@ class Rehearsal:
 
     def text(self) -> str:
         lines = [
-            f"rehearsal: {self.frames} frames, every effect hidden in turn at a change of the images by {percent(self.change)}, in the "
-            "camera's noise alone"
+            f"rehearsal: {self.frames} frames, every effect hidden in turn at a change of the images by "
+            f"{percent(self.change)}, in the camera's noise alone"
         ]
         lines.append(
             table(
@@ -82,11 +95,12 @@ class Rehearsal:
         )
         if self.rows:
             lines.append(
-                f"all: first in {np.mean([r.first for r in self.rows]):.0%}, named in {np.mean([r.named for r in self.rows]):.0%}; never "
-                f"named: {', '.join(r.effect for r in self.rows if r.named < 0.01) or 'none'}"
+                f"all: first in {np.mean([r.first for r in self.rows]):.0%}, named in "
+                f"{np.mean([r.named for r in self.rows]):.0%}; never named: "
+                f"{', '.join(r.effect for r in self.rows if r.named < NEVER) or 'none'}"
             )
         if self.unseen:
-            lines.append(f"leave nothing to be seen in these captures: {', '.join(self.unseen)}")
+            lines.append(f"invisible in these captures: {', '.join(self.unseen)}")
         return "\n".join(lines) + "\n"
 
     def to_json(self) -> str:
@@ -94,18 +108,20 @@ class Rehearsal:
 
 
 def rehearse(
-    model,
-    fit,
-    effects: Sequence,
-    variables_of: Callable,
+    model: Model,
+    fit: Fit,
+    effects: Sequence[Effect],
+    variables_of: Callable[[Effect], Sequence[Variable]],
     fitted: Sequence[int],
     *,
     change: float = 0.005,
     draws: int = 2000,
     seed: int = 0,
-    progress=None,
+    progress: Progress | None = None,
 ) -> Rehearsal:
-    """Hide every effect in turn; arguments as of `optics.diagnosis.diagnose.diagnose`, change as in `Rehearsal`.
+    """Hide every effect in turn.
+
+    change   as in `Rehearsal`; draws: simulated data sets; other arguments as of `optics.diagnosis.diagnose.diagnose`
 
     Raises ValueError for a change that is not positive, Underdetermined as a diagnosis does.
     """
@@ -126,7 +142,7 @@ def rehearse(
         falls = np.stack([other.cone.fall(scores[:, own]) for other, own in zip(live, places)])
         noticed = (falls > np.array(levels)[:, None]).any(0)
         net = falls - np.array([other.cone.expectation for other in live])[:, None]
-        # what contains the effect fits as well by itself, and rivals it only beyond what decides
+        # an effect that contains it fits as well in any case, and rivals it only if it leads by CLEAR
         net -= np.array([[CLEAR if other.contains(c) else 0.0] for other in live])
         rivals = np.delete(net, a, 0)
         lead = net[a] - rivals.max(0, initial=0.0)
@@ -149,16 +165,16 @@ def rehearse(
     return Rehearsal(change, len(evidence.frames), rows, [c.effect.name for c in table.order if c not in live])
 
 
-def imitate(model, values: Values, folder: str | Path, seed: int = 0) -> Path:
-    """Captures as this model would take them at these values: its predictions, with noise of its camera, and the
-    settings of its frames.
+def imitate(model: SceneModel, values: Values, folder: str | Path, seed: int = 0) -> Path:
+    """Write captures as this model predicts them at these values, with its camera's noise and its frames' settings.
 
-    They show what a residual would look like, and what the loop says of it. They prove nothing about the model: both
-    sides are the same. Raises BadCapture for readings in a table, and as `optics.captures.capture_set.write`."""
+    They show what a residual would look like, and what the loop concludes from it. They prove nothing about the model,
+    which made them. Raises BadCapture for readings in a table, and as `optics.captures.capture_set.write`."""
     captures = model.captures
     if captures.table is not None:
         raise BadCapture(
-            f"{captures.folder}: readings in a table are not imitated; allowed: images; `optics rehearse` works for both"
+            f"{captures.folder}: readings in a table cannot be imitated; allowed: images; `optics rehearse` works "
+            "for both"
         )
     rng = np.random.default_rng([seed, 31])
     frames = []

@@ -29,7 +29,7 @@ USUALLY = "the same press at 0.4 of the exposure, and one deeper press, often te
 
 
 def write_limits(case: Case, claimed: Candidate | None, fits: Mapping[str, Fit], basis: Basis) -> None:
-    """Upper limits of every effect; after a claim, at the values with the claimed effect, so that it misleads no other."""
+    """Upper limits of every effect; after a claim, at the values with the claimed effect, so as not to be misled."""
     evidence, others, widen = case.evidence, case.table.order, math.sqrt(max(basis.phi, 1.0))
     if claimed is not None:
         values, refit = fits[claimed.effect.name].values, claimed.row.refitted
@@ -115,8 +115,9 @@ def warnings_of(
         )
     if basis.high_frequency < SMOOTH:
         texts.append(
-            f"fine detail of the residual has {basis.high_frequency:.2f} of the noise expected: the images look interpolated "
-            "or filtered, or the noise is overstated; neighbouring pixels then share their noise and p is too small"
+            f"fine detail of the residual has {basis.high_frequency:.2f} of the noise expected: the images look "
+            "interpolated or filtered, or the noise is overstated; neighbouring pixels then share their noise and "
+            "p is too small"
         )
     if abs(basis.excess_sd) > EXCESS and basis.structure_p >= LEVEL:
         texts.append(
@@ -160,7 +161,8 @@ def hints_of(
         hints.append(f"no effect brings the model near its images: check {AT_FAULT}")
     if CURVE in failed:
         hints.append(
-            "check [noise]: repeats of one frame tell system_gain and dark_noise, a flat_field takes the sensor's own pattern out"
+            "check [noise]: repeats of one frame determine system_gain and dark_noise, a flat_field removes the "
+            "sensor's own pattern"
         )
     if word == "UNKNOWN":
         hints.append(

@@ -124,9 +124,9 @@ def _require_convergence(evidence: Evidence, fit: Fit) -> None:
         raise Underdetermined(
             f"diagnose: the base model is not calibrated to convergence{how}: moving its {rank} "
             f"parameters would lower chi2 by {evidence.projected.absorbed:.3g}, {evidence.gradient:.3g} per parameter "
-            f"(most of all {some(_off(evidence))}); allowed: below {allowed:.3g}; calibrate again from there, without robust "
-            "weights, or hold parameters that the captures hardly tell apart: leave them out of --free, or give them a "
-            "--prior"
+            f"(most of all {some(_off(evidence))}); allowed: below {allowed:.3g}; calibrate again from there, without "
+            "robust weights, or hold parameters that the captures hardly tell apart: leave them out of --free, or "
+            "give them a --prior"
         )
 
 

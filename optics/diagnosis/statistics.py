@@ -29,9 +29,7 @@ import numpy as np
 
 Index = Sequence[int] | np.ndarray  # places of columns
 
-TRUNCATION = (
-    1e-9  # of the largest eigenvalue of unit-length columns: below, a direction is not calibrated but undetermined
-)
+TRUNCATION = 1e-9  # of the largest eigenvalue of unit-length columns: below, a direction is undetermined
 VISIBLE = 1e-6  # survival below which normal equations in double precision cannot tell what is left from rounding
 DRAWS = 40_000  # of the simulated maximum: 1 % of them are 400, known to 5 %
 BINS = 16  # of a curve along a coordinate
@@ -84,9 +82,9 @@ class Normal:
     def truncation(self, columns: Index) -> float:
         """Eigenvalues of these columns that their noise can make: kappa^2/sqrt(n), times 5, and never below TRUNCATION.
 
-        Only theirs: a candidate's noisy image says nothing about what the base can absorb, and a direction of the base
-        that is left out passes for a missing effect's (a sixth of a strength was found so, and an eighth of a fall of
-        chi2)."""
+        Only theirs: a candidate's noisy image says nothing about what the base can absorb, and a base direction that is
+        truncated is mistaken for part of a missing effect (a sixth of a strength was lost so, and an eighth of a fall
+        of chi2)."""
         columns = np.asarray(columns, int)
         kappa = self.kappa()[columns][np.diag(self.gram)[columns] > 0]
         return max(TRUNCATION, 5 * float(kappa.max(initial=0.0)) ** 2 / np.sqrt(max(self.count, 1)))
@@ -140,9 +138,8 @@ def project(
     """Project the columns `base` off the columns `rest` and the residual.
 
     precision, pull   (p,) 1/tau^2 and (mean - value)/tau^2 of priors on the base: rows that a calibration sees as well
-    settled           the base is known to be at its optimum, where J'r = 0: what noise of the images makes of J'r is
-                      left
-                      out of the scores, and its expectation out of `absorbed`
+    settled           the base is known to be at its optimum, where J'r = 0: noise of the images in J'r is left out of
+                      the scores, and its expectation out of `absorbed`
     """
     base, rest = np.asarray(base, int), np.asarray(rest, int)
     precision = np.zeros(len(base)) if precision is None else precision
@@ -175,7 +172,7 @@ class Cone:
 
     T = max over allowed s of 2 s'u - s'Vs. Under the null hypothesis T follows a mixture of chi2 distributions whose
     weights (probability that j strengths come out off their bound) are exact for one strength and simulated for more.
-    Combinations of strengths of which the projection has left no more than rounding (VISIBLE) are known to nobody.
+    Combinations of strengths of which the projection has left only rounding (VISIBLE) are undetermined.
     """
 
     def __init__(self, information: np.ndarray, sides: Sequence[int], seed: int = 0, draws: int = 10_000):
@@ -245,7 +242,7 @@ class Cone:
 
     @property
     def sd(self) -> np.ndarray:
-        """(k,) standard deviation of each strength, NaN where nothing is known of it."""
+        """(k,) standard deviation of each strength, NaN where it is undetermined."""
         variance = np.diag(self.inverse)
         return np.sqrt(np.where(variance > 0, variance, np.nan))
 
@@ -307,10 +304,10 @@ def _descend(v: np.ndarray, u: np.ndarray, sweeps: int = 100, tolerance: float =
 
 
 class Family:
-    """Probability that the best of all candidates looks as good as p by Monte Carlo: the simulated maximum.
+    """Family-wise error: the probability that the best of all absent candidates has a p as small as this one.
 
-    Scores are drawn from N(0, V) with the V of all candidates together, so that look-alikes count once.
-    Below the reach of the simulation the number of effectively independent candidates found there is kept.
+    Simulated: scores are drawn from N(0, V) with the V of all candidates together, so that look-alikes count once.
+    Below the reach of the simulation, the number of effectively independent candidates found at its end is kept.
     """
 
     def __init__(
@@ -534,13 +531,13 @@ class Spectrum:
 
 
 class Sweeps:
-    """Of readings, as `Spectrum` of images: power of whitened residuals in the NARROW lowest cosines along what was
-    swept, against the rest.
+    """As `Spectrum`, for readings: power of whitened residuals in the NARROW lowest cosines along what was swept,
+    against the rest.
 
-    Along each coordinate in turn, by the ranks of its values; what a calibration takes is projected off, so that F is
+    Along each coordinate in turn, by the ranks of its values. What a calibration absorbs is projected off, so that F is
     exactly F-distributed in white noise of any size. p is that of the best coordinate times their number."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         self.parts: list[tuple] = []
 
     def add(self, use: np.ndarray, where: Index, columns: np.ndarray, along: Mapping[str, np.ndarray]) -> None:
@@ -555,7 +552,7 @@ class Sweeps:
         )
 
     def test(self, residuals: Sequence[np.ndarray], base: Index, inverse_gram: np.ndarray) -> Structure:
-        """As of `Spectrum`; `high` is NaN: neighbours among readings share nothing that pixels do."""
+        """As `Spectrum.test`; `high` is NaN, as neighbouring readings share no interpolation, unlike pixels."""
         r = np.concatenate([residual[use] for residual, (use, *_) in zip(residuals, self.parts)]).astype(float)
         calibrated = np.zeros((len(r), len(base)))
         for (use, where, columns, _), end in zip(self.parts, np.cumsum([use.sum() for use, *_ in self.parts])):
@@ -573,8 +570,8 @@ class Sweeps:
 
 
 def follows(x: np.ndarray, y: np.ndarray) -> float:
-    """p of numbers y (n,) that do not depend on x (n,), by the test of `Sweeps` about their mean; NaN where they are
-    too few, or all one. No error of y enters: what scatters about a curve is its own measure."""
+    """p of numbers y (n,) if they did not depend on x (n,), by the test of `Sweeps` about their mean; NaN where they
+    are too few or all equal. The error of y is taken from its scatter about the curve."""
     y = y - np.mean(y)
     found = _slow(x, y, np.full((len(y), 1), len(y) ** -0.5)) if y.any() else None
     return found[0] if found else float("nan")

@@ -25,8 +25,8 @@ from optics.words import p_text, percent, spaced, table, with_sd
 
 # what to check where no effect brings the model near its images
 AT_FAULT = (
-    "units, LEDs that were off, black_level, and that images are linear (not encoded for viewing) and whole, with row 0 "
-    "at the top"
+    "units, LEDs that were off, black_level, and that images are linear (not encoded for viewing) and whole, with row "
+    "0 at the top"
 )
 
 
@@ -135,8 +135,8 @@ def _claim(
     refit = row.refitted
     text = (
         f"{row.name} is missing, strength {strength_text(refit.strength, refit.sd, row.units)}. Adding it lowers "
-        f"held-out misfit from {percent(levels[0].held_out)} to {percent(levels[-1].held_out)} (noise: {percent(basis.noise)}). "
-        "Its strength is the same in every part of the data."
+        f"held-out misfit from {percent(levels[0].held_out)} to {percent(levels[-1].held_out)} "
+        f"(noise: {percent(basis.noise)}). Its strength is the same in every part of the data."
     )
     others = [r for r in rows if r is not row and any(math.isfinite(u) for u in r.upper)]
     if others:
@@ -147,8 +147,8 @@ def _claim(
     text += (
         " With it nothing is left to explain."
         if refit.complete
-        else f" With it an excess of {refit.excess_sd:.2g} sd and structure (p {p_text(refit.structure_p)}) are left: add "
-        "it, calibrate and diagnose again."
+        else f" With it an excess of {refit.excess_sd:.2g} sd and structure (p {p_text(refit.structure_p)}) are left: "
+        "add it, calibrate and diagnose again."
     )
     if "fragile" in row.flags:
         text += " Fragile: other weights or masks prefer another effect."
@@ -171,8 +171,8 @@ def _partial(f: Findings, winner: Row, failing: Sequence[Condition]) -> str:
         return f"{winner.name} explains {f.share:.0%} of the excess misfit, {1 - f.share:.0%} has another cause."
     part = f"{f.share:.0%} of the excess" if f.weighed else "part of the residual"
     return (
-        f"{winner.name} would explain {part}, but not with one strength ({uneven.text}): it stands in for "
-        "another cause, or comes with one."
+        f"{winner.name} would explain {part}, but not with one strength ({uneven.text}): another "
+        "cause makes it up, or acts besides."
     )
 
 

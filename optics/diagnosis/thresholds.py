@@ -1,4 +1,4 @@
-"""The numbers that verdicts hang on, each with its reason. Fractions are fractions (0.01 is 1 %); falls are of chi2."""
+"""The thresholds of a verdict, each with its reason. Fractions are fractions (0.01 is 1 %); falls are of chi2."""
 
 from __future__ import annotations
 

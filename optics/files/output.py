@@ -13,8 +13,8 @@ from contextlib import contextmanager
 from importlib import metadata
 from pathlib import Path
 
-from optics import __version__
 from optics.errors import OutputExists
+from optics.version import __version__
 
 PACKAGES = ("mitsuba", "drjit", "numpy", "scipy", "scikit-image")
 

@@ -1,1 +1,1 @@
-"""Fit: a model held against captures, its calibration, its comparison with the measurement, and null models."""
+"""Fit: a model of captures, its calibration, its comparison with the measurement, and null models."""

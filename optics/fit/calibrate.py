@@ -277,13 +277,14 @@ def extended(
         new = stacked(images, scale)
         there = np.array([index_of[n] for n in images], int)
         whitened = whiten(model, frame, prediction, scale)
-        a[np.ix_(there, there)] += (new @ new.T).astype(float)
-        cross = (j @ new.T).astype(float)
+        added = new.astype(float)
+        a[np.ix_(there, there)] += added @ added.T
+        cross = j.astype(float) @ added.T
         a[np.ix_(where, there)] += cross
         a[np.ix_(there, where)] += cross.T
         acting, both = np.array([*where, *there], int), np.concatenate([j, new])
         rows.append((acting, both, scale))
-        b[acting] += (both @ whitened).astype(float)
+        b[acting] += both.astype(float) @ whitened
     pull, curvature, prior = prior_terms(model, variables, values)
     a[first:, first:] += np.diag(curvature[first:])
     descent = Descent(model, variables, values, base.frames, damping=CHORD_DAMPING)

@@ -1,4 +1,4 @@
-"""How far a prediction is from the measurement: numbers per frame, LED, region and channel, curves and maps.
+"""Comparison of predictions with measurements: numbers per frame, LED, region and channel, curves and maps.
 
 Pure functions on arrays: nothing here knows a scene, a plugin or a file format. The residual is measured minus
 predicted throughout, and "in sigmas" means divided by the standard deviation that the noise model gives each value.
@@ -19,7 +19,7 @@ import numpy as np
 from optics.errors import Underdetermined
 from optics.words import table
 
-SCOPES = (  # what the numbers are split by; regions may overlap, everything else adds up to the whole
+SCOPES = (  # what the numbers are split by; regions may overlap, all other parts add up to the whole
     (),
     ("role",),
     ("frame",),

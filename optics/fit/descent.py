@@ -85,8 +85,11 @@ def normal_equations(
         whitened = whiten(model, frame, prediction, scale)
         j = stacked(images, scale)
         where = np.array([index_of[n] for n in images], int)
-        a[np.ix_(where, where)] += (j @ j.T).astype(float)
-        b[where] += (j @ whitened).astype(float)
+        # Sums in double precision: only priors hold the common factor of powers and reflectances, and beside precise
+        # data single precision loses a prior.
+        exact = j.astype(float)
+        a[np.ix_(where, where)] += exact @ exact.T
+        b[where] += exact @ whitened
         frame_chi2.append(float(whitened.astype(float) @ whitened))
         frame_n.append(int(mask.sum()))
         rows.append((where, j, scale))
@@ -126,7 +129,7 @@ def again(model: Model, variables: Sequence[Variable], values: Values, frames: S
     b, frame_chi2 = np.zeros(len(variables)), []
     for frame, prediction, (where, j, scale) in zip(frames, model.predict(values, frames), normal.rows):
         whitened = whiten(model, frame, prediction, scale)
-        b[where] += (j @ whitened).astype(float)
+        b[where] += j.astype(float) @ whitened
         frame_chi2.append(float(whitened.astype(float) @ whitened))
     pull, _, prior = prior_terms(model, variables, values)
     return Normal(normal.a, b + pull, sum(frame_chi2), prior, frame_chi2, normal.frame_n, normal.rows)

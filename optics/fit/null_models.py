@@ -3,14 +3,13 @@
     background           I = B
     directional          I = B + l . (n - n0)   or   I = B max(0, n . l)/(n0 . l)      one light at infinity per
                          channel;
-                         the form with the smaller error on the held-out frames stands in the table
+                         the table shows the form with the smaller error on the held-out frames
     linear in the normal I = B + sum over (n_x, n_y, n_z - 1) x (1, x, y, x^2, xy, y^2), 18 coefficients per channel
 
 with the background B (the flat field times the frame's gain), the normal n of the pressed face towards the camera, n0
-the same at rest, and x, y the place on the face in units of half the image's width. All see the frames, masks, gains
-and split of the physical model, and its geometry. Poses: those of the physical model, or poses refined for the null
-itself, by Gauss-Newton on fitted and held-out frames; of the two the one with the smaller held-out error counts, so
-that every doubt goes to the null.
+the same at rest, and x, y the position on the face in units of half the image's width. All use the frames, masks,
+gains, split and geometry of the physical model. Poses are those of the physical model, or refined for the null by
+Gauss-Newton on fitted and held-out frames; whichever gives the null the smaller held-out error counts.
 
 Errors are differences to the images in DN on usable pixels, predictions clipped to the camera's range: rms and L1,
 within `NEAR` labelled radii of the contact and in the whole image."""
@@ -30,7 +29,7 @@ if TYPE_CHECKING:
     from optics.fit.scene_model import SceneModel
 
 NEAR = 2.0  # labelled radii
-STEPS = (0.02, 0.02, 0.02)  # mm, of the differences by which normals follow a pose
+STEPS = (0.02, 0.02, 0.02)  # mm, of the central differences of normals by the pose
 
 
 @dataclass
@@ -81,7 +80,8 @@ class NullTable:
                     lines.append(f"  {s.model:<28}{s.poses:<10}" + "".join(f"{c:>24}" for c in cells))
         lines.append(f"{'noise of the camera':<40}{' / '.join(f'{v:.2f}' for v in self.noise):>24}")
         lines.append(
-            f"the physical model beats every null on held-out frames in {self.won or 'no channel'} (rms near the contact)"
+            f"the physical model beats every null on held-out frames in {self.won or 'no channel'} "
+            "(rms near the contact)"
         )
         return "\n".join(lines)
 
@@ -229,7 +229,7 @@ class Multiplicative:
 
 @dataclass
 class Shape:
-    """What a null sees of a frame: background (H, W, C) DN, n - n0 (H, W, 3), place x, y (H, W)."""
+    """What a null knows of a frame: background (H, W, C) DN, n - n0 (H, W, 3), place x, y (H, W)."""
 
     background: np.ndarray
     tilt: np.ndarray
@@ -238,7 +238,7 @@ class Shape:
 
 
 class Bench:
-    """The frames of a model with their shapes for any pose; shapes are kept, as all nulls start from the same poses."""
+    """The frames of a model and their shapes for any pose. Shapes are kept: all nulls start from the same poses."""
 
     def __init__(self, model: SceneModel, values: Values, circles: np.ndarray):
         self.model, self.circles = model, circles
@@ -284,8 +284,8 @@ class Bench:
         return np.clip(image, 0, self.model.noise.saturation)
 
     def refined(self, null: Null, index: int, pose: Sequence[float]) -> tuple[float, ...]:
-        """One Gauss-Newton step of the pose for a fitted null, halved until the misfit falls; else the pose as it
-        was."""
+        """One Gauss-Newton step of the pose for a fitted null, shortened once if the misfit does not fall; else the
+        same pose."""
         image, weight = self.row(index)
         sides = [
             [null.predict(self.shape(index, [p + sign * (k == j) * s for j, p in enumerate(pose)])) for sign in (1, -1)]

@@ -1,5 +1,6 @@
-"""The model: a scene held against a capture set. Predictions, derivative images, masks and coordinates, frame by
-frame."""
+"""`SceneModel`: a scene compared with a capture set, frame by frame.
+
+It implements `optics.fit.model.Model`, which documents what a fit and a diagnosis ask of it."""
 
 from __future__ import annotations
 
@@ -27,14 +28,14 @@ FLAT_FIELDS = ("multiplicative", "additive", "none")
 
 
 class SceneModel:
-    """A scene held against a capture set: predictions, derivative images, masks and coordinates, frame by frame.
+    """A scene and its captures: predictions, derivative images, masks and coordinates of every frame.
 
-    frames       of the captures; a raw mosaic stands in all three channels, and `usable` takes each pixel in its own
-    base         scene values overlaid with what holds in every frame, by key
-    parameters   key -> Parameter
-    shape        (H, W, C)
-    flat_field   how the measured background B of the untouched sensor enters: "multiplicative" (True), what the scene
-                 does not know of the background is a gain; "additive", it is light that a press leaves as it is; None
+    frames       of the captures; a raw mosaic is repeated in all channels, of which `usable` keeps each pixel's own
+    base         values of the scene, overlaid with what the captures set in every frame
+    flat_field   how the measured background B of the untouched sensor enters: "multiplicative" (True): what the
+                 scene does not explain of it is a gain; "additive": it is light that a press does not change; None: it
+                 is not used
+    flat         (H, W, C) DN, that background above black; None where it is not used
     """
 
     def __init__(
@@ -86,12 +87,13 @@ class SceneModel:
         if self.developer.matrix.shape[0] != self.shape[2]:
             channels, wanted, first = self.shape[2], self.developer.matrix.shape[0], captures.frames[0].file
             raise BadScene(
-                f"{captures.folder / 'captures.toml'}: '{first}' has channels: {channels}, the camera of the scene '{captures.scene}' has "
-                f"{wanted}; allowed: {wanted}, "
+                f"{captures.folder / 'captures.toml'}: '{first}' has channels: {channels}, the camera of the "
+                f"scene '{captures.scene}' has {wanted}; allowed: {wanted}, "
                 + (
                     "a column of `values` for each"
                     if captures.table is not None
-                    else 'or one with cfa = "RGGB" (or its like) if it is a raw mosaic; or take a scene whose integrator names one band'
+                    else 'or one with cfa = "RGGB" (or its like) if it is a raw mosaic; or take a scene whose '
+                    "integrator names one band"
                     if channels == 1
                     else "one for each band of the scene's integrator"
                 )
@@ -102,15 +104,14 @@ class SceneModel:
         self.flat = None  # the measured background above black, a declared nuisance; see `predict`
         if self.flat_field and background is not None and scene.gel is None:
             raise BadScene(
-                f"{captures.folder}: the set has a background, and the scene no gel that could be at rest in it; allowed: "
-                "--flat-field none"
+                f"{captures.folder}: the set has a background, and the scene no gel that could be at rest in it; "
+                "allowed: --flat-field none"
             )
         if self.flat_field and background is not None:
             self.flat = np.maximum(np.asarray(background, float) - self.noise.black_level, 1e-3)
 
     def imagine(self, frames: Sequence[Frame]) -> SceneModel:
-        """The same model, with the same renderer, with further frames: what `optics.diagnosis.advice` could have
-        somebody measure."""
+        """The same model, with the same renderer, with further frames: measurements that could be made."""
         twin = copy.copy(self)
         twin.frames = [*self.frames, *frames]
         twin.driven = self.driven | (
@@ -143,7 +144,7 @@ class SceneModel:
         return {k: own.get(k, 1.0) for k in variable.keys if k not in own or k in self.driven}
 
     def _companions(self) -> list[set[str]]:
-        """For each frame the LEDs that are lit in any frame of the same press: they share its geometry."""
+        """For each frame, the LEDs that are lit in any frame of the same press: these share its geometry."""
         presses: dict[tuple, set[str]] = {}
         keys = []
         for frame in self.frames:
@@ -199,7 +200,7 @@ class SceneModel:
         return [self._predict(self._turn_to(values, i), seed) for i in self._indices(frames)]
 
     def _turn_to(self, values: Values, index: int) -> dict:
-        """A frame's values, and word to the renderer of what else is wanted of its geometry."""
+        """A frame's values; tells the renderer which other LEDs will be asked for in the same geometry."""
         self.renderer.together = self.companions[index]
         return self.at(values, index)
 
@@ -222,11 +223,11 @@ class SceneModel:
         return self.developer.gains(self.developer.view(now))
 
     def background_share(self, values: Values | None = None, index: int = 0) -> list[dict[str, float]]:
-        """How much of the flat field the scene explains by itself, per channel: rms of the flat field's structure about
-        its mean, rms of what is left of it after the predicted background, both in DN, and the share 1 -
-        (left/structure)^2.
+        """How much of the flat field's structure the scene explains by itself, per channel.
 
-        A multiplicative flat field divides what is left out, an additive one adds it; either way it is not explained.
+        structure   DN, rms of the flat field about its mean; left: DN, rms of it less the predicted background
+        share       1 - (left/structure)^2
+        What is left enters predictions as a gain or as light (`flat_field`); either way it is not explained.
         """
         if self.flat is None:
             raise BadScene(f"{self.captures.folder}: no flat field in use")
@@ -299,7 +300,7 @@ class SceneModel:
         return prediction, images
 
     def _secant(self, values: Values, variable: Variable, index: int, step: float, prediction, seed: int) -> np.ndarray:
-        """[f(value + step) - f(value)] / step of the whole prediction; the step turns round at a bound."""
+        """[f(value + step) - f(value)] / step of the whole prediction; at a bound, the step goes the other way."""
         value = value_of(self, values, variable)
         if not variable.parameter.bounds[0] <= value + step <= variable.parameter.bounds[1]:
             step = -step
@@ -391,8 +392,8 @@ class SceneModel:
     # --------------------------------------------------------------------
 
     def usable(self, index: int) -> np.ndarray:
-        """(H, W, C) pixels to use: not saturated, not clipped at black, not masked by the user, of a mosaic's own
-        channel."""
+        """(H, W, C) bool, the values to use: not saturated, not clipped at black, not masked by the user, in a mosaic
+        the pixel's own channel."""
         frame = self.frames[index]
         mask = self.noise.usable(frame.image)
         mask = np.broadcast_to(mask if mask.ndim == 3 else mask[..., None], frame.image.shape).copy()
@@ -405,9 +406,9 @@ class SceneModel:
         return mask
 
     def _resolved(self, index: int) -> np.ndarray:
-        """(H, W, C) False at sharp edges that the finer samples resolve worse than the noise: where the step across a
-        pixel, over the number of samples, is more than a sixth of the noise. At the base's values, so that a fit cannot
-        move it."""
+        """(H, W, C) False at sharp edges that the finer samples do not resolve to the noise: where the step across a
+        pixel, over the number of samples, exceeds a sixth of the noise. At the base's values, so that no fit changes
+        it."""
         if index not in self._edges_kept:
             now = self.at(Values(), index)
             low: Any = 0.0
@@ -438,8 +439,8 @@ class SceneModel:
         return float(np.mean([f.image.size for f in self.frames])) / (3 if self.mosaic is not None else 1)
 
     def variance(self, values: Values, index: int, prediction: np.ndarray) -> np.ndarray:
-        """(H, W, C) in DN^2, of a frame about its prediction: the camera's noise, and the prediction's own error where
-        images are Monte Carlo estimates, averaged over 3 x 3 pixels (the error itself is known to a quarter)."""
+        """(H, W, C) in DN^2, of a frame about its prediction: the camera's noise and, where images are Monte Carlo
+        estimates, their own error, averaged over 3 x 3 pixels as it is itself known to a quarter only."""
         noise = self.noise.variance(prediction)
         return noise + self._error(values, index) if self.monte_carlo else noise
 

@@ -282,7 +282,9 @@ def transmission(scene, path: Path, values: Mapping, bands: np.ndarray, componen
                 name,
                 scene,
                 values,
-                lambda: layer_matrix(scene, name, crossing_at(step, rays, bands), values, path.fields),
+                lambda name=name, step=step, rays=rays: layer_matrix(
+                    scene, name, crossing_at(step, rays, bands), values, path.fields
+                ),
             )
             for place, (name, step) in enumerate(names)
         ]

@@ -134,7 +134,8 @@ class Transport:
             raise ValueError(f"reach = {reach!r}; allowed: maps, paths")
         if reach == "paths" and self.scene.leds:
             raise BadScene(
-                f"{self.scene.path}: rays of the camera never meet an LED, which is a point; allowed with reach = 'paths': "
+                f"{self.scene.path}: rays of the camera never meet an LED, which is a point; allowed with reach = "
+                "'paths': "
                 "luminous areas (emitters of the type 'source')"
             )
         # bands that go different ways are followed apart
@@ -150,7 +151,8 @@ class Transport:
             followed, lost, astray = followed + run.followed, lost + run.lost, astray + run.astray
         if astray > ASTRAY * followed:
             raise BadScene(
-                f"{self.scene.path}: {astray / followed:.2g} times per ray a face of a dielectric body is met from a material that is not "
+                f"{self.scene.path}: {astray / followed:.2g} times per ray a face of a dielectric body is met "
+                "from a material that is not "
                 "its neighbour: bodies overlap, a normal points inwards, or `outside` names the wrong material"
             )
         mean, error = images.mean(0), images.std(0, ddof=1) / np.sqrt(BATCHES)
@@ -190,13 +192,15 @@ class Transport:
         for number, m in enumerate(self.materials):
             if number not in filling and m.scattering.max() > 1e-12:
                 raise BadScene(
-                    f"{self.scene.path}: {m.name}.scattering = {m.scattering.max():g} 1/mm; allowed: 0 in a material that fills no "
+                    f"{self.scene.path}: {m.name}.scattering = {m.scattering.max():g} 1/mm; allowed: 0 in a "
+                    "material that fills no "
                     "`cells`, as light is mapped in cells only"
                 )
         for name, part in self.scene.sources.items():
             if part.number("dop_q") or part.number("dop_u"):
                 raise BadScene(
-                    f"{self.scene.path}: '{name}' sends polarized light; allowed among dielectric bodies: dop_q = dop_u = 0"
+                    f"{self.scene.path}: '{name}' sends polarized light; allowed among dielectric bodies: dop_q = "
+                    "dop_u = 0"
                 )
 
 
@@ -388,102 +392,7 @@ class Run:
         import drjit as dr
         import mitsuba as mi
 
-        count, context = dr.width(start["d"]), mi.BSDFContext()
-
-        def onward(s):
-            s = dict(s)
-            active, rng, flight = s["active"], s["rng"], s["d"]
-            si = self.scene.mitsuba.ray_intersect(
-                mi.Ray3f(s["p"], flight, mi.Float(0), self.wavelengths), mi.RayFlags.All, False, active
-            )
-            hit = active & si.is_valid()
-            k = self.number(si)
-            sigma = dr.gather(mi.Float, self.scattering, s["medium"])
-            length, scattered = dr.select(hit, si.t, 0.0), mi.Bool(False)
-            if drawn:
-                free = -dr.log(1 - rng.next_float32()) / dr.maximum(sigma, 1e-12)
-                scattered = hit & (free < length)
-                length = dr.select(scattered, free, length)
-            along(s, length, sigma, hit)
-            s["tau"] = self.faded(s, length, 0.0 if drawn else sigma)
-            s["ways"] = self.ways(s, length)
-            if self.retardance is not None:
-                s["v"], s["x"] = self.retarded(s, length, forward)
-            hit &= ~scattered
-            ends = at(s, si, k, hit)
-
-            # at a face of a dielectric body: reflected or refracted
-            outside, inside = (dr.gather(mi.Int32, a, k) for a in (self.outside, self.inside))
-            cell = mi.UInt32(dr.gather(mi.Int32, self.first, k)) + si.prim_index // 12  # where it is one
-            if self.filled is not None:
-                grid = hit & (dr.gather(mi.Int32, self.grid, k) > 0)
-                inside = dr.select(grid, dr.gather(mi.Int32, self.filled, cell, grid), inside)
-            face = hit & (inside >= 0)
-            front = dr.dot(flight, si.n) < 0
-            normal = mi.Vector3f(dr.select(front, si.n, -si.n))
-            here, there = mi.UInt32(dr.select(front, outside, inside)), mi.UInt32(dr.select(front, inside, outside))
-            n = dr.gather(mi.Float, self.index, there, face) / dr.select(
-                face, dr.gather(mi.Float, self.index, here, face), 1.0
-            )
-            n = dr.select(face, n, 1.0)
-            if self.roughness is not None:
-                normal, seen = self.facet(flight, normal, dr.gather(mi.Float, self.roughness, k, face), rng)
-            cos = dr.minimum(dr.abs(dr.dot(flight, normal)), 1.0)
-            r_s, r_p, cos2 = fresnel(cos, n)
-            share = (r_s + r_p) / 2
-            back = rng.next_float32() < share
-            bounced, passed = dr.maximum(share, 1e-9), dr.maximum(1 - share, 1e-9)
-            if not forward:
-                passed = passed * (n * n)  # of a radiance
-            across = dr.cross(flight, normal)
-            level = dr.squared_norm(across) < 1e-10  # at normal incidence every axis serves
-            axis = dr.select(level, s["x"], dr.normalize(across))
-            turned = self.turned(s["v"], s["x"], axis, flight, forward)
-            act = (lambda m: m @ tuple(turned)) if forward else (lambda m: m.after(tuple(turned)))
-            v = [
-                dr.select(face, dr.select(back, a / bounced, b / passed), c)
-                for a, b, c in zip(act(fresnel_reflection(cos, n)), act(diattenuator(1.0, 0, 1 - r_s, 1 - r_p)), s["v"])
-            ]
-            d = dr.select(
-                face, dr.select(back, flight + 2 * cos * normal, flight / n + (cos / n - cos2) * normal), flight
-            )
-            if self.roughness is not None:
-                s["tau"] = [dr.select(face, t * seen(d), t) for t in s["tau"]]
-            s["astray"] = s["astray"] + dr.select(face & (here != s["medium"]), 1.0, 0.0)
-            s["medium"] = dr.select(face, dr.select(back, here, there), s["medium"])  # what rounding led astray is back
-            entered = face & ~back & front & (dr.gather(mi.Int32, self.grid, k) > 0)
-            s["cell"] = dr.select(entered, cell, s["cell"])
-
-            # at another surface, or within a body: into all directions, unpolarized
-            other = hit & ~face & ~ends
-            bs, weight = si.bsdf().sample(
-                context, si, rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32()), other
-            )
-            weight = mi.unpolarized_spectrum(weight)
-            s["tau"] = [dr.select(other, t * weight[b], t) for b, t in zip(self.group, s["tau"])]
-            sphere = mi.warp.square_to_uniform_sphere(mi.Point2f(rng.next_float32(), rng.next_float32()))
-            s["d"] = dr.select(
-                ends, flight, dr.normalize(dr.select(other, si.to_world(bs.wo), dr.select(scattered, sphere, d)))
-            )
-            mixed = other | scattered
-            s["v"] = [v[0]] + [dr.select(mixed, 0.0, entry) for entry in v[1:]]
-            s["x"] = dr.select(mixed, mi.Vector3f(mi.Frame3f(s["d"]).s), dr.select(face, axis, s["x"]))
-
-            # of the faint, half go on with twice the weight
-            brightest = reduce(dr.maximum, s["tau"])
-            faint = (brightest < FAINT) & ~ends
-            on = (face | mixed) & (brightest > 0) & (~faint | (rng.next_float32() < 0.5))
-            s["tau"] = [dr.select(faint, 2 * t, t) for t in s["tau"]]
-            s["depth"] = s["depth"] + 1
-            s["cut"] = on & (s["depth"] >= DEPTH)
-            s["active"] = on & ~s["cut"]
-            s["ended"] = ends
-            s["p"] = dr.select(
-                scattered, s["p"] + length * flight, dr.select(hit & ~ends, si.spawn_ray(s["d"]).o, s["p"])
-            )
-            s["rng"] = rng
-            return (s,)
-
+        count = dr.width(start["d"])
         zero = dr.zeros(mi.Float, count)
         state = {
             **{
@@ -502,12 +411,125 @@ class Run:
             "cut": dr.full(mi.Bool, False, count),
             "ended": dr.full(mi.Bool, False, count),
         }
-        end = dr.while_loop((state,), lambda s: s["active"], onward)[0]
+        end = dr.while_loop(
+            (state,), lambda s: s["active"], lambda s: (self.onward(dict(s), forward, drawn, along, at),)
+        )[0]
         dr.eval(end)  # all at once: what is asked for alone follows the rays anew
         self.followed += count
         self.lost += float(dr.count(end["cut"])[0])
         self.astray += float(dr.sum(end["astray"])[0])
         return end
+
+    def onward(self, s: dict, forward: bool, drawn: bool, along: Callable, at: Callable) -> dict:
+        """The state after the next surface, or after the next place where a body scatters."""
+        import drjit as dr
+        import mitsuba as mi
+
+        active, rng, flight = s["active"], s["rng"], s["d"]
+        si = self.scene.mitsuba.ray_intersect(
+            mi.Ray3f(s["p"], flight, mi.Float(0), self.wavelengths), mi.RayFlags.All, False, active
+        )
+        hit = active & si.is_valid()
+        k = self.number(si)
+        sigma = dr.gather(mi.Float, self.scattering, s["medium"])
+        length, scattered = dr.select(hit, si.t, 0.0), mi.Bool(False)
+        if drawn:
+            free = -dr.log(1 - rng.next_float32()) / dr.maximum(sigma, 1e-12)
+            scattered = hit & (free < length)
+            length = dr.select(scattered, free, length)
+        along(s, length, sigma, hit)
+        s["tau"] = self.faded(s, length, 0.0 if drawn else sigma)
+        s["ways"] = self.ways(s, length)
+        if self.retardance is not None:
+            s["v"], s["x"] = self.retarded(s, length, forward)
+        hit &= ~scattered
+        ends = at(s, si, k, hit)
+        face, axis, d = self.at_face(s, si, k, hit, rng, forward)
+        mixed = self.scatter(s, si, hit & ~face & ~ends, scattered, ends, d, rng)
+        s["x"] = dr.select(mixed, mi.Vector3f(mi.Frame3f(s["d"]).s), dr.select(face, axis, s["x"]))
+        self.thin_out(s, face | mixed, ends, rng)
+        s["ended"] = ends
+        s["p"] = dr.select(scattered, s["p"] + length * flight, dr.select(hit & ~ends, si.spawn_ray(s["d"]).o, s["p"]))
+        s["rng"] = rng
+        return s
+
+    def at_face(self, s: dict, si, k, hit, rng, forward: bool) -> tuple:
+        """Reflect or refract rays at the faces of dielectric bodies, into the state; gives where that is, the axis that
+        Stokes vectors refer to from there on, and the direction."""
+        import drjit as dr
+        import mitsuba as mi
+
+        flight = s["d"]
+        outside, inside = (dr.gather(mi.Int32, a, k) for a in (self.outside, self.inside))
+        cell = mi.UInt32(dr.gather(mi.Int32, self.first, k)) + si.prim_index // 12  # where it is one
+        if self.filled is not None:
+            grid = hit & (dr.gather(mi.Int32, self.grid, k) > 0)
+            inside = dr.select(grid, dr.gather(mi.Int32, self.filled, cell, grid), inside)
+        face = hit & (inside >= 0)
+        front = dr.dot(flight, si.n) < 0
+        normal = mi.Vector3f(dr.select(front, si.n, -si.n))
+        here, there = mi.UInt32(dr.select(front, outside, inside)), mi.UInt32(dr.select(front, inside, outside))
+        n = dr.gather(mi.Float, self.index, there, face) / dr.select(
+            face, dr.gather(mi.Float, self.index, here, face), 1.0
+        )
+        n = dr.select(face, n, 1.0)
+        if self.roughness is not None:
+            normal, seen = self.facet(flight, normal, dr.gather(mi.Float, self.roughness, k, face), rng)
+        cos = dr.minimum(dr.abs(dr.dot(flight, normal)), 1.0)
+        r_s, r_p, cos2 = fresnel(cos, n)
+        share = (r_s + r_p) / 2
+        back = rng.next_float32() < share
+        bounced, passed = dr.maximum(share, 1e-9), dr.maximum(1 - share, 1e-9)
+        if not forward:
+            passed = passed * (n * n)  # of a radiance
+        across = dr.cross(flight, normal)
+        level = dr.squared_norm(across) < 1e-10  # at normal incidence every axis serves
+        axis = dr.select(level, s["x"], dr.normalize(across))
+        turned = self.turned(s["v"], s["x"], axis, flight, forward)
+        act = (lambda m: m @ tuple(turned)) if forward else (lambda m: m.after(tuple(turned)))
+        s["v"] = [
+            dr.select(face, dr.select(back, a / bounced, b / passed), c)
+            for a, b, c in zip(act(fresnel_reflection(cos, n)), act(diattenuator(1.0, 0, 1 - r_s, 1 - r_p)), s["v"])
+        ]
+        d = dr.select(face, dr.select(back, flight + 2 * cos * normal, flight / n + (cos / n - cos2) * normal), flight)
+        if self.roughness is not None:
+            s["tau"] = [dr.select(face, t * seen(d), t) for t in s["tau"]]
+        s["astray"] = s["astray"] + dr.select(face & (here != s["medium"]), 1.0, 0.0)
+        s["medium"] = dr.select(face, dr.select(back, here, there), s["medium"])  # what rounding led astray is back
+        entered = face & ~back & front & (dr.gather(mi.Int32, self.grid, k) > 0)
+        s["cell"] = dr.select(entered, cell, s["cell"])
+        return face, axis, d
+
+    def scatter(self, s: dict, si, other, scattered, ends, d, rng):
+        """Send rays on from other surfaces (`other`) and from within bodies (`scattered`), into all directions and
+        unpolarized; all others along d. Gives where light was scattered."""
+        import drjit as dr
+        import mitsuba as mi
+
+        bs, weight = si.bsdf().sample(
+            mi.BSDFContext(), si, rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32()), other
+        )
+        weight = mi.unpolarized_spectrum(weight)
+        s["tau"] = [dr.select(other, t * weight[b], t) for b, t in zip(self.group, s["tau"])]
+        sphere = mi.warp.square_to_uniform_sphere(mi.Point2f(rng.next_float32(), rng.next_float32()))
+        s["d"] = dr.select(
+            ends, s["d"], dr.normalize(dr.select(other, si.to_world(bs.wo), dr.select(scattered, sphere, d)))
+        )
+        mixed = other | scattered
+        s["v"] = [s["v"][0]] + [dr.select(mixed, 0.0, entry) for entry in s["v"][1:]]
+        return mixed
+
+    def thin_out(self, s: dict, on, ends, rng) -> None:
+        """Of the faint, half go on with twice the weight; after DEPTH faces a ray is cut off."""
+        import drjit as dr
+
+        brightest = reduce(dr.maximum, s["tau"])
+        faint = (brightest < FAINT) & ~ends
+        on = on & (brightest > 0) & (~faint | (rng.next_float32() < 0.5))
+        s["tau"] = [dr.select(faint, 2 * t, t) for t in s["tau"]]
+        s["depth"] = s["depth"] + 1
+        s["cut"] = on & (s["depth"] >= DEPTH)
+        s["active"] = on & ~s["cut"]
 
     def retarded(self, s, length, forward: bool) -> tuple:
         """Stokes vector or row, and its axis, after a stretch of a material that is birefringent along the world's x
@@ -868,7 +890,8 @@ class Surface:
         self.matt = diffuse and not self.light
         if self.matt and shape.is_mesh() and not shape.has_vertex_texcoords():
             raise BadScene(
-                f"{scene.path}: '{shape.id()}' is matt, and no map of its light can be kept on a mesh without texture coordinates; "
+                f"{scene.path}: '{shape.id()}' is matt, and no map of its light can be kept on a mesh without "
+                "texture coordinates; "
                 "allowed among dielectric bodies: rectangles, cubes, spheres, meshes with coordinates"
             )
         if (
@@ -878,7 +901,8 @@ class Surface:
             and mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta | mi.BSDFFlags.Null)
         ):
             raise BadScene(
-                f"{scene.path}: the surface '{shape.id()}' is neither clear nor matt; allowed among dielectric bodies: materials of the type "
+                f"{scene.path}: the surface '{shape.id()}' is neither clear nor matt; allowed among dielectric "
+                "bodies: materials of the type "
                 "'clear', and matt ones (diffuse, membrane)"
             )
         self.rectangle = Rectangle.of(shape) if self.light else None

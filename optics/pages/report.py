@@ -87,7 +87,7 @@ def render(study: Record) -> str:
     comparisons = [study.comparison(i) for i in range(len(study.steps))]
     shown = [study.frames(i) for i in range(len(study.steps))]
     points = Readings.of(shown)
-    viewer = pictures(study, shown) if points is None else NO_IMAGES
+    viewer = viewer_images(study, shown) if points is None else NO_IMAGES
     nouns = FRAMES if points is None else SWEEPS
     verdicts = [verdict(told(study.diagnosis(i), points)) for i in range(len(study.steps))]
     return environment.get_template("report.html.j2").render(
@@ -119,7 +119,7 @@ def render(study: Record) -> str:
     )
 
 
-# -- words --------------------------------------------------------------------------------------------------------------
+# -- words -------------------------------------------------------------------------------------------------------------
 
 
 def headline(study: Record, verdicts: list, nouns: Mapping[str, str]) -> dict:
@@ -248,7 +248,7 @@ def _text(value: float, form: str) -> str:
 # -- images -----------------------------------------------------------------------------------------------------------
 
 
-def pictures(study: Record, steps: list[list[Shown]]) -> dict:
+def viewer_images(study: Record, steps: list[list[Shown]]) -> dict:
     """What the viewer shows: measured once per frame, predicted and residual per frame and step.
 
     Fewer frames, then binned pixels, keep the page small; `note` says so.
@@ -375,9 +375,9 @@ def webp(image: np.ndarray) -> str:
     """Lossless image as a data URI. image: (H, W, 1 or 3) uint8."""
     from PIL import Image
 
-    picture = Image.fromarray(image[..., 0] if image.shape[2] == 1 else image).convert("RGB")
+    shown = Image.fromarray(image[..., 0] if image.shape[2] == 1 else image).convert("RGB")
     out = io.BytesIO()
-    picture.save(out, "WEBP", lossless=True, quality=60, method=3, exact=True)
+    shown.save(out, "WEBP", lossless=True, quality=60, method=3, exact=True)
     return "data:image/webp;base64," + base64.b64encode(out.getvalue()).decode()
 
 
@@ -586,7 +586,7 @@ def reading_plots(r: Readings, steps: Sequence[Mapping], channels: Sequence[str]
     scales = (float(r.settings[along].min()), float(r.settings[along].max())), (min(low, 0.0), high), top
     axis = ",".join(filter(None, (_spoken(along), spaced(r.units.get(along, "")))))
     out = []
-    for i, step in enumerate(steps):
+    for i in range(len(steps)):
         for c in range(r.measured.shape[1]):
             z = r.residual[i][:, c]
             beyond = float(np.mean(np.abs(z[np.isfinite(z)]) > 3)) if np.isfinite(z).any() else math.nan
@@ -756,7 +756,7 @@ def _angles(low: float, high: float, unit: str) -> list[float]:
     return [k * step for k in range(math.ceil(low / step), math.floor(high / step) + 1)]
 
 
-# -- charts -------------------------------------------------------------------------------------------------------------
+# -- charts ------------------------------------------------------------------------------------------------------------
 
 
 def ladder_chart(study: Record, width: int, height: int, nouns: Mapping[str, str] = FRAMES) -> str:
@@ -927,6 +927,12 @@ def _spoken(key: str) -> str:
     return key if "." in key else key.replace("_", " ")
 
 
+def _reading_curve(key: str, unit: str, x: np.ndarray, values, se) -> Curve:
+    """Readings or predictions against a setting; se: standard errors."""
+    one = np.ones(len(x))
+    return Curve(key, unit, "all", x, np.array(values), np.array(se), one, one)
+
+
 def reading_charts(comparisons: list[Comparison]) -> list[str]:
     """For frames of one or a few pixels: mean reading against each setting that varies, with the prediction."""
     first, last = comparisons[0], comparisons[-1]
@@ -938,11 +944,8 @@ def reading_charts(comparisons: list[Comparison]) -> list[str]:
         rows, before = last.by("frame"), first.by("frame")
         order = [i for i in order if rows[i].n]
         one = np.ones(len(order))
-
-        def curve(values, se):
-            return Curve(key, last_unit, "all", x[order], np.array(values), np.array(se), one, one)
-
-        last_unit = next((c.unit for c in last.curves if c.coordinate == key), "")
+        unit = next((c.unit for c in last.curves if c.coordinate == key), "")
+        curve = partial(_reading_curve, key, unit, x[order])
         measured = curve(
             [rows[i].signal + rows[i].bias for i in order], [rows[i].noise / math.sqrt(rows[i].n) for i in order]
         )
@@ -1045,7 +1048,7 @@ def _value(level: Mapping | None, key: str) -> float:
     return math.nan if value is None else float(value)
 
 
-# -- tables -------------------------------------------------------------------------------------------------------------
+# -- tables ------------------------------------------------------------------------------------------------------------
 
 
 def step_name(step: Mapping) -> str:
@@ -1153,7 +1156,7 @@ def verdict(diagnosis: Mapping | None) -> dict | None:
         "not_tested": [f"{name} ({prose(why)})" for name, why in (d.get("not_tested") or {}).items()],
         "splits": [_split(s) for s in d.get("splits") or ()],
         "levels": list(d.get("levels") or ()),
-        "shifts": [s for s in d.get("shifts") or ()][:8],
+        "shifts": list(d.get("shifts") or ())[:8],
         "curves": [_draft(f) for f in curves[:6]],
         "pairs": _pairs(d),
         "advice": _advice(d),

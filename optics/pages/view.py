@@ -518,7 +518,8 @@ class Server(ThreadingHTTPServer):
             super().__init__((HOST, port), Handler)
         except (OSError, OverflowError) as error:
             raise OSError(
-                f"--port {port}: {getattr(error, 'strerror', None) or error}; give another one, or none to take any that is "
+                f"--port {port}: {getattr(error, 'strerror', None) or error}; give another one, or none to take "
+                "any that is "
                 "free"
             ) from error
         self.hosts = {f"{name}:{self.server_address[1]}" for name in (HOST, "localhost")}

@@ -22,7 +22,7 @@ LIBRARY = (
 )
 UNKNOWN_CHANGE = 0.01
 PAIR_CHANGE = 0.01
-# what is written down wrongly of the camera, or done to its images (diagnosis laboratory, 3.3)
+# what is written down wrongly of the camera, or done to its images
 MISTAKES = ("gain +20 %", "gain -20 %", "pattern 0.3 %", "pattern 1 %", "black level 0.5 DN", "demosaiced")
 
 

@@ -20,20 +20,22 @@ QUICK = {"polarizer_bench": 1}
 
 def main(
     output: Annotated[
-        Path, typer.Option("-o", "--output", metavar="DIR", help="Records, table and page; taken up again if there.")
+        Path,
+        typer.Option(
+            "-o", "--output", metavar="DIR", help="Folder of records, table and page; a run is resumed from there."
+        ),
     ] = Path("renders/proof"),
-    rig: Annotated[list[str] | None, typer.Option(help="Only this sensor or bench; may be given again.")] = None,
-    rounds: Annotated[int, typer.Option(help="Rounds of cells: some thirty cells each.")] = 40,
+    rig: Annotated[list[str] | None, typer.Option(help="Only this sensor or bench; may be repeated.")] = None,
+    rounds: Annotated[int, typer.Option(help="Rounds of the plan, some thirty cells each.")] = 40,
     kind: Annotated[
         list[str] | None, typer.Option(help="Only cells of this kind: library, none, pair, unknown, mistake.")
     ] = None,
     jobs: Annotated[int, typer.Option(help="Processes; 0: one per core.")] = 0,
-    minutes: Annotated[float, typer.Option(help="Begin no cell after so long; 0: go on to the end.")] = 0.0,
+    minutes: Annotated[float, typer.Option(help="Start no cell after this many minutes; 0: no limit.")] = 0.0,
     quick: Annotated[bool, typer.Option("--quick", help="One round of the fastest bench, in a minute.")] = False,
-    count_only: Annotated[bool, typer.Option("--count", help="Run nothing: count what is there.")] = False,
+    count_only: Annotated[bool, typer.Option("--count", help="Run nothing; count the records that exist.")] = False,
 ) -> None:
-    """Hide effects in captures made by another path than the model, run the loop blind on each, and count what it
-    said."""
+    """Hide effects in captures that an independent renderer makes, run the loop blind on each, and count its verdicts."""
     from optics.proof import count, page
     from optics.proof.rigs import RIGS
 

@@ -95,8 +95,8 @@ class Count:
     def text(self) -> str:
         """For a terminal."""
         lines = [
-            f"proof: {self.done} of {self.planned} cells ({self.unreachable} cannot be made that strong, {len(self.failed)} failed), "
-            f"{self.seconds / max(self.done, 1):.0f} s each"
+            f"proof: {self.done} of {self.planned} cells run, {self.seconds / max(self.done, 1):.0f} s each; "
+            f"{self.unreachable} skipped because the effect cannot be made so strong, {len(self.failed)} failed"
         ]
         for name, one in {"": self, **self.rigs}.items():
             if name and len(self.rigs) < 2:
@@ -111,25 +111,27 @@ class Count:
                 lines.append(
                     f"  {r.name:<52}{r.value:>7.3f}{r.n:>6}   {lo:.3f}-{hi:.3f}   {r.first:>5g} {r.ambitious:>7g}  {r.verdict}"
                 )
-            lines += [f"  ties declared {one.ties[1]}, with the hidden effect among them {one.ties[0]}"]
+            lines += [f"  ambiguous verdicts: {one.ties[1]}; {one.ties[0]} of them list the hidden effect"]
             if one.set_size is not None:
-                lines += [f"  effects in the set at 0.2 %, on average: {one.set_size:.2f} (to be: 2 at most)"]
+                lines += [f"  mean number of effects in the set at 0.2 %: {one.set_size:.2f} (target: at most 2)"]
             for law, values in one.pulls.items():
                 if len(values) > 1:
                     lines.append(
-                        f"  pulls of strengths ({law}): n {len(values)}, mean {np.mean(values):+.2f}, sd {np.std(values, ddof=1):.2f}"
+                        f"  pulls of strengths ({law}): n {len(values)}, mean {np.mean(values):+.2f}, "
+                        f"sd {np.std(values, ddof=1):.2f}"
                     )
             if one.falls:
                 q = np.percentile(one.falls, [10, 50, 90])
                 lines.append(
-                    f"  fall of chi2 over its prediction: {q[1]:.2f} ({q[0]:.2f} to {q[2]:.2f}), n {len(one.falls)}"
+                    f"  fall of chi2 over its prediction: median {q[1]:.2f}, 10 % to 90 % {q[0]:.2f} to {q[2]:.2f}, "
+                    f"n {len(one.falls)}"
                 )
             if len(one.null_p) > 4:
                 from scipy.stats import kstest
 
                 lines.append(
-                    f"  family-wise p of {len(one.null_p)} clean null sets, uniform with p {kstest(one.null_p, 'uniform').pvalue:.2g} "
-                    "(Kolmogorov-Smirnov)"
+                    f"  family-wise p of {len(one.null_p)} sets without a hidden effect or clutter: uniform with "
+                    f"p = {kstest(one.null_p, 'uniform').pvalue:.2g} (Kolmogorov-Smirnov)"
                 )
             if one.held_out:
                 lines.append(f"  held-out chi2 per value after a right claim: median {np.median(one.held_out):.3f}")
@@ -152,6 +154,141 @@ def named(r: dict) -> set[str]:
     return found
 
 
+def _some(good: Sequence[dict], kind: str, test: Callable[[dict], bool] = lambda c: True) -> list[dict]:
+    return [r for r in good if r["cell"]["kind"] == kind and test(r["cell"])]
+
+
+def _own(good: Sequence[dict]) -> tuple[list[dict], list[dict]]:
+    """Cells with an effect of the library by its own law, and those of them without clutter."""
+    own = _some(good, "library", lambda c: c["law"] == "same")
+    return own, [r for r in own if r["cell"]["clutter"] == CLEAN]
+
+
+def _hidden(r: dict):
+    return r["cell"]["hidden"]
+
+
+def _rate(name, of: Sequence[dict], test: Callable[[dict], bool], first, ambitious, low=False) -> Rate:
+    return Rate(name, sum(bool(test(r)) for r in of), len(of), first, ambitious, low)
+
+
+def _named_rates(good: Sequence[dict]) -> list[Rate]:
+    """How often the right effect is named first, stands in the set, and is claimed; how often nothing or another is."""
+    own, clean = _own(good)
+    middle = [r for r in clean if r["cell"]["change"] == 0.005]
+    weak = [r for r in clean if r["cell"]["change"] == 0.002]
+    shown = [r for r in weak if _last(r)["p_best"] < LEVEL]
+    none, pair = _some(good, "none"), _some(good, "pair")
+    calm = [r for r in none if r["cell"]["clutter"] == CLEAN]
+
+    def claims(of):
+        return [r for r in of if named(r)]
+
+    def right(r):
+        return named(r) <= set(_hidden(r))
+
+    return [
+        _rate(
+            "top-1 after refit, 0.5 %, no clutter",
+            middle,
+            lambda r: [_last(r)["claimed"] or (_last(r)["refit"] or [""])[0]] == _hidden(r),
+            0.95,
+            0.99,
+        ),
+        _rate(
+            "top-3 by score, 0.5 %, no clutter", middle, lambda r: _hidden(r)[0] in _last(r)["score"][:3], 0.97, 0.99
+        ),
+        _rate("in the set, 0.2 %, no clutter", weak, lambda r: _hidden(r)[0] in _last(r)["set"], 0.97, 0.99),
+        _rate(
+            "in the set, 0.2 %, no clutter, where one stands out",
+            shown,
+            lambda r: _hidden(r)[0] in _last(r)["set"],
+            0.97,
+            0.99,
+        ),
+        _rate(
+            "an effect stands out where none is hidden", calm, lambda r: _last(r)["p_best"] < LEVEL, 0.03, 0.015, True
+        ),
+        _rate("claims where none is hidden, any clutter", none, named, 0.03, 0.01, True),
+        _rate("precision of claims, own law, any clutter", claims([*own, *pair, *none]), right, 0.95, 0.99),
+        _rate(
+            "precision of claims, another law",
+            claims(_some(good, "library", lambda c: c["law"] == "other")),
+            right,
+            0.85,
+            0.95,
+        ),
+    ]
+
+
+def _size_rates(good: Sequence[dict]) -> list[Rate]:
+    """Claims against clutter, unknown kinds, pairs, and how near strengths and falls of chi2 come."""
+    own, clean = _own(good)
+    unknown, pair, rates = _some(good, "unknown"), _some(good, "pair"), []
+    for clutter, first, ambitious in ((0.0, 0.8, 0.9), (0.15, 0.7, 0.85), (0.5, 0.5, 0.65), (1.0, 0.3, 0.5)):
+        of = [r for r in own if r["cell"]["change"] == 0.02 and r["cell"]["clutter"] == clutter]
+        rates.append(
+            _rate(
+                f"right claims, 2 %, clutter {clutter:g}", of, lambda r: named(r) == set(_hidden(r)), first, ambitious
+            )
+        )
+    judged = [r for r in own if _last(r)["strength"]]
+    seen = [r for r in clean if r["cell"]["change"] <= 0.005 and _fall(r)]
+    return rates + [
+        _rate("unknown kinds falsely claimed", unknown, named, 0.10, 0.03, True),
+        _rate(
+            "unknown kind's coordinate in the top two, no clutter",
+            [r for r in unknown if r["cell"]["clutter"] == CLEAN],
+            lambda r: set(r["coordinates"]) & set(_last(r)["coordinates"][:2]),
+            0.75,
+            0.90,
+        ),
+        _rate("pairs named exactly, 1 % + 1 %, no clutter", pair, lambda r: named(r) == set(_hidden(r)), 0.85, 0.95),
+        _rate("strength within 20 % where claimed", judged, lambda r: abs(_ratio(r) - 1) < 0.2, 0.80, 0.95),
+        _rate(
+            "fall of chi2 within 20 % of its prediction, to 0.5 %",
+            seen,
+            lambda r: abs(_fall(r) - 1) < 0.2,
+            0.90,
+            0.90,
+        ),
+    ]
+
+
+def _told(good: Sequence[dict]) -> tuple[dict[str, dict[str, int]], dict[str, dict[str, int]]]:
+    """What was named by what was hidden, and the verdicts by the kind of cell: numbers of cells."""
+    confusion: dict[str, dict[str, int]] = {}
+    words: dict[str, dict[str, int]] = {}
+    for r in good:
+        c = r["cell"]
+        kind = {
+            "library": _hidden(r)[0] if _hidden(r) else "",
+            "none": "nothing",
+            "pair": "two effects",
+            "unknown": f"not in the library: {_hidden(r)[0] if _hidden(r) else ''}",
+            "mistake": f"noise mistaken: {c['mistake']}",
+        }[c["kind"]]
+        names, true = named(r), set(_hidden(r))
+        told = next(iter(names), _last(r)["word"])
+        if c["kind"] == "pair" and names:
+            told = "both" if names == true else "one of two" if names < true else "another"
+        confusion.setdefault(kind, {}).setdefault(told, 0)
+        confusion[kind][told] += 1
+        words.setdefault(c["kind"], {}).setdefault(_last(r)["word"], 0)
+        words[c["kind"]][_last(r)["word"]] += 1
+    return confusion, words
+
+
+def _power(clean: Sequence[dict]) -> dict[str, dict[str, list[int]]]:
+    """Of each rig, at each raw change in percent: [right claims, cells]."""
+    power: dict[str, dict[str, list[int]]] = {}
+    for r in clean:
+        own_rig = power.setdefault(r["cell"]["rig"], {}).setdefault(f"{100 * r['cell']['change']:g}", [0, 0])
+        own_rig[0] += named(r) == set(_hidden(r))
+        own_rig[1] += 1
+    return power
+
+
 def count(records: Sequence[dict], planned: int, parts: bool = True) -> Count:
     """Count records; `planned`: how many cells the plan has."""
     made = [r for r in records if not r["unreachable"]]
@@ -162,109 +299,15 @@ def count(records: Sequence[dict], planned: int, parts: bool = True) -> Count:
     ]
     good = [r for r in made if r["steps"] and not r["failed"]]
 
-    def some(kind: str, test: Callable[[dict], bool] = lambda c: True) -> list[dict]:
-        return [r for r in good if r["cell"]["kind"] == kind and test(r["cell"])]
-
-    def rate(name, of: Sequence[dict], test: Callable[[dict], bool], first, ambitious, low=False) -> Rate:
-        return Rate(name, sum(bool(test(r)) for r in of), len(of), first, ambitious, low)
-
-    def hidden(r):
-        return r["cell"]["hidden"]
-
-    own = some("library", lambda c: c["law"] == "same")
-    clean = [r for r in own if r["cell"]["clutter"] == CLEAN]
-    middle = [r for r in clean if r["cell"]["change"] == 0.005]
+    own, clean = _own(good)
     weak = [r for r in clean if r["cell"]["change"] == 0.002]
-    shown = [r for r in weak if _last(r)["p_best"] < LEVEL]
-    none, unknown, pair = some("none"), some("unknown"), some("pair")
-    calm = [r for r in none if r["cell"]["clutter"] == CLEAN]
-
-    def claims(of):
-        return [r for r in of if named(r)]
-
-    def right(r):
-        return named(r) <= set(hidden(r))
-
-    rates = [
-        rate(
-            "top-1 after refit, 0.5 %, no clutter",
-            middle,
-            lambda r: [_last(r)["claimed"] or (_last(r)["refit"] or [""])[0]] == hidden(r),
-            0.95,
-            0.99,
-        ),
-        rate("top-3 by score, 0.5 %, no clutter", middle, lambda r: hidden(r)[0] in _last(r)["score"][:3], 0.97, 0.99),
-        rate("in the set, 0.2 %, no clutter", weak, lambda r: hidden(r)[0] in _last(r)["set"], 0.97, 0.99),
-        rate(
-            "in the set, 0.2 %, no clutter, where one stands out",
-            shown,
-            lambda r: hidden(r)[0] in _last(r)["set"],
-            0.97,
-            0.99,
-        ),
-        rate(
-            "an effect stands out where none is hidden", calm, lambda r: _last(r)["p_best"] < LEVEL, 0.03, 0.015, True
-        ),
-        rate("claims where none is hidden, any clutter", none, named, 0.03, 0.01, True),
-        rate("precision of claims, own law, any clutter", claims([*own, *pair, *none]), right, 0.95, 0.99),
-        rate(
-            "precision of claims, another law",
-            claims(some("library", lambda c: c["law"] == "other")),
-            right,
-            0.85,
-            0.95,
-        ),
-    ]
-    for clutter, first, ambitious in ((0.0, 0.8, 0.9), (0.15, 0.7, 0.85), (0.5, 0.5, 0.65), (1.0, 0.3, 0.5)):
-        of = [r for r in own if r["cell"]["change"] == 0.02 and r["cell"]["clutter"] == clutter]
-        rates.append(
-            rate(f"right claims, 2 %, clutter {clutter:g}", of, lambda r: named(r) == set(hidden(r)), first, ambitious)
-        )
+    seen = [r for r in clean if r["cell"]["change"] <= 0.005 and _fall(r)]
     judged = [r for r in own if _last(r)["strength"]]
-    rates += [
-        rate("unknown kinds falsely claimed", unknown, named, 0.10, 0.03, True),
-        rate(
-            "unknown kind's coordinate in the top two, no clutter",
-            [r for r in unknown if r["cell"]["clutter"] == CLEAN],
-            lambda r: set(r["coordinates"]) & set(_last(r)["coordinates"][:2]),
-            0.75,
-            0.90,
-        ),
-        rate("pairs named exactly, 1 % + 1 %, no clutter", pair, lambda r: named(r) == set(hidden(r)), 0.85, 0.95),
-        rate("strength within 20 % where claimed", judged, lambda r: abs(_ratio(r) - 1) < 0.2, 0.80, 0.95),
-        rate(
-            "fall of chi2 within 20 % of its prediction, to 0.5 %",
-            (seen := [r for r in clean if r["cell"]["change"] <= 0.005 and _fall(r)]),
-            lambda r: abs(_fall(r) - 1) < 0.2,
-            0.90,
-            0.90,
-        ),
+    calm = [r for r in _some(good, "none") if r["cell"]["clutter"] == CLEAN]
+    ties = [
+        r for r in [*own, *_some(good, "library", lambda c: c["law"] == "other")] if _last(r)["word"] == "AMBIGUOUS"
     ]
-    ties = [r for r in [*own, *some("library", lambda c: c["law"] == "other")] if _last(r)["word"] == "AMBIGUOUS"]
-    confusion: dict[str, dict[str, int]] = {}
-    words: dict[str, dict[str, int]] = {}
-    for r in good:
-        c = r["cell"]
-        kind = {
-            "library": hidden(r)[0] if hidden(r) else "",
-            "none": "nothing",
-            "pair": "two effects",
-            "unknown": f"not in the library: {hidden(r)[0] if hidden(r) else ''}",
-            "mistake": f"noise mistaken: {c['mistake']}",
-        }[c["kind"]]
-        names, true = named(r), set(hidden(r))
-        told = next(iter(names), _last(r)["word"])
-        if c["kind"] == "pair" and names:
-            told = "both" if names == true else "one of two" if names < true else "another"
-        confusion.setdefault(kind, {}).setdefault(told, 0)
-        confusion[kind][told] += 1
-        words.setdefault(c["kind"], {}).setdefault(_last(r)["word"], 0)
-        words[c["kind"]][_last(r)["word"]] += 1
-    power: dict[str, dict[str, list[int]]] = {}
-    for r in clean:
-        own_rig = power.setdefault(r["cell"]["rig"], {}).setdefault(f"{100 * r['cell']['change']:g}", [0, 0])
-        own_rig[0] += named(r) == set(hidden(r))
-        own_rig[1] += 1
+    confusion, words = _told(good)
     pulls = {
         "no clutter": [_pull(r) for r in judged if r["cell"]["clutter"] == CLEAN and _pull(r) is not None],
         "clutter": [_pull(r) for r in judged if r["cell"]["clutter"] > CLEAN and _pull(r) is not None],
@@ -275,16 +318,16 @@ def count(records: Sequence[dict], planned: int, parts: bool = True) -> Count:
         planned,
         len(records) - len(made),
         failed,
-        rates,
+        [*_named_rates(good), *_size_rates(good)],
         confusion,
         words,
-        power,
-        (sum(hidden(r)[0] in _last(r)["ambiguous"] for r in ties), len(ties)),
+        _power(clean),
+        (sum(_hidden(r)[0] in _last(r)["ambiguous"] for r in ties), len(ties)),
         float(np.mean([len(_last(r)["set"]) for r in weak])) if weak else None,
         pulls,
         falls,
         [_last(r)["p_best"] for r in calm],
-        [_last(r)["held_out"][-1] for r in own if named(r) == set(hidden(r)) and _last(r)["held_out"][-1] is not None],
+        [_last(r)["held_out"][-1] for r in own if named(r) == set(_hidden(r)) and _last(r)["held_out"][-1] is not None],
         float(sum(r.get("seconds", 0.0) for r in records)),
     )
     if parts:

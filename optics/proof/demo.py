@@ -1,9 +1,10 @@
-"""The demonstration: a sensor with a secret, and the loop that finds it.
+"""The demonstration: a sensor with a hidden effect, and the loop that finds it.
 
-Captures of a shipped sensor are made by another path than the model (`optics.proof.makers.touch`: stock Mitsuba, a
-denser mesh, photons, read noise, 8 bits), with one effect that the base model lacks, chosen by the seed. Then the loop
-runs blind: calibrate, compare, name the missing effect, add it, watch the error on held-out presses fall; and a report
-tells the story."""
+An independent path makes the captures of a shipped sensor (`optics.proof.makers.touch`: stock Mitsuba, a denser mesh,
+photons, read noise, 12 bits), with one effect that the base model lacks, chosen by the seed. They are taken with care:
+raw, near full scale, many frames summed, and the noise of the sum written down. Then the loop runs blind: calibrate,
+compare, name the missing effect, add it, and see the error on held-out presses fall to the noise. A report shows every
+step."""
 
 from __future__ import annotations
 
@@ -14,17 +15,18 @@ from pathlib import Path
 import numpy as np
 
 from optics.captures import capture_set as capture_files
+from optics.captures.noise import Noise
 from optics.errors import OutputExists, UnknownKey
 from optics.proof.makers import touch as synthetic
 from optics.scene import loader as scenes
 from optics.scene.registry import known
 from optics.study import loop
 
-# Hidden strengths, in the units of the effects' own parameters: a few percent of the image, as real sensors have it.
-# Not here: interreflection, 0.2 % of the light under a dent this shallow. White LEDs cannot show colour crosstalk: it
-# is to be had on request, with the coloured ones of digit.
+# Hidden strengths, in the units of the effects' own parameters: of a size that real sensors have. Calibration absorbs
+# most of what they change. Interreflection is left out: 0.2 % of the light under a dent so shallow. White LEDs cannot
+# show colour crosstalk: ask for it with the coloured LEDs of digit.
 SECRETS = {
-    "lens vignetting": 0.8,
+    "lens vignetting": 0.9,  # of 1, the natural fall-off cos^4
     "veiling glare": 0.03,
     "ambient light": 1e-4,
     "lens blur": 0.6,
@@ -41,8 +43,8 @@ SECRETS = {
 SENSORS = {
     "gelsight": ((160, 120), 200.0),
     "digit": ((120, 160), 700.0),
-}  # px; exposure: one LED at a time is near full scale
-# 1000 readings of a photodiode, by coherency matrices (optics.proof.makers.bench); of effects that can be told apart
+}  # px; exposure at which one LED alone comes near full scale
+# 1000 readings of a photodiode, made by coherency matrices (optics.proof.makers.bench); effects that can be told apart
 BENCH = "polarizer_bench"
 BENCH_SECRETS = {
     "polarizer misalignment": 1.0,
@@ -54,13 +56,18 @@ BENCH_SECRETS = {
     "polarized source": 0.02,
     "extinction leak": 0.004,
 }
+# One frame: 12 bits raw, 20 000 electrons at full scale, as machine-vision cameras have them. No fixed pattern: a flat
+# field has divided it out.
+CAMERA = Noise(system_gain=0.2, dark_noise=2.0, black_level=64.0, saturation=4095.0, prnu=0.0)
+FRAMES = 16  # summed to one image: their 12 bits fill the 16 bits of a file
+PHOTODIODE = Noise(system_gain=0.01, dark_noise=1.0, black_level=64.0, saturation=4095.0, prnu=0.0)
 PRESSES = 4
 STEPS = 3  # effects that the loop may add before it must stop
 
 
 def truth(scene, seed: int) -> dict[str, float]:
-    """A sensor as it was built and not as it was drawn: LEDs half a millimetre and some degrees off, powers by a
-    tenth."""
+    """Values of a sensor as built: its LEDs are up to half a millimetre and some degrees off the drawing, their powers
+    up to a tenth."""
     rng = np.random.default_rng([seed, 1])
     drawn, built = scene.values(), {}
     for led in scene.leds:
@@ -74,21 +81,21 @@ def truth(scene, seed: int) -> dict[str, float]:
 
 
 def secret(seed: int, name: str | None = None, sensor: str = "gelsight") -> tuple[str, float]:
-    """The hidden effect of a seed, or the one of a name."""
+    """(name, strength) of the hidden effect: the one of that name, or the seed's choice."""
     choices = BENCH_SECRETS if sensor == BENCH else SECRETS
     names = sorted(choices)
     name = name or names[int(np.random.default_rng([seed, 2]).integers(len(names)))]
     secrets = choices if sensor == BENCH else {**SECRETS, "colour crosstalk": 0.03}
     effect = known().find_effect(name).name
     if effect not in secrets:
-        raise UnknownKey(effect, secrets, "secret", hint="the demonstration knows no independent way to make it")
+        raise UnknownKey(effect, secrets, "secret", hint="there is no independent way to make any other")
     return effect, secrets[effect]
 
 
 def make(
     folder: Path, seed: int, name: str | None = None, progress: Callable | None = None, sensor: str = "gelsight"
 ) -> tuple[str, float]:
-    """Write the captures of a demonstration; returns the secret, which the captures do not tell."""
+    """Write the captures of a demonstration; returns (name, strength) of the hidden effect, which they do not hold."""
     effect, strength = secret(seed, name, sensor)
     if sensor == BENCH:
         make_bench(folder, seed, effect, strength)
@@ -96,19 +103,18 @@ def make(
     (width, height), exposure = SENSORS[sensor]
     scene = scenes.load(sensor, {"width": str(width), "height": str(height)})
     built = {**truth(scene, seed), "camera.exposure": exposure}
-    maker = synthetic.Maker(scene, built, {effect: strength}, seed=seed + 1000)
-    # each LED alone, and none: the dark frame tells light from outside from light that the camera scatters
+    maker = synthetic.Maker(scene, built, {effect: strength}, CAMERA, seed + 1000, frames=FRAMES)
+    # Each LED alone, and none: the dark frame separates ambient light from light that the camera scatters.
     drives = [*({led: 1.0} for led in scene.leds), {}]
     found = maker.captures(synthetic.presses(PRESSES, seed), drives, progress=progress, scene_name=sensor)
     found.parameters["camera.exposure"] = exposure
-    capture_files.write(found, folder, bits=8)
+    capture_files.write(found, folder, bits=16)
     return effect, strength
 
 
 def make_bench(folder: Path, seed: int, effect: str, strength: float) -> None:
-    """Readings of the polarizer bench with one effect: P1 at five angles, the analyser round and back, two powers of
-    the lamp."""
-    from optics.captures.noise import Noise
+    """Write readings of the polarizer bench with one effect: P1 at five angles, the analyser a full turn and back, the
+    lamp at two powers."""
     from optics.proof.makers.bench import malus_sweep, with_effects, write
 
     settings = malus_sweep(1000, polarizer_angles=(0.0, 60.0, 100.0, 190.0, 250.0))
@@ -117,7 +123,22 @@ def make_bench(folder: Path, seed: int, effect: str, strength: float) -> None:
     truth = with_effects(
         {effect: strength - (effect == "servo scale")}, gain=2.2
     )  # a scale is known by its value, 1 is none
-    write(folder, truth, settings, Noise(0.05, 2.0, 64.0, 4095.0, 0.0), seed + 1000)
+    write(folder, truth, settings, PHOTODIODE, seed + 1000)
+
+
+def _opening(sensor: str) -> str:
+    """What the captures are, before anything is found."""
+    if sensor == BENCH:
+        return (
+            "1000 readings of a photodiode behind two polarizers. They were computed from coherency matrices, not by "
+            "the model, and hold one effect that the base model lacks."
+        )
+    (width, height), _ = SENSORS[sensor]
+    return (
+        f"{PRESSES} presses on {sensor}, each under one LED at a time and in the dark. Every image has "
+        f"{width} x {height} pixels and sums {FRAMES} raw frames of 12 bits. Stock Mitsuba made them, not the model, "
+        "and they hold one effect that the base model lacks."
+    )
 
 
 def run(
@@ -128,10 +149,11 @@ def run(
     progress: Callable | None = None,
     say: Callable[[str], None] = lambda text: None,
 ) -> dict:
-    """Make captures, run the loop, write the report; returns what happened.
+    """Make captures, run the loop, write the report; returns what was hidden, what was claimed, and the errors.
 
-    folder   gets `captures/`, `study/` and `report.html`; what is there already from the same seed is taken up
-    say      receives the story, a paragraph at a time
+    folder   receives `captures/`, `study/` and `report.html`; a run that was cut off is resumed from there
+    say      is called with the text of each stage
+    Raises OutputExists where the folder holds another demonstration.
     """
     from optics.pages.report import report
 
@@ -144,16 +166,11 @@ def run(
     asked = (seed, sensor, known().find_effect(effect).name if effect else hidden["effect"])
     if asked != (hidden["seed"], hidden["sensor"], hidden["effect"]):
         raise OutputExists(
-            f"{folder} holds the demonstration of {hidden['sensor']}, seed {hidden['seed']}, with a secret of its "
-            "own; choose another folder for this one (-o)"
+            f"{folder} holds another demonstration, of {hidden['sensor']} with seed {hidden['seed']}; "
+            "choose another folder for this one (-o)"
         )
-    say(
-        "1000 readings of a photodiode behind two polarizers, made by coherency matrices with an effect that the base model lacks."
-        if sensor == BENCH
-        else f"{PRESSES} presses under the LEDs of {sensor}, one at a time and in the dark, made by stock Mitsuba with an effect that "
-        "the base model lacks."
-    )
-    # The stage is trusted (S1.2): solving for every press as well takes three times as long and tells the same story.
+    say(_opening(sensor))
+    # Press positions are taken as known: to solve for them too takes three times as long and leads to the same verdict.
     setup = loop.Setup(captures=str(folder / "captures"), per_group=[], seed=seed)
     study, model, fit = loop.begin(setup, folder / "study", title="Demonstration", resume=True, progress=progress)
     say(study.table())
@@ -171,7 +188,9 @@ def run(
         say(study.table())
     page = report(study.folder, folder / "report.html", overwrite=True)
     last = study.steps[-1]["held_out"]
-    keys = {key for name in claimed for key in sum(model.scene.keys_of(model.scene.registry.find_effect(name)).values(), [])}
+    keys = {
+        key for name in claimed for key in sum(model.scene.keys_of(model.scene.registry.find_effect(name)).values(), [])
+    }
     strengths = {v["name"]: (v["value"], v["sd"]) for v in study.steps[-1]["variables"] if keys & set(v["keys"])}
     return {
         "hidden": hidden,

@@ -159,8 +159,8 @@ class References:
     def share(self) -> np.ndarray:
         """(3,) share a of the image that the grid's mask covers, by channel: near 0 or 1 it shows no grid.
 
-        Also the similarity by Monte Carlo, of a mask of the same share that has nothing to do with it; and none of that
-        share comes below 2 - 1/a."""
+        It is also the similarity that an unrelated mask of the same share has by chance; no mask of that share comes
+        below 2 - 1/a."""
         return np.asarray(self.grid).mean(axis=(0, 1))
 
     def map(self, image: np.ndarray) -> np.ndarray:
@@ -297,7 +297,7 @@ def proximity(
                     and a correlation of 0.00: above 0.6 DN a still noisy image is 'Approaching'. (The paper's own
                     indoor baseline is 0.48 bit.) A dead band of 3 s takes E below 0.12 for s up to 8 DN, and hides what
                     brightens less. Without one, as many backgrounds as frames (count = 30) keep E below 0.5 up to 8 DN:
-                    one of 30 is brighter by Monte Carlo. Noise that the channels share, as of a lamp that flickers,
+                    one of 30 is brighter by chance. Noise that the channels share, as of a lamp that flickers,
                     correlates and is 'Noise'
       drift         lamps 0.3 % brighter than when the references were taken, at 100 DN and 0.3 DN of noise, pass tau_E
                     as

@@ -21,7 +21,7 @@ from scipy.optimize import linear_sum_assignment
 from skimage.filters import threshold_otsu
 
 SMALLEST = 9  # px; below, an area says nothing about roundness
-SIGNIFICANT = 5.0  # sd of the smoothed noise: once in 3e6 pixels by Monte Carlo
+SIGNIFICANT = 5.0  # sd of the smoothed noise: once in 3e6 pixels by chance
 LAPLACIAN = np.outer(
     (1, -2, 1), (1, -2, 1)
 )  # blind to planes and to straight edges along rows and columns; white noise x 6

@@ -71,6 +71,8 @@ class Part:
             second camera says role="camera", and every effect of cameras whose parameters it has is one of its own
     refracts   True of a boundary that camera rays pass, bent by its parameter `index`
     polarizes  True of what makes polarized light of unpolarized light
+    random  f(rng) -> {parameter name: value}: plausible values of parameters whose default and `plausible` are not
+            enough (optics.scene.checking.draw)
     """
 
     kind: str
@@ -85,6 +87,7 @@ class Part:
     role: str = ""
     refracts: bool = False
     polarizes: bool = False
+    random: Callable | None = None
 
     def __post_init__(self) -> None:
         if not self.role:
@@ -114,6 +117,7 @@ class Effect:
                 further parameters
                 that do nothing at neutral, found from the residual before the effect is scored or added
     checks      closed forms, as in Part
+    random      plausible values, as in Part
     """
 
     name: str
@@ -131,6 +135,7 @@ class Effect:
     seek: Callable | None = None
     field: Callable | None = None
     checks: tuple[Callable[[], None], ...] = ()
+    random: Callable | None = None
     doc: str = ""
     file: str = ""
 

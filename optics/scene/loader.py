@@ -128,7 +128,6 @@ class Scene:
                 self.parameters[f"{name}.{p.name}"] = p
         self._stock = self._stock_parameters()
         self.parameters.update({k: p for k, (p, _) in self._stock.items() if k not in self.parameters})
-        self._now = self._read()
         self._warn_of_depolarizers()
 
     @contextmanager
@@ -185,10 +184,6 @@ class Scene:
 
     # -- values ---------------------------------------------------------------------------------------------------------
 
-    def values(self) -> dict[str, float | str]:
-        """The present value of every parameter."""
-        return dict(self._now)
-
     def records(self) -> list[dict]:
         """One record per parameter (optics.scene.showing.records)."""
         return showing.records(self)
@@ -196,8 +191,9 @@ class Scene:
     def _repr_html_(self) -> str:
         return showing.html(self)
 
-    def _read(self) -> dict[str, float | str]:
-        now = {}
+    def values(self) -> dict[str, float | str]:
+        """The present value of every parameter, whoever set it: this scene, or `mi.traverse` and an update."""
+        now: dict[str, float | str] = {}
         for name, part in self.parts.items():
             now.update({f"{name}.{n}": part.number(n) for n in part.numbers})
             now.update({f"{name}.{n}": getattr(part, n) for n in part.words})
@@ -217,7 +213,8 @@ class Scene:
         """Set parameters by key; geometry is rebuilt once, and only if it changed."""
         import mitsuba as mi
 
-        changed = {k: v for k, v in self.check(values, where).items() if self._now[k] != v}
+        now = self.values()
+        changed = {k: v for k, v in self.check(values, where).items() if now[k] != v}
         moved, stock = set(), False
         for key, value in changed.items():
             if key in self._stock:
@@ -232,7 +229,6 @@ class Scene:
                 part.hold(parameter, value)
             if part.placed_by([parameter]):
                 moved.add(name)
-        self._now.update(changed)
         if stock:
             self._traversed.update()
         with self._named():

@@ -75,6 +75,21 @@ def wire(scene, integrator=None) -> Neighbours:
     return around
 
 
+def traverse_paths(scene) -> dict[str, str]:
+    """{key: path}: where `mi.traverse(scene)` has each number of our parts, whose key is `id.name` in this library.
+
+    A part that stands inside another object is under that object's path: `film.angle` is `film_sheet.bsdf.angle`."""
+    import mitsuba as mi
+
+    Neighbours(scene)  # names parts without an id
+    found: dict[str, str] = {}
+    for path, (_, _, node, _) in mi.traverse(scene).properties.items():
+        name = path.rsplit(".", 1)[-1]
+        if is_part(node) and name in node.numbers:
+            found.setdefault(f"{node.name}.{name}", path)
+    return found
+
+
 def ensure_wired(scene, integrator) -> None:
     """`wire` a scene that an integrator is about to render, unless it is wired."""
     parts = [integrator, *scene.sensors(), *scene.emitters()]

@@ -158,7 +158,7 @@ def _check(pitch: float, poisson: float, *depths: float) -> None:
 
 
 class SkinStress:
-    """The stress pattern of a pressed skin for a sheet in it (plugins/effects/stress.py): f(x, y, size) -> (P_q, P_u)
+    """The stress pattern of a pressed skin for a sheet in it (plugins/effects/stress_birefringence.py): f(x, y, size) -> (P_q, P_u)
     in mm.
 
     x, y are the sheet's own axes as the camera sees it (x right, y up): y of the world and 2 s_xy change their signs.

@@ -1,4 +1,4 @@
-"""Many images of one scene, from a job file; any process can stop and go on, and the result is the same bit by bit.
+"""Many images of one scene, from a job file; a run can be stopped and resumed, and the result is the same bit by bit.
 
     scene   = "gelsight"                       # a shipped scene, or an XML file relative to this one
     out     = "presses"                        # folder, relative to this file
@@ -68,7 +68,7 @@ class Strict(BaseModel):
 
 
 class Distribution(Strict):
-    """Exactly one of the five."""
+    """A distribution of values: exactly one of the five is given."""
 
     uniform: Pair | None = Field(None, description="[low, high], low < high")
     log_uniform: Pair | None = Field(None, description="[low, high], 0 < low < high")
@@ -104,7 +104,7 @@ class Distribution(Strict):
 
     @property
     def extremes(self) -> list[float | str]:
-        """Values that stand for all draws in a check of bounds; nothing of a normal, which has no ends."""
+        """The extreme values of all draws, for a check of bounds; none for a normal, which has no ends."""
         return self.uniform or self.log_uniform or self.choice or self.grid or []
 
 
@@ -174,7 +174,7 @@ class Job(Strict):
         return {key: chosen[key] if key in chosen else d.draw(self.rng(index, key)) for key, d in self.sample.items()}
 
     def rng(self, index: int, purpose: str) -> np.random.Generator:
-        """The stream of one index for one purpose."""
+        """The random stream of one index for one purpose."""
         return np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(index, zlib.crc32(purpose.encode()))))
 
     def camera_noise(self) -> Noise | None:
@@ -210,7 +210,7 @@ def read(file: str | Path) -> Job:
 
 
 def _explained(error: ValidationError, file: Path) -> Exception:
-    """The first complaint in one sentence: what, where, allowed."""
+    """The first validation error as a sentence: what, where, allowed."""
     first, more = error.errors()[0], error.error_count() - 1
     place = [str(p) for p in first["loc"] if not str(p).startswith(("list[", "constrained-", "float", "str", "int"))]
     model, field = Job, None
@@ -252,13 +252,14 @@ class Maker:
         self.folder = folder_of(job, self.file)
 
     def check(self) -> None:
-        """Hold every value that can be drawn against the scene; raises before anything is rendered."""
+        """Check every value that can be drawn against the scene; raises before anything is rendered."""
         job, scene = self.job, self.images.scene
         if job.lights == "each" and not scene.lights:
             raise BadJob(f'{self.file}: lights = "each", but {scene.path} has no LED or source; allowed: "together"')
         if "dn" in job.outputs and self.images.developer is None:
             raise BadJob(
-                f"{self.file}: outputs names \"dn\", but {scene.path} has no part 'camera' to make DN; allowed: exr, png"
+                f"{self.file}: outputs names \"dn\", but {scene.path} has no part 'camera' to make DN; allowed: "
+                "exr, png"
             )
         scene.check(job.parameters, f"{self.file}: [parameters]")
         for key, d in job.sample.items():
@@ -352,7 +353,7 @@ def folder_of(job: Job, file: Path) -> Path:
 
 
 def _open_folder(folder: Path, identity: Mapping) -> None:
-    """Start a folder, or go on with one that was made from the same job."""
+    """Start a folder, or resume one that was made from the same job."""
     note = folder / "job.json"
     if note.is_file():
         try:
@@ -387,7 +388,7 @@ def _changes(before, now, name: str = "") -> list[str]:
 
 @contextmanager
 def _alone(folder: Path, shard: tuple[int, int]) -> Iterator[None]:
-    """Keeps a second process from the same shard; the system frees the lock when a process ends in whatever way."""
+    """Lock a shard against a second process; the system frees the lock however the process ends."""
     try:
         import fcntl
     except ImportError:  # Windows: two processes would do the same work twice, with the same result
@@ -408,7 +409,7 @@ def _manifest(folder: Path, shard: tuple[int, int]) -> Path:
 
 
 def _lines(file: Path) -> dict[int, dict]:
-    """Records by index; a line that a kill cut short is passed over."""
+    """Records by index; a line that a killed process left incomplete is skipped."""
     found = {}
     for line in file.read_text(encoding="utf-8").splitlines() if file.is_file() else ():
         try:
@@ -440,7 +441,7 @@ def _text(records: Mapping[int, dict]) -> str:
 
 
 def _finish(folder: Path, job: Job) -> bool:
-    """When every sample of the job is there: one manifest in order, and the table."""
+    """Write one ordered manifest and the table once every sample of the job is complete."""
     records = _all_lines(folder)
     if len(records) < job.total:
         return False
@@ -488,7 +489,7 @@ def run(
     plugins: Path | None = None,
     progress: Progress | None = None,
 ) -> Result:
-    """Make what is missing of a job's shard. May be ended at any moment and called again.
+    """Make the missing samples of a job's shard. It can be stopped at any moment and called again.
 
     workers   processes of one thread each; None: as many as there are cores. With 1 everything happens in this process.
     Raises BadJob, UnknownKey, OutOfBounds, OutputExists before any rendering, SampleFailed in its course.
@@ -524,7 +525,7 @@ def run(
 
 
 def _remaining(folder: Path, shard: tuple[int, int], own: Sequence[int], progress: Progress | None) -> list[int]:
-    """Indices of a shard that have no line, or whose files are not what the line says; clears what a kill left."""
+    """Indices of a shard without a record, or whose files differ from it; removes what a killed process left."""
     known, bad = _all_lines(folder), set()
     done = [i for i in own if i in known]
     for k, index in enumerate(done):
@@ -579,7 +580,7 @@ def _cores() -> int:
 
 
 def _crew(file: Path, plugins: Path | None, todo: Sequence[int], workers: int) -> Iterator[dict]:
-    """Records from processes of their own, in the order in which they are ready.
+    """Records from worker processes, in the order in which they finish.
 
     Each holds one end of a pipe and nothing else of this process, so that it ends when this one is killed.
     """
@@ -626,7 +627,7 @@ def _crew(file: Path, plugins: Path | None, todo: Sequence[int], workers: int) -
 
 
 def _work(connection, file: Path, plugins: Path | None) -> None:
-    """A worker's life: an index comes in, a record goes out, or the text of an error."""
+    """The loop of a worker: it receives an index, and sends a record or the text of an error."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent decides
     try:
         index = connection.recv()

@@ -1,15 +1,15 @@
-"""A capture session before it is taken: which frames keep a scene's effects apart, and which no frames will.
+"""A capture session before it is taken: which frames tell a scene's effects apart, and which effects no frames can.
 
 Candidate frames (places and depths of a press, lights, exposures; angles of polarizers and powers where there is no
 gel; distances of an object) are rendered once, with the derivative images of all that `optics calibrate` solves for and
-of every effect. Frames are then chosen one after the other for the greatest mean probability to decide rightly,
+of every effect. Frames are then chosen one after the other for the greatest mean probability of the right decision,
 
     mean over ordered pairs (a, b) of Phi(sqrt(D_ab)/2),      b another effect, or none
 
-with every effect at a tenth of its plausible strength, the size at which a diagnosis states its power. The mean and not
-the smallest D: two effects that no frame can tell apart would have a D of 0 whatever is chosen, and hide what can be
-gained for all others. Each term saturates once a pair is decided, so that frames go to what is not. Nothing is assumed
-known but the noise and what is set."""
+with every effect at a tenth of its plausible strength, the size at which a diagnosis states its power. The
+criterion is the mean and not the smallest D, which two effects that no frame can tell apart would hold at 0 whatever is
+chosen. Each term saturates once a pair is decided, so further frames go to pairs that are not. Only the noise and the
+settings are assumed known."""
 
 from __future__ import annotations
 
@@ -34,6 +34,7 @@ from optics.diagnosis.evidence import Candidate, Evidence, Progress, measure
 from optics.diagnosis.thresholds import CLEAR, LEVEL
 from optics.errors import BadScene, Underdetermined
 from optics.files.output import new_folder, shipped
+from optics.fit.scene_model import SceneModel
 from optics.scene.loader import Scene
 from optics.scene.parameter import Parameter, Values
 from optics.study.setup import Setup, effect_variables, variables_of_base
@@ -92,7 +93,7 @@ class Power:
 
 @dataclass
 class Plan:
-    """Frames in the order in which they were chosen (`worth`: mean P(correct) up to each), and what they keep apart."""
+    """Frames in the order in which they were chosen (`worth`: mean P(correct) up to each), and what they tell apart."""
 
     scene: str
     frames: list[Choice]
@@ -165,7 +166,8 @@ class Plan:
         if weak:
             lines += [
                 "",
-                f"too weak to be noticed at {self.share:g} of the plausible strength (D against none): {', '.join(weak)}",
+                f"too weak to be noticed at {self.share:g} of the plausible strength (D against none): "
+                f"{', '.join(weak)}",
             ]
         if self.unseen:
             lines.append(f"no candidate frame shows: {', '.join(self.unseen)}")
@@ -267,7 +269,8 @@ def _sweeps(parameters: dict, base: dict, lights: Sequence[str], exposures: Sequ
     films = [k for k, there in inserted.items() if there and k.rpartition(".")[0] + ".inserted" in base]
     if not films:
         raise Underdetermined(
-            "design: a camera of one pixel and no polarizer to turn: no two readings differ but in brightness; allowed: a scene "
+            "design: a camera of one pixel and no polarizer to turn: no two readings differ but in brightness; "
+            "allowed: a scene "
             "with images (-D width=..., -D height=...) or with a polarizer film"
         )
     swept, *others = films
@@ -294,6 +297,54 @@ def _sweeps(parameters: dict, base: dict, lights: Sequence[str], exposures: Sequ
 # -----------------------------------------------------------------------------------------------------------
 
 
+def _checked(scene: Scene, effects: Sequence | None) -> tuple[list, list]:
+    """(every effect that the scene can express, those that were asked for); raises BadScene."""
+    for part, kind, tag in ((scene.camera, "camera", "sensor"), (scene.integrator, "tactile", "integrator")):
+        if part is None:
+            raise BadScene(
+                f"{scene.path}: no part of the type '{kind}'; a capture session needs one: add a <{tag} "
+                f'type="{kind}">'
+            )
+    swept = math.prod(scene.camera.resolution) == 1  # readings of a photodiode
+    known = [
+        e for _, e in sorted(scene.registry.effects.items()) if scene.can_express(e) and not (swept and e.mixes_pixels)
+    ]
+    effects = list({e.key: e for e in effects or ()}.values())  # an effect named twice would be its own rival
+    for e in effects:
+        if e not in known:
+            raise BadScene(
+                f"{scene.path}: the scene cannot express the effect '{e.name}'; it can: "
+                f"{', '.join(k.key for k in known)}"
+            )
+    return known, effects
+
+
+def _imagined(scene: Scene, pool: Sequence[Choice], noise: Noise) -> SceneModel:
+    """A model of the candidates: their settings, and black images that predictions will replace."""
+    width, height = scene.camera.resolution
+    swept = width * height == 1
+    bands = scene.integrator.bands if scene.integrator is not None else ()
+    channels = 1 if len(bands or (0,)) == 1 else 3
+    blank = np.zeros((height, width, channels), np.float32)
+    first = Frame("first", blank, parameters=dict(pool[0].readings[0]), file="design")
+    table = Table("readings.csv", ["reading"]) if swept else None
+    model = SceneModel(scene, Captures(Path("."), str(scene.path), [first], noise=noise, table=table), noise)
+    model.frames = []
+    return model.imagine(
+        [
+            Frame(
+                f"candidate-{i}",
+                np.repeat(blank, len(c.readings), 0) if c.swept else blank,
+                group=c.group or None,
+                parameters=dict(c.settings),
+                file="design",
+                readings={k: np.array(v).reshape(-1, 1, 1) for k, v in c.swept.items()},
+            )
+            for i, c in enumerate(pool)
+        ]
+    )
+
+
 def plan(
     scene: Scene,
     frames: int,
@@ -308,11 +359,11 @@ def plan(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> Plan:
-    """Choose `frames` frames of a scene (optics.scene.loader.Scene) that keep its effects apart.
+    """Choose `frames` frames of a scene (optics.scene.loader.Scene) that tell its effects apart.
 
     effects   that may be missing; None: all that the scene can express
-    values    of a calibration, in place of the scene's own; setup: what it solves for (optics.study.setup.Setup), added:
-              effects that it has
+    values    of a calibration, in place of the scene's own
+    setup     what that calibration solves for (optics.study.setup.Setup); added: effects that it has
     share     of the plausible strength, at which effects are told apart
     fixed_exposure   leave the exposure as the scene has it
 
@@ -320,50 +371,14 @@ def plan(
     """
     from scipy.special import ndtr
 
-    from optics.fit.scene_model import SceneModel
-
     say = progress or (lambda what, done, total: None)
     _require(frames, share)
-    for part, kind, tag in ((scene.camera, "camera", "sensor"), (scene.integrator, "tactile", "integrator")):
-        if part is None:
-            raise BadScene(
-                f"{scene.path}: no part of the type '{kind}'; a capture session needs one: add a <{tag} type=\"{kind}\">"
-            )
-    width, height = scene.camera.resolution
-    swept = width * height == 1
-    known = [
-        e for _, e in sorted(scene.registry.effects.items()) if scene.can_express(e) and not (swept and e.mixes_pixels)
-    ]
-    effects = list({e.key: e for e in effects or ()}.values())  # an effect named twice would be its own rival
-    for e in effects:
-        if e not in known:
-            raise BadScene(
-                f"{scene.path}: the scene cannot express the effect '{e.name}'; it can: {', '.join(k.key for k in known)}"
-            )
+    known, effects = _checked(scene, effects)
     setup = setup or Setup(captures="")
     values = Values() if values is None else Values(dict(values.common))
     base = {**scene.values(), **values.common}
-    pool = candidates(scene.parameters, base, swept, fixed_exposure)
-    bands = scene.integrator.bands if scene.integrator is not None else ()
-    channels = 1 if len(bands or (0,)) == 1 else 3
-    blank = np.zeros((height, width, channels), np.float32)
-    first = Frame("first", blank, parameters=dict(pool[0].readings[0]), file="design")
-    table = Table("readings.csv", ["reading"]) if swept else None
-    model = SceneModel(scene, Captures(Path("."), str(scene.path), [first], noise=noise, table=table), noise)
-    model.frames = []
-    model = model.imagine(
-        [
-            Frame(
-                f"candidate-{i}",
-                np.repeat(blank, len(c.readings), 0) if c.swept else blank,
-                group=c.group or None,
-                parameters=dict(c.settings),
-                file="design",
-                readings={k: np.array(v).reshape(-1, 1, 1) for k, v in c.swept.items()},
-            )
-            for i, c in enumerate(pool)
-        ]
-    )
+    pool = candidates(scene.parameters, base, math.prod(scene.camera.resolution) == 1, fixed_exposure)
+    model = _imagined(scene, pool, noise)
     for key in model.driven:
         values.common.setdefault(key, float(base[key]))
     pool = _expose(model, values, pool, base, say)
@@ -383,7 +398,8 @@ def plan(
     members = [c for c in members if not any(k in taken for v in c.variables for k in v.keys)]
     if not members:
         raise Underdetermined(
-            f"{scene.path}: none of the effects asked for is free to be missing; the calibration solves for them already"
+            f"{scene.path}: none of the effects asked for is free to be missing; the calibration solves for them "
+            "already"
         )
     evidence = measure(model, values, solved, members, range(len(pool)), ROWS, seed, say, "what candidate frames show")
     diagonal = np.diag(evidence.normal.gram)
@@ -475,7 +491,8 @@ def session(
 def _require(frames: int, share: float) -> None:
     if frames < FEWEST:
         raise Underdetermined(
-            f"design: {frames} frames; allowed: {FEWEST} or more, as with one nothing can be held out and nothing compared"
+            f"design: {frames} frames; allowed: {FEWEST} or more, as with one nothing can be held out and nothing "
+            "compared"
         )
     if not 0 < share < math.inf:
         raise ValueError(f"design: strength of {share:g} plausible sizes; allowed: > 0, finite")
@@ -619,7 +636,8 @@ def _report(
     groups = len({f.group for f in frames}) if any(f.group for f in frames) else len(frames)
     if groups < GROUPS and not frames[0].swept:  # readings are dealt out to sweeps, of which there are enough
         warnings.append(
-            f"{groups} presses or places: fewer than {GROUPS} groups are not held out by themselves, and without held-out frames "
+            f"{groups} presses or places: fewer than {GROUPS} groups are not held out by themselves, and without "
+            "held-out frames "
             "there is no CLAIM; plan more frames, or name one with --hold-out"
         )
     name = scene.path.stem if scene.path.parent == shipped("scenes") else str(scene.path)
@@ -652,7 +670,8 @@ def write(planned: Plan, folder: str | Path) -> Path:
     # not captures.MARK: once its images are in, the folder is a measured set, which no writing of captures may replace
     document.add(
         tomlkit.comment(
-            "A session to be taken, planned by optics. Put each image where `image` says, correct what you set otherwise,"
+            "A session to be taken, planned by optics. Put each image where `image` says, correct what you set "
+            "otherwise,"
         )
     )
     document.add(tomlkit.comment("and put your camera's numbers under [noise]."))

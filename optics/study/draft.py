@@ -9,8 +9,9 @@ numbers and says what the cause is.
 
 A curve along a coordinate of the camera acts on its image (stages `lens`, `sensor`, `response`). One along a coordinate
 of light or geometry is a factor on the light along its path in the gel (stage `segment`), which knows the lit point,
-its normal, the lamp and the camera at every value of every parameter: derivatives by forward mode and by differences
-hold. What neither sees, such as the distance in pixels to a contact, has no draft."""
+its normal, the lamp and the camera at every value of every parameter: both its derivatives,
+in forward mode and by differences, are right. A coordinate that neither sees, such as the distance in pixels to a
+contact, cannot be drafted."""
 
 from __future__ import annotations
 
@@ -110,13 +111,15 @@ CARRIERS = {
     ),
     "led_angle": Carrier("emission", (ANGLE.format("beam.cos"),), "angle to the LED's axis, deg"),
 }
-ELSEWHERE = {  # what carries no table, and what to do in its place
+EDGES = "a change that depends on edges mixes pixels: use the stage 'lens' (plugins/effects/lens_blur.py)"
+ELSEWHERE = {  # coordinates that carry no table, and what to do instead
     "intensity": "a curve along the radiance before the camera bends it is no image function; draft along 'signal'",
     "frame": "a number per frame says nothing of the next frame; 'gain drift' frees a gain per frame",
-    "reading": "the row of a table is no setting; write when each reading was taken into a column `source.time`, or what else changed into one",
+    "reading": "the row of a table is no setting; add a column `source.time` with the time of each reading, or one "
+    "of what else changed",
     "LED": "an LED's own level is its power, which a calibration solves for; draft along 'led_distance' or 'led_angle'",
-    "gradient": "a change that goes with edges mixes pixels: write it at the stage 'lens' (plugins/effects/blur.py)",
-    "laplacian": "a change that goes with edges mixes pixels: write it at the stage 'lens' (plugins/effects/blur.py)",
+    "gradient": EDGES,
+    "laplacian": EDGES,
 }
 
 VIEWS = {  # stage: (the function's arguments, the line that applies a curve, of the variable `curve`)
@@ -196,11 +199,12 @@ DEFAULT_STAGE = {"camera": "lens", "led": "emission", "gel": "segment", "membran
 
 
 def identifier(name: str) -> str:
-    """'Row banding' -> 'row_banding': the name of the file and of the parameter. Raises ValueError for what is none."""
+    """'Row banding' -> 'row_banding': the name of file and parameter. Raises ValueError for any other."""
     word = re.sub(r"[\s-]+", "_", name.strip().lower())
     if not re.fullmatch(r"[a-z][a-z0-9_]*", word) or keyword.iskeyword(word) or word == "new":
         raise ValueError(
-            f"effect name '{name}': allowed: words of letters and digits, the first a letter, such as 'row banding'; not a "
+            f"effect name '{name}': allowed: words of letters and digits, the first a letter, such as 'row "
+            "banding'; not a "
             "word of Python, and not 'new'"
         )
     return word
@@ -213,7 +217,8 @@ def check_name(name: str, part: str, registry: Registry) -> str:
     key = word.replace("_", "-")
     if key in registry.effects:
         raise ValueError(
-            f"an effect '{registry.effects[key].name}' exists already ({registry.effects[key].file}); choose another name"
+            f"an effect '{registry.effects[key].name}' exists already ({registry.effects[key].file}); choose "
+            "another name"
         )
     if any(p.name == word for p in registry.parameters_of(part)):
         raise ValueError(f"the part '{part}' has a parameter '{word}' already; choose another name")
@@ -238,7 +243,7 @@ def write(text: str, folder: Path, name: str) -> Path:
 
 
 def stage_of(part: str | None, stage: str | None) -> str:
-    """The stage that is meant by a part, a stage or both. Raises UnknownKey or ValueError."""
+    """The stage that a part, a stage or both name. Raises UnknownKey or ValueError."""
     if part is not None and part not in DEFAULT_STAGE:
         raise UnknownKey(
             part,
@@ -296,7 +301,7 @@ def new_effect(name: str, stage: str = "lens") -> str:
 
 
 def _rests_at_0(word: str, stage: str) -> list[str]:
-    """A closed form that the file must meet; the user puts the formula's own in its place."""
+    """A check that the file must pass; the user replaces it by one of the formula."""
     if STAGES[stage] != "camera":
         return [
             "def rests_at_0():",
@@ -332,8 +337,8 @@ def drafted(diagnosis: Diagnosis) -> list[str]:
 
 
 def fingerprint_of(diagnosis: Diagnosis, along: str | None) -> Fingerprint:
-    """The curve along a coordinate, or along the one that the residual goes with best. Raises ValueError, saying which
-    can be drafted."""
+    """The curve along a coordinate, or along the one that explains the residual best. Raises ValueError, which names
+    those that can be drafted."""
     known = {f.coordinate: f for f in diagnosis.fingerprints}
     if not known:
         raise ValueError("the diagnosis has no curves along coordinates; diagnose the study again")
@@ -378,7 +383,7 @@ def draft_effect(
 ) -> str:
     """The text of a plugin file that carries the curve of a diagnosis as a table.
 
-    along                    a coordinate of the diagnosis's fingerprints; None: the one that the residual goes with
+    along                    a coordinate of the diagnosis's fingerprints; None: the one that explains the residual
                              best
     black_level, saturation  DN, of the captures
     source                   where the diagnosis is, for the file's References
@@ -399,7 +404,8 @@ def draft_effect(
         level = diagnosis.basis.signal
         values, sd = values / level, sd / level
         remark = (
-            f"\nThe curve was found as an offset in DN; here it is a gain, relative to the mean signal of {level:.4g} DN. Light that "
+            "\nThe curve was found as an offset in DN; here it is a gain, relative to the mean signal of "
+            f"{level:.4g} DN. Light that "
             "does not follow the LED is not this."
         )
     if f.coordinate == "signal":
@@ -423,10 +429,12 @@ def draft_effect(
                 "REPLACE the table by a formula g(x): it has fewer numbers, is smooth, and says what the cause is.",
             )
         ),
-        f"goes with {'the camera' if family == 'camera' else family}: a gain and an offset along '{f.coordinate}' together lowered "
-        f"chi2 by {f.net:.4g}, {f.ratio:.3g} times as much as the best effect of the library; here is the {f.kind}, which did more.",
-        "for the sensor, and within the range of the coordinate, that the captures had; beyond it the end of the table holds."
-        + remark,
+        f"goes with {'the camera' if family == 'camera' else family}: a gain and an offset along '{f.coordinate}' "
+        "together lowered "
+        f"chi2 by {f.net:.4g}, {f.ratio:.3g} times as much as the best effect of the library; here is the "
+        f"{f.kind}, which did more.",
+        "for the sensor, and within the range of the coordinate, that the captures had; beyond it the end of the "
+        "table holds." + remark,
         f"the diagnosis of {source or 'a study'}.",
         head=[
             *([] if exact else [_table("AT", list(at))]),
@@ -448,7 +456,7 @@ def draft_effect(
                 ]
                 if exact
                 else [
-                    '    """The curve passes its ends, and holds beyond them. With a formula: a value known by other means."""',
+                    '    """The curve meets its ends, and is constant beyond. With a formula: a known value."""',
                     "    assert abs(curve(AT[0]) - CURVE[0]) < 1e-9",
                     "    assert abs(curve(AT[-1] + 1e6) - CURVE[-1]) < 1e-9",
                 ]
@@ -565,8 +573,8 @@ def _file(
     declaration = [
         "effect = Effect(",
         f'    name="{word.replace("_", " ")}", part="{STAGES[stage]}", stages={{"{stage}": act}},',
-        f'    parameters=(Parameter("{word}", "1", 0.0, (-10.0, 10.0), "strength s", neutral=0.0, plausible={plausible:g}, '
-        f'how="{STUBS[stage][4]}"),),',
+        f'    parameters=(Parameter("{word}", "1", 0.0, (-10.0, 10.0), "strength s", neutral=0.0, '
+        f'plausible={plausible:g}, how="{STUBS[stage][4]}"),),',
         "    acts=(" + ", ".join(f'"{a}"' for a in acts) + ("," if len(acts) == 1 else "") + "),",
         f'    needs="{needs}", checks=({check[0][4:-3]},))',
     ]

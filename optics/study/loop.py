@@ -56,7 +56,7 @@ ROUGH = 0.5  # chi2 per variable at which a refit of a diagnosis, which compares
 FEW = 4  # iterations of a refit that continues one
 
 
-# -- begin, and continue ------------------------------------------------------------------------------------------------
+# -- begin, and continue -----------------------------------------------------------------------------------------------
 
 
 def begin(
@@ -145,7 +145,7 @@ def _of_fitted(variables: Sequence[Variable], fitted: Sequence[int]) -> list[Var
     return [v for v in variables if v.frames is None or set(v.frames) <= set(fitted)]
 
 
-# -- what can be added --------------------------------------------------------------------------------------------------
+# -- what can be added -------------------------------------------------------------------------------------------------
 
 
 def effects_of(record: Record, registry: Registry) -> list[Effect]:
@@ -170,7 +170,7 @@ def seek(model: SceneModel, values: Values, effects: Sequence[Effect], frames: S
             values.common.update(model.scene.check(effect.seek(model, values, frames), effect.name))
 
 
-# -- diagnose -----------------------------------------------------------------------------------------------------------
+# -- diagnose ----------------------------------------------------------------------------------------------------------
 
 
 def examine(
@@ -217,7 +217,8 @@ def _variables_of(model: Any, effect: Effect) -> list[Variable]:
 
 
 class Refits:
-    """The refits that a diagnosis asks for: chord steps on the base's derivative images where they will do, else a fit."""
+    """The refits that a diagnosis asks for: chord steps on the base's derivative images where they will do, else a
+    fit."""
 
     def __init__(self, model: SceneModel, setup: Setup, base: Fit, tested: Sequence[Effect]):
         self.model, self.setup, self.base = model, setup, base
@@ -246,7 +247,8 @@ class Refits:
     def afresh(
         self, variables: Sequence[Variable], extra: Sequence[Variable], frames: Sequence[int], quick: Fit
     ) -> Fit:
-        """Calibrate from the study's start values: a strong effect may have bent the base's values far from the truth."""
+        """Calibrate from the study's start values: a strong effect may have bent the base's values far from the
+        truth."""
         values = off_neutral(self.model, Values(dict(self.setup.values)), extra)
         best = fit_base(self.model, variables, frames, values, tolerance=ROUGH)
         if best.chi2 < quick.chi2:
@@ -254,7 +256,7 @@ class Refits:
         return calibrate.fit(self.model, variables, quick.values, frames, max_iterations=FEW, tolerance=ROUGH)
 
 
-# -- add ----------------------------------------------------------------------------------------------------------------
+# -- add ---------------------------------------------------------------------------------------------------------------
 
 
 def extend(

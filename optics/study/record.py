@@ -7,7 +7,8 @@ A study is a folder that a later run, a report, or a reader without this program
                         fit.toml       [parameters] to lay over the scene again, [uncertainty], [frames.NAME]
                         metrics.json   optics.fit.compare, and null models where there are any
                         diagnosis.json optics.diagnosis
-                        images/*.npz   measured, predicted, sd, usable of the frames shown, and the settings of a sweep of
+                        images/*.npz   measured, predicted, sd, usable of the frames shown, and the settings of a sweep
+                        of
                                        readings; fingerprints; maps
     STUDY/steps/01-lens-vignetting/...
 
@@ -128,13 +129,15 @@ class Record:
     def open(cls, folder: str | Path, empty: bool = False) -> Record:
         """Read a study. Steps that were written whole but not yet listed are included.
 
-        Raises FileNotFoundError without a ladder.json, ValueError where it cannot be read, or has no step and may not be
+        Raises FileNotFoundError without a ladder.json, ValueError where it cannot be read, or has no step and may not
+        be
         `empty`."""
         folder = Path(folder)
         file = folder / "ladder.json"
         if not file.is_file():
             raise FileNotFoundError(
-                f"{folder} is no study: it has no ladder.json; name the folder that `optics calibrate CAPTURES -o STUDY` "
+                f"{folder} is no study: it has no ladder.json; name the folder that `optics calibrate CAPTURES -o "
+                "STUDY` "
                 "wrote"
             )
         try:

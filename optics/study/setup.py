@@ -58,7 +58,7 @@ class Setup:
 
 
 def setup_for(captures: str | Path, **given: object) -> Setup:
-    """The setup of the given fields (None and empty count as not given); those that an imported set advises fill the rest.
+    """The setup of the given fields; what an imported set advises stands for None and empty.
 
     An importer writes its advice to import.json. Where `free` or `per_group` is given, the advised priors belong to
     other parameters and are left out.
@@ -83,11 +83,12 @@ def plugins_of(setup: Setup) -> Path:
     return Path(setup.plugins) if setup.plugins else Path(setup.captures) / "plugins"
 
 
-# -- the model ----------------------------------------------------------------------------------------------------------
+# -- the model ---------------------------------------------------------------------------------------------------------
 
 
 def open_model(setup: Setup, model_class: type = SceneModel) -> SceneModel:
-    """Captures and scene of a setup as a model; raises, before anything is rendered, where they contradict each other."""
+    """Captures and scene of a setup as a model; raises, before anything is rendered, where they contradict each
+    other."""
     found = capture_files.load(setup.captures)
     path = scenes.find(found.scene)
     defines = dict(setup.defines)
@@ -133,11 +134,12 @@ def split(model: SceneModel, setup: Setup) -> tuple[list[int], list[int]]:
     return fitted, out
 
 
-# -- what is free -------------------------------------------------------------------------------------------------------
+# -- what is free ------------------------------------------------------------------------------------------------------
 
 
 def default_free(model: SceneModel) -> list[str]:
-    """Position, axis, lobe and power of every LED, reflectance and roughness of every membrane, power of every source."""
+    """Position, axis, lobe and power of every LED, reflectance and roughness of every membrane, power of every
+    source."""
     patterns = []
     integrator = model.scene.integrator
     spectral = len((integrator.bands if integrator is not None else ()) or (0,))

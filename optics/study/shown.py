@@ -19,7 +19,8 @@ from optics.scene.parameter import Values
 class Shown:
     """A frame for the eye.
 
-    measured, predicted, sd   (H, W, C) in DN, sd being one standard deviation of the noise; usable: bool, (H, W) or (H, W, C)
+    measured, predicted, sd   (H, W, C) in DN; sd is one standard deviation of the noise
+    usable                    bool, (H, W) or (H, W, C)
     led, group, held_out      what was lit, the group it belongs to, and whether the calibration has not seen it
     settings                  of a sweep of point readings, (N, 1, C): the N values of every key; units: of these keys
     """

@@ -32,7 +32,8 @@ def fit_base(
     tolerance: float = TOGETHER,
     robust: bool = False,
 ) -> Fit:
-    """Calibrate in three stages: what all frames share, then the poses of one press at a time, then everything together."""
+    """Calibrate in three stages: what all frames share, then the poses of one press at a time, then everything
+    together."""
     variables = list(variables)
     begun = np.array([value_of(model, start, v) for v in variables])  # where the first stage starts
     common = [v for v in variables if v.frames is None]
@@ -55,7 +56,8 @@ def fit_base(
 
 
 def off_neutral(model: SceneModel, values: Values, variables: Sequence[Variable]) -> Values:
-    """Values with variables a tenth of their plausible size off: at a bound a one-sided onset has no slope to follow."""
+    """Values with variables a tenth of their plausible size off: at a bound a one-sided onset has no slope to
+    follow."""
     moved = values.copy()
     for v in variables:
         moved.put(v, value_of(model, moved, v) + OFF * v.parameter.plausible)

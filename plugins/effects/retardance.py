@@ -3,12 +3,13 @@
 Definition
     delta(lambda) = delta_540 (540/lambda) (1 + retard_dispersion ((540/lambda)^2 - 1))
     delta_540 = sqrt(retard_0^2 + retard_45^2),  fast axis = atan2(retard_45, retard_0)/2 + angle of the sheet
-An oblique ray sees what of the in-plane birefringence lies across it, over a longer path
-(optics.polarization.layers.Crossing.retardance). A wave plate is retard_0 = 90 (quarter) or 180 deg (half wave) and an
-`angle`; the two components, in place of retardance and axis, go through zero without a seam. Dispersion 0 is a
-birefringence that is the same at all wavelengths. Fingerprint
-    between crossed polarizers, light returns as sin(delta/2)^2 sin(2 psi)^2, without first order: a faint retardance
-    hides, and its sign does not show. Behind a quarter-wave plate it shows in first order, and with its sign.
+An oblique ray sees the part of the in-plane birefringence that lies across it, over a longer path
+(optics.polarization.layers.Crossing.retardance). A wave plate is retard_0 = 90 deg (quarter wave) or 180 deg (half
+wave) and an `angle`. The two components, in place of retardance and axis, pass through zero without a seam. Dispersion
+0 means a birefringence that is the same at all wavelengths.
+Fingerprint
+    between crossed polarizers, light returns as sin(delta/2)^2 sin(2 psi)^2, without a first order: a faint retardance
+    is hidden, and its sign does not show. Behind a quarter-wave plate it shows in first order, and with its sign.
 Validity
     a sheet whose birefringence is small against its index. Rays run in it as its `index` bends them.
 References
@@ -17,7 +18,10 @@ References
 
 import math
 
+import numpy as np
+
 from optics.polarization.mueller import cos, retarder, sin
+from optics.scene.checking import agree, mueller, ray
 from optics.scene.declare import Effect
 from optics.scene.parameter import Parameter
 
@@ -29,6 +33,28 @@ def retard(crossing, sheet):
     ratio = 540.0 / crossing.wavelengths
     radians = (math.pi / 180) * ratio * (1 + sheet.retard_dispersion * (ratio * ratio - 1))
     return retarder(*(c * radians for c in crossing.retardance(a, b, sheet.index)))
+
+
+def check_crossed_polarizers():
+    """sin(delta/2)^2 sin(2 psi)^2 of the light behind the first polarizer, delta = 40 deg 540/lambda, psi = 45 and 15
+    deg: by the second component, and by the sheet's angle."""
+    bands = np.array([620.0, 540.0, 460.0])
+    at = ray(wavelengths=bands)
+    films = [mueller("polarizer_film", at, transmittance=1.0, angle=angle) for angle in (0.0, 90.0)]
+    for sheet, psi in (({"retard_45": 40.0}, 45.0), ({"retard_0": 40.0, "angle": 15.0}, 15.0)):
+        passed = (films[1] @ mueller("sheet", at, **sheet) @ films[0])[:, 0, 0]
+        agree(passed, np.sin(np.radians(20 * 540 / bands)) ** 2 * np.sin(np.radians(2 * psi)) ** 2 / 2, 1e-12)
+
+
+def check_quarter_wave_plate():
+    """With the fast axis at +45 degrees, light at 0 degrees becomes S3 = +1."""
+    agree(mueller("sheet", retard_0=90.0, angle=45.0)[0] @ [1, 1, 0, 0], [1, 0, 0, 1], 0, 1e-12)
+
+
+def random(rng):
+    """A retardance of up to 40 degrees with its axis anywhere."""
+    size, axis = rng.uniform(0, 40), rng.uniform(0, 2 * math.pi)
+    return {"retard_0": size * math.cos(axis), "retard_45": size * math.sin(axis)}
 
 
 effect = Effect(
@@ -72,4 +98,6 @@ effect = Effect(
     ),
     acts=("analyzer.angle", "sample.angle"),
     needs="the sheet at two angles or more, best behind a quarter-wave plate",
+    checks=(check_crossed_polarizers, check_quarter_wave_plate),
+    random=random,
 )

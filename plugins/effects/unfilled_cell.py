@@ -5,14 +5,15 @@ Definition
 Fingerprint
     one cell with bright and dark edges, as its walls reflect totally; the cells behind it are displaced.
 Validity
-    one cell, and which is sought where the residual is, before u is fitted: `seek` weighs the misfit by the cells that
-    each pixel is seen through, and tries those that come first, the best of them in all frames.
+    one cell. Which one is searched where the residual is, before u is fitted: `seek` weighs the misfit by the cells
+    that each pixel is seen through, and tries those with the highest score, the best of them in all frames.
 References
     Fan, Li, Cong & Zhang, MagicGripper, III.A, prints cells that are all filled.
 """
 
 import numpy as np
 
+from optics.scene.checking import agree, scene_of
 from optics.scene.declare import Effect
 
 TRIED = 12  # cells whose image is made
@@ -75,6 +76,33 @@ def seek(model, values, frames):
     return at[best] if falls[best] > 0 else {}
 
 
+def check_material():
+    """Half filled with a resin of n = 1.5 and 0.2/mm a cell has n = 1.25 and 0.1/mm; empty it is air."""
+    from optics.light.transport import Transport
+
+    grid = (
+        '<shape type="cells" id="grid"><integer name="columns" value="2"/><integer name="rows" value="2"/>'
+        '<integer name="layers" value="1"/><float name="unfilled" value="{}"/><float name="unfilled_column" value="1"/>'
+        '<bsdf type="clear" id="resin"><float name="index" value="1.5"/><float name="absorption" value="0.2"/></bsdf>'
+        "</shape>"
+    )
+    lamp = '<shape type="rectangle"><emitter type="source" id="lamp"/></shape>'
+    for share, index, absorption in ((0.5, 1.25, 0.1), (1.0, 1.0, 0.0)):
+        transport = Transport(scene_of(grid.format(share), lamp))
+        cells = next(s for s in transport.surfaces if s.cells is not None)
+        # cells count layers first, then rows: column 1, row 0 is the third; the others have the resin
+        assert len(set(cells.fillings[[0, 1, 3]])) == 1
+        odd = transport.materials[cells.fillings[2]]
+        agree(odd.index, [index] * 3, 1e-6)
+        agree(odd.absorption, [absorption] * 3, 1e-6)
+
+
+def random(rng):
+    """One of the first 2 x 2 x 2 cells, which every grid of two cells each way has, filled by half or less."""
+    place = {f"unfilled_{axis}": float(rng.integers(2)) for axis in ("column", "row", "layer")}
+    return {"unfilled": rng.uniform(0.5, 1), **place}
+
+
 effect = Effect(
     name="unfilled cell",
     part="cells",
@@ -84,4 +112,6 @@ effect = Effect(
     seek=seek,
     acts=("row", "column"),
     needs="sharp images of the grid",
+    checks=(check_material,),
+    random=random,
 )

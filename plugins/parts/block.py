@@ -19,6 +19,7 @@ XML
     pitch float, 0.1: mm, of the mesh of the faces
 """
 
+from optics.scene.checking import agree, made
 from optics.scene.declare import Part
 from optics.scene.mitsuba_parts import Declared
 from optics.scene.parameter import Parameter
@@ -176,4 +177,23 @@ def build():
     return Block
 
 
-part = Part("block", "shape", PARAMETERS, build)
+def check_closed_box():
+    """At rest the mesh is a closed box: by the divergence theorem its faces, normals outwards, hold width x length x
+    thickness."""
+    import mitsuba as mi
+    import numpy as np
+
+    body = made("block", width=3.0, length=2.0, thickness=1.5, pitch=0.5, layers=2, bsdf={"type": "clear"})
+    held = mi.traverse(body)
+    points = np.array(held["vertex_positions"], float).reshape(-1, 3)
+    a, b, c = (points[np.array(held["faces"]).reshape(-1, 3)[:, i]] for i in range(3))
+    agree((a * np.cross(b, c)).sum() / 6, 9.0, 1e-5)
+    agree([points.min(0), points.max(0)], [[-1.5, -1, -1.5], [1.5, 1, 0]], 0, 1e-6)
+
+
+def random(rng):
+    """A soft print of a few millimetres."""
+    return {"thickness": rng.uniform(3, 8), "young": rng.uniform(0.1, 2), "poisson": rng.uniform(0.3, 0.49)}
+
+
+part = Part("block", "shape", PARAMETERS, build, checks=(check_closed_box,), random=random)

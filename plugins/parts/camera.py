@@ -32,6 +32,7 @@ XML
 
 import math
 
+from optics.scene.checking import agree, made
 from optics.scene.declare import Part
 from optics.scene.mitsuba_parts import Declared
 from optics.scene.parameter import Parameter
@@ -248,4 +249,18 @@ def build():
     return Camera
 
 
-part = Part("camera", "sensor", PARAMETERS, build)
+def check_field_of_view():
+    """The middle of the image looks along z, its edges by half of the field of view to either side; roll turns right to
+    down."""
+    import mitsuba as mi
+    import numpy as np
+
+    film = {"type": "hdrfilm", "width": 80, "height": 60}
+    for roll in (0.0, 90.0):
+        _, d = made("camera", x_fov=60.0, roll=roll, film=film).ray(mi.Float([0, 40, 80]), mi.Float(30.0))
+        x = np.array([-0.5, 0.0, 0.5])
+        z = np.sqrt(0.75) * np.array([1, 1 / np.sqrt(0.75), 1])
+        agree(np.array(d), [x, 0 * x, z] if roll == 0 else [0 * x, x, z], 0, 1e-6)
+
+
+part = Part("camera", "sensor", PARAMETERS, build, checks=(check_field_of_view,))

@@ -21,6 +21,7 @@ XML
     rows integer, 109: vertices of the mesh along y
 """
 
+from optics.scene.checking import agree, made
 from optics.scene.declare import Part
 from optics.scene.mitsuba_parts import Declared
 from optics.scene.parameter import Parameter
@@ -83,4 +84,15 @@ def build():
     return Carried
 
 
-part = Part("carried", "shape", PARAMETERS, build)
+def check_flat_at_rest():
+    """Without a press the sheet is the rectangle at its depth, its first direction along x."""
+    import mitsuba as mi
+    import numpy as np
+
+    sheet = made("carried", width=8.0, length=6.0, depth=2.5, columns=3, rows=2, bsdf={"type": "sheet"})
+    found = np.array(mi.traverse(sheet)["vertex_positions"]).reshape(2, 3, 3)
+    x, y = np.meshgrid([-4.0, 0.0, 4.0], [-3.0, 3.0])
+    agree(found, np.stack([x, y, np.full_like(x, -2.5)], -1), 0, 1e-6)
+
+
+part = Part("carried", "shape", PARAMETERS, build, checks=(check_flat_at_rest,))

@@ -21,6 +21,7 @@ XML
     layers integer, 6: cells along z
 """
 
+from optics.scene.checking import agree, made
 from optics.scene.declare import Part
 from optics.scene.mitsuba_parts import Declared
 from optics.scene.parameter import Parameter
@@ -187,4 +188,20 @@ def build():
     return Cells
 
 
-part = Part("cells", "shape", PARAMETERS, build)
+def check_boxes():
+    """Cells of pitch - wall each way, the first layer's tops half a wall below the skin; their volumes."""
+    import numpy as np
+
+    grid = made("cells", columns=2, rows=1, layers=2, pitch=0.8, wall=0.2, skin=0.5, bsdf={"type": "clear"})
+    corners = grid.vertices()
+    agree(corners.max(1)[0], [-0.1, 0.3, -0.6], 0, 1e-6)
+    agree(corners.min((0, 1)), [-0.7, -0.3, -2.0], 0, 1e-6)
+    agree(grid.cells(1).volumes, np.full((4, 1), 0.6**3), 1e-5)
+
+
+def random(rng):
+    """A grid that a printer of droplets makes."""
+    return {"pitch": rng.uniform(0.6, 1.0), "wall": rng.uniform(0.1, 0.3), "skin": rng.uniform(0.3, 0.8)}
+
+
+part = Part("cells", "shape", PARAMETERS, build, checks=(check_boxes,), random=random)

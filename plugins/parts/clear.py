@@ -21,6 +21,7 @@ XML
     outside string: id of the clear material around the body; without it, air
 """
 
+from optics.scene.checking import agree, made
 from optics.scene.declare import Part
 from optics.scene.parameter import Parameter
 from optics.scene.surfaces import passing
@@ -51,6 +52,10 @@ def build():
     class Clear(passing(mi.BSDFFlags.DeltaTransmission)):
         kind = "clear"
         around = None  # the clear material outside; None is air
+        unrendered = dict.fromkeys(
+            ("scattering", "roughness", "birefringence"),
+            "mi.render follows neither scattering, roughness nor birefringence",
+        )
         fills_cells = False  # what light is scattered is known in cells only
         bands = 3  # of the scene
 
@@ -150,4 +155,30 @@ def build():
     return Clear
 
 
-part = Part("clear", "bsdf", PARAMETERS, build)
+def check_faces():
+    """Along the normal a face of the index 1.5 reflects 4 % from either side; beyond the critical angle it reflects all
+    light."""
+    import drjit as dr
+    import mitsuba as mi
+    import numpy as np
+
+    glass = made("clear", index=1.5)
+
+    def weight(wi, component):
+        context, si = mi.BSDFContext(), dr.zeros(mi.SurfaceInteraction3f, 1)
+        context.component, si.wi, si.t = component, mi.Vector3f(*wi), mi.Float(1)
+        found = glass.sample(context, si, mi.Float(0.5), mi.Point2f(0.5))[1]
+        return np.array(mi.unpolarized_spectrum(found)).ravel()[0]
+
+    for cos in (1.0, -1.0):
+        agree(weight((0, 0, cos), 0), 0.04, 1e-5)
+    inside = (0.8, 0.0, -0.6)  # sin = 0.8 > 1/1.5
+    agree([weight(inside, 0), weight(inside, 1)], [1.0, 0.0], 1e-5)
+
+
+def random(rng):
+    """A printed resin, clear over centimetres."""
+    return {"index": rng.uniform(1.4, 1.6), "absorption": rng.uniform(0, 0.05)}
+
+
+part = Part("clear", "bsdf", PARAMETERS, build, checks=(check_faces,), random=random)

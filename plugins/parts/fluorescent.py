@@ -21,6 +21,7 @@ References
 
 import math
 
+from optics.scene.checking import agree, made
 from optics.scene.declare import Part
 from optics.scene.parameter import Parameter
 from optics.scene.surfaces import matt
@@ -81,4 +82,31 @@ def build():
     return Fluorescent
 
 
-part = Part("fluorescent", "bsdf", PARAMETERS, build)
+def check_photons():
+    """The radiance over all wavelengths, as photons: yield/pi times the photons absorbed, summed over the spectra."""
+    import drjit as dr
+    import mitsuba as mi
+    import numpy as np
+
+    paint = made("fluorescent", **{"yield": 0.4, "absorptance": 0.8, "absorption_peak": 330.0, "absorption_fwhm": 90.0})
+    led = made("led", position=[0.0, 0.0, 10.0], power=100.0, wavelength=365.0, fwhm=20.0)
+    nm = np.linspace(100, 900, 4001)
+    spectrum, taken = (np.exp(-4 * math.log(2) * ((nm - p) / w) ** 2) for p, w in ((365.0, 20.0), (330.0, 90.0)))
+    absorbed = 0.8 * (spectrum * taken * nm).sum() * 0.2
+    si = dr.zeros(mi.SurfaceInteraction3f, nm.size)
+    si.sh_frame, si.wi = mi.Frame3f(mi.Normal3f(0, 0, 1)), mi.Vector3f(0, 0, 1)
+    si.wavelengths = type(si.wavelengths)(mi.Float(nm.astype("f")))
+    found = np.array(paint.fluorescence(si, led, mi.Vector3f(0, 0, 1), mi.Float(10.0)))[0]
+    agree((found * nm).sum() * 0.2, 0.4 / math.pi * absorbed, 1e-4)  # power/d^2 = 1
+
+
+def random(rng):
+    """A pigment that ultraviolet light excites."""
+    return {
+        "yield": rng.uniform(0.2, 0.9),
+        "emission_peak": rng.uniform(450, 620),
+        "emission_fwhm": rng.uniform(40, 100),
+    }
+
+
+part = Part("fluorescent", "bsdf", PARAMETERS, build, checks=(check_photons,), random=random)

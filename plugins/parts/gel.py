@@ -26,6 +26,7 @@ XML
     rows integer, 161: vertices of the mesh along y
 """
 
+from optics.scene.checking import agree, made
 from optics.scene.declare import Part
 from optics.scene.mitsuba_parts import Declared
 from optics.scene.parameter import Parameter
@@ -240,4 +241,22 @@ def build():
     return Gel
 
 
-part = Part("gel", "shape", PARAMETERS, build)
+def check_sphere():
+    """Inside the contact the face is the ball: a cap of the height d - R + sqrt(R^2 - r^2); at rest it is flat."""
+    import numpy as np
+
+    r, radius, depth = np.array([0.0, 0.3, 0.6]), 1.5, 0.5
+    pressed = made("gel", press_depth=depth, indenter_size=radius, press_x=0.7, bsdf={"type": "membrane"})
+    # mm; the map's pitch is 0.03 mm: a sagitta of 0.03^2/8/1.5 = 1e-4, and smoothing
+    agree(pressed.heights(0.7 + r, [0.0])[0], -(depth - radius + np.sqrt(radius**2 - r**2)), 0, 2e-3)
+    agree(made("gel", bsdf={"type": "membrane"}).heights(r, r), np.zeros((3, 3)))
+
+
+def random(rng):
+    """A ball or an edge of a few millimetres, pressed by less than half of its size, beside the middle."""
+    size = rng.uniform(1, 3)
+    place = {f"press_{axis}": rng.uniform(-2, 2) for axis in "xy"}
+    return {"indenter_size": size, "press_depth": size * rng.uniform(0.1, 0.4), **place}
+
+
+part = Part("gel", "shape", PARAMETERS, build, checks=(check_sphere,), random=random)

@@ -15,6 +15,7 @@ References
     Born & Wolf, Principles of Optics, 1.5.2 (Fresnel's formulae).
 """
 
+from optics.scene.checking import agree, made
 from optics.scene.declare import Part
 from optics.scene.parameter import Parameter
 from optics.scene.surfaces import passing
@@ -90,4 +91,25 @@ def build():
     return Interface
 
 
-part = Part("interface", "bsdf", PARAMETERS, build, refracts=True)
+def check_brewster():
+    """At Brewster's angle, tan = n, p-polarized light passes whole and s loses ((n^2 - 1)/(n^2 + 1))^2; beyond the
+    critical angle nothing passes."""
+    import math
+
+    import mitsuba as mi
+
+    n = 1.41
+    angle = math.atan(n)
+    wo, t_s, t_p, _ = made("interface", index=n).refract(mi.Vector3f(math.sin(angle), 0, math.cos(angle)))
+    agree([t_s[0], t_p[0]], [1 - ((n * n - 1) / (n * n + 1)) ** 2, 1.0], 1e-5)
+    agree([-wo.x[0], -wo.z[0]], [math.cos(angle), math.sin(angle)], 1e-5)  # at right angles to what is reflected
+    _, t_s, t_p, _ = made("interface", index=1 / n).refract(mi.Vector3f(0.8, 0, 0.6))
+    agree([t_s[0], t_p[0]], [0.0, 0.0])
+
+
+def random(rng):
+    """A clear polymer in air."""
+    return {"index": rng.uniform(1.35, 1.6)}
+
+
+part = Part("interface", "bsdf", PARAMETERS, build, checks=(check_brewster,), refracts=True, random=random)

@@ -26,6 +26,7 @@ XML
 
 import math
 
+from optics.scene.checking import agree, made
 from optics.scene.declare import Part
 from optics.scene.mitsuba_parts import Declared
 from optics.scene.parameter import Parameter
@@ -211,4 +212,26 @@ class Beam:
         self.cos, self.distance, self.to_led, self.point, self.wavelengths = cos, distance, to_led, point, wavelengths
 
 
-part = Part("led", "emitter", PARAMETERS, build)
+def check_inverse_square():
+    """power/d^2 on the axis, times cos(60 deg)^mu off it, nothing behind; half of the peak at half the width of the
+    spectrum."""
+    import drjit as dr
+    import mitsuba as mi
+    import numpy as np
+
+    led = made("led", position=[0.0, 0.0, -5.0], power=3.0, mu=2.0, wavelength=540.0, fwhm=40.0, power_g=0.5)
+    # on the axis, 60 degrees off it at twice the distance, behind
+    it = dr.zeros(mi.Interaction3f, 3)
+    it.p = mi.Point3f([0, 10 * math.sin(math.pi / 3), 0], 0, [0, 0, -10])
+    it.wavelengths = type(it.wavelengths)(560.0, 540.0, 520.0, 540.0)
+    to = led.position() - it.p
+    found = np.array(led.radiance(it, to / dr.norm(to), dr.norm(to)))
+    agree(found[:3], np.outer([0.5, 0.5, 0.5], [3 / 25, 3 / 100 / 4, 0.0]), 1e-5)
+
+
+def random(rng):
+    """A coloured LED of the visible."""
+    return {"wavelength": rng.uniform(450, 640), "fwhm": rng.uniform(20, 150), "mu": rng.uniform(0.8, 6)}
+
+
+part = Part("led", "emitter", PARAMETERS, build, checks=(check_inverse_square,), random=random)

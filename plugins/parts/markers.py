@@ -18,6 +18,7 @@ XML
     rows integer, 4: markers along y
 """
 
+from optics.scene.checking import agree, made
 from optics.scene.declare import Part
 from optics.scene.mitsuba_parts import Declared
 from optics.scene.parameter import Parameter
@@ -122,4 +123,20 @@ def build():
     return Markers
 
 
-part = Part("markers", "shape", PARAMETERS, build)
+def check_rows_and_columns():
+    """Two by three caps, a height of 1 mm above the face that is 5 mm deep, at their pitches around the middle."""
+    import numpy as np
+
+    size = {"columns": 2, "rows": 3, "pitch_x": 6.0, "pitch_y": 4.0, "height": 1.0, "depth": 5.0}
+    caps = made("markers", **size, bsdf={"type": "fluorescent"}).centres()
+    x, y = np.meshgrid([-3.0, 3.0], [-4.0, 0.0, 4.0])
+    agree(caps, np.stack([x.ravel(), y.ravel(), np.full(6, -6.0)], -1), 0, 1e-6)
+
+
+def random(rng):
+    """Markers that leave at least half of the face free."""
+    pitch = rng.uniform(4, 12)
+    return {"pitch_x": pitch, "pitch_y": pitch, "radius": pitch * rng.uniform(0.1, 0.3)}
+
+
+part = Part("markers", "shape", PARAMETERS, build, checks=(check_rows_and_columns,), random=random)

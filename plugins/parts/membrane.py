@@ -19,6 +19,7 @@ XML
     reflectance texture, 1.0: a factor of the reflectance that varies over the surface
 """
 
+from optics.scene.checking import agree, made
 from optics.scene.declare import Part
 from optics.scene.parameter import Parameter
 from optics.scene.surfaces import matt
@@ -86,4 +87,26 @@ class Geometry:
         self.cos_view, self.cos_light, self.albedo = cos_view, cos_light, albedo
 
 
-part = Part("membrane", "bsdf", PARAMETERS, build)
+def check_lambert():
+    """rho cos/pi of a smooth face in every direction; a rough one, sigma = 0.5, is A rho/pi along the normal, whatever
+    the light's direction."""
+    import drjit as dr
+    import mitsuba as mi
+    import numpy as np
+
+    wi = np.array([[0.0, 0.0, 1.0], [0.6, 0.0, 0.8], [-0.8, 0.0, 0.6]])
+    si = dr.zeros(mi.SurfaceInteraction3f, 3)
+    si.t, si.wi = mi.Float(1), mi.Vector3f(*wi.T.astype("f"))
+    for sigma, towards, share in ((0.0, [0.6, 0.0, 0.8], 1.0), (0.5, [0.0, 0.0, 1.0], 1 - 0.125 / 0.58)):
+        face = made("membrane", rho_r=0.7, rho_g=0.5, rho_b=0.2, sigma=sigma)
+        found = face.eval(mi.BSDFContext(), si, mi.Vector3f(*towards), True)
+        expected = np.outer([0.7, 0.5, 0.2], [share * towards[2] / np.pi] * 3)
+        agree(np.array(mi.unpolarized_spectrum(found))[:3], expected, 1e-5)
+
+
+def random(rng):
+    """A coloured paint."""
+    return {"sigma": rng.uniform(0.05, 0.6), **{f"rho_{c}": rng.uniform(0.2, 0.9) for c in "rgb"}}
+
+
+part = Part("membrane", "bsdf", PARAMETERS, build, checks=(check_lambert,), random=random)

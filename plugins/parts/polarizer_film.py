@@ -25,6 +25,7 @@ References
 import math
 
 from optics.polarization.mueller import absorber, cos, diattenuator, exp, real, sin, where
+from optics.scene.checking import agree, mueller
 from optics.scene.layer import layer
 from optics.scene.parameter import Parameter
 
@@ -149,4 +150,18 @@ def polarize(crossing, film):
     return film_matrix * film.inserted + absorber(1 - film.inserted)
 
 
-part = layer("polarizer_film", PARAMETERS, polarize, polarizes=True)
+def check_malus():
+    """cos(d)^2/2 of unpolarized light behind two ideal films; a film that was taken out does nothing."""
+    first = mueller("polarizer_film", transmittance=1.0, angle=20.0)
+    for angle in (20.0, 65.0, 80.0, 110.0):
+        pair = mueller("polarizer_film", transmittance=1.0, angle=angle) @ first
+        agree(pair[0, 0, 0], math.cos(math.radians(angle - 20)) ** 2 / 2, 1e-12, 1e-15)
+    agree(mueller("polarizer_film", inserted=0.0)[0], [[float(i == j) for j in range(4)] for i in range(4)])
+
+
+def random(rng):
+    """A sheet polarizer at any angle, with a leak of up to 5 %."""
+    return {"angle": rng.uniform(0, 180), "transmittance": rng.uniform(0.6, 0.9), "leak": rng.uniform(1e-4, 0.05)}
+
+
+part = layer("polarizer_film", PARAMETERS, polarize, polarizes=True, checks=(check_malus,), random=random)

@@ -29,6 +29,7 @@ References
     for the sampling of visible facets; Born & Wolf, Principles of Optics, 1.5.2 and 1.5.4.
 """
 
+from optics.scene.checking import agree, made
 from optics.scene.declare import Part
 from optics.scene.mitsuba_parts import Declared
 from optics.scene.parameter import Parameter
@@ -220,4 +221,25 @@ def build():
     return RoughInterface
 
 
-part = Part("rough_interface", "bsdf", PARAMETERS, build)
+def check_mirror_direction():
+    """Along the normal of Beckmann's facets of the slope alpha, D(0) = 1/(pi alpha^2): the light that comes straight
+    back has the radiance R D/4, R = ((n - 1)/(n + 1))^2, and what passes straight T D n^2/(n - 1)^2/n^2."""
+    import drjit as dr
+    import mitsuba as mi
+    import numpy as np
+
+    n, alpha = 1.5, 0.2
+    face, si = made("rough_interface", index=n, alpha=alpha), dr.zeros(mi.SurfaceInteraction3f, 1)
+    si.wi = mi.Vector3f(0, 0, 1)
+    d = 1 / (np.pi * alpha**2)
+    for cos, expected in ((1.0, 0.04 * d / 4), (-1.0, 0.96 * d / (n - 1) ** 2)):
+        found = face.eval(mi.BSDFContext(), si, mi.Vector3f(0, 0, cos))
+        agree(np.array(mi.unpolarized_spectrum(found)).ravel()[0], expected, 1e-5)
+
+
+def random(rng):
+    """Ground glass in air."""
+    return {"index": rng.uniform(1.35, 1.6), "alpha": rng.uniform(0.05, 0.5)}
+
+
+part = Part("rough_interface", "bsdf", PARAMETERS, build, checks=(check_mirror_direction,), random=random)

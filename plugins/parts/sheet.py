@@ -15,7 +15,10 @@ References
     Born & Wolf, Principles of Optics, 1.5.2.
 """
 
+import math
+
 from optics.polarization.mueller import diattenuator, exp, fresnel
+from optics.scene.checking import agree, mueller, principal_transmittances, ray
 from optics.scene.layer import layer
 from optics.scene.parameter import Parameter
 
@@ -62,4 +65,19 @@ def pass_sheet(crossing, sheet):
     return diattenuator(q, u, t * ((1 - r_s) * (1 - r_s)), t * ((1 - r_p) * (1 - r_p)))
 
 
-part = layer("sheet", PARAMETERS, pass_sheet)
+def check_plate():
+    """A plate of n = 1.5 passes t 0.96^2 along its normal, with a colour of its own; at Brewster's angle p whole and s
+    (1 - R_s)^2, R_s = ((n^2 - 1)/(n^2 + 1))^2."""
+    n, bands = 1.5, (640.0, 540.0)
+    matrix = mueller("sheet", ray(wavelengths=bands), index=n, transmittance=0.9, transmittance_slope=-math.log(2))
+    agree(matrix[:, 0, 0], [0.45 * 0.96**2, 0.9 * 0.96**2])
+    oblique = principal_transmittances(mueller("sheet", ray(math.degrees(math.atan(n))), index=n))
+    agree(oblique, [[1.0], [(1 - ((n * n - 1) / (n * n + 1)) ** 2) ** 2]])
+
+
+def random(rng):
+    """A plate or a foil at any angle; its transmittance leaves room for a colour."""
+    return {"index": rng.uniform(1.0, 1.6), "transmittance": rng.uniform(0.5, 0.85), "angle": rng.uniform(0, 180)}
+
+
+part = layer("sheet", PARAMETERS, pass_sheet, checks=(check_plate,), random=random)

@@ -21,6 +21,8 @@ import math
 from dataclasses import replace
 
 from optics.polarization.mueller import exp, real, where
+from optics.scene.checking import agree, ray
+from optics.scene.checking import stokes as sent
 from optics.scene.declare import Part
 from optics.scene.mitsuba_parts import Declared
 from optics.scene.parameter import Parameter
@@ -156,5 +158,23 @@ def build(kind_of="source"):
     return Source
 
 
-part = Part("source", "emitter", PARAMETERS, build, stokes=stokes)
-room = Part("room", "emitter", ROOM, lambda: build("room"), stokes=stokes)
+def check_stokes_vector():
+    """(1, p cos 2a, p sin 2a, 0) of the degree p = 0.3 at the angle a = 30 deg, half as bright at half the width of its
+    spectrum."""
+    c, s = 0.3 * math.cos(math.radians(60)), 0.3 * math.sin(math.radians(60))
+    light = {"dop_q": c, "dop_u": s, "wavelength": 540.0, "fwhm": 40.0}
+    for kind in ("source", "room"):
+        vector = sent(kind, ray(wavelengths=(540.0, 560.0)), **light)
+        agree(vector, [[1, c, s, 0], [0.5, c / 2, s / 2, 0]], 1e-12, 1e-15)
+
+
+def random(rng):
+    """A lamp of any colour that is polarized by up to 0.3 at any angle."""
+    p, double = rng.uniform(0, 0.3), rng.uniform(0, 2 * math.pi)
+    colours = {f"power_{c}": rng.uniform(0.5, 1.5) for c in "rgb"}
+    return {"dop_q": p * math.cos(double), "dop_u": p * math.sin(double), "time": rng.uniform(0, 5), **colours}
+
+
+CHECKS = (check_stokes_vector,)
+part = Part("source", "emitter", PARAMETERS, build, CHECKS, stokes=stokes, random=random)
+room = Part("room", "emitter", ROOM, lambda: build("room"), CHECKS, stokes=stokes)

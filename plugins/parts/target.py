@@ -17,6 +17,7 @@ References
     Vi2TaP (RA-L 2025), Fig. 5: cylinders of 20, 30 and 40 mm diameter, 60 to 10 mm before the skin.
 """
 
+from optics.scene.checking import agree, made
 from optics.scene.declare import Part
 from optics.scene.mitsuba_parts import Declared
 from optics.scene.parameter import Parameter
@@ -147,4 +148,25 @@ def build():
     return Target
 
 
-part = Part("target", "shape", PARAMETERS, build)
+def check_sizes():
+    """The box about a lying and a standing cylinder and about a ball, 7 mm before the face."""
+    import mitsuba as mi
+    import numpy as np
+
+    size = {"diameter": 20.0, "length": 30.0, "distance": 7.0, "x": 1.0, "y": -2.0}
+    boxes = {
+        "lying": ((-14, -12, 7), (16, 8, 27)),
+        "standing": ((-9, -12, 7), (11, 8, 37)),
+        "ball": ((-9, -12, 7), (11, 8, 27)),
+    }
+    for stance, box in boxes.items():
+        points = np.array(mi.traverse(made("target", stance=stance, **size))["vertex_positions"]).reshape(-1, 3)
+        agree([points.min(0), points.max(0)], box, 0, 10 * 8e-5)  # polygons of 256 sides
+
+
+def random(rng):
+    """An object of 1 to 4 cm, up to 6 cm before the skin."""
+    return {"diameter": rng.uniform(10, 40), "length": rng.uniform(20, 100), "distance": rng.uniform(5, 60)}
+
+
+part = Part("target", "shape", PARAMETERS, build, checks=(check_sizes,), random=random)

@@ -1,5 +1,4 @@
-"""What every parameter of dielectric bodies must meet: as tests/contract/test_plugins.py asks it, where the light is
-followed by Monte Carlo.
+"""The contract of test_plugins.py for the parameters of dielectric bodies, where light is followed by Monte Carlo.
 
 A small printed block, one LED in each band. Derivatives are compared as weighted means over the image, over seeds, in
 units of their own standard errors."""
@@ -28,7 +27,7 @@ DEFINES = {
     "rays": 128,
     "packets": 32_000,
 }
-# so dark that few ways are long: a difference between images is the noise of the ways that part, and long ones part
+# so dark that few paths are long: the noise of a difference of images is that of the paths that diverge, the long ones
 VALUES = {
     "filling.absorption": 0.6,
     "walls.absorption": 0.5,
@@ -132,7 +131,7 @@ def test_derivatives_against_differences(key, bench):
 
 
 def test_a_material_that_absorbs_nothing_has_its_derivative(bench):
-    """At neutral, which is a bound: more absorption is less light, by the lengths of the ways."""
+    """At neutral, which is a bound, more absorption means less light, in proportion to the path lengths."""
     scene, renderer, values = bench
     clear = {**values, "window.absorption": 0.0}
     found = renderer.tangent(clear, "window.absorption").mean()
@@ -242,7 +241,7 @@ def test_effects_are_offered_where_they_act(bench):
         renderer.radiance({**values, "walls.scattering": 0.1})
 
 
-def test_what_light_by_monte_carlo_does_not_pass_is_refused(bench, tmp_path):
+def test_scenes_that_monte_carlo_cannot_follow_are_refused(bench, tmp_path):
     """An image by mi.render, in which LEDs would be dark; a curve LED by LED; films and meshes without coordinates in
     between."""
     from optics import cli
@@ -320,7 +319,7 @@ def test_the_model_differentiates_by_the_renderer(bench, tmp_path, monkeypatch):
 
 
 def test_a_study_is_told_of_the_error_of_its_predictions(bench, tmp_path):
-    """Four times the rays and packets halve it."""
+    """Four times the rays and packets halve the error."""
     from optics.captures.capture_set import Captures, Frame
     from optics.captures.noise import Noise
     from optics.fit.scene_model import SceneModel
@@ -337,9 +336,13 @@ def test_a_study_is_told_of_the_error_of_its_predictions(bench, tmp_path):
     try:
         for more in (1, 4):
             scene.integrator.rays, scene.integrator.packets = rays * more, packets * more
-            model = SceneModel(scene, Captures(tmp_path, str(scene.path), [frame], noise=Noise(0.1, 0.05, 0.0, 255.0, 0.0)))
+            model = SceneModel(
+                scene, Captures(tmp_path, str(scene.path), [frame], noise=Noise(0.1, 0.05, 0.0, 255.0, 0.0))
+            )
             shares.append(model.chance())
     finally:
         scene.integrator.rays, scene.integrator.packets = rays, packets
     assert 1.4 < shares[0] / shares[1] < 2.8 and shares[0] > checks.CHANCE
-    assert any("an estimate by Monte Carlo" in text for text in checks.of_captures(model)) == (shares[1] > checks.CHANCE)
+    assert any("an estimate by Monte Carlo" in text for text in checks.of_captures(model)) == (
+        shares[1] > checks.CHANCE
+    )

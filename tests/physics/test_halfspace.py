@@ -1,4 +1,4 @@
-"""A dent's reach into the skin against Boussinesq's and Hertz' closed forms, and against equilibrium:
+"""Displacement in the skin under a dent, against Boussinesq's and Hertz' closed forms, and against equilibrium:
 optics/skin/halfspace.py."""
 
 import math
@@ -86,7 +86,7 @@ def test_hertz_on_the_axis():
 
 
 @pytest.mark.parametrize("depth", [0.5, 2.5, 5.0])
-def test_every_bit_of_a_dent_pushes_straight_away_from_itself(depth):
+def test_every_element_of_a_dent_displaces_radially(depth):
     """u = sum D 3 h^2 (x - x', y - y', h)/(2 pi R^5), also at the maps' border, where they are cut off."""
     dent = pressed()
     maps = carried(dent, dent.pitch, depth)

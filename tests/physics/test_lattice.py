@@ -344,13 +344,16 @@ def test_glued_block_under_shear_is_that_of_finite_elements(tall_block):
     assert 0.45 * -0.07 < 0.45 * wrong[4] < wrong[8] < 0
 
 
-def contact(elastic, shape, depth, reach):
-    """Displacement and force of a frictionless indenter on finite elements, by its nodes' unit loads and an active
-    set."""
+def unit_loads(elastic, reach):
+    """The face's degrees of freedom within `reach` of the axis, and the displacements under a unit load on each."""
     face = np.flatnonzero(elastic.top & (elastic.component == 2) & (np.hypot(*elastic.at[:2]) < reach))
     unit = np.zeros((elastic.basis.N, len(face)))
     unit[face, np.arange(len(face))] = 1
-    moved = elastic.solve(unit)
+    return face, elastic.solve(unit)
+
+
+def contact(elastic, shape, depth, face, moved):
+    """Displacement and force of a frictionless indenter on finite elements, by unit loads and an active set."""
     want = shape(*elastic.at[:2, face]) - depth
     touch = want < 0
     for _ in range(50):
@@ -367,10 +370,10 @@ def test_sphere_presses_as_on_finite_elements():
     """8 mm, 0.2 and 0.4 mm deep in 3 mm: elements with nodes every 0.2 mm under the sphere, good to 1 %."""
     across, along = 4.5 * np.linspace(0, 1, 8) ** 1.5, -3 * np.linspace(1, 0, 6) ** 1.4
     elastic = Elastic(RUBBER, across, across, along, (0,), (1,))
-    skin = block(4.5, 3.0, 8)
+    skin, loads = block(4.5, 3.0, 8), unit_loads(elastic, 1.9)
     # the contact's edge is known to a pitch: force to 2 % with 21 nodes in contact and 1 % with 49
     for depth, count, force_error, error in ((0.2, 21, 0.03, 0.04), (0.4, 49, 0.02, 0.025)):
-        u, force = contact(elastic, sphere(8.0), depth, 1.9)
+        u, force = contact(elastic, sphere(8.0), depth, *loads)
         pressed = balance(skin, Push(sphere(8.0), depth), linear=True)
         assert pressed.contact.sum() == count
         assert -pressed.force[2] == pytest.approx(force, rel=force_error)
@@ -392,7 +395,7 @@ def test_sphere_converges_to_finite_elements():
     """Nodes every 0.12 mm under the sphere; force and displacement at three pitches."""
     across, along = 4.5 * np.linspace(0, 1, 11) ** 1.6, -3 * np.linspace(1, 0, 7) ** 1.4
     elastic = Elastic(RUBBER, across, across, along, (0,), (1,))
-    u, force = contact(elastic, sphere(8.0), 0.4, 1.9)
+    u, force = contact(elastic, sphere(8.0), 0.4, *unit_loads(elastic, 1.9))
     errors = []
     for n, force_error in ((4, 0.07), (8, 0.02), (12, 0.01)):
         pressed = balance(block(4.5, 3.0, n), Push(sphere(8.0), 0.4), linear=True)

@@ -74,7 +74,7 @@ def test_a_factor_moves_by_its_logarithm():
         assert power.stepped(value, 0.2) * power.stepped(value, -0.2) == pytest.approx(value**2)
         assert power.stepped(value, 1e-6) == pytest.approx(value + 1e-6, rel=1e-10)
         slow, fast = (power.stepped(value, value * (1 + side * 1e-6)) for side in (-1, 1))
-        assert 0 < fast - slow == pytest.approx(2e-6 * np.e * value, rel=1e-3)  # smooth where it goes on straight
+        assert 0 < fast - slow == pytest.approx(2e-6 * np.e * value, rel=1e-3)  # smooth at the turn to a line
     assert power.stepped(2.0, -9.0) > 0 and power.stepped(0.0, 0.5) == 0.5  # a light that is off can be switched on
     for other in (Parameter("x", "mm", 1.0), Parameter("glare", "DN", 1.0, (0.0, 9.0), neutral=0.0, linear=True)):
         assert other.stepped(1.0, 0.5) == 1.5
@@ -209,7 +209,7 @@ class Bend(Exact):
 
 @pytest.mark.parametrize("start", [1.3, 1.36, 1.38, 1.39, 1.4, -1.38])
 def test_a_step_that_brings_a_hundredth_of_its_promise_is_shortened(start):
-    """On the same derivative images, which are dear: at most four linearisations with the one that sees the end, where
+    """On the same derivative images, which cost most: at most four linearisations with the one that sees the end, where
     taking any gain for progress needs five to eight. To .05 in chi2, which `fit` allows a variable."""
     model = Bend()
     found = fit(model, [Variable("led.x", ("led.x",), model.parameters["led.x"])], Values({"led.x": start}))

@@ -273,7 +273,7 @@ def test_a_image_of_a_sensor(optics, tmp_path):
     assert column + 0.5 == pytest.approx(24 + focal * 1 / 17.6, abs=0.5) and row + 0.5 == pytest.approx(32, abs=0.5)
     record = json.loads(header["provenance"])
     assert record["parameters"]["gel.press_x"] == 1 and record["scene"]["defines"]["depth"] == "0.5"
-    assert record["scene"]["hash"].startswith("sha256:") and "effects/vignetting.py" in record["plugins"]
+    assert record["scene"]["hash"].startswith("sha256:") and "effects/lens_vignetting.py" in record["plugins"]
     assert {**json.loads(file.with_suffix(".json").read_text()), "command": 0} == {**record, "command": 0}
 
     again = scene.load("digit", record["scene"]["defines"])  # the record is enough to make it again
@@ -333,7 +333,8 @@ STOCK = """<scene version="3.0.0"><integrator type="path"/>
   <film type="hdrfilm"><integer name="width" value="32"/><integer name="height" value="24"/></film>
   <sampler type="independent"><integer name="sample_count" value="16"/></sampler></sensor>
 <shape type="obj"><string name="filename" value="block.obj"/>
-  <bsdf type="diffuse"><texture type="bitmap" name="reflectance"><string name="filename" value="check.png"/></texture></bsdf></shape>
+  <bsdf type="diffuse"><texture type="bitmap" name="reflectance">
+    <string name="filename" value="check.png"/></texture></bsdf></shape>
 <shape type="ply"><string name="filename" value="ball.ply"/><bsdf type="roughconductor"/></shape>
 <emitter type="constant"/></scene>"""
 

@@ -25,10 +25,10 @@ from optics.diagnosis.fingerprints import (
     places,
     unexplained,
 )
-from optics.diagnosis.statistics import Sweeps
 from optics.diagnosis.result import Basis, Family, Fingerprint
-from optics.fit.geometry import lit_geometry
+from optics.diagnosis.statistics import Sweeps
 from optics.errors import OutputExists, UnknownKey
+from optics.fit.geometry import lit_geometry
 from optics.lookup import lookup
 from optics.scene.registry import declared, known
 from optics.study import draft
@@ -76,7 +76,7 @@ def test_an_unknown_effect_is_put_into_its_family(name, strength, family, coordi
     )
 
 
-def test_the_numbers_of_a_curve_are_of_all_values_where_it_was_found_in_some():
+def test_the_numbers_of_a_curve_are_those_of_all_values_although_some_found_it():
     model, fit, evidence, found = case("banding", 0.03)
     whole = next(f for f in found if f.coordinate == "row")
     some = measure(model, fit.values, fit.variables, [], FITTED, 2 * evidence.normal.count // 5, 0, lambda *a: None)
@@ -117,7 +117,7 @@ def test_a_pattern_fixed_in_the_image_is_told_from_a_curve(pattern):
     assert all(np.isnan(fixed_pattern(model, *given)) for given in ((few, excess), (swept, excess), (evidence, 0.0)))
 
 
-def test_in_noise_no_curve_stands_out_and_none_has_a_share():
+def test_in_noise_no_curve_is_significant_and_none_has_a_share():
     found = case("banding", 0.0)[3]
     assert min(f.p for f in found) * len(found) > 0.01 and all(np.isnan(f.share) for f in found)
     assert "how much a curve along it explains of what the best curve does" in goes_with(
@@ -168,7 +168,7 @@ def test_a_map_or_a_number_per_frame_comes_first_only_where_no_curve_is_nearly_a
     assert " or " not in goes_with([one, Family("time", "frame", 95.0, 0.85, 0.95)])
 
 
-def test_what_curve_effect_and_neither_explain_adds_up():
+def test_shares_of_curve_effect_and_remainder_add_up():
     found = case("banding", 0.03)[3]
     row = next(f for f in found if f.coordinate == "row")
     assert "along 'row', explains 100%; 0% neither" in unexplained(
@@ -238,7 +238,7 @@ def lit_point(powers):
     )
 
 
-def test_how_the_brightest_led_stands_to_a_point_and_that_no_frame_loses_a_coordinate():
+def test_geometry_of_the_brightest_led_exists_in_every_frame():
     for powers in ({"near": 1.0, "above": 0.5}, {"above": 0.5, "near": 1.0}):
         found = {k: float(v[0, 0]) for k, v in lit_geometry(lit_point(powers), None, 0).items()}
         # to the lamp 45 deg off the normal, to the camera atan(2/4), both to the same side
@@ -427,7 +427,7 @@ def test_lookup():
 # -----------------------------------------------------------------------------------------------------
 
 
-def test_what_no_draft_can_carry_is_said_with_what_can():
+def test_what_no_draft_can_carry_is_refused_with_the_alternatives():
     known = [
         Fingerprint(c, 9.0, 1, 0.0, 8.0, 2.0, "gain", [0.0, 1.0], [0.0, 0.1], [0.01] * 2, [], "camera")
         for c in ("laplacian", "row", "contact_distance")
@@ -602,7 +602,7 @@ def test_no_effect_is_called_new(tmp_path):
 
 
 @pytest.mark.parametrize("word", ["takes", "held", "eval"])  # of every part, of an instance, of Mitsuba's own classes
-def test_no_parameter_hides_what_its_part_has(word, tmp_path):
+def test_no_parameter_hides_an_attribute_of_its_part(word, tmp_path):
     from optics.errors import BadPlugin
     from optics.scene.mitsuba_parts import use_variant
 
@@ -643,7 +643,7 @@ def test_components_find_what_frames_have_in_common():
     )  # means over 3 x 3 px, still in sigmas; the largest of six is above 1
 
 
-def test_pages_are_of_the_first_and_the_last_step():
+def test_pages_belong_to_the_first_and_the_last_step():
     from optics.fit.compare import compare
     from optics.pages.residual_maps import coordinates, pages
 
@@ -668,7 +668,7 @@ def picture(uri):
     return Image.open(io.BytesIO(base64.b64decode(uri.partition(",")[2])))
 
 
-def test_colours_of_noise_are_alike_in_a_image_and_in_a_mosaic():
+def test_colours_of_noise_are_alike_in_an_image_and_in_a_mosaic():
     """In a mosaic a block holds a quarter of the pixels of a channel, and its mean scatters twice as much."""
     from optics.fit.compare import compare
     from optics.pages.residual_maps import colours, regions

@@ -230,3 +230,23 @@ def test_warnings_name_what_weakens_a_verdict():
     for text, word in zip(texts, ("pedestal", "demosaiced", "8 bit", "one frame", "PRNU 1.00%"), strict=True):
         assert word in text
     assert not any("PRNU" in t for t in warnings_of(replace(CAMERA, prnu=0.01), replace(c, flat_field=frame.image)))
+
+
+def test_the_noise_of_a_sum_of_frames_is_that_of_its_frames():
+    one, rng = Noise(0.2, 2.0, 64.0, 4095.0, 0.0), np.random.default_rng(5)
+    many = one.summed(16)
+    assert (many.black_level, many.saturation, many.system_gain) == (1024.0, 65520.0, 0.2)
+    for level in (64.0, 200.0, 3000.0):
+        signal = np.full((200, 200, 1), level)
+        sums = sum(one.expose(signal, rng) for _ in range(16))
+        assert many.variance(16 * level) == pytest.approx(16 * one.variance(level), rel=1e-12)
+        # 40 000 values tell a variance to 0.7 %, and a mean to 1/200 of their scatter: four of these
+        assert sums.var() == pytest.approx(float(many.variance(16 * level)), rel=0.028)
+        assert sums.mean() == pytest.approx(16 * level, abs=4 * many.sd(16 * level) / 200)
+    assert one.summed(1) == one
+
+
+def test_a_fixed_pattern_does_not_average_down_in_a_sum():
+    one, signal = Noise(0.2, 2.0, 64.0, 4095.0, 0.01), 3000.0
+    floor = one.summed(16).variance(16 * signal) - replace(one, prnu=0.0).summed(16).variance(16 * signal)
+    assert floor == pytest.approx((0.01 * 16 * (signal - 64.0)) ** 2)

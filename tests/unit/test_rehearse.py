@@ -1,4 +1,4 @@
-"""What a rehearsal says of hidden effects, against the closed form for two rivals and against a diagnosis of what was
+"""What a rehearsal predicts for hidden effects, against the closed form for two rivals and against a diagnosis of what was
 really hidden."""
 
 import sys
@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from optics.diagnosis.score import score
 from optics.diagnosis.rehearse import rehearse
+from optics.diagnosis.score import score
 
 sys.path.insert(0, str(Path(__file__).parent))
 from mock_model import LIBRARY, MockModel, mock_fit, simulate

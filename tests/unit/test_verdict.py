@@ -14,15 +14,14 @@ import numpy as np
 import pytest
 
 from optics.captures.noise import Noise
-from optics.diagnosis import fingerprints, pairs
-from optics.diagnosis import homogeneity
+from optics.diagnosis import fingerprints, homogeneity, pairs
 from optics.diagnosis import statistics as st
+from optics.diagnosis.decide import Findings, decide
 from optics.diagnosis.diagnose import diagnose
 from optics.diagnosis.evidence import Candidate, measure
 from optics.diagnosis.findings import refuted
-from optics.diagnosis.score import score
-from optics.diagnosis.decide import Findings, decide
 from optics.diagnosis.result import WORDS, Diagnosis, Pair
+from optics.diagnosis.score import score
 from optics.diagnosis.thresholds import CLEAR, CLUTTERED, MARGIN
 from optics.errors import Underdetermined
 from optics.fit.model import value_of
@@ -679,7 +678,7 @@ def test_noisy_derivatives_are_rendered_twice_with_seeds_of_their_own():
     assert len(seeds - {0}) == 2
 
 
-class ByChance(MockModel):
+class Estimated(MockModel):
     """The mock with images that are estimates: the same error in an image and in what follows it (a lamp's power), by
     the seed."""
 
@@ -707,11 +706,11 @@ class ByChance(MockModel):
         return {**super().coordinates(values, frame), "intensity": self.predict(values, [frame], seed)[0]}
 
 
-def test_no_curve_follows_the_error_of_a_image_made_by_monte_carlo():
+def test_no_curve_follows_the_error_of_an_image_made_by_monte_carlo():
     """The error of the prediction is in the residual: binned or scaled by that same image, it would look like a curve
     (8 % of the variance here, so hundreds of chi2 of 5 800 values)."""
     exact, fit = calibrated(side=22)
-    model = ByChance(PRESSES, 22)
+    model = Estimated(PRESSES, 22)
     model.frames = exact.frames
     share = np.mean(
         [

@@ -69,7 +69,7 @@ def test_a_tie_is_resolved_by_what_is_advised(example, hidden, family, tmp_path,
 
 @pytest.mark.slow
 @pytest.mark.parametrize("hidden", ["leak", "stray"])
-def test_the_other_cause_is_named_where_it_is_the_other(example, hidden, tmp_path):
+def test_the_other_cause_is_named_where_it_is_the_true_one(example, hidden, tmp_path):
     effect, before, after = example.main(hidden, tmp_path)
     assert before.word == "AMBIGUOUS" and after.missing == effect
 
@@ -95,8 +95,8 @@ def test_a_planned_session_keeps_effects_apart(bench):
     assert not bench.warnings
 
 
-def test_what_a_single_exposure_cannot_tell_is_said():
-    """At one exposure nothing parts stray light from an offset: the plan says so."""
+def test_what_a_single_exposure_cannot_separate_is_reported():
+    """At one exposure nothing separates stray light from an offset, and the plan says so."""
     effects = [known().find_effect(n) for n in ("stray light", "dark offset")]
     found = design.plan(scenes.load("polarizer_bench"), 4, effects, noise=NOISE, share=1.0, fixed_exposure=True)
     assert not any("camera.exposure" in f.settings for f in found.frames)
@@ -131,7 +131,7 @@ def test_a_session_is_a_capture_set_to_fill_in(bench, tmp_path):
         captures.write(captures.load(folder), folder, overwrite=True)
 
 
-def test_a_session_for_a_scene_of_ones_own(tmp_path):
+def test_a_session_for_a_users_own_scene(tmp_path):
     """A folder that is called `scenes` is not ours; an effect named twice is one; few sweeps are enough to hold some
     out."""
     path = tmp_path / "scenes" / "polarizer_bench.xml"

@@ -1,4 +1,4 @@
-"""What a user gets wrong is refused in one line that names it, before anything is written.
+"""Wrong input is refused in one line that names it, before anything is written.
 
 Every case is a command line. It must end with exit code 2, say exactly one line on stderr, which matches the pattern
 given here (the thing, where it stands, what is allowed or what to do), show no traceback, print nothing on stdout, and

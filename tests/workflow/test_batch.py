@@ -309,7 +309,7 @@ def test_a_changed_plugin_is_another_job(whole, tmp_path, monkeypatch):
 
     (tmp_path / "job.toml").write_text(JOB.replace('"out"', f'"{whole}"'))
     monkeypatch.setattr(batch, "RenderJob", rendering.RenderJob)
-    monkeypatch.setattr(rendering, "plugins_record", lambda: {"effects/vignetting.py": "sha256:0"})
+    monkeypatch.setattr(rendering, "plugins_record", lambda registry: {"effects/lens_vignetting.py": "sha256:0"})
     with pytest.raises(OutputExists, match="changed plugins"):
         batch.run(tmp_path / "job.toml", workers=1)
 

@@ -1,4 +1,4 @@
-"""What is written down wrongly and yet can be rendered: a calibration says so, where no effect can explain it."""
+"""Input that is wrong but can be rendered: a calibration reports it where no effect can explain it."""
 
 import csv
 from types import SimpleNamespace
@@ -16,7 +16,7 @@ NOISE = Noise(system_gain=0.05, dark_noise=2.0, black_level=64.0, saturation=409
 
 
 @pytest.mark.parametrize("wrong", [False, True])
-def test_angles_in_radians_are_no_matter_of_effects(wrong, tmp_path):
+def test_angles_in_radians_are_reported_and_no_effect_is_claimed(wrong, tmp_path):
     folder = jones.write(
         tmp_path / "captures",
         jones.Truth(photodiode=jones.Photodiode(gain=2.2)),
@@ -35,10 +35,10 @@ def test_angles_in_radians_are_no_matter_of_effects(wrong, tmp_path):
     assert any("too far for a missing effect: check units" in w for w in fit.warnings) == wrong
 
 
-def test_a_value_far_from_what_is_known_of_it_is_named():
+def test_a_value_far_from_its_prior_is_named():
     depth = Parameter("press_depth", "mm", 0.2, (0.0, 1.0), plausible=0.1)
     variables = [Variable(f"gel.press_depth[{i}]", ("gel.press_depth",), depth, (i,), (0.2, 0.05)) for i in range(3)]
-    model = SimpleNamespace(at=lambda values, i: {"gel.press_depth": 0.2, **values.frame[i]})
+    model = SimpleNamespace(at=lambda values, i: {"gel.press_depth": 0.2, **values.frame.get(i, {})})
     near = SimpleNamespace(rms=1.0, signal=100.0)
 
     def told(*depths):
@@ -91,15 +91,15 @@ def test_a_press_beyond_the_gel_is_named(x, warned):
     "groups, held, asked, warned",
     [(3, [], None, True), (1, [], None, False), (4, [1], None, False), (3, [], [], False)],
 )
-def test_a_set_of_which_nothing_is_held_out_says_so(groups, held, asked, warned):
+def test_a_set_without_held_out_frames_is_reported(groups, held, asked, warned):
     frames = [SimpleNamespace(name=f"f{i}", group=f"g{i}") for i in range(groups)]
     model = SimpleNamespace(captures=SimpleNamespace(frames=frames))
     texts = checks._unverified(model, loop.Setup(captures="c", held_out=asked), held)
     assert bool(texts) == warned and (not warned or texts[0].startswith("3 groups of frames: none is held out"))
 
 
-def test_an_effect_that_does_not_predict_is_said_to_be_no_cause(monkeypatch):
-    """Held-out frames that get worse with an effect, though the fitted ones get better."""
+def test_an_effect_that_does_not_predict_is_reported_as_no_cause(monkeypatch):
+    """Held-out frames get worse with the effect, although the fitted ones get better."""
     study = SimpleNamespace(steps=[{"held_out": {"chi2_per_dof": 1.5}}], note_inputs=lambda files: None)
 
     def record(*_):

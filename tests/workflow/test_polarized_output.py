@@ -66,7 +66,7 @@ def test_a_scene_with_layers_gives_stokes_vectors(optics, tmp_path):
             assert np.ptp(np.asarray(shown.convert("L"))) > 100
 
 
-def test_exactly_and_by_monte_carlo_the_same(optics, tmp_path):
+def test_the_exact_image_and_monte_carlo_agree(optics, tmp_path):
     options = ["vi2tap", *SMALL, "-D", "analyzer=35", "-D", "depth=1", "-D", "bands=650, 580, 520, 460"]
     for name, more in (("exact", []), ("random", ["--spp", "16", "--seed", "2"])):
         assert optics("render", *options, *more, "-o", tmp_path / f"{name}.exr")[0] == 0
@@ -338,7 +338,7 @@ WRONG = [
 
 
 @pytest.mark.parametrize("arguments, message", WRONG, ids=[" ".join(a[:1] + a[-2:]) for a, _ in WRONG])
-def test_one_line_says_what_is_wrong(optics, measured, tmp_path, arguments, message):
+def test_errors_are_one_line(optics, measured, tmp_path, arguments, message):
     import re
 
     before = sorted(p for p in tmp_path.rglob("*"))

@@ -135,7 +135,7 @@ def test_the_set_and_its_size_are_counted_whether_or_not_something_stands_out():
         }
 
     found = count.count([weak(1e-4, "a"), weak(1e-4, "b", "a", "c"), weak(0.3, "c", "b")], 3)
-    assert found.set_size == 2 and "2.00 (to be: 2 at most)" in found.text()
+    assert found.set_size == 2 and "2.00 (target: at most 2)" in found.text()
     rates = [found.rate(f"in the set, 0.2 %, no clutter{where}") for where in ("", ", where one stands out")]
     assert [(r.k, r.n) for r in rates] == [(2, 3), (2, 2)]
 

@@ -285,8 +285,8 @@ def demo_diagnosis(rows, found, index, names) -> dict:
         "rows": table,
         "not_tested": {"retardance": "no polarizer in the scene"},
         "warnings": [],
-        "sentence": f"none of {len(table)} effects stands out (family-wise p 0.8) and no low-frequency structure is left "
-        "(p 0.31).",
+        "sentence": f"none of {len(table)} effects stands out (family-wise p 0.8) and no low-frequency structure is "
+        "left (p 0.31).",
         "conditions": [
             {"name": "an effect stands out", "holds": claim, "text": "family-wise p <1e-9 against 0.01"},
             {"name": "structure is left", "holds": False, "text": "low-frequency test p 0.31 against 0.01"},
@@ -330,8 +330,8 @@ def demo_diagnosis(rows, found, index, names) -> dict:
         "word": "CLAIM",
         "claimed": best["name"],
         "splits": splits,
-        "sentence": f"{best['name']} is missing, strength {best['change'][0]:.3f} +- {best['sd'][0]:.4f}. Its strength is "
-        "the same in every part of the data. Not glare < 0.0007, not LED lobe < 0.03. Before, led_red.power "
+        "sentence": f"{best['name']} is missing, strength {best['change'][0]:.3f} +- {best['sd'][0]:.4f}. Its strength "
+        "is the same in every part of the data. Not glare < 0.0007, not LED lobe < 0.03. Before, led_red.power "
         "stood 0.26 off.",
         "levels": [
             {"model": "base", **level},
@@ -377,7 +377,7 @@ def demo_diagnosis(rows, found, index, names) -> dict:
     }
 
 
-# -- tests --------------------------------------------------------------------------------------------------------------
+# -- tests -------------------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -725,8 +725,8 @@ def test_what_the_page_reads_is_what_a_diagnosis_writes():
 
     declared = typing.get_type_hints(Diagnosis)
     read = {
-        "rows": "name units fall p_family start change sd of_plausible image share survival confused_with cos upper refit flags "
-        "verdict",
+        "rows": "name units fall p_family start change sd of_plausible image share survival confused_with cos upper "
+        "refit flags verdict",
         "splits": "effect by labels strength sd h p holds",
         "shifts": "variable unit before after in_sd warn",
         "fingerprints": "coordinate net dof ratio kind centres curve sd labels",

@@ -838,10 +838,14 @@ def test_the_address_brings_a_state_back_and_names_what_is_unknown(page, server)
 def test_everything_has_a_name_and_fits(page):
     """Every control can be reached and has a name; nothing is wider than the window."""
     page.run("for (const d of document.querySelectorAll('details')) d.open = true; toggle('led-size', true)")
-    nameless = page.run("""[...document.querySelectorAll('input, button, select, [role=slider]')].filter(e => !(e.ariaLabel || e.textContent.trim()
-        || (e.labels && [...e.labels].some(l => l.textContent.trim())) || e.placeholder)).map(e => e.outerHTML)""")
+    nameless = page.run(
+        "[...document.querySelectorAll('input, button, select, [role=slider]')].filter(e => "
+        "!(e.ariaLabel || e.textContent.trim() || (e.labels && [...e.labels].some(l => l.textContent.trim())) "
+        "|| e.placeholder)).map(e => e.outerHTML)"
+    )
     unreachable = page.run(
-        "[...document.querySelectorAll('input, button, select, [role=slider]')].filter(e => e.tabIndex < 0).map(e => e.outerHTML)"
+        "[...document.querySelectorAll('input, button, select, [role=slider]')].filter(e => e.tabIndex < 0).map(e "
+        "=> e.outerHTML)"
     )
     assert nameless == [] and unreachable == []
     page.run("document.activeElement.blur()")

@@ -1,1 +1,1 @@
-"""Captures made by another path than the model that is fitted to them."""
+"""Makers of captures: independent renderers that share no code path with the model that is fitted to them."""

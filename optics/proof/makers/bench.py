@@ -47,8 +47,7 @@ PAULI = np.array([[[1, 0], [0, 1]], [[1, 0], [0, -1]], [[0, 1], [1, 0]], [[0, -1
 Settings = Sequence[Mapping[str, float]]  # one reading each, by key; what is missing stands at DEFAULTS
 
 
-# -- What is on the bench
-# -----------------------------------------------------------------------------------------------
+# -- What is on the bench ----------------------------------------------------------------------------------------------
 
 
 def _within(low: float, high: float, default: float):
@@ -143,8 +142,7 @@ class Truth(_Checked):
     photodiode: Photodiode = Photodiode()
 
 
-# -- Light through it
-# ---------------------------------------------------------------------------------------------------
+# -- Light through it --------------------------------------------------------------------------------------------------
 
 
 def radiance(truth: Truth, settings: Settings) -> np.ndarray:
@@ -256,8 +254,7 @@ def _intensity(light: np.ndarray) -> np.ndarray:
     return np.trace(light, axis1=-2, axis2=-1).real
 
 
-# -- Readings of it
-# -----------------------------------------------------------------------------------------------------
+# -- Readings of it ----------------------------------------------------------------------------------------------------
 
 
 def expected(truth: Truth, settings: Settings, noise: Noise) -> np.ndarray:

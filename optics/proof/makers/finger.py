@@ -1,14 +1,14 @@
-"""Captures of the Vi2TaP finger made by another path than the model: stock Mitsuba's `path`, its `polarizer`, finer
-meshes.
+"""Captures of the Vi2TaP finger by a renderer of its own: stock Mitsuba's `path`, its `polarizer`, finer meshes.
 
-Nothing of `optics.light.renderer`, `optics.light.paths`, `optics.polarization.mueller` or the `tactile` integrator
-takes part. A polarizer with a leak is a mixture of two ideal ones, T1 along its axis and T2 across it: exact for light
-that enters unpolarized and is only weighed in the end. Four renders in the mono variant (each film along or across)
-hold every such pair; what is outside and what the markers send are rendered apart, for unit reflectance and unit
-excitation, and get their colours by quadrature over the spectra. Effects are made by mixing renders, by turning a film,
-or by numpy on the image; then photons, read noise and 8 bits. A retarder is a mixture of films too: the stock one turns
-by the angle to its x axis, which is not across an oblique ray, and has a seam there. Shared with the model are the
-shape of a dent, the boundary's Snell and Fresnel and the LED's lobe, which tests hold to closed forms."""
+It shares nothing with `optics.light.renderer`, `optics.light.paths`, `optics.polarization.mueller` or the `tactile`
+integrator. A polarizer with a leak is a mixture of two ideal ones, T1 along its axis and T2 across it: this is exact
+for light that enters unpolarized and is only weighted at the end. Four renders in the mono variant (each film along or
+across) hold every such pair. Objects outside and the markers are rendered separately, for unit reflectance and unit
+excitation; quadrature over the spectra gives them their colours. Effects are made by mixing renders, by turning a film,
+or by numpy on the image. Then come photons, read noise and 8 bits. A retarder is a mixture of films too: the stock one
+turns by the angle to its x axis, which is not across an oblique ray, and has a seam there. Shared with the model are
+the shape of a dent, Snell's and Fresnel's laws at the boundary, and the LED's lobe, which tests hold to closed
+forms."""
 
 from __future__ import annotations
 
@@ -70,8 +70,7 @@ class FingerMaker:
         self._kept: dict = {}  # displacements and images of the present geometry
         self.wall_dark = scene.defines.get("wall_dark", 0.6)
 
-    # -- geometry
-    # -------------------------------------------------------------------------------------------------------
+    # -- geometry ------------------------------------------------------------------------------------------------------
 
     def dent(self, press: Sequence[float]):
         """The pressed outer face's displacement map, or None."""
@@ -206,7 +205,7 @@ class FingerMaker:
         )
         return self.mesh(np.concatenate([*ends, middles]), faces, bsdf, "object")
 
-    # -- light ----------------------------------------------------------------------------------------------------------
+    # -- light ---------------------------------------------------------------------------------------------------------
 
     def rectangle(self, z: float, half: float, bsdf: dict) -> dict:
         import mitsuba as mi
@@ -311,12 +310,15 @@ class FingerMaker:
         """(B,) radiance per nm of the pigment per unit of pi x irradiance's kappa cos: by quadrature over both
         spectra."""
         v = self.values
-        l = np.linspace(150, 700, 20001)
+        wavelength = np.linspace(150, 700, 20001)
         gauss = lambda x, peak, fwhm: np.exp(-4 * np.log(2) * ((x - peak) / fwhm) ** 2)  # noqa: E731
-        lamp = gauss(l, v["uv_left.wavelength"], v["uv_left.fwhm"])
+        lamp = gauss(wavelength, v["uv_left.wavelength"], v["uv_left.fwhm"])
         photons = np.trapezoid(
-            lamp * v["pigment.absorptance"] * gauss(l, v["pigment.absorption_peak"], v["pigment.absorption_fwhm"]) * l,
-            l,
+            lamp
+            * v["pigment.absorptance"]
+            * gauss(wavelength, v["pigment.absorption_peak"], v["pigment.absorption_fwhm"])
+            * wavelength,
+            wavelength,
         )
         wide = np.linspace(200, 1200, 40001)
         shape = gauss(wide, v["pigment.emission_peak"], v["pigment.emission_fwhm"])
@@ -409,7 +411,7 @@ class FingerMaker:
             total = total * (1 + e["analyzer wobble"] * np.cos(np.radians(dial)))
         return total + e.get("stray light", 0.0)
 
-    # -- camera ---------------------------------------------------------------------------------------------------------
+    # -- camera --------------------------------------------------------------------------------------------------------
 
     def photograph(self, radiance: np.ndarray, rng, frame: int) -> np.ndarray:
         """Noisy, quantised DN of a radiance (H, W, 3); the camera's effects in numpy."""

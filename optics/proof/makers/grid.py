@@ -1,12 +1,12 @@
-"""Captures of a small printed grid made by another path than the model: stock Mitsuba's `volpath`, `dielectric` faces
-around stock media.
+"""Captures of a small printed grid by a renderer of its own: stock Mitsuba's `volpath`, `dielectric` faces around stock
+media.
 
-Nothing of `optics.light.transport` or of our parts takes part: rays come from the camera alone and meet the panels
-where a matt surface sends a shadow ray, or by Monte Carlo; absorption and scattering are drawn, not weighed; the faces
-of cells and of the rod are meshes of their own. Each panel is rendered alone and unpolarized light stays what the faces
-make of it (mono variant, Mueller matrices). Effects are stock means: a medium's coefficients, an index,
-`roughdielectric` (Beckmann, which takes all polarization away), another mesh. Then photons, read noise and 8 bits. An
-image's own error, from independent passes, is reported as a share of the camera's noise: to stay below 0.3."""
+It shares nothing with `optics.light.transport` or our parts. Rays start at the camera; they reach a panel through a
+shadow ray from a matt surface, or by hitting it. Absorption and scattering are sampled, not weighted. The faces of the
+cells and of the rod are separate meshes. Each panel is rendered alone; light is unpolarized until the faces polarize it
+(mono variant, Mueller matrices). Effects are made by stock means: a medium's coefficients, an index, `roughdielectric`
+(Beckmann, which depolarizes completely), another mesh. Then come photons, read noise and 8 bits. The Monte Carlo error
+of an image, from independent passes, is reported as a share of the camera's noise: it should stay below 0.3."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ class GridMaker:
         self.noise, self.seed, self.spp, self.count = noise, seed, spp, 0
         self.shares: list[float] = []
 
-    # -- bodies ---------------------------------------------------------------------------------------------------------
+    # -- bodies --------------------------------------------------------------------------------------------------------
 
     def mesh(self, name: str, points, faces, **has):
         """A mesh of flat triangles with its material, and its media."""
@@ -233,7 +233,7 @@ class GridMaker:
         finally:
             use_variant(DEFAULT_VARIANT)
 
-    # -- camera ---------------------------------------------------------------------------------------------------------
+    # -- camera --------------------------------------------------------------------------------------------------------
 
     def photograph(self, radiance: np.ndarray, error: np.ndarray, rng) -> np.ndarray:
         """(H, W, 1) noisy, quantised DN; what the image's own error is of that noise goes to `shares`."""

@@ -45,8 +45,7 @@ class Rig:
     def __init__(self):
         self._strengths: dict[tuple[str, float], float] = {}
 
-    # -- what a sensor says of itself
-    # -----------------------------------------------------------------------------------
+    # -- what a sensor says of itself ----------------------------------------------------------------------------------
 
     def captures(
         self, cell: Cell, truth: Mapping[str, float], unknown: Mapping[str, float], *, mean: bool = False
@@ -63,8 +62,7 @@ class Rig:
         compare with."""
         raise NotImplementedError
 
-    # -- what follows
-    # ---------------------------------------------------------------------------------------------------
+    # -- what follows --------------------------------------------------------------------------------------------------
 
     def strength(self, effect: str, change: float) -> float:
         """That changes the image by so much (rms over mean, before any calibration); inf where none does."""
@@ -223,8 +221,7 @@ def demosaiced(image: np.ndarray) -> np.ndarray:
     return np.stack(out, -1).astype(np.float32)
 
 
-# -- makers from a workshop
-# ---------------------------------------------------------------------------------------------
+# -- makers from a workshop --------------------------------------------------------------------------------------------
 
 
 class Mean:

@@ -1,11 +1,10 @@
-"""Sensors that see a pressed gel lit by LEDs: `digit` and `gelsight`, by stock Mitsuba's path tracer on meshes of its
-own.
+"""Sensors that see a pressed gel lit by LEDs: `digit` and `gelsight`, made by stock Mitsuba's path tracer.
 
-`Wild` is `optics.proof.makers.touch.Maker` as it comes from a workshop, with
+`Wild` is `optics.proof.makers.touch.Maker` with the imperfections of a built sensor:
 
     clutter    c = 1: fixed pattern of the sensor 0.5 % rms, mottle of the coating 1 % rms (0.4 mm), wrinkles of the
                skin of 0.3 deg rms,
-               the same in every frame; of these no effect of the library knows (diagnosis laboratory, 3.4)
+               the same in every frame; no effect of the library describes these
     shape      "other": effects with the same cause and size as the library's, but another law, as in OTHER
     unknown    what the library does not have, as in UNKNOWN
 """
@@ -114,8 +113,7 @@ class Wild(Workshop, synthetic.Maker):
         y, x = np.mgrid[:height, :width] + 0.5
         return (x - width / 2) / focal, (y - height / 2) / focal
 
-    # -- the face
-    # -------------------------------------------------------------------------------------------------------
+    # -- the face ------------------------------------------------------------------------------------------------------
 
     def mesh(self, press: Sequence[float], pitch: float = 0.02):
         import mitsuba as mi
@@ -165,7 +163,7 @@ class Wild(Workshop, synthetic.Maker):
         size = self.clutter * np.tan(np.radians(WRINKLE)) / np.sqrt((gx**2 + gy**2).mean())
         return size * rise, size * slope_x, size * slope_y
 
-    # -- light ----------------------------------------------------------------------------------------------------------
+    # -- light ---------------------------------------------------------------------------------------------------------
 
     def light(self, press: Sequence[float]) -> dict[str, np.ndarray]:
         key = (
@@ -234,7 +232,7 @@ class Wild(Workshop, synthetic.Maker):
             out = clear + (out - clear) * phase[..., None]
         return out
 
-    # -- camera ---------------------------------------------------------------------------------------------------------
+    # -- camera --------------------------------------------------------------------------------------------------------
 
     def photograph(self, radiance, rng, frame, press=None, exposure: float = 1.0):
         values, key = self.values, f"{self.camera}.exposure"
@@ -346,8 +344,7 @@ def _disc(radius: float) -> np.ndarray:
     return kernel / kernel.sum()
 
 
-# -- the sensors
-# --------------------------------------------------------------------------------------------------------
+# -- the sensors -------------------------------------------------------------------------------------------------------
 
 
 class Touch(ImageRig):

@@ -1,0 +1,106 @@
+"""LED by LED: the light of a single LED on given points of the skin, what calibration and batches use.
+
+The camera's rays are followed once through the flat interfaces (`hits`); each LED is then a shading of these points
+with a visibility of its own (`direct`, `visible`), so that powers, colours and exposures need no new rays. The methods
+of `LedByLed` become methods of the integrator `tactile`; this module is imported where a part is built, after a variant
+is set."""
+
+from __future__ import annotations
+
+import math
+
+import drjit as dr
+import mitsuba as mi
+
+# share of the coordinates' size (mm) that a ray is moved along its direction beyond a flat interface, so that it does
+# not meet it again; float32 resolves 1e-7
+BEYOND = 1e-4
+
+
+def is_interface(shape) -> bool:
+    """Whether a shape is a flat boundary that the camera looks through."""
+    return getattr(shape.bsdf(), "kind", "") == "interface"
+
+
+class LedByLed:
+    """Methods of the integrator that follow the light of one LED at a time."""
+
+    def hits(self, scene, camera, u, v):
+        """Where the camera's rays through the pixel positions (u, v) meet the membrane: (si, weight, origin)."""
+        o, d = camera.ray(u, v)
+        ray = mi.Ray3f(o, d, mi.Float(0), self.wavelengths(dr.width(u)))
+        si = scene.ray_intersect(ray)
+        weight = mi.UnpolarizedSpectrum(1.0)
+        for _ in range(sum(1 for s in scene.shapes() if is_interface(s))):
+            flat = si.is_valid() & mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.DeltaTransmission)
+            bs, passed = si.bsdf().sample(mi.BSDFContext(), si, mi.Float(0.5), mi.Point2f(0.5), flat)
+            d = si.to_world(bs.wo)
+            # spawn_ray would shift it sideways, along the normal
+            start = si.p + d * (BEYOND * (1 + dr.max(dr.abs(si.p))))
+            through = scene.ray_intersect(mi.Ray3f(start, d, mi.Float(0), si.wavelengths), flat)
+            weight = dr.select(flat, weight * mi.unpolarized_spectrum(passed), weight)
+            si = dr.select(flat, through, si)
+        return si, weight, dr.select(si.is_valid(), si.p + si.to_world(si.wi) * si.t, o)
+
+    def windows(self, scene, led):
+        """How many flat interfaces stand between an LED and the skin."""
+        reach = math.sqrt(led.number("area") / math.pi)
+        return sum(1 for s in scene.shapes() if is_interface(s) and s.bbox().max.z > led.number("z") - reach)
+
+    def visible(self, scene, si, point, led):
+        """Whether the straight line from the surface to a point of an LED meets nothing but windows (detached)."""
+        with dr.suspend_grad():
+            valid = si.is_valid()
+            ray = si.spawn_ray_to(point)
+            for _ in range(self.windows(scene, led)):
+                hit = scene.ray_intersect(ray, valid)
+                flat = hit.is_valid() & mi.has_flag(hit.bsdf().flags(), mi.BSDFFlags.DeltaTransmission)
+                ray = dr.select(flat, hit.spawn_ray_to(point), ray)
+            return valid & ~scene.ray_test(ray, valid)
+
+    def excited(self, scene, si, led, to_led, distance):
+        """Radiance per band of the fluorescence that one LED excites."""
+        total = mi.UnpolarizedSpectrum(0.0)
+        for pigment in self.glowing(scene):
+            own = si.is_valid() & (si.bsdf() == mi.BSDFPtr(pigment))
+            total += dr.select(own, pigment.fluorescence(si, led, to_led, distance), 0.0)
+        return total
+
+    def direct(self, scene, si, weight, origin, led, visibility, sample=None):
+        """Radiance per band that one LED sends to the camera by one reflection (S3, S5), and by the gel itself."""
+        point = led.position() if sample is None else led.point(sample)
+        to_led = point - si.p
+        distance = dr.norm(to_led)
+        s = to_led / distance
+        value = mi.unpolarized_spectrum(si.bsdf().eval(mi.BSDFContext(), si, si.to_local(s), si.is_valid()))
+        light = value * led.radiance(si, s, distance) + self.excited(scene, si, led, s, distance)
+        light = light & visibility
+        gel = self.gel(scene)
+        if gel is not None:
+            path = gel.path(si.p, origin, point, led, si)
+            for function in gel.functions("segment"):
+                light *= function(path, gel)
+            for function in gel.functions("volume"):
+                light += dr.select(si.is_valid(), function(path, gel), 0.0)
+        return light * weight
+
+    def ambient(self, scene, si, weight, membrane):
+        """Radiance per band that no LED made, of one membrane."""
+        own = si.is_valid() & (si.bsdf() == mi.BSDFPtr(membrane))
+        return dr.select(own, membrane.ambient_radiance(si), 0.0) * weight
+
+    def bounced(self, scene, si, weight, origin, led, count, sampler):
+        """Radiance per band that one LED sends to the camera by two reflections, mean of `count` directions."""
+        total = mi.UnpolarizedSpectrum(0.0)
+        context = mi.BSDFContext()
+        for _ in range(count):
+            bs, factor = si.bsdf().sample(context, si, sampler.next_1d(), sampler.next_2d(), si.is_valid())
+            second = scene.ray_intersect(si.spawn_ray(si.to_world(bs.wo)), si.is_valid())
+            light = self.direct(scene, second, 1.0, si.p, led, self.visible(scene, second, led.position(), led))
+            total += dr.select(second.is_valid(), mi.unpolarized_spectrum(factor) * light, 0.0)
+        gel = self.gel(scene)
+        if gel is not None:
+            last = gel.path(si.p, origin, si.p, led, si)  # `direct` followed the light up to the first surface only
+            for function in gel.functions("segment"):
+                weight = weight * function(last, gel)
+        return total * weight / count
