@@ -13,6 +13,8 @@ ROOT = Path(__file__).resolve().parents[2]
 MEASURED = Path(os.environ.get("OPTICS_DATA", ROOT.parent / "shared" / "data")) / "digitdepth_digit_ball"
 # Sums over threads and other versions of LLVM move the last digits; a wrong model moves far more.
 CLOSE = 0.05
+# A calibration of 52 parameters on hand-drawn labels stops a little elsewhere on another machine.
+CLOSE_REAL = 0.15
 SMALL = 1e-3  # numbers below are rounding or nearly nothing: their digits say nothing
 
 
@@ -24,7 +26,7 @@ def without_windows():
     matplotlib.use(before)
 
 
-def hold(found):
+def hold(found, close=CLOSE):
     """Every line that the page shows is printed, with its numbers."""
     missing = [line for block in found for line in block.missing]
     assert missing == []
@@ -35,7 +37,7 @@ def hold(found):
         for said, printed in zip(block.text.splitlines(), now.splitlines()):
             numbers = [[float(n) for n in tour.NUMBER.findall(line)] for line in (said, printed)]
             for a, b in zip(*numbers, strict=True):
-                assert abs(a - b) <= max(CLOSE * abs(a), SMALL), f"the page says: {said}\nthe program: {printed}"
+                assert abs(a - b) <= max(close * abs(a), SMALL), f"the page says: {said}\nthe program: {printed}"
 
 
 def test_the_bench_part_runs_as_it_stands(mitsuba, tmp_path):
@@ -52,7 +54,7 @@ def test_the_bench_part_runs_as_it_stands(mitsuba, tmp_path):
 def test_the_real_part_runs_as_it_stands(mitsuba, tmp_path):
     tour.lay_out(MEASURED, tmp_path)
     found = tour.walk(tmp_path, real=True, quick=False)
-    hold(found)
+    hold(found, CLOSE_REAL)
     for name in tour.images(tour.PAGE.read_text(encoding="utf-8"), real=True):
         assert (tour.IMAGES / name).is_file()
 
