@@ -26,9 +26,9 @@ def before_after(study: str | Path, file: str | Path) -> Path:
     from PIL import Image, ImageDraw
 
     from optics.pages.drawing import SIGMA_RANGE, step_name
-    from optics.study.record import Study
+    from optics.study.record import Record
 
-    record = Study.open(study)
+    record = Record.open(study)
     if len(record.steps) < 2:
         raise ValueError(f"{study}: {len(record.steps)} step; allowed: 2 or more; add an effect first")
     first, last = ({f.name: f for f in record.frames(i)} for i in (0, len(record.steps) - 1))
