@@ -122,7 +122,6 @@ class SceneModel:
         return twin
 
     # -- values -------------------------------------------------------------------------------------------------------
-
     def at(self, values: Values, index: int) -> dict[str, Any]:
         """Every parameter's value in a frame: base <- fitted in all frames <- set in this frame <- fitted in this
         frame.
@@ -174,7 +173,6 @@ class SceneModel:
         return {n: self.renderer.powers(now, n) for n in self.renderer.lit(now)}
 
     # -- prediction ---------------------------------------------------------------------------------------------------
-
     def radiance(self, now: Mapping, seed: int = 0) -> np.ndarray:
         """(H, W, B): linear image of a frame."""
         return self.renderer.radiance(now, seed)
@@ -388,9 +386,7 @@ class SceneModel:
         low, high = self.parameters[key].sides(now[key])
         return (self.renderer.ambient({**now, key: high}) - self.renderer.ambient({**now, key: low})) / (high - low)
 
-    # -- what a fit and a diagnosis need of the data
-    # --------------------------------------------------------------------
-
+    # -- what a fit and a diagnosis need of the data ------------------------------------------------------------------
     def usable(self, index: int) -> np.ndarray:
         """(H, W, C) bool, the values to use: not saturated, not clipped at black, not masked by the user, in a mosaic
         the pixel's own channel."""

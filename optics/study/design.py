@@ -176,10 +176,7 @@ class Plan:
         return "\n".join([*lines, *(f"warning: {w}" for w in self.warnings)]) + "\n"
 
 
-# -- candidates
-# ---------------------------------------------------------------------------------------------------------
-
-
+# -- candidates ------------------------------------------------------------------------------------------------------
 def candidates(parameters: dict[str, Parameter], base: dict, swept: bool, fixed_exposure: bool = False) -> list[Choice]:
     """The frames to choose from: every place under several lights and exposures; of a camera of one pixel, sweeps.
 
@@ -293,10 +290,7 @@ def _sweeps(parameters: dict, base: dict, lights: Sequence[str], exposures: Sequ
     return [*found, Choice("all lights off", "", {**found[0].settings, **dict.fromkeys(lights, 0.0)}, angles)]
 
 
-# -- the plan
-# -----------------------------------------------------------------------------------------------------------
-
-
+# -- the plan --------------------------------------------------------------------------------------------------------
 def _checked(scene: Scene, effects: Sequence | None) -> tuple[list, list]:
     """(every effect that the scene can express, those that were asked for); raises BadScene."""
     for part, kind, tag in ((scene.camera, "camera", "sensor"), (scene.integrator, "tactile", "integrator")):
@@ -657,10 +651,7 @@ def _report(
     )
 
 
-# -- what to fill in
-# ----------------------------------------------------------------------------------------------------
-
-
+# -- what to fill in -------------------------------------------------------------------------------------------------
 def write(planned: Plan, folder: str | Path) -> Path:
     """Write a folder with a captures.toml that lists the frames to take, without images. Raises OutputExists."""
     import tomlkit

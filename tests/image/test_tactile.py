@@ -191,10 +191,7 @@ def test_the_comparison_notices_two_percent(mitsuba):
     assert least_p(two, 1.02 * renders(scene, tactile(2), first=500))[1] < 1e-6
 
 
-# -- the shipped sensor
-# ---------------------------------------------------------------------------------------------------
-
-
+# -- the shipped sensor ----------------------------------------------------------------------------------------------
 def gelsight(tmp_path, variant, leds=None, window=True, size=(32, 24), stokes=False, bands=True, **defines):
     """The GelSight-type scene, pressed; with some LEDs only, without its window, without bands, or with Stokes
     channels."""
@@ -391,10 +388,7 @@ def test_bands_bring_no_spectral_noise(mitsuba, tmp_path):
     assert loud > 20 * quiet
 
 
-# -- polarization
-# ---------------------------------------------------------------------------------------------------------
-
-
+# -- polarization ----------------------------------------------------------------------------------------------------
 def polarizer(mi, angle, height, tilt=0.0):
     return {
         "type": "rectangle",
@@ -544,7 +538,7 @@ def test_painted_edges_are_as_smooth_as_those_of_shapes(mitsuba):
     from optics.light.renderer import Renderer
     from optics.scene import loader as scenes
 
-    def picture(width):
+    def rendered(width):
         scene = scenes.load("vi2tap", {"width": str(width), "height": str(width * 3 // 4)})
         values = {
             **scene.values(),
@@ -554,6 +548,6 @@ def test_painted_edges_are_as_smooth_as_those_of_shapes(mitsuba):
         }
         return Renderer(scene).radiance(values)[..., 0]
 
-    fine = picture(384).reshape(36, 8, 48, 8)
-    assert np.abs(picture(48) - fine.mean((1, 3))).max() < 0.05 * fine.max()
+    fine = rendered(384).reshape(36, 8, 48, 8)
+    assert np.abs(rendered(48) - fine.mean((1, 3))).max() < 0.05 * fine.max()
     assert fine.std((1, 3)).max() > 0.1 * fine.max()  # there are edges

@@ -309,7 +309,7 @@ def test_an_offset_becomes_what_its_stage_can_do(tmp_path):
     curve = Fingerprint(
         "row", 100.0, 4, 0.0, 96.0, 2.0, "offset", [0.0, 10.0, 20.0], [1.0, -2.0, 1.0], [0.1] * 3, [], "camera"
     )
-    options = dict(black_level=5.0, saturation=205.0)
+    options = {"black_level": 5.0, "saturation": 205.0}
     effect = load(draft.draft_effect(diagnosis(curve), "row", name="amp glow", **options), tmp_path, "amp glow")
     v, u = np.mgrid[:30, :2] + 0.5
     out = effect.stages["sensor"](np.zeros((30, 2, 3)), SimpleNamespace(v=v, u=u, amp_glow=1.0))
@@ -325,7 +325,7 @@ def test_an_offset_becomes_what_its_stage_can_do(tmp_path):
 
 
 def test_signal_and_cells_are_read_where_they_are(tmp_path):
-    options = dict(black_level=5.0, saturation=205.0)
+    options = {"black_level": 5.0, "saturation": 205.0}
     curve = Fingerprint(
         "signal", 100.0, 4, 0.0, 96.0, 2.0, "gain", [5.0, 105.0, 205.0], [0.0, 0.1, 0.0], [0.01] * 3, [], "camera"
     )
@@ -371,7 +371,7 @@ def test_a_setting_of_any_part_is_drafted_whatever_the_scene_calls_it(x, tmp_pat
 
 
 def test_a_table_has_each_place_once_and_a_strength_that_is_plausible():
-    options, nan = dict(name="x", black_level=0.0, saturation=1.0), np.nan
+    options, nan = {"name": "x", "black_level": 0.0, "saturation": 1.0}, np.nan
     curve = Fingerprint(
         "incidence",
         9.0,
@@ -423,16 +423,13 @@ def test_lookup():
             lookup(0.5, wrong, values)
 
 
-# -- what cannot be
-# -----------------------------------------------------------------------------------------------------
-
-
+# -- what cannot be --------------------------------------------------------------------------------------------------
 def test_what_no_draft_can_carry_is_refused_with_the_alternatives():
     known = [
         Fingerprint(c, 9.0, 1, 0.0, 8.0, 2.0, "gain", [0.0, 1.0], [0.0, 0.1], [0.01] * 2, [], "camera")
         for c in ("laplacian", "row", "contact_distance")
     ]
-    options = dict(name="x", black_level=0.0, saturation=1.0)
+    options = {"name": "x", "black_level": 0.0, "saturation": 1.0}
     with pytest.raises(ValueError, match="no draft along 'laplacian': .* mixes pixels.*; a draft can follow row"):
         draft.draft_effect(diagnosis(*known), "laplacian", **options)
     with pytest.raises(ValueError, match="no stage of a model sees it; a draft can follow row"):
@@ -614,10 +611,7 @@ def test_no_parameter_hides_an_attribute_of_its_part(word, tmp_path):
         use_variant(registry=known(tmp_path))
 
 
-# -- residuals in a report
-# ----------------------------------------------------------------------------------------------
-
-
+# -- residuals in a report -------------------------------------------------------------------------------------------
 def test_components_find_what_frames_have_in_common():
     from optics.pages.residual_maps import components
     from optics.study.record import Shown
@@ -662,7 +656,7 @@ def test_pages_belong_to_the_first_and_the_last_step():
     assert [(r["name"], r["bar"]) for r in coordinates(told)] == [("row", "100.0")] and coordinates(None) == []
 
 
-def picture(uri):
+def decoded(uri):
     from PIL import Image
 
     return Image.open(io.BytesIO(base64.b64decode(uri.partition(",")[2])))
@@ -681,7 +675,7 @@ def test_colours_of_noise_are_alike_in_an_image_and_in_a_mosaic():
     for usable in (full, mosaic):
         c = compare(list(images), [np.zeros_like(images[0])] * 8, [np.ones_like(images[0])] * 8, [usable] * 8)
         sd = (
-            np.asarray(picture(colours(c)), float).std((0, 1)) / 255 * 10
+            np.asarray(decoded(colours(c)), float).std((0, 1)) / 255 * 10
         )  # of 4096 blocks: good to 1 %, and 4 % more of 16 levels
         assert sd == pytest.approx(1.0, abs=0.08)
         regions(c)
@@ -699,7 +693,7 @@ def test_regions_tell_a_wrong_mean_from_a_wide_spread():
         list(images), [np.zeros((32, 48, 1))] * 12, [np.ones((32, 48, 1))] * 12, [np.ones((32, 48, 1), bool)] * 12
     )
     found = regions(c)
-    assert picture(found["mean"]).size == picture(found["sd"]).size == (16, 11) and found["cell"] == 3
+    assert decoded(found["mean"]).size == decoded(found["sd"]).size == (16, 11) and found["cell"] == 3
     assert 0.4 < float(found["mean_top"]) < 0.95 and 1.4 < float(found["worst"]) < 2.1
     images = 5 + 0.1 * rng.standard_normal((12, 32, 48, 1))  # wrong, and steady
     c = compare(
