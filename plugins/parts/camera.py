@@ -96,7 +96,9 @@ PARAMETERS = (
     Parameter("pan", "deg", 0.0, (-80.0, 80.0), "turn about the y axis", plausible=0.5, how="difference", step=0.2),
     Parameter("tilt", "deg", 0.0, (-80.0, 80.0), "turn about the x axis", plausible=0.5, how="difference", step=0.2),
     Parameter("roll", "deg", 0.0, (-180.0, 180.0), "turn about the z axis", plausible=0.5, how="difference", step=0.8),
-    Parameter("exposure", "1", 1.0, (0.0, 1e6), "full scale per unit of radiance", plausible=0.1, how="image"),
+    Parameter(
+        "exposure", "1", 1.0, (0.0, 1e6), "full scale per unit of radiance", plausible=0.1, how="image", role="exposure"
+    ),
     Parameter(
         "gain",
         "1",

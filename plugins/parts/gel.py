@@ -31,11 +31,19 @@ from optics.scene.declare import Part
 from optics.scene.mitsuba_parts import Declared
 from optics.scene.parameter import Parameter
 
+STAGE = 0.05  # mm: how well a stage usually knows where it presses
 PARAMETERS = (
-    Parameter("width", "mm", 20.0, (0.1, 1000.0), "size along x", plausible=0.1, how="difference"),
-    Parameter("length", "mm", 16.0, (0.1, 1000.0), "size along y", plausible=0.1, how="difference"),
+    Parameter("width", "mm", 20.0, (0.1, 1000.0), "size along x", plausible=0.1, how="difference", role="width"),
+    Parameter("length", "mm", 16.0, (0.1, 1000.0), "size along y", plausible=0.1, how="difference", role="length"),
     Parameter(
-        "thickness", "mm", 4.0, (0.01, 100.0), "from the window to the coated face", plausible=0.1, how="difference"
+        "thickness",
+        "mm",
+        4.0,
+        (0.01, 100.0),
+        "from the window to the coated face",
+        plausible=0.1,
+        how="difference",
+        role="thickness",
     ),
     Parameter(
         "press_x",
@@ -45,6 +53,9 @@ PARAMETERS = (
         "where the indenter's axis meets the face, right",
         plausible=0.1,
         how="difference",
+        role="press x",
+        free="press",
+        prior_sd=STAGE,
     ),
     Parameter(
         "press_y",
@@ -54,6 +65,9 @@ PARAMETERS = (
         "where the indenter's axis meets the face, down",
         plausible=0.1,
         how="difference",
+        role="press y",
+        free="press",
+        prior_sd=STAGE,
     ),
     Parameter(
         "press_depth",
@@ -64,6 +78,9 @@ PARAMETERS = (
         plausible=0.05,
         how="difference",
         step=0.4,
+        role="press depth",
+        free="press",
+        prior_sd=STAGE,
     ),
     Parameter("press_rx", "deg", 0.0, (-180.0, 180.0), "turn of the indenter about x", plausible=1.0, how="difference"),
     Parameter("press_ry", "deg", 0.0, (-180.0, 180.0), "turn of the indenter about y", plausible=1.0, how="difference"),

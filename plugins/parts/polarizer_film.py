@@ -37,10 +37,18 @@ PARAMETERS = (
         (0.0, 1.0),
         "1: the film stands in the light; 0: it was taken out",
         how="layer",
+        role="inserted",
         plausible=0.1,
     ),
     Parameter(
-        "angle", "deg", 0.0, (-7200.0, 7200.0), "dial angle psi of the transmission axis", plausible=1.0, how="layer"
+        "angle",
+        "deg",
+        0.0,
+        (-7200.0, 7200.0),
+        "dial angle psi of the transmission axis",
+        role="angle",
+        plausible=1.0,
+        how="layer",
     ),
     Parameter("transmittance", "1", 0.8, (0.0, 1.0), "transmittance T1 along the axis", plausible=0.05, how="layer"),
     Parameter(
@@ -93,6 +101,7 @@ PARAMETERS = (
         0.0,
         (-1.0, 1.0),
         "side from which the dial came: +1 from below, -1 from above, 0 unknown",
+        role="approach",
         plausible=1.0,
         how="layer",
     ),
