@@ -48,28 +48,13 @@ FAMILIES = {  # what a coordinate belongs to; a setting belongs to the family of
     ),
     "time": ("frame", "reading"),
 }
-PARTS = {
-    "camera": "camera",
-    "led": "light",
-    "source": "light",
-    "room": "light",
-    "gel": "geometry",
-    "block": "geometry",
-    "target": "geometry",
-    "cells": "geometry",
-    "carried": "geometry",
-    "markers": "geometry",
-}
-TIMES = ("time", "frame_time", "timestamp")
 
 
-def family_of(coordinate: str, kind: str = "") -> str:
-    """camera, light, geometry, time or setting; `kind` is that of the part whose setting the coordinate is."""
-    name, _, parameter = coordinate.rpartition(".")
-    if parameter in TIMES:
-        return "time"
+def family_of(coordinate: str, of_setting: str = "") -> str:
+    """camera, light, geometry, time or setting; `of_setting` is what the model says of a setting
+    (`optics.fit.model.Model.family`)."""
     found = next((family for family, names in FAMILIES.items() if coordinate in names), "")
-    return found or PARTS.get(kind or name, "setting")
+    return found or of_setting or "setting"
 
 
 # -- covariates -------------------------------------------------------------------------------------------------------
@@ -213,7 +198,7 @@ def fingerprints(
                 curve.tolist(),
                 sd.tolist(),
                 _labels(evidence, model, name, centres),
-                family_of(name, model.part_kind(name)),
+                family_of(name, model.family(name)),
                 net / excess if weighed else math.nan,
                 _unit_of(model, name),
             )

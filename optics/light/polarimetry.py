@@ -660,7 +660,7 @@ def sweep(
 
 
 def _powers(scene: Scene) -> set[str]:
-    return {f"{name}.power" for name in scene.lights}
+    return set(scene.powers.values())
 
 
 def _colours(bands: Sequence[float], channels: int, radiance: bool) -> list:

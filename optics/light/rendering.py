@@ -32,7 +32,7 @@ from optics.files.output import file_hash, versions
 from optics.light import paths
 from optics.light.development import Developer
 from optics.light.monte_carlo import renderer_of
-from optics.light.renderer import POWERS, Hits, Renderer, Sample
+from optics.light.renderer import Hits, Renderer, Sample
 from optics.scene.loader import Scene
 from optics.scene.mitsuba_parts import is_part
 from optics.scene.registry import Registry
@@ -161,7 +161,7 @@ class RenderJob:
             self.renderer.progress = progress
         now = {**self.base, **self.scene.check(values or {})}
         if lit is not None:
-            now.update({f"{led}.power": 0.0 for led in self.scene.lights if led not in lit})
+            now.update({power: 0.0 for led, power in self.scene.powers.items() if led not in lit})
         image = self._exact(now, seed) if self.renderer is not None else self._monte_carlo(now, seed)
         image.header["provenance"] = {**self.record, "seed": seed, "parameters": now}
         pressed = None if self.scene.block is None else self.scene.block.press()
@@ -381,7 +381,7 @@ def veiled(renderer: Renderer, values: Mapping) -> str:
     import mitsuba as mi
 
     hits, scene = renderer.hits(values), renderer.scene
-    scene.set({**values, **{f"{name}.{power}": 1.0 for name in scene.lights for power in POWERS}})
+    scene.set({**values, **dict.fromkeys(scene.power_keys(*scene.lights), 1.0)})
     passing = int(mi.BSDFFlags.Null | mi.BSDFFlags.DeltaTransmission)
     found = []
     with dr.suspend_grad():

@@ -882,7 +882,7 @@ class Surface:
         names = [m.name for m in known]
         self.shape, self.first = shape, 0
         bsdf = shape.bsdf()
-        clear = getattr(bsdf, "kind", "") == "clear"
+        clear = getattr(bsdf, "role", "") == "clear"
         self.inside = names.index(bsdf.name) if clear else -1
         self.outside = names.index(bsdf.around.name if bsdf.around is not None else AIR) if clear else -1
         self.light = next((n for n, part in scene.sources.items() if shape.emitter() is part), "")
@@ -906,14 +906,14 @@ class Surface:
                 "'clear', and matt ones (diffuse, membrane)"
             )
         self.rectangle = Rectangle.of(shape) if self.light else None
-        self.cells = shape.cells(SPLIT) if getattr(shape, "kind", "") == "cells" else None
+        self.cells = shape.cells(SPLIT) if hasattr(shape, "cells") else None
 
 
 def materials(scene, bands: np.ndarray) -> list[Material]:
     """Air, then the scene's clear materials, at the present values."""
     found, values = [Material(AIR, np.ones(len(bands)), np.zeros(len(bands)), np.zeros(len(bands)))], scene.values()
     for name, part in scene.parts.items():
-        if part.kind == "clear":
+        if part.role == "clear":
             own = part_values(scene, name, values, {})
             found.append(
                 Material(
