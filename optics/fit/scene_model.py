@@ -171,6 +171,10 @@ class SceneModel:
         """The lights that are on and their powers per band (B,), or (N, 1, B) of readings."""
         return {n: self.renderer.powers(now, n) for n in self.renderer.lit(now)}
 
+    def set_scene(self, values: Values, index: int) -> None:
+        """Put the scene itself into the state of a frame, every light at power 1: what tracers of rays start from."""
+        self.renderer.apply(self.at(values, index))
+
     # -- prediction ---------------------------------------------------------------------------------------------------
 
     def radiance(self, now: Mapping, seed: int = 0) -> np.ndarray:

@@ -14,8 +14,9 @@ import numpy as np
 from optics.light import paths
 from optics.light.development import STEP
 from optics.light.renderer import LedImage, Renderer
-from optics.light.transport import Estimate, Transport, coefficient
+from optics.light.transport import Estimate, Transport
 from optics.scene.loader import Scene
+from optics.scene.surfaces import coefficient
 
 MEMORY = 5e8  # bytes of images that are kept
 
@@ -48,7 +49,7 @@ class MonteCarloRenderer(Renderer):
         known = self._estimates.get(key)
         self._sloped |= slopes
         if known is None or slopes and not known.slopes:
-            self._apply(values)
+            self.apply(values)
             integrator = self.scene.integrator
             known = self._estimates[key] = Transport(self.scene, lights).take(
                 integrator.rays, integrator.packets, seed, self._sloped, progress=self.progress

@@ -101,7 +101,7 @@ class Renderer:
     def geometry(self, values: Mapping) -> tuple:
         return tuple(values[k] for k in self.geometry_keys)
 
-    def _apply(self, values: Mapping, move: bool = True) -> None:
+    def apply(self, values: Mapping, move: bool = True) -> None:
         """Set everything but the LEDs' powers, which stay at 1: images are kept per unit of power.
 
         move = False leaves the geometry where it is (rebuilding the gel costs more than an image): enough for shading
@@ -137,7 +137,7 @@ class Renderer:
         if key in self._hits:
             self._hits.move_to_end(key)
             return self._hits[key]
-        self._apply(values)
+        self.apply(values)
         v, u = np.mgrid[: self.height, : self.width] + 0.5
         hits = Hits(self._trace(u.ravel(), v.ravel()), self.height, self.width)
         hits.edges |= self._painted(hits)
@@ -152,7 +152,7 @@ class Renderer:
 
     def contact_weight(self, values: Mapping, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """1 where the gel is touched at points (x, y) in mm of any shape, 0 elsewhere; between at the rim."""
-        self._apply(values)
+        self.apply(values)
         return self.scene.gel.contact_weight(x, y)
 
     def _painted(self, hits: Hits) -> np.ndarray:
@@ -192,7 +192,7 @@ class Renderer:
             self._images.move_to_end(key)
             return self._images[key]
         hits = self.hits(values)
-        self._apply(values)
+        self.apply(values)
         image = self._keep(key, self._render_led(hits, led))
         for other in self.together - {
             led
@@ -453,7 +453,7 @@ class Renderer:
         name, parameter = key.rsplit(".", 1)
         part, lamp = self.scene.parts[name], self.scene.leds[led]
         moves = part is lamp and part.numbers[parameter].role in ("light x", "light y", "light z")
-        self._apply(values, move=moves and len(image.index) > 0)
+        self.apply(values, move=moves and len(image.index) > 0)
         value = getattr(part, parameter)
 
         def tangent(sample, visible):
@@ -501,7 +501,7 @@ class Renderer:
         if key in self._images:
             self._images.move_to_end(key)
             return self._bounced(values, led, self._images[key], component)
-        self._apply(values)
+        self.apply(values)
         rows, columns = -(-self.height // BOUNCE_CELL), -(-self.width // BOUNCE_CELL)
         v, u = np.mgrid[:rows, :columns]
         rng = np.random.default_rng([seed, 77])
@@ -558,7 +558,7 @@ class Renderer:
 
     def _shone(self, values: Mapping, sample: Sample) -> np.ndarray:
         """(N, B): radiance of the membranes that no LED made, at the ends of camera rays."""
-        self._apply(values, move=False)
+        self.apply(values, move=False)
         return sum(
             self._bands(
                 self.scene.integrator.ambient(self.scene.mitsuba, sample.si, sample.weight, m) + 0 * sample.si.t

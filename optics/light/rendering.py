@@ -256,7 +256,7 @@ class RenderJob:
         if not self.bands:
             parts = radiance[..., 0, :] if radiance.ndim == 4 and radiance.shape[3] == 4 else ()
             return {"Y": s0[..., 0], **{f"S{i}.Y": parts[..., i] for i in range(4) if len(parts)}}
-        channels = exr.preview_channels(self.bands, s0 * now[f"{self.scene.camera.name}.exposure"])
+        channels = exr.preview_channels(self.bands, s0 * now[self.scene.key(self.scene.camera.name, "exposure")])
         if "spectral" in self.layers:
             parts = radiance[..., 0] if radiance.ndim == 4 and radiance.shape[3] == 1 else radiance
             channels.update(exr.spectral_channels(self.bands, parts))
