@@ -133,9 +133,7 @@ def filled_in(stub: str, phase: float) -> str:
     return text
 
 
-# -- images ---------------------------------------------------------------------------------------------------------
-
-
+# -- images ----------------------------------------------------------------------------------------------------------
 def show_frame(file: Path, study: Path, title: str) -> None:
     """The worst frame at the first and the last step of a study: measured, predicted, residual in sigmas."""
     from matplotlib.figure import Figure
@@ -238,9 +236,7 @@ def show_ladder(file: Path, levels: dict[str, float]) -> None:
     figure.savefig(file, dpi=110)
 
 
-# -- the story --------------------------------------------------------------------------------------------------------
-
-
+# -- the story -------------------------------------------------------------------------------------------------------
 def main(output: Path) -> dict:
     """Tell the story; returns its numbers."""
     captures, study, answer = (str(output / n) for n in ("captures", "study", "answer"))

@@ -199,8 +199,7 @@ class Study:
         """An existing study. Raises FileNotFoundError, or ValueError where it cannot be read."""
         return cls(Record.open(folder))
 
-    # -- what it holds ----------------------------------------------------------------------------------------------
-
+    # -- what it holds ------------------------------------------------------------------------------------------------
     @property
     def folder(self) -> Path:
         return self.record.folder
@@ -258,8 +257,7 @@ class Study:
             raise IndexError(f"{self.folder}: no step {step}; there are {names}")
         return step % count
 
-    # -- verbs ------------------------------------------------------------------------------------------------------
-
+    # -- verbs --------------------------------------------------------------------------------------------------------
     def diagnose(self, *, advised: bool = True, progress: Progress | None = None) -> Diagnosis:
         """Ask what the last step lacks: every effect scored, the best added and refitted, one of six verdicts.
 
@@ -333,8 +331,7 @@ class Study:
 
         view.serve(self.folder, port, step, ready)
 
-    # -- the ladder -------------------------------------------------------------------------------------------------
-
+    # -- the ladder ---------------------------------------------------------------------------------------------------
     def records(self) -> list[dict[str, Any]]:
         """One record per step: index, name, effect, converged, reason, seconds, parameters, and for fitted_ and
         held_out_ each chi2_per_dof, misfit and noise (of the mean signal), n. None where nothing is held out."""

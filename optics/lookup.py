@@ -11,13 +11,13 @@ def lookup(x, at: Sequence[float], values: Sequence[float]):
     """The polygon through the points (at, values) at x, constant beyond its ends; `at` rises.
 
     x   a number, an array (complex where a derivative is taken by complex step: the slope goes along), or a Dr.Jit
-        float (the
-        derivative by forward mode goes along)
+        float (the derivative by forward mode goes along)
     """
     at, values = np.asarray(at, float), np.asarray(values, float)
     if len(at) != len(values) or len(at) < 2 or not np.all(np.diff(at) > 0):
         raise ValueError(
-            f"lookup: {len(at)} places and {len(values)} values; allowed: as many of either, at least two, places rising"
+            f"lookup: {len(at)} places and {len(values)} values; allowed: as many of either, at least two, places "
+            "rising"
         )
     slopes = np.diff(values) / np.diff(at)
     if type(x).__module__.startswith(("drjit", "mitsuba")):

@@ -80,9 +80,7 @@ class Captures:
     bits: int | None = None
 
 
-# -- Loading -----------------------------------------------------------------------------------------------------------
-
-
+# -- Loading ---------------------------------------------------------------------------------------------------------
 def load(path: str | Path) -> Captures:
     """Read and check a capture set, given its folder or its `captures.toml`.
 
@@ -240,8 +238,10 @@ def _check_levels(captures: Captures, where: str) -> None:
         for what, values in used:
             if values.size and (middle := float(np.median(values))) < least:
                 raise BadCapture(
-                    f"{where}: {what}: half of its values are {middle:g} DN or less, far below what it has without light, "
-                    f"black_level = {captures.noise.black_level:g} DN; allowed: {least:.4g} DN or more; correct [noise] black_level"
+                    f"{where}: {what}: half of its values are {middle:g} DN or less, far below what it has without "
+                    "light, "
+                    f"black_level = {captures.noise.black_level:g} DN; allowed: {least:.4g} DN or more; correct "
+                    "[noise] black_level"
                 )
     if captures.noise is not None and not any(_lit(captures, f).any() for f in captures.frames):
         raise BadCapture(f"{where}: {_unusable(captures)}")
@@ -274,8 +274,10 @@ def _unusable(captures: Captures) -> str:
     ]
     files = list(dict.fromkeys(f.file for f in captures.frames))
     return (
-        f"none of the {dark + bright + masked} values of '{files[0]}'{' ...' if len(files) > 1 else ''} ({low:g} to {high:g}) is usable: "
-        f"{', '.join(why)}; allowed: raw DN (no volts, no 0 to 1) between these levels; correct [noise], the masks or the exposure"
+        f"none of the {dark + bright + masked} values of '{files[0]}'{' ...' if len(files) > 1 else ''} ({low:g} to "
+        f"{high:g}) is usable: "
+        f"{', '.join(why)}; allowed: raw DN (no volts, no 0 to 1) between these levels; correct [noise], the masks or "
+        "the exposure"
     )
 
 
@@ -299,9 +301,7 @@ def _read_table(folder: Path, data: object, where: str) -> tuple[Table, list[Fra
     return Table(name, values, rename, scale), frames
 
 
-# -- Using -------------------------------------------------------------------------------------------------------------
-
-
+# -- Using -----------------------------------------------------------------------------------------------------------
 def check(captures: Captures, parameters: Mapping[str, Parameter]) -> None:
     """Hold every setting against the scene's parameters by key; raises UnknownKey, OutOfBounds or ValueError."""
     path = captures.folder / FILE
@@ -394,9 +394,7 @@ def cfa_channel(shape: Sequence[int], pattern: str) -> np.ndarray:
     return cell[np.ix_(np.arange(shape[0]) % 2, np.arange(shape[1]) % 2)]
 
 
-# -- Writing -----------------------------------------------------------------------------------------------------------
-
-
+# -- Writing ---------------------------------------------------------------------------------------------------------
 def write(captures: Captures, folder: str | Path, *, overwrite: bool = False, bits: int | None = None) -> Path:
     """Write a capture set that `load` reads back; the folder appears whole or not at all. Returns the folder.
 

@@ -133,9 +133,7 @@ def import_circles(
     return import_presses(presses, folder, ball_radius=ball_radius, mm_per_pixel=mm_per_pixel, **options)
 
 
-# -- Reading -----------------------------------------------------------------------------------------------------------
-
-
+# -- Reading ---------------------------------------------------------------------------------------------------------
 def read_taxim(pack: str | Path) -> Presses:
     """Presses of a Taxim calibration pack; raises BadCapture with the array, its shape and what is allowed."""
     path = Path(pack)
@@ -232,9 +230,7 @@ def _colour_image(file: Path, where: str, shape: tuple | None) -> np.ndarray:
     return image.astype(np.float64)
 
 
-# -- Importing ---------------------------------------------------------------------------------------------------------
-
-
+# -- Importing -------------------------------------------------------------------------------------------------------
 def import_presses(
     presses: Presses,
     folder: str | Path,
@@ -565,7 +561,8 @@ def contradictions(
     if count:
         texts.append(
             f"{count} of {len(presses.circles)} labelled circles are larger than the ball itself: radius up to "
-            f"{presses.circles[:, 2].max():g} px = {high:.2f} mm, ball radius {ball:.2f} mm; the scale, the ball or the "
+            f"{presses.circles[:, 2].max():g} px = {high:.2f} mm, ball radius {ball:.2f} mm; the scale, the ball or "
+            "the "
             "labels are wrong, or the circle is drawn around the skirt of the dent: free gel.press_depth per press, "
             "and gel.indenter_size"
         )
@@ -663,7 +660,8 @@ def readme(facts: dict) -> str:
         "",
         "Derived",
         f"- images of {width} x {height} px" + (f", means of blocks of {facts['bin']} px" if facts["bin"] > 1 else ""),
-        f"- labelled radii {facts['labelled_radius_mm'][0]:.2f} to {facts['labelled_radius_mm'][1]:.2f} mm; the touched radius "
+        f"- labelled radii {facts['labelled_radius_mm'][0]:.2f} to {facts['labelled_radius_mm'][1]:.2f} mm; the "
+        "touched radius "
         f"starts at {facts['contact_share']:g} of that",
         f"- background: {facts['background']}"
         + (" of the presses, per pixel" if facts["background"] == "median" else ""),

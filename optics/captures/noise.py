@@ -243,7 +243,8 @@ def warnings_of(noise: Noise, captures: Captures) -> list[str]:
     found = [
         (
             captures.values_are == "DN" and not noise.pedestal,
-            f"no pedestal: black level {noise.black_level:g} DN is below 3 sigma of the dark noise; dim pixels are cut at 0 and "
+            f"no pedestal: black level {noise.black_level:g} DN is below 3 sigma of the dark noise; dim pixels are cut "
+            "at 0 and "
             "masked, and half a DN of black level looks like glare: raise the camera's offset",
         ),
         (
@@ -260,7 +261,8 @@ def warnings_of(noise: Noise, captures: Captures) -> list[str]:
         ),
         (
             noise.prnu > 0.003 and captures.flat_field is None,
-            f"PRNU {noise.prnu:.2%} is above 0.3 % and does not average down over frames: record a flat_field to divide it out",
+            f"PRNU {noise.prnu:.2%} is above 0.3 % and does not average down over frames: record a flat_field to "
+            "divide it out",
         ),
     ]
     return [text for holds, text in found if holds]

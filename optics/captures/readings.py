@@ -30,7 +30,8 @@ def read(
     columns = [column.strip() for column in rows[0]]
     if len(columns) == 1 and (found := next((mark for mark in ";\t" if mark in rows[0][0]), None)):
         raise BadCapture(
-            f"{file}: its cells are separated by {found!r}; allowed: commas, and points in decimal numbers; save it as such"
+            f"{file}: its cells are separated by {found!r}; allowed: commas, and points in decimal numbers; save it as "
+            "such"
         )
     for column in rename:
         if column not in columns:

@@ -262,31 +262,25 @@ def sweep(
         found.plot(output)
     for text in found.notes:
         terminal.note(text)
-    rows = found.summary()
     if as_json:
-        curves = [{"settings": c.settings, "values": c.x.tolist(), "readings": c.y.tolist()} for c in found.curves]
-        return show(
-            {
-                "scene": str(loaded.path),
-                "key": key,
-                "unit": found.unit,
-                "at": list(place),
-                "black": found.black,
-                "quantity": "radiance" if radiance else "DN",
-                "channels": found.channels,
-                "summary": rows,
-                "curves": curves,
-                "files": [str(f) for f in (output, csv) if f],
-            }
-        )
+        place_of = {"scene": str(loaded.path), "key": key, "unit": found.unit, "at": list(place)}
+        return show({**place_of, **_sweep_record(found, radiance), "files": [str(f) for f in (output, csv) if f]})
     print(
         f"{key} from {first:g} to {last:g} {found.unit}, {'radiance per band' if radiance else 'DN'} at pixel "
         f"{place[0]:g},{place[1]:g}" + (f", black {found.black:g}" if found.black else "")
     )
-    print(_readings(found, rows))
-    for file in (output, csv):
-        if file is not None:
-            print(file)
+    print("\n".join([_readings(found, found.summary()), *(str(f) for f in (output, csv) if f)]))
+
+
+def _sweep_record(found: "Sweep", radiance: bool) -> dict[str, Any]:
+    """What a sweep found, as `optics sweep --json` gives it."""
+    return {
+        "black": found.black,
+        "quantity": "radiance" if radiance else "DN",
+        "channels": found.channels,
+        "summary": found.summary(),
+        "curves": [{"settings": c.settings, "values": c.x.tolist(), "readings": c.y.tolist()} for c in found.curves],
+    }
 
 
 def _readings(found: "Sweep", rows: Sequence[Mapping[str, Any]]) -> str:

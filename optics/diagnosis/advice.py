@@ -71,9 +71,7 @@ class Shot:
     press: str = ""
 
 
-# -- which shots a scene admits ---------------------------------------------------------------------------------------
-
-
+# -- which shots a scene admits --------------------------------------------------------------------------------------
 def families(model: Model, values: Values, frames: Sequence[int]) -> list[Shot]:
     """The shots to try, at most SHOTS, in turn from each family: by the keys that the model has and that frames turn.
 
@@ -311,9 +309,7 @@ def _turned(model: Model, frames: Sequence[int], now: Mapping, like: int) -> Ite
                 )
 
 
-# -- what shots would add ---------------------------------------------------------------------------------------------
-
-
+# -- what shots would add --------------------------------------------------------------------------------------------
 @dataclass
 class Member:
     """An effect in the information matrix: its columns in the present frames, and those that each shot brings (`more`).
@@ -616,9 +612,7 @@ def _unknown(v: Variable) -> str:
     return v.keys[0] + ("" if v.prior is None else f" +- {v.prior[1]:g}{spaced(v.parameter.unit)}")
 
 
-# -- advice -----------------------------------------------------------------------------------------------------------
-
-
+# -- advice ----------------------------------------------------------------------------------------------------------
 def next_measurement(
     model: Model,
     values: Values,

@@ -111,9 +111,7 @@ class Candidate:
         return np.where(self._squares(), sd / np.where(slope > 0, slope, 1.0), sd)
 
 
-# -- measuring: one pass over the frames ------------------------------------------------------------------------------
-
-
+# -- measuring: one pass over the frames -----------------------------------------------------------------------------
 @dataclass
 class Block:
     """Values of one frame that are kept: whitened columns a (n, k) in the places `where`, residual r (n,).

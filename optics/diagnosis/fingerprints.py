@@ -57,9 +57,7 @@ def family_of(coordinate: str, of_setting: str = "") -> str:
     return found or of_setting or "setting"
 
 
-# -- covariates -------------------------------------------------------------------------------------------------------
-
-
+# -- covariates ------------------------------------------------------------------------------------------------------
 def places(model: Model, values: Values, evidence: Evidence) -> list[dict[str, np.ndarray]]:
     """Per block, {coordinate: (n,) of its values}: of the model, of the prediction, of any image, and settings."""
     found = []
@@ -122,9 +120,7 @@ def settings(model: Model, evidence: Evidence) -> dict[str, list[float]]:
     return turned
 
 
-# -- curves -----------------------------------------------------------------------------------------------------------
-
-
+# -- curves ----------------------------------------------------------------------------------------------------------
 def fingerprints(
     model: Model, evidence: Evidence, found: list[dict], reference: float, say: Progress
 ) -> list[Fingerprint]:
@@ -236,9 +232,7 @@ def channel_names(evidence: Evidence) -> list[str]:
     return ["R", "G", "B"] if evidence.channels == 3 else [str(i) for i in range(evidence.channels)]
 
 
-# -- families of coordinates ------------------------------------------------------------------------------------------
-
-
+# -- families of coordinates -----------------------------------------------------------------------------------------
 def families(found: Sequence[Fingerprint]) -> list[Family]:
     """The best curve of each family; the family that the residual depends on most comes first.
 

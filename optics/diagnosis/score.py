@@ -65,9 +65,7 @@ def score(
     return Scored(evidence, _rank(evidence, candidates, seed), dropped, not_tested)
 
 
-# -- what must hold before any score ----------------------------------------------------------------------------------
-
-
+# -- what must hold before any score ---------------------------------------------------------------------------------
 def _require_noise(model: Model) -> None:
     """Refuse images of unknown saturation or black level: both fake effects at any significance."""
     for name, cost in (
@@ -137,9 +135,7 @@ def _off(evidence: Evidence) -> list[str]:
     return [evidence.columns[evidence.base[i]].name for i in np.argsort(-change)[:3] if change[i] > 0.3 * change.max()]
 
 
-# -- ranking ----------------------------------------------------------------------------------------------------------
-
-
+# -- ranking ---------------------------------------------------------------------------------------------------------
 @dataclass
 class Table:
     """All candidates, best first, and the family-wise test that they share.

@@ -36,9 +36,7 @@ BINS = 16  # of a curve along a coordinate
 NARROW = 8  # cosines per side that count as low frequency
 
 
-# -- normal equations -------------------------------------------------------------------------------------------------
-
-
+# -- normal equations ------------------------------------------------------------------------------------------------
 class Normal:
     """Sums over pixels of products of whitened columns A (n, m) and residual r (n,): A'A, A'r, r'r.
 
@@ -164,9 +162,7 @@ def project(
     )
 
 
-# -- one effect -------------------------------------------------------------------------------------------------------
-
-
+# -- one effect ------------------------------------------------------------------------------------------------------
 class Cone:
     """Strengths that an effect may take: each free, >= 0 or <= 0, with the information V on them.
 
@@ -300,9 +296,7 @@ def _descend(v: np.ndarray, u: np.ndarray, sweeps: int = 100, tolerance: float =
     return x
 
 
-# -- many effects -----------------------------------------------------------------------------------------------------
-
-
+# -- many effects ----------------------------------------------------------------------------------------------------
 class Family:
     """Family-wise error: the probability that the best of all absent candidates has a p as small as this one.
 
@@ -353,9 +347,7 @@ def probability_correct(d: float) -> float:
     return float(ndtr(np.sqrt(max(d, 0.0)) / 2))
 
 
-# -- bins: fingerprints and splits ------------------------------------------------------------------------------------
-
-
+# -- bins: fingerprints and splits -----------------------------------------------------------------------------------
 def bin_edges(x: np.ndarray, bins: int = BINS) -> np.ndarray | None:
     """Edges of at most `bins` bins: half of them hold equal counts, half are equally wide, so that neither a flat
     region nor a long tail takes them all. One bin per value where there are few values; None where there is only
@@ -431,9 +423,7 @@ def joint(
     return fall, int(keep.sum()), vectors @ (z / values[keep]), np.sqrt(np.sum(vectors**2 / values[keep], 1))
 
 
-# -- structure --------------------------------------------------------------------------------------------------------
-
-
+# -- structure -------------------------------------------------------------------------------------------------------
 @dataclass(frozen=True)
 class Structure:
     """Test of low against high spatial frequencies: F, its degrees of freedom and p; NaN where images are too small.
@@ -604,9 +594,7 @@ def _orthonormal(columns: np.ndarray) -> np.ndarray:
     return u[:, s > 1e-6 * s.max(initial=0.0)]
 
 
-# -- thinning ---------------------------------------------------------------------------------------------------------
-
-
+# -- thinning --------------------------------------------------------------------------------------------------------
 def thinning(values: int, limit: int) -> int:
     """Smallest odd k so that every k-th of `values` pixels are at most `limit`; odd, so that a mosaic is thinned
     evenly."""

@@ -194,9 +194,7 @@ def _unknown(f: Findings, curve: Fingerprint, basis: Basis) -> str:
     return text
 
 
-# -- the report -------------------------------------------------------------------------------------------------------
-
-
+# -- the report ------------------------------------------------------------------------------------------------------
 def report(d: Diagnosis) -> str:
     """Everything that a diagnosis says, for a terminal; blocks without content are left out."""
     lines = [

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 # Told apart with every kind of colour vision, and in grey.
 BLUE, ORANGE, RED, GREY = "#1d5fa6", "#d9962f", "#b22f33", "#8a8a8a"
 
-LEGEND_AT = -0.16  # heights of the axis: below its label
+LEGEND_AT = -0.42  # inches from the axis: below its label
 
 
 class Chart(Figure):
@@ -34,7 +34,12 @@ def chart(width: float, height: float, columns: int = 1, shares: Sequence[float]
 
 def legend_below(axis: Any, columns: int) -> None:
     """A legend under the axis label, where it hides no data."""
-    axis.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, LEGEND_AT), ncol=columns, frameon=False)
+    from matplotlib.transforms import offset_copy
+
+    below = offset_copy(axis.transAxes, axis.figure, y=LEGEND_AT)
+    axis.legend(
+        fontsize=8, loc="upper center", bbox_to_anchor=(0.5, 0), bbox_transform=below, ncol=columns, frameon=False
+    )
 
 
 def height_for(rows: int) -> float:

@@ -33,9 +33,7 @@ RESERVED = (
 SPECTRAL_NAME = re.compile(r"S([0-3])\.(\d+(?:,\d+)?)nm")
 
 
-# -- EXR ---------------------------------------------------------------------------------------------------------------
-
-
+# -- EXR -------------------------------------------------------------------------------------------------------------
 def write(
     path: str | Path,
     channels: Mapping[str, np.ndarray],
@@ -127,10 +125,7 @@ def _attribute(path: Path, key: str, value: object) -> str | int | float:
     return value.item() if isinstance(value, np.generic) else value
 
 
-# -- Spectra
-# ------------------------------------------------------------------------------------------------------------
-
-
+# -- Spectra ---------------------------------------------------------------------------------------------------------
 def spectral_name(band_nm: float, stokes: int = 0) -> str:
     """525 -> 'S0.525,000000nm' (the comma because EXR splits layer names at dots)."""
     return f"S{stokes}." + f"{band_nm:.6f}nm".replace(".", ",")
@@ -190,9 +185,7 @@ def preview_channels(bands_nm: Sequence[float], radiance: np.ndarray) -> dict[st
     return {name: rgb[..., i] for i, name in enumerate("RGB")}
 
 
-# -- PNG ---------------------------------------------------------------------------------------------------------------
-
-
+# -- PNG -------------------------------------------------------------------------------------------------------------
 def srgb(linear: np.ndarray) -> np.ndarray:
     """The display value of a linear one, both 0..1 (IEC 61966-2-1)."""
     linear = np.clip(linear, 0.0, 1.0)

@@ -33,9 +33,7 @@ TRIES = 4  # linearisations close to the optimum, before a fit that no longer ga
 CHORD_DAMPING = 1e-6  # of `extended`, which starts at the base's optimum: only directions that nothing determines
 
 
-# -- variables --------------------------------------------------------------------------------------------------------
-
-
+# -- variables -------------------------------------------------------------------------------------------------------
 def variables_from(
     model: Model,
     free: Sequence[str],
@@ -130,9 +128,7 @@ def with_start(model: Model, variables: Sequence[Variable], values: Values) -> V
     return filled
 
 
-# -- fits -------------------------------------------------------------------------------------------------------------
-
-
+# -- fits ------------------------------------------------------------------------------------------------------------
 def fit(
     model: Model,
     variables: Sequence[Variable],

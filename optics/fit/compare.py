@@ -348,9 +348,7 @@ def structural_similarity_map(measured: np.ndarray, predicted: np.ndarray, usabl
     return local, inner & usable
 
 
-# -- input ------------------------------------------------------------------------------------------------------------
-
-
+# -- input -----------------------------------------------------------------------------------------------------------
 def _same_length(frames: int, **lists) -> None:
     if not frames:
         raise ValueError("no frames to compare")
@@ -410,9 +408,7 @@ def _group_names(groups, frames: int) -> list[str]:
     return [f"{i:03d}" if g is None else str(g) for i, g in enumerate(groups)]
 
 
-# -- numbers ----------------------------------------------------------------------------------------------------------
-
-
+# -- numbers ---------------------------------------------------------------------------------------------------------
 def _region_names(coordinates: list[dict]) -> list[str]:
     """'all' first, then every boolean coordinate, then the far field where nothing else is given."""
     found = list(dict.fromkeys(n for planes in coordinates for n, v in planes.items() if v.dtype == bool))
@@ -529,9 +525,7 @@ def _mean_sd(values: list[float]) -> tuple[float, float]:
     return float(known.mean()), float(known.std(ddof=1)) if len(known) > 1 else math.nan
 
 
-# -- maps and curves --------------------------------------------------------------------------------------------------
-
-
+# -- maps and curves -------------------------------------------------------------------------------------------------
 def _maps(whitened: list[np.ndarray]) -> tuple[np.ndarray | None, np.ndarray | None]:
     """Root mean square and mean over frames per pixel; None where frames differ in size."""
     if len({z.shape for z in whitened}) != 1:
@@ -620,9 +614,7 @@ def _binned(name, unit, channel, x, z, edges, labels=None) -> Curve:
     return Curve(name, unit, channel, centre, mean, se, np.sqrt(square), n, labels)
 
 
-# -- views ------------------------------------------------------------------------------------------------------------
-
-
+# -- views -----------------------------------------------------------------------------------------------------------
 def _cells(row: Row) -> tuple[str, ...]:
     if not row.n:
         return (row.label, "0", *["-"] * 8)

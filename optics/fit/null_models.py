@@ -2,8 +2,7 @@
 
     background           I = B
     directional          I = B + l . (n - n0)   or   I = B max(0, n . l)/(n0 . l)      one light at infinity per
-                         channel;
-                         the table shows the form with the smaller error on the held-out frames
+                         channel; the table shows the form with the smaller error on the held-out frames
     linear in the normal I = B + sum over (n_x, n_y, n_z - 1) x (1, x, y, x^2, xy, y^2), 18 coefficients per channel
 
 with the background B (the flat field times the frame's gain), the normal n of the pressed face towards the camera, n0
@@ -135,9 +134,7 @@ def pooled(tables: Sequence[NullTable]) -> NullTable:
     )
 
 
-# -- the nulls --------------------------------------------------------------------------------------------------------
-
-
+# -- the nulls -------------------------------------------------------------------------------------------------------
 class Null(Protocol):
     """A model without physics: fitted to frames, it predicts others from their shapes."""
 

@@ -119,7 +119,6 @@ class SceneModel:
         return twin
 
     # -- values -------------------------------------------------------------------------------------------------------
-
     def at(self, values: Values, index: int) -> dict[str, Any]:
         """Every parameter's value in a frame: base <- fitted in all frames <- set in this frame <- fitted in this
         frame.
@@ -176,7 +175,6 @@ class SceneModel:
         self.renderer.apply(self.at(values, index))
 
     # -- prediction ---------------------------------------------------------------------------------------------------
-
     def radiance(self, now: Mapping, seed: int = 0) -> np.ndarray:
         """(H, W, B): linear image of a frame."""
         return self.renderer.radiance(now, seed)
@@ -391,9 +389,7 @@ class SceneModel:
         low, high = self.parameters[key].sides(now[key])
         return (self.renderer.ambient({**now, key: high}) - self.renderer.ambient({**now, key: low})) / (high - low)
 
-    # -- what a fit and a diagnosis need of the data
-    # --------------------------------------------------------------------
-
+    # -- what a fit and a diagnosis need of the data ------------------------------------------------------------------
     def usable(self, index: int) -> np.ndarray:
         """(H, W, C) bool, the values to use: not saturated, not clipped at black, not masked by the user, in a mosaic
         the pixel's own channel."""

@@ -13,6 +13,8 @@ from collections.abc import Callable
 import drjit as dr
 import mitsuba as mi
 
+from optics.scene.surfaces import to_world_mueller
+
 NEAR = 1e-4  # mm: a shadow ray that ends nearer to its light than this has arrived
 
 
@@ -49,6 +51,12 @@ def repeat(state: dict, going: Callable, step: Callable, times: int | None = Non
     for _ in range(times):
         state = masked(going(state), step(state), state)
     return state
+
+
+def held(mask, value):
+    """The value, without derivatives where the mask is false: there they may be infinite, and 0 times that is no
+    number."""
+    return dr.select(mask, value, dr.detach(value)) if dr.grad_enabled(value) else value
 
 
 def reflecting() -> int:
@@ -129,6 +137,7 @@ class Walk:
         s = dict(s)
         sampler, active = s["sampler"], s["active"]
         si = scene.ray_intersect(s["ray"], mi.RayFlags.All, coherent=False, active=active)
+        si = held(active & si.is_valid(), si)
         filled = active & (s["medium"] != None) & si.is_valid()  # noqa: E711 (a Dr.Jit comparison)
         fade = dr.select(filled, dr.exp(-self.absorption(s["medium"], si, filled) * si.t), 1.0)
         s["throughput"] = product(s["throughput"], scaled(fade))
@@ -160,22 +169,28 @@ class Walk:
         """The light gathered after what the gel, every point light and one of the other lights send to a surface; and
         the surfaces that the longest shadow ray met."""
         ray, medium, throughput = s["ray"], s["medium"], s["throughput"]
-        light, longest = s["light"], mi.UInt32(0)
+        light, longest, si = s["light"], mi.UInt32(0), held(lit, si)
         light = dr.select(lit, light + product(throughput, self.own_light(scene, si, ray.o)), light)
         if self.points > 0:
             sent, longest = self.from_points(scene, s["sampler"], si, ray.o, medium, lit, times)
             light = light + product(throughput, sent)
         if self.others:
-            ds, weight = scene.sample_emitter_direction(si, s["sampler"].next_2d(), False, lit)
+            sample = s["sampler"].next_2d()
+            ds, weight = scene.sample_emitter_direction(si, sample, False, lit)
             one = lit & (ds.pdf != 0) & ~mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.DeltaPosition)
+            if dr.grad_enabled(si):  # from within the plane of a luminous area, the weight has no derivative
+                one = one & dr.isfinite(ds.pdf) & (mi.unpolarized_spectrum(weight)[0] != 0)
+                si = held(one, si)
+                ds, weight = scene.sample_emitter_direction(si, sample, False, lit)
             sent, met = self.sent(scene, si, ray.o, medium, ds, weight, one, times)
             light, longest = light + product(throughput, sent), dr.maximum(longest, met)
         return light, longest
 
     def send_on(self, s: dict, si, bsdf, sampler, onward, lit) -> None:
         """Draw the rays' way on from a surface, into the state."""
+        si = held(onward, si)
         bs, factor = bsdf.sample(mi.BSDFContext(), si, sampler.next_1d(), sampler.next_2d(), onward)
-        factor = si.to_world_mueller(factor, -bs.wo, si.wi)
+        factor = to_world_mueller(si, factor, -bs.wo, si.wi)
         straight = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
         s["reflected"] = s["reflected"] | onward & ((bs.sampled_type & reflecting()) != 0)
         factor = dr.select(lit, product(factor, self.kept(si, s["ray"].o, si.p)), factor)
@@ -245,7 +260,7 @@ class Walk:
             fade = dr.select(filled, dr.exp(-self.absorption(w["inside"], hit, filled) * length), 1.0)
             through = product(w["through"], scaled(fade))
             passed = hit.bsdf().eval_null_transmission(hit, met)
-            passed = hit.to_world_mueller(passed, hit.wi, hit.wi)
+            passed = to_world_mueller(hit, passed, hit.wi, hit.wi)
             w["through"] = dr.select(met, product(through, passed), through)
             w["inside"] = dr.select(met & hit.is_medium_transition(), hit.target_medium(ray.d), w["inside"])
             w["remaining"] = remaining - length
@@ -269,7 +284,7 @@ class Walk:
         way, met = self.transmittance(scene, si, ds, start, active, times)
         wo = si.to_local(ds.d)
         value, density = si.bsdf().eval_pdf(mi.BSDFContext(), si, wo, active)
-        value = si.to_world_mueller(value, -wo, si.wi)
+        value = to_world_mueller(si, value, -wo, si.wi)
         mis = dr.select(ds.delta, 1.0, heuristic(ds.pdf, density))
         way = product(way, self.kept(si, origin, ds.p))
         return dr.select(active, product(product(value, way), weight) * mis, 0.0), met

@@ -119,9 +119,7 @@ def render(study: Record) -> str:
     )
 
 
-# -- words -------------------------------------------------------------------------------------------------------------
-
-
+# -- words -----------------------------------------------------------------------------------------------------------
 def headline(study: Record, verdicts: list, nouns: Mapping[str, str]) -> dict:
     """One sentence with the numbers that matter, and the last verdict."""
     first, last = _level(study.steps[0]), _level(study.steps[-1])
@@ -245,9 +243,7 @@ def _text(value: float, form: str) -> str:
     return form.format(value) if math.isfinite(value) else "–"
 
 
-# -- images -----------------------------------------------------------------------------------------------------------
-
-
+# -- images ----------------------------------------------------------------------------------------------------------
 def viewer_images(study: Record, steps: list[list[Shown]]) -> dict:
     """What the viewer shows: measured once per frame, predicted and residual per frame and step.
 
@@ -481,10 +477,7 @@ def _script(viewer: dict) -> str:
     return json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")
 
 
-# -- readings
-# -----------------------------------------------------------------------------------------------------------
-
-
+# -- readings --------------------------------------------------------------------------------------------------------
 @dataclass(frozen=True)
 class Readings:
     """All point readings of a study: (M,) settings by key, (M, C) DN measured, and of each step (M, C) predicted and
@@ -756,9 +749,7 @@ def _angles(low: float, high: float, unit: str) -> list[float]:
     return [k * step for k in range(math.ceil(low / step), math.floor(high / step) + 1)]
 
 
-# -- charts ------------------------------------------------------------------------------------------------------------
-
-
+# -- charts ----------------------------------------------------------------------------------------------------------
 def ladder_chart(study: Record, width: int, height: int, nouns: Mapping[str, str] = FRAMES) -> str:
     """SVG: chi2/dof of every step, held out and fitted, over the noise floor, on a logarithmic scale."""
     steps = study.steps
@@ -1048,9 +1039,7 @@ def _value(level: Mapping | None, key: str) -> float:
     return math.nan if value is None else float(value)
 
 
-# -- tables ------------------------------------------------------------------------------------------------------------
-
-
+# -- tables ----------------------------------------------------------------------------------------------------------
 def step_name(step: Mapping) -> str:
     return ("+ " if step["index"] else "") + step["name"]
 
@@ -1108,9 +1097,7 @@ def parameter_tables(steps: Sequence[Mapping]) -> dict:
     return {"common": common, "frames": own}
 
 
-# -- diagnoses
-# ----------------------------------------------------------------------------------------------------------
-
+# -- diagnoses -------------------------------------------------------------------------------------------------------
 NAMED = 0.01  # family-wise p at or above which an effect only gets an upper limit
 COLUMNS = (  # of the ranking: key, title, whether it is text
     ("verdict", "verdict", True),

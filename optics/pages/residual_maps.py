@@ -1,13 +1,11 @@
 """What a report shows of residuals beyond a mean per pixel: by region, by colour, and what many frames have in common.
 
 regions      mean and standard deviation of the residual in cells of the sensor: a mean off 0 is a wrong model, a
-             standard
-             deviation above 1 something that changes from frame to frame or from pixel to pixel
+             standard deviation above 1 something that changes from frame to frame or from pixel to pixel
 colours      the mean residual of the three channels as a colour: grey where all agree, a hue where some channels miss
              more
 components   singular vectors of the residual frames: what the frames have in common, and how much of it each frame has;
-             noise
-             alone gives every component the same share
+             noise alone gives every component the same share
 coordinates  how much of the excess a curve along each coordinate explains, by family
 """
 

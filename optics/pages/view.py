@@ -150,9 +150,7 @@ class View:
             effect,
         )
 
-    # -- what a page needs to know first
-    # ------------------------------------------------------------------------------------
-
+    # -- what a page needs to know first ------------------------------------------------------------------------------
     def record(self) -> dict:
         """Everything but images: frames, sliders, effects, and how the study's own numbers stand."""
         rows = {row.scope["frame"]: row for row in self.comparison.by("frame")}
@@ -216,9 +214,7 @@ class View:
             "effect": s.effect,
         }
 
-    # -- questions
-    # --------------------------------------------------------------------------------------------------------
-
+    # -- questions ----------------------------------------------------------------------------------------------------
     def frame(self, index) -> int:
         """A frame's index, or ValueError."""
         if not isinstance(index, int) or isinstance(index, bool) or not 0 <= index < len(self.model.frames):
@@ -422,9 +418,7 @@ class View:
             "frames": len(self.fitted),
         }
 
-    # -- values to keep
-    # -----------------------------------------------------------------------------------------------------
-
+    # -- values to keep -----------------------------------------------------------------------------------------------
     def _toml(self, changes: Mapping[str, float]) -> str:
         """Values as `optics compare --fit` reads them: [parameters] and [frames.NAME], key = value."""
         self._seek(changes)
@@ -488,10 +482,7 @@ def quoted(value) -> str:
     return json.dumps(value, ensure_ascii=False)
 
 
-# -- the server
-# -------------------------------------------------------------------------------------------------------------
-
-
+# -- the server ------------------------------------------------------------------------------------------------------
 def floats(*arrays: np.ndarray) -> bytes:
     """Arrays one after the other, little-endian float32."""
     return b"".join(np.ascontiguousarray(a, "<f4").tobytes() for a in arrays)

@@ -20,8 +20,6 @@ from collections.abc import Sequence
 import numpy as np
 
 # -- functions for both kinds of arrays -------------------------------------------------------------------------------
-
-
 def _library(*values):
     drjit = sys.modules.get("drjit")
     return drjit if drjit is not None and any(drjit.is_array_v(v) for v in values) else np
@@ -74,9 +72,7 @@ def cosc(x2):
     return half * half / 2
 
 
-# -- matrices ---------------------------------------------------------------------------------------------------------
-
-
+# -- matrices --------------------------------------------------------------------------------------------------------
 def _nothing(x) -> bool:
     return isinstance(x, int) and x == 0
 
@@ -219,9 +215,7 @@ def mirrored(r) -> Mueller:
     return Mueller([[r, 0, 0, 0], [0, r, 0, 0], [0, 0, -r, 0], [0, 0, 0, -r]])
 
 
-# -- surfaces ---------------------------------------------------------------------------------------------------------
-
-
+# -- surfaces --------------------------------------------------------------------------------------------------------
 def fresnel(cos1, n) -> tuple:
     """Power reflectances R_s, R_p of a boundary with relative index n = n2/n1, and cos of the refracted angle.
 
@@ -265,9 +259,7 @@ def fresnel_reflection(cos1, n) -> Mueller:
     return Mueller([[a, b, 0, 0], [b, a, 0, 0], [0, 0, c, -s], [0, 0, s, c]])
 
 
-# -- stacks of layers with reflecting faces ---------------------------------------------------------------------------
-
-
+# -- stacks of layers with reflecting faces --------------------------------------------------------------------------
 class Slab:
     """A layer that transmits and reflects: matrices for light from the front (r, t) and from behind (r_back, t_back).
 
@@ -303,9 +295,7 @@ def face(r) -> Slab:
     return Slab(absorber(1 - r), mirrored(r), absorber(1 - r), mirrored(r))
 
 
-# -- what a matrix or a vector says -----------------------------------------------------------------------------------
-
-
+# -- what a matrix or a vector says ----------------------------------------------------------------------------------
 def physical(matrix: np.ndarray) -> np.ndarray:
     """Smallest eigenvalue of the coherency matrix of M (..., 4, 4), over its trace: >= 0 where M is physically
     realisable.

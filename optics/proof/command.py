@@ -35,7 +35,8 @@ def main(
     quick: Annotated[bool, typer.Option("--quick", help="One round of the fastest bench, in a minute.")] = False,
     count_only: Annotated[bool, typer.Option("--count", help="Run nothing; count the records that exist.")] = False,
 ) -> None:
-    """Hide effects in captures that an independent renderer makes, run the loop blind on each, and count its verdicts."""
+    """Hide effects in captures that an independent renderer makes, run the loop blind on each, and count its
+    verdicts."""
     from optics.proof import count, page
     from optics.proof.rigs import RIGS
 

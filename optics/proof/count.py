@@ -8,8 +8,7 @@ A target is reached when the near end of the interval reaches it: few cells reac
     strength     of right claims by the library's own law: within 20 %; pulls: (found - true)/sd of those without
                  clutter
     fall         of chi2, brought by the refit over predicted before it (by the score; where the image of a weak effect
-                 is not that of a
-                 strong one, by its image at the strength that the score found), of the right effects
+                 is not that of a strong one, by its image at the strength that the score found), of the right effects
 """
 
 from __future__ import annotations
@@ -109,7 +108,8 @@ class Count:
             for r in one.rates:
                 lo, hi = r.interval
                 lines.append(
-                    f"  {r.name:<52}{r.value:>7.3f}{r.n:>6}   {lo:.3f}-{hi:.3f}   {r.first:>5g} {r.ambitious:>7g}  {r.verdict}"
+                    f"  {r.name:<52}{r.value:>7.3f}{r.n:>6}   {lo:.3f}-{hi:.3f}   {r.first:>5g} {r.ambitious:>7g}  "
+                    f"{r.verdict}"
                 )
             lines += [f"  ambiguous verdicts: {one.ties[1]}; {one.ties[0]} of them list the hidden effect"]
             if one.set_size is not None:

@@ -50,14 +50,16 @@ GRID = """<scene version="3.0.0">
         <bsdf type="diffuse"><spectrum name="reflectance" value="0.6"/></bsdf>
     </shape>
     LAMPS
-</scene>"""
+</scene>"""  # noqa: E501
 SIDES = ((-8.7, 0.0), (8.7, 0.0), (0.0, 8.7))
 
 
 def lamps(emitter: str) -> str:
     return "\n".join(
-        f'<shape type="rectangle" id="panel_{k}"><transform name="to_world"><scale x="6" y="2"/><lookat origin="{x}, {y}, -2.5" '
-        f'target="0, 0, -2.5" up="0, 0, 1"/></transform><bsdf type="diffuse"><spectrum name="reflectance" value="0"/></bsdf>'
+        f'<shape type="rectangle" id="panel_{k}"><transform name="to_world"><scale x="6" y="2"/><lookat origin="{x}, '
+        f'{y}, -2.5" '
+        'target="0, 0, -2.5" up="0, 0, 1"/></transform><bsdf type="diffuse"><spectrum name="reflectance" '
+        'value="0"/></bsdf>'
         f"{emitter.format(k)}</shape>"
         for k, (x, y) in enumerate(SIDES)
     )
@@ -71,16 +73,22 @@ def printed_grid() -> None:
     ours = {
         "MEDIA": "",
         "INTEGRATOR": '<integrator type="tactile" id="integrator"><string name="bands" value="540"/></integrator>',
-        "WALLS": '<bsdf type="clear" id="walls"><float name="index" value="1.5"/><float name="absorption" value="0.05"/></bsdf>',
-        "FILLING": '<bsdf type="clear" id="filling"><string name="outside" value="walls"/><float name="index" value="1.4"/>'
+        "WALLS": '<bsdf type="clear" id="walls"><float name="index" value="1.5"/><float name="absorption" '
+        'value="0.05"/></bsdf>',
+        "FILLING": '<bsdf type="clear" id="filling"><string name="outside" value="walls"/><float name="index" '
+        'value="1.4"/>'
         '<float name="absorption" value="0.1"/></bsdf>',
         "LAMPS": lamps('<emitter type="source" id="lamp_{}"/>'),
     }
-    medium = '<medium type="homogeneous" id="{}"><spectrum name="sigma_t" value="{}"/><spectrum name="albedo" value="0"/></medium>'
+    medium = (
+        '<medium type="homogeneous" id="{}"><spectrum name="sigma_t" value="{}"/>'
+        '<spectrum name="albedo" value="0"/></medium>'
+    )
     glass = '<bsdf type="dielectric"><float name="int_ior" value="{}"/><float name="ext_ior" value="{}"/></bsdf>'
     stock = {
         "MEDIA": medium.format("resin", 0.05) + medium.format("support", 0.1),
-        "INTEGRATOR": '<integrator type="volpath"><integer name="max_depth" value="512"/><integer name="rr_depth" value="1000"/></integrator>',
+        "INTEGRATOR": '<integrator type="volpath"><integer name="max_depth" value="512"/><integer name="rr_depth" '
+        'value="1000"/></integrator>',
         "WALLS": glass.format(1.5, 1.0) + '<ref id="resin" name="interior"/>',
         "FILLING": glass.format(1.4, 1.5) + '<ref id="support" name="interior"/><ref id="resin" name="exterior"/>',
         "LAMPS": lamps('<emitter type="area"><spectrum name="radiance" value="1"/></emitter>'),

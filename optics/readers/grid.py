@@ -41,9 +41,7 @@ PAIRS = ((0, 1), (0, 2), (1, 2))  # R and G, R and B, G and B
 CONSTANT = 1e-3  # 8 bit DN; a channel of less spread is rounding and no image
 
 
-# -- The quantities ----------------------------------------------------------------------------------------------------
-
-
+# -- The quantities --------------------------------------------------------------------------------------------------
 def eight_bit(image: np.ndarray, black_level: float = 0.0, saturation: float = TOP) -> np.ndarray:
     """255 (DN - black level) / (saturation - black level), cut to 0 ... 255: (H, W, 3) float64, not rounded.
 
@@ -111,9 +109,7 @@ def _mask(image: np.ndarray, binary: float, blur: float, dark: bool) -> np.ndarr
     return (image > binary) != dark
 
 
-# -- Algorithm 1 -------------------------------------------------------------------------------------------------------
-
-
+# -- Algorithm 1 -----------------------------------------------------------------------------------------------------
 @dataclass(frozen=True, eq=False)
 class References:
     """The sensor with nothing near, as `references` makes it, and the settings that later images must share.
@@ -198,12 +194,10 @@ def references(
     Decided:
       blur       1.1 px cut to 5 x 5 px, which is OpenCV's Gaussian for that kernel; the paper gives no width
       grid       the mean of N binary masks is a share of frames. It becomes a mask again by majority, a share of
-                 exactly one half
-                 counting as not set. With 0, the union, a still grid loses what flickers about tau_B
+                 exactly one half counting as not set. With 0, the union, a still grid loses what flickers about tau_B
       remainder  where N is no multiple of M all frames are used, the first groups being longer by one (7 = 3 + 2 + 2)
       rounding   backgrounds stay fractions; cut to whole DN, as by a cast to 8 bit, they would be 0.5 DN too dark, and
-                 0.1 DN
-                 of noise enough for the entropy of a still image to pass tau_E
+                 0.1 DN of noise enough for the entropy of a still image to pass tau_E
       sign       "binary threshold" is taken as printed: above is grid. Then added light and the sharp brightening of
                  touched cells (III.B.2) can only add pixels, and S of eq. (3) cannot fall by them: it falls where cells
                  shift out of their mask or darken. The sharp drop below 0.5 by light alone (IV.E.1) follows with
@@ -239,9 +233,7 @@ def references(
     return References(background, votes > majority * len(images), binary, blur, bool(dark), black_level, saturation)
 
 
-# -- Algorithm 2 -------------------------------------------------------------------------------------------------------
-
-
+# -- Algorithm 2 -----------------------------------------------------------------------------------------------------
 @dataclass(frozen=True, eq=False)
 class Proximity:
     """What `proximity` found.
@@ -290,8 +282,7 @@ def proximity(
                     which a robot slows down
     Validity:
       noise         makes up to two values of five of a still F differ from 0. Noise of s DN rms, apart in each pixel
-                    and
-                    channel, in whole DN of 8 bit, with 3 backgrounds of 10 frames each, gives
+                    and channel, in whole DN of 8 bit, with 3 backgrounds of 10 frames each, gives
                         s  0.1   0.2   0.3   0.4   0.5   0.6   0.7   1     2     5     DN rms, 8 bit
                         E  0.05  0.12  0.19  0.29  0.39  0.50  0.59  0.83  1.41  2.37  bit
                     and a correlation of 0.00: above 0.6 DN a still noisy image is 'Approaching'. (The paper's own
@@ -300,12 +291,10 @@ def proximity(
                     one of 30 is brighter by chance. Noise that the channels share, as of a lamp that flickers,
                     correlates and is 'Noise'
       drift         lamps 0.3 % brighter than when the references were taken, at 100 DN and 0.3 DN of noise, pass tau_E
-                    as
-                    well: take new references, or a dead band
+                    as well: take new references, or a dead band
       darkening     what darkens the image is cut to 0 and not seen: a black thing, a shadow
       colour        an object lit alike in all channels is 'Noise': the method lives on lamps of different colour at
-                    different
-                    sides. Coloured light that reaches one channel alone is 'Approaching'
+                    different sides. Coloured light that reaches one channel alone is 'Approaching'
       even light    that adds the same everywhere has entropy 0 and is 'Normal'
     Raises ValueError for another size, values that are not finite, thresholds out of range. Source: Algorithm 2, eqs.
     (1), (2)."""
@@ -320,9 +309,7 @@ def proximity(
     return Proximity(state, total, mean, pairs, filtered)
 
 
-# -- Algorithm 3 -------------------------------------------------------------------------------------------------------
-
-
+# -- Algorithm 3 -----------------------------------------------------------------------------------------------------
 @dataclass(frozen=True, eq=False)
 class Contact:
     """What `contact` found.
@@ -353,8 +340,7 @@ def contact(image: np.ndarray, references: References, *, similarity_threshold: 
               shift is a touch; most of an image of a mean of 100 to 115 DN, as the paper's, stands above 35 DN. Look at
               `share` before trusting S
       still   an image whose light has not changed has S near 1, above 0.98 in drawn scenes: only levels within the
-              noise of tau_B
-              flicker. The 0.85 of the paper's untouched sensor must have another cause
+              noise of tau_B flicker. The 0.85 of the paper's untouched sensor must have another cause
       light   a change of the lamps or of the exposure changes S as well: see `combine`
     Raises ValueError for another size, values that are not finite, a threshold out of range, and references without any
     grid. Source: Algorithm 3, eq. (3)."""
@@ -371,9 +357,7 @@ def contact(image: np.ndarray, references: References, *, similarity_threshold: 
     return Contact("Touched" if mean < similarity_threshold else "Untouched", mean, channels, grid)
 
 
-# -- Both together -----------------------------------------------------------------------------------------------------
-
-
+# -- Both together ---------------------------------------------------------------------------------------------------
 class Reading(NamedTuple):
     """A row of `read_sequence`; zip(*rows) gives columns. `state` is of `combine`, the others as in Proximity and
     Contact."""
@@ -445,9 +429,7 @@ def read_sequence(
     return rows
 
 
-# -- Checks ------------------------------------------------------------------------------------------------------------
-
-
+# -- Checks ----------------------------------------------------------------------------------------------------------
 def _check(name: str, value: float, low: float, high: float, unit: str, open_top: bool = False) -> None:
     if not low <= value <= high or (open_top and value == high):
         raise ValueError(

@@ -30,9 +30,7 @@ LOW = 0.5  # of the marker's mean brightness: the most that the centroid cuts of
 OFF_GRID = 0.5  # cells; beyond, a point is nearer to another node
 
 
-# -- Finding -----------------------------------------------------------------------------------------------------------
-
-
+# -- Finding ---------------------------------------------------------------------------------------------------------
 @dataclass(frozen=True, eq=False)
 class Markers:
     """What `find` found, the most detectable first.
@@ -235,9 +233,7 @@ def _measure(grey: np.ndarray, place: tuple[slice, slice], mask: np.ndarray, bla
     )
 
 
-# -- Following ---------------------------------------------------------------------------------------------------------
-
-
+# -- Following -------------------------------------------------------------------------------------------------------
 def match(rest: Markers | np.ndarray, now: Markers | np.ndarray, reach: float | None = None) -> np.ndarray:
     """dU = U - U0: the displacement of each marker of `rest`, (n, 2) px, NaN where none of `now` is its own.
 
@@ -282,8 +278,7 @@ def displacement(
     lost.
 
     grid     (columns, rows) of the markers: exactly that many are looked for, and places come row by row, as a network
-             wants
-             them. None: all that `find` finds at rest, the most detectable first
+             wants them. None: all that `find` finds at rest, the most detectable first
     reach    px, see `match`
     options  of `find` but for the count, the same for both images
 

@@ -27,9 +27,7 @@ BRIDGING = 5  # medians over 7 x 7 px: after as many the outline through a marke
 LEVEL = 6.0  # px, sd of the Gaussian over which an object's level is averaged
 
 
-# -- Area --------------------------------------------------------------------------------------------------------------
-
-
+# -- Area ------------------------------------------------------------------------------------------------------------
 def area(
     image: np.ndarray,
     background: np.ndarray | None = None,
@@ -51,8 +49,7 @@ def area(
                             differences, which stays true where the object fills the image. 1: the threshold is in DN,
                             to keep shadows and reflections off, and for images without noise
     hidden                  (H, W) bool: pixels that show a marker or the sensor's body, through which outlines run on
-                            straight;
-                            `Markers.mask` makes it
+                            straight; `Markers.mask` makes it
 
     The threshold decides which pixels are looked at, not where the rim is. A pixel of the rim counts by (s - s_out) /
     (s_in - s_out): s is its depth, in and out are the nearest and the farthest within 3 px; or its difference, in is
@@ -166,9 +163,7 @@ def _level(signal: np.ndarray, where: np.ndarray) -> np.ndarray:
     return np.divide(total, weight, out=np.full(signal.shape, np.nan), where=weight > 1e-12)
 
 
-# -- Metric ------------------------------------------------------------------------------------------------------------
-
-
+# -- Metric ----------------------------------------------------------------------------------------------------------
 def metric(
     areas: np.ndarray | float, initial: float, reference_initial: float, pixels: int, form: str = "consistent"
 ) -> np.ndarray | float:
@@ -178,8 +173,7 @@ def metric(
     initial            A0, px: of this object where it was first detected
     reference_initial  A0', px: of the reference object at the same distance
     pixels             of the image, H W: the paper calls r dimensionless and gives values such as 0.238, but its eq.
-                       (9) is in
-                       px; as a share of the image r keeps its value when the resolution changes
+                       (9) is in px; as a share of the image r keeps its value when the resolution changes
 
     Eq. (9) as printed, and the sentence below it, multiply A by A0 / A0'. That makes a large object's r larger still:
     of two discs of diameters D and D' at one distance, r is in the ratio (D/D')^4 instead of 1. The purpose that the
@@ -234,7 +228,8 @@ def distance(r: np.ndarray | float, curve_r: np.ndarray, curve_d: np.ndarray) ->
     if len(wrong):
         k = wrong[0]
         raise ValueError(
-            f"reference curve: r = {curve_r[k]:g} at {curve_d[k]:g} mm and {curve_r[k + 1]:g} at {curve_d[k + 1]:g} mm; "
+            f"reference curve: r = {curve_r[k]:g} at {curve_d[k]:g} mm and {curve_r[k + 1]:g} at {curve_d[k + 1]:g} "
+            "mm; "
             "allowed: r falls strictly as the distance grows; average repeats, or end the curve where it turns"
         )
     r = np.asarray(r, float)
@@ -261,7 +256,8 @@ def reliable_range(d: np.ndarray, r_by_object: Mapping[str, np.ndarray], toleran
     odd = [name for name, r in curves.items() if r.shape != d.shape or not np.isfinite(r).all()]
     if d.ndim != 1 or not len(d) or len(curves) < 2 or odd or not tolerance > 0:
         raise ValueError(
-            f"d {d.shape}, {len(curves)} objects, not finite or not of that shape: {', '.join(odd) or 'none'}, tolerance "
+            f"d {d.shape}, {len(curves)} objects, not finite or not of that shape: {', '.join(odd) or 'none'}, "
+            "tolerance "
             f"= {tolerance:g}; allowed: (n,) for all, two objects or more, tolerance above 0"
         )
     order = np.argsort(d, kind="stable")

@@ -11,7 +11,7 @@ from optics.polarization.layers import Crossing, Texture, evaluate
 from optics.polarization.mueller import real, where
 from optics.scene.declare import Part
 from optics.scene.registry import Registry
-from optics.scene.surfaces import passing
+from optics.scene.surfaces import passing, to_local_mueller
 
 MONO = 540.0  # nm: the wavelength of variants that know none
 
@@ -140,6 +140,7 @@ def bsdf(kind: str, own: Callable) -> type:
     import mitsuba as mi
 
     class Layer(passing(mi.BSDFFlags.Null)):
+        unrendered = {"face": "mi.render leaves out what layers reflect to one another"}
         carrier = None  # the stretching shape that it lies on, if it does
         skin = None  # the gel of the scene
         field = None  # what an effect makes of both (optics.scene.declare.Effect.field)
@@ -174,7 +175,7 @@ def bsdf(kind: str, own: Callable) -> type:
             matrix = self.matrix(si)
             value = matrix.mitsuba() if mi.is_polarized else mi.Spectrum(matrix.rows[0][0])
             if mi.is_polarized:  # in BSDF code matrices stand in the implicit axes of local directions
-                value = si.to_local_mueller(value, si.to_world(si.wi), si.to_world(si.wi))
+                value = to_local_mueller(si, value, si.to_world(si.wi), si.to_world(si.wi))
             return dr.select(active, value, 0.0)
 
         def sample(self, ctx, si, sample1, sample2, active=True):

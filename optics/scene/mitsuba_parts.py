@@ -7,13 +7,13 @@ import itertools
 import math
 import sys
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextvars import ContextVar
 from functools import wraps
 from pathlib import Path
 
 from optics.errors import BadPlugin, BadScene, UnknownKey
-from optics.scene.declare import Part
+from optics.scene.declare import IMAGE_STAGES, Part
 from optics.scene.parameter import Parameter
 from optics.scene.registry import Registry, default, include
 
@@ -203,6 +203,7 @@ class Declared:
     registry: Registry  # that it was built for
     role: str
     band: float | None = None  # nm: what a mono variant renders, where the scene's integrator names one band
+    unrendered: Mapping[str, str] = {}  # parameters without a derivative through mi.render, and why
     _wired = False
     _waits = ""  # of a material: why it cannot be asked before its scene is wired
     _leaders = ()
@@ -306,7 +307,28 @@ class Declared:
         import mitsuba as mi
 
         for name in getattr(self, "numbers", ()):
-            cb.put(name, getattr(self, name), mi.ParamFlags.Differentiable)
+            flags = mi.ParamFlags.Differentiable if self.rendered(name) else mi.ParamFlags.NonDifferentiable
+            cb.put(name, getattr(self, name), flags)
+
+    def beyond(self, name: str) -> str:
+        """Why Dr.Jit finds no derivative by a parameter through `mi.render`, or a wrong one; empty where it does."""
+        if self.numbers[name].how == "image":
+            return "it acts on the finished image"
+        if name in self.registry.shaping(self.kind):
+            return "it moves a surface that is made outside Dr.Jit"
+        stages = {
+            s
+            for e in self.registry.effects.values()
+            if name in e.parameter_names and self.kind in self.registry.kinds(e.part)
+            for s in e.stages
+        }
+        if stages and stages <= {*IMAGE_STAGES, "glow"}:
+            return "it acts on the finished image"
+        return self.unrendered.get(name, "")
+
+    def rendered(self, name: str) -> bool:
+        """Whether `mi.render` has the derivative by a parameter, away from edges that move."""
+        return not self.beyond(name)
 
     def hold(self, name: str, value: float) -> None:
         """Set a number, as an evaluated variable: a literal would be compiled into every kernel."""
@@ -317,10 +339,22 @@ class Declared:
         self.held[name] = float(value)
 
     def reread(self, keys=()) -> None:
-        """After a change through mi.traverse: take the numbers over."""
+        """After a change through mi.traverse: take the numbers over.
+
+        Raises ValueError where a derivative is asked for that `mi.render` does not have."""
+        import drjit as dr
+
         for name in keys or self.held:
-            if name in self.held:
-                self.held[name] = float(getattr(self, name)[0])
+            if name not in self.held:
+                continue
+            value = getattr(self, name)
+            if dr.grad_enabled(value) and not self.rendered(name):
+                raise ValueError(
+                    f"{self.name}.{name} has no derivative through mi.render: {self.beyond(name)}; allowed: a central "
+                    "difference of two images"
+                )
+            dr.make_opaque(value)  # as in `hold`
+            self.held[name] = float(value[0])
 
     def number(self, name: str) -> float:
         return self.held[name]

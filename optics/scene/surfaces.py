@@ -112,3 +112,45 @@ def coefficient(clear, stage: str, wavelengths, functions: Sequence[Callable]):
     for function in functions:
         value = function(value, wavelengths, clear)
     return value
+
+
+def axis_rotation(forward, current, target):
+    """Mueller matrix that turns Stokes vectors of light along `forward` from one axis across it to another.
+
+    mi.mueller.rotate_stokes_basis by way of cosine and sine: its angle has no derivative where the axes are the same."""
+    import drjit as dr
+    import mitsuba as mi
+
+    c, s = dr.dot(current, target), dr.dot(forward, dr.cross(current, target))
+    c, s = mi.UnpolarizedSpectrum(c * c - s * s), mi.UnpolarizedSpectrum(2 * c * s)
+    return mi.Spectrum(1, 0, 0, 0, 0, c, s, 0, 0, -s, c, 0, 0, 0, 0, 1)
+
+
+def _between(si, matrix, forward_in, forward_out, to):
+    """A Mueller matrix in the axes that Mitsuba implies for two directions, as one in those of the turned
+    directions."""
+    import mitsuba as mi
+
+    basis, into, out = mi.mueller.stokes_basis, to(forward_in), to(forward_out)
+    first = axis_rotation(into, basis(into), to(basis(forward_in)))
+    return axis_rotation(out, to(basis(forward_out)), basis(out)) @ matrix @ first
+
+
+def to_world_mueller(si, matrix, forward_in, forward_out):
+    """si.to_world_mueller, with derivatives by the directions."""
+    import drjit as dr
+    import mitsuba as mi
+
+    if not mi.is_polarized or not dr.grad_enabled(forward_in, forward_out, si.sh_frame):
+        return si.to_world_mueller(matrix, forward_in, forward_out)
+    return _between(si, matrix, forward_in, forward_out, si.to_world)
+
+
+def to_local_mueller(si, matrix, forward_in, forward_out):
+    """si.to_local_mueller, with derivatives by the directions."""
+    import drjit as dr
+    import mitsuba as mi
+
+    if not mi.is_polarized or not dr.grad_enabled(forward_in, forward_out, si.sh_frame):
+        return si.to_local_mueller(matrix, forward_in, forward_out)
+    return _between(si, matrix, forward_in, forward_out, si.to_local)

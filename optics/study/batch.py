@@ -155,8 +155,7 @@ class Job(Strict):
             raise ValueError(f"{twice[0]} stands in [parameters] and in [sample]; allowed: one of them")
         return self
 
-    # -- samples ----------------------------------------------------------------------------------------------------
-
+    # -- samples ------------------------------------------------------------------------------------------------------
     @property
     def grids(self) -> dict[str, list]:
         return {key: d.grid for key, d in self.sample.items() if d.grid is not None}
@@ -234,10 +233,7 @@ def _explained(error: ValidationError, file: Path) -> Exception:
     )
 
 
-# -- one sample
-# ---------------------------------------------------------------------------------------------------------
-
-
+# -- one sample ------------------------------------------------------------------------------------------------------
 class Maker:
     """Makes the files of one sample after the other."""
 
@@ -344,10 +340,7 @@ class Maker:
         return path
 
 
-# -- the folder
-# ---------------------------------------------------------------------------------------------------------
-
-
+# -- the folder ------------------------------------------------------------------------------------------------------
 def folder_of(job: Job, file: Path) -> Path:
     return Path(os.path.abspath(Path(file).parent / job.out))
 
@@ -459,10 +452,7 @@ def _finish(folder: Path, job: Job) -> bool:
     return True
 
 
-# -- the work
-# -----------------------------------------------------------------------------------------------------------
-
-
+# -- the work --------------------------------------------------------------------------------------------------------
 @dataclass(frozen=True)
 class Result:
     """folder, samples of the job, of this shard, those made now, and whether the whole job is complete."""

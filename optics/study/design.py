@@ -33,6 +33,7 @@ from optics.diagnosis.evidence import Candidate, Evidence, Progress, measure
 from optics.diagnosis.thresholds import CLEAR, LEVEL
 from optics.errors import BadScene, Underdetermined
 from optics.files.output import new_folder, shipped
+from optics.fit.scene_model import SceneModel
 from optics.scene.loader import Scene
 from optics.scene.parameter import Parameter, Values, beside, keys_with
 from optics.study.setup import Setup, effect_variables, variables_of_base
@@ -174,10 +175,7 @@ class Plan:
         return "\n".join([*lines, *(f"warning: {w}" for w in self.warnings)]) + "\n"
 
 
-# -- candidates
-# ---------------------------------------------------------------------------------------------------------
-
-
+# -- candidates ------------------------------------------------------------------------------------------------------
 def candidates(parameters: dict[str, Parameter], base: dict, swept: bool, fixed_exposure: bool = False) -> list[Choice]:
     """The frames to choose from: every place under several lights and exposures; of a camera of one pixel, sweeps.
 
@@ -296,8 +294,54 @@ def _sweeps(parameters: dict, base: dict, lights: Sequence[str], exposures: Sequ
     return [*found, Choice("all lights off", "", {**found[0].settings, **dict.fromkeys(lights, 0.0)}, angles)]
 
 
-# -- the plan
-# -----------------------------------------------------------------------------------------------------------
+# -- the plan --------------------------------------------------------------------------------------------------------
+def _checked(scene: Scene, effects: Sequence | None) -> tuple[list, list]:
+    """(every effect that the scene can express, those that were asked for); raises BadScene."""
+    for part, role in ((scene.camera, "camera"), (scene.integrator, "integrator")):
+        if part is None:
+            first = next(p for p in scene.registry.parts.values() if p.role == role)
+            raise BadScene(
+                f"{scene.path}: no part of the type '{first.kind}'; a capture session needs one: add a "
+                f'<{first.category} type="{first.kind}">'
+            )
+    swept = math.prod(scene.camera.resolution) == 1  # readings of a photodiode
+    known = [
+        e for _, e in sorted(scene.registry.effects.items()) if scene.can_express(e) and not (swept and e.mixes_pixels)
+    ]
+    effects = list({e.key: e for e in effects or ()}.values())  # an effect named twice would be its own rival
+    for e in effects:
+        if e not in known:
+            raise BadScene(
+                f"{scene.path}: the scene cannot express the effect '{e.name}'; it can: "
+                f"{', '.join(k.key for k in known)}"
+            )
+    return known, effects
+
+
+def _imagined(scene: Scene, pool: Sequence[Choice], noise: Noise) -> SceneModel:
+    """A model of the candidates: their settings, and black images that predictions will replace."""
+    width, height = scene.camera.resolution
+    swept = width * height == 1
+    bands = scene.integrator.bands if scene.integrator is not None else ()
+    channels = 1 if len(bands or (0,)) == 1 else 3
+    blank = np.zeros((height, width, channels), np.float32)
+    first = Frame("first", blank, parameters=dict(pool[0].readings[0]), file="design")
+    table = Table("readings.csv", ["reading"]) if swept else None
+    model = SceneModel(scene, Captures(Path("."), str(scene.path), [first], noise=noise, table=table), noise)
+    model.frames = []
+    return model.imagine(
+        [
+            Frame(
+                f"candidate-{i}",
+                np.repeat(blank, len(c.readings), 0) if c.swept else blank,
+                group=c.group or None,
+                parameters=dict(c.settings),
+                file="design",
+                readings={k: np.array(v).reshape(-1, 1, 1) for k, v in c.swept.items()},
+            )
+            for i, c in enumerate(pool)
+        ]
+    )
 
 
 def plan(
@@ -326,53 +370,14 @@ def plan(
     """
     from scipy.special import ndtr
 
-    from optics.fit.scene_model import SceneModel
-
     say = progress or (lambda what, done, total: None)
     _require(frames, share)
-    for part, role in ((scene.camera, "camera"), (scene.integrator, "integrator")):
-        if part is None:
-            first = next(p for p in scene.registry.parts.values() if p.role == role)
-            raise BadScene(
-                f"{scene.path}: no part of the type '{first.kind}'; a capture session needs one: add a "
-                f'<{first.category} type="{first.kind}">'
-            )
-    width, height = scene.camera.resolution
-    swept = width * height == 1
-    known = [
-        e for _, e in sorted(scene.registry.effects.items()) if scene.can_express(e) and not (swept and e.mixes_pixels)
-    ]
-    effects = list({e.key: e for e in effects or ()}.values())  # an effect named twice would be its own rival
-    for e in effects:
-        if e not in known:
-            raise BadScene(
-                f"{scene.path}: the scene cannot express the effect '{e.name}'; it can: "
-                f"{', '.join(k.key for k in known)}"
-            )
+    known, effects = _checked(scene, effects)
     setup = setup or Setup(captures="")
     values = Values() if values is None else Values(dict(values.common))
     base = {**scene.values(), **values.common}
-    pool = candidates(scene.parameters, base, swept, fixed_exposure)
-    bands = scene.integrator.bands if scene.integrator is not None else ()
-    channels = 1 if len(bands or (0,)) == 1 else 3
-    blank = np.zeros((height, width, channels), np.float32)
-    first = Frame("first", blank, parameters=dict(pool[0].readings[0]), file="design")
-    table = Table("readings.csv", ["reading"]) if swept else None
-    model = SceneModel(scene, Captures(Path("."), str(scene.path), [first], noise=noise, table=table), noise)
-    model.frames = []
-    model = model.imagine(
-        [
-            Frame(
-                f"candidate-{i}",
-                np.repeat(blank, len(c.readings), 0) if c.swept else blank,
-                group=c.group or None,
-                parameters=dict(c.settings),
-                file="design",
-                readings={k: np.array(v).reshape(-1, 1, 1) for k, v in c.swept.items()},
-            )
-            for i, c in enumerate(pool)
-        ]
-    )
+    pool = candidates(scene.parameters, base, math.prod(scene.camera.resolution) == 1, fixed_exposure)
+    model = _imagined(scene, pool, noise)
     for key in model.driven:
         values.common.setdefault(key, float(base[key]))
     pool = _expose(model, values, pool, base, say)
@@ -651,10 +656,7 @@ def _report(
     )
 
 
-# -- what to fill in
-# ----------------------------------------------------------------------------------------------------
-
-
+# -- what to fill in -------------------------------------------------------------------------------------------------
 def write(planned: Plan, folder: str | Path) -> Path:
     """Write a folder with a captures.toml that lists the frames to take, without images. Raises OutputExists."""
     import tomlkit

@@ -195,9 +195,7 @@ STUBS = {  # stage: the formula, what stands in Definition, coordinates, plausib
 DEFAULT_STAGE = {"camera": "lens", "led": "emission", "gel": "segment", "membrane": "reflection"}
 
 
-# -- what a name may be, and where a file goes ------------------------------------------------------------------------
-
-
+# -- what a name may be, and where a file goes -----------------------------------------------------------------------
 def identifier(name: str) -> str:
     """'Row banding' -> 'row_banding': the name of file and parameter. Raises ValueError for any other."""
     word = re.sub(r"[\s-]+", "_", name.strip().lower())
@@ -270,9 +268,7 @@ def stage_of(part: str | None, stage: str | None) -> str:
     return stage
 
 
-# -- a stub -----------------------------------------------------------------------------------------------------------
-
-
+# -- a stub ----------------------------------------------------------------------------------------------------------
 def new_effect(name: str, stage: str = "lens") -> str:
     """The text of a plugin file with a formula to fill in; runnable as it stands."""
     word = identifier(name)
@@ -328,9 +324,7 @@ def _title(word: str) -> str:
     return word.replace("_", " ").capitalize()
 
 
-# -- a draft ----------------------------------------------------------------------------------------------------------
-
-
+# -- a draft ---------------------------------------------------------------------------------------------------------
 def drafted(diagnosis: Diagnosis) -> list[str]:
     """Coordinates of a diagnosis that a draft can carry, best first."""
     return [f.coordinate for f in diagnosis.fingerprints if _carrier(f)]
@@ -530,9 +524,7 @@ def _table(name: str, values: Sequence[float], remark: str = "") -> str:
     return "\n".join([f"{name} = [{'  # ' + remark if remark else ''}", *rows, "]"])
 
 
-# -- the file ---------------------------------------------------------------------------------------------------------
-
-
+# -- the file --------------------------------------------------------------------------------------------------------
 def _file(
     word: str,
     stage: str,

@@ -56,9 +56,7 @@ ROUGH = 0.5  # chi2 per variable at which a refit of a diagnosis, which compares
 FEW = 4  # iterations of a refit that continues one
 
 
-# -- begin, and continue -----------------------------------------------------------------------------------------------
-
-
+# -- begin, and continue ---------------------------------------------------------------------------------------------
 def begin(
     setup: Setup,
     folder: str | Path,
@@ -145,9 +143,7 @@ def _of_fitted(variables: Sequence[Variable], fitted: Sequence[int]) -> list[Var
     return [v for v in variables if v.frames is None or set(v.frames) <= set(fitted)]
 
 
-# -- what can be added -------------------------------------------------------------------------------------------------
-
-
+# -- what can be added -----------------------------------------------------------------------------------------------
 def effects_of(record: Record, registry: Registry) -> list[Effect]:
     """The effects that the study has added so far, of the registry of its scene."""
     return [registry.find_effect(step["effect"]) for step in record.steps if step["effect"]]
@@ -170,9 +166,7 @@ def seek(model: SceneModel, values: Values, effects: Sequence[Effect], frames: S
             values.common.update(model.scene.check(effect.seek(model, values, frames), effect.name))
 
 
-# -- diagnose ----------------------------------------------------------------------------------------------------------
-
-
+# -- diagnose --------------------------------------------------------------------------------------------------------
 def examine(
     record: Record,
     model: SceneModel,
@@ -256,9 +250,7 @@ class Refits:
         return calibrate.fit(self.model, variables, quick.values, frames, max_iterations=FEW, tolerance=ROUGH)
 
 
-# -- add ---------------------------------------------------------------------------------------------------------------
-
-
+# -- add -------------------------------------------------------------------------------------------------------------
 def extend(
     record: Record,
     model: SceneModel,
@@ -314,7 +306,8 @@ def write_step(
     values, extra = held_out_values(model, found, held)
     comparison = comparison_of(model, values, held, len(found.variables), extra)
     found.warnings += checks.after_calibration(model, found, comparison.fitted)
-    everywhere = Values(dict(found.values.common), {**values.frame, **found.values.frame})
+    # A study that was taken up again brings the held-out poses of the step before: those found now replace them.
+    everywhere = Values(dict(found.values.common), {**found.values.frame, **values.frame})
     record.add_step(
         name,
         effect.key if effect else None,

@@ -53,8 +53,7 @@ class Record:
     def __init__(self, folder: Path, ladder: dict[str, Any]):
         self.folder, self.ladder = Path(folder), ladder
 
-    # -- life -------------------------------------------------------------------------------------------------------
-
+    # -- life ---------------------------------------------------------------------------------------------------------
     @classmethod
     def create(
         cls,
@@ -192,8 +191,7 @@ class Record:
             if not Path(path).is_file() or file_hash(Path(path)) != digest
         ]
 
-    # -- a step -----------------------------------------------------------------------------------------------------
-
+    # -- a step -------------------------------------------------------------------------------------------------------
     def add_step(
         self,
         name: str,
@@ -288,8 +286,7 @@ class Record:
     def _save(self) -> None:
         write_text(self.folder / "ladder.json", _dumps(self.ladder))
 
-    # -- reading ----------------------------------------------------------------------------------------------------
-
+    # -- reading ------------------------------------------------------------------------------------------------------
     def path(self, index: int) -> Path:
         return self.folder / "steps" / self.steps[index]["folder"]
 

@@ -80,9 +80,7 @@ def plugins_of(setup: Setup) -> Path:
     return Path(setup.plugins) if setup.plugins else Path(setup.captures) / "plugins"
 
 
-# -- the model ---------------------------------------------------------------------------------------------------------
-
-
+# -- the model -------------------------------------------------------------------------------------------------------
 def open_model(setup: Setup, model_class: type = SceneModel) -> SceneModel:
     """Captures and scene of a setup as a model; raises, before anything is rendered, where they contradict each
     other."""
@@ -131,9 +129,7 @@ def split(model: SceneModel, setup: Setup) -> tuple[list[int], list[int]]:
     return fitted, out
 
 
-# -- what is free ------------------------------------------------------------------------------------------------------
-
-
+# -- what is free ----------------------------------------------------------------------------------------------------
 def default_free(model: SceneModel) -> list[str]:
     """The parameters that parts declare free in all frames, of LEDs, of sources, then of other parts: position, axis,
     lobe and power of every LED, power of every source, reflectance and roughness of every membrane.

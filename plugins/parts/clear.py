@@ -52,6 +52,10 @@ def build():
     class Clear(passing(mi.BSDFFlags.DeltaTransmission)):
         kind = "clear"
         around = None  # the clear material outside; None is air
+        unrendered = dict.fromkeys(
+            ("scattering", "roughness", "birefringence"),
+            "mi.render follows neither scattering, roughness nor birefringence",
+        )
         fills_cells = False  # what light is scattered is known in cells only
         bands = 3  # of the scene
 

@@ -56,6 +56,7 @@ def build():
     from optics.light.led_by_led import LedByLed
     from optics.light.replay import Replay
     from optics.light.walk import Walk
+    from optics.scene.surfaces import axis_rotation
 
     class Tactile(with_methods(Declared.on(ADIntegrator), LedByLed, Walk, Replay)):
         kind = "tactile"
@@ -122,7 +123,8 @@ def build():
                 return []
             basis = mi.mueller.stokes_basis(-first)
             side = dr.normalize(dr.cross(first, vertical))
-            vector = mi.mueller.rotate_stokes_basis_m(-first, basis, side) @ light
+            turn = axis_rotation if dr.grad_enabled(first, vertical) else mi.mueller.rotate_stokes_basis_m
+            vector = turn(-first, basis, side) @ light
             return [vector[i, 0][j] for i in range(4) for j in range(self.lanes)]
 
         def sample(self, mode, scene, sampler, ray, δL=None, state_in=None, active=True, **_):

@@ -152,7 +152,7 @@ SLAB = """<scene version="3.0.0">
         <bsdf type="clear" id="glass"><float name="index" value="1.5"/></bsdf></shape>
     <shape type="rectangle" id="screen"><transform name="to_world"><rotate x="1" angle="180"/><scale x="8" y="8"/><translate z="20"/></transform>
         <bsdf type="diffuse"><spectrum name="reflectance" value="0"/></bsdf><emitter type="source" id="lamp"/></shape>
-</scene>"""
+</scene>"""  # noqa: E501
 
 
 @pytest.mark.parametrize(

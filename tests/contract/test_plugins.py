@@ -82,10 +82,7 @@ def settling():
     return [pytest.param(e, id=e.key) for e in (*(REGISTRY.effects[k] for k in EFFECTS), *alone)]
 
 
-# -- what a plugin says about itself
-# ------------------------------------------------------------------------------------------
-
-
+# -- what a plugin says about itself ---------------------------------------------------------------------------------
 def check_documentation(item):
     """The four sections, each with a text."""
     name = item.kind if not isinstance(item, Effect) else item.name
@@ -201,12 +198,10 @@ def test_samplers_draw_plausible_values(item):
         )
 
 
-# -- where a parameter is seen
-# ------------------------------------------------------------------------------------------------
-
-
+# -- where a parameter is seen ---------------------------------------------------------------------------------------
 class Material:
-    """A material alone, as a bench, for materials that only mi.render can pass: it reflects (left) and transmits a smooth
+    """A material alone, as a bench, for materials that only mi.render can pass: it reflects (left) and transmits a
+    smooth
     world.
 
     Rows of the image are directions of sight, channels S0, S1 and S3; the mean over a grid of sampled directions has no
@@ -222,7 +217,7 @@ class Material:
         parameters = {f"sample.{name}": p for name, p in self.bsdf.numbers.items()}
         self.values = {key: p.default for key, p in parameters.items()}
         self.values.update({k: v for k, v in {"sample.index": 1.3, "sample.alpha": 0.2}.items() if k in parameters})
-        self.scene = SimpleNamespace(parts={"sample": self.bsdf}, parameters=parameters, gel=None)
+        self.scene = SimpleNamespace(registry=REGISTRY, parts={"sample": self.bsdf}, parameters=parameters, gel=None)
         self.scene.check = lambda values: scene.Scene.check(self.scene, values)
         self.scene.set = lambda values: None
         self.renderer = SimpleNamespace(kind=lambda key: kind, bounce_key="")
@@ -353,7 +348,8 @@ def differences(f, value, step, bounds):
 
 
 def calm(bench, key, values, base):
-    """Pixels that contain no rim (of a shadow or of the face) at any of the values: elsewhere an edge crosses samples."""
+    """Pixels that contain no rim (of a shadow or of the face) at any of the values: elsewhere an edge crosses
+    samples."""
     rim = np.zeros(bench.model.shape[:2], bool)
     for value in values:
         now = {**base, key: value}
@@ -372,10 +368,7 @@ def moves(bench, key):
     )
 
 
-# -- effects at and near neutral
-# ------------------------------------------------------------------------------------------------
-
-
+# -- effects at and near neutral -------------------------------------------------------------------------------------
 def beside(p):
     """A value next to neutral. Functions are evaluated there; at neutral itself the program skips them."""
     return inward(p, p.neutral, 1e-30 if p.neutral == 0 else 4e-16 * abs(p.neutral))
@@ -450,7 +443,8 @@ def check_onset(bench, effect):
             off = np.linalg.norm((one - other)[keep])
             rounding = FLOAT * np.linalg.norm(rest) / abs(h)
             assert off <= 0.05 * size + rounding, (
-                f"{effect.name}: the slope in {p.name} changes by {off / size:.0%} when the step is halved or turned round"
+                f"{effect.name}: the slope in {p.name} changes by {off / size:.0%} when the step is halved or turned "
+                "round"
             )
 
 
@@ -533,10 +527,7 @@ def test_a_rough_boundary_of_index_1_is_not_there_in_a_render(benches, tmp_path)
     assert np.abs(images[0] - images[1]).max() <= 10 * IDENTITY  # spawned once more, a ray is rounded once more
 
 
-# -- derivatives
-# ----------------------------------------------------------------------------------------------------------------
-
-
+# -- derivatives -----------------------------------------------------------------------------------------------------
 def compare(found, reference, image, step, tolerance, keep=True, what=""):
     """|found - reference| <= tolerance |reference| + the rounding of float32 in a difference over the step."""
     keep = np.broadcast_to(np.asarray(keep)[..., None] if np.ndim(keep) else True, found.shape)
@@ -839,10 +830,7 @@ def test_moved_rims_carry_about_the_right_light(key, bench):
     check_rim(bench.derivative(key), reference, ~calm(bench, key, [value, *used], bench.values), key)
 
 
-# -- images stay images
-# -----------------------------------------------------------------------------------------------------------
-
-
+# -- images stay images ----------------------------------------------------------------------------------------------
 def check_image_function(effect, stage, bench):
     """lens and sensor are affine in the image; response acts pixel by pixel; none changes the shape; none is in
     place."""
@@ -916,7 +904,8 @@ def test_random_strengths_give_images(key, bench_of):
     check_random_values(bench_of(effect), effect, seed=EFFECTS.index(key))
 
 
-@pytest.mark.parametrize("seed", (2, 5))  # 5: interreflection, haze and gloss are on; 2: they are off
+# 5: interreflection, haze, absorption, gloss and the size of LEDs are on; 2: absorption and sizes alone
+@pytest.mark.parametrize("seed", [pytest.param(2, marks=pytest.mark.slow), 5])
 def test_everything_drawn_at_once_gives_images(seed, bench):
     """All parameters of the sensor within a plausible change, all effects on; and derivatives at that point are
     finite."""
@@ -992,10 +981,7 @@ def test_bounds_are_kept(kind, name, bench_of):
             bench.scene.check({key: wrong})
 
 
-# -- layers and sources
-# ------------------------------------------------------------------------------------------------------------
-
-
+# -- layers and sources ----------------------------------------------------------------------------------------------
 def crossings(rng, count, bands=(620.0, 540.0, 460.0), steepest=60.0):
     """Random crossings: either side, any direction, place and axes; (count, 1) against the bands."""
     from optics.polarization.layers import Crossing
@@ -1131,9 +1117,7 @@ def test_renders_meet_the_same_matrices(kind, bench_of, mitsuba):
     check_both_arithmetics(mitsuba, bench_of(kind), kind)
 
 
-# -- a user's own folder
-# ----------------------------------------------------------------------------------------------------------
-
+# -- a user's own folder ---------------------------------------------------------------------------------------------
 GOOD = '''"""LED halo: the package of an LED scatters a little light aside.
 
 Definition
@@ -1191,7 +1175,7 @@ part = layer("sugar_cell", (
     Parameter("rotation", "deg", 20.0, (-720.0, 720.0), "rotation at 540 nm", plausible=1.0, how="layer")), turn)
 effect = Effect(name="cloudy cell", part="sugar_cell", stages={"layer": scramble}, acts=("analyzer.angle",), needs="Malus' curve",
                 parameters=(Parameter("cloud", "1", 0.0, (0.0, 1.0), "share h", neutral=0.0, plausible=0.05, how="layer"),))
-'''
+'''  # noqa: E501
 
 BAD = {  # what is wrong -> (replacements in the good plugin, the check that has to notice)
     "not the identity at neutral": ([("return 1 +", "return 1.001 +")], check_identity),

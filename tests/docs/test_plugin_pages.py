@@ -23,9 +23,7 @@ def record():
     return json.loads((plugin_pages.FIGURES / "figures.json").read_text(encoding="utf-8"))
 
 
-# -- figures ----------------------------------------------------------------------------------------------------------
-
-
+# -- figures ---------------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize("key", EFFECTS)
 def test_every_effect_has_a_fingerprint_figure_of_its_own_parameters(key, record):
     from PIL import Image
@@ -50,9 +48,7 @@ def test_no_figure_is_left_of_an_effect_that_is_gone(record):
     assert sorted(f.stem for f in plugin_pages.FIGURES.glob("*.webp")) == EFFECTS
 
 
-# -- pages ------------------------------------------------------------------------------------------------------------
-
-
+# -- pages -----------------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize("kind", PARTS)
 def test_a_parts_page_lists_every_xml_parameter_and_attribute(kind, generated):
     page = (generated / "parts" / f"{kind}.md").read_text(encoding="utf-8")
@@ -87,9 +83,7 @@ def test_a_docstrings_sections_are_found_wherever_their_headings_stand():
     assert plugin_pages.definition(found["Definition"]) == "```text\na = b\n```\n\nwith b."
 
 
-# -- XML attributes that are no parameters ----------------------------------------------------------------------------
-
-
+# -- XML attributes that are no parameters ---------------------------------------------------------------------------
 def read_by_the_file(kind: str) -> set[str]:
     """Names that a part's file asks `props` for, by its source: also those that no shipped scene makes it ask for."""
     tree = ast.parse(Path(known().parts[kind].file).read_text(encoding="utf-8"))

@@ -191,10 +191,7 @@ def test_the_comparison_notices_two_percent(mitsuba):
     assert least_p(two, 1.02 * renders(scene, tactile(2), first=500))[1] < 1e-6
 
 
-# -- the shipped sensor
-# ---------------------------------------------------------------------------------------------------
-
-
+# -- the shipped sensor ----------------------------------------------------------------------------------------------
 def gelsight(tmp_path, variant, leds=None, window=True, size=(32, 24), stokes=False, bands=True, **defines):
     """The GelSight-type scene, pressed; with some LEDs only, without its window, without bands, or with Stokes
     channels."""
@@ -391,10 +388,7 @@ def test_bands_bring_no_spectral_noise(mitsuba, tmp_path):
     assert loud > 20 * quiet
 
 
-# -- polarization
-# ---------------------------------------------------------------------------------------------------------
-
-
+# -- polarization ----------------------------------------------------------------------------------------------------
 def polarizer(mi, angle, height, tilt=0.0):
     return {
         "type": "rectangle",

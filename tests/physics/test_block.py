@@ -32,7 +32,7 @@ SCENE = """<scene version="3.0.0">
     </shape>
     <shape type="rectangle"><transform name="to_world"><scale x="2" y="1.5"/><lookat origin="-5,0,-1.5" target="0,0,-1.5" up="0,0,1"/></transform>
         <bsdf type="diffuse"><spectrum name="reflectance" value="0"/></bsdf><emitter type="source" id="lamp"/></shape>
-</scene>"""
+</scene>"""  # noqa: E501
 SIGMAS = 5.0
 
 
@@ -146,7 +146,7 @@ def test_a_cell_that_was_not_filled(load):
     derivative by the filling's absorption, of what is left of it."""
     from optics.light.transport import Transport
 
-    one = dict(columns=1, rows=1, layers=1, scattering=0.2)
+    one = {"columns": 1, "rows": 1, "layers": 1, "scattering": 0.2}
     images = []
     for lack, index, alpha, sigma in (
         (1.0, 1.42, 0.1, 0.2),

@@ -76,9 +76,7 @@ def moved(scene, x, y, depth):
     return np.stack([x + ux, y + uy, -depth - uz], -1)
 
 
-# -- At rest -----------------------------------------------------------------------------------------------------------
-
-
+# -- At rest ---------------------------------------------------------------------------------------------------------
 @BOTH
 def test_an_untouched_skin_is_flat(load, variant):
     scene = load(SCENE % MARKERS, 0, variant)
@@ -126,9 +124,7 @@ def test_other_numbers_of_markers(load):
     np.testing.assert_allclose(load(text).parts["m"].centres(), [(-2, 0, -6), (2, 0, -6)])
 
 
-# -- Pressed -----------------------------------------------------------------------------------------------------------
-
-
+# -- Pressed ---------------------------------------------------------------------------------------------------------
 @BOTH
 def test_a_press_carries_sheets_and_markers(load, variant):
     scene = load(SCENE % MARKERS, 1.5, variant)
@@ -247,9 +243,7 @@ def test_the_foot_of_a_marker_stays_on_the_face(load):
     assert np.ptp(foot[:, 2]) > 0.3
 
 
-# -- Target ------------------------------------------------------------------------------------------------------------
-
-
+# -- Target ----------------------------------------------------------------------------------------------------------
 def edge(scene, inside, outside, axis):
     """Where a ray stops meeting the target along x or y, mm, by bisection."""
     for _ in range(30):

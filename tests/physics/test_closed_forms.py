@@ -59,10 +59,7 @@ def hemisphere(rng, count, lowest=0.05):
     return np.stack([r * np.cos(phi), r * np.sin(phi), z], -1)
 
 
-# -- the LED
-# --------------------------------------------------------------------------------------------------------------
-
-
+# -- the LED ---------------------------------------------------------------------------------------------------------
 @pytest.fixture(scope="module")
 def plugin(mitsuba):
     """Makes one part from its parameters."""
@@ -130,10 +127,7 @@ def test_led_spectrum_is_a_gaussian_of_its_fwhm(mitsuba, plugin):
     close(share[0], [1, 0.5, 0.5, 1 / 16], CLOSE)
 
 
-# -- the membrane
-# -----------------------------------------------------------------------------------------------------------
-
-
+# -- the membrane ----------------------------------------------------------------------------------------------------
 def reflect(mi, membrane, wi, wo, cosine_too=True):
     """(N, 4) of the membrane's eval (with the cosine) or brdf."""
     import drjit as dr
@@ -249,10 +243,7 @@ def test_membrane_sampling_returns_the_albedo(mitsuba, plugin):
     assert mean == pytest.approx(directional_albedo(mi, membrane, 0.6), rel=2e-4)  # midpoints against quadrature
 
 
-# -- the camera
-# -------------------------------------------------------------------------------------------------------------
-
-
+# -- the camera ------------------------------------------------------------------------------------------------------
 def camera_of(mi, width=320, height=240, **values):
     return mi.load_dict({"type": "camera", **values, "film": {"type": "hdrfilm", "width": width, "height": height}})
 
@@ -312,10 +303,7 @@ def test_pose_is_roll_then_tilt_then_pan_about_fixed_axes(mitsuba):
     close(o, np.broadcast_to(np.array([1, 2, -24]) + outer.apply([0.3, -0.2, 0.5]), o.shape), CLOSE)
 
 
-# -- the whole pixel
-# --------------------------------------------------------------------------------------------------------
-
-
+# -- the whole pixel -------------------------------------------------------------------------------------------------
 def flat_pixel(values, width, height, led="led_1", camera_z=-24.0, absorption=0.0):
     """(H, W, 3) radiance of the flat face z = 0 under one LED at power 1, in numpy: rays, distances, (S2), (S3),
     paths."""
@@ -459,9 +447,7 @@ def test_height_fall_off_and_ambient_light(bench):
     assert np.abs(found - rho * ground / np.pi * share).max() < 1e-7  # 1 + n_z cancels where the face is flat
 
 
-# -- the window
-# -------------------------------------------------------------------------------------------------------------
-
+# -- the window ------------------------------------------------------------------------------------------------------
 WINDOWED = """<scene version="3.0.0">
     <integrator type="tactile" id="integrator"><string name="bands" value="610, 540, 460"/></integrator>
     <sensor type="camera" id="camera">
@@ -480,7 +466,7 @@ WINDOWED = """<scene version="3.0.0">
     </shape>
     <shape type="gel" id="gel"><float name="width" value="40"/><float name="length" value="30"/><ref id="membrane"/></shape>
     <emitter type="led" id="led_1"><point name="position" x="10" y="2" z="-3"/></emitter>
-</scene>"""
+</scene>"""  # noqa: E501
 
 
 def fresnel(n, c1):
@@ -600,10 +586,7 @@ def test_window_polarizes_by_its_transmittances(mitsuba, plugin):
     assert np.abs(m - expected).max() < 1e-5
 
 
-# -- the gel's shape
-# ----------------------------------------------------------------------------------------------------------
-
-
+# -- the gel's shape -------------------------------------------------------------------------------------------------
 def test_wedge_is_a_tilted_plane(bench):
     """z = x tan(w_x) + y tan(w_y) and its normal, where each ray meets it."""
     values = {**bench.values, "gel.press_depth": 0.0, "gel.wedge_x": 2.0, "gel.wedge_y": -1.0}
@@ -628,10 +611,7 @@ def test_a_pressed_sphere_is_seen_where_it_is(bench):
     )  # mm; grid pitch 0.06: sagitta 0.06^2/8/1.5 = 3e-4, and smoothing
 
 
-# -- the camera's arithmetic
-# ----------------------------------------------------------------------------------------------------
-
-
+# -- the camera's arithmetic -----------------------------------------------------------------------------------------
 @pytest.fixture
 def view(bench):
     """The camera as image functions see it, all at neutral."""
@@ -696,10 +676,7 @@ def test_bend_and_the_chain_to_digital_numbers(bench):
     assert np.abs(developer.develop(image, values) - (7 + 243 * m + 0.5)).max() < 1e-10
 
 
-# -- light that the face sends to itself
-# ------------------------------------------------------------------------------------
-
-
+# -- light that the face sends to itself -----------------------------------------------------------------------------
 def ball(mi, rho, max_depth=2, **led):
     """A membrane all around, seen from inside, with an LED in its middle: the integrating sphere."""
     return mi.load_dict(

@@ -32,8 +32,6 @@ def radii(local_map):
 
 
 # -- Depth against closed forms --------------------------------------------------------------------------------------
-
-
 def last_blur(smoothing, pitch=PITCH, levels=4):
     """Variance of the blur that comes last, mm^2."""
     return (smoothing / 2**levels) ** 2 + pitch**2
@@ -148,8 +146,6 @@ def test_blur_is_a_gaussian_of_the_variance_asked_for():
 
 
 # -- Indenters -------------------------------------------------------------------------------------------------------
-
-
 def test_profiles_lie_on_their_envelopes():
     for shape, size, rotation in (
         ("sphere", 1.5, (0, 0, 0)),
@@ -285,8 +281,6 @@ def test_errors_name_what_is_wrong(tmp_path):
 
 
 # -- Smoothness: central differences with two steps must tell the same derivative ------------------------------------
-
-
 X, Y = np.linspace(-7, 7, 121)[None, :], np.linspace(-7, 7, 121)[:, None]  # fixed points; the press moves below them
 
 
@@ -311,7 +305,7 @@ def agreement(function, steps=(0.005, 0.02)):
     [("sphere", R, (0, 0, 0), 0.01), ("cylinder", 1.0, (0, 0, 20), 0.04), ("cube", 2.0, (8, 5, 15), 0.04)],
 )
 def test_smooth_in(what, shape, size, rotation, tolerance):
-    base = dict(size=size, x=0.2, y=-0.3, depth=DEPTH, smoothing=SMOOTHING)
+    base = {"size": size, "x": 0.2, "y": -0.3, "depth": DEPTH, "smoothing": SMOOTHING}
     walls_in_size = 2.5 if what == "size" else 1
     difference = agreement(lambda h: skin(shape, rotation=rotation, **{**base, what: base[what] + h}))
     assert difference < tolerance * walls_in_size
@@ -335,8 +329,6 @@ def test_smooth_in_depth_at_every_node_and_step():
 
 
 # -- Interpolation, axes, ring, normals ------------------------------------------------------------------------------
-
-
 def test_surface_passes_through_the_nodes_is_zero_outside_and_the_same_both_ways():
     pressed, _ = pressed_sphere()
     u = pressed.axis

@@ -41,9 +41,7 @@ def pressed(depth=1.0):
     return displacement(indenter_profile("cube", 6.0, (35, 20, 30), extent=8.0, pitch=0.08), depth, 5.0, 0.4)[0]
 
 
-# -- Displacement ------------------------------------------------------------------------------------------------------
-
-
+# -- Displacement ----------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize("depth", [0.0, 0.5, 2.5, 5.0])
 @pytest.mark.parametrize("poisson", RATIOS)
 def test_point_loads_of_boussinesq(depth, poisson):
@@ -162,9 +160,7 @@ def test_incompressible_and_in_equilibrium():
         )  # fifth derivatives, larger yet: 1.7 %
 
 
-# -- Stress ------------------------------------------------------------------------------------------------------------
-
-
+# -- Stress ----------------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize("between", [(0.0, 2.5), (2.5, 5.0), (1.0, 1.2)])
 @pytest.mark.parametrize("poisson", RATIOS)
 def test_stress_of_point_loads(between, poisson):
@@ -211,9 +207,7 @@ def test_beside_a_contact_the_skin_is_compressed_along_the_radius():
     assert abs(surface(0.0, 0.0, 0, 0, q)) < 1e-9
 
 
-# -- Maps --------------------------------------------------------------------------------------------------------------
-
-
+# -- Maps ------------------------------------------------------------------------------------------------------------
 def test_maps_fit_a_local_map_and_change_smoothly_with_depth():
     dent = pressed()
     for m in carried(dent, dent.pitch, 2.5) + stress_integrals(dent, dent.pitch, 0.0, 2.5):

@@ -38,9 +38,7 @@ RUBBER = Material(young=0.6, poisson=0.47, density=1.1)
 SKIN = Lattice((11, 11, 6), 1.0, RUBBER)
 
 
-# -- The continuum behind the springs ----------------------------------------------------------------------------------
-
-
+# -- The continuum behind the springs --------------------------------------------------------------------------------
 def neighbours(h=1.0):
     """The shape matrix of D3Q14, eqs. (4)-(6): 6 + 8 vectors, and their weights."""
     axes = [s * h * np.eye(3)[i] for i in range(3) for s in (1, -1)]
@@ -135,9 +133,7 @@ def test_angles_as_printed_are_not_isotropic():
     assert ratio(3**-0.5, 1 / 3) == pytest.approx(0.9465, abs=1e-3)
 
 
-# -- Patch tests -------------------------------------------------------------------------------------------------------
-
-
+# -- Patch tests -----------------------------------------------------------------------------------------------------
 def tractions(skin, stress):
     """sigma n times each node's share of the faces: whole faces have h^2, edges h^2/2, corners h^2/4 per face."""
     shape, found = skin.shape, np.zeros((*skin.shape, 3))
@@ -230,9 +226,7 @@ def test_forces_are_the_energys_slope_and_stiffness_that_of_forces(poisson):
     np.testing.assert_allclose((stiffness @ way.ravel()).reshape(x.shape), (behind - ahead) / (2 * e), atol=1e-7)
 
 
-# -- Against finite elements -------------------------------------------------------------------------------------------
-
-
+# -- Against finite elements -----------------------------------------------------------------------------------------
 class Elastic:
     """A quarter block 0..X, 0..Y, -H..0 of linear elastic hexahedra with 27 nodes, glued at z = -H.
 
@@ -428,9 +422,7 @@ def test_large_strains_are_nearly_neo_hookean(stretch, allowed):
     assert stress(lattice) == pytest.approx(stress(neo_hooke), rel=allowed)
 
 
-# -- Motion ------------------------------------------------------------------------------------------------------------
-
-
+# -- Motion ----------------------------------------------------------------------------------------------------------
 def swinging(step, damping=0.0, poisson=0.3, layers=9):
     """A column that only shears: the lowest swing, sin(pi (z + H)/(2H)), as (skin, moments)."""
     held = np.zeros((2, 2, layers, 3), bool)
@@ -524,9 +516,7 @@ def test_motion_comes_to_the_rest_that_balance_finds(push, forces, gravity):
     assert end.energy == pytest.approx(rest.energy, rel=1e-4)
 
 
-# -- Contact -----------------------------------------------------------------------------------------------------------
-
-
+# -- Contact ---------------------------------------------------------------------------------------------------------
 PUSHES = {
     "sphere": Push(sphere(6.0), 1.2, at=(0.3, -0.2)),
     "punch": Push(punch(4.0, 0.5), 0.5),
@@ -621,9 +611,7 @@ def test_weight_hangs_on_the_glue():
     assert pressed.displacement[5, 5, -1, 2] > 0
 
 
-# -- Cells and materials -----------------------------------------------------------------------------------------------
-
-
+# -- Cells and materials ---------------------------------------------------------------------------------------------
 def test_unfilled_cells_soften_and_dent():
     factors = np.ones((10, 10, 5))
     factors[4:6, 4:6, 3:] = 0.01
@@ -707,9 +695,7 @@ def test_a_resolved_cell_lies_between_the_bounds(ratio):
     assert found == pytest.approx(middle, rel={0.1: 0.4, 0.3: 0.15, 3.0: 0.15}[ratio])  # Hill's mean is an estimate
 
 
-# -- Errors ------------------------------------------------------------------------------------------------------------
-
-
+# -- Errors ----------------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize(
     "call, text",
     [

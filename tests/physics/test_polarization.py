@@ -32,10 +32,7 @@ GEOMETRY = (
 FLOAT32 = 2e-5  # of intensities: matrices in float32 through some ten surfaces, retardances as above
 
 
-# -- the textbooks' elements
-# ------------------------------------------------------------------------------------------------
-
-
+# -- the textbooks' elements -----------------------------------------------------------------------------------------
 def rows(*entries):
     """(..., 4, 4) of sixteen entries that broadcast."""
     return np.stack(np.broadcast_arrays(*(np.asarray(e, float) for e in entries)), -1).reshape(
@@ -92,10 +89,7 @@ def off(found, expected, scale=None):
     return float((np.abs(found - expected) / (np.abs(expected).max() if scale is None else scale)).max())
 
 
-# -- stacks of plates
-# -------------------------------------------------------------------------------------------------------
-
-
+# -- stacks of plates ------------------------------------------------------------------------------------------------
 class Plate(NamedTuple):
     """A square in the way at z (mm), looking at the camera, spun about its normal and tilted about x and y (deg)."""
 
@@ -119,11 +113,14 @@ class Plate(NamedTuple):
         return f"""<shape type="rectangle" id="{name}_plate"><transform name="to_world"><rotate x="1" angle="180"/>
             <rotate z="1" angle="{self.spin}"/><rotate x="1" angle="{self.tilt_x}"/><rotate y="1" angle="{self.tilt_y}"/>
             <scale value="{half}"/><translate z="{self.z}"/></transform>
-            <bsdf type="{self.kind}" id="{name}">{self.bsdf}</bsdf></shape>"""
+            <bsdf type="{self.kind}" id="{name}">{self.bsdf}</bsdf></shape>"""  # noqa: E501
 
 
 LAMP = Plate("diffuse", 200.0, bsdf='<spectrum name="reflectance" value="0"/>')
-CENTRES = '<sampler type="stratified"><boolean name="jitter" value="false"/><integer name="sample_count" value="1"/></sampler>'
+CENTRES = (
+    '<sampler type="stratified"><boolean name="jitter" value="false"/>'
+    '<integer name="sample_count" value="1"/></sampler>'
+)
 STACK = """<scene version="3.0.0">
     <default name="size" value="1"/><default name="x_fov" value="1"/><default name="bands" value="540"/>
     <integrator type="tactile" id="integrator">
@@ -186,10 +183,7 @@ def rendered(scene, values):
     return np.moveaxis(image.reshape(*image.shape[:2], 4, lanes)[..., :bands], 2, 0)
 
 
-# -- layers by hand
-# ---------------------------------------------------------------------------------------------------------
-
-
+# -- layers by hand --------------------------------------------------------------------------------------------------
 def azimuth(axis, k, x):
     """Angle of an axis against x, seen by whom the light along k reaches."""
     return np.arctan2(dot(axis, np.cross(k, x)), dot(axis, x))
@@ -365,9 +359,7 @@ def drawn(rng, bounds, name):
     return {f"{name}.{p}": rng.uniform(*b) for p, b in bounds.items()}
 
 
-# -- the bench
-# --------------------------------------------------------------------------------------------------------------
-
+# -- the bench -------------------------------------------------------------------------------------------------------
 TURNS = np.arange(0.0, 360.0, 5.0)
 
 
@@ -468,9 +460,7 @@ def test_a_polarization_ratio_of_99_percent(variant):
     assert off(two, (t1**2 + t2**2) / 2 * c2 + t1 * t2 * (1 - c2)) < ROUNDING
 
 
-# -- single matrices
-# --------------------------------------------------------------------------------------------------------
-
+# -- single matrices -------------------------------------------------------------------------------------------------
 KNOWN = ((45.0, 36.239), (51.782, 45.000), (60.0, 40.336), (75.0, 21.902), (85.0, 7.425))  # deg, n = 1.49661
 
 
@@ -626,10 +616,7 @@ def test_an_element_met_from_behind_is_its_mirror_image():
     assert off(plates.reversed.reversed.numpy(), plates.numpy()) < 1e-12
 
 
-# -- stacks of layers
-# -------------------------------------------------------------------------------------------------------
-
-
+# -- stacks of layers ------------------------------------------------------------------------------------------------
 def summed(elements):
     """(4, 4) that a row of elements leaves of light that passes them in order, all reflections solved for at once.
 
@@ -841,10 +828,7 @@ def test_stock_polarizers_and_retarders_on_the_axis(variant, tmp_path):
         assert off(found, expected[:, None, None] + 0 * found, expected[0]) < FLOAT32
 
 
-# -- crossed films in a wide field
-# ------------------------------------------------------------------------------------------
-
-
+# -- crossed films in a wide field -----------------------------------------------------------------------------------
 @JUST_MONO
 def test_crossed_films_in_a_wide_field(variant, tmp_path):
     """Korger et al. (2013): T = |t1.t2|^2/2 with t = k x a/|k x a|, in every azimuth up to 62 deg from the axis; dark
@@ -897,10 +881,7 @@ def test_crossed_films_in_a_wide_field(variant, tmp_path):
             assert corner == pytest.approx(0.5 * np.cos(2 * np.arctan(cos)) ** 2, rel=1e-5)
 
 
-# -- what light can be
-# ------------------------------------------------------------------------------------------------------
-
-
+# -- what light can be -----------------------------------------------------------------------------------------------
 def crossings(rng, count, wavelengths=(400.0, 540.0, 700.0)):
     """Light from both sides up to 80 deg from the normal, in any axes across it."""
     cos, phi, roll = (
@@ -1024,10 +1005,7 @@ def test_slabs_with_reflecting_faces_keep_the_energy(mitsuba):
     assert r[..., 0, 0].max() > 0.3
 
 
-# -- derivatives
-# ------------------------------------------------------------------------------------------------------------
-
-
+# -- derivatives -----------------------------------------------------------------------------------------------------
 def generic(scene):
     """Every number of the bench's layers and of its lamp away from neutral, so that all of them matter."""
     rng = RNG(11)
@@ -1114,8 +1092,7 @@ def test_forward_derivatives_of_a_render_are_those_of_differences(variant, key, 
     assert off(found, expected) < 3e-4
 
 
-# -- Vi2TaP -----------------------------------------------------------------------------------------------------------------
-
+# -- Vi2TaP ----------------------------------------------------------------------------------------------------------
 SKIN = {"analyzer": -23.0, "inner_face": -5.0, "silicone": -3.75, "film": -2.5, "outer_face": 0.0}  # mm
 KINDS = {"analyzer": "polarizer_film", "film": "polarizer_film", "silicone": "sheet"}
 ROOM = ("room_left", "room_right")

@@ -109,10 +109,7 @@ def pairs(mi, bsdf, index, rng, count):
     return wi[keep], wo[keep]
 
 
-# -- Walter's formulae with Jones vectors, in double precision
-# --------------------------------------------------------------
-
-
+# -- Walter's formulae with Jones vectors, in double precision -------------------------------------------------------
 def facets(kind, alpha, m, *directions):
     """D(m) and the product of G1: eqs. (25), (27) of the Beckmann, (33), (34) of the GGX distribution."""
     cos2 = m[:, 2] ** 2
@@ -209,10 +206,7 @@ def test_forward_derivatives_of_every_element_are_those_of_the_formula(mitsuba, 
     assert worst.max() <= 1e-3
 
 
-# -- against Mitsuba's own boundaries
-# ----------------------------------------------------------------------------------------
-
-
+# -- against Mitsuba's own boundaries --------------------------------------------------------------------------------
 @pytest.mark.parametrize(
     "variant", ["llvm_ad_rgb", "llvm_ad_mono", "llvm_ad_mono_polarized", "llvm_ad_spectral_polarized"], indirect=True
 )
@@ -289,10 +283,7 @@ def test_total_reflection_keeps_its_phase(mitsuba):
     assert delta < np.radians(45)
 
 
-# -- what makes it a scattering function
-# -------------------------------------------------------------------------------------
-
-
+# -- what makes it a scattering function -----------------------------------------------------------------------------
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("index, degrees", [(1.5, 40.0), (1.5, 150.0)])
 def test_samples_fall_as_the_density_says(mitsuba, kind, index, degrees, tmp_path, monkeypatch):
@@ -442,10 +433,7 @@ def test_a_slightly_rough_boundary_keeps_the_polarization_that_the_stock_one_los
             assert kept[0] == pytest.approx(lost[0], rel=1e-5)
 
 
-# -- near the values where an effect vanishes
-# ----------------------------------------------------------------------------------
-
-
+# -- near the values where an effect vanishes ------------------------------------------------------------------------
 @pytest.mark.parametrize("index", [1.5, 0.7])
 def test_roughness_sets_in_with_its_square(mitsuba, index):
     """Means over the refracted lobe of `beckmann`: four times as far from the smooth boundary at twice the
@@ -532,10 +520,7 @@ def test_derivatives_follow_the_sampled_directions(mitsuba, name):
     assert both.std() / np.sqrt(count) < 0.03 * abs(total)
 
 
-# -- in a scene
-# ------------------------------------------------------------------------------------------------------------------
-
-
+# -- in a scene ------------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize(
     "integrator, stride",
     [

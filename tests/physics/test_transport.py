@@ -21,7 +21,7 @@ SCENE = """<scene version="3.0.0">
         <transform name="to_world"><translate x="0.013" y="0.007" z="-20"/></transform>
     </sensor>
     BODIES
-</scene>"""
+</scene>"""  # noqa: E501
 BLACK = '<bsdf type="diffuse"><spectrum name="reflectance" value="0"/></bsdf>'
 
 
@@ -29,20 +29,23 @@ def clear(name, index, absorption=0.0, outside="", more="", roughness=0.0):
     more += f'<float name="roughness" value="{roughness}"/>' if roughness else ""
     where = f'<string name="outside" value="{outside}"/>' if outside else ""
     return (
-        f'<bsdf type="clear" id="{name}">{where}<float name="index" value="{index}"/><float name="absorption" value="{absorption}"/>'
+        f'<bsdf type="clear" id="{name}">{where}<float name="index" value="{index}"/><float name="absorption" '
+        f'value="{absorption}"/>'
         f"{more}</bsdf>"
     )
 
 
 def box(name, bsdf, half, middle=(0, 0, 0), turn=""):
     scale, shift = (" ".join(f'{a}="{v}"' for a, v in zip("xyz", values)) for values in (half, middle))
-    return f'<shape type="cube" id="{name}"><transform name="to_world"><scale {scale}/>{turn}<translate {shift}/></transform>{bsdf}</shape>'
+    place = f'<transform name="to_world"><scale {scale}/>{turn}<translate {shift}/></transform>'
+    return f'<shape type="cube" id="{name}">{place}{bsdf}</shape>'
 
 
 def screen(z, half=400.0, name="screen", more=""):
     """A luminous plane that faces the camera."""
     return (
-        f'<shape type="rectangle" id="{name}_plane"><transform name="to_world"><rotate x="1" angle="180"/><scale x="{half}" y="{half}"/>'
+        f'<shape type="rectangle" id="{name}_plane"><transform name="to_world"><rotate x="1" angle="180"/><scale '
+        f'x="{half}" y="{half}"/>'
         f'<translate z="{z}"/></transform>{BLACK}<emitter type="source" id="{name}">{more}</emitter></shape>'
     )
 
@@ -50,7 +53,8 @@ def screen(z, half=400.0, name="screen", more=""):
 def grid(cells, bsdf, pitch=0.8, wall=0.2, skin=0.5):
     counts = "".join(f'<integer name="{n}" value="{v}"/>' for n, v in zip(("columns", "rows", "layers"), cells))
     return (
-        f'<shape type="cells" id="grid">{counts}<float name="pitch" value="{pitch}"/><float name="wall" value="{wall}"/>'
+        f'<shape type="cells" id="grid">{counts}<float name="pitch" value="{pitch}"/><float name="wall" '
+        f'value="{wall}"/>'
         f'<float name="skin" value="{skin}"/>{bsdf}</shape>'
     )
 
@@ -70,9 +74,7 @@ def near(found, error, expected):
     assert (np.abs(mean - expected) < SIGMAS * sd + 1e-6).all(), f"{mean} +- {sd}, expected {expected}"
 
 
-# -- closed forms ------------------------------------------------------------------------------------------------------
-
-
+# -- closed forms ----------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize("alpha", [0.0, 0.4])
 def test_a_slab_transmits_all_orders(tmp_path, mitsuba, alpha):
     """T = (1 - R)^2 a/(1 - R^2 a^2), a = exp(-alpha d), and its derivative by alpha (Born & Wolf, 7.6.1, without
@@ -161,7 +163,8 @@ def test_light_goes_both_ways_alike(tmp_path, mitsuba):
         def panel(side, inner):
             return (
                 f'<shape type="rectangle" id="p{side + 1}"><transform name="to_world"><scale x="0.7" y="0.7"/><lookat '
-                f'origin="{side * 3},{0.4 * side},-1.5" target="0,0,-1.2" up="0,1,0"/></transform>{BLACK}{inner}</shape>'
+                f'origin="{side * 3},{0.4 * side},-1.5" target="0,0,-1.2" '
+                f'up="0,1,0"/></transform>{BLACK}{inner}</shape>'
             )
 
         t = load(
@@ -182,8 +185,7 @@ def test_light_goes_both_ways_alike(tmp_path, mitsuba):
     assert a > 20 * da and abs(a - b) < SIGMAS * np.hypot(da, db), power
 
 
-# -- rough faces -------------------------------------------------------------------------------------------------------
-
+# -- rough faces -----------------------------------------------------------------------------------------------------
 SKY = (
     '<shape type="sphere" id="sky"><float name="radius" value="60"/><boolean name="flip_normals" value="true"/>'
     f'{BLACK}<emitter type="source" id="light"/></shape>'
@@ -192,7 +194,8 @@ SKY = (
 
 def rough_dielectric(roughness, index=1.5):
     return (
-        f'<bsdf type="roughdielectric"><float name="int_ior" value="{index}"/><float name="ext_ior" value="1"/><float name="alpha" '
+        f'<bsdf type="roughdielectric"><float name="int_ior" value="{index}"/><float name="ext_ior" value="1"/><float '
+        'name="alpha" '
         f'value="{roughness}"/><string name="distribution" value="beckmann"/></bsdf>'
     )
 
@@ -211,7 +214,8 @@ def by_stock(folder, bodies, fov, integrator="path"):
     text = SCENE.replace("BANDS", "540").replace("FOV", str(fov)).replace("BODIES", "\n".join(bodies))
     text = text.replace(
         '<integrator type="tactile"><string name="bands" value="540"/></integrator>',
-        f'<integrator type="{integrator}"><integer name="max_depth" value="512"/><integer name="rr_depth" value="1000"/></integrator>',
+        f'<integrator type="{integrator}"><integer name="max_depth" value="512"/><integer name="rr_depth" '
+        'value="1000"/></integrator>',
     )
     (folder / "stock.xml").write_text(text)
     return mi.load_file(str(folder / "stock.xml"), optimize=False, size="8")
@@ -290,9 +294,7 @@ def test_what_rough_faces_lose(tmp_path, mitsuba, roughness):
     assert abs(loss - {0.1: 0.0, 0.3: 0.0044, 0.5: 0.072}[roughness]) < 1e-4 + 0.03 * loss
 
 
-# -- ray by ray --------------------------------------------------------------------------------------------------------
-
-
+# -- ray by ray ------------------------------------------------------------------------------------------------------
 def amplitudes(cos, n):
     """r_s, r_p of Fresnel, complex beyond the critical angle, and the cosine beyond."""
     beyond = np.sqrt(1 - (1 - cos**2) / n**2 + 0j)
@@ -480,7 +482,8 @@ def through_prism(folder, apex, n, incidence, copies=8):
         "".join("{} {} {} {}\n".format(*row) for row in [("v", *c) for c in corners] + [("f", *f) for f in faces])
     )
     shape = (
-        f'<shape type="obj" id="prism"><string name="filename" value="{folder / "prism.obj"}"/><boolean name="face_normals" value="true"/>'
+        f'<shape type="obj" id="prism"><string name="filename" value="{folder / "prism.obj"}"/><boolean '
+        'name="face_normals" value="true"/>'
         f"{clear('glass', n)}</shape>"
     )
     t = load(folder, [shape, screen(30)])
@@ -532,15 +535,16 @@ def test_the_aperture_of_a_light_guide(tmp_path, mitsuba):
     assert (leaks[fan < limit - 2e-4] == 0).all() and (leaks[fan > limit + 2e-3] > 0).all()
 
 
-# -- two routes, and stock Mitsuba -------------------------------------------------------------------------------------
-
+# -- two routes, and stock Mitsuba -----------------------------------------------------------------------------------
 LAMPS = [
-    f'<shape type="rectangle" id="lamp_{i}"><transform name="to_world"><scale x="1.4" y="1.0"/><lookat origin="{x},{y},-1.4" '
+    f'<shape type="rectangle" id="lamp_{i}"><transform name="to_world"><scale x="1.4" y="1.0"/><lookat '
+    f'origin="{x},{y},-1.4" '
     f'target="0,0,-1.3" up="0,0,1"/></transform>{BLACK}<emitter type="source" id="light_{i}"/></shape>'
     for i, (x, y) in enumerate(((3, 0), (0, -3)))
 ]
 COAT = (
-    '<shape type="rectangle" id="coat"><transform name="to_world"><rotate x="1" angle="180"/><scale x="2.6" y="2.6"/><translate z="0.2"/></transform>'
+    '<shape type="rectangle" id="coat"><transform name="to_world"><rotate x="1" angle="180"/><scale x="2.6" '
+    'y="2.6"/><translate z="0.2"/></transform>'
     '<bsdf type="diffuse"><spectrum name="reflectance" value="0.6"/></bsdf></shape>'
 )
 
@@ -574,12 +578,15 @@ def stock(folder, roughness, alpha_wall=0.05, alpha_fill=0.1, fill=1.4):
     """The little grid of stock dielectrics, or of rough interfaces, with stock media and lamps, for `volpath`."""
 
     def medium(name, alpha):
-        return f'<medium type="homogeneous" id="{name}"><spectrum name="sigma_t" value="{alpha}"/><spectrum name="albedo" value="0"/></medium>'
+        spectra = f'<spectrum name="sigma_t" value="{alpha}"/><spectrum name="albedo" value="0"/>'
+        return f'<medium type="homogeneous" id="{name}">{spectra}</medium>'
 
     def face(inside, outside, within, without=""):
         around = f'<ref id="{without}" name="exterior"/>' if without else ""
-        smooth = f'<bsdf type="dielectric"><float name="int_ior" value="{inside}"/><float name="ext_ior" value="{outside}"/></bsdf>'
-        rough = f'<bsdf type="rough_interface"><float name="index" value="{inside / outside}"/><float name="alpha" value="{roughness}"/></bsdf>'
+        indices = f'<float name="int_ior" value="{inside}"/><float name="ext_ior" value="{outside}"/>'
+        smooth = f'<bsdf type="dielectric">{indices}</bsdf>'
+        numbers = f'<float name="index" value="{inside / outside}"/><float name="alpha" value="{roughness}"/>'
+        rough = f'<bsdf type="rough_interface">{numbers}</bsdf>'
         return f'{rough if roughness else smooth}<ref id="{within}" name="interior"/>{around}'
 
     return by_stock(

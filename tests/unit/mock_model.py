@@ -170,9 +170,7 @@ class MockModel(Exact):
         now = self.at(values, frame)
         return {k: v / self.unit.get(k, self.unit.get(k.split(".")[1], 1.0)) for k, v in now.items()}
 
-    # -- the physics
-    # ----------------------------------------------------------------------------------------------------
-
+    # -- the physics --------------------------------------------------------------------------------------------------
     def surface(self, v: dict):
         """Height (mm) and its slopes: a ball's cap with a soft rim."""
         key = tuple(v[f"gel.{a}"] for a in ("press_x", "press_y", "press_depth"))
@@ -245,9 +243,7 @@ class MockModel(Exact):
             image = np.exp((1 + e["gamma"]) * np.log(np.where(image.real > 1e-6, image, 1e-6)))
         return self.noise.black_level + (self.noise.saturation - self.noise.black_level) * image
 
-    # -- the interface
-    # --------------------------------------------------------------------------------------------------
-
+    # -- the interface ------------------------------------------------------------------------------------------------
     def predict(self, values: Values, frames=None, seed: int = 0) -> list[np.ndarray]:
         return [self._image(self._at(values, f)) for f in (range(len(self.frames)) if frames is None else frames)]
 
@@ -292,8 +288,7 @@ class MockModel(Exact):
             "intensity": self._image(now),
         }
 
-    # -- roles ----------------------------------------------------------------------------------------------------------
-
+    # -- roles --------------------------------------------------------------------------------------------------------
     def variable(self, key: str, frame: int | None = None, prior=None) -> Variable:
         name = key if frame is None else f"{key}[{self.frames[frame].name}]"
         return Variable(name, (key,), self.parameters[key], None if frame is None else (frame,), prior)
@@ -371,7 +366,7 @@ def simulate(model: MockModel, rng: np.random.Generator, truth: dict | None = No
 
     true, start = Values(), Values()
     count = len(model.frames)
-    for key, parameter in model.parameters.items():
+    for key in model.parameters:
         if key.startswith("led"):
             u = model.unit.get(key, 1.0)
             size = 0.03 * u if key.endswith("power") else 0.15 * u

@@ -109,9 +109,7 @@ def stacked(model, values, variables, effect_variables, frames):
     return (np.concatenate(r) for r in rows)
 
 
-# -- the algebra ------------------------------------------------------------------------------------------------------
-
-
+# -- the algebra -----------------------------------------------------------------------------------------------------
 def test_gaps_are_those_of_the_frames_taken_together():
     """D by normal equations of each shot against least squares on all pixels of all frames at once, pose and prior of
     the new press included."""
@@ -279,9 +277,7 @@ def test_a_planned_effect_has_a_share_of_its_plausible_size():
     assert len(drawn) == 6 and {round(x, 9) for x in drawn} == {-0.002, 0.002} and not own["flicker"].columns
 
 
-# -- which shots ------------------------------------------------------------------------------------------------------
-
-
+# -- which shots -----------------------------------------------------------------------------------------------------
 def test_families_come_from_what_the_model_has():
     model, true, _, _ = session(3, 1)
     found = advise.families(model, true, range(3))
@@ -330,8 +326,7 @@ def test_places_keep_their_distance():
     assert all(abs(x) <= 2 and abs(y) <= 2 for x, y in found)
 
 
-# -- what advice is worth ---------------------------------------------------------------------------------------------
-
+# -- what advice is worth --------------------------------------------------------------------------------------------
 SESSIONS = ((3, 1.8, (0.4, 1.0)), (2, 0.3, (0.15, 0.3)))  # presses, spread (mm), depths (mm)
 CONFUSED = 0.6  # |cos| between what calibration leaves of two effects
 
@@ -455,9 +450,7 @@ def test_following_the_advice_resolves_ties():
     assert ties >= 10 and won[True] >= 1.5 * won[False] and wrong[True] <= 0.1 * ties
 
 
-# -- in a diagnosis ---------------------------------------------------------------------------------------------------
-
-
+# -- in a diagnosis --------------------------------------------------------------------------------------------------
 @cache
 def tie():
     """A diagnosis that cannot tell two effects apart, with its model."""

@@ -71,10 +71,7 @@ def load(folder, text):
     return captures.load(folder)
 
 
-# -- What is right
-# ------------------------------------------------------------------------------------------------------
-
-
+# -- What is right ---------------------------------------------------------------------------------------------------
 def test_every_key_of_the_format(folder):
     Image.fromarray(np.full((6, 8), 200, np.uint8)).save(folder / "background.png")
     c = load(
@@ -183,10 +180,7 @@ def test_the_step_is_read_off_the_images(folder):
     assert load(folder, 'scene = "bench"\n' + NOISE + FRAME.replace("000.png", "mean.npy")).noise.quantisation == 0.0
 
 
-# -- What is wrong
-# ------------------------------------------------------------------------------------------------------
-
-
+# -- What is wrong ---------------------------------------------------------------------------------------------------
 def frames(extra="", image="frames/000.png", before=""):
     return f'scene = "bench"\n{before}{NOISE}[[frames]]\nimage = "{image}"\n{extra}'
 
@@ -351,10 +345,7 @@ def test_settings_are_held_against_the_scene(folder):
             captures.check(c, known)
 
 
-# -- Using and writing
-# --------------------------------------------------------------------------------------------------
-
-
+# -- Using and writing -----------------------------------------------------------------------------------------------
 def made(folder, shape=(6, 8, 3), bits=8):
     rng = np.random.default_rng(2)
     top = 2 ** (bits or 8) - 10

@@ -48,10 +48,7 @@ def measured(tmp_path_factory):
     return capture_files.write(found, folder / "set", bits=8)
 
 
-# -- looking around
-# -------------------------------------------------------------------------------------------------------
-
-
+# -- looking around --------------------------------------------------------------------------------------------------
 def test_help_needs_nothing_heavy():
     code = (
         "import sys, optics.cli as c\ntry: c.main(['--help'])\nfinally: print([m for m in sys.argv[1].split() if m in "
@@ -177,10 +174,7 @@ def test_doctor(optics):
     assert {"ok", "rows"} <= json.loads(optics("doctor", "--json")[1]).keys()
 
 
-# -- arguments and errors
-# -------------------------------------------------------------------------------------------------
-
-
+# -- arguments and errors --------------------------------------------------------------------------------------------
 def test_priors():
     assert shared.priors(["led_*.x=11+-0.5", "gel.press_*=+-0.05", "a=-1e-3±2", "b=1 +/- .1"]) == {
         "led_*.x": (11.0, 0.5),
@@ -237,9 +231,7 @@ def test_quiet_says_nothing_but_results(optics, tmp_path):
     assert optics("render", "gelsight", *SIZE, "-o", tmp_path / "b.exr", "--quiet")[2] == ""
 
 
-# -- render ---------------------------------------------------------------------------------------------------------
-
-
+# -- render ----------------------------------------------------------------------------------------------------------
 def test_a_image_of_a_sensor(optics, tmp_path):
     file = tmp_path / "new" / "a.exr"
     code, out, _ = optics(
@@ -377,10 +369,7 @@ def test_a_sensor_beside_other_lights_goes_through_mitsuba(optics, tmp_path):
     assert exr.read(tmp_path / "lit.exr")[0]["S0.610,000000nm"].mean() > 0.1  # of a sky of 1
 
 
-# -- models and measurements
-# ----------------------------------------------------------------------------------------------
-
-
+# -- models and measurements -----------------------------------------------------------------------------------------
 def test_compare(optics, measured, tmp_path):
     code, text, _ = optics("compare", measured, "-o", tmp_path / "cmp")
     assert code == 0 and text.splitlines()[1].split()[1] == str(6 * 48 * 36 * 3)

@@ -317,7 +317,7 @@ def test_an_offset_becomes_what_its_stage_can_do(tmp_path):
     curve = Fingerprint(
         "row", 100.0, 4, 0.0, 96.0, 2.0, "offset", [0.0, 10.0, 20.0], [1.0, -2.0, 1.0], [0.1] * 3, [], "camera"
     )
-    options = dict(black_level=5.0, saturation=205.0)
+    options = {"black_level": 5.0, "saturation": 205.0}
     effect = load(draft.draft_effect(diagnosis(curve), "row", name="amp glow", **options), tmp_path, "amp glow")
     v, u = np.mgrid[:30, :2] + 0.5
     out = effect.stages["sensor"](np.zeros((30, 2, 3)), SimpleNamespace(v=v, u=u, amp_glow=1.0))
@@ -333,7 +333,7 @@ def test_an_offset_becomes_what_its_stage_can_do(tmp_path):
 
 
 def test_signal_and_cells_are_read_where_they_are(tmp_path):
-    options = dict(black_level=5.0, saturation=205.0)
+    options = {"black_level": 5.0, "saturation": 205.0}
     curve = Fingerprint(
         "signal", 100.0, 4, 0.0, 96.0, 2.0, "gain", [5.0, 105.0, 205.0], [0.0, 0.1, 0.0], [0.01] * 3, [], "camera"
     )
@@ -379,7 +379,7 @@ def test_a_setting_of_any_part_is_drafted_whatever_the_scene_calls_it(x, tmp_pat
 
 
 def test_a_table_has_each_place_once_and_a_strength_that_is_plausible():
-    options, nan = dict(name="x", black_level=0.0, saturation=1.0), np.nan
+    options, nan = {"name": "x", "black_level": 0.0, "saturation": 1.0}, np.nan
     curve = Fingerprint(
         "incidence",
         9.0,
@@ -431,16 +431,13 @@ def test_lookup():
             lookup(0.5, wrong, values)
 
 
-# -- what cannot be
-# -----------------------------------------------------------------------------------------------------
-
-
+# -- what cannot be --------------------------------------------------------------------------------------------------
 def test_what_no_draft_can_carry_is_refused_with_the_alternatives():
     known = [
         Fingerprint(c, 9.0, 1, 0.0, 8.0, 2.0, "gain", [0.0, 1.0], [0.0, 0.1], [0.01] * 2, [], "camera")
         for c in ("laplacian", "row", "contact_distance")
     ]
-    options = dict(name="x", black_level=0.0, saturation=1.0)
+    options = {"name": "x", "black_level": 0.0, "saturation": 1.0}
     with pytest.raises(ValueError, match="no draft along 'laplacian': .* mixes pixels.*; a draft can follow row"):
         draft.draft_effect(diagnosis(*known), "laplacian", **options)
     with pytest.raises(ValueError, match="no stage of a model sees it; a draft can follow row"):
@@ -622,10 +619,7 @@ def test_no_parameter_hides_an_attribute_of_its_part(word, tmp_path):
         use_variant(registry=known(tmp_path))
 
 
-# -- residuals in a report
-# ----------------------------------------------------------------------------------------------
-
-
+# -- residuals in a report -------------------------------------------------------------------------------------------
 def test_components_find_what_frames_have_in_common():
     from optics.pages.residual_maps import components
     from optics.study.record import Shown

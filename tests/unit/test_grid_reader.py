@@ -11,9 +11,8 @@ HEIGHT, WIDTH = 120, 160  # px
 SHAPE = (HEIGHT, WIDTH, 3)
 Y, X = np.indices((HEIGHT, WIDTH)) + 0.5
 
-# -- Drawing -----------------------------------------------------------------------------------------------------------
 
-
+# -- Drawing ----------------------------------------------------------------------------------------------------------
 def repeat(plane):
     return np.repeat(np.asarray(plane, float)[..., None], 3, axis=2)
 
@@ -52,9 +51,7 @@ def lit(walls, on=120.0, off=10.0):
     return repeat(np.where(walls, on, off))
 
 
-# -- The quantities ----------------------------------------------------------------------------------------------------
-
-
+# -- The quantities --------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize(
     "levels, bits",
     [
@@ -127,9 +124,7 @@ def test_similarity_is_the_share_of_the_reference_that_is_left():
     assert grid.similarity(now, reference) == pytest.approx([0.3, 1, np.nan], nan_ok=True)
 
 
-# -- Depth -------------------------------------------------------------------------------------------------------------
-
-
+# -- Depth -----------------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize("black_level, saturation", [(0, 65535), (0, 4080), (64, 64 + 4 * 255), (2.5, 3.5)])
 def test_depth_and_black_level_change_nothing(black_level, saturation):
     rng = np.random.default_rng(2)
@@ -173,9 +168,7 @@ def test_frames_of_another_depth_are_noticed():
         references([np.full(SHAPE, 200.0), np.full(SHAPE, 4000.0)], 1)
 
 
-# -- Algorithm 1 -------------------------------------------------------------------------------------------------------
-
-
+# -- Algorithm 1 -----------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize("count, means", [(1, [3]), (2, [1.5, 5]), (3, [1, 3.5, 5.5]), (7, [0, 1, 2, 3, 4, 5, 6])])
 def test_backgrounds_are_means_of_frames_in_a_row(count, means):
     still = references([np.full(SHAPE, float(i)) for i in range(7)], count)
@@ -219,9 +212,7 @@ def test_channels_are_not_mixed():
     assert still.share[1] > 0.2 and still.share[[0, 2]].tolist() == [0, 0]
 
 
-# -- Algorithm 2 -------------------------------------------------------------------------------------------------------
-
-
+# -- Algorithm 2 -----------------------------------------------------------------------------------------------------
 def test_intersection_is_the_running_minimum_of_the_differences():
     rng = np.random.default_rng(4)
     frames = [take(texture(), 5.0, rng) for _ in range(9)]
@@ -362,9 +353,7 @@ def test_even_light_and_what_darkens_are_not_seen():
         assert found.entropy == 0 and found.state == "Normal" and found.correlation == 0 and np.isnan(found.pairs).all()
 
 
-# -- Algorithm 3 -------------------------------------------------------------------------------------------------------
-
-
+# -- Algorithm 3 -----------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize(
     "shift, where, left",
     [(0, None, 1), (1, None, 0.75), (2, None, 0.5), (4, None, 0), (16, None, 1), (4, 90, 0.75), (2, 30, 0.625)],
@@ -450,9 +439,7 @@ def test_without_any_grid_there_is_no_contact_to_read(level, dark, said):
     assert proximity(np.full(SHAPE, level), still).state == "Normal"
 
 
-# -- Both together -----------------------------------------------------------------------------------------------------
-
-
+# -- Both together ---------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize(
     "near, touch, left, together",
     [
@@ -537,8 +524,7 @@ def test_a_bad_frame_is_named():
         read_sequence([lit(stripes()), lit(stripes())[::2]], still)
 
 
-# -- What is refused ---------------------------------------------------------------------------------------------------
-
+# -- What is refused -------------------------------------------------------------------------------------------------
 NAN = np.full(SHAPE, np.nan)
 GOOD = [np.full(SHAPE, 100.0)] * 3
 

@@ -28,7 +28,7 @@ def presses():
     return importing.Presses("made here", [f"p{i}" for i in range(12)], np.array(images), circles, flat + 12)
 
 
-OPTIONS = dict(ball_radius=2.0, mm_per_pixel=0.2)
+OPTIONS = {"ball_radius": 2.0, "mm_per_pixel": 0.2}
 
 
 def test_presses_become_captures_with_a_scene_and_numbers(presses, tmp_path):

@@ -43,10 +43,7 @@ def check(found, wanted, error=EXACT):
     np.testing.assert_allclose(found, wanted, rtol=0, atol=error)
 
 
-# -- Polarizers
-# ---------------------------------------------------------------------------------------------------------
-
-
+# -- Polarizers ------------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize("angle", [0.0, 25.0, -130.0])
 def test_malus(angle):
     check(mono(Truth(), turns(polarizer_angle=angle)), 0.8**2 / 2 * cos(ANGLES - angle) ** 2)
@@ -99,10 +96,7 @@ def test_turning_the_whole_bench_changes_nothing():
     )
 
 
-# -- The sample
-# ---------------------------------------------------------------------------------------------------------
-
-
+# -- The sample ------------------------------------------------------------------------------------------------------
 def between(p, a, axis, phase):
     """Fraction of Malus' maximum behind a retarder: cos^2(a - p) - sin 2(axis - p) sin 2(axis - a) sin^2(phase/2)."""
     return cos(a - p) ** 2 - sin(2 * (axis - p)) * sin(2 * (axis - a)) * sin(phase / 2) ** 2
@@ -165,10 +159,7 @@ def test_depolarizer():
     check([np.trace(light).real, 2 * light[1, 0].imag], [1.0, -0.8])  # circular light too; S3 < 0: clockwise, as above
 
 
-# -- Reflections between the faces
-# --------------------------------------------------------------------------------------
-
-
+# -- Reflections between the faces -----------------------------------------------------------------------------------
 def film(t, r):
     """(transmittance, reflectance) of face, absorber, face for one polarization: sums of geometric series."""
     ring = (1 - r) ** 2 / (1 - (r * t) ** 2)
@@ -259,10 +250,7 @@ def test_all_orders_of_reflection_against_an_inversion():
         )
 
 
-# -- Dials, lamp and photodiode
-# -----------------------------------------------------------------------------------------
-
-
+# -- Dials, lamp and photodiode --------------------------------------------------------------------------------------
 def test_dial_to_angle():
     crooked = Polarizer(offset=2.0, scale=1.01, backlash=3.0)
     for part in ("polarizer", "analyzer"):
@@ -312,10 +300,7 @@ def test_readings_are_clipped():
     assert np.all(high == 4095) and np.all(low == 0)
 
 
-# -- Sweeps and files
-# ---------------------------------------------------------------------------------------------------
-
-
+# -- Sweeps and files ------------------------------------------------------------------------------------------------
 def test_sweep():
     settings = jones.malus_sweep(73, (0.0, 45.0, 90.0), turns=2, minutes=36, fixed={"sample.angle": 5.0})
     column = {key: np.array([s[key] for s in settings]) for key in settings[0]}

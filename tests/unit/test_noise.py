@@ -26,10 +26,7 @@ def record(noise, seed, exposures=EXPOSURES, readings=4, size=64, slope=0.0, **c
     return replace(Captures(None, "bench", frames), **changes)
 
 
-# -- The model
-# ----------------------------------------------------------------------------------------------------------
-
-
+# -- The model -------------------------------------------------------------------------------------------------------
 def test_variance_is_the_sum_of_its_terms():
     assert CAMERA.variance(8.0) == pytest.approx(1.5**2 + 1 / 12)
     assert CAMERA.variance(108.0) == pytest.approx(0.05 * 100 + 1.5**2 + 1 / 12 + 0.3**2)
@@ -110,10 +107,7 @@ def test_masks_follow_data_and_noise_per_channel():
     assert CAMERA.pedestal and not bare.pedestal
 
 
-# -- Estimation
-# ---------------------------------------------------------------------------------------------------------
-
-
+# -- Estimation ------------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize("slope", [0.0, 0.5])
 @pytest.mark.parametrize(
     "noise",

@@ -37,10 +37,7 @@ def embedded(block, column=(0, 0, 0)):
     return matrix
 
 
-# -- decomposition
-# --------------------------------------------------------------------------------------------------------
-
-
+# -- decomposition ---------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize("seed", range(12))
 def test_the_factors_of_a_product_come_back(seed):
     rng = np.random.default_rng(seed)
@@ -131,9 +128,7 @@ def test_no_light_and_no_matrix():
     assert decompose(np.diag([1, 1, 1, -1.0])).realisable < -0.1  # a mirror of the Poincare sphere is no layer
 
 
-# -- rays -----------------------------------------------------------------------------------------------------------------
-
-
+# -- rays ------------------------------------------------------------------------------------------------------------
 @pytest.fixture(scope="module")
 def scenes(mitsuba):
     return {
@@ -218,9 +213,7 @@ def test_places(bench):
         polarimetry.pixel(bare, None)
 
 
-# -- images -------------------------------------------------------------------------------------------------------------
-
-
+# -- images ----------------------------------------------------------------------------------------------------------
 def test_the_colours_of_angles_close_and_keep_their_lightness():
     angles = np.arange(0, 180, 5.0)
     colours = polarimetry.wheel(angles)
@@ -245,10 +238,7 @@ def test_maps_are_black_where_nothing_can_be_said():
     assert not degree[1].any() and not angle[1].any()
 
 
-# -- readings against a parameter
-# -----------------------------------------------------------------------------------------
-
-
+# -- readings against a parameter ------------------------------------------------------------------------------------
 def test_a_spot_is_a_pixel_of_the_image(finger):
     whole, values = Renderer(finger), {**finger.values(), "analyzer.angle": 20.0}
     picture = sum(whole.powers(values, n) * whole.image(values, n) for n in finger.lights) + whole.ambient(values)

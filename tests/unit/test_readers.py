@@ -14,9 +14,8 @@ COLUMNS, ROWS, PITCH_X, PITCH_Y = 5, 4, 26.0, 24.0  # px
 RADIUS, BRIGHT, DARK = 4.2, 120.0, 20.0  # px, DN, DN
 FINE = 8  # samples per pixel and axis: the sampled outline places a centre of this radius to 0.01 px
 
-# -- Drawing -----------------------------------------------------------------------------------------------------------
 
-
+# -- Drawing ----------------------------------------------------------------------------------------------------------
 def cover(inside, shape=(HEIGHT, WIDTH)):
     """(H, W) share of each pixel in which inside(x, y) holds, by FINE x FINE samples."""
     s = (np.arange(FINE) + 0.5) / FINE
@@ -58,9 +57,7 @@ def errors(true, found):
     return np.linalg.norm(true[:, None] - found.centres, axis=2).min(axis=1)
 
 
-# -- Finding markers ---------------------------------------------------------------------------------------------------
-
-
+# -- Finding markers -------------------------------------------------------------------------------------------------
 def test_centres_are_sub_pixel_and_a_pixel_s_middle_is_at_one_half():
     true = grid(seed=1)
     found = find(draw(true))
@@ -217,9 +214,7 @@ def test_find_refuses_what_it_cannot_mean(image, options, said):
         find(image, **options)
 
 
-# -- Following markers -------------------------------------------------------------------------------------------------
-
-
+# -- Following markers -----------------------------------------------------------------------------------------------
 def push(points, strength):
     """A press in the middle: outwards, strongest at one pitch from it, px."""
     away = (points - [WIDTH / 2, HEIGHT / 2]) / PITCH_X
@@ -303,9 +298,7 @@ def test_grid_order_refuses_rather_than_guesses():
         grid_order(grid()[1:])
 
 
-# -- Area --------------------------------------------------------------------------------------------------------------
-
-
+# -- Area ------------------------------------------------------------------------------------------------------------
 def scene(a, thing=100.0, behind=None, noise=0.0, blur=0.0, seed=20):
     """(image with the object, image without), DN: coverage a of the object before a textured room."""
     behind = texture(21, 10, 40) if behind is None else behind
@@ -425,8 +418,7 @@ def test_area_refuses_what_it_cannot_mean(arguments, said):
         area(*arguments)
 
 
-# -- Metric ------------------------------------------------------------------------------------------------------------
-
+# -- Metric ----------------------------------------------------------------------------------------------------------
 DISTANCES = np.arange(60.0, 9.0, -1.0)  # mm from the skin, as in IV.A.3
 CAMERA = 25.0  # mm, from the camera to the skin's outer face
 SIZES = (20, 30, 40)  # mm

@@ -1,4 +1,5 @@
-"""What a rehearsal predicts for hidden effects, against the closed form for two rivals and against a diagnosis of what was
+"""What a rehearsal predicts for hidden effects, against the closed form for two rivals and against a diagnosis of what
+was
 really hidden."""
 
 import sys

@@ -22,9 +22,7 @@ def normal_of(*columns, r):
     return normal
 
 
-# -- projection -------------------------------------------------------------------------------------------------------
-
-
+# -- projection ------------------------------------------------------------------------------------------------------
 def test_projection_is_the_difference_of_two_least_squares():
     j, g, r = data()
     left = st.project(normal_of(j, g, r=r), range(6), range(6, 9))
@@ -102,9 +100,7 @@ def test_what_calibration_absorbs_is_invisible_not_infinite():
     assert cone.power(np.ones(2), 6.0) == 0 and np.isnan(cone.sd).all()
 
 
-# -- one-sided and many strengths -------------------------------------------------------------------------------------
-
-
+# -- one-sided and many strengths ------------------------------------------------------------------------------------
 def test_a_strength_that_may_only_rise():
     cone = st.Cone(np.array([[4.0]]), [1])
     assert cone.solve(np.array([-3.0])) == (0.0, pytest.approx([0.0]))
@@ -161,9 +157,7 @@ def test_power_is_what_simulation_finds():
         assert cone.power(s, critical) == pytest.approx(np.mean(cone.fall(u) > critical), abs=0.015)
 
 
-# -- families ---------------------------------------------------------------------------------------------------------
-
-
+# -- families --------------------------------------------------------------------------------------------------------
 def candidates_of(information, sizes, sides):
     out, at = [], 0
     for size, side in zip(sizes, sides):
@@ -222,9 +216,7 @@ def test_gap_predicts_how_often_the_right_effect_wins():
     assert st.gap(v, [0], strength, [1], one_sided) == pytest.approx(float(strength[0] ** 2 * v[0, 0]))
 
 
-# -- noisy derivative images ------------------------------------------------------------------------------------------
-
-
+# -- noisy derivative images -----------------------------------------------------------------------------------------
 @pytest.mark.parametrize("kappa", [0.1, 0.3])
 def test_two_renders_of_a_derivative_remove_the_bias(kappa):
     """R8: strength to 5 % at kappa 0.1 and, on average, at 0.3 as well, where one render gives 1/(1 +
@@ -251,9 +243,7 @@ def test_two_renders_of_a_derivative_remove_the_bias(kappa):
     assert np.mean(naive) < 0.9
 
 
-# -- bins -------------------------------------------------------------------------------------------------------------
-
-
+# -- bins ------------------------------------------------------------------------------------------------------------
 def test_bins_are_columns():
     j, _, r = data()
     rng = np.random.default_rng(9)
@@ -293,9 +283,7 @@ def test_bin_edges_survive_flat_regions_and_few_values():
     assert st.bin_edges(np.full(50, 3.0)) is None and st.bin_edges(np.full(5, np.nan)) is None
 
 
-# -- structure --------------------------------------------------------------------------------------------------------
-
-
+# -- structure -------------------------------------------------------------------------------------------------------
 def spectrum_of(use, columns=None):
     columns = np.zeros((*use.shape, 0)) if columns is None else columns
     spectrum = st.Spectrum(columns.shape[-1])
@@ -397,9 +385,7 @@ def test_a_mosaic_is_seen_in_its_planes_and_points_have_no_structure():
     assert np.isnan(point.test([np.ones((1, 1, 3))], [], np.zeros((0, 0))).p)
 
 
-# -- thinning ---------------------------------------------------------------------------------------------------------
-
-
+# -- thinning --------------------------------------------------------------------------------------------------------
 def test_thinning_is_odd_even_handed_and_enough():
     assert [st.thinning(n, 100) for n in (50, 100, 101, 300, 301, 1000)] == [1, 1, 3, 3, 5, 11]
     for k in (3, 5, 7):

@@ -70,9 +70,7 @@ def case(name):
     return judge(*calibrated(truth, seed=2), effects)
 
 
-# -- what is claimed --------------------------------------------------------------------------------------------------
-
-
+# -- what is claimed -------------------------------------------------------------------------------------------------
 def test_nothing_is_said_of_a_complete_model():
     d = case("null")
     assert d.word == "NOTHING" and len(d.rows) == len(LIBRARY)
@@ -152,9 +150,7 @@ def test_after_it_is_added_nothing_is_left():
     assert d.word == "NOTHING" and d.not_tested == {"vignetting": "in the model already"}
 
 
-# -- what is not claimed ----------------------------------------------------------------------------------------------
-
-
+# -- what is not claimed ---------------------------------------------------------------------------------------------
 @pytest.mark.parametrize("name, coordinates", [("stain", {"place", "row", "column"}), ("height", {"height"})])
 def test_what_the_library_lacks_is_unknown_and_named_by_its_coordinate(name, coordinates):
     d = case(name)
@@ -208,15 +204,13 @@ def test_without_held_out_frames_there_is_no_claim():
     assert d.word == "CANNOT_TELL" and "held out" in d.sentence and any("hold out" in h for h in d.hints)
 
 
-# -- only a claim names a cause ---------------------------------------------------------------------------------------
-
-
+# -- only a claim names a cause --------------------------------------------------------------------------------------
 @pytest.mark.parametrize("name", ["null", "weak", "stain", "height", "drift"])
 def test_no_cause_without_a_claim(name):
     """R10: neither the attribute nor any text names a missing effect."""
     d = case(name)
     with pytest.raises(Underdetermined, match=d.word):
-        d.missing
+        assert d.missing
     assert d.claimed == ""
     assert not re.search(r"is missing|MISSING", d.text() + d.to_json() + d.to_csv())
 
@@ -508,9 +502,7 @@ def test_misfit_that_hides_refutes_no_true_effect(apart, hidden):
         assert right > 0.9
 
 
-# -- views ------------------------------------------------------------------------------------------------------------
-
-
+# -- views -----------------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize("name", ["null", "vignetting", "flicker", "drift"])
 def test_json_brings_everything_back(name):
     d = case(name)
@@ -541,9 +533,7 @@ def test_the_report_can_be_read():
         assert part in text
 
 
-# -- invariance, determinism, refusal ---------------------------------------------------------------------------------
-
-
+# -- invariance, determinism, refusal --------------------------------------------------------------------------------
 def test_units_change_nothing_and_one_seed_gives_one_table():
     """R7 and R20: T, p, survival and cos to 1e-6 under other units of effects and base parameters; same seed, same
     bytes."""
@@ -594,9 +584,7 @@ def test_frames_are_fitted_or_held_out():
         diagnose(model, fit, LIBRARY, model.variables_of, HELD, fitted=(), refit=mock_fit)
 
 
-# -- awkward effects and models ---------------------------------------------------------------------------------------
-
-
+# -- awkward effects and models --------------------------------------------------------------------------------------
 def test_what_cannot_be_seen_or_is_not_finite_never_wins():
     model, fit = calibrated({"crosstalk": 0.03})
     plain = model.derivatives
@@ -763,7 +751,7 @@ def test_family_wise_alarms_on_the_images_of_the_mock():
                 e, variables, np.zeros(len(variables)), sides, np.array([v.parameter.plausible for v in variables])
             )
         )
-    base = [v for v in fit.variables]
+    base = list(fit.variables)
     evidence = measure(model, fit.values, base, candidates, FITTED, 10**6, 0, lambda *a: None)
     rng = np.random.default_rng(3)
     gram = evidence.normal.gram
@@ -806,10 +794,7 @@ def test_values_are_not_changed_by_a_diagnosis():
     assert fit.values == before
 
 
-# -- two at once
-# --------------------------------------------------------------------------------------------------------
-
-
+# -- two at once -----------------------------------------------------------------------------------------------------
 def test_pairs_expect_nothing_of_what_the_projection_left_as_rounding():
     """b has a second strength that shows nowhere, as of a film that no frame turns: its share of chi2 would be rounding
     over rounding."""

@@ -74,9 +74,7 @@ def test_the_other_cause_is_named_where_it_is_the_true_one(example, hidden, tmp_
     assert before.word == "AMBIGUOUS" and after.missing == effect
 
 
-# -- a session --------------------------------------------------------------------------------------------------------
-
-
+# -- a session -------------------------------------------------------------------------------------------------------
 @pytest.fixture(scope="module")
 def bench():
     """A plan for three effects of the bench, two of which only an exposure tells apart."""
@@ -179,9 +177,7 @@ def test_a_session_of_images(tmp_path, capsys):
         assert all(keys[k].bounds[0] <= v <= keys[k].bounds[1] for k, v in frame["parameters"].items())
 
 
-# -- bad input --------------------------------------------------------------------------------------------------------
-
-
+# -- bad input -------------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize(
     "arguments, says",
     [

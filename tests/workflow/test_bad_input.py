@@ -351,7 +351,8 @@ CASES = [
     ("compare captures/white", r"frame 1.*all saturated"),
     (
         "compare captures/sunk",
-        r"frame 1 \('black\.png'\): half of its values are 0 DN or less, far below .* black_level = 8 DN; allowed: 2\.796 DN",
+        r"frame 1 \('black\.png'\): half of its values are 0 DN or less, far below .* black_level = 8 DN; allowed: "
+        r"2\.796 DN",
     ),
     ("compare captures/jpeg", r"frame 1.*'\.jpg' files are not read; allowed"),
     ("compare captures/photo", r"frame 1.*a JPEG by the name of \.png"),
@@ -369,15 +370,18 @@ CASES = [
     ("compare captures/dark", r"dark\.xml: the scene has no light"),
     (
         "compare captures/black",
-        r"captures\.toml: none of the 10368 values of 'black\.png' \.\.\. \(0 to 0\) is usable: 10368 not above black_level = 0 DN; allowed",
+        r"captures\.toml: none of the 10368 values of 'black\.png' \.\.\. \(0 to 0\) is usable: 10368 not above "
+        r"black_level = 0 DN; allowed",
     ),
     (
         "compare captures/volts",
-        r"none of the 9 values of 'volts\.csv' \(0\.1 to 1\.7\) is usable: 9 not above black_level = 8 DN; allowed: raw DN \(no volts",
+        r"none of the 9 values of 'volts\.csv' \(0\.1 to 1\.7\) is usable: 9 not above black_level = 8 DN; allowed: "
+        r"raw DN \(no volts",
     ),
     (
         "compare captures/column",
-        r"frame 0 \('column\.csv'\): unknown parameter 'angle'.*rename = \{ \"angle\" = \"KEY\" \} under \[table\] of captures\.toml",
+        r"frame 0 \('column\.csv'\): unknown parameter 'angle'.*rename = \{ \"angle\" = \"KEY\" \} under \[table\] of "
+        r"captures\.toml",
     ),
     (
         "compare captures/columns",

@@ -71,10 +71,7 @@ def whole(tmp_path_factory):
     return folder / "out"
 
 
-# -- what is drawn
-# --------------------------------------------------------------------------------------------------------
-
-
+# -- what is drawn ---------------------------------------------------------------------------------------------------
 def draws(tmp_path, sample, count=400, **more):
     text = f'scene = "gelsight"\nout = "out"\ncount = {count}\n' + "".join(f"{k} = {v}\n" for k, v in more.items())
     (tmp_path / "draws.toml").write_text(text + "[sample]\n" + sample)
@@ -119,10 +116,7 @@ def test_shards(text, shard):
     assert batch.parse_shard(text) == shard
 
 
-# -- what is written
-# ------------------------------------------------------------------------------------------------------
-
-
+# -- what is written -------------------------------------------------------------------------------------------------
 def test_files_tell_how_they_were_made(whole):
     names = [f"{i:06d}{end}" for i in range(TOTAL) for end in ("-dn.png", ".exr", ".png")]
     assert sorted(p.name for p in (whole / "images").iterdir()) == names
@@ -183,10 +177,7 @@ def test_each_light_alone(tmp_path):
     )
 
 
-# -- what happens on the way
-# ----------------------------------------------------------------------------------------------
-
-
+# -- what happens on the way -----------------------------------------------------------------------------------------
 def test_nothing_is_made_twice(whole):
     before = content(whole)
     result = batch.run(whole.parent / "job.toml", workers=1)

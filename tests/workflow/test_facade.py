@@ -45,9 +45,7 @@ def made(tmp_path_factory):
     return study, verdict, before, after, captures
 
 
-# -- import ------------------------------------------------------------------------------------------------------------
-
-
+# -- import ----------------------------------------------------------------------------------------------------------
 def test_importing_is_quick_and_sets_no_variant():
     names = "mitsuba drjit numpy scipy matplotlib colour pydantic typer"
     loaded = in_a_new_process(f"import sys, optics; print([m for m in {names.split()} if m in sys.modules])")
@@ -73,9 +71,7 @@ def test_a_scene_by_name():
         optics.load("gelsigt")
 
 
-# -- a study -----------------------------------------------------------------------------------------------------------
-
-
+# -- a study ---------------------------------------------------------------------------------------------------------
 def test_the_error_falls_to_the_noise_on_frames_that_were_held_out(made):
     study, verdict, before, after, _ = made
     first, last = study.records()
@@ -137,9 +133,7 @@ def test_captures_against_a_fit(made):
     assert len(found.frames()) == len(found.model.frames)
 
 
-# -- tables, charts, notebook ------------------------------------------------------------------------------------------
-
-
+# -- tables, charts, notebook ----------------------------------------------------------------------------------------
 def test_records_are_plain(made):
     study, verdict, _, after, _ = made
     for rows in (study.records(), after.records(), verdict.records(), study.model.scene.records()):

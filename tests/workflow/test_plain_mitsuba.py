@@ -180,10 +180,7 @@ def test_values_and_traverse_agree(name, mi):
         assert all(scene.values()[k] == pytest.approx(v, rel=1e-6) for k, v in changed.items())
 
 
-# -- what cannot be wired is said
-# ------------------------------------------------------------------------------------------
-
-
+# -- what cannot be wired is said ------------------------------------------------------------------------------------
 @pytest.mark.parametrize(
     "name, told",
     [

@@ -23,9 +23,7 @@ def stokes_of(file):
     return (*exr.spectral_image(channels), channels, header)
 
 
-# -- images -------------------------------------------------------------------------------------------------------------
-
-
+# -- images ----------------------------------------------------------------------------------------------------------
 def test_a_scene_with_layers_gives_stokes_vectors(optics, tmp_path):
     file = tmp_path / "a.exr"
     code, out, err = optics(
@@ -137,10 +135,7 @@ def test_stokes_vectors_of_a_scene_without_layers(optics, tmp_path):
     assert exr.spectral_image(exr.read(tmp_path / "b.exr")[0])[1].shape[3] == 1  # as ever
 
 
-# -- what layers do
-# -------------------------------------------------------------------------------------------------------
-
-
+# -- what layers do --------------------------------------------------------------------------------------------------
 def test_matrices_for_programs(optics):
     code, out, err = optics(
         "mueller",
@@ -188,10 +183,7 @@ def test_matrices_in_words(optics):
     assert code == 0 and "product" not in out and "0.8" not in out.splitlines()[3]
 
 
-# -- a reading against an angle
-# -------------------------------------------------------------------------------------------
-
-
+# -- a reading against an angle --------------------------------------------------------------------------------------
 @pytest.fixture
 def measured(tmp_path):
     """A table of readings that follow Malus, with two polarizer angles, a drive level of 0.5 and a clock."""
@@ -285,9 +277,7 @@ def test_a_sweep_beside_readings(optics, measured, tmp_path):
     assert json.loads(out)["summary"][0]["from_measured"] > 30
 
 
-# -- what a user gets wrong
-# -----------------------------------------------------------------------------------------------
-
+# -- what a user gets wrong ------------------------------------------------------------------------------------------
 WRONG = [
     (["mueller", "polarizer_bench", "--at", "3,1"], r"--at 3,1: outside the image; allowed: .* to 1,1"),
     (

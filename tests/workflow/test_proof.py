@@ -29,10 +29,7 @@ def judged(bench, effects=FOUND, seeds=(0,)):
     return count.count(records, len(records))
 
 
-# -- the plan
-# -----------------------------------------------------------------------------------------------------------
-
-
+# -- the plan --------------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize("rig", RIGS.values())
 def test_every_round_hides_every_effect_once_and_nothing_too(rig):
     rig = rig()
@@ -77,10 +74,7 @@ def test_another_law_has_the_cause_and_size_of_the_librarys_but_not_its_shape(be
         readings.other_light("polarizer misalignment", 1.0, settings)
 
 
-# -- counting
-# -----------------------------------------------------------------------------------------------------------
-
-
+# -- counting --------------------------------------------------------------------------------------------------------
 def test_a_target_is_reached_by_the_end_of_the_interval_and_not_by_the_rate():
     def rate(k, n, low=False):
         return count.Rate("", k, n, *((0.03, 0.01) if low else (0.95, 0.99)), low).verdict
@@ -140,10 +134,7 @@ def test_the_set_and_its_size_are_counted_whether_or_not_something_stands_out():
     assert [(r.k, r.n) for r in rates] == [(2, 3), (2, 2)]
 
 
-# -- the loop, blind
-# ----------------------------------------------------------------------------------------------------
-
-
+# -- the loop, blind -------------------------------------------------------------------------------------------------
 def test_the_bench_finds_what_is_hidden_and_predicts_what_comes(bench):
     effects = (*FOUND, "extinction leak", "retardance")  # these two have other images when weak than when strong
     found = judged(bench, effects)
@@ -210,16 +201,16 @@ def test_a_run_is_taken_up_again_and_becomes_a_page(tmp_path, monkeypatch, capsy
     monkeypatch.setattr(
         command.plan, "rounds", lambda rig, n: iter([[strong("", "none"), strong("third harmonic", "unknown", 0.01)]])
     )
-    arguments = dict(
-        output=tmp_path,
-        rig=["polarizer_bench"],
-        rounds=1,
-        kind=None,
-        jobs=1,
-        minutes=0.0,
-        quick=False,
-        count_only=False,
-    )
+    arguments = {
+        "output": tmp_path,
+        "rig": ["polarizer_bench"],
+        "rounds": 1,
+        "kind": None,
+        "jobs": 1,
+        "minutes": 0.0,
+        "quick": False,
+        "count_only": False,
+    }
     command.main(**arguments)
     files = sorted((tmp_path / "records").glob("*.json"))
     assert len(files) == 2

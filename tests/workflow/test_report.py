@@ -377,9 +377,7 @@ def demo_diagnosis(rows, found, index, names) -> dict:
     }
 
 
-# -- tests -------------------------------------------------------------------------------------------------------------
-
-
+# -- tests -----------------------------------------------------------------------------------------------------------
 @pytest.fixture(scope="module")
 def studied(tmp_path_factory):
     folder = tmp_path_factory.mktemp("demo")

@@ -144,10 +144,7 @@ def busy(view):
         job.result(60)
 
 
-# -- what the server answers
-# ------------------------------------------------------------------------------------------------
-
-
+# -- what the server answers -----------------------------------------------------------------------------------------
 def test_the_record_names_frames_sliders_and_effects(ask, study):
     status, body, headers = ask("/study", "GET")
     record, step = json.loads(body), Record.open(study).steps[0]
@@ -406,10 +403,7 @@ def test_a_frames_name_survives_in_the_file(view, monkeypatch, tmp_path):
     assert list(read_fit(tmp_path / "fit.toml")["frames"])[:2] == names[:2]
 
 
-# -- the command
-# ----------------------------------------------------------------------------------------------------------------
-
-
+# -- the command -----------------------------------------------------------------------------------------------------
 def test_what_is_no_study_is_refused_in_a_line(optics, study, tmp_path):
     Record.create(
         tmp_path / "empty", scene="gelsight", captures="x", facts={"setup": Record.open(study).ladder["facts"]["setup"]}
@@ -454,10 +448,7 @@ def test_the_command_serves_until_it_is_interrupted(study):
     assert child.returncode == 0 and err.splitlines() == ["Ctrl-C ends it"]
 
 
-# -- the page
-# ---------------------------------------------------------------------------------------------------------------------
-
-
+# -- the page --------------------------------------------------------------------------------------------------------
 class Chromium:
     """A headless Chromium, spoken to by its DevTools protocol over a pipe: JSON messages that end in NUL."""
 

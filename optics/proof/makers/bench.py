@@ -47,9 +47,7 @@ PAULI = np.array([[[1, 0], [0, 1]], [[1, 0], [0, -1]], [[0, 1], [1, 0]], [[0, -1
 Settings = Sequence[Mapping[str, float]]  # one reading each, by key; what is missing stands at DEFAULTS
 
 
-# -- What is on the bench ----------------------------------------------------------------------------------------------
-
-
+# -- What is on the bench --------------------------------------------------------------------------------------------
 def _within(low: float, high: float, default: float):
     return field(default=default, metadata={"bounds": (low, high)})
 
@@ -142,9 +140,7 @@ class Truth(_Checked):
     photodiode: Photodiode = Photodiode()
 
 
-# -- Light through it --------------------------------------------------------------------------------------------------
-
-
+# -- Light through it ------------------------------------------------------------------------------------------------
 def radiance(truth: Truth, settings: Settings) -> np.ndarray:
     """Radiance at the photodiode (n, C), stray light included, for n readings and C channels.
 
@@ -254,9 +250,7 @@ def _intensity(light: np.ndarray) -> np.ndarray:
     return np.trace(light, axis1=-2, axis2=-1).real
 
 
-# -- Readings of it ----------------------------------------------------------------------------------------------------
-
-
+# -- Readings of it --------------------------------------------------------------------------------------------------
 def expected(truth: Truth, settings: Settings, noise: Noise) -> np.ndarray:
     """Mean reading (n, C) in DN, neither rounded nor clipped; errors as of `radiance`."""
     diode = truth.photodiode

@@ -70,8 +70,7 @@ class FingerMaker:
         self._kept: dict = {}  # displacements and images of the present geometry
         self.wall_dark = scene.defines.get("wall_dark", 0.6)
 
-    # -- geometry ------------------------------------------------------------------------------------------------------
-
+    # -- geometry -----------------------------------------------------------------------------------------------------
     def dent(self, press: Sequence[float]):
         """The pressed outer face's displacement map, or None."""
         from optics.skin import contact
@@ -205,8 +204,7 @@ class FingerMaker:
         )
         return self.mesh(np.concatenate([*ends, middles]), faces, bsdf, "object")
 
-    # -- light ---------------------------------------------------------------------------------------------------------
-
+    # -- light --------------------------------------------------------------------------------------------------------
     def rectangle(self, z: float, half: float, bsdf: dict) -> dict:
         import mitsuba as mi
 
@@ -411,8 +409,7 @@ class FingerMaker:
             total = total * (1 + e["analyzer wobble"] * np.cos(np.radians(dial)))
         return total + e.get("stray light", 0.0)
 
-    # -- camera --------------------------------------------------------------------------------------------------------
-
+    # -- camera -------------------------------------------------------------------------------------------------------
     def photograph(self, radiance: np.ndarray, rng, frame: int) -> np.ndarray:
         """Noisy, quantised DN of a radiance (H, W, 3); the camera's effects in numpy."""
         v, e, n = self.values, self.effects, self.noise

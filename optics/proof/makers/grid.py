@@ -74,8 +74,7 @@ class GridMaker:
         self.noise, self.seed, self.spp, self.count = noise, seed, spp, 0
         self.shares: list[float] = []
 
-    # -- bodies --------------------------------------------------------------------------------------------------------
-
+    # -- bodies -------------------------------------------------------------------------------------------------------
     def mesh(self, name: str, points, faces, **has):
         """A mesh of flat triangles with its material, and its media."""
         import mitsuba as mi
@@ -233,8 +232,7 @@ class GridMaker:
         finally:
             use_variant(DEFAULT_VARIANT)
 
-    # -- camera --------------------------------------------------------------------------------------------------------
-
+    # -- camera -------------------------------------------------------------------------------------------------------
     def photograph(self, radiance: np.ndarray, error: np.ndarray, rng) -> np.ndarray:
         """(H, W, 1) noisy, quantised DN; what the image's own error is of that noise goes to `shares`."""
         n = self.noise

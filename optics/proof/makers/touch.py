@@ -93,8 +93,7 @@ class Maker:
             scene.camera.sensitivity, scene.integrator.bands
         )  # of the camera's channels, (3, 3)
 
-    # -- the face ------------------------------------------------------------------------------------------------------
-
+    # -- the face -----------------------------------------------------------------------------------------------------
     def mesh(self, press: Sequence[float], pitch: float = 0.02):
         """The coated face on a grid three times as fine as the model's around the dent, with its exact normals."""
         import mitsuba as mi
@@ -139,8 +138,7 @@ class Maker:
             "specular": float(self.effects.get("specular lobe", 0.0)),
         }
 
-    # -- light ---------------------------------------------------------------------------------------------------------
-
+    # -- light --------------------------------------------------------------------------------------------------------
     def sensor(self) -> dict:
         import mitsuba as mi
 
@@ -324,8 +322,7 @@ class Maker:
             z = -contact.surface(p[..., 0], p[..., 1], press[0], press[1], pressed)
         return camera + direction * (z - self.camera_z)[..., None], camera
 
-    # -- camera --------------------------------------------------------------------------------------------------------
-
+    # -- camera -------------------------------------------------------------------------------------------------------
     def photograph(self, radiance: np.ndarray, rng, frame: int) -> np.ndarray:
         """Noisy, quantised DN of a radiance (H, W, 3); the camera's effects by scipy."""
         from scipy.ndimage import gaussian_filter, map_coordinates

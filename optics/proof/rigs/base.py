@@ -45,8 +45,7 @@ class Rig:
     def __init__(self):
         self._strengths: dict[tuple[str, float], float] = {}
 
-    # -- what a sensor says of itself ----------------------------------------------------------------------------------
-
+    # -- what a sensor says of itself ---------------------------------------------------------------------------------
     def captures(
         self, cell: Cell, truth: Mapping[str, float], unknown: Mapping[str, float], *, mean: bool = False
     ) -> capture_files.Captures:
@@ -62,8 +61,7 @@ class Rig:
         compare with."""
         raise NotImplementedError
 
-    # -- what follows --------------------------------------------------------------------------------------------------
-
+    # -- what follows -------------------------------------------------------------------------------------------------
     def strength(self, effect: str, change: float) -> float:
         """That changes the image by so much (rms over mean, before any calibration); inf where none does."""
         if (effect, change) not in self._strengths:
@@ -196,9 +194,7 @@ def strength_at(change: float, changed_by: Callable[[float], float], start: floa
     return trial
 
 
-# -- what is written down wrongly, or done to images ------------------------------------------------------------------
-
-
+# -- what is written down wrongly, or done to images -----------------------------------------------------------------
 def noted(noise: Noise, mistake: str) -> Noise:
     """What is written down of a camera."""
     if mistake.startswith("gain"):
@@ -221,9 +217,7 @@ def demosaiced(image: np.ndarray) -> np.ndarray:
     return np.stack(out, -1).astype(np.float32)
 
 
-# -- makers from a workshop --------------------------------------------------------------------------------------------
-
-
+# -- makers from a workshop ------------------------------------------------------------------------------------------
 class Mean:
     """A camera without noise: `photograph` gives the mean."""
 

@@ -3,8 +3,7 @@
 `Wild` is `optics.proof.makers.touch.Maker` with the imperfections of a built sensor:
 
     clutter    c = 1: fixed pattern of the sensor 0.5 % rms, mottle of the coating 1 % rms (0.4 mm), wrinkles of the
-               skin of 0.3 deg rms,
-               the same in every frame; no effect of the library describes these
+               skin of 0.3 deg rms, the same in every frame; no effect of the library describes these
     shape      "other": effects with the same cause and size as the library's, but another law, as in OTHER
     unknown    what the library does not have, as in UNKNOWN
 """
@@ -113,8 +112,7 @@ class Wild(Workshop, synthetic.Maker):
         y, x = np.mgrid[:height, :width] + 0.5
         return (x - width / 2) / focal, (y - height / 2) / focal
 
-    # -- the face ------------------------------------------------------------------------------------------------------
-
+    # -- the face -----------------------------------------------------------------------------------------------------
     def mesh(self, press: Sequence[float], pitch: float = 0.02):
         import mitsuba as mi
 
@@ -163,8 +161,7 @@ class Wild(Workshop, synthetic.Maker):
         size = self.clutter * np.tan(np.radians(WRINKLE)) / np.sqrt((gx**2 + gy**2).mean())
         return size * rise, size * slope_x, size * slope_y
 
-    # -- light ---------------------------------------------------------------------------------------------------------
-
+    # -- light --------------------------------------------------------------------------------------------------------
     def light(self, press: Sequence[float]) -> dict[str, np.ndarray]:
         key = (
             self.seed,
@@ -232,8 +229,7 @@ class Wild(Workshop, synthetic.Maker):
             out = clear + (out - clear) * phase[..., None]
         return out
 
-    # -- camera --------------------------------------------------------------------------------------------------------
-
+    # -- camera -------------------------------------------------------------------------------------------------------
     def photograph(self, radiance, rng, frame, press=None, exposure: float = 1.0):
         values, key = self.values, f"{self.camera}.exposure"
         self.values = {**values, key: values[key] * exposure}
@@ -344,9 +340,7 @@ def _disc(radius: float) -> np.ndarray:
     return kernel / kernel.sum()
 
 
-# -- the sensors -------------------------------------------------------------------------------------------------------
-
-
+# -- the sensors -----------------------------------------------------------------------------------------------------
 class Touch(ImageRig):
     """12 bits, 38 000 electrons: noise of 1 % at the mean signal of a bright frame."""
 

@@ -1,0 +1,26 @@
+"""What a step records of held-out frames is what was fitted in them for this step."""
+
+from types import SimpleNamespace
+
+from optics.scene.parameter import Values
+from optics.study import loop
+
+
+def test_a_resumed_study_records_the_poses_found_in_this_step(monkeypatch):
+    """A study that was taken up again starts with the poses of the step before, in held-out frames as well."""
+    now = Values({"camera.blur": 0.5}, {0: {"gel.press_x": 1.1}, 1: {"gel.press_x": 2.0}})  # frame 1 is held out
+    found_now = Values(dict(now.common), {**now.frame, 1: {"gel.press_x": 2.7}})
+    fit = SimpleNamespace(values=now, variables=[], frames=[0], warnings=[])
+    monkeypatch.setattr(loop, "held_out_values", lambda model, found, held: (found_now, 1))
+    monkeypatch.setattr(loop, "comparison_of", lambda *a: SimpleNamespace(fitted=None))
+    monkeypatch.setattr(loop.checks, "after_calibration", lambda *a: [])
+    monkeypatch.setattr(loop, "null_models", lambda *a: None)
+    monkeypatch.setattr(loop, "background_of", lambda *a: None)
+    monkeypatch.setattr(loop, "Fit", SimpleNamespace)
+    seen = {}
+    monkeypatch.setattr(loop, "shown_frames", lambda model, values, held: seen.setdefault("shown", values))
+    record = SimpleNamespace(add_step=lambda name, key, kept, *a, **more: seen.setdefault("kept", kept.values))
+    loop.write_step(record, None, "lens blur", None, fit, [1], 0.0)
+    for values in (seen["shown"], seen["kept"]):
+        assert values.frame == {0: {"gel.press_x": 1.1}, 1: {"gel.press_x": 2.7}}
+        assert values.common == {"camera.blur": 0.5}
