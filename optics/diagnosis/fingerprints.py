@@ -21,7 +21,7 @@ from optics.diagnosis.result import Family, Fingerprint
 from optics.diagnosis.thresholds import AS_GOOD, EXCESS, MIMICS, SHARE
 from optics.fit.compare import UNITS, led_label
 from optics.fit.model import Model
-from optics.scene.parameter import Values
+from optics.scene.parameter import Values, keys_with
 
 SIDE = 4  # cells per side of the coordinate 'place': a finer map would fit any clutter and forbid every claim
 NOT_A_COORDINATE = {"far", "quadrant"}  # regions that others make up
@@ -112,7 +112,8 @@ def settings(model: Model, evidence: Evidence) -> dict[str, list[float]]:
     """key -> value per fitted frame of the numbers that the experimenter turned, other than which LED was on."""
     turned: dict[str, list[float]] = {}
     frames = [model.frames[f] for f in evidence.frames]
-    for key in sorted({key for f in frames for key in f.parameters if not key.endswith(".power")}):
+    lights = keys_with(model.parameters, "power")
+    for key in sorted({key for f in frames for key in f.parameters if key not in lights}):
         values = [f.parameters.get(key, math.nan) for f in frames]
         numbers = [float(v) if isinstance(v, (int, float)) else math.nan for v in values]
         if len({v for v in numbers if math.isfinite(v)}) > 1:

@@ -104,22 +104,23 @@ def stack(
     def numbers(matrix: Mueller) -> np.ndarray:
         return np.broadcast_to(matrix.numpy(), (1, len(bands), 4, 4))[0]
 
-    own = [numbers(paths.slab(n, m, values).t) for n, m in chosen]
-    return names, np.array(own).reshape(-1, len(bands), 4, 4), numbers(_combined(names, [m for _, m in chosen], values))
+    slabs = [(m, paths.reflected(scene, n, values)) for n, m in chosen]
+    own = [numbers(paths.slab(m, share).t) for m, share in slabs]
+    return names, np.array(own).reshape(-1, len(bands), 4, 4), numbers(_combined(slabs))
 
 
-def _combined(names: Sequence[str], matrices: Sequence[Mueller], values: Mapping) -> Mueller:
-    """The product of matrices, from the camera on; where faces reflect, with the light that goes to and fro between
-    them."""
-    if not names:
+def _combined(layers: Sequence[tuple[Mueller, float]]) -> Mueller:
+    """The product of matrices, from the camera on; where faces reflect a share, with the light that goes to and fro
+    between them."""
+    if not layers:
         return mueller.identity()
-    if any(values.get(f"{n}.face", 0.0) != 0 for n in names):
-        whole = paths.slab(names[-1], matrices[-1], values)
-        for name, matrix in zip(names[-2::-1], matrices[-2::-1]):
-            whole = paths.slab(name, matrix, values).after(whole)
+    if any(share != 0 for _, share in layers):
+        whole = paths.slab(*layers[-1])
+        for matrix, share in layers[-2::-1]:
+            whole = paths.slab(matrix, share).after(whole)
         return whole.t
-    whole = matrices[0]
-    for matrix in matrices[1:]:
+    whole = layers[0][0]
+    for matrix, _ in layers[1:]:
         whole = whole @ matrix
     return whole
 

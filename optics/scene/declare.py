@@ -57,10 +57,10 @@ STAGES = {  # stage -> the role of the parts that it belongs to
 IMAGE_STAGES = ("lens", "sensor", "response")
 LED_BY_LED = frozenset(("emission", "segment", "volume", "reflection", "ambient"))  # Monte Carlo light passes none
 ROLES = {  # of parts: all that the library knows of them; a kind plays the role of its own name unless it says another
-    "camera": "images are developed from its pixels; one in a scene",
+    "camera": "images are developed from its pixels, by the names of the shipped camera's parameters; one in a scene",
     "integrator": "renders, and names the bands",
     "gel": "the skin that a press dents: the parameters of a press, its map of displacements, paths of light in it",
-    "led": "a point light, of which images are made one by one",
+    "led": "a point light, of which images are made one by one; among dielectric bodies its lobe is that of `mu`",
     "membrane": "a matt coat of the skin",
     "interface": "a flat boundary that is passed without reflections",
     "clear": "the material of a dielectric body (`index`, `absorption`), where light is followed by Monte Carlo",

@@ -35,6 +35,7 @@ ROLES = {  # of parameters: what the library turns, sets or solves for, whatever
     "distance": "from the untouched skin to an object, mm",
     "angle": "turn of a film about its normal, deg",
     "inserted": "1 where a film is in the beam, 0 where it is taken out",
+    "face": "share of light that each face of a film reflects",
     "clock": "when a frame was taken",
     "approach": "from which side a setting was reached",
 }

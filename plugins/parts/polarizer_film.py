@@ -142,6 +142,7 @@ PARAMETERS = (
         (0.0, 0.1),
         "reflectance r of each face, T1 <= (1 - r)^2; 0: reflections are left out",
         neutral=0.0,
+        role="face",
         plausible=0.04,
         how="layer",
     ),

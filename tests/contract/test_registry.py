@@ -362,3 +362,29 @@ def test_a_light_without_a_power_is_refused(tmp_path):
     )
     with pytest.raises(BadPlugin, match="'spot' has no parameter with role='power'"):
         known(written(tmp_path / "own", spot=source))
+
+
+NAMED = {  # files that read a parameter by its name, and why they may
+    "optics/light/paths.py": {"index"},  # the declared meaning of `refracts`
+    "optics/light/transport.py": {"dop_q", "dop_u"},  # of sources among dielectric bodies, which must not polarize
+}
+
+
+def test_the_library_knows_no_kind_and_reads_no_parameter_by_name():
+    """Between scene and study, parts are told apart by role and traits, and parameters are found by role."""
+    import ast
+
+    root = shipped("plugins").parent / "optics"
+    found = []
+    for package in ("scene", "skin", "polarization", "light", "fit", "diagnosis", "study"):
+        for file in sorted((root / package).glob("*.py")):
+            name = file.relative_to(root.parent).as_posix()
+            for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+                if not isinstance(node, ast.Call) or not all(isinstance(a, ast.Constant) for a in node.args[1:2]):
+                    continue
+                call, given = ast.unparse(node.func), [a.value for a in node.args if isinstance(a, ast.Constant)]
+                if call == "getattr" and given[:1] == ["kind"]:
+                    found.append(f"{name}:{node.lineno}: getattr(..., 'kind')")
+                if call.endswith(".number") and given and given[0] not in NAMED.get(name, ()):
+                    found.append(f"{name}:{node.lineno}: number({given[0]!r})")
+    assert found == []
