@@ -423,7 +423,7 @@ class SceneModel:
                 view = self.developer.view(now)
                 full = self.noise.saturation - self.noise.black_level
                 step = (
-                    ((high - low) @ self.developer.matrix.T) * np.abs(view.exposure * self.developer.gains(view)) * full
+                    ((high - low) @ self.developer.matrix.T) * np.abs(self.developer.scale(view)) * full
                 )
                 level = self.predict(Values(), [index])[0].reshape(-1, self.shape[2])[image.index]
                 known.reshape(-1, self.shape[2])[image.index] = (
@@ -449,7 +449,7 @@ class SceneModel:
 
         now = self.at(values, index)
         view = self.developer.view(now)
-        full = (self.noise.saturation - self.noise.black_level) * np.abs(view.exposure * self.developer.gains(view))
+        full = (self.noise.saturation - self.noise.black_level) * np.abs(self.developer.scale(view))
         error = cast("MonteCarloRenderer", self.renderer).error(now)
         return uniform_filter((error**2 @ (self.developer.matrix**2).T) * full**2, (3, 3, 0), mode="nearest")
 

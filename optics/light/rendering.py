@@ -306,11 +306,7 @@ class RenderJob:
 
         camera = self.scene.camera
         if camera is not None:
-            width, height = camera.resolution
-            o, d = camera.ray(
-                mi.Float(width / 2 + now[f"{camera.name}.principal_x"]),
-                mi.Float(height / 2 + now[f"{camera.name}.principal_y"]),
-            )
+            o, d = camera.ray(*(mi.Float(place) for place in camera.middle()))
         else:
             pose = self.scene.mitsuba.sensors()[0].world_transform()
             o, d = pose @ mi.Point3f(0), pose @ mi.Vector3f(0, 0, 1)

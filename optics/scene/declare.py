@@ -57,7 +57,7 @@ STAGES = {  # stage -> the role of the parts that it belongs to
 IMAGE_STAGES = ("lens", "sensor", "response")
 LED_BY_LED = frozenset(("emission", "segment", "volume", "reflection", "ambient"))  # Monte Carlo light passes none
 ROLES = {  # of parts: all that the library knows of them; a kind plays the role of its own name unless it says another
-    "camera": "images are developed from its pixels, by the names of the shipped camera's parameters; one in a scene",
+    "camera": "images are developed by its gains, response and what it adds; one in a scene",
     "integrator": "renders, and names the bands",
     "gel": "the skin that a press dents: the parameters of a press, its map of displacements, paths of light in it",
     "led": "a point light, of which images are made one by one; among dielectric bodies its lobe is that of `mu`",

@@ -364,6 +364,20 @@ def test_a_light_without_a_power_is_refused(tmp_path):
         known(written(tmp_path / "own", spot=source))
 
 
+def test_the_shipped_parts_have_what_their_roles_ask_for(mitsuba, load_bench):
+    """The table of the page on parts, on parts of a scene: some are set when a part is made."""
+    import re
+
+    text = (shipped("plugins").parent / "docs" / "write-a-part.md").read_text(encoding="utf-8")
+    table = text.split("| role | methods and attributes of its class |")[1].split("\n\n")[0]
+    told = {row[0]: row[1:] for row in (re.findall(r"`(\w+)`", line) for line in table.splitlines()) if row}
+    assert sorted(told) == ["camera", "gel", "led", "membrane"]
+    parts = load_bench("gelsight").scene.parts.values()
+    for role, names in told.items():
+        part = next(p for p in parts if p.role == role)
+        assert len(names) > 2 and [n for n in names if not hasattr(part, n)] == []
+
+
 NAMED = {  # files that read a parameter by its name, and why they may
     "optics/light/paths.py": {"index"},  # the declared meaning of `refracts`
     "optics/light/transport.py": {"dop_q", "dop_u"},  # of sources among dielectric bodies, which must not polarize
@@ -385,6 +399,10 @@ def test_the_library_knows_no_kind_and_reads_no_parameter_by_name():
                 call, given = ast.unparse(node.func), [a.value for a in node.args if isinstance(a, ast.Constant)]
                 if call == "getattr" and given[:1] == ["kind"]:
                     found.append(f"{name}:{node.lineno}: getattr(..., 'kind')")
-                if call.endswith(".number") and isinstance((given or [0])[0], str) and given[0] not in NAMED.get(name, ()):
+                if (
+                    call.endswith(".number")
+                    and isinstance((given or [0])[0], str)
+                    and given[0] not in NAMED.get(name, ())
+                ):
                     found.append(f"{name}:{node.lineno}: number({given[0]!r})")
     assert found == []

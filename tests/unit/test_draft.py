@@ -593,6 +593,7 @@ def test_names_that_functions_of_a_camera_see_are_those_that_no_effect_may_take(
         resolution=(4, 3),
         sensitivity="identity",
         numbers={n: SimpleNamespace(neutral=None) for n in own},
+        normalised=lambda own, u, v: (u, v, 1.0),
     )
     view = Developer(camera, (450.0, 550.0, 650.0)).view({f"camera.{n}": value for n, value in own.items()})
     assert set(vars(view)) - set(own) == set(draft.VIEW)
