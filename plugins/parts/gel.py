@@ -230,32 +230,36 @@ def build():
         def to_string(self):
             return f"Gel[{self.name}]"
 
-    def chord_corrected(z, x, y):
-        """Vertex heights whose linear interpolation has the surface's mean: z - (h_x^2 z_xx + h_y^2 z_yy)/12.
-
-        A mesh with its vertices on a dent lies inside the dent, by h^2/12 of its curvature on average; uncorrected,
-        cast shadows come out shorter, by 0.01 px at a pitch of 0.06 mm, which a calibration on many frames notices."""
-        out = z.copy()
-        hx, hy = np.diff(x), np.diff(y)
-        out[:, 1:-1] -= (
-            (np.diff(z, axis=1)[:, 1:] / hx[1:] - np.diff(z, axis=1)[:, :-1] / hx[:-1]) * (hx[1:] + hx[:-1]) / 24
-        )
-        out[1:-1] -= (np.diff(z, axis=0)[1:] / hy[1:, None] - np.diff(z, axis=0)[:-1] / hy[:-1, None]) * (
-            (hy[1:] + hy[:-1]) / 24
-        )[:, None]
-        return out
-
-    class Path:
-        """What a `segment` or `volume` function sees: lit point, camera, lamp, LED and the lengths inside the gel
-        (mm)."""
-
-        def __init__(self, gel, p, camera, lamp, led, si):
-            self.p, self.camera, self.lamp, self.led, self.si = p, camera, lamp, led, si
-            self.view = gel.length_inside(p, camera)
-            self.light = gel.length_inside(p, lamp)
-            self.wavelengths = si.wavelengths
-
     return Gel
+
+
+def chord_corrected(z, x, y):
+    """Vertex heights whose linear interpolation has the surface's mean: z - (h_x^2 z_xx + h_y^2 z_yy)/12.
+
+    A mesh with its vertices on a dent lies inside the dent, by h^2/12 of its curvature on average; uncorrected,
+    cast shadows come out shorter, by 0.01 px at a pitch of 0.06 mm, which a calibration on many frames notices."""
+    import numpy as np
+
+    out = z.copy()
+    hx, hy = np.diff(x), np.diff(y)
+    out[:, 1:-1] -= (
+        (np.diff(z, axis=1)[:, 1:] / hx[1:] - np.diff(z, axis=1)[:, :-1] / hx[:-1]) * (hx[1:] + hx[:-1]) / 24
+    )
+    out[1:-1] -= (np.diff(z, axis=0)[1:] / hy[1:, None] - np.diff(z, axis=0)[:-1] / hy[:-1, None]) * (
+        (hy[1:] + hy[:-1]) / 24
+    )[:, None]
+    return out
+
+
+class Path:
+    """What a `segment` or `volume` function sees: lit point, camera, lamp, LED and the lengths inside the gel
+    (mm)."""
+
+    def __init__(self, gel, p, camera, lamp, led, si):
+        self.p, self.camera, self.lamp, self.led, self.si = p, camera, lamp, led, si
+        self.view = gel.length_inside(p, camera)
+        self.light = gel.length_inside(p, lamp)
+        self.wavelengths = si.wavelengths
 
 
 def check_sphere():

@@ -146,27 +146,11 @@ def build():
                     props[name] = float(value)
             self.declare(props)
             nominal = [float(t) - self.number(n) for t, n in zip(target, "xyz")]
-            length = math.sqrt(sum(c * c for c in nominal))
-            if length == 0:
+            if not any(nominal):
                 raise ValueError(
                     f"led '{self.name}': position and target are the same point; the axis has no direction"
                 )
-            axis = [c / length for c in nominal]
-            # a side axis that does not degenerate for the usual LEDs, which shine along +-z or towards the middle
-            helper = [0.0, 1.0, 0.0] if abs(axis[1]) < 0.9 else [1.0, 0.0, 0.0]
-            side = [
-                helper[1] * axis[2] - helper[2] * axis[1],
-                helper[2] * axis[0] - helper[0] * axis[2],
-                helper[0] * axis[1] - helper[1] * axis[0],
-            ]
-            norm = math.sqrt(sum(c * c for c in side))
-            side = [c / norm for c in side]
-            up = [
-                axis[1] * side[2] - axis[2] * side[1],
-                axis[2] * side[0] - axis[0] * side[2],
-                axis[0] * side[1] - axis[1] * side[0],
-            ]
-            self.frame = [dr.opaque(mi.Vector3f, v) for v in (side, up, axis)]
+            self.frame = [dr.opaque(mi.Vector3f, v) for v in frame_along(nominal)]
             self.m_flags = +mi.EmitterFlags.DeltaPosition
             self.m_needs_sample_3 = False
 
@@ -258,6 +242,22 @@ def build():
             return f"LED[{self.name}]"
 
     return LED
+
+
+def frame_along(direction):
+    """Unit vectors (side, up, forward) of a frame that looks along a direction, each three numbers."""
+    length = math.sqrt(sum(c * c for c in direction))
+    axis = [c / length for c in direction]
+    # a side axis that does not degenerate for the usual LEDs, which shine along +-z or towards the middle
+    helper = [0.0, 1.0, 0.0] if abs(axis[1]) < 0.9 else [1.0, 0.0, 0.0]
+    side = cross(helper, axis)
+    norm = math.sqrt(sum(c * c for c in side))
+    side = [c / norm for c in side]
+    return side, cross(axis, side), axis
+
+
+def cross(a, b):
+    return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
 
 
 class Beam:
