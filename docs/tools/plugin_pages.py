@@ -209,7 +209,7 @@ def figure_of(effect, record: dict) -> str:
         )
     return (
         f":::{{figure}} ../../fingerprints/{effect.key}.webp\n:alt: What {escaped(effect.name)} changes in an image\n"
-        f":class: fingerprint\n\n{seen} Scene: `{own['view']}`.\n:::"
+        f":figclass: fingerprint\n\n{seen} Scene: `{own['view']}`.\n:::"
     )
 
 

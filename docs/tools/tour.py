@@ -60,8 +60,11 @@ def run(command: list[str]) -> str:
     """What a command of the page prints; `optics` runs in this process."""
     from optics.cli import main
 
+    if command[:2] == ["cp", "-r"]:
+        shutil.copytree(*command[2:])
+        return ""
     if command[0] != "optics":
-        raise ValueError(f"{shlex.join(command)}: the tour runs `optics` only")
+        raise ValueError(f"{shlex.join(command)}: the tour runs `optics` and `cp -r` only")
     out = io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(out):  # a terminal shows both
         code = main(command[1:])

@@ -39,8 +39,8 @@ Rows = tuple[np.ndarray, np.ndarray, np.ndarray]  # of a frame, see `Normal`
 class Normal:
     """Normal equations at one point: A = J'WJ + priors, b = J'Wr + priors, chi2 of data and of priors.
 
-    rows   per frame: indices of the variables that act in it, their whitened derivative images (k, n) float32, and
-           sqrt(weight) (H, W, C), 0 where a value is not used
+    rows   per frame: indices of the variables that act in it, their whitened derivative images (k, n) float32 at the
+           n values that are used, and sqrt(weight) (H, W, C), 0 at the others
     """
 
     a: np.ndarray
@@ -100,15 +100,17 @@ def normal_equations(
 
 
 def stacked(images: dict[str, np.ndarray], scale: np.ndarray) -> np.ndarray:
-    """(k, n) derivative images times sqrt(weight), flat."""
+    """(k, n) derivative images times sqrt(weight) at the n values that are used: a third of a raw mosaic's."""
+    used = scale > 0
     if not images:
-        return np.zeros((0, scale.size), np.float32)
-    return np.stack([(image * scale).ravel() for image in images.values()])
+        return np.zeros((0, int(used.sum())), np.float32)
+    return np.stack([image[used] * scale[used] for image in images.values()])
 
 
 def whiten(model: Model, frame: int, prediction: np.ndarray, scale: np.ndarray) -> np.ndarray:
-    """(n,) residual times sqrt(weight), flat; 0 where a value is not used."""
-    return np.where(scale > 0, (model.frames[frame].image - prediction) * scale, 0).ravel().astype(np.float32)
+    """(n,) residual times sqrt(weight) at the n values that are used."""
+    used = scale > 0
+    return ((model.frames[frame].image[used] - prediction[used]) * scale[used]).astype(np.float32)
 
 
 def prior_terms(model: Model, variables: Sequence[Variable], values: Values) -> tuple[np.ndarray, np.ndarray, float]:

@@ -19,6 +19,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+
 # -- functions for both kinds of arrays -------------------------------------------------------------------------------
 def _library(*values):
     drjit = sys.modules.get("drjit")

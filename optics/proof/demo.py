@@ -26,7 +26,7 @@ from optics.study import loop
 # most of what they change. Interreflection is left out: 0.2 % of the light under a dent so shallow. White LEDs cannot
 # show colour crosstalk: ask for it with the coloured LEDs of digit.
 SECRETS = {
-    "lens vignetting": 0.9,  # of 1, the natural fall-off cos^4
+    "lens vignetting": 2.0,  # of 1, the natural fall-off cos^4: corners as dark as cheap wide lenses leave them
     "veiling glare": 0.03,
     "ambient light": 1e-4,
     "lens blur": 0.6,
@@ -41,8 +41,8 @@ SECRETS = {
     "gain drift": 0.02,
 }
 SENSORS = {
-    "gelsight": ((160, 120), 200.0),
-    "digit": ((120, 160), 700.0),
+    "gelsight": ((120, 90), 200.0),
+    "digit": ((90, 120), 700.0),
 }  # px; exposure at which one LED alone comes near full scale
 # 1000 readings of a photodiode, made by coherency matrices (optics.proof.makers.bench); effects that can be told apart
 BENCH = "polarizer_bench"
@@ -59,7 +59,8 @@ BENCH_SECRETS = {
 # One frame: 12 bits raw, 20 000 electrons at full scale, as machine-vision cameras have them. No fixed pattern: a flat
 # field has divided it out.
 CAMERA = Noise(system_gain=0.2, dark_noise=2.0, black_level=64.0, saturation=4095.0, prnu=0.0)
-FRAMES = 16  # summed to one image: their 12 bits fill the 16 bits of a file
+FRAMES = 4  # summed to one image
+MOSAIC = "RGGB"  # raw: every pixel holds one channel
 PHOTODIODE = Noise(system_gain=0.01, dark_noise=1.0, black_level=64.0, saturation=4095.0, prnu=0.0)
 PRESSES = 4
 STEPS = 3  # effects that the loop may add before it must stop
@@ -103,10 +104,10 @@ def make(
     (width, height), exposure = SENSORS[sensor]
     scene = scenes.load(sensor, {"width": str(width), "height": str(height)})
     built = {**truth(scene, seed), "camera.exposure": exposure}
-    maker = synthetic.Maker(scene, built, {effect: strength}, CAMERA, seed + 1000, frames=FRAMES)
+    maker = synthetic.Maker(scene, built, {effect: strength}, CAMERA, seed + 1000, spp=128, frames=FRAMES)
     # Each LED alone, and none: the dark frame separates ambient light from light that the camera scatters.
     drives = [*({led: 1.0} for led in scene.leds), {}]
-    found = maker.captures(synthetic.presses(PRESSES, seed), drives, progress=progress, scene_name=sensor)
+    found = maker.captures(synthetic.presses(PRESSES, seed), drives, progress=progress, scene_name=sensor, cfa=MOSAIC)
     found.parameters["camera.exposure"] = exposure
     capture_files.write(found, folder, bits=16)
     return effect, strength
