@@ -31,7 +31,7 @@ DERIVATIVE = {
     "difference": "central differences",
     "image": "complex step on the images",
     "layer": "complex step through the Mueller matrices",
-    "path": "lengths of the paths in clear bodies",
+    "path": "lengths of the paths in dielectric bodies",
 }
 CODE = (tokenize.NAME, tokenize.NUMBER, tokenize.OP)  # docstrings and messages are no part of a formula
 ELEMENT = {"bsdf": "bsdf", "emitter": "emitter", "sensor": "sensor", "shape": "shape", "integrator": "integrator"}

@@ -251,7 +251,7 @@ def _of_the_strength(f: Findings) -> list[Condition]:
 def rivals(fingerprints: Sequence[Fingerprint], fall: float) -> list[Fingerprint]:
     """The curves that do better than an effect with this net fall; the one to name first.
 
-    Better by more than `allowed`, significantly, and by more than the number of bins gives by Monte Carlo (3 sd)."""
+    Better by more than `allowed`, significantly, and by more than the number of bins gives by noise alone (3 sd)."""
     better = [
         f
         for f in fingerprints

@@ -6,8 +6,6 @@ study lacks (a diagnosis, held-out frames, null models) is left out of the page.
 
 from __future__ import annotations
 
-import base64
-import io
 import json
 import math
 import re
@@ -22,16 +20,40 @@ from optics import words
 from optics.errors import OutputExists
 from optics.files.output import write_text
 from optics.fit.compare import UNITS, Comparison, Curve
+from optics.pages.drawing import (
+    CODES_PER_SIGMA,
+    DIVERGING,
+    MASKED,
+    SEQUENTIAL,
+    SIDE_MIN,
+    SIGMA_RANGE,
+    codes,
+    colour_bar,
+    colour_planes,
+    coloured,
+    combined,
+    eight_bit,
+    escaped,
+    log_ticks_between,
+    number,
+    percent,
+    ramp,
+    rgb,
+    rounded_up,
+    scaled,
+    step_name,
+    svg_chart,
+    ticks_between,
+    webp,
+    wrapped,
+)
 from optics.study.record import Record
 from optics.study.shown import Fingerprint, Shown
 from optics.words import as_float, figures, fixed, some, spaced
 
 BUDGET = 4_500_000  # bytes of embedded images; the page stays below 6 MB
 SIDE_MAX = 512  # px; larger frames are binned for display
-SIDE_MIN = 8  # px; smaller frames are readings, shown as points over the settings
 FRAMES_MIN = 4  # frames that stay when the budget is short; below that, pixels are binned
-SIGMA_RANGE = 5.0  # the residual colour bar is symmetric, +- this
-CODES_PER_SIGMA = 4  # residual images carry quarters of a sigma, so that the page can colour and read them
 FINGERPRINTS_SHOWN = 4
 FINGERPRINT_SIDE = 128  # px
 FEW = 8  # values of a setting that colours or panels can tell apart
@@ -42,15 +64,10 @@ LINEAR_TO = 15.0  # sigmas; residuals beyond bend their axis
 PLACE = "place in the sweep"
 MOVED_SHOWN = 3.0  # standard deviations; beyond, a parameter's move is marked
 
-# Blue, paper, red: told apart with every kind of colour vision, lightness falls evenly to both ends.
-DIVERGING = ("#08306b", "#1d5fa6", "#6aa5d8", "#bcd6ea", "#f5f3ef", "#f3c3a8", "#dd7c5c", "#b22f33", "#650a1c")
-SEQUENTIAL = ("#f5f3ef", "#e6d9c0", "#d9b36c", "#b9762f", "#7a3d1a", "#33160b")
-MASKED = "#8a8a8a"
 NO_IMAGES = {"frames": [], "steps": [], "channels": [], "note": ""}
 FRAMES = {"frame": "frame", "frames": "frames", "data": "frames"}  # what the page calls the parts of the data
 SWEEPS = {"frame": "sweep", "frames": "sweeps", "data": "readings"}
 # the formats of a page: a true minus, powers of ten, a dash for what is missing
-number, percent = partial(words.number, typeset=True), partial(words.percent, typeset=True)
 measure, pvalue = partial(words.with_sd, typeset=True), partial(words.p_text, typeset=True)
 CHANNEL_STYLE = {"R": "red", "G": "green", "B": "blue"}
 
@@ -300,7 +317,7 @@ def _encode(name: str, table: list[dict[str, Shown]], rows: list[dict], bins: in
         "height": y.shape[0],
         "width": y.shape[1],
         "white": white,
-        "measured": webp(_eight_bit(y, white)),
+        "measured": webp(eight_bit(y, white)),
         "grey": y.shape[2] not in (1, 3),
     }
     steps = []
@@ -308,8 +325,8 @@ def _encode(name: str, table: list[dict[str, Shown]], rows: list[dict], bins: in
         f = shown[name]
         steps.append(
             {
-                "predicted": webp(_eight_bit(_block(f.predicted, bins), white)),
-                "residual": webp(codes(_planes(_block_sigma(f.residual, bins)))),
+                "predicted": webp(eight_bit(_block(f.predicted, bins), white)),
+                "residual": webp(codes(colour_planes(_block_sigma(f.residual, bins)))),
                 "chi2": figures(row[name].chi2_per_dof, 3) if name in row else "–",
             }
         )
@@ -322,30 +339,6 @@ def _white(frame: Shown) -> float:
     top = float(np.nanpercentile(frame.measured, 99)) if np.isfinite(frame.measured).any() else 1.0
     step = 10 ** math.floor(math.log10(max(top, 1e-9))) / 4
     return math.ceil(max(top, 1e-9) / step) * step
-
-
-def _eight_bit(image: np.ndarray, white: float) -> np.ndarray:
-    image = image if image.shape[2] in (1, 3) else image.mean(2, keepdims=True)
-    return np.clip(np.nan_to_num(image) / white * 255 + 0.5, 0, 255).astype(np.uint8)
-
-
-def _planes(z: np.ndarray) -> np.ndarray:
-    """Residual planes for the viewer: its channels where there are 1 or 3, else their combination."""
-    return z if z.shape[2] in (1, 3) else combined(z)[..., None]
-
-
-def combined(z: np.ndarray) -> np.ndarray:
-    """Sum over channels / sqrt(number of usable channels): noise keeps a standard deviation of 1. (H, W), NaN if
-    none."""
-    n = np.isfinite(z).sum(2)
-    return np.where(n > 0, np.nansum(z, 2) / np.sqrt(np.maximum(n, 1)), np.nan)
-
-
-def codes(z: np.ndarray) -> np.ndarray:
-    """Residuals in sigmas as bytes: 128 + 4 z, clipped to 1..255; 0 is masked."""
-    return np.where(np.isfinite(z), np.clip(np.round(np.nan_to_num(z) * CODES_PER_SIGMA) + 128, 1, 255), 0).astype(
-        np.uint8
-    )
 
 
 def _blocks(image: np.ndarray, bins: int) -> np.ndarray:
@@ -367,47 +360,6 @@ def _block_sigma(z: np.ndarray, bins: int) -> np.ndarray:
     return np.where(n > 0, np.nansum(blocks, -1) / np.sqrt(np.maximum(n, 1)), np.nan)
 
 
-def webp(image: np.ndarray) -> str:
-    """Lossless image as a data URI. image: (H, W, 1 or 3) uint8."""
-    from PIL import Image
-
-    shown = Image.fromarray(image[..., 0] if image.shape[2] == 1 else image).convert("RGB")
-    out = io.BytesIO()
-    shown.save(out, "WEBP", lossless=True, quality=60, method=3, exact=True)
-    return "data:image/webp;base64," + base64.b64encode(out.getvalue()).decode()
-
-
-def coloured(plane: np.ndarray, low: float, high: float, colours: Sequence[str]) -> str:
-    """(H, W) with NaN for masked -> palette PNG as a data URI, 41 levels from low to high."""
-    from PIL import Image
-
-    levels = 41
-    index = np.clip(np.round((np.nan_to_num(plane) - low) / (high - low) * (levels - 1)), 0, levels - 1)
-    image = Image.fromarray(np.where(np.isfinite(plane), index, levels).astype(np.uint8))
-    image.putpalette([v for colour in (*ramp(colours, levels), _rgb(MASKED)) for v in colour])
-    out = io.BytesIO()
-    image.save(out, "PNG", optimize=True)
-    return "data:image/png;base64," + base64.b64encode(out.getvalue()).decode()
-
-
-def _rgb(colour: str) -> tuple[int, int, int]:
-    return tuple(int(colour[i : i + 2], 16) for i in (1, 3, 5))
-
-
-def ramp(colours: Sequence[str], count: int) -> list[tuple[int, int, int]]:
-    """`count` colours between equally spaced ones."""
-    anchors = np.array([_rgb(c) for c in colours], float)
-    at = np.linspace(0, len(colours) - 1, count)
-    return [
-        tuple(int(round(v)) for v in c)
-        for c in np.stack([np.interp(at, np.arange(len(colours)), anchors[:, k]) for k in range(3)], 1)
-    ]
-
-
-def colour_bar() -> str:
-    return "linear-gradient(to right," + ",".join(DIVERGING) + ")"
-
-
 def fingerprint_images(fingerprints: Sequence[Fingerprint]) -> list[dict]:
     """Per effect: what it would add, beside the residual that it is to explain, on one scale."""
     out = []
@@ -418,7 +370,7 @@ def fingerprint_images(fingerprints: Sequence[Fingerprint]) -> list[dict]:
         image, residual = (combined(_block_sigma(a, bins)) / bins for a in (f.image, f.residual))
         top = float(np.nanpercentile(np.abs(image), 99.5)) if np.isfinite(image).any() else 0.0
         noise = 1 / bins
-        scale = _round_up(max(top, 2 * noise))
+        scale = rounded_up(max(top, 2 * noise))
         out.append(
             {
                 "effect": f.effect,
@@ -460,17 +412,12 @@ def map_images(comparisons: list[Comparison], steps: Sequence[Mapping]) -> list[
     return out
 
 
-def _round_up(value: float) -> float:
-    power = 10 ** math.floor(math.log10(value)) if value > 0 else 1.0
-    return next(k * power for k in (1, 1.5, 2, 3, 5, 7, 10) if value <= k * power * (1 + 1e-9))
-
-
 def _script(viewer: dict) -> str:
     """The viewer's data for a script element; '<' is written so that no text can end the element."""
     data = {
         **viewer,
         "ramp": ramp(DIVERGING, 81),
-        "masked": _rgb(MASKED),
+        "masked": rgb(MASKED),
         "range": SIGMA_RANGE,
         "perSigma": CODES_PER_SIGMA,
     }
@@ -634,9 +581,9 @@ def reading_panel(
         return z_at(shape(value))
 
     pad = 0.04 * ((y_high - y_low) or 1.0)
-    x, y = _scale(x_low, x_high, left + 6, width - right - 6), _scale(y_low - pad, y_high + pad, split - 12, top)
+    x, y = scaled(x_low, x_high, left + 6, width - right - 6), scaled(y_low - pad, y_high + pad, split - 12, top)
     reach = 1.06 * float(shape(z_top))
-    z_at = _scale(-reach, reach, bottom, split)
+    z_at = scaled(-reach, reach, bottom, split)
 
     def grid(at: float, text: str, style: str = "grid") -> str:
         return (
@@ -644,8 +591,8 @@ def reading_panel(
             f'<text class="tick" x="{left - 6}" y="{at + 4:.1f}" text-anchor="end">{text}</text>'
         )
 
-    parts = [f'<text class="title" x="{left}" y="14">{_escape(title)}</text>'] if title else []
-    parts += [grid(y(t), number(t, 4)) for t in _ticks(y_low, y_high, 4)]
+    parts = [f'<text class="title" x="{left}" y="14">{escaped(title)}</text>'] if title else []
+    parts += [grid(y(t), number(t, 4)) for t in ticks_between(y_low, y_high, 4)]
     for sigmas in (3, 1):
         parts.append(
             f'<rect class="sigmas" x="{left}" width="{width - left - right}" y="{z(sigmas):.1f}" '
@@ -664,7 +611,7 @@ def reading_panel(
     ]
     parts.append(
         f'<text class="axis" x="{(left + width - right) / 2:.0f}" y="{floor - 6}" text-anchor="middle">'
-        f"{_escape(axis)}</text>"
+        f"{escaped(axis)}</text>"
     )
     at, predicted, measured, sigma = (
         v[..., channel] if v.ndim > 1 else v
@@ -686,7 +633,7 @@ def reading_panel(
                 )
     used = sigma[mine & np.isfinite(sigma)]
     rms = number(math.sqrt(np.mean(used**2))) if len(used) else "–"
-    return _svg(
+    return svg_chart(
         width,
         floor,
         parts,
@@ -744,7 +691,7 @@ def _bezier(x: np.ndarray, y: np.ndarray) -> str:
 def _angles(low: float, high: float, unit: str) -> list[float]:
     """Ticks; of angles over more than a right angle, whole parts of a turn."""
     if unit != "deg" or high - low < 90:
-        return _ticks(low, high, 6)
+        return ticks_between(low, high, 6)
     step = next(s for s in (30, 45, 90, 180, 360, 720, 1e9) if (high - low) / s <= 9)
     return [k * step for k in range(math.ceil(low / step), math.floor(high / step) + 1)]
 
@@ -758,10 +705,10 @@ def ladder_chart(study: Record, width: int, height: int, nouns: Mapping[str, str
     values = [v for _, line in lines for v in line if math.isfinite(v) and v > 0] or [floor]
     low, high = 0.88 * min([floor, *values]), 1.3 * max([1.25 * floor, *values])
     left, right, top, bottom = 46, 16, 34, 62
-    x = _scale(-0.35, len(steps) - 0.65, left, width - right)
-    y = _scale(math.log(low), math.log(high), height - bottom, top)
+    x = scaled(-0.35, len(steps) - 0.65, left, width - right)
+    y = scaled(math.log(low), math.log(high), height - bottom, top)
     parts = []
-    for tick in _log_ticks(low, high):
+    for tick in log_ticks_between(low, high):
         at = y(math.log(tick))
         parts.append(
             f'<line class="grid" x1="{left}" x2="{width - right}" y1="{at:.1f}" y2="{at:.1f}"/>'
@@ -794,10 +741,10 @@ def ladder_chart(study: Record, width: int, height: int, nouns: Mapping[str, str
             ]
     slot = (width - left - right) / max(len(steps), 1)
     for i, step in enumerate(steps):
-        for k, label in enumerate(_wrap(("+ " if i else "") + step["name"], max(8, int(slot / 6.6)))[:3]):
+        for k, label in enumerate(wrapped(("+ " if i else "") + step["name"], max(8, int(slot / 6.6)))[:3]):
             parts.append(
                 f'<text class="step" x="{x(i):.1f}" y="{height - bottom + 22 + 15 * k}" text-anchor="middle">'
-                f"{_escape(label)}</text>"
+                f"{escaped(label)}</text>"
             )
     parts.append(f'<text class="tick" x="{left}" y="14">χ²/dof</text>')
     legend = width - right
@@ -813,7 +760,7 @@ def ladder_chart(study: Record, width: int, height: int, nouns: Mapping[str, str
         f"fitted {number(_value(s['fitted'], 'chi2_per_dof'))}"
         for s in steps
     )
-    return _svg(width, height, parts, f"Chi-squared per degree of freedom. {said}. Noise floor {number(floor)}.")
+    return svg_chart(width, height, parts, f"Chi-squared per degree of freedom. {said}. Noise floor {number(floor)}.")
 
 
 def residual_curves(comparisons: list[Comparison], points: Readings | None = None) -> list[dict]:
@@ -855,7 +802,7 @@ def curve_chart(
     low = min(float(extent.min()) if len(extent) else 0.0, -0.15 * top_value)
     high = max(float(extent.max()) if len(extent) else 0.0, 0.15 * top_value)
     pad = 0.08 * (high - low)
-    y = _scale(low - pad, high + pad, height - bottom, top)
+    y = scaled(low - pad, high + pad, height - bottom, top)
     centres = np.concatenate([c.centre for c in drawn])
     centres = centres[np.isfinite(centres)]
     if not len(centres):
@@ -863,19 +810,19 @@ def curve_chart(
     x_low, x_high = float(centres.min()), float(centres.max())
     gap = 0.04 * (x_high - x_low) or 0.5
     gap = 0.5 if curve.labels else gap
-    x = _scale(x_low - gap, x_high + gap, left, width - right)
+    x = scaled(x_low - gap, x_high + gap, left, width - right)
     parts = []
-    marks = _ticks(low - pad, high + pad, 4)
-    for tick in marks if len(marks) > 2 else _ticks(low - pad, high + pad, 8):
+    marks = ticks_between(low - pad, high + pad, 4)
+    for tick in marks if len(marks) > 2 else ticks_between(low - pad, high + pad, 8):
         parts.append(
             f'<line class="grid" x1="{left}" x2="{width - right}" y1="{y(tick):.1f}" y2="{y(tick):.1f}"/>'
             f'<text class="tick" x="{left - 6}" y="{y(tick) + 4:.1f}" text-anchor="end">{number(tick)}</text>'
         )
     parts.append(f'<line class="zero" x1="{left}" x2="{width - right}" y1="{y(0):.1f}" y2="{y(0):.1f}"/>')
     if curve.labels and len(curve.labels) <= 4:
-        ticks = [(i, _escape(label)) for i, label in enumerate(curve.labels)]
+        ticks = [(i, escaped(label)) for i, label in enumerate(curve.labels)]
     else:
-        ticks = [(t, number(t, 4)) for t in _ticks(x_low, x_high, 5)]
+        ticks = [(t, number(t, 4)) for t in ticks_between(x_low, x_high, 5)]
     parts += [
         f'<text class="tick" x="{x(t):.1f}" y="{height - bottom + 16}" text-anchor="middle">{label}</text>'
         for t, label in ticks
@@ -884,7 +831,7 @@ def curve_chart(
     number_of = " number" if curve.coordinate in ("frame", "sweep") else ""
     parts.append(
         f'<text class="axis" x="{(left + width - right) / 2:.0f}" y="{height - 4}" text-anchor="middle">'
-        f"{_escape(_spoken(curve.coordinate))}{number_of}{unit}</text>"
+        f"{escaped(_spoken(curve.coordinate))}{number_of}{unit}</text>"
     )
     for c in channels:
         good = np.isfinite(c.centre) & np.isfinite(c.mean)
@@ -904,7 +851,7 @@ def curve_chart(
                 f'<circle class="point {style}" cx="{x(a):.1f}" cy="{y(b):.1f}" r="2.4"/>'
             )
     largest = float(np.nanmax(np.abs(curve.mean))) if np.isfinite(curve.mean).any() else math.nan
-    return _svg(
+    return svg_chart(
         width,
         height,
         parts,
@@ -951,22 +898,22 @@ def _reading_chart(measured: Curve, lines: Sequence[tuple[str, Curve]], width: i
     left, right, top, bottom = 52, 12, 12, 38
     values = np.concatenate([measured.mean, *(c.mean for _, c in lines)])
     span = float(np.ptp(values)) or 1.0
-    x = _scale(float(measured.centre.min()), float(measured.centre.max()), left + 6, width - right - 6)
+    x = scaled(float(measured.centre.min()), float(measured.centre.max()), left + 6, width - right - 6)
     low, high = float(values.min()) - 0.06 * span, float(values.max()) + 0.06 * span
-    y = _scale(low, high, height - bottom, top)
+    y = scaled(low, high, height - bottom, top)
     parts = [
         f'<line class="grid" x1="{left}" x2="{width - right}" y1="{y(t):.1f}" y2="{y(t):.1f}"/>'
         f'<text class="tick" x="{left - 6}" y="{y(t) + 4:.1f}" text-anchor="end">{number(t, 4)}</text>'
-        for t in _ticks(low, high, 5)
+        for t in ticks_between(low, high, 5)
     ]
     parts += [
         f'<text class="tick" x="{x(t):.1f}" y="{height - bottom + 16}" text-anchor="middle">{number(t, 4)}</text>'
-        for t in _ticks(float(measured.centre.min()), float(measured.centre.max()), 6)
+        for t in ticks_between(float(measured.centre.min()), float(measured.centre.max()), 6)
     ]
     unit = f", {measured.unit}" if measured.unit else ""
     parts.append(
         f'<text class="axis" x="{(left + width - right) / 2:.0f}" y="{height - 4}" text-anchor="middle">'
-        f"{_escape(_spoken(measured.coordinate))}{unit}</text>"
+        f"{escaped(_spoken(measured.coordinate))}{unit}</text>"
     )
     for style, c in lines:
         points = " ".join(f"{x(a):.1f},{y(b):.1f}" for a, b in zip(c.centre, c.mean))
@@ -976,72 +923,12 @@ def _reading_chart(measured: Curve, lines: Sequence[tuple[str, Curve]], width: i
             f'<line class="bar ink" x1="{x(a):.1f}" x2="{x(a):.1f}" y1="{y(b - e):.1f}" y2="{y(b + e):.1f}"/>'
             f'<circle class="point ink" cx="{x(a):.1f}" cy="{y(b):.1f}" r="3"/>'
         )
-    return _svg(width, height, parts, f"Readings and predictions against {measured.coordinate}")
-
-
-def _svg(width: int, height: int, parts: Sequence[str], words: str, fixed: bool = False) -> str:
-    size = f' style="width:{width}px;height:{height}px"' if fixed else ""
-    return (
-        f'<svg viewBox="0 0 {width} {height}"{size} role="img" aria-label="{_escape(words)}">'
-        + "".join(parts)
-        + "</svg>"
-    )
-
-
-def _scale(low: float, high: float, start: float, end: float):
-    span = high - low or 1.0
-    return lambda value: start + (value - low) / span * (end - start)
-
-
-def _ticks(low: float, high: float, count: int) -> list[float]:
-    """Round numbers in [low, high], about `count` of them."""
-    rough = (high - low) / max(count, 1)
-    if not rough > 0:
-        return [low]
-    power = 10 ** math.floor(math.log10(rough))
-    step = next(k * power for k in (1, 2, 5, 10) if rough <= k * power * 1.0001)
-    return [round(k * step, 12) + 0.0 for k in range(math.ceil(low / step), math.floor(high / step) + 1)]
-
-
-def _log_ticks(low: float, high: float) -> list[float]:
-    for marks in (
-        (1,),
-        (1, 3),
-        (1, 2, 5),
-        (1, 1.2, 1.5, 2, 3, 5, 7),
-        (1, 1.05, 1.1, 1.2, 1.3, 1.5, 2, 3, 4, 5, 6, 7, 8, 9),
-    ):
-        found = [
-            m * 10.0**k
-            for k in range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
-            for m in marks
-            if low <= m * 10.0**k <= high
-        ]
-        if len(found) >= 4:
-            return found
-    return found
-
-
-def _wrap(text: str, width: int) -> list[str]:
-    import textwrap
-
-    return textwrap.wrap(text, width) or [""]
-
-
-def _escape(text) -> str:
-    import html
-
-    return html.escape(str(text), quote=True)
+    return svg_chart(width, height, parts, f"Readings and predictions against {measured.coordinate}")
 
 
 def _value(level: Mapping | None, key: str) -> float:
     value = (level or {}).get(key)
     return math.nan if value is None else float(value)
-
-
-# -- tables ----------------------------------------------------------------------------------------------------------
-def step_name(step: Mapping) -> str:
-    return ("+ " if step["index"] else "") + step["name"]
 
 
 def number_tables(comparisons: list[Comparison], nouns: Mapping[str, str] = FRAMES) -> list[dict]:
@@ -1228,18 +1115,18 @@ def strip(
     if not good:
         return ""
     reach = max([0.05] + [abs(v - 1) + s for v, s in good])
-    x, y = _scale(-0.5, len(values) - 0.5, 6, width - 6), _scale(1 - 1.1 * reach, 1 + 1.1 * reach, height - 3, 3)
+    x, y = scaled(-0.5, len(values) - 0.5, 6, width - 6), scaled(1 - 1.1 * reach, 1 + 1.1 * reach, height - 3, 3)
     parts = [f'<line class="zero" x1="0" x2="{width}" y1="{y(1):.1f}" y2="{y(1):.1f}"/>']
     for i, (v, s, label) in enumerate(zip(values, sds, labels)):
         if math.isfinite(v):
             s = s if math.isfinite(s) else 0.0
             parts.append(
                 f'<line class="bar after" x1="{x(i):.1f}" x2="{x(i):.1f}" y1="{y(v - s):.1f}" y2="{y(v + s):.1f}"/>'
-                f'<circle class="point after" cx="{x(i):.1f}" cy="{y(v):.1f}" r="3"><title>{_escape(label)}: '
+                f'<circle class="point after" cx="{x(i):.1f}" cy="{y(v):.1f}" r="3"><title>{escaped(label)}: '
                 f"{measure(v, s)}</title></circle>"
             )
     said = ", ".join(f"{label} {measure(v, s)}" for label, v, s in zip(labels, values, sds))
-    return _svg(width, height, parts, f"Strength relative to the whole: {said}", fixed=True)
+    return svg_chart(width, height, parts, f"Strength relative to the whole: {said}", fixed=True)
 
 
 def _draft(f: Mapping) -> dict:
@@ -1250,7 +1137,7 @@ def _draft(f: Mapping) -> dict:
     what, image, chart = "relative gain, %" if gain else "offset, DN", "", ""
     side = math.isqrt(len(curve))
     if name == "place" and side * side == len(curve):
-        top = _round_up(float(np.nanmax(np.abs(curve), initial=1e-9)))
+        top = rounded_up(float(np.nanmax(np.abs(curve), initial=1e-9)))
         image, what = coloured(curve.reshape(side, side), -top, top, DIVERGING), f"{what}, colours ±{number(top)}"
     elif len(curve) == len(centres) == len(sd):
         one = np.ones(len(curve))

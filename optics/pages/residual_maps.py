@@ -19,8 +19,18 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from optics.fit.compare import Comparison
-from optics.pages.report import DIVERGING, SEQUENTIAL, SIDE_MIN, coloured, combined, fixed, number, percent, step_name
+from optics.pages.drawing import (
+    DIVERGING,
+    SEQUENTIAL,
+    SIDE_MIN,
+    coloured,
+    combined,
+    number,
+    percent,
+    step_name,
+)
 from optics.study.shown import Shown
+from optics.words import fixed
 
 CELLS = 16  # of a regional map along the longer side
 COMPONENTS = 3

@@ -32,7 +32,7 @@ from optics.errors import UnknownKey
 from optics.fit import calibrate, descent
 from optics.fit.compare import led_label
 from optics.fit.model import value_of
-from optics.pages.report import DIVERGING, MASKED, SIGMA_RANGE, colour_bar, ramp
+from optics.pages.drawing import DIVERGING, MASKED, SIGMA_RANGE, colour_bar, ramp
 from optics.scene.parameter import Values, Variable
 from optics.study import loop
 from optics.study.setup import effect_variables

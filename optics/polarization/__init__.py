@@ -1,1 +1,1 @@
-"""Mueller calculus, and layers that change the polarization of light that passes."""
+"""Polarization: Mueller calculus, and how thin layers change the light that passes them."""

@@ -25,10 +25,10 @@ def before_after(study: str | Path, file: str | Path) -> Path:
     """
     from PIL import Image, ImageDraw
 
-    from optics.pages.report import SIGMA_RANGE, step_name
-    from optics.study.record import Study
+    from optics.pages.drawing import SIGMA_RANGE, step_name
+    from optics.study.record import Record
 
-    record = Study.open(study)
+    record = Record.open(study)
     if len(record.steps) < 2:
         raise ValueError(f"{study}: {len(record.steps)} step; allowed: 2 or more; add an effect first")
     first, last = ({f.name: f for f in record.frames(i)} for i in (0, len(record.steps) - 1))
@@ -67,7 +67,7 @@ def _coloured(residual: np.ndarray):
     """A residual (H, W, C) in sigmas as an image, channels combined so that noise keeps a standard deviation of 1."""
     from PIL import Image
 
-    from optics.pages.report import DIVERGING, MASKED, SIGMA_RANGE, combined, ramp
+    from optics.pages.drawing import DIVERGING, MASKED, SIGMA_RANGE, combined, ramp
 
     z = combined(np.asarray(residual, float))
     levels = np.array([*ramp(DIVERGING, 101), tuple(int(MASKED[i : i + 2], 16) for i in (1, 3, 5))], np.uint8)

@@ -1,2 +1,2 @@
-"""What a robot computes from the images of a touch sensor that also sees: marker displacements, and how near a thing
-is."""
+"""Readers: what a robot computes from the images of a touch sensor that also sees, such as marker displacements,
+proximity and contact."""

@@ -1,1 +1,1 @@
-"""How the skins of touch sensors deform: the mechanics that the optics looks at."""
+"""Skin: how a soft skin deforms under an indenter, by contact mechanics and by a lattice of springs."""

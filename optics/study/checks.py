@@ -36,7 +36,7 @@ def of_captures(model: SceneModel) -> list[str]:
         texts.append(f"the model leaves out light that comes through layers: {what}")
     if model.monte_carlo and (share := model.chance()) > CHANCE:
         texts.append(
-            "the prediction of dielectric bodies is an estimate by Monte Carlo; its error is "
+            "the prediction of dielectric bodies is a Monte Carlo estimate; its error is "
             f"{share:.2g} of the noise in the first frame. It is added to the noise, pixel by pixel, but frames of the "
             "same geometry share it: raise `rays` and `packets` of the scene's integrator until it is below "
             f"{CHANCE:g}"

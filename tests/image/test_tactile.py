@@ -538,7 +538,7 @@ def test_painted_edges_are_as_smooth_as_those_of_shapes(mitsuba):
     from optics.light.renderer import Renderer
     from optics.scene import loader as scenes
 
-    def picture(width):
+    def rendered(width):
         scene = scenes.load("vi2tap", {"width": str(width), "height": str(width * 3 // 4)})
         values = {
             **scene.values(),
@@ -548,6 +548,6 @@ def test_painted_edges_are_as_smooth_as_those_of_shapes(mitsuba):
         }
         return Renderer(scene).radiance(values)[..., 0]
 
-    fine = picture(384).reshape(36, 8, 48, 8)
-    assert np.abs(picture(48) - fine.mean((1, 3))).max() < 0.05 * fine.max()
+    fine = rendered(384).reshape(36, 8, 48, 8)
+    assert np.abs(rendered(48) - fine.mean((1, 3))).max() < 0.05 * fine.max()
     assert fine.std((1, 3)).max() > 0.1 * fine.max()  # there are edges

@@ -665,7 +665,7 @@ def test_pages_belong_to_the_first_and_the_last_step():
     assert [(r["name"], r["bar"]) for r in coordinates(told)] == [("row", "100.0")] and coordinates(None) == []
 
 
-def picture(uri):
+def decoded(uri):
     from PIL import Image
 
     return Image.open(io.BytesIO(base64.b64decode(uri.partition(",")[2])))
@@ -684,7 +684,7 @@ def test_colours_of_noise_are_alike_in_an_image_and_in_a_mosaic():
     for usable in (full, mosaic):
         c = compare(list(images), [np.zeros_like(images[0])] * 8, [np.ones_like(images[0])] * 8, [usable] * 8)
         sd = (
-            np.asarray(picture(colours(c)), float).std((0, 1)) / 255 * 10
+            np.asarray(decoded(colours(c)), float).std((0, 1)) / 255 * 10
         )  # of 4096 blocks: good to 1 %, and 4 % more of 16 levels
         assert sd == pytest.approx(1.0, abs=0.08)
         regions(c)
@@ -702,7 +702,7 @@ def test_regions_tell_a_wrong_mean_from_a_wide_spread():
         list(images), [np.zeros((32, 48, 1))] * 12, [np.ones((32, 48, 1))] * 12, [np.ones((32, 48, 1), bool)] * 12
     )
     found = regions(c)
-    assert picture(found["mean"]).size == picture(found["sd"]).size == (16, 11) and found["cell"] == 3
+    assert decoded(found["mean"]).size == decoded(found["sd"]).size == (16, 11) and found["cell"] == 3
     assert 0.4 < float(found["mean_top"]) < 0.95 and 1.4 < float(found["worst"]) < 2.1
     images = 5 + 0.1 * rng.standard_normal((12, 32, 48, 1))  # wrong, and steady
     c = compare(

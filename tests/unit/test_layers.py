@@ -19,7 +19,7 @@ def bench(folder, **defines):
     return scenes.load(folder / "bench.xml", {**CAMERA, **defines})
 
 
-def picture(scene, **values):
+def rendered(scene, **values):
     renderer = Renderer(scene)
     now = {**scene.values(), "sample.angle": 20.0, "sample.stress": 3.0, "sample.stress_size": 24.0, **values}
     return renderer, renderer.image(now, "source")
@@ -34,8 +34,8 @@ def test_a_pattern_from_a_file_is_the_formula_that_it_was_made_from(tmp_path):
     n = 480
     x, y = np.meshgrid((np.arange(n) + 0.5) / n * 24 - 12, 12 - (np.arange(n) + 0.5) / n * 24)  # row 0 at +y
     np.save(tmp_path / "disc.npy", np.stack(disc(x, y, 12.0), -1).clip(-40, 40))  # the loads' points are infinite
-    _, want = picture(bench(tmp_path, pattern="disc"))
-    _, got = picture(bench(tmp_path, pattern="disc.npy"))
+    _, want = rendered(bench(tmp_path, pattern="disc"))
+    _, got = rendered(bench(tmp_path, pattern="disc.npy"))
     assert want.max() > 0.1  # fringes
     # linear between pixels of 0.05 mm, a fiftieth of the narrowest fringe away from the loads
     assert np.median(np.abs(got - want)) < 1e-4 and np.abs(got - want)[6:18].max() < 5e-3
@@ -61,7 +61,7 @@ def test_a_pattern_from_a_file_has_its_derivatives(tmp_path):
     x, y = np.meshgrid((np.arange(n) + 0.5) / n * 24 - 12, 12 - (np.arange(n) + 0.5) / n * 24)
     np.save(tmp_path / "p.npy", np.stack([np.cos(0.3 * x + 0.2 * y), np.sin(0.4 * y - 0.1 * x)], -1))
     scene = bench(tmp_path, pattern="p.npy")
-    renderer, _ = picture(scene)
+    renderer, _ = rendered(scene)
     base = {**scene.values(), "sample.angle": 20.0, "sample.stress": 3.0, "sample.stress_size": 24.0}
     for key, step in (("sample.angle", 1e-5), ("sample.stress_size", 1e-5)):  # so small that no ray changes its cell
         found = renderer.image({**base, key: base[key] + 1e-30j}, "source").imag / 1e-30
@@ -72,7 +72,7 @@ def test_a_pattern_from_a_file_has_its_derivatives(tmp_path):
 
 def test_a_pattern_that_is_changed_changes_the_image(tmp_path):
     scene = bench(tmp_path, pattern="even")
-    renderer, even = picture(scene)
+    renderer, even = rendered(scene)
     now = {
         **scene.values(),
         "sample.angle": 20.0,

@@ -795,3 +795,18 @@ if __name__ == "__main__":
     study = demo(where / "study", *((240, 320) if big else (72, 96)), presses=5 if big else 4)
     print(study.table())
     print(report(where / "study", where / "report.html"))
+
+
+def test_the_residuals_before_and_after_stand_side_by_side(studied, swept, tmp_path):
+    from PIL import Image
+
+    from optics.proof.before_after import before_after
+
+    study, _ = studied
+    page = np.asarray(Image.open(before_after(study.folder, tmp_path / "residual.png")), float)
+    assert page.shape[1:] == (640, 3)
+    body = page[20 : page.shape[0] - 40]
+    first, last = body[:, :300].std(), body[:, 340:].std()
+    assert first > last > 0  # structure in saturated colours on the left, noise on the right
+    with pytest.raises(ValueError, match="point readings"):
+        before_after(swept[0].folder, tmp_path / "readings.png")
