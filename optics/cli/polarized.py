@@ -95,7 +95,7 @@ def mueller(
         title = name if name != "product" else f"product: {' '.join(names)}"
         print(f"\n{title}\n" + _matrices(own, bands))
     print("\n" + _meanings(shown, bands))
-    if any(loaded.parts[n].kind == "interface" for n in names):
+    if any(loaded.parts[n].role == "interface" for n in names):
         terminal.note(
             "the transmittance of an interface is of radiance, which grows with n^2; at the way out it falls again"
         )

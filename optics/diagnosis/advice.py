@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from itertools import chain, zip_longest
@@ -32,7 +32,7 @@ from optics.diagnosis.result import Advice, Apart, Diagnosis, Row
 from optics.diagnosis.thresholds import CLEAR, MARGIN, close
 from optics.fit.model import Model
 from optics.scene.declare import Effect
-from optics.scene.parameter import Values, Variable
+from optics.scene.parameter import Values, Variable, beside, keys_with
 from optics.words import spaced
 
 VariablesOf = Callable[[Model, Effect], Sequence[Variable]]  # what adding an effect to this model frees
@@ -51,7 +51,7 @@ ENOUGH = 4 * CLEAR  # D at which the right one wins in 99.95 % of cases; a plan 
 MEMBERS = 5  # effects that are told apart at once
 # of chi2 below the best: 20 times less likely the cause in noise alone; a rival still, but not taken to be true
 LIKELY = 6.0
-CLOCKS = ("time", "approach")  # settings that tell when and from where, not what
+CLOCKS = ("clock", "approach")  # roles of settings that tell when and from where, not what
 UNTOUCHED = "untouched"  # the name of no press: it has no place to solve for
 
 
@@ -107,18 +107,13 @@ def _now(model: Model, values: Values, frame: int) -> dict[str, float]:
     return {**model.base, **values.common, **own.parameters, **swept, **values.frame.get(frame, {})}
 
 
-def keys_named(parameters: Iterable[str], name: str) -> list[str]:
-    """The keys of a parameter's name in all parts that have it."""
-    return [k for k in parameters if k.rpartition(".")[2] == name]
-
-
 def _press(model: Model) -> tuple[str, str, str] | None:
     """Keys of place and depth of a press; None where nothing can be pressed."""
-    depth = keys_named(model.parameters, "press_depth")
+    depth = keys_with(model.parameters, "press depth")
     if not depth:
         return None
-    x, y = (depth[0].replace("press_depth", n) for n in ("press_x", "press_y"))
-    return x, y, depth[0]
+    x, y = (beside(model.parameters, depth[0], role) for role in ("press x", "press y"))
+    return None if x is None or y is None else (x, y, depth[0])
 
 
 def _same(model: Model, like: int) -> str:
@@ -140,7 +135,7 @@ def _typical(model: Model, values: Values, frames: Sequence[int]) -> int:
 
 
 def _exposures(model: Model, now: Mapping, like: int) -> Iterator[Shot]:
-    for key in keys_named(model.parameters, "exposure")[:1]:
+    for key in keys_with(model.parameters, "exposure")[:1]:
         image, noise = np.asarray(model.frames[like].image, float), model.noise
         for factor in EXPOSURES:
             brighter = noise.black_level + factor * (image - noise.black_level)
@@ -160,7 +155,7 @@ def _presses(model: Model, values: Values, frames: Sequence[int], now: Mapping, 
     known = np.array([[_now(model, values, f)[k] for k in keys] for f in frames])
     known = known[known[:, 2] > 0] if (known[:, 2] > 0).any() else known
     depth = float(np.median(known[:, 2])) or 0.5
-    deepest = DEEPEST * float(now.get(keys[2].replace("press_depth", "thickness"), math.inf))
+    deepest = DEEPEST * float(now.get(beside(model.parameters, keys[2], "thickness"), math.inf))
     near, far = _reaches(model, known, now, keys)
     for i, (x, y) in enumerate(places(known[:, :2], near, PLACES)):
         yield Shot(
@@ -200,7 +195,7 @@ def _reaches(model: Model, known: np.ndarray, now: Mapping, keys: Sequence[str])
     """(2,), (2,) mm from the middle: how far other presses may lie (as far as the present ones, or 0.3 of the gel's
     side where these are few), and how far out one still lies on the pad, if the scene states its size."""
     reach = np.abs(known[:, :2]).max(0)
-    sides = [now.get(f"{key.rpartition('.')[0]}.{name}") for key, name in zip(keys, ("width", "length"))]
+    sides = [now.get(beside(model.parameters, key, role)) for key, role in zip(keys, ("width", "length"))]
     least = np.array([1.0 if side is None else 0.3 * float(side) for side in sides])
     far = [
         min(2 * max(r, 0.5), 0.9 * model.parameters[key].bounds[1]) if side is None else RIM * float(side) / 2
@@ -224,7 +219,7 @@ def places(known: np.ndarray, reach: np.ndarray, count: int) -> list[tuple[float
 
 
 def _lights(model: Model, values: Values, frames: Sequence[int], now: Mapping, like: int) -> Iterator[Shot]:
-    keys = keys_named(model.parameters, "power")
+    keys = keys_with(model.parameters, "power")
     driven = model.driven
     if not keys:
         return
@@ -260,9 +255,9 @@ def _lights(model: Model, values: Values, frames: Sequence[int], now: Mapping, l
 def _films(model: Model, now: Mapping, like: int) -> Iterator[Shot]:
     """Angles of polarizers and sheets, and films put in and taken out."""
     what = _same(model, like)
-    for key in keys_named(model.parameters, "angle"):
-        inserted = f"{key.rpartition('.')[0]}.inserted"
-        if not now.get(inserted, 1.0):
+    for key in keys_with(model.parameters, "angle"):
+        inserted = beside(model.parameters, key, "inserted")
+        if inserted is not None and not now[inserted]:
             for turn in (45.0, 20.0):
                 yield Shot(
                     "film put in",
@@ -274,12 +269,12 @@ def _films(model: Model, now: Mapping, like: int) -> Iterator[Shot]:
         for turn in (45.0, 90.0, 20.0):
             to = (float(now[key]) + turn) % 180.0
             yield Shot("polarizer angle", f"{what} with {key} = {to:g} deg", like, {key: to})
-        if inserted in now:
+        if inserted is not None:
             yield Shot("film taken out", f"{what} without {key.rpartition('.')[0]}", like, {inserted: 0.0})
 
 
 def _distances(model: Model, now: Mapping, like: int) -> Iterator[Shot]:
-    for key in keys_named(model.parameters, "distance"):
+    for key in keys_with(model.parameters, "distance"):
         for factor in (0.5, 2.0, 0.25):
             if now[key] > 0:
                 to = factor * float(now[key])
@@ -289,8 +284,8 @@ def _distances(model: Model, now: Mapping, like: int) -> Iterator[Shot]:
 def _turned(model: Model, frames: Sequence[int], now: Mapping, like: int) -> Iterator[Shot]:
     """Settings that the frames turned and that no family above covers: a value in the widest gap, and one beyond either
     end."""
-    known = ("power", "exposure", "angle", "inserted", "distance", *CLOCKS)
-    special = {*(_press(model) or ()), *(k for name in known for k in keys_named(model.parameters, name))}
+    known = ("power", "exposure", "angle", "inserted", "distance", *CLOCKS)  # roles
+    special = {*(_press(model) or ()), *(k for name in known for k in keys_with(model.parameters, name))}
     turned: dict[str, set[float]] = {}
     for f in frames:
         own = model.frames[f]
@@ -579,7 +574,8 @@ def _frame(model: Model, shot: Shot, number: int) -> Frame:
 
 def is_place(model: Model, key: str) -> bool:
     """Whether a parameter belongs to the touched object and not to the frame: all frames of a press share it."""
-    return key.rpartition(".")[2].startswith("press_") or model.parameters[key].how == "difference"
+    p = model.parameters[key]
+    return p.role.startswith("press ") or p.how == "difference"
 
 
 def _base_with_shots(

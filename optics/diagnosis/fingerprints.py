@@ -21,7 +21,7 @@ from optics.diagnosis.result import Family, Fingerprint
 from optics.diagnosis.thresholds import AS_GOOD, EXCESS, MIMICS, SHARE
 from optics.fit.compare import UNITS, led_label
 from optics.fit.model import Model
-from optics.scene.parameter import Values
+from optics.scene.parameter import Values, keys_with
 
 SIDE = 4  # cells per side of the coordinate 'place': a finer map would fit any clutter and forbid every claim
 NOT_A_COORDINATE = {"far", "quadrant"}  # regions that others make up
@@ -48,28 +48,13 @@ FAMILIES = {  # what a coordinate belongs to; a setting belongs to the family of
     ),
     "time": ("frame", "reading"),
 }
-PARTS = {
-    "camera": "camera",
-    "led": "light",
-    "source": "light",
-    "room": "light",
-    "gel": "geometry",
-    "block": "geometry",
-    "target": "geometry",
-    "cells": "geometry",
-    "carried": "geometry",
-    "markers": "geometry",
-}
-TIMES = ("time", "frame_time", "timestamp")
 
 
-def family_of(coordinate: str, kind: str = "") -> str:
-    """camera, light, geometry, time or setting; `kind` is that of the part whose setting the coordinate is."""
-    name, _, parameter = coordinate.rpartition(".")
-    if parameter in TIMES:
-        return "time"
+def family_of(coordinate: str, of_setting: str = "") -> str:
+    """camera, light, geometry, time or setting; `of_setting` is what the model says of a setting
+    (`optics.fit.model.Model.family`)."""
     found = next((family for family, names in FAMILIES.items() if coordinate in names), "")
-    return found or PARTS.get(kind or name, "setting")
+    return found or of_setting or "setting"
 
 
 # -- covariates ------------------------------------------------------------------------------------------------------
@@ -127,7 +112,8 @@ def settings(model: Model, evidence: Evidence) -> dict[str, list[float]]:
     """key -> value per fitted frame of the numbers that the experimenter turned, other than which LED was on."""
     turned: dict[str, list[float]] = {}
     frames = [model.frames[f] for f in evidence.frames]
-    for key in sorted({key for f in frames for key in f.parameters if not key.endswith(".power")}):
+    lights = keys_with(model.parameters, "power")
+    for key in sorted({key for f in frames for key in f.parameters if key not in lights}):
         values = [f.parameters.get(key, math.nan) for f in frames]
         numbers = [float(v) if isinstance(v, (int, float)) else math.nan for v in values]
         if len({v for v in numbers if math.isfinite(v)}) > 1:
@@ -209,7 +195,7 @@ def fingerprints(
                 curve.tolist(),
                 sd.tolist(),
                 _labels(evidence, model, name, centres),
-                family_of(name, model.part_kind(name)),
+                family_of(name, model.family(name)),
                 net / excess if weighed else math.nan,
                 _unit_of(model, name),
             )

@@ -67,7 +67,7 @@ def _light(model: SceneModel, now: Mapping, hits: Hits) -> tuple[np.ndarray, np.
         image = model.renderer.led(now, led)
         shadow |= ~image.lit & hits.valid
         rim |= image.rim
-        to = np.array([now[f"{led}.{a}"] for a in "xyz"]) - hits.position
+        to = _place(model, now, led) - hits.position
         strength = (power * model.renderer.image(now, led)).sum(-1)
         brightest = strength > best
         best = np.where(brightest, strength, best)
@@ -90,7 +90,7 @@ def _press(model: SceneModel, now: Mapping, hits: Hits, emission: np.ndarray) ->
         "curvature": np.gradient(n[..., 0], axis=1) + np.gradient(n[..., 1], axis=0),
         "contact_distance": distance_transform_edt(~touch) if touch.any() else np.full(hits.shape, np.nan),
         # a grazing view, of which a camera sees next to nothing, would give a path without end: 0.001 bounds it
-        "gel_path": np.array(model.scene.gel.number("thickness") + p[..., 2])
+        "gel_path": np.array(model.scene.gel.numbered("thickness") + p[..., 2])
         / np.maximum(np.cos(np.radians(emission)), 1e-3),
     }
 
@@ -116,7 +116,7 @@ def lit_geometry(model: SceneModel, values: Values, frame: int) -> dict[str, np.
     to_camera = _unit(eye)
     found = {"depth": np.where(hits.valid, np.linalg.norm(eye, axis=-1), np.nan)} if scene.gel is None else {}
     best, toward, axis = np.full(hits.shape, -1.0), np.zeros(p.shape), np.zeros(p.shape)
-    at = {led: np.array([float(now[f"{led}.{a}"]) for a in "xyz"]) for led in scene.leds}
+    at = {led: _place(model, now, led) for led in scene.leds}
     on = model.lit(now)
     for led, power in on.items():
         if led not in at:
@@ -125,16 +125,16 @@ def lit_geometry(model: SceneModel, values: Values, frame: int) -> dict[str, np.
         brighter = strength > best
         best = np.where(brighter, strength, best)
         toward[brighter] = _unit(at[led] - p)[brighter]
-        axis[brighter] = _axis(scene.leds[led], now[f"{led}.pan"], now[f"{led}.tilt"])
+        axis[brighter] = _axis(scene.leds[led], *(now[scene.key(led, f"light {turn}")] for turn in ("pan", "tilt")))
     lit = (best > 0) & hits.valid
     # a dark frame gets NaN, not nothing: a coordinate that one frame lacks is dropped for all
     found["half_angle"] = np.where(lit, _angle(n, _unit(toward + to_camera)), np.nan)
     found["led_angle"] = np.where(lit, _angle(-toward, axis), np.nan)
     found["light_azimuth"] = np.where(lit & (_slope(n) > FLAT), _angle(_flat(n), _flat(toward)), np.nan)
-    if scene.gel is not None and f"{scene.gel.name}.press_x" in now:
-        found["press_distance"] = np.hypot(
-            *(p[..., i] - float(now[f"{scene.gel.name}.press_{a}"]) for i, a in enumerate("xy"))
-        )
+    if scene.gel is not None:
+        press = [scene.key(scene.gel.name, f"press {axis}") for axis in "xy"]
+        if all(press):
+            found["press_distance"] = np.hypot(*(p[..., i] - float(now[key]) for i, key in enumerate(press)))
     if 1 < len(at) <= DISTANCES:
         found.update(
             {
@@ -143,6 +143,11 @@ def lit_geometry(model: SceneModel, values: Values, frame: int) -> dict[str, np.
             }
         )
     return found
+
+
+def _place(model: SceneModel, now: Mapping, led: str) -> np.ndarray:
+    """(3,) mm, where an LED stands."""
+    return np.array([float(now[model.scene.key(led, f"light {axis}")]) for axis in "xyz"])
 
 
 def _axis(led, pan: float, tilt: float) -> np.ndarray:

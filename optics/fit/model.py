@@ -118,8 +118,8 @@ class Model(Protocol):
         """Mean wavelength of each channel, nm; 0 where unknown."""
         ...
 
-    def part_kind(self, key: str) -> str:
-        """Kind of the part that a parameter key belongs to ('camera', 'led', ...); '' for any other name."""
+    def family(self, key: str) -> str:
+        """What a parameter key belongs to: 'camera', 'light', 'geometry' or 'time'; '' for any other name."""
         ...
 
     def imagine(self, frames: Sequence[Frame]) -> Model:

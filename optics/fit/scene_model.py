@@ -17,7 +17,6 @@ from optics.errors import BadScene, UnknownKey
 from optics.fit import geometry
 from optics.fit.model import value_of
 from optics.light.development import STEP, Developer
-from optics.light.renderer import POWERS
 from optics.scene.loader import Scene
 from optics.scene.parameter import Parameter, Values, Variable
 
@@ -71,9 +70,7 @@ class SceneModel:
             scene.check(frame.parameters, f"{frame.file or captures.folder}: frame {frame.name}")
         self.companions = self._companions()
         # A power that frames set is a drive level: what a calibration finds is the LED's power at drive 1.
-        self.driven = {f"{n}.power" for n in scene.lights} & {
-            k for f in self.frames for k in (*f.parameters, *f.readings)
-        }
+        self.driven = set(scene.powers.values()) & {k for f in self.frames for k in (*f.parameters, *f.readings)}
         self.base.update(dict.fromkeys(self.driven, 1.0))
         self.shape = self.frames[0].image.shape
         height, width = self.shape[:2] if captures.table is None else (1, 1)
@@ -115,7 +112,7 @@ class SceneModel:
         twin = copy.copy(self)
         twin.frames = [*self.frames, *frames]
         twin.driven = self.driven | (
-            {f"{n}.power" for n in self.scene.lights} & {k for f in frames for k in (*f.parameters, *f.readings)}
+            set(self.scene.powers.values()) & {k for f in frames for k in (*f.parameters, *f.readings)}
         )
         twin.base = {**self.base, **dict.fromkeys(twin.driven - self.driven, 1.0)}
         twin.companions, twin._edges_kept = twin._companions(), dict(self._edges_kept)
@@ -149,7 +146,9 @@ class SceneModel:
         for frame in self.frames:
             own = {**self.base, **frame.parameters, **frame.readings}
             key = (frame.group, *(own[k] for k in self.renderer.geometry_keys))
-            presses.setdefault(key, set()).update(n for n in self.scene.lights if np.any(own[f"{n}.power"] != 0))
+            presses.setdefault(key, set()).update(
+                n for n, power in self.scene.powers.items() if np.any(own[power] != 0)
+            )
             keys.append(key)
         return [presses[key] for key in keys]
 
@@ -159,8 +158,7 @@ class SceneModel:
         return all(self._is_power(k) for k in variable.keys)
 
     def _is_power(self, key: str) -> bool:
-        name, _, parameter = key.rpartition(".")
-        return name in self.scene.lights and parameter in POWERS
+        return key in self.renderer.power_keys
 
     def check_variables(self, variables: Sequence[Variable]) -> None:
         for variable in variables:
@@ -172,6 +170,10 @@ class SceneModel:
         """The lights that are on and their powers per band (B,), or (N, 1, B) of readings."""
         return {n: self.renderer.powers(now, n) for n in self.renderer.lit(now)}
 
+    def set_scene(self, values: Values, index: int) -> None:
+        """Put the scene itself into the state of a frame, every light at power 1: what tracers of rays start from."""
+        self.renderer.apply(self.at(values, index))
+
     # -- prediction ---------------------------------------------------------------------------------------------------
     def radiance(self, now: Mapping, seed: int = 0) -> np.ndarray:
         """(H, W, B): linear image of a frame."""
@@ -179,13 +181,13 @@ class SceneModel:
 
     def untouched(self, now: Mapping) -> dict:
         """The same frame with the gel at rest."""
-        gel = self.scene.gel.name
-        return {**now, **dict.fromkeys((f"{gel}.press_x", f"{gel}.press_y", f"{gel}.press_depth"), 0.0)}
+        keys = (self.scene.key(self.scene.gel.name, role) for role in ("press x", "press y", "press depth"))
+        return {**now, **dict.fromkeys((key for key in keys if key), 0.0)}
 
     def _rests(self, key: str) -> bool:
         """Whether a parameter does nothing while the gel is untouched."""
         name, _, parameter = key.rpartition(".")
-        return self.renderer.kind(key) == "gel" and parameter in self.scene.gel.pressing
+        return name == self.scene.gel.name and parameter in self.scene.gel.pressing
 
     def predict(self, values: Values, frames: Sequence[int] | None = None, seed: int = 0) -> list[np.ndarray]:
         """Noise-free DN (H, W, C) of each frame.
@@ -325,8 +327,8 @@ class SceneModel:
 
     def _light_tangent(self, now: Mapping, key: str, factor: Any, seed: int, at_rest: bool) -> np.ndarray | None:
         """factor times d radiance / d key in a frame."""
-        name, parameter = key.rsplit(".", 1)
-        kind = self.renderer.kind(key)
+        name = key.rsplit(".", 1)[0]
+        own = name in self.scene.leds  # a parameter of one point light
         lit = self.lit(now)
         tangent = self.renderer.led_tangent_at_rest if at_rest else self.renderer.led_tangent
         glows = self.renderer.glows(now)
@@ -345,21 +347,22 @@ class SceneModel:
                 return None
             # the power is a product of four: the derivative by one of them is the product of the others
             others = self.renderer.powers({**now, key: 1.0}, name)
-            if parameter != "power":
-                others = np.where(np.arange(self.renderer.bands) == POWERS.index(parameter) - 1, others, 0.0)
+            if key != self.scene.powers[name]:
+                band = self.scene.band_powers[name].index(key)
+                others = np.where(np.arange(self.renderer.bands) == band, others, 0.0)
             factor = factor * others
             if not np.any(factor):
                 return None
-            return factor * self.renderer.light({**now, **{f"{name}.{p}": 1.0 for p in POWERS}}, name, seed)
-        if kind == "led" and name not in lit:
+            return factor * self.renderer.light({**now, **dict.fromkeys(self.scene.power_keys(name), 1.0)}, name, seed)
+        if own and name not in lit:
             return None
         if self.renderer.monte_carlo:
             return factor * cast("MonteCarloRenderer", self.renderer).tangent(now, key, seed)
         if key in self.renderer.ambient_keys:
             return factor * self._difference_ambient(now, key)
-        if self.parameters[key].how == "difference" and kind != "led":
+        if self.parameters[key].how == "difference" and not own:
             return factor * self._difference(now, key, seed)
-        if kind == "led":
+        if own:
             image = (
                 self._difference_led(now, name, key)
                 if self.parameters[key].how == "difference"
@@ -420,7 +423,7 @@ class SceneModel:
                 view = self.developer.view(now)
                 full = self.noise.saturation - self.noise.black_level
                 step = (
-                    ((high - low) @ self.developer.matrix.T) * np.abs(view.exposure * self.developer.gains(view)) * full
+                    ((high - low) @ self.developer.matrix.T) * np.abs(self.developer.scale(view)) * full
                 )
                 level = self.predict(Values(), [index])[0].reshape(-1, self.shape[2])[image.index]
                 known.reshape(-1, self.shape[2])[image.index] = (
@@ -446,7 +449,7 @@ class SceneModel:
 
         now = self.at(values, index)
         view = self.developer.view(now)
-        full = (self.noise.saturation - self.noise.black_level) * np.abs(view.exposure * self.developer.gains(view))
+        full = (self.noise.saturation - self.noise.black_level) * np.abs(self.developer.scale(view))
         error = cast("MonteCarloRenderer", self.renderer).error(now)
         return uniform_filter((error**2 @ (self.developer.matrix**2).T) * full**2, (3, 3, 0), mode="nearest")
 
@@ -470,7 +473,8 @@ class SceneModel:
             return [0.0] * self.shape[2]
         return list(matrix @ np.array(bands) / matrix.sum(1))
 
-    def part_kind(self, key: str) -> str:
-        """Kind of the part that a parameter key belongs to; '' for any other name."""
-        part = self.scene.parts.get(key.rpartition(".")[0])
-        return part.kind if part is not None else ""
+    def family(self, key: str) -> str:
+        if key in self.parameters and self.parameters[key].role == "clock":
+            return "time"
+        name = key.rpartition(".")[0]
+        return self.scene.declaration(name).family if name in self.scene.parts else ""

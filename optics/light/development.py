@@ -46,7 +46,7 @@ class Developer:
     """
 
     def __init__(self, camera, bands: tuple[float, ...], black: float = 0.0, saturation: float = 255.0):
-        self.name = camera.name
+        self.camera, self.name = camera, camera.name
         self.width, self.height = camera.resolution
         self.bands = tuple(bands)
         self.matrix = sensitivities(camera.sensitivity, self.bands)
@@ -63,9 +63,7 @@ class Developer:
         height (px); bands (nm); settings: all values by key, those of other parts too, (N, 1, 1) where readings were
         swept."""
         own = {n: values[f"{self.name}.{n}"] for n in self.names}
-        focal = self.width / 2 / np.tan(np.deg2rad(np.real(own["x_fov"])) / 2)
-        x = (self.u - self.width / 2 - np.real(own["principal_x"])) / focal
-        y = (self.v - self.height / 2 - np.real(own["principal_y"])) / (focal * np.real(own["aspect"]))
+        x, y, focal = self.camera.normalised(SimpleNamespace(**own), self.u, self.v)
         return SimpleNamespace(
             **own,
             u=self.u,
@@ -91,25 +89,20 @@ class Developer:
         """Irradiance per channel, 1 = full scale, of an image per band (H, W, B)."""
         image = self._stage("lens", image, view)
         image = image @ self.matrix.T
-        return self._stage("sensor", image * (view.exposure * self.gains(view)), view)
+        return self._stage("sensor", image * self.scale(view), view)
 
     def gains(self, view) -> np.ndarray:
         """(C,) gain of each channel."""
-        return view.gain * np.array([getattr(view, f"gain_{'rgb'[min(c, 2)]}") for c in range(len(self.matrix))])
+        return self.camera.gains(view, len(self.matrix))
+
+    def scale(self, view) -> np.ndarray:
+        """(C,) full scale per unit of irradiance in each channel."""
+        return getattr(view, self.camera.named("exposure")) * self.gains(view)
 
     def respond(self, irradiance, view):
         """DN of an irradiance per channel."""
-        m = np.empty(
-            irradiance.shape,
-            np.result_type(irradiance, *(getattr(view, f"response{k}_{c}") for k in (2, 3) for c in "rgb")),
-        )
-        for index in range(irradiance.shape[-1]):
-            c = "rgb"[min(index, 2)]
-            m[..., index] = inverse_cubic(
-                irradiance[..., index], getattr(view, f"response2_{c}"), getattr(view, f"response3_{c}")
-            )
-        m = self._stage("response", m, view)
-        return self.black + (self.saturation - self.black) * m + view.offset
+        m = self._stage("response", self.camera.respond(view, irradiance), view)
+        return self.black + (self.saturation - self.black) * m + self.camera.added(view)
 
     def develop(self, image: np.ndarray, values: Mapping[str, complex]) -> np.ndarray:
         """DN (H, W, C), noise-free and not clipped, of radiance per band (H, W, B)."""
@@ -147,32 +140,3 @@ class Linear:
     def at(self, keys: tuple[str, ...], value: float) -> np.ndarray:
         """DN at another value of camera parameters (for finite steps)."""
         return self.developer.develop(self.bands, {**self.values, **dict.fromkeys(keys, value)})
-
-
-def inverse_cubic(irradiance, a, b):
-    """m with G(m) = m + a (m^2 - m) + b (m^3 - m) = irradiance, by Newton from m = irradiance; (S1.1).
-
-    Beyond full scale (m > 1) and below 0 the response goes on as a straight line, so that it stays invertible.
-    """
-    if np.all(a == 0) and np.all(b == 0):
-        return irradiance
-    x = np.asarray(irradiance)
-    m = np.clip(x.real, 0, 1)
-    ra, rb = np.real(a), np.real(b)
-    for _ in range(30):
-        slope = 1 + ra * (2 * m - 1) + rb * (3 * m * m - 1)
-        if np.any(slope <= 0):
-            raise ValueError(
-                f"response with quadratic term {ra:g} and cubic term {rb:g} is not monotone on [0, 1]; "
-                "its inverse needs 1 + a (2m - 1) + b (3m^2 - 1) > 0"
-            )
-        step = (m + ra * (m * m - m) + rb * (m**3 - m) - np.clip(x.real, 0, 1)) / slope
-        m = np.clip(m - step, 0, 1)
-        if np.abs(step).max() < 1e-13:
-            break
-    inside = (x.real >= 0) & (x.real <= 1)
-    # one complex Newton step carries the derivative along; outside, the end's slope does
-    slope = 1 + a * (2 * m - 1) + b * (3 * m * m - 1)
-    end = np.clip(x.real, 0, 1)
-    value = m - (m + a * (m * m - m) + b * (m**3 - m) - np.where(inside, x, end)) / slope
-    return value + np.where(inside, 0, (x - end) / slope)

@@ -19,7 +19,7 @@ BEYOND = 1e-4
 
 def is_interface(shape) -> bool:
     """Whether a shape is a flat boundary that the camera looks through."""
-    return getattr(shape.bsdf(), "kind", "") == "interface"
+    return getattr(shape.bsdf(), "role", "") == "interface"
 
 
 class LedByLed:
@@ -44,8 +44,8 @@ class LedByLed:
 
     def windows(self, scene, led):
         """How many flat interfaces stand between an LED and the skin."""
-        reach = math.sqrt(led.number("area") / math.pi)
-        return sum(1 for s in scene.shapes() if is_interface(s) and s.bbox().max.z > led.number("z") - reach)
+        reach = math.sqrt(led.numbered("light area") / math.pi)
+        return sum(1 for s in scene.shapes() if is_interface(s) and s.bbox().max.z > led.numbered("light z") - reach)
 
     def visible(self, scene, si, point, led):
         """Whether the straight line from the surface to a point of an LED meets nothing but windows (detached)."""

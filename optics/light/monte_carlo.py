@@ -13,9 +13,10 @@ import numpy as np
 
 from optics.light import paths
 from optics.light.development import STEP
-from optics.light.renderer import POWERS, LedImage, Renderer
-from optics.light.transport import Estimate, Transport, coefficient
+from optics.light.renderer import LedImage, Renderer
+from optics.light.transport import Estimate, Transport
 from optics.scene.loader import Scene
+from optics.scene.surfaces import coefficient
 
 MEMORY = 5e8  # bytes of images that are kept
 
@@ -29,12 +30,10 @@ class MonteCarloRenderer(Renderer):
     def __init__(self, scene: Scene, remember: int = 24):
         super().__init__(scene, remember)
         self.layered = False
-        silent = {k for k, p in scene.parameters.items() if p.how == "image"} | {
-            f"{n}.{p}" for n in scene.lights for p in POWERS
-        }
+        silent = {k for k, p in scene.parameters.items() if p.how == "image"} | set(scene.power_keys(*scene.lights))
         self.deciding = sorted(k for k in scene.parameters if k not in silent)
         # lights that are off at first are followed only where they are on
-        self.always = {n for n, p in scene.lights.items() if p.number("power") > 0}
+        self.always = {n for n, p in scene.lights.items() if p.numbered("power") > 0}
         self._estimates: OrderedDict = OrderedDict()
         # all differences of a geometry, which each of its frames asks for: an image, its error, and slopes by four
         # materials
@@ -45,12 +44,12 @@ class MonteCarloRenderer(Renderer):
 
     def estimate(self, values: Mapping, seed: int = 0, slopes: bool = False) -> Estimate:
         """The lights at power 1; kept. slopes: with the derivatives by absorption."""
-        lights = tuple(n for n in self.scene.lights if n in self.always or values[f"{n}.power"] != 0)
+        lights = tuple(n for n in self.scene.lights if n in self.always or values[self.scene.powers[n]] != 0)
         key = (seed, lights, *(values[k] for k in self.deciding))
         known = self._estimates.get(key)
         self._sloped |= slopes
         if known is None or slopes and not known.slopes:
-            self._apply(values)
+            self.apply(values)
             integrator = self.scene.integrator
             known = self._estimates[key] = Transport(self.scene, lights).take(
                 integrator.rays, integrator.packets, seed, self._sloped, progress=self.progress
@@ -61,7 +60,7 @@ class MonteCarloRenderer(Renderer):
         return known
 
     def image(self, values: Mapping, light: str, component: int = 0) -> np.ndarray:
-        return self.light({**values, **{f"{light}.{p}": 1.0 for p in POWERS}}, light, 0, component)
+        return self.light({**values, **dict.fromkeys(self.scene.power_keys(light), 1.0)}, light, 0, component)
 
     def light(self, values: Mapping, light: str, seed: int = 0, component: int = 0) -> np.ndarray:
         found = self.estimate(values, seed)

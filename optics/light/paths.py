@@ -246,10 +246,15 @@ def layer_matrix(
     return evaluate(scene.declaration(name).mueller, crossing, own, active)
 
 
-def slab(name: str, matrix: Mueller, values: Mapping) -> Slab:
-    """A layer with the reflections of its faces, where it declares any (`face`); its matrix holds their losses
-    already."""
-    share = values.get(f"{name}.face", 0.0) * values.get(f"{name}.inserted", 1.0)
+def reflected(scene, name: str, values: Mapping):
+    """Share of light that each face of a layer reflects: its parameter with the role `face`, 0 where it has none or is
+    taken out."""
+    share, inserted = scene.key(name, "face"), scene.key(name, "inserted")
+    return 0.0 if share is None else values[share] * (1.0 if inserted is None else values[inserted])
+
+
+def slab(matrix: Mueller, share) -> Slab:
+    """A layer whose faces reflect a share of the light each; its matrix holds their losses already."""
     if np.all(np.asarray(share) == 0):
         return Slab(matrix)
     share = np.reshape(share, (-1, 1)) if isinstance(share, np.ndarray) else share
@@ -289,7 +294,8 @@ def transmission(scene, path: Path, values: Mapping, bands: np.ndarray, componen
             for place, (name, step) in enumerate(names)
         ]
         row = tuple(1.0 if j == component else 0 for j in range(4))
-        if any(np.any(np.asarray(values.get(f"{name}.face", 0.0)) != 0) for name, _ in names):
+        shares = {name: reflected(scene, name, values) for name, _ in names}
+        if any(np.any(np.asarray(share) != 0) for share in shares.values()):
             stack = None
             for (name, step), matrix in reversed(list(zip(names, matrices))):  # light meets the farthest first
                 if scene.declaration(name).refracts:  # a radiance grows by n^2 one way and shrinks by it the other
@@ -297,7 +303,7 @@ def transmission(scene, path: Path, values: Mapping, bands: np.ndarray, componen
                     back = np.where(step.k[rays][:, 2:] > 0, index, 1 / index) ** 4
                     own = Slab(matrix, t_back=matrix.reversed * back)
                 else:
-                    own = slab(name, matrix, values)
+                    own = slab(matrix, shares[name])
                 stack = own if stack is None else own.after(stack)
             row = stack.t.after(row)
         else:

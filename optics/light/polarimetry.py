@@ -104,22 +104,23 @@ def stack(
     def numbers(matrix: Mueller) -> np.ndarray:
         return np.broadcast_to(matrix.numpy(), (1, len(bands), 4, 4))[0]
 
-    own = [numbers(paths.slab(n, m, values).t) for n, m in chosen]
-    return names, np.array(own).reshape(-1, len(bands), 4, 4), numbers(_combined(names, [m for _, m in chosen], values))
+    slabs = [(m, paths.reflected(scene, n, values)) for n, m in chosen]
+    own = [numbers(paths.slab(m, share).t) for m, share in slabs]
+    return names, np.array(own).reshape(-1, len(bands), 4, 4), numbers(_combined(slabs))
 
 
-def _combined(names: Sequence[str], matrices: Sequence[Mueller], values: Mapping) -> Mueller:
-    """The product of matrices, from the camera on; where faces reflect, with the light that goes to and fro between
-    them."""
-    if not names:
+def _combined(layers: Sequence[tuple[Mueller, float]]) -> Mueller:
+    """The product of matrices, from the camera on; where faces reflect a share, with the light that goes to and fro
+    between them."""
+    if not layers:
         return mueller.identity()
-    if any(values.get(f"{n}.face", 0.0) != 0 for n in names):
-        whole = paths.slab(names[-1], matrices[-1], values)
-        for name, matrix in zip(names[-2::-1], matrices[-2::-1]):
-            whole = paths.slab(name, matrix, values).after(whole)
+    if any(share != 0 for _, share in layers):
+        whole = paths.slab(*layers[-1])
+        for matrix, share in layers[-2::-1]:
+            whole = paths.slab(matrix, share).after(whole)
         return whole.t
-    whole = matrices[0]
-    for matrix in matrices[1:]:
+    whole = layers[0][0]
+    for matrix, _ in layers[1:]:
         whole = whole @ matrix
     return whole
 
@@ -379,7 +380,7 @@ class Spot(Renderer):
 
     def __init__(self, scene: Scene, column: int, row: int, whole: bool = False):
         super().__init__(scene, remember=4)
-        full = self.width, self.height
+        self.whole, full = whole, (self.width, self.height)
         self.corner = (0, 0) if whole else (max(column - 1, 0), max(row - 1, 0))
         self.at = (row - self.corner[1], column - self.corner[0])
         if not whole:
@@ -605,25 +606,17 @@ def sweep(
     groups, notes = [({}, [], None)], []
     if captures is not None:
         groups, notes = _groups(captures, scene, key, base, values or {}, only, row, column)
-    camera = {
-        f"{developer.name}.{n}" for effects in developer.effects.values() for e in effects for n in e.parameter_names
-    }
-    mixes = {k for settings, *_ in groups for k in settings} | {key}
-    whole = bool(camera & mixes) or any(
-        base[k] != scene.parameters[k].neutral for k in camera
-    )  # effects that mix pixels need all
+    whole = _needs_all_pixels(scene, developer, base, {k for settings, *_ in groups for k in settings} | {key})
     spot = Spot(scene, column, row, whole)
     total, done = sum(len(x) + len(own) for _, own, _ in groups), 0
-    drives = _powers(scene) if captures is not None else set()
+    drives = set(scene.powers.values()) if captures is not None else set()
 
     def read(settings: Sequence[Mapping]) -> np.ndarray:
         nonlocal done
         rows = []
         for own in settings:
             now = {**base, **{k: v * base[k] if k in drives else v for k, v in own.items()}}
-            image = spot.radiance(now)
-            image = image if radiance else developer.develop(image if whole else image[spot.at][None, None], now)
-            rows.append(image[spot.at if whole or radiance else (0, 0)])
+            rows.append(_reading(spot, now, None if radiance else developer))
             done += 1
             if progress is not None:
                 progress("readings", done, total)
@@ -659,8 +652,23 @@ def sweep(
     )
 
 
-def _powers(scene: Scene) -> set[str]:
-    return {f"{name}.power" for name in scene.lights}
+def _needs_all_pixels(scene: Scene, developer: Developer, base: Mapping, turned: set[str]) -> bool:
+    """Whether an effect of the camera, which may mix pixels, is turned or off neutral: then one pixel takes the whole
+    image."""
+    camera = {
+        f"{developer.name}.{n}" for effects in developer.effects.values() for e in effects for n in e.parameter_names
+    }
+    return bool(camera & turned) or any(base[k] != scene.parameters[k].neutral for k in camera)
+
+
+def _reading(spot: Spot, now: Mapping, developer: Developer | None) -> np.ndarray:
+    """(C,) what the spot's pixel reads in DN, or without a developer its radiance per band."""
+    image = spot.radiance(now)
+    if developer is None:
+        return image[spot.at]
+    if spot.whole:
+        return developer.develop(image, now)[spot.at]
+    return developer.develop(image[spot.at][None, None], now)[0, 0]
 
 
 def _colours(bands: Sequence[float], channels: int, radiance: bool) -> list:
@@ -684,7 +692,7 @@ def _groups(
     clock, at their mean."""
     where = str(captures.folder)
     check(captures, scene.parameters)
-    powers = _powers(scene)
+    powers = set(scene.powers.values())
     base.update({k: v for k, v in captures.parameters.items() if k not in values})
     base.update({k: values.get(k, 1.0) for f in captures.frames for k in f.parameters if k in powers})  # drive levels
     rows = [f for f in captures.frames if key in f.parameters]

@@ -29,7 +29,6 @@ PAINTED = 0.05  # of the largest reflectance of a texture: a step from pixel to 
 # level in 200
 BENT = 1e-3
 CREASE = 25.0  # deg from pixel to pixel: what is no smooth surface
-POWERS = ("power", "power_r", "power_g", "power_b")  # images are kept per unit of each
 FLAT_FIELDS = ("multiplicative", "additive", "none")
 BOUNCE_SAMPLES = 32  # directions per cell for the second bounce
 BOUNCE_CELL = 2  # px each way of a cell
@@ -69,8 +68,9 @@ class Renderer:
         }
         self.layer_order = sorted(self.layer_keys | words)  # what the layers' matrices depend on
         led_keys = {k for k in scene.parameters if k.rsplit(".", 1)[0] in scene.lights} - self.layer_keys
+        self.power_keys = scene.power_keys(*scene.lights)  # images are kept per unit of each
         own = [k for k in scene.parameters if k not in image_keys and k not in led_keys and k not in self.layer_keys]
-        self.bounce_key = f"{scene.integrator.name}.interreflection"
+        self.bounce_key = scene.key(scene.integrator.name, "second bounce") or ""
         self.geometry_keys = [k for k in own if scene.moves(k)]
         ambient = {
             f"{n}.{parameter}"
@@ -83,8 +83,7 @@ class Renderer:
             k for k in own if k not in self.geometry_keys and k != self.bounce_key and k not in self.ambient_keys
         ]
         self.led_keys = {
-            n: [k for k in led_keys if k.rsplit(".", 1)[0] == n and k.rsplit(".", 1)[1] not in POWERS]
-            for n in scene.lights
+            n: [k for k in led_keys if k.rsplit(".", 1)[0] == n and k not in self.power_keys] for n in scene.lights
         }
         self._fixed = {
             k for k in self.geometry_keys if self.kind(k)
@@ -102,7 +101,7 @@ class Renderer:
     def geometry(self, values: Mapping) -> tuple:
         return tuple(values[k] for k in self.geometry_keys)
 
-    def _apply(self, values: Mapping, move: bool = True) -> None:
+    def apply(self, values: Mapping, move: bool = True) -> None:
         """Set everything but the LEDs' powers, which stay at 1: images are kept per unit of power.
 
         move = False leaves the geometry where it is (rebuilding the gel costs more than an image): enough for shading
@@ -115,7 +114,7 @@ class Renderer:
             and not isinstance(v, np.ndarray)
             and (move or k not in self._fixed)
         }
-        now.update({f"{n}.{power}": 1.0 for n in self.scene.lights for power in POWERS})
+        now.update(dict.fromkeys(self.power_keys, 1.0))
         self.scene.set(now)
 
     def _trace(self, u: np.ndarray, v: np.ndarray) -> tuple:
@@ -138,7 +137,7 @@ class Renderer:
         if key in self._hits:
             self._hits.move_to_end(key)
             return self._hits[key]
-        self._apply(values)
+        self.apply(values)
         v, u = np.mgrid[: self.height, : self.width] + 0.5
         hits = Hits(self._trace(u.ravel(), v.ravel()), self.height, self.width)
         hits.edges |= self._painted(hits)
@@ -153,7 +152,7 @@ class Renderer:
 
     def contact_weight(self, values: Mapping, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """1 where the gel is touched at points (x, y) in mm of any shape, 0 elsewhere; between at the rim."""
-        self._apply(values)
+        self.apply(values)
         return self.scene.gel.contact_weight(x, y)
 
     def _painted(self, hits: Hits) -> np.ndarray:
@@ -193,7 +192,7 @@ class Renderer:
             self._images.move_to_end(key)
             return self._images[key]
         hits = self.hits(values)
-        self._apply(values)
+        self.apply(values)
         image = self._keep(key, self._render_led(hits, led))
         for other in self.together - {
             led
@@ -335,12 +334,12 @@ class Renderer:
 
     def lit(self, values: Mapping) -> list[str]:
         """The lights that are on."""
-        return [n for n in self.scene.lights if np.any(values[f"{n}.power"] != 0)]
+        return [n for n in self.scene.lights if np.any(values[self.scene.powers[n]] != 0)]
 
     def light(self, values: Mapping, light: str, seed: int = 0, component: int = 0) -> np.ndarray:
         """(H, W, B) what one light makes at its power, by one reflection and by two."""
         image = self.image(values, light, component)
-        if values[self.bounce_key]:
+        if self.bounce_key and values[self.bounce_key]:
             image = image + values[self.bounce_key] * self.bounced(values, light, seed, component)
         return self.powers(values, light) * image
 
@@ -373,7 +372,7 @@ class Renderer:
         Four points stand for the inner quarter of the disc's area and twelve for the ring around it, each on the circle
         that has its part's mean square radius, 1/8 and 5/8: the width of a penumbra is that of the whole disc.
         """
-        if part.number("area") == 0:
+        if part.numbered("light area") == 0:
             return [None]
         at = [
             0.5 + sign * (mean_square**0.5) / 2
@@ -432,8 +431,8 @@ class Renderer:
 
     def powers(self, values: Mapping, led: str) -> np.ndarray:
         """(B,) power of an LED in each band, relative to its image."""
-        shares = [values[f"{led}.{name}"] for name in POWERS[1:]] + [1.0] * self.bands
-        return values[f"{led}.power"] * np.array(shares[: self.bands])
+        shares = [values[key] for key in self.scene.band_powers[led]] + [1.0] * self.bands
+        return values[self.scene.powers[led]] * np.array(shares[: self.bands])
 
     def led_tangent_at_rest(self, values: Mapping, led: str, key: str) -> np.ndarray:
         """`led_tangent`, kept: all frames share the gel at rest."""
@@ -453,8 +452,8 @@ class Renderer:
         image = self.led(values, led)
         name, parameter = key.rsplit(".", 1)
         part, lamp = self.scene.parts[name], self.scene.leds[led]
-        moves = part is lamp and parameter in ("x", "y", "z")
-        self._apply(values, move=moves and len(image.index) > 0)
+        moves = part is lamp and part.numbers[parameter].role in ("light x", "light y", "light z")
+        self.apply(values, move=moves and len(image.index) > 0)
         value = getattr(part, parameter)
 
         def tangent(sample, visible):
@@ -502,7 +501,7 @@ class Renderer:
         if key in self._images:
             self._images.move_to_end(key)
             return self._bounced(values, led, self._images[key], component)
-        self._apply(values)
+        self.apply(values)
         rows, columns = -(-self.height // BOUNCE_CELL), -(-self.width // BOUNCE_CELL)
         v, u = np.mgrid[:rows, :columns]
         rng = np.random.default_rng([seed, 77])
@@ -559,7 +558,7 @@ class Renderer:
 
     def _shone(self, values: Mapping, sample: Sample) -> np.ndarray:
         """(N, B): radiance of the membranes that no LED made, at the ends of camera rays."""
-        self._apply(values, move=False)
+        self.apply(values, move=False)
         return sum(
             self._bands(
                 self.scene.integrator.ambient(self.scene.mitsuba, sample.si, sample.weight, m) + 0 * sample.si.t

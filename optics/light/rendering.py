@@ -32,7 +32,7 @@ from optics.files.output import file_hash, versions
 from optics.light import paths
 from optics.light.development import Developer
 from optics.light.monte_carlo import renderer_of
-from optics.light.renderer import POWERS, Hits, Renderer, Sample
+from optics.light.renderer import Hits, Renderer, Sample
 from optics.scene.loader import Scene
 from optics.scene.mitsuba_parts import is_part
 from optics.scene.registry import Registry
@@ -161,7 +161,7 @@ class RenderJob:
             self.renderer.progress = progress
         now = {**self.base, **self.scene.check(values or {})}
         if lit is not None:
-            now.update({f"{led}.power": 0.0 for led in self.scene.lights if led not in lit})
+            now.update({power: 0.0 for led, power in self.scene.powers.items() if led not in lit})
         image = self._exact(now, seed) if self.renderer is not None else self._monte_carlo(now, seed)
         image.header["provenance"] = {**self.record, "seed": seed, "parameters": now}
         pressed = None if self.scene.block is None else self.scene.block.press()
@@ -256,7 +256,7 @@ class RenderJob:
         if not self.bands:
             parts = radiance[..., 0, :] if radiance.ndim == 4 and radiance.shape[3] == 4 else ()
             return {"Y": s0[..., 0], **{f"S{i}.Y": parts[..., i] for i in range(4) if len(parts)}}
-        channels = exr.preview_channels(self.bands, s0 * now[f"{self.scene.camera.name}.exposure"])
+        channels = exr.preview_channels(self.bands, s0 * now[self.scene.key(self.scene.camera.name, "exposure")])
         if "spectral" in self.layers:
             parts = radiance[..., 0] if radiance.ndim == 4 and radiance.shape[3] == 1 else radiance
             channels.update(exr.spectral_channels(self.bands, parts))
@@ -306,11 +306,7 @@ class RenderJob:
 
         camera = self.scene.camera
         if camera is not None:
-            width, height = camera.resolution
-            o, d = camera.ray(
-                mi.Float(width / 2 + now[f"{camera.name}.principal_x"]),
-                mi.Float(height / 2 + now[f"{camera.name}.principal_y"]),
-            )
+            o, d = camera.ray(*(mi.Float(place) for place in camera.middle()))
         else:
             pose = self.scene.mitsuba.sensors()[0].world_transform()
             o, d = pose @ mi.Point3f(0), pose @ mi.Vector3f(0, 0, 1)
@@ -381,7 +377,7 @@ def veiled(renderer: Renderer, values: Mapping) -> str:
     import mitsuba as mi
 
     hits, scene = renderer.hits(values), renderer.scene
-    scene.set({**values, **{f"{name}.{power}": 1.0 for name in scene.lights for power in POWERS}})
+    scene.set({**values, **dict.fromkeys(scene.power_keys(*scene.lights), 1.0)})
     passing = int(mi.BSDFFlags.Null | mi.BSDFFlags.DeltaTransmission)
     found = []
     with dr.suspend_grad():

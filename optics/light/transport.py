@@ -40,6 +40,7 @@ from optics.errors import BadScene
 from optics.light.paths import part_values
 from optics.light.solid_angle import Rectangle
 from optics.polarization.mueller import diattenuator, fresnel, fresnel_reflection, retarder, rotation
+from optics.scene.surfaces import coefficient
 
 DEPTH = 512  # faces that a ray may meet; of the scene magictac's, 6e-5 would meet more
 FAINT = 0.3  # below this share of its start, half of the packets go on with twice the weight
@@ -600,7 +601,7 @@ class Run:
     @staticmethod
     def chip(led, sample):
         """A point of an LED."""
-        return led.point(sample) if led.number("area") > 0 else led.position()
+        return led.point(sample) if led.numbered("light area") > 0 else led.position()
 
     def _emitted(self, light: int, drawn: Sequence):
         """Where packets of a light start, which way they go, the power of all of them, and the weight of each, by five
@@ -882,7 +883,7 @@ class Surface:
         names = [m.name for m in known]
         self.shape, self.first = shape, 0
         bsdf = shape.bsdf()
-        clear = getattr(bsdf, "kind", "") == "clear"
+        clear = getattr(bsdf, "role", "") == "clear"
         self.inside = names.index(bsdf.name) if clear else -1
         self.outside = names.index(bsdf.around.name if bsdf.around is not None else AIR) if clear else -1
         self.light = next((n for n, part in scene.sources.items() if shape.emitter() is part), "")
@@ -906,14 +907,14 @@ class Surface:
                 "'clear', and matt ones (diffuse, membrane)"
             )
         self.rectangle = Rectangle.of(shape) if self.light else None
-        self.cells = shape.cells(SPLIT) if getattr(shape, "kind", "") == "cells" else None
+        self.cells = shape.cells(SPLIT) if hasattr(shape, "cells") else None
 
 
 def materials(scene, bands: np.ndarray) -> list[Material]:
     """Air, then the scene's clear materials, at the present values."""
     found, values = [Material(AIR, np.ones(len(bands)), np.zeros(len(bands)), np.zeros(len(bands)))], scene.values()
     for name, part in scene.parts.items():
-        if part.kind == "clear":
+        if part.role == "clear":
             own = part_values(scene, name, values, {})
             found.append(
                 Material(
@@ -928,12 +929,3 @@ def materials(scene, bands: np.ndarray) -> list[Material]:
                 )
             )
     return found
-
-
-def coefficient(clear, stage: str, wavelengths, functions: Sequence[Callable]):
-    """`index` or `absorption` (1/mm) of a clear material per band, with what the functions of effects of that stage
-    make of it; for numpy, complex numbers among them, and for Dr.Jit."""
-    value = getattr(clear, stage) + 0 * wavelengths
-    for function in functions:
-        value = function(value, wavelengths, clear)
-    return value

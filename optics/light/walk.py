@@ -85,12 +85,12 @@ class Walk:
         self.point_lights = dr.gather(mi.EmitterPtr, scene.emitters_dr(), mi.UInt32(points)) if points else None
         self.point_list = [emitters[i] for i in points]
         self.lamps = (
-            [e for e in emitters if getattr(e, "kind", "") == "led"] if self.veils or self.glowing(scene) else []
+            [e for e in emitters if getattr(e, "role", "") == "led"] if self.veils or self.glowing(scene) else []
         )
         self.shining = [
             m
             for m in {s.bsdf() for s in scene.shapes()}
-            if getattr(m, "kind", "") == "membrane" and m.functions("ambient")
+            if getattr(m, "role", "") == "membrane" and m.functions("ambient")
         ]
 
     # -- the rays ---------------------------------------------------------------------------------------------------

@@ -55,6 +55,18 @@ STAGES = {  # stage -> the role of the parts that it belongs to
     "response": "camera",
 }
 IMAGE_STAGES = ("lens", "sensor", "response")
+LED_BY_LED = frozenset(("emission", "segment", "volume", "reflection", "ambient"))  # Monte Carlo light passes none
+ROLES = {  # of parts: all that the library knows of them; a kind plays the role of its own name unless it says another
+    "camera": "images are developed by its gains, response and what it adds; one in a scene",
+    "integrator": "renders, and names the bands",
+    "gel": "the skin that a press dents: the parameters of a press, its map of displacements, paths of light in it",
+    "led": "a point light, of which images are made one by one; among dielectric bodies its lobe is that of `mu`",
+    "membrane": "a matt coat of the skin",
+    "interface": "a flat boundary that is passed without reflections",
+    "clear": "the material of a dielectric body (`index`, `absorption`), where light is followed by Monte Carlo",
+    "block": "a body that gives way to what presses it",
+    "target": "an object in front of the sensor",
+}
 CATEGORIES = ("bsdf", "emitter", "sensor", "shape", "integrator")
 
 
@@ -67,8 +79,9 @@ class Part:
     mueller of a layer: its Mueller matrix (optics.polarization.layers)
     stokes  of a luminous area: the Stokes vector that it sends; an emitter without one is a point light, which images
             are made of one by one
-    role    what it is to the other parts and to effects; the kind itself, unless it stands in for another kind: a
-            second camera says role="camera", and every effect of cameras whose parameters it has is one of its own
+    role    what it is to the library, to other parts and to effects (ROLES); the kind itself, unless it stands in for
+            another kind: a second camera says role="camera", and every effect of cameras whose parameters it has is
+            one of its own
     refracts   True of a boundary that camera rays pass, bent by its parameter `index`
     polarizes  True of what makes polarized light of unpolarized light
     random  f(rng) -> {parameter name: value}: plausible values of parameters whose default and `plausible` are not
@@ -92,6 +105,11 @@ class Part:
     def __post_init__(self) -> None:
         if not self.role:
             object.__setattr__(self, "role", self.kind)
+
+    @property
+    def family(self) -> str:
+        """What a setting of the part changes: camera, light, geometry, or '' for none of them."""
+        return {"sensor": "camera", "emitter": "light", "shape": "geometry"}.get(self.category, "")
 
 
 @dataclass(frozen=True)

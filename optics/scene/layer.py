@@ -147,7 +147,7 @@ def bsdf(kind: str, own: Callable) -> type:
 
         def wire(self, scene):
             shapes = scene.shapes_of(self)
-            carriers = [shape for shape in shapes if hasattr(shape, "carrier") and "width" in shape.numbers]
+            carriers = [shape for shape in shapes if hasattr(shape, "carrier") and shape.named("width")]
             if carriers and len(shapes) > 1:
                 raise BadScene(
                     f"'{self.name}' lies on {len(shapes)} shapes ({', '.join(repr(s.id()) for s in shapes)}), but a "
@@ -164,7 +164,7 @@ def bsdf(kind: str, own: Callable) -> type:
             self.field = next((found for found in fields if found is not None), None)
 
         def extent(self):
-            return None if self.carrier is None else (self.carrier.number("width"), self.carrier.number("length"))
+            return None if self.carrier is None else (self.carrier.numbered("width"), self.carrier.numbered("length"))
 
         def matrix(self, si):
             """What light that leaves towards si.wi went through, in Mitsuba's implicit axes."""

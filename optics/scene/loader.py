@@ -16,19 +16,12 @@ from pathlib import Path
 from optics.errors import BadScene, UnknownKey
 from optics.files.output import shipped
 from optics.scene import showing
-from optics.scene.declare import Effect, Part
+from optics.scene.declare import LED_BY_LED, Effect, Part
 from optics.scene.mitsuba_parts import DEFAULT_VARIANT, Declared, is_part, loading, move, use_variant
-from optics.scene.parameter import Parameter, Variable
+from optics.scene.parameter import Parameter, Variable, keys_with
 from optics.scene.registry import Registry, known
 from optics.scene.wiring import wire
 
-LED_BY_LED = {
-    "emission",
-    "segment",
-    "volume",
-    "reflection",
-    "ambient",
-}  # stages that light followed by Monte Carlo does not pass
 KEEPS = "use 'interface', 'rough_interface' or 'sheet', which keep it"
 DEPOLARIZERS = {  # stock materials without a Mueller matrix, by the name that Mitsuba prints
     "ThinDielectric": KEEPS,
@@ -81,6 +74,7 @@ class Scene:
     parts        id -> Mitsuba plugin object of ours
     parameters   key -> Parameter, in the order of the file
     camera, integrator, gel, block, leds, membranes    the parts by role (None or empty where the scene has none)
+    powers, band_powers    the key of each light's power, and of its powers in single bands
     """
 
     def __init__(
@@ -126,6 +120,7 @@ class Scene:
         for name, part in self.parts.items():
             for p in self.registry.parameters_of(part.kind):
                 self.parameters[f"{name}.{p.name}"] = p
+        self.powers, self.band_powers = self._light_powers()
         self._stock = self._stock_parameters()
         self.parameters.update({k: p for k, (p, _) in self._stock.items() if k not in self.parameters})
         self._warn_of_depolarizers()
@@ -137,6 +132,21 @@ class Scene:
             yield
         except BadScene as error:
             raise BadScene(f"{self.path}: {error}") from error
+
+    def _light_powers(self) -> tuple[dict[str, str], dict[str, list[str]]]:
+        """The key of each light's power; the keys of its powers in single bands, in the order of the bands."""
+        own = {n: {k: p for k, p in self.parameters.items() if k.rpartition(".")[0] == n} for n in self.lights}
+        bands = {n: sorted(keys_with(p, "band power"), key=lambda k: p[k].band or 0) for n, p in own.items()}
+        return {n: keys_with(p, "power")[0] for n, p in own.items()}, bands
+
+    def power_keys(self, *lights: str) -> list[str]:
+        """The keys of all powers of some lights: of each light as a whole, then in single bands."""
+        return [key for n in lights for key in (self.powers[n], *self.band_powers[n])]
+
+    def key(self, part: str, role: str) -> str | None:
+        """The key of a part's parameter that has a role; None where it has none."""
+        name = self.parts[part].named(role)
+        return None if name is None else f"{part}.{name}"
 
     def declaration(self, name: str) -> Part:
         """What the plugin file says of a part of the scene."""

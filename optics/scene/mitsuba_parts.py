@@ -359,6 +359,19 @@ class Declared:
     def number(self, name: str) -> float:
         return self.held[name]
 
+    def named(self, role: str) -> str | None:
+        """The name of the part's number that has a role (optics.scene.parameter.ROLES); None where it has none."""
+        return next((name for name, p in self.numbers.items() if p.role == role), None)
+
+    def numbered(self, role: str) -> float:
+        """The number that has a role; raises BadScene where the part declares none."""
+        name = self.named(role)
+        if name is None:
+            raise BadScene(
+                f"'{self.name}': the part '{self.kind}' declares no parameter with role={role!r}, which is needed here"
+            )
+        return self.held[name]
+
     def takes(self, name: str) -> bool:
         """Whether a parameter does anything where the part stands in its scene."""
         return True

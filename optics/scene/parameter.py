@@ -14,6 +14,31 @@ from optics.errors import OutOfBounds, UnknownKey
 from optics.words import spaced
 
 HOW = ("ad", "difference", "image", "layer", "path")
+FREE = ("", "all", "press")
+ROLES = {  # of parameters: what the library turns, sets or solves for, whatever a part calls it
+    "power": "scales all light of a light; 0 switches it off",
+    "band power": "share of the power in one spectral band (`band`)",
+    "light x": "where a point light stands, right, mm",
+    "light y": "where a point light stands, down, mm",
+    "light z": "where a point light stands, from the camera towards the skin, mm",
+    "light pan": "turn of a point light's axis about its up axis, deg",
+    "light tilt": "turn of a point light's axis about its side axis, deg",
+    "light area": "emitting area of a point light, mm^2; 0: a point",
+    "second bounce": "weight of light that the skin reflects twice",
+    "exposure": "full scale of the camera per unit of radiance",
+    "press x": "where the skin is pressed, right, mm",
+    "press y": "where the skin is pressed, down, mm",
+    "press depth": "how deep the skin is pressed, mm; 0: untouched",
+    "thickness": "of the skin, mm",
+    "width": "of a skin or a sheet along x, mm",
+    "length": "of a skin or a sheet along y, mm",
+    "distance": "from the untouched skin to an object, mm",
+    "angle": "turn of a film about its normal, deg",
+    "inserted": "1 where a film is in the beam, 0 where it is taken out",
+    "face": "share of light that each face of a film reflects",
+    "clock": "when a frame was taken",
+    "approach": "from which side a setting was reached",
+}
 
 
 @dataclass(frozen=True)
@@ -40,6 +65,12 @@ class Parameter:
     saturates   of a squared parameter s: the value v beyond which its effect levels off; a fit steps in s^2/(1 +
                 s^2/v^2)
     linear      True where the image is exactly linear in it (one render serves every value)
+    role        what it is to the library, one of ROLES; '' for what only the part itself and effects read
+    band        number of the spectral band that it belongs to, from 0; None: of all bands
+    free        what a calibration solves for unless its setup says otherwise: 'all' (one value for all frames), 'press'
+                (a value for each group of frames), '' (not)
+    prior_sd    standard deviation of the prior about the scene's value that holds where it is free by `free`; None: no
+                prior
     choices     the allowed words, for a parameter that is a choice and not a number; files: endings of files that serve
                 as well
     """
@@ -56,10 +87,18 @@ class Parameter:
     linear: bool = False
     squared: bool = False
     saturates: float = math.inf
+    role: str = ""
+    band: int | None = None
+    free: str = ""
+    prior_sd: float | None = None
     choices: tuple[str, ...] = ()
     files: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
+        if self.role and self.role not in ROLES:
+            raise ValueError(f"parameter {self.name}: role = {self.role!r} is none of {', '.join(ROLES)}")
+        if self.free not in FREE:
+            raise ValueError(f"parameter {self.name}: free = {self.free!r} is none of {', '.join(map(repr, FREE))}")
         if self.how not in HOW:
             raise ValueError(f"parameter {self.name}: how = {self.how!r} is none of {', '.join(HOW)}")
         if not self.choices and not self.bounds[0] <= float(self.default) <= self.bounds[1]:
@@ -139,6 +178,17 @@ class Parameter:
         if not self.bounds[0] <= number <= self.bounds[1]:
             raise OutOfBounds(key, number, self.unit, self.bounds, where)
         return number
+
+
+def keys_with(parameters: Mapping[str, Parameter], role: str) -> list[str]:
+    """The keys of all parameters that have a role, in their order."""
+    return [key for key, p in parameters.items() if p.role == role]
+
+
+def beside(parameters: Mapping[str, Parameter], key: str, role: str) -> str | None:
+    """The key of the parameter with this role of the part that `key` belongs to; None where the part has none."""
+    part = key.rpartition(".")[0]
+    return next((k for k, p in parameters.items() if p.role == role and k.rpartition(".")[0] == part), None)
 
 
 @dataclass(frozen=True)

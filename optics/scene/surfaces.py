@@ -1,9 +1,11 @@
-"""Surfaces: what matt surfaces, and surfaces that send light one way only, have in common as Mitsuba BSDFs.
+"""Surfaces and materials: what matt surfaces, surfaces that send light one way, and clear materials have in common.
 
 Classes belong to the Mitsuba variant that is set when they are made, so these functions are called where a part is
 built."""
 
 from __future__ import annotations
+
+from collections.abc import Callable, Sequence
 
 from optics.scene.mitsuba_parts import Declared
 
@@ -101,6 +103,15 @@ def passing(flags: int) -> type:
             return f"{type(self).__name__}[{self.kind}, {self.name}]"
 
     return Passing
+
+
+def coefficient(clear, stage: str, wavelengths, functions: Sequence[Callable]):
+    """`index` or `absorption` (1/mm) of a clear material per band, with what the functions of effects of that stage
+    make of it; for numpy, complex numbers among them, and for Dr.Jit."""
+    value = getattr(clear, stage) + 0 * wavelengths
+    for function in functions:
+        value = function(value, wavelengths, clear)
+    return value
 
 
 def axis_rotation(forward, current, target):

@@ -57,7 +57,16 @@ class Neighbours:
 
 
 def wire(scene, integrator=None) -> Neighbours:
-    """Have every part of a Mitsuba scene find its neighbours, and place what they move; returns the parts."""
+    """Have every part of a Mitsuba scene find its neighbours, and place what they move; returns the parts.
+
+    Raises TypeError for anything but a scene that Mitsuba loaded."""
+    import mitsuba as mi
+
+    if mi.variant() is None or not isinstance(scene, mi.Scene):
+        raise TypeError(
+            f"optics.wire takes a scene of mi.load_file or mi.load_dict in the present variant, not a "
+            f"'{type(scene).__name__}'; scenes of optics.load are wired already"
+        )
     around = Neighbours(scene, integrator)
     bands = getattr(around.integrator, "bands", ())
     single = bands[0] if getattr(around.integrator, "lanes", 0) == 1 and len(bands) == 1 else None

@@ -100,7 +100,7 @@ def displaced(gel, x: np.ndarray, y: np.ndarray, depth: float) -> np.ndarray:
     """
     ux = uy = uz = 0.0
     if gel is not None and gel.map.values.any():
-        press = gel.number("press_x"), gel.number("press_y")
+        press = gel.numbered("press x"), gel.numbered("press y")
         ux, uy, uz = (surface(x, y, *press, m) for m in _carried(gel.map, depth))
     return np.stack(np.broadcast_arrays(x + ux, y + uy, -depth - uz), -1)
 
@@ -165,7 +165,7 @@ class SkinStress:
     The integral runs from h1 to h2. Taken over by whoever traces rays, as the scene moves on to other presses."""
 
     def __init__(self, gel, h1: float, h2: float):
-        self.press = gel.number("press_x"), gel.number("press_y")
+        self.press = gel.numbered("press x"), gel.numbered("press y")
         self.maps = _stress(gel.map, h1, h2) if gel.map.values.any() else None
         self.texture = None if self.maps is None else Texture(np.stack([m.values for m in self.maps], -1))
 

@@ -79,8 +79,11 @@ def _astray(model: SceneModel) -> list[str]:
     gel = model.scene.gel
     if gel is None:
         return []
-    for axis, side in (("press_x", "width"), ("press_y", "length")):
-        key, size = f"{gel.name}.{axis}", float(model.base[f"{gel.name}.{side}"])
+    for axis, side in (("press x", "width"), ("press y", "length")):
+        key, across = (model.scene.key(gel.name, role) for role in (axis, side))
+        if key is None or across is None:
+            continue
+        size = float(model.base[across])
         for f in model.frames:
             if abs(float(f.parameters.get(key, 0.0))) > size / 2:
                 return [
@@ -95,7 +98,7 @@ def _unnamed(model: SceneModel) -> list[str]:
     own = [{*f.parameters, *f.readings} for f in model.frames]
     left = {
         key: i
-        for key in (f"{n}.power" for n in model.scene.lights)
+        for key in model.scene.powers.values()
         if model.base[key] and any(key in keys for keys in own)
         for i, keys in enumerate(own)
         if key not in keys

@@ -29,14 +29,13 @@ from optics.captures.capture_set import FILE, NOISE_KEYS, Captures, Frame, Table
 from optics.captures.noise import UNITS, Noise
 from optics.diagnosis import advice as advise
 from optics.diagnosis import statistics as st
-from optics.diagnosis.advice import keys_named
 from optics.diagnosis.evidence import Candidate, Evidence, Progress, measure
 from optics.diagnosis.thresholds import CLEAR, LEVEL
 from optics.errors import BadScene, Underdetermined
 from optics.files.output import new_folder, shipped
 from optics.fit.scene_model import SceneModel
 from optics.scene.loader import Scene
-from optics.scene.parameter import Parameter, Values
+from optics.scene.parameter import Parameter, Values, beside, keys_with
 from optics.study.setup import Setup, effect_variables, variables_of_base
 from optics.words import spaced, table
 
@@ -183,8 +182,8 @@ def candidates(parameters: dict[str, Parameter], base: dict, swept: bool, fixed_
     Exposures are factors here, 1 where an image is as bright as it may be; `plan` turns them into settings.
     """
     lights, exposures = (
-        keys_named(parameters, "power"),
-        [] if fixed_exposure else keys_named(parameters, "exposure")[:1],
+        keys_with(parameters, "power"),
+        [] if fixed_exposure else keys_with(parameters, "exposure")[:1],
     )
     if swept:
         return _sweeps(parameters, base, lights, exposures)
@@ -218,11 +217,12 @@ def candidates(parameters: dict[str, Parameter], base: dict, swept: bool, fixed_
 def _places(parameters: dict[str, Parameter], base: dict) -> list[tuple[str, str, dict]]:
     """(group, words, settings) of the places of a press, distances of an object, angles of films; one place where
     nothing moves."""
-    keys = partial(keys_named, parameters)
-    if depth := keys("press_depth"):
-        gel = depth[0].rpartition(".")[0]
-        wide = [0.3 * float(base.get(f"{gel}.{side}", 8.0)) for side in ("width", "length")]
-        normal = 0.12 * float(base.get(f"{gel}.thickness", 4.0))
+    keys = partial(keys_with, parameters)
+    if depth := keys("press depth"):
+        skin = partial(beside, parameters, depth[0])
+        press_x, press_y = skin("press x"), skin("press y")
+        wide = [0.3 * float(base.get(skin(side), 8.0)) for side in ("width", "length")]
+        normal = 0.12 * float(base.get(skin("thickness"), 4.0))
         spots = [(0.0, 0.0), *advise.places(np.zeros((1, 2)), np.array(wide), 5)]
         found: list[tuple[str, str, dict]] = []
         for i, (x, y) in enumerate(spots):
@@ -231,7 +231,7 @@ def _places(parameters: dict[str, Parameter], base: dict) -> list[tuple[str, str
                     (
                         f"press-{len(found):02d}",
                         f"press at x = {x:.2g}, y = {y:.2g} mm, {to:.2g} mm deep",
-                        {f"{gel}.press_x": x, f"{gel}.press_y": y, f"{gel}.press_depth": round(to, 4)},
+                        {press_x: x, press_y: y, depth[0]: round(to, 4)},
                     )
                 )
         return [
@@ -239,7 +239,7 @@ def _places(parameters: dict[str, Parameter], base: dict) -> list[tuple[str, str
             (
                 "untouched",
                 "nothing pressed",
-                dict.fromkeys((f"{gel}.press_x", f"{gel}.press_y", f"{gel}.press_depth"), 0.0),
+                dict.fromkeys((press_x, press_y, depth[0]), 0.0),
             ),
         ]
     if distance := keys("distance"):
@@ -248,7 +248,7 @@ def _places(parameters: dict[str, Parameter], base: dict) -> list[tuple[str, str
             (f"distance-{i}", f"object at {to:g} mm", {distance[0]: to})
             for i, to in enumerate((here, here / 2, 2 * here, here / 8, 0.0))
         ]
-    angles = [k for k in keys("angle") if base.get(k.rpartition(".")[0] + ".inserted", 1.0)]
+    angles = [k for k in keys("angle") if base.get(beside(parameters, k, "inserted"), 1.0)]
     if angles:
         return [
             (f"angle-{to:g}", f"{angles[0]} = {to:g} deg", {angles[0]: float(base[angles[0]]) + to})
@@ -262,8 +262,11 @@ def _sweeps(parameters: dict, base: dict, lights: Sequence[str], exposures: Sequ
     setting evenly."""
     from scipy.stats import qmc
 
-    inserted = {k: base.get(k.rpartition(".")[0] + ".inserted", 1.0) for k in keys_named(parameters, "angle")}
-    films = [k for k, there in inserted.items() if there and k.rpartition(".")[0] + ".inserted" in base]
+    switch = {
+        k: beside(parameters, k, "inserted") for k in keys_with(parameters, "angle")
+    }  # angle -> what takes it out
+    inserted = {k: base.get(known, 1.0) for k, known in switch.items()}
+    films = [k for k, there in inserted.items() if there and switch[k] in base]
     if not films:
         raise Underdetermined(
             "design: a camera of one pixel and no polarizer to turn: no two readings differ but in brightness; "
@@ -274,15 +277,16 @@ def _sweeps(parameters: dict, base: dict, lights: Sequence[str], exposures: Sequ
     levels: dict[str, list[float]] = {
         k: [0.0, 20.0, 45.0, 90.0] for k in (*others, *(k for k in inserted if k not in films))
     }
-    levels |= {k.rpartition(".")[0] + ".inserted": [0.0, 0.0, 1.0] for k, there in inserted.items() if not there}
+    levels |= {known: [0.0, 0.0, 1.0] for k, known in switch.items() if known is not None and not inserted[k]}
     levels |= {k: [1.0, 0.4] for k in (*lights, *exposures)}
-    levels |= {k: [1.0, -1.0] for k in parameters if k == swept.replace(".angle", ".approach")}
+    if (approach := beside(parameters, swept, "approach")) is not None:
+        levels[approach] = [1.0, -1.0]
     points = qmc.Sobol(len(levels), scramble=True, rng=np.random.default_rng(0)).random(64)[:SWEEPS]
     angles = {swept: np.arange(0.0, 180.0, STEP).tolist()}
     found = []
     for row in points:
         own = {k: values[int(u * len(values))] for u, (k, values) in zip(row, levels.items())}
-        out = [k for k, there in own.items() if k.endswith(".inserted") and not there]
+        out = [k for k, there in own.items() if k in switch.values() and not there]
         words = ", ".join(
             f"{k} {v:g}" for k, v in own.items() if not k.startswith(tuple(o.rpartition(".")[0] + "." for o in out))
         )
@@ -293,11 +297,12 @@ def _sweeps(parameters: dict, base: dict, lights: Sequence[str], exposures: Sequ
 # -- the plan --------------------------------------------------------------------------------------------------------
 def _checked(scene: Scene, effects: Sequence | None) -> tuple[list, list]:
     """(every effect that the scene can express, those that were asked for); raises BadScene."""
-    for part, kind, tag in ((scene.camera, "camera", "sensor"), (scene.integrator, "tactile", "integrator")):
+    for part, role in ((scene.camera, "camera"), (scene.integrator, "integrator")):
         if part is None:
+            first = next(p for p in scene.registry.parts.values() if p.role == role)
             raise BadScene(
-                f"{scene.path}: no part of the type '{kind}'; a capture session needs one: add a <{tag} "
-                f'type="{kind}">'
+                f"{scene.path}: no part of the type '{first.kind}'; a capture session needs one: add a "
+                f'<{first.category} type="{first.kind}">'
             )
     swept = math.prod(scene.camera.resolution) == 1  # readings of a photodiode
     known = [
@@ -377,7 +382,7 @@ def plan(
         values.common.setdefault(key, float(base[key]))
     pool = _expose(model, values, pool, base, say)
     places = [c.group or str(i) for i, c in enumerate(pool)]
-    depths = keys_named(scene.parameters, "press_depth")
+    depths = keys_with(scene.parameters, "press depth")
     untouched = {
         i for i, c in enumerate(pool) if any(c.settings.get(k) == 0 for k in depths)
     }  # where nobody has to find a place
@@ -497,8 +502,8 @@ def _expose(model: Any, values: Values, pool: list[Choice], base: dict, say: Pro
 
     One exposure per light, the same at all places: what a session can do.
     """
-    key = next(iter(keys_named(model.parameters, "exposure")), None)
-    lights = keys_named(model.parameters, "power")
+    key = next(iter(keys_with(model.parameters, "exposure")), None)
+    lights = keys_with(model.parameters, "power")
     images = model.captures.table is None
     fitting: dict[tuple, float] = {}
     found = []

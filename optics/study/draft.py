@@ -479,14 +479,19 @@ def from_study(folder: str | Path, along: str | None, name: str, further: str | 
     plugins = plugins_of(recorded(study.ladder["facts"]["setup"]))
     registry = known(further, plugins if plugins.is_dir() else None)
     text = scenes.find(study.ladder["scene"]).read_text(encoding="utf-8")
-    if part != "camera" and (f'type="{part}"' not in text or 'type="clear"' in text):
+
+    def holds(role: str) -> bool:
+        """Whether the scene's file has a part that plays a role."""
+        return any(f'type="{kind}"' in text for kind in registry.kinds(role))
+
+    if part != "camera" and (not holds(part) or holds("clear")):
         carriers = {g.coordinate: _carrier(g) for g in diagnosis.fingerprints}
         can = [name for name, c in carriers.items() if c is not None and STAGES[c.stage] == "camera"]
         raise ValueError(
             f"no draft along '{f.coordinate}': light in the scene {study.ladder['scene']} "
             + (
                 "is followed by Monte Carlo, where effects do not act on its path"
-                if 'type="clear"' in text
+                if holds("clear")
                 else f"passes no {part}"
             )
             + f"; a draft can follow {', '.join(can) or 'none of these curves'}"

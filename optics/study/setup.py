@@ -16,11 +16,8 @@ from optics.fit.model import value_of
 from optics.fit.scene_model import SceneModel
 from optics.scene import loader as scenes
 from optics.scene.declare import Effect
-from optics.scene.parameter import Values, Variable
+from optics.scene.parameter import Values, Variable, keys_with
 
-POSE = ("press_x", "press_y", "press_depth")  # solved for in every group of frames, unless the setup says otherwise
-POSE_SD = 0.05  # mm: how well a stage usually knows where it presses
-POWER_SD = 0.3  # of an LED's power: the lambda term of S4. Powers and reflectances are determined only as a product
 ASPECT = 0.02  # relative difference of aspect ratio between images and scene beyond which they are said to be cut
 GROUPS = 4  # with at least this many groups of frames, every fourth is held out
 GAUGE = 10.0  # plausible sizes: standard deviation of the prior that keeps a degenerate mode near the scene's value
@@ -134,31 +131,35 @@ def split(model: SceneModel, setup: Setup) -> tuple[list[int], list[int]]:
 
 # -- what is free ----------------------------------------------------------------------------------------------------
 def default_free(model: SceneModel) -> list[str]:
-    """Position, axis, lobe and power of every LED, reflectance and roughness of every membrane, power of every
-    source."""
-    patterns = []
-    integrator = model.scene.integrator
-    spectral = len((integrator.bands if integrator is not None else ()) or (0,))
-    for led in model.scene.leds:
-        patterns += [f"{led}.{n}" for n in ("x", "y", "z", "pan", "tilt", "mu", "power")]
-    for source in (n for n, part in model.scene.sources.items() if part.kind == "source"):
-        patterns += [f"{source}.power"] if spectral == 1 else [f"{source}.power_{c}" for c in "rgb"[:spectral]]
-    for membrane in model.scene.membranes:
-        patterns += [f"{membrane}.rho_{c}" for c in "rgb"[:spectral]] + [f"{membrane}.sigma"]
-    return patterns
+    """The parameters that parts declare free in all frames, of LEDs, of sources, then of other parts: position, axis,
+    lobe and power of every LED, power of every source, reflectance and roughness of every membrane.
+
+    Of a light with free powers in single bands, these are free where the scene has several bands, and the power of all
+    bands where it has one."""
+    scene = model.scene
+    bands = len((scene.integrator.bands if scene.integrator is not None else ()) or (0,))
+    keys = []
+    for name in dict.fromkeys((*scene.leds, *scene.sources, *scene.parts)):
+        own = [p for p in scene.parts[name].numbers.values() if p.free == "all" and (p.band or 0) < bands]
+        if any(p.role == "band power" for p in own):
+            own = [p for p in own if p.role != ("power" if bands > 1 else "band power")]
+        keys += [f"{name}.{p.name}" for p in own]
+    return keys
 
 
 def variables_of_base(model: SceneModel, setup: Setup, frames: Sequence[int]) -> list[Variable]:
     """The base model's variables in these frames: those of all frames, then those of each group."""
     priors = dict(setup.priors)
     if not setup.free:
-        priors = {**{f"{led}.power": (None, POWER_SD) for led in model.scene.leds}, **priors}
+        own = {k: model.parameters[k].prior_sd for k in default_free(model)}
+        priors = {**{k: (None, sd) for k, sd in own.items() if sd is not None}, **priors}
     per_group = setup.per_group
     if per_group is None:
         per_group = []
-        if any(f.group for f in model.frames) and model.scene.gel is not None:
-            per_group = [f"{model.scene.gel.name}.{n}" for n in POSE]
-            priors = {**{f"{p}*": (None, POSE_SD) for p in per_group}, **priors}
+        if any(f.group for f in model.frames):
+            per_group = [k for k, p in model.parameters.items() if p.free == "press"]
+            own = {f"{k}*": model.parameters[k].prior_sd for k in per_group}
+            priors = {**{k: (None, sd) for k, sd in own.items() if sd is not None}, **priors}
     variables = calibrate.variables_from(model, setup.free or default_free(model), per_group, None, frames)
     if setup.per_group is None:
         variables = [v for v in variables if v.frames is None or not _untouched(model, v.frames)]
@@ -188,9 +189,9 @@ def effect_variables(model: SceneModel, effect: Effect) -> list[Variable]:
 
 
 def _untouched(model: SceneModel, frames: Sequence[int]) -> bool:
-    """Whether frames say that nothing presses the gel, so that there is no place of a press to solve for."""
-    key = f"{model.scene.gel.name}.press_depth"
-    return all(model.frames[i].parameters.get(key) == 0 for i in frames)
+    """Whether frames say that nothing presses the skin, so that there is no place of a press to solve for."""
+    keys = keys_with(model.parameters, "press depth")
+    return bool(keys) and all(model.frames[i].parameters.get(key) == 0 for key in keys for i in frames)
 
 
 def _with_prior(model: SceneModel, variable: Variable, pattern: str, prior: tuple[float | None, float]) -> Variable:

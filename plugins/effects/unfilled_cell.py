@@ -34,7 +34,7 @@ def seek(model, values, frames):
         np.where(model.usable(i), model.frames[i].image - p, 0.0) / s for i, p, s in zip(frames, predictions, sd)
     ]
     excess = np.mean([(r**2).mean(-1) for r in residual], 0)
-    model.renderer._apply(model.at(values, frames[0]))
+    model.set_scene(values, frames[0])
     seen = Transport(model.scene).seen_through(RAYS)
     seen = seen[: np.prod(grid.counts)].reshape(-1, excess.size)
     size = np.sqrt((seen**2).sum(1))

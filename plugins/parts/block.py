@@ -74,7 +74,7 @@ def build():
                 for n, d in (("width", 16.4), ("length", 16.4))
             ]
             self.counts = (*counts, 4 * self.layers)
-            faces, number = self.faces()
+            faces, self.sides, number = box_faces(self.counts)
             mi.Mesh.__init__(self, "block", number, len(faces), props, False, False)
             self.declare(props)
             self.pressed, self.pressed_by = None, None
@@ -86,34 +86,9 @@ def build():
             self.target = scene.one("target")
             self.follow(self.target)
 
-        def faces(self):
-            """Triangles of the six sides, and the number of vertices: a grid on each, of (columns, rows) or along z."""
-            nx, ny, nz = self.counts
-            found, self.sides, first = [], [], 0
-            for axis, end in ((2, 1), (2, 0), (0, 0), (0, 1), (1, 0), (1, 1)):
-                across = [a for a in range(3) if a != axis]
-                size = [1 + (nx, ny, nz)[a] for a in across]
-                index = first + np.arange(size[0] * size[1]).reshape(size)
-                a, b, c, d = index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]
-                quads = np.stack([a, b, c, a, c, d], -1).reshape(-1, 3)
-                outwards = (end == 1) != (axis == 1)  # x cross z is -y
-                found.append(quads if outwards else quads[:, ::-1])
-                self.sides.append((axis, end, across, size))
-                first += index.size
-            return np.concatenate(found), first
-
         def at_rest(self):
             """(N, 3) vertices of the untouched body, mm; those of the touched face come first."""
-            low = np.array([-self.number("width") / 2, -self.number("length") / 2, -self.number("thickness")])
-            extent = np.array([self.number("width"), self.number("length"), self.number("thickness")])
-            points = []
-            for axis, end, across, size in self.sides:
-                share = np.empty((*size, 3))
-                share[..., axis] = end
-                for a, grid in zip(across, np.meshgrid(*(np.linspace(0, 1, n) for n in size), indexing="ij")):
-                    share[..., a] = grid
-                points.append((low + share * extent).reshape(-1, 3))
-            return np.concatenate(points)
+            return box_points(self.sides, [self.number(n) for n in ("width", "length", "thickness")])
 
         # -- the press ------------------------------------------------------------------------------------------------
 
@@ -175,6 +150,42 @@ def build():
             return f"Block[{self.name}]"
 
     return Block
+
+
+def box_faces(counts):
+    """Triangles of the six sides of a box, its sides, and the number of vertices: a grid on each side, of
+    (columns, rows) or along z."""
+    import numpy as np
+
+    nx, ny, nz = counts
+    found, sides, first = [], [], 0
+    for axis, end in ((2, 1), (2, 0), (0, 0), (0, 1), (1, 0), (1, 1)):
+        across = [a for a in range(3) if a != axis]
+        size = [1 + (nx, ny, nz)[a] for a in across]
+        index = first + np.arange(size[0] * size[1]).reshape(size)
+        a, b, c, d = index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]
+        quads = np.stack([a, b, c, a, c, d], -1).reshape(-1, 3)
+        outwards = (end == 1) != (axis == 1)  # x cross z is -y
+        found.append(quads if outwards else quads[:, ::-1])
+        sides.append((axis, end, across, size))
+        first += index.size
+    return np.concatenate(found), sides, first
+
+
+def box_points(sides, extent):
+    """(N, 3) mm, the vertices of the sides of a box of this extent below z = 0, in the order of `box_faces`."""
+    import numpy as np
+
+    extent = np.array(extent)
+    low = np.array([-extent[0] / 2, -extent[1] / 2, -extent[2]])
+    points = []
+    for axis, end, across, size in sides:
+        share = np.empty((*size, 3))
+        share[..., axis] = end
+        for a, grid in zip(across, np.meshgrid(*(np.linspace(0, 1, n) for n in size), indexing="ij")):
+            share[..., a] = grid
+        points.append((low + share * extent).reshape(-1, 3))
+    return np.concatenate(points)
 
 
 def check_closed_box():

@@ -96,7 +96,9 @@ PARAMETERS = (
     Parameter("pan", "deg", 0.0, (-80.0, 80.0), "turn about the y axis", plausible=0.5, how="difference", step=0.2),
     Parameter("tilt", "deg", 0.0, (-80.0, 80.0), "turn about the x axis", plausible=0.5, how="difference", step=0.2),
     Parameter("roll", "deg", 0.0, (-180.0, 180.0), "turn about the z axis", plausible=0.5, how="difference", step=0.8),
-    Parameter("exposure", "1", 1.0, (0.0, 1e6), "full scale per unit of radiance", plausible=0.1, how="image"),
+    Parameter(
+        "exposure", "1", 1.0, (0.0, 1e6), "full scale per unit of radiance", plausible=0.1, how="image", role="exposure"
+    ),
     Parameter(
         "gain",
         "1",
@@ -163,6 +165,9 @@ PARAMETERS = (
 def build():
     import drjit as dr
     import mitsuba as mi
+    import numpy as np
+
+    from optics.scene.response import inverse_cubic
 
     class Camera(Declared.on(mi.Sensor)):
         kind = "camera"
@@ -228,6 +233,39 @@ def build():
             return mi.Point3f(origin) + dr.zeros(mi.Point3f, dr.width(u)), self.turned(
                 dr.normalize(mi.Vector3f(x, y, 1))
             )
+
+        # -- how images are developed: numpy; `own` has the parameters as numbers, complex ones for derivatives -----
+
+        def middle(self):
+            """Where the optical axis meets the image, px."""
+            width, height = self.resolution
+            return width / 2 + self.number("principal_x"), height / 2 + self.number("principal_y")
+
+        def normalised(self, own, u, v):
+            """x, y of pixel positions over the focal length, without distortion, and the focal length in px."""
+            width, height = self.resolution
+            focal = width / 2 / np.tan(np.deg2rad(np.real(own.x_fov)) / 2)
+            x = (u - width / 2 - np.real(own.principal_x)) / focal
+            y = (v - height / 2 - np.real(own.principal_y)) / (focal * np.real(own.aspect))
+            return x, y, focal
+
+        def gains(self, own, channels):
+            """(channels,) gain of each channel in the frame."""
+            return own.gain * np.array([getattr(own, f"gain_{'rgb'[min(c, 2)]}") for c in range(channels)])
+
+        def respond(self, own, irradiance):
+            """m (..., C) of the irradiance per channel, 1 = full scale: the inverse of G_c (S1.1)."""
+            terms = [
+                [getattr(own, f"response{k}_{'rgb'[min(c, 2)]}") for k in (2, 3)] for c in range(irradiance.shape[-1])
+            ]
+            m = np.empty(irradiance.shape, np.result_type(irradiance, *(t for pair in terms for t in pair)))
+            for c, (a, b) in enumerate(terms):
+                m[..., c] = inverse_cubic(irradiance[..., c], a, b)
+            return m
+
+        def added(self, own):
+            """DN added to every pixel after the response."""
+            return own.offset
 
         def sample_ray(self, time, sample1, sample2, sample3, active=True):
             wavelengths, weight = self.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), sample1, active)

@@ -27,8 +27,12 @@ from optics.scene.mitsuba_parts import Declared
 from optics.scene.parameter import Parameter
 
 PARAMETERS = (
-    Parameter("width", "mm", 48.0, (0.1, 1000.0), "size along x", plausible=0.1, how="difference", step=1.0),
-    Parameter("length", "mm", 43.0, (0.1, 1000.0), "size along y", plausible=0.1, how="difference", step=1.0),
+    Parameter(
+        "width", "mm", 48.0, (0.1, 1000.0), "size along x", plausible=0.1, how="difference", step=1.0, role="width"
+    ),
+    Parameter(
+        "length", "mm", 43.0, (0.1, 1000.0), "size along y", plausible=0.1, how="difference", step=1.0, role="length"
+    ),
     Parameter(
         "depth",
         "mm",

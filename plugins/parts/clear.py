@@ -46,8 +46,8 @@ def build():
     import mitsuba as mi
 
     from optics.errors import BadScene
-    from optics.light.transport import coefficient
     from optics.polarization.mueller import diattenuator, fresnel, fresnel_reflection
+    from optics.scene.surfaces import coefficient
 
     class Clear(passing(mi.BSDFFlags.DeltaTransmission)):
         kind = "clear"

@@ -31,11 +31,19 @@ from optics.scene.declare import Part
 from optics.scene.mitsuba_parts import Declared
 from optics.scene.parameter import Parameter
 
+STAGE = 0.05  # mm: how well a stage usually knows where it presses
 PARAMETERS = (
-    Parameter("width", "mm", 20.0, (0.1, 1000.0), "size along x", plausible=0.1, how="difference"),
-    Parameter("length", "mm", 16.0, (0.1, 1000.0), "size along y", plausible=0.1, how="difference"),
+    Parameter("width", "mm", 20.0, (0.1, 1000.0), "size along x", plausible=0.1, how="difference", role="width"),
+    Parameter("length", "mm", 16.0, (0.1, 1000.0), "size along y", plausible=0.1, how="difference", role="length"),
     Parameter(
-        "thickness", "mm", 4.0, (0.01, 100.0), "from the window to the coated face", plausible=0.1, how="difference"
+        "thickness",
+        "mm",
+        4.0,
+        (0.01, 100.0),
+        "from the window to the coated face",
+        plausible=0.1,
+        how="difference",
+        role="thickness",
     ),
     Parameter(
         "press_x",
@@ -45,6 +53,9 @@ PARAMETERS = (
         "where the indenter's axis meets the face, right",
         plausible=0.1,
         how="difference",
+        role="press x",
+        free="press",
+        prior_sd=STAGE,
     ),
     Parameter(
         "press_y",
@@ -54,6 +65,9 @@ PARAMETERS = (
         "where the indenter's axis meets the face, down",
         plausible=0.1,
         how="difference",
+        role="press y",
+        free="press",
+        prior_sd=STAGE,
     ),
     Parameter(
         "press_depth",
@@ -64,6 +78,9 @@ PARAMETERS = (
         plausible=0.05,
         how="difference",
         step=0.4,
+        role="press depth",
+        free="press",
+        prior_sd=STAGE,
     ),
     Parameter("press_rx", "deg", 0.0, (-180.0, 180.0), "turn of the indenter about x", plausible=1.0, how="difference"),
     Parameter("press_ry", "deg", 0.0, (-180.0, 180.0), "turn of the indenter about y", plausible=1.0, how="difference"),
@@ -213,32 +230,36 @@ def build():
         def to_string(self):
             return f"Gel[{self.name}]"
 
-    def chord_corrected(z, x, y):
-        """Vertex heights whose linear interpolation has the surface's mean: z - (h_x^2 z_xx + h_y^2 z_yy)/12.
-
-        A mesh with its vertices on a dent lies inside the dent, by h^2/12 of its curvature on average; uncorrected,
-        cast shadows come out shorter, by 0.01 px at a pitch of 0.06 mm, which a calibration on many frames notices."""
-        out = z.copy()
-        hx, hy = np.diff(x), np.diff(y)
-        out[:, 1:-1] -= (
-            (np.diff(z, axis=1)[:, 1:] / hx[1:] - np.diff(z, axis=1)[:, :-1] / hx[:-1]) * (hx[1:] + hx[:-1]) / 24
-        )
-        out[1:-1] -= (np.diff(z, axis=0)[1:] / hy[1:, None] - np.diff(z, axis=0)[:-1] / hy[:-1, None]) * (
-            (hy[1:] + hy[:-1]) / 24
-        )[:, None]
-        return out
-
-    class Path:
-        """What a `segment` or `volume` function sees: lit point, camera, lamp, LED and the lengths inside the gel
-        (mm)."""
-
-        def __init__(self, gel, p, camera, lamp, led, si):
-            self.p, self.camera, self.lamp, self.led, self.si = p, camera, lamp, led, si
-            self.view = gel.length_inside(p, camera)
-            self.light = gel.length_inside(p, lamp)
-            self.wavelengths = si.wavelengths
-
     return Gel
+
+
+def chord_corrected(z, x, y):
+    """Vertex heights whose linear interpolation has the surface's mean: z - (h_x^2 z_xx + h_y^2 z_yy)/12.
+
+    A mesh with its vertices on a dent lies inside the dent, by h^2/12 of its curvature on average; uncorrected,
+    cast shadows come out shorter, by 0.01 px at a pitch of 0.06 mm, which a calibration on many frames notices."""
+    import numpy as np
+
+    out = z.copy()
+    hx, hy = np.diff(x), np.diff(y)
+    out[:, 1:-1] -= (
+        (np.diff(z, axis=1)[:, 1:] / hx[1:] - np.diff(z, axis=1)[:, :-1] / hx[:-1]) * (hx[1:] + hx[:-1]) / 24
+    )
+    out[1:-1] -= (np.diff(z, axis=0)[1:] / hy[1:, None] - np.diff(z, axis=0)[:-1] / hy[:-1, None]) * (
+        (hy[1:] + hy[:-1]) / 24
+    )[:, None]
+    return out
+
+
+class Path:
+    """What a `segment` or `volume` function sees: lit point, camera, lamp, LED and the lengths inside the gel
+    (mm)."""
+
+    def __init__(self, gel, p, camera, lamp, led, si):
+        self.p, self.camera, self.lamp, self.led, self.si = p, camera, lamp, led, si
+        self.view = gel.length_inside(p, camera)
+        self.light = gel.length_inside(p, lamp)
+        self.wavelengths = si.wavelengths
 
 
 def check_sphere():

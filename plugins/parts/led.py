@@ -32,9 +32,39 @@ from optics.scene.mitsuba_parts import Declared
 from optics.scene.parameter import Parameter
 
 PARAMETERS = (
-    Parameter("x", "mm", 0.0, doc="position S, to the right in the image", plausible=0.5, how="ad", step=0.2),
-    Parameter("y", "mm", 0.0, doc="position S, down in the image", plausible=0.5, how="ad", step=0.2),
-    Parameter("z", "mm", -5.0, doc="position S, from the camera towards the skin", plausible=0.5, how="ad", step=0.2),
+    Parameter(
+        "x",
+        "mm",
+        0.0,
+        doc="position S, to the right in the image",
+        plausible=0.5,
+        how="ad",
+        step=0.2,
+        role="light x",
+        free="all",
+    ),
+    Parameter(
+        "y",
+        "mm",
+        0.0,
+        doc="position S, down in the image",
+        plausible=0.5,
+        how="ad",
+        step=0.2,
+        role="light y",
+        free="all",
+    ),
+    Parameter(
+        "z",
+        "mm",
+        -5.0,
+        doc="position S, from the camera towards the skin",
+        plausible=0.5,
+        how="ad",
+        step=0.2,
+        role="light z",
+        free="all",
+    ),
     Parameter(
         "pan",
         "deg",
@@ -42,6 +72,8 @@ PARAMETERS = (
         (-89.0, 89.0),
         "turn of the axis p from its nominal direction, about the local up axis",
         plausible=5.0,
+        role="light pan",
+        free="all",
     ),
     Parameter(
         "tilt",
@@ -50,10 +82,21 @@ PARAMETERS = (
         (-89.0, 89.0),
         "turn of the axis p from its nominal direction, about the local side axis",
         plausible=5.0,
+        role="light tilt",
+        free="all",
     ),
-    Parameter("mu", "1", 1.2, (0.0, 200.0), "lobe exponent mu of (S2)", plausible=0.3),
+    Parameter("mu", "1", 1.2, (0.0, 200.0), "lobe exponent mu of (S2)", plausible=0.3, free="all"),
     Parameter(
-        "power", "1", 1.0, (0.0, 1e6), "power eta of (S2), relative; 0 switches the LED off", plausible=0.1, linear=True
+        "power",
+        "1",
+        1.0,
+        (0.0, 1e6),
+        "power eta of (S2), relative; 0 switches the LED off",
+        plausible=0.1,
+        linear=True,
+        role="power",
+        free="all",
+        prior_sd=0.3,  # the lambda term of S4: powers and reflectances are determined only as a product
     ),
     *(
         Parameter(
@@ -64,11 +107,23 @@ PARAMETERS = (
             f"share of the power in the {word} band ({colour})",
             plausible=0.1,
             linear=True,
+            role="band power",
+            band=band,
         )
-        for c, word, colour in (("r", "first", "red"), ("g", "second", "green"), ("b", "third", "blue"))
+        for band, (c, word, colour) in enumerate(
+            (("r", "first", "red"), ("g", "second", "green"), ("b", "third", "blue"))
+        )
     ),
     Parameter(
-        "area", "mm^2", 0.0, (0.0, 25.0), "emitting area A of the disc", neutral=0.0, plausible=1.0, how="difference"
+        "area",
+        "mm^2",
+        0.0,
+        (0.0, 25.0),
+        "emitting area A of the disc",
+        neutral=0.0,
+        plausible=1.0,
+        how="difference",
+        role="light area",
     ),
     Parameter("wavelength", "nm", 0.0, (0.0, 2000.0), "peak wavelength; 0: the same in every band", plausible=3.0),
     Parameter("fwhm", "nm", 30.0, (1.0, 1000.0), "full width at half maximum of the spectrum", plausible=5.0),
@@ -91,27 +146,11 @@ def build():
                     props[name] = float(value)
             self.declare(props)
             nominal = [float(t) - self.number(n) for t, n in zip(target, "xyz")]
-            length = math.sqrt(sum(c * c for c in nominal))
-            if length == 0:
+            if not any(nominal):
                 raise ValueError(
                     f"led '{self.name}': position and target are the same point; the axis has no direction"
                 )
-            axis = [c / length for c in nominal]
-            # a side axis that does not degenerate for the usual LEDs, which shine along +-z or towards the middle
-            helper = [0.0, 1.0, 0.0] if abs(axis[1]) < 0.9 else [1.0, 0.0, 0.0]
-            side = [
-                helper[1] * axis[2] - helper[2] * axis[1],
-                helper[2] * axis[0] - helper[0] * axis[2],
-                helper[0] * axis[1] - helper[1] * axis[0],
-            ]
-            norm = math.sqrt(sum(c * c for c in side))
-            side = [c / norm for c in side]
-            up = [
-                axis[1] * side[2] - axis[2] * side[1],
-                axis[2] * side[0] - axis[0] * side[2],
-                axis[0] * side[1] - axis[1] * side[0],
-            ]
-            self.frame = [dr.opaque(mi.Vector3f, v) for v in (side, up, axis)]
+            self.frame = [dr.opaque(mi.Vector3f, v) for v in frame_along(nominal)]
             self.m_flags = +mi.EmitterFlags.DeltaPosition
             self.m_needs_sample_3 = False
 
@@ -203,6 +242,22 @@ def build():
             return f"LED[{self.name}]"
 
     return LED
+
+
+def frame_along(direction):
+    """Unit vectors (side, up, forward) of a frame that looks along a direction, each three numbers."""
+    length = math.sqrt(sum(c * c for c in direction))
+    axis = [c / length for c in direction]
+    # a side axis that does not degenerate for the usual LEDs, which shine along +-z or towards the middle
+    helper = [0.0, 1.0, 0.0] if abs(axis[1]) < 0.9 else [1.0, 0.0, 0.0]
+    side = cross(helper, axis)
+    norm = math.sqrt(sum(c * c for c in side))
+    side = [c / norm for c in side]
+    return side, cross(axis, side), axis
+
+
+def cross(a, b):
+    return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
 
 
 class Beam:

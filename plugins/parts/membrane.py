@@ -25,10 +25,50 @@ from optics.scene.parameter import Parameter
 from optics.scene.surfaces import matt
 
 PARAMETERS = (
-    Parameter("rho_r", "1", 1.0, (0.0, 10.0), "reflectance rho in the first band (red)", plausible=0.1, linear=True),
-    Parameter("rho_g", "1", 1.0, (0.0, 10.0), "reflectance rho in the second band (green)", plausible=0.1, linear=True),
-    Parameter("rho_b", "1", 1.0, (0.0, 10.0), "reflectance rho in the third band (blue)", plausible=0.1, linear=True),
-    Parameter("sigma", "rad", 0.2, (0.0, 1.5), "roughness sigma of (S3)", plausible=0.1, squared=True, saturates=0.3),
+    Parameter(
+        "rho_r",
+        "1",
+        1.0,
+        (0.0, 10.0),
+        "reflectance rho in the first band (red)",
+        plausible=0.1,
+        linear=True,
+        band=0,
+        free="all",
+    ),
+    Parameter(
+        "rho_g",
+        "1",
+        1.0,
+        (0.0, 10.0),
+        "reflectance rho in the second band (green)",
+        plausible=0.1,
+        linear=True,
+        band=1,
+        free="all",
+    ),
+    Parameter(
+        "rho_b",
+        "1",
+        1.0,
+        (0.0, 10.0),
+        "reflectance rho in the third band (blue)",
+        plausible=0.1,
+        linear=True,
+        band=2,
+        free="all",
+    ),
+    Parameter(
+        "sigma",
+        "rad",
+        0.2,
+        (0.0, 1.5),
+        "roughness sigma of (S3)",
+        plausible=0.1,
+        squared=True,
+        saturates=0.3,
+        free="all",
+    ),
 )
 
 

@@ -53,7 +53,16 @@ PARAMETERS = (
         plausible=0.1,
         how="layer",
     ),
-    Parameter("angle", "deg", 0.0, (-7200.0, 7200.0), "turn of the sheet about its normal", plausible=1.0, how="layer"),
+    Parameter(
+        "angle",
+        "deg",
+        0.0,
+        (-7200.0, 7200.0),
+        "turn of the sheet about its normal",
+        role="angle",
+        plausible=1.0,
+        how="layer",
+    ),
 )
 
 

@@ -29,7 +29,15 @@ from optics.scene.parameter import Parameter
 
 PARAMETERS = (
     Parameter(
-        "power", "1", 1.0, (0.0, 1e6), "radiance L, relative; 0 switches the source off", plausible=0.1, linear=True
+        "power",
+        "1",
+        1.0,
+        (0.0, 1e6),
+        "radiance L, relative; 0 switches the source off",
+        plausible=0.1,
+        linear=True,
+        role="power",
+        free="all",
     ),
     *(
         Parameter(
@@ -40,8 +48,13 @@ PARAMETERS = (
             f"share of the power in the {word} band ({colour})",
             plausible=0.1,
             linear=True,
+            role="band power",
+            band=band,
+            free="all",
         )
-        for c, word, colour in (("r", "first", "red"), ("g", "second", "green"), ("b", "third", "blue"))
+        for band, (c, word, colour) in enumerate(
+            (("r", "first", "red"), ("g", "second", "green"), ("b", "third", "blue"))
+        )
     ),
     Parameter(
         "dop_q",
@@ -72,6 +85,7 @@ PARAMETERS = (
         0.0,
         (-1e6, 1e6),
         "the clock: minutes, or any unit that `drift` is meant in",
+        role="clock",
         plausible=1.0,
         how="layer",
     ),
@@ -83,8 +97,10 @@ PARAMETERS = (
     ),
 )
 ROOM = (
-    replace(PARAMETERS[0], default=0.0, neutral=0.0, plausible=1e-5, doc="radiance L of the surroundings, relative"),
-    *PARAMETERS[1:],
+    replace(
+        PARAMETERS[0], default=0.0, neutral=0.0, plausible=1e-5, doc="radiance L of the surroundings, relative", free=""
+    ),
+    *(replace(p, free="") for p in PARAMETERS[1:]),
 )
 
 

@@ -41,6 +41,7 @@ PARAMETERS = (
         (0.0, 4.0),
         "scale of every bounce after the first; 1 is physics",
         neutral=0.0,
+        role="second bounce",
         plausible=1.0,
         linear=True,
     ),
@@ -89,16 +90,14 @@ def build():
             """The gel part of the scene, if it has one."""
             key = scene.ptr if hasattr(scene, "ptr") else id(scene)
             if key not in self.gel_of:
-                self.gel_of[key] = next((s for s in scene.shapes() if getattr(s, "kind", "") == "gel"), None)
+                self.gel_of[key] = next((s for s in scene.shapes() if getattr(s, "role", "") == "gel"), None)
             return self.gel_of[key]
 
         def glowing(self, scene):
             """The fluorescent pigments of the scene."""
             key = scene.ptr if hasattr(scene, "ptr") else id(scene)
             if key not in self.glowing_of:
-                found = {
-                    s.bsdf().name: s.bsdf() for s in scene.shapes() if getattr(s.bsdf(), "kind", "") == "fluorescent"
-                }
+                found = {s.bsdf().name: s.bsdf() for s in scene.shapes() if hasattr(s.bsdf(), "fluorescence")}
                 self.glowing_of[key] = tuple(found.values())
             return self.glowing_of[key]
 
@@ -177,4 +176,4 @@ def check_lit_plate():
     agree(stokes[..., 1:, :], np.zeros((2, 2, 3, 4)), 0, 1e-7)
 
 
-part = Part("tactile", "integrator", PARAMETERS, build, checks=(check_lit_plate,))
+part = Part("tactile", "integrator", PARAMETERS, build, checks=(check_lit_plate,), role="integrator")

@@ -35,6 +35,7 @@ PARAMETERS = (
         20.0,
         (-5.0, 2000.0),
         "from the untouched face to its nearest point",
+        role="distance",
         plausible=0.2,
         how="difference",
         step=1.0,

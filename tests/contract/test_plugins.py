@@ -16,7 +16,6 @@ import pytest
 
 from optics.errors import BadPlugin
 from optics.files.output import shipped
-from optics.light.renderer import POWERS
 from optics.scene import checking
 from optics.scene.declare import IMAGE_STAGES, Effect
 from optics.scene.registry import Registry, known
@@ -30,6 +29,7 @@ NUMBERS = [
     (kind, p.name) for kind in PARTS if kind not in MONTE_CARLO for p in REGISTRY.parameters_of(kind) if p.is_number
 ]
 LAYERS = [kind for kind in PARTS if REGISTRY.parts[kind].mueller is not None]
+POWERS = ("power", "band power")  # roles
 MOVED = ("carried", "markers", "target")  # kinds of shapes that a scene moves besides the gel
 LAYERED = ("layer", "glow")  # stages whose functions are differentiated by complex step
 SECTIONS = ("Definition", "Fingerprint", "Validity", "References")
@@ -139,7 +139,7 @@ def test_parts_document_and_declare_themselves(kind, mitsuba):
         check_declaration(p)
     if part.mueller is not None or part.stokes is not None:
         for p in REGISTRY.parameters_of(kind):
-            assert not p.is_number or p.how == ("ad" if part.stokes and p.name in POWERS else "layer"), (
+            assert not p.is_number or p.how == ("ad" if part.stokes and p.role in POWERS else "layer"), (
                 f"{kind}.{p.name}: {p.how}"
             )
 
@@ -635,7 +635,8 @@ def test_forward_mode_against_differences(kind, name, bench_of):
     """In the image of one LED, where the parameter acts there, and in the model's."""
     bench = bench_of(kind, name)
     key = key_of(bench, kind, name)
-    if name not in POWERS and key != bench.renderer.bounce_key and key not in bench.renderer.ambient_keys:
+    apart = (bench.renderer.bounce_key, *bench.renderer.ambient_keys)
+    if bench.scene.parameters[key].role not in POWERS and key not in apart:
         check_forward_mode(bench, key)
     # 1e-3: twice the tolerance of one LED's image, since ambient light is differentiated by differences
     assert check_model_derivative(bench, key, 1e-3) > 1e-7, f"{key} does nothing to the bench"

@@ -178,6 +178,19 @@ part = Part("fisheye", "sensor", _CAMERA.parameters, build, role="camera")
 '''
 
 
+def model_of(scene, *settings):
+    """A model of black 8 bit frames, one for each of the settings, each a group of its own."""
+    from optics.captures.capture_set import Captures, Frame
+    from optics.captures.noise import Noise
+    from optics.fit.scene_model import SceneModel
+
+    width, height = scene.camera.resolution
+    black = np.zeros((height, width, 3), np.float32)
+    frames = [Frame(f"f{i}", black, group=f"g{i}", parameters=dict(s)) for i, s in enumerate(settings or [{}])]
+    noise = Noise(system_gain=0.1, dark_noise=1.0, black_level=0.0, saturation=255.0, prnu=0.0)
+    return SceneModel(scene, Captures(scene.path.parent, str(scene.path), frames, noise=noise))
+
+
 def test_a_second_camera_is_one_new_file(tmp_path, mitsuba):
     """It renders, predicts, has its derivatives, and takes part in every effect of cameras."""
     from optics.light.rendering import RenderJob
@@ -202,14 +215,9 @@ def test_a_second_camera_is_one_new_file(tmp_path, mitsuba):
     shaded = RenderJob(scene).take({"camera.exposure": 150.0, "camera.vignetting": 1.0}).camera
     assert shaded[0, 0, 0] < image[0, 0, 0] and np.allclose(shaded[12, 16], image[12, 16], rtol=0.02)
 
-    from optics.captures.capture_set import Captures, Frame
-    from optics.captures.noise import Noise
-    from optics.fit.model import Model
     from optics.scene.parameter import Values, Variable
 
-    frame = Frame("one", np.zeros((24, 32, 3), np.float32))
-    noise = Noise(system_gain=0.1, dark_noise=1.0, black_level=0.0, saturation=255.0, prnu=0.0)
-    model = Model(scene, Captures(tmp_path, str(path), [frame], noise=noise))
+    model = model_of(scene)
     # the step of the first is the model's own, as rims jump with a step; shading is linear in the second
     for key, here, step in (("camera.x_fov", model.base["camera.x_fov"], 0.4), ("camera.vignetting", 0.5, 0.01)):
         variable = Variable(key, (key,), scene.parameters[key])
@@ -219,3 +227,182 @@ def test_a_second_camera_is_one_new_file(tmp_path, mitsuba):
         difference = (high - low) / (2 * step)
         # rounding: 1e-6 of 255 DN over twice the step
         assert np.abs(slopes[key] - difference).max() < 0.02 and np.abs(difference).max() > 1, key
+
+
+LIGHT = '''"""Spot: an LED whose power is called drive."""
+from dataclasses import replace
+
+from optics.scene.registry import known
+
+_LED = known().parts["led"]
+
+
+def build():
+    class Spot(_LED.build()):
+        kind = "spot"
+        power = property(lambda self: self.drive)
+
+    return Spot
+
+
+PARAMETERS = tuple(replace(p, name="drive") if p.role == "power" else p for p in _LED.parameters)
+part = replace(_LED, kind="spot", role="led", parameters=PARAMETERS, build=build)
+'''
+
+SKIN = '''"""Pad: a gel whose press has names of its own."""
+from dataclasses import replace
+
+from optics.scene.registry import known
+
+_GEL = known().parts["gel"]
+NAMES = {"press_x": "touch_x", "press_y": "touch_y", "press_depth": "dent"}
+
+
+def build():
+    class Pad(_GEL.build()):
+        kind = "pad"
+        pressing = tuple(NAMES.values())
+
+        def number(self, name):
+            return super().number(NAMES.get(name, name))
+
+    return Pad
+
+
+PARAMETERS = tuple(replace(p, name=NAMES.get(p.name, p.name)) for p in _GEL.parameters)
+part = replace(_GEL, kind="pad", role="gel", parameters=PARAMETERS, build=build)
+'''
+
+SMALL = {"width": "32", "height": "24"}
+
+
+def both_of(tmp_path, source, *changes):
+    """gelsight with some of its text replaced and a folder of plugins, and as it ships."""
+    from optics.scene import loader
+
+    text = loader.find("gelsight").read_text(encoding="utf-8")
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new)
+    path = tmp_path / "own.xml"
+    path.write_text(text, encoding="utf-8")
+    own = loader.load(path, SMALL, plugins=written(tmp_path / "own", part=source))
+    return own, loader.load("gelsight", SMALL)
+
+
+def test_a_second_kind_of_light_is_one_new_file(tmp_path, mitsuba):
+    """It is lit, driven, freed and differentiated by its own names."""
+    from optics.diagnosis.advice import families
+    from optics.scene.parameter import Values, Variable
+    from optics.study.setup import Setup, default_free, variables_of_base
+
+    own, usual = both_of(
+        tmp_path, LIGHT, ('<emitter type="led"', '<emitter type="spot"'), ('name="power"', 'name="drive"')
+    )
+    assert [part.kind for part in own.leds.values()] == ["spot"] * len(usual.leds)
+    press = {"gel.press_depth": 0.5}
+    half, full = ({f"led_{k}.{name}": 0.0 for k in range(2, 7)} for name in ("drive", "power"))
+    model, other = model_of(own, press, {**press, **half}), model_of(usual, press, {**press, **full})
+    at = Values({"camera.exposure": 150.0})
+    for found, expected in zip(model.predict(at), other.predict(at)):
+        assert expected.max() > 5 and np.allclose(found, expected, atol=1e-4)
+    assert [k.replace("drive", "power") for k in default_free(model)] == default_free(other)
+    assert model.driven == set(half) and {k.replace("drive", "power") for k in model.driven} == other.driven
+    priors = [{v.name: v.prior for v in variables_of_base(m, Setup(""), [0, 1])} for m in (model, other)]
+    assert priors[0]["led_1.drive"] == priors[1]["led_1.power"] and priors[0]["led_1.drive"][1] == 0.3
+    slopes = [
+        next(iter(m.derivatives(at, [Variable(k, (k,), m.parameters[k])], [0])))[1][k]
+        for m, k in ((model, "led_1.drive"), (other, "led_1.power"))
+    ]
+    assert np.abs(slopes[1]).max() > 1 and np.allclose(*slopes, atol=1e-4)
+    shots = [[s.settings for s in families(m, at, [0, 1]) if s.family == "dark"] for m in (model, other)]
+    assert shots[0] == [dict.fromkeys((f"led_{k}.drive" for k in range(1, 7)), 0.0)] and len(shots[1]) == 1
+
+
+def test_a_second_kind_of_skin_is_one_new_file(tmp_path, mitsuba):
+    """It is pressed, freed per press and set back to rest by its own names, and what moves with a skin moves with it."""
+    from optics.diagnosis.advice import families
+    from optics.scene.parameter import Values
+    from optics.study.setup import Setup, variables_of_base
+
+    own, usual = both_of(
+        tmp_path,
+        SKIN,
+        ('<shape type="gel"', '<shape type="pad"'),
+        ('name="press_x"', 'name="touch_x"'),
+        ('name="press_y"', 'name="touch_y"'),
+        ('name="press_depth"', 'name="dent"'),
+    )
+    assert own.gel.kind == "pad"
+    names = {"press_x": "touch_x", "press_y": "touch_y", "press_depth": "dent"}
+    press = {"press_x": 0.5, "press_y": -0.25, "press_depth": 0.5}
+    model = model_of(own, {f"gel.{names[k]}": v for k, v in press.items()})
+    other = model_of(usual, {f"gel.{k}": v for k, v in press.items()})
+    at = Values({"camera.exposure": 150.0})
+    found, expected = (m.predict(at)[0] for m in (model, other))
+    rest = other.developer.develop(other.radiance(other.untouched(other.at(at, 0))), other.at(at, 0))
+    assert np.abs(expected - rest).max() > 5 and np.allclose(found, expected, atol=1e-3)
+    assert [k for k, v in model.untouched(model.at(at, 0)).items() if v != model.at(at, 0)[k]] == [
+        f"gel.{n}" for n in names.values()
+    ]
+    solved = [
+        {v.name: v.prior for v in variables_of_base(m, Setup(""), [0]) if v.frames is not None} for m in (model, other)
+    ]
+    assert list(solved[0].values()) == list(solved[1].values()) == [(v, 0.05) for v in press.values()]
+    assert [n.split("[")[0] for n in solved[0]] == [f"gel.{n}" for n in names.values()]
+    places = [m.lit_geometry(at, 0)["press_distance"] for m in (model, other)]
+    assert np.allclose(*places, equal_nan=True, atol=1e-4)
+    words = [[s.words for s in families(m, at, [0])] for m in (model, other)]
+    assert words[0] == words[1] and any("deep" in w for w in words[0])
+
+
+def test_a_light_without_a_power_is_refused(tmp_path):
+    source = LIGHT.replace('replace(p, name="drive") if p.role == "power" else p for p in', "p for p in").replace(
+        "_LED.parameters)", '_LED.parameters if p.role != "power")'
+    )
+    with pytest.raises(BadPlugin, match="'spot' has no parameter with role='power'"):
+        known(written(tmp_path / "own", spot=source))
+
+
+def test_the_shipped_parts_have_what_their_roles_ask_for(mitsuba, load_bench):
+    """The table of the page on parts, on parts of a scene: some are set when a part is made."""
+    import re
+
+    text = (shipped("plugins").parent / "docs" / "write-a-part.md").read_text(encoding="utf-8")
+    table = text.split("| role | methods and attributes of its class |")[1].split("\n\n")[0]
+    told = {row[0]: row[1:] for row in (re.findall(r"`(\w+)`", line) for line in table.splitlines()) if row}
+    assert sorted(told) == ["camera", "gel", "led", "membrane"]
+    parts = load_bench("gelsight").scene.parts.values()
+    for role, names in told.items():
+        part = next(p for p in parts if p.role == role)
+        assert len(names) > 2 and [n for n in names if not hasattr(part, n)] == []
+
+
+NAMED = {  # files that read a parameter by its name, and why they may
+    "optics/light/paths.py": {"index"},  # the declared meaning of `refracts`
+    "optics/light/transport.py": {"dop_q", "dop_u"},  # of sources among dielectric bodies, which must not polarize
+}
+
+
+def test_the_library_knows_no_kind_and_reads_no_parameter_by_name():
+    """Between scene and study, parts are told apart by role and traits, and parameters are found by role."""
+    import ast
+
+    root = shipped("plugins").parent / "optics"
+    found = []
+    for package in ("scene", "skin", "polarization", "light", "fit", "diagnosis", "study"):
+        for file in sorted((root / package).glob("*.py")):
+            name = file.relative_to(root.parent).as_posix()
+            for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+                if not isinstance(node, ast.Call) or not all(isinstance(a, ast.Constant) for a in node.args[1:2]):
+                    continue
+                call, given = ast.unparse(node.func), [a.value for a in node.args if isinstance(a, ast.Constant)]
+                if call == "getattr" and given[:1] == ["kind"]:
+                    found.append(f"{name}:{node.lineno}: getattr(..., 'kind')")
+                if (
+                    call.endswith(".number")
+                    and isinstance((given or [0])[0], str)
+                    and given[0] not in NAMED.get(name, ())
+                ):
+                    found.append(f"{name}:{node.lineno}: number({given[0]!r})")
+    assert found == []

@@ -61,6 +61,15 @@ def test_every_field_of_a_declaration_has_its_row():
         assert [name for name in names if not re.search(rf"\b{name}\b", told)] == []
 
 
+def test_every_role_has_its_row():
+    from optics.scene.declare import ROLES as of_parts
+    from optics.scene.parameter import ROLES as of_parameters
+
+    text = page("write-a-part")
+    for role, meaning in (*of_parts.items(), *of_parameters.items()):
+        assert f"| `{role}` | {meaning} |" in text, role
+
+
 def test_the_example_effect_is_an_effect(tmp_path):
     """The file that the page shows is found by a scan and leaves an image alone at neutral."""
     import numpy as np

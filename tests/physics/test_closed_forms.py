@@ -619,7 +619,8 @@ def view(bench):
 
 
 def test_response_is_the_inverse_of_its_cubic(mitsuba):
-    from optics.light.development import STEP, inverse_cubic
+    from optics.light.development import STEP
+    from optics.scene.response import inverse_cubic
 
     irradiance = np.concatenate([np.linspace(0, 1, 2001), RNG(10).uniform(0, 1, 500)])
     for a, b in ((0.3, 0.1), (-0.4, 0.2), (0.6, -0.3), (0.9, 0.0), (0.0, -0.4), (0.0, 0.0)):
@@ -655,7 +656,8 @@ def test_the_view_has_the_tangent_of_the_field_angle(view):
 
 def test_bend_and_the_chain_to_digital_numbers(bench):
     """DN = black + (saturation - black) m, m = G^-1(exposure gain M L) + bend m (1 - m)."""
-    from optics.light.development import Developer, inverse_cubic
+    from optics.light.development import Developer
+    from optics.scene.response import inverse_cubic
 
     camera = bench.scene.camera
     developer = Developer(camera, bench.scene.integrator.bands, black=7.0, saturation=250.0)

@@ -994,7 +994,7 @@ def test_slabs_with_reflecting_faces_keep_the_energy(mitsuba):
         )
         slab = mueller.Slab(matrices)
         if kind == "polarizer_film":
-            slab = paths.slab("film", matrices, {"film.face": share.ravel(), "film.inserted": 1.0})
+            slab = paths.slab(matrices, share.ravel())
         stacked = slab if stacked is None else slab.after(stacked)
         for t, r in ((stacked.t, stacked.r), (stacked.t_back, stacked.r_back)):
             t, r = t.numpy(), (r + mueller.absorber(0.0)).numpy()

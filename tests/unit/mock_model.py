@@ -91,7 +91,7 @@ class Exact:
     def wavelengths(self) -> list[float]:
         return [0.0] * self.shape[2]
 
-    def part_kind(self, key: str) -> str:
+    def family(self, key: str) -> str:
         return ""
 
     def imagine(self, frames):
@@ -128,14 +128,21 @@ class MockModel(Exact):
                 bounds = (1e-3, 10.0) if name == "power" else (-30.0, 30.0)
                 self._add(
                     f"led{i}.{name}",
-                    Parameter(name, "1" if name == "power" else "mm", value, bounds, plausible=plausible),
+                    Parameter(
+                        name,
+                        "1" if name == "power" else "mm",
+                        value,
+                        bounds,
+                        plausible=plausible,
+                        role="power" if name == "power" else f"light {name}",
+                    ),
                 )
         for name, value, bounds in (
             ("press_x", 0.0, (-5.0, 5.0)),
             ("press_y", 0.0, (-5.0, 5.0)),
             ("press_depth", 0.6, (0.05, 2.0)),
         ):
-            self._add(f"gel.{name}", Parameter(name, "mm", value, bounds, plausible=0.1))
+            self._add(f"gel.{name}", Parameter(name, "mm", value, bounds, plausible=0.1, role=name.replace("_", " ")))
         for name, parameter in EFFECT_PARAMETERS.items():
             self._add(f"sensor.{name}", parameter)
         self.frames = [Frame(f"press-{i:02d}", np.zeros(self.shape)) for i in range(presses)]
@@ -300,8 +307,8 @@ class PointModel(Exact):
 
     shape = (1, 1, 1)
     parameters = {
-        "lamp.power": Parameter("power", "1", 1.0, (0.0, 10.0), plausible=0.1),
-        "polarizer.angle": Parameter("angle", "deg", 0.0, (-90.0, 90.0), plausible=1.0),
+        "lamp.power": Parameter("power", "1", 1.0, (0.0, 10.0), plausible=0.1, role="power"),
+        "polarizer.angle": Parameter("angle", "deg", 0.0, (-90.0, 90.0), plausible=1.0, role="angle"),
         "polarizer.leak": Parameter("leak", "1", 0.0, (0.0, 1.0), neutral=0.0, plausible=0.02),
         "lamp.drift": Parameter("drift", "1", 0.0, (-1.0, 1.0), neutral=0.0, plausible=0.02),
         "lamp.ripple": Parameter("ripple", "1", 0.0, (-1.0, 1.0), neutral=0.0, plausible=0.02),

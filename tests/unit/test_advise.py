@@ -34,7 +34,7 @@ class Exposed(MockModel):
 
     def __init__(self, presses):
         super().__init__(presses, SIDE)
-        self._add("camera.exposure", Parameter("exposure", "1", 1.0, (0.0, 100.0)))
+        self._add("camera.exposure", Parameter("exposure", "1", 1.0, (0.0, 100.0), role="exposure"))
         for i in range(LEDS):
             self.parameters[f"led{i}.power"] = replace(self.parameters[f"led{i}.power"], bounds=(0.0, 10.0))
 

@@ -188,15 +188,19 @@ def test_families_that_explain_alike_are_not_told_apart():
 
 
 def test_a_setting_has_the_family_of_its_part():
+    """The family follows from the category of the part, and from the role of a clock."""
+    from optics.scene.registry import known
+
+    parts = known().parts
     assert [
-        family_of(*a)
-        for a in (
-            ("camera.exposure", "camera"),
-            ("source.time", "source"),
-            ("analyzer.angle", "polarizer_film"),
-            ("led_3.distance", "led"),
-            ("skin.press_depth", "gel"),
-            ("object.distance", "target"),
+        family_of(f"part.{name}", "time" if known().parameter(kind, name).role == "clock" else parts[kind].family)
+        for kind, name in (
+            ("camera", "exposure"),
+            ("source", "time"),
+            ("polarizer_film", "angle"),
+            ("led", "x"),
+            ("gel", "press_depth"),
+            ("target", "distance"),
         )
     ] == ["camera", "time", "setting", "light", "geometry", "geometry"]
 
@@ -234,7 +238,11 @@ def lit_point(powers):
         at=lambda values, frame: now,
         captures=SimpleNamespace(table=None),
         lit=lambda now: powers,
-        scene=SimpleNamespace(gel=None, leds={led: SimpleNamespace(frame=axes) for led in ("near", "above")}),
+        scene=SimpleNamespace(
+            gel=None,
+            leds={led: SimpleNamespace(frame=axes) for led in ("near", "above")},
+            key=lambda part, role: f"{part}.{role.split()[-1]}",
+        ),
     )
 
 
@@ -585,6 +593,7 @@ def test_names_that_functions_of_a_camera_see_are_those_that_no_effect_may_take(
         resolution=(4, 3),
         sensitivity="identity",
         numbers={n: SimpleNamespace(neutral=None) for n in own},
+        normalised=lambda own, u, v: (u, v, 1.0),
     )
     view = Developer(camera, (450.0, 550.0, 650.0)).view({f"camera.{n}": value for n, value in own.items()})
     assert set(vars(view)) - set(own) == set(draft.VIEW)

@@ -308,7 +308,7 @@ class Slope(Exact):
 
     shape, captures = (32, 32, 1), None
     parameters = {
-        "lamp.power": Parameter("power", "1", 1.0, (0.0, 10.0), plausible=0.1),
+        "lamp.power": Parameter("power", "1", 1.0, (0.0, 10.0), plausible=0.1, role="power"),
         "lamp.slope": Parameter("slope", "1", 0.0, (-1.0, 1.0), neutral=0.0, plausible=0.02),
     }
     noise = Noise(system_gain=0.02, dark_noise=1.0, black_level=64.0, saturation=1023.0, prnu=0.0)

@@ -66,7 +66,7 @@ def test_a_value_far_from_its_prior_is_named():
 def test_lights_named_in_some_frames_only(frames, key):
     model = SimpleNamespace(
         frames=[SimpleNamespace(name=f"f{i}", parameters=p, readings={}) for i, p in enumerate(frames)],
-        scene=SimpleNamespace(lights=["led_1", "led_2", "led_3"]),
+        scene=SimpleNamespace(powers={f"led_{k}": f"led_{k}.power" for k in (1, 2, 3)}),
         base={f"led_{k}.power": 1.0 for k in (1, 2, 3)},
     )
     texts = checks._unnamed(model)
@@ -78,7 +78,7 @@ def test_lights_named_in_some_frames_only(frames, key):
 def test_a_press_beyond_the_gel_is_named(x, warned):
     gel = SimpleNamespace(name="gel")
     model = SimpleNamespace(
-        scene=SimpleNamespace(gel=gel),
+        scene=SimpleNamespace(gel=gel, key=lambda part, role: f"{part}.{role.replace(' ', '_')}"),
         base={"gel.width": 18.8, "gel.length": 14.0},
         frames=[SimpleNamespace(name="a", parameters={}), SimpleNamespace(name="b", parameters={"gel.press_x": x})],
     )

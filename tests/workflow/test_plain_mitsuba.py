@@ -8,8 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from optics.errors import BadScene
-
 SMALL = {"width": "24", "height": "18"}
 GRID = {"columns": "4", "rows": "4", "layers": "2", "block_width": "3.6", "block_length": "3.6"}
 CASES = {  # every shipped scene: what replaces its <default>s, at rest and pressed
@@ -24,6 +22,9 @@ CASES = {  # every shipped scene: what replaces its <default>s, at rest and pres
 # order round, so that images agree in the mean only.
 DRAWN = ("grid_bench", "magictac")
 SEEDS = 8
+# Mitsuba sums a smooth mesh's vertex normals in parallel, in an order that changes from load to load: a normal, and with
+# it an image, is known to some roundings of a float32 (6e-8 each; up to 5e-9 of the largest value was seen).
+ROUNDING = 1e-6
 
 
 @pytest.fixture(scope="module")
@@ -72,13 +73,13 @@ def test_load_file_gives_what_our_loader_gives(name, pressed, mi):
     if name not in DRAWN:
         found, expected = image(mi, plain), image(mi, ours.mitsuba)
         assert expected.max() > 0
-        # Mitsuba joins rectangles of one material to one mesh: their places differ in the last bit of a float32
-        assert np.abs(found - expected).max() <= 1e-6 * expected.max()
+        # Mitsuba also joins rectangles of one material to one mesh: their places differ in the last bit of a float32
+        assert np.abs(found - expected).max() <= ROUNDING * expected.max()
         return
     exact, _ = both(mi, name, CASES[name][pressed], optimize=False)
     expected = image(mi, ours.mitsuba)
     assert expected.max() > 0
-    assert np.array_equal(image(mi, exact), expected)
+    assert np.abs(image(mi, exact) - expected).max() <= ROUNDING * expected.max()
     images = [np.array([image(mi, s, 10 + k, 64) for k in range(SEEDS)]) for s in (plain, ours.mitsuba)]
     means, errors = zip(*((i.mean((1, 2)).mean(0), i.mean((1, 2)).std(0, ddof=1) / SEEDS**0.5) for i in images))
     # Student's t of three channels with 14 degrees of freedom: 5 is reached once in 2000
@@ -123,7 +124,7 @@ def test_updates_through_traverse_are_those_of_our_scene(name, mi):
         params.update()
         ours.set(values)
         found, expected = image(mi, plain), image(mi, ours.mitsuba)
-        assert np.array_equal(found, expected)
+        assert np.abs(found - expected).max() <= ROUNDING * expected.max()
         assert before is None or np.abs(found - before).max() > 1e-3 * found.max()
         before = found
         for a, b in zip(plain.shapes(), ours.mitsuba.shapes()):
@@ -138,7 +139,7 @@ def test_what_is_updated_before_the_first_image_is_in_it(mi):
     params.update()
     ours.set({"skin.press_depth": 3.0})
     expected = image(mi, ours.mitsuba)
-    assert np.abs(image(mi, plain) - expected).max() <= 1e-6 * expected.max()  # rectangles are joined, as above
+    assert np.abs(image(mi, plain) - expected).max() <= ROUNDING * expected.max()
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -222,8 +223,8 @@ def test_shapes_that_move_are_not_joined_by_mitsubas_optimization(mi, tmp_path):
     assert lowest["one"] < -1.01 and lowest["two"] < -2.01  # each with a dent, from its own place at rest
 
     path.write_text(SHEETS.format(kind="sheet"), encoding="utf-8")
-    with pytest.raises(BadScene, match="'a' lies on 2 shapes.*optimize=False"):
-        image(mi, mi.load_file(str(path)), spp=1)
+    joined = mi.load_file(str(path))
+    assert re.search("'a' lies on 2 shapes.*optimize=False", said(lambda: image(mi, joined, spp=1)))
     image(mi, mi.load_file(str(path), optimize=False), spp=1)
 
 
