@@ -422,9 +422,7 @@ class SceneModel:
             if np.ndim(high):
                 view = self.developer.view(now)
                 full = self.noise.saturation - self.noise.black_level
-                step = (
-                    ((high - low) @ self.developer.matrix.T) * np.abs(self.developer.scale(view)) * full
-                )
+                step = ((high - low) @ self.developer.matrix.T) * np.abs(self.developer.scale(view)) * full
                 level = self.predict(Values(), [index])[0].reshape(-1, self.shape[2])[image.index]
                 known.reshape(-1, self.shape[2])[image.index] = (
                     step / self.renderer.rim_samples < self.noise.sd(level) / 6

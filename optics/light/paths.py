@@ -208,9 +208,7 @@ def _refract(here: np.ndarray, direction: np.ndarray, x: np.ndarray, normal: np.
     return np.where(on, bent, direction), np.where(on, turned, x), total
 
 
-# -- what light loses -------------------------------------------------------------------------------------------------
-
-
+# -- what light loses ------------------------------------------------------------------------------------------------
 def part_values(scene, name: str, values: Mapping, fields: Mapping) -> SimpleNamespace:
     """A part's parameters as its functions read them; arrays of readings stand along the first axis."""
     part = scene.parts[name]

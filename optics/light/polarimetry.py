@@ -27,9 +27,8 @@ from optics.polarization import mueller
 from optics.polarization.mueller import Mueller
 from optics.scene.loader import Scene
 
+
 # -- what a ray passes ------------------------------------------------------------------------------------------------
-
-
 def pixel(scene: Scene, text: str | None) -> tuple[float, float]:
     """Position (u, v) in px of "U,V", u to the right and v down, centre of the first pixel at 0.5; the image's centre
     for None."""
@@ -125,9 +124,7 @@ def _combined(layers: Sequence[tuple[Mueller, float]]) -> Mueller:
     return whole
 
 
-# -- what a matrix says -----------------------------------------------------------------------------------------------
-
-
+# -- what a matrix says ----------------------------------------------------------------------------------------------
 @dataclass(frozen=True)
 class Decomposition:
     """A Mueller matrix M = m00 M_depolarizer M_retarder M_diattenuator in numbers; NaN for what has no meaning.
@@ -138,8 +135,8 @@ class Decomposition:
                                                circular
     polarizance, polarizance_axis              degree and angle of polarization of unpolarized light behind it
     retardance, fast_axis, fast_ellipticity    deg: 0 ... 180, the state that runs ahead; of a half wave fast and slow
-                                               are one.
-                                               No retardance for D = 1: no second polarization is left to be late
+                                               are one. No retardance for D = 1: no second polarization is left to be
+                                               late
     depolarization               power of depolarization 1 - |tr(m)|/3 of the depolarizer: 0 none, 1 all
     depolarization_index         sqrt((sum m_ij^2 - m00^2)/(3 m00^2)): 1 none, 0 all (Gil & Bernabeu)
     realisable                   `mueller.physical`: < 0 where no layer can do this
@@ -282,8 +279,7 @@ def _state(vector: np.ndarray | None) -> tuple[float, float]:
     return angle if linear > 1e-9 * length else float("nan"), float(np.degrees(np.arctan2(vector[2], linear))) / 2
 
 
-# -- images ---------------------------------------------------------------------------------------------------------
-
+# -- images ----------------------------------------------------------------------------------------------------------
 DARK = 2e-3  # of the brightest: nothing is said of pixels below
 
 
@@ -372,9 +368,7 @@ def save(figure, file: Path) -> None:
         figure.savefig(temporary, metadata={"Software": None} if Path(file).suffix == ".png" else None)
 
 
-# -- a reading against a parameter ------------------------------------------------------------------------------------
-
-
+# -- a reading against a parameter -----------------------------------------------------------------------------------
 class Spot(Renderer):
     """One pixel of a scene's image, by its own light: the pixels about it say whether it lies at a rim."""
 
@@ -721,7 +715,8 @@ def _groups(
         if len(found) > CURVES and not any(isinstance(v, str) for v in found):
             mean = float(np.mean([s[name] for s in settings if name in s]))
             notes.append(
-                f"{name} takes {len(found)} values, {min(found):g} to {max(found):g}; the curve is for their mean, {mean:g}"
+                f"{name} takes {len(found)} values, {min(found):g} to {max(found):g}; the curve is for their mean, "
+                f"{mean:g}"
             )
             settings = [{**s, name: mean} if name in s else s for s in settings]
     groups: dict[tuple, list[int]] = {}

@@ -97,7 +97,6 @@ class Renderer:
         return part.kind if part is not None else ""
 
     # -- geometry -----------------------------------------------------------------------------------------------------
-
     def geometry(self, values: Mapping) -> tuple:
         return tuple(values[k] for k in self.geometry_keys)
 
@@ -176,7 +175,6 @@ class Renderer:
         return edges
 
     # -- one LED ------------------------------------------------------------------------------------------------------
-
     def _led_key(self, values: Mapping, led: str) -> tuple:
         return (
             led,
@@ -245,9 +243,7 @@ class Renderer:
             hits.joint = np.logical_or.reduce([hits.edges, *rims])
         return hits.joint
 
-    # -- what layers leave of it
-    # ----------------------------------------------------------------------------------------
-
+    # -- what layers leave of it --------------------------------------------------------------------------------------
     def image(self, values: Mapping, light: str, component: int = 0) -> np.ndarray:
         """(H, W, B) what one light makes at power 1, layers and all; (N, 1, B) where `values` hold arrays of readings.
 
@@ -331,7 +327,6 @@ class Renderer:
         return sum(r * s for r, s in zip(row, sent) if not isinstance(s, int))
 
     # -- all lights ---------------------------------------------------------------------------------------------------
-
     def lit(self, values: Mapping) -> list[str]:
         """The lights that are on."""
         return [n for n in self.scene.lights if np.any(values[self.scene.powers[n]] != 0)]

@@ -117,7 +117,8 @@ class RenderJob:
             reason = "Stokes vectors were asked for of a scene without layers"
         if reason and scene.monte_carlo and scene.leds:
             raise BadScene(
-                f"{scene.path}: {reason}, but mi.render brings no light of an LED, which is a point, through dielectric bodies; allowed: "
+                f"{scene.path}: {reason}, but mi.render brings no light of an LED, which is a point, through "
+                "dielectric bodies; allowed: "
                 "without --spp and --stokes, or luminous areas (emitters of the type 'source') in place of LEDs"
             )
         self.renderer = None if reason else renderer_of(scene, remember=2)
@@ -406,10 +407,7 @@ def veiled(renderer: Renderer, values: Mapping) -> str:
     return f"the light of {' and '.join(found)} passes layers before it meets anything" if found else ""
 
 
-# -- provenance
-# ---------------------------------------------------------------------------------------------------------
-
-
+# -- provenance ------------------------------------------------------------------------------------------------------
 def scene_record(scene: Scene) -> dict:
     """Name and hash of the scene file, its definitions, and the hash of every file that it names."""
     text = scene.path.read_text(encoding="utf-8")
@@ -439,4 +437,4 @@ def plugins_record(registry: Registry) -> dict[str, str]:
     }
 
 
-# -- files --------------------------------------------------------------------------------------------------------------
+# -- files -----------------------------------------------------------------------------------------------------------

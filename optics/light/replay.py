@@ -104,8 +104,7 @@ class Replay:
                 backward((shot.ray.o, adjoint["o"]), (shot.ray.d, adjoint["d"] + first), (self.vertical, vertical))
             dr.eval()
 
-    # -- the image --------------------------------------------------------------------------------------------------
-
+    # -- the image ----------------------------------------------------------------------------------------------------
     def shoot(self, scene, sensor, seed, spp):
         """The camera's rays: `start` without derivatives, `ray` with those of the camera."""
         sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
@@ -137,8 +136,7 @@ class Replay:
         shot.film.put_block(block)
         return shot.film.develop()
 
-    # -- the way ----------------------------------------------------------------------------------------------------
-
+    # -- the way ------------------------------------------------------------------------------------------------------
     def checkpoints(self, scene, shot) -> tuple[list[dict], object, int]:
         """Every STRIDE-th state of the rays' way, the light that they gather on all of it, and the number of surfaces
         that the longest of their shadow rays meets."""

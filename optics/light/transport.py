@@ -9,8 +9,8 @@ So light is followed from both ends to where it is scattered:
                        fluence in every cell of a grid (track length by volume, 1/mm^2 per unit of power), and the
                        irradiance on matt surfaces
     from the camera    rays fly through all faces the same way; each ends on a matt surface, where it reads the
-                       irradiance, and
-                       gathers on its way what the bodies scatter towards it, sigma_s/(4 pi) of the fluence
+                       irradiance, and gathers on its way what the bodies scatter towards it, sigma_s/(4 pi) of the
+                       fluence
 
 At every face the way is drawn by Fresnel's reflectance; absorption is weighed, never drawn, so that derivatives by
 absorption are exact: every contribution times the length of its way (d/d alpha exp(-alpha l) = -l exp(-alpha l)).
@@ -326,8 +326,7 @@ class Run:
 
         return ((s["batch"] * len(self.rows) + mi.UInt32(row)) * self.kinds + kind) * size
 
-    # -- places ------------------------------------------------------------------------------------------------------
-
+    # -- places -------------------------------------------------------------------------------------------------------
     def voxel(self, cell, p, active):
         """Which part of its cell a place lies in."""
         import drjit as dr
@@ -376,15 +375,13 @@ class Run:
             for t, a in zip(s["tau"], self.absorption)
         ]
 
-    # -- flight ------------------------------------------------------------------------------------------------------
-
+    # -- flight -------------------------------------------------------------------------------------------------------
     def fly(self, start: dict, forward: bool, drawn: bool, along: Callable, at: Callable) -> dict:
         """Follow rays through all faces until they end; gives their last state, with `ended` where `at` says so: there
         p and d are those of the last stretch.
 
         start    p, d, rng, x (axis across d that Stokes vectors refer to), tau (share of what each ray started with,
-                 per band of the
-                 group), weight (what that is; 1), and numbers that stay: pixel, light, batch
+                 per band of the group), weight (what that is; 1), and numbers that stay: pixel, light, batch
         forward  from a light: the Stokes vector is carried along; else from the camera: what it is sensitive to
         drawn    scattering is drawn by Monte Carlo; else it only weakens, and `along` gathers it
         along    f(s, length, sigma, active): what is left or found on a straight stretch of the state s
@@ -577,8 +574,7 @@ class Run:
             return rotation(c * c - u * u, -2 * c * u) @ tuple(v)
         return rotation(c * c - u * u, 2 * c * u).after(tuple(v))
 
-    # -- from the lights ---------------------------------------------------------------------------------------------
-
+    # -- from the lights ----------------------------------------------------------------------------------------------
     def panel(self, name: str) -> Surface:
         """What a source shines from."""
         return next(s for s in self.of.surfaces if s.light == name)
@@ -720,8 +716,7 @@ class Run:
         )
         dr.eval(self.fluence, self.irradiance)
 
-    # -- from the camera ---------------------------------------------------------------------------------------------
-
+    # -- from the camera ----------------------------------------------------------------------------------------------
     def straight(self, light: int, si, sample, active):
         """Irradiance that a light at power 1 sends to a surface with nothing in between, from the point of it that a
         sample names: a panel's is cos_s Omega (of its solid angle), an LED's cos_l^mu cos_s/r^2."""
@@ -868,10 +863,7 @@ class Run:
             see_light(s, row, value, in_air)
 
 
-# -- what a scene is made of
-# --------------------------------------------------------------------------------------------
-
-
+# -- what a scene is made of -----------------------------------------------------------------------------------------
 class Surface:
     """A shape as rays know it: `outside`, `inside` numbers of the materials that it parts (-1: it is no face of a
     dielectric body), `light` the name of the source that it is, `matt` whether it keeps a map of its irradiance,

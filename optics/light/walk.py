@@ -93,8 +93,7 @@ class Walk:
             if getattr(m, "role", "") == "membrane" and m.functions("ambient")
         ]
 
-    # -- the rays ---------------------------------------------------------------------------------------------------
-
+    # -- the rays -----------------------------------------------------------------------------------------------------
     def start(self, ray, sampler, active=True) -> dict:
         """The state of rays that leave the camera.
 
@@ -204,8 +203,7 @@ class Walk:
         s["delta"] = dr.select(scattered, mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta), s["delta"])
         s["bounce"] = dr.select(scattered, s["bounce"] + 1, s["bounce"])
 
-    # -- light that is sampled --------------------------------------------------------------------------------------
-
+    # -- light that is sampled ----------------------------------------------------------------------------------------
     def absorption(self, medium, si, active):
         """sigma_a of a homogeneous medium in each band, 1/mm."""
         mei = dr.zeros(mi.MediumInteraction3f, dr.width(si))

@@ -20,7 +20,7 @@ from collections.abc import Sequence
 import numpy as np
 
 
-# -- functions for both kinds of arrays -------------------------------------------------------------------------------
+# -- functions for both kinds of arrays ------------------------------------------------------------------------------
 def _library(*values):
     drjit = sys.modules.get("drjit")
     return drjit if drjit is not None and any(drjit.is_array_v(v) for v in values) else np

@@ -27,9 +27,7 @@ def agree(found, expected, relative: float = 1e-12, absolute: float = 0.0) -> No
     np.testing.assert_allclose(np.asarray(found, float), np.asarray(expected, float), rtol=relative, atol=absolute)
 
 
-# -- parts without a scene --------------------------------------------------------------------------------------------
-
-
+# -- parts without a scene -------------------------------------------------------------------------------------------
 def numbers(kind: str, **changed) -> SimpleNamespace:
     """A part's parameters at their defaults, some of them changed, as the functions of effects read them."""
     declared = {p.name: p.default for p in known().parameters_of(kind)}
@@ -64,9 +62,7 @@ def scene_of(*elements: str, bands: str = "620, 540, 460", width: int = 4, x_fov
         return loader.load(file)
 
 
-# -- layers and sources -----------------------------------------------------------------------------------------------
-
-
+# -- layers and sources ----------------------------------------------------------------------------------------------
 def ray(theta: float = 0.0, phi: float = 0.0, wavelengths=(540.0,), u: float = 0.0, v: float = 0.0) -> Crossing:
     """Light that crosses a layer towards the viewer, theta degrees off the normal in the azimuth phi, at (u, v) mm.
 
@@ -110,9 +106,7 @@ def principal_transmittances(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray
     return matrix[..., 0, 0] + swing, matrix[..., 0, 0] - swing
 
 
-# -- plausible values -------------------------------------------------------------------------------------------------
-
-
+# -- plausible values ------------------------------------------------------------------------------------------------
 def draw(
     item: Part | Effect,
     parameters: Iterable[Parameter],

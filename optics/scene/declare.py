@@ -120,7 +120,8 @@ class Effect:
     part        kind of the part that carries it, or a role that several kinds play
     parameters  new ones (declared here) or names of parameters that the part already has
     stages      stage -> function: where the physics enters, see the module's text; empty: the part itself does it
-    field       of a layer's effect: f(layer) -> what its function reads as `layer.field`, made anew whenever the layer's
+    field       of a layer's effect: f(layer) -> what its function reads as `layer.field`, made anew whenever the
+                layer's
                 words, its shape or the skin around it change
     shape       further parameters that the functions use and that stay as they are (a width, an exponent)
     onset       'tangent' (linear at neutral), 'secant' (the derivative at neutral says nothing: a finite step to
@@ -132,8 +133,8 @@ class Effect:
     acts        coordinates that it acts through: radius, height, slope, led, channel, frame, intensity ...
     needs       what a capture set must vary for it to be seen, in words
     seek        where an effect has a place that no derivative leads to: f(model, values, frames) -> {key: value} of
-                further parameters
-                that do nothing at neutral, found from the residual before the effect is scored or added
+                further parameters that do nothing at neutral, found from the residual before the effect is scored or
+                added
     checks      closed forms, as in Part
     random      plausible values, as in Part
     """

@@ -163,7 +163,8 @@ class Scene:
             for name, advice in DEPOLARIZERS.items():
                 if re.search(rf"\b{name}(\[| BSDF)", str(shape.bsdf())):
                     warnings.warn(
-                        f"{self.path}: the material '{name}' of the shape '{shape.id()}' takes all polarization out of the "
+                        f"{self.path}: the material '{name}' of the shape '{shape.id()}' takes all polarization out of "
+                        "the "
                         f"light that it lets through or reflects, whatever the physics; {advice}",
                         stacklevel=2,
                     )
@@ -192,8 +193,7 @@ class Scene:
                 )
         return found
 
-    # -- values ---------------------------------------------------------------------------------------------------------
-
+    # -- values -------------------------------------------------------------------------------------------------------
     def records(self) -> list[dict]:
         """One record per parameter (optics.scene.showing.records)."""
         return showing.records(self)

@@ -138,7 +138,8 @@ def _built(registry: Registry, part: Part) -> type:
                 if part.kind in registry.kinds(e.part) and p in (*e.parameters, *e.shape)
             ]
             raise BadPlugin(
-                f"{files[0] if files else part.file}: parameter '{p.name}' has the name of something else that the part "
+                f"{files[0] if files else part.file}: parameter '{p.name}' has the name of something else that the "
+                "part "
                 f"'{part.kind}' has; choose another name"
             )
     return cls
@@ -157,7 +158,8 @@ def _once_wired(method: Callable) -> Callable:
             return _nan(answer)
         if any(shape.bsdf() is self for shape in scene.shapes()):
             raise BadScene(
-                f"{self._waits}, and this scene's parts have not been told of one another; the integrator 'tactile' does "
+                f"{self._waits}, and this scene's parts have not been told of one another; the integrator 'tactile' "
+                "does "
                 "that at its first image; call optics.wire(scene) before you render with another integrator"
             )
         return answer  # Dr.Jit traces every material alive, those of other scenes as well
@@ -275,8 +277,7 @@ class Declared:
         places = [Path(folder) / name for folder in self._folders]
         return next((place for place in places if place.is_file()), places[0])
 
-    # -- neighbours -------------------------------------------------------------------------------------------------
-
+    # -- neighbours ---------------------------------------------------------------------------------------------------
     def wire(self, scene) -> None:
         """Find the neighbours that the part depends on (optics.scene.wiring.Neighbours); called once a scene."""
 
@@ -295,8 +296,7 @@ class Declared:
         shaping = self.registry.shaping(self.kind) or self.words
         return any(name in shaping for name in names or (*self.numbers, *self.words))
 
-    # -- parameters -------------------------------------------------------------------------------------------------
-
+    # -- parameters ---------------------------------------------------------------------------------------------------
     def traverse(self, cb) -> None:
         self.put_parameters(cb)
 

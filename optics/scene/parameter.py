@@ -53,15 +53,13 @@ class Parameter:
     neutral     value at which its effect vanishes; None where it has none (a position has no neutral value)
     plausible   the size of a change that a real sensor shows; sets steps and scales, > 0
     step        half width of a central difference, in plausible sizes: narrow where the image bends, wide where an edge
-                that
-                moves changes a rim's pixel by jumps of one sample
+                that moves changes a rim's pixel by jumps of one sample
     how         how its derivative image is made: 'ad' (forward mode through the render), 'difference' (central, common
                 random numbers: it moves shadows or geometry), 'image' (arithmetic on the linear images), 'layer'
                 (complex step through the Mueller matrices of the layers and the Stokes vectors of sources), 'path' (by
                 the lengths of the ways that light took through dielectric bodies)
     squared     True where the image depends on the square of it (a roughness): a fit steps in the square, whose onset
-                is
-                linear, and stays above a thousandth of `plausible`
+                is linear, and stays above a thousandth of `plausible`
     saturates   of a squared parameter s: the value v beyond which its effect levels off; a fit steps in s^2/(1 +
                 s^2/v^2)
     linear      True where the image is exactly linear in it (one render serves every value)
@@ -171,7 +169,8 @@ class Parameter:
             number = float(value)
         except (TypeError, ValueError):
             raise ValueError(
-                f"{where + ': ' if where else ''}{key} = {value!r} is not a number{f' in {self.unit}' if spaced(self.unit) else ''}"
+                f"{where + ': ' if where else ''}{key} = {value!r} is not a "
+                f"number{f' in {self.unit}' if spaced(self.unit) else ''}"
             ) from None
         if not math.isfinite(number):
             raise ValueError(f"{where + ': ' if where else ''}{key} = {number}{spaced(self.unit)} is not finite")

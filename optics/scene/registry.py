@@ -202,9 +202,7 @@ def _add(parts: dict[str, Part], effects: dict[str, Effect], item: Part | Effect
     effects[item.key] = item
 
 
-# -- which plugins there are
-# --------------------------------------------------------------------------------------------
-
+# -- which plugins there are -----------------------------------------------------------------------------------------
 _registries: dict[tuple[Path, ...], tuple[tuple, Registry]] = {}  # folders -> their files, and what they hold
 _included: tuple[Path, ...] = ()  # folders that every scene of this process knows beside the shipped ones
 _default: Registry | None = None
@@ -232,10 +230,7 @@ def default() -> Registry:
     return _default
 
 
-# -- one file
-# ------------------------------------------------------------------------------------------------------------
-
-
+# -- one file --------------------------------------------------------------------------------------------------------
 def _files(folder: Path) -> list[Path]:
     """The plugin files of a folder and its subfolders, in order."""
     if not folder.is_dir():

@@ -117,7 +117,8 @@ def coefficient(clear, stage: str, wavelengths, functions: Sequence[Callable]):
 def axis_rotation(forward, current, target):
     """Mueller matrix that turns Stokes vectors of light along `forward` from one axis across it to another.
 
-    mi.mueller.rotate_stokes_basis by way of cosine and sine: its angle has no derivative where the axes are the same."""
+    mi.mueller.rotate_stokes_basis by way of cosine and sine: its angle has no derivative where the axes are the
+    same."""
     import drjit as dr
     import mitsuba as mi
 

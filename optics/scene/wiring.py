@@ -1,6 +1,7 @@
 """Wiring: each part of a scene finds the parts that it depends on.
 
-A film in the skin moves with the skin's dent, the cells of a grid with the block around them, the block gives way to the
+A film in the skin moves with the skin's dent, the cells of a grid with the block around them, the block gives way to
+the
 target that presses it, a filling borders on the material that it is nested in. Mitsuba makes each part by itself, so a
 part looks for its neighbours when the scene is complete: `wire(scene)`. The integrator `tactile` calls it at its first
 image and the loader of this library at once; for Mitsuba's own integrators it is `optics.wire(scene)`. From then on

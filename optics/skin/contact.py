@@ -35,9 +35,7 @@ FLATTEST = 0.05  # slope that softens the contact edge of flat faces: a twentiet
 DETACHING = 0.3  # the weight of contact fades while the smoothed skin goes from 1 to 1.3 times the indenter's depth
 
 
-# -- Maps --------------------------------------------------------------------------------------------------------------
-
-
+# -- Maps ------------------------------------------------------------------------------------------------------------
 @dataclass(frozen=True, eq=False)
 class LocalMap:
     """A quantity around the press axis: values [v, u] at `axis` x `axis`, zero outside, twice differentiable.
@@ -114,9 +112,7 @@ def gaussian_blur(a: np.ndarray, sd: float) -> np.ndarray:
     return np.maximum(irfft2(spectrum, (m, m), overwrite_x=True), 0.0)
 
 
-# -- Indenters ---------------------------------------------------------------------------------------------------------
-
-
+# -- Indenters -------------------------------------------------------------------------------------------------------
 @dataclass(frozen=True, eq=False)
 class Profile:
     """Lower surface of an indenter: height in mm above its lowest point, on [v, u] = `axis` x `axis`.
@@ -346,9 +342,7 @@ def cone_over_polygon(u, v, corners, slope):
     return best
 
 
-# -- Mesh indenters ----------------------------------------------------------------------------------------------------
-
-
+# -- Mesh indenters --------------------------------------------------------------------------------------------------
 def mesh(axis, size, path, stamp, rotation, extent, pitch, slope):
     """Height and envelope of a mesh file at axis x axis, from a sampling at the nearest power of two of its size."""
     from scipy.ndimage import map_coordinates
@@ -457,9 +451,7 @@ def cone_envelope(height: np.ndarray, rise: float) -> np.ndarray:
     return out
 
 
-# -- Deformation -------------------------------------------------------------------------------------------------------
-
-
+# -- Deformation -----------------------------------------------------------------------------------------------------
 @lru_cache(maxsize=16)
 def displacement(
     profile: Profile, depth: float, thickness: float, smoothing: float, levels: int = 4, skirt: float = 0.0
@@ -490,7 +482,8 @@ def displacement(
         math.isfinite(depth) and math.isfinite(smoothing) and smoothing >= 0 and thickness > 0 and 0 <= skirt < 1e3
     ):
         raise ValueError(
-            f"press: depth = {depth:g} mm, smoothing = {smoothing:g} mm, thickness = {thickness:g} mm, skirt = {skirt:g} mm; "
+            f"press: depth = {depth:g} mm, smoothing = {smoothing:g} mm, thickness = {thickness:g} mm, skirt = "
+            f"{skirt:g} mm; "
             "need finite depth, smoothing >= 0, thickness > 0 and skirt >= 0"
         )
     n, pitch = len(profile.height), profile.pitch
@@ -600,9 +593,7 @@ def _hats(n: int, stride: int, m: int) -> np.ndarray:
     return np.maximum(0.0, 1.0 - np.abs(fine - coarse[:, None])) / stride
 
 
-# -- Surface -----------------------------------------------------------------------------------------------------------
-
-
+# -- Surface ---------------------------------------------------------------------------------------------------------
 def spline_weights(at: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
     """First index into padded coefficients and the four cubic B-spline weights (4, ...) at positions in nodes."""
     at = np.clip(at, -2.0, n + 1.0)  # beyond, all four weights fall on the zeros around
@@ -628,7 +619,7 @@ def surface(x: np.ndarray, y: np.ndarray, press_x: float, press_y: float, local_
         return sum(rows[:, i + k] * wx[k] for k in range(4))
     z = 0.0
     for k in range(4):
-        z = z + wy[k] * sum(wx[l] * c[j + k, i + l] for l in range(4))
+        z = z + wy[k] * sum(wx[m] * c[j + k, i + m] for m in range(4))
     return z
 
 

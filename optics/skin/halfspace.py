@@ -152,13 +152,15 @@ def _check(pitch: float, poisson: float, *depths: float) -> None:
     in_order = all(map(math.isfinite, depths)) and sorted(depths) == [*depths] and depths[0] >= 0
     if not (pitch > 0 and 0 <= poisson <= 0.5 and in_order):
         raise ValueError(
-            f"half-space: pitch = {pitch:g} mm, Poisson's ratio {poisson:g}, depth {' to '.join(f'{d:g}' for d in depths)} mm; "
+            f"half-space: pitch = {pitch:g} mm, Poisson's ratio {poisson:g}, depth "
+            f"{' to '.join(f'{d:g}' for d in depths)} mm; "
             "need pitch > 0, a ratio in 0 ... 0.5 and depths >= 0 in rising order"
         )
 
 
 class SkinStress:
-    """The stress pattern of a pressed skin for a sheet in it (plugins/effects/stress_birefringence.py): f(x, y, size) -> (P_q, P_u)
+    """The stress pattern of a pressed skin for a sheet in it (plugins/effects/stress_birefringence.py): f(x, y, size)
+    -> (P_q, P_u)
     in mm.
 
     x, y are the sheet's own axes as the camera sees it (x right, y up): y of the world and 2 s_xy change their signs.

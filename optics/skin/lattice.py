@@ -19,8 +19,7 @@ node, X the same at rest and V = h^3 the energy of a cell is
 
 alpha   N/mm  linear springs, along their lines at any length and direction
 beta    N mm  shear springs, chi = 2/3: what a spring's end moves in the frame that turns with the cell; T is the
-        rotation in the
-              polar decomposition of the cell's mean deformation gradient
+        rotation in the polar decomposition of the cell's mean deformation gradient
 kappa   MPa   the cell's resistance to a change of its volume V J, of the hexahedron with trilinear faces
 
 The first two are the source's. For long waves, with C_ijkl = 1/(2V) sum_j alpha g_j X_i X_j X_k X_l / |X|^2 over the 14
@@ -36,19 +35,16 @@ shear springs bear SHARE of mu; where nu < 1/6 they bear more, and kappa = 0: th
 
 Where the printed equations do not agree with each other or with the lattice, this is used:
 (7), (8)  alpha and beta are spring constants, so the braces are an energy and a force; over V they are densities, which
-          (9) then
-          adds to a weight in N and (12) divides by a mass. Here: without 1/V. (12) is right with F in N and theta in
-          1/ms.
+          (9) then adds to a weight in N and (12) divides by a mass. Here: without 1/V. (12) is right with F in N and
+          theta in 1/ms.
 (8)       F = +d phi/du has the wrong sign. The right-hand side is the force -d Phi/du of Phi = 1/2 sum_i phi_i, which
-          counts
-          every spring once.
+          counts every spring once.
 (7)       No angle of D3Q14 has the cosine sqrt(2)/2: they are 54.7 deg (1/sqrt(3)) between edge and diagonal and 70.5
           deg (1/3) between diagonals. With 45 deg the lattice is under stress at rest. With the right ones it is not
           isotropic: what springs on these angles add to C44 is 2 times what they add to (C11 - C12)/2 for the former
           alone, 0.95 times for both.
 (8)       The second term belongs to the energy chi beta g/2 |u_j - u_i|^2/|x|^2, which is no linearised angle and
-          charges for
-          turning the body as a whole (a Born spring). Here it is taken in the frame of the cell, as above.
+          charges for turning the body as a whole (a Born spring). Here it is taken in the frame of the cell, as above.
 
 Validity. Small strains: isotropic linear elasticity, turned by any angle. Large strains: a law of its own. For nu =
 0.47 its stress is within 4 % of a neo-Hookean body's from 0.6 to 1.1 times the length, 9 % above it at 1.2. Cells turn
@@ -105,9 +101,7 @@ BENDING = np.array([32 / 3] * 3 + [56 / 3])[:, None]
 VOLUME = ((1.0, (1, 2, 3)), (-1 / 3, (1, 5, 6)), (-1 / 3, (2, 6, 4)), (-1 / 3, (3, 4, 5)))
 
 
-# -- Materials and springs ---------------------------------------------------------------------------------------------
-
-
+# -- Materials and springs -------------------------------------------------------------------------------------------
 @dataclass(frozen=True)
 class Material:
     """An isotropic elastic material.
@@ -126,7 +120,8 @@ class Material:
         _positive("density", self.density, "g/cm^3")
         if not 0 <= self.poisson <= 0.499:
             raise ValueError(
-                f"Poisson's ratio = {self.poisson:g}; the lattice needs 0 to 0.499: below 0 its springs push, at 0.5 nothing "
+                f"Poisson's ratio = {self.poisson:g}; the lattice needs 0 to 0.499: below 0 its springs push, at 0.5 "
+                "nothing "
                 "changes its volume; take 0.47 to 0.49 for rubber"
             )
 
@@ -188,8 +183,10 @@ def equivalent(springs: Springs, pitch: float, weights: tuple[float, float] = WE
     c44 = diagonal + shear
     if not (c11 > c12 and c11 + 2 * c12 > 0 and c44 > 0):
         raise ValueError(
-            f"springs alpha = {springs.alpha:g} N/mm, beta = {springs.beta:g} N mm, kappa = {springs.kappa:g} MPa at a pitch of "
-            f"{pitch:g} mm carry no load (C11 = {c11:g}, C12 = {c12:g}, C44 = {c44:g} MPa); beta/h^3 must be above -alpha/h"
+            f"springs alpha = {springs.alpha:g} N/mm, beta = {springs.beta:g} N mm, kappa = {springs.kappa:g} MPa at a "
+            "pitch of "
+            f"{pitch:g} mm carry no load (C11 = {c11:g}, C12 = {c12:g}, C44 = {c44:g} MPa); beta/h^3 must be above "
+            "-alpha/h"
         )
     young = (c11 - c12) * (c11 + 2 * c12) / (c11 + c12)
     return Equivalent(young, c12 / (c11 + c12), 2 * c44 / (c11 - c12))
@@ -235,9 +232,7 @@ def _from_moduli(bulk: float, shear: float, density: float) -> Material:
     return Material(9 * bulk * shear / (3 * bulk + shear), (3 * bulk - 2 * shear) / (2 * (3 * bulk + shear)), density)
 
 
-# -- The lattice -------------------------------------------------------------------------------------------------------
-
-
+# -- The lattice -----------------------------------------------------------------------------------------------------
 @dataclass(frozen=True, eq=False)
 class Lattice:
     """A skin at rest, cut into cubes.
@@ -246,8 +241,7 @@ class Lattice:
     pitch     h in mm, the edge of a cell
     material  of a full cell
     factors   (R-1, C-1, L-1) > 0 that multiply the stiffness of single cells: 0.01 for one that was not filled; None:
-              all 1.
-              Below about 1e-4 a press takes long to solve. Masses stay
+              all 1. Below about 1e-4 a press takes long to solve. Masses stay
     held      'base' (the face z = -(L-1) h is glued), 'base and sides', or (R, C, L, 3) bool: coordinates of nodes that
               stay
 
@@ -274,7 +268,8 @@ class Lattice:
             factors = np.array(self.factors, float)
             if factors.shape != cells_shape or not (np.isfinite(factors).all() and (factors > 0).all()):
                 raise ValueError(
-                    f"stiffness factors of shape {factors.shape}, least {np.min(factors, initial=np.inf):g}; need shape "
+                    f"stiffness factors of shape {factors.shape}, least {np.min(factors, initial=np.inf):g}; need "
+                    "shape "
                     f"{cells_shape}, one above 0 for each cell (0.01 where it was not filled)"
                 )
             object.__setattr__(self, "factors", factors)
@@ -392,7 +387,7 @@ def inverted(positions: np.ndarray) -> np.ndarray:
     return found.reshape([n - 1 for n in shape])
 
 
-# -- Energy of the cells -----------------------------------------------------------------------------------------------
+# -- Energy of the cells ---------------------------------------------------------------------------------------------
 # Arrays are (3, 8, cells): component, corner or mode, cell.
 
 
@@ -545,9 +540,7 @@ def _assembled(lattice: Lattice, x):
     return bsr_array((data, columns, starts), shape=(3 * len(x), 3 * len(x))), data[diagonal]
 
 
-# -- Indenters ---------------------------------------------------------------------------------------------------------
-
-
+# -- Indenters -------------------------------------------------------------------------------------------------------
 Height = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
@@ -586,14 +579,13 @@ class Push:
     """An indenter that comes from +z, without friction.
 
     shape  f(x, y) -> mm above its lowest point, for arrays of mm from its own axis; inf where there is nothing.
-           `sphere`,
-           `punch`, `plate` or any function with bounded slopes: walls are to be cones, as in optics/skin/contact.py
+           `sphere`, `punch`, `plate` or any function with bounded slopes: walls are to be cones, as in
+           optics/skin/contact.py
     depth  mm, >= 0: how far its lowest point lies under the untouched face
     at     (x, y) mm of its axis
     shear  (x, y) mm by which it then moves sideways
     stuck  True: nodes that touch before the shear move with the indenter, whole; the others stay free and may come to
-           touch it.
-           False: it slides, so only where it ends matters
+           touch it. False: it slides, so only where it ends matters
     """
 
     shape: Height
@@ -616,9 +608,7 @@ class Push:
                 raise ValueError(f"{name} = {getattr(self, name)}; need two numbers (x, y) in mm")
 
 
-# -- Results -----------------------------------------------------------------------------------------------------------
-
-
+# -- Results ---------------------------------------------------------------------------------------------------------
 @dataclass(frozen=True, eq=False)
 class Deformed:
     """A skin under load.
@@ -661,9 +651,7 @@ class Deformed:
         return volume_ratio(self.positions, self.lattice.pitch)
 
 
-# -- Loads -------------------------------------------------------------------------------------------------------------
-
-
+# -- Loads -----------------------------------------------------------------------------------------------------------
 class _Setup:
     """A lattice and all that acts on it, checked: `nodal` forces (nodes, 3) N, the push, the nodes of the outer `face`.
 
@@ -688,7 +676,8 @@ class _Setup:
         heights = np.asarray(self.legs()[0].indenter(1.0).height(rest))
         if heights.shape != (len(rest),) or np.isnan(heights).any():
             raise ValueError(
-                f"the indenter's shape gives heights of shape {heights.shape}, {np.isnan(heights).sum()} of them not a number, "
+                f"the indenter's shape gives heights of shape {heights.shape}, {np.isnan(heights).sum()} of them not a "
+                "number, "
                 f"over {len(rest)} nodes; it must give one height in mm for each x, y, and inf where there is nothing"
             )
         if ((heights < push.depth) & ~lattice._free[self.face, 2]).any():
@@ -697,7 +686,8 @@ class _Setup:
             )
         if push.depth > 0 and heights.min() >= push.depth:
             raise ValueError(
-                f"depth = {push.depth:g} mm reaches no node: over the nearest one the indenter is {heights.min():g} mm above "
+                f"depth = {push.depth:g} mm reaches no node: over the nearest one the indenter is {heights.min():g} mm "
+                "above "
                 f"its lowest point; press deeper, take a pitch below {lattice.pitch:g} mm, or move it over the skin"
             )
 
@@ -866,9 +856,7 @@ def _result(leg: _Leg, share, x, touching, at_rest, steps, duration=0.0) -> Defo
     )
 
 
-# -- Rest, found directly ----------------------------------------------------------------------------------------------
-
-
+# -- Rest, found directly --------------------------------------------------------------------------------------------
 def balance(
     lattice: Lattice,
     push: Push | None = None,
@@ -883,8 +871,8 @@ def balance(
     forces     (R, C, L, 3) N on the nodes
     gravity    (3,) m/s^2, along x, y, z
     linear     True: small strains and displacements, as in linear elasticity: the stiffness at rest, heights of the
-               indenter over
-               the nodes at rest, contact forces along z. For comparisons; the default is exact for the lattice
+               indenter over the nodes at rest, contact forces along z. For comparisons; the default is exact for the
+               lattice
     tolerance  of Deformed.residual
     progress   called with (steps done, residual)
 
@@ -986,9 +974,7 @@ def _solve(matrix, diagonal, right, bounds: _Bounds, tolerance: float, most: int
     return x
 
 
-# -- Motion ------------------------------------------------------------------------------------------------------------
-
-
+# -- Motion ----------------------------------------------------------------------------------------------------------
 @dataclass(frozen=True, eq=False)
 class Moment:
     """One step of a motion; arrays are (R, C, L, 3), in mm, mm/ms and N.

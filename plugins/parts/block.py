@@ -91,7 +91,6 @@ def build():
             return box_points(self.sides, [self.number(n) for n in ("width", "length", "thickness")])
 
         # -- the press ------------------------------------------------------------------------------------------------
-
         def press(self):
             """The lattice under the present target (optics.skin.lattice.Deformed), or None where no corner is reached;
             kept."""

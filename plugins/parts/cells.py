@@ -107,7 +107,8 @@ def build():
             pitch, wall = self.number("pitch"), self.number("wall") + self.number("wall_error")
             if not 0 < wall < pitch:
                 raise ValueError(
-                    f"{self.name}.wall + wall_error = {wall:g} mm; allowed: above 0 and below {self.name}.pitch = {pitch:g} mm"
+                    f"{self.name}.wall + wall_error = {wall:g} mm; allowed: above 0 and below {self.name}.pitch = "
+                    f"{pitch:g} mm"
                 )
             i, j, k = (a.ravel() for a in np.meshgrid(*map(np.arange, self.counts), indexing="ij"))
             low = (

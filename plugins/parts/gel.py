@@ -217,7 +217,6 @@ def build():
             return map_coordinates(values, at, order=1, mode="constant")
 
         # -- the way of light in the gel ------------------------------------------------------------------------------
-
         def length_inside(self, p, q):
             """Length (mm) of the part of the segment p-q that lies in the gel, z > -thickness, for p inside."""
             share = (p.z + self.thickness) / dr.maximum(p.z - q.z, 1e-6)

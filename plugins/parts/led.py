@@ -199,8 +199,7 @@ def build():
                 kappa *= function(Beam(cos, distance, to_led, it.p, it.wavelengths), self)
             return kappa
 
-        # -- Mitsuba ------------------------------------------------------------------------------------------------
-
+        # -- Mitsuba --------------------------------------------------------------------------------------------------
         def sample_direction(self, it, sample, active=True):
             ds = dr.zeros(mi.DirectionSample3f)
             ds.p = self.point(sample)

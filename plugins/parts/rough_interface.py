@@ -153,8 +153,7 @@ def build():
             """J = d omega_m / d omega_o for along = wi.m and across = wo.m."""
             return dr.select(reflected, 0.25 / dr.abs(across), dr.abs(across) * dr.square(nu / (along + nu * across)))
 
-        # -- Mitsuba ------------------------------------------------------------------------------------------------
-
+        # -- Mitsuba --------------------------------------------------------------------------------------------------
         def sample(self, ctx, si, sample1, sample2, active=True):
             wi, facets = si.wi, self.facets()
             m, density = facets.sample(dr.mulsign(wi, wi.z), sample2)

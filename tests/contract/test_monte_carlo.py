@@ -343,6 +343,4 @@ def test_a_study_is_told_of_the_error_of_its_predictions(bench, tmp_path):
     finally:
         scene.integrator.rays, scene.integrator.packets = rays, packets
     assert 1.4 < shares[0] / shares[1] < 2.8 and shares[0] > checks.CHANCE
-    assert any("a Monte Carlo estimate" in text for text in checks.of_captures(model)) == (
-        shares[1] > checks.CHANCE
-    )
+    assert any("a Monte Carlo estimate" in text for text in checks.of_captures(model)) == (shares[1] > checks.CHANCE)

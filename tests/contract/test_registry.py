@@ -320,7 +320,8 @@ def test_a_second_kind_of_light_is_one_new_file(tmp_path, mitsuba):
 
 
 def test_a_second_kind_of_skin_is_one_new_file(tmp_path, mitsuba):
-    """It is pressed, freed per press and set back to rest by its own names, and what moves with a skin moves with it."""
+    """It is pressed, freed per press and set back to rest by its own names, and what moves with a skin moves with
+    it."""
     from optics.diagnosis.advice import families
     from optics.scene.parameter import Values
     from optics.study.setup import Setup, variables_of_base

@@ -15,7 +15,7 @@ RADIUS, BRIGHT, DARK = 4.2, 120.0, 20.0  # px, DN, DN
 FINE = 8  # samples per pixel and axis: the sampled outline places a centre of this radius to 0.01 px
 
 
-# -- Drawing ----------------------------------------------------------------------------------------------------------
+# -- Drawing ---------------------------------------------------------------------------------------------------------
 def cover(inside, shape=(HEIGHT, WIDTH)):
     """(H, W) share of each pixel in which inside(x, y) holds, by FINE x FINE samples."""
     s = (np.arange(FINE) + 0.5) / FINE

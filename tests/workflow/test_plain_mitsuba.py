@@ -22,7 +22,8 @@ CASES = {  # every shipped scene: what replaces its <default>s, at rest and pres
 # order round, so that images agree in the mean only.
 DRAWN = ("grid_bench", "magictac")
 SEEDS = 8
-# Mitsuba sums a smooth mesh's vertex normals in parallel, in an order that changes from load to load: a normal, and with
+# Mitsuba sums a smooth mesh's vertex normals in parallel, in an order that changes from load to load: a normal, and
+# with
 # it an image, is known to some roundings of a float32 (6e-8 each; up to 5e-9 of the largest value was seen).
 ROUNDING = 1e-6
 
