@@ -559,9 +559,8 @@ def _file(
     code = "\n".join([*body, *function, *check])
     imports = [
         *(["import numpy as np", ""] if re.search(r"\bnp\.", code) else []),
-        "from optics.scene.declare import Effect",
+        "from optics import Effect, Parameter",
         *(["from optics.lookup import lookup"] if "lookup(" in code else []),
-        "from optics.scene.parameter import Parameter",
     ]
     sections = {"Definition": definition, "Fingerprint": fingerprint, "Validity": validity, "References": references}
     doc = [f'"""{title}', ""]
