@@ -41,7 +41,7 @@ demo: setup  ## run the demonstration
 	@$(BIN)/optics demo $(ARGS)
 
 # One worker for each core, at most four: each takes 2 GB. A file stays with one worker, and so do its fixtures.
-PYTEST := $(BIN)/pytest -q -n auto --maxprocesses 4 --dist loadfile
+PYTEST := $(BIN)/pytest -q -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 
 test: setup  ## run the tests, but for the slow ones (ARGS="-n 0": in one process)
 	@$(PYTEST) -m "not slow" $(ARGS)
