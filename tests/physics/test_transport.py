@@ -211,6 +211,8 @@ def stock_lamp(shape):
 def by_stock(folder, bodies, fov, integrator="path"):
     import mitsuba as mi
 
+    from optics.scene.wiring import wire
+
     text = SCENE.replace("BANDS", "540").replace("FOV", str(fov)).replace("BODIES", "\n".join(bodies))
     text = text.replace(
         '<integrator type="tactile"><string name="bands" value="540"/></integrator>',
@@ -218,7 +220,9 @@ def by_stock(folder, bodies, fov, integrator="path"):
         'value="1000"/></integrator>',
     )
     (folder / "stock.xml").write_text(text)
-    return mi.load_file(str(folder / "stock.xml"), optimize=False, size="8")
+    scene = mi.load_file(str(folder / "stock.xml"), optimize=False, size="8")
+    wire(scene)  # for an integrator that does not know the parts
+    return scene
 
 
 def rendered(scene, spp, seeds):

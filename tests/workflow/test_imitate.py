@@ -73,4 +73,4 @@ def test_readings_are_not_imitated(tmp_path):
     capture_files.write(readings.sweep(bench.light({}), bench.settings()[:100], 1), tmp_path / "captures")
     loop.begin(bench.setup(tmp_path / "captures", 1), tmp_path / "study")
     said = CliRunner().invoke(app, ["imitate", str(tmp_path / "study"), "-o", str(tmp_path / "out")])
-    assert said.exit_code != 0 and "readings in a table are not imitated" in str(said.exception)
+    assert said.exit_code != 0 and "readings in a table cannot be imitated" in str(said.exception)

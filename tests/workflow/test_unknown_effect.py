@@ -21,7 +21,7 @@ def test_the_formula_is_what_the_maker_does_to_rows(tmp_path):
     height, width = 48, 6
     maker = object.__new__(story["RollingShutter"])
     maker.values, maker.camera, maker.size = {"camera.x_fov": 40.0, "camera.exposure": 1.0}, "camera", (width, height)
-    maker.effects, maker.seed = {}, 0
+    maker.effects, maker.seed, maker.frames_summed = {}, 0, 1
     maker.matrix, maker.noise = np.eye(3), Noise(1e-9, 0.0, 0.0, 1e9, 0.0)  # next to no noise and no rounding
     rows = maker.photograph(np.full((height, width, 3), 0.5), np.random.default_rng(0), 0)[:, 0, 0] / 0.5e9 - 1
     period = 1 / (story["HERTZ"] * story["LINE"])
