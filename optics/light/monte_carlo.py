@@ -1,5 +1,5 @@
-"""Predictions of scenes with dielectric bodies: their light is followed by Monte Carlo (optics.light.transport), with
-the same random numbers every time.
+"""Predictions of scenes with dielectric bodies, by Monte Carlo (optics.light.transport) with the same random numbers
+every time.
 
 The same seed gives the same image, so that fits and differences see a smooth function; its error is that of the rays
 and packets that the scene's integrator names (`rays` per pixel, `packets` per light)."""

@@ -2,7 +2,7 @@
 
 An independent path makes the captures of a shipped sensor (`optics.proof.makers.touch`: stock Mitsuba, a denser mesh,
 photons, read noise, 12 bits), with one effect that the base model lacks, chosen by the seed. They are taken with care:
-raw, near full scale, many frames summed, and the noise of the sum written down. Then the loop runs blind: calibrate,
+raw, near full scale, four frames summed, and the noise of the sum written down. Then the loop runs blind: calibrate,
 compare, name the missing effect, add it, and see the error on held-out presses fall to the noise. A report shows every
 step."""
 

@@ -48,7 +48,7 @@ def test_the_error_falls_to_the_noise_at_a_glance(mitsuba, tmp_path, monkeypatch
     monkeypatch.setitem(demo.SENSORS, "gelsight", (SMALL, demo.SENSORS["gelsight"][1]))
     result, story = found(tmp_path, "lens vignetting")
     assert result["first"] > 10, story
-    # of about 2000 values held out per LED, chi2 per value scatters by 1 %; rims of a few pixels add to that
+    # 7 mosaics of 3072 values are held out: chi2 per value scatters by sqrt(2/21504) = 1 %; the model's rims add to it
     assert result["held_out"] == pytest.approx(1, abs=0.05), story
     assert result["verdict"] == "NOTHING" and result["right"], story
 
