@@ -1,9 +1,13 @@
 """What the camera makes of the light: bands to irradiance, channels, response, digital numbers.
 
     I_b  = lens(L_b)                        effects of the stage `lens`
+         = sum_j w_j lens(S_j)_b            of a camera with a mosaic of analysers: what its pixels let through
     I_c  = exposure gain gain_c sum_b M_cb I_b     then effects of the stage `sensor`
     m_c  = G_c^-1(I_c)                      then effects of the stage `response`
     DN   = black + (saturation - black) m_c + offset
+
+with the weights w = 1/2 (1, cos 2a, sin 2a) of the Stokes vector in a pixel whose analyser stands at the angle a,
+counterclockwise in the image from its right, and the effects of the stage `site` on them.
 
 All of it is numpy arithmetic, analytic in the image and in every camera parameter, so that derivatives come from a
 complex step: f'(x) v = Im f(x + i h v)/h with h = 1e-30, exact to rounding (Squire & Trapp, SIAM Rev. 40, 110, 1998).
@@ -13,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 
@@ -43,6 +48,8 @@ class Developer:
     camera     the scene's camera part
     bands      wavelengths of the image's bands, nm
     black, saturation    DN; (0, 1) for radiance
+    site       (H, W) rad, the analyser angle of each pixel of a mosaic; None for a camera without one. With a mosaic
+               images per band are Stokes vectors, (3, H, W, B)
     """
 
     def __init__(self, camera, bands: tuple[float, ...], black: float = 0.0, saturation: float = 255.0):
@@ -55,6 +62,11 @@ class Developer:
         self.neutral = {n: p.neutral for n, p in camera.numbers.items()}
         self.effects = {stage: camera.registry.at_stage(camera.kind, stage) for stage in IMAGE_STAGES}
         self.v, self.u = np.mgrid[: self.height, : self.width] + 0.5
+        self.site = None
+        mosaic = getattr(camera, "mosaic", ())
+        if mosaic:
+            cell = np.radians(np.array(mosaic, float))
+            self.site = cell[np.ix_(*(np.arange(n) % m for n, m in zip((self.height, self.width), cell.shape)))]
 
     def view(self, values: Mapping[str, complex]) -> SimpleNamespace:
         """What an image function sees as `camera`: every parameter of the camera, and the geometry of its pixels.
@@ -75,6 +87,7 @@ class Developer:
             width=self.width,
             height=self.height,
             bands=np.array(self.bands),
+            site=self.site,
             settings=values,
         )
 
@@ -87,9 +100,26 @@ class Developer:
 
     def channels(self, image, view):
         """Irradiance per channel, 1 = full scale, of an image per band (H, W, B)."""
-        image = self._stage("lens", image, view)
+        image = self._stage("lens", image, view) if self.site is None else self.behind_analysers(image, view)
         image = image @ self.matrix.T
         return self._stage("sensor", image * self.scale(view), view)
+
+    def behind_analysers(self, stokes, view) -> np.ndarray:
+        """Irradiance per band (H, W, B) behind the analyser of each pixel, of Stokes vectors (3, H, W, B).
+
+        A lens treats all polarizations alike; what it adds to darkness is unpolarized."""
+        dark = self._stage("lens", np.zeros(np.shape(stokes)[1:]), view)
+        weights = self.weights(view)
+        total: Any = 0.0
+        for j, component in enumerate(stokes):
+            total = total + weights[..., j, None] * (self._stage("lens", component, view) - (dark if j else 0.0))
+        return total
+
+    def weights(self, view) -> np.ndarray:
+        """(H, W, 3): share of S0, S1 and S2 that each pixel of a mosaic records."""
+        double = 2 * self.site
+        ideal = np.stack([np.ones_like(double), np.cos(double), np.sin(double)], -1) / 2
+        return self._stage("site", ideal, view)
 
     def gains(self, view) -> np.ndarray:
         """(C,) gain of each channel."""
@@ -105,7 +135,8 @@ class Developer:
         return self.black + (self.saturation - self.black) * m + self.camera.added(view)
 
     def develop(self, image: np.ndarray, values: Mapping[str, complex]) -> np.ndarray:
-        """DN (H, W, C), noise-free and not clipped, of radiance per band (H, W, B)."""
+        """DN (H, W, C), noise-free and not clipped, of radiance per band (H, W, B), of Stokes
+        vectors (3, H, W, B) for a mosaic of analysers."""
         view = self.view(values)
         return self.respond(self.channels(image, view), view)
 

@@ -51,6 +51,7 @@ class Path:
     shape: np.ndarray  # (N,) index of the scene's shape that a path ends on, -1 for none
     lost: np.ndarray  # (N,) bool: reflected totally, or after STEPS surfaces
     fields: dict  # the layers' stress patterns when the rays were traced
+    regions: list[np.ndarray] = field(default_factory=list)  # (N,) the number of the region met, of each map
     matrices: dict = field(
         default_factory=dict
     )  # of layers at real values: a derivative by one layer leaves the others
@@ -147,7 +148,22 @@ def trace(scene, u: np.ndarray, v: np.ndarray) -> Path:
         shape,
         lost,
         {n: scene.parts[n].field for n in names if getattr(scene.parts[n], "field", None) is not None},
+        _regions(scene, names, steps, step),
     )
+
+
+def _regions(scene, names: list[str], steps: list[Step], end: Step) -> list[np.ndarray]:
+    """The numbers of the regions that rays meet, of each map on a layer or a source; 0 where they meet none."""
+    found = []
+    for name in (*names, *scene.sources):
+        part = scene.parts[name]
+        regions = part.map_of_regions({n: getattr(part, n) for n in part.words})
+        if regions is not None:
+            layer = name in names
+            for step in steps if layer else [end]:
+                met = regions(step.u, step.v)
+                found.append(np.where(step.part == names.index(name), met, 0) if layer else met)
+    return found
 
 
 def _which(met, pointers: list):
@@ -217,7 +233,10 @@ def part_values(scene, name: str, values: Mapping, fields: Mapping) -> SimpleNam
         return np.reshape(value, (-1, 1)) if isinstance(value, np.ndarray) else value
 
     return SimpleNamespace(
-        name=name, **{n: shaped(values[f"{name}.{n}"]) for n in (*part.numbers, *part.words)}, field=fields.get(name)
+        name=name,
+        **{n: shaped(values[f"{name}.{n}"]) for n in (*part.numbers, *part.words)},
+        **part.context({n: values[f"{name}.{n}"] for n in part.words}),
+        field=fields.get(name),
     )
 
 
@@ -260,9 +279,32 @@ def slab(matrix: Mueller, share) -> Slab:
     return side.after(Slab(matrix * (1 / ((1 - share) * (1 - share))))).after(side)
 
 
+def detected(scene, values: Mapping) -> tuple:
+    """The row (r0, r1, r2, r3) by which the camera weighs S0 ... S3 of the light that reaches it: (1, 0, 0, 0) unless
+    effects of the stage `detector` are in force; entries are numbers or (N, 1).
+
+    Behind a mosaic of analysers a detector meets one polarization: its weights are those of the stage `site`."""
+    row: tuple = (1.0, 0, 0, 0)
+    camera = scene.camera
+    if camera is None or getattr(camera, "mosaic", ()) or not scene.registry.at_stage(camera.kind, "detector"):
+        return row
+    own = part_values(scene, camera.name, values, {})
+    for effect in active_effects(scene.registry, camera.kind, vars(own), "detector"):
+        row = effect.stages["detector"](row, own)
+    return row
+
+
+def undetected(scene) -> dict[str, float]:
+    """The parameters of the stage `detector` at neutral, by key: with them component 0 is S0."""
+    camera = scene.camera
+    effects = () if camera is None else scene.registry.at_stage(camera.kind, "detector")
+    return {f"{camera.name}.{n}": camera.numbers[n].neutral for e in effects for n in e.parameter_names}
+
+
 def transmission(scene, path: Path, values: Mapping, bands: np.ndarray, component: int = 0, until: str = "") -> tuple:
     """A row of the Mueller matrix from a path's end to the camera: how much of each of S0 ... S3 there becomes the
-    `component` here; 4 entries (N, B).
+    `component` here; 4 entries (N, B). Component 0 is what the camera records (`detected`): S0, unless its detector
+    prefers a polarization.
 
     N is the number of rays, or of the readings that `values` holds arrays for (then one ray serves them all). Rays that
     are lost transmit nothing. `until` a part: from that part, without it, to the camera; nothing where a ray does not
@@ -271,6 +313,7 @@ def transmission(scene, path: Path, values: Mapping, bands: np.ndarray, componen
     count = max([len(path.lost), *(np.size(v) for v in values.values() if isinstance(v, np.ndarray))])
     kind = complex if any(np.iscomplexobj(v) for v in values.values()) else float
     out = [np.zeros((count, len(bands)), kind) for _ in range(4)]
+    start = detected(scene, values) if component == 0 else tuple(1.0 if j == component else 0 for j in range(4))
     for group, (parts, rays) in enumerate(path.sequences()):
         names = [(path.names[index], step) for step, index in zip(path.steps, parts) if index >= 0]
         if until:
@@ -291,7 +334,7 @@ def transmission(scene, path: Path, values: Mapping, bands: np.ndarray, componen
             )
             for place, (name, step) in enumerate(names)
         ]
-        row = tuple(1.0 if j == component else 0 for j in range(4))
+        row = start
         shares = {name: reflected(scene, name, values) for name, _ in names}
         if any(np.any(np.asarray(share) != 0) for share in shares.values()):
             stack = None

@@ -17,6 +17,7 @@ from types import MappingProxyType
 import numpy as np
 
 from optics.captures.capture_set import Captures, check
+from optics.captures.noise import Noise
 from optics.errors import BadCapture, BadScene, UnknownKey
 from optics.files import exr
 from optics.files.output import replacing
@@ -575,14 +576,15 @@ def sweep(
     *,
     radiance: bool = False,
     captures: Captures | None = None,
+    noise: Noise | None = None,
     only: Mapping = MappingProxyType({}),
     progress: Callable[[str, int, int], None] | None = None,
 ) -> Sweep:
     """What the pixel that holds the position `at` reads as a parameter takes the values x.
 
     values     replace the scene's
-    radiance   per band; without it DN per channel, by the captures' black level and saturation (0 and 255 without
-               captures)
+    radiance   per band; without it DN per channel, by black level and saturation of the captures, or else of `noise`
+               (0 and 255 without either)
     captures   readings to hold beside it, of a table or of the pixel: a curve for each combination of their other
                settings
     only       of the captures those with these settings; of a light's power, which captures set as a drive level, it is
@@ -593,14 +595,16 @@ def sweep(
     width, height = scene.camera.resolution
     column, row = (min(int(p), size - 1) for p, size in zip(at, (width, height)))
     base = {**scene.values(), **scene.check(values or {})}
-    noise = captures.noise if captures is not None else None
+    noise = captures.noise if captures is not None else noise
     black, top = (noise.black_level, noise.saturation) if noise is not None else (0.0, 255.0)
     bands = scene.integrator.bands or (540.0,)
     developer = Developer(scene.camera, bands, black, top)
     groups, notes = [({}, [], None)], []
     if captures is not None:
         groups, notes = _groups(captures, scene, key, base, values or {}, only, row, column)
-    whole = _needs_all_pixels(scene, developer, base, {k for settings, *_ in groups for k in settings} | {key})
+    whole = developer.site is not None or _needs_all_pixels(
+        scene, developer, base, {k for settings, *_ in groups for k in settings} | {key}
+    )
     spot = Spot(scene, column, row, whole)
     total, done = sum(len(x) + len(own) for _, own, _ in groups), 0
     drives = set(scene.powers.values()) if captures is not None else set()
@@ -657,6 +661,8 @@ def _needs_all_pixels(scene: Scene, developer: Developer, base: Mapping, turned:
 
 def _reading(spot: Spot, now: Mapping, developer: Developer | None) -> np.ndarray:
     """(C,) what the spot's pixel reads in DN, or without a developer its radiance per band."""
+    if developer is not None and developer.site is not None:
+        return developer.develop(np.stack([spot.radiance(now, component=j) for j in range(3)]), now)[spot.at]
     image = spot.radiance(now)
     if developer is None:
         return image[spot.at]

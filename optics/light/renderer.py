@@ -68,6 +68,7 @@ class Renderer:
         }
         self.layer_order = sorted(self.layer_keys | words)  # what the layers' matrices depend on
         led_keys = {k for k in scene.parameters if k.rsplit(".", 1)[0] in scene.lights} - self.layer_keys
+        led_keys -= {k for k in led_keys if scene.parameters[k].role == "regions"}  # which are geometry
         self.power_keys = scene.power_keys(*scene.lights)  # images are kept per unit of each
         own = [k for k in scene.parameters if k not in image_keys and k not in led_keys and k not in self.layer_keys]
         self.bounce_key = scene.key(scene.integrator.name, "second bounce") or ""
@@ -247,7 +248,8 @@ class Renderer:
     def image(self, values: Mapping, light: str, component: int = 0) -> np.ndarray:
         """(H, W, B) what one light makes at power 1, layers and all; (N, 1, B) where `values` hold arrays of readings.
 
-        component  of the Stokes vector in the camera's axes
+        component  of the Stokes vector in the camera's axes; 0: what the camera records, S0 unless its detector
+                   prefers a polarization (stage `detector`)
         """
         image = self.led(values, light)
         if not self.layered:
@@ -339,13 +341,15 @@ class Renderer:
         return self.powers(values, light) * image
 
     def radiance(self, values: Mapping, seed: int = 0, component: int = 0) -> np.ndarray:
-        """(H, W, B): linear image; complex where `values` hold a complex step of a layer's parameter."""
+        """(H, W, B): linear image that the camera records; complex where `values` hold a complex step of a layer's
+        parameter."""
         lights = (self.light(values, n, seed, component) for n in self.lit(values))
         return sum(lights, self.ambient(values, component))
 
     def stokes(self, values: Mapping, seed: int = 0) -> np.ndarray:
         """(4, H, W, B): Stokes vectors at the camera; (4, N, 1, B) where `values` hold arrays of readings."""
-        return np.stack([self.radiance(values, seed, component) for component in range(4)])
+        plain = {**values, **paths.undetected(self.scene)}
+        return np.stack([self.radiance(plain, seed, component) for component in range(4)])
 
     def _rim_samples(self, hits: Hits, index: np.ndarray):
         key = index.tobytes()
@@ -429,18 +433,18 @@ class Renderer:
         shares = [values[key] for key in self.scene.band_powers[led]] + [1.0] * self.bands
         return values[self.scene.powers[led]] * np.array(shares[: self.bands])
 
-    def led_tangent_at_rest(self, values: Mapping, led: str, key: str) -> np.ndarray:
+    def led_tangent_at_rest(self, values: Mapping, led: str, key: str, component: int = 0) -> np.ndarray:
         """`led_tangent`, kept: all frames share the gel at rest."""
-        known = (key, *self._led_key(values, led), *(values[k] for k in self.layer_order))
+        known = (key, component, *self._led_key(values, led), *(values[k] for k in self.layer_order))
         if known not in self._tangents:
-            self._tangents[known] = self.led_tangent(values, led, key).astype(np.float32)
+            self._tangents[known] = self.led_tangent(values, led, key, component).astype(np.float32)
             while len(self._tangents) > 8 * len(self.scene.lights):
                 self._tangents.popitem(last=False)
         return self._tangents[known]
 
-    def led_tangent(self, values: Mapping, led: str, key: str) -> np.ndarray:
-        """d radiance / d parameter of one LED's image, forward mode; rims by central differences where the LED
-        moves."""
+    def led_tangent(self, values: Mapping, led: str, key: str, component: int = 0) -> np.ndarray:
+        """d / d parameter of one LED's image (of a component of the Stokes vectors), forward mode; rims by central
+        differences where the LED moves."""
         import drjit as dr
         import mitsuba as mi
 
@@ -478,7 +482,9 @@ class Renderer:
             lambda: tangent(image.hits.sample, image.visible),
             moved_rim if moves else lambda: tangent(image.samples, image.rim_visible),
         )
-        return self._mix(image, raw, self.weights(values, image) if self.layered else (1.0, 1.0))
+        if component and not self.layered:
+            return np.zeros((self.height, self.width, self.bands))
+        return self._mix(image, raw, self.weights(values, image, component) if self.layered else (1.0, 1.0))
 
     def bounced(self, values: Mapping, led: str, seed: int = 0, component: int = 0) -> np.ndarray:
         """(H, W, B): light of one LED at power 1 after two reflections, unpolarized before any layers, as a component
@@ -583,7 +589,7 @@ class Hits:
         self.valid = np.array(self.si.is_valid()).reshape(height, width)
         self.edges = _edges(self.valid)
         if self.path is not None:  # what is passed, and what is met, changes at an edge
-            for met in (self.path.shape, *(step.part for step in self.path.steps)):
+            for met in (self.path.shape, *self.path.regions, *(step.part for step in self.path.steps)):
                 self.edges |= _edges(met.reshape(height, width))
             self.edges |= _creases(np.where(self.valid[..., None], self.normal, 0.0))
         self.bent = (

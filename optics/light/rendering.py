@@ -172,10 +172,11 @@ class RenderJob:
 
     def _exact(self, now: Mapping, seed: int) -> Rendering:
         renderer = self.renderer
-        alone = {light: renderer.light(now, light, seed) for light in renderer.lit(now)}
-        totals = [sum(alone.values(), renderer.ambient(now))]
+        arriving = {**now, **paths.undetected(self.scene)}  # the Stokes vectors before the detector weighs them
+        alone = {light: renderer.light(arriving, light, seed) for light in renderer.lit(now)}
+        totals = [sum(alone.values(), renderer.ambient(arriving))]
         if renderer.layered:
-            totals += [renderer.radiance(now, seed, component) for component in (1, 2, 3)]
+            totals += [renderer.radiance(arriving, seed, component) for component in (1, 2, 3)]
         channels = self._radiance_channels(np.stack(totals, -1), now)
         if "aov" in self.layers:
             channels.update(self._surface(renderer.hits(now), now))
@@ -188,7 +189,15 @@ class RenderJob:
             channels.update({f"variance.{name}": image for name, image in scatter.items() if name in channels})
         header = exr.spectral_header(renderer.layered, UNITS) if self.bands else {}
         self.scene.set(now)  # the renderer leaves the LEDs at power 1
-        return Rendering(channels, header, self.developer.develop(totals[0], now))
+        return Rendering(channels, header, self._developed(totals, now))
+
+    def _developed(self, stokes: Sequence[np.ndarray], now: Mapping) -> np.ndarray:
+        """(H, W, C) DN of Stokes vectors, (H, W, B) each; without S1 and S2, light is unpolarized."""
+        if self.developer.site is None:
+            row = paths.detected(self.scene, now)
+            return self.developer.develop(sum(w * s for w, s in zip(row[1:], stokes[1:])) + row[0] * stokes[0], now)
+        whole = [stokes[j] if j < len(stokes) else np.zeros_like(stokes[0]) for j in range(3)]
+        return self.developer.develop(np.stack(whole), now)
 
     def _monte_carlo(self, now: Mapping, seed: int) -> Rendering:
         scene = self.scene
@@ -202,14 +211,14 @@ class RenderJob:
         finally:
             if ours:
                 scene.integrator.stokes = asked
-        radiance = None
+        vectors: list[np.ndarray] = []
         if ours and polarized:
             mean, variance = ({name: image for name, image in c.items() if "." in name} for c in (mean, variance))
             lanes = self.bands or (0.0,)
             pick = lambda c, s: np.stack([c[f"S{s}.{j}"] for j in range(len(lanes))], -1)  # noqa: E731
-            radiance = pick(mean, 0)
+            vectors = [pick(mean, s) for s in range(4)]
             components = range(4) if self.stokes else range(1)
-            channels = self._radiance_channels(np.stack([pick(mean, s) for s in components], -1), now)
+            channels = self._radiance_channels(np.stack([vectors[s] for s in components], -1), now)
             if self.bands:
                 scatter = exr.spectral_channels(self.bands, np.stack([pick(variance, s) for s in range(4)], -1))
                 variance = {n: image for n, image in scatter.items() if n in channels}
@@ -219,10 +228,10 @@ class RenderJob:
         if "aov" in self.layers:
             channels.update(self._surface(self._hits(), now))
         header = {
-            **(exr.spectral_header(self.stokes, UNITS) if radiance is not None and self.bands else {}),
+            **(exr.spectral_header(self.stokes, UNITS) if vectors and self.bands else {}),
             "samplesPerPixel": spp,
         }
-        camera = self.developer.develop(radiance, now) if radiance is not None else None
+        camera = self._developed(vectors, now) if vectors else None
         return Rendering(channels, header, camera)
 
     def _passes(self, seed: int) -> tuple[dict, dict, int]:

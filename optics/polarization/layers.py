@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
-from optics.polarization.mueller import Mueller, cos, sin, sqrt, where
+from optics.polarization.mueller import Mueller, absorber, cos, sin, sqrt, where
 
 
 def dot(a, b):
@@ -92,11 +92,17 @@ class Crossing:
 
 
 def evaluate(own: Callable, crossing: Crossing, layer, effects=()) -> Mueller:
-    """The layer's own Mueller matrix, then those of `effects` (of the stage `layer`), in their order."""
+    """The layer's own Mueller matrix, then those of `effects` (of the stage `layer`), in their order.
+
+    A layer with `cover`, f(u, v) -> 1 or 0, does nothing where that is 0."""
     matrix = own(crossing, layer)
     for effect in effects:
         matrix = effect.stages["layer"](crossing, layer) @ matrix
-    return matrix
+    cover = getattr(layer, "cover", None)
+    if cover is None:
+        return matrix
+    inside = cover(crossing.u, crossing.v)
+    return matrix * inside + absorber(1 - inside)
 
 
 class Texture:

@@ -204,6 +204,36 @@ def retarder(a, b) -> Mueller:
     )
 
 
+def elliptical_retarder(a, b, c) -> Mueller:
+    """Retarder of the linear components a, b (as in `retarder`) and the circular component c, rad, which act together.
+
+    A turn of the Poincare sphere by delta = sqrt(a^2 + b^2 + c^2) about w = (a, b, c)/delta: S' = cos(delta) S +
+    sin(delta) S x w + (1 - cos(delta)) (w.S) w. c alone turns the axis of linear polarization by -c/2, counted from x
+    to y. Goldstein (2011), sec. 9.5; Azzam & Bashara, Ellipsometry and Polarized Light (1987), 2.5."""
+    square = a * a + b * b + c * c
+    s, g = sinc(square), cosc(square)
+    return Mueller(
+        [
+            [1.0, 0, 0, 0],
+            [0, 1 - g * (b * b + c * c), g * (a * b) + s * c, g * (a * c) - s * b],
+            [0, g * (a * b) - s * c, 1 - g * (a * a + c * c), g * (b * c) + s * a],
+            [0, g * (a * c) + s * b, g * (b * c) - s * a, 1 - g * (a * a + b * b)],
+        ]
+    )
+
+
+def twisted_retarder(a, b, twist, c=0.0) -> Mueller:
+    """Retarder whose axis turns evenly by `twist` (rad, from x to y) from where light enters to where it leaves; (a, b)
+    are its linear components with the axis that it has in its middle, c a circular one.
+
+    In axes that turn along with it the plate is uniform and has the circular component 2 twist on top:
+        M = rotation(-twist) elliptical_retarder(a', b', c + 2 twist),  a' + i b' = (a + i b) exp(-i twist)
+    Yeh & Gu, Optics of Liquid Crystal Displays, 2nd ed., 4.3."""
+    half_q, half_u = cos(twist), sin(twist)  # of the axis, which stands at half the twist in the middle
+    entry = elliptical_retarder(a * half_q + b * half_u, b * half_q - a * half_u, c + 2 * twist)
+    return rotation(cos(2 * twist), -sin(2 * twist)) @ entry
+
+
 def depolarizer(keep_linear, keep_circular=None) -> Mueller:
     """diag(1, l, l, c): the share of linear and of circular polarization that a layer leaves (c = l unless given)."""
     c = keep_linear if keep_circular is None else keep_circular

@@ -31,7 +31,7 @@ def agree(found, expected, relative: float = 1e-12, absolute: float = 0.0) -> No
 def numbers(kind: str, **changed) -> SimpleNamespace:
     """A part's parameters at their defaults, some of them changed, as the functions of effects read them."""
     declared = {p.name: p.default for p in known().parameters_of(kind)}
-    unknown = changed.keys() - declared.keys()
+    unknown = changed.keys() - declared.keys() - {"cover", "regions"}
     assert not unknown, f"{kind} has no parameter {', '.join(sorted(unknown))}"
     return SimpleNamespace(name=kind, field=None, **{**declared, **changed})
 
@@ -82,7 +82,7 @@ def mueller(kind: str, crossing: Crossing | None = None, **changed) -> np.ndarra
     crossing, layer = crossing or ray(), numbers(kind, **changed)
     effects = known().at_stage(kind, "layer")
     neutral = {p.name: p.neutral for p in known().parameters_of(kind)}
-    active = [e for e in effects if any(getattr(layer, n) != neutral[n] for n in e.parameter_names)]
+    active = [e for e in effects if any(getattr(layer, n) != neutral[n] for n in e.at_rest)]
     matrix = evaluate(known().parts[kind].mueller, crossing, layer, active).numpy()
     return np.broadcast_to(matrix, (1, len(crossing.wavelengths), 4, 4))[0]
 

@@ -20,15 +20,20 @@ Where an effect enters, in the order that light takes (`STAGES`):
                 optics.polarization.mueller
     layer       a layer   M  = f(crossing, layer)     Mueller matrix that light passes after the layer's own
                 (optics.polarization.layers)
+    detector    camera    r  = f(row, camera)         the row (r0, r1, r2, r3) by which the detector weighs S0 ... S3,
+                (1, 0, 0, 0) before; numpy
     lens        camera    I  = f(image, camera)       irradiance per band, (H, W, B); numpy
+    site        camera    w  = f(weights, camera)     share of S0, S1, S2 that a pixel of a mosaic of analysers
+                records, (H, W, 3); numpy
     sensor      camera    I  = f(image, camera)       signal per channel, (H, W, C), 1 = full scale; numpy
     response    camera    m  = f(image, camera)       response per channel, 1 = full scale; numpy
 
-`camera` has the camera's parameters, the geometry of its pixels (optics.light.development), and in `settings` all
-values by key, such as `source.time`. Functions of the stages `lens` and `sensor` are affine in the image, those of
-`response` act pixel by pixel. All three must be analytic (no abs, max or branches on their complex arguments): their
-derivatives are taken by complex step, exact to rounding (Squire & Trapp, SIAM Rev. 40, 110, 1998). An effect without
-functions frees parameters that its part has."""
+`camera` has the camera's parameters, the geometry of its pixels (optics.light.development), in `settings` all
+values by key, such as `source.time`; `site` (H, W) holds the analyser angle of each pixel of a mosaic, rad. Functions
+of the stages `lens`, `site` and `sensor` are affine in what they are given, those of `response` act pixel by pixel. All
+must be analytic (no abs, max or branches on their complex arguments): their derivatives are taken by complex step,
+exact to rounding (Squire & Trapp, SIAM Rev. 40, 110, 1998). An effect without functions frees parameters that its part
+has."""
 
 from __future__ import annotations
 
@@ -50,11 +55,13 @@ STAGES = {  # stage -> the role of the parts that it belongs to
     "index": "clear",
     "absorption": "clear",
     "layer": "",
+    "detector": "camera",
     "lens": "camera",
+    "site": "camera",
     "sensor": "camera",
     "response": "camera",
 }
-IMAGE_STAGES = ("lens", "sensor", "response")
+IMAGE_STAGES = ("lens", "site", "sensor", "response")
 LED_BY_LED = frozenset(("emission", "segment", "volume", "reflection", "ambient"))  # Monte Carlo light passes none
 ROLES = {  # of parts: all that the library knows of them; a kind plays the role of its own name unless it says another
     "camera": "images are developed by its gains, response and what it adds; one in a scene",
@@ -137,6 +144,8 @@ class Effect:
                 added
     checks      closed forms, as in Part
     random      plausible values, as in Part
+    drafted_from  of a draft: what identifies the captures that its numbers were drawn from, words apart by blanks
+                (optics.captures.identity). A diagnosis of the same data does not test it
     """
 
     name: str
@@ -155,8 +164,15 @@ class Effect:
     field: Callable | None = None
     checks: tuple[Callable[[], None], ...] = ()
     random: Callable | None = None
+    drafted_from: str = ""
     doc: str = ""
     file: str = ""
+
+    @property
+    def at_rest(self) -> tuple[str, ...]:
+        """Names of all that must be at neutral for its functions to be the identity: its parameters, and of what shapes
+        it that which other effects free."""
+        return (*self.parameter_names, *(p.name for p in self.shape if p.neutral is not None))
 
     @property
     def key(self) -> str:

@@ -16,16 +16,13 @@ from optics.scene.surfaces import passing, to_local_mueller
 MONO = 540.0  # nm: the wavelength of variants that know none
 
 
-def active_effects(registry: Registry, kind: str, values: Mapping) -> list:
-    """Effects of the stage `layer` that do not rest at neutral, for values by parameter name (numbers, arrays,
-    complex)."""
+def active_effects(registry: Registry, kind: str, values: Mapping, stage: str = "layer") -> list:
+    """Effects of a stage that do not rest at neutral, for values by parameter name (numbers, arrays, complex)."""
     import numpy as np
 
     neutral = {p.name: p.neutral for p in registry.parameters_of(kind)}
     return [
-        e
-        for e in registry.at_stage(kind, "layer")
-        if any(np.any(np.asarray(values[n]) != neutral[n]) for n in e.parameter_names)
+        e for e in registry.at_stage(kind, stage) if any(np.any(np.asarray(values[n]) != neutral[n]) for n in e.at_rest)
     ]
 
 
@@ -107,6 +104,7 @@ def numbers_of(part) -> SimpleNamespace:
     return SimpleNamespace(
         name=part.name,
         field=getattr(part, "field", None),
+        **part.context({n: getattr(part, n) for n in part.words}),
         **{n: getattr(part, n) for n in (*part.numbers, *part.words)},
     )
 
@@ -119,14 +117,20 @@ def layer(
     polarizes: bool = False,
     checks: tuple = (),
     random: Callable | None = None,
+    beside: tuple[str, ...] = (),
 ) -> Part:
     """The declaration of a layer: its name in XML, its parameters, its Mueller matrix, whether it polarizes light, its
-    checks and its sampler."""
+    checks and its sampler.
+
+    beside  parameters that effects free only where the layer covers a part of the view: elsewhere they are a share of
+    the
+            light's power
+    """
     return Part(
         kind,
         "bsdf",
         parameters,
-        lambda: bsdf(kind, mueller),
+        lambda: bsdf(kind, mueller, beside),
         checks,
         mueller=mueller,
         polarizes=polarizes,
@@ -134,7 +138,7 @@ def layer(
     )
 
 
-def bsdf(kind: str, own: Callable) -> type:
+def bsdf(kind: str, own: Callable, beside: tuple[str, ...] = ()) -> type:
     """A null BSDF of the present Mitsuba variant that weighs passing light with the layer's matrix."""
     import drjit as dr
     import mitsuba as mi
@@ -155,6 +159,8 @@ def bsdf(kind: str, own: Callable) -> type:
                     "optimize=False, as Mitsuba makes one of equal materials"
                 )
             self.carrier, self.skin = carriers[0] if carriers else None, scene.one("gel")
+            if self.word("regions") is not None and shapes:
+                self.place_maps(scene.one("camera"), shapes[0])
             self.follow(self.carrier, self.skin)
             if not self._leaders:
                 self.place()
@@ -162,6 +168,19 @@ def bsdf(kind: str, own: Callable) -> type:
         def place(self):
             fields = [e.field(self) for e in self.registry.at_stage(kind, "layer") if e.field is not None]
             self.field = next((found for found in fields if found is not None), None)
+
+        def takes(self, name):
+            regions = self.map_of_regions({n: getattr(self, n) for n in self.words})
+            if regions is None:
+                return name not in beside
+            return regions.has(int(getattr(self, self.word("region"))))
+
+        def context(self, words):
+            regions = self.map_of_regions(words)
+            if regions is None:
+                return {}
+            number = int(words[self.word("region")])
+            return {"cover": lambda x, y: regions.within(x, y, number)}
 
         def extent(self):
             return None if self.carrier is None else (self.carrier.numbered("width"), self.carrier.numbered("length"))

@@ -251,7 +251,7 @@ class Scene:
         if name not in self.parts:
             return True  # a stock plugin's may do anything
         declared = self.declaration(name)
-        if declared.category == "sensor" or declared.refracts:
+        if declared.category == "sensor" or declared.refracts or self.parameters[key].role == "regions":
             return True
         return parameter in self.registry.shaping(declared.kind)
 

@@ -15,6 +15,7 @@ from pathlib import Path
 from optics.errors import BadPlugin, BadScene, UnknownKey
 from optics.scene.declare import IMAGE_STAGES, Part
 from optics.scene.parameter import Parameter
+from optics.scene.regions import found_file
 from optics.scene.registry import Registry, default, include
 
 DEFAULT_VARIANT = "llvm_ad_spectral_polarized"
@@ -206,6 +207,7 @@ class Declared:
     role: str
     band: float | None = None  # nm: what a mono variant renders, where the scene's integrator names one band
     unrendered: Mapping[str, str] = {}  # parameters without a derivative through mi.render, and why
+    region_size = 0.0  # mm across a map of regions; 0: as wide as the camera sees
     _wired = False
     _waits = ""  # of a material: why it cannot be asked before its scene is wired
     _leaders = ()
@@ -263,6 +265,8 @@ class Declared:
         self.held: dict[str, float] = {}  # the numbers as Python floats, to ask without waiting for the device
         self._order = next(_made)
         self._folders = tuple(str(folder) for folder in mi.file_resolver())
+        if any(p.role == "regions" for p in self.registry.parameters_of(self.kind)):
+            self.read_map_size(props)
         for p in self.registry.parameters_of(self.kind):
             value = p.check(props.get(p.name, p.default), f"{self.name}.{p.name}", "scene")
             if p.is_number:
@@ -274,8 +278,7 @@ class Declared:
 
     def find_file(self, name: str) -> Path:
         """A file that the scene names, beside the scene's file or where Mitsuba looks for files."""
-        places = [Path(folder) / name for folder in self._folders]
-        return next((place for place in places if place.is_file()), places[0])
+        return found_file(self._folders, name)
 
     # -- neighbours ---------------------------------------------------------------------------------------------------
     def wire(self, scene) -> None:
@@ -322,7 +325,7 @@ class Declared:
             if name in e.parameter_names and self.kind in self.registry.kinds(e.part)
             for s in e.stages
         }
-        if stages and stages <= {*IMAGE_STAGES, "glow"}:
+        if stages and stages <= {*IMAGE_STAGES, "detector", "glow"}:
             return "it acts on the finished image"
         return self.unrendered.get(name, "")
 
@@ -372,6 +375,28 @@ class Declared:
             )
         return self.held[name]
 
+    def word(self, role: str) -> str | None:
+        """The name of the part's word that has a role; None where it has none."""
+        return next((name for name, p in self.words.items() if p.role == role), None)
+
+    def context(self, words: Mapping[str, str]) -> dict:
+        """What the part's functions read besides its parameters, for values of its words."""
+        return {}
+
+    def map_of_regions(self, words: Mapping[str, str]):
+        """The map of regions (optics.scene.regions.Regions) that the part's words name; None for none."""
+        name = self.word("regions")
+        return None if name is None or words[name] == "whole" else self.maps(words[name])
+
+    def read_map_size(self, props) -> None:
+        self.region_size = float(props.get("region_size", 0.0))
+
+    def place_maps(self, camera, shape) -> None:
+        """Maps of regions `region_size` mm wide, or as wide as the camera sees the shape."""
+        from optics.scene.regions import Maps, view_width
+
+        self.maps = Maps(self._folders, self.region_size or view_width(camera, shape))
+
     def takes(self, name: str) -> bool:
         """Whether a parameter does anything where the part stands in its scene."""
         return True
@@ -388,7 +413,7 @@ class Declared:
             for e in self.registry.at_stage(self.kind, stage)
             if any(
                 n in self.held and (self.held[n] != self.numbers[n].neutral or dr.grad_enabled(getattr(self, n)))
-                for n in e.parameter_names
+                for n in e.at_rest
             )
         )
 

@@ -11,10 +11,11 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from optics.errors import OutOfBounds, UnknownKey
-from optics.words import spaced
+from optics.words import Reach, spaced
 
 HOW = ("ad", "difference", "image", "layer", "path")
 FREE = ("", "all", "press")
+FALL = 10.0  # a linearisation lowers a factor to no less than this part of it: at 0 it would hide everything else
 ROLES = {  # of parameters: what the library turns, sets or solves for, whatever a part calls it
     "power": "scales all light of a light; 0 switches it off",
     "band power": "share of the power in one spectral band (`band`)",
@@ -38,6 +39,8 @@ ROLES = {  # of parameters: what the library turns, sets or solves for, whatever
     "face": "share of light that each face of a film reflects",
     "clock": "when a frame was taken",
     "approach": "from which side a setting was reached",
+    "regions": "a word: the map of regions on a surface (optics.scene.regions)",
+    "region": "a word: the number of the region that a layer covers",
 }
 
 
@@ -63,6 +66,15 @@ class Parameter:
     saturates   of a squared parameter s: the value v beyond which its effect levels off; a fit steps in s^2/(1 +
                 s^2/v^2)
     linear      True where the image is exactly linear in it (one render serves every value)
+    multiplies  True of a factor on the light that passes (a transmittance, a gain) in which the image need not be
+                linear: a fit that stepped it to 0 would see nothing of anything else
+    starts      values at which a search begins besides the present one, of what a fit cannot reach step by step from
+                there: other orders of a retardance, other quadrants of an unknown zero
+    pair        name of the part's parameter that is the other component of the same vector; `starts` are then its
+                lengths, each taken in eight directions
+    through     name of the part's setting through whose changes alone it shows: where that has one value in all frames,
+                it acts as other parameters do (a wobble as a transmittance, a scale as an offset), and no effect frees
+                it there
     role        what it is to the library, one of ROLES; '' for what only the part itself and effects read
     band        number of the spectral band that it belongs to, from 0; None: of all bands
     free        what a calibration solves for unless its setup says otherwise: 'all' (one value for all frames), 'press'
@@ -83,6 +95,10 @@ class Parameter:
     how: str = "ad"
     step: float = 0.1
     linear: bool = False
+    multiplies: bool = False
+    starts: tuple[float, ...] = ()
+    pair: str = ""
+    through: str = ""
     squared: bool = False
     saturates: float = math.inf
     role: str = ""
@@ -99,8 +115,10 @@ class Parameter:
             raise ValueError(f"parameter {self.name}: free = {self.free!r} is none of {', '.join(map(repr, FREE))}")
         if self.how not in HOW:
             raise ValueError(f"parameter {self.name}: how = {self.how!r} is none of {', '.join(HOW)}")
-        if not self.choices and not self.bounds[0] <= float(self.default) <= self.bounds[1]:
-            raise OutOfBounds(self.name, float(self.default), self.unit, self.bounds, "declaration")
+        if not self.choices:
+            for value, where in ((self.default, "declaration"), *((start, "a start") for start in self.starts)):
+                if not self.bounds[0] <= float(value) <= self.bounds[1]:
+                    raise OutOfBounds(self.name, float(value), self.unit, self.bounds, where)
 
     @property
     def is_number(self) -> bool:
@@ -111,9 +129,19 @@ class Parameter:
         return self.is_number
 
     @property
+    def reach(self) -> Reach:
+        """What its value can be, for text."""
+        return Reach(*self.bounds, self.plausible)
+
+    @property
     def factor(self) -> bool:
-        """Whether the image is proportional to it, or a part of the image is."""
-        return self.linear and self.neutral is None and self.bounds[0] == 0
+        """Whether the image is proportional to it, or a part of the image is: a power, a reflectance, a
+        transmittance. 0 switches that off, and is no place that a fit may step to from above."""
+        return (self.linear or self.multiplies) and self.neutral != 0 and self.bounds[0] == 0
+
+    def lowest(self, value: float) -> float:
+        """How far down one linearisation may lead: to the lower bound, of a factor above 0 to a tenth of its value."""
+        return value / FALL if self.factor and value > 0 else self.bounds[0]
 
     def coordinate(self, value: float) -> float:
         """u(value): what a fit steps in, so that the image is nearly linear in it."""
@@ -144,9 +172,10 @@ class Parameter:
         return 1e-6 * self.plausible
 
     def side(self, value: float) -> int:
-        """+1 at the lower bound, from which it may only rise; -1 at the upper; 0 between."""
+        """+1 at the lower bound, from which it may only rise; -1 at the upper; 0 between. A factor, whose scale may be
+        any, stands at 0 only where it is 0."""
         low, high = self.bounds
-        return 1 if value <= low + self.near else -1 if value >= high - self.near else 0
+        return 1 if value <= low + (0 if self.factor else self.near) else -1 if value >= high - self.near else 0
 
     def sides(self, value: float) -> tuple[float, float]:
         """The two values of a central difference, `step` to either side, within bounds."""

@@ -36,6 +36,7 @@ def check_contrast():
 effect = Effect(
     name="depolarization",
     part="sheet",
+    per="part",
     stages={"layer": mix},
     parameters=(
         Parameter(

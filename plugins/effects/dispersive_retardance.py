@@ -27,6 +27,7 @@ def check_ratio_of_colours():
 effect = Effect(
     name="dispersive retardance",
     part="sheet",
+    per="part",
     parameters=("retard_dispersion",),
     acts=("channel", "analyzer.angle"),
     needs="a retardance, in two colours or more",

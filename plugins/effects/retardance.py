@@ -3,6 +3,9 @@
 Definition
     delta(lambda) = delta_540 (540/lambda) (1 + retard_dispersion ((540/lambda)^2 - 1))
     delta_540 = sqrt(retard_0^2 + retard_45^2),  fast axis = atan2(retard_45, retard_0)/2 + angle of the sheet
+    M = twisted_retarder(a, b, twist, -2 rotation (540/lambda)^2)      optics.polarization.mueller
+where (a, b) are delta cos and sin of twice the axis, in the plate's middle if it is twisted. `twist` and `rotation` are
+0 unless their own effects, `twisted plate` and `optical rotation`, free them.
 An oblique ray sees the part of the in-plane birefringence that lies across it, over a longer path
 (optics.polarization.layers.Crossing.retardance). A wave plate is retard_0 = 90 deg (quarter wave) or 180 deg (half
 wave) and an `angle`. The two components, in place of retardance and axis, pass through zero without a seam. Dispersion
@@ -20,10 +23,13 @@ import math
 
 import numpy as np
 
-from optics.polarization.mueller import cos, retarder, sin
+from optics.polarization.mueller import cos, retarder, sin, twisted_retarder
 from optics.scene.checking import agree, mueller, ray
 from optics.scene.declare import Effect
 from optics.scene.parameter import Parameter
+
+# deg: within a quarter of an order cos(delta) is monotonic; the first leaves 0, where it has no slope
+ORDERS = (30.0, *(90.0 * k for k in range(1, 9)))
 
 
 def retard(crossing, sheet):
@@ -32,7 +38,11 @@ def retard(crossing, sheet):
     b = sheet.retard_0 * sin(turn) + sheet.retard_45 * cos(turn)
     ratio = 540.0 / crossing.wavelengths
     radians = (math.pi / 180) * ratio * (1 + sheet.retard_dispersion * (ratio * ratio - 1))
-    return retarder(*(c * radians for c in crossing.retardance(a, b, sheet.index)))
+    a, b = (c * radians for c in crossing.retardance(a, b, sheet.index))
+    if all(isinstance(angle, (int, float)) and angle == 0 for angle in (sheet.twist, sheet.rotation)):
+        return retarder(a, b)
+    circular = (-2 * math.pi / 180) * sheet.rotation * (ratio * ratio)
+    return twisted_retarder(a, b, (math.pi / 180) * sheet.twist + 0.0 * a, circular)
 
 
 def check_crossed_polarizers():
@@ -60,6 +70,7 @@ def random(rng):
 effect = Effect(
     name="retardance",
     part="sheet",
+    per="part",
     stages={"layer": retard},
     onset="both",
     parameters=(
@@ -71,6 +82,8 @@ effect = Effect(
             "retardance at 540 nm with the fast axis at 0 deg of the sheet (less that at 90)",
             neutral=0.0,
             plausible=10.0,
+            starts=ORDERS,
+            pair="retard_45",
             how="layer",
         ),
         Parameter(
@@ -81,6 +94,8 @@ effect = Effect(
             "retardance at 540 nm with the fast axis at 45 deg of the sheet (less that at 135)",
             neutral=0.0,
             plausible=10.0,
+            starts=ORDERS,
+            pair="retard_0",
             how="layer",
         ),
     ),
@@ -93,6 +108,26 @@ effect = Effect(
             "dispersion of the birefringence",
             neutral=0.0,
             plausible=0.05,
+            how="layer",
+        ),
+        Parameter(
+            "twist",
+            "deg",
+            0.0,
+            (-1440.0, 1440.0),
+            "turn of the plate's axis along the light, counterclockwise for who sees it",
+            neutral=0.0,
+            plausible=5.0,
+            how="layer",
+        ),
+        Parameter(
+            "rotation",
+            "deg",
+            0.0,
+            (-1440.0, 1440.0),
+            "optical rotation at 540 nm, counterclockwise for who sees the light",
+            neutral=0.0,
+            plausible=1.0,
             how="layer",
         ),
     ),

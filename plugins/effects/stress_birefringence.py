@@ -110,10 +110,21 @@ effect = Effect(
     name="stress birefringence",
     field=field,
     part="sheet",
+    per="part",
     stages={"layer": strain},
     onset="both",
     parameters=(
-        Parameter("stress", "MPa", 0.0, (-1e3, 1e3), "stress of the pattern", neutral=0.0, plausible=0.2, how="layer"),
+        Parameter(
+            "stress",
+            "MPa",
+            0.0,
+            (-1e3, 1e3),
+            "stress of the pattern",
+            neutral=0.0,
+            plausible=0.2,
+            starts=(-9.0, 9.0, -18.0, 18.0, -27.0, 27.0, -36.0, 36.0),  # 9 MPa in 3 mm retard by 90 deg
+            how="layer",
+        ),
     ),
     shape=(
         Parameter(

@@ -26,12 +26,15 @@ XML
     fy float, fx: focal length in px along y, in place of `aspect`; read where `fx` is given, as are cx and cy
     cx float, half the width: principal point, px, in place of `principal_x`
     cy float, half the height: principal point, px, in place of `principal_y`
+    mosaic string: angles of the analysers on the pixels of a polarization camera, deg, row by row as the camera sees
+        them: "90 45; 135 0"; none without it; `mosaic` in captures.toml replaces it
     sensitivity string, identity: sensitivities of the channels: a camera of the colour-science library by its name, or
         one channel per band
 """
 
 import math
 
+from optics.polarization.mosaic import read_mosaic
 from optics.scene.checking import agree, made
 from optics.scene.declare import Part
 from optics.scene.mitsuba_parts import Declared
@@ -107,6 +110,7 @@ PARAMETERS = (
         "gain of a frame relative to the others",
         neutral=1.0,
         plausible=0.02,
+        multiplies=True,
         how="image",
     ),
     *(
@@ -118,6 +122,7 @@ PARAMETERS = (
             f"gain of channel {c} in a frame, times `gain`",
             neutral=1.0,
             plausible=0.02,
+            multiplies=True,
             how="image",
         )
         for c in "rgb"
@@ -183,11 +188,16 @@ def build():
                 props["principal_x"] = float(props.get("cx", width / 2)) - width / 2
                 props["principal_y"] = float(props.get("cy", height / 2)) - height / 2
             self.sensitivity = props.get("sensitivity", "identity")
+            self.mosaic = read_mosaic(props.get("mosaic", ""))
             self.declare(props)
             self.resolution = (width, height)
             matrix = [[float(nominal.matrix[i, j]) for j in range(4)] for i in range(3)]
             self.columns = [dr.opaque(mi.Vector3f, [matrix[i][j] for i in range(3)]) for j in range(4)]
             self.m_needs_sample_3 = False
+
+        def takes(self, name):
+            idle = "detector" if self.mosaic else "site"  # behind an analyser a pixel meets one polarization
+            return not any(name in effect.parameter_names for effect in self.registry.at_stage(self.kind, idle))
 
         def traverse(self, cb):
             mi.Sensor.traverse(self, cb)

@@ -2,7 +2,8 @@
 
 Definition
     M = diattenuator(t(angle), T1, T2) (1 + w_c cos(psi) + w_s sin(psi))
-    angle = scale psi + offset + approach backlash / 2           psi: what the dial says, `angle`
+    angle = scale psi + offset + approach backlash / 2 + e_c cos(psi) + e_s sin(psi)
+                                                                 psi: what the dial says, `angle`
     T1 = transmittance exp(transmittance_slope (lambda - 540)/100)   along the transmission axis t
     T2 = leak + leak_tilt (lambda - 540)/100 + leak_oblique sin(theta)^2       across it, not below 0
 with t across the ray and across the absorbing molecules, t = k x a: two crossed sheets that are dark on the axis leak
@@ -12,7 +13,8 @@ a viewer at whom the surface's normal points. T1 and T2 are those of the whole s
 reflect that share, and light that goes to and fro between them and the faces of other films is summed.
 Fingerprint
     two of them follow Malus, cos^2 of the angle between; a leak lifts the dark end, an offset shifts the curve, a
-    wobble returns once per turn (Malus twice), a backlash splits the curves turned one way and the other.
+    wobble returns once per turn (Malus twice), an eccentric dial shifts the curve one way and, half a turn on, the
+    other, a backlash splits the curves turned one way and the other.
 Validity
     thin sheets, no refraction in them; reflections between films as at normal incidence. At T2 = 0 the leak of a film
     that polarized light reaches (the middle one of three, one behind a tilted face) starts as a square root, whose
@@ -50,7 +52,16 @@ PARAMETERS = (
         plausible=1.0,
         how="layer",
     ),
-    Parameter("transmittance", "1", 0.8, (0.0, 1.0), "transmittance T1 along the axis", plausible=0.05, how="layer"),
+    Parameter(
+        "transmittance",
+        "1",
+        0.8,
+        (0.0, 1.0),
+        "transmittance T1 along the axis",
+        plausible=0.05,
+        multiplies=True,
+        how="layer",
+    ),
     Parameter(
         "transmittance_slope",
         "1",
@@ -83,7 +94,15 @@ PARAMETERS = (
         how="layer",
     ),
     Parameter(
-        "offset", "deg", 0.0, (-90.0, 90.0), "misalignment: axis at dial 0", neutral=0.0, plausible=1.0, how="layer"
+        "offset",
+        "deg",
+        0.0,
+        (-180.0, 180.0),
+        "misalignment: axis at dial 0",
+        neutral=0.0,
+        plausible=1.0,
+        starts=(-45.0, 45.0, 90.0),
+        how="layer",
     ),
     Parameter(
         "scale",
@@ -93,6 +112,7 @@ PARAMETERS = (
         "axis turns this much per turn of the dial",
         neutral=1.0,
         plausible=0.01,
+        through="angle",
         how="layer",
     ),
     Parameter(
@@ -113,6 +133,29 @@ PARAMETERS = (
         "width of the dead zone of the drive",
         neutral=0.0,
         plausible=0.5,
+        through="approach",
+        how="layer",
+    ),
+    Parameter(
+        "eccentric_c",
+        "deg",
+        0.0,
+        (-20.0, 20.0),
+        "error of the dial once per turn, cosine part e_c",
+        neutral=0.0,
+        plausible=0.4,
+        through="angle",
+        how="layer",
+    ),
+    Parameter(
+        "eccentric_s",
+        "deg",
+        0.0,
+        (-20.0, 20.0),
+        "error of the dial once per turn, sine part e_s",
+        neutral=0.0,
+        plausible=0.4,
+        through="angle",
         how="layer",
     ),
     Parameter(
@@ -123,6 +166,7 @@ PARAMETERS = (
         "change of transmittance once per turn, cosine part w_c",
         neutral=0.0,
         plausible=0.01,
+        through="angle",
         how="layer",
     ),
     Parameter(
@@ -133,6 +177,7 @@ PARAMETERS = (
         "change of transmittance once per turn, sine part w_s",
         neutral=0.0,
         plausible=0.01,
+        through="angle",
         how="layer",
     ),
     Parameter(
@@ -150,12 +195,13 @@ PARAMETERS = (
 
 
 def polarize(crossing, film):
-    q, u = crossing.polarizer_axis(film.scale * film.angle + film.offset + film.approach * film.backlash / 2)
+    dial = film.angle * (math.pi / 180)
+    shifted = film.eccentric_c * cos(dial) + film.eccentric_s * sin(dial)
+    q, u = crossing.polarizer_axis(film.scale * film.angle + film.offset + film.approach * film.backlash / 2 + shifted)
     steps = (crossing.wavelengths - 540.0) / 100
     t1 = film.transmittance * exp(film.transmittance_slope * steps)
     t2 = film.leak + film.leak_tilt * steps + film.leak_oblique * (1 - crossing.cos * crossing.cos)
     t2 = where(real(t2) < 0, 0.0 * t2, t2)
-    dial = film.angle * (math.pi / 180)
     film_matrix = diattenuator(q, u, t1, t2) * (1 + film.wobble_c * cos(dial) + film.wobble_s * sin(dial))
     return film_matrix * film.inserted + absorber(1 - film.inserted)
 

@@ -7,12 +7,17 @@ n = `index` is the sheet's index over that of what surrounds it: 1 in the middle
 plate in air. What the sheet does to polarization besides are effects: `retardance`, `stress`, `depolarization`. With
 them it is a wave plate, a stressed plate, or a depolarizing foil; their axes turn with the sheet's `angle`. Angles
 count from the surface's x axis to its y axis: counterclockwise for a viewer at whom the surface's normal points.
+A sheet that covers a part of the view alone has a map, `region_map` (optics.scene.regions): it acts where the map has
+the number `region` and does nothing elsewhere, so that one photograph shows the sample beside bare light. The map stays
+where it is when the sheet turns. Two sheets with one map and two numbers are two samples.
 Fingerprint
     weakens the light behind it; a tilted one polarizes weakly, across the plane of incidence.
 Validity
     thin: a ray is not shifted; reflections between its own faces are left out (4 % of 4 % at n = 1.5).
 References
     Born & Wolf, Principles of Optics, 1.5.2.
+XML
+    region_size float, 0.0: width of the map of regions, mm; 0: as wide as the camera sees
 """
 
 import math
@@ -21,6 +26,7 @@ from optics.polarization.mueller import diattenuator, exp, fresnel
 from optics.scene.checking import agree, mueller, principal_transmittances, ray
 from optics.scene.layer import layer
 from optics.scene.parameter import Parameter
+from optics.scene.regions import FILES, PATTERNS, Regions
 
 PARAMETERS = (
     Parameter(
@@ -31,6 +37,7 @@ PARAMETERS = (
         "transmittance at 540 nm without the faces' losses",
         neutral=1.0,
         plausible=0.05,
+        multiplies=True,
         how="layer",
     ),
     Parameter(
@@ -61,9 +68,29 @@ PARAMETERS = (
         "turn of the sheet about its normal",
         role="angle",
         plausible=1.0,
+        starts=(22.5, 67.5, 112.5, 157.5),
         how="layer",
     ),
+    Parameter(
+        "region_map",
+        "-",
+        "whole",
+        role="regions",
+        choices=("whole", "halves", "quarters"),
+        doc="where the sheet is: whole, halves (0 left, 1 right), quarters (0 1 above 2 3) or an image of numbers",
+        files=FILES,
+    ),
+    Parameter(
+        "region",
+        "-",
+        "1",
+        role="region",
+        choices=tuple("01234567"),
+        doc="number of the region that the sheet covers, where it has a map",
+    ),
 )
+
+BESIDE = ("transmittance",)  # without bare light beside it, it is a share of the light's power
 
 
 def pass_sheet(crossing, sheet):
@@ -84,9 +111,22 @@ def check_plate():
     agree(oblique, [[1.0], [(1 - ((n * n - 1) / (n * n + 1)) ** 2) ** 2]])
 
 
+def check_regions():
+    """A sheet of t = 0.5 on the right half alone: 0.5 at x = +1 mm, 1 at -1 mm; in a quarter alone, in the fourth."""
+    for pattern, number, expected in (("halves", 1, [0.5, 1.0, 0.5, 1.0]), ("quarters", 3, [1.0, 1.0, 0.5, 1.0])):
+        regions = Regions(PATTERNS[pattern], 4.0)
+
+        def cover(x, y, regions=regions, number=number):
+            return regions.within(x, y, number)
+
+        places = ((1.0, 1.0), (-1.0, 1.0), (1.0, -1.0), (-1.0, -1.0))
+        found = [mueller("sheet", ray(u=u, v=v), transmittance=0.5, cover=cover)[0, 0, 0] for u, v in places]
+        agree(found, expected)
+
+
 def random(rng):
     """A plate or a foil at any angle; its transmittance leaves room for a colour."""
     return {"index": rng.uniform(1.0, 1.6), "transmittance": rng.uniform(0.5, 0.85), "angle": rng.uniform(0, 180)}
 
 
-part = layer("sheet", PARAMETERS, pass_sheet, checks=(check_plate,), random=random)
+part = layer("sheet", PARAMETERS, pass_sheet, checks=(check_plate, check_regions), random=random, beside=BESIDE)

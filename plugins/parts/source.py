@@ -77,7 +77,15 @@ PARAMETERS = (
         how="layer",
     ),
     Parameter(
-        "drift", "1", 0.0, (-1.0, 1.0), "relative change per unit of time", neutral=0.0, plausible=0.01, how="layer"
+        "drift",
+        "1",
+        0.0,
+        (-1.0, 1.0),
+        "relative change per unit of time",
+        neutral=0.0,
+        plausible=0.01,
+        through="time",
+        how="layer",
     ),
     Parameter(
         "time",
