@@ -6,6 +6,7 @@ import html
 import math
 import re
 from collections.abc import Collection, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 
@@ -82,6 +83,14 @@ def percent(value: object, digits: int = 3, typeset: bool = False) -> str:
     return f"{figures(100 * x, digits)}\u202f%" if typeset else f"{100 * x:.{digits}g} %"
 
 
+def share_text(share: object, typeset: bool = False) -> str:
+    """A part of a whole in whole per cent, 0 to 100: what noise puts beyond either end is the end."""
+    x = as_float(share)
+    if math.isnan(x):
+        return "–" if typeset else "-"
+    return f"{min(max(x, 0.0), 1.0):.0%}".replace("%", "\u202f%" if typeset else "%")
+
+
 def p_text(p: object, typeset: bool = False) -> str:
     """A probability, in two digits."""
     x = as_float(p)
@@ -90,11 +99,61 @@ def p_text(p: object, typeset: bool = False) -> str:
     return "?" if math.isnan(x) else "<1e-9" if x < 1e-9 else f"{x:.1e}" if x < 1e-3 else f"{x:.2g}"
 
 
-def with_sd(value: object, sd: object, typeset: bool = False) -> str:
-    """0.3142, 0.0123 -> '0.314 +- 0.012': both rounded at the second digit of the standard deviation."""
+# -- numbers that mean something -------------------------------------------------------------------------------------
+NOT_DETERMINED, ERROR_UNKNOWN, NO_LIMIT = "not determined", "error unknown", "no limit"
+BEYOND = 10.0  # plausible sizes: a limit above it excludes nothing that anybody would expect
+UNBOUNDED = 1000.0  # plausible sizes that stand for the range of a parameter without bounds
+
+
+@dataclass(frozen=True)
+class Reach:
+    """What a parameter's value can be: its bounds and its plausible size, in its unit. NaN: not known."""
+
+    low: float = -math.inf
+    high: float = math.inf
+    plausible: float = math.nan
+
+    @property
+    def width(self) -> float:
+        """high - low; without bounds, UNBOUNDED plausible sizes; infinite where these are not known."""
+        if math.isfinite(self.high - self.low):
+            return self.high - self.low
+        return math.inf if math.isnan(self.plausible) else UNBOUNDED * abs(self.plausible)
+
+    def holds(self, value: object, sd: object = 0.0) -> bool:
+        """Whether an estimate says anything: it is finite and within its bounds, and its error is less than their
+        width. An error that is not known (NaN) is no reason against it."""
+        x, s = as_float(value), as_float(sd)
+        slack = 1e-6 * self.width if math.isfinite(self.width) else 0.0  # of rounding, for what stands at a bound
+        return math.isfinite(x) and self.low - slack <= x <= self.high + slack and not s >= self.width
+
+    def excludes(self, limit: object, start: object = 0.0) -> bool:
+        """Whether an upper limit of the change from `start` rules anything out: it is finite, some value within bounds
+        lies beyond it, and it is below BEYOND plausible sizes."""
+        x, at = as_float(limit), as_float(start)
+        farthest = max(self.high - at, at - self.low)
+        return math.isfinite(x) and x < farthest and not x > BEYOND * abs(self.plausible)
+
+
+ANYWHERE = Reach()
+
+
+def with_sd(value: object, sd: object, typeset: bool = False, unit: str = "", reach: Reach = ANYWHERE) -> str:
+    """0.3142, 0.0123 -> '0.314 +- 0.012': both rounded at the second digit of the standard deviation.
+
+    'not determined' in place of a number that says nothing: it is not finite, lies beyond the bounds of its parameter,
+    or its standard deviation is infinite or larger than the bounds are wide. 'error unknown' where the standard
+    deviation is not a number. A standard deviation of 0 is left out: the value is not an estimate.
+    """
     x, s = as_float(value), as_float(sd)
-    if not (math.isfinite(s) and s > 0 and (math.isfinite(x) or not typeset)):
-        return number(x, 5, typeset=True) + (" ± ∞" if math.isinf(s) else "") if typeset else f"{x:.3g}"
+    if not reach.holds(x, s):
+        return NOT_DETERMINED
+    return _rounded(x, s, typeset) + spaced(unit) + (f" ({ERROR_UNKNOWN})" if math.isnan(s) else "")
+
+
+def _rounded(x: float, s: float, typeset: bool) -> str:
+    if not s > 0:
+        return number(x, 5, typeset=True) if typeset else f"{x:.3g}"
     places = max(0, 1 - math.floor(math.log10(s)))
     if not typeset:
         places = min(places, 12)
@@ -102,6 +161,19 @@ def with_sd(value: object, sd: object, typeset: bool = False) -> str:
     if places > 7 or s >= 1e5:
         return f"{number(x, 4, typeset=True)} ± {number(s, 2, typeset=True)}"
     return f"{round(x, places) + 0.0:.{places}f} ± {s:.{places}f}".replace("-", "−")
+
+
+def below(
+    limit: object, typeset: bool = False, unit: str = "", reach: Reach = ANYWHERE, start: object = 0.0, digits: int = 2
+) -> str:
+    """An upper limit of the change from `start`: '< 0.55 deg', or 'no limit' where it rules nothing out."""
+    return f"< {number(limit, digits, typeset)}{spaced(unit)}" if reach.excludes(limit, start) else NO_LIMIT
+
+
+def times_sd(value: object) -> str:
+    """A difference in standard deviations: '+3.1 sd'; 'error unknown' where there is no such number."""
+    x = as_float(value)
+    return f"{x:+.1f} sd" if math.isfinite(x) else ERROR_UNKNOWN
 
 
 def as_float(value: Any) -> float:

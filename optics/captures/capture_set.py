@@ -12,23 +12,54 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from optics.captures import readings
-from optics.captures.noise import DEMOSAICED, SATURATED, UNITS, Noise, step_of
+from optics.captures.noise import DEMOSAICED, SATURATED, UNITS, UNLIMITED, Noise, repeated, step_of
+from optics.captures.readings import DECIMALS, DELIMITERS, NAMES, Row, Table
 from optics.errors import BadCapture, OutputExists, UnknownKey
 from optics.files import toml_checks as checks
 from optics.files.images import SUFFIXES, read_image, read_mask, write_image
 from optics.files.output import new_folder
+from optics.polarization import mosaic as mosaics
+from optics.polarization.mosaic import Mosaic
 from optics.scene.parameter import Parameter
+from optics.words import key_of
 
 FILE = "captures.toml"
 MARK = "# Written by optics"
-KEYS = ("scene", "values_are", "flat_field", "cfa", "noise", "parameters", "frames", "table")
-FRAME_KEYS = ("image", "mask", "repeats", "group", "parameters")
-TABLE_KEYS = ("file", "values", "rename", "scale")
+KEYS = (
+    "scene",
+    "values_are",
+    "bands",
+    "absent",
+    "flat_field",
+    "cfa",
+    "mosaic",
+    "noise",
+    "parameters",
+    "uncertainty",
+    "exclude",
+    "frames",
+    "table",
+)
+FRAME_KEYS = ("image", "mask", "repeats", "group", "flat_field", "parameters", "uncertainty")
+TABLE_KEYS = (
+    "file",
+    "values",
+    "rename",
+    "delimiter",
+    "decimal",
+    "skip",
+    "group",
+    "scale",
+    "offset",
+    "uncertainty",
+)
 NOISE_KEYS = tuple(name for name in UNITS if name != "quantisation")  # the step is read off the images
+UNMOVED = 8  # readings in a row at one setting, on average, from which its error is solved for and not weighed
 SUNK = 5.0  # sd of the dark noise that the median of a frame may lie below the black level
 CFA = ("RGGB", "BGGR", "GRBG", "GBRG")
 
@@ -51,21 +82,24 @@ class Frame:
         # of a sweep: (N, 1, 1) row of the table that each reading stands in, as it was recorded; None: nowhere yet
         None
     )
-
-
-@dataclass
-class Table:
-    """Point readings: one row per frame. `rename`: column -> parameter key; `scale`: to the parameter's unit."""
-
-    file: str
-    values: list[str]
-    rename: dict[str, str] = field(default_factory=dict)
-    scale: dict[str, float] = field(default_factory=dict)
+    flat_field: np.ndarray | None = None  # (H, W, C) float32: the untouched sensor under this frame's lights
+    # standard deviation of a setting by key, in its unit; it replaces the set's. Of a sweep: see `sweeps`
+    uncertainty: dict[str, Any] = field(default_factory=dict)
+    # of a sweep: which time each of its settings was made, by key: sweeps of one number share the setting's error
+    made: dict[str, int] = field(default_factory=dict)
 
 
 @dataclass
 class Captures:
-    """A capture set; `bits` is 8 or 16 for integer files, None for floats."""
+    """A capture set.
+
+    bits         8 or 16 for integer files, None for floats
+    bands        nm, the scene's definition `bands`; empty: the scene's own
+    absent       names of parts of the scene that were not there
+    uncertainty  standard deviation of a setting by key, in its unit, where a frame says no other
+    exclude      effect -> why it is ruled out
+    step         one unit of the last place that a table's readings are written with; 0: unknown
+    """
 
     folder: Path
     scene: str  # name of a shipped scene, or absolute path of an XML file
@@ -78,6 +112,17 @@ class Captures:
     table: Table | None = None
     warnings: list[str] = field(default_factory=list)
     bits: int | None = None
+    bands: list[float] = field(default_factory=list)
+    absent: list[str] = field(default_factory=list)
+    uncertainty: dict[str, float] = field(default_factory=dict)
+    exclude: dict[str, str] = field(default_factory=dict)
+    step: float = 0.0
+    mosaic: Mosaic | None = None  # of analysers (deg), row by row: image is (H, W, 1), each pixel seen through its own
+
+    def uncertainty_of(self, frame: Frame) -> dict[str, Any]:
+        """Standard deviations of what a frame sets, by key; those of 0 are left out."""
+        known = {**self.uncertainty, **frame.uncertainty}
+        return {key: sd for key, sd in known.items() if key in frame.parameters and sd > 0}
 
 
 # -- Loading ---------------------------------------------------------------------------------------------------------
@@ -100,19 +145,25 @@ def load(path: str | Path) -> Captures:
         scene = str(checks.existing(folder, scene, f"{where}: scene").resolve())
     values_are = checks.text(data, "values_are", where, ("DN", "radiance")) or "DN"
     cfa = checks.text(data, "cfa", where, CFA)
-    noise = _noise(data["noise"], f"{where}: [noise]") if "noise" in data else None
+    noise = _noise(data["noise"], f"{where}: [noise]", "table" in data) if "noise" in data else None
     common = checks.settings(data.get("parameters", {}), f"{where}: [parameters]")
     if ("frames" in data) == ("table" in data):
         raise BadCapture(
             f"{where}: {'both [[frames]] and [table] stand' if 'frames' in data else 'zero frames'}; allowed: "
             "one [[frames]] or more, or one [table] of point readings"
         )
-    captures = Captures(folder, scene, [], common, noise, None, cfa, values_are)
+    mosaic = _mosaic(data["mosaic"], cfa, where) if "mosaic" in data else None
+    captures = Captures(folder, scene, [], common, noise, None, cfa, values_are, mosaic=mosaic)
+    captures.bands = _bands(data, where)
+    captures.absent = checks.texts(data, "absent", where)
+    captures.uncertainty = _uncertainty(data.get("uncertainty", {}), f"{where}: [uncertainty]")
+    captures.exclude = _exclude(data.get("exclude", {}), f"{where}: [exclude]")
+    step = 0.0
     if "table" in data:
-        for key in ("cfa", "flat_field"):
+        for key in ("cfa", "mosaic", "flat_field"):
             if key in data:
                 raise BadCapture(f"{where}: {key} belongs to images, not to a [table]; remove it")
-        captures.table, captures.frames = _read_table(folder, data["table"], f"{where}: [table]")
+        captures.table, captures.frames, step = _read_table(folder, data["table"], f"{where}: [table]")
     else:
         _read_frames(captures, data["frames"], where)
         if values_are == "DN" and cfa is None and captures.frames[0].image.shape[2] == 3:
@@ -125,29 +176,95 @@ def load(path: str | Path) -> Captures:
             _same_size(captures.flat_field, captures, here)
     images = [image for f in captures.frames for image in (f.image, *f.repeats)]
     if noise is not None:
-        captures.noise = replace(noise, quantisation=step_of(images))
+        noise = captures.noise = replace(noise, quantisation=max(step, step_of(images)))
+        if captures.table is not None and noise.saturation == math.inf:
+            captures.noise = replace(noise, saturation=_top(captures, noise.black_level))
+    elif captures.table is not None:
+        captures.step = step
+    if captures.table is not None and (noise is None or noise.saturation == math.inf):
+        captures.warnings.append(UNLIMITED)
     _check_levels(captures, where)
-    if noise is None and len(images) == len(captures.frames):
+    if noise is None and not any(f.repeats for f in captures.frames) and not repeated(captures):
         captures.warnings.append(
-            "neither [noise] nor repeats: nothing says how large a residual may be; give the EMVA 1288 "
-            f"numbers ({', '.join(NOISE_KEYS)}) or repeated frames"
+            "neither [noise] nor repeats: nothing says how large a residual may be; give "
+            + (
+                "dark_noise (the standard deviation of a reading) under [noise], or rows of equal settings"
+                if captures.table is not None
+                else f"the EMVA 1288 numbers ({', '.join(NOISE_KEYS)}) or repeated frames"
+            )
         )
     return captures
 
 
-def _noise(table: object, where: str) -> Noise:
-    checks.keys(table, NOISE_KEYS, where)
-    missing = [f"{key} ({UNITS[key]})" for key in NOISE_KEYS if key not in table]
-    if missing:
+def _mosaic(rows: object, cfa: str | None, where: str) -> Mosaic:
+    if cfa is not None:
         raise BadCapture(
-            f"{where}: {', '.join(missing)} missing; give all of {', '.join(NOISE_KEYS)}, or leave [noise] out "
-            "to have it estimated from repeats"
+            f"{where}: both cfa and mosaic stand; allowed: one of them; of a colour polarization camera, write the "
+            "pixels of one colour as images of their own"
         )
-    numbers = {key: checks.number(table[key], key, UNITS[key], where) for key in NOISE_KEYS}
     try:
-        return Noise(**numbers)
+        return mosaics.checked(rows)
     except ValueError as error:
         raise BadCapture(f"{where}: {error}") from error
+
+
+def _noise(table: object, where: str, readings_: bool) -> Noise:
+    """The noise model; of a table of readings only the standard deviation of a reading must be given."""
+    checks.keys(table, NOISE_KEYS, where)
+    assert isinstance(table, Mapping)
+    usual = {"system_gain": 0.0, "black_level": 0.0, "saturation": math.inf, "prnu": 0.0} if readings_ else {}
+    missing = [f"{key} ({UNITS[key]})" for key in NOISE_KEYS if key not in table and key not in usual]
+    if missing:
+        raise BadCapture(
+            f"{where}: {', '.join(missing)} missing; give "
+            + (
+                "the standard deviation of a reading, or leave [noise] out to have it estimated from rows of equal "
+                "settings"
+                if readings_
+                else f"all of {', '.join(NOISE_KEYS)}, or leave [noise] out to have it estimated from repeats"
+            )
+        )
+    numbers = {key: checks.number(table[key], key, UNITS[key], where) for key in NOISE_KEYS if key in table}
+    try:
+        return Noise(**{**usual, **numbers}, signed=readings_, ends="saturation" in numbers or not readings_)
+    except ValueError as error:
+        raise BadCapture(f"{where}: {error}") from error
+
+
+def _bands(data: Mapping, where: str) -> list[float]:
+    if "bands" not in data:
+        return []
+    bands = data["bands"]
+    if not isinstance(bands, list) or not bands:
+        raise BadCapture(f"{where}: bands = {bands!r}; allowed: a list of wavelengths in nm, such as [470, 530, 625]")
+    numbers = [checks.number(band, "bands", "nm", where) for band in bands]
+    if min(numbers) <= 0 or len(set(numbers)) < len(numbers):
+        raise BadCapture(f"{where}: bands = {bands!r} nm; allowed: wavelengths above 0, each once")
+    return numbers
+
+
+def _uncertainty(table: object, where: str) -> dict[str, float]:
+    """Standard deviations by key, 0 or more."""
+    settings = checks.settings(table, where)
+    for key, sd in settings.items():
+        if isinstance(sd, str) or sd < 0:
+            raise BadCapture(f'{where}: "{key}" = {sd!r}; allowed: a standard deviation in the key\'s unit, 0 or more')
+    return {key: float(sd) for key, sd in settings.items()}
+
+
+def _exclude(table: object, where: str) -> dict[str, str]:
+    checks.keys(table, (), where)
+    assert isinstance(table, Mapping)
+    for effect, reason in table.items():
+        if not isinstance(reason, str) or not reason.strip():
+            raise BadCapture(f'{where}: "{effect}" = {reason!r}; allowed: the reason in quotes, which is printed')
+    return dict(table)
+
+
+def _top(captures: Captures, black: float) -> float:
+    """A full scale for readings whose end nobody knows: the largest, so that powers near 1 predict it."""
+    top = max(float(f.image.max()) for f in captures.frames)
+    return top if top > black else black + 1.0
 
 
 def _read_frames(captures: Captures, tables: object, where: str) -> None:
@@ -177,22 +294,31 @@ def _read_frames(captures: Captures, tables: object, where: str) -> None:
         mask = checks.text(table, "mask", here)
         mask = checks.existing(captures.folder, mask, f"{here}: mask") if mask else None
         settings = checks.settings(table.get("parameters", {}), f"{here}: parameters")
-        specs.append((here, image, files, mask, checks.text(table, "group", here), settings))
+        spread = _uncertainty(table.get("uncertainty", {}), f"{here}: uncertainty")
+        flat = checks.text(table, "flat_field", here)
+        flat = checks.existing(captures.folder, flat, f"{here}: flat_field") if flat else None
+        specs.append((here, image, files, mask, checks.text(table, "group", here), settings, spread, flat))
     stems = [Path(image).stem for _, image, *_ in specs]
     depths = {}
-    for (here, image, files, mask, group, settings), stem in zip(specs, stems):
+    flats: dict[Path, np.ndarray] = {}
+    for (here, image, files, mask, group, settings, spread, flat), stem in zip(specs, stems):
         name = stem if stems.count(stem) == 1 else image
         for file in files:
             image_read, bits = read_image(file, f"{here}: {file.name}")
             depths.setdefault(bits, file.name)
             if file is files[0]:
-                frame = Frame(name, image_read, None, group, settings, [], image)
+                frame = Frame(name, image_read, None, group, settings, [], image, uncertainty=spread)
                 captures.frames.append(frame)
             else:
                 frame.repeats.append(image_read)
             _same_size(image_read, captures, f"{here}: {file.name}")
         if mask is not None:
             frame.mask = read_mask(mask, frame.image.shape, f"{here}: mask '{mask.name}'")
+        if flat is not None:
+            if flat not in flats:
+                flats[flat], _ = read_image(flat, f"{here}: flat_field '{flat.name}'")
+                _same_size(flats[flat], captures, f"{here}: flat_field '{flat.name}'")
+            frame.flat_field = flats[flat]
     if len(depths) > 1:
         raise BadCapture(
             f"{where}: files of different depth ({', '.join(f'{n}: {b or 32} bit' for b, n in depths.items())}): "
@@ -214,6 +340,13 @@ def _same_size(image: np.ndarray, captures: Captures, where: str) -> None:
             "value per pixel); remove cfa if the image is demosaiced"
         )
 
+    if captures.mosaic and shape[2] != 1:
+        raise BadCapture(
+            f"{where}: mosaic = {[list(row) for row in captures.mosaic]} but the image has {shape[2]} channels; "
+            "allowed: the raw frame (one value per pixel); remove mosaic if the image is no raw frame of a "
+            "polarization camera"
+        )
+
 
 def _check_levels(captures: Captures, where: str) -> None:
     full = 2**captures.bits - 1 if captures.bits else math.inf
@@ -227,7 +360,11 @@ def _check_levels(captures: Captures, where: str) -> None:
         (f"frame {i} ('{f.file}')", f.image if f.mask is None else f.image[f.mask])
         for i, f in enumerate(captures.frames)
     ]
-    for what, values in used + [("flat_field", captures.flat_field)] * (captures.flat_field is not None):
+    flats = [("flat_field", captures.flat_field)] + [
+        (f"frame {i} ('{f.file}'): flat_field", f.flat_field) for i, f in enumerate(captures.frames)
+    ]
+    limited = captures.table is None or (captures.noise is not None and captures.noise.ends)
+    for what, values in used + [(what, flat) for what, flat in flats if flat is not None] if limited else []:
         if np.all(values >= top):
             raise BadCapture(
                 f"{where}: {what}: all saturated, every value used is >= {top:g} DN; allowed: some values below; "
@@ -276,29 +413,78 @@ def _unusable(captures: Captures) -> str:
     return (
         f"none of the {dark + bright + masked} values of '{files[0]}'{' ...' if len(files) > 1 else ''} ({low:g} to "
         f"{high:g}) is usable: "
-        f"{', '.join(why)}; allowed: raw DN (no volts, no 0 to 1) between these levels; correct [noise], the masks or "
-        "the exposure"
+        f"{', '.join(why)}; allowed: "
+        + (
+            "readings above black_level, which is in their own unit; correct [noise], scale or offset"
+            if captures.table is not None
+            else "raw DN (no volts, no 0 to 1) between these levels; correct [noise], the masks or the exposure"
+        )
     )
 
 
-def _read_table(folder: Path, data: object, where: str) -> tuple[Table, list[Frame]]:
+def _read_table(folder: Path, data: object, where: str) -> tuple[Table, list[Frame], float]:
+    """(table, a frame per row, step of the readings)."""
     checks.keys(data, TABLE_KEYS, where)
+    assert isinstance(data, Mapping)
     name, values = checks.text(data, "file", where), checks.texts(data, "values", where)
     if name is None or not values:
         raise BadCapture(
-            f"{where}: file = {name!r}, values = {values}; allowed: the path of a CSV file, one column or more"
+            f"{where}: file = {name!r}, values = {values}; allowed: the path of a table, one column or more"
         )
-    rename, scale = data.get("rename", {}), data.get("scale", {})
-    checks.keys(rename, (), f"{where}: rename")
-    checks.keys(scale, (), f"{where}: scale")
-    rename = {column: checks.text(rename, column, f"{where}: rename") for column in rename}
-    scale = {key: checks.number(factor, f'"{key}"', "", f"{where}: scale") for key, factor in scale.items()}
-    rows = readings.read(checks.existing(folder, name, f"{where}: file"), values, rename, scale, where)
+    words = {what: _words(data, what, where) for what in ("rename", "uncertainty")}
+    numbers: dict[str, dict[str, float]] = {}
+    for what in ("scale", "offset"):
+        checks.keys(data.get(what, {}), (), f"{where}: {what}")
+        numbers[what] = {
+            key: checks.number(value, f'"{key}"', "", f"{where}: {what}") for key, value in data.get(what, {}).items()
+        }
+    for column, factor in numbers["scale"].items():
+        if factor == 0:
+            raise BadCapture(f'{where}: scale: "{column}" = 0; allowed: any other number')
+    delimiter, decimal = data.get("delimiter", ","), data.get("decimal", ".")
+    if delimiter not in DELIMITERS:
+        raise BadCapture(f"{where}: delimiter = {delimiter!r}; allowed: {', '.join(map(repr, DELIMITERS))}")
+    if decimal not in DECIMALS:
+        raise BadCapture(f"{where}: decimal = {decimal!r}; allowed: {', '.join(map(repr, DECIMALS))}")
+    if delimiter == decimal:
+        raise BadCapture(
+            f"{where}: decimal = ',' and cells separated by {NAMES[delimiter]}; allowed: another delimiter, such as ';'"
+        )
+    skip = data.get("skip", 0)
+    if isinstance(skip, bool) or not isinstance(skip, int) or skip < 0:
+        raise BadCapture(f"{where}: skip = {skip!r}; allowed: the number of lines before the column names, 0 or more")
+    table = Table(
+        name,
+        values,
+        words["rename"],
+        numbers["scale"],
+        delimiter,
+        decimal,
+        skip,
+        checks.text(data, "group", where) or "",
+        numbers["offset"],
+        words["uncertainty"],
+    )
+    rows, step = readings.read(checks.existing(folder, name, f"{where}: file"), table, where)
     frames = [
-        Frame(f"row {index}", np.array(reading, np.float32).reshape(1, 1, -1), parameters=settings, file=name)
-        for index, (settings, reading) in enumerate(rows)
+        Frame(
+            f"row {index}",
+            np.array(row.values, np.float32).reshape(1, 1, -1),
+            group=row.group,
+            parameters=row.settings,
+            file=name,
+            uncertainty=row.uncertainty,
+        )
+        for index, row in enumerate(rows)
     ]
-    return Table(name, values, rename, scale), frames
+    return table, frames, step
+
+
+def _words(data: Mapping, what: str, where: str) -> dict[str, str]:
+    """A table of texts."""
+    table = data.get(what, {})
+    checks.keys(table, (), f"{where}: {what}")
+    return {key: checks.text(table, key, f"{where}: {what}") or "" for key in table}
 
 
 # -- Using -----------------------------------------------------------------------------------------------------------
@@ -323,6 +509,81 @@ def check(captures: Captures, parameters: Mapping[str, Parameter]) -> None:
                     ),
                 )
             parameters[key].check(value, key, where)
+    _check_uncertainties(captures, parameters)
+
+
+def _check_uncertainties(captures: Captures, parameters: Mapping[str, Parameter]) -> None:
+    """Uncertainties belong to numbers that the set, or the frame, sets."""
+    path = captures.folder / FILE
+    everywhere = {*captures.parameters, *(key for f in captures.frames for key in f.parameters)}
+    places = [(f"{path}: [uncertainty]", captures.uncertainty, everywhere)]
+    places += [
+        (f"{path}: frame {i} ('{f.file or f.name}'): uncertainty", f.uncertainty, {*captures.parameters, *f.parameters})
+        for i, f in enumerate(captures.frames)
+    ]
+    for where, table, stated in places:
+        for key in table:
+            if key not in parameters:
+                raise UnknownKey(key, parameters, "parameter", where, "`optics params SCENE` lists them")
+            if not parameters[key].is_number:
+                raise BadCapture(f"{where}: {key} is a choice of words; allowed: numbers")
+            if key not in stated:
+                raise BadCapture(
+                    f"{where}: {key} has an uncertainty, and nothing sets it; allowed: keys that [parameters] or "
+                    "frames set; what is known of a free parameter beforehand is a prior (--prior)"
+                )
+
+
+def state(captures: Captures, parts: Mapping[str, Any], effects: Mapping[str, str]) -> Captures:
+    """The set with what it says of a scene checked: parts that are absent are taken out where they can be.
+
+    parts     name -> part, with the method `named(role)`;   effects   key -> name of all that are known
+    A part with a parameter of the role "inserted" has it at 0. Raises UnknownKey, and BadCapture for a part that is
+    absent and inserted."""
+    where = f"{captures.folder / FILE}"
+    found = dict(captures.parameters)
+    for part in captures.absent:
+        if part not in parts:
+            raise UnknownKey(part, parts, "part", f"{where}: absent", "`optics params SCENE` lists what they have")
+        name = parts[part].named("inserted")
+        if name is None:
+            continue
+        key = f"{part}.{name}"
+        settings = [("[parameters]", captures.parameters)]
+        settings += [(f"frame {i} ('{f.file or f.name}')", f.parameters) for i, f in enumerate(captures.frames)]
+        for place, own in settings:
+            if own.get(key, 0.0) != 0.0:
+                raise BadCapture(f"{where}: {place}: {key} = {own[key]}, but '{part}' is absent; allowed: one of these")
+        found[key] = 0.0
+    for effect in captures.exclude:
+        if key_of(effect) not in effects:
+            raise UnknownKey(effect, effects.values(), "effect", f"{where}: [exclude]", "`optics effects` lists them")
+    return replace(captures, parameters=found)
+
+
+def definitions(captures: Captures, given: Mapping[str, str], scene: Path) -> dict[str, str]:
+    """The scene's definitions (-D): those given, then what the set says. Raises BadCapture for bands that the scene
+    does not take."""
+    if not captures.bands or "bands" in given:
+        return dict(given)
+    if not re.search(r'<default\s+name="bands"', scene.read_text(encoding="utf-8")):
+        raise BadCapture(
+            f'{captures.folder / FILE}: bands = {captures.bands} nm, but {scene} has no <default name="bands">; '
+            "allowed: a scene whose integrator takes $bands; name it in the XML, or remove bands"
+        )
+    return {**given, "bands": ", ".join(f"{band:g}" for band in captures.bands)}
+
+
+def stated(captures: Captures) -> dict[str, float | str]:
+    """What every frame has, with one value, because the experimenter said so: {key: value}."""
+    found: dict[str, float | str] = {}
+    for key in dict.fromkeys((*captures.parameters, *(k for f in captures.frames for k in f.parameters))):
+        if any(key in f.readings for f in captures.frames):
+            continue
+        values = {f.parameters.get(key, captures.parameters.get(key)) for f in captures.frames}
+        if len(values) == 1 and (value := values.pop()) is not None:
+            found[key] = value
+    return found
 
 
 def subset(captures: Captures, frames: Sequence[int]) -> Captures:
@@ -337,43 +598,96 @@ def subset(captures: Captures, frames: Sequence[int]) -> Captures:
 def sweeps(captures: Captures, parameters: Mapping[str, Parameter], lights: Sequence[str]) -> Captures:
     """The rows of a table as a few frames of many readings, (N, 1, C), which are predicted at once.
 
-    Readings are ordered by the setting that takes the most values and dealt out to 8 sweeps (4 of fewer than 32
-    readings, 1 of fewer than 8), so that each covers the whole range. Settings that move the scene's geometry keep
-    sweeps of their own."""
+    Readings of a group make a sweep. Without groups they are ordered by the setting that takes the most values and
+    dealt out to 8 sweeps (4 of fewer than 32 readings, 1 of fewer than 8), so that each covers the whole range.
+    Settings that move the scene's geometry keep sweeps of their own.
+
+    The error of a setting is drawn when the setting is made, and rows that follow each other with the same value share
+    it. Where a setting lasts for UNMOVED rows or more on average, its error is one number for all of these: such rows
+    keep sweeps of their own, which say its standard deviation (`Frame.uncertainty`, a number) and which of them share
+    it (`Frame.made`); a setting that is made once for the whole table becomes one of the set. Elsewhere a sweep says
+    (N, 1, 1) sd sqrt(n) for n rows in a row: readings are weighed as independent ones, and the mean of n independent
+    errors of that size has the standard deviation sd of the one that they share. Such rows stay in one sweep."""
     settings = [f.parameters for f in captures.frames]
     keys = sorted({k for own in settings for k in own})
     powers = {f"{name}.power" for name in lights}
     still = [k for k in keys if parameters[k].how not in ("layer", "image") and k not in powers]
+    spread = [captures.uncertainty_of(f) for f in captures.frames]
+    runs = {k: _runs(captures.frames, k) for k in keys if any(k in own for own in spread)}
+    together = {k: np.bincount(number) for k, number in runs.items()}
+    lasting = [
+        k
+        for k, number in runs.items()
+        if k not in powers and (k in still or len(number) >= UNMOVED * (number[-1] + 1) or number[-1] == 0)
+    ]
+    once = [k for k in lasting if runs[k][-1] == 0]
+    lasting = [k for k in lasting if k not in once]
+    common = {k: settings[0][k] for k in once}
+    # what all readings share of a light's drive level, its power takes up
+    weighed_keys = [k for k in runs if k not in lasting and runs[k][-1] > 0]
     found: dict[tuple, list[int]] = {}
     for index, own in enumerate(settings):
-        found.setdefault((tuple(sorted(own)), *(own.get(k) for k in still)), []).append(index)
+        apart = (*(own.get(k) for k in still), *(int(runs[k][index]) for k in lasting))
+        found.setdefault((captures.frames[index].group, tuple(sorted(own)), *apart), []).append(index)
     frames = []
     for rows in found.values():
-        own = settings[rows[0]]
-        moving = [k for k in own if k not in still and len({settings[i][k] for i in rows}) > 1]
+        first = rows[0]
+        moving = [
+            k for k in settings[first] if k not in still and k not in once and len({settings[i][k] for i in rows}) > 1
+        ]
         if moving:
-            first = max(moving, key=lambda k: (parameters[k].unit == "deg", len({settings[i][k] for i in rows})))
-            rows = sorted(rows, key=lambda i: settings[i][first])
+            along = max(moving, key=lambda k: (parameters[k].unit == "deg", len({settings[i][k] for i in rows})))
+            rows = sorted(rows, key=lambda i: settings[i][along])
+        dealt: dict[tuple, list[int]] = {}  # rows that share an error are held out together
+        for i in rows:
+            dealt.setdefault(tuple(int(runs[k][i]) for k in weighed_keys) or (i,), []).append(i)
         count = 8 if len(rows) >= 32 else 4 if len(rows) >= 8 else 1
+        count = 1 if captures.frames[first].group is not None else min(count, len(dealt))
         for part in range(count):
-            mine = rows[part::count]
-            readings = {k: np.array([settings[i][k] for i in mine], float).reshape(-1, 1, 1) for k in moving}
+            mine = [i for own in list(dealt.values())[part::count] for i in own]
+            swept = {k: _column([settings[i][k] for i in mine]) for k in moving}
             image = np.concatenate([captures.frames[i].image for i in mine])
             name = f"readings {mine[0]} ... {mine[-1]}" if len(mine) > 1 else f"reading {mine[0]}"
+            weighed = {
+                k: _column([spread[i].get(k, 0.0) * math.sqrt(together[k][runs[k][i]]) for i in mine])
+                for k in weighed_keys
+            }
+            shared = {k: spread[first][k] for k in lasting if k in spread[first]}
             frames.append(
                 Frame(
                     name,
                     image,
                     None,
-                    None,
-                    {k: v for k, v in own.items() if k not in moving},
+                    captures.frames[first].group,
+                    {k: v for k, v in settings[first].items() if k not in moving and k not in once},
                     [],
-                    captures.frames[mine[0]].file,
-                    readings,
-                    np.array(mine, float).reshape(-1, 1, 1),
+                    captures.frames[first].file,
+                    swept,
+                    _column(mine),
+                    uncertainty={**weighed, **shared},
+                    made={k: int(runs[k][first]) for k in shared},
                 )
             )
-    return replace(captures, frames=frames, warnings=list(captures.warnings))
+    return replace(
+        captures,
+        frames=frames,
+        parameters={**captures.parameters, **common},
+        uncertainty={
+            **{k: sd for k, sd in captures.uncertainty.items() if k in captures.parameters},
+            **{k: spread[0][k] for k in once if k in spread[0]},
+        },
+        warnings=list(captures.warnings),
+    )
+
+
+def _column(values: Sequence[Any]) -> np.ndarray:
+    return np.array(values, float).reshape(-1, 1, 1)
+
+
+def _runs(frames: Sequence[Frame], key: str) -> np.ndarray:
+    """(N,) number of the time that a setting was made for each row: it was made anew where its value changes."""
+    changed = [a.parameters.get(key) != b.parameters.get(key) for a, b in zip(frames, frames[1:])]
+    return np.concatenate([[0], np.cumsum(changed, dtype=int)])
 
 
 def groups(captures: Captures) -> dict[str, list[int]]:
@@ -412,7 +726,7 @@ def write(captures: Captures, folder: str | Path, *, overwrite: bool = False, bi
         names = {p.name if p.stem != "flat_field" else "flat_field" for p in folder.glob("*")}
         if (
             FILE not in names
-            or names - {FILE, "frames", "readings.csv", "flat_field"}
+            or names - {FILE, "frames", "readings.csv", "flat_field", "flat"}
             or not ((folder / FILE).read_text(encoding="utf-8").startswith(MARK))
         ):
             raise OutputExists(
@@ -433,21 +747,40 @@ def _fill(captures: Captures, folder: Path, final: Path, bits: int | None) -> No
     document["scene"] = Path(os.path.relpath(captures.scene, final)).as_posix() if xml else captures.scene
     if captures.values_are != "DN":
         document["values_are"] = captures.values_are
-    if (flat := captures.flat_field) is not None:
-        depth = bits if np.all(flat == np.round(flat)) else None
-        document["flat_field"] = write_image(folder / "flat_field", flat, depth).name
+    if captures.bands:
+        document["bands"] = [int(band) if band == int(band) else band for band in captures.bands]
+    if captures.absent:
+        document["absent"] = captures.absent
+    if captures.flat_field is not None:
+        document["flat_field"] = _write_flat(folder / "flat_field", captures.flat_field, bits).name
     if captures.cfa:
         document["cfa"] = captures.cfa
+    if captures.mosaic:
+        document["mosaic"] = [list(row) for row in captures.mosaic]
     if captures.noise:
         document["noise"] = tomlkit.table()
         for key in NOISE_KEYS:
-            document["noise"].add(key, tomlkit.item(float(getattr(captures.noise, key))).comment(UNITS[key]))
-    if captures.parameters:
-        document["parameters"] = _plain(captures.parameters)
+            if key != "saturation" or captures.noise.ends:
+                document["noise"].add(key, tomlkit.item(float(getattr(captures.noise, key))).comment(UNITS[key]))
+    for name, content in (
+        ("parameters", _plain(captures.parameters)),
+        ("uncertainty", _plain(captures.uncertainty)),
+        ("exclude", captures.exclude),
+    ):
+        if content:
+            document[name] = content
     if captures.table is not None:
-        document["table"] = {"file": "readings.csv", "values": captures.table.values}
-        rows = [(_plain(f.parameters), [float(value) for value in f.image.ravel()]) for f in captures.frames]
-        readings.write(folder / "readings.csv", rows, captures.table.values)
+        rows = [
+            Row(_plain(f.parameters), [float(v) for v in f.image.ravel()], f.group, dict(f.uncertainty))
+            for f in captures.frames
+        ]
+        group, spread = readings.write(folder / "readings.csv", rows, captures.table.values)
+        table = {"file": "readings.csv", "values": captures.table.values}
+        document["table"] = {
+            **table,
+            **({"group": group} if group else {}),
+            **({"uncertainty": spread} if spread else {}),
+        }
     else:
         names = [
             re.sub(r"[^\w.+-]+", "_", f.name) or "frame" for f in captures.frames
@@ -455,6 +788,7 @@ def _fill(captures: Captures, folder: Path, final: Path, bits: int | None) -> No
         if len(set(names)) < len(names):
             raise BadCapture(f"{final}: two frames are called '{max(names, key=names.count)}'; allowed: each name once")
         (folder / "frames").mkdir()
+        flats: dict[int, str] = {}  # frames of one flat field share its file
         tables = document["frames"] = tomlkit.aot()
         for name, f in zip(names, captures.frames):
             stem = folder / "frames" / name
@@ -467,10 +801,21 @@ def _fill(captures: Captures, folder: Path, final: Path, bits: int | None) -> No
                 table["repeats"] = [f"frames/{file.name}" for file in files]
             if f.group is not None:
                 table["group"] = f.group
-            if f.parameters:
-                table["parameters"] = _plain(f.parameters)
+            if f.flat_field is not None:
+                if id(f.flat_field) not in flats:
+                    (folder / "flat").mkdir(exist_ok=True)
+                    flats[id(f.flat_field)] = f"flat/{_write_flat(folder / 'flat' / name, f.flat_field, bits).name}"
+                table["flat_field"] = flats[id(f.flat_field)]
+            for key, content in (("parameters", f.parameters), ("uncertainty", f.uncertainty)):
+                if content:
+                    table[key] = _plain(content)
             tables.append(tomlkit.item(table))
     (folder / FILE).write_text(tomlkit.dumps(document), encoding="utf-8")
+
+
+def _write_flat(file: Path, flat: np.ndarray, bits: int | None) -> Path:
+    """A flat field in the frames' depth, where it is whole."""
+    return write_image(file, flat, bits if np.all(flat == np.round(flat)) else None)
 
 
 def _plain(parameters: Mapping[str, float | str]) -> dict[str, float | str]:

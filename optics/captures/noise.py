@@ -10,7 +10,7 @@ transfer; p is a fixed pattern, the same in every image, so that averaging frame
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Hashable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -19,7 +19,7 @@ import numpy as np
 from optics.errors import Underdetermined
 
 if TYPE_CHECKING:
-    from optics.captures.capture_set import Captures
+    from optics.captures.capture_set import Captures, Frame
 
 SATURATED = (
     0.96  # of saturation: above, response bends before it clips (top-1 of a diagnosis fell from 99 to 17 % unmasked)
@@ -39,11 +39,21 @@ DEMOSAICED = (
     "3 channels and no cfa: if these are demosaiced, neighbouring pixels share their noise and a diagnosis raises "
     "false alarms (85 % of sets at a perfect chi2); supply raw frames and cfa"
 )
+UNLIMITED = (
+    "the end of the instrument's range is not known, so that no reading is left out as saturated; give saturation "
+    "under [noise] where it has one"
+)
+REPEATS = 10  # degrees of freedom of repeated readings: their standard deviation is then known to 22 %
+SLOPED = 3.0  # standard deviations from 0 of a gain that readings determine
 
 
 @dataclass(frozen=True)
 class Noise:
-    """Noise of a camera; every number as in the module's text, `saturation` in DN."""
+    """Noise of a camera; every number as in the module's text, `saturation` in DN.
+
+    signed   whether a value below 0 is a reading like any other, as of a volt meter, and not cut off there
+    ends     whether values end at `saturation`; else it only sets the scale of what a camera makes of light
+    """
 
     system_gain: float
     dark_noise: float
@@ -51,10 +61,15 @@ class Noise:
     saturation: float
     prnu: float
     quantisation: float = 1.0
+    signed: bool = False
+    ends: bool = True
 
     def __post_init__(self):
+        rules = {"black_level": "finite"} if self.signed else {"black_level": "finite", "system_gain": "> 0"}
         for name, unit in UNITS.items():
-            value, allowed = getattr(self, name), {"black_level": "finite", "system_gain": "> 0"}.get(name, ">= 0")
+            value, allowed = getattr(self, name), rules.get(name, ">= 0")
+            if name == "saturation" and not self.ends and value == math.inf:
+                continue
             if not math.isfinite(value) or (allowed != "finite" and value < 0) or (allowed == "> 0" and value == 0):
                 raise ValueError(f"{name} = {value:g} {unit}; allowed: {allowed}; see the camera's EMVA 1288 sheet")
         if self.saturation <= self.black_level:
@@ -97,9 +112,18 @@ class Noise:
         light = np.maximum(np.asarray(signal, float) - self.black_level, 0.0)
         if fixed_pattern is not None:
             light = light * np.maximum(1.0 + fixed_pattern, 0.0)
-        frame = self.black_level + self.system_gain * rng.poisson(light / self.system_gain)
-        frame = np.clip(frame + self.dark_noise * rng.standard_normal(light.shape), 0.0, self.saturation)
+        if self.system_gain > 0:
+            light = self.system_gain * rng.poisson(light / self.system_gain)
+        if self.signed:  # what a camera adds may lie below its black level
+            light = light + np.minimum(np.asarray(signal, float) - self.black_level, 0.0)
+        frame = self.black_level + light + self.dark_noise * rng.standard_normal(light.shape)
+        frame = np.clip(frame, -math.inf if self.signed else 0.0, self.saturation if self.ends else math.inf)
         return np.round(frame / self.quantisation) * self.quantisation if self.quantisation else frame
+
+    def in_scale_of(self, other: Noise | None) -> Noise:
+        """The same noise in the full scale of another, which a fit's powers are stated in, where neither ends there."""
+        alike = other is not None and not other.ends and not self.ends
+        return replace(self, saturation=other.saturation) if alike and other is not None else self
 
     @property
     def pedestal(self) -> bool:
@@ -109,14 +133,17 @@ class Noise:
     def usable(self, image: np.ndarray, dilate: int = 1) -> np.ndarray:
         """Mask (H, W, C), True = use: not within `dilate` pixels of saturation, in each channel's own plane.
 
-        Without a pedestal, what stands within 3 sigma of 0 is cut by the clipping and left out as well.
+        Without a pedestal, what stands within 3 sigma of 0 is cut by the clipping and left out as well, unless values
+        below 0 are readings like any other. Where values do not end, none is saturated.
         """
         image = np.asarray(image)
+        if not self.ends:
+            return np.ones(image.shape, bool) if self.signed or self.pedestal else image >= 3 * self.sd(image)
         bad = image >= SATURATED * self.saturation
         for axis in (0, 1):  # a square neighbourhood, one axis after the other
             padded = np.pad(bad, [(dilate, dilate) if a == axis else (0, 0) for a in range(3)])
             bad = np.lib.stride_tricks.sliding_window_view(padded, 2 * dilate + 1, axis).any(-1)
-        return ~bad if self.pedestal else ~bad & (image >= 3 * self.sd(image))
+        return ~bad if self.pedestal or self.signed else ~bad & (image >= 3 * self.sd(image))
 
 
 def step_of(images: Sequence[np.ndarray]) -> float:
@@ -130,28 +157,38 @@ def step_of(images: Sequence[np.ndarray]) -> float:
     return float(np.gcd.reduce(levels.astype(np.int64))) if len(levels) >= 32 else 1.0  # few levels share one by chance
 
 
-def estimate(captures: Captures, black_level: float | None = None, saturation: float | None = None) -> Noise:
+def estimate(
+    captures: Captures,
+    black_level: float | None = None,
+    saturation: float | None = None,
+    clocks: Collection[str] = (),
+) -> Noise:
     """Noise from repeated frames: photon transfer (EMVA 1288), one gain for all channels; PRNU is an upper limit, as
     texture of the scene finer than three pixels counts as PRNU. Raises Underdetermined with what to supply.
 
+    Readings of a table: see `_of_readings`.
+
     black_level  DN; None: the mean of dark frames with repeats (every `*.power` or `*.exposure` that is set is 0)
     saturation   DN; None: full scale of the smallest converter (8, 10, 12, 14, 16 bit) that holds the values
+    clocks       keys that say when a reading was taken: readings that differ in nothing else are repeats
     """
+    if captures.table is not None:
+        return _of_readings(captures, black_level, saturation, clocks)
     here = f"{captures.folder}/captures.toml"
-    repeated = [frame for frame in captures.frames if frame.repeats]
-    if not repeated:
+    repeated_frames = [frame for frame in captures.frames if frame.repeats]
+    if not repeated_frames:
         raise Underdetermined(
             f"{here}: noise: no frame has repeats; add `repeats` at six exposures or more, or give [noise]"
         )
-    stacks = [np.stack([f.image, *f.repeats]).astype(float) for f in repeated]
-    masks = [np.broadcast_to(True if f.mask is None else f.mask[..., None], f.image.shape) for f in repeated]
+    stacks = [np.stack([f.image, *f.repeats]).astype(float) for f in repeated_frames]
+    masks = [np.broadcast_to(True if f.mask is None else f.mask[..., None], f.image.shape) for f in repeated_frames]
     lights = [
         [
             value
             for key, value in {**captures.parameters, **f.parameters}.items()
             if key.endswith((".power", ".exposure"))
         ]
-        for f in repeated
+        for f in repeated_frames
     ]
     dark = [bool(values) and not any(values) for values in lights]
     step = step_of(stacks)
@@ -193,9 +230,75 @@ def estimate(captures: Captures, black_level: float | None = None, saturation: f
             "or the response is bent; give the black level, and raw frames"
         )
     noise = Noise(float(gain), math.sqrt(max(floor - step**2 / 12, 0.0)), black_level, saturation, 0.0, step)
-    stride = 2 if captures.cfa else 1  # to the next pixel of the same colour
+    # to the next pixel of the same colour, or behind the same analyser
+    stride = 2 if captures.cfa else len(captures.mosaic[0]) if captures.mosaic else 1
     lit = [(stack, mask) for stack, mask, d in zip(stacks, masks, dark) if not d and stack.shape[2] > 2 * stride]
     return replace(noise, prnu=_prnu(lit, noise, stride))
+
+
+def repeated(captures: Captures, clocks: Collection[str] = ()) -> list[list[Frame]]:
+    """Readings of a table that repeat each other, two or more in each list: those of equal settings (`clocks` aside) in
+    consecutive rows where these hold REPEATS degrees of freedom, else all of equal settings in a group.
+
+    What comes back to a setting later brings the error of the dial, and drift; consecutive rows do not."""
+    if captures.table is None:
+        return []
+
+    def key(frame: Frame) -> Hashable:
+        return (frame.group, *sorted(item for item in frame.parameters.items() if item[0] not in clocks))
+
+    runs: list[list[Frame]] = []
+    equal: dict[Hashable, list[Frame]] = {}
+    for frame in captures.frames:
+        if runs and key(runs[-1][0]) == key(frame):
+            runs[-1].append(frame)
+        else:
+            runs.append([frame])
+        equal.setdefault(key(frame), []).append(frame)
+    channels = captures.frames[0].image.size
+    runs = [rows for rows in runs if len(rows) > 1]
+    if channels * sum(len(rows) - 1 for rows in runs) >= REPEATS:
+        return runs
+    return [rows for rows in equal.values() if len(rows) > 1]
+
+
+def _of_readings(
+    captures: Captures, black_level: float | None, saturation: float | None, clocks: Collection[str]
+) -> Noise:
+    """Noise of repeated readings (`repeated`) from their variance about their own mean ("pure error").
+
+    variance = K (S - b) + d^2 with b the black level, 0 unless given, where the gain K stands SLOPED standard
+    deviations from 0 and d^2 is not below 0; else the same d^2 at every level. Readings have no end unless a saturation
+    is given.
+    Raises Underdetermined where fewer than REPEATS degrees of freedom are there, or all repeats are the same number."""
+    here = f"{captures.folder}/captures.toml"
+    groups = [np.stack([f.image.reshape(-1) for f in rows]).astype(float) for rows in repeated(captures, clocks)]
+    channels = captures.frames[0].image.size
+    freedom = channels * sum(len(rows) - 1 for rows in groups)
+    if freedom < REPEATS:
+        raise Underdetermined(
+            f"{here}: noise: rows of equal settings leave {freedom} degrees of freedom, {REPEATS} are needed; give "
+            "dark_noise (the standard deviation of a reading) under [noise], or repeat readings"
+        )
+    mean = np.concatenate([rows.mean(0) for rows in groups])
+    variance = np.concatenate([rows.var(0, ddof=1) for rows in groups])
+    weight = np.concatenate([np.full(channels, (len(rows) - 1) / 2) for rows in groups])
+    step, black = captures.step, 0.0 if black_level is None else black_level
+    pooled = float(weight @ variance / weight.sum())
+    if pooled == 0 and step == 0:
+        raise Underdetermined(
+            f"{here}: noise: rows of equal settings hold the same number, copies and not repeats; give dark_noise "
+            "(the standard deviation of a reading) under [noise]"
+        )
+    gain, floor = 0.0, pooled
+    if pooled > 0 and len(mean) > 2 and np.ptp(mean) > 0:
+        (slope, intercept), covariance = photon_transfer(mean - black, variance, weight)
+        if slope > SLOPED * math.sqrt(covariance[0, 0]) and intercept >= step**2 / 12:
+            gain, floor = float(slope), float(intercept)
+    top = max(float(f.image.max()) for f in captures.frames)
+    dark = math.sqrt(max(floor - step**2 / 12, 0.0))
+    scale = saturation if saturation is not None else top if top > black else black + 1.0
+    return Noise(gain, dark, black, scale, 0.0, step, signed=True, ends=saturation is not None)
 
 
 def photon_transfer(light: np.ndarray, variance: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -242,7 +345,7 @@ def warnings_of(noise: Noise, captures: Captures) -> list[str]:
     """What about the camera and the frames weakens a verdict, in sentences."""
     found = [
         (
-            captures.values_are == "DN" and not noise.pedestal,
+            captures.values_are == "DN" and not noise.pedestal and not noise.signed,
             f"no pedestal: black level {noise.black_level:g} DN is below 3 sigma of the dark noise; dim pixels are cut "
             "at 0 and "
             "masked, and half a DN of black level looks like glare: raise the camera's offset",
@@ -260,7 +363,7 @@ def warnings_of(noise: Noise, captures: Captures) -> list[str]:
             "one frame only: nothing can be held out, so no verdict can be verified; add frames",
         ),
         (
-            noise.prnu > 0.003 and captures.flat_field is None,
+            noise.prnu > 0.003 and captures.flat_field is None and any(f.flat_field is None for f in captures.frames),
             f"PRNU {noise.prnu:.2%} is above 0.3 % and does not average down over frames: record a flat_field to "
             "divide it out",
         ),
