@@ -8,11 +8,14 @@ The steps are those of `optics.fit.descent`; what is found is an `optics.fit.res
 from __future__ import annotations
 
 import fnmatch
+import functools
+import math
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
 from optics.errors import Underdetermined, UnknownKey
+from optics.fit import starts
 from optics.fit.descent import Descent, Normal, Rows, covariance_of, prior_terms, stacked, whiten
 from optics.fit.model import Model, value_of
 from optics.fit.result import Fit, warnings_of
@@ -29,6 +32,12 @@ STEPS, STEPS_NEAR = 8, 3  # predictions per linearisation: far off, eight cost l
 # more variables; close to the optimum the first step does nearly all
 WORTH = 0.1  # of the accuracy asked for: what a step on the same derivative images must promise or gain
 PART = 0.3  # of the first promise: while a linearisation still promises more, it no longer holds, and a new one is made
+SCALINGS = 3  # times that powers are solved for by themselves before the first step
+OFF = 0.1  # sd: a factor that is smaller is off, as far as the data tell
+EXCESS = 3.0  # sd of chi2 above its degrees of freedom, from which a misfit is worth a search
+SHORT = 8  # linearisations of such a descent, before it is known to lead anywhere
+LEAD = 10.8  # of chi2, by which another start must be better: a lead that noise alone takes in 1 of 1000 cases
+LEADS = 0.01  # of the excess of chi2, by which it must: ten times what is NEGLIGIBLE to where each of the two ends
 TRIES = 4  # linearisations close to the optimum, before a fit that no longer gains ends
 CHORD_DAMPING = 1e-6  # of `extended`, which starts at the base's optimum: only directions that nothing determines
 
@@ -104,6 +113,9 @@ def for_frames(model: Model, variables: Sequence[Variable], frames: Sequence[int
 def _prior_in(model: Model, alike: Sequence[Variable], frame: int) -> tuple[float, float] | None:
     """The prior in another frame of what variables have in theirs; None where theirs do not say."""
     key, priors = alike[0].keys[0], [v.prior for v in alike]
+    said = _said(model, frame, key)
+    if said is not None and all(v.prior == _said(model, _first(v), key) for v in alike):
+        return said
     if len(set(priors)) == 1:
         return priors[0]
     known = [prior for prior in priors if prior is not None]
@@ -112,6 +124,15 @@ def _prior_in(model: Model, alike: Sequence[Variable], frame: int) -> tuple[floa
     if all(mean == model.at(Values(), _first(v))[key] for v, (mean, _) in zip(alike, known)):
         return float(model.at(Values(), frame)[key]), known[0][1]
     return None
+
+
+def _said(model: Model, frame: int, key: str) -> tuple[float, float] | None:
+    """(setting, its uncertainty) of a frame; None where it does not say both."""
+    if model.captures is None:
+        return None
+    own = model.frames[frame]
+    sd = model.captures.uncertainty_of(own).get(key)
+    return None if sd is None or np.ndim(sd) else (float(own.parameters[key]), float(sd))
 
 
 def _first(variable: Variable) -> int:
@@ -166,6 +187,97 @@ def fit(
     return _fit_at(descent, history, reason, first)
 
 
+def fit_over_starts(
+    model: Model,
+    variables: Sequence[Variable],
+    start: Values | None = None,
+    frames: Sequence[int] | None = None,
+    *,
+    max_iterations: int = 40,
+    robust: bool = False,
+    tolerance: float = 0.05,
+    progress: Callable[[str, int, int], None] | None = None,
+    over: Sequence[str] | None = None,
+) -> Fit:
+    """As `fit`; where misfit is left and variables declare starts (`Parameter.starts`), from the best of these too.
+
+    over   names of the variables whose starts are tried; None: of all. A refit tries those of the effect that is added
+
+    Other starts are tried by predictions only (`optics.fit.starts`), at the start values of all else; the best
+    few are followed for SHORT linearisations, and one that leads is calibrated. Of several that are as good
+    the one with the smallest values is taken. Without such variables, or without misfit, this is `fit`. Raises
+    Underdetermined only after the starts: at 0 a retardance between crossed polarizers has no slope."""
+    frames = list(range(len(model.frames))) if frames is None else list(frames)
+    filled = with_start(model, variables, start or Values())
+    follow = functools.partial(fit, model, variables, frames=frames, robust=robust, progress=progress)
+    first: Fit | None = None
+    error = Underdetermined("no start")
+    try:
+        first = follow(filled, max_iterations=max_iterations, tolerance=tolerance)
+    except Underdetermined as raised:
+        error = raised
+    values = _elsewhere(model, variables, filled, frames, first, follow, over)
+    if values is not None:
+        found = follow(values, max_iterations=max_iterations, tolerance=tolerance)
+        found.start = np.array([value_of(model, filled, v) for v in variables])
+        if first is None or found.total < first.total - _lead(first):
+            return found
+    if first is None:
+        raise error
+    return first
+
+
+def _misfits(found: Fit) -> bool:
+    """Whether a fit leaves more than noise."""
+    return found.chi2 - found.dof > EXCESS * math.sqrt(2 * max(found.dof, 1))
+
+
+def _lead(found: Fit) -> float:
+    """By how much another minimum must be lower than this one."""
+    return max(LEAD, LEADS * (found.chi2 - found.dof))
+
+
+def _elsewhere(
+    model: Model,
+    variables: Sequence[Variable],
+    start: Values,
+    frames: Sequence[int],
+    first: Fit | None,
+    follow: Callable[..., Fit],
+    over: Sequence[str] | None,
+) -> Values | None:
+    """Values that a search over starts leads to, if they lead."""
+    own = starts.declared(variables, over)
+    if not own or not any(model.usable(f).any() for f in frames):
+        return None
+    if first is not None and not _misfits(first):
+        return None
+    blind = first is None or not first.seen(own)
+    most = starts.number_of_trials(model, frames, blind)
+    ended: list[Fit] = []
+    trials = (
+        starts.search(model, variables, start, frames, most, over)[: starts.number_followed(model, frames)]
+        if most
+        else []
+    )
+
+    def size(values: Values) -> float:
+        return sum((value_of(model, values, variables[i]) / variables[i].parameter.plausible) ** 2 for i in own)
+
+    for n, (_, values) in enumerate(trials):
+        try:
+            ended.append(follow(values, max_iterations=SHORT, tolerance=1.0))
+        except Underdetermined:  # as blind there as at the start
+            continue
+        if not _misfits(ended[-1]) and all(size(ended[-1].values) < size(other) for _, other in trials[n + 1 :]):
+            break  # what is left is no better, and larger
+    least = min((f.total for f in ended), default=math.inf)
+    if not least < (math.inf if first is None else first.total - _lead(first)):
+        return None
+    alike = [f for f in ended if f.total - least < _lead(f)]
+    return min((f.values for f in alike), key=size)
+
+
 def _descend(
     descent: Descent, max_iterations: int, accuracy: float, tick: Callable[[], None]
 ) -> tuple[list[float], str]:
@@ -177,6 +289,10 @@ def _descend(
     for iteration in range(max_iterations):
         normal = descent.linearise(tick)
         _require_data(descent, normal)
+        for _ in range(SCALINGS if iteration == 0 else 0):  # sigma goes with the prediction: once more at the new scale
+            if not descent.scale():
+                break
+            normal = descent.linearise(tick)
         history.append(normal.total)
         promise, excess = descent.promised, max(normal.chi2 - sum(normal.frame_n) + count, 0.0)
         if promise < max(accuracy, NEGLIGIBLE * excess):
@@ -243,7 +359,11 @@ def _fit_at(descent: Descent, history: list[float], reason: str, start: np.ndarr
         reason,
         history,
         start=start,
-        at_bound=[v.name for v, t, lo, hi in zip(variables, theta, descent.low, descent.high) if t <= lo or t >= hi],
+        at_bound=[
+            v.name
+            for v, t, lo, hi, var in zip(variables, theta, descent.low, descent.high, np.diag(covariance))
+            if t <= lo or t >= hi or (v.parameter.factor and t < OFF * np.sqrt(var) < np.inf)
+        ],
         normal=normal,
     )
     result.warnings = warnings_of(result, normal.a)

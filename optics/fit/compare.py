@@ -36,6 +36,7 @@ UNITS = {
     "radius": "px",
     "row": "px",
     "column": "px",
+    "site": "deg",
     "height": "mm",
     "depth": "mm",
     "incidence": "deg",
@@ -172,10 +173,11 @@ class Comparison:
         lines = iter(table([line for block in blocks for line in block], left=(0,)).split("\n"))
         shown = ["\n".join(next(lines) for _ in block) for block in blocks]
         s = self.similarity
+        several = len(self.frames) > 1
         shown.append(
-            "over frames, mean and sd: "
+            f"over frames, {'mean and sd' if several else 'one of them'}: "
             + ", ".join(
-                f"{name} {s[key][0]:.{p}f} +- {s[key][1]:.{p}f}{unit}"
+                f"{name} {_fixed(s[key][0], p)}{f' +- {s[key][1]:.{p}f}' if math.isfinite(s[key][1]) else ''}{unit}"
                 for key, name, p, unit in (("l1", "L1", 4, ""), ("ssim", "SSIM", 4, ""), ("psnr", "PSNR", 2, " dB"))
             )
         )
@@ -618,18 +620,15 @@ def _binned(name, unit, channel, x, z, edges, labels=None) -> Curve:
 def _cells(row: Row) -> tuple[str, ...]:
     if not row.n:
         return (row.label, "0", *["-"] * 8)
-    return (
-        row.label,
-        str(row.n),
-        f"{100 * row.share:.1f} %",
-        f"{row.chi2_per_dof:.3f}",
-        f"{row.bias:+.3f}",
-        f"{row.rms:.3f}",
-        f"{row.noise:.3f}",
-        f"{row.l1:.4f}",
-        f"{row.psnr:.2f}",
-        f"{row.ssim:.4f}",
-    )
+    numbers = (row.chi2_per_dof, row.bias, row.rms, row.noise, row.l1, row.psnr, row.ssim)
+    cells = [_fixed(x, places) for x, places in zip(numbers, (3, 3, 3, 3, 4, 2, 4))]
+    cells[1] = f"{row.bias:+.3f}"
+    return (row.label, str(row.n), f"{100 * row.share:.1f} %", *cells)
+
+
+def _fixed(value: float, places: int) -> str:
+    """With so many decimal places; '-' where there is no such number: no degree of freedom, no window, no error."""
+    return f"{value:.{places}f}" if math.isfinite(value) else "-"
 
 
 def _row_from(data: Mapping[str, Any]) -> Row:

@@ -29,6 +29,7 @@ FIRST_DAMPING = 1e-3  # share of the diagonal: shortens only directions that the
 EASING = 10.0  # factor between one damping and the next, as Marquardt has it
 LEAST_DAMPING = 1e-9  # below the eigenvalue of a degenerate mode (`result.DEGENERATE`), which may then be followed
 MOST_DAMPING = 1e4  # leaves a ten-thousandth of the step along the gradient: a shorter one is no progress
+SCALED = 2.0  # times the truth: a power that starts further off is solved for before all else
 HUBER = 3.0  # standard deviations beyond which a robust fit lowers the weight of a value
 
 
@@ -238,15 +239,21 @@ class Descent:
         sensor does not come back), or further where steps have brought what they promised. Without damping, only the
         bounds limit it."""
         reach = self.trust * self.reach if damping else np.inf
-        box = (self.theta, np.maximum(self.low, self.theta - reach), np.minimum(self.high, self.theta + reach))
+        box = (self.theta, np.maximum(self.lowest, self.theta - reach), np.minimum(self.high, self.theta + reach))
         u, low, high = (np.array([v.parameter.coordinate(t) for v, t in zip(self.variables, values)]) for values in box)
         a, b = self.here.a * np.outer(self.slope, self.slope), self.here.b * self.slope
         step = solve(a, b, low - u, high - u, damping)
         fall = float(2 * b @ step - step @ a @ step)
         moved = np.array([v.parameter.stepped(t, d, self.bent) for v, t, d in zip(self.variables, self.theta, step)])
         for end in (self.low, self.high):  # rounding must not leave a parameter just beside its bound
-            moved = np.where(np.abs(moved - end) < self.near, end, moved)
-        return np.clip(moved, self.low, self.high), fall
+            moved = np.where((np.abs(moved - end) < self.near) & (end >= self.lowest), end, moved)
+        return np.clip(moved, self.lowest, self.high), fall
+
+    @property
+    def lowest(self) -> np.ndarray:
+        """(p,) how far down steps on these derivative images may lead: a factor that is switched off hides everything
+        else."""
+        return np.maximum(self.low, [v.parameter.lowest(t) for v, t in zip(self.variables, self.at)])
 
     def creep(self) -> None:
         """Follow nearly flat valleys, close to the optimum: next to no damping, which would forbid to move along them,
@@ -267,10 +274,32 @@ class Descent:
     def _settled(self, theta: np.ndarray, values: Values) -> tuple[np.ndarray, Values, Normal]:
         """Theta after the powers, in which the image is linear, are solved for with all else fixed (variable
         projection)."""
+        variables = [self.variables[i] for i in self.powers]
+        return self._at(self._solved(normal_equations(self.model, variables, values, self.frames, self.robust), theta))
+
+    def _solved(self, normal: Normal, theta: np.ndarray) -> np.ndarray:
+        """Theta with the powers at the minimum of their own normal equations; one that is best switched off falls to a
+        part of its value, as in a step."""
         index, theta = self.powers, theta.copy()
-        normal = normal_equations(self.model, [self.variables[i] for i in index], values, self.frames, self.robust)
-        theta[index] += solve(normal.a, normal.b, (self.low - theta)[index], (self.high - theta)[index])
-        return self._at(np.clip(theta, self.low, self.high))
+        best = theta[index] + solve(normal.a, normal.b, (self.low - theta)[index], (self.high - theta)[index])
+        least = self.lowest[index]
+        theta[index] = np.where(best > self.low[index], np.clip(best, self.low[index], self.high[index]), least)
+        return theta
+
+    def scale(self) -> bool:
+        """Solve for the powers alone on the images of `linearise`, and move there if one of them is off by more than
+        SCALED: of readings in volts or in 12 bits nobody knows the scale, and all other images are proportional to it.
+        Returns whether theta has moved."""
+        if not self.powers:
+            return False
+        index, here = self.powers, self.here
+        own = Normal(here.a[np.ix_(index, index)], here.b[index], 0.0, 0.0, [], [], [])
+        moved = self._solved(own, self.theta)
+        old, new = self.theta[index], moved[index]
+        if not np.any((new > SCALED * old) | (old > SCALED * new)):
+            return False
+        self.theta, self.values = moved, self.moved(self.values, moved)
+        return True
 
     def chord(self, steps: int, enough: float, rough: float = 0.0, part: float = 0.0) -> float:
         """Take steps on the same derivative images; returns the total fall. At most `steps` of them are tried.

@@ -24,12 +24,12 @@ def coordinates(model: SceneModel, values: Values, index: int, seed: int = 0) ->
 
     Of a sweep of readings, (N, 1): only intensity, the set values and the row in the table tell readings apart."""
     now = model.at(values, index)
-    intensity = model.radiance(now, seed).mean(-1)
+    intensity = model.intensity(now, index, seed)
     if model.captures.table is not None:
         frame = model.frames[index]
         count = frame.image.shape[0]
         return {
-            "intensity": np.broadcast_to(intensity, (count, 1)),
+            "intensity": intensity,
             "far": np.ones((count, 1), bool),
             "reading": np.asarray(frame.rows)[..., 0],
             "frame": np.full((count, 1), float(index)),
@@ -51,6 +51,8 @@ def coordinates(model: SceneModel, values: Values, index: int, seed: int = 0) ->
         "rim": rim,
         "frame": np.full(hits.shape, float(index)),
     }
+    if view.site is not None:
+        known["site"] = np.degrees(view.site)
     if model.scene.gel is not None:
         known.update(_press(model, now, hits, emission))
     known["far"] = ~(known.get("contact", shadow) | rim | shadow) & hits.valid

@@ -65,6 +65,12 @@ class Model(Protocol):
         ...
 
     @property
+    def drives(self) -> set[str]:
+        """Keys of `driven` whose value in a frame is a drive level when it is fitted, as it is when it is set: those
+        that are set with an uncertainty. What is fitted of others in a frame is the power itself."""
+        ...
+
+    @property
     def monte_carlo(self) -> bool:
         """Whether predictions are Monte Carlo estimates, whose own error `variance` includes."""
         ...
@@ -127,9 +133,19 @@ class Model(Protocol):
         ...
 
 
+def values_in(model: Model, frames: Sequence[int]) -> float:
+    """Measured values that these frames hold, used or not: sweeps of readings differ in length."""
+    mean = np.mean([f.image.size for f in model.frames])
+    return float(model.size * sum(model.frames[i].image.size for i in frames) / mean)
+
+
 def value_of(model: Model, values: Values, variable: Variable) -> float:
-    """The present value of a variable: fitted in its first frame <- set in it <- fitted in all <- the scene's."""
+    """The present value of a variable: fitted in its first frame <- set in it <- fitted in all <- the scene's; of a
+    drive level (`Model.drives`), the level and not the power."""
     key = variable.keys[0]
     if variable.frames is None:
         return float(values.common.get(key, model.base[key]))
-    return float(model.at(values, variable.frames[0])[key])
+    first = variable.frames[0]
+    if key in model.drives:
+        return float(values.frame.get(first, {}).get(key, model.frames[first].parameters.get(key, 1.0)))
+    return float(model.at(values, first)[key])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -10,8 +11,9 @@ from scipy.sparse.csgraph import connected_components
 
 from optics.fit import showing
 from optics.fit.descent import Normal, scaled_eigen
+from optics.fit.gauges import STILL, Gauges, gauges_of, sparse_basis
 from optics.scene.parameter import Values, Variable
-from optics.words import some
+from optics.words import NOT_DETERMINED, some
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -20,6 +22,9 @@ ALIKE = 0.995  # correlation beyond which two variables are reported as not told
 # error that either would have alone
 DEGENERATE = (
     1e-7  # eigenvalue of the scaled normal matrix, over the largest, of a degenerate mode: 3000 times the error
+)
+HUGE = (
+    3.0  # plausible sizes: a standard deviation beyond, of a variable in a gauge, is that of its prior or of rounding
 )
 MEMBER = 0.15  # component in a degenerate mode above which a variable is named with it: 2 % of the mode's square
 
@@ -69,19 +74,50 @@ class Fit:
     def chi2_per_dof(self) -> float:
         return self.chi2 / max(self.dof, 1)
 
+    @property
+    def total(self) -> float:
+        """What was minimised: chi2 of the data plus that of the priors; NaN without a linearisation."""
+        return np.nan if self.normal is None else self.normal.total
+
+    def seen(self, places: Sequence[int]) -> bool:
+        """Whether a change of each of these variables by its plausible size changes the frames, to first order."""
+        if self.normal is None:
+            return True
+        sizes = np.array([self.variables[i].parameter.plausible for i in places])
+        return bool(np.all(np.diag(self.normal.a)[list(places)] * sizes**2 > STILL))
+
+    @property
+    def gauges(self) -> Gauges:
+        """What no frame shows, and the combinations that are known beside it (optics.fit.gauges)."""
+        return gauges_of(self)
+
+    def blurred(self, gauges: Gauges) -> set[int]:
+        """Places of variables whose own standard deviation is that of their priors, or of nothing: gauges leave them
+        open, or no frame depends on them."""
+        sd = self.sd
+        return {i for i in (*gauges.members, *gauges.silent) if sd[i] > HUGE * self.variables[i].parameter.plausible}
+
     def table(self) -> str:
-        """One line per variable: estimate, standard deviation, unit, start, and the strongest correlation."""
+        """One line per variable: estimate, standard deviation, unit, start, and the strongest correlation. Of variables
+        that only a combination of is determined, the combinations follow."""
         lines = [f"{'variable':<28}{'estimate':>12}{'+- sd':>11}  {'unit':<6}{'start':>11}   strongest correlation"]
         correlation = np.abs(self.correlation - np.eye(len(self.variables)))
+        gauges = self.gauges
+        blurred = self.blurred(gauges)
         for i, variable in enumerate(self.variables):
             j = int(np.argmax(correlation[i])) if len(self.variables) > 1 else i
             other = f"{self.correlation[i, j]:+.2f} {self.variables[j].name}" if j != i else ""
             start = "" if self.start is None else f"{self.start[i]:11.5g}"
             bound = "  at its bound" if variable.name in self.at_bound else ""
-            lines.append(
-                f"{variable.name:<28}{self.estimate[i]:12.5g}{self.sd[i]:11.2g}  {variable.parameter.unit:<6}"
-                f"{start}   {other}{bound}"
-            )
+            number = f"{self.estimate[i]:12.5g}{self.sd[i]:11.2g}"
+            if i in blurred:
+                number = f"{self.estimate[i]:12.5g}{'unseen' if i in gauges.silent else 'gauge':>11}"
+            elif not variable.parameter.reach.holds(self.estimate[i], self.sd[i]):
+                number = f"{NOT_DETERMINED:>23}"
+            elif np.isnan(self.sd[i]):
+                number = f"{self.estimate[i]:12.5g}{'?':>11}"
+            lines.append(f"{variable.name:<28}{number}  {variable.parameter.unit:<6}{start}   {other}{bound}")
+        lines += gauges.lines()
         lines.append(
             f"chi2 per degree of freedom {self.chi2_per_dof:.4f} ({self.dof} degrees of freedom); {self.reason}"
         )
@@ -106,14 +142,19 @@ def warnings_of(result: Fit, a: np.ndarray) -> list[str]:
     """
     names = [v.name for v in result.variables]
     silent = [n for n, d in zip(names, np.diag(a)) if d == 0]
-    texts = [f"nothing in the frames depends on {some(silent, 8)}"] if silent else []
+    still = [v.name for v, d in zip(result.variables, np.diag(a)) if d == 0 and v.parameter.starts]
+    unseen = [n for n in silent if n not in still]
+    texts = [f"nothing in the frames depends on {some(unseen, 8)}"] if unseen else []
+    if still:
+        texts.append(f"to first order nothing in the frames depends on {some(still, 8)} at the values found")
     modes = _degenerate_modes(names, a, silent)
+    held = [{names[i] for i in g.members} for g in result.gauges.gauges]  # by priors: the table lists them
     for mode in modes:
         texts.append(
             f"the captures cannot tell apart {some(mode, 8)}: only a combination is determined; hold one of "
             "them, or give it a prior"
         )
-    texts += _correlated(result, names, [set(), *map(set, modes)])
+    texts += _correlated(result, names, [set(), *map(set, modes), *held])
     texts += [f"{n} ended at its bound" for n in result.at_bound]
     if not result.converged:
         texts.append(result.reason)
@@ -121,14 +162,15 @@ def warnings_of(result: Fit, a: np.ndarray) -> list[str]:
 
 
 def _degenerate_modes(names: list[str], a: np.ndarray, silent: list[str]) -> list[list[str]]:
-    """The variables of each direction that the data do not determine."""
+    """The variables of each direction that data and priors do not determine, in as few variables as there may be."""
     if not len(a):
         return []
     _, eigen, vectors = scaled_eigen(a)
+    live = np.array([n not in silent for n in names])
+    basis, _ = sparse_basis(vectors[:, (eigen < DEGENERATE * eigen.max()) & vectors[live].any(0)])
     modes = [
-        [n for n, c in zip(names, vector) if abs(c) > MEMBER and n not in silent]
-        for value, vector in zip(eigen, vectors.T)
-        if value < DEGENERATE * eigen.max()
+        [n for n, c in zip(names, vector) if abs(c) > MEMBER * np.linalg.norm(vector) and n not in silent]
+        for vector in basis.T
     ]
     return [mode for mode in modes if len(mode) > 1]
 

@@ -5,8 +5,10 @@ It implements `optics.fit.model.Model`, which documents what a fit and a diagnos
 from __future__ import annotations
 
 import copy
+from collections import OrderedDict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -23,6 +25,7 @@ from optics.scene.parameter import Parameter, Values, Variable
 if TYPE_CHECKING:
     from optics.light.monte_carlo import MonteCarloRenderer
 
+KEPT = 4  # points in parameter space, for each frame, at which the variance that settings bring is remembered
 FLAT_FIELDS = ("multiplicative", "additive", "none")
 
 
@@ -34,7 +37,7 @@ class SceneModel:
     flat_field   how the measured background B of the untouched sensor enters: "multiplicative" (True): what the
                  scene does not explain of it is a gain; "additive": it is light that a press does not change; None: it
                  is not used
-    flat         (H, W, C) DN, that background above black; None where it is not used
+    flat         (H, W, C) DN, the background of all frames above black; None where it is not used
     """
 
     def __init__(
@@ -48,30 +51,46 @@ class SceneModel:
                 f"{captures.folder}: no noise model; give [noise] in captures.toml or repeats to estimate it from"
             )
         if captures.table is not None:
+            noise = replace(noise, signed=True)  # of point readings, those below 0 are data
             captures = sweeps(captures, scene.parameters, list(scene.lights))
+        captures = _with_files(captures, scene)
         self.scene, self.captures, self.noise = scene, captures, noise
         self.mosaic, self.frames = None, captures.frames
-        background = captures.flat_field
         if captures.cfa is not None:
             self.mosaic = cfa_channel(captures.frames[0].image.shape, captures.cfa)[..., None] == np.arange(3)
             self.frames = [replace(f, image=np.repeat(f.image, 3, axis=2)) for f in captures.frames]
-            background = None if background is None else np.repeat(background, 3, axis=2)
         self.renderer = renderer_of(scene)
         self.monte_carlo = (
             self.renderer.monte_carlo
         )  # whether predictions are Monte Carlo estimates, whose error `variance` holds
         self._edges_kept: dict[int, np.ndarray] = {}
+        self._dialled_kept: OrderedDict[tuple, np.ndarray] = OrderedDict()
+        # Values at which slopes turn errors of settings into errors of readings; None: the present ones. While a fit
+        # moves, slopes that moved with it would change its weights, and it could circle without an end.
+        self.weighed_at: Values | None = None
+        if captures.mosaic:
+            scene.camera.mosaic = captures.mosaic
+        if getattr(scene.camera, "mosaic", ()) and captures.cfa is not None:
+            raise BadScene(
+                f"{captures.folder}: cfa = '{captures.cfa}', but the scene's camera has a mosaic of analysers; "
+                "allowed: mosaic in captures.toml, or a scene whose camera has none"
+            )
         self.parameters: dict[str, Parameter] = scene.parameters
         self.base = {
             **scene.values(),
             **scene.check(captures.parameters, f"{captures.folder}/captures.toml [parameters]"),
         }
+        # a part may say by its words what it takes
+        scene.set({k: v for k, v in self.base.items() if self.parameters[k].role in ("regions", "region")})
         for frame in self.frames:
             scene.check(frame.parameters, f"{frame.file or captures.folder}: frame {frame.name}")
         self.companions = self._companions()
         # A power that frames set is a drive level: what a calibration finds is the LED's power at drive 1.
         self.driven = set(scene.powers.values()) & {k for f in self.frames for k in (*f.parameters, *f.readings)}
         self.base.update(dict.fromkeys(self.driven, 1.0))
+        self.drives = self.driven & {
+            k for f in self.frames for k, sd in captures.uncertainty_of(f).items() if np.ndim(sd) == 0
+        }
         self.shape = self.frames[0].image.shape
         height, width = self.shape[:2] if captures.table is None else (1, 1)
         if (width, height) != scene.camera.resolution:
@@ -81,6 +100,11 @@ class SceneModel:
                 f"-D width={width} -D height={height}"
             )
         self.developer = Developer(scene.camera, scene.integrator.bands or (0.0,), noise.black_level, noise.saturation)
+        if self.developer.site is not None and self.monte_carlo:
+            raise BadScene(
+                f"{captures.folder}: a mosaic of analysers before a scene with dielectric bodies, whose light is "
+                "followed without its polarization at the camera; allowed: scenes of layers and matt surfaces"
+            )
         if self.developer.matrix.shape[0] != self.shape[2]:
             channels, wanted, first = self.shape[2], self.developer.matrix.shape[0], captures.frames[0].file
             raise BadScene(
@@ -98,14 +122,30 @@ class SceneModel:
         if flat_field not in (True, False, None, *FLAT_FIELDS):
             raise UnknownKey(str(flat_field), FLAT_FIELDS, "flat-field mode")
         self.flat_field = {True: FLAT_FIELDS[0], False: None, "none": None}.get(flat_field, flat_field)
-        self.flat = None  # the measured background above black, a declared nuisance; see `predict`
-        if self.flat_field and background is not None and scene.gel is None:
+        backgrounds = [captures.flat_field, *(f.flat_field for f in self.frames)]
+        if self.flat_field and any(b is not None for b in backgrounds) and scene.gel is None:
             raise BadScene(
                 f"{captures.folder}: the set has a background, and the scene no gel that could be at rest in it; "
                 "allowed: --flat-field none"
             )
-        if self.flat_field and background is not None:
-            self.flat = np.maximum(np.asarray(background, float) - self.noise.black_level, 1e-3)
+        self._backgrounds: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+        self.flat = self._above_black(captures.flat_field)  # a declared nuisance; see `predict`
+
+    def _above_black(self, background: np.ndarray | None) -> np.ndarray | None:
+        """A measured background above black, (H, W, C) DN; None where backgrounds are not used."""
+        if background is None or not self.flat_field:
+            return None
+        if id(background) not in self._backgrounds:  # frames may share one
+            whole = np.repeat(background, 3, axis=2) if self.mosaic is not None else background
+            above = np.maximum(np.asarray(whole, float) - self.noise.black_level, 1e-3)
+            self._backgrounds[id(background)] = background, above  # kept alive, so that no other takes its id
+        return self._backgrounds[id(background)][1]
+
+    def flat_of(self, index: int) -> np.ndarray | None:
+        """The background of a frame above black, (H, W, C) DN: its own, else that of the set; None where it has
+        none."""
+        own = self._above_black(self.frames[index].flat_field)
+        return self.flat if own is None else own
 
     def imagine(self, frames: Sequence[Frame]) -> SceneModel:
         """The same model, with the same renderer, with further frames: measurements that could be made."""
@@ -116,6 +156,7 @@ class SceneModel:
         )
         twin.base = {**self.base, **dict.fromkeys(twin.driven - self.driven, 1.0)}
         twin.companions, twin._edges_kept = twin._companions(), dict(self._edges_kept)
+        twin._dialled_kept = OrderedDict()
         return twin
 
     # -- values -------------------------------------------------------------------------------------------------------
@@ -129,14 +170,19 @@ class SceneModel:
         frame = self.frames[index]
         for key, value in (*frame.parameters.items(), *frame.readings.items()):
             now[key] = value * now[key] if key in self.driven else value
-        now.update(values.frame.get(index, {}))
+        found = values.frame.get(index, {})
+        powers = {k: values.common.get(k, self.base[k]) for k in self.drives & found.keys()}
+        now.update(found)
+        now.update({k: found[k] * power for k, power in powers.items()})
         return now
 
-    def _acts(self, variable: Variable, index: int) -> dict[str, Any]:
+    def _acts(self, values: Values, variable: Variable, index: int) -> dict[str, Any]:
         """The keys through which a variable acts in a frame, each with d key / d variable."""
         own: dict[str, Any] = {**self.frames[index].parameters, **self.frames[index].readings}
+        found = values.frame.get(index, {})
+        own.update({k: found[k] for k in self.drives & found.keys()})
         if variable.frames is not None:
-            return dict.fromkeys(variable.keys, 1.0)
+            return {k: values.common.get(k, self.base[k]) if k in self.drives else 1.0 for k in variable.keys}
         return {k: own.get(k, 1.0) for k in variable.keys if k not in own or k in self.driven}
 
     def _companions(self) -> list[set[str]]:
@@ -154,8 +200,9 @@ class SceneModel:
 
     def linear_in(self, variable: Variable) -> bool:
         """Whether predictions are linear in a variable together with all others of which this holds: the LEDs'
-        powers."""
-        return all(self._is_power(k) for k in variable.keys)
+        powers, but for drive levels, which multiply them."""
+        drive = variable.frames is not None and not self.drives.isdisjoint(variable.keys)
+        return not drive and all(self._is_power(k) for k in variable.keys)
 
     def _is_power(self, key: str) -> bool:
         return key in self.renderer.power_keys
@@ -175,9 +222,21 @@ class SceneModel:
         self.renderer.apply(self.at(values, index))
 
     # -- prediction ---------------------------------------------------------------------------------------------------
-    def radiance(self, now: Mapping, seed: int = 0) -> np.ndarray:
-        """(H, W, B): linear image of a frame."""
-        return self.renderer.radiance(now, seed)
+    def radiance(self, now: Mapping, index: int = 0, seed: int = 0) -> np.ndarray:
+        """(H, W, B): linear image of a frame at these values; of readings (N, 1, B), also where nothing is lit or
+        nothing differs between them: all images have one size, sweeps of readings have each their own. Stokes vectors
+        (3, H, W, B) for a mosaic of analysers."""
+        if self.developer.site is not None:
+            return np.stack([self.renderer.radiance(now, seed, component) for component in range(3)])
+        image = self.renderer.radiance(now, seed)
+        return np.broadcast_to(image, (*self.frames[index].image.shape[:2], image.shape[2]))
+
+    def intensity(self, now: Mapping, index: int = 0, seed: int = 0) -> np.ndarray:
+        """(H, W) radiance that a pixel sees, behind its analyser where it has one; mean of the bands."""
+        image = self.radiance(now, index, seed)
+        if self.developer.site is not None:
+            image = self.developer.behind_analysers(image, self.developer.view(now))
+        return image.mean(-1)
 
     def untouched(self, now: Mapping) -> dict:
         """The same frame with the gel at rest."""
@@ -197,23 +256,24 @@ class SceneModel:
             multiplicative   black + g (B - black) (P - black)/(P0 - black)
             additive         black + g (B - black) + P - P0             (light adds up: exact for a linear response)
         """
-        return [self._predict(self._turn_to(values, i), seed) for i in self._indices(frames)]
+        return [self._predict(self._turn_to(values, i), i, seed) for i in self._indices(frames)]
 
     def _turn_to(self, values: Values, index: int) -> dict:
         """A frame's values; tells the renderer which other LEDs will be asked for in the same geometry."""
         self.renderer.together = self.companions[index]
         return self.at(values, index)
 
-    def _develop(self, now: Mapping, seed: int) -> np.ndarray:
-        return self.developer.develop(self.radiance(now, seed), now)
+    def _develop(self, now: Mapping, index: int, seed: int) -> np.ndarray:
+        return self.developer.develop(self.radiance(now, index, seed), now)
 
-    def _predict(self, now: Mapping, seed: int = 0) -> np.ndarray:
-        image = self._develop(now, seed)
-        if self.flat is None:
+    def _predict(self, now: Mapping, index: int, seed: int = 0) -> np.ndarray:
+        image = self._develop(now, index, seed)
+        background = self.flat_of(index)
+        if background is None:
             return image
         black = self.noise.black_level
-        flat = self.flat * self.gains(now)
-        rest = self._develop(self.untouched(now), seed)
+        flat = background * self.gains(now)
+        rest = self._develop(self.untouched(now), index, seed)
         if self.flat_field == "additive":
             return black + flat + image - rest
         return black + (image - black) * flat / np.maximum(rest - black, 1e-6)
@@ -229,12 +289,13 @@ class SceneModel:
         share       1 - (left/structure)^2
         What is left enters predictions as a gain or as light (`flat_field`); either way it is not explained.
         """
-        if self.flat is None:
+        background = self.flat_of(index)
+        if background is None:
             raise BadScene(f"{self.captures.folder}: no flat field in use")
-        rest = self._develop(self.untouched(self.at(values or Values(), index)), 0) - self.noise.black_level
+        rest = self._develop(self.untouched(self.at(values or Values(), index)), index, 0) - self.noise.black_level
         found = []
         for c in range(self.shape[2]):
-            structure, left = np.std(self.flat[..., c]), np.sqrt(np.mean((self.flat - rest)[..., c] ** 2))
+            structure, left = np.std(background[..., c]), np.sqrt(np.mean((background - rest)[..., c] ** 2))
             found.append(
                 {"structure": float(structure), "left": float(left), "share": float(1 - (left / structure) ** 2)}
             )
@@ -264,12 +325,13 @@ class SceneModel:
     ):
         now = self._turn_to(values, index)
         black = self.noise.black_level
-        linear = self.developer.linearise(self.radiance(now, seed), now)
+        linear = self.developer.linearise(self.radiance(now, index, seed), now)
         prediction = linear.image
-        if self.flat is not None:
+        background = self.flat_of(index)
+        if background is not None:
             at_rest = self.untouched(now)
-            rest = self.developer.linearise(self.radiance(at_rest, seed), at_rest)
-            flat = self.flat * self.gains(now)
+            rest = self.developer.linearise(self.radiance(at_rest, index, seed), at_rest)
+            flat = background * self.gains(now)
             if self.flat_field == "additive":
                 prediction, scale, share, gained = black + flat + linear.image - rest.image, 1.0, 1.0, 1.0
             else:
@@ -278,15 +340,18 @@ class SceneModel:
                 prediction, gained = black + (linear.image - black) * scale, share
         images: dict[str, np.ndarray] = {}
         image: Any
+        at_once = self._light_at_once(values, now, variables, secant, index, seed)
         for variable in variables:
-            acts = self._acts(variable, index)
+            acts = self._acts(values, variable, index)
             if not acts:
                 continue
             if variable.name in secant:
-                image = self._secant(values, variable, index, secant[variable.name], prediction, seed)
+                image = self._secant(values, variable, index, secant[variable.name], prediction, seed, at_once)
+            elif variable.name in at_once:
+                image = linear.of_image(at_once[variable.name])
             else:
                 image = self._tangent(linear, now, acts, seed)
-                if self.flat is not None:
+                if background is not None:
                     still = self._tangent(
                         rest, at_rest, {k: f for k, f in acts.items() if not self._rests(k)}, seed, True
                     )
@@ -294,19 +359,73 @@ class SceneModel:
                         image = scale * ((0 if image is None else image) - share * (0 if still is None else still))
                         if any(self.parameters[k].how == "image" for k in acts):
                             stepped = {**now, **{k: now[k] + 1j * STEP for k in acts}}
-                            image = image + gained * self.flat * (self.gains(stepped).imag / STEP)
+                            image = image + gained * background * (self.gains(stepped).imag / STEP)
             if image is not None:
-                images[variable.name] = image.astype(np.float32)
+                images[variable.name] = np.broadcast_to(image.astype(np.float32), self.frames[index].image.shape)
         return prediction, images
 
-    def _secant(self, values: Values, variable: Variable, index: int, step: float, prediction, seed: int) -> np.ndarray:
-        """[f(value + step) - f(value)] / step of the whole prediction; at a bound, the step goes the other way."""
+    def _secant(
+        self,
+        values: Values,
+        variable: Variable,
+        index: int,
+        step: float,
+        prediction: np.ndarray,
+        seed: int,
+        at_once: Mapping[str, np.ndarray] = MappingProxyType({}),
+    ) -> np.ndarray:
+        """[f(value + step) - f(value)] / step of the whole prediction; at a bound, the step goes the other way.
+
+        at_once   linear images with the steps, of variables for which they are known
+        """
+        moved, step = self._stepped(values, variable, step)
+        now = self.at(moved, index)
+        if variable.name in at_once:
+            return (self.developer.develop(at_once[variable.name], now) - prediction) / step
+        return (self._predict(now, index, seed) - prediction) / step
+
+    def _stepped(self, values: Values, variable: Variable, step: float) -> tuple[Values, float]:
+        """(values with a step of a variable, the step); at a bound it goes the other way."""
         value = value_of(self, values, variable)
         if not variable.parameter.bounds[0] <= value + step <= variable.parameter.bounds[1]:
             step = -step
         moved = values.copy()
         moved.put(variable, value + step)
-        return (self._predict(self.at(moved, index), seed) - prediction) / step
+        return moved, step
+
+    def _light_at_once(
+        self,
+        values: Values,
+        now: Mapping,
+        variables: Sequence[Variable],
+        secant: Mapping[str, float],
+        index: int,
+        seed: int,
+    ) -> dict[str, np.ndarray]:
+        """Of readings, name -> (N, 1, B): d radiance / d value, or the radiance with the step of a secant, of all
+        variables that act in layers alone: their readings are predicted one behind the other, as one long sweep."""
+        if self.captures.table is None or not (self.lit(now) or self.renderer.glows(now)):
+            return {}
+        found: dict[str, np.ndarray] = {}
+        for stepped in (False, True):
+            own, states = [], []
+            for v in variables:
+                acts = self._acts(values, v, index)
+                alike = all(self.parameters[k].how == "layer" and self.parameters[k].role != "face" for k in acts)
+                if not acts or not alike or (v.name in secant) != stepped:
+                    continue
+                own.append(v)
+                if stepped:
+                    states.append(self.at(self._stepped(values, v, secant[v.name])[0], index))
+                else:
+                    states.append({**now, **{k: now[k] + 1j * STEP * factor for k, factor in acts.items()}})
+            if len(own) < 2:
+                continue
+            radiance = self.renderer.radiance(_behind(now, states), seed)
+            parts = np.split(radiance, len(own))
+            shape = (*self.frames[index].image.shape[:2], radiance.shape[2])
+            found.update({v.name: np.broadcast_to(p if stepped else p.imag / STEP, shape) for v, p in zip(own, parts)})
+        return found
 
     def _tangent(
         self, linear, now: Mapping, acts: Mapping[str, float], seed: int, at_rest: bool = False
@@ -326,7 +445,16 @@ class SceneModel:
         return total
 
     def _light_tangent(self, now: Mapping, key: str, factor: Any, seed: int, at_rest: bool) -> np.ndarray | None:
-        """factor times d radiance / d key in a frame."""
+        """factor times d radiance / d key in a frame; of Stokes vectors, as `radiance` has them."""
+        if self.developer.site is None:
+            return self._component_tangent(now, key, factor, seed, at_rest, 0)
+        parts = [self._component_tangent(now, key, factor, seed, at_rest, component) for component in range(3)]
+        return None if parts[0] is None else np.stack(cast("list[np.ndarray]", parts))
+
+    def _component_tangent(
+        self, now: Mapping, key: str, factor: Any, seed: int, at_rest: bool, component: int
+    ) -> np.ndarray | None:
+        """factor times d / d key of one component of the Stokes vectors at the camera."""
         name = key.rsplit(".", 1)[0]
         own = name in self.scene.leds  # a parameter of one point light
         lit = self.lit(now)
@@ -335,10 +463,12 @@ class SceneModel:
         if not lit and not glows and key not in self.renderer.ambient_keys and self.parameters[key].how != "difference":
             return None  # a dark frame
         if self.parameters[key].how == "layer":
-            return factor * (np.imag(self.radiance({**now, key: now[key] + 1j * STEP}, seed)) / STEP)
+            return factor * (
+                np.imag(self.renderer.radiance({**now, key: now[key] + 1j * STEP}, seed, component)) / STEP
+            )
         if key == self.renderer.bounce_key:
             return (
-                factor * sum(power * self.renderer.bounced(now, led, seed) for led, power in lit.items())
+                factor * sum(power * self.renderer.bounced(now, led, seed, component) for led, power in lit.items())
                 if lit
                 else None
             )
@@ -353,48 +483,52 @@ class SceneModel:
             factor = factor * others
             if not np.any(factor):
                 return None
-            return factor * self.renderer.light({**now, **dict.fromkeys(self.scene.power_keys(name), 1.0)}, name, seed)
+            return factor * self.renderer.light(
+                {**now, **dict.fromkeys(self.scene.power_keys(name), 1.0)}, name, seed, component
+            )
         if own and name not in lit:
             return None
         if self.renderer.monte_carlo:
             return factor * cast("MonteCarloRenderer", self.renderer).tangent(now, key, seed)
         if key in self.renderer.ambient_keys:
-            return factor * self._difference_ambient(now, key)
+            return factor * self._difference_ambient(now, key, component)
         if self.parameters[key].how == "difference" and not own:
-            return factor * self._difference(now, key, seed)
+            return factor * self._difference(now, key, seed, component)
         if own:
             image = (
-                self._difference_led(now, name, key)
+                self._difference_led(now, name, key, component)
                 if self.parameters[key].how == "difference"
-                else tangent(now, name, key)
+                else tangent(now, name, key, component)
             )
             return factor * lit[name] * image
-        total: Any = sum((power * tangent(now, led, key) for led, power in lit.items()), 0.0)
+        total: Any = sum((power * tangent(now, led, key, component) for led, power in lit.items()), 0.0)
         if glows:
-            total = total + self._difference_ambient(now, key)
+            total = total + self._difference_ambient(now, key, component)
         return factor * total
 
-    def _difference(self, now: Mapping, key: str, seed: int) -> np.ndarray:
+    def _difference(self, now: Mapping, key: str, seed: int, component: int) -> np.ndarray:
         """Central difference of the linear image, one-sided at a bound; common samples."""
         low, high = self.parameters[key].sides(now[key])
-        return (self.radiance({**now, key: high}, seed) - self.radiance({**now, key: low}, seed)) / (high - low)
+        first, second = (self.renderer.radiance({**now, key: value}, seed, component) for value in (low, high))
+        return (second - first) / (high - low)
 
-    def _difference_led(self, now: Mapping, led: str, key: str) -> np.ndarray:
+    def _difference_led(self, now: Mapping, led: str, key: str, component: int) -> np.ndarray:
         low, high = self.parameters[key].sides(now[key])
-        return (self.renderer.image({**now, key: high}, led) - self.renderer.image({**now, key: low}, led)) / (
-            high - low
-        )
+        first, second = (self.renderer.image({**now, key: value}, led, component) for value in (low, high))
+        return (second - first) / (high - low)
 
-    def _difference_ambient(self, now: Mapping, key: str) -> np.ndarray:
+    def _difference_ambient(self, now: Mapping, key: str, component: int) -> np.ndarray:
         low, high = self.parameters[key].sides(now[key])
-        return (self.renderer.ambient({**now, key: high}) - self.renderer.ambient({**now, key: low})) / (high - low)
+        first, second = (self.renderer.ambient({**now, key: value}, component) for value in (low, high))
+        return (second - first) / (high - low)
 
     # -- what a fit and a diagnosis need of the data ------------------------------------------------------------------
     def usable(self, index: int) -> np.ndarray:
         """(H, W, C) bool, the values to use: not saturated, not clipped at black, not masked by the user, in a mosaic
         the pixel's own channel."""
         frame = self.frames[index]
-        mask = self.noise.usable(frame.image)
+        beside = 1 if self.captures.table is None else 0  # readings of a sweep are no neighbours
+        mask = self.noise.usable(frame.image, beside)
         mask = np.broadcast_to(mask if mask.ndim == 3 else mask[..., None], frame.image.shape).copy()
         if frame.mask is not None:
             mask &= np.asarray(frame.mask, bool)[..., None]
@@ -410,19 +544,21 @@ class SceneModel:
         it."""
         if index not in self._edges_kept:
             now = self.at(Values(), index)
-            low: Any = 0.0
-            high: Any = 0.0
+            across: Any = 0.0  # the step, of Stokes vectors the sum of the steps of three components: an upper bound
             images = [(self.renderer.led(now, light), power) for light, power in self.lit(now).items()]
-            for image, power in images + [(self.renderer.glow(now), 1.0)] * self.renderer.glows(now):
+            if self.renderer.glows(now):
+                images.append((self.renderer.glow(now), np.ones(1)))
+            for image, power in images:
                 if image.raw is None or not len(image.index):
                     continue
-                fine = image.raw[1] * self.renderer.weights(now, image)[1]
-                low, high = low + power * fine.min(1), high + power * fine.max(1)
+                for component in range(1 if self.developer.site is None else 3):
+                    fine = image.raw[1] * self.renderer.weights(now, image, component)[1]
+                    across = across + power * (fine.max(1) - fine.min(1))
             known = np.ones(self.shape, bool)
-            if np.ndim(high):
+            if np.ndim(across):
                 view = self.developer.view(now)
                 full = self.noise.saturation - self.noise.black_level
-                step = ((high - low) @ self.developer.matrix.T) * np.abs(self.developer.scale(view)) * full
+                step = (across @ self.developer.matrix.T) * np.abs(self.developer.scale(view)) * full
                 level = self.predict(Values(), [index])[0].reshape(-1, self.shape[2])[image.index]
                 known.reshape(-1, self.shape[2])[image.index] = (
                     step / self.renderer.rim_samples < self.noise.sd(level) / 6
@@ -436,10 +572,44 @@ class SceneModel:
         return float(np.mean([f.image.size for f in self.frames])) / (3 if self.mosaic is not None else 1)
 
     def variance(self, values: Values, index: int, prediction: np.ndarray) -> np.ndarray:
-        """(H, W, C) in DN^2, of a frame about its prediction: the camera's noise and, where images are Monte Carlo
-        estimates, their own error, averaged over 3 x 3 pixels as it is itself known to a quarter only."""
+        """(H, W, C) in DN^2, of a frame about its prediction: the camera's noise; where images are Monte Carlo
+        estimates, their own error, averaged over 3 x 3 pixels as it is itself known to a quarter only; and of readings,
+        (d prediction / d setting x sd)^2 for every setting with an uncertainty (`capture_set.sweeps`)."""
         noise = self.noise.variance(prediction)
-        return noise + self._error(values, index) if self.monte_carlo else noise
+        if self.monte_carlo:
+            noise = noise + self._error(values, index)
+        if self._dialled(index):
+            noise = noise + self._of_settings(values, index)
+        return noise
+
+    @property
+    def dialled(self) -> bool:
+        """Whether readings have settings with an error of their own."""
+        return any(self._dialled(i) for i in range(len(self.frames)))
+
+    def _dialled(self, index: int) -> dict[str, np.ndarray]:
+        """The settings of a sweep whose errors differ from reading to reading: (N, 1, 1) standard deviations by key."""
+        return {k: sd for k, sd in self.frames[index].uncertainty.items() if isinstance(sd, np.ndarray) and sd.any()}
+
+    def _of_settings(self, values: Values, index: int) -> np.ndarray:
+        """(N, 1, C) variance in DN^2 that the errors of a sweep's settings bring, at the values or at `weighed_at`."""
+        values = self.weighed_at or values
+        own = values.frame.get(index, {})
+        state = (index, *sorted(values.common.items()), None, *sorted(own.items()))
+        if state not in self._dialled_kept:
+            now = self._turn_to(values, index)
+            linear = self.developer.linearise(self.radiance(now, index), now)
+            total = np.zeros((1, 1, 1))
+            for key, sd in self._dialled(index).items():
+                # of a drive level, the power that it multiplies
+                factor = {**self.base, **values.common}[key] if key in self.driven else 1.0
+                slope = self._tangent(linear, now, {key: factor}, 0)
+                if slope is not None:
+                    total = total + (slope * sd) ** 2
+            self._dialled_kept[state] = total
+            while len(self._dialled_kept) > KEPT * len(self.frames):
+                self._dialled_kept.popitem(last=False)
+        return self._dialled_kept[state]
 
     def _error(self, values: Values, index: int) -> np.ndarray:
         """(H, W, C) variance of a Monte Carlo prediction, DN^2."""
@@ -474,5 +644,36 @@ class SceneModel:
     def family(self, key: str) -> str:
         if key in self.parameters and self.parameters[key].role == "clock":
             return "time"
+        if key == "site":
+            return "camera"
         name = key.rpartition(".")[0]
         return self.scene.declaration(name).family if name in self.scene.parts else ""
+
+
+def _behind(now: Mapping, states: Sequence[Mapping]) -> dict[str, Any]:
+    """Values of one sweep that holds those of several, one behind the other; what never differs stays as it is."""
+    arrays = {key for key, value in now.items() if isinstance(value, np.ndarray)}
+    count = max([now[key].size for key in arrays], default=1)
+    joined = dict(now)
+    for key, value in now.items():
+        if key not in arrays and all(state[key] is value or state[key] == value for state in states):
+            continue
+        own = [np.broadcast_to(np.reshape(state[key], (-1, 1, 1)), (count, 1, 1)) for state in states]
+        joined[key] = np.concatenate(own)
+    return joined
+
+
+def _with_files(captures: Captures, scene: Scene) -> Captures:
+    """The set with the files that its settings name (a map of regions) as paths, where they lie in its folder."""
+
+    def found(settings: Mapping) -> dict:
+        own = dict(settings)
+        for key, value in settings.items():
+            parameter = scene.parameters.get(key)
+            if parameter is not None and parameter.files and str(value).endswith(parameter.files):
+                file = captures.folder / str(value)
+                own[key] = str(file.resolve()) if file.is_file() else value
+        return own
+
+    frames = [replace(f, parameters=found(f.parameters)) for f in captures.frames]
+    return replace(captures, parameters=found(captures.parameters), frames=frames)

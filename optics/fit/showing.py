@@ -22,9 +22,10 @@ def records(fit: Fit) -> list[dict[str, Any]]:
     """One record per variable.
 
     name, keys, unit, value, sd (1 standard deviation), start, neutral, plausible, frames (indices; None: all),
-    prior_mean, prior_sd, pull = (value - prior_mean) / prior_sd, at_bound. None where there is no such number.
+    prior_mean, prior_sd, pull = (value - prior_mean) / prior_sd, at_bound, gauge (whether only combinations of it with
+    others are determined). None where there is no such number.
     """
-    out = []
+    out, members = [], fit.gauges.members
     for i, (v, value, sd) in enumerate(zip(fit.variables, np.asarray(fit.estimate, float), fit.sd)):
         mean, width = v.prior if v.prior is not None else (None, None)
         out.append(
@@ -42,6 +43,7 @@ def records(fit: Fit) -> list[dict[str, Any]]:
                 "prior_sd": width,
                 "pull": None if mean is None or width is None else (float(value) - mean) / width,
                 "at_bound": v.name in fit.at_bound,
+                "gauge": i in members,
             }
         )
     return out
@@ -94,13 +96,16 @@ def plot(fit: Fit) -> Figure:
 def html(fit: Fit) -> str:
     """What a notebook shows of a fit."""
     correlation = np.abs(fit.correlation - np.eye(len(fit.variables)))
-    lines = []
+    gauges = fit.gauges
+    lines, blurred = [], fit.blurred(gauges)
     for i, r in enumerate(records(fit)):
         j = int(np.argmax(correlation[i])) if len(fit.variables) > 1 else i
         lines.append(
             (
                 r["name"],
-                words.with_sd(r["value"], r["sd"], typeset=True),
+                words.with_sd(r["value"], r["sd"], typeset=True, reach=fit.variables[i].parameter.reach)
+                if i not in blurred
+                else words.number(r["value"], 4, typeset=True) + (" (unseen)" if i in gauges.silent else " (gauge)"),
                 r["unit"] if words.spaced(r["unit"]) else "",
                 words.number(r["start"], 5, typeset=True),
                 "" if r["pull"] is None else words.number(r["pull"], 2, typeset=True),
@@ -113,7 +118,7 @@ def html(fit: Fit) -> str:
     return words.html_block(
         f"Fit: χ²/dof {words.figures(fit.chi2_per_dof)}, {state}",
         words.html_table(head, lines, left=(0, 2, 5, 6)),
-        words.html_list([f"warning: {w}" for w in fit.warnings]),
+        words.html_list([*gauges.lines(), *(f"warning: {w}" for w in fit.warnings)]),
         note=f"{len(fit.frames)} frames, {fit.dof} degrees of freedom; {fit.reason}",
     )
 
