@@ -15,11 +15,13 @@ from __future__ import annotations
 
 import json
 import os
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from optics import words
+from optics.captures import capture_set as capture_files
 from optics.diagnosis.result import Diagnosis
 from optics.fit.compare import Comparison
 from optics.fit.result import Fit
@@ -29,11 +31,11 @@ from optics.scene.loader import Scene
 from optics.scene.mitsuba_parts import DEFAULT_VARIANT
 from optics.scene.parameter import Values
 from optics.study import loop
-from optics.study.fit_files import values_of
+from optics.study.calibrated import noise_of, plugins_of_fit, scene_of, tested
+from optics.study.fit_files import fit_file, read_fit, values_of
 from optics.study.record import Record
 from optics.study.setup import Setup, open_model, recorded, setup_for, split
 from optics.study.shown import Shown, shown_frames
-from optics.study.stages import comparison_of, held_out_values
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -45,22 +47,40 @@ Prior = tuple[float | None, float]  # (mean, standard deviation); a mean of None
 
 
 def load(
-    scene: str | Path,
+    scene: str | Path | None = None,
     defines: Mapping[str, object] | None = None,
     *,
+    fit: str | Path | None = None,
+    frame: str | None = None,
     variant: str = DEFAULT_VARIANT,
     plugins: str | Path | None = None,
 ) -> Scene:
-    """A scene by its shipped name or the path of its XML.
+    """A scene by its shipped name or the path of its XML; or the calibrated sensor that a study found.
 
     defines   replace the XML's <default>s, such as {"depth": 0.5}
+    fit       a study's folder (its last step) or a fit.toml: the scene that it belongs to, with the values that were
+              found; `scene` may be left out
+    frame     of the fit's captures: with what was set and found in it. None: with the values that all frames share
     variant   of Mitsuba, which is set; plugins: a further folder of plugins
 
-    Raises UnknownKey for an unknown name or definition, BadScene for what cannot be loaded.
+    Raises UnknownKey for an unknown name, definition or frame, BadScene for what cannot be loaded or where the fit
+    belongs to another scene.
     """
+    given = {name: str(value) for name, value in (defines or {}).items()}
+    if fit is not None:
+        from optics.study.calibrated import calibrated
+
+        sensor = calibrated(fit, frame=frame, scene=scene, defines=given, variant=variant, plugins=plugins)
+        for text in sensor.notes:
+            warnings.warn(text, stacklevel=2)
+        sensor.scene.set(sensor.values)
+        return sensor.scene
     from optics.scene import loader
 
-    given = {name: str(value) for name, value in (defines or {}).items()}
+    if scene is None:
+        raise ValueError("no scene; allowed: a shipped scene's name, the path of an XML file, or fit=STUDY")
+    if frame is not None:
+        raise ValueError(f"frame = {frame!r} without a fit; a scene alone has no frames: add fit=STUDY")
     return loader.load(scene, given, variant, None if plugins is None else Path(plugins))
 
 
@@ -68,6 +88,7 @@ def calibrate(
     captures: str | Path,
     folder: str | Path,
     *,
+    fit: str | Path | None = None,
     free: Sequence[str] = (),
     per_group: Sequence[str] | None = None,
     priors: Mapping[str, Prior] | None = None,
@@ -86,13 +107,16 @@ def calibrate(
     """Start a study: solve for the base model's free parameters in three stages, and test it on held-out frames.
 
     captures    folder with captures.toml; folder: of the new study, which appears with its first step
+    fit         a study's folder (its last step) or a fit.toml, to start from: what all its frames share becomes start
+                values, effects that it added stay at their strengths, and its definitions and plugins hold. None: the
+                scene's values
     free        key patterns with one value for all frames, such as "led_*.x". Empty: position, axis, lobe and power of
                 every LED, reflectance and roughness of every membrane, and a prior of 30 % on powers
     per_group   key patterns with a value per group of frames. None: place and depth of each press, with a prior of
                 0.05 mm about what the stage said; []: none
     priors      pattern -> (mean, standard deviation)
     held_out    groups of frames to test on and not to fit. None: every fourth, where there are four or more; []: none
-    values      start values, by key;   defines, plugins: as in `load`
+    values      start values, by key, above those of the fit;   defines, plugins: as in `load`
     flat_field  how a background image enters: "multiplicative", "additive" or "none"; None: as the captures ask
     robust      residuals beyond three sigmas count less (Huber)
     resume      continue the study in `folder`, if its inputs are the same
@@ -104,21 +128,25 @@ def calibrate(
     from optics.files.output import check_folder
 
     check_folder(Path(folder))
+    start: Mapping[str, float | str] = {}
+    if fit is not None:
+        origin, defines, plugins = _taken_from(fit, captures, defines, plugins)
+        start = origin["parameters"]
     setup = setup_of(
         captures,
         free=_listed(free) or [],
         per_group=_listed(per_group),
         priors=dict(priors or {}),
         held_out=_listed(held_out),
-        values=dict(values or {}),
+        values={**start, **(values or {})},
         defines=defines,
         plugins=plugins,
         flat_field=flat_field,
         robust=robust,
         seed=seed,
     )
-    record, model, fit = loop.begin(setup, folder, title=title, command=command, resume=resume, progress=progress)
-    return Study(record, model, fit)
+    record, model, found = loop.begin(setup, folder, title=title, command=command, resume=resume, progress=progress)
+    return Study(record, model, found)
 
 
 def compare(
@@ -126,26 +154,48 @@ def compare(
     fit: str | Path | None = None,
     *,
     values: Mapping[str, float | str] | None = None,
-    held_out: Sequence[str] = (),
+    held_out: Sequence[str] | None = None,
     defines: Mapping[str, object] | None = None,
     plugins: str | Path | None = None,
     flat_field: str | None = None,
 ) -> Compared:
     """Captures measured against a scene's predictions, without fitting anything.
 
-    fit      a study's fit.toml; values, by key, stand above it; held_out: groups that the fit has not seen
+    fit        a study's folder (its last step) or a fit.toml: its values, definitions, plugins and flat field. On the
+               captures of the study the numbers are the study's own: values of held-out frames are those that it found
+    values     by key, above those of the fit
+    held_out   groups that the fit has not seen; None: those that it held out
+    defines, plugins, flat_field   replace those of the fit
+
+    Raises BadScene where the fit belongs to another scene than the captures.
     """
-    setup = setup_of(
-        captures,
-        values=dict(values or {}),
-        held_out=_listed(held_out),
-        defines=defines,
-        plugins=plugins,
-        flat_field=flat_field,
-    )
-    model = open_model(setup)
-    present = values_of(model, fit, setup.values)
-    return Compared(model, present, comparison_of(model, present, split(model, setup)[1]))
+    origin: Mapping[str, Any] = {}
+    noise = None
+    if fit is not None:
+        data, defines, plugins = _taken_from(fit, captures, defines, plugins)
+        origin = data["sensor"]
+        noise = noise_of(fit_file(fit), origin["noise"]) if origin.get("noise") else None
+    setup = setup_of(captures, defines=defines, plugins=plugins, flat_field=flat_field or origin.get("flat_field"))
+    model = open_model(setup, fitted=noise)
+    present = values_of(model, fit, {**({} if fit is not None else setup.values), **(values or {})})
+    comparison, notes = tested(model, present, fit, _listed(held_out))
+    return Compared(model, present, comparison, notes)
+
+
+def _taken_from(
+    fit: str | Path,
+    captures: str | Path,
+    defines: Mapping[str, object] | None,
+    plugins: str | Path | None,
+) -> tuple[dict[str, dict], Mapping[str, object], str | Path | None]:
+    """(a fit's tables, definitions, folder of plugins) for captures; what is given stands above the fit's, and images
+    have the size that they have. Raises BadScene where the fit belongs to another scene than the captures."""
+    file = fit_file(fit)
+    data = read_fit(file)
+    origin = data["sensor"]
+    scene_of(file, origin, capture_files.load(captures).scene)
+    found = {k: v for k, v in origin.get("defines", {}).items() if k not in ("width", "height")}
+    return data, {**found, **(defines or {})}, plugins_of_fit(file, origin) if plugins is None else plugins
 
 
 def setup_of(
@@ -169,10 +219,11 @@ class Compared:
     """A comparison, with the model and the values that it is of.
 
     comparison   optics.fit.compare.Comparison: misfit by frame, LED, region and channel
+    notes        how the captures stand to those of the fit, where it is not plain
     """
 
-    def __init__(self, model: SceneModel, values: Values, comparison: Comparison):
-        self.model, self.values, self.comparison = model, values, comparison
+    def __init__(self, model: SceneModel, values: Values, comparison: Comparison, notes: Sequence[str] = ()):
+        self.model, self.values, self.comparison, self.notes = model, values, comparison, list(notes)
 
     def frames(self, indices: Sequence[int] | None = None) -> list[Shown]:
         """Measured, predicted and residual of frames; None: of all."""
@@ -258,13 +309,20 @@ class Study:
         return step % count
 
     # -- verbs --------------------------------------------------------------------------------------------------------
-    def diagnose(self, *, advised: bool = True, progress: Progress | None = None) -> Diagnosis:
+    def diagnose(
+        self, *, without: Sequence[str] = (), advised: bool = True, progress: Progress | None = None
+    ) -> Diagnosis:
         """Ask what the last step lacks: every effect scored, the best added and refitted, one of six verdicts.
 
+        without   names of effects that are not tested
         advised   where effects tie, simulate further frames and say which would tell them apart
+
+        Raises UnknownKey for an unknown effect.
         """
-        model, fit = self.model, self.fit
-        self._verdict = loop.examine(self.record, model, self.setup, fit, progress, advised)
+        model = self.model
+        left_out = _listed(without) or []
+        loop.excluded(model, self.record, left_out)  # a wrong name costs no fit
+        self._verdict = loop.examine(self.record, model, self.setup, self.fit, progress, advised, left_out)
         return self._verdict
 
     def add(self, effect: str, *, start: Values | None = None, progress: Progress | None = None) -> Fit:
@@ -315,7 +373,7 @@ class Study:
         from optics.diagnosis.rehearse import imitate
 
         model = self.model
-        present, _ = held_out_values(model, self.fit, split(model, self.setup)[1])
+        _, present, _ = loop.kept(self.record, model)  # with what was found in held-out frames
         present.common.update(model.scene.check(values or {}, "values"))
         return imitate(model, present, folder, seed)
 

@@ -11,6 +11,7 @@ from optics.cli.shared import (
     CaptureSet,
     Debug,
     Defines,
+    FitFile,
     FlatField,
     Force,
     Plugins,
@@ -30,7 +31,8 @@ if TYPE_CHECKING:
 
 
 @app.command(
-    "import", help="Read a measured data set of ball presses into a capture folder, with a scene to start from."
+    "import",
+    help="Read a measured data set of ball presses, or raw frames of a polarization camera, into a capture folder.",
 )
 def import_(
     source: Annotated[Path, typer.Argument(metavar="SOURCE", help="An .npz calibration pack, or a folder of images.")],
@@ -56,14 +58,81 @@ def import_(
     leds: Annotated[int, typer.Option("--leds", help="LEDs of the scene to start from: 3 or 6.")] = 3,
     bin: Annotated[int, typer.Option("--bin", min=1, help="Average this many pixels each way.")] = 1,
     every: Annotated[int, typer.Option("--every", min=1, help="Take every n-th press.")] = 1,
+    mosaic: Annotated[
+        str | None,
+        typer.Option(
+            "--mosaic",
+            metavar='"90 45 135 0"',
+            help="SOURCE holds raw frames of a polarization camera with analysers at these angles, row by row.",
+        ),
+    ] = None,
+    listed: Annotated[
+        Path | None,
+        typer.Option(
+            "--settings",
+            metavar="CSV",
+            help="Of raw frames: file, and a column per setting; without it file names say them, angle=30__2.tif.",
+        ),
+    ] = None,
+    rename: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--rename", metavar="NAME=KEY", help="Key of a setting's name: angle=polarizer.angle. Repeatable."
+        ),
+    ] = None,
+    scene: Annotated[
+        str | None, typer.Option("--scene", help="Scene of raw frames.", show_default="polarization_camera")
+    ] = None,
+    bits: Annotated[int | None, typer.Option("--bits", help="Of raw frames; without it, derived.")] = None,
+    black_level: Annotated[float | None, typer.Option("--black-level", help="Of raw frames, DN.")] = None,
+    system_gain: Annotated[float | None, typer.Option("--system-gain", help="Of raw frames, DN per electron.")] = None,
+    dark_noise: Annotated[float | None, typer.Option("--dark-noise", help="Of raw frames, DN, rms.")] = None,
     force: Force = False,
     quiet: Quiet = False,
     debug: Debug = False,
 ) -> None:
-    """Read presses; write captures.toml, a scene, and a report of contradictions between labels, scale and images."""
-    from optics.captures import importing
+    """Read presses; write captures.toml, a scene, and a report of contradictions between labels, scale and images.
+
+    With --mosaic, read raw frames of a polarization camera."""
+    from optics.captures import importing, raw_frames
+    from optics.polarization.mosaic import read_mosaic
 
     terminal.quiet, terminal.debug = quiet, debug
+    raw = {
+        "--settings": listed,
+        "--rename": rename,
+        "--scene": scene,
+        "--bits": bits,
+        "--black-level": black_level,
+        "--system-gain": system_gain,
+        "--dark-noise": dark_noise,
+    }
+    if mosaic is None and (given := [name for name, value in raw.items() if value is not None]):
+        raise ValueError(
+            f'{", ".join(given)}: for raw frames of a polarization camera only; give --mosaic "90 45 135 0" as well'
+        )
+    if mosaic is not None:
+        presses = {"--circles": circles, "--ball-radius": ball_radius, "--mm-per-pixel": mm_per_pixel}
+        if given := [name for name, value in {**presses, "--untouched": untouched}.items() if value is not None]:
+            raise ValueError(f"{', '.join(given)}: for presses only; leave out --mosaic, or these")
+        read = raw_frames.import_frames(
+            source,
+            output,
+            mosaic=read_mosaic(mosaic),
+            settings=listed,
+            rename=pairs(rename, "--rename"),
+            scene=scene or "polarization_camera",
+            bits=bits,
+            bin=bin,
+            black_level=black_level or 0.0,
+            system_gain=system_gain,
+            dark_noise=dark_noise,
+            overwrite=force,
+        )
+        for text in read.warnings:
+            terminal.note(f"warning: {one_line(text)}")
+        print(read.folder)
+        return
     options: dict[str, Any] = {"leds": leds, "bin": bin, "every": every, "overwrite": force}
     if ball_radius is not None:
         options["ball_radius"] = ball_radius
@@ -145,9 +214,7 @@ def design(
 @command
 def compare(
     captures: CaptureSet,
-    fit: Annotated[
-        Path | None, typer.Option("--fit", metavar="FIT.toml", help="Calibrated values, from a study.")
-    ] = None,
+    fit: FitFile = None,
     output: Annotated[
         Path | None, typer.Option("-o", "--output", metavar="DIR", help="Write numbers and images here.")
     ] = None,
@@ -157,6 +224,7 @@ def compare(
             "--hold-out",
             metavar="GROUP",
             help="Groups of frames that the fit has not seen, reported apart. Repeatable.",
+            show_default="those that the fit held out",
         ),
     ] = None,
     define: Defines = None,
@@ -176,12 +244,14 @@ def compare(
         captures,
         fit,
         values=settings(sets),
-        held_out=hold_out or (),
+        held_out=hold_out,
         defines=pairs(define, "-D"),
         plugins=plugins,
         flat_field=flat_field,
     )
     comparison = found.comparison
+    for text in found.notes:
+        terminal.note(text)
     if output is not None:
         with new_folder(output) as folder:
             (folder / "comparison.txt").write_text(comparison.text() + "\n", encoding="utf-8")

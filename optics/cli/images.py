@@ -10,13 +10,15 @@ import typer
 from optics.cli.shared import (
     AsJson,
     Defines,
+    FitFile,
     Force,
+    FrameName,
     Plugins,
-    SceneName,
+    SceneOrFit,
     Settings,
     Variant,
     command,
-    load_scene,
+    load_sensor,
     settings,
     show,
     terminal,
@@ -25,8 +27,10 @@ from optics.cli.shared import (
 
 @command
 def render(
-    scene: SceneName,
     output: Annotated[Path, typer.Option("-o", "--output", metavar="FILE.exr", help="Where the image goes.")],
+    scene: SceneOrFit = None,
+    fit: FitFile = None,
+    frame: FrameName = None,
     define: Defines = None,
     sets: Settings = None,
     png: Annotated[
@@ -69,15 +73,15 @@ def render(
     maps = (output.with_suffix(".dolp.png"), output.with_suffix(".aolp.png"))
     files = [output, record, *([preview] if png else []), *(maps if stokes else ())]
     claim(files, force)
-    loaded = load_scene(scene, define, plugins, variant)
-    values = loaded.check(settings(sets), "--set")
+    sensor = load_sensor(scene, fit, frame, define, plugins, variant)
+    values = {**sensor.values, **sensor.scene.check(settings(sets), "--set")}
     clock = time.perf_counter()
-    images = RenderJob(loaded, spp=spp, stokes=stokes)
+    images = RenderJob(sensor.scene, spp=spp, stokes=stokes, black=sensor.black, saturation=sensor.saturation)
     with terminal.progress() as progress:
         image = images.take(values, seed, progress=progress)
     seconds = time.perf_counter() - clock
     if png:
-        image.write_png(preview)
+        image.write_png(preview, sensor.saturation)
     if stokes:
         from optics.light.polarimetry import write_maps
 
@@ -109,6 +113,8 @@ def batch(
         str, typer.Option("--shard", metavar="K/N", help="Make only every N-th sample, from the K-th on.")
     ] = "1/1",
     workers: Annotated[int | None, typer.Option("--workers", help="Processes.", show_default="one per core")] = None,
+    fit: FitFile = None,
+    frame: FrameName = None,
     plugins: Plugins = None,
     as_json: AsJson = False,
 ) -> None:
@@ -118,9 +124,11 @@ def batch(
     part = work.parse_shard(shard)
     try:
         with terminal.progress() as progress:
-            result = work.run(job, part, workers, plugins, progress)
+            result = work.run(job, part, workers, plugins, progress, fit=fit, frame=frame)
     except KeyboardInterrupt:
         raise KeyboardInterrupt("what was made is kept, the same command goes on") from None
+    for text in result.notes:
+        terminal.note(text)
     if as_json:
         return show(
             {

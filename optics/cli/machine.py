@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from optics.cli.shared import AsJson, command, terminal
+from optics.words import with_sd
 
 
 @command
@@ -30,7 +31,7 @@ def demo(
             raise UnknownKey(sensor, (*story.SENSORS, story.BENCH), "sensor")
         found = story.run(output, seed, effect, sensor, progress, lambda text: print(text + "\n", flush=True))
     hidden = found["hidden"]
-    strengths = [f"{name} = {value:.4g} +- {sd:.2g}" for name, (value, sd) in found["strengths"].items()]
+    strengths = [f"{name} = {with_sd(value, sd)}" for name, (value, sd) in found["strengths"].items()]
     print(
         f"hidden: {hidden['effect']}, strength {hidden['strength']:g}; "
         f"named: {', '.join(found['claimed']) or 'nothing'}"

@@ -11,13 +11,16 @@ from optics.cli.shared import (
     AsJson,
     At,
     Defines,
+    FitFile,
     Force,
+    FrameName,
     Plugins,
-    SceneName,
+    SceneOrFit,
     Settings,
     Variant,
     command,
-    load_scene,
+    load_sensor,
+    pairs,
     settings,
     show,
     terminal,
@@ -32,8 +35,10 @@ DEFAULT_BAND = 540.0  # nm, for a scene without bands: the middle of the visible
 
 @command
 def mueller(
-    scene: SceneName,
+    scene: SceneOrFit = None,
     at: At = None,
+    fit: FitFile = None,
+    frame: FrameName = None,
     sets: Settings = None,
     wavelength: Annotated[
         list[float] | None,
@@ -54,8 +59,9 @@ def mueller(
     to y. Layers are named from the camera on: the last one is the first that light meets."""
     from optics.light import paths, polarimetry
 
-    loaded = load_scene(scene, define, plugins, variant)
-    values = {**loaded.values(), **loaded.check(settings(sets), "--set")}
+    sensor = load_sensor(scene, fit, frame, define, plugins, variant)
+    loaded = sensor.scene
+    values = {**loaded.values(), **sensor.values, **loaded.check(settings(sets), "--set")}
     u, v = polarimetry.pixel(loaded, at)
     own = loaded.integrator.bands if loaded.integrator is not None else ()
     bands = wavelength or list(own) or [DEFAULT_BAND]
@@ -184,7 +190,7 @@ def _meanings(shown: Sequence[tuple[str, Any]], bands: Sequence[float]) -> str:
 
 @command
 def sweep(
-    scene: SceneName,
+    scene: SceneOrFit = None,
     key: Annotated[str, typer.Option("--key", metavar="KEY", help="What is turned or changed.")] = "analyzer.angle",
     first: Annotated[
         float | None, typer.Option("--from", metavar="VALUE", help="First value.", show_default="0 of an angle")
@@ -202,9 +208,8 @@ def sweep(
             "--captures", metavar="CAPTURES", help="Measured readings to hold beside it: a folder with captures.toml."
         ),
     ] = None,
-    fit: Annotated[
-        Path | None, typer.Option("--fit", metavar="FIT.toml", help="Calibrated values, from a study.")
-    ] = None,
+    fit: FitFile = None,
+    frame: FrameName = None,
     radiance: Annotated[
         bool, typer.Option("--radiance", help="Radiance per band in place of the camera's DN.")
     ] = False,
@@ -225,7 +230,7 @@ def sweep(
     from optics.captures import capture_set as capture_files
     from optics.files.output import claim, write_text
     from optics.light import polarimetry, rendering
-    from optics.study.fit_files import read_fit
+    from optics.scene.loader import find
 
     if output is not None and output.suffix.lower() not in (".png", ".pdf", ".svg"):
         raise ValueError(
@@ -234,24 +239,33 @@ def sweep(
     claim([f for f in (output, csv) if f is not None], force)
     if radiance and captures is not None:
         raise ValueError("--radiance and --captures: readings are DN; leave out one of them")
-    loaded = load_scene(scene, define, plugins, variant)
+    if frame is not None and captures is not None:
+        raise ValueError("--frame and --captures: the readings have their own settings; leave out one of them")
+    readings = capture_files.load(captures) if captures is not None else None
+    if readings is not None:
+        own = capture_files.definitions(readings, pairs(define, "-D"), find(scene or readings.scene))
+        define = [f"{name}={text}" for name, text in own.items()]
+    sensor = load_sensor(scene, fit, frame, define, plugins, variant, driven=captures is None)
+    loaded = sensor.scene
+    if readings is not None:
+        effects = {k: e.name for k, e in loaded.registry.effects.items()}
+        capture_files.check(readings, loaded.parameters)
+        readings = capture_files.state(readings, loaded.parts, effects)
+        readings.noise = sensor.noise if readings.noise is None else readings.noise.in_scale_of(sensor.noise)
     place = polarimetry.pixel(loaded, at)
     if reason := rendering.obstacle(loaded):
         raise ValueError(f"{loaded.path}: no prediction light by light: {reason}; `optics render` goes through Mitsuba")
-    values = {}
-    if fit is not None:
-        values = loaded.check(read_fit(fit)["parameters"], f"{fit}: [parameters]")
     chosen = loaded.check(settings(sets), "--set")
     first, last = polarimetry.span(loaded, key, first, last)
-    readings = capture_files.load(captures) if captures is not None else None
     with terminal.progress() as progress:
         found = polarimetry.sweep(
             loaded,
             key,
             list(np.linspace(first, last, steps)),
             place,
-            {**values, **chosen},
+            {**sensor.values, **chosen},
             radiance=radiance,
+            noise=sensor.noise,
             captures=readings,
             only=chosen,
             progress=progress,

@@ -21,6 +21,7 @@ from optics.version import __version__
 if TYPE_CHECKING:
     from optics.scene.loader import Scene
     from optics.scene.registry import Registry
+    from optics.study.calibrated import Calibrated
 
 INTERRUPTED = 130  # 128 and the number of SIGINT, as shells count
 
@@ -79,6 +80,14 @@ AsJson = Annotated[bool, typer.Option("--json", help="The result for programs.")
 SceneName = Annotated[
     str, typer.Argument(metavar="SCENE", help="A shipped scene's name (`optics scenes`) or an XML file.")
 ]
+SceneOrFit = Annotated[
+    str | None,
+    typer.Argument(
+        metavar="SCENE",
+        help="A shipped scene's name (`optics scenes`) or an XML file.",
+        show_default="that of --fit",
+    ),
+]
 CaptureSet = Annotated[str, typer.Argument(metavar="CAPTURES", help="Folder with captures.toml.")]
 StudyFolder = Annotated[Path, typer.Argument(metavar="STUDY", help="Folder that `optics calibrate` made.")]
 Defines = Annotated[
@@ -90,6 +99,21 @@ Settings = Annotated[
     typer.Option("--set", metavar="KEY=VALUE", help="Set a parameter (`optics params SCENE` lists them). Repeatable."),
 ]
 Plugins = Annotated[Path | None, typer.Option("--plugins", metavar="DIR", help="A further folder of plugins.")]
+FitFile = Annotated[
+    Path | None,
+    typer.Option(
+        "--fit", metavar="FIT", help="A calibrated sensor: a study's folder (its last step), or a fit.toml of it."
+    ),
+]
+FrameName = Annotated[
+    str | None,
+    typer.Option(
+        "--frame",
+        metavar="NAME",
+        help="With --fit: with what was set and found in this frame of its captures.",
+        show_default="the values that all frames share",
+    ),
+]
 Variant = Annotated[str | None, typer.Option("--variant", help="Mitsuba variant.", show_default=False)]
 Force = Annotated[bool, typer.Option("--force", help="Replace existing files.")]
 At = Annotated[
@@ -246,6 +270,39 @@ def load_scene(name: str, defines: Sequence[str] | None, plugins: Path | None, v
     from optics import facade
 
     return facade.load(name, pairs(defines, "-D"), variant=variant or facade.DEFAULT_VARIANT, plugins=plugins)
+
+
+def load_sensor(
+    name: str | None,
+    fit: Path | None,
+    frame: str | None,
+    defines: Sequence[str] | None,
+    plugins: Path | None,
+    variant: str | None = None,
+    driven: bool = True,
+) -> "Calibrated":
+    """The scene of a command line, or with --fit the calibrated sensor, whose scene need not be named."""
+    from optics.scene.mitsuba_parts import DEFAULT_VARIANT
+    from optics.study.calibrated import Calibrated, calibrated
+
+    if fit is None:
+        if frame is not None:
+            raise ValueError(f"--frame {frame}: of which captures? Add --fit STUDY")
+        if name is None:
+            raise ValueError("no scene; allowed: a shipped scene's name (`optics scenes`), an XML file, or --fit STUDY")
+        return Calibrated(load_scene(name, defines, plugins, variant), {})
+    found = calibrated(
+        fit,
+        frame=frame,
+        scene=name,
+        defines=pairs(defines, "-D"),
+        variant=variant or DEFAULT_VARIANT,
+        plugins=plugins,
+        driven=driven,
+    )
+    for text in found.notes:
+        terminal.note(text)
+    return found
 
 
 def scan(plugins: Path | None) -> "Registry":

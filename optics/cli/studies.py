@@ -28,10 +28,22 @@ if TYPE_CHECKING:
     from optics.facade import Study
 
 
+StartFit = Annotated[
+    Path | None,
+    typer.Option(
+        "--fit",
+        metavar="FIT",
+        help="Start from a calibrated sensor: a study's folder (its last step), or a fit.toml of it. Effects that it "
+        "has stay at their strengths.",
+    ),
+]
+
+
 @command
 def calibrate(
     captures: CaptureSet,
     output: Annotated[Path, typer.Option("-o", "--output", metavar="STUDY", help="Folder of the new study.")],
+    fit: StartFit = None,
     free: Annotated[
         list[str] | None,
         typer.Option(
@@ -81,6 +93,7 @@ def calibrate(
         study = facade.calibrate(
             captures,
             output,
+            fit=fit,
             free=free or (),
             per_group=_unless_none(per_group),
             priors=priors(prior),
@@ -130,6 +143,10 @@ def null_text(study: "Study") -> str:
 @command
 def diagnose(
     study: StudyFolder,
+    without: Annotated[
+        list[str] | None,
+        typer.Option("--without", metavar="EFFECT", help="Do not test this effect (`optics effects`). Repeatable."),
+    ] = None,
     as_json: AsJson = False,
     csv: Annotated[Path | None, typer.Option("--csv", metavar="FILE", help="Write the table of effects here.")] = None,
 ) -> None:
@@ -143,7 +160,7 @@ def diagnose(
 
     found = Study.open(study)
     with terminal.progress() as progress:
-        result = found.diagnose(progress=progress)
+        result = found.diagnose(without=without or (), progress=progress)
     if csv is not None:
         write_text(csv, result.to_csv())
     print(result.to_json() if as_json else result.text())

@@ -255,7 +255,10 @@ def _lights(model: Model, values: Values, frames: Sequence[int], now: Mapping, l
 def _films(model: Model, now: Mapping, like: int) -> Iterator[Shot]:
     """Angles of polarizers and sheets, and films put in and taken out."""
     what = _same(model, like)
+    absent = set(model.captures.absent) if model.captures is not None else set()
     for key in keys_with(model.parameters, "angle"):
+        if key.rpartition(".")[0] in absent:  # nobody can turn what is not there
+            continue
         inserted = beside(model.parameters, key, "inserted")
         if inserted is not None and not now[inserted]:
             for turn in (45.0, 20.0):
@@ -710,12 +713,23 @@ def _advice(
     )
 
 
+def exchanged(sets: Sequence[Sequence[str]]) -> list[str]:
+    """The effects of which each may stand in the place of the others in a set: the longest such list, or none. Shots
+    tell effects apart one by one, not sets that differ in two."""
+    places: dict[frozenset[str], list[str]] = {}
+    for names in sets:
+        for name in names:
+            places.setdefault(frozenset(names) - {name}, []).append(name)
+    longest = max(places.values(), key=len, default=[])
+    return longest if len(longest) > 1 else []
+
+
 def asked_for(diagnosis: Diagnosis) -> list[str]:
     """Names of the effects that a next measurement has to tell apart; none where the verdict does not depend on it."""
     failed = {c.name for c in diagnosis.conditions if not c.holds}
-    if diagnosis.word == "AMBIGUOUS" and len(diagnosis.ambiguous) > 1:
-        return diagnosis.ambiguous[:MEMBERS]
-    if diagnosis.word != "AMBIGUOUS" and not (diagnosis.word == "CANNOT_TELL" and failed & {"lead", "margin"}):
+    if diagnosis.word == "AMBIGUOUS" and len(diagnosis.survivors) > 1:
+        return exchanged([e.effects for e in diagnosis.survivors])[:MEMBERS]
+    if diagnosis.word != "AMBIGUOUS" and not (diagnosis.word == "CANNOT_TELL" and "lead" in failed):
         return []
     net = {row.name: _net(row) for row in diagnosis.rows}
     best = max(net.values(), default=0.0)

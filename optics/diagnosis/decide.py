@@ -12,20 +12,21 @@ from dataclasses import dataclass
 from optics.diagnosis.result import Condition, Fingerprint
 from optics.diagnosis.thresholds import (
     AS_GOOD,
-    CLEAR,
+    CARRIED,
     EXCESS,
     FAR,
     LEVEL,
-    MARGIN,
     MIMICS,
     SHARE,
     STRENGTH,
+    TOLD,
     UNEVEN,
     allowed,
     is_structured,
 )
 from optics.words import p_text, percent
 
+MANY = 3  # effects of one explanation
 CURVE = "a curve explains it"  # name of the condition that a curve must meet for UNKNOWN
 
 
@@ -33,22 +34,30 @@ CURVE = "a curve explains it"  # name of the condition that a curve must meet fo
 class Findings:
     """The numbers that a verdict is made of. Falls are of chi2, net: less what an absent effect gives on average.
 
-    p_family     of the best of all candidates; structure_p: of low-frequency structure, NaN where there are too few
+    p_family     of the best of all candidates; structure_p: of structure in the residual, NaN where there are too few
                  readings, or too small images, to show any
-    winner       the effect with the largest fall after a refit, '' if none; p_winner: family-wise, of that fall
-    fall, runner_up   of the winner and of the next one
-    refuted      with the winner nothing is left to explain, while every effect within the margin leaves structure, or
-                 more than could hide beside the winner: the misfit that makes small differences worthless is absent
-    ratio        the best curve's fall over the winner's; coordinate: of that curve
-    rival        whether a curve does significantly better, by RIVAL (a map) or RIVAL_CURVE
-    share        of the excess that the winner explains, where excess_sd > EXCESS; curve_share: that of the best curve
-    left         misfit over mean signal with the winner
+    winner       the effect that is part of every explanation that survives; where there is none, the best single
+                 effect; '' if nothing is told apart from no effect at all. p_winner: family-wise, of its fall
+    fall         of the best explanation
+    common       whether the winner is part of every explanation that survives; survivors: their number
+    lead         of the best explanation's score over that of the best one without the winner; needed: TOLD, or more
+                 where misfit is left
+    against      that explanation, in words
+    ratio        the best curve's fall, less its cost, over that of the best explanation; coordinate: of that curve
+    rival        whether a curve does significantly better, by RIVAL (a map) or RIVAL_CURVE, where misfit is left
+    share        of the excess that the best explanation explains, where excess_sd > EXCESS; curve_share: the best curve
+    left         misfit over mean signal with the best explanation
     uneven       largest h of the winner's splits, by the split uneven_by (in words), uneven_limit allowed; even:
-                 whether all its splits hold; some_even: whether those of any member of the ambiguous set do
+                 whether all its splits hold; some_even: whether those of any survivor do
     held_out     fall on held-out frames, NaN where there are none
+    ahead        fall of chi2 on blocks of readings that were left out in turn; NaN for images
     clear        of the winner's strength from none, in standard deviations; NaN where they are unknown
     chance       family-wise p of that strength by its scatter between parts of the sensor or session, NaN where there
                  are too few parts
+    carried      share of the winner's fall in the one part that carries most of it, by the part carried_by (in words);
+                 of effects with a strength per frame
+    fragile      an effect that other weights or masks prefer clearly, '' for none
+    measured     whether repeats fix the size of the noise
     """
 
     p_family: float
@@ -56,8 +65,11 @@ class Findings:
     winner: str = ""
     p_winner: float = 1.0
     fall: float = 0.0
-    runner_up: float = 0.0
-    refuted: bool = False
+    common: bool = True
+    survivors: int = 1
+    lead: float = math.inf
+    needed: float = TOLD
+    against: str = ""
     ratio: float = 0.0
     rival: bool = False
     coordinate: str = ""
@@ -71,13 +83,18 @@ class Findings:
     even: bool = True
     some_even: bool = True
     held_out: float = math.nan
+    ahead: float = math.nan
     clear: float = math.nan
     chance: float = math.nan
+    carried: float = 0.0
+    carried_by: str = ""
+    fragile: str = ""
+    measured: bool = False
 
     @property
     def structured(self) -> bool:
-        """Whether the base model leaves low-frequency structure."""
-        return is_structured(self.structure_p, self.excess_sd)
+        """Whether the base model leaves structure, or more than a noise that repeats have measured."""
+        return is_structured(self.structure_p, self.excess_sd) or (self.measured and self.weighed)
 
     @property
     def weighed(self) -> bool:
@@ -99,7 +116,13 @@ def decide(f: Findings) -> tuple[str, list[Condition]]:
             return word, conditions
     elif significant:
         conditions.append(
-            Condition("significant", 1.0, LEVEL, False, "no refit brought the fall that the score promised")
+            Condition(
+                "significant",
+                1.0,
+                LEVEL,
+                False,
+                "no effect is told apart from none when everything is calibrated again",
+            )
         )
         if not f.structured and not f.weighed:
             return "NOTHING", conditions
@@ -127,13 +150,21 @@ def _word_of_winner(f: Findings, failed: set[str]) -> str:
         # The refit did not bring the fall that the score promised, or the base's own calibration brought it.
         return "NOTHING"
     alone = not failed & {"significant", "no better curve", "share", "beyond clutter", "near"}
-    if failed & {"lead", "margin"} and alone and f.some_even:
+    if "lead" in failed and alone and f.some_even and f.survivors > 1:
         return "AMBIGUOUS"
-    return "PARTIAL" if failed <= {"share", "even"} else ""
+    return "PARTIAL" if failed - {"spread"} and failed <= {"share", "even", "spread"} else ""
 
 
 def _is_anything_there(f: Findings, significant: bool) -> list[Condition]:
     """Whether an effect stands out, and whether structure is left: if neither, nothing is missing."""
+    if math.isnan(f.structure_p):
+        structure = (
+            f"too few readings, or too small images, to show any; excess {f.excess_sd:.2g} sd against {EXCESS:g}"
+        )
+    else:
+        structure = f"test of structure p {p_text(f.structure_p)} against {LEVEL:g}"
+        if f.measured and f.weighed:
+            structure += f"; excess {f.excess_sd:.2g} sd over a noise that repeats have measured"
     return [
         Condition(
             "an effect stands out",
@@ -142,40 +173,31 @@ def _is_anything_there(f: Findings, significant: bool) -> list[Condition]:
             significant,
             f"family-wise p {p_text(f.p_family)} against {LEVEL:g}",
         ),
-        Condition(
-            "structure is left",
-            f.structure_p,
-            LEVEL,
-            f.structured,
-            f"too few readings, or too small images, to show any; excess {f.excess_sd:.2g} sd against {EXCESS:g}"
-            if math.isnan(f.structure_p)
-            else f"low-frequency test p {p_text(f.structure_p)} against {LEVEL:g}",
-        ),
+        Condition("structure is left", f.structure_p, LEVEL, f.structured, structure),
     ]
 
 
 def _against_effects(f: Findings) -> list[Condition]:
-    """The winner against noise and against the other effects, after the refit."""
-    lead = f.fall - f.runner_up
-    margin = lead / f.fall if f.fall > 0 else 0.0
+    """The winner against noise and against the explanations without it, after the refit."""
     return [
         Condition(
             "significant", f.p_winner, LEVEL, f.p_winner < LEVEL, f"after refit, family-wise p {p_text(f.p_winner)}"
         ),
         Condition(
-            "lead", lead, CLEAR, lead > CLEAR, f"chi2 falls by {lead:.3g} more than with the next, {CLEAR:g} needed"
+            "lead",
+            f.lead,
+            f.needed,
+            f.common and f.lead > f.needed,
+            f"{f.lead:.3g} ahead of {f.against or 'no effect'}, {f.needed:.3g} needed"
+            if f.common
+            else f"{f.survivors} explanations are not told apart, and no effect is part of all",
         ),
         Condition(
-            "margin",
-            margin,
-            MARGIN,
-            margin > MARGIN or f.refuted,
-            f"{margin:.0%} ahead of the next, "
-            + (
-                "which leaves more than could hide beside the best"
-                if f.refuted and margin <= MARGIN
-                else f"{MARGIN:.0%} needed"
-            ),
+            "robust",
+            float(bool(f.fragile)),
+            0.0,
+            not f.fragile,
+            f"other weights or masks prefer {f.fragile}" if f.fragile else "other weights and masks agree",
         ),
     ]
 
@@ -189,7 +211,8 @@ def _against_causes_outside(f: Findings) -> list[Condition]:
             f.ratio,
             limit,
             not f.rival,
-            f"the best curve ({f.coordinate or 'none'}) explains {f.ratio:.2f} of it, {limit:g} allowed",
+            f"the best curve ({f.coordinate or 'none'}) explains {f.ratio:.2f} of it, "
+            + (f"{limit:g} allowed" if f.rival or f.ratio < limit else "but not when its bins are counted"),
         ),
         Condition(
             "share",
@@ -212,7 +235,7 @@ def _against_causes_outside(f: Findings) -> list[Condition]:
 
 def _of_the_strength(f: Findings) -> list[Condition]:
     """Whether the winner's strength is real: above its error and its scatter, homogeneous, good for other frames."""
-    return [
+    found = [
         Condition(
             "strength",
             f.clear,
@@ -246,18 +269,60 @@ def _of_the_strength(f: Findings) -> list[Condition]:
             else f"chi2 of held-out frames falls by {f.held_out:.3g}",
         ),
     ]
+    if not math.isnan(f.ahead):
+        text = f"chi2 of blocks of readings that were left out falls by {f.ahead:.3g}"
+        found.append(Condition("blocks left out", f.ahead, 0.0, f.ahead > 0, text))
+    if f.carried_by:
+        text = f"{f.carried:.0%} of the fall lies in {f.carried_by}, {CARRIED:.0%} allowed"
+        found.append(Condition("spread", f.carried, CARRIED, f.carried < CARRIED, text))
+    return found
 
 
-def rivals(fingerprints: Sequence[Fingerprint], fall: float) -> list[Fingerprint]:
-    """The curves that do better than an effect with this net fall; the one to name first.
+@dataclass(frozen=True)
+class Opponent:
+    """The explanation that curves are held against.
 
-    Better by more than `allowed`, significantly, and by more than the number of bins gives by noise alone (3 sd)."""
+    fall      net fall of chi2; cost: of its strengths;   strengths, effects: their numbers
+    decides   whether small differences decide: it leaves nothing, or has readings to explain, whose noise is known
+    complete  whether it leaves nothing that a curve could explain
+    laws      coordinates through which effects act that the model has already, which may follow another law
+    """
+
+    fall: float
+    cost: float = 0.0
+    effects: int = 1
+    strengths: int = 1
+    complete: bool = False
+    decides: bool = False
+    laws: frozenset[str] = frozenset()
+
+
+def rivals(fingerprints: Sequence[Fingerprint], best: Opponent) -> list[Fingerprint]:
+    """The curves that do better than an explanation; the one to name first.
+
+    Better by more than `allowed`, significantly, by more than the number of bins gives by noise alone (3 sd), and by
+    more than bins could have fitted whatever the data are (`Fingerprint.cost`). Where small differences decide, a
+    curve is a rival of several effects if its score is better: one unknown cause is simpler. If it has no more than
+    twice as many numbers as they have strengths, or they are MANY, it is one if it is not told apart from them, and so
+    is any curve along `laws`."""
+    near = []
+    for f in fingerprints:
+        as_many = best.effects >= MANY or f.dof <= 2 * best.strengths
+        slack = TOLD if f.coordinate in best.laws or (best.effects > 1 and as_many) else 0.0
+        asked = f.coordinate in best.laws or (best.decides and best.effects > 1)
+        behind = best.fall - best.cost - (f.net - f.cost)
+        if asked and f.coordinate not in MIMICS and f.p < LEVEL / len(fingerprints) and behind < slack:
+            near.append(f)
+    if best.complete or near:
+        return ordered(near)
+    fall = best.fall
     better = [
         f
         for f in fingerprints
         if f.ratio >= allowed(f.coordinate)
         and f.p < LEVEL / len(fingerprints)
         and f.net - fall > 3 * math.sqrt(2 * f.dof) * f.net / (f.fall - f.dof)
+        and f.net - f.cost > fall
     ]
     return ordered(better)
 

@@ -4,34 +4,35 @@
 
     score         every effect against the calibrated model; the best are chosen        optics.diagnosis.score
     refit         each chosen effect is added and everything calibrated again            optics.diagnosis.refit
+    explanations  sets of effects compete: what survives, and what all survivors share   optics.diagnosis.explanations
     fingerprints  the residual as curves along every coordinate                          optics.diagnosis.fingerprints
     homogeneity   whether an effect's strength is the same in every part of the data     optics.diagnosis.homogeneity
     held out      frames that were not fitted                                            optics.diagnosis.held_out
     decide        findings, and one of six words                                         optics.diagnosis.decide
-    pairs         two effects at once, where no single one leaves nothing                optics.diagnosis.pairs
     remarks       upper limits, warnings, hints                                          optics.diagnosis.remarks
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 
+from optics.diagnosis import explanations, homogeneity, remarks
 from optics.diagnosis import fingerprints as prints
 from optics.diagnosis import held_out as held
-from optics.diagnosis import homogeneity, pairs, remarks
 from optics.diagnosis import statistics as st
 from optics.diagnosis.decide import Findings, decide
 from optics.diagnosis.evidence import Candidate, Evidence, Progress, silent
-from optics.diagnosis.findings import basis_of, findings_of, refuted, simplest
-from optics.diagnosis.refit import Case, add_both, refit_each
-from optics.diagnosis.result import Basis, Diagnosis, Family, Fingerprint, Pair, Split
-from optics.diagnosis.score import Table, score
+from optics.diagnosis.explanations import Outcome
+from optics.diagnosis.findings import basis_of, findings_of, subject_of
+from optics.diagnosis.refit import Case, refit_each
+from optics.diagnosis.result import Basis, Diagnosis, Family, Fingerprint, Split
+from optics.diagnosis.score import score
 from optics.diagnosis.text import sentence
-from optics.diagnosis.thresholds import CLEAR, EXCESS, LEVEL, MAX_SPLIT, close
+from optics.diagnosis.thresholds import EXCESS, LEVEL, MAX_SPLIT, close
 from optics.fit import calibrate
 from optics.fit.model import Model
 from optics.fit.result import Fit
@@ -55,6 +56,8 @@ def diagnose(
     seed: int = 0,
     top: int = 5,
     progress: Progress | None = None,
+    excluded: Mapping[str, str] | None = None,
+    added: Sequence[Effect] = (),
 ) -> Diagnosis:
     """Score, refit and judge: which effect a calibrated model lacks.
 
@@ -66,6 +69,9 @@ def diagnose(
     rows_max      values (pixel x channel) that curves, splits and alternative weights may use
     seed          of the simulations and of derivative images; the same seed gives the same table
     top           how many of the best effects are refitted, besides those that cannot be told from the best
+    excluded      effect -> why it is not among `effects`, for the record
+
+    added         effects that the model has already, whose laws may differ from the library's
 
     Raises Underdetermined when the base is not calibrated to convergence, or black level or saturation are unknown;
     ValueError when frames are fitted and held out at once, or none is fitted.
@@ -89,36 +95,33 @@ def diagnose(
         rows_max,
         seed,
         say,
+        laws=frozenset(coordinate for e in added for coordinate in e.acts),
     )
     basis = basis_of(model, evidence, evidence.structure(evidence.whitened, evidence.base))
-    chosen = _choose(table, top)
+    case.places = places = prints.places(model, fit.values, evidence)
+    chosen = _choose(case, top)
     fits = refit_each(case, chosen)
-    winner, done, members = _contenders(chosen, basis)
+    outcome = explanations.search(case, chosen, fits)
+    subject, best = subject_of(outcome), outcome.best
 
-    places = prints.places(model, fit.values, evidence)
-    reference = winner.row.net_refit if winner else max([c.row.net for c in table.order], default=0.0)
+    reference = best.fall - best.expectation if subject else max([c.row.net for c in table.order], default=0.0)
     fingerprints = prints.fingerprints(model, evidence, places, max(reference, 1.0), say)
     families = prints.families(fingerprints)
-    split = partial(homogeneity.split, model, evidence, places, rows_max, seed, say)
-    splits = _split_members(case, members, fits, split)
-    levels = held.levels(case, winner, fits)
-    shifts = held.shifts(case, winner, fits) if winner else []
+    splits, chance = _split(case, outcome, subject)
+    levels = held.levels(case, best.members, best.fit)
+    shifts = held.shifts(case, best.members, best.fit) if subject else []
 
-    findings = findings_of(case, winner, done, members, fits, fingerprints, splits, levels, basis)
+    findings = findings_of(case, outcome, fingerprints, splits, chance, levels, basis)
     word, conditions = decide(findings)
-    tried = _pairs(case, word, winner, done, fingerprints, split)
-    word = "PARTIAL" if any(p.complete for p in tried) else word
+    told = outcome.told()
 
-    remarks.write_limits(case, winner if word == "CLAIM" else None, fits, basis)
-    remarks.write_verdicts(table, word, winner, members, splits)
+    remarks.write_limits(case, best if word == "CLAIM" else None, basis)
+    remarks.write_verdicts(table, word, subject, outcome, splits)
     rows, names = [c.row for c in table.order], [c.effect.name for c in chosen]
     gaps, correct = _gaps(evidence, chosen)
-    hints = remarks.hints_of(word, conditions, members, gaps, names)
-    text = sentence(word, conditions, findings, rows, [c.row for c in members], fingerprints, levels, shifts, basis)
-    if any(p.complete for p in tried):
-        text = pairs.words(tried, {row.name: row.share for row in rows})
-    elif word in ("PARTIAL", "UNKNOWN"):
-        text += pairs.doubt(tried)
+    ambiguous = list(dict.fromkeys(name for e in told if e.survives for name in e.effects))
+    hints = remarks.hints_of(word, conditions, outcome, findings, gaps, names)
+    text = sentence(word, conditions, findings, rows, told, fingerprints, levels, shifts, basis)
     if word in ("UNKNOWN", "CANNOT_TELL"):
         text, fixed = _unexplained(case, word, text, fingerprints, families, findings, basis)
         hints = [FIXED_HINT, *hints] if fixed else hints
@@ -128,7 +131,7 @@ def diagnose(
         conditions=conditions,
         basis=basis,
         rows=rows,
-        ambiguous=[c.effect.name for c in members] if word == "AMBIGUOUS" else [],
+        ambiguous=ambiguous if word == "AMBIGUOUS" else [],
         compared=names,
         gaps=gaps,
         correct=correct,
@@ -137,75 +140,73 @@ def diagnose(
         fingerprints=fingerprints,
         shifts=shifts,
         hints=hints,
-        not_tested=scored.not_tested,
-        warnings=remarks.warnings_of(case, word, winner, shifts, scored.dropped, basis),
-        claimed=winner.effect.name if winner and word == "CLAIM" else "",
-        pairs=tried,
+        not_tested={**scored.not_tested, **(excluded or {})},
+        warnings=remarks.warnings_of(case, word, subject, outcome, shifts, scored.dropped, basis),
+        claimed=subject.effect.name if subject and word == "CLAIM" else "",
+        explanations=told,
         families=families,
         fits=fits,
         evidence=replace(evidence, blocks=[], sigma=[], whitened=[], use=[], candidates=table.order),
     )
 
 
-def _choose(table: Table, top: int) -> list[Candidate]:
-    """The effects to refit: the best ones, those that cannot be told from the best, winners of other weights.
+def _choose(case: Case, top: int) -> list[Candidate]:
+    """The effects to refit: those that cannot be told from the best by score; of a table all that stand out besides, as
+    its refits are cheap; of images the best of them, and winners of other weights.
 
-    An effect that noise explains is not refitted: a refit costs a calibration.
-    """
-    live = [c for c in table.order if c.row.net > 0 and c.row.p_family < LEVEL]
-    chosen = live[:top] + [c for c in live[top:] if close(live[0].row.net, c.row.net)]
+    Where noise explains every effect, none is refitted."""
+    seen = [c for c in case.table.order if c.row.net > 0]
+    live = [c for c in seen if c.row.p_family < LEVEL]
+    if not live:
+        return []
+    near = [c for c in seen if close(live[0].row.net, c.row.net)]
+    if case.evidence.is_table:
+        return [c for c in seen if c in live or c in near]
+    chosen = live[:top] + [c for c in near if c not in live[:top]]
     chosen = chosen[:MAX_REFITS]
-    others = {table.winner_uniform, table.winner_dilated} - {c.effect.name for c in chosen}
+    others = {*case.table.preferred.values()} - {c.effect.name for c in chosen}
     return chosen + [c for c in live if c.effect.name in others]
 
 
-def _contenders(chosen: Sequence[Candidate], basis: Basis) -> tuple[Candidate | None, list[Candidate], list[Candidate]]:
-    """(winner, refitted effects, members of the ambiguous set), the winner first in both lists.
+def _split(case: Case, outcome: Outcome, subject: Candidate | None) -> tuple[list[Split], float]:
+    """(splits of the main effect of each survivor, p of the subject's strength by its scatter).
 
-    An effect that contains another and does no better is left out: it is the other one with strengths to spare."""
-    done = sorted((c for c in chosen if c.row.refit is not None), key=lambda c: -c.row.net_refit)
-    winner = simplest(done) if done and done[0].row.net_refit > 0 else None
-    done = [c for c in done if not any(c.contains(d) and c.row.net_refit - d.row.net_refit < CLEAR for d in done)]
-    if winner is None:
-        return None, done, []
-    done.sort(key=lambda c: c is not winner)
-    members = [
-        c
-        for c in done
-        if c.row.net_refit > 0 and close(winner.row.net_refit, c.row.net_refit) and not refuted(winner, c, basis.dof)
-    ]
-    return winner, done, members
-
-
-def _split_members(
-    case: Case,
-    members: Sequence[Candidate],
-    fits: Mapping[str, Fit],
-    split: Callable[..., tuple[list[Split], float, np.ndarray]],
-) -> list[Split]:
-    """Test the members' homogeneity, and write into their refits what the scatter of their strengths says."""
-    splits = []
-    for c in members[:MAX_SPLIT]:
-        own, p, clutter = split(c, fits[c.effect.name], c.row.refitted, c.row.net_refit)
+    What scatters is written into the refit of an effect that explains the residual by itself."""
+    splits: list[Split] = []
+    chance = math.nan
+    done: set[str] = set()
+    for told, trial in zip([e for e in outcome.told() if e.survives], outcome.survivors):
+        if not trial.members or len(done) >= MAX_SPLIT:
+            continue
+        main = (
+            subject
+            if subject in trial.members
+            else max(trial.members, key=lambda c: outcome.own_fall(trial, c.effect.name))
+        )
+        if main is None or main.effect.name in done:
+            continue
+        done.add(main.effect.name)
+        beside = [v for c in trial.members if c is not main for v in c.variables]
+        net = outcome.own_fall(trial, main.effect.name) - main.cone.expectation
+        own, p, clutter = homogeneity.split(
+            case.model,
+            case.evidence,
+            case.places or [],
+            case.rows_max,
+            case.seed,
+            case.say,
+            main,
+            trial.fit,
+            told,
+            net,
+            beside,
+        )
         splits += own
-        c.row.refit = homogeneity.scattered(c.row.refitted, case.table.family.p(p), clutter)
-    return splits
-
-
-def _pairs(
-    case: Case,
-    word: str,
-    winner: Candidate | None,
-    done: Sequence[Candidate],
-    fingerprints: Sequence[Fingerprint],
-    split: Callable[..., tuple[list[Split], float, np.ndarray]],
-) -> list[Pair]:
-    """Pairs of effects, tried where no single effect is claimed or leaves nothing to explain."""
-    if winner is None or word in ("NOTHING", "CLAIM") or any(c.row.refitted.complete for c in done):
-        return []
-    order = case.table.order
-    found = pairs.search(case.evidence, order, winner.row.net_refit, lambda both: add_both(case, both, split))
-    return pairs.beside_curves(found, fingerprints, {c.row.name: c.row.expected for c in order})
+        p = case.table.family.p(p)
+        chance = p if main is subject else chance
+        if len(trial.members) == 1 and main.row.refit is not None:
+            main.row.refit = homogeneity.scattered(main.row.refitted, p, clutter)
+    return splits, chance
 
 
 def _gaps(evidence: Evidence, chosen: Sequence[Candidate]) -> tuple[list[list[float]], list[list[float]]]:

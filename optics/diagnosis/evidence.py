@@ -16,11 +16,12 @@ from optics.captures.capture_set import Frame
 from optics.diagnosis import statistics as st
 from optics.diagnosis.result import Row
 from optics.errors import Underdetermined
-from optics.fit.model import Model, value_of
+from optics.fit.model import Model, value_of, values_in
 from optics.scene.declare import Effect
 from optics.scene.parameter import Values, Variable
 
 NOT_FINITE = 0.01  # of the usable values: more than stray pixels, such as a normal that no surface has
+OF_SCALE = 0.003  # of full scale: the offset of an amplifier or a meter that was not set to zero
 SQUARE_ONSET = 1e-3  # plausible sizes from neutral below which a squared parameter counts as being there
 
 Progress = Callable[[str, int, int], None]  # (what, done, total)
@@ -73,7 +74,7 @@ class Candidate:
         """An effect under test at the values: its strengths start there, and move to the sides that are open."""
         start = np.array([value_of(model, values, v) for v in variables])
         sides = [v.parameter.side(value) for v, value in zip(variables, start)]
-        return cls(effect, list(variables), start, sides, np.array([v.parameter.plausible for v in variables]))
+        return cls(effect, list(variables), start, sides, np.array([_plausible(model, v) for v in variables]))
 
     @property
     def usual(self) -> np.ndarray:
@@ -111,6 +112,14 @@ class Candidate:
         return np.where(self._squares(), sd / np.where(slope > 0, slope, 1.0), sd)
 
 
+def _plausible(model: Model, variable: Variable) -> float:
+    """The plausible size of a variable, in its unit. What is declared in DN is meant for cameras: of a table, whose
+    readings have any unit, it is a share of the full scale."""
+    if variable.parameter.unit != "DN" or model.captures is None or model.captures.table is None:
+        return variable.parameter.plausible
+    return OF_SCALE * float(model.noise.saturation - model.noise.black_level)
+
+
 # -- measuring: one pass over the frames -----------------------------------------------------------------------------
 @dataclass
 class Block:
@@ -136,6 +145,14 @@ class Block:
     @property
     def middle(self) -> np.ndarray:
         return self.a if self.b is None else (self.a + self.b) / 2
+
+    def columns(self, columns: Sequence[int]) -> np.ndarray:
+        """(n, k) whitened derivative images; 0 where the block has none of a column."""
+        position = {int(w): i for i, w in enumerate(self.where)}
+        images = np.zeros((len(self.r), len(columns)))
+        there = [(i, position[c]) for i, c in enumerate(columns) if c in position]
+        images[:, [i for i, _ in there]] = self.middle[:, [j for _, j in there]]
+        return images
 
 
 @dataclass
@@ -180,6 +197,24 @@ class Evidence:
     @property
     def channels(self) -> int:
         return self.use[0].shape[2]
+
+    @property
+    def is_table(self) -> bool:
+        """Whether the values are readings of a table."""
+        return isinstance(self.spectrum, st.Sweeps)
+
+    def dense(self, columns: Sequence[int]) -> np.ndarray:
+        """(n, k) whitened derivative images of all kept values, 0 where a block has none of a column."""
+        return np.concatenate([block.columns(columns) for block in self.blocks])
+
+    def order(self, model: Model) -> np.ndarray:
+        """(n,) number of each kept value in the order of recording: the row of the table that it stands in."""
+        numbers = []
+        for block in self.blocks:
+            frame = model.frames[block.frame]
+            rows = frame.rows if frame.rows is not None else np.full(frame.image.shape[:1] + (1, 1), block.frame, float)
+            numbers.append(np.broadcast_to(rows, frame.image.shape).reshape(-1)[block.index])
+        return np.concatenate(numbers)
 
     @property
     def gradient(self) -> float:
@@ -343,9 +378,7 @@ def _empty(
 ) -> tuple[Evidence, float]:
     """(evidence without a frame yet, values that the frames hold); base: columns of the base."""
     columns = layout.columns
-    total, used = 0.0, 0
-    for frame in frames:
-        total, used = total + model.size, used + int(model.usable(frame).sum())
+    total, used = values_in(model, frames), sum(int(model.usable(frame).sum()) for frame in frames)
     sweeps = all(model.frames[f].readings for f in frames)
     precision, pull = _priors(model, values, columns[:base])
     evidence = Evidence(

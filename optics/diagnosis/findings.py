@@ -1,26 +1,25 @@
-"""Findings: the numbers that a verdict is made of, gathered from scores, refits, splits, curves and held-out frames."""
+"""Findings: the numbers that a verdict is made of, gathered from scores, explanations, splits, curves and held-out
+frames."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from optics.diagnosis import fingerprints as prints
 from optics.diagnosis import statistics as st
-from optics.diagnosis.decide import Findings, rivals
+from optics.diagnosis.decide import Findings, Opponent, rivals
 from optics.diagnosis.evidence import Candidate, Evidence
-from optics.diagnosis.refit import Case
+from optics.diagnosis.explanations import Outcome, design_effect_without, lead_without
+from optics.diagnosis.refit import Case, clear
 from optics.diagnosis.result import Basis, Fingerprint, Level, Split
-from optics.diagnosis.thresholds import AS_GOOD, CLEAR, HIDDEN, LEVEL, MAX_SPLIT, UNEVEN, close
+from optics.diagnosis.thresholds import AS_GOOD, LEVEL, UNEVEN
+from optics.fit.compare import led_label
 from optics.fit.model import Model, value_of
 from optics.fit.result import Fit
-
-# Of the misfit that hides: the share that lies along the one direction in which two effects differ. Measured: .006 on
-# average and .07 at most on the polarizer bench, .002 on gelsight.
-ALONG = 0.05
 
 
 def basis_of(model: Model, evidence: Evidence, structure: st.Structure) -> Basis:
@@ -54,124 +53,160 @@ def basis_of(model: Model, evidence: Evidence, structure: st.Structure) -> Basis
     )
 
 
-def simplest(done: Sequence[Candidate]) -> Candidate:
-    """The best effect, or one that it contains and that does as well."""
-    best = done[0]
-    return next((c for c in done[1:] if best.contains(c) and best.row.net_refit - c.row.net_refit < CLEAR), best)
-
-
-def refuted(winner: Candidate, other: Candidate, dof: int) -> bool:
-    """Whether the winner leaves nothing to explain, while another effect, refitted, leaves more than misfit that hides
-    beside the winner could fake.
-
-    For the wrong one of two to lead by L in chi2, sqrt(L) or more must lie along the one direction in which their
-    images differ. Noise has a variance of 1 there, and of misfit of which H is hidden, a share ALONG lies there: the
-    right one leads if L > CLEAR (1 + ALONG H)."""
-    own, left = winner.row.refit, other.row.refit
-    if own is None or other is winner or not own.complete or left is None or not left.converged:
-        return False
-    # an excess below none means that the noise is overstated by as much, and hides that much more
-    hidden = (abs(own.excess_sd) + HIDDEN) * math.sqrt(2 * dof)
-    return left.structure_p < LEVEL or winner.row.net_refit - other.row.net_refit > CLEAR * (1 + ALONG * hidden)
+def subject_of(outcome: Outcome) -> Candidate | None:
+    """The effect that a verdict may name: of those that every survivor has, or else of the best explanation, the one
+    without which most is lost; None where nothing is told apart from no effect at all."""
+    best = outcome.best
+    able = [c for c in best.members if c.effect.name in outcome.core] or best.members
+    return max(able, key=lambda c: outcome.own_fall(best, c.effect.name), default=None)
 
 
 def findings_of(
     case: Case,
-    winner: Candidate | None,
-    done: Sequence[Candidate],
-    members: Sequence[Candidate],
-    fits: Mapping[str, Fit],
+    outcome: Outcome,
     fingerprints: Sequence[Fingerprint],
     splits: Sequence[Split],
+    chance: float,
     levels: Sequence[Level],
     basis: Basis,
 ) -> Findings:
     """The numbers that decide.
 
-    done      refitted effects, the winner first; members: those that explain the residual about equally well
-    splits    of the members that were split
+    splits   of the survivors' main effects; chance: p of the subject's strength by scatter
     """
-    table = case.table
-    if winner is None:
-        best = max((c.row.net for c in table.order), default=0.0)
-        own = Findings(table.p_best, basis.structure_p, fall=max(best, 0.0), excess_sd=basis.excess_sd)
+    table, subject, best = case.table, subject_of(outcome), outcome.best
+    measured = case.model.captures is not None and case.model.captures.noise is None
+    if subject is None:
+        fall = max([t.fall - t.expectation for t in outcome.trials] + [0.0])
+        own = Findings(table.p_best, basis.structure_p, fall=fall, excess_sd=basis.excess_sd, measured=measured)
     else:
-        own = _of_winner(case, winner, done, members, splits, levels, basis)
+        own = _of_subject(case, outcome, subject, splits, chance, levels, basis)
+        own = replace(own, measured=measured)
     if not fingerprints:
         return own
-    followed = _followed(case, winner, fits, fingerprints)
-    better = [followed] if followed else rivals(fingerprints, own.fall)
+    followed = _followed(case, subject, best.fit, best.fall - best.expectation, fingerprints)
+    complete = bool(best.members) and best.complete
+    opponent = Opponent(
+        own.fall,
+        best.cost,
+        len(best.members),
+        sum(len(c.cone.live) for c in best.members),
+        complete,
+        complete or case.evidence.is_table,
+        case.laws,
+    )
+    better = [followed] if followed else rivals(fingerprints, opponent)
     best_curve = better[0] if better else fingerprints[0]
     return replace(
         own,
-        ratio=best_curve.ratio,
+        ratio=best_curve.net / max(own.fall, 1.0),
         rival=bool(better),
         coordinate=best_curve.coordinate,
         curve_share=best_curve.share,
     )
 
 
-def _of_winner(
+def _of_subject(
     case: Case,
-    winner: Candidate,
-    done: Sequence[Candidate],
-    members: Sequence[Candidate],
+    outcome: Outcome,
+    subject: Candidate,
     splits: Sequence[Split],
+    chance: float,
     levels: Sequence[Level],
     basis: Basis,
 ) -> Findings:
-    """What the refit, the splits and the held-out frames say about the winner."""
-    refit, table = winner.row.refitted, case.table
-    mine = [s for s in splits if s.effect == winner.effect.name]
-    others = [c for c in table.order if c is not winner and not c.contains(winner)]
-    even = [all(s.holds for s in splits if s.effect == c.effect.name) for c in members[:MAX_SPLIT]]
+    """What the refits, the splits and the held-out frames say about the subject of a verdict."""
+    name, best, table = subject.effect.name, outcome.best, case.table
+    mine = [s for s in splits if s.effect == name]
+    names = {s.effect for s in splits}
+    even = [all(s.holds for s in splits if s.effect == n) for n in names]
     worst = max(mine, key=lambda s: (not s.holds, s.h), default=None)
     excess = basis.chi2 - basis.dof
+    own = outcome.own_fall(best, name)
+    lead, needed, against = lead_without(case, outcome, name)
+    carried, carried_by = _carried(case, outcome, subject)
+    strength = [value_of(case.model, best.fit.values, v) for v in subject.variables]
     return Findings(
         table.p_best,
         basis.structure_p,
-        winner.effect.name,
-        table.family.p(float(winner.cone.p(refit.fall))),
-        winner.row.net_refit,
-        max([c.row.net_refit for c in done[1:]] + [c.row.net for c in others if c not in done] + [0.0]),
-        refuted=refit.complete
-        and all(
-            refuted(winner, c, basis.dof)
-            for c in others
-            if close(winner.row.net_refit, max(c.row.net_refit, 0.0 if c in done else c.row.net))
-        ),
-        share=winner.row.net_refit / excess if excess > 0 else math.nan,
+        name,
+        table.family.p(float(subject.cone.p(own / design_effect_without(case, outcome, name)))),
+        best.fall - best.expectation,
+        common=name in outcome.core,
+        survivors=len(outcome.survivors),
+        lead=lead,
+        needed=needed,
+        against=against,
+        share=(best.fall - best.expectation) / excess if excess > 0 else math.nan,
         excess_sd=basis.excess_sd,
-        left=basis.misfit * math.sqrt(max(1 - refit.fall / basis.chi2, 0.0)),
+        left=basis.misfit * math.sqrt(max(1 - best.fall / basis.chi2, 0.0)),
         uneven=worst.h if worst else 0.0,
         uneven_by=f" by {worst.by} ({_extremes(worst)})" if worst else "",
         uneven_limit=worst.limit if worst else UNEVEN,
         even=all(s.holds for s in mine),
         some_even=any(even) if even else True,
         held_out=levels[-1].fall if len(levels) > 1 else math.nan,
-        clear=refit.clear,
-        chance=refit.chance,
+        ahead=-best.ahead,
+        clear=clear(best.fit, subject, strength),
+        chance=chance,
+        carried=carried,
+        carried_by=carried_by,
+        fragile=table.fragile(name, best.names),
     )
 
 
+def _carried(case: Case, outcome: Outcome, subject: Candidate) -> tuple[float, str]:
+    """(share, part) of the frame, the LED or the channel in which most of the fall lies by an effect that has a
+    strength per frame; (0, '') for other effects, and where there are fewer than three parts."""
+    if subject.effect.scope != "frame":
+        return 0.0, ""
+    model, evidence = case.model, case.evidence
+    without = outcome.without(outcome.best, subject.effect.name)
+    gain = [np.asarray(a, float) ** 2 - np.asarray(b, float) ** 2 for a, b in zip(without.images, outcome.best.images)]
+    total = sum(float(g.sum()) for g in gain)
+    frames = [model.frames[f] for f in evidence.frames]
+    by: dict[str, dict[str, float]] = {"frame": {}, "LED": {}, "channel": {}}
+    for frame, g in zip(frames, gain):
+        for kind, label in (("frame", frame.name), ("LED", led_label(frame.parameters))):
+            by[kind][label] = by[kind].get(label, 0.0) + float(g.sum())
+        for label, own in zip(prints.channel_names(evidence), g.sum((0, 1))):
+            by["channel"][label] = by["channel"].get(label, 0.0) + float(own)
+    most = [
+        (max(parts.values()), f"{kind} {max(parts, key=lambda k: parts[k])}")
+        for kind, parts in by.items()
+        if len(parts) > 2
+    ]
+    if not most or not total > 0:
+        return 0.0, ""
+    fall, part = max(most)
+    return fall / total, part
+
+
 def _followed(
-    case: Case, winner: Candidate | None, fits: Mapping[str, Fit], fingerprints: Sequence[Fingerprint]
+    case: Case, subject: Candidate | None, fit: Fit, net: float, fingerprints: Sequence[Fingerprint]
 ) -> Fingerprint | None:
-    """The curve along a setting (clocks aside) that an effect's per-frame strengths follow, and that explains as much:
-    such strengths mimic whatever depends on what was set in each frame. None for other effects, and where they do not
-    follow any setting, as a drift does not."""
-    if winner is None or winner.effect.scope != "frame":
+    """The curve along a setting (clocks aside), or of LEDs, that an effect's per-frame strengths follow, and that
+    explains as much: such strengths mimic whatever depends on what was set in each frame. None for other effects, and
+    where they do not follow any, as a drift does not."""
+    if subject is None or subject.effect.scope != "frame":
         return None
-    model, evidence, fit = case.model, case.evidence, fits[winner.effect.name]
+    model, evidence = case.model, case.evidence
     own = {
         v.frames[0]: value_of(model, fit.values, v)
         for v in fit.variables
-        if v.name in winner.row.variables and v.frames
+        if v.name in subject.row.variables and v.frames
     }
     turned = prints.settings(model, evidence)
     found: list[tuple[float, Fingerprint]] = []
     for curve in fingerprints:
-        if curve.coordinate in turned and curve.family != "time" and curve.net > AS_GOOD * winner.row.net_refit:
+        if curve.net <= AS_GOOD * net:
+            continue
+        if curve.coordinate == "LED":
+            groups: dict[str, list[float]] = {}
+            for f, y in own.items():
+                groups.setdefault(led_label(model.frames[f].parameters), []).append(y)
+            found.append((st.differs(list(groups.values())), curve))
+        elif curve.coordinate in turned and curve.family != "time":
             x = dict(zip(evidence.frames, turned[curve.coordinate]))
             both = [(x[f], y) for f, y in own.items() if math.isfinite(x.get(f, math.nan))]
             found.append((st.follows(*np.array(both).T) if len(both) > 1 else math.nan, curve))

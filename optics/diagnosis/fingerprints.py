@@ -26,6 +26,7 @@ from optics.scene.parameter import Values, keys_with
 SIDE = 4  # cells per side of the coordinate 'place': a finer map would fit any clutter and forbid every claim
 NOT_A_COORDINATE = {"far", "quadrant"}  # regions that others make up
 YES_NO = ("contact", "shadow", "rim")
+PER_BIN = 4  # readings per bin, at least: a gain and an offset are fitted to them
 LINES = 64  # bins of 'row', 'column' and 'reading': a shutter, a read-out or an unsteady lamp acts on single rows
 REPEATED = 3  # frames that show a pixel, for a pattern to be called fixed
 # Share of a curve's direction that calibration must leave for it to be drawn; the rest (a level, a slope) is unknown.
@@ -133,8 +134,6 @@ def fingerprints(
     found      what `places` returns
     reference  net fall of chi2 of the best effect, which the curves' ratios refer to
     """
-    from scipy.special import chdtrc
-
     k, black = evidence.thinning, float(model.noise.black_level)
     names = sorted(set.intersection(*[set(p) for p in found]) - NOT_A_COORDINATE)
     # bins that have names: one each, whether it holds data or not
@@ -152,6 +151,9 @@ def fingerprints(
     dof_all = max(evidence.normal.count - evidence.projected.rank, 1)
     excess = evidence.projected.chi2 - dof_all
     weighed = excess > EXCESS * math.sqrt(2 * dof_all)
+    # a gain and an offset per bin: of few readings, more bins would fit each reading by itself
+    kept = sum(len(block.r) for block in evidence.blocks)
+    most = max(min(LINES, kept // PER_BIN), 2) if evidence.is_table else LINES
     curves_of = []
     for n, name in enumerate(names):
         say("fingerprints", n, len(names))
@@ -159,7 +161,11 @@ def fingerprints(
         edges = (
             np.arange(named[name] + 1) - 0.5
             if name in named
-            else st.bin_edges(x, LINES if name in ("row", "column", "reading") else st.BINS)
+            else st.bin_edges(
+                x,
+                most if name in ("row", "column", "reading") else min(st.BINS, most),
+                PER_BIN if evidence.is_table else 20,
+            )
         )
         if edges is None or len(edges) < 3:
             continue
@@ -187,7 +193,7 @@ def fingerprints(
                 name,
                 fall,
                 dof,
-                float(chdtrc(dof, fall)),
+                _chance(evidence, fall, dof, dof_all),
                 net,
                 net / reference,
                 kind,
@@ -202,6 +208,19 @@ def fingerprints(
         )
     say("fingerprints", len(names), len(names))
     return sorted(curves_of, key=lambda f: -f.net)
+
+
+def _chance(evidence: Evidence, fall: float, dof: int, free: int) -> float:
+    """p of a fall by `dof` bins in noise alone; of readings, in noise as large as what the bins leave of the residual:
+    its size is often stated too small, and nothing else is there to tell."""
+    from scipy.special import chdtrc
+    from scipy.stats import f as fisher
+
+    p = float(chdtrc(dof, fall))
+    if not evidence.is_table or free <= dof:
+        return p
+    left = max(evidence.projected.chi2 - fall, 1e-300) / (free - dof)
+    return max(p, float(fisher.sf(fall / dof / left, dof, free - dof)))
 
 
 def _unit_of(model: Model, coordinate: str) -> str:

@@ -6,10 +6,11 @@ for, for the base and for the base with the winner alike."""
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Sequence
 
 import numpy as np
 
+from optics.diagnosis import statistics as st
 from optics.diagnosis.evidence import Candidate
 from optics.diagnosis.refit import Case, chi2
 from optics.diagnosis.result import Level, Shift
@@ -18,41 +19,95 @@ from optics.fit.model import Model, value_of
 from optics.fit.result import Fit
 from optics.scene.parameter import Values, Variable
 
+SQUARES = 4  # fields per side of a held-out frame that is judged in halves
 MOVED = 3.0  # standard deviations, of the fit or of the prior, that a parameter must have moved to be reported
 
 
-def levels(case: Case, winner: Candidate | None, fits: Mapping[str, Fit]) -> list[Level]:
-    """Misfit of the base and, if there is a winner, of the base with it, on fitted and on held-out frames."""
+def levels(case: Case, members: Sequence[Candidate], with_them: Fit) -> list[Level]:
+    """Misfit of the base and, if there are any, of the base with effects, on fitted and on held-out frames.
+
+    A strength per frame is found on one half of a held-out frame and judged on the other."""
     evidence, fit, held_out, say = case.evidence, case.fit, case.held_out, case.say
-    before, after = evidence.normal.square, chi2(case, fits[winner.effect.name].values)[0] if winner else math.nan
+    before, after = evidence.normal.square, chi2(case, with_them.values)[0] if members else math.nan
+    name = " + ".join(c.effect.name for c in members)
 
     if not held_out:
         found = [_level(case, "base", before)]
-        return found + ([_level(case, winner.effect.name, after)] if winner else [])
+        return found + ([_level(case, name, after)] if members else [])
     say("held-out frames", 0, 2)
     pose = for_frames(case.model, fit.variables, held_out)
-    predictions, values = _predicted(case, fit.values.copy(), pose)
+    predictions_of_base, base_values = _predicted(case, fit.values.copy(), pose)
     masks, sds, base = [], [], []
-    for f, prediction in zip(held_out, predictions):
-        variance = evidence.variance(case.model, f, prediction, values)
+    for f, prediction in zip(held_out, predictions_of_base):
+        variance = evidence.variance(case.model, f, prediction, base_values)
         use = np.asarray(case.model.usable(f), bool) & np.isfinite(prediction)
         masks.append(use)
         sds.append(np.sqrt(np.where(use, variance, 1.0)))
         base.append(_square(case.model, f, prediction, use, sds[-1]))
     count = int(sum(m.sum() for m in masks))
     found = [_level(case, "base", before, sum(base), count)]
-    if winner is None or not count:
+    if not members or not count:
         return found
     say("held-out frames", 1, 2)
-    own = [v for v in case.variables_of(winner.effect) if v.frames is not None and set(v.frames) & set(held_out)]
-    predictions, _ = _predicted(case, fits[winner.effect.name].values.copy(), [*pose, *own])
-    with_effect = [
-        _square(case.model, f, prediction, use, sd) for f, prediction, use, sd in zip(held_out, predictions, masks, sds)
+    own = [
+        v
+        for c in members
+        for v in case.variables_of(c.effect)
+        if v.frames is not None and set(v.frames) & set(held_out)
     ]
-    fall = sum(base) - sum(with_effect) - len(own)
+    free = [*pose, *own]
+    predictions, values = _predicted(case, with_them.values.copy(), free)
+    if own:
+        base = _crossed(case, pose, held_out, predictions_of_base, base_values, masks, sds)
+        with_effect = _crossed(case, free, held_out, predictions, values, masks, sds)
+        found[0] = _level(case, "base", before, sum(base), count)
+    else:
+        with_effect = [
+            _square(case.model, f, prediction, use, sd)
+            for f, prediction, use, sd in zip(held_out, predictions, masks, sds)
+        ]
     better = int(sum(b > w for b, w in zip(base, with_effect)))
     say("held-out frames", 2, 2)
-    return [*found, _level(case, winner.effect.name, after, sum(with_effect), count, fall, better)]
+    return [*found, _level(case, name, after, sum(with_effect), count, sum(base) - sum(with_effect), better)]
+
+
+def _crossed(
+    case: Case,
+    free: Sequence[Variable],
+    frames: Sequence[int],
+    predictions: Sequence[np.ndarray],
+    values: Values,
+    masks: Sequence[np.ndarray],
+    sds: Sequence[np.ndarray],
+) -> list[float]:
+    """chi2 of each frame, one half of it predicted by a fit of the other, and the other way round.
+
+    With images X and residuals r of a half at the optimum of both, (G - G_h) step = -X'r moves it to that of the other
+    half. Halves are a chessboard of SQUARES x SQUARES fields, of readings the first and the second half."""
+    found = []
+    for f, prediction, use, sd in zip(frames, predictions, masks, sds):
+        here = [v for v in free if v.holds_in(f)]
+        ((_, images),) = case.model.derivatives(values, here, [f], seed=case.seed)
+        acting = [np.asarray(images[v.name], float) for v in here if v.name in images]
+        residual = np.where(use, (np.asarray(case.model.frames[f].image, float) - prediction) / sd, 0.0)
+        residual = np.where(np.isfinite(residual), residual, 0.0)
+        x = np.stack([np.where(use, image / sd, 0.0) for image in acting], -1) if acting else np.zeros((*use.shape, 0))
+        first, total = _half(use.shape), 0.0
+        gram = np.einsum("hwci,hwcj->ij", x, x)
+        for half in (first, ~first):
+            own, r = x[half], residual[half]
+            inverse, _ = st.inverse(gram - np.einsum("nci,ncj->ij", own, own))
+            total += float(np.sum((r + own @ (inverse @ np.einsum("nci,nc->i", own, r))) ** 2))
+        found.append(total)
+    return found
+
+
+def _half(shape: tuple[int, ...]) -> np.ndarray:
+    """(H, W) bool, the fields of one colour of a chessboard; of readings (N, 1), the first half."""
+    row, column = (np.arange(n) * min(SQUARES, n) // n for n in shape[:2])
+    if shape[1] == 1:
+        return np.broadcast_to((np.arange(shape[0]) < shape[0] // 2)[:, None], shape[:2])
+    return (row[:, None] + column) % 2 == 0
 
 
 def _predicted(case: Case, values: Values, free: list[Variable]) -> tuple[list[np.ndarray], Values]:
@@ -93,9 +148,9 @@ def _square(model: Model, frame: int, prediction: np.ndarray, use: np.ndarray, s
     return float(np.sum(np.where(use & np.isfinite(residual), residual, 0.0) ** 2))
 
 
-def shifts(case: Case, winner: Candidate, fits: Mapping[str, Fit]) -> list[Shift]:
-    """How far the base's parameters moved when the winner was added, the farthest (in their own sd) first."""
-    model, fit, found = case.model, case.fit, fits[winner.effect.name]
+def shifts(case: Case, members: Sequence[Candidate], found: Fit) -> list[Shift]:
+    """How far the base's parameters moved when effects were added, the farthest (in their own sd) first."""
+    model, fit, name = case.model, case.fit, " + ".join(c.effect.name for c in members)
     sd = {v.name: float(s) for v, s in zip(fit.variables, fit.sd)}
     present = {v.name for v in found.variables}
     moved = []
@@ -107,5 +162,5 @@ def shifts(case: Case, winner: Candidate, fits: Mapping[str, Fit]) -> list[Shift
         in_sd = (after - before) / own if own > 0 else math.nan
         out = v.prior is not None and abs(after - v.prior[0]) > MOVED * v.prior[1]
         warn = bool(abs(in_sd) > MOVED or out)
-        moved.append(Shift(winner.effect.name, v.name, v.parameter.unit, before, after, in_sd, warn))
+        moved.append(Shift(name, v.name, v.parameter.unit, before, after, in_sd, warn))
     return sorted(moved, key=lambda s: -abs(s.in_sd) if math.isfinite(s.in_sd) else 0.0)

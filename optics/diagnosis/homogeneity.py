@@ -13,8 +13,8 @@ import numpy as np
 
 from optics.diagnosis import fingerprints as prints
 from optics.diagnosis import statistics as st
-from optics.diagnosis.evidence import Block, Candidate, Evidence, Progress, at_bound, measure
-from optics.diagnosis.result import Pair, Refit, Split
+from optics.diagnosis.evidence import Candidate, Evidence, Progress, at_bound, measure
+from optics.diagnosis.result import Explanation, Refit, Split
 from optics.diagnosis.thresholds import LEVEL, MAPS, UNEVEN
 from optics.fit.compare import led_label
 from optics.fit.model import Model, value_of
@@ -58,7 +58,7 @@ def split(
     say: Progress,
     c: Candidate,
     found: Fit,
-    left: Refit | Pair,
+    left: Refit | Explanation,
     net: float,
     beside: Sequence[Variable] = (),
 ) -> tuple[list[Split], float, np.ndarray]:
@@ -86,7 +86,7 @@ def split(
             return max(s.h, UNEVEN)
         if left.complete:  # only noise is left, and p is what it says
             return HAIR
-        return min(EVEN if s.chance < LEVEL else UNEVEN, SAME_PLACE * excess / max(net, 1e-9))
+        return max(HAIR, min(EVEN if s.chance < LEVEL else UNEVEN, SAME_PLACE * excess / max(net, 1e-9)))
 
     results = [replace(s, limit=most(s), holds=s.h <= most(s)) for s in results]
     return results, *scatter(own, added.calibrated, added.effect, added.change, places)
@@ -193,7 +193,7 @@ def scatter(
     projected, clutter = own.project(own.thinned(), calibrated, effect, own.thinning), np.zeros((len(effect),) * 2)
     white = st.root(projected.information, st.VISIBLE)
     covariance = white.T @ white
-    images = _off_base(own, [_columns(block, effect) for block in own.blocks], projected, calibrated)
+    images = _off_base(own, [block.columns(effect) for block in own.blocks], projected, calibrated)
     found = variances(images, [block.r for block in own.blocks], places)
     for b, parts in found:
         if st.inverse(white @ b @ white.T)[1] < parts - 1:
@@ -205,20 +205,11 @@ def scatter(
     return by_clutter(projected.information @ change, projected.information, found), clutter
 
 
-def _columns(block: Block, columns: Sequence[int]) -> np.ndarray:
-    """(n, k) images of a block; 0 where it has none of a column."""
-    position = {int(w): i for i, w in enumerate(block.where)}
-    images = np.zeros((len(block.r), len(columns)))
-    there = [(i, position[c]) for i, c in enumerate(columns) if c in position]
-    images[:, [i for i, _ in there]] = block.middle[:, [j for _, j in there]]
-    return images
-
-
 def _off_base(
     own: Evidence, images: Sequence[np.ndarray], projected: st.Projected, base: Sequence[int]
 ) -> list[np.ndarray]:
     """Images of each block after projecting off what the base absorbs."""
-    return [image + _columns(block, base) @ projected.response for block, image in zip(own.blocks, images)]
+    return [image + block.columns(base) @ projected.response for block, image in zip(own.blocks, images)]
 
 
 def variances(

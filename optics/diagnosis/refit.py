@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from optics.diagnosis import statistics as st
 from optics.diagnosis.evidence import Candidate, Evidence, Progress, at_bound
-from optics.diagnosis.result import Pair, Refit, Split
+from optics.diagnosis.result import Refit
 from optics.diagnosis.score import Table
-from optics.diagnosis.thresholds import CLEAR, LEVEL
+from optics.diagnosis.thresholds import CLEAR
+from optics.fit import gauges
 from optics.fit.model import Model, value_of
 from optics.fit.result import Fit
 from optics.scene.declare import Effect
@@ -46,6 +47,8 @@ class Case:
     rows_max: int
     seed: int
     say: Progress
+    places: list[dict[str, np.ndarray]] | None = None
+    laws: frozenset[str] = frozenset()
 
     @property
     def base(self) -> list[Variable]:
@@ -108,23 +111,23 @@ def _best_attempt(case: Case, c: Candidate, predicted: float, linear: np.ndarray
         if enough and (predicted < CLEAR or best is not None and best.fall > enough * predicted):
             break
         try:
-            refitted = _with_effects(case, [(c, linear)], fraction)
+            refitted = with_effects(case, [(c, linear)], fraction)
         except FAILURES as error:
             c.row.flags.append(f"refit failed: {error}")
             continue
-        found = _weighed(case, refitted)
+        found = weighed(case, refitted)
         if math.isfinite(found.after) and (best is None or found.fall > best.fall):
             best = found
     return best
 
 
-def _with_effects(case: Case, effects: Sequence[tuple[Candidate, np.ndarray]], fraction: float) -> Fit:
+def with_effects(case: Case, effects: Sequence[tuple[Candidate, np.ndarray]], fraction: float) -> Fit:
     """Refit with effects, from a fraction of their expected change; raises one of FAILURES without a result."""
     variables = [*case.base, *(v for c, _ in effects for v in c.variables)]
     return case.refit(case.model, variables, _start(case, effects, fraction), frames=list(case.fitted))
 
 
-def _weighed(case: Case, found: Fit) -> Attempt:
+def weighed(case: Case, found: Fit) -> Attempt:
     """A refit with what it leaves, by the base's weights."""
     after, expected, images = chi2(case, found.values)
     after += case.prior_chi2(found.values)
@@ -147,11 +150,12 @@ def _write(case: Case, c: Candidate, best: Attempt, predicted: float) -> None:
         strength=strength,
         sd=[sd.get(v.name, math.nan) for v in c.variables],
         at_bound=ended,
-        excess_sd=_excess(evidence, best.after, best.expected, [c]),
+        excess_sd=excess_of(evidence, best.after, best.expected, [c]),
         structure_p=evidence.structure(best.images, [*evidence.base, *c.columns]).p,
         converged=bool(found.converged),
         reason=str(found.reason),
         clear=clear(found, c, strength),
+        told=known_of(found, c),
     )
     if not 1 / NONLINEAR <= ratio <= NONLINEAR and predicted > CLEAR:
         c.row.flags.append("nonlinear")
@@ -160,6 +164,17 @@ def _write(case: Case, c: Candidate, best: Attempt, predicted: float) -> None:
     size = np.abs(np.array(strength) - c.start) / c.plausible
     if size.max() > IMPLAUSIBLE and best.fall > CLEAR:
         c.row.flags.append(f"{size.max():.2g} times the plausible strength")
+
+
+def known_of(found: Fit, c: Candidate) -> str:
+    """What is known of strengths of which a gauge leaves only combinations, in words; '' where each is known."""
+    names = [v.name for v in found.variables]
+    if not all(v.name in names for v in c.variables):
+        return ""
+    own = [names.index(v.name) for v in c.variables]
+    covariance = np.asarray(found.covariance, float)[np.ix_(own, own)]
+    text = gauges.strengths_told(covariance, c.variables, [float(found.estimate[i]) for i in own])
+    return text if "not show" in text else ""
 
 
 def clear(found: Fit, c: Candidate, strength: Sequence[float]) -> float:
@@ -173,35 +188,6 @@ def clear(found: Fit, c: Candidate, strength: Sequence[float]) -> float:
     change = np.array(strength) - c.start
     inverse, rank = st.inverse(covariance)
     return math.sqrt(max(float(change @ inverse @ change), 0.0)) if rank else math.nan
-
-
-def add_both(
-    case: Case, both: list[Candidate], split: Callable[..., tuple[list[Split], float, np.ndarray]]
-) -> Pair | None:
-    """Refit with two effects together; None without a result. `split` is `optics.diagnosis.homogeneity.split`."""
-    try:
-        refitted = _with_effects(case, [(c, c.linear) for c in both], START)
-    except FAILURES:
-        return None
-    found = _weighed(case, refitted)
-    columns = [*case.evidence.base, *(i for c in both for i in c.columns)]
-    pair = Pair(
-        [c.effect.name for c in both],
-        found.fall,
-        _excess(case.evidence, found.after, found.expected, both),
-        case.evidence.structure(found.images, columns).p,
-    )
-    if not pair.complete:
-        return pair
-    for c, other in (both, both[::-1]):  # a second effect may absorb clutter, or an error of the first
-        strength = [value_of(case.model, found.fit.values, v) for v in c.variables]
-        alone = clear(found.fit, c, strength) ** 2
-        own, chance, _ = split(c, found.fit, pair, found.fall if math.isnan(alone) else alone, other.variables)
-        uneven = [s.by for s in own if not s.holds]
-        if uneven or case.table.family.p(chance) >= LEVEL:
-            how = f"then differs by {uneven[0]}" if uneven else "is no more than its scatter between parts of the data"
-            return replace(pair, but=f"{c.effect.name}'s strength {how}")
-    return pair
 
 
 def _look_again(case: Case, c: Candidate) -> tuple[float, np.ndarray]:
@@ -276,7 +262,7 @@ def chi2(case: Case, values: Values) -> tuple[float, float, list[np.ndarray]]:
     return total, expected, images
 
 
-def _excess(evidence: Evidence, after: float, expected: float, added: Sequence[Candidate]) -> float:
+def excess_of(evidence: Evidence, after: float, expected: float, added: Sequence[Candidate]) -> float:
     """Standard deviations by which chi2 with these effects exceeds its expectation if nothing else were missing."""
     free = evidence.projected.rank + sum(len(c.cone.live) for c in added)
     return (after - expected + free) / math.sqrt(2 * max(evidence.normal.count - free, 1))

@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from optics.captures import noise as camera_noise
 from optics.diagnosis import statistics as st
-from optics.diagnosis.decide import CURVE
+from optics.diagnosis.decide import CURVE, Findings
 from optics.diagnosis.evidence import Candidate, Evidence, at_bound, measure
+from optics.diagnosis.explanations import Outcome, Trial
 from optics.diagnosis.refit import Case
 from optics.diagnosis.result import NAMED, Basis, Condition, Shift, Split
 from optics.diagnosis.score import KAPPA, Table
 from optics.diagnosis.text import AT_FAULT, moved_by
 from optics.diagnosis.thresholds import CLEAR, EXCESS, LEVEL
 from optics.fit.model import value_of
-from optics.fit.result import Fit
 from optics.words import some
 
 RENDER_NOISE = 0.01  # of the camera's variance: Monte Carlo noise above it weakens every test
@@ -28,21 +28,21 @@ REPEATABLE = 1000  # times as many frames: above, repeats are no advice
 USUALLY = "the same press at 0.4 of the exposure, and one deeper press, often tell more than repeats"
 
 
-def write_limits(case: Case, claimed: Candidate | None, fits: Mapping[str, Fit], basis: Basis) -> None:
-    """Upper limits of every effect; after a claim, at the values with the claimed effect, so as not to be misled."""
+def write_limits(case: Case, claimed: Trial | None, basis: Basis) -> None:
+    """Upper limits of every effect; after a claim, at the values of the best explanation, so as not to be misled."""
     evidence, others, widen = case.evidence, case.table.order, math.sqrt(max(basis.phi, 1.0))
     if claimed is not None:
-        values, refit = fits[claimed.effect.name].values, claimed.row.refitted
+        values = claimed.fit.values
         base = [
             v
-            for v in [*(evidence.columns[i] for i in evidence.base), *claimed.variables]
+            for v in [*(evidence.columns[i] for i in evidence.base), *(v for c in claimed.members for v in c.variables)]
             if not at_bound(v, value_of(case.model, values, v))
         ]
-        others = [replace(c, forms={}, broken=False) for c in others if c is not claimed]
+        others = [replace(c, forms={}, broken=False) for c in others if c not in claimed.members]
         evidence = measure(
             case.model, values, base, others, evidence.frames, case.rows_max, case.seed, case.say, "upper limits"
         )
-        widen = math.sqrt(max(1 + refit.excess_sd * math.sqrt(2 / basis.dof), 1.0))
+        widen = math.sqrt(max(1 + claimed.excess_sd * math.sqrt(2 / basis.dof), 1.0))
     for c in others:
         _write_limit(evidence, c, list(c.forms) if claimed is not None else [c.form], widen)
 
@@ -67,9 +67,10 @@ def _write_limit(evidence: Evidence, c: Candidate, forms: Sequence[str], widen: 
 
 
 def write_verdicts(
-    table: Table, word: str, winner: Candidate | None, members: Sequence[Candidate], splits: Sequence[Split]
+    table: Table, word: str, winner: Candidate | None, outcome: Outcome, splits: Sequence[Split]
 ) -> None:
     """Each effect's own verdict and the flags that come of splits and of other weights."""
+    members = [c for t in outcome.survivors for c in t.members]
     for c in table.order:
         mine = [s for s in splits if s.effect == c.effect.name]
         if mine and not all(s.holds for s in mine):
@@ -82,7 +83,7 @@ def write_verdicts(
             c.row.verdict = "possible"
         elif word == "PARTIAL" and c is winner:
             c.row.verdict = "partial"
-        if c is winner and table.p_best < LEVEL and {table.winner_uniform, table.winner_dilated} - {c.effect.name}:
+        if c is winner and table.p_best < LEVEL and table.fragile(c.effect.name, outcome.best.names):
             c.row.flags.append("fragile")
 
 
@@ -90,6 +91,7 @@ def warnings_of(
     case: Case,
     word: str,
     winner: Candidate | None,
+    outcome: Outcome,
     shifts: Sequence[Shift],
     dropped: Sequence[str],
     basis: Basis,
@@ -125,12 +127,15 @@ def warnings_of(
             "rather than the physics"
         )
     if winner is not None and table.p_best < LEVEL:
-        for other, what in (
-            (table.winner_uniform, "with uniform weights"),
-            (table.winner_dilated, "with masks one pixel wider"),
-        ):
-            if other and other != winner.effect.name:
-                texts.append(f"fragile: {what} the best effect is {other}, not {winner.effect.name}")
+        name = winner.effect.name
+        for what, other in table.preferred.items():
+            if other and other == table.fragile(name, outcome.best.names):
+                texts.append(f"fragile: {what} the best effect is {other}, not {name}")
+    if outcome.correlation.share > 0:
+        texts.append(
+            f"neighbouring readings share {outcome.correlation.share:.0%} of their noise, over some "
+            f"{outcome.correlation.length:.2g} readings: falls of chi2 count for less by that"
+        )
     moved = [s for s in shifts if s.warn]
     if winner is not None and moved and word in NAMED:
         texts.append(
@@ -143,7 +148,8 @@ def warnings_of(
 def hints_of(
     word: str,
     conditions: Sequence[Condition],
-    members: Sequence[Candidate],
+    outcome: Outcome,
+    findings: Findings,
     gaps: Sequence[Sequence[float]],
     names: Sequence[str],
 ) -> list[str]:
@@ -151,8 +157,15 @@ def hints_of(
 
     gaps   D[i][j] between the refitted effects `names`
     """
+    members = list({c.effect.name: c for t in outcome.survivors for c in t.members}.values())
+    single = [t.members[0] for t in outcome.survivors if len(t.members) == 1]
     failed = {c.name for c in conditions if not c.holds}
-    hints = _for_a_tie(members, gaps, names) if word == "AMBIGUOUS" and len(members) > 1 else []
+    hints = []
+    if word == "AMBIGUOUS":
+        hints = _for_a_tie(single, gaps, names) if len(single) > 1 else []
+        hints += [f"{c.effect.name} needs: {c.effect.needs}" for c in members if c.effect.needs and c not in single]
+    if "spread" in failed:
+        hints.append(f"repeat {findings.carried_by}: nearly all that would be explained lies there")
     if "held out" in failed and word != "NOTHING":
         hints.append(
             "hold out frames that the fit has not seen (other presses or places), or find why they do not improve"

@@ -1,9 +1,9 @@
 """What a diagnosis is: one of six verdict words, the table of effects and everything that the verdict rests on.
 
     NOTHING      no effect stands out among all that were tested, and no low-frequency structure is left
-    CLAIM        one effect leads by a margin after a refit of everything; no curve along a coordinate does better; its
-                 strength is homogeneous; held-out frames improve
-    AMBIGUOUS    several effects explain the residual about equally well: the set, and what would tell them apart
+    CLAIM        one effect is part of every explanation (set of effects) that a refit of everything does not rule out;
+                 no curve along a coordinate does better; its strength is homogeneous; held-out frames improve
+    AMBIGUOUS    several explanations are not told apart and no effect is part of all: the set, and what would decide
     PARTIAL      an effect explains a part; the rest, or the inhomogeneity of its strength, has another cause
     UNKNOWN      a curve along a coordinate (radius, height, ...) explains more than any effect: the curve
     CANNOT_TELL  none of these: which condition failed, and what would decide
@@ -26,6 +26,7 @@ from optics.diagnosis import showing
 from optics.diagnosis.thresholds import EXCESS, MARGIN, TELLS, is_structured
 from optics.errors import Underdetermined
 from optics.fit.compare import plain
+from optics.words import Reach
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -57,6 +58,7 @@ class Refit:
     chance           family-wise p of the strength by its scatter between parts of the sensor or session; NaN: not
                      computed, or too few parts
     clutter          covariance of the strengths by that scatter, beyond noise; empty: none
+    told             what is known of strengths of which a gauge leaves only combinations, in words; '' otherwise
     """
 
     fall: float
@@ -74,32 +76,56 @@ class Refit:
     clear: float = math.nan
     chance: float = math.nan
     clutter: list[list[float]] = field(default_factory=list)
+    told: str = ""
 
     @property
     def complete(self) -> bool:
         """Whether nothing is left to explain."""
-        return _leaves_nothing(self.structure_p, self.excess_sd)
+        return leaves_nothing(self.structure_p, self.excess_sd)
 
 
-def _leaves_nothing(structure_p: float, excess_sd: float) -> bool:
+def leaves_nothing(structure_p: float, excess_sd: float) -> bool:
+    """Whether nothing is left to explain, by p of its structure and by its excess in standard deviations."""
     return excess_sd < EXCESS and not is_structured(structure_p, excess_sd)
 
 
 @dataclass
-class Pair:
-    """Two effects that were added together: fall of chi2, and what is left (as in Refit); but: the argument against one
-    of them, '' for none."""
+class Explanation:
+    """A set of effects that was added together, everything calibrated again (`optics.diagnosis.explanations`).
+
+    effects      names, none for the base
+    fall         of chi2; cost: what its strengths could have fitted and how far they are from plausible, in chi2
+    excess_sd, structure_p   what is left (as in Refit)
+    lead         of the best explanation's score over this one's; needed: the lead by which it would be told apart
+    ahead        chi2 of blocks of readings left out in turn, less that of the base; NaN for images
+    variables, strength, sd, units   of all its strengths
+    survives     whether it is not told apart from the best
+    told         effect -> what is known of its strengths where a gauge leaves only combinations, in words
+    """
 
     effects: list[str]
     fall: float
+    cost: float
     excess_sd: float
     structure_p: float
-    but: str = ""
+    lead: float
+    needed: float
+    ahead: float
+    variables: list[str]
+    strength: list[float]
+    sd: list[float]
+    units: list[str]
+    survives: bool
+    told: dict[str, str] = field(default_factory=dict)
 
     @property
     def complete(self) -> bool:
-        """Whether nothing is left to explain and no argument stands against either."""
-        return not self.but and _leaves_nothing(self.structure_p, self.excess_sd)
+        """Whether nothing is left to explain."""
+        return leaves_nothing(self.structure_p, self.excess_sd)
+
+    @property
+    def name(self) -> str:
+        return " with ".join(self.effects)
 
 
 @dataclass
@@ -116,6 +142,7 @@ class Row:
     kappa        noise over signal per pixel of its derivative images
     upper        upper limit of the absolute change, |change| + 2 sd, the sd widened by sqrt(phi) where there is misfit;
                  after a claim, with the claimed effect in the model
+    low, high, plausible   bounds and plausible size of each strength
     """
 
     name: str
@@ -142,6 +169,14 @@ class Row:
     refit: Refit | None = None
     flags: list[str] = field(default_factory=list)
     verdict: str = ""
+    low: list[float] = field(default_factory=list)
+    high: list[float] = field(default_factory=list)
+    plausible: list[float] = field(default_factory=list)
+
+    def reach(self, index: int) -> Reach:
+        """What the strength of this index can be, for text."""
+        known = index < min(len(self.low), len(self.high), len(self.plausible))
+        return Reach(self.low[index], self.high[index], self.plausible[index]) if known else Reach()
 
     @property
     def net(self) -> float:
@@ -211,6 +246,12 @@ class Fingerprint:
     family: str = ""
     share: float = math.nan
     unit: str = ""
+
+    @property
+    def cost(self) -> float:
+        """dof ln(1 + fall/dof): what so many bins could have fitted, whatever the data are, with a prior as wide as the
+        curve that was found (as `optics.diagnosis.explanations.occam`)."""
+        return self.dof * math.log1p(max(self.fall, 0.0) / self.dof)
 
 
 @dataclass(frozen=True)
@@ -359,10 +400,11 @@ class Diagnosis:
 
     word        one of WORDS; sentence: the verdict in words; conditions: what decided it
     rows        one per tested effect, best first; not_tested: effect -> why
-    ambiguous   effects that the data cannot tell apart, under AMBIGUOUS; claimed: the cause, under CLAIM
+    ambiguous   effects of the explanations that the data cannot tell apart, under AMBIGUOUS, the simplest explanation
+                first; claimed: the cause, under CLAIM
     compared    effects that were refitted, in the order of gaps (D between them) and correct (P(correct))
     levels      misfit of the base, then of the base with the best effect, on fitted and held-out frames
-    pairs       effects that were tried together; families: what the residual depends on, best first
+    explanations   sets of effects that were refitted, best first; families: what the residual depends on, best first
     advice      what to measure next; hints: the same in words, from declarations
     fits        effect -> `optics.fit.result.Fit` of its refit; evidence: `optics.diagnosis.evidence.Evidence` without
                 pixels. Neither is written to a file
@@ -385,7 +427,7 @@ class Diagnosis:
     not_tested: dict[str, str]
     warnings: list[str]
     claimed: str = ""
-    pairs: list[Pair] = field(default_factory=list)
+    explanations: list[Explanation] = field(default_factory=list)
     advice: list[Advice] = field(default_factory=list)
     families: list[Family] = field(default_factory=list)
     fits: dict[str, Any] = field(default_factory=dict, repr=False, compare=False)
@@ -396,6 +438,11 @@ class Diagnosis:
             raise ValueError(f"verdict {self.word!r} is none of {', '.join(WORDS)}")
         if (self.word == "CLAIM") != bool(self.claimed):
             raise ValueError(f"verdict {self.word}: only a CLAIM names a cause, and always one; got {self.claimed!r}")
+
+    @property
+    def survivors(self) -> list[Explanation]:
+        """The explanations that are not told apart, best first."""
+        return [e for e in self.explanations if e.survives]
 
     @property
     def missing(self) -> str:

@@ -6,7 +6,7 @@ Nothing is added to the model yet: derivative images, projection and ranking. Th
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,7 +14,7 @@ import numpy as np
 from optics.diagnosis import statistics as st
 from optics.diagnosis.evidence import Candidate, Evidence, Progress, at_bound, measure, silent
 from optics.diagnosis.result import Row
-from optics.diagnosis.thresholds import EXCESS, LEVEL
+from optics.diagnosis.thresholds import CLEAR, EXCESS, JUDGED, LEVEL
 from optics.errors import Underdetermined
 from optics.fit.model import Model, value_of
 from optics.fit.result import Fit
@@ -103,11 +103,30 @@ def _candidates(
         if not variables:
             not_tested[effect.name] = "the scene has no part that carries it"
             continue
-        if any(key in taken for v in variables for key in v.keys):
+        left = [v for v in variables if not any(key in taken for key in v.keys)]
+        if not left:
             not_tested[effect.name] = "in the model already"
             continue
-        found.append(Candidate.at(model, fit.values, effect, variables))
+        if effect.scope == "frame" and _is_dealt_out(model, fitted):
+            not_tested[effect.name] = "readings of one frame are spread over the session; name runs by [table] group"
+            continue
+        if effect.scope == "frame" and _fewest(model, left) < JUDGED:
+            not_tested[effect.name] = (
+                f"one strength per frame fits frames of fewer than {JUDGED} values, whatever they hold"
+            )
+            continue
+        found.append(Candidate.at(model, fit.values, effect, left))
     return found, not_tested
+
+
+def _is_dealt_out(model: Model, frames: Sequence[int]) -> bool:
+    """Whether frames are sweeps of a table that no group keeps together."""
+    return any(model.frames[f].readings and model.frames[f].group is None for f in frames)
+
+
+def _fewest(model: Model, variables: Sequence[Variable]) -> float:
+    """Usable values per strength, in the frames of the strength that has the fewest."""
+    return min(sum(int(model.usable(f).sum()) for f in v.frames or ()) for v in variables)
 
 
 def _require_convergence(evidence: Evidence, fit: Fit) -> None:
@@ -142,19 +161,47 @@ class Table:
 
     information   (k, k) V of all columns of candidates, zero where nothing is visible
     p_best        the smallest family-wise p
-    winner_uniform, winner_dilated   the best effect with uniform weights, and with masks one pixel wider
+    uniform, dilated   effect -> net fall with uniform weights, and with masks one pixel wider
     """
 
     order: list[Candidate]
     information: np.ndarray
     family: st.Family
     p_best: float
-    winner_uniform: str
-    winner_dilated: str
+    uniform: dict[str, float]
+    dilated: dict[str, float]
+
+    @property
+    def preferred(self) -> dict[str, str]:
+        """In words, other weights -> the best effect by them; '' for none."""
+        return {
+            how: max(net, key=lambda name: net[name], default="")
+            for how, net in (("with uniform weights", self.uniform), ("with masks one pixel wider", self.dilated))
+        }
+
+    def fragile(self, effect: str, beside: Collection[str] = ()) -> str:
+        """An effect that other weights or masks prefer clearly, while the score itself does not; '' for none.
+
+        beside   effects that are missing as well
+        """
+        own = {c.effect.name: c for c in self.order}
+        for net in (self.uniform, self.dilated):
+            for name in sorted(net, key=lambda n: -net[n]):
+                if name == effect or name in beside or own[name].contains(own[effect]) or effect not in net:
+                    continue
+                if net[name] - net[effect] > CLEAR and own[name].row.net - own[effect].row.net < CLEAR:
+                    return name
+                break
+        return ""
 
 
-def _rank(evidence: Evidence, candidates: list[Candidate], seed: int) -> Table:
-    """Score every candidate in its best form, and write its row."""
+def solve(
+    evidence: Evidence, candidates: Sequence[Candidate], seed: int = 0
+) -> tuple[np.ndarray, list[tuple[np.ndarray, st.Cone]]]:
+    """Score every candidate in its best form, and set that form, its columns, its cone and its row.
+
+    Returns V of all columns of candidates (k, k), zero where nothing is visible, and (columns, cone) of every form.
+    """
     projected, first = evidence.projected, len(evidence.base)
     # Where the noise of a derivative image exceeds what survives of it, products of two such images are random, and may
     # be next to nothing.
@@ -177,14 +224,20 @@ def _rank(evidence: Evidence, candidates: list[Candidate], seed: int) -> Table:
         c.form, own, c.cone, fall, c.linear = max(forms, key=lambda t: t[3] - t[2].expectation)
         c.columns = [int(i) + first for i in own]
         c.row = _row(evidence, c, own, fall)
+    return information, shared
+
+
+def _rank(evidence: Evidence, candidates: list[Candidate], seed: int) -> Table:
+    """Score every candidate in its best form, and write its row."""
+    information, shared = solve(evidence, candidates, seed)
     family = st.Family(information, shared, seed)
     uniform_gram = evidence.thinned(lambda block: block.sigma)
     for c in candidates:
         _write_row(evidence, c, candidates, information, family, uniform_gram)
     order = sorted(candidates, key=lambda c: (not len(c.cone.live), -c.row.net, c.effect.name))
     p_best = min((c.row.p_family for c in candidates), default=1.0)
-    uniform = _winner(evidence, uniform_gram, candidates)
-    dilated = _winner(evidence, evidence.thinned(lambda block: block.inner.astype(float)), candidates)
+    uniform = _net_by(evidence, uniform_gram, candidates)
+    dilated = _net_by(evidence, evidence.thinned(lambda block: block.inner.astype(float)), candidates)
     return Table(order, information, family, p_best, uniform, dilated)
 
 
@@ -249,6 +302,9 @@ def _row(evidence: Evidence, c: Candidate, own: np.ndarray, fall: float) -> Row:
         confused_with="",
         cos=0.0,
         upper=[math.nan] * len(c.variables),
+        low=[v.parameter.bounds[0] for v in c.variables],
+        high=[v.parameter.bounds[1] for v in c.variables],
+        plausible=[v.parameter.plausible for v in c.variables],
     )
 
 
@@ -268,10 +324,10 @@ def _confused(information: np.ndarray, c: Candidate, candidates: Sequence[Candid
     return best
 
 
-def _winner(evidence: Evidence, normal: st.Normal, candidates: Sequence[Candidate]) -> str:
-    """Name of the best effect with other weights; only their proportions matter to an order."""
+def _net_by(evidence: Evidence, normal: st.Normal, candidates: Sequence[Candidate]) -> dict[str, float]:
+    """{effect: net fall} with other weights, scaled to a residual of one standard deviation."""
     if not candidates:
-        return ""
+        return {}
     projected = evidence.project(normal, evidence.base, evidence.rest, evidence.thinning)
     first = len(evidence.base)
     scale = projected.chi2 / max(normal.count - projected.rank, 1)
@@ -283,4 +339,4 @@ def _winner(evidence: Evidence, normal: st.Normal, candidates: Sequence[Candidat
         seen = (projected.survival[own] > st.VISIBLE).astype(float)
         cone = st.Cone(projected.information[np.ix_(own, own)] * np.outer(seen, seen), c.sides, draws=1000)
         net[c.effect.name] = cone.solve(projected.score[own] * seen)[0] / scale - cone.expectation
-    return max(net, key=lambda name: net[name], default="")
+    return net

@@ -100,9 +100,11 @@ def html(diagnosis: Diagnosis) -> str:
                 words.number(r.fall, 4, typeset=True),
                 words.number(r.refit.fall, 4, typeset=True) if r.refit else "",
                 words.p_text(r.p_family, typeset=True),
-                words.with_sd(strength[0], sd[0], typeset=True) if len(strength) == 1 else f"{len(strength)} values",
+                words.with_sd(strength[0], sd[0], typeset=True, reach=r.reach(0))
+                if len(strength) == 1
+                else f"{len(strength)} values",
                 r.units[0] if len(strength) == 1 and words.spaced(r.units[0]) else "",
-                "" if math.isnan(r.share) else words.percent(r.share, 2, typeset=True),
+                "" if math.isnan(r.share) else words.share_text(r.share, typeset=True),
                 r.verdict,
             )
         )

@@ -33,6 +33,7 @@ TRUNCATION = 1e-9  # of the largest eigenvalue of unit-length columns: below, a 
 VISIBLE = 1e-6  # survival below which normal equations in double precision cannot tell what is left from rounding
 DRAWS = 40_000  # of the simulated maximum: 1 % of them are 400, known to 5 %
 BINS = 16  # of a curve along a coordinate
+RIPPLES, FREQUENCIES = 8, 1000  # frequencies from which, and up to which, the strongest one is looked for
 NARROW = 8  # cosines per side that count as low frequency
 
 
@@ -348,7 +349,7 @@ def probability_correct(d: float) -> float:
 
 
 # -- bins: fingerprints and splits -----------------------------------------------------------------------------------
-def bin_edges(x: np.ndarray, bins: int = BINS) -> np.ndarray | None:
+def bin_edges(x: np.ndarray, bins: int = BINS, fewest: int = 20) -> np.ndarray | None:
     """Edges of at most `bins` bins: half of them hold equal counts, half are equally wide, so that neither a flat
     region nor a long tail takes them all. One bin per value where there are few values; None where there is only
     one."""
@@ -366,7 +367,7 @@ def bin_edges(x: np.ndarray, bins: int = BINS) -> np.ndarray | None:
         [np.quantile(sample, np.linspace(0, 1, bins // 2 + 1))[1:-1], np.linspace(low, high, bins // 2 + 2)[1:-1]]
     )
     edges = np.unique(inner)
-    keep, floor = [], max(20, len(sample) // 2000)
+    keep, floor = [], max(fewest, len(sample) // 2000)
     last = 0
     counts = np.searchsorted(np.sort(sample), edges)
     for edge, count in zip(edges, counts):
@@ -463,7 +464,8 @@ def planes_of(use: np.ndarray) -> list[tuple]:
 
 
 class Spectrum:
-    """Power of whitened residuals in the lowest NARROW x NARROW cosines against the highest quarter.
+    """Power of whitened residuals in the lowest NARROW x NARROW cosines against the highest quarter; and of the
+    strongest frequency along rows and columns against all others. p is the smaller of both, times two.
 
     White noise has the same power in both, whatever its size: an error of the gain changes nothing, structure does.
     The degrees of freedom that a calibration takes from the low frequencies are counted from the images of J.
@@ -517,7 +519,36 @@ class Spectrum:
         dof_high = max(self.high_count, 1.0)
         mean_high = high / dof_high
         f = low / expected / max(mean_high, 1e-300)
-        return Structure(f, float(fdtrc(dof_low, dof_high, f)), dof_low, dof_high, mean_high)
+        p = float(fdtrc(dof_low, dof_high, f))
+        if (ripple := self._ripple(residuals)) < p:
+            p = ripple
+        return Structure(f, min(1.0, 2 * p), dof_low, dof_high, mean_high)
+
+    def _ripple(self, residuals: Sequence[np.ndarray]) -> float:
+        """p of the strongest frequency in the means of rows and of columns, against the mean of all frequencies: bands
+        of a read-out, flicker of mains light under a rolling shutter. Summed over frames by power, as its phase may
+        change from frame to frame, and by amplitude, as a fixed pattern does not."""
+        from scipy.special import gammaincc
+
+        profiles: dict[tuple[int, int, str], list[np.ndarray]] = {}
+        for residual, planes in zip(residuals, self.planes):
+            for plane in planes:
+                use = (residual[plane] != 0).astype(float)
+                for axis in (0, 1):
+                    count = use.sum(1 - axis)
+                    mean = residual[plane].sum(1 - axis) / np.sqrt(np.maximum(count, 1.0))
+                    mean = mean * math.sqrt(len(count) / max(int(np.count_nonzero(count)), 1))
+                    profiles.setdefault((axis, len(mean), str(plane)), []).append(mean)
+        ps = []
+        for own in profiles.values():
+            together = np.array(own)
+            for group in (together, together.sum(0, keepdims=True)):
+                power = (np.abs(np.fft.rfft(group, axis=1)[:, 1:-1]) ** 2).sum(0)
+                if len(power) > RIPPLES and power.mean() > 0:
+                    count = len(group)
+                    excess = float(power.max()) / float(power.mean())
+                    ps.append(float(gammaincc(count, count * excess)) * len(power))
+        return min(1.0, min(ps, default=1.0) * max(len(ps), 1))
 
 
 class Sweeps:
@@ -548,15 +579,31 @@ class Sweeps:
         for (use, where, columns, _), end in zip(self.parts, np.cumsum([use.sum() for use, *_ in self.parts])):
             here = [(i, int(np.flatnonzero(where == c)[0])) for i, c in enumerate(base) if c in where]
             calibrated[end - use.sum() : end, [i for i, _ in here]] = columns[:, [j for _, j in here]]
-        taken = _orthonormal(calibrated)
+        taken = orthonormal(calibrated)
         r -= taken @ (taken.T @ r)
         names = sorted(set.intersection(*[set(along) for *_, along in self.parts]))
         tests = [_slow(np.concatenate([along[name] for *_, along in self.parts]), r, taken) for name in names]
         found = [test for test in tests if test]
+        if all("reading" in along for *_, along in self.parts):
+            found += _ripple_of(np.concatenate([along["reading"] for *_, along in self.parts]), r, taken.shape[1])
         if not found:
             return Structure(*[float("nan")] * 5)
         p, f, low, free = min(found)
         return Structure(f, min(1.0, p * len(found)), low, free, float("nan"))
+
+
+def _ripple_of(t: np.ndarray, r: np.ndarray, taken: int) -> list[tuple[float, float, int, int]]:
+    """[(p, F, 2, free)] of the strongest frequency of readings r (n,) with the numbers t, against all others: flicker
+    of a lamp, a periodic error of a drive; empty where there are too few. `taken` directions are projected off r."""
+    span, total, free = float(np.ptp(t)) + 1, float(r @ r), len(r) - taken
+    count = min(int(span // 2) - 1, FREQUENCIES)
+    if count < RIPPLES or free < 2 * RIPPLES or not total > 0:
+        return []
+    turns = np.arange(1, count + 1)
+    power = np.array([2 / len(r) * abs(np.exp(-2j * np.pi * k * t / span) @ r) ** 2 for k in turns])
+    share = min(float(power.max()) / total, 1.0)
+    p = (1 - share) ** ((free - 2) / 2) * count  # of white noise: the share of one of free/2 planes
+    return [(min(1.0, p), float(power.max()) * free / (2 * total), 2, free - 2)]
 
 
 def follows(x: np.ndarray, y: np.ndarray) -> float:
@@ -567,6 +614,15 @@ def follows(x: np.ndarray, y: np.ndarray) -> float:
     return found[0] if found else float("nan")
 
 
+def differs(groups: Sequence[Sequence[float]]) -> float:
+    """p of groups of numbers if all had one mean (one-way analysis of variance); NaN where no group repeats."""
+    from scipy.stats import f_oneway
+
+    if len(groups) < 2 or all(len(g) < 2 for g in groups) or len({y for g in groups for y in g}) < 2:
+        return float("nan")
+    return float(f_oneway(*groups).pvalue)
+
+
 def _slow(x: np.ndarray, r: np.ndarray, taken: np.ndarray) -> tuple[float, float, int, int] | None:
     """(p, F, low, free) of the lowest cosines of r (n,) by the ranks of x, at most NARROW and n/4 of them, against the
     rest; None where there are too few. Columns of `taken`, orthonormal, are projected off r already."""
@@ -574,7 +630,7 @@ def _slow(x: np.ndarray, r: np.ndarray, taken: np.ndarray) -> tuple[float, float
     from scipy.stats import rankdata
 
     count = min(NARROW, len(np.unique(x)) - 1, len(x) // 4)
-    slow = _orthonormal(np.cos(np.pi * np.outer((rankdata(x) - 0.5) / len(x), np.arange(1, count + 1))))
+    slow = orthonormal(np.cos(np.pi * np.outer((rankdata(x) - 0.5) / len(x), np.arange(1, count + 1))))
     left, s, _ = np.linalg.svd(slow - taken @ (taken.T @ slow), full_matrices=False)
     basis = left[:, s**2 > VISIBLE]
     low, free = basis.shape[1], len(r) - taken.shape[1] - basis.shape[1]
@@ -585,7 +641,7 @@ def _slow(x: np.ndarray, r: np.ndarray, taken: np.ndarray) -> tuple[float, float
     return float(fdtrc(low, free, f)), f, low, free
 
 
-def _orthonormal(columns: np.ndarray) -> np.ndarray:
+def orthonormal(columns: np.ndarray) -> np.ndarray:
     """A basis of what columns of any units span."""
     length = np.linalg.norm(columns, axis=0)
     if not length.any():

@@ -15,13 +15,27 @@ from optics.diagnosis.result import (
     Basis,
     Condition,
     Diagnosis,
+    Explanation,
     Fingerprint,
     Level,
     Row,
     Shift,
 )
 from optics.diagnosis.thresholds import CLEAR, CLUTTERED, LEVEL, MARGIN
-from optics.words import p_text, percent, spaced, table, with_sd
+from optics.words import (
+    ANYWHERE,
+    NO_LIMIT,
+    NOT_DETERMINED,
+    Reach,
+    below,
+    p_text,
+    percent,
+    share_text,
+    spaced,
+    table,
+    times_sd,
+    with_sd,
+)
 
 # what to check where no effect brings the model near its images
 AT_FAULT = (
@@ -30,21 +44,37 @@ AT_FAULT = (
 )
 
 
-def strength_text(values: Sequence[float], sds: Sequence[float], units: Sequence[str]) -> str:
-    """Strengths with their standard deviations: all of them up to three, else the largest."""
-    unit = spaced(units[0] if units else "")
-    if len(values) == 1:
-        return with_sd(values[0], sds[0]) + unit
+def strength_text(
+    values: Sequence[float], sds: Sequence[float], units: Sequence[str], reaches: Sequence[Reach] = ()
+) -> str:
+    """Strengths with their standard deviations: all of them up to three, else the largest that is determined."""
+    unit = units[0] if units else ""
+    reaches = reaches or [ANYWHERE] * len(values)
+    sds = [math.inf if math.isnan(s) else s for s in sds]  # of a strength that the projection has left nothing of
     if len(values) <= 3:
-        return ", ".join(with_sd(v, s) for v, s in zip(values, sds)) + unit
-    biggest = int(np.argmax(np.abs(values)))
-    return f"{len(values)} values up to {with_sd(values[biggest], sds[biggest])}{unit}"
+        texts = [with_sd(v, s, reach=r) for v, s, r in zip(values, sds, reaches)]
+        said = texts[-1:] if len(set(texts)) == 1 and texts[0] == NOT_DETERMINED else texts
+        return ", ".join(said) + (spaced(unit) if said and said[-1] != NOT_DETERMINED else "")
+    known = [i for i, (v, s, r) in enumerate(zip(values, sds, reaches)) if r.holds(v, s)]
+    if not known:
+        return f"{len(values)} values, {NOT_DETERMINED}"
+    biggest = max(known, key=lambda i: abs(values[i]))
+    return f"{len(values)} values up to {with_sd(values[biggest], sds[biggest], unit=unit)}"
+
+
+def limits(row: Row) -> list[float]:
+    """The upper limits of an effect's strengths that rule something out; none where one of them has no limit."""
+    seen = [i for i, u in enumerate(row.upper) if math.isfinite(u)]
+    start = [*row.start, *[0.0] * (len(row.upper) - len(row.start))]
+    return [row.upper[i] for i in seen] if all(row.reach(i).excludes(row.upper[i], start[i]) for i in seen) else []
 
 
 def limit_text(row: Row) -> str:
     """The upper limit of an effect: of its strengths, the largest."""
-    limits = [u for u in row.upper if math.isfinite(u)]
-    return f"{row.name} < {max(limits):.2g}{spaced(row.units[0])}" if limits else f"{row.name}: nothing visible"
+    if not any(math.isfinite(u) for u in row.upper):
+        return f"{row.name}: nothing visible"
+    known = limits(row)
+    return f"{row.name} {below(max(known), unit=row.units[0])}" if known else f"{row.name}: {NO_LIMIT}"
 
 
 def moved_by(s: Shift) -> str:
@@ -86,7 +116,7 @@ def sentence(
     conditions: Sequence[Condition],
     f: Findings,
     rows: Sequence[Row],
-    members: Sequence[Row],
+    explanations: Sequence[Explanation],
     fingerprints: Sequence[Fingerprint],
     levels: Sequence[Level],
     shifts: Sequence[Shift],
@@ -94,14 +124,14 @@ def sentence(
 ) -> str:
     """The verdict in words, with the numbers that decided it.
 
-    rows      all effects; members: those that explain the residual about equally well, the winner first
+    rows      all effects; explanations: sets of effects that were refitted, best first
     levels    misfit without and with the winner; shifts: what moved when it was added
     """
     failing = [c for c in conditions if not c.holds and c.name != "structure is left"]
     if word == "NOTHING":
         return _nothing(f, len(rows))
     if word == "AMBIGUOUS":
-        return _ambiguous(members)
+        return _ambiguous(explanations)
     if word == "UNKNOWN":
         return _unknown(f, next(c for c in fingerprints if c.coordinate == f.coordinate), basis)
     if word == "CANNOT_TELL":
@@ -110,7 +140,7 @@ def sentence(
         return f"misfit is left, but no verdict holds ({reasons})."
     winner = next(row for row in rows if row.name == f.winner)
     if word == "CLAIM":
-        return _claim(f, winner, rows, levels, shifts, basis)
+        return _claim(f, winner, rows, explanations, levels, shifts, basis)
     return _partial(f, winner, failing)
 
 
@@ -130,15 +160,25 @@ def _nothing(f: Findings, tested: int) -> str:
 
 
 def _claim(
-    f: Findings, row: Row, rows: Sequence[Row], levels: Sequence[Level], shifts: Sequence[Shift], basis: Basis
+    f: Findings,
+    row: Row,
+    rows: Sequence[Row],
+    explanations: Sequence[Explanation],
+    levels: Sequence[Level],
+    shifts: Sequence[Shift],
+    basis: Basis,
 ) -> str:
-    refit = row.refitted
-    text = (
-        f"{row.name} is missing, strength {strength_text(refit.strength, refit.sd, row.units)}. Adding it lowers "
-        f"held-out misfit from {percent(levels[0].held_out)} to {percent(levels[-1].held_out)} "
-        f"(noise: {percent(basis.noise)}). Its strength is the same in every part of the data."
+    alive = [e for e in explanations if e.survives]
+    best = alive[0]
+    text = f"{row.name} is missing, strength {_strength_in(best, row)}."
+    if len(best.effects) > 1 or len(alive) > 1:
+        text += " It is part of every explanation that is not ruled out: " + ", or ".join(e.name for e in alive) + "."
+    text += (
+        f" Adding {'it' if len(best.effects) == 1 else 'all of the first'} lowers held-out misfit from "
+        f"{percent(levels[0].held_out)} to {percent(levels[-1].held_out)} (noise: {percent(basis.noise)}). Its "
+        "strength is the same in every part of the data."
     )
-    others = [r for r in rows if r is not row and any(math.isfinite(u) for u in r.upper)]
+    others = [r for r in rows if r is not row and limits(r)]
     if others:
         text += " Not " + ", not ".join(limit_text(r) for r in others[:3]) + "."
     moved = [s for s in shifts if s.warn][:2]
@@ -146,30 +186,44 @@ def _claim(
         text += " Without it, " + " and ".join(moved_by(s).replace(" by ", " was off by ", 1) for s in moved) + "."
     text += (
         " With it nothing is left to explain."
-        if refit.complete
-        else f" With it an excess of {refit.excess_sd:.2g} sd and structure (p {p_text(refit.structure_p)}) are left: "
-        "add it, calibrate and diagnose again."
+        if best.complete and len(best.effects) == 1
+        else f" Add it, calibrate and diagnose again: with {best.name} nothing is left to explain."
+        if best.complete
+        else f" With {best.name} an excess of {best.excess_sd:.2g} sd (structure: p {p_text(best.structure_p)}) is "
+        "left: add it, calibrate and diagnose again."
     )
-    if "fragile" in row.flags:
-        text += " Fragile: other weights or masks prefer another effect."
     return text + (
-        " Falling held-out error verifies the prediction, not the identity; the identity rests on the margin "
-        f"({f.fall - f.runner_up:.3g} in chi2), the homogeneity and the absence of a better curve."
+        " Falling held-out error verifies the prediction, not the identity; the identity rests on the lead "
+        f"({f.lead:.3g} in chi2, over {f.against or 'no effect'}), the homogeneity and the absence of a better curve."
     )
 
 
-def _ambiguous(members: Sequence[Row]) -> str:
-    names = ", ".join(f"{row.name} ({row.refitted.fall:.3g})" for row in members)
-    if len(members) < 2:
-        names += " and at least one that was not added"
-    return f"these explain the residual about equally well (fall of chi2): {names}. The data cannot tell them apart."
+def _strength_in(e: Explanation, row: Row) -> str:
+    """The strengths of an effect within an explanation."""
+    if e.told.get(row.name):
+        return e.told[row.name]
+    own = [i for i, name in enumerate(e.variables) if name in row.variables]
+    reaches = [row.reach(row.variables.index(e.variables[i])) for i in own]
+    return strength_text([e.strength[i] for i in own], [e.sd[i] for i in own], [e.units[i] for i in own], reaches)
+
+
+def _ambiguous(explanations: Sequence[Explanation]) -> str:
+    alive = [e for e in explanations if e.survives]
+    names = ", or ".join(f"{e.name} ({e.fall:.4g})" for e in alive)
+    return (
+        f"{len(alive)} explanations are not told apart (fall of chi2): {names}. All others are behind by more than "
+        "noise and misfit allow."
+        if len(alive) > 1
+        else f"these explain the residual: {names}; the data do not tell what else would."
+    )
 
 
 def _partial(f: Findings, winner: Row, failing: Sequence[Condition]) -> str:
     uneven = next((c for c in failing if c.name == "even"), None)
     if uneven is None:
-        return f"{winner.name} explains {f.share:.0%} of the excess misfit, {1 - f.share:.0%} has another cause."
-    part = f"{f.share:.0%} of the excess" if f.weighed else "part of the residual"
+        rest = share_text(1 - f.share)
+        return f"{winner.name} explains {share_text(f.share)} of the excess misfit, {rest} has another cause."
+    part = f"{share_text(f.share)} of the excess" if f.weighed else "part of the residual"
     return (
         f"{winner.name} would explain {part}, but not with one strength ({uneven.text}): another "
         "cause makes it up, or acts besides."
@@ -204,6 +258,7 @@ def report(d: Diagnosis) -> str:
         *_effect_lines(d),
         "",
         "decided by: " + "; ".join(f"{c.name} {'yes' if c.holds else 'no'} ({c.text})" for c in d.conditions),
+        *_explanation_lines(d),
         *_split_lines(d),
         *_level_lines(d),
         *_curve_lines(d),
@@ -255,6 +310,8 @@ def _effect_lines(d: Diagnosis) -> list[str]:
 
 def _cells(r: Row, d: Diagnosis) -> tuple[str, ...]:
     now, sd = (r.refit.strength, r.refit.sd) if r.refit else ([a + c for a, c in zip(r.start, r.change)], r.sd)
+    reaches = [r.reach(i) for i in range(len(now))]
+    known = any(reach.holds(v, s) for reach, v, s in zip(reaches, now, sd))  # else its size says nothing either
     note = ", ".join([x for x in (r.verdict, *r.flags) if x])
     if r.verdict == "MISSING":
         note += f" (even: yes, held out: {'yes' if d.levels[-1].fall > 0 else 'no'})"
@@ -262,16 +319,36 @@ def _cells(r: Row, d: Diagnosis) -> tuple[str, ...]:
         r.name,
         f"{r.fall:.4g}",
         p_text(r.p_family),
-        strength_text(now, sd, r.units),
-        f"{r.of_plausible:.2g}",
-        percent(r.image),
+        r.refit.told.split(" (")[0] if r.refit and r.refit.told else strength_text(now, sd, r.units, reaches),
+        f"{r.of_plausible:.2g}" if known else "-",
+        percent(r.image) if known else "-",
         percent(r.misfit_after),
-        "-" if math.isnan(r.share) else f"{r.share:.0%}",
+        share_text(r.share),
         percent(r.survival),
         f"{r.refit.fall:.4g}" if r.refit else "-",
         f"{r.confused_with} (.{min(int(100 * r.cos), 99):02d})" if r.confused_with else "-",
         note,
     )
+
+
+def _explanation_lines(d: Diagnosis) -> list[str]:
+    """The explanations that survive, and the best of those that do not."""
+    if len([e for e in d.explanations if e.effects]) < 2:
+        return []
+    alive = d.survivors
+    others = [e for e in d.explanations if e.effects and not e.survives]
+    head = ("explanation", "fall", "cost", "excess left", "behind", "needed", "blocks left out", "")
+    lines = []
+    for e in [*alive[:6], *others[:5]]:
+        blocks = "-" if math.isnan(e.ahead) else f"{e.ahead:+.4g}"
+        behind, needed = ("-", "-") if e in alive[:1] else (f"{e.lead:.3g}", f"{e.needed:.3g}")
+        mark = "survives" if e.survives else "" if e.lead > e.needed else "the same with more"
+        lines.append((e.name, f"{e.fall:.4g}", f"{e.cost:.3g}", f"{e.excess_sd:.2g} sd", behind, needed, blocks, mark))
+    return [
+        "",
+        "explanations (behind the best in score, and what would rule one out):",
+        table([head, *lines], left=(0, 7)),
+    ]
 
 
 def _split_lines(d: Diagnosis) -> list[str]:
@@ -318,7 +395,7 @@ def _curve_lines(d: Diagnosis) -> list[str]:
     lines += [
         f"  {f.coordinate:<18} {f.net:10.4g}  R {f.ratio:8.3g}  p {p_text(f.p)}"
         + (f"  {f.family:<8}" if f.family else "")
-        + (f"  {f.share:.0%} of the excess" if math.isfinite(f.share) else "")
+        + (f"  {share_text(f.share)} of the excess" if math.isfinite(f.share) else "")
         for f in d.fingerprints[:8]
     ]
     if d.families:
@@ -333,5 +410,5 @@ def _shift_lines(d: Diagnosis) -> list[str]:
     return [
         "",
         "calibrated parameters had moved to hide it:",
-        *(f"  {s.variable:<24} {s.before:.5g} -> {s.after:.5g} {s.unit} ({s.in_sd:+.1f} sd)" for s in d.shifts[:6]),
+        *(f"  {s.variable:<24} {s.before:.5g} -> {s.after:.5g} {s.unit} ({times_sd(s.in_sd)})" for s in d.shifts[:6]),
     ]

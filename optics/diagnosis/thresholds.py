@@ -5,8 +5,15 @@ from __future__ import annotations
 import math
 
 LEVEL = 0.01  # nominal level of the family-wise test and of the structure test
+CARRIED = 0.9  # of the fall of an effect with a strength per frame: more in one part says something of that part alone
+JUDGED = 4  # values per strength of a frame, below which such a strength fits anything
 CLEAR = 10.8  # fall of chi2 between two effects at which the right one wins in 95 % of cases: Phi(sqrt(10.8)/2)
 MARGIN = 0.2  # of the best effect's fall: with real misfit, smaller differences of chi2 decide nothing
+TOLD = 2 * math.log(
+    19
+)  # lead in score at which the odds are 19 to 1: one in twenty of such decisions is wrong, at most
+EACH = 2 * math.log(9)  # cost of an effect: prior odds of one in ten that a given one of the library acts
+HALF = 0.5  # of what the best explanation leaves: misfit that is left may lie along the direction that tells two apart
 # A map of the sensor or of the session that explains this much more than the best effect: the effect is not the cause.
 RIVAL = 1.5
 # The same for a curve along one coordinate. With a true effect it gains only what clutter adds: 1.02 was measured, and
@@ -34,7 +41,7 @@ def is_structured(structure_p: float, excess_sd: float) -> bool:
 
 
 def close(best: float, other: float) -> bool:
-    """Whether two falls of chi2 are too close to tell the effects apart."""
+    """Whether two falls of chi2 that were predicted, or that leave misfit, are too close to tell the effects apart."""
     return best - other < max(CLEAR, MARGIN * best)
 
 

@@ -49,7 +49,7 @@ from optics.pages.drawing import (
 )
 from optics.study.record import Record
 from optics.study.shown import Fingerprint, Shown
-from optics.words import as_float, figures, fixed, some, spaced
+from optics.words import ANYWHERE, NO_LIMIT, Reach, as_float, below, figures, fixed, share_text, some, spaced
 
 BUDGET = 4_500_000  # bytes of embedded images; the page stays below 6 MB
 SIDE_MAX = 512  # px; larger frames are binned for display
@@ -69,6 +69,21 @@ FRAMES = {"frame": "frame", "frames": "frames", "data": "frames"}  # what the pa
 SWEEPS = {"frame": "sweep", "frames": "sweeps", "data": "readings"}
 # the formats of a page: a true minus, powers of ten, a dash for what is missing
 measure, pvalue = partial(words.with_sd, typeset=True), partial(words.p_text, typeset=True)
+
+
+def scatter(pair: tuple[float, float]) -> str:
+    """Mean ± standard deviation over frames; of a single frame, its own."""
+    mean, sd = pair
+    return measure(mean, sd) if math.isfinite(mean) and math.isfinite(sd) else number(mean, 5)
+
+
+def estimated(v: Mapping) -> str:
+    """A calibrated value of a step's record, with its standard deviation, or that it is not determined."""
+    low, high = v.get("bounds") or (-math.inf, math.inf)
+    reach = Reach(as_float(low), as_float(high), as_float(v.get("plausible")))
+    return measure(v["value"], v["sd"], reach=reach)
+
+
 CHANNEL_STYLE = {"R": "red", "G": "green", "B": "blue"}
 
 
@@ -98,9 +113,14 @@ def render(study: Record) -> str:
         lstrip_blocks=True,
     )
     environment.filters.update(
-        number=number, fixed=fixed, figures=figures, measure=measure, percent=percent, pvalue=pvalue
+        number=number,
+        fixed=fixed,
+        figures=figures,
+        measure=measure,
+        percent=percent,
+        pvalue=pvalue,
     )
-    environment.globals.update(measure=measure)
+    environment.globals.update(measure=measure, scatter=scatter, estimated=estimated)
     comparisons = [study.comparison(i) for i in range(len(study.steps))]
     shown = [study.frames(i) for i in range(len(study.steps))]
     points = Readings.of(shown)
@@ -1033,6 +1053,7 @@ def verdict(diagnosis: Mapping | None) -> dict | None:
         "shifts": list(d.get("shifts") or ())[:8],
         "curves": [_draft(f) for f in curves[:6]],
         "pairs": _pairs(d),
+        "explanations": _explanations(d),
         "advice": _advice(d),
     }
 
@@ -1059,18 +1080,26 @@ def _candidate(r: Mapping) -> dict:
         as_float(a) + as_float(c) for a, c in zip(r.get("start") or (), r.get("change") or ())
     ]
     sd = refit.get("sd") or r.get("sd") or [None] * len(strength)
-    unit = spaced((r.get("units") or [""])[0])
-    values = [measure(as_float(v), None if s is None else float(s)) + unit for v, s in zip(strength, sd)]
-    upper = [as_float(u) for u in r.get("upper") or () if math.isfinite(as_float(u))]
-    limit = f"< {number(max(upper), 2)}{unit}" if upper else ""
+    unit = (r.get("units") or [""])[0]
+    told = list(zip(*(r.get(key) or () for key in ("low", "high", "plausible"))))
+    reaches = [Reach(*map(as_float, own)) for own in told] or [ANYWHERE] * len(strength)
+    sd = [math.inf if s is None else s for s in sd]  # of a strength that the projection has left nothing of
+    known = any(reach.holds(v, s) for reach, v, s in zip(reaches, strength, sd)) or not strength
+    values = [measure(v, s, unit=unit, reach=reach) for v, s, reach in zip(strength, sd, reaches)]
+    upper = [
+        (as_float(u), start, reach) for u, start, reach in zip(r.get("upper") or (), r.get("start") or (), reaches)
+    ]
+    upper = [u for u in upper if math.isfinite(u[0])]
+    meant = all(reach.excludes(u, start) for u, start, reach in upper)
+    limit = (below(max(u[0] for u in upper), True, unit) if meant else NO_LIMIT) if upper else ""
     confused = f"{r['confused_with']} ({number(as_float(r.get('cos')), 2)})" if r.get("confused_with") else ""
     cells = {
         "fall": number(as_float(r.get("fall")), 4),
         "actual": number(as_float(refit.get("fall")), 4),
-        "strength": some(values, 3, "; "),
-        "plausible": number(as_float(r.get("of_plausible")), 2),
-        "image": percent(as_float(r.get("image")), 2),
-        "share": percent(as_float(r.get("share")), 2),
+        "strength": some(list(dict.fromkeys(values)) if not known else values, 3, "; "),
+        "plausible": number(as_float(r.get("of_plausible")), 2) if known else "–",
+        "image": percent(as_float(r.get("image")), 2) if known else "–",
+        "share": share_text(r.get("share"), typeset=True),
         "survival": percent(as_float(r.get("survival")), 2),
         "p": pvalue(as_float(r.get("p_family"))),
         "confused": confused,
@@ -1155,6 +1184,28 @@ def _draft(f: Mapping) -> dict:
         "ratio": number(as_float(f.get("ratio")), 2),
         "net": number(as_float(f.get("net"))),
     }
+
+
+def _explanations(d: Mapping) -> list[dict]:
+    """Sets of effects that were refitted: all that are not ruled out, and the best of the others; none where there is
+    but one effect to tell of."""
+    sets = [e for e in d.get("explanations") or () if e.get("effects")]
+    if len(sets) < 2:
+        return []
+    alive, others = ([e for e in sets if bool(e.get("survives")) == wanted] for wanted in (True, False))
+    return [
+        {
+            "name": " + ".join(e["effects"]),
+            "fall": _text(as_float(e.get("fall")), "{:.4g}"),
+            "cost": _text(as_float(e.get("cost")), "{:.3g}"),
+            "excess": _text(as_float(e.get("excess_sd")), "{:.2g}") + " sd",
+            "lead": "–" if e in alive[:1] else _text(as_float(e.get("lead")), "{:.3g}"),
+            "needed": "–" if e in alive[:1] else _text(as_float(e.get("needed")), "{:.3g}"),
+            "survives": bool(e.get("survives")),
+            "why": "" if as_float(e.get("lead")) > as_float(e.get("needed")) else "the same with more",
+        }
+        for e in [*alive[:8], *others[:4]]
+    ]
 
 
 def _pairs(d: Mapping) -> dict | None:

@@ -35,6 +35,7 @@ from optics.fit.model import value_of
 from optics.pages.drawing import DIVERGING, MASKED, SIGMA_RANGE, colour_bar, ramp
 from optics.scene.parameter import Values, Variable
 from optics.study import loop
+from optics.study.calibrated import origin_toml
 from optics.study.setup import effect_variables
 from optics.words import spaced
 
@@ -172,7 +173,7 @@ class View:
                     "name": f.name,
                     "led": led_label(f.parameters),
                     "held_out": i in self.held,
-                    **{k: getattr(rows[f.name], k) for k in ("n", "chi2", "rms", "noise")},
+                    **{k: getattr(rows[f.name], k) for k in ("n", "dof", "chi2", "rms", "noise")},
                 }
                 for i, f in enumerate(self.model.frames)
             ],
@@ -446,7 +447,7 @@ class View:
                     f"[frames.{quoted(self.model.frames[index].name)}]",
                     *(entry(k, v) for k, v in own.items()),
                 ]
-        return "\n".join(lines) + "\n"
+        return "\n".join(lines) + "\n" + origin_toml(self.study.fit(self.step["index"]))
 
     def write(self, changes: Mapping[str, float]) -> dict:
         """Write values into a new file of the study's folder; the file, its text, and the command that uses it."""

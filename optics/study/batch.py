@@ -1,6 +1,8 @@
 """Many images of one scene, from a job file; a run can be stopped and resumed, and the result is the same bit by bit.
 
-    scene   = "gelsight"                       # a shipped scene, or an XML file relative to this one
+    scene   = "gelsight"                       # a shipped scene, or an XML file relative to this one;
+    # fit   = "study"                          # or a calibrated sensor: a study's folder or a fit.toml. frame = "NAME":
+    #                                          # with what was set and found in this frame of its captures
     out     = "presses"                        # folder, relative to this file
     count   = 1000                             # random draws; with grids: draws per point of the grid
     seed    = 1
@@ -33,7 +35,7 @@ import signal
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -47,6 +49,7 @@ from optics.files.output import check_folder, file_hash, replacing, write_text
 from optics.light.rendering import LAYERS, RenderJob
 from optics.scene import loader as scenes
 from optics.scene.mitsuba_parts import DEFAULT_VARIANT
+from optics.study.calibrated import Calibrated, calibrated
 
 Progress = Callable[[str, int, int], None]
 
@@ -119,7 +122,15 @@ class Camera(Strict):
 
 
 class Job(Strict):
-    scene: Annotated[str, Field(min_length=1)] = Field(description="a shipped scene's name or the path of an XML file")
+    scene: Annotated[str, Field(min_length=1)] | None = Field(
+        None, description="a shipped scene's name or the path of an XML file"
+    )
+    fit: Annotated[str, Field(min_length=1)] | None = Field(
+        None, description="a study's folder or a fit.toml, relative to the job file, in place of a scene"
+    )
+    frame: Annotated[str, Field(min_length=1)] | None = Field(
+        None, description="a frame of the fit's captures, with what was set and found in it"
+    )
     out: Annotated[str, Field(min_length=1)] = Field(description="a folder, relative to the job file")
     count: Annotated[int, Field(ge=1)] | None = Field(None, description="a whole number from 1 on")
     seed: Annotated[int, Field(ge=0)] = Field(0, description="a whole number from 0 on")
@@ -146,9 +157,13 @@ class Job(Strict):
 
     @model_validator(mode="after")
     def _whole(self):
+        if self.scene is None and self.fit is None:
+            raise ValueError("scene is missing; allowed: a shipped scene's name, the path of an XML file, or a fit")
+        if self.frame is not None and self.fit is None:
+            raise ValueError(f'frame = "{self.frame}", but no fit; give the fit of whose captures it is')
         if self.count is None and not self.grids:
             raise ValueError("count is missing; allowed: a whole number from 1 on, or a grid in [sample]")
-        if "dn" in self.outputs and self.noise is None:
+        if "dn" in self.outputs and self.noise is None and self.fit is None:
             raise ValueError('outputs names "dn", but [noise] is missing; give ' + ", ".join(Camera.model_fields))
         twice = sorted(set(self.parameters) & set(self.sample))
         if twice:
@@ -180,12 +195,22 @@ class Job(Strict):
         return None if self.noise is None else Noise(**self.noise.model_dump())
 
 
-def read(file: str | Path) -> Job:
-    """Read and check a job file; raises BadJob, or UnknownKey for a key that the format lacks."""
+def read(file: str | Path, fit: str | Path | None = None, frame: str | None = None) -> Job:
+    """Read and check a job file; raises BadJob, or UnknownKey for a key that the format lacks.
+
+    fit, frame   stand for those of the file; where the file names others they are refused
+    """
     file = Path(file)
     if not file.is_file():
         raise FileNotFoundError(f"{file}: no such job file; a job is a TOML file with scene, out, count and [sample]")
     data = checks.parse(file)
+    for name, value in (("fit", None if fit is None else os.path.abspath(fit)), ("frame", frame)):
+        if value is None:
+            continue
+        own = data.get(name)
+        if own is not None and value != (os.path.abspath(file.parent / str(own)) if name == "fit" else own):
+            raise BadJob(f"{file}: {name} = {own!r}, but --{name} {value}; leave out one of them")
+        data[name] = value
     for name in ("parameters", "sample"):
         for key, value in (data.get(name) or {}).items() if isinstance(data.get(name), dict) else ():
             names = Distribution.model_fields if name == "sample" else ()
@@ -233,18 +258,33 @@ def _explained(error: ValidationError, file: Path) -> Exception:
     )
 
 
+def _sensor(job: Job, file: Path, plugins: Path | None) -> Calibrated:
+    """The scene of a job, and the values of its fit."""
+    given = None
+    if job.scene is not None:
+        given = file.parent / job.scene if job.scene.endswith(".xml") else job.scene
+    defines = {k: str(v) for k, v in job.defines.items()}
+    if job.fit is None:
+        return Calibrated(scenes.load(given, defines, job.variant, plugins), {})
+    fit = file.parent / job.fit
+    return calibrated(fit, frame=job.frame, scene=given, defines=defines, variant=job.variant, plugins=plugins)
+
+
 # -- one sample ------------------------------------------------------------------------------------------------------
 class Maker:
     """Makes the files of one sample after the other."""
 
     def __init__(self, job: Job, file: Path, plugins: Path | None):
         self.job, self.file = job, Path(file)
-        path = self.file.parent / job.scene if job.scene.endswith(".xml") else job.scene
-        scene = scenes.load(path, {k: str(v) for k, v in job.defines.items()}, job.variant, plugins)
-        noise = job.camera_noise()
-        options = {} if noise is None else {"black": noise.black_level, "saturation": noise.saturation}
-        self.noise = noise
-        self.images = RenderJob(scene, spp=job.spp, layers=job.layers, **options)
+        sensor = _sensor(job, self.file, plugins)
+        sensor.noise = job.camera_noise() or sensor.noise
+        self.noise, self.notes = sensor.noise, sensor.notes
+        if "dn" in job.outputs and self.noise is None:
+            raise BadJob(f'{file}: outputs names "dn", but neither [noise] nor the fit tells the noise of the camera')
+        self.values = {**sensor.values, **job.parameters}
+        self.images = RenderJob(
+            sensor.scene, spp=job.spp, layers=job.layers, black=sensor.black, saturation=sensor.saturation
+        )
         self.folder = folder_of(job, self.file)
 
     def check(self) -> None:
@@ -294,7 +334,8 @@ class Maker:
         record = self.images.record
         numbers = {k: v for k, v in record["versions"].items() if k not in ("python", "system")}
         return {
-            "job": self.job.model_dump(mode="json", exclude={"out"}),
+            "job": self.job.model_dump(mode="json", exclude={"out", "fit", "frame"}),
+            **({"fit": self.values} if self.job.fit is not None else {}),
             "scene": record["scene"],
             "plugins": record["plugins"],
             "versions": numbers,
@@ -309,7 +350,7 @@ class Maker:
         for led in lights:
             stem = self.folder / "images" / (f"{index:06d}" if led is None else f"{index:06d}-{led}")
             seed = int(job.rng(index, "render").integers(2**31))
-            image = self.images.take({**job.parameters, **values}, seed, None if led is None else [led])
+            image = self.images.take({**self.values, **values}, seed, None if led is None else [led])
             for output in job.outputs:
                 path = self._write(image, output, stem, index)
                 files[output if led is None else f"{led}.{output}"] = {
@@ -455,13 +496,15 @@ def _finish(folder: Path, job: Job) -> bool:
 # -- the work --------------------------------------------------------------------------------------------------------
 @dataclass(frozen=True)
 class Result:
-    """folder, samples of the job, of this shard, those made now, and whether the whole job is complete."""
+    """folder, samples of the job, of this shard, those made now, whether the whole job is complete, and what images of
+    a calibrated sensor leave out."""
 
     folder: Path
     total: int
     own: int
     made: int
     complete: bool
+    notes: list[str] = field(default_factory=list)
 
 
 def parse_shard(text: str) -> tuple[int, int]:
@@ -478,16 +521,20 @@ def run(
     workers: int | None = None,
     plugins: Path | None = None,
     progress: Progress | None = None,
+    *,
+    fit: str | Path | None = None,
+    frame: str | None = None,
 ) -> Result:
     """Make the missing samples of a job's shard. It can be stopped at any moment and called again.
 
+    fit, frame   a calibrated sensor, where the job file names none (optics.study.calibrated)
     workers   processes of one thread each; None: as many as there are cores. With 1 everything happens in this process.
     Raises BadJob, UnknownKey, OutOfBounds, OutputExists before any rendering, SampleFailed in its course.
     """
     if workers is not None and workers < 1:
         raise ValueError(f"workers = {workers}; allowed: whole numbers from 1 on")
     file = Path(os.path.abspath(file))
-    job = read(file)
+    job = read(file, fit, frame)
     folder = folder_of(job, file)
     check_folder(folder)
     maker = Maker(job, file, plugins)
@@ -498,7 +545,7 @@ def run(
     with _alone(folder, shard):
         todo = _remaining(folder, shard, own, progress)
         workers = max(1, min(workers or _cores(), len(todo)))
-        work = _here(maker, todo) if workers == 1 else _crew(file, plugins, todo, workers)
+        work = _here(maker, todo) if workers == 1 else _crew(job, file, plugins, todo, workers)
         manifest = _manifest(folder, shard)
         try:
             with open(manifest, "a", encoding="utf-8") as lines:
@@ -511,7 +558,7 @@ def run(
         finally:
             work.close()
             _sweep(folder, shard)
-    return Result(folder, job.total, len(own), made, _finish(folder, job))
+    return Result(folder, job.total, len(own), made, _finish(folder, job), maker.notes)
 
 
 def _remaining(folder: Path, shard: tuple[int, int], own: Sequence[int], progress: Progress | None) -> list[int]:
@@ -569,7 +616,7 @@ def _cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _crew(file: Path, plugins: Path | None, todo: Sequence[int], workers: int) -> Iterator[dict]:
+def _crew(job: Job, file: Path, plugins: Path | None, todo: Sequence[int], workers: int) -> Iterator[dict]:
     """Records from worker processes, in the order in which they finish.
 
     Each holds one end of a pipe and nothing else of this process, so that it ends when this one is killed.
@@ -578,14 +625,13 @@ def _crew(file: Path, plugins: Path | None, todo: Sequence[int], workers: int) -
     from multiprocessing.connection import wait
 
     context = get_context("spawn")
-    job = read(file)
     waiting = iter(todo)
     busy = {}  # connection -> (process, index)
     processes = []
     try:
         for index in itertools.islice(waiting, workers):
             here, there = context.Pipe()
-            process = context.Process(target=_work, args=(there, file, plugins), daemon=True)
+            process = context.Process(target=_work, args=(there, job, file, plugins), daemon=True)
             process.start()
             there.close()
             processes.append(process)
@@ -616,7 +662,7 @@ def _crew(file: Path, plugins: Path | None, todo: Sequence[int], workers: int) -
             process.join(10)
 
 
-def _work(connection, file: Path, plugins: Path | None) -> None:
+def _work(connection, job: Job, file: Path, plugins: Path | None) -> None:
     """The loop of a worker: it receives an index, and sends a record or the text of an error."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent decides
     try:
@@ -625,7 +671,7 @@ def _work(connection, file: Path, plugins: Path | None) -> None:
             import drjit as dr
 
             dr.set_thread_count(0)  # see `_here`
-            maker = Maker(read(file), file, plugins)
+            maker = Maker(job, file, plugins)
         except Exception as error:
             connection.send(f"{type(error).__name__}: {error}")
             return

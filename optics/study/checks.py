@@ -48,10 +48,12 @@ def after_calibration(model: SceneModel, found: Fit, level: Row | None) -> list[
     """What no effect explains: a model nowhere near its images, or values that contradict their priors."""
     texts = []
     if level is not None and level.rms > FAR * level.signal:
-        texts.append(
-            f"the model misses the images by {level.rms / max(level.signal, 1e-9):.0%} of its own mean, too far for a "
-            f"missing effect: check {AT_FAULT}"
+        what = (
+            f"misses the images by {level.rms / level.signal:.0%} of its own mean"
+            if level.signal > level.noise
+            else f"sends no light, and misses the images by {level.rms:.3g} DN"
         )
+        texts.append(f"the model {what}, too far for a missing effect: check {AT_FAULT}")
     known = [(v, value_of(model, found.values, v), v.prior) for v in found.variables if v.prior is not None]
     moved = [(v, value, prior) for v, value, prior in known if abs(value - prior[0]) > SURPRISING * prior[1]]
     if moved:

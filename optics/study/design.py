@@ -674,7 +674,8 @@ def write(planned: Plan, folder: str | Path) -> Path:
     document["scene"] = planned.scene
     document["noise"] = tomlkit.table()
     for key in NOISE_KEYS:
-        document["noise"].add(key, tomlkit.item(float(getattr(planned.noise, key))).comment(UNITS[key]))
+        if key != "saturation" or planned.noise.ends:
+            document["noise"].add(key, tomlkit.item(float(getattr(planned.noise, key))).comment(UNITS[key]))
     if planned.size == (1, 1):
         document["table"] = {"file": "readings.csv", "values": ["reading"]}
     else:
@@ -688,7 +689,8 @@ def write(planned: Plan, folder: str | Path) -> Path:
             tables.append(table)
     with new_folder(folder) as new:
         if planned.size == (1, 1):
-            rows: list[Any] = [(own, [""]) for f in planned.frames for own in f.readings]
+            blank: list[Any] = [""]
+            rows = [readings.Row(dict(own), blank) for f in planned.frames for own in f.readings]
             readings.write(new / "readings.csv", rows, ["reading"])
         else:
             (new / "frames").mkdir()

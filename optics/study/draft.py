@@ -7,6 +7,9 @@ A draft has one strength: 0 is no effect, 1 the curve as it was found. `optics a
 falls by about as much as the diagnosis said; then the table is replaced by a formula, which is smooth, has fewer
 numbers and says what the cause is.
 
+A draft records which captures it was drawn from. It fits them by construction, so a diagnosis of the same data does not
+test it, wherever the files lie; `optics add` takes it, and the held-out frames judge.
+
 A curve along a coordinate of the camera acts on its image (stages `lens`, `sensor`, `response`). One along a coordinate
 of light or geometry is a factor on the light along its path in the gel (stage `segment`), which knows the lit point,
 its normal, the lamp and the camera at every value of every parameter: both its derivatives,
@@ -44,6 +47,7 @@ VIEW = (
     "py",
     "tan",
     "focal",
+    "site",
     "width",
     "height",
     "bands",
@@ -115,6 +119,7 @@ EDGES = "a change that depends on edges mixes pixels: use the stage 'lens' (plug
 ELSEWHERE = {  # coordinates that carry no table, and what to do instead
     "intensity": "a curve along the radiance before the camera bends it is no image function; draft along 'signal'",
     "frame": "a number per frame says nothing of the next frame; 'gain drift' frees a gain per frame",
+    "site": "an analyser's own level is its gain: 'site gain' frees one for each angle of a mosaic",
     "reading": "the row of a table is no setting; add a column `source.time` with the time of each reading, or one "
     "of what else changed",
     "LED": "an LED's own level is its power, which a calibration solves for; draft along 'led_distance' or 'led_angle'",
@@ -374,6 +379,7 @@ def draft_effect(
     black_level: float,
     saturation: float,
     source: str = "",
+    prints: Sequence[str] = (),
 ) -> str:
     """The text of a plugin file that carries the curve of a diagnosis as a table.
 
@@ -381,6 +387,7 @@ def draft_effect(
                              best
     black_level, saturation  DN, of the captures
     source                   where the diagnosis is, for the file's References
+    prints                   of the captures that were diagnosed (optics.captures.identity)
 
     Raises ValueError or UnknownKey for a coordinate that no draft can carry.
     """
@@ -433,7 +440,9 @@ def draft_effect(
         head=[
             *([] if exact else [_table("AT", list(at))]),
             _table("CURVE", [float(f"{v:.4g}") for v in values], f"+- {np.median(sd):.2g}, the median"),
+            *([_prints(prints)] if prints else []),
         ],
+        drawn=bool(prints),
         body=[
             "def curve(x):",
             f'    """g of the definition: {what}, of the {carrier.words}."""',
@@ -505,7 +514,16 @@ def from_study(folder: str | Path, along: str | None, name: str, further: str | 
         black_level=noise["black_level"],
         saturation=noise["saturation"],
         source=f"{folder}, step '{study.steps[index]['name']}'",
+        prints=study.ladder.get("prints") or _sketch(study),
     ), plugins
+
+
+def _sketch(study: Record) -> list[str]:
+    """What identifies the captures of a study that did not record it."""
+    from optics.captures import capture_set as capture_files
+    from optics.captures import identity
+
+    return identity.sketch_of(capture_files.load(recorded(study.ladder["facts"]["setup"]).captures))
 
 
 def _points(f: Fingerprint) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -529,6 +547,14 @@ def _table(name: str, values: Sequence[float], remark: str = "") -> str:
     return "\n".join([f"{name} = [{'  # ' + remark if remark else ''}", *rows, "]"])
 
 
+def _prints(prints: Sequence[str]) -> str:
+    rows = ["    " + " ".join(prints[i : i + 8]) for i in range(0, len(prints), 8)]
+    remark = (
+        "# the captures that the curve was drawn from: it fits them by construction, so no diagnosis of them tests it"
+    )
+    return "\n".join([remark, 'DRAWN_FROM = """', *rows, '"""'])
+
+
 # -- the file --------------------------------------------------------------------------------------------------------
 def _file(
     word: str,
@@ -547,6 +573,7 @@ def _file(
     plausible: float,
     head: Sequence[str] = (),
     lines: Sequence[str] = (),
+    drawn: bool = False,
 ) -> str:
     """The text: docstring, imports, tables, the curve or formula, the stage's function with its last line `applied`,
     check, declaration."""
@@ -572,7 +599,7 @@ def _file(
         f'    parameters=(Parameter("{word}", "1", 0.0, (-10.0, 10.0), "strength s", neutral=0.0, '
         f'plausible={plausible:g}, how="{STUBS[stage][4]}"),),',
         "    acts=(" + ", ".join(f'"{a}"' for a in acts) + ("," if len(acts) == 1 else "") + "),",
-        f'    needs="{needs}", checks=({check[0][4:-3]},))',
+        f'    needs="{needs}", checks=({check[0][4:-3]},){", drafted_from=DRAWN_FROM" if drawn else ""})',
     ]
     blocks = ["\n".join([*doc, '"""']), "\n".join(imports), *(["\n".join(head)] if head else [])]
     functions = ["\n".join(block) for block in (body, function, check, declaration)]

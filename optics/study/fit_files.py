@@ -19,7 +19,7 @@ CORRELATION_SHOWN = 0.9  # absolute correlation beyond which a pair of variables
 def fit_record(fit: Fit | Mapping, frame_names: Sequence[str] = ()) -> dict:
     """A fit as plain data; a mapping of that form is completed and returned.
 
-    variables   name, keys, unit, value, sd, frames (names or None), prior, pull, neutral, plausible, at_bound
+    variables   name, keys, unit, value, sd, frames (names or None), prior, pull, neutral, plausible, bounds, at_bound
     pull        (value - prior mean) / prior sd: how far the data moved it from what was known
     """
     blank: dict[str, Any] = {
@@ -54,6 +54,7 @@ def fit_record(fit: Fit | Mapping, frame_names: Sequence[str] = ()) -> dict:
                 "pull": None if v.prior is None else (float(value) - v.prior[0]) / v.prior[1],
                 "neutral": p.neutral,
                 "plausible": p.plausible,
+                "bounds": list(p.bounds),
                 "at_bound": v.name in getattr(fit, "at_bound", ()),
             }
         )
@@ -77,16 +78,19 @@ def fit_record(fit: Fit | Mapping, frame_names: Sequence[str] = ()) -> dict:
     }
 
 
-def fit_toml(record: Mapping, name: str = "") -> str:
-    """The values of a fit as TOML that can be laid over a scene again: [parameters] and [frames.NAME], key = value."""
+def fit_toml(record: Mapping, name: str = "", origin: Mapping[str, Mapping] | None = None) -> str:
+    """The values of a fit as TOML that can be laid over a scene again: [parameters] and [frames.NAME], key = value.
+
+    origin   `optics.study.calibrated.origin_of`: the tables `sensor`, and entries that `fit` has besides its own
+    """
     import tomlkit
 
     unit = {key: v["unit"] for v in record["variables"] for key in v["keys"]}
     document = tomlkit.document()
     document.add(
         tomlkit.comment(
-            f"Calibrated values{f' of the step {chr(34)}{name}{chr(34)}' if name else ''}: lay them over "
-            "the scene with --values FILE."
+            f"Calibrated values{f' of the step {chr(34)}{name}{chr(34)}' if name else ''}: `--fit FILE` of "
+            "compare, render, batch and sweep takes them."
         )
     )
 
@@ -117,28 +121,56 @@ def fit_toml(record: Mapping, name: str = "") -> str:
         if own:
             document.add("frames_uncertainty", nested(own))
     fit = tomlkit.table()
-    for key in ("chi2", "dof", "converged", "reason"):
-        if record[key] is not None:
-            fit.add(key, record[key])
+    origin = origin or {}
+    for key, value in {
+        **{k: record[k] for k in ("chi2", "dof", "converged", "reason")},
+        **origin.get("fit", {}),
+    }.items():
+        if value is not None:
+            fit.add(key, value)
     document.add("fit", fit)
+    if origin.get("sensor"):
+        document.add("sensor", tomlkit.item(dict(origin["sensor"])))
     return tomlkit.dumps(document)
 
 
+TABLES = ("parameters", "uncertainty", "frames", "frames_uncertainty", "fit", "sensor")
+
+
 def read_fit(file: str | Path) -> dict[str, dict]:
-    """fit.toml as plain dictionaries: parameters, uncertainty, frames, frames_uncertainty, fit.
+    """fit.toml as plain dictionaries: parameters, uncertainty, frames, frames_uncertainty, fit, sensor.
+
+    file   a fit.toml, or the folder of a study, whose last step is taken
 
     Raises FileNotFoundError, and ValueError for what is not TOML.
     """
     import tomlkit
 
-    file = Path(file)
-    if not file.is_file():
-        raise FileNotFoundError(f"{file}: no such file; a study writes one to STUDY/steps/NN-name/fit.toml")
+    file = fit_file(file)
     try:
         data = tomlkit.parse(file.read_text(encoding="utf-8")).unwrap()
     except ValueError as error:
         raise ValueError(f"{file}: not valid TOML: {error}") from error
-    return {key: data.get(key, {}) for key in ("parameters", "uncertainty", "frames", "frames_uncertainty", "fit")}
+    for key in TABLES:
+        if not isinstance(data.get(key, {}), dict):
+            raise ValueError(f"{file}: {key} = {data[key]!r}; allowed: a table, [{key}]")
+    return {key: data.get(key, {}) for key in TABLES}
+
+
+def fit_file(path: str | Path) -> Path:
+    """The fit.toml that a path names: the file itself, or that of the last step of a study's folder."""
+    path = Path(path)
+    if path.is_dir():
+        steps = sorted(path.glob("steps/[0-9][0-9]-*/fit.toml"))
+        if not steps and not (path / "fit.toml").is_file():
+            raise FileNotFoundError(
+                f"{path}: neither a study nor a step of one: no fit.toml in it; name the folder that `optics calibrate "
+                "CAPTURES -o STUDY` wrote, or one of its files STUDY/steps/NN-name/fit.toml"
+            )
+        return steps[-1] if steps else path / "fit.toml"
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file; a study writes one to STUDY/steps/NN-name/fit.toml")
+    return path
 
 
 def values_of(model: SceneModel, file: str | Path | None, sets: Mapping[str, float | str]) -> Values:

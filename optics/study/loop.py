@@ -12,23 +12,27 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from optics.captures import capture_set as capture_files
+from optics.captures import identity
 from optics.diagnosis.result import Diagnosis
-from optics.errors import BadCapture, UnknownKey
+from optics.errors import BadCapture, Underdetermined, UnknownKey
 from optics.fit import calibrate
 from optics.fit.compare import Comparison
+from optics.fit.model import values_in
 from optics.fit.result import Fit
 from optics.fit.scene_model import SceneModel
 from optics.scene.declare import Effect
 from optics.scene.parameter import Values, Variable
 from optics.scene.registry import Registry
 from optics.study import checks
+from optics.study.calibrated import origin_of
 from optics.study.record import Record
 from optics.study.setup import (
     Setup,
@@ -48,7 +52,9 @@ from optics.study.stages import (
     held_out_values,
     null_models,
     off_neutral,
+    settled,
 )
+from optics.words import key_of
 
 AGAIN, FURTHER = 6, 30  # iterations of a restored fit: one that had converged only needs its derivatives again
 PROMISING = 0.7  # of the best fall of chi2 so far: an unconverged refit that falls by more is worth a fit of its own
@@ -89,9 +95,10 @@ def begin(
             "fitted": len(fitted),
             "held_out": len(held),
             "image": list(model.shape),
-            "masked": 1 - float(np.mean([u.sum() / model.size for u in usable])),
+            "masked": 1 - float(sum(u.sum() for u in usable)) / values_in(model, range(len(usable))),
             "setup": asdict(setup),
         },
+        prints=identity.sketch_of(model.captures),
     )
     if record.steps:
         return record, model, restore(record, model)
@@ -127,7 +134,8 @@ def kept(record: Record, model: SceneModel, index: int = -1) -> tuple[list[Varia
     variables = variables_of_base(model, setup, fitted)
     for step in steps:
         if step["effect"]:
-            variables += _of_fitted(effect_variables(model, model.scene.registry.find_effect(step["effect"])), fitted)
+            effect = model.scene.registry.find_effect(step["effect"])
+            variables += _of_fitted(effect_variables(model, effect, variables), fitted)
     return variables, values, fitted
 
 
@@ -135,6 +143,8 @@ def restore(record: Record, model: SceneModel, index: int = -1) -> Fit:
     """The fit of a step, from its folder: the same variables and values, with derivatives and errors computed anew."""
     variables, values, fitted = kept(record, model, index)
     most = AGAIN if record.steps[index]["converged"] else FURTHER
+    if model.dialled:
+        model.weighed_at = values.copy()
     return calibrate.fit(model, variables, values, fitted, max_iterations=most)
 
 
@@ -149,7 +159,58 @@ def effects_of(record: Record, registry: Registry) -> list[Effect]:
     return [registry.find_effect(step["effect"]) for step in record.steps if step["effect"]]
 
 
-def candidates(model: SceneModel, record: Record) -> list[Effect]:
+def candidates(model: SceneModel, record: Record, without: Sequence[str] = ()) -> list[Effect]:
+    """Every effect that the scene can express, the study has not added, and nothing rules out (`excluded`)."""
+    left_out = excluded(model, record, without)
+    return [e for e in _expressible(model, record) if e.name not in left_out]
+
+
+def excluded(model: SceneModel, record: Record, without: Sequence[str] = ()) -> dict[str, str]:
+    """Effects that could be tested but for what the captures state, or `without` names: {name: reason}.
+
+    absent       every part that could carry the effect, or that it requires, is not there
+    unseen       whatever its strength, the frames would be the same: a film is out of the beam, a dial never turned
+    [exclude]    the reason is the user's
+    a setting    that is stated with one value in every frame and without an uncertainty rules out what would vary it
+                 from frame to frame
+    drafted      a draft was drawn from these captures, or from some of them (optics.captures.identity)
+    Raises UnknownKey for an unknown effect in `without`."""
+    registry, captures = model.scene.registry, model.captures
+    dropped = {registry.find_effect(name).key for name in without}
+    ruled_out = {key_of(name): reason for name, reason in captures.exclude.items()}
+    stated = capture_files.stated(captures)
+    doubted = {*captures.uncertainty, *(key for f in model.frames for key in f.uncertainty)}
+    drawn = _drawn_from(model, _expressible(model, record))
+    found = {}
+    for effect in _expressible(model, record):
+        if effect.key in ruled_out:
+            found[effect.name] = f"excluded: {ruled_out[effect.key]}"
+        elif effect.key in dropped:
+            found[effect.name] = "left out on request"
+        elif missing := _missing(model, effect):
+            found[effect.name] = f"absent: {', '.join(missing)}"
+        elif effect.key in drawn:
+            found[effect.name] = "drafted from these captures: it fits them by construction; test it on others"
+        elif not effect_variables(model, effect):
+            found[effect.name] = f"no frame can show it; it needs {effect.needs}"
+        elif effect.scope == "frame":
+            keys = [key for keys in model.scene.keys_of(effect).values() for key in keys]
+            fixed = [key for key in keys if key in stated and key not in doubted]
+            if fixed:
+                found[effect.name] = f"stated: {fixed[0]} = {stated[fixed[0]]:g} in every frame"
+    return found
+
+
+def _drawn_from(model: SceneModel, effects: Sequence[Effect]) -> set[str]:
+    """The keys of effects that were drafted from the captures of the model, or from some of them."""
+    drafts = [e for e in effects if e.drafted_from]
+    if not drafts:
+        return set()
+    prints, table = identity.prints_of(model.captures), model.captures.table is not None
+    return {e.key for e in drafts if identity.shared(e.drafted_from.split(), prints, table)}
+
+
+def _expressible(model: SceneModel, record: Record) -> list[Effect]:
     """Every effect that the scene can express and the study has not added."""
     done = {e.key for e in effects_of(record, model.scene.registry)}
     return [
@@ -157,6 +218,20 @@ def candidates(model: SceneModel, record: Record) -> list[Effect]:
         for k, e in sorted(model.scene.registry.effects.items())
         if k not in done and model.scene.can_express(e) and not (e.mixes_pixels and model.captures.table is not None)
     ]
+
+
+def _missing(model: SceneModel, effect: Effect) -> list[str]:
+    """The absent parts that an effect cannot do without; empty where others carry it."""
+    absent = model.captures.absent
+    for keys in model.scene.keys_of(effect).values():
+        holders = {key.rpartition(".")[0] for key in keys}
+        if holders and holders <= set(absent):
+            return sorted(holders)
+    for kind in effect.requires:
+        holders = {name for name, part in model.scene.parts.items() if kind in (part.kind, part.role)}
+        if holders and holders <= set(absent):
+            return sorted(holders)
+    return []
 
 
 def seek(model: SceneModel, values: Values, effects: Sequence[Effect], frames: Sequence[int]) -> None:
@@ -174,9 +249,11 @@ def examine(
     found: Fit,
     progress: Progress | None = None,
     advised: bool = True,
+    without: Sequence[str] = (),
 ) -> Diagnosis:
     """Diagnose the last step, and add the diagnosis with the best effects' fingerprints to its folder.
 
+    without     effects that are not tested
     advised     where effects tie, also advise what to measure next, which renders frames that nobody has taken yet
     """
     from optics.diagnosis.advice import advise
@@ -184,7 +261,7 @@ def examine(
     from optics.diagnosis.remarks import USUALLY
 
     fitted, held = split(model, setup)
-    tested = candidates(model, record)
+    tested, ruled_out = candidates(model, record, without), excluded(model, record, without)
     seek(model, found.values, tested, fitted)
     result = diagnose(
         model,
@@ -196,8 +273,10 @@ def examine(
         refit=Refits(model, setup, found, tested).of,
         seed=setup.seed,
         progress=progress,
+        added=effects_of(record, model.scene.registry),
+        excluded=ruled_out,
     )
-    result.advice = advise(model, result, _variables_of, setup.seed, progress) if advised else []
+    result.advice = advise(model, result, _freed_as_in(model, found.variables), setup.seed, progress) if advised else []
     if result.advice:
         result.hints = [hint for hint in result.hints if hint != USUALLY]
     worst = int(np.argmax(np.array(found.frame_chi2) / np.maximum(found.frame_n, 1)))
@@ -205,9 +284,15 @@ def examine(
     return result
 
 
-def _variables_of(model: Any, effect: Effect) -> list[Variable]:
-    """What adding an effect frees, in a model of the scene or of frames imagined for it."""
-    return effect_variables(model, effect)
+def _freed_as_in(model: SceneModel, held: Sequence[Variable]) -> Callable[[Any, Effect], list[Variable]]:
+    """f(imagined, effect): what adding an effect frees in a model with further frames: what it frees in this one, and
+    the values of those frames alone. A film that only a further frame puts into the beam is not asked for yet."""
+
+    def freed(imagined: Any, effect: Effect) -> list[Variable]:
+        present = {v.name for v in effect_variables(model, effect, held)}
+        return [v for v in effect_variables(imagined, effect, held) if v.frames is not None or v.name in present]
+
+    return freed
 
 
 class Refits:
@@ -217,7 +302,7 @@ class Refits:
     def __init__(self, model: SceneModel, setup: Setup, base: Fit, tested: Sequence[Effect]):
         self.model, self.setup, self.base = model, setup, base
         self.known = {v.name for v in base.variables}
-        curved = [v for e in tested if e.onset != "tangent" for v in effect_variables(model, e)]
+        curved = [v for e in tested if e.onset != "tangent" for v in effect_variables(model, e, base.variables)]
         self.steps = {v.name: v.parameter.plausible for v in curved}  # of variables without a slope at neutral
         self.results: dict[tuple[str, ...], Fit] = {}
 
@@ -225,9 +310,12 @@ class Refits:
         """The fit of these variables from this start."""
         base = self.base
         extra = [v for v in variables if v.name not in self.known]
+        over = [v.name for v in extra]  # of the base the best start is known
+        if model.captures.table is not None:  # readings are predicted in milliseconds
+            return calibrate.fit_over_starts(model, variables, start, frames, over=over)
         product = sum(v.name in self.steps for v in extra) > 1  # a chord per parameter misses their products
         if base.normal is None or not extra or product or list(frames) != list(base.frames):
-            return calibrate.fit(model, variables, start, frames)
+            return calibrate.fit_over_starts(model, variables, start, frames, over=over)
         names = tuple(v.name for v in extra)
         if names not in self.results:  # a diagnosis asks again from another start, which chord steps do not use
             leader = max((base.chi2 - f.chi2 for f in self.results.values()), default=0.0)
@@ -275,13 +363,26 @@ def extend(
             str(model.scene.path),
             f"the effect '{effect.name}' needs it for {', '.join(missing)}",
         )
-    extra = _of_fitted(effect_variables(model, effect), fitted)
+    if gone := _missing(model, effect):
+        raise BadCapture(
+            f"{model.captures.folder / capture_files.FILE}: absent: {', '.join(gone)}, which the effect "
+            f"'{effect.name}' needs; allowed: effects of parts that are there, or a new study of captures without it"
+        )
+    extra = _of_fitted(effect_variables(model, effect, found.variables), fitted)
+    if not extra:
+        why = "no frame can show it" if not effect_variables(model, effect) else "the model solves for all of it"
+        raise Underdetermined(
+            f"{record.folder}: adding '{effect.name}' would change nothing: {why}; it needs {effect.needs or 'more'}"
+        )
     variables = [*found.variables, *extra]
     if start is None:
         seek(model, found.values, [effect], fitted)
         start = off_neutral(model, found.values, extra)
     clock = time.perf_counter()
-    best = calibrate.fit(model, variables, start, fitted, robust=setup.robust, progress=progress)
+    best = calibrate.fit_over_starts(
+        model, variables, start, fitted, robust=setup.robust, progress=progress, over=[v.name for v in extra]
+    )
+    best = settled(model, best, setup.robust, progress)
     record.note_inputs([effect.file] if effect.file else [])  # a draft is written after the study began
     comparison = write_step(record, model, effect.name, effect, best, held, time.perf_counter() - clock)
     before, after = (step["held_out"]["chi2_per_dof"] if step["held_out"] else math.nan for step in record.steps[-2:])
@@ -317,5 +418,6 @@ def write_step(
         seconds=seconds,
         nulls=null_models(model, values, found.frames, held),
         background=background_of(model, values),
+        origin=origin_of(model, held, len(found.variables), extra),
     )
     return comparison

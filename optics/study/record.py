@@ -4,7 +4,8 @@ A study is a folder that a later run, a report, or a reader without this program
 
     STUDY/ladder.json                  inputs by hash, versions, seed, command, noise, and the list of steps
     STUDY/steps/00-base/step.json      the same entry as in ladder.json, which can be rebuilt from these
-                        fit.toml       [parameters] to lay over the scene again, [uncertainty], [frames.NAME]
+                        fit.toml       [parameters] to lay over the scene again, [uncertainty], [frames.NAME], and what
+                                       they belong to (optics.study.calibrated)
                         metrics.json   optics.fit.compare, and null models where there are any
                         diagnosis.json optics.diagnosis
                         images/*.npz   measured, predicted, sd, usable of the frames shown, and the settings of a sweep
@@ -68,6 +69,7 @@ class Record:
         noise: Any = None,
         warnings: Sequence[str] = (),
         facts: Mapping | None = None,
+        prints: Sequence[str] = (),
         noise_floor: float = 1.0,
         noise_floor_source: str = "noise model",
         resume: bool = False,
@@ -76,6 +78,7 @@ class Record:
 
         inputs       files and folders that the result depends on; each file is recorded by SHA-256
         noise        optics.captures.noise.Noise, or a dictionary; facts: plain values to print (frames, image size ...)
+        prints       of the captures (optics.captures.identity), by which a draft knows them again
         noise_floor  chi2/dof of a perfect model: 1, unless repeated frames say otherwise
         resume       go on with the study in `folder` when its inputs, scene and seed are the same
 
@@ -116,6 +119,7 @@ class Record:
             "noise_floor": {"chi2_per_dof": float(noise_floor), "source": noise_floor_source},
             "warnings": list(warnings),
             "facts": dict(facts or {}),
+            "prints": list(prints),
             "shown": [],
             "steps": [],
         }
@@ -204,6 +208,7 @@ class Record:
         *,
         nulls: Mapping | None = None,
         background: Mapping | None = None,
+        origin: Mapping[str, Mapping] | None = None,
         seconds: float | None = None,
         warnings: Sequence[str] = (),
     ) -> Path:
@@ -218,6 +223,7 @@ class Record:
                      step, and at least one held-out frame where there is one; of sweeps of readings, every one
         nulls        optics.fit.null_models.NullTable.json(): errors of models without physics
         background   mode of the flat field, and per channel how much of the background the scene explains
+        origin       optics.study.calibrated.origin_of: what fit.toml says of the scene and the captures
 
         Raises OutputExists when the effect has a step already.
         """
@@ -252,7 +258,7 @@ class Record:
             raise OutputExists(f"{path} exists; open the study again to go on after its last step")
         with new_folder(path) as new:
             (new / "images").mkdir()
-            (new / "fit.toml").write_text(fit_toml(record, name), encoding="utf-8")
+            (new / "fit.toml").write_text(fit_toml(record, name, origin), encoding="utf-8")
             (new / "metrics.json").write_text(
                 _dumps({**comparison.to_dict(), "nulls": nulls or {}, "background": background or {}}), encoding="utf-8"
             )

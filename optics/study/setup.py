@@ -5,13 +5,17 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from fnmatch import fnmatch
 from pathlib import Path
 
+import numpy as np
+
 from optics.captures import capture_set as capture_files
+from optics.captures.noise import Noise, estimate
 from optics.errors import Underdetermined, UnknownKey
 from optics.fit import calibrate
+from optics.fit.gauges import acting
 from optics.fit.model import value_of
 from optics.fit.scene_model import SceneModel
 from optics.scene import loader as scenes
@@ -81,12 +85,14 @@ def plugins_of(setup: Setup) -> Path:
 
 
 # -- the model -------------------------------------------------------------------------------------------------------
-def open_model(setup: Setup, model_class: type = SceneModel) -> SceneModel:
+def open_model(setup: Setup, model_class: type = SceneModel, fitted: Noise | None = None) -> SceneModel:
     """Captures and scene of a setup as a model; raises, before anything is rendered, where they contradict each
-    other."""
+    other.
+
+    fitted   noise of the captures that the values to come were fitted to, if they are others"""
     found = capture_files.load(setup.captures)
     path = scenes.find(found.scene)
-    defines = dict(setup.defines)
+    defines = capture_files.definitions(found, setup.defines, path)
     height, width = found.frames[0].image.shape[:2]
     usual = dict(re.findall(r'<default name="(width|height)" value="(\d+)"', path.read_text(encoding="utf-8")))
     for name, size in (("width", width), ("height", height)):
@@ -103,13 +109,12 @@ def open_model(setup: Setup, model_class: type = SceneModel) -> SceneModel:
     plugins = plugins_of(setup)
     loaded = scenes.load(path, defines, plugins=plugins if setup.plugins or plugins.is_dir() else None)
     capture_files.check(found, loaded.parameters)
+    found = capture_files.state(found, loaded.parts, {k: e.name for k, e in loaded.registry.effects.items()})
     noise = found.noise
     if noise is None:
-        from optics.captures.noise import estimate
-
-        noise = estimate(found)
+        noise = estimate(found, clocks=keys_with(loaded.parameters, "clock"))
     options = {} if setup.flat_field is None else {"flat_field": setup.flat_field}
-    return model_class(loaded, found, noise, **options)
+    return model_class(loaded, found, noise.in_scale_of(fitted), **options)
 
 
 def split(model: SceneModel, setup: Setup) -> tuple[list[int], list[int]]:
@@ -148,7 +153,9 @@ def default_free(model: SceneModel) -> list[str]:
 
 
 def variables_of_base(model: SceneModel, setup: Setup, frames: Sequence[int]) -> list[Variable]:
-    """The base model's variables in these frames: those of all frames, then those of each group."""
+    """The base model's variables in these frames: those of all frames, those of each group, and settings that are
+    known with an uncertainty (`settings_in_doubt`)."""
+    doubts = settings_in_doubt(model, frames)
     priors = dict(setup.priors)
     if not setup.free:
         own = {k: model.parameters[k].prior_sd for k in default_free(model)}
@@ -165,7 +172,46 @@ def variables_of_base(model: SceneModel, setup: Setup, frames: Sequence[int]) ->
         variables = [v for v in variables if v.frames is None or not _untouched(model, v.frames)]
     for pattern, prior in priors.items():
         variables = [_with_prior(model, v, pattern, prior) for v in variables]
-    return variables
+    for i, v in enumerate(variables):  # what is free anyway has its setting as its prior, unless the setup has another
+        given = any(fnmatch(name, pattern) for pattern in setup.priors for name in (v.keys[0], v.name))
+        known = [d.prior for d in doubts if d.keys == v.keys and _within(d, v) and d.prior is not None]
+        if known and not given:
+            variables[i] = v.with_prior(*known[0])
+    free = {(key, frame) for v in variables for key in v.keys for frame in v.frames or (None,)}
+    return variables + [d for d in doubts if not free & {(d.keys[0], frame) for frame in d.frames or (None,)}]
+
+
+def _within(inner: Variable, outer: Variable) -> bool:
+    """Whether a variable holds in some of the frames that another holds in, or both in all."""
+    if inner.frames is None or outer.frames is None:
+        return inner.frames is outer.frames
+    return set(inner.frames) <= set(outer.frames)
+
+
+def settings_in_doubt(model: SceneModel, frames: Sequence[int]) -> list[Variable]:
+    """The settings of these frames whose error all pixels of a frame, or all readings of a sweep, share: a variable
+    each, with the setting and its uncertainty as its prior.
+
+    One for all frames of what [parameters] sets; one for each image of what frames set; one for the sweeps that say
+    they share a setting (`Frame.made`). Errors that differ from reading to reading are in the variance
+    (`SceneModel.variance`). A light that a frame switches off is off."""
+    captures, found = model.captures, []
+    single = {key for f in model.frames for key in (*f.parameters, *f.readings)}
+    for key, sd in captures.uncertainty.items():
+        if key in captures.parameters and key not in single and sd > 0:
+            mean = float(captures.parameters[key])
+            found.append(Variable(key, (key,), model.parameters[key], None, (mean, sd)))
+    shared: dict[tuple[str, object], list[int]] = {}
+    for index in frames:
+        frame = model.frames[index]
+        for key, sd in captures.uncertainty_of(frame).items():
+            if np.ndim(sd) == 0 and not (key in model.driven and frame.parameters[key] == 0):
+                shared.setdefault((key, frame.made.get(key, frame.name)), []).append(index)
+    for (key, _), own in shared.items():
+        first = model.frames[own[0]]
+        prior = (float(first.parameters[key]), float(captures.uncertainty_of(first)[key]))
+        found.append(Variable(f"{key}[{first.name}]", (key,), model.parameters[key], tuple(own), prior))
+    return found
 
 
 def check_priors(model: SceneModel, setup: Setup) -> None:
@@ -176,15 +222,23 @@ def check_priors(model: SceneModel, setup: Setup) -> None:
             raise UnknownKey(pattern, [v.name for v in everywhere], "free parameter for a prior")
 
 
-def effect_variables(model: SceneModel, effect: Effect) -> list[Variable]:
-    """What adding an effect frees.
+def effect_variables(model: SceneModel, effect: Effect, held: Sequence[Variable] = ()) -> list[Variable]:
+    """What adding an effect frees: of what the captures can show (`optics.fit.gauges.acting`), what a model with the
+    variables `held` does not solve for already.
 
     Of several strengths a common mode may be degenerate, such as a gain that all frames share. A prior of GAUGE
-    plausible sizes holds it at the scene's value, and data that determine it outweigh the prior.
+    plausible sizes holds it at the scene's value, and data that determine it outweigh the prior. Parts that are absent
+    have no part in it.
     """
-    found = model.scene.variables_of(effect, len(model.frames))
+    taken = {key for v in held for key in v.keys}
+    present = []
+    for v in model.scene.variables_of(effect, len(model.frames)):
+        keys = tuple(k for k in v.keys if k.rpartition(".")[0] not in model.captures.absent)
+        if keys:
+            present.append(v if keys == v.keys else replace(v, keys=keys))
+    found = [v for v in acting(model, present) if not taken & set(v.keys)]
     if len(found) < 2:
-        return list(found)
+        return found
     return [_with_prior(model, v, "*", (None, GAUGE * v.parameter.plausible)) for v in found]
 
 

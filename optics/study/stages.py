@@ -20,6 +20,7 @@ Progress = Callable[[str, int, int], None]
 COMMON: dict[str, Any] = {"max_iterations": 12, "tolerance": 20.0}
 POSES: dict[str, Any] = {"max_iterations": 6, "tolerance": 2.0}
 TOGETHER = 0.05  # chi2 per variable: a twentieth of what noise alone makes of each
+SETTLING = 2  # fits after which weights that follow the slopes of readings change little
 OFF = 0.1  # plausible sizes off neutral from which an effect is followed
 
 
@@ -35,12 +36,16 @@ def fit_base(
     """Calibrate in three stages: what all frames share, then the poses of one press at a time, then everything
     together."""
     variables = list(variables)
+    if model.dialled:
+        model.weighed_at = start.copy()
     begun = np.array([value_of(model, start, v) for v in variables])  # where the first stage starts
     common = [v for v in variables if v.frames is None]
     if len(common) < len(variables):
         values = start
         if common:
-            values = calibrate.fit(model, common, start, fitted, **COMMON, robust=robust, progress=progress).values
+            values = calibrate.fit_over_starts(
+                model, common, start, fitted, **COMMON, robust=robust, progress=progress
+            ).values
         start = values.copy()
         groups: dict[tuple[int, ...], list[Variable]] = {}
         for v in variables:
@@ -50,8 +55,26 @@ def fit_base(
             found = calibrate.fit(model, own, values, frames, **POSES, robust=robust, progress=progress)
             for index in frames:
                 start.frame.setdefault(index, {}).update(found.values.frame[index])
-    found = calibrate.fit(model, variables, start, fitted, tolerance=tolerance, robust=robust, progress=progress)
+    found = calibrate.fit_over_starts(
+        model, variables, start, fitted, tolerance=tolerance, robust=robust, progress=progress
+    )
+    found = settled(model, found, robust, progress, tolerance)
     found.start = begun
+    return found
+
+
+def settled(
+    model: SceneModel, found: Fit, robust: bool = False, progress: Progress | None = None, tolerance: float = TOGETHER
+) -> Fit:
+    """A fit calibrated again with the errors of settings weighed at its own values; the fit itself where no reading has
+    such an error."""
+    if not model.dialled:
+        return found
+    for _ in range(SETTLING):
+        model.weighed_at = found.values.copy()
+        found = calibrate.fit(
+            model, found.variables, found.values, found.frames, tolerance=tolerance, robust=robust, progress=progress
+        )
     return found
 
 
@@ -107,4 +130,4 @@ def null_models(model: SceneModel, values: Values, fitted: Sequence[int], held: 
 
 def background_of(model: SceneModel, values: Values) -> dict | None:
     """The flat field's mode, and how much of the background the scene explains without it, per channel."""
-    return None if model.flat is None else {"mode": model.flat_field, "channels": model.background_share(values)}
+    return None if model.flat_of(0) is None else {"mode": model.flat_field, "channels": model.background_share(values)}

@@ -1,0 +1,606 @@
+"""Explanations: sets of one, two or three effects, refitted together, that compete on equal terms.
+
+Every explanation is calibrated together with all that the base calibrates. What counts is its score
+
+    score = fall / scale - cost
+    cost  = ln det(1 + t V t) + sum over effects (3 ln(1 + x^2/2) + EACH)
+
+with the fall of chi2, the scale of what is left (chi2 per degree of freedom with the most complete explanation, at
+least 1), V the information that the data hold on the strengths (k, k), t their plausible sizes, and x how far an
+effect's strengths are from neutral, in plausible sizes. The first term of the cost is what strengths could have fitted,
+whatever the data are: the Occam factor of a marginal likelihood whose prior is t wide. The second is the density of
+Student's t with two degrees of freedom: a strength of 36 plausible sizes costs 19. The third is the prior odds of an
+effect.
+
+Whether an explanation needs an effect that a simpler one lacks is a question of significance: family-wise, with the
+design effect (`optics.diagnosis.correlation`). Of two that are not nested, one is told apart from the best when its
+score is TOLD lower (CLEAR, where plausibility alone decides), the difference of falls divided by its design effect;
+when that difference exceeds the smaller of HALF of what the best one leaves and MARGIN of its fall, as misfit that is
+left may lie along any direction; and, of readings, when it predicts blocks of the session worse that were left out. All
+others survive. An effect that is part of every explanation that survives is missing, whichever of them is right.
+
+Sources: MacKay, Bayesian interpolation, Neural Computation 4, 415 (1992), Occam factor; Vuong, Econometrica 57, 307
+(1989), the variance of a difference of log likelihoods."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from optics.diagnosis import correlation as correlations
+from optics.diagnosis import homogeneity, pairs
+from optics.diagnosis import statistics as st
+from optics.diagnosis.correlation import Correlation
+from optics.diagnosis.evidence import Candidate, measure, silent
+from optics.diagnosis.refit import FAILURES, START, Case, excess_of, known_of, weighed, with_effects
+from optics.diagnosis.result import Explanation, leaves_nothing
+from optics.diagnosis.score import solve
+from optics.diagnosis.thresholds import CLEAR, EACH, HALF, LEVEL, MARGIN, TOLD
+from optics.fit import calibrate
+from optics.fit.model import value_of
+from optics.fit.result import Fit
+from optics.scene.parameter import Values
+
+LARGEST = 3  # effects of one explanation
+LEADERS, FOLLOWERS = 3, 4  # explanations that are extended in each round, and effects that each is extended by
+REACH = 3 * CLEAR  # of the best score: an explanation that is expected to stay farther behind is not refitted
+LINEAR = 0.1  # relative difference of a refit's fall from the one expected, below which nothing is linearised again
+NEARLY = 0.9  # the same beside an explanation that leaves nothing
+TRUSTED = 0.7  # of what a linearisation expects: an explanation that is expected to fall short by more is not refitted
+BLOCKS = 8  # pieces of a session, each left out once
+LEAST = 2  # values per number that is fitted, below which no set of effects is refitted
+LOOSE = 10.0  # plausible sizes: what keeps a strength that a left-out block alone determines near neutral
+
+
+@dataclass(eq=False)
+class Trial:
+    """An explanation that was refitted.
+
+    members    effects, none for the base;   fit, fall, after, expected, images   as of `optics.diagnosis.refit.Attempt`
+    cost       see the module
+    ahead      chi2 of the blocks that were left out in turn, less that of the base; NaN where it was not computed
+    """
+
+    members: list[Candidate]
+    fit: Fit
+    fall: float
+    after: float
+    expected: float
+    images: list[np.ndarray]
+    cost: float = 0.0
+    excess_sd: float = 0.0
+    structure_p: float = math.nan
+    ahead: float = math.nan
+
+    @property
+    def names(self) -> frozenset[str]:
+        return frozenset(c.effect.name for c in self.members)
+
+    @property
+    def expectation(self) -> float:
+        """Mean fall if none of its effects were there."""
+        return sum(c.cone.expectation for c in self.members)
+
+    @property
+    def keys(self) -> set:
+        return {(key, v.frames) for c in self.members for v in c.variables for key in v.keys}
+
+    @property
+    def complete(self) -> bool:
+        """Whether it leaves nothing to explain."""
+        return leaves_nothing(self.structure_p, self.excess_sd)
+
+    def left(self, dof: int) -> float:
+        """chi2 beyond its expectation, 0 or more."""
+        return max(self.excess_sd, 0.0) * math.sqrt(2 * dof)
+
+
+@dataclass
+class Outcome:
+    """What the competition came to.
+
+    leader       the explanation with the best score; best: the simplest that is not told apart from it
+    survivors    all that are not told apart from the best, the best first
+    core         effects that every survivor has
+    leads        explanation -> (lead of the best in score, lead needed)
+    """
+
+    leader: Trial
+    best: Trial
+    survivors: list[Trial]
+    trials: list[Trial]
+    scale: float
+    correlation: Correlation
+    leads: dict[frozenset[str], tuple[float, float]] = field(default_factory=dict)
+
+    @property
+    def core(self) -> list[str]:
+        common = frozenset.intersection(*[t.names for t in self.survivors])
+        return [c.effect.name for c in self.best.members if c.effect.name in common]
+
+    def without(self, trial: Trial, name: str) -> Trial:
+        """The trial with most of the other effects of a trial: what is lost without the one."""
+        return max((t for t in self.trials if t.names <= trial.names - {name}), key=lambda t: t.fall)
+
+    def own_fall(self, trial: Trial, name: str) -> float:
+        """What an effect adds to the fall of the others of its trial."""
+        return trial.fall - self.without(trial, name).fall
+
+    def told(self) -> list[Explanation]:
+        """All trials as records, best first."""
+        found = []
+        for t in self.trials:
+            sd = {v.name: float(s) for v, s in zip(t.fit.variables, t.fit.sd)}
+            variables = [v for c in t.members for v in c.variables]
+            estimates = {v.name: float(e) for v, e in zip(t.fit.variables, t.fit.estimate)}
+            lead, needed = self.leads.get(t.names, (0.0, 0.0))
+            found.append(
+                Explanation(
+                    effects=[c.effect.name for c in t.members],
+                    fall=t.fall,
+                    cost=t.cost,
+                    excess_sd=t.excess_sd,
+                    structure_p=t.structure_p,
+                    lead=lead,
+                    needed=needed,
+                    ahead=t.ahead,
+                    variables=[v.name for v in variables],
+                    strength=[estimates.get(v.name, math.nan) for v in variables],
+                    sd=[sd.get(v.name, math.nan) for v in variables],
+                    units=[v.parameter.unit for v in variables],
+                    survives=bool(t.members) and t in self.survivors,
+                    told={c.effect.name: known_of(t.fit, c) for c in t.members if t in self.survivors},
+                )
+            )
+        return found
+
+
+# -- what an explanation costs ---------------------------------------------------------------------------------------
+def occam(information: np.ndarray, plausible: np.ndarray) -> float:
+    """ln det(1 + t V t): what strengths could have fitted; 0 for those that no data determine."""
+    scaled = information * np.outer(plausible, plausible)
+    return float(np.sum(np.log1p(np.maximum(np.linalg.eigvalsh((scaled + scaled.T) / 2), 0.0))))
+
+
+def implausible(c: Candidate, change: np.ndarray) -> float:
+    """3 ln(1 + x^2/2), x the length of the change in plausible sizes; of strengths per frame, their rms."""
+    square = np.square(np.asarray(change, float) / c.plausible)
+    x2 = float(np.mean(square) if c.effect.scope == "frame" else np.sum(square))
+    return 3 * math.log1p(x2 / 2) + EACH
+
+
+def cost_of(case: Case, members: Sequence[Candidate], found: Fit) -> float:
+    """Of a refit."""
+    names = [v.name for v in found.variables]
+    own = [names.index(v.name) for c in members for v in c.variables if v.name in names]
+    covariance = np.asarray(found.covariance, float)[np.ix_(own, own)]
+    known = np.isfinite(np.diag(covariance)) & (np.diag(covariance) > 0)
+    t = np.concatenate([c.plausible for c in members])[: len(own)]
+    total = 0.0
+    if known.any():
+        inner, size = covariance[np.ix_(known, known)], t[known]
+        spread = np.linalg.eigvalsh(inner / np.outer(size, size))
+        total = float(np.sum(np.log1p(1 / np.maximum(spread, 1e-12))))
+    for c in members:
+        total += implausible(c, np.array([value_of(case.model, found.values, v) for v in c.variables]) - c.start)
+    return total
+
+
+def expected_cost(c: Candidate) -> float:
+    """Of an effect that was scored."""
+    return occam(c.cone.information, c.plausible) + implausible(c, c.change_of(c.linear))
+
+
+# -- the search ------------------------------------------------------------------------------------------------------
+def search(case: Case, chosen: Sequence[Candidate], fits: dict[str, Fit]) -> Outcome:
+    """Refit the sets of effects that may explain the residual, and let them compete.
+
+    chosen   effects that were refitted one by one; fits: their fits
+    """
+    trials: dict[frozenset[str], Trial] = {frozenset(): _nothing(case)}
+    for c in chosen:
+        if c.effect.name in fits:
+            trials[frozenset([c.effect.name])] = _trial(case, [c], fits[c.effect.name])
+    if not case.evidence.is_table:
+        _joined(case, trials)
+        return compete(case, list(trials.values()))
+    race = Race(case, trials)
+    race.widen()
+    for name in sorted(race.leader.names):
+        race.widen(without=name)
+    outcome = compete(case, list(trials.values()))
+    if race.exchange(outcome.survivors):
+        outcome = compete(case, list(trials.values()))
+    return _weighed_by_blocks(case, outcome)
+
+
+def _nothing(case: Case) -> Trial:
+    """The base, as the explanation without effects."""
+    evidence = case.evidence
+    after = evidence.normal.square
+    excess = excess_of(evidence, after, float(evidence.normal.count), [])
+    return Trial([], case.fit, 0.0, case.before, after, evidence.whitened, 0.0, excess)
+
+
+def _trial(case: Case, members: list[Candidate], found: Fit) -> Trial:
+    made = weighed(case, found)
+    columns = [*case.evidence.base, *(i for c in members for i in c.columns)]
+    return Trial(
+        members,
+        found,
+        made.fall,
+        made.after,
+        made.expected,
+        made.images,
+        cost_of(case, members, found),
+        excess_of(case.evidence, made.after, made.expected, members),
+        case.evidence.structure(made.images, columns).p,
+    )
+
+
+def _score(trial: Trial, scale: float) -> float:
+    return trial.fall / scale - trial.cost
+
+
+def _scale(case: Case, trials: Iterable[Trial]) -> float:
+    """chi2 per degree of freedom of the most complete explanation, at least 1."""
+    best = max(trials, key=lambda t: t.fall)
+    dof = max(case.evidence.normal.count - case.evidence.projected.rank - len(best.keys), 1)
+    return max(1.0 + best.excess_sd * math.sqrt(2 * dof) / dof, 1.0)
+
+
+def _leader(case: Case, trials: dict[frozenset[str], Trial]) -> Trial:
+    scale = _scale(case, trials.values())
+    return max(trials.values(), key=lambda t: _score(t, scale))
+
+
+def _fits_in(case: Case, members: Sequence[Candidate]) -> bool:
+    """Whether a set may be refitted: no strength twice, none that contains another, values enough for all of them."""
+    keys = [key for c in members for v in c.variables for key in v.keys]
+    numbers = case.evidence.projected.rank + sum(len(c.cone.live) for c in members)
+    return len(set(keys)) == len(keys) and case.evidence.normal.count > LEAST * numbers
+
+
+class Race:
+    """The search among explanations of a table, whose refits take milliseconds; `trials` is filled."""
+
+    def __init__(self, case: Case, trials: dict[frozenset[str], Trial]):
+        self.case, self.trials = case, trials
+        self.known: dict[frozenset[str], list[tuple[Candidate, float, Values]]] = {}
+
+    @property
+    def leader(self) -> Trial:
+        return _leader(self.case, self.trials)
+
+    def widen(self, without: str = "") -> None:
+        """Extend the best explanations by the effects that explain most of what each of them leaves."""
+        for size in range(1, LARGEST):
+            # by falls as they are: what no explanation has reached yet must not count as noise
+            ranked = sorted(self.trials.values(), key=lambda t: -_score(t, 1.0))
+            top = _score(ranked[0], 1.0)
+            leaders: list[Trial] = []
+            for t in ranked:
+                if len(t.members) == size and without not in t.names and not any(o.keys <= t.keys for o in leaders):
+                    leaders.append(t)
+            # beside an explanation that leaves nothing, only what may come near it is of interest
+            few = bool(without) and ranked[0].complete
+            for t in leaders[: 2 * LEADERS if few else LEADERS]:
+                short = top - _score(t, 1.0)
+                followers = [f for f in self.followers(t) if f[0].effect.name != without]
+                for c, gain, values in followers[:FOLLOWERS]:
+                    if gain - expected_cost(c) > max(0.0, (NEARLY if few else TRUSTED) * short - REACH):
+                        self.add(t, c, values)
+
+    def exchange(self, survivors: Sequence[Trial]) -> bool:
+        """Put in place of each effect of an explanation all that explain as much beside the others; whether any did."""
+        before, scale = len(self.trials), _scale(self.case, self.trials.values())
+        for t in survivors:
+            for c in t.members if len(t.members) > 1 else []:
+                rest = self.trials.get(t.names - {c.effect.name})
+                if rest is None or not rest.members:
+                    continue
+                gain = _score(t, scale) - _score(rest, scale)
+                for other, net, values in self.followers(rest):
+                    if net / scale - expected_cost(other) > TRUSTED * gain - REACH:
+                        self.add(rest, other, values)
+        return len(self.trials) > before
+
+    def add(self, trial: Trial, c: Candidate, start: Values) -> None:
+        """Refit an explanation with one more effect, if that has not been done."""
+        names = trial.names | {c.effect.name}
+        members = [*trial.members, _original(self.case, c)]
+        if names in self.trials or not _fits_in(self.case, members):
+            return
+        variables = [*self.case.base, *(v for m in members for v in m.variables)]
+        alone = self.trials.get(frozenset([c.effect.name]))
+        if alone is not None and "nonlinear" in members[-1].row.flags:
+            # a strength that a linearisation does not find, such as a retardance of another order
+            start = start.copy()
+            for v in members[-1].variables:
+                start.put(v, value_of(self.case.model, alone.fit.values, v))
+        try:
+            found = calibrate.fit(self.case.model, variables, start, list(self.case.fitted))
+        except FAILURES:
+            return
+        made = _trial(self.case, members, found)
+        if math.isfinite(made.after):
+            self.trials[names] = made
+
+    def followers(self, trial: Trial) -> list[tuple[Candidate, float, Values]]:
+        """(effect, expected fall, start) of effects beside an explanation, best first."""
+        if trial.names not in self.known:
+            self.known[trial.names] = _followers(self.case, trial)
+        return self.known[trial.names]
+
+
+def _original(case: Case, c: Candidate) -> Candidate:
+    """The candidate as the base's evidence knows it."""
+    return next(o for o in case.table.order if o.effect.name == c.effect.name)
+
+
+def _followers(case: Case, trial: Trial) -> list[tuple[Candidate, float, Values]]:
+    """(effect, expected fall, start) of effects beside an explanation, best first: where its refit brought what was
+    expected of it, by the derivative images of the base, else by those at its fit."""
+    values = trial.fit.values
+    taken = {key for c in trial.members for v in c.variables for key in v.keys}
+    others = [
+        o
+        for o in case.table.order
+        if o.effect.name not in trial.names
+        and not o.broken
+        and len(o.cone.live)
+        and not taken & {key for v in o.variables for key in v.keys}
+    ]
+    if not others:
+        return []
+    scored = _beside(case, trial, others) if _is_linear(case, trial) else _beside_at(case, trial, others)
+    found = []
+    for c, net, change in scored:
+        start = values.copy()
+        for v, step in zip(c.variables, START * change):
+            start.put(v, float(np.clip(value_of(case.model, values, v) + step, *v.parameter.bounds)))
+        found.append((c, net, start))
+    return sorted(found, key=lambda t: -t[1])
+
+
+def _is_linear(case: Case, trial: Trial) -> bool:
+    """Whether the fall of an explanation is the one that the base's derivative images expect."""
+    own = np.array([i for c in trial.members for i in c.columns]) - len(case.evidence.base)
+    live = own[[bool(x) for x in np.diag(case.table.information)[own] > 0]]
+    inverse, _ = st.inverse(case.table.information[np.ix_(live, live)], st.VISIBLE)
+    score = case.evidence.projected.score[live]
+    return abs(trial.fall / max(float(score @ inverse @ score), 1e-9) - 1) < LINEAR
+
+
+def _beside(case: Case, trial: Trial, others: Sequence[Candidate]) -> list[tuple[Candidate, float, np.ndarray]]:
+    """(effect, expected fall, change) by the base's derivative images, an explanation's own projected off too."""
+    evidence, found = case.evidence, []
+    base = [*evidence.base, *(i for c in trial.members for i in c.columns)]
+    rest = [i for c in others for i in c.columns]
+    projected = evidence.project(evidence.normal, base, rest)
+    seen = projected.survival > st.VISIBLE
+    first = 0
+    for c in others:
+        own = np.arange(first, first + len(c.columns))
+        first += len(c.columns)
+        shown = np.outer(seen[own], seen[own])
+        cone = st.Cone(projected.information[np.ix_(own, own)] * shown, c.sides, case.seed, draws=1000)
+        fall, linear = cone.solve(projected.score[own] * seen[own])
+        twin = replace(c, cone=cone, linear=linear)
+        found.append((twin, fall - cone.expectation, twin.change_of(linear)))
+    return found
+
+
+def _beside_at(case: Case, trial: Trial, others: Sequence[Candidate]) -> list[tuple[Candidate, float, np.ndarray]]:
+    """As `_beside`, by derivative images at the fit of the explanation."""
+    values = trial.fit.values
+    there = [Candidate.at(case.model, values, o.effect, o.variables) for o in others]
+    base = [case.evidence.columns[i] for i in case.evidence.base] + [v for c in trial.members for v in c.variables]
+    evidence = measure(case.model, values, base, there, case.evidence.frames, case.rows_max, case.seed, silent)
+    solve(evidence, there, case.seed)
+    return [(c, c.row.net, c.change_of(c.linear)) for c in there]
+
+
+def _joined(case: Case, trials: dict[frozenset[str], Trial]) -> None:
+    """Pairs of images' effects, whose refits are dear: by the linear fall of both, those that may win."""
+    evidence, scale = case.evidence, _scale(case, trials.values())
+    best = _leader(case, trials)
+    top = _score(best, scale)
+    live = [c for c in case.table.order if c.row.p_family < LEVEL and len(c.cone.live) and not c.broken]
+    wanted = []
+    for net, a, b, linear in pairs.ranked(evidence, live[: pairs.CONSIDERED]):
+        both = [a, b]
+        both_cost = sum(map(expected_cost, both))
+        nested = best.names <= frozenset(c.effect.name for c in both)
+        needed = max(CLEAR, pairs.LEAD * best.fall) if nested else -CLEAR
+        if (nested and (not best.members or best.complete)) or net / scale - both_cost - top < needed:
+            continue
+        wanted.append((net / scale - both_cost, both, linear))
+    for _, (a, b), linear in sorted(wanted, key=lambda t: -t[0])[: pairs.REFITTED]:
+        try:
+            found = with_effects(case, [(a, linear[: len(a.columns)]), (b, linear[len(a.columns) :])], START)
+        except FAILURES:
+            continue
+        made = _trial(case, [a, b], found)
+        if math.isfinite(made.after):
+            trials[made.names] = made
+
+
+# -- the competition -------------------------------------------------------------------------------------------------
+def compete(case: Case, trials: list[Trial]) -> Outcome:
+    """The explanations that are not told apart from the best."""
+    scale = _scale(case, trials)
+    order = sorted(trials, key=lambda t: -_score(t, scale))
+    # whether there is anything is a question of its own, which costs do not answer
+    leader = next((t for t in order if t.members), order[0])
+    correlation = _correlation(case, leader) if case.evidence.is_table else Correlation(scale)
+    outcome = Outcome(leader, leader, [leader], order, scale, correlation)
+    for t in order:
+        if t is not leader:
+            outcome.leads[t.names] = _lead(case, outcome, leader, t)
+    return _with_survivors(case, outcome)
+
+
+def _with_survivors(case: Case, outcome: Outcome) -> Outcome:
+    best = outcome.leader
+    while True:
+        alive = [best] + [t for t in outcome.trials if t is not best and not _told(case, outcome, best, t)]
+        alive += [t for t in _inherited(case, outcome, alive) if t not in alive]
+        # an explanation within another that is not told apart says the same with less
+        kept = [t for t in alive if not any(o is not t and o.keys < t.keys for o in alive)]
+        kept.sort(key=lambda t: -_score(t, outcome.scale))
+        if best in kept:
+            break
+        best = next(t for t in kept if t.keys < best.keys) if any(t.keys < best.keys for t in kept) else kept[0]
+    outcome.best, outcome.survivors = best, [best, *(t for t in kept if t is not best)]
+    return outcome
+
+
+def _told(case: Case, outcome: Outcome, best: Trial, other: Trial) -> bool:
+    """Whether an explanation is ruled out beside the best; one that says the same with more is not asked."""
+    if best.keys < other.keys:
+        return True
+    lead, needed = outcome.leads[other.names] if best is outcome.leader else _lead(case, outcome, best, other)
+    return lead > needed and not (best.ahead > other.ahead)
+
+
+def _inherited(case: Case, outcome: Outcome, alive: Sequence[Trial]) -> list[Trial]:
+    """Explanations that are not told apart from a simpler one within one that survives: freedom that the simpler one
+    lacks, such as a colour, is no evidence against a third that lacks it too."""
+    found = []
+    for t in alive:
+        for inner in outcome.trials:
+            if inner.members and inner.keys < t.keys and len(inner.members) == len(t.members):
+                for other in outcome.trials:
+                    if len(other.members) > len(t.members) or inner.keys <= other.keys or other in (t, inner):
+                        continue
+                    lead, needed = _lead(case, outcome, inner, other)
+                    if not lead > needed and _score(other, outcome.scale) > _score(inner, outcome.scale) - CLEAR:
+                        found.append(other)
+    return found
+
+
+def _lead(case: Case, outcome: Outcome, best: Trial, other: Trial) -> tuple[float, float]:
+    """(lead in score, lead needed) of one explanation over another; over one within it, the fall that the rest brings,
+    and the fall that would be significant among so many effects."""
+    fall, cost = best.fall - other.fall, other.cost - best.cost
+    data = fall / _design_effect(case, outcome, best, other)
+    lead, needed = data + cost, TOLD if data > TOLD else CLEAR  # what is plausible decides alone only where it is clear
+    if other.keys < best.keys:
+        lead, needed, cost = lead - cost, _significant(case, best, other), 0.0
+    dof = max(case.evidence.normal.count - case.evidence.projected.rank, 1)
+    misfit = 0.0 if best.complete else min(HALF * best.left(dof), MARGIN * best.fall)
+    if misfit and fall + cost * outcome.scale < misfit:
+        return lead, max(needed, lead + misfit - fall)
+    return lead, needed
+
+
+def _significant(case: Case, best: Trial, inner: Trial) -> float:
+    """The fall of chi2 by the effects beside those of an inner explanation at which LEVEL is reached, family-wise."""
+    single = case.table.family.critical(LEVEL)
+    more = [c for c in best.members if c.effect.name not in inner.names]
+    if len(more) == 1:
+        return more[0].cone.critical(single)
+    from scipy.special import chdtri
+
+    # of one that contains another, the strengths that it has besides
+    free = sum(len(c.cone.live) for c in best.members) - sum(len(c.cone.live) for c in inner.members)
+    return float(chdtri(max(free, 1), single))
+
+
+def _design_effect(case: Case, outcome: Outcome, one: Trial, other: Trial) -> float:
+    """By how much the variance of the difference of two chi2 exceeds what independent noise makes."""
+    direction = _kept(case, [a - b for a, b in zip(one.images, other.images)])
+    if case.evidence.is_table:
+        return outcome.correlation.design_effect(np.concatenate(direction), case.evidence.order(case.model))
+    left = _kept(case, outcome.trials[0].images)
+    total = sum(float(d @ d) for d in direction)
+    if not total > 0 or case.places is None:
+        return 1.0
+    found = homogeneity.variances([d[:, None] for d in direction], left, case.places)
+    return max([1.0, *(float(b[0, 0]) / total for b, parts in found if parts > 2)])
+
+
+def lead_without(case: Case, outcome: Outcome, name: str) -> tuple[float, float, str]:
+    """(lead, lead needed, rival in words) of the best explanation over the best one without an effect."""
+    others = [t for t in outcome.trials if name not in t.names]
+    rival = max(others, key=lambda t: _score(t, outcome.scale))
+    return (*_lead(case, outcome, outcome.best, rival), " with ".join(c.effect.name for c in rival.members))
+
+
+def design_effect_without(case: Case, outcome: Outcome, name: str) -> float:
+    """The design effect of what an effect adds to the best explanation."""
+    return _design_effect(case, outcome, outcome.best, outcome.without(outcome.best, name))
+
+
+def _kept(case: Case, images: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Of whitened images (H, W, C), the values that the evidence keeps, per block."""
+    return [np.asarray(i, float).reshape(-1)[b.index] for i, b in zip(images, case.evidence.blocks)]
+
+
+def _correlation(case: Case, best: Trial) -> Correlation:
+    """Of the readings about an explanation."""
+    dense = _measured(case, best)
+    return correlations.estimate(np.concatenate(_kept(case, best.images)), dense, case.evidence.order(case.model))
+
+
+def _measured(case: Case, trial: Trial) -> np.ndarray:
+    """(n, k) whitened derivative images of the base and of an explanation's strengths, at its fit."""
+    base = [case.evidence.columns[i] for i in case.evidence.base] + [v for c in trial.members for v in c.variables]
+    normal = trial.fit.normal
+    if normal is not None and trial.fit.frames == case.evidence.frames:
+        names = {v.name: i for i, v in enumerate(trial.fit.variables)}
+        place = {names[v.name]: i for i, v in enumerate(base)}
+        parts = [np.zeros((j.shape[1], len(base))) for _, j, _ in normal.rows]
+        for part, (where, j, _) in zip(parts, normal.rows):
+            there = [(place[int(w)], k) for k, w in enumerate(where) if int(w) in place]
+            part[:, [i for i, _ in there]] = j[[k for _, k in there]].T
+        if [len(p) for p in parts] == [len(b.r) for b in case.evidence.blocks]:
+            return np.concatenate(parts)
+    own = measure(case.model, trial.fit.values, base, [], case.evidence.frames, case.rows_max, case.seed, silent)
+    return own.dense(own.base)
+
+
+# -- blocks left out -------------------------------------------------------------------------------------------------
+def _weighed_by_blocks(case: Case, outcome: Outcome) -> Outcome:
+    """The outcome when explanations near the best must also predict blocks of the session that were left out."""
+    near = [t for t in outcome.trials if t is outcome.leader or t in outcome.survivors or not t.members]
+    near += [t for t in outcome.trials[: 2 * LEADERS] if t not in near]
+    for t in near:
+        t.ahead = left_out(case, t)
+    base = next(t.ahead for t in near if not t.members)
+    for t in near:
+        t.ahead -= base
+    return _with_survivors(case, outcome)
+
+
+def left_out(case: Case, trial: Trial) -> float:
+    """chi2 of the readings, each block of the session predicted by a fit of all others.
+
+    With images X and residuals r of block b at the optimum, (G - G_b + P) step = -X_b'r_b moves the optimum to that of
+    the others; P holds priors, and strengths that only the block determines (LOOSE)."""
+    columns, r = _measured(case, trial), np.concatenate(_kept(case, trial.images))
+    order = case.evidence.order(case.model)
+    prior = np.zeros(columns.shape[1])
+    prior[: len(case.evidence.precision)] = case.evidence.precision
+    known = len(case.evidence.base)
+    prior[known:] = [1 / (LOOSE * t) ** 2 for c in trial.members for t in c.plausible]
+    gram, total = columns.T @ columns + np.diag(prior), 0.0
+    for block in blocks(case, order):
+        own = columns[block]
+        inverse, _ = st.inverse(gram - own.T @ own)
+        total += float(np.sum((r[block] + own @ (inverse @ (own.T @ r[block]))) ** 2))
+    return total
+
+
+def blocks(case: Case, order: np.ndarray) -> list[np.ndarray]:
+    """Places of the readings of each block: groups where captures name three or more, else pieces of the session."""
+    numbers = np.concatenate([np.full(len(b.r), i) for i, b in enumerate(case.evidence.blocks)])
+    groups = [case.model.frames[f].group for f in case.evidence.frames]
+    names = list(dict.fromkeys(groups))
+    if None not in names and len(names) > 2:
+        return [np.flatnonzero(np.isin(numbers, [i for i, g in enumerate(groups) if g == name])) for name in names]
+    return [piece for piece in np.array_split(np.argsort(order, kind="stable"), BLOCKS) if len(piece)]
