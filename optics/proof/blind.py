@@ -1,7 +1,7 @@
 """One cell: captures made, the loop run blind on them, and the record of what it said.
 
-The loop sees the captures alone. It is what a user does: calibrate, diagnose; add what a CLAIM names, or the pair that
-a PARTIAL verdict has found to be complete, and diagnose again, while more than one effect may be hidden."""
+The loop sees the captures alone. It is what a user does: calibrate, diagnose; add what a CLAIM names, and
+diagnose again, while more than one effect may be hidden."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import json
 import math
 import tempfile
 import time
+import traceback
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -22,13 +23,13 @@ from optics.fit.model import value_of
 from optics.proof.cells import Cell
 from optics.study import loop
 
-STEPS = 3  # effects that the loop may add where two are hidden
+STEPS = 3  # effects that the loop may add where two are hidden, or nobody says how many
 
 
 def run(rig, cell: Cell) -> dict:
     """The record of a cell: the truth, every diagnosis in short, and the time. Errors that the program means to raise
     are records too."""
-    clock = time.perf_counter()
+    clock, busy = time.perf_counter(), time.process_time()
     record = {
         "cell": cell.json(),
         "truth": {},
@@ -37,38 +38,35 @@ def run(rig, cell: Cell) -> dict:
         "unreachable": False,
         "coordinates": list(rig.unknown.get(cell.hidden[0], ())) if cell.kind == "unknown" else [],
     }
+    if rig.outside:
+        record["facts"] = rig.facts(cell)
     with tempfile.TemporaryDirectory() as folder:
         captures, study_folder = Path(folder) / "captures", Path(folder) / "study"
         record["truth"] = rig.make(captures, cell)
         if cell.hidden and not record["truth"]:
             return {**record, "unreachable": True}
         record["made"] = time.perf_counter() - clock
+        several = rig.outside or cell.kind == "pair"
+        # Readings of a stranger may break the program anywhere: whatever is raised on them is a crash to be counted.
+        errors = Exception if rig.outside else (ValueError, KeyError, ArithmeticError, np.linalg.LinAlgError)
         try:
             setup = rig.setup(captures, cell.seed)
             study, model, fit = loop.begin(setup, study_folder)
-            for _ in range(STEPS if cell.kind == "pair" else 1):
+            for _ in range(STEPS if several else 1):
                 diagnosis = loop.examine(study, model, setup, fit, advised=False)
                 record["steps"].append(_step(rig, model, cell, diagnosis))
-                added = _to_add(diagnosis)
-                if cell.kind != "pair" or not added:
+                if not several or diagnosis.word != "CLAIM":
                     break
-                record["steps"][-1]["added"] = added
-                for name in added:
-                    start = diagnosis.fits[name].values if name in diagnosis.fits and len(added) == 1 else None
-                    fit, _ = loop.extend(study, model, setup, fit, model.scene.registry.find_effect(name), start)
-        except (ValueError, KeyError, ArithmeticError, np.linalg.LinAlgError) as error:
+                name = diagnosis.missing
+                record["steps"][-1]["added"] = [name]
+                start = diagnosis.fits[name].values if name in diagnosis.fits else None
+                fit, _ = loop.extend(study, model, setup, fit, model.scene.registry.find_effect(name), start)
+        except errors as error:
+            last = traceback.extract_tb(error.__traceback__)[-1]
             record["failed"] = f"{type(error).__name__}: {error}"
-    record["seconds"] = time.perf_counter() - clock
+            record["where"] = f"{Path(last.filename).name}:{last.lineno}"
+    record["seconds"], record["cpu"] = time.perf_counter() - clock, time.process_time() - busy
     return plain(record)
-
-
-def _to_add(d: Diagnosis) -> list[str]:
-    if d.word == "CLAIM":
-        return [d.missing]
-    complete = [p for p in d.pairs if p.complete]
-    if d.word == "PARTIAL" and complete:
-        return list(max(complete, key=lambda p: p.fall).effects)
-    return []
 
 
 def _step(rig, model, cell: Cell, d: Diagnosis) -> dict:
@@ -97,9 +95,20 @@ def _step(rig, model, cell: Cell, d: Diagnosis) -> dict:
         "misfit": [level.held_out for level in d.levels],
         "complete": {r.name: r.refit.complete for r in refitted[:1]},
         "coordinates": [f.coordinate for f in d.fingerprints[:4]],
-        "pair": _to_add(d) if d.word == "PARTIAL" else [],
+        "explanations": [e.effects for e in d.survivors],
+        "correct": _correct(d, cell, rig.says_the_same(cell)),
         "strength": _strengths(rig, model, cell, d),
     }
+
+
+def _correct(d: Diagnosis, cell: Cell, same: Sequence[str]) -> float | None:
+    """P(correct) of the hidden effect against the rival that is hardest to tell from it, as printed; None where it was
+    not among the refitted."""
+    names = [name for name in (*cell.hidden, *same) if name in d.compared]
+    if len(cell.hidden) != 1 or not names:
+        return None
+    own = d.compared.index(names[0])
+    return min((p for k, p in enumerate(d.correct[own]) if k != own), default=1.0)
 
 
 def _close(rows: Sequence[Row], fall: Callable[[Row], float]) -> list[str]:

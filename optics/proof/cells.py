@@ -32,6 +32,8 @@ class Cell:
 
     kind     library, none, pair, unknown, mistake;   hidden   effects, or the unknown kind
     change   rms of the image's change by each, over its mean;   law   "same" as the library's, or "other"
+    snr      in place of `change` on benches of other laboratories: rms change per value over its noise
+    salt     tells cells apart that are else alike
     """
 
     rig: str
@@ -42,6 +44,8 @@ class Cell:
     law: str
     mistake: str
     seed: int
+    snr: float = 0.0
+    salt: int = 0
 
     @property
     def name(self) -> str:
@@ -54,6 +58,8 @@ class Cell:
             self.law,
         ]
         words += [self.mistake] if self.mistake else []
+        words += [f"snr{self.snr:g}"] if self.snr else []
+        words += [f"n{self.salt}"] if self.salt else []
         text = "_".join([*words, f"s{self.seed:03d}"])
         return "".join(ch if ch.isalnum() or ch in "+-._" else "-" for ch in text)
 
@@ -69,8 +75,12 @@ def rounds(rig, count: int, first: int = 0) -> Iterator[list[Cell]]:
     """Cells of one rig, round by round: every effect once, three sets with nothing hidden, unknown kinds, a pair, a
     mistake.
 
-    rig   with `name`, `effects`, `others` (effects with another law), `unknown`, `pairs`, `mistakes`, `cluttered`
+    rig   with `name`, `effects`, `others` (effects with another law), `unknown`, `pairs`, `mistakes`, `cluttered`; one
+          of another laboratory (`outside`) has `rounds` of its own
     """
+    if rig.outside:
+        yield from rig.rounds(count, first)
+        return
     effects = list(rig.effects)
     for number in range(first, first + count):
         rng = np.random.default_rng([number, 23])

@@ -19,47 +19,10 @@ from dataclasses import asdict, dataclass, field
 import numpy as np
 
 from optics.diagnosis.thresholds import CLEAR, LEVEL
+from optics.proof.elsewhere import Elsewhere, elsewhere
+from optics.proof.rates import Rate, last, named, rate_of
 
 CLEAN = 0.0
-
-
-@dataclass(frozen=True)
-class Rate:
-    """k of n, its 95 % interval, and the targets ('at least', or 'at most' where `low` is good)."""
-
-    name: str
-    k: int
-    n: int
-    first: float
-    ambitious: float
-    low: bool = False
-
-    @property
-    def value(self) -> float:
-        return self.k / self.n if self.n else float("nan")
-
-    @property
-    def interval(self) -> tuple[float, float]:
-        from scipy.stats import binomtest
-
-        if not self.n:
-            return 0.0, 1.0
-        ci = binomtest(self.k, self.n).proportion_ci(0.95, method="exact")
-        return float(ci.low), float(ci.high)
-
-    def reached(self, target: float) -> bool:
-        return self.interval[1] <= target if self.low else self.interval[0] >= target
-
-    @property
-    def verdict(self) -> str:
-        if not self.n:
-            return "no cells"
-        if self.reached(self.ambitious):
-            return "ambitious"
-        if self.reached(self.first):
-            return "first release"
-        beyond = self.interval[0] > self.first if self.low else self.interval[1] < self.first
-        return "MISSED" if beyond else "open"  # open: the interval holds the target, more cells would tell
 
 
 @dataclass
@@ -82,6 +45,7 @@ class Count:
     held_out: list[float]
     seconds: float
     rigs: dict[str, Count] = field(default_factory=dict)
+    elsewhere: Elsewhere | None = None  # benches of other laboratories, which have rates of their own
 
     def rate(self, name: str) -> Rate:
         return next(r for r in self.rates if r.name == name)
@@ -89,7 +53,8 @@ class Count:
     @property
     def holds(self) -> bool:
         """Whether no target of the first release is missed for certain."""
-        return all(r.verdict != "MISSED" for r in self.rates)
+        rates = [*self.rates, *(self.elsewhere.rates if self.elsewhere else [])]
+        return all(r.verdict != "MISSED" for r in rates)
 
     def text(self) -> str:
         """For a terminal."""
@@ -135,23 +100,13 @@ class Count:
                 )
             if one.held_out:
                 lines.append(f"  held-out chi2 per value after a right claim: median {np.median(one.held_out):.3f}")
+        lines = [] if self.elsewhere and not self.done else lines
         lines += [f"failed: {f}" for f in self.failed[:10]]
+        lines += ["", *self.elsewhere.lines()] if self.elsewhere else []
         return "\n".join(lines) + "\n"
 
     def json(self) -> dict:
         return asdict(self)
-
-
-def _last(r: dict) -> dict:
-    return r["steps"][-1]
-
-
-def named(r: dict) -> set[str]:
-    """All effects that the loop added, claimed, or named as two that together leave nothing."""
-    found = set()
-    for step in r["steps"]:
-        found |= {*step.get("added", ()), *step.get("pair", ()), *filter(None, [step["claimed"]])}
-    return found
 
 
 def _some(good: Sequence[dict], kind: str, test: Callable[[dict], bool] = lambda c: True) -> list[dict]:
@@ -168,16 +123,12 @@ def _hidden(r: dict):
     return r["cell"]["hidden"]
 
 
-def _rate(name, of: Sequence[dict], test: Callable[[dict], bool], first, ambitious, low=False) -> Rate:
-    return Rate(name, sum(bool(test(r)) for r in of), len(of), first, ambitious, low)
-
-
 def _named_rates(good: Sequence[dict]) -> list[Rate]:
     """How often the right effect is named first, stands in the set, and is claimed; how often nothing or another is."""
     own, clean = _own(good)
     middle = [r for r in clean if r["cell"]["change"] == 0.005]
     weak = [r for r in clean if r["cell"]["change"] == 0.002]
-    shown = [r for r in weak if _last(r)["p_best"] < LEVEL]
+    shown = [r for r in weak if last(r)["p_best"] < LEVEL]
     none, pair = _some(good, "none"), _some(good, "pair")
     calm = [r for r in none if r["cell"]["clutter"] == CLEAN]
 
@@ -188,30 +139,30 @@ def _named_rates(good: Sequence[dict]) -> list[Rate]:
         return named(r) <= set(_hidden(r))
 
     return [
-        _rate(
+        rate_of(
             "top-1 after refit, 0.5 %, no clutter",
             middle,
-            lambda r: [_last(r)["claimed"] or (_last(r)["refit"] or [""])[0]] == _hidden(r),
+            lambda r: [last(r)["claimed"] or (last(r)["refit"] or [""])[0]] == _hidden(r),
             0.95,
             0.99,
         ),
-        _rate(
-            "top-3 by score, 0.5 %, no clutter", middle, lambda r: _hidden(r)[0] in _last(r)["score"][:3], 0.97, 0.99
+        rate_of(
+            "top-3 by score, 0.5 %, no clutter", middle, lambda r: _hidden(r)[0] in last(r)["score"][:3], 0.97, 0.99
         ),
-        _rate("in the set, 0.2 %, no clutter", weak, lambda r: _hidden(r)[0] in _last(r)["set"], 0.97, 0.99),
-        _rate(
+        rate_of("in the set, 0.2 %, no clutter", weak, lambda r: _hidden(r)[0] in last(r)["set"], 0.97, 0.99),
+        rate_of(
             "in the set, 0.2 %, no clutter, where one stands out",
             shown,
-            lambda r: _hidden(r)[0] in _last(r)["set"],
+            lambda r: _hidden(r)[0] in last(r)["set"],
             0.97,
             0.99,
         ),
-        _rate(
-            "an effect stands out where none is hidden", calm, lambda r: _last(r)["p_best"] < LEVEL, 0.03, 0.015, True
+        rate_of(
+            "an effect stands out where none is hidden", calm, lambda r: last(r)["p_best"] < LEVEL, 0.03, 0.015, True
         ),
-        _rate("claims where none is hidden, any clutter", none, named, 0.03, 0.01, True),
-        _rate("precision of claims, own law, any clutter", claims([*own, *pair, *none]), right, 0.95, 0.99),
-        _rate(
+        rate_of("claims where none is hidden, any clutter", none, named, 0.03, 0.01, True),
+        rate_of("precision of claims, own law, any clutter", claims([*own, *pair, *none]), right, 0.95, 0.99),
+        rate_of(
             "precision of claims, another law",
             claims(_some(good, "library", lambda c: c["law"] == "other")),
             right,
@@ -228,24 +179,24 @@ def _size_rates(good: Sequence[dict]) -> list[Rate]:
     for clutter, first, ambitious in ((0.0, 0.8, 0.9), (0.15, 0.7, 0.85), (0.5, 0.5, 0.65), (1.0, 0.3, 0.5)):
         of = [r for r in own if r["cell"]["change"] == 0.02 and r["cell"]["clutter"] == clutter]
         rates.append(
-            _rate(
+            rate_of(
                 f"right claims, 2 %, clutter {clutter:g}", of, lambda r: named(r) == set(_hidden(r)), first, ambitious
             )
         )
-    judged = [r for r in own if _last(r)["strength"]]
+    judged = [r for r in own if last(r)["strength"]]
     seen = [r for r in clean if r["cell"]["change"] <= 0.005 and _fall(r)]
     return rates + [
-        _rate("unknown kinds falsely claimed", unknown, named, 0.10, 0.03, True),
-        _rate(
+        rate_of("unknown kinds falsely claimed", unknown, named, 0.10, 0.03, True),
+        rate_of(
             "unknown kind's coordinate in the top two, no clutter",
             [r for r in unknown if r["cell"]["clutter"] == CLEAN],
-            lambda r: set(r["coordinates"]) & set(_last(r)["coordinates"][:2]),
+            lambda r: set(r["coordinates"]) & set(last(r)["coordinates"][:2]),
             0.75,
             0.90,
         ),
-        _rate("pairs named exactly, 1 % + 1 %, no clutter", pair, lambda r: named(r) == set(_hidden(r)), 0.85, 0.95),
-        _rate("strength within 20 % where claimed", judged, lambda r: abs(_ratio(r) - 1) < 0.2, 0.80, 0.95),
-        _rate(
+        rate_of("pairs named exactly, 1 % + 1 %, no clutter", pair, lambda r: named(r) == set(_hidden(r)), 0.85, 0.95),
+        rate_of("strength within 20 % where claimed", judged, lambda r: abs(_ratio(r) - 1) < 0.2, 0.80, 0.95),
+        rate_of(
             "fall of chi2 within 20 % of its prediction, to 0.5 %",
             seen,
             lambda r: abs(_fall(r) - 1) < 0.2,
@@ -269,13 +220,13 @@ def _told(good: Sequence[dict]) -> tuple[dict[str, dict[str, int]], dict[str, di
             "mistake": f"noise mistaken: {c['mistake']}",
         }[c["kind"]]
         names, true = named(r), set(_hidden(r))
-        told = next(iter(names), _last(r)["word"])
+        told = next(iter(names), last(r)["word"])
         if c["kind"] == "pair" and names:
             told = "both" if names == true else "one of two" if names < true else "another"
         confusion.setdefault(kind, {}).setdefault(told, 0)
         confusion[kind][told] += 1
-        words.setdefault(c["kind"], {}).setdefault(_last(r)["word"], 0)
-        words[c["kind"]][_last(r)["word"]] += 1
+        words.setdefault(c["kind"], {}).setdefault(last(r)["word"], 0)
+        words[c["kind"]][last(r)["word"]] += 1
     return confusion, words
 
 
@@ -290,7 +241,9 @@ def _power(clean: Sequence[dict]) -> dict[str, dict[str, list[int]]]:
 
 
 def count(records: Sequence[dict], planned: int, parts: bool = True) -> Count:
-    """Count records; `planned`: how many cells the plan has."""
+    """Count records; `planned`: how many cells the plan has. Those of other laboratories are counted by themselves."""
+    others = [r for r in records if r.get("facts") is not None]
+    records = [r for r in records if r.get("facts") is None]
     made = [r for r in records if not r["unreachable"]]
     failed = [
         f"{r['cell']['rig']} {'+'.join(r['cell']['hidden'])} s{r['cell']['seed']}: {r['failed']}"
@@ -302,11 +255,9 @@ def count(records: Sequence[dict], planned: int, parts: bool = True) -> Count:
     own, clean = _own(good)
     weak = [r for r in clean if r["cell"]["change"] == 0.002]
     seen = [r for r in clean if r["cell"]["change"] <= 0.005 and _fall(r)]
-    judged = [r for r in own if _last(r)["strength"]]
+    judged = [r for r in own if last(r)["strength"]]
     calm = [r for r in _some(good, "none") if r["cell"]["clutter"] == CLEAN]
-    ties = [
-        r for r in [*own, *_some(good, "library", lambda c: c["law"] == "other")] if _last(r)["word"] == "AMBIGUOUS"
-    ]
+    ties = [r for r in [*own, *_some(good, "library", lambda c: c["law"] == "other")] if last(r)["word"] == "AMBIGUOUS"]
     confusion, words = _told(good)
     pulls = {
         "no clutter": [_pull(r) for r in judged if r["cell"]["clutter"] == CLEAN and _pull(r) is not None],
@@ -322,32 +273,33 @@ def count(records: Sequence[dict], planned: int, parts: bool = True) -> Count:
         confusion,
         words,
         _power(clean),
-        (sum(_hidden(r)[0] in _last(r)["ambiguous"] for r in ties), len(ties)),
-        float(np.mean([len(_last(r)["set"]) for r in weak])) if weak else None,
+        (sum(_hidden(r)[0] in last(r)["ambiguous"] for r in ties), len(ties)),
+        float(np.mean([len(last(r)["set"]) for r in weak])) if weak else None,
         pulls,
         falls,
-        [_last(r)["p_best"] for r in calm],
-        [_last(r)["held_out"][-1] for r in own if named(r) == set(_hidden(r)) and _last(r)["held_out"][-1] is not None],
+        [last(r)["p_best"] for r in calm],
+        [last(r)["held_out"][-1] for r in own if named(r) == set(_hidden(r)) and last(r)["held_out"][-1] is not None],
         float(sum(r.get("seconds", 0.0) for r in records)),
     )
     if parts:
         names = sorted({r["cell"]["rig"] for r in records})
         found.rigs = {n: count([r for r in records if r["cell"]["rig"] == n], planned, parts=False) for n in names}
+        found.elsewhere = elsewhere(others)
     return found
 
 
 def _ratio(r: dict) -> float:
-    name, (found, _) = next(iter(_last(r)["strength"].items()))
+    name, (found, _) = next(iter(last(r)["strength"].items()))
     return abs(found) / abs(r["truth"][name])  # of some, such as a stop between two lobes, the sign is not seen
 
 
 def _fall(r: dict) -> float | None:
     """Fall of chi2 by the hidden effect over its prediction, where that says that there is something; None
     elsewhere."""
-    before, after = _last(r)["falls"].get(r["cell"]["hidden"][0], (0.0, 0.0))
+    before, after = last(r)["falls"].get(r["cell"]["hidden"][0], (0.0, 0.0))
     return after / before if before > CLEAR else None
 
 
 def _pull(r: dict) -> float | None:
-    name, (found, sd) = next(iter(_last(r)["strength"].items()))
+    name, (found, sd) = next(iter(last(r)["strength"].items()))
     return (found - r["truth"][name]) / sd if isinstance(sd, float) and sd > 0 else None

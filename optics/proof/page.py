@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from optics.files.output import write_text
-from optics.proof.count import Count, Rate, _last, named
+from optics.proof.count import Count
+from optics.proof.rates import Rate, last, named
 
 INK, GOOD, BAD, SOFT = "#26323c", "#1d5fa6", "#b22f33", "#d9b36c"
 
@@ -32,31 +33,34 @@ def write(found: Count, records: Sequence[dict], file: Path) -> Path:
                 "kind": r["cell"]["kind"],
                 "hidden": " + ".join(r["cell"]["hidden"]) or "nothing",
                 "change": 100 * r["cell"]["change"],
+                "snr": r["cell"].get("snr", 0.0),
                 "clutter": r["cell"]["clutter"],
                 "law": r["cell"]["law"],
                 "mistake": r["cell"]["mistake"],
                 "seed": r["cell"]["seed"],
-                "word": _last(r)["word"].replace("_", " ") if r["steps"] else "",
-                "named": " + ".join(sorted(named(r))) or ", ".join(_last(r)["ambiguous"] if r["steps"] else []),
+                "word": " then ".join(s["word"].replace("_", " ") for s in r["steps"]),
+                "named": " + ".join(sorted(named(r))) or ", ".join(last(r)["ambiguous"] if r["steps"] else []),
                 "right": _right(r),
-                "note": r["failed"] or (_last(r)["sentence"] if r["steps"] else "cannot be made that strong"),
+                "note": r["failed"] or (last(r)["sentence"] if r["steps"] else "cannot be made that strong"),
             }
             for r in records
         ),
         key=lambda c: (c["rig"], c["kind"], c["hidden"], c["change"], c["clutter"], c["seed"]),
     )
-    figures = {
-        "confusion": confusion(found),
-        "power": power(found),
-        "falls": falls(records),
-        "pulls": pulls(found),
-        "nulls": nulls(found),
-    }
+    figures = {}
+    if found.done:
+        figures = {
+            "confusion": confusion(found),
+            "power": power(found),
+            "falls": falls(records),
+            "pulls": pulls(found),
+            "nulls": nulls(found),
+        }
     html = environment.get_template("page.html.j2").render(
         found=found,
         figures=figures,
         cells=cells,
-        tables=[("all", found), *(found.rigs.items() if len(found.rigs) > 1 else [])],
+        tables=[("all", found), *(found.rigs.items() if len(found.rigs) > 1 else [])] if found.done else [],
     )
     for path, text in ((file, html), (file.with_name("proof.json"), json.dumps(found.json(), indent=1))):
         write_text(path, text)
@@ -67,14 +71,14 @@ def _right(r: dict) -> str:
     """'right', 'wrong' or '' (nothing claimed)."""
     if not r["steps"] or not named(r):
         return ""
-    return "right" if r["cell"]["kind"] in ("library", "pair") and named(r) <= set(r["cell"]["hidden"]) else "wrong"
+    same = (r.get("facts") or {}).get("same", {})
+    true = {*r["cell"]["hidden"], *(name for names in same.values() for name in names)}
+    return "right" if r["cell"]["kind"] in ("library", "pair") and named(r) <= true else "wrong"
 
 
 def _svg(draw, width: float = 5.2, height: float = 3.4) -> str:
     import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
+    from matplotlib.figure import Figure
 
     with matplotlib.rc_context(
         {
@@ -87,13 +91,10 @@ def _svg(draw, width: float = 5.2, height: float = 3.4) -> str:
             "svg.hashsalt": "proof",
         }
     ):
-        figure, axes = plt.subplots(figsize=(width, height), layout="constrained")
-        try:
-            draw(axes)
-            out = io.StringIO()
-            figure.savefig(out, format="svg", transparent=True, metadata={"Date": None})
-        finally:
-            plt.close(figure)
+        figure = Figure(figsize=(width, height), layout="constrained")
+        draw(figure.subplots())
+        out = io.StringIO()
+        figure.savefig(out, format="svg", transparent=True, metadata={"Date": None})
     text = out.getvalue()
     return text[text.index("<svg") :]
 
@@ -174,8 +175,8 @@ def falls(records: Sequence[dict]) -> str:
     points = [
         (before, after, name in r["cell"]["hidden"])
         for r in records
-        if r["steps"] and not r["failed"] and r["cell"]["kind"] == "library"
-        for name, (before, after) in _last(r)["falls"].items()
+        if r["steps"] and not r["failed"] and r["cell"]["kind"] == "library" and r.get("facts") is None
+        for name, (before, after) in last(r)["falls"].items()
         if before > 1 and after > 1
     ]
 

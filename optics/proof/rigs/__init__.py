@@ -6,12 +6,30 @@ touch    digit, gelsight: stock Mitsuba's `path` (optics.proof.makers.touch)
 finger   vi2tap: stock films in the mono variant (optics.proof.makers.finger)
 grid     grid_bench: stock `volpath` (optics.proof.makers.grid)
 bench    polarizer_bench: coherency matrices (optics.proof.makers.bench)
+laboratory   student, motor, polarimeter, phone, photographs, polarization_camera: benches of other
+         laboratories, by plain formulas (optics.proof.makers.laboratory)
 """
 
 from optics.proof.rigs.base import Rig
 from optics.proof.rigs.bench import Bench
 from optics.proof.rigs.finger import Finger
 from optics.proof.rigs.grid import Grid
+from optics.proof.rigs.laboratory import Motor, Phone, Photographs, Polarimeter, PolarizationCamera, Student
 from optics.proof.rigs.touch import Digit, Gelsight
 
-RIGS: dict[str, type[Rig]] = {rig.name: rig for rig in (Digit, Gelsight, Finger, Grid, Bench)}
+RIGS: dict[str, type[Rig]] = {
+    rig.name: rig
+    for rig in (
+        Digit,
+        Gelsight,
+        Finger,
+        Grid,
+        Bench,
+        Student,
+        Motor,
+        Polarimeter,
+        Phone,
+        Photographs,
+        PolarizationCamera,
+    )
+}

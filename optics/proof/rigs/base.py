@@ -41,6 +41,7 @@ class Rig:
     free: tuple[str, ...] = ()
     defines: Mapping[str, str] = {}
     held_out: tuple[str, ...] | None = None
+    outside = False  # a bench of another laboratory, which plans and counts its cells by itself
 
     def __init__(self):
         self._strengths: dict[tuple[str, float], float] = {}
@@ -60,6 +61,10 @@ class Rig:
         """({key: weight}, start) of the sum of parameters that a hidden strength is, from its start; None: nothing to
         compare with."""
         raise NotImplementedError
+
+    def says_the_same(self, cell: Cell) -> Sequence[str]:
+        """Effects of the library that mean what is hidden, besides its own name."""
+        return ()
 
     # -- what follows -------------------------------------------------------------------------------------------------
     def strength(self, effect: str, change: float) -> float:
