@@ -226,11 +226,48 @@ FINGER_POINT = {
     "markers.pitch_y": 6.0,
 }
 
+# Each region is polarized in another way and none along an axis of the mosaic; the film and the sheet are in.
+CAMERA_POINT = {
+    **{k: v for k, v in POLARIZER_POINT.items() if k.startswith(("camera.", "polarizer.", "sample."))},
+    "camera.x": -58.0,  # looks aslant at the panel's middle, where its regions meet
+    "camera.y": -75.0,
+    "camera.exposure": 3.0,
+    "panel.power": 0.8,
+    "panel.power_r": 0.9,
+    "panel.power_g": 1.1,
+    "panel.power_b": 0.7,
+    "panel.level_1": 1.4,
+    "panel.level_2": 0.7,
+    "panel.dop_q": 0.1,
+    "panel.dop_u": -0.05,
+    "panel.dop_q_1": -0.2,
+    "panel.dop_u_1": 0.15,
+    "panel.dop_q_2": 0.25,
+    "panel.dop_u_3": 0.3,
+    "panel.drift": 0.02,
+    "panel.time": 3.0,
+}
+
 POINTS = {  # scene: (what replaces its <default>s, values)
     "gelsight": ({"width": WIDTH, "height": HEIGHT, "depth": 0.5}, WORKING_POINT),
     "polarizer_bench": (
         {"width": 8, "height": 6, "x_fov": 7, "bands": "620, 540, 460", "middle": 1, "pattern": "disc"},
         POLARIZER_POINT,
+    ),
+    "reflection_bench": (
+        {"width": 8, "height": 6, "x_fov": 7, "bands": "620, 540, 460"},
+        {
+            **POLARIZER_POINT,
+            "camera.exposure": 40.0,
+            "plate.incidence": 50.0,
+            "plate.plane": 8.0,
+            "plate.scatter": 2e-3,
+        },
+    ),
+    "polariscope": ({"width": 8, "height": 6, "x_fov": 7, "bands": "620, 540, 460"}, POLARIZER_POINT),
+    "polarization_camera": (
+        {"width": 8, "height": 6, "x_fov": 7, "bands": "620, 540, 460", "polarizer": 1, "sample_regions": "halves"},
+        CAMERA_POINT,
     ),
     "vi2tap": ({"width": 32, "height": 24, "x_fov": 45, "depth": 1, "wall_dark": 1}, FINGER_POINT),
 }

@@ -31,7 +31,7 @@ NUMBERS = [
 LAYERS = [kind for kind in PARTS if REGISTRY.parts[kind].mueller is not None]
 POWERS = ("power", "band power")  # roles
 MOVED = ("carried", "markers", "target")  # kinds of shapes that a scene moves besides the gel
-LAYERED = ("layer", "glow")  # stages whose functions are differentiated by complex step
+LAYERED = ("layer", "detector", "glow")  # stages whose functions are differentiated by complex step
 SECTIONS = ("Definition", "Fingerprint", "Validity", "References")
 UNITS = {"1", "mm", "mm^2", "deg", "rad", "nm", "px", "px^2", "DN", "1/mm", "1/mm^2", "MPa", "1e-12/Pa", "-"}
 
@@ -268,11 +268,18 @@ def bench_of(benches, mitsuba):
             brought = [p.name for p in (*effect.parameters, *effect.shape) if not isinstance(p, str)]
             if effect.part == part.kind and name in brought:
                 kinds += effect.requires
-        for shipped_scene in sorted(scene.shipped_scenes(), key=lambda n: (n != "gelsight", n)):
+        for shipped_scene in sorted(
+            scene.shipped_scenes(),
+            key=lambda n: (n != "gelsight", n.startswith("polari") and n != "polarizer_bench", n),
+        ):
             text = scene.find(shipped_scene).read_text(encoding="utf-8")
             if 'type="clear"' not in text and all(f'type="{kind}"' in text for kind in kinds):
-                used.append(benches(shipped_scene))
-                return used[-1]
+                bench = benches(shipped_scene)
+                named = thing.parameter_names if isinstance(thing, Effect) else (name,) if name else ()
+                holders = [p for p in bench.scene.parts.values() if p.kind == kinds[0]]
+                if all(any(p.takes(n) for p in holders) for n in named):
+                    used.append(bench)
+                    return bench
         if part.mueller is not None:
             used.append(benches("polarizer_bench", slot=part.kind))
             return used[-1]

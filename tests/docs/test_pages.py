@@ -44,6 +44,29 @@ def test_the_example_of_captures_toml_is_read(tmp_path):
     assert found.scene == "gelsight" and found.frames[0].parameters["gel.press_depth"] == 0.5
 
 
+def test_the_examples_of_tables_are_read(tmp_path):
+    """Volts with semicolons and decimal commas, whole lux with a column of uncertainties; what is known besides."""
+    from optics.captures import capture_set as captures
+
+    text = page("captures")
+    (tmp_path / "readings.txt").write_text(re.search(r"```text\n(.*?)```", text, re.DOTALL)[1], encoding="utf-8")
+    (tmp_path / "lux.csv").write_text("analyzer.angle,sd,lux\n0,1,705\n10,2,699\n", encoding="utf-8")
+    known, volts, lux = re.findall(r"```toml\n(scene = \"polarizer_bench\".*?)```", text, re.DOTALL)
+    read = {}
+    for name, content in (
+        ("known", known + '[table]\nfile = "lux.csv"\nvalues = ["sd"]\nrename = {"lux" = "source.time"}\n'),
+        ("volts", volts),
+        ("lux", lux),
+    ):
+        (tmp_path / "captures.toml").write_text(content, encoding="utf-8")
+        read[name] = captures.load(tmp_path)
+    assert read["known"].bands == [470, 530, 625] and read["known"].uncertainty["polarizer.angle"] == 1.0
+    assert [f.group for f in read["volts"].frames] == ["up", "up", "down"]
+    assert float(read["volts"].frames[2].image.item()) == pytest.approx(1000 * -0.00102 + 2.5)
+    assert read["volts"].frames[1].parameters["analyzer.angle"] == pytest.approx(0.2498, abs=1e-4)  # deg
+    assert [f.uncertainty for f in read["lux"].frames] == [{"analyzer.angle": 1.0}, {"analyzer.angle": 2.0}]
+
+
 def test_every_stage_has_its_row():
     from optics.scene.declare import STAGES
 
@@ -101,14 +124,15 @@ def test_the_limits_of_the_method_page_are_the_programs():
     text = " ".join(page("method").split())
     for sentence in (
         f"p below {v.LEVEL:g}",
-        f"falls by {v.CLEAR:g} more",
-        f"{v.MARGIN:.0%} ahead".replace("%", " %"),
+        f"{v.TOLD:.1f} in score",
+        f"half of what it leaves, or {v.MARGIN:.0%} of its fall".replace("%", " %"),
         f"explains {v.RIVAL_CURVE:g} times as much ({v.RIVAL:g} times for a map of the sensor)",
+        f"carries {v.CARRIED:.0%} of the fall".replace("%", " %"),
         f"more than {v.SHARE:.0%} of the excess".replace("%", " %"),
         f"below {v.FAR:.0%} of the mean signal".replace("%", " %"),
     ):
         assert sentence in text, f"the method page does not say: {sentence}"
-    assert v.STRENGTH == 2 and "two standard deviations from none" in text
+    assert v.HALF == 0.5 and v.STRENGTH == 2 and "two standard deviations from none" in text
 
 
 def test_readme_says_what_the_front_door_offers():

@@ -143,7 +143,11 @@ def plain(benches):
     return load
 
 
-@pytest.mark.parametrize("name", SCENES)
+# Two of them compile for more than a minute where Dr.Jit's cache of kernels is empty: among the slow tests.
+LONG = ("vi2tap", "grid_bench")
+
+
+@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n in LONG else n for n in SCENES])
 def test_reverse_mode_is_forward_mode_and_differences(name, plain):
     scene = plain(name)
     single = [path for path, (part, _) in scene.numbers.items() if part.name in scene.single]

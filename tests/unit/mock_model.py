@@ -65,6 +65,7 @@ class Exact:
     monte_carlo = False
     captures = None
     driven = None  # what a frame sets is a light's power itself
+    drives: frozenset[str] = frozenset()
 
     @property
     def size(self) -> float:

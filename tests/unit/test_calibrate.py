@@ -228,6 +228,59 @@ def test_far_from_the_best_a_factor_moves_straight():
     assert descent.step(0.0)[0] == pytest.approx(np.exp(0.5))
 
 
+class Lamps(Exact):
+    """Frames in which each lamp of a scene shines alone, y = power (1 + x): one lamp is dead."""
+
+    def __init__(self, light):
+        self.noise = Noise(system_gain=0.02, dark_noise=1.0, black_level=64.0, saturation=4095.0, prnu=0.0)
+        self.shape = (4, 4, 1)
+        self.pattern = 1 + np.arange(16.0).reshape(self.shape)
+        power = Parameter("power", "1", 1.0, (0.0, 1e6), linear=True, plausible=0.1)
+        self.parameters = {f"led_{i}.power": power for i in range(len(light))}
+        self.base = dict.fromkeys(self.parameters, 1.0)
+        noise = np.random.default_rng(0).normal(size=(len(light), *self.shape))
+        self.frames = [Frame(f"f{i}", 64 + p * self.pattern + e) for i, (p, e) in enumerate(zip(light, noise))]
+
+    def linear_in(self, variable):
+        return True
+
+    def predict(self, values, frames=None, seed=0):
+        return [64 + self.at(values, i)[f"led_{i}.power"] * self.pattern for i in frames]
+
+    def derivatives(self, values, variables, frames=None, secant=None, seed=0):
+        for i, image in zip(frames, self.predict(values, frames)):
+            yield image, {v.name: self.pattern for v in variables if v.keys[0] == f"led_{i}.power"}
+
+
+def lamps(light):
+    model = Lamps(light)
+    return model, [Variable(k, (k,), p) for k, p in model.parameters.items()]
+
+
+@pytest.mark.parametrize("start", [1e-6, 1.0, 1e5])
+def test_powers_are_solved_for_before_the_first_step(start):
+    """They are linear: two linearisations, the second with the noise of the right brightness, serve any start."""
+    model, variables = lamps([30.0, 200.0])
+    found = fit(model, variables, Values(dict.fromkeys(model.parameters, start)))
+    assert found.converged and len(found.history) <= 2
+    assert np.abs(found.estimate - [30.0, 200.0]).max() < 4 * found.sd.max()
+
+
+def test_a_factor_falls_but_is_not_switched_off():
+    """A dead lamp ends within its error of 0 and is named; none of the steps there is more than tenfold."""
+    model, variables = lamps([50.0, -0.5])  # darker than black by half a DN, as a wrong black level makes it
+    seen = []
+    predict = model.predict
+    model.predict = lambda values, *a, **k: seen.append(values.common["led_1.power"]) or predict(values, *a, **k)
+    found = fit(model, variables, Values(dict.fromkeys(model.parameters, 50.0)))
+    assert found.converged and 0 < found.estimate[1] < found.sd[1] and found.at_bound == ["led_1.power"]
+    assert min(b / a for a, b in zip(seen, seen[1:])) >= 0.1 * (1 - 1e-9)
+    off = fit(model, variables, Values({"led_0.power": 50.0, "led_1.power": 0.0}))
+    assert off.estimate[1] == 0.0 and off.at_bound == ["led_1.power"]  # a lamp that is off may stay off
+    light, variables = lamps([50.0, 40.0])
+    assert fit(light, variables, Values({"led_1.power": 0.0})).estimate[1] == pytest.approx(40.0, rel=0.02)
+
+
 def test_an_effect_may_do_nothing_in_a_dark_frame():
     model = Twice(np.random.default_rng(0))
     model.frames.append(Frame("dark", model.noise.sd(0.0) * np.ones(model.shape)))

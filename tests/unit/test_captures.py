@@ -62,6 +62,7 @@ def folder(tmp_path):
     exr.write(frames / "depth.exr", {"depth.Z": np.ones((6, 8)), "Y": np.ones((6, 8))})
     (tmp_path / "malus.csv").write_text("angle (rad),reading\n0.0,100\n0.7853981634,50.5\n1.5707963268,1\n")
     (tmp_path / "bad.csv").write_text("analyzer.angle,reading\n0,1\n10,nan\n20,dark\n30\n")
+    (tmp_path / "spread.csv").write_text("analyzer.angle,sd,reading\n0,1,10\n10,-1,9\n")
     (tmp_path / "scene.xml").write_text("<scene version='3.0.0'/>")
     return tmp_path
 
@@ -106,6 +107,105 @@ def test_table_rows_become_frames_of_one_pixel(folder):
     assert [f.parameters["analyzer.angle"] for f in c.frames] == pytest.approx(
         [0, 45, 90], abs=1e-6
     )  # ten digits in the file
+
+
+DIODE = """# an instrument's own header, which is not read
+made on a Monday; 20 readings
+run;Winkel/rad;sd/deg;U/V
+a;0;0,25;1,002
+a;0;0,25;0,998
+
+b;1,5;1;-0,104
+b;1,5;1;-0,101
+"""
+DIODE_TOML = """scene = "bench"
+bands = [540]
+absent = ["sample"]
+[uncertainty]
+"polarizer.angle" = 0.5
+[parameters]
+"polarizer.angle" = 10
+[exclude]
+"gain drift" = "fixed gain, checked before and after"
+[table]
+file = "diode.txt"
+values = ["U/V"]
+delimiter = ";"
+decimal = ","
+skip = 2
+group = "run"
+rename = { "Winkel/rad" = "analyzer.angle" }
+scale = { "analyzer.angle" = 57.29577951, "U/V" = 1000 }
+offset = { "analyzer.angle" = 3.0, "U/V" = 100 }
+uncertainty = { "analyzer.angle" = "sd/deg" }
+"""
+
+
+def test_a_table_as_an_instrument_writes_it(folder):
+    """A photodiode in volts: semicolons, decimal commas, lines above the header, a negative reading."""
+    (folder / "diode.txt").write_text(DIODE)
+    c = load(folder, DIODE_TOML)
+    assert (c.bands, c.absent, c.uncertainty) == ([540.0], ["sample"], {"polarizer.angle": 0.5})
+    assert c.exclude == {"gain drift": "fixed gain, checked before and after"}
+    values = [float(f.image[0, 0, 0]) for f in c.frames]
+    assert values == pytest.approx([1102, 1098, -4, -1])  # 1000 U + 100: below 0 it is a reading like any other
+    assert [f.parameters["analyzer.angle"] for f in c.frames] == pytest.approx([3, 3, 88.943669, 88.943669])
+    assert [f.uncertainty for f in c.frames] == [{"analyzer.angle": sd} for sd in (0.25, 0.25, 1.0, 1.0)]
+    assert captures.groups(c) == {"a": [0, 1], "b": [2, 3]}
+    assert c.step == pytest.approx(1.0)  # 0.001 V, times 1000
+    assert sum("not known" in w for w in c.warnings) == 1 and not any("repeats" in w for w in c.warnings)
+    assert c.uncertainty_of(c.frames[2]) == {"analyzer.angle": 1.0}
+
+
+@pytest.mark.parametrize(
+    ("delimiter", "text"),
+    [
+        ("\\t", "a.b\treading\n1\t2.5\n3\t4\n"),
+        (" ", "  a.b   reading\n 1  2.5\n3       4\n"),
+        (";", "a.b;reading;\n1;2.5;\n3;4;\n"),  # a delimiter at the end of each line
+    ],
+)
+def test_delimiters(folder, delimiter, text):
+    (folder / "malus.csv").write_text(text)
+    c = load(folder, BENCH + f'delimiter = "{delimiter}"\n')
+    assert [(f.parameters, float(f.image.item())) for f in c.frames] == [({"a.b": 1.0}, 2.5), ({"a.b": 3.0}, 4.0)]
+
+
+def test_scale_may_name_a_column_as_it_is_in_the_file(folder):
+    c = load(folder, BENCH + 'rename = { "angle (rad)" = "a.b" }\nscale = { "angle (rad)" = 57.29577951 }\n')
+    assert [f.parameters["a.b"] for f in c.frames] == pytest.approx([0, 45, 90], abs=1e-6)
+
+
+def test_of_a_table_the_noise_is_one_number_and_nothing_is_masked(folder):
+    """A lux meter: no saturation, no black level, no gain; readings at and below 0 are used."""
+    (folder / "malus.csv").write_text("a.b,reading\n0,705\n45,350\n90,0\n90,-2\n")
+    c = load(folder, BENCH + "[noise]\ndark_noise = 2.0\n")
+    assert not c.noise.ends and c.noise.signed and c.noise.system_gain == 0 and c.noise.saturation == 705
+    assert all(c.noise.usable(f.image).all() for f in c.frames)
+    assert float(c.noise.variance(-2.0)) == pytest.approx(4 + 1 / 12)  # whole lux
+    ends = load(folder, BENCH + "[noise]\ndark_noise = 2.0\nsaturation = 720\n")
+    assert [bool(ends.noise.usable(f.image).all()) for f in ends.frames] == [False, True, True, True]
+    assert not any("not known" in w for w in ends.warnings)
+    with pytest.raises(BadCapture, match=r"dark_noise \(DN, rms\) missing; give the standard deviation of a reading"):
+        load(folder, BENCH + "[noise]\nsaturation = 720\n")
+
+
+def test_a_flat_field_per_frame(folder):
+    for name, level in (("red", 100), ("green", 50)):
+        Image.fromarray(np.full((6, 8), level, np.uint8)).save(folder / f"{name}.png")
+    c = load(
+        folder,
+        'scene = "bench"\nflat_field = "red.png"\n'
+        + NOISE
+        + FRAME
+        + 'flat_field = "green.png"\n[frames.uncertainty]\n"gel.press_x" = 0.02\n[frames.parameters]\n'
+        + '"gel.press_x" = 1\n[[frames]]\nimage = "frames/001.png"\n',
+    )
+    assert np.all(c.frames[0].flat_field == 50) and c.frames[1].flat_field is None and np.all(c.flat_field == 100)
+    assert c.frames[0].uncertainty == {"gel.press_x": 0.02} and c.frames[1].uncertainty == {}
+    back = captures.load(captures.write(c, folder / "copy", bits=8))
+    assert np.all(back.frames[0].flat_field == 50) and back.frames[1].flat_field is None
+    assert back.frames[0].uncertainty == {"gel.press_x": 0.02}
 
 
 def test_what_costs_trust_is_a_warning(folder):
@@ -283,6 +383,66 @@ BAD = {
     "column twice": (BENCH + 'rename = { "angle (rad)" = "reading" }\n', "each name once"),
     "reading not finite": (BENCH.replace("malus", "bad"), "frame 1: reading = nan; allowed: finite"),
     "table key": (BENCH + "columns = 3\n", r"\[table\]: unknown key 'columns'"),
+    "bands no list": ('bands = "470"\n' + BENCH, "bands = '470'; allowed: a list of wavelengths in nm"),
+    "bands empty": ("bands = []\n" + BENCH, r"bands = \[\]; allowed: a list"),
+    "bands a word": ('bands = ["red"]\n' + BENCH, "bands = 'red' nm; allowed: a finite number"),
+    "bands negative": ("bands = [470, -1]\n" + BENCH, r"bands = \[470, -1\] nm; allowed: wavelengths above 0"),
+    "bands twice": ("bands = [470, 470]\n" + BENCH, "allowed: wavelengths above 0, each once"),
+    "absent a text": ('absent = "sample"\n' + BENCH, "absent = 'sample'; allowed: a list of texts"),
+    "uncertainty negative": (
+        BENCH + '[uncertainty]\n"analyzer.angle" = -1\n',
+        r'\[uncertainty\]: "analyzer.angle" = -1.0; allowed: a standard deviation in the key',
+    ),
+    "uncertainty a word": (
+        BENCH + '[uncertainty]\n"analyzer.angle" = "1 deg"\n',
+        r'"analyzer.angle" = .1 deg.; allowed: a standard deviation',
+    ),
+    "uncertainty of a frame": (
+        frames('[frames.uncertainty]\n"led.power" = -0.1\n'),
+        r'frame 0 .*uncertainty: "led.power" = -0.1; allowed',
+    ),
+    "exclude without reason": (
+        BENCH + '[exclude]\n"gain drift" = true\n',
+        r'\[exclude\]: "gain drift" = True; allowed: the reason in quotes',
+    ),
+    "exclude a list": ('exclude = ["gain drift"]\n' + BENCH, r"\[exclude\] = .* is no table"),
+    "flat field of a frame missing": (
+        frames('flat_field = "flat.png"\n'),
+        "frame 0 .*flat_field = 'flat.png': no such",
+    ),
+    "flat field of a frame of another size": (
+        frames('flat_field = "frames/other_size.png"\n'),
+        r"frame 0 .*flat_field 'other_size.png': .*\(4, 8, 1\) pixels; allowed",
+    ),
+    "flat field of a frame saturated": (
+        frames('flat_field = "frames/white.png"\n'),
+        "frame 0 .*flat_field: all saturated",
+    ),
+    "delimiter": (BENCH + 'delimiter = "|"\n', r"delimiter = '\|'; allowed: ',', ';'"),
+    "decimal": (BENCH + 'decimal = "·"\n', "decimal = '·'; allowed: '.', ','"),
+    "decimal commas between commas": (
+        BENCH + 'decimal = ","\n',
+        "decimal = ',' and cells separated by commas; allowed",
+    ),
+    "skip": (BENCH + "skip = -1\n", "skip = -1; allowed: the number of lines before the column names"),
+    "skip too many": (BENCH + "skip = 40\n", "skip = 40, but it has 4 lines; allowed: fewer"),
+    "group of no column": (BENCH + 'group = "run"\n', r"\[table\]: group: unknown column 'run'"),
+    "group is a reading": (BENCH + 'group = "reading"\n', "column 'reading' is named twice"),
+    "offset of no column": (BENCH + 'offset = { "volts" = 1 }\n', "offset: unknown column 'volts'"),
+    "offset not a number": (BENCH + 'offset = { "reading" = "1" }\n', "offset: .*= '1'; allowed: a finite number"),
+    "scale of zero": (BENCH + 'scale = { "reading" = 0 }\n', 'scale: "reading" = 0; allowed: any other'),
+    "uncertainty column missing": (
+        BENCH + 'uncertainty = { "angle (rad)" = "sd" }\n',
+        "uncertainty: unknown column 'sd'",
+    ),
+    "uncertainty of no column": (
+        BENCH.replace("malus", "spread") + 'uncertainty = { "analyzer.angel" = "sd" }\n',
+        "uncertainty: unknown setting 'analyzer.angel'; did you mean 'analyzer.angle'",
+    ),
+    "uncertainty column negative": (
+        BENCH.replace("malus", "spread") + 'uncertainty = { "analyzer.angle" = "sd" }\n',
+        "frame 1: sd = -1, the uncertainty of analyzer.angle; allowed: 0 or more",
+    ),
     "table with cfa": ('cfa = "RGGB"\n' + BENCH, "cfa belongs to images"),
 }
 
@@ -304,7 +464,9 @@ def test_bad_input_is_refused_in_words(folder, kind):
         ("a.b,reading\n0\n", r"1 cells \['0'\]; allowed: 2"),
         ("a.b,reading\n", "zero frames"),
         ("a.b,reading\n,3\n", "a.b = '' is no number"),
-        ("a.b;reading\n0;1\n", "separated by .;."),
+        ("a.b;reading\n0;1\n", "separated by .;., not by commas; allowed: delimiter = .;. under"),
+        ("a.b\treading\n0\t1\n", r'allowed: delimiter = "\\t" under'),
+        ('a.b,reading\n0,"1,5"\n', "reading = '1,5' is no number.*decimal = \",\" under"),
     ],
 )
 def test_bad_rows_are_refused_in_words(folder, rows, expected):
@@ -343,6 +505,26 @@ def test_settings_are_held_against_the_scene(folder):
         c.frames[0].parameters = settings
         with pytest.raises(error, match=text):
             captures.check(c, known)
+
+
+def test_uncertainties_belong_to_settings(folder):
+    known = {
+        "analyzer.angle": Parameter("angle", "deg", 0.0, (-180, 180)),
+        "camera.x_fov": Parameter("x_fov", "deg", 40.0, (1, 90)),
+        "indenter.shape": Parameter("shape", "", "ball", choices=("ball", "edge")),
+    }
+    text = 'scene = "bench"\n[parameters]\n"indenter.shape" = "edge"\n' + NOISE
+    frame = FRAME + '[frames.parameters]\n"analyzer.angle" = 45\n'
+    captures.check(load(folder, text + '[uncertainty]\n"analyzer.angle" = 1\n' + frame), known)
+    for key, error, expected in (
+        ("analyzer.angel", UnknownKey, r"\[uncertainty\]: .*did you mean 'analyzer.angle'"),
+        ("camera.x_fov", BadCapture, "camera.x_fov has an uncertainty, and nothing sets it; allowed: keys that"),
+        ("indenter.shape", BadCapture, "indenter.shape is a choice of words; allowed: numbers"),
+    ):
+        with pytest.raises(error, match=expected):
+            captures.check(load(folder, text + f'[uncertainty]\n"{key}" = 1\n' + frame), known)
+        with pytest.raises(error, match=expected.replace(r"\[uncertainty\]", "frame 0 .*uncertainty")):
+            captures.check(load(folder, text + frame + f'[frames.uncertainty]\n"{key}" = 1\n'), known)
 
 
 # -- Using and writing -----------------------------------------------------------------------------------------------
@@ -414,6 +596,22 @@ def test_a_written_table_comes_back_in_parameter_units(folder):
     assert [float(f.image[0, 0, 0]) for f in back.frames] == [100.0, 50.5, 1.0]
     c.frames[1].parameters["led.power"] = 1.0
     with pytest.raises(BadCapture, match="allowed in a table"):
+        captures.write(c, folder / "copy2")
+
+
+def test_a_written_table_keeps_all_that_is_known(folder):
+    (folder / "diode.txt").write_text(DIODE)
+    c = load(folder, DIODE_TOML + "[noise]\ndark_noise = 2.0\nblack_level = 100\n")
+    back = captures.load(captures.write(c, folder / "copy"))
+    again = captures.load(captures.write(back, folder / "again"))
+    for other in (back, again):
+        for name in ("scene", "parameters", "noise", "bands", "absent", "uncertainty", "exclude", "warnings"):
+            assert getattr(other, name) == getattr(c, name), name
+        for f, g in zip(c.frames, other.frames):
+            assert (f.parameters, f.uncertainty, f.group) == (g.parameters, g.uncertainty, g.group)
+            np.testing.assert_array_equal(f.image, g.image)
+    c.frames[1].group = None
+    with pytest.raises(BadCapture, match="frame 1 has the group None"):
         captures.write(c, folder / "copy2")
 
 

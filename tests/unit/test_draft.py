@@ -462,6 +462,7 @@ def study(tmp_path):
         "inputs": {},
         "shown": [],
         "facts": {"setup": {"captures": str(tmp_path / "captures"), "plugins": None}},
+        "prints": ["00a1b2c3d4e5", "10a1b2c3d4e5"],
         "steps": [],
     }
     told = {

@@ -16,6 +16,7 @@ def test_a_resumed_study_records_the_poses_found_in_this_step(monkeypatch):
     monkeypatch.setattr(loop.checks, "after_calibration", lambda *a: [])
     monkeypatch.setattr(loop, "null_models", lambda *a: None)
     monkeypatch.setattr(loop, "background_of", lambda *a: None)
+    monkeypatch.setattr(loop, "origin_of", lambda *a: None)
     monkeypatch.setattr(loop, "Fit", SimpleNamespace)
     seen = {}
     monkeypatch.setattr(loop, "shown_frames", lambda model, values, held: seen.setdefault("shown", values))

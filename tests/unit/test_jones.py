@@ -334,7 +334,7 @@ def test_capture_set_comes_back(tmp_path, channels):
     folder = jones.write(tmp_path / "set", truth, settings, DIODE, seed=7, bits=12)
     back = captures.load(folder)
     assert (back.scene, back.values_are, back.warnings) == ("polarizer_bench", "DN", [])
-    assert back.noise == replace(DIODE, quantisation=1.0)  # a step of 1 DN, read off the values
+    assert back.noise == replace(DIODE, quantisation=1.0, signed=True)  # a step of 1 DN, read off the values
     assert back.table.values == (["reading"] if channels == 1 else ["red", "green", "blue"])
     values = np.stack([f.image[0, 0] for f in back.frames])
     assert np.array_equal(values, jones.readings(truth, settings, DIODE, seed=7, bits=12))

@@ -299,7 +299,7 @@ def test_white_noise_has_no_structure_whatever_its_size_and_mask():
     use[5:12, 8:16, 0] = False
     spectrum = spectrum_of(use)
     p = [spectrum.test([(0.8 * rng.standard_normal(use.shape)) * use], [], np.zeros((0, 0))).p for _ in range(300)]
-    assert np.mean(np.array(p) < 0.05) < 0.09 and 0.4 < np.mean(p) < 0.6  # 3 sd of 300
+    assert np.mean(np.array(p) < 0.05) < 0.09 and 0.4 < np.mean(p) < 0.8  # two tests, p counted twice
     high = spectrum.test([0.8 * rng.standard_normal(use.shape) * use], [], np.zeros((0, 0))).high
     assert high == pytest.approx(0.64, rel=0.2)
 

@@ -376,7 +376,7 @@ CASES = [
     (
         "compare captures/volts",
         r"none of the 9 values of 'volts\.csv' \(0\.1 to 1\.7\) is usable: 9 not above black_level = 8 DN; allowed: "
-        r"raw DN \(no volts",
+        r"readings above black_level, which is in their own unit",
     ),
     (
         "compare captures/column",
@@ -387,7 +387,10 @@ CASES = [
         "compare captures/columns",
         r"'column\.csv' has channels: 2, .*'polarizer_bench' has 1; allowed: 1, a column of `values` for each",
     ),
-    ("compare captures/semicolons", r"semicolons\.csv: its cells are separated by ';'; allowed: commas, and points"),
+    (
+        "compare captures/semicolons",
+        r"semicolons\.csv: its cells are separated by ';', not by commas; allowed: delimiter = \";\"",
+    ),
     (
         "compare captures/gray",
         r"captures\.toml: 'gray\.png' has channels: 1, .*small\.xml' has 3; allowed: 3, or one with cfa = \"RGGB\"",

@@ -62,7 +62,10 @@ CASES = {
         ("coloured leak",),
         ("extinction leak", "depolarization"),
     ),  # an exponential in the data, a straight line in the model
-    "misalignment": Case(Truth(**lamp(p2=Polarizer(offset=1.0))), ("polarizer misalignment",)),
+    # what turns the polarization between two films is no other thing to readings than a film that is off its dial
+    "misalignment": Case(
+        Truth(**lamp(p2=Polarizer(offset=1.0))), ("polarizer misalignment",), ("optical rotation", "retardance")
+    ),
     "scale": Case(Truth(**lamp(p2=Polarizer(scale=1.01))), ("servo scale",)),
     "backlash": Case(
         Truth(**lamp(p2=Polarizer(backlash=1.0))), ("servo backlash",), (), {"polarizer_film.backlash": 1.0}
@@ -121,7 +124,7 @@ CASES = {
     "misalignment and leak": Case(
         Truth(**lamp(p1=LEAKY, p2=Polarizer(leak=0.004, offset=1.0))),
         ("polarizer misalignment", "extinction leak"),
-        ("depolarization", "retardance"),
+        ("depolarization", "retardance", "optical rotation", "dark offset", "stray light"),
     ),
     "depolarization and drift": Case(
         Truth(**lamp(source=Source(drift=0.002), sample=Sample(depolarization=0.01))),
@@ -147,25 +150,28 @@ def at_the_noise(chi2_per_dof: float, count: int) -> bool:
     return abs(chi2_per_dof - 1) < 5 * np.sqrt(2 / count)
 
 
-@pytest.mark.parametrize("name", CASES)
+# Whose readings have three bands, or whose refits are dear: among the slow tests.
+DEAR = ("film reflections", "dispersive retardance", "gamma", "coloured leak", "scale", "stress")
+
+
+@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n in DEAR else n for n in CASES])
 def test_a_hidden_effect_is_found(name, tmp_path):
     case = CASES[name]
     setup, study, model, fit = study_of(case, tmp_path)
     diagnosis = loop.examine(study, model, setup, fit)
     known = {*case.effects, *case.alike}
     if diagnosis.word == "CLAIM":
-        assert diagnosis.missing == case.effects[0], diagnosis.sentence
+        assert diagnosis.missing in case.effects, diagnosis.sentence
+        assert any(set(e.effects) <= known for e in diagnosis.survivors), diagnosis.sentence
     elif diagnosis.word == "AMBIGUOUS":
-        assert case.effects[0] in diagnosis.ambiguous and set(diagnosis.ambiguous) <= known, diagnosis.sentence
+        assert {*case.effects} <= {*diagnosis.ambiguous} <= known, diagnosis.sentence
         assert case.alike, diagnosis.sentence
         needs = model.scene.registry.find_effect(case.effects[0]).needs
         assert any(needs in hint for hint in diagnosis.hints), (
             "no word about the measurement that would tell them apart"
         )
-    else:  # two effects at once
-        assert diagnosis.word == "PARTIAL" and len(case.effects) == 2, f"{diagnosis.word}: {diagnosis.sentence}"
-        whole = [set(p.effects) for p in diagnosis.pairs if p.complete]
-        assert set(case.effects) in whole and all(pair <= known for pair in whole), diagnosis.sentence
+    else:
+        raise AssertionError(f"{diagnosis.word}: {diagnosis.sentence}")
     for effect in case.effects:
         start = diagnosis.fits[effect].values if effect in diagnosis.fits else None
         fit, comparison = loop.extend(study, model, setup, fit, model.scene.registry.find_effect(effect), start)
@@ -211,9 +217,15 @@ def test_what_goes_with_a_setting_is_drafted_then_claimed_as_a_formula(tmp_path)
 
     file.write_text(
         "import numpy as np\n"
-        + text.replace("lookup(x, AT, CURVE)", "-np.exp(-np.asarray(x) / 4.0)").replace("checks=(meets_its_table,)", "")
+        + text.replace("lookup(x, AT, CURVE)", "-np.exp(-np.asarray(x) / 4.0)").replace(
+            "checks=(meets_its_table,),", ""
+        )
     )
-    study, model, fit = loop.begin(setup, tmp_path / "formula")  # the edited file is taken up
+    # the edited file is taken up; the readings that it was drafted from would claim it whatever it says
+    capture_files.write(sweep(rig.light({}), rig.settings(), 6, {"warm-up": 0.1}), tmp_path / "another")
+    setup = rig.setup(tmp_path / "another", 6)
+    setup.plugins = str(plugins)
+    study, model, fit = loop.begin(setup, tmp_path / "formula")
     diagnosis = loop.examine(study, model, setup, fit, advised=False)
     assert diagnosis.missing == "warm up"
     assert abs(diagnosis.row("warm up").refit.strength[0] - 0.1) < 4 * diagnosis.row("warm up").refit.sd[0]

@@ -38,7 +38,7 @@ def test_angles_in_radians_are_reported_and_no_effect_is_claimed(wrong, tmp_path
 def test_a_value_far_from_its_prior_is_named():
     depth = Parameter("press_depth", "mm", 0.2, (0.0, 1.0), plausible=0.1)
     variables = [Variable(f"gel.press_depth[{i}]", ("gel.press_depth",), depth, (i,), (0.2, 0.05)) for i in range(3)]
-    model = SimpleNamespace(at=lambda values, i: {"gel.press_depth": 0.2, **values.frame.get(i, {})})
+    model = SimpleNamespace(at=lambda values, i: {"gel.press_depth": 0.2, **values.frame.get(i, {})}, drives=())
     near = SimpleNamespace(rms=1.0, signal=100.0)
 
     def told(*depths):
@@ -106,11 +106,15 @@ def test_an_effect_that_does_not_predict_is_reported_as_no_cause(monkeypatch):
         study.steps.append({"held_out": {"chi2_per_dof": 1.6}})
 
     monkeypatch.setattr(loop, "split", lambda model, setup: ([0], [1]))
-    monkeypatch.setattr(loop, "effect_variables", lambda model, effect: [])
+    monkeypatch.setattr(
+        loop, "effect_variables", lambda model, effect, held=(): [SimpleNamespace(frames=None, name="row")]
+    )
     monkeypatch.setattr(loop, "write_step", record)
-    monkeypatch.setattr(loop.calibrate, "fit", lambda *_, **__: SimpleNamespace(warnings=[]))
-    model = SimpleNamespace(scene=SimpleNamespace(can_express=lambda effect: True))
-    effect = SimpleNamespace(name="row curve", file="")
+    monkeypatch.setattr(loop.calibrate, "fit_over_starts", lambda *_, **__: SimpleNamespace(warnings=[]))
+    captures = SimpleNamespace(absent=[], exclude={}, folder="captures")
+    scene = SimpleNamespace(can_express=lambda effect: True, keys_of=lambda effect: {})
+    model = SimpleNamespace(scene=scene, captures=captures, dialled=False, frames=[])
+    effect = SimpleNamespace(name="row curve", file="", requires=(), part="camera")
     found, _ = loop.extend(study, model, SimpleNamespace(robust=False), SimpleNamespace(variables=[]), effect, Values())
     assert found.warnings == [
         "held-out chi2/dof rises from 1.5 to 1.6 with row curve: it does not predict the frames that "

@@ -15,7 +15,10 @@ CASES = {  # every shipped scene: what replaces its <default>s, at rest and pres
     "gelsight": ({}, {"depth": "0.8"}),
     "grid_bench": ({}, {"distance": "0.5"}),
     "magictac": ({**GRID, "room": "1"}, {**GRID, "room": "1", "distance": "-0.5"}),
+    "polariscope": ({"analyzer": "30"}, {"analyzer": "60", "polarizer": "30", "regions": "quarters"}),
+    "polarization_camera": ({"polarizer": "1"}, {"regions": "halves", "sample_regions": "halves"}),
     "polarizer_bench": ({"analyzer": "30"}, {"analyzer": "30", "polarizer": "30", "pattern": "disc"}),
+    "reflection_bench": ({}, {"analyzer": "60", "incidence": "57"}),
     "vi2tap": ({}, {"analyzer": "60", "depth": "3", "x": "4"}),
 }
 # Two of them draw one of several lights per path, in the order in which Mitsuba lists them: its optimization turns the

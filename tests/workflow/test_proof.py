@@ -30,7 +30,7 @@ def judged(bench, effects=FOUND, seeds=(0,)):
 
 
 # -- the plan --------------------------------------------------------------------------------------------------------
-@pytest.mark.parametrize("rig", RIGS.values())
+@pytest.mark.parametrize("rig", [rig for rig in RIGS.values() if not rig.outside])
 def test_every_round_hides_every_effect_once_and_nothing_too(rig):
     rig = rig()
     batches = list(cells.rounds(rig, 40))
@@ -151,19 +151,17 @@ def test_where_nothing_stands_out_the_set_is_that_of_the_scores(bench):
     assert 1 < len(step["set"]) < 12 and set(step["set"]) & set(step["score"]) >= {"source drift"}
 
 
-@pytest.mark.parametrize(
-    "seed, why",
-    [(3, "'s strength is no more than its scatter"), (41, "one curve, along 'polarizer.angle', explains 99%")],
-)
-def test_a_film_that_is_smeared_at_one_angle_is_no_polarized_source(bench, seed, why):
+@pytest.mark.parametrize("seed", [3, 41])
+def test_a_film_that_is_smeared_at_one_angle_is_no_polarized_source(bench, seed):
     """Five angles of the polarizer, a lamp that wanders: a polarized source, whose light goes with that angle too,
-    explains nearly all of it, and with an analyser's wobble all."""
+    explains nearly all of it, and with wobbles all: as many strengths as the five angles tell apart."""
     cell = cells.Cell("polarizer_bench", "unknown", ("smeared film",), 0.01, 0.5, "same", "", seed)
     step = blind.run(bench, cell)["steps"][-1]
-    assert step["word"] in ("PARTIAL", "UNKNOWN") and not step["pair"] and step["refit"][0] == "polarized source"
-    assert not step["conditions"]["even"][1] and why in step["sentence"]
+    assert step["word"] in ("PARTIAL", "UNKNOWN") and step["refit"][0] == "polarized source"
+    assert not step["conditions"]["no better curve"][1] and "polarizer.angle" in step["sentence"]
 
 
+@pytest.mark.slow
 def test_ranked_by_monte_carlo_it_fails(bench, monkeypatch):
     """Each candidate's scores stand under the name of another."""
     rng, solve = np.random.default_rng(1), statistics.Cone.solve
@@ -174,10 +172,11 @@ def test_ranked_by_monte_carlo_it_fails(bench, monkeypatch):
             cone, rng.standard_normal(len(u)) * 3 * np.sqrt(np.maximum(np.diag(cone.information), 0))
         ),
     )
-    top = judged(bench).rate("top-1 after refit, 0.5 %, no clutter")
+    top = judged(bench).rate("top-3 by score, 0.5 %, no clutter")  # refits find the best of what they are given
     assert top.verdict == "MISSED" and top.k < len(FOUND) - 1
 
 
+@pytest.mark.slow
 def test_without_the_projection_it_fails(bench, monkeypatch):
     """The lamp's power takes 70 % of a gamma; where the score does not know that, it promises what no refit brings."""
     name = "fall of chi2 within 20 % of its prediction, to 0.5 %"

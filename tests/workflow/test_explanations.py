@@ -1,0 +1,142 @@
+"""Sets of effects compete: readings that a formula of this file makes, judged through the whole loop.
+
+    V = P (cos(t)^2 + leak sin(t)^2 + stray) (1 + w_c cos(psi) + w_s sin(psi)) gain       t = psi + offset
+
+psi the dial of one of two films, P the reading of parallel films. The noise is white unless a test says otherwise."""
+
+import numpy as np
+import pytest
+
+from optics.diagnosis.evidence import Candidate
+from optics.diagnosis.explanations import implausible
+from optics.diagnosis.thresholds import CLEAR, EACH
+from optics.scene.declare import Effect
+from optics.scene.parameter import Parameter, Variable
+from optics.study import loop
+from optics.study.setup import setup_for
+
+MALUS = np.arange(-90.0, 91.0, 5.0)
+NOISE = 0.004  # of a reading between parallel films
+
+
+def malus(psi, offset=0.0, leak=0.0, stray=0.0, wobble=(0.0, 0.0)):
+    """Readings over that of parallel ideal films."""
+    t, dial = np.radians(psi + offset), np.radians(psi)
+    light = np.cos(t) ** 2 + leak * np.sin(t) ** 2 + stray
+    return light * (1 + wobble[0] * np.cos(dial) + wobble[1] * np.sin(dial))
+
+
+def write(folder, columns, values, head="", noise=NOISE):
+    """A capture set of readings: columns {key: (n,)}, values (n,) or (n, C)."""
+    values = np.asarray(values, float).reshape(len(next(iter(columns.values()))), -1)
+    names = [f"v{i}" for i in range(values.shape[1])]
+    rows = [[*own, *v] for *own, v in zip(*columns.values(), values)]
+    text = "\n".join([",".join([*columns, *names]), *(",".join(f"{x:.9g}" for x in row) for row in rows)])
+    folder.mkdir()
+    (folder / "readings.csv").write_text(text + "\n", encoding="utf-8")
+    (folder / "captures.toml").write_text(
+        f'scene = "polarizer_bench"\n{head}\n[noise]\ndark_noise = {noise}\n[table]\nfile = "readings.csv"\n'
+        f"values = {names}\n",
+        encoding="utf-8",
+    )
+
+
+def diagnosed(folder, study, **options):
+    setup = setup_for(folder, **options)
+    record, model, fit = loop.begin(setup, study)
+    return loop.examine(record, model, setup, fit, advised=False)
+
+
+def judged(tmp_path, values, columns=None, head="", **options):
+    write(tmp_path / "captures", columns or {"analyzer.angle": MALUS}, values, head)
+    return diagnosed(tmp_path / "captures", tmp_path / "study", **options)
+
+
+def noisy(values, seed=1, sd=NOISE):
+    return values + sd * np.random.default_rng(seed).standard_normal(np.shape(values))
+
+
+def test_two_simple_effects_tie_with_one_of_two_strengths(tmp_path):
+    """A film that is 2 degrees off and a leak of 1 % are, between two films, exactly a plate in between: cos(2t) and
+    sin(2t) with a constant. No claim of the plate, although it is one effect with as many strengths."""
+    d = judged(tmp_path, noisy(malus(MALUS, offset=2.0, leak=0.02)))
+    assert d.word == "AMBIGUOUS", d.sentence
+    alive = [set(e.effects) for e in d.survivors]
+    assert {"retardance"} in alive and {"polarizer misalignment", "extinction leak"} in alive
+    falls = [e.fall for e in d.survivors]
+    assert np.ptp(falls) < 0.01 * max(falls)  # as large: it is the number of effects and their sizes that differ
+
+
+def test_what_every_explanation_holds_is_claimed(tmp_path):
+    """Without a sample the plate is ruled out: each explanation that is left has the misalignment, with one of four
+    that the session cannot tell apart."""
+    d = judged(tmp_path, noisy(malus(MALUS, offset=2.0, leak=0.02)), head='absent = ["sample"]')
+    assert d.missing == "polarizer misalignment", d.sentence
+    assert all("polarizer misalignment" in e.effects for e in d.survivors) and len(d.survivors) > 1
+    assert "retardance" in d.not_tested and "does not show" in d.sentence
+    told = d.survivors[0].told["polarizer misalignment"]
+    assert "analyzer.offset - polarizer.offset = 2.0" in told or "analyzer.offset - polarizer.offset = 1.9" in told
+
+
+def test_far_from_plausible_is_no_tie():
+    """Half a wave, 18 plausible sizes, or 36 of them, against 1: the odds are beyond 19 to 1."""
+    angle = Parameter("angle", "deg", 0.0, neutral=0.0, plausible=10.0)
+    own = [Variable("plate.angle", ("plate.angle",), angle)]
+    plate = Candidate(Effect("plate", "sheet", ("angle",)), own, np.zeros(1), [0], np.array([10.0]))
+    costs = [implausible(plate, np.array([size])) for size in (0.0, 10.0, 180.0, 360.0)]
+    assert costs[0] == EACH and costs[1] < costs[0] + 2 and costs[2] > costs[1] + CLEAR and costs[3] > costs[2] + 4
+
+
+def test_a_lamp_that_wanders_is_no_effect(tmp_path):
+    """Noise shared by some 12 neighbours, twice that of a reading: counted as white it would show effects."""
+    claims, stood_out, psi = 0, 0, np.arange(-180.0, 181.0, 4.0)
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        wander = np.zeros(len(psi))
+        for i in range(1, len(psi)):
+            wander[i] = 0.92 * wander[i - 1] + np.sqrt(1 - 0.92**2) * rng.standard_normal()
+        own = tmp_path / str(seed)
+        own.mkdir()
+        d = judged(own, noisy(malus(psi) * (1 + 2 * NOISE * wander), seed + 100), {"analyzer.angle": psi})
+        claims += d.word == "CLAIM"
+        stood_out += any(r.p_family < 0.01 for r in d.rows)
+    assert claims == 0 and stood_out >= 3
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_one_thing_swept_is_enough_for_a_claim(seed, tmp_path):
+    """Along the only setting a free curve explains as much as any effect: its bins cost what they could have fitted."""
+    psi = np.arange(-180.0, 180.0, 6.0)
+    d = judged(tmp_path, noisy(malus(psi, wobble=(0.012, 0.008)), seed), {"analyzer.angle": psi})
+    assert d.missing == "analyzer wobble", d.sentence
+    curve = next(f for f in d.fingerprints if f.coordinate == "analyzer.angle")
+    assert curve.ratio > 0.9
+
+
+def test_freedom_of_colour_breaks_no_tie(tmp_path):
+    """A haze whose strength has a colour: `coloured leak` fits it, `depolarization` has no slope to offer. The leak
+    within the coloured one is not told from a haze, so neither is the coloured one."""
+    t = np.radians(MALUS)
+    values = np.stack([np.cos(t) ** 2 * (1 - d) + d / 2 for d in (0.036, 0.03, 0.024)], 1)
+    free = ["source.power_r", "source.power_g", "source.power_b"]
+    d = judged(tmp_path, noisy(values), head="bands = [640, 540, 440]", free=free, per_group=[])
+    assert d.word != "CLAIM" or d.claimed not in ("coloured leak", "extinction leak"), d.sentence
+    assert any("depolarization" in e.effects for e in d.survivors), [e.effects for e in d.survivors]
+
+
+def test_a_tone_along_the_session_is_not_nothing(tmp_path):
+    """31.5 cycles of a flickering lamp: beyond the eight lowest cosines, and no effect of the library."""
+    psi = np.arange(-180.0, 180.0, 2.0)
+    values = malus(psi) * (1 + 0.012 * np.sin(2 * np.pi * 31.5 * np.arange(len(psi)) / len(psi)))
+    plain = judged(tmp_path, noisy(malus(psi), 3), {"analyzer.angle": psi})
+    (tmp_path / "other").mkdir()
+    d = judged(tmp_path / "other", noisy(values, 3), {"analyzer.angle": psi})
+    assert plain.word == "NOTHING" and d.word not in ("NOTHING", "CLAIM"), d.sentence
+
+
+def test_a_contained_effect_does_not_come_back_by_its_score(tmp_path):
+    """`coloured leak` holds the leak and does no better: it is no rival by the fall that its score promised."""
+    d = judged(tmp_path, noisy(malus(MALUS, leak=0.03)), head='absent = ["sample"]')
+    assert not any("coloured leak" in e.effects for e in d.survivors)
+    assert "at least one that was not added" not in d.sentence
+    assert {"extinction leak"} in [set(e.effects) for e in d.survivors]
