@@ -70,7 +70,16 @@ FINGER = View("vi2tap", {"width": "240", "height": "180", "analyzer": "90", "dep
 GRID = View("magictac", {"width": "120", "height": "90", "columns": "10", "rows": "10", "block_width": "8.4",
                          "block_length": "8.4", "led_x": "5.2", "led_y": "5.2", "x_fov": "21", "distance": "-0.3",
                          "packets": "400000", "rays": "128"})  # fmt: skip
-VIEWS = (PRESSED, COLOURED, BENCH, FINGER, GRID)  # the first that can express an effect shows it
+MOSAIC = View(
+    "polarization_camera",
+    {"width": "24", "height": "18"},  # few pixels, so that those of one cell are told apart
+    {"panel.dop_q": 0.6, "panel.dop_u_1": 0.6, "panel.dop_q_2": -0.6, "panel.dop_u_3": -0.6, "panel.power": 1.2},
+)
+MIRROR = View(
+    "reflection_bench", {}, {"polarizer.angle": 0.0, "analyzer.inserted": 0.0, "source.power": 4.0}, "plate.incidence",
+    (5.0, 80.0),
+)  # fmt: skip
+VIEWS = (PRESSED, COLOURED, BENCH, FINGER, MOSAIC, MIRROR, GRID)  # the first that can express an effect shows it
 
 # effect -> (view, holders of the effect; None: every part of its kind)
 SHOWN: dict[str, tuple[View, tuple[str, ...] | None]] = {
@@ -86,12 +95,18 @@ SHOWN: dict[str, tuple[View, tuple[str, ...] | None]] = {
     "height-fall-off": (ONE_SIDE, None),
     "specular-lobe": (ONE_SIDE, None),
     "analyzer-wobble": (FULL_TURN, ("analyzer",)),  # one cycle per turn
+    "eccentric-dial": (FULL_TURN, ("analyzer",)),
+    "polarized-detector": (FULL_TURN, None),  # two cycles per turn
     "polarizer-misalignment": (BENCH, ("analyzer",)),
     "servo-scale": (FULL_TURN, ("analyzer",)),  # an error that grows with the angle
     "servo-backlash": (View("polarizer_bench", {}, {"analyzer.approach": 1.0}, "analyzer.angle"), None),
     "source-drift": (View("polarizer_bench", {}, {}, "source.time", (0.0, 10.0)), None),
     "polarized-source": (View("polarizer_bench", {}, {"analyzer.inserted": 0.0}, "polarizer.angle"), None),
     "retardance": (CROSSED, None),
+    "optical-rotation": (BENCH, None),
+    "twisted-plate": (View("polarizer_bench", {"analyzer": "90"}, {"sample.retard_0": 180.0}, "sample.angle"), None),
+    "sample-absorption": (View("polariscope", {"width": "180", "height": "135", "analyzer": "45"}), ("sample",)),
+    "soft-saturation": (View("polarizer_bench", {}, {"source.power": 2.8}, "analyzer.angle"), None),
     "stress-birefringence": (
         View("polarizer_bench", {"width": "180", "height": "180", "x_fov": "8", "pattern": "disc", "analyzer": "90"}),
         None,
