@@ -143,8 +143,8 @@ def plain(benches):
     return load
 
 
-# Two of them compile for more than a minute where Dr.Jit's cache of kernels is empty: among the slow tests.
-LONG = ("vi2tap", "grid_bench")
+# Most of them compile for half a minute and more where Dr.Jit's cache of kernels is empty: among the slow tests.
+LONG = ("gelsight", "polarizer_bench", "vi2tap", "grid_bench")
 
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n in LONG else n for n in SCENES])
@@ -195,6 +195,7 @@ def test_other_parameters_refuse_a_derivative(name, plain):
         assert scene.params.flags(path) & mi.ParamFlags.NonDifferentiable.value
 
 
+@pytest.mark.slow
 def test_memory_does_not_grow_with_the_way(plain):
     """Only STRIDE states are kept at a time: four times the surfaces take less than twice the memory."""
     import drjit as dr
