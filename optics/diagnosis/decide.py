@@ -27,6 +27,7 @@ from optics.diagnosis.thresholds import (
 from optics.words import p_text, percent
 
 MANY = 3  # effects of one explanation
+LAW = "no other law"  # of an effect that the model has already
 CURVE = "a curve explains it"  # name of the condition that a curve must meet for UNKNOWN
 
 
@@ -56,6 +57,8 @@ class Findings:
                  are too few parts
     carried      share of the winner's fall in the one part that carries most of it, by the part carried_by (in words);
                  of effects with a strength per frame
+    law          an effect that the model has, and the coordinate along which another law of it explains most; ''  for
+                 none that is significant; law_lead: of the best explanation's score over that law's
     fragile      an effect that other weights or masks prefer clearly, '' for none
     measured     whether repeats fix the size of the noise
     """
@@ -88,6 +91,8 @@ class Findings:
     chance: float = math.nan
     carried: float = 0.0
     carried_by: str = ""
+    law: str = ""
+    law_lead: float = math.inf
     fragile: str = ""
     measured: bool = False
 
@@ -126,6 +131,8 @@ def decide(f: Findings) -> tuple[str, list[Condition]]:
         )
         if not f.structured and not f.weighed:
             return "NOTHING", conditions
+    if f.law and f.law_lead < -TOLD and f.structured:
+        return "UNKNOWN", conditions
     if f.rival and f.structured:
         if not f.curve_share < SHARE:
             return "UNKNOWN", conditions
@@ -150,7 +157,8 @@ def _word_of_winner(f: Findings, failed: set[str]) -> str:
         # The refit did not bring the fall that the score promised, or the base's own calibration brought it.
         return "NOTHING"
     alone = not failed & {"significant", "no better curve", "share", "beyond clutter", "near"}
-    if "lead" in failed and alone and f.some_even and f.survivors > 1:
+    alone = alone and f.law_lead > -TOLD
+    if failed & {"lead", LAW} and alone and f.some_even and (f.survivors > 1 or LAW in failed):
         return "AMBIGUOUS"
     return "PARTIAL" if failed - {"spread"} and failed <= {"share", "even", "spread"} else ""
 
@@ -213,6 +221,15 @@ def _against_causes_outside(f: Findings) -> list[Condition]:
             not f.rival,
             f"the best curve ({f.coordinate or 'none'}) explains {f.ratio:.2f} of it, "
             + (f"{limit:g} allowed" if f.rival or f.ratio < limit else "but not when its bins are counted"),
+        ),
+        Condition(
+            LAW,
+            f.law_lead,
+            TOLD,
+            f.law_lead > TOLD,
+            f"{f.law_lead:.3g} ahead of another law of {f.law}, {TOLD:.3g} needed"
+            if f.law
+            else "no effect that the model has explains it by another law",
         ),
         Condition(
             "share",
@@ -285,7 +302,6 @@ class Opponent:
     fall      net fall of chi2; cost: of its strengths;   strengths, effects: their numbers
     decides   whether small differences decide: it leaves nothing, or has readings to explain, whose noise is known
     complete  whether it leaves nothing that a curve could explain
-    laws      coordinates through which effects act that the model has already, which may follow another law
     """
 
     fall: float
@@ -294,7 +310,6 @@ class Opponent:
     strengths: int = 1
     complete: bool = False
     decides: bool = False
-    laws: frozenset[str] = frozenset()
 
 
 def rivals(fingerprints: Sequence[Fingerprint], best: Opponent) -> list[Fingerprint]:
@@ -303,15 +318,14 @@ def rivals(fingerprints: Sequence[Fingerprint], best: Opponent) -> list[Fingerpr
     Better by more than `allowed`, significantly, by more than the number of bins gives by noise alone (3 sd), and by
     more than bins could have fitted whatever the data are (`Fingerprint.cost`). Where small differences decide, a
     curve is a rival of several effects if its score is better: one unknown cause is simpler. If it has no more than
-    twice as many numbers as they have strengths, or they are MANY, it is one if it is not told apart from them, and so
-    is any curve along `laws`."""
+    twice as many numbers as they have strengths, or they are MANY, it is one if it is not told apart from them."""
     near = []
     for f in fingerprints:
         as_many = best.effects >= MANY or f.dof <= 2 * best.strengths
-        slack = TOLD if f.coordinate in best.laws or (best.effects > 1 and as_many) else 0.0
-        asked = f.coordinate in best.laws or (best.decides and best.effects > 1)
         behind = best.fall - best.cost - (f.net - f.cost)
-        if asked and f.coordinate not in MIMICS and f.p < LEVEL / len(fingerprints) and behind < slack:
+        slack = TOLD if as_many else 0.0
+        asked = best.decides and best.effects > 1 and f.coordinate not in MIMICS
+        if asked and f.p < LEVEL / len(fingerprints) and behind < slack:
             near.append(f)
     if best.complete or near:
         return ordered(near)

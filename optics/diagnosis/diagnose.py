@@ -28,6 +28,7 @@ from optics.diagnosis.decide import Findings, decide
 from optics.diagnosis.evidence import Candidate, Evidence, Progress, silent
 from optics.diagnosis.explanations import Outcome
 from optics.diagnosis.findings import basis_of, findings_of, subject_of
+from optics.diagnosis.laws import other_laws
 from optics.diagnosis.refit import Case, refit_each
 from optics.diagnosis.result import Basis, Diagnosis, Family, Fingerprint, Split
 from optics.diagnosis.score import score
@@ -71,7 +72,7 @@ def diagnose(
     top           how many of the best effects are refitted, besides those that cannot be told from the best
     excluded      effect -> why it is not among `effects`, for the record
 
-    added         effects that the model has already, whose laws may differ from the library's
+    added         effects that the model has already, whose laws may differ from the library's (optics.diagnosis.laws)
 
     Raises Underdetermined when the base is not calibrated to convergence, or black level or saturation are unknown;
     ValueError when frames are fitted and held out at once, or none is fitted.
@@ -95,7 +96,6 @@ def diagnose(
         rows_max,
         seed,
         say,
-        laws=frozenset(coordinate for e in added for coordinate in e.acts),
     )
     basis = basis_of(model, evidence, evidence.structure(evidence.whitened, evidence.base))
     case.places = places = prints.places(model, fit.values, evidence)
@@ -107,11 +107,12 @@ def diagnose(
     reference = best.fall - best.expectation if subject else max([c.row.net for c in table.order], default=0.0)
     fingerprints = prints.fingerprints(model, evidence, places, max(reference, 1.0), say)
     families = prints.families(fingerprints)
+    laws = other_laws(model, evidence, places, added, variables_of)
     splits, chance = _split(case, outcome, subject)
     levels = held.levels(case, best.members, best.fit)
     shifts = held.shifts(case, best.members, best.fit) if subject else []
 
-    findings = findings_of(case, outcome, fingerprints, splits, chance, levels, basis)
+    findings = findings_of(case, outcome, fingerprints, laws, splits, chance, levels, basis)
     word, conditions = decide(findings)
     told = outcome.told()
 
@@ -145,6 +146,7 @@ def diagnose(
         claimed=subject.effect.name if subject and word == "CLAIM" else "",
         explanations=told,
         families=families,
+        laws=laws,
         fits=fits,
         evidence=replace(evidence, blocks=[], sigma=[], whitened=[], use=[], candidates=table.order),
     )

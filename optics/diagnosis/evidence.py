@@ -216,6 +216,11 @@ class Evidence:
             numbers.append(np.broadcast_to(rows, frame.image.shape).reshape(-1)[block.index])
         return np.concatenate(numbers)
 
+    def lit(self, model: Model) -> np.ndarray:
+        """(n,) predicted signal of each kept value over its standard deviation."""
+        black = float(model.noise.black_level)
+        return np.concatenate([(block.prediction - black) / block.sigma for block in self.blocks])
+
     @property
     def gradient(self) -> float:
         """|Q'r|^2 per parameter of the base: below 1 it is calibrated."""

@@ -515,7 +515,8 @@ def _design_effect(case: Case, outcome: Outcome, one: Trial, other: Trial) -> fl
     """By how much the variance of the difference of two chi2 exceeds what independent noise makes."""
     direction = _kept(case, [a - b for a, b in zip(one.images, other.images)])
     if case.evidence.is_table:
-        return outcome.correlation.design_effect(np.concatenate(direction), case.evidence.order(case.model))
+        order, signal = case.evidence.order(case.model), case.evidence.lit(case.model)
+        return outcome.correlation.design_effect(np.concatenate(direction), order, signal)
     left = _kept(case, outcome.trials[0].images)
     total = sum(float(d @ d) for d in direction)
     if not total > 0 or case.places is None:
@@ -544,7 +545,8 @@ def _kept(case: Case, images: Sequence[np.ndarray]) -> list[np.ndarray]:
 def _correlation(case: Case, best: Trial) -> Correlation:
     """Of the readings about an explanation."""
     dense = _measured(case, best)
-    return correlations.estimate(np.concatenate(_kept(case, best.images)), dense, case.evidence.order(case.model))
+    order, signal = case.evidence.order(case.model), case.evidence.lit(case.model)
+    return correlations.estimate(np.concatenate(_kept(case, best.images)), dense, order, signal)
 
 
 def _measured(case: Case, trial: Trial) -> np.ndarray:

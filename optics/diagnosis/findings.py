@@ -15,7 +15,7 @@ from optics.diagnosis.decide import Findings, Opponent, rivals
 from optics.diagnosis.evidence import Candidate, Evidence
 from optics.diagnosis.explanations import Outcome, design_effect_without, lead_without
 from optics.diagnosis.refit import Case, clear
-from optics.diagnosis.result import Basis, Fingerprint, Level, Split
+from optics.diagnosis.result import Basis, Fingerprint, Law, Level, Split
 from optics.diagnosis.thresholds import AS_GOOD, LEVEL, UNEVEN
 from optics.fit.compare import led_label
 from optics.fit.model import Model, value_of
@@ -65,6 +65,7 @@ def findings_of(
     case: Case,
     outcome: Outcome,
     fingerprints: Sequence[Fingerprint],
+    laws: Sequence[Law],
     splits: Sequence[Split],
     chance: float,
     levels: Sequence[Level],
@@ -72,6 +73,7 @@ def findings_of(
 ) -> Findings:
     """The numbers that decide.
 
+    laws     of the effects that the model has already, best first
     splits   of the survivors' main effects; chance: p of the subject's strength by scatter
     """
     table, subject, best = case.table, subject_of(outcome), outcome.best
@@ -82,6 +84,10 @@ def findings_of(
     else:
         own = _of_subject(case, outcome, subject, splits, chance, levels, basis)
         own = replace(own, measured=measured)
+    if laws and laws[0].p < LEVEL:
+        # in the scale of what the best explanation leaves, as explanations are compared
+        fall, lead = best.fall / outcome.scale - best.cost, laws[0].fall / outcome.scale - laws[0].cost
+        own = replace(own, law=f"{laws[0].effect} along {laws[0].coordinate}", law_lead=fall - lead)
     if not fingerprints:
         return own
     followed = _followed(case, subject, best.fit, best.fall - best.expectation, fingerprints)
@@ -93,7 +99,6 @@ def findings_of(
         sum(len(c.cone.live) for c in best.members),
         complete,
         complete or case.evidence.is_table,
-        case.laws,
     )
     better = [followed] if followed else rivals(fingerprints, opponent)
     best_curve = better[0] if better else fingerprints[0]

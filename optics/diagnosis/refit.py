@@ -48,7 +48,6 @@ class Case:
     seed: int
     say: Progress
     places: list[dict[str, np.ndarray]] | None = None
-    laws: frozenset[str] = frozenset()
 
     @property
     def base(self) -> list[Variable]:

@@ -255,6 +255,30 @@ class Fingerprint:
 
 
 @dataclass(frozen=True)
+class Law:
+    """A freer law of an effect that the model has: its strength changes slowly along a coordinate.
+
+    fall, dof   of chi2 with so many further strengths; p: of that fall in noise
+    """
+
+    effect: str
+    coordinate: str
+    fall: float
+    dof: int
+    p: float
+
+    @property
+    def cost(self) -> float:
+        """As of `Fingerprint`."""
+        return self.dof * math.log1p(max(self.fall, 0.0) / self.dof)
+
+    @property
+    def score(self) -> float:
+        """fall less cost, in noise of the size that is stated."""
+        return self.fall - self.cost
+
+
+@dataclass(frozen=True)
 class Family:
     """The best curve of the coordinates that belong together: camera, light, geometry, time, or a setting.
 
@@ -405,6 +429,7 @@ class Diagnosis:
     compared    effects that were refitted, in the order of gaps (D between them) and correct (P(correct))
     levels      misfit of the base, then of the base with the best effect, on fitted and held-out frames
     explanations   sets of effects that were refitted, best first; families: what the residual depends on, best first
+    laws        freer laws of the effects that the model has already, best first
     advice      what to measure next; hints: the same in words, from declarations
     fits        effect -> `optics.fit.result.Fit` of its refit; evidence: `optics.diagnosis.evidence.Evidence` without
                 pixels. Neither is written to a file
@@ -430,6 +455,7 @@ class Diagnosis:
     explanations: list[Explanation] = field(default_factory=list)
     advice: list[Advice] = field(default_factory=list)
     families: list[Family] = field(default_factory=list)
+    laws: list[Law] = field(default_factory=list)
     fits: dict[str, Any] = field(default_factory=dict, repr=False, compare=False)
     evidence: Any = field(default=None, repr=False, compare=False)
 

@@ -21,7 +21,7 @@ from optics.diagnosis.result import (
     Row,
     Shift,
 )
-from optics.diagnosis.thresholds import CLEAR, CLUTTERED, LEVEL, MARGIN
+from optics.diagnosis.thresholds import CLEAR, CLUTTERED, LEVEL, MARGIN, TOLD
 from optics.words import (
     ANYWHERE,
     NO_LIMIT,
@@ -131,7 +131,13 @@ def sentence(
     if word == "NOTHING":
         return _nothing(f, len(rows))
     if word == "AMBIGUOUS":
-        return _ambiguous(explanations)
+        return _ambiguous(f, explanations)
+    if word == "UNKNOWN" and f.law and f.law_lead < -TOLD:
+        return (
+            f"structure is left that another law of {f.law} explains: its strength changes along it, and that is "
+            f"{-f.law_lead:.3g} ahead of what any effect of the library does. It is in the model, by another law than "
+            "this sensor follows."
+        )
     if word == "UNKNOWN":
         return _unknown(f, next(c for c in fingerprints if c.coordinate == f.coordinate), basis)
     if word == "CANNOT_TELL":
@@ -207,9 +213,15 @@ def _strength_in(e: Explanation, row: Row) -> str:
     return strength_text([e.strength[i] for i in own], [e.sd[i] for i in own], [e.units[i] for i in own], reaches)
 
 
-def _ambiguous(explanations: Sequence[Explanation]) -> str:
+def _ambiguous(f: Findings, explanations: Sequence[Explanation]) -> str:
     alive = [e for e in explanations if e.survives]
     names = ", or ".join(f"{e.name} ({e.fall:.4g})" for e in alive)
+    if f.law_lead < TOLD:
+        one = len(alive) == 1
+        return (
+            f"{'this explanation is' if one else f'{len(alive)} explanations are'} not told apart (fall of chi2) from "
+            f"another law of {f.law}, which is in the model: {names}."
+        )
     return (
         f"{len(alive)} explanations are not told apart (fall of chi2): {names}. All others are behind by more than "
         "noise and misfit allow."
