@@ -46,6 +46,7 @@ class Findings:
     against      that explanation, in words
     ratio        the best curve's fall, less its cost, over that of the best explanation; coordinate: of that curve
     rival        whether a curve does significantly better, by RIVAL (a map) or RIVAL_CURVE, where misfit is left
+    shared       whether noise that neighbouring readings share explains it as well as the best explanation
     share        of the excess that the best explanation explains, where excess_sd > EXCESS; curve_share: the best curve
     left         misfit over mean signal with the best explanation
     uneven       largest h of the winner's splits, by the split uneven_by (in words), uneven_limit allowed; even:
@@ -69,6 +70,7 @@ class Findings:
     p_winner: float = 1.0
     fall: float = 0.0
     common: bool = True
+    shared: bool = False
     survivors: int = 1
     lead: float = math.inf
     needed: float = TOLD
@@ -158,7 +160,8 @@ def _word_of_winner(f: Findings, failed: set[str]) -> str:
         return "NOTHING"
     alone = not failed & {"significant", "no better curve", "share", "beyond clutter", "near"}
     alone = alone and f.law_lead > -TOLD
-    if failed & {"lead", LAW} and alone and f.some_even and (f.survivors > 1 or LAW in failed):
+    rivals = f.survivors > 1 or f.shared or LAW in failed
+    if failed & {"lead", LAW} and alone and f.some_even and rivals:
         return "AMBIGUOUS"
     return "PARTIAL" if failed - {"spread"} and failed <= {"share", "even", "spread"} else ""
 
@@ -195,7 +198,7 @@ def _against_effects(f: Findings) -> list[Condition]:
             "lead",
             f.lead,
             f.needed,
-            f.common and f.lead > f.needed,
+            f.common and f.lead > f.needed and not f.shared,
             f"{f.lead:.3g} ahead of {f.against or 'no effect'}, {f.needed:.3g} needed"
             if f.common
             else f"{f.survivors} explanations are not told apart, and no effect is part of all",
@@ -333,8 +336,8 @@ def rivals(fingerprints: Sequence[Fingerprint], best: Opponent) -> list[Fingerpr
     better = [
         f
         for f in fingerprints
-        if f.ratio >= allowed(f.coordinate)
-        and f.p < LEVEL / len(fingerprints)
+        if f.p < LEVEL / len(fingerprints)
+        and f.net > allowed(f.coordinate) * fall
         and f.net - fall > 3 * math.sqrt(2 * f.dof) * f.net / (f.fall - f.dof)
         and f.net - f.cost > fall
     ]

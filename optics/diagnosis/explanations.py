@@ -2,22 +2,24 @@
 
 Every explanation is calibrated together with all that the base calibrates. What counts is its score
 
-    score = fall / scale - cost
+    score = fall - cost
     cost  = ln det(1 + t V t) + sum over effects (3 ln(1 + x^2/2) + EACH)
 
-with the fall of chi2, the scale of what is left (chi2 per degree of freedom with the most complete explanation, at
-least 1), V the information that the data hold on the strengths (k, k), t their plausible sizes, and x how far an
-effect's strengths are from neutral, in plausible sizes. The first term of the cost is what strengths could have fitted,
-whatever the data are: the Occam factor of a marginal likelihood whose prior is t wide. The second is the density of
-Student's t with two degrees of freedom: a strength of 36 plausible sizes costs 19. The third is the prior odds of an
-effect.
+with the fall of deviance, V the information that the data hold on the strengths (k, k), t their plausible sizes, and x
+how far an effect's strengths are from neutral, in plausible sizes. The first term of the cost is what strengths could
+have fitted, whatever the data are: the Occam factor of a marginal likelihood whose prior is t wide. The second is the
+density of Student's t with two degrees of freedom: a strength of 36 plausible sizes costs 19. The third is the prior
+odds of an effect. The deviance is chi2 in units of what the best explanation leaves, or of the noise that is stated
+where that is more; of readings, each explanation may have noise that neighbours share besides
+(`optics.diagnosis.correlation`): a lamp that wanders is a rival of whatever changes slowly.
 
-Whether an explanation needs an effect that a simpler one lacks is a question of significance: family-wise, with the
-design effect (`optics.diagnosis.correlation`). Of two that are not nested, one is told apart from the best when its
-score is TOLD lower (CLEAR, where plausibility alone decides), the difference of falls divided by its design effect;
-when that difference exceeds the smaller of HALF of what the best one leaves and MARGIN of its fall, as misfit that is
-left may lie along any direction; and, of readings, when it predicts blocks of the session worse that were left out. All
-others survive. An effect that is part of every explanation that survives is missing, whichever of them is right.
+Whether an explanation needs an effect that a simpler one lacks is a question of significance: family-wise; of images,
+with the design effect of what tells the two apart (`optics.diagnosis.homogeneity.variances`). Of two that are not
+nested, one is told apart from the best when its score is TOLD lower (CLEAR, where plausibility alone decides); when, of
+images or of readings with MISSTATED noise, the difference of falls exceeds the smaller of HALF of what the best one
+leaves and MARGIN of its fall, as misfit that is left may lie along any direction; and, of readings, when it predicts
+blocks of the session worse that were left out. All others survive. An effect that is part of every explanation that
+survives is missing, whichever of them is right.
 
 Sources: MacKay, Bayesian interpolation, Neural Computation 4, 415 (1992), Occam factor; Vuong, Econometrica 57, 307
 (1989), the variance of a difference of log likelihoods."""
@@ -30,11 +32,10 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from optics.diagnosis import correlation as correlations
 from optics.diagnosis import homogeneity, pairs
 from optics.diagnosis import statistics as st
-from optics.diagnosis.correlation import Correlation
-from optics.diagnosis.evidence import Candidate, measure, silent
+from optics.diagnosis.correlation import Correlation, Readings
+from optics.diagnosis.evidence import Candidate, at_bound, measure, silent
 from optics.diagnosis.refit import FAILURES, START, Case, excess_of, known_of, weighed, with_effects
 from optics.diagnosis.result import Explanation, leaves_nothing
 from optics.diagnosis.score import solve
@@ -42,7 +43,7 @@ from optics.diagnosis.thresholds import CLEAR, EACH, HALF, LEVEL, MARGIN, TOLD
 from optics.fit import calibrate
 from optics.fit.model import value_of
 from optics.fit.result import Fit
-from optics.scene.parameter import Values
+from optics.scene.parameter import Values, Variable
 
 LARGEST = 3  # effects of one explanation
 LEADERS, FOLLOWERS = 3, 4  # explanations that are extended in each round, and effects that each is extended by
@@ -52,6 +53,8 @@ NEARLY = 0.9  # the same beside an explanation that leaves nothing
 TRUSTED = 0.7  # of what a linearisation expects: an explanation that is expected to fall short by more is not refitted
 BLOCKS = 8  # pieces of a session, each left out once
 LEAST = 2  # values per number that is fitted, below which no set of effects is refitted
+CONTENDERS = 40  # explanations of a table whose shared noise is sought; others are behind without it
+MISSTATED = 2.0  # variance over the stated one above which what the best explanation leaves is misfit, not noise
 LOOSE = 10.0  # plausible sizes: what keeps a strength that a left-out block alone determines near neutral
 
 
@@ -61,6 +64,7 @@ class Trial:
 
     members    effects, none for the base;   fit, fall, after, expected, images   as of `optics.diagnosis.refit.Attempt`
     cost       see the module
+    deviance   see the module; NaN before the competition
     ahead      chi2 of the blocks that were left out in turn, less that of the base; NaN where it was not computed
     """
 
@@ -73,6 +77,7 @@ class Trial:
     cost: float = 0.0
     excess_sd: float = 0.0
     structure_p: float = math.nan
+    deviance: float = math.nan
     ahead: float = math.nan
 
     @property
@@ -106,6 +111,8 @@ class Outcome:
     survivors    all that are not told apart from the best, the best first
     core         effects that every survivor has
     leads        explanation -> (lead of the best in score, lead needed)
+    scale        chi2 per degree of freedom that the best leaves, at least 1; correlation: of the readings about it
+    shared       whether noise that neighbouring readings share explains it as well as the best does
     """
 
     leader: Trial
@@ -115,11 +122,20 @@ class Outcome:
     scale: float
     correlation: Correlation
     leads: dict[frozenset[str], tuple[float, float]] = field(default_factory=dict)
+    shared: bool = False
 
     @property
     def core(self) -> list[str]:
         common = frozenset.intersection(*[t.names for t in self.survivors])
         return [c.effect.name for c in self.best.members if c.effect.name in common]
+
+    def fall(self, trial: Trial) -> float:
+        """Of chi2, with what noise shared by neighbours takes up beside the effects of a trial."""
+        return self.trials_base.after - self.scale * trial.deviance
+
+    @property
+    def trials_base(self) -> Trial:
+        return next(t for t in self.trials if not t.members)
 
     def without(self, trial: Trial, name: str) -> Trial:
         """The trial with most of the other effects of a trial: what is lost without the one."""
@@ -432,11 +448,20 @@ def _joined(case: Case, trials: dict[frozenset[str], Trial]) -> None:
 # -- the competition -------------------------------------------------------------------------------------------------
 def compete(case: Case, trials: list[Trial]) -> Outcome:
     """The explanations that are not told apart from the best."""
-    scale = _scale(case, trials)
+    scale, correlation = _scale(case, trials), Correlation()
     order = sorted(trials, key=lambda t: -_score(t, scale))
+    for t in order:
+        t.deviance = t.after / scale
+    if case.evidence.is_table:
+        best = next((t for t in order if t.members), order[0])
+        correlation = _readings(case, best).correlation()
+        scale = max(correlation.scale, 1.0)
+        for i, t in enumerate(order):
+            near = i < CONTENDERS or len(t.members) < 2
+            t.deviance = _readings(case, t).deviance(scale) if near else t.after / scale
+        order.sort(key=lambda t: t.deviance + t.cost)
     # whether there is anything is a question of its own, which costs do not answer
     leader = next((t for t in order if t.members), order[0])
-    correlation = _correlation(case, leader) if case.evidence.is_table else Correlation(scale)
     outcome = Outcome(leader, leader, [leader], order, scale, correlation)
     for t in order:
         if t is not leader:
@@ -446,12 +471,18 @@ def compete(case: Case, trials: list[Trial]) -> Outcome:
 
 def _with_survivors(case: Case, outcome: Outcome) -> Outcome:
     best = outcome.leader
+    base = outcome.trials_base
+    lead, needed = _lead(case, outcome, best, base) if best.members else (0.0, 0.0)
+    fall = (base.after - best.after) / outcome.scale
+    outcome.shared = case.evidence.is_table and lead <= needed < fall
     while True:
         alive = [best] + [t for t in outcome.trials if t is not best and not _told(case, outcome, best, t)]
         alive += [t for t in _inherited(case, outcome, alive) if t not in alive]
+        if outcome.shared:  # a rival that is no explanation by effects
+            alive = [t for t in alive if t.members]
         # an explanation within another that is not told apart says the same with less
         kept = [t for t in alive if not any(o is not t and o.keys < t.keys for o in alive)]
-        kept.sort(key=lambda t: -_score(t, outcome.scale))
+        kept.sort(key=lambda t: t.deviance + t.cost)
         if best in kept:
             break
         best = next(t for t in kept if t.keys < best.keys) if any(t.keys < best.keys for t in kept) else kept[0]
@@ -478,7 +509,7 @@ def _inherited(case: Case, outcome: Outcome, alive: Sequence[Trial]) -> list[Tri
                     if len(other.members) > len(t.members) or inner.keys <= other.keys or other in (t, inner):
                         continue
                     lead, needed = _lead(case, outcome, inner, other)
-                    if not lead > needed and _score(other, outcome.scale) > _score(inner, outcome.scale) - CLEAR:
+                    if not lead > needed and other.deviance + other.cost < inner.deviance + inner.cost + CLEAR:
                         found.append(other)
     return found
 
@@ -486,13 +517,18 @@ def _inherited(case: Case, outcome: Outcome, alive: Sequence[Trial]) -> list[Tri
 def _lead(case: Case, outcome: Outcome, best: Trial, other: Trial) -> tuple[float, float]:
     """(lead in score, lead needed) of one explanation over another; over one within it, the fall that the rest brings,
     and the fall that would be significant among so many effects."""
-    fall, cost = best.fall - other.fall, other.cost - best.cost
-    data = fall / _design_effect(case, outcome, best, other)
+    cost, is_table = other.cost - best.cost, case.evidence.is_table
+    data = other.deviance - best.deviance
+    if not is_table:
+        data = outcome.scale * data / _design_effect(case, outcome, best, other)
     lead, needed = data + cost, TOLD if data > TOLD else CLEAR  # what is plausible decides alone only where it is clear
     if other.keys < best.keys:
-        lead, needed, cost = lead - cost, _significant(case, best, other), 0.0
+        lead, needed, cost = data, _significant(case, best, other), 0.0
+    if best.complete or (is_table and outcome.scale < MISSTATED):
+        return lead, needed
+    fall = best.fall - other.fall
     dof = max(case.evidence.normal.count - case.evidence.projected.rank, 1)
-    misfit = 0.0 if best.complete else min(HALF * best.left(dof), MARGIN * best.fall)
+    misfit = min(HALF * best.left(dof), MARGIN * best.fall)
     if misfit and fall + cost * outcome.scale < misfit:
         return lead, max(needed, lead + misfit - fall)
     return lead, needed
@@ -512,12 +548,9 @@ def _significant(case: Case, best: Trial, inner: Trial) -> float:
 
 
 def _design_effect(case: Case, outcome: Outcome, one: Trial, other: Trial) -> float:
-    """By how much the variance of the difference of two chi2 exceeds what independent noise makes."""
+    """By how much the variance of the difference of two chi2 of images exceeds what independent noise makes."""
     direction = _kept(case, [a - b for a, b in zip(one.images, other.images)])
-    if case.evidence.is_table:
-        order, signal = case.evidence.order(case.model), case.evidence.lit(case.model)
-        return outcome.correlation.design_effect(np.concatenate(direction), order, signal)
-    left = _kept(case, outcome.trials[0].images)
+    left = _kept(case, outcome.leader.images)
     total = sum(float(d @ d) for d in direction)
     if not total > 0 or case.places is None:
         return 1.0
@@ -525,16 +558,21 @@ def _design_effect(case: Case, outcome: Outcome, one: Trial, other: Trial) -> fl
     return max([1.0, *(float(b[0, 0]) / total for b, parts in found if parts > 2)])
 
 
-def lead_without(case: Case, outcome: Outcome, name: str) -> tuple[float, float, str]:
-    """(lead, lead needed, rival in words) of the best explanation over the best one without an effect."""
-    others = [t for t in outcome.trials if name not in t.names]
-    rival = max(others, key=lambda t: _score(t, outcome.scale))
+def lead_without(case: Case, outcome: Outcome, subject: Candidate) -> tuple[float, float, str]:
+    """(lead, lead needed, rival in words) of the best explanation over the best one without an effect, and without one
+    that contains it."""
+    own = {(key, v.frames) for v in subject.variables for key in v.keys}
+    others = [t for t in outcome.trials if not own <= t.keys]
+    rival = min(others, key=lambda t: t.deviance + t.cost)
     return (*_lead(case, outcome, outcome.best, rival), " with ".join(c.effect.name for c in rival.members))
 
 
-def design_effect_without(case: Case, outcome: Outcome, name: str) -> float:
-    """The design effect of what an effect adds to the best explanation."""
-    return _design_effect(case, outcome, outcome.best, outcome.without(outcome.best, name))
+def fall_over_noise(case: Case, outcome: Outcome, name: str) -> float:
+    """What an effect adds to the best explanation, less what noise shared by neighbours would take up without it."""
+    without = outcome.without(outcome.best, name)
+    if case.evidence.is_table:
+        return without.deviance - outcome.best.deviance
+    return outcome.own_fall(outcome.best, name) / _design_effect(case, outcome, outcome.best, without)
 
 
 def _kept(case: Case, images: Sequence[np.ndarray]) -> list[np.ndarray]:
@@ -542,16 +580,23 @@ def _kept(case: Case, images: Sequence[np.ndarray]) -> list[np.ndarray]:
     return [np.asarray(i, float).reshape(-1)[b.index] for i, b in zip(images, case.evidence.blocks)]
 
 
-def _correlation(case: Case, best: Trial) -> Correlation:
-    """Of the readings about an explanation."""
-    dense = _measured(case, best)
+def _readings(case: Case, trial: Trial) -> Readings:
+    """The readings about an explanation."""
     order, signal = case.evidence.order(case.model), case.evidence.lit(case.model)
-    return correlations.estimate(np.concatenate(_kept(case, best.images)), dense, order, signal)
+    return Readings(np.concatenate(_kept(case, trial.images)), _measured(case, trial), order, signal)
 
 
 def _measured(case: Case, trial: Trial) -> np.ndarray:
-    """(n, k) whitened derivative images of the base and of an explanation's strengths, at its fit."""
+    """(n, k) whitened derivative images of the base and of an explanation's strengths, at its fit; 0 of those that
+    stand at a bound there."""
     base = [case.evidence.columns[i] for i in case.evidence.base] + [v for c in trial.members for v in c.variables]
+    columns = _derivatives(case, trial, base)
+    columns[:, [at_bound(v, value_of(case.model, trial.fit.values, v)) for v in base]] = 0.0
+    return columns
+
+
+def _derivatives(case: Case, trial: Trial, base: Sequence[Variable]) -> np.ndarray:
+    """(n, k) whitened derivative images at an explanation's fit; those that the fit made last, where it has them."""
     normal = trial.fit.normal
     if normal is not None and trial.fit.frames == case.evidence.frames:
         names = {v.name: i for i, v in enumerate(trial.fit.variables)}

@@ -13,7 +13,7 @@ from optics.diagnosis import fingerprints as prints
 from optics.diagnosis import statistics as st
 from optics.diagnosis.decide import Findings, Opponent, rivals
 from optics.diagnosis.evidence import Candidate, Evidence
-from optics.diagnosis.explanations import Outcome, design_effect_without, lead_without
+from optics.diagnosis.explanations import Outcome, fall_over_noise, lead_without
 from optics.diagnosis.refit import Case, clear
 from optics.diagnosis.result import Basis, Fingerprint, Law, Level, Split
 from optics.diagnosis.thresholds import AS_GOOD, LEVEL, UNEVEN
@@ -86,14 +86,15 @@ def findings_of(
         own = replace(own, measured=measured)
     if laws and laws[0].p < LEVEL:
         # in the scale of what the best explanation leaves, as explanations are compared
-        fall, lead = best.fall / outcome.scale - best.cost, laws[0].fall / outcome.scale - laws[0].cost
-        own = replace(own, law=f"{laws[0].effect} along {laws[0].coordinate}", law_lead=fall - lead)
+        score, other = outcome.fall(best) / outcome.scale - best.cost, laws[0].score
+        own = replace(own, law=f"{laws[0].effect} along {laws[0].coordinate}", law_lead=score - other)
     if not fingerprints:
         return own
     followed = _followed(case, subject, best.fit, best.fall - best.expectation, fingerprints)
     complete = bool(best.members) and best.complete
+    fall = max(outcome.fall(best), own.fall) if case.evidence.is_table else own.fall
     opponent = Opponent(
-        own.fall,
+        fall,
         best.cost,
         len(best.members),
         sum(len(c.cone.live) for c in best.members),
@@ -104,7 +105,7 @@ def findings_of(
     best_curve = better[0] if better else fingerprints[0]
     return replace(
         own,
-        ratio=best_curve.net / max(own.fall, 1.0),
+        ratio=best_curve.net / max(fall, 1.0),
         rival=bool(better),
         coordinate=best_curve.coordinate,
         curve_share=best_curve.share,
@@ -127,17 +128,17 @@ def _of_subject(
     even = [all(s.holds for s in splits if s.effect == n) for n in names]
     worst = max(mine, key=lambda s: (not s.holds, s.h), default=None)
     excess = basis.chi2 - basis.dof
-    own = outcome.own_fall(best, name)
-    lead, needed, against = lead_without(case, outcome, name)
+    lead, needed, against = lead_without(case, outcome, subject)
     carried, carried_by = _carried(case, outcome, subject)
     strength = [value_of(case.model, best.fit.values, v) for v in subject.variables]
     return Findings(
         table.p_best,
         basis.structure_p,
         name,
-        table.family.p(float(subject.cone.p(own / design_effect_without(case, outcome, name)))),
+        table.family.p(float(subject.cone.p(fall_over_noise(case, outcome, name)))),
         best.fall - best.expectation,
         common=name in outcome.core,
+        shared=outcome.shared,
         survivors=len(outcome.survivors),
         lead=lead,
         needed=needed,

@@ -3,8 +3,8 @@
 The library gives each effect one law. Where a bench follows another, such as a lamp that warms up and then stays, or a
 dial that is squeezed as well as eccentric, the effect is right, and what it leaves looks like some second effect. So
 each effect that was added is given a freer law, s + sum over k of s_k cos(pi k x) with x the rank of a coordinate
-between 0 and 1, and competes with the explanations of what is left. `Law.cost` is what so many strengths could have
-fitted (`optics.diagnosis.result.Fingerprint.cost`)."""
+between 0 and 1, and competes with the explanations of what is left, of readings by the same deviance. `Law.cost` is
+what so many strengths could have fitted (`optics.diagnosis.result.Fingerprint.cost`)."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from scipy.stats import rankdata
 
 from optics.diagnosis import fingerprints as prints
 from optics.diagnosis import statistics as st
+from optics.diagnosis.correlation import Readings
 from optics.diagnosis.evidence import Evidence
 from optics.diagnosis.result import Law
 from optics.diagnosis.thresholds import MIMICS
@@ -34,51 +35,78 @@ def other_laws(
     places: Sequence[dict[str, np.ndarray]],
     added: Sequence[Effect],
     variables_of: Callable[[Effect], Sequence[Variable]],
+    scale: float,
 ) -> list[Law]:
     """A freer law of each added effect along each coordinate, best score first.
 
     places   what `optics.diagnosis.fingerprints.places` returns
+    scale    variance over the stated one, in which falls of readings are judged beside noise that neighbours share
     """
     if not added:
         return []
     turned = set(prints.settings(model, evidence))
     common = set.intersection(*[set(p) for p in places])
+    judge = _fall_of_readings(model, evidence, scale) if evidence.is_table else _fall_of_images(evidence)
     found = []
     for effect in added:
         keys = {key for v in variables_of(effect) for key in v.keys}
         own = [i for i in evidence.base if keys & set(evidence.columns[i].keys)]
         along = {*effect.acts, *((*turned, *ALWAYS) if evidence.is_table else ())}
         for coordinate in sorted((along & common) - {*MIMICS}) if own else []:
-            laws = list(_laws(evidence, effect, own, coordinate, [p[coordinate] for p in places]))
+            x = np.concatenate([p[coordinate] for p in places])
+            laws = []
+            for images in _strengths(evidence, own, x):
+                fall, dof = judge(images)
+                if dof:
+                    laws.append(Law(effect.name, coordinate, fall, dof, float(chdtrc(dof, max(fall, 0.0)))))
             found += [max(laws, key=lambda law: law.score)] if laws else []
     return sorted(found, key=lambda law: -law.score)
 
 
-def _laws(
-    evidence: Evidence, effect: Effect, own: Sequence[int], coordinate: str, values: Sequence[np.ndarray]
-) -> Iterator[Law]:
-    """Laws of one effect along one coordinate, by the number of cosines."""
-    x = np.concatenate(values)
+def _strengths(evidence: Evidence, own: Sequence[int], x: np.ndarray) -> Iterator[list[np.ndarray]]:
+    """Per block, the images (n, k) of further strengths of the columns `own`, by the number of cosines along x (n,)."""
     good = np.isfinite(x)
     levels = len(np.unique(x[good]))
     place = np.where(good, (rankdata(np.where(good, x, 0.0)) - 0.5) / len(x), 0.5)
-    ends = np.cumsum([len(v) for v in values])[:-1]
-    for order in ORDERS:
-        order = min(order, levels - 1)
-        room = evidence.normal.count - evidence.projected.rank
+    ends = np.cumsum([len(block.r) for block in evidence.blocks])[:-1]
+    room = evidence.normal.count - evidence.projected.rank
+    for order in dict.fromkeys(min(order, levels - 1) for order in ORDERS):
         if order < 1 or PER_NUMBER * order * len(own) > room:
             return
-        waves = [np.cos(np.pi * k * place) * good for k in range(1, order + 1)]
-        first = len(evidence.columns)
-        normal = evidence.thinned(extra=order * len(own))
-        for block, *curves in zip(evidence.blocks, *(np.split(w, ends) for w in waves)):
-            images = block.columns(own)
-            carriers = [images[:, i] * w for i in range(len(own)) for w in curves]
-            st.add_bins(normal, block.where, block.middle, block.r, first, np.zeros(len(block.r), int), 1, carriers)
-        rest = list(range(first, first + order * len(own)))
+        waves = np.cos(np.pi * place[:, None] * np.arange(1, order + 1)) * good[:, None]
+        yield [
+            (block.columns(own)[:, :, None] * wave[:, None, :]).reshape(len(block.r), -1)
+            for block, wave in zip(evidence.blocks, np.split(waves, ends))
+        ]
+
+
+def _fall_of_images(evidence: Evidence) -> Callable[[Sequence[np.ndarray]], tuple[float, int]]:
+    """(fall of chi2, dof) of further images of each block."""
+
+    def fall_of(images: Sequence[np.ndarray]) -> tuple[float, int]:
+        count, first = images[0].shape[1], len(evidence.columns)
+        normal = evidence.thinned(extra=count)
+        for block, own in zip(evidence.blocks, images):
+            st.add_bins(normal, block.where, block.middle, block.r, first, np.zeros(len(block.r), int), 1, [*own.T])
+        rest = list(range(first, first + count))
         projected = evidence.project(normal, evidence.base, rest, evidence.thinning)
         fall, dof, *_ = st.joint(projected, np.diag(normal.gram)[rest])
-        if dof:
-            yield Law(effect.name, coordinate, fall * evidence.thinning, dof, float(chdtrc(dof, fall)))
-        if order == levels - 1:
-            return
+        return fall * evidence.thinning, dof
+
+    return fall_of
+
+
+def _fall_of_readings(
+    model: Model, evidence: Evidence, scale: float
+) -> Callable[[Sequence[np.ndarray]], tuple[float, int]]:
+    """The same for readings, beside noise that neighbours share, in units of the scale."""
+    base, r = evidence.dense(evidence.base), np.concatenate([block.r for block in evidence.blocks])
+    order, signal = evidence.order(model), evidence.lit(model)
+    rank, before = st.orthonormal(base).shape[1], Readings(r, base, order, signal).deviance(scale)
+
+    def fall_of(images: Sequence[np.ndarray]) -> tuple[float, int]:
+        whole = np.hstack([base, np.concatenate(images)])
+        dof = st.orthonormal(whole).shape[1] - rank
+        return before - Readings(r, whole, order, signal).deviance(scale) if dof else 0.0, dof
+
+    return fall_of

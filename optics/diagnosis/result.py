@@ -258,7 +258,8 @@ class Fingerprint:
 class Law:
     """A freer law of an effect that the model has: its strength changes slowly along a coordinate.
 
-    fall, dof   of chi2 with so many further strengths; p: of that fall in noise
+    fall, dof   with so many further strengths, of chi2 or, of readings, of deviance (optics.diagnosis.correlation)
+    p           of that fall in noise
     """
 
     effect: str
@@ -274,7 +275,7 @@ class Law:
 
     @property
     def score(self) -> float:
-        """fall less cost, in noise of the size that is stated."""
+        """fall less cost."""
         return self.fall - self.cost
 
 

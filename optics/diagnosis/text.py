@@ -216,6 +216,11 @@ def _strength_in(e: Explanation, row: Row) -> str:
 def _ambiguous(f: Findings, explanations: Sequence[Explanation]) -> str:
     alive = [e for e in explanations if e.survives]
     names = ", or ".join(f"{e.name} ({e.fall:.4g})" for e in alive)
+    if f.shared:
+        return (
+            "noise that neighbouring readings share, such as a lamp that wanders, is not told apart from "
+            f"{'this explanation' if len(alive) == 1 else f'these {len(alive)} explanations'} (fall of chi2): {names}."
+        )
     if f.law_lead < TOLD:
         one = len(alive) == 1
         return (

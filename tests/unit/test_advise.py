@@ -436,7 +436,7 @@ def test_following_the_advice_resolves_ties():
     """Taking what is advised against taking as many other presses at random, on the same ties."""
     ties, won, wrong = 0, {True: 0, False: 0}, {True: 0, False: 0}
     told = []
-    for names, seed in itertools.product(TIES, range(5)):
+    for names, seed in itertools.product(TIES, range(8)):
         for advised in (True, False):
             first, second = follow(names, seed, advised)
             if second is None:

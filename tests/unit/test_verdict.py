@@ -287,6 +287,13 @@ GOOD = Findings(
         ({"rival": True, "ratio": 2.0, "curve_share": 0.06}, "UNKNOWN"),
         ({"rival": True, "ratio": 2.0, "curve_share": 0.04}, "CANNOT_TELL"),
         ({"p_family": 0.02, "rival": True, "ratio": 3.0, "curve_share": 0.01}, "CANNOT_TELL"),
+        ({"law": "b along frame", "law_lead": TOLD + 0.1}, "CLAIM"),
+        ({"law": "b along frame", "law_lead": 1.0}, "AMBIGUOUS"),
+        ({"law": "b along frame", "law_lead": -TOLD - 0.1}, "UNKNOWN"),
+        ({"law": "b along frame", "law_lead": -TOLD - 0.1, "structure_p": 0.5}, "CANNOT_TELL"),
+        ({"law": "b along frame", "law_lead": -TOLD - 0.1, "p_family": 0.02, "structure_p": 0.5}, "NOTHING"),
+        ({"shared": True}, "AMBIGUOUS"),
+        ({"shared": True, "share": 0.02}, "CANNOT_TELL"),
     ],
 )
 def test_the_rule(changes, word):
@@ -801,11 +808,3 @@ def curve(coordinate, net, dof=16):
 def test_bins_of_a_curve_cost_what_they_could_have_fitted(found, effects, rival):
     best = decide_rules.Opponent(1000.0, 12.0, effects, 3, complete=True, decides=True)
     assert bool(decide_rules.rivals([found], best)) == rival
-
-
-def test_the_law_of_what_was_added_may_be_another():
-    """A curve along the clock beside one effect, where a drift is in the model."""
-    curves = [curve("time", 1000.0, dof=4)]
-    plain = decide_rules.Opponent(1000.0, 25.0, 1, 2, complete=True, decides=True)
-    assert decide_rules.rivals(curves, plain) == []
-    assert decide_rules.rivals(curves, replace(plain, laws=frozenset({"time"}))) == curves

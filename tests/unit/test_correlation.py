@@ -1,0 +1,100 @@
+"""Noise that neighbouring readings share: its likelihood is that of the covariance, its numbers are found, and slow
+curves owe it most of their significance."""
+
+import numpy as np
+import pytest
+
+from optics.diagnosis.correlation import FEWEST, KINDS, LENGTHS, NOTED, Readings
+
+COUNT = 160
+TURN = np.linspace(0, 2 * np.pi, COUNT)
+SIGNAL = 30 * np.cos(TURN) ** 2
+FITTED = np.column_stack([SIGNAL, np.ones(COUNT)])
+
+
+def covariance(power, length, kind, order=None):
+    """V, as the module writes it."""
+    order = np.arange(COUNT) if order is None else order
+    load = SIGNAL / np.sqrt(np.mean(SIGNAL**2)) if kind == "lamp" else np.ones(COUNT)
+    return np.eye(COUNT) + power * np.outer(load, load) * np.exp(-np.abs(order[:, None] - order) / length)
+
+
+def drawn(rng, power, length, kind):
+    return np.linalg.cholesky(covariance(power, length, kind)) @ rng.standard_normal(COUNT)
+
+
+def about(residual, fitted=FITTED, order=None):
+    """Readings about a fit, in whatever order."""
+    order = np.arange(COUNT) if order is None else order
+    basis = np.linalg.qr(fitted)[0]
+    return Readings(residual - basis @ (basis.T @ residual), fitted, order, SIGNAL)
+
+
+def test_the_filter_gives_the_likelihood_of_the_covariance():
+    """r'(V^-1 - V^-1 X (X'V^-1 X)^-1 X'V^-1) r + ln det V, for gaps in the numbering and readings of one moment."""
+    rng = np.random.default_rng(1)
+    order = np.sort(rng.integers(0, 300, COUNT))
+    shuffled = rng.permutation(COUNT)
+    residual = rng.standard_normal(COUNT)
+    basis = np.linalg.qr(FITTED)[0]
+    residual = residual - basis @ (basis.T @ residual)
+    found = Readings(residual[shuffled], FITTED[shuffled], order[shuffled], SIGNAL[shuffled])
+    for kind, left, logs, determinant in found.shared:
+        for i in (3, len(left) // 2, len(left) - 5):
+            v = covariance(found.power[i], found.length[i], kind, order)
+            inverse = np.linalg.inv(v)
+            normal = basis.T @ inverse @ basis
+            fit = np.linalg.solve(normal, basis.T @ inverse @ residual)
+            rest = residual - basis @ fit
+            assert left[i] == pytest.approx(rest @ inverse @ rest, rel=1e-9)
+            assert logs[i] == pytest.approx(np.linalg.slogdet(v)[1], rel=1e-9)
+            assert determinant[i] == pytest.approx(np.linalg.slogdet(normal)[1], abs=1e-8)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_power_length_and_kind_are_found(kind):
+    rng = np.random.default_rng(2)
+    found = [about(drawn(rng, 2.0, 8.0, kind)).correlation() for _ in range(20)]
+    assert np.mean([c.kind == kind for c in found]) >= 0.9
+    assert np.median([c.scale for c in found]) == pytest.approx(1, abs=0.15)
+    # a grid in steps of 2.5 and 1.9
+    assert 0.8 < np.median([c.power for c in found]) < 5 and 3 < np.median([c.length for c in found]) < 16
+
+
+def test_white_noise_is_left_alone():
+    """NOTED, twice the log likelihood, for three numbers of two kinds."""
+    rng = np.random.default_rng(3)
+    found = [about(rng.standard_normal(COUNT)) for _ in range(60)]
+    assert np.mean([f.correlation().power > 0 for f in found]) <= 0.15
+    white = [f.white for f in found]
+    assert [f.deviance(1.0) for f in found] == pytest.approx(white, abs=2 * NOTED)
+
+
+def test_a_slow_curve_is_worth_little_beside_a_lamp_that_wanders():
+    """What a wobble's two strengths gain of chi2 is ten times what noise is allowed; of deviance it is what independent
+    noise would give them."""
+    rng = np.random.default_rng(4)
+    wobble = np.column_stack([FITTED, SIGNAL * np.sin(TURN / 2), SIGNAL * np.cos(TURN / 2)])
+    falls = []
+    for _ in range(30):
+        noise = drawn(rng, 3.0, 20.0, "lamp")
+        plain, with_it = about(noise), about(noise, wobble)
+        falls.append((plain.white - with_it.white, plain.deviance(1.0) - with_it.deviance(1.0)))
+    chi2, deviance = np.mean(falls, 0)
+    assert chi2 > 40 and deviance < 8
+
+
+def test_a_sharp_curve_keeps_its_significance_beside_a_lamp_that_wanders():
+    rng = np.random.default_rng(5)
+    sharp = np.where(np.arange(COUNT) % 2, 1.0, -1.0)
+    noise = drawn(rng, 3.0, 20.0, "lamp") + sharp
+    fall = about(noise).deviance(1.0) - about(noise, np.column_stack([FITTED, sharp])).deviance(1.0)
+    assert fall == pytest.approx(COUNT, rel=0.25)
+
+
+def test_of_few_readings_no_correlation_is_asked():
+    few = FEWEST + 1
+    readings = Readings(np.ones(few), FITTED[:few], np.arange(few), SIGNAL[:few])
+    assert not readings.shared and readings.correlation().power == 0
+    many = FEWEST + 2
+    assert len(Readings(TURN[:many], FITTED[:many], np.arange(many), SIGNAL[:many]).length) % LENGTHS == 0
