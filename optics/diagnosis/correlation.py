@@ -10,9 +10,10 @@ goes with the signal over its noise, as of a lamp (`kind`), rms 1 in both cases.
 slowly during a session. So each explanation of the readings is judged by its deviance with the shared noise that suits
 it best,
 
-    deviance = min over power, length, kind of (r' V^-1 r / scale + ln det V + NOTED [power > 0])
+    deviance = min over power, length, kind of (r' V^-1 r / scale + ln det V + [power > 0] (NOTED + 3 ln(1 + x^2/2)))
 
-with the residual r after everything that was fitted is fitted again by these weights.
+with the residual r after everything that was fitted is fitted again by these weights. x is the rms of the shared noise
+over that of the signal, in units of WANDER: like the strength of an effect, it pays for being far from plausible.
 
 The exponential is an Ornstein-Uhlenbeck process, which is Markov: a Kalman filter whitens n readings in n steps. The
 scale is found by restricted maximum likelihood.
@@ -30,9 +31,11 @@ from optics.diagnosis import statistics as st
 
 FEWEST = 12  # degrees of freedom from which a correlation is estimated
 POWERS = np.geomspace(0.01, 100.0, 11)
-LENGTHS = 8  # tried, from one reading to half of the session
+LENGTHS = 7  # tried, from SHORTEST to half of the session
+SHORTEST = 3.0  # readings: shared over fewer, it is hardly more than noise of a wrong size
 # What shared noise must gain in twice the log likelihood: few white sessions exceed it, and these lose little.
 NOTED = 4.0
+WANDER = 0.01  # of the signal: what a lamp or an amplifier may wander in a session
 KINDS = ("amplifier", "lamp")
 
 
@@ -64,12 +67,13 @@ class Readings:
         places = np.argsort(order, kind="stable")
         left = residual - basis @ (basis.T @ residual)
         self.white = float(left @ left)
+        self.bright = float(np.mean(np.square(signal))) if len(signal) else 0.0
         self.free = len(residual) - basis.shape[1]
         self.shared: list[tuple[str, np.ndarray, np.ndarray, np.ndarray]] = []  # kind, and what `_whitened` returns
         if self.free < FEWEST or not self.white > 0:
             return
         columns, t = np.column_stack([basis, residual])[places], order[places].astype(float)
-        lengths = np.geomspace(1.0, max(float(np.ptp(t)) / 2, 2.0), LENGTHS)
+        lengths = np.geomspace(SHORTEST, max(float(np.ptp(t)) / 2, 2 * SHORTEST), LENGTHS)
         self.power, self.length = (grid.ravel() for grid in np.meshgrid(POWERS, lengths))
         self.shared = [
             (kind, *_whitened(columns, t, _loading(kind, signal)[places], self.power, self.length)) for kind in KINDS
@@ -77,9 +81,11 @@ class Readings:
 
     def deviance(self, scale: float) -> float:
         """See the module."""
-        return min(
-            [self.white / scale, *(float(np.min(left / scale + logs)) + NOTED for _, left, logs, _ in self.shared)]
-        )
+        if not self.shared:
+            return self.white / scale
+        x2 = self.power * scale / max(self.bright, 1e-12) / WANDER**2
+        cost = NOTED + 3 * np.log1p(x2 / 2)
+        return min(self.white / scale, *(float(np.min(left / scale + logs + cost)) for _, left, logs, _ in self.shared))
 
     def correlation(self) -> Correlation:
         """By restricted maximum likelihood; one that noise alone makes (NOTED) is none."""

@@ -476,7 +476,10 @@ def _with_survivors(case: Case, outcome: Outcome) -> Outcome:
     fall = (base.after - best.after) / outcome.scale
     outcome.shared = case.evidence.is_table and lead <= needed < fall
     while True:
-        alive = [best] + [t for t in outcome.trials if t is not best and not _told(case, outcome, best, t)]
+        # what the leader rules out stays so beside a simpler one
+        judges = [best] if best is outcome.leader else [best, outcome.leader]
+        told = {id(t) for t in outcome.trials for j in judges if t is not j and _told(case, outcome, j, t)}
+        alive = [best] + [t for t in outcome.trials if t is not best and id(t) not in told]
         alive += [t for t in _inherited(case, outcome, alive) if t not in alive]
         if outcome.shared:  # a rival that is no explanation by effects
             alive = [t for t in alive if t.members]
