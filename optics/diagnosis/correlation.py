@@ -10,7 +10,7 @@ goes with the signal over its noise, as of a lamp (`kind`), rms 1 in both cases.
 slowly during a session. So each explanation of the readings is judged by its deviance with the shared noise that suits
 it best,
 
-    deviance = min over power, length, kind of (r' V^-1 r / scale + ln det V + [power > 0] (NOTED + 3 ln(1 + x^2/2)))
+    deviance = min over power >= 0, length, kind of (r' V^-1 r / scale + ln det V + 3 ln(1 + x^2/2))
 
 with the residual r after everything that was fitted is fitted again by these weights. x is the rms of the shared noise
 over that of the signal, in units of WANDER: like the strength of an effect, it pays for being far from plausible.
@@ -84,7 +84,7 @@ class Readings:
         if not self.shared:
             return self.white / scale
         x2 = self.power * scale / max(self.bright, 1e-12) / WANDER**2
-        cost = NOTED + 3 * np.log1p(x2 / 2)
+        cost = 3 * np.log1p(x2 / 2)
         return min(self.white / scale, *(float(np.min(left / scale + logs + cost)) for _, left, logs, _ in self.shared))
 
     def correlation(self) -> Correlation:

@@ -336,8 +336,8 @@ def rivals(fingerprints: Sequence[Fingerprint], best: Opponent) -> list[Fingerpr
     better = [
         f
         for f in fingerprints
-        if f.p < LEVEL / len(fingerprints)
-        and f.net > allowed(f.coordinate) * fall
+        if f.ratio >= allowed(f.coordinate)
+        and f.p < LEVEL / len(fingerprints)
         and f.net - fall > 3 * math.sqrt(2 * f.dof) * f.net / (f.fall - f.dof)
         and f.net - f.cost > fall
     ]

@@ -498,7 +498,8 @@ def _told(case: Case, outcome: Outcome, best: Trial, other: Trial) -> bool:
     if best.keys < other.keys:
         return True
     lead, needed = outcome.leads[other.names] if best is outcome.leader else _lead(case, outcome, best, other)
-    return lead > needed and not (best.ahead > other.ahead)
+    # whether anything predicts better than nothing is a condition of a claim, not of what is told apart
+    return lead > needed and not (other.members and best.ahead > other.ahead)
 
 
 def _inherited(case: Case, outcome: Outcome, alive: Sequence[Trial]) -> list[Trial]:

@@ -92,9 +92,8 @@ def findings_of(
         return own
     followed = _followed(case, subject, best.fit, best.fall - best.expectation, fingerprints)
     complete = bool(best.members) and best.complete
-    fall = max(outcome.fall(best), own.fall) if case.evidence.is_table else own.fall
     opponent = Opponent(
-        fall,
+        own.fall,
         best.cost,
         len(best.members),
         sum(len(c.cone.live) for c in best.members),
@@ -105,7 +104,7 @@ def findings_of(
     best_curve = better[0] if better else fingerprints[0]
     return replace(
         own,
-        ratio=best_curve.net / max(fall, 1.0),
+        ratio=best_curve.net / max(own.fall, 1.0),
         rival=bool(better),
         coordinate=best_curve.coordinate,
         curve_share=best_curve.share,

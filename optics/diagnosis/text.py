@@ -279,6 +279,7 @@ def report(d: Diagnosis) -> str:
         *_split_lines(d),
         *_level_lines(d),
         *_curve_lines(d),
+        *_law_lines(d),
         *_shift_lines(d),
         *advice_lines(d.advice),
         *(f"next: {hint}" for hint in d.hints),
@@ -419,6 +420,16 @@ def _curve_lines(d: Diagnosis) -> list[str]:
         best = ", ".join(f"{f.family} {f.coordinate} {f.of_best:.2f}" for f in d.families)
         lines.append(f"  best of each family: {best}")
     return lines
+
+
+def _law_lines(d: Diagnosis) -> list[str]:
+    if not d.laws or not d.laws[0].p < LEVEL:
+        return []
+    lines = ["", "freer laws of what was added (a strength that changes slowly along a coordinate)"]
+    return lines + [
+        f"  {law.effect} along {law.coordinate}: {law.dof} further numbers, fall {law.fall:.4g}, p {p_text(law.p)}"
+        for law in d.laws[:3]
+    ]
 
 
 def _shift_lines(d: Diagnosis) -> list[str]:

@@ -158,7 +158,9 @@ def test_a_film_that_is_smeared_at_one_angle_is_no_polarized_source(bench, seed)
     cell = cells.Cell("polarizer_bench", "unknown", ("smeared film",), 0.01, 0.5, "same", "", seed)
     step = blind.run(bench, cell)["steps"][-1]
     assert step["word"] in ("PARTIAL", "UNKNOWN") and step["refit"][0] == "polarized source"
-    assert not step["conditions"]["no better curve"][1] and "polarizer.angle" in step["sentence"]
+    # a curve along the angle explains it better, or the strength differs from angle to angle
+    held = step["conditions"]
+    assert not (held["no better curve"][1] and held["even"][1]) and "polarizer.angle" in step["sentence"]
 
 
 @pytest.mark.slow
