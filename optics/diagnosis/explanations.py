@@ -353,8 +353,10 @@ class Race:
 
 
 def _original(case: Case, c: Candidate) -> Candidate:
-    """The candidate as the base's evidence knows it."""
-    return next(o for o in case.table.order if o.effect.name == c.effect.name)
+    """The candidate as the base's evidence knows it; where nothing of it is visible there, as a dispersion without a
+    retardance, with the test of what is visible beside the other effects."""
+    found = next(o for o in case.table.order if o.effect.name == c.effect.name)
+    return found if len(found.cone.live) else replace(found, cone=c.cone)
 
 
 def _followers(case: Case, trial: Trial) -> list[tuple[Candidate, float, Values]]:
@@ -362,17 +364,18 @@ def _followers(case: Case, trial: Trial) -> list[tuple[Candidate, float, Values]
     expected of it, by the derivative images of the base, else by those at its fit."""
     values = trial.fit.values
     taken = {key for c in trial.members for v in c.variables for key in v.keys}
+    linear = _is_linear(case, trial)
     others = [
         o
         for o in case.table.order
         if o.effect.name not in trial.names
         and not o.broken
-        and len(o.cone.live)
+        and (len(o.cone.live) or not linear)
         and not taken & {key for v in o.variables for key in v.keys}
     ]
     if not others:
         return []
-    scored = _beside(case, trial, others) if _is_linear(case, trial) else _beside_at(case, trial, others)
+    scored = _beside(case, trial, others) if linear else _beside_at(case, trial, others)
     found = []
     for c, net, change in scored:
         start = values.copy()
@@ -417,7 +420,7 @@ def _beside_at(case: Case, trial: Trial, others: Sequence[Candidate]) -> list[tu
     base = [case.evidence.columns[i] for i in case.evidence.base] + [v for c in trial.members for v in c.variables]
     evidence = measure(case.model, values, base, there, case.evidence.frames, case.rows_max, case.seed, silent)
     solve(evidence, there, case.seed)
-    return [(c, c.row.net, c.change_of(c.linear)) for c in there]
+    return [(c, c.row.net, c.change_of(c.linear)) for c in there if len(c.cone.live) and not c.broken]
 
 
 def _joined(case: Case, trials: dict[frozenset[str], Trial]) -> None:

@@ -164,6 +164,11 @@ def hints_of(
     if word == "AMBIGUOUS":
         hints = _for_a_tie(single, gaps, names) if len(single) > 1 else []
         hints += [f"{c.effect.name} needs: {c.effect.needs}" for c in members if c.effect.needs and c not in single]
+        if findings.shared:
+            hints.append(
+                "take the readings in a shuffled order, or return to one setting again and again: what wanders with "
+                "the session then no longer follows the settings"
+            )
     if "spread" in failed:
         hints.append(f"repeat {findings.carried_by}: nearly all that would be explained lies there")
     if "held out" in failed and word != "NOTHING":

@@ -140,3 +140,22 @@ def test_a_contained_effect_does_not_come_back_by_its_score(tmp_path):
     assert not any("coloured leak" in e.effects for e in d.survivors)
     assert "at least one that was not added" not in d.sentence
     assert {"extinction leak"} in [set(e.effects) for e in d.survivors]
+
+
+def test_what_shows_only_beside_another_effect_is_found_with_it(tmp_path):
+    """A plate of 40 degrees at 540 nm whose birefringence falls with the wavelength, at two angles between films:
+    without the plate its dispersion changes nothing, so that no score of the base can rank it.
+
+    I = cos(a)^2 + sin(2 b) sin(2 (a - b)) sin(d/2)^2, with the analyser at a and the plate's axis at b"""
+    bands = np.array([620.0, 540.0, 460.0])
+    a, turned = np.repeat(MALUS, 2), np.tile([0.0, 45.0], len(MALUS))
+    wave = 540 / bands
+    half = np.radians(40.0 / 2) * wave * (1 + 0.1 * (wave**2 - 1))
+    axis = np.radians(20 + turned)[:, None]
+    angle = np.radians(a)[:, None]
+    light = np.cos(angle) ** 2 + np.sin(2 * axis) * np.sin(2 * (angle - axis)) * np.sin(half) ** 2
+    columns = {"analyzer.angle": a, "sample.angle": turned}
+    d = judged(tmp_path, noisy(light), columns, "bands = [620, 540, 460]")
+    assert d.row("dispersive retardance").image == pytest.approx(0, abs=1e-6)
+    assert d.missing == "retardance", d.sentence
+    assert {"retardance", "dispersive retardance"} in [set(e.effects) for e in d.survivors], d.sentence
