@@ -87,6 +87,10 @@ class Readings:
         cost = 3 * np.log1p(x2 / 2)
         return min(self.white / scale, *(float(np.min(left / scale + logs + cost)) for _, left, logs, _ in self.shared))
 
+    def gain(self, scale: float) -> float:
+        """What shared noise lowers the deviance by."""
+        return self.white / scale - self.deviance(scale)
+
     def correlation(self) -> Correlation:
         """By restricted maximum likelihood; one that noise alone makes (NOTED) is none."""
         best = Correlation(self.white / max(self.free, 1))

@@ -460,8 +460,9 @@ def compete(case: Case, trials: list[Trial]) -> Outcome:
         correlation = _readings(case, best).correlation()
         scale = max(correlation.scale, 1.0)
         for i, t in enumerate(order):
+            # from what its refit reached: where that stopped short, images promise what no refit brings
             near = i < CONTENDERS or len(t.members) < 2
-            t.deviance = _readings(case, t).deviance(scale) if near else t.after / scale
+            t.deviance = t.after / scale - (_readings(case, t).gain(scale) if near else 0.0)
         order.sort(key=lambda t: t.deviance + t.cost)
     # whether there is anything is a question of its own, which costs do not answer
     leader = next((t for t in order if t.members), order[0])
