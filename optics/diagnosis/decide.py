@@ -99,6 +99,11 @@ class Findings:
     measured: bool = False
 
     @property
+    def another_law(self) -> bool:
+        """Whether another law of an effect that the model has does clearly better than the best explanation."""
+        return self.law_lead < -TOLD
+
+    @property
     def structured(self) -> bool:
         """Whether the base model leaves structure, or more than a noise that repeats have measured."""
         return is_structured(self.structure_p, self.excess_sd) or (self.measured and self.weighed)
@@ -133,7 +138,7 @@ def decide(f: Findings) -> tuple[str, list[Condition]]:
         )
         if not f.structured and not f.weighed:
             return "NOTHING", conditions
-    if f.law and f.law_lead < -TOLD and f.structured:
+    if f.another_law and f.structured:
         return "UNKNOWN", conditions
     if f.rival and f.structured:
         if not f.curve_share < SHARE:
@@ -159,7 +164,7 @@ def _word_of_winner(f: Findings, failed: set[str]) -> str:
         # The refit did not bring the fall that the score promised, or the base's own calibration brought it.
         return "NOTHING"
     alone = not failed & {"significant", "no better curve", "share", "beyond clutter", "near"}
-    alone = alone and f.law_lead > -TOLD
+    alone = alone and not f.another_law
     rivals = f.survivors > 1 or f.shared or LAW in failed
     if failed & {"lead", LAW} and alone and f.some_even and rivals:
         return "AMBIGUOUS"

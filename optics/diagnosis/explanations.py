@@ -64,7 +64,7 @@ class Trial:
 
     members    effects, none for the base;   fit, fall, after, expected, images   as of `optics.diagnosis.refit.Attempt`
     cost       see the module
-    deviance   see the module; NaN before the competition
+    deviance   see the module; NaN before the competition;   readings: of a table, about it; None before
     ahead      chi2 of the blocks that were left out in turn, less that of the base; NaN where it was not computed
     """
 
@@ -78,6 +78,7 @@ class Trial:
     excess_sd: float = 0.0
     structure_p: float = math.nan
     deviance: float = math.nan
+    readings: Readings | None = None
     ahead: float = math.nan
 
     @property
@@ -129,13 +130,14 @@ class Outcome:
         common = frozenset.intersection(*[t.names for t in self.survivors])
         return [c.effect.name for c in self.best.members if c.effect.name in common]
 
-    def fall(self, trial: Trial) -> float:
-        """Of chi2, with what noise shared by neighbours takes up beside the effects of a trial."""
-        return self.trials_base.after - self.scale * trial.deviance
-
     @property
-    def trials_base(self) -> Trial:
+    def base(self) -> Trial:
+        """The explanation without effects."""
         return next(t for t in self.trials if not t.members)
+
+    def score(self, trial: Trial) -> float:
+        """Fall of deviance from chi2 of the base, less the cost."""
+        return self.base.after / self.scale - trial.deviance - trial.cost
 
     def without(self, trial: Trial, name: str) -> Trial:
         """The trial with most of the other effects of a trial: what is lost without the one."""
@@ -475,7 +477,7 @@ def compete(case: Case, trials: list[Trial]) -> Outcome:
 
 def _with_survivors(case: Case, outcome: Outcome) -> Outcome:
     best = outcome.leader
-    base = outcome.trials_base
+    base = outcome.base
     lead, needed = _lead(case, outcome, best, base) if best.members else (0.0, 0.0)
     fall = (base.after - best.after) / outcome.scale
     outcome.shared = case.evidence.is_table and lead <= needed < fall
@@ -589,9 +591,12 @@ def _kept(case: Case, images: Sequence[np.ndarray]) -> list[np.ndarray]:
 
 
 def _readings(case: Case, trial: Trial) -> Readings:
-    """The readings about an explanation."""
-    order, signal = case.evidence.order(case.model), case.evidence.lit(case.model)
-    return Readings(np.concatenate(_kept(case, trial.images)), _measured(case, trial), order, signal)
+    """The readings about an explanation; whitened once, as it competes more than once."""
+    if trial.readings is None:
+        order, signal = case.evidence.order(case.model), case.evidence.lit(case.model)
+        residual = np.concatenate(_kept(case, trial.images))
+        trial.readings = Readings(residual, _measured(case, trial), order, signal)
+    return trial.readings
 
 
 def _measured(case: Case, trial: Trial) -> np.ndarray:

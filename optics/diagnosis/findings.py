@@ -85,9 +85,8 @@ def findings_of(
         own = _of_subject(case, outcome, subject, splits, chance, levels, basis)
         own = replace(own, measured=measured)
     if laws and laws[0].p < LEVEL:
-        # in the scale of what the best explanation leaves, as explanations are compared
-        score, other = outcome.fall(best) / outcome.scale - best.cost, laws[0].score
-        own = replace(own, law=f"{laws[0].effect} along {laws[0].coordinate}", law_lead=score - other)
+        lead = outcome.score(best) - laws[0].score
+        own = replace(own, law=f"{laws[0].effect} along {laws[0].coordinate}", law_lead=lead)
     if not fingerprints:
         return own
     followed = _followed(case, subject, best.fit, best.fall - best.expectation, fingerprints)

@@ -132,7 +132,7 @@ def sentence(
         return _nothing(f, len(rows))
     if word == "AMBIGUOUS":
         return _ambiguous(f, explanations)
-    if word == "UNKNOWN" and f.law and f.law_lead < -TOLD:
+    if word == "UNKNOWN" and f.another_law:
         return (
             f"structure is left that another law of {f.law} explains: its strength changes along it, and that is "
             f"{-f.law_lead:.3g} ahead of what any effect of the library does. It is in the model, by another law than "
