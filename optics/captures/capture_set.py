@@ -85,8 +85,9 @@ class Frame:
     flat_field: np.ndarray | None = None  # (H, W, C) float32: the untouched sensor under this frame's lights
     # standard deviation of a setting by key, in its unit; it replaces the set's. Of a sweep: see `sweeps`
     uncertainty: dict[str, Any] = field(default_factory=dict)
-    # of a sweep: which time each of its settings was made, by key: sweeps of one number share the setting's error
-    made: dict[str, int] = field(default_factory=dict)
+    # of a sweep: which time each of its settings was made, by key, a number or, where `uncertainty` has one standard
+    # deviation for each reading, (N, 1, 1): readings, or sweeps, of one number share the setting's error
+    made: dict[str, Any] = field(default_factory=dict)
 
 
 @dataclass
@@ -665,7 +666,10 @@ def sweeps(captures: Captures, parameters: Mapping[str, Parameter], lights: Sequ
                     swept,
                     _column(mine),
                     uncertainty={**weighed, **shared},
-                    made={k: int(runs[k][first]) for k in shared},
+                    made={
+                        **{k: _column(runs[k][mine]) for k in weighed_keys},
+                        **{k: int(runs[k][first]) for k in shared},
+                    },
                 )
             )
     return replace(

@@ -5,10 +5,10 @@ which they were recorded then have the covariance scale V,
 
     V_ij = [i = j] + power h_i h_j exp(-|t_i - t_j|/length)
 
-in units of the variance that the noise model states, with the number t of a reading. h is 1, as of an amplifier, or
-goes with the signal over its noise, as of a lamp (`kind`), rms 1 in both cases. Such noise imitates whatever changes
-slowly during a session. So each explanation of the readings is judged by its deviance with the shared noise that suits
-it best,
+in units of the variance that the noise model states, with the number t of a reading. h goes with one over the noise of
+a reading, as of an amplifier, or with the signal over it, as of a lamp (`kind`), rms 1 in both cases. Such noise
+imitates whatever changes slowly during a session. So each explanation of the readings is judged by its deviance with
+the shared noise that suits it best,
 
     deviance = min over power >= 0, length, kind of (r' V^-1 r / scale + ln det V + 3 ln(1 + x^2/2))
 
@@ -23,6 +23,7 @@ Source: Patterson & Thompson, Recovery of inter-block information when block siz
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -59,24 +60,25 @@ class Readings:
     """Readings about one explanation.
 
     residual  (n,) whitened;   fitted: (n, k) whitened images of what was fitted
-    order     (n,) numbers of the readings, in any order;   signal: (n,) whitened
+    order     (n,) numbers of the readings, in any order
+    loads     kind -> (n,) whitened: what an amplifier or a lamp moves, the latter the signal
     """
 
-    def __init__(self, residual: np.ndarray, fitted: np.ndarray, order: np.ndarray, signal: np.ndarray):
+    def __init__(self, residual: np.ndarray, fitted: np.ndarray, order: np.ndarray, loads: Mapping[str, np.ndarray]):
         basis = st.orthonormal(fitted)
         places = np.argsort(order, kind="stable")
         left = residual - basis @ (basis.T @ residual)
         self.white = float(left @ left)
-        self.bright = float(np.mean(np.square(signal))) if len(signal) else 0.0
+        self.bright = float(np.mean(np.square(loads["lamp"]))) if len(residual) else 0.0
         self.free = len(residual) - basis.shape[1]
-        self.shared: list[tuple[str, np.ndarray, np.ndarray, np.ndarray]] = []  # kind, and what `_whitened` returns
+        self.shared: list[tuple[str, np.ndarray, np.ndarray, np.ndarray]] = []  # kind, and what `_left` returns
         if self.free < FEWEST or not self.white > 0:
             return
         columns, t = np.column_stack([basis, residual])[places], order[places].astype(float)
         lengths = np.geomspace(SHORTEST, max(float(np.ptp(t)) / 2, 2 * SHORTEST), LENGTHS)
         self.power, self.length = (grid.ravel() for grid in np.meshgrid(POWERS, lengths))
         self.shared = [
-            (kind, *_whitened(columns, t, _loading(kind, signal)[places], self.power, self.length)) for kind in KINDS
+            (kind, *_left(columns, t, of_rms_1(load)[places], self.power, self.length)) for kind, load in loads.items()
         ]
 
     def deviance(self, scale: float) -> float:
@@ -104,19 +106,34 @@ class Readings:
         return best
 
 
-def _loading(kind: str, signal: np.ndarray) -> np.ndarray:
-    """h (n,), rms 1."""
-    rms = float(np.sqrt(np.mean(np.square(signal)))) if len(signal) else 0.0
-    return np.asarray(signal, float) / rms if kind == "lamp" and rms > 0 else np.ones(len(signal))
+def of_rms_1(load: np.ndarray) -> np.ndarray:
+    """h (n,); 0 where nothing is lit."""
+    rms = float(np.sqrt(np.mean(np.square(load)))) if len(load) else 0.0
+    return np.asarray(load, float) / (rms or 1.0)
 
 
-def _whitened(
+def _left(
     columns: np.ndarray, t: np.ndarray, load: np.ndarray, power: np.ndarray, length: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(r' V^-1 r after the fit, ln det V, ln det of the fit's normal equations), each (g,), by powers and lengths (g,).
 
     columns   (n, k + 1): an orthonormal basis of what was fitted, and the residual, in the order of t
     """
+    white, logs = whitened(columns, t, load, power, length)
+    products = np.einsum("igj,igk->gjk", white, white, optimize=True)
+    fitted, own, across = products[:, :-1, :-1], products[:, -1, -1], products[:, :-1, -1]
+    if columns.shape[1] == 1:
+        return own, logs, np.zeros(len(power))
+    solved = np.linalg.solve(fitted, across[..., None])[..., 0]
+    left = np.maximum(own - np.einsum("gk,gk->g", across, solved), 1e-300)
+    return left, logs, np.linalg.slogdet(fitted)[1]
+
+
+def whitened(
+    columns: np.ndarray, t: np.ndarray, load: np.ndarray, power: np.ndarray, length: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """(L^-1 columns (n, g, k), ln det V (g,)) with V = L L', by powers and lengths (g,); columns (n, k) in the order
+    of t."""
     count, width = columns.shape
     state, spread = np.zeros((len(power), width)), np.array(power)
     white, logs = np.empty((count, len(power), width)), np.zeros(len(power))
@@ -132,10 +149,4 @@ def _whitened(
         logs += np.log(variance)
         state = state + gain[:, None] * surprise
         spread = spread * (1 - gain * load[i])
-    products = np.einsum("igj,igk->gjk", white, white, optimize=True)
-    fitted, own, across = products[:, :-1, :-1], products[:, -1, -1], products[:, :-1, -1]
-    if width == 1:
-        return own, logs, np.zeros(len(power))
-    solved = np.linalg.solve(fitted, across[..., None])[..., 0]
-    left = np.maximum(own - np.einsum("gk,gk->g", across, solved), 1e-300)
-    return left, logs, np.linalg.slogdet(fitted)[1]
+    return white, logs

@@ -107,7 +107,9 @@ def diagnose(
     reference = best.fall - best.expectation if subject else max([c.row.net for c in table.order], default=0.0)
     fingerprints = prints.fingerprints(model, evidence, places, max(reference, 1.0), say)
     families = prints.families(fingerprints)
-    laws = other_laws(model, evidence, places, added, variables_of, outcome.scale)
+    laws = other_laws(
+        model, evidence, places, added, variables_of, outcome.scale, case.session if evidence.is_table else None
+    )
     splits, chance = _split(case, outcome, subject)
     levels = held.levels(case, best.members, best.fit)
     shifts = held.shifts(case, best.members, best.fit) if subject else []

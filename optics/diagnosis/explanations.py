@@ -585,6 +585,18 @@ def fall_over_noise(case: Case, outcome: Outcome, name: str) -> float:
     return outcome.own_fall(outcome.best, name) / _design_effect(case, outcome, outcome.best, without)
 
 
+def fall_beside(case: Case, outcome: Outcome, noise: Correlation) -> float:
+    """Fall of chi2 by the best explanation of readings, in noise that neighbours share."""
+
+    def left(trial: Trial) -> float:
+        columns = np.column_stack([_measured(case, trial), np.concatenate(_kept(case, trial.images))])
+        whole = case.session.independent(columns, noise)
+        taken = st.orthonormal(whole[:, :-1])
+        return float(np.sum(np.square(whole[:, -1] - taken @ (taken.T @ whole[:, -1]))))
+
+    return left(outcome.base) - left(outcome.best)
+
+
 def _kept(case: Case, images: Sequence[np.ndarray]) -> list[np.ndarray]:
     """Of whitened images (H, W, C), the values that the evidence keeps, per block."""
     return [np.asarray(i, float).reshape(-1)[b.index] for i, b in zip(images, case.evidence.blocks)]
@@ -593,9 +605,7 @@ def _kept(case: Case, images: Sequence[np.ndarray]) -> list[np.ndarray]:
 def _readings(case: Case, trial: Trial) -> Readings:
     """The readings about an explanation; whitened once, as it competes more than once."""
     if trial.readings is None:
-        order, signal = case.evidence.order(case.model), case.evidence.lit(case.model)
-        residual = np.concatenate(_kept(case, trial.images))
-        trial.readings = Readings(residual, _measured(case, trial), order, signal)
+        trial.readings = case.session.about(np.concatenate(_kept(case, trial.images)), _measured(case, trial))
     return trial.readings
 
 

@@ -13,7 +13,7 @@ from optics.diagnosis import fingerprints as prints
 from optics.diagnosis import statistics as st
 from optics.diagnosis.decide import Findings, Opponent, rivals
 from optics.diagnosis.evidence import Candidate, Evidence
-from optics.diagnosis.explanations import Outcome, fall_over_noise, lead_without
+from optics.diagnosis.explanations import Outcome, fall_beside, fall_over_noise, lead_without
 from optics.diagnosis.refit import Case, clear
 from optics.diagnosis.result import Basis, Fingerprint, Law, Level, Split
 from optics.diagnosis.thresholds import AS_GOOD, LEVEL, UNEVEN
@@ -85,14 +85,25 @@ def findings_of(
         own = _of_subject(case, outcome, subject, splits, chance, levels, basis)
         own = replace(own, measured=measured)
     if laws and laws[0].p < LEVEL:
-        lead = outcome.score(best) - laws[0].score
+        # a law falls from what noise that neighbours share leaves without any effect
+        lead = outcome.score(best) - outcome.score(outcome.base) - laws[0].score
         own = replace(own, law=f"{laws[0].effect} along {laws[0].coordinate}", law_lead=lead)
     if not fingerprints:
         return own
     followed = _followed(case, subject, best.fit, best.fall - best.expectation, fingerprints)
     complete = bool(best.members) and best.complete
+    fall = own.fall
+    if case.evidence.is_table:
+        noise = outcome.correlation
+        fingerprints = prints.beside_shared_noise(
+            case.model, case.evidence, case.places or [], fingerprints, case.session, noise
+        )
+        fall = fall_beside(case, outcome, noise) - best.expectation if subject else own.fall / max(noise.scale, 1.0)
+        fingerprints = [replace(f, ratio=f.net / max(fall, 1.0)) for f in fingerprints]
+    if not fingerprints:
+        return own
     opponent = Opponent(
-        own.fall,
+        fall,
         best.cost,
         len(best.members),
         sum(len(c.cone.live) for c in best.members),
@@ -103,7 +114,7 @@ def findings_of(
     best_curve = better[0] if better else fingerprints[0]
     return replace(
         own,
-        ratio=best_curve.net / max(own.fall, 1.0),
+        ratio=best_curve.net / max(fall, 1.0),
         rival=bool(better),
         coordinate=best_curve.coordinate,
         curve_share=best_curve.share,

@@ -9,15 +9,17 @@ camera, on light, on geometry or on time."""
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from optics.diagnosis import statistics as st
+from optics.diagnosis.correlation import Correlation
 from optics.diagnosis.decide import ordered
 from optics.diagnosis.evidence import Evidence, Progress
 from optics.diagnosis.result import Family, Fingerprint
+from optics.diagnosis.session import Session
 from optics.diagnosis.thresholds import AS_GOOD, EXCESS, MIMICS, SHARE
 from optics.fit.compare import UNITS, led_label
 from optics.fit.model import Model
@@ -134,43 +136,24 @@ def fingerprints(
     found      what `places` returns
     reference  net fall of chi2 of the best effect, which the curves' ratios refer to
     """
-    k, black = evidence.thinning, float(model.noise.black_level)
+    k = evidence.thinning
     names = sorted(set.intersection(*[set(p) for p in found]) - NOT_A_COORDINATE)
-    # bins that have names: one each, whether it holds data or not
-    named = {
-        "place": SIDE * SIDE,
-        "frame": len(evidence.frames),
-        "channel": evidence.channels,
-        "LED": len(_lights(evidence, model)),
-    }
+    named = _named(evidence, model)
     plain_normal = evidence.thinned(extra=2 * max(LINES, *named.values()))
     middles = [block.middle for block in evidence.blocks]
-    carriers = [((block.prediction - black) / block.sigma, 1 / block.sigma) for block in evidence.blocks]
+    carriers = _carriers(model, evidence)
     ends = np.cumsum([len(block.r) for block in evidence.blocks])[:-1]
     first = len(evidence.columns)
     dof_all = max(evidence.normal.count - evidence.projected.rank, 1)
     excess = evidence.projected.chi2 - dof_all
     weighed = excess > EXCESS * math.sqrt(2 * dof_all)
-    # a gain and an offset per bin: of few readings, more bins would fit each reading by itself
-    kept = sum(len(block.r) for block in evidence.blocks)
-    most = max(min(LINES, kept // PER_BIN), 2) if evidence.is_table else LINES
     curves_of = []
     for n, name in enumerate(names):
         say("fingerprints", n, len(names))
         x = np.concatenate([p[name] for p in found])
-        edges = (
-            np.arange(named[name] + 1) - 0.5
-            if name in named
-            else st.bin_edges(
-                x,
-                most if name in ("row", "column", "reading") else min(st.BINS, most),
-                PER_BIN if evidence.is_table else 20,
-            )
-        )
-        if edges is None or len(edges) < 3:
+        index, count = _bins(evidence, name, x, named)
+        if not count:
             continue
-        count = len(edges) - 1
-        index = np.where(np.isfinite(x), np.searchsorted(edges, x, side="right") - 1, -1)
         normal = plain_normal.copy()
         for block, middle, bins, carrier in zip(evidence.blocks, middles, np.split(index, ends), carriers):
             st.add_bins(normal, block.where, middle, block.r, first, bins, count, carrier)
@@ -193,7 +176,7 @@ def fingerprints(
                 name,
                 fall,
                 dof,
-                _chance(evidence, fall, dof, dof_all),
+                _chance(evidence, fall, dof, dof_all, evidence.projected.chi2),
                 net,
                 net / reference,
                 kind,
@@ -210,17 +193,81 @@ def fingerprints(
     return sorted(curves_of, key=lambda f: -f.net)
 
 
-def _chance(evidence: Evidence, fall: float, dof: int, free: int) -> float:
-    """p of a fall by `dof` bins in noise alone; of readings, in noise as large as what the bins leave of the residual:
-    its size is often stated too small, and nothing else is there to tell."""
+def beside_shared_noise(
+    model: Model,
+    evidence: Evidence,
+    found: list[dict],
+    curves: Sequence[Fingerprint],
+    session: Session,
+    noise: Correlation,
+) -> list[Fingerprint]:
+    """Curves of readings with the falls that they bring where neighbours share noise: a curve along what was turned
+    slowly follows a lamp that wanders."""
+    named, carriers = _named(evidence, model), [np.concatenate(c) for c in zip(*_carriers(model, evidence))]
+    bins = []
+    for f in curves:
+        index, count = _bins(evidence, f.coordinate, np.concatenate([p[f.coordinate] for p in found]), named)
+        held = index[:, None] == np.arange(count)
+        bins.append(np.hstack([held * carrier[:, None] for carrier in carriers]))
+    base, r = evidence.dense(evidence.base), np.concatenate([block.r for block in evidence.blocks])
+    whole = session.independent(np.hstack([base, r[:, None], *bins]), noise)
+    taken, rest = st.orthonormal(whole[:, : base.shape[1]]), whole[:, base.shape[1] :]
+    left = rest - taken @ (taken.T @ rest)
+    residual, first, judged = left[:, 0], 1, []
+    free, chi2 = len(r) - taken.shape[1], float(residual @ residual)
+    for f, own in zip(curves, bins):
+        part = slice(first, first + own.shape[1])
+        first += own.shape[1]
+        seen = replace(
+            evidence.projected, information=left[:, part].T @ left[:, part], score=left[:, part].T @ residual
+        )
+        fall, dof, _, _ = st.joint(seen, np.sum(np.square(rest[:, part]), 0))
+        judged.append(replace(f, fall=fall, dof=dof, p=_chance(evidence, fall, dof, free, chi2), net=fall - dof))
+    return [f for f in judged if f.dof]
+
+
+def _named(evidence: Evidence, model: Model) -> dict[str, int]:
+    """Coordinates whose bins have names: one each, whether it holds data or not."""
+    return {
+        "place": SIDE * SIDE,
+        "frame": len(evidence.frames),
+        "channel": evidence.channels,
+        "LED": len(_lights(evidence, model)),
+    }
+
+
+def _carriers(model: Model, evidence: Evidence) -> list[tuple[np.ndarray, np.ndarray]]:
+    """What a gain and an offset of one do to the kept values of each block, whitened."""
+    black = float(model.noise.black_level)
+    return [((block.prediction - black) / block.sigma, 1 / block.sigma) for block in evidence.blocks]
+
+
+def _bins(evidence: Evidence, name: str, x: np.ndarray, named: Mapping[str, int]) -> tuple[np.ndarray, int]:
+    """(bin (n,) of every kept value along a coordinate, -1 for none; their number, 0 where there are too few).
+
+    A gain and an offset are fitted to each bin: of few readings, more bins would fit each reading by itself."""
+    if name in named:
+        edges: np.ndarray | None = np.arange(named[name] + 1) - 0.5
+    else:
+        most = max(min(LINES, len(x) // PER_BIN), 2) if evidence.is_table else LINES
+        lines = most if name in ("row", "column", "reading") else min(st.BINS, most)
+        edges = st.bin_edges(x, lines, PER_BIN if evidence.is_table else 20)
+    if edges is None or len(edges) < 3:
+        return np.full(len(x), -1), 0
+    return np.where(np.isfinite(x), np.searchsorted(edges, x, side="right") - 1, -1), len(edges) - 1
+
+
+def _chance(evidence: Evidence, fall: float, dof: int, free: int, chi2: float) -> float:
+    """p of a fall by `dof` bins in noise alone; of readings, in noise as large as what the bins leave of chi2: its size
+    is often stated too small, and nothing else is there to tell."""
     from scipy.special import chdtrc
     from scipy.stats import f as fisher
 
     p = float(chdtrc(dof, fall))
     if not evidence.is_table or free <= dof:
         return p
-    left = max(evidence.projected.chi2 - fall, 1e-300) / (free - dof)
-    return max(p, float(fisher.sf(fall / dof / left, dof, free - dof)))
+    left = max(chi2 - fall, 1e-300) / (free - dof)
+    return max(p, float(fisher.sf(fall / max(dof, 1) / left, dof, free - dof)))
 
 
 def _unit_of(model: Model, coordinate: str) -> str:

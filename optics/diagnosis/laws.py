@@ -16,9 +16,9 @@ from scipy.stats import rankdata
 
 from optics.diagnosis import fingerprints as prints
 from optics.diagnosis import statistics as st
-from optics.diagnosis.correlation import Readings
 from optics.diagnosis.evidence import Evidence
 from optics.diagnosis.result import Law
+from optics.diagnosis.session import Session
 from optics.diagnosis.thresholds import MIMICS
 from optics.fit.model import Model
 from optics.scene.declare import Effect
@@ -36,17 +36,19 @@ def other_laws(
     added: Sequence[Effect],
     variables_of: Callable[[Effect], Sequence[Variable]],
     scale: float,
+    session: Session | None,
 ) -> list[Law]:
     """A freer law of each added effect along each coordinate, best score first.
 
     places   what `optics.diagnosis.fingerprints.places` returns
     scale    variance over the stated one, in which falls of readings are judged beside noise that neighbours share
+    session  of a table; None: of images
     """
     if not added:
         return []
     turned = set(prints.settings(model, evidence))
     common = set.intersection(*[set(p) for p in places])
-    judge = _fall_of_readings(model, evidence, scale) if evidence.is_table else _fall_of_images(evidence)
+    judge = _fall_of_readings(evidence, session, scale) if session is not None else _fall_of_images(evidence)
     found = []
     for effect in added:
         keys = {key for v in variables_of(effect) for key in v.keys}
@@ -97,16 +99,15 @@ def _fall_of_images(evidence: Evidence) -> Callable[[Sequence[np.ndarray]], tupl
 
 
 def _fall_of_readings(
-    model: Model, evidence: Evidence, scale: float
+    evidence: Evidence, session: Session, scale: float
 ) -> Callable[[Sequence[np.ndarray]], tuple[float, int]]:
     """The same for readings, beside noise that neighbours share, in units of the scale."""
     base, r = evidence.dense(evidence.base), np.concatenate([block.r for block in evidence.blocks])
-    order, signal = evidence.order(model), evidence.lit(model)
-    rank, before = st.orthonormal(base).shape[1], Readings(r, base, order, signal).deviance(scale)
+    rank, before = st.orthonormal(base).shape[1], session.about(r, base).deviance(scale)
 
     def fall_of(images: Sequence[np.ndarray]) -> tuple[float, int]:
         whole = np.hstack([base, np.concatenate(images)])
         dof = st.orthonormal(whole).shape[1] - rank
-        return before - Readings(r, whole, order, signal).deviance(scale) if dof else 0.0, dof
+        return before - session.about(r, whole).deviance(scale) if dof else 0.0, dof
 
     return fall_of

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from optics.diagnosis import statistics as st
 from optics.diagnosis.evidence import Candidate, Evidence, Progress, at_bound
 from optics.diagnosis.result import Refit
 from optics.diagnosis.score import Table
+from optics.diagnosis.session import Session
 from optics.diagnosis.thresholds import CLEAR
 from optics.fit import gauges
 from optics.fit.model import Model, value_of
@@ -48,6 +50,11 @@ class Case:
     seed: int
     say: Progress
     places: list[dict[str, np.ndarray]] | None = None
+
+    @cached_property
+    def session(self) -> Session:
+        """Of a table."""
+        return Session(self.model, self.evidence)
 
     @property
     def base(self) -> list[Variable]:

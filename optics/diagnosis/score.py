@@ -58,8 +58,8 @@ def score(
     if not fitted:
         raise ValueError("diagnose: no fitted frames given; name the frames that the base was calibrated on")
     _require_noise(model)
-    base, dropped = _base_variables(model, fit, fitted)
-    candidates, not_tested = _candidates(model, fit, effects, variables_of, fitted)
+    base, dropped = base_variables(model, fit, fitted)
+    candidates, not_tested = candidates_of(model, fit, effects, variables_of, fitted)
     evidence = measure(model, fit.values, base, candidates, fitted, rows_max, seed, progress or silent)
     _require_convergence(evidence, fit)
     return Scored(evidence, _rank(evidence, candidates, seed), dropped, not_tested)
@@ -80,14 +80,14 @@ def _require_noise(model: Model) -> None:
             )
 
 
-def _base_variables(model: Model, fit: Fit, fitted: Sequence[int]) -> tuple[list[Variable], list[str]]:
+def base_variables(model: Model, fit: Fit, fitted: Sequence[int]) -> tuple[list[Variable], list[str]]:
     """The variables that the base may move in the fitted frames, and names of those at a bound."""
     present = [v for v in fit.variables if v.frames is None or set(v.frames) & set(fitted)]
     bound = [v.name for v in present if v.name in fit.at_bound or at_bound(v, value_of(model, fit.values, v))]
     return [v for v in present if v.name not in bound], bound
 
 
-def _candidates(
+def candidates_of(
     model: Model,
     fit: Fit,
     effects: Sequence[Effect],

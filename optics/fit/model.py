@@ -110,6 +110,11 @@ class Model(Protocol):
         """(H, W, C) in DN^2, of a frame about its prediction: camera noise and, if `monte_carlo`, the estimate's."""
         ...
 
+    def errors_of_settings(self, values: Values, index: int) -> dict[str, np.ndarray]:
+        """key -> (N, 1, C) standard deviation in DN, signed, that the error of a setting brings to each reading of a
+        sweep (`Frame.uncertainty`); it is part of `variance`. Empty where settings are exact."""
+        ...
+
     def coordinates(self, values: Values, index: int, seed: int = 0) -> dict[str, np.ndarray]:
         """name -> (H, W) or (H, W, C): what is known of every pixel, in the units of `optics.fit.compare.UNITS`;
         boolean for a region. A comparison bins residuals by these, a diagnosis as well."""

@@ -50,6 +50,8 @@ class SceneModel:
             raise BadScene(
                 f"{captures.folder}: no noise model; give [noise] in captures.toml or repeats to estimate it from"
             )
+        # settings whose error the captures state, be it none
+        self.stated_errors = {*captures.uncertainty, *(key for f in captures.frames for key in f.uncertainty)}
         if captures.table is not None:
             noise = replace(noise, signed=True)  # of point readings, those below 0 are data
             captures = sweeps(captures, scene.parameters, list(scene.lights))
@@ -591,25 +593,34 @@ class SceneModel:
         """The settings of a sweep whose errors differ from reading to reading: (N, 1, 1) standard deviations by key."""
         return {k: sd for k, sd in self.frames[index].uncertainty.items() if isinstance(sd, np.ndarray) and sd.any()}
 
+    def errors_of_settings(self, values: Values, index: int) -> dict[str, np.ndarray]:
+        """key -> (N, 1, C) standard deviation in DN of the readings of a sweep, signed as their slopes, by the errors
+        of a setting that differ from reading to reading; at the values or at `weighed_at`."""
+        values, errors = self.weighed_at or values, self._dialled(index)
+        # of a drive level, the power that it multiplies
+        factors = {key: {**self.base, **values.common}[key] if key in self.driven else 1.0 for key in errors}
+        return {key: slope * errors[key] for key, slope in self.slopes(values, index, factors).items()}
+
     def _of_settings(self, values: Values, index: int) -> np.ndarray:
-        """(N, 1, C) variance in DN^2 that the errors of a sweep's settings bring, at the values or at `weighed_at`."""
+        """(N, 1, C) variance in DN^2 that these bring."""
         values = self.weighed_at or values
         own = values.frame.get(index, {})
         state = (index, *sorted(values.common.items()), None, *sorted(own.items()))
         if state not in self._dialled_kept:
-            now = self._turn_to(values, index)
-            linear = self.developer.linearise(self.radiance(now, index), now)
-            total = np.zeros((1, 1, 1))
-            for key, sd in self._dialled(index).items():
-                # of a drive level, the power that it multiplies
-                factor = {**self.base, **values.common}[key] if key in self.driven else 1.0
-                slope = self._tangent(linear, now, {key: factor}, 0)
-                if slope is not None:
-                    total = total + (slope * sd) ** 2
-            self._dialled_kept[state] = total
+            self._dialled_kept[state] = sum(
+                (error**2 for error in self.errors_of_settings(values, index).values()), np.zeros((1, 1, 1))
+            )
             while len(self._dialled_kept) > KEPT * len(self.frames):
                 self._dialled_kept.popitem(last=False)
         return self._dialled_kept[state]
+
+    def slopes(self, values: Values, index: int, factors: Mapping[str, float]) -> dict[str, np.ndarray]:
+        """key -> factor d prediction / d setting in a frame, (N, 1, C) DN per unit; without those that change
+        nothing."""
+        now = self._turn_to(values, index)
+        linear = self.developer.linearise(self.radiance(now, index), now)
+        found = {key: self._tangent(linear, now, {key: factor}, 0) for key, factor in factors.items()}
+        return {key: slope for key, slope in found.items() if slope is not None}
 
     def _error(self, values: Values, index: int) -> np.ndarray:
         """(H, W, C) variance of a Monte Carlo prediction, DN^2."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from optics.captures import capture_set as capture_files
+from optics.diagnosis.dials import Width
 from optics.diagnosis.text import AT_FAULT
 from optics.diagnosis.thresholds import FAR
 from optics.fit.compare import Row
@@ -63,6 +64,17 @@ def after_calibration(model: SceneModel, found: Fit, level: Row | None) -> list[
             f"{v.name}: {value:.4g}{spaced(v.parameter.unit)} for {prior[0]:.4g} +- {prior[1]:g}; check {AT_FAULT}"
         )
     return texts
+
+
+def of_dials(keys: Sequence[str], width: Width | None) -> list[str]:
+    """What was found of the errors of dials that nobody states."""
+    if width is None:
+        return []
+    return [
+        f"{some(keys, 4)}: captures.toml does not state how well they were set; the readings say "
+        f"{width.stated:g} deg (1 sd, {width.low:.2g} to {width.high:.2g}), which is taken from now on. State your own "
+        f'under [uncertainty], as "{keys[0]}" = {width.stated:g}, or 0 for a dial that is exact'
+    ]
 
 
 def _unverified(model: SceneModel, setup: Setup, held: Sequence[int]) -> list[str]:

@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ import numpy as np
 
 from optics.captures import capture_set as capture_files
 from optics.captures import identity
+from optics.diagnosis.dials import Width, unstated, width_of
 from optics.diagnosis.result import Diagnosis
 from optics.errors import BadCapture, Underdetermined, UnknownKey
 from optics.fit import calibrate
@@ -72,12 +73,19 @@ def begin(
     resume: bool = False,
     progress: Progress | None = None,
 ) -> tuple[Record, SceneModel, Fit]:
-    """Start a study: calibrate the base model and record it as the first step."""
+    """Start a study: calibrate the base model and record it as the first step.
+
+    Where nothing states how well dials were set, their errors are found from the readings first; the study takes them
+    as if they had been stated."""
     model = open_model(setup)
-    fitted, held = split(model, setup)
-    variables = variables_of_base(model, setup, fitted)
     check_priors(model, setup)
     model.scene.check(setup.values, "start values")
+    doubts = checks.of_dials(unstated(model), width := _dial_error(model, setup))
+    if width is not None:
+        setup = replace(setup, uncertainty=dict.fromkeys(unstated(model), width.stated))
+        model = open_model(setup)
+    fitted, held = split(model, setup)
+    variables = variables_of_base(model, setup, fitted)
     usable = [model.usable(i) for i in range(len(model.frames))]
     record = Record.create(
         folder,
@@ -88,7 +96,7 @@ def begin(
         command=command,
         title=title,
         noise=asdict(model.noise),
-        warnings=checks.before_calibration(model, setup, held),
+        warnings=[*doubts, *checks.before_calibration(model, setup, held)],
         resume=resume,
         facts={
             "frames": len(model.frames),
@@ -102,15 +110,25 @@ def begin(
     )
     if record.steps:
         return record, model, restore(record, model)
-    start = Values(dict(setup.values))
     clock = time.perf_counter()
     try:
-        found = fit_base(model, variables, fitted, start, progress, robust=setup.robust)
+        found = fit_base(model, variables, fitted, Values(dict(setup.values)), progress, robust=setup.robust)
         write_step(record, model, "base", None, found, held, time.perf_counter() - clock)
     except BaseException:
         record.discard()
         raise
     return record, model, found
+
+
+def _dial_error(model: SceneModel, setup: Setup) -> Width | None:
+    """The error of dials that the captures do not state, by a first calibration; None where readings show none."""
+    if setup.uncertainty is not None or not unstated(model):
+        return None
+    fitted, _ = split(model, setup)
+    found = fit_base(model, variables_of_base(model, setup, fitted), fitted, Values(dict(setup.values)))
+    tested = candidates(model, None)
+    seek(model, found.values, tested, fitted)
+    return width_of(model, found, tested, lambda e: effect_variables(model, e), fitted, setup.seed)
 
 
 def take_up(folder: str | Path) -> tuple[Record, SceneModel, Setup]:
@@ -154,18 +172,18 @@ def _of_fitted(variables: Sequence[Variable], fitted: Sequence[int]) -> list[Var
 
 
 # -- what can be added -----------------------------------------------------------------------------------------------
-def effects_of(record: Record, registry: Registry) -> list[Effect]:
-    """The effects that the study has added so far, of the registry of its scene."""
-    return [registry.find_effect(step["effect"]) for step in record.steps if step["effect"]]
+def effects_of(record: Record | None, registry: Registry) -> list[Effect]:
+    """The effects that the study has added so far, of the registry of its scene; none before it begins."""
+    return [] if record is None else [registry.find_effect(step["effect"]) for step in record.steps if step["effect"]]
 
 
-def candidates(model: SceneModel, record: Record, without: Sequence[str] = ()) -> list[Effect]:
+def candidates(model: SceneModel, record: Record | None, without: Sequence[str] = ()) -> list[Effect]:
     """Every effect that the scene can express, the study has not added, and nothing rules out (`excluded`)."""
     left_out = excluded(model, record, without)
     return [e for e in _expressible(model, record) if e.name not in left_out]
 
 
-def excluded(model: SceneModel, record: Record, without: Sequence[str] = ()) -> dict[str, str]:
+def excluded(model: SceneModel, record: Record | None, without: Sequence[str] = ()) -> dict[str, str]:
     """Effects that could be tested but for what the captures state, or `without` names: {name: reason}.
 
     absent       every part that could carry the effect, or that it requires, is not there
@@ -210,7 +228,7 @@ def _drawn_from(model: SceneModel, effects: Sequence[Effect]) -> set[str]:
     return {e.key for e in drafts if identity.shared(e.drafted_from.split(), prints, table)}
 
 
-def _expressible(model: SceneModel, record: Record) -> list[Effect]:
+def _expressible(model: SceneModel, record: Record | None) -> list[Effect]:
     """Every effect that the scene can express and the study has not added."""
     done = {e.key for e in effects_of(record, model.scene.registry)}
     return [

@@ -41,6 +41,8 @@ class Setup:
     held_out    names of groups that the calibration does not see; None: every fourth of four or more
     values      start values, by key
     flat_field  how a background image enters, see `optics.fit.model.Model`
+    uncertainty standard deviation of settings by key, where the captures state none; None: that of dials is found from
+                the readings when a study begins (optics.diagnosis.dials)
     robust      residuals beyond three sigmas count less (Huber), for dirt and glints; a diagnosis weighs all alike
     seed        of everything random
     """
@@ -54,6 +56,7 @@ class Setup:
     held_out: list[str] | None = None
     values: dict[str, float | str] = field(default_factory=dict)
     flat_field: str | None = None
+    uncertainty: dict[str, float] | None = None
     robust: bool = False
     seed: int = 0
 
@@ -110,6 +113,7 @@ def open_model(setup: Setup, model_class: type = SceneModel, fitted: Noise | Non
     loaded = scenes.load(path, defines, plugins=plugins if setup.plugins or plugins.is_dir() else None)
     capture_files.check(found, loaded.parameters)
     found = capture_files.state(found, loaded.parts, {k: e.name for k, e in loaded.registry.effects.items()})
+    found.uncertainty = {**(setup.uncertainty or {}), **found.uncertainty}
     noise = found.noise
     if noise is None:
         noise = estimate(found, clocks=keys_with(loaded.parameters, "clock"))

@@ -86,6 +86,9 @@ class Exact:
     def coordinates(self, values: Values, index: int, seed: int = 0) -> dict[str, np.ndarray]:
         return {}
 
+    def errors_of_settings(self, values: Values, index: int) -> dict[str, np.ndarray]:
+        return {}
+
     def lit_geometry(self, values: Values, index: int) -> dict[str, np.ndarray]:
         return {}
 

@@ -9,6 +9,7 @@ from optics.diagnosis.correlation import FEWEST, KINDS, LENGTHS, NOTED, Readings
 COUNT = 160
 TURN = np.linspace(0, 2 * np.pi, COUNT)
 SIGNAL = 30 * np.cos(TURN) ** 2
+LOADS = {"amplifier": np.ones(COUNT), "lamp": SIGNAL}
 FITTED = np.column_stack([SIGNAL, np.ones(COUNT)])
 
 
@@ -27,7 +28,7 @@ def about(residual, fitted=FITTED, order=None):
     """Readings about a fit, in whatever order."""
     order = np.arange(COUNT) if order is None else order
     basis = np.linalg.qr(fitted)[0]
-    return Readings(residual - basis @ (basis.T @ residual), fitted, order, SIGNAL)
+    return Readings(residual - basis @ (basis.T @ residual), fitted, order, LOADS)
 
 
 def test_the_filter_gives_the_likelihood_of_the_covariance():
@@ -38,7 +39,7 @@ def test_the_filter_gives_the_likelihood_of_the_covariance():
     residual = rng.standard_normal(COUNT)
     basis = np.linalg.qr(FITTED)[0]
     residual = residual - basis @ (basis.T @ residual)
-    found = Readings(residual[shuffled], FITTED[shuffled], order[shuffled], SIGNAL[shuffled])
+    found = Readings(residual[shuffled], FITTED[shuffled], order[shuffled], {k: v[shuffled] for k, v in LOADS.items()})
     for kind, left, logs, determinant in found.shared:
         for i in (3, len(left) // 2, len(left) - 5):
             v = covariance(found.power[i], found.length[i], kind, order)
@@ -94,7 +95,11 @@ def test_a_sharp_curve_keeps_its_significance_beside_a_lamp_that_wanders():
 
 def test_of_few_readings_no_correlation_is_asked():
     few = FEWEST + 1
-    readings = Readings(np.ones(few), FITTED[:few], np.arange(few), SIGNAL[:few])
+    readings = Readings(np.ones(few), FITTED[:few], np.arange(few), {k: v[:few] for k, v in LOADS.items()})
     assert not readings.shared and readings.correlation().power == 0
     many = FEWEST + 2
-    assert len(Readings(TURN[:many], FITTED[:many], np.arange(many), SIGNAL[:many]).length) % LENGTHS == 0
+    assert (
+        len(Readings(TURN[:many], FITTED[:many], np.arange(many), {k: v[:many] for k, v in LOADS.items()}).length)
+        % LENGTHS
+        == 0
+    )

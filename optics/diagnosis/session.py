@@ -1,0 +1,100 @@
+"""The readings of a table as a session: in the order in which they were taken, with the errors that some of them share.
+
+Readings at one setting of a dial share its error, and so do the channels of one reading. The noise model weighs them as
+independent, with an error that is larger by the root of their number (`optics.captures.capture_set.sweeps`). Here they
+have the covariance that they really have, about one setting
+
+    V_ij = [i = j] (1 - sum over dials of u_i^2) + sum over dials of u_i u_j / n
+
+with u_i the share of the noise of a reading that comes from a dial, as it is weighed, and n readings at that setting.
+Residuals and images are whitened by it before neighbours are asked what they share besides
+(`optics.diagnosis.correlation`). What is known of variables beforehand are further readings, of no time."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from scipy import linalg
+
+from optics.diagnosis.correlation import Correlation, Readings, of_rms_1, whitened
+from optics.diagnosis.evidence import Evidence
+from optics.fit.model import Model
+
+LEAST = 1e-3  # of the noise of a reading: what its instrument brings, at least
+MOST = 64  # values that share an error, beyond which they are left as they are
+
+
+class Session:
+    """Of the kept readings of a table, in the order of the evidence's blocks."""
+
+    def __init__(self, model: Model, evidence: Evidence):
+        self.order = evidence.order(model).astype(float)
+        self.parts = _shared_errors(model, evidence)
+        self.loads = {
+            "amplifier": np.concatenate([1 / block.sigma for block in evidence.blocks]),
+            "lamp": evidence.lit(model),
+        }
+        self.loads = {kind: self.apart(load[:, None])[:, 0] for kind, load in self.loads.items()}
+        for index, _ in self.parts:
+            self.order[index] = self.order[index].mean()
+
+    def apart(self, columns: np.ndarray) -> np.ndarray:
+        """(n, k) whitened by what readings of one setting share."""
+        found = np.array(columns, float)
+        for index, turn in self.parts:
+            found[index] = turn @ found[index]
+        return found
+
+    def about(self, residual: np.ndarray, fitted: np.ndarray) -> Readings:
+        """Readings about an explanation: residual (n,) and images (n, k), whitened."""
+        whole = self.apart(np.column_stack([fitted, residual]))
+        return Readings(whole[:, -1], whole[:, :-1], self.order, self.loads)
+
+    def independent(self, columns: np.ndarray, noise: Correlation) -> np.ndarray:
+        """(n, k) images as of readings that are independent, in units of their noise; in the order of the session."""
+        places = np.argsort(self.order, kind="stable")
+        apart = self.apart(columns)[places] / np.sqrt(max(noise.scale, 1.0))
+        if not noise.power:
+            return apart
+        load = of_rms_1(self.loads[noise.kind])[places]
+        power, length = np.array([noise.power]), np.array([noise.length])
+        return whitened(apart, self.order[places], load, power, length)[0][:, 0]
+
+
+def _shared_errors(model: Model, evidence: Evidence) -> list[tuple[np.ndarray, np.ndarray]]:
+    """[(places of values that share an error, (m, m) that whitens them)]."""
+    found, first = [], 0
+    for block in evidence.blocks:
+        frame = model.frames[block.frame]
+        made = {key: number for key, number in frame.made.items() if isinstance(number, np.ndarray)}
+        if made:
+
+            def kept(values: np.ndarray, frame=frame, block=block) -> np.ndarray:
+                return np.broadcast_to(values, frame.image.shape).reshape(-1)[block.index]
+
+            errors = model.errors_of_settings(evidence.values, block.frame)
+            shares = {key: kept(error) / block.sigma for key, error in errors.items()}
+            numbers = {key: kept(number) for key, number in made.items()}
+            rows = kept(np.arange(len(frame.image)).reshape(-1, 1, 1))
+            # readings that share the error of the dial that is turned least often share any other's too, or none
+            last = min(numbers, key=lambda key: len(np.unique(numbers[key])))
+            for number in np.unique(numbers[last]):
+                own = np.flatnonzero(numbers[last] == number)
+                if 1 < len(own) <= MOST:
+                    found.append((first + own, _whitening(own, shares, numbers, rows)))
+        first += len(block.r)
+    return found
+
+
+def _whitening(
+    own: np.ndarray, shares: Mapping[str, np.ndarray], numbers: Mapping[str, np.ndarray], rows: np.ndarray
+) -> np.ndarray:
+    """L^-1 of the covariance L L' of values, see the module; `own`: their places."""
+    alone = 1 - sum(np.square(share[own]) for share in shares.values())
+    covariance = np.diag(np.maximum(alone, LEAST))
+    for key, share in shares.items():
+        same = numbers[key][own][:, None] == numbers[key][own]
+        readings = np.array([len(np.unique(rows[numbers[key] == number])) for number in numbers[key][own]])
+        covariance += same * np.outer(share[own], share[own]) / readings
+    return linalg.solve_triangular(np.linalg.cholesky(covariance), np.eye(len(own)), lower=True)
