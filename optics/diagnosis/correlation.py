@@ -42,7 +42,8 @@ KINDS = ("amplifier", "lamp")
 
 @dataclass(frozen=True)
 class Correlation:
-    """scale, power, length and kind of V; gain: twice the restricted log likelihood over that of white noise."""
+    """scale, power, length and kind of V; gain: twice the log likelihood, restricted or less what is implausible, over
+    that of white noise."""
 
     scale: float = 1.0
     power: float = 0.0
@@ -83,15 +84,21 @@ class Readings:
 
     def deviance(self, scale: float) -> float:
         """See the module."""
+        return self.white / scale - self.noise(scale).gain
+
+    def noise(self, scale: float) -> Correlation:
+        """The shared noise of least deviance; `gain` is what it lowers the deviance by."""
+        best = Correlation(scale)
         if not self.shared:
-            return self.white / scale
+            return best
         x2 = self.power * scale / max(self.bright, 1e-12) / WANDER**2
         cost = 3 * np.log1p(x2 / 2)
-        return min(self.white / scale, *(float(np.min(left / scale + logs + cost)) for _, left, logs, _ in self.shared))
-
-    def gain(self, scale: float) -> float:
-        """What shared noise lowers the deviance by."""
-        return self.white / scale - self.deviance(scale)
+        for kind, left, logs, _ in self.shared:
+            gains = self.white / scale - (left / scale + logs + cost)
+            i = int(np.argmax(gains))
+            if gains[i] > best.gain:
+                best = Correlation(scale, float(self.power[i]), float(self.length[i]), kind, float(gains[i]))
+        return best
 
     def correlation(self) -> Correlation:
         """By restricted maximum likelihood; one that noise alone makes (NOTED) is none."""

@@ -275,7 +275,7 @@ def _of_the_strength(f: Findings) -> list[Condition]:
             not f.chance >= LEVEL,
             "too few parts of the data to tell"
             if math.isnan(f.chance)
-            else f"family-wise p {p_text(f.chance)} by the scatter between parts of the data, against {LEVEL:g}",
+            else f"p {p_text(f.chance)} by the scatter between parts of the data, against {LEVEL:g}",
         ),
         Condition(
             "even",

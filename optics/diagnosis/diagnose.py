@@ -99,7 +99,7 @@ def diagnose(
     )
     basis = basis_of(model, evidence, evidence.structure(evidence.whitened, evidence.base))
     case.places = places = prints.places(model, fit.values, evidence)
-    chosen = _choose(case, top)
+    chosen = choose(case, top)
     fits = refit_each(case, chosen)
     outcome = explanations.search(case, chosen, fits)
     subject, best = subject_of(outcome), outcome.best
@@ -154,7 +154,7 @@ def diagnose(
     )
 
 
-def _choose(case: Case, top: int) -> list[Candidate]:
+def choose(case: Case, top: int) -> list[Candidate]:
     """The effects to refit: those that cannot be told from the best by score; of a table all that stand out besides, as
     its refits are cheap; of images the best of them, and winners of other weights.
 
@@ -204,9 +204,11 @@ def _split(case: Case, outcome: Outcome, subject: Candidate | None) -> tuple[lis
             told,
             net,
             beside,
+            outcome.correlation if case.evidence.is_table else None,
         )
         splits += own
-        p = case.table.family.p(p)
+        if not case.evidence.is_table:  # readings have had their noise that neighbours share as a rival
+            p = case.table.family.p(p)
         chance = p if main is subject else chance
         if len(trial.members) == 1 and main.row.refit is not None:
             main.row.refit = homogeneity.scattered(main.row.refitted, p, clutter)

@@ -27,8 +27,12 @@ import numpy as np
 from scipy import linalg
 
 from optics.diagnosis import statistics as st
-from optics.diagnosis.evidence import Evidence, measure, silent
-from optics.diagnosis.score import base_variables, candidates_of
+from optics.diagnosis.diagnose import choose
+from optics.diagnosis.evidence import Candidate, Evidence, measure, silent
+from optics.diagnosis.explanations import search
+from optics.diagnosis.refit import Case, refit_each
+from optics.diagnosis.score import score
+from optics.fit import calibrate
 from optics.fit.result import Fit
 from optics.fit.scene_model import SceneModel
 from optics.scene.declare import Effect
@@ -39,6 +43,8 @@ WIDTHS = np.geomspace(1e-3, 10.0, 121)  # deg
 NOTED = 4.0  # twice the log likelihood that errors must gain: in one of forty exact benches chance brings as much
 PER_WAVE = 8  # readings per slow wave of the session
 WAVES = 40  # slow waves, at most
+ROWS = 400_000  # readings to keep: all
+TOP = 5  # effects that are refitted, besides all that stand out
 FEWEST = 8  # degrees of freedom from which a width is sought
 
 
@@ -74,18 +80,45 @@ def width_of(
     effects: Sequence[Effect],
     variables_of: Callable[[Effect], Sequence[Variable]],
     fitted: Sequence[int],
+    *,
+    refit: Callable[..., Fit] | None = None,
     seed: int = 0,
 ) -> Width | None:
     """The error that the settings of all unstated dials have; None where readings show none.
 
-    fit, effects, variables_of, fitted, seed   as of `optics.diagnosis.diagnose.diagnose`
+    It is sought about the calibrated base first. What a strong effect leaves beside its tangent would count as dial
+    error: so it is sought again about the best explanation of the readings, in the noise that is stated, and the
+    smaller of the two is returned.
+
+    fit, effects, variables_of, fitted, refit, seed   as of `optics.diagnosis.diagnose.diagnose`
     """
     keys = unstated(model)
     if not keys:
         return None
-    base, _ = base_variables(model, fit, fitted)
-    candidates, _ = candidates_of(model, fit, effects, variables_of, fitted)
-    evidence = measure(model, fit.values, base, candidates, fitted, 400_000, seed, silent)
+    scored = score(model, fit, effects, variables_of, fitted, seed=seed)
+    evidence, table = scored.evidence, scored.table
+    first = _width_about(model, evidence, table.order, keys)
+    if first is None:
+        return None
+    case = Case(model, fit, evidence, table, refit or calibrate.fit, [*fitted], [], variables_of, ROWS, seed, silent)
+    chosen = choose(case, TOP)
+    leader = search(case, chosen, refit_each(case, chosen)).leader
+    if not leader.members:
+        return first
+    held = {c.effect.name for c in leader.members}
+    others = [
+        Candidate.at(model, leader.fit.values, c.effect, c.variables) for c in table.order if c.effect.name not in held
+    ]
+    base = [evidence.columns[i] for i in evidence.base] + [v for c in leader.members for v in c.variables]
+    again = measure(model, leader.fit.values, base, others, list(fitted), ROWS, seed, silent)
+    second = _width_about(model, again, others, keys)
+    return second if second is None or second.sd < first.sd else first
+
+
+def _width_about(
+    model: SceneModel, evidence: Evidence, candidates: Sequence[Candidate], keys: Sequence[str]
+) -> Width | None:
+    """The width about calibrated values."""
     images = [_waves(model, evidence)]
     for c in candidates:
         if not c.broken:

@@ -459,12 +459,12 @@ def compete(case: Case, trials: list[Trial]) -> Outcome:
         t.deviance = t.after / scale
     if case.evidence.is_table:
         best = next((t for t in order if t.members), order[0])
-        correlation = _readings(case, best).correlation()
-        scale = max(correlation.scale, 1.0)
+        scale = max(_readings(case, best).correlation().scale, 1.0)
+        correlation = _readings(case, best).noise(scale)
         for i, t in enumerate(order):
             # from what its refit reached: where that stopped short, images promise what no refit brings
             near = i < CONTENDERS or len(t.members) < 2
-            t.deviance = t.after / scale - (_readings(case, t).gain(scale) if near else 0.0)
+            t.deviance = t.after / scale - (_readings(case, t).noise(scale).gain if near else 0.0)
         order.sort(key=lambda t: t.deviance + t.cost)
     # whether there is anything is a question of its own, which costs do not answer
     leader = next((t for t in order if t.members), order[0])
@@ -583,18 +583,6 @@ def fall_over_noise(case: Case, outcome: Outcome, name: str) -> float:
     if case.evidence.is_table:
         return without.deviance - outcome.best.deviance
     return outcome.own_fall(outcome.best, name) / _design_effect(case, outcome, outcome.best, without)
-
-
-def fall_beside(case: Case, outcome: Outcome, noise: Correlation) -> float:
-    """Fall of chi2 by the best explanation of readings, in noise that neighbours share."""
-
-    def left(trial: Trial) -> float:
-        columns = np.column_stack([_measured(case, trial), np.concatenate(_kept(case, trial.images))])
-        whole = case.session.independent(columns, noise)
-        taken = st.orthonormal(whole[:, :-1])
-        return float(np.sum(np.square(whole[:, -1] - taken @ (taken.T @ whole[:, -1]))))
-
-    return left(outcome.base) - left(outcome.best)
 
 
 def _kept(case: Case, images: Sequence[np.ndarray]) -> list[np.ndarray]:

@@ -13,7 +13,7 @@ from optics.diagnosis import fingerprints as prints
 from optics.diagnosis import statistics as st
 from optics.diagnosis.decide import Findings, Opponent, rivals
 from optics.diagnosis.evidence import Candidate, Evidence
-from optics.diagnosis.explanations import Outcome, fall_beside, fall_over_noise, lead_without
+from optics.diagnosis.explanations import Outcome, fall_over_noise, lead_without
 from optics.diagnosis.refit import Case, clear
 from optics.diagnosis.result import Basis, Fingerprint, Law, Level, Split
 from optics.diagnosis.thresholds import AS_GOOD, LEVEL, UNEVEN
@@ -94,11 +94,9 @@ def findings_of(
     complete = bool(best.members) and best.complete
     fall = own.fall
     if case.evidence.is_table:
-        noise = outcome.correlation
-        fingerprints = prints.beside_shared_noise(
-            case.model, case.evidence, case.places or [], fingerprints, case.session, noise
-        )
-        fall = fall_beside(case, outcome, noise) - best.expectation if subject else own.fall / max(noise.scale, 1.0)
+        places, scale = case.places or [], outcome.scale
+        fingerprints = prints.beside_shared_noise(case.model, case.evidence, places, fingerprints, case.session, scale)
+        fall = outcome.base.deviance - best.deviance - best.expectation if subject else own.fall / scale
         fingerprints = [replace(f, ratio=f.net / max(fall, 1.0)) for f in fingerprints]
     if not fingerprints:
         return own

@@ -15,12 +15,11 @@ from dataclasses import replace
 import numpy as np
 
 from optics.diagnosis import statistics as st
-from optics.diagnosis.correlation import Correlation
 from optics.diagnosis.decide import ordered
 from optics.diagnosis.evidence import Evidence, Progress
 from optics.diagnosis.result import Family, Fingerprint
 from optics.diagnosis.session import Session
-from optics.diagnosis.thresholds import AS_GOOD, EXCESS, MIMICS, SHARE
+from optics.diagnosis.thresholds import AS_GOOD, EXCESS, LEVEL, MIMICS, SHARE
 from optics.fit.compare import UNITS, led_label
 from optics.fit.model import Model
 from optics.scene.parameter import Values, keys_with
@@ -140,8 +139,9 @@ def fingerprints(
     names = sorted(set.intersection(*[set(p) for p in found]) - NOT_A_COORDINATE)
     named = _named(evidence, model)
     plain_normal = evidence.thinned(extra=2 * max(LINES, *named.values()))
-    middles = [block.middle for block in evidence.blocks]
     carriers = _carriers(model, evidence)
+    lit = sum(float(np.sum(np.square(gain))) for gain, _ in carriers)
+    middles = [block.middle for block in evidence.blocks]
     ends = np.cumsum([len(block.r) for block in evidence.blocks])[:-1]
     first = len(evidence.columns)
     dof_all = max(evidence.normal.count - evidence.projected.rank, 1)
@@ -187,6 +187,7 @@ def fingerprints(
                 family_of(name, model.family(name)),
                 net / excess if weighed else math.nan,
                 _unit_of(model, name),
+                math.sqrt(max(fall, 0.0) / max(lit, 1e-12)),
             )
         )
     say("fingerprints", len(names), len(names))
@@ -199,31 +200,31 @@ def beside_shared_noise(
     found: list[dict],
     curves: Sequence[Fingerprint],
     session: Session,
-    noise: Correlation,
+    scale: float,
 ) -> list[Fingerprint]:
-    """Curves of readings with the falls that they bring where neighbours share noise: a curve along what was turned
-    slowly follows a lamp that wanders."""
+    """The significant curves of readings, with their falls of deviance (`optics.diagnosis.correlation`): beside noise
+    that neighbours share, a curve along what was turned slowly counts for less, as a lamp that wanders brings it too.
+
+    scale   variance over the stated one
+    """
     named, carriers = _named(evidence, model), [np.concatenate(c) for c in zip(*_carriers(model, evidence))]
-    bins = []
+    base, r = evidence.dense(evidence.base), np.concatenate([block.r for block in evidence.blocks])
+    before, rank, judged = session.about(r, base).deviance(scale), st.orthonormal(base).shape[1], []
     for f in curves:
+        if f.p > LEVEL:
+            continue
         index, count = _bins(evidence, f.coordinate, np.concatenate([p[f.coordinate] for p in found]), named)
         held = index[:, None] == np.arange(count)
-        bins.append(np.hstack([held * carrier[:, None] for carrier in carriers]))
-    base, r = evidence.dense(evidence.base), np.concatenate([block.r for block in evidence.blocks])
-    whole = session.independent(np.hstack([base, r[:, None], *bins]), noise)
-    taken, rest = st.orthonormal(whole[:, : base.shape[1]]), whole[:, base.shape[1] :]
-    left = rest - taken @ (taken.T @ rest)
-    residual, first, judged = left[:, 0], 1, []
-    free, chi2 = len(r) - taken.shape[1], float(residual @ residual)
-    for f, own in zip(curves, bins):
-        part = slice(first, first + own.shape[1])
-        first += own.shape[1]
-        seen = replace(
-            evidence.projected, information=left[:, part].T @ left[:, part], score=left[:, part].T @ residual
-        )
-        fall, dof, _, _ = st.joint(seen, np.sum(np.square(rest[:, part]), 0))
-        judged.append(replace(f, fall=fall, dof=dof, p=_chance(evidence, fall, dof, free, chi2), net=fall - dof))
-    return [f for f in judged if f.dof]
+        whole = np.hstack([base, *(held * carrier[:, None] for carrier in carriers)])
+        dof = st.orthonormal(whole).shape[1] - rank
+        free = len(r) - rank
+        if not 0 < dof < free:
+            continue
+        after = session.about(r, whole).deviance(scale)
+        fall = before - after
+        p = _chance(evidence, fall, dof, free, before)
+        judged.append(replace(f, fall=fall, dof=dof, p=p, net=fall - dof))
+    return judged
 
 
 def _named(evidence: Evidence, model: Model) -> dict[str, int]:

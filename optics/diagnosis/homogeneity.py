@@ -6,15 +6,17 @@ strength is therefore compared with its scatter between parts of the sensor, or 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from optics.diagnosis import fingerprints as prints
 from optics.diagnosis import statistics as st
-from optics.diagnosis.evidence import Candidate, Evidence, Progress, at_bound, measure
+from optics.diagnosis.correlation import Correlation
+from optics.diagnosis.evidence import Block, Candidate, Evidence, Progress, at_bound, measure
 from optics.diagnosis.result import Explanation, Refit, Split
+from optics.diagnosis.session import Session
 from optics.diagnosis.thresholds import LEVEL, MAPS, UNEVEN
 from optics.fit.compare import led_label
 from optics.fit.model import Model, value_of
@@ -38,6 +40,7 @@ class Added:
     change      (k,) of its strengths from where they started
     images      per block, the whitened difference (n,) that the effect makes
     net         fall of chi2 with it
+    apart       (n, k) of all kept values -> the same as of independent values, in which `own` is then given
     """
 
     name: str
@@ -47,6 +50,7 @@ class Added:
     change: np.ndarray
     images: list[np.ndarray]
     net: float
+    apart: Callable[[np.ndarray], np.ndarray] = np.asarray
 
 
 def split(
@@ -61,6 +65,7 @@ def split(
     left: Refit | Explanation,
     net: float,
     beside: Sequence[Variable] = (),
+    noise: Correlation | None = None,
 ) -> tuple[list[Split], float, np.ndarray]:
     """Whether a fitted effect has the same strength in every part of the data, and `scatter` of its strength.
 
@@ -70,8 +75,11 @@ def split(
     places   coordinates of every kept value (`optics.diagnosis.fingerprints.places`)
     found    the fit with the effect; left: what is left with it; net: its fall
     beside   variables of what was added together with it
+    noise    of readings: what neighbours share of it
     """
     added = _added(model, evidence, rows_max, seed, say, c, found, net, beside)
+    if noise is not None:
+        added = _of_independent_readings(model, added, noise)
     own = added.own
     parts = _parts(model, own, places)
     plain_normal = own.thinned(extra=max([len(labels) for labels, _ in parts.values()], default=0))
@@ -127,6 +135,31 @@ def _added(
     return Added(c.effect.name, own, calibrated, effect, change, images, net)
 
 
+def _of_independent_readings(model: Model, added: Added, noise: Correlation) -> Added:
+    """The same with columns and residuals of readings as if these were independent."""
+    own, session = added.own, Session(model, added.own)
+
+    def apart(columns: np.ndarray) -> np.ndarray:
+        return session.independent(columns, noise)
+
+    everything = np.arange(len(own.columns))
+    residual = np.concatenate([block.r for block in own.blocks])
+    whole = _dealt(apart(np.column_stack([own.dense(list(everything)), residual])), own.blocks)
+    blocks = [
+        replace(block, where=everything, a=part[:, :-1], b=None, r=part[:, -1])
+        for block, part in zip(own.blocks, whole)
+    ]
+    own = replace(own, blocks=blocks)
+    projected = own.project(own.thinned(), added.calibrated, added.effect)
+    net = float(added.change @ projected.information @ added.change)
+    return replace(added, own=own, net=net, apart=apart)
+
+
+def _dealt(values: np.ndarray, blocks: Sequence[Block]) -> list[np.ndarray]:
+    """Values (n, ...) of all blocks, one array each."""
+    return np.split(values, np.cumsum([len(block.r) for block in blocks])[:-1])
+
+
 def _cut(
     added: Added, by: str, labels: list[str], bins: list[np.ndarray], plain: st.Normal, places: list[dict]
 ) -> Split | None:
@@ -139,17 +172,21 @@ def _cut(
 
     own, calibrated, effect = added.own, added.calibrated, added.effect
     count, first, k = len(labels), len(own.columns), own.thinning
-    normal = plain.copy()
-    for block, image, index in zip(own.blocks, added.images, bins):
-        st.add_bins(normal, block.where, block.middle, block.r, first, index, count, [image])
-    rest = list(range(first, first + count))
+    cut = [image[:, None] * (index[:, None] == np.arange(count)) for image, index in zip(added.images, bins)]
+    cut = _dealt(added.apart(np.concatenate(cut)), own.blocks)
+    normal, rest = plain.copy(), np.arange(first, first + count)
+    for block, part in zip(own.blocks, cut):
+        across = part.T @ block.middle
+        normal.gram[np.ix_(rest, block.where)] += across
+        normal.gram[np.ix_(block.where, rest)] += across.T
+        normal.gram[np.ix_(rest, rest)] += part.T @ part
+        normal.score[rest] += part.T @ block.r
     lengths = np.diag(normal.gram)[rest]
-    projected = own.project(normal, calibrated + effect, rest, k)
+    projected = own.project(normal, calibrated + effect, [*rest], k)
     fall, dof, *_ = st.joint(projected, lengths)
     if dof == 0:
         return None
-    _, _, delta, sd = st.joint(own.project(normal, calibrated, rest, k), lengths)
-    cut = [image[:, None] * (index[:, None] == np.arange(count)) for image, index in zip(added.images, bins)]
+    _, _, delta, sd = st.joint(own.project(normal, calibrated, [*rest], k), lengths)
     cut = _off_base(own, cut, projected, calibrated + effect)
     found = variances(cut, [block.r for block in own.blocks], places)
     return Split(
@@ -296,9 +333,12 @@ def _parts(model: Model, evidence: Evidence, places: list[dict]) -> dict[str, tu
             parts[by] = (kinds, [np.full(len(p["channel"]), i) for i, p in zip(numbers, places)])
 
     of_coordinate("channel", "channel", prints.channel_names(evidence))
-    of_frame("frame", names)
+    dealt = evidence.is_table and not any(f.group for f in frames)  # readings are dealt out in turn
+    if not dealt:
+        of_frame("frame", names)
     of_frame("LED", [led_label(f.parameters) for f in frames])
-    of_frame("group", [f.group or f.name for f in frames])
+    if not dealt:
+        of_frame("group", [f.group or f.name for f in frames])
     for key, numbers in prints.settings(model, evidence).items():
         if len(set(numbers)) <= 8:
             of_frame(key, [f"{v:g}" for v in numbers])

@@ -23,7 +23,7 @@ from dataclasses import asdict, dataclass, field, fields, is_dataclass
 from typing import TYPE_CHECKING, Any, cast
 
 from optics.diagnosis import showing
-from optics.diagnosis.thresholds import EXCESS, MARGIN, TELLS, is_structured
+from optics.diagnosis.thresholds import EACH, EXCESS, MARGIN, TELLS, USUAL, is_structured
 from optics.errors import Underdetermined
 from optics.fit.compare import plain
 from optics.words import Reach
@@ -230,6 +230,7 @@ class Fingerprint:
                 row
     family      what the coordinate belongs to (`optics.diagnosis.fingerprints`)
     share       of the excess misfit, NaN within noise
+    size        rms change that it makes, over the rms signal
     """
 
     coordinate: str
@@ -246,12 +247,15 @@ class Fingerprint:
     family: str = ""
     share: float = math.nan
     unit: str = ""
+    size: float = 0.0
 
     @property
     def cost(self) -> float:
-        """dof ln(1 + fall/dof): what so many bins could have fitted, whatever the data are, with a prior as wide as the
-        curve that was found (as `optics.diagnosis.explanations.occam`)."""
-        return self.dof * math.log1p(max(self.fall, 0.0) / self.dof)
+        """dof ln(1 + fall/dof) + 3 ln(1 + (size/USUAL)^2/2) + EACH: what so many bins could have fitted, whatever the
+        data are, with a prior as wide as the curve that was found; how far that width is from usual; and the odds that
+        an unknown cause acts. The same three costs as of an effect (`optics.diagnosis.explanations`)."""
+        bins = self.dof * math.log1p(max(self.fall, 0.0) / self.dof)
+        return bins + 3 * math.log1p((self.size / USUAL) ** 2 / 2) + EACH
 
 
 @dataclass(frozen=True)

@@ -52,14 +52,16 @@ class Session:
         return Readings(whole[:, -1], whole[:, :-1], self.order, self.loads)
 
     def independent(self, columns: np.ndarray, noise: Correlation) -> np.ndarray:
-        """(n, k) images as of readings that are independent, in units of their noise; in the order of the session."""
-        places = np.argsort(self.order, kind="stable")
-        apart = self.apart(columns)[places] / np.sqrt(max(noise.scale, 1.0))
+        """(n, k) images as of readings that are independent, in units of their noise: what is new in each of them."""
+        apart = self.apart(columns) / np.sqrt(noise.scale)
         if not noise.power:
             return apart
+        places = np.argsort(self.order, kind="stable")
         load = of_rms_1(self.loads[noise.kind])[places]
         power, length = np.array([noise.power]), np.array([noise.length])
-        return whitened(apart, self.order[places], load, power, length)[0][:, 0]
+        found = np.empty_like(apart)
+        found[places] = whitened(apart[places], self.order[places], load, power, length)[0][:, 0]
+        return found
 
 
 def _shared_errors(model: Model, evidence: Evidence) -> list[tuple[np.ndarray, np.ndarray]]:

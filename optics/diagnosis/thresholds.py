@@ -13,6 +13,7 @@ TOLD = 2 * math.log(
     19
 )  # lead in score at which the odds are 19 to 1: one in twenty of such decisions is wrong, at most
 EACH = 2 * math.log(9)  # cost of an effect: prior odds of one in ten that a given one of the library acts
+USUAL = 0.05  # of the signal: what an unknown cause changes, as effects of plausible size do
 HALF = 0.5  # of what the best explanation leaves: misfit that is left may lie along the direction that tells two apart
 # A map of the sensor or of the session that explains this much more than the best effect: the effect is not the cause.
 RIVAL = 1.5

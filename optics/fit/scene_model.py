@@ -25,6 +25,7 @@ from optics.scene.parameter import Parameter, Values, Variable
 if TYPE_CHECKING:
     from optics.light.monte_carlo import MonteCarloRenderer
 
+CUT_OFF = 3  # readings of 0, and none below, that tell of an instrument that shows no negative numbers
 KEPT = 4  # points in parameter space, for each frame, at which the variance that settings bring is remembered
 FLAT_FIELDS = ("multiplicative", "additive", "none")
 
@@ -50,10 +51,12 @@ class SceneModel:
             raise BadScene(
                 f"{captures.folder}: no noise model; give [noise] in captures.toml or repeats to estimate it from"
             )
+        self.cut_off = False  # whether readings of 0 are limits
         # settings whose error the captures state, be it none
         self.stated_errors = {*captures.uncertainty, *(key for f in captures.frames for key in f.uncertainty)}
         if captures.table is not None:
             noise = replace(noise, signed=True)  # of point readings, those below 0 are data
+            self.cut_off = _cut_off([f.image for f in captures.frames])
             captures = sweeps(captures, scene.parameters, list(scene.lights))
         captures = _with_files(captures, scene)
         self.scene, self.captures, self.noise = scene, captures, noise
@@ -536,6 +539,8 @@ class SceneModel:
             mask &= np.asarray(frame.mask, bool)[..., None]
         if self.mosaic is not None:
             mask &= self.mosaic
+        if self.cut_off:
+            mask &= frame.image != 0
         if self.renderer.layered and self.captures.table is None:
             mask &= self._resolved(index)
         return mask
@@ -602,17 +607,32 @@ class SceneModel:
         return {key: slope * errors[key] for key, slope in self.slopes(values, index, factors).items()}
 
     def _of_settings(self, values: Values, index: int) -> np.ndarray:
-        """(N, 1, C) variance in DN^2 that these bring."""
+        """(N, 1, C) variance in DN^2 that these bring, to second order: (I' s)^2 + 3/4 (I'' s^2)^2, the mean square of
+        I' e + I'' e^2/2. Where a dial stands at an extinction the slope vanishes, and its error still brings light."""
         values = self.weighed_at or values
         own = values.frame.get(index, {})
         state = (index, *sorted(values.common.items()), None, *sorted(own.items()))
         if state not in self._dialled_kept:
-            self._dialled_kept[state] = sum(
-                (error**2 for error in self.errors_of_settings(values, index).values()), np.zeros((1, 1, 1))
-            )
+            first = self.errors_of_settings(values, index)
+            self._dialled_kept[state] = sum((error**2 for error in first.values()), np.zeros((1, 1, 1)))
+            self._dialled_kept[state] = self._dialled_kept[state] + self._bent(values, index)
             while len(self._dialled_kept) > KEPT * len(self.frames):
                 self._dialled_kept.popitem(last=False)
         return self._dialled_kept[state]
+
+    def _bent(self, values: Values, index: int) -> np.ndarray:
+        """The second order of `_of_settings`, by finite differences of one standard deviation."""
+        now, frame = self._turn_to(values, index), self.frames[index]
+        total = np.zeros((1, 1, 1))
+        for key, weighed in self._dialled(index).items():
+            if key in self.driven:
+                continue  # readings are linear in a drive level
+            _, place, count = np.unique(frame.made[key], return_inverse=True, return_counts=True)
+            together = count[place].reshape(weighed.shape)
+            sd = weighed / np.sqrt(together)
+            up, there, down = (self._predict({**now, key: now[key] + step * sd}, index) for step in (1, 0, -1))
+            total = total + 0.75 * together * (up - 2 * there + down) ** 2
+        return total
 
     def slopes(self, values: Values, index: int, factors: Mapping[str, float]) -> dict[str, np.ndarray]:
         """key -> factor d prediction / d setting in a frame, (N, 1, C) DN per unit; without those that change
@@ -672,6 +692,11 @@ def _behind(now: Mapping, states: Sequence[Mapping]) -> dict[str, Any]:
         own = [np.broadcast_to(np.reshape(state[key], (-1, 1, 1)), (count, 1, 1)) for state in states]
         joined[key] = np.concatenate(own)
     return joined
+
+
+def _cut_off(images: Sequence[np.ndarray]) -> bool:
+    """Whether readings of 0 are those of an instrument that shows none below: CUT_OFF or more, and none below."""
+    return all((image >= 0).all() for image in images) and sum(int((image == 0).sum()) for image in images) >= CUT_OFF
 
 
 def _with_files(captures: Captures, scene: Scene) -> Captures:

@@ -32,6 +32,12 @@ def of_captures(model: SceneModel) -> list[str]:
     from optics.light.rendering import veiled
 
     texts = [*model.captures.warnings, *warnings_of(model.noise, model.captures), *_unnamed(model), *_astray(model)]
+    if model.cut_off:
+        count = sum(int((f.image == 0).sum()) for f in model.frames)
+        texts.append(
+            f"{count} readings are 0 and none is negative: the instrument shows nothing below 0, and these are left "
+            "out, as they say no more than that there was less"
+        )
     images_through_layers = model.renderer.layered and model.captures.table is None
     if images_through_layers and (what := veiled(model.renderer, model.at(Values(), 0))):
         texts.append(f"the model leaves out light that comes through layers: {what}")

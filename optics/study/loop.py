@@ -128,7 +128,13 @@ def _dial_error(model: SceneModel, setup: Setup) -> Width | None:
     found = fit_base(model, variables_of_base(model, setup, fitted), fitted, Values(dict(setup.values)))
     tested = candidates(model, None)
     seek(model, found.values, tested, fitted)
-    return width_of(model, found, tested, lambda e: effect_variables(model, e), fitted, setup.seed)
+    refit = Refits(model, setup, found, tested).of
+    try:
+        return width_of(
+            model, found, tested, lambda e: effect_variables(model, e), fitted, refit=refit, seed=setup.seed
+        )
+    except Underdetermined:  # a diagnosis will say why
+        return None
 
 
 def take_up(folder: str | Path) -> tuple[Record, SceneModel, Setup]:
