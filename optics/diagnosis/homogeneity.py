@@ -78,13 +78,12 @@ def split(
     noise    of readings: what neighbours share of it
     """
     added = _added(model, evidence, rows_max, seed, say, c, found, net, beside)
-    if noise is not None:
+    parts = _parts(model, added.own, places)
+    results = _cuts(added, parts, places)
+    if noise is not None:  # how sure a split is depends on what neighbours share, its share of the fall does not
         added = _of_independent_readings(model, added, noise)
-    own = added.own
-    parts = _parts(model, own, places)
-    plain_normal = own.thinned(extra=max([len(labels) for labels, _ in parts.values()], default=0))
-    cuts = [_cut(added, by, labels, bins, plain_normal, places) for by, (labels, bins) in parts.items()]
-    results = [cut for cut in cuts if cut is not None]
+        sure = {s.by: s for s in _cuts(added, parts, places)}
+        results = [replace(sure[s.by], fall=s.fall, h=s.h) for s in results if s.by in sure]
     level = LEVEL / max(len(results), 1)  # Bonferroni
     excess = left.excess_sd * math.sqrt(2 * max(evidence.normal.count - evidence.projected.rank, 1))
 
@@ -97,7 +96,14 @@ def split(
         return max(HAIR, min(EVEN if s.chance < LEVEL else UNEVEN, SAME_PLACE * excess / max(net, 1e-9)))
 
     results = [replace(s, limit=most(s), holds=s.h <= most(s)) for s in results]
-    return results, *scatter(own, added.calibrated, added.effect, added.change, places)
+    return results, *scatter(added.own, added.calibrated, added.effect, added.change, places)
+
+
+def _cuts(added: Added, parts: dict[str, tuple[list[str], list[np.ndarray]]], places: list[dict]) -> list[Split]:
+    """The splits by each of `_parts`."""
+    plain = added.own.thinned(extra=max([len(labels) for labels, _ in parts.values()], default=0))
+    cuts = [_cut(added, by, labels, bins, plain, places) for by, (labels, bins) in parts.items()]
+    return [cut for cut in cuts if cut is not None]
 
 
 def _added(
@@ -149,10 +155,7 @@ def _of_independent_readings(model: Model, added: Added, noise: Correlation) -> 
         replace(block, where=everything, a=part[:, :-1], b=None, r=part[:, -1])
         for block, part in zip(own.blocks, whole)
     ]
-    own = replace(own, blocks=blocks)
-    projected = own.project(own.thinned(), added.calibrated, added.effect)
-    net = float(added.change @ projected.information @ added.change)
-    return replace(added, own=own, net=net, apart=apart)
+    return replace(added, own=replace(own, blocks=blocks), apart=apart)
 
 
 def _dealt(values: np.ndarray, blocks: Sequence[Block]) -> list[np.ndarray]:
