@@ -684,13 +684,29 @@ def sweeps(captures: Captures, parameters: Mapping[str, Parameter], lights: Sequ
     )
 
 
+def with_lasting_settings(captures: Captures) -> Captures:
+    """The images of a set, each with the time that its uncertain settings were made (`Frame.made`): frames of a group
+    that follow each other with the same value share its error, as rows of a table do (`sweeps`)."""
+    spread = [captures.uncertainty_of(f) for f in captures.frames]
+    runs = {k: _runs(captures.frames, k, groups=True) for k in {k for own in spread for k in own}}
+    frames = [
+        replace(f, made={k: int(runs[k][i]) for k in own}) for i, (f, own) in enumerate(zip(captures.frames, spread))
+    ]
+    return replace(captures, frames=frames, warnings=list(captures.warnings))
+
+
 def _column(values: Sequence[Any]) -> np.ndarray:
     return np.array(values, float).reshape(-1, 1, 1)
 
 
-def _runs(frames: Sequence[Frame], key: str) -> np.ndarray:
-    """(N,) number of the time that a setting was made for each row: it was made anew where its value changes."""
-    changed = [a.parameters.get(key) != b.parameters.get(key) for a, b in zip(frames, frames[1:])]
+def _runs(frames: Sequence[Frame], key: str, groups: bool = False) -> np.ndarray:
+    """(N,) number of the time that a setting was made for each row: it was made anew where its value changes, or the
+    group does."""
+
+    def made(frame: Frame) -> tuple[object, ...]:
+        return frame.parameters.get(key), frame.group if groups else None
+
+    changed = [made(a) != made(b) for a, b in zip(frames, frames[1:])]
     return np.concatenate([[0], np.cumsum(changed, dtype=int)])
 
 

@@ -63,23 +63,41 @@ class Readings:
     residual  (n,) whitened;   fitted: (n, k) whitened images of what was fitted
     order     (n,) numbers of the readings, in any order
     loads     kind -> (n,) whitened: what an amplifier or a lamp moves, the latter the signal
+    beside    (k + 1, k + 1) products of images and residual among further values, which share nothing; None: there are
+              none
+    shortest  length, in readings
     """
 
-    def __init__(self, residual: np.ndarray, fitted: np.ndarray, order: np.ndarray, loads: Mapping[str, np.ndarray]):
-        basis = st.orthonormal(fitted)
+    def __init__(
+        self,
+        residual: np.ndarray,
+        fitted: np.ndarray,
+        order: np.ndarray,
+        loads: Mapping[str, np.ndarray],
+        beside: np.ndarray | None = None,
+        shortest: float = SHORTEST,
+    ):
         places = np.argsort(order, kind="stable")
-        left = residual - basis @ (basis.T @ residual)
-        self.white = float(left @ left)
+        columns = np.column_stack([fitted, residual])[places]
+        beside = np.zeros((columns.shape[1],) * 2) if beside is None else beside
+        whole = columns.T @ columns + beside
+        root = st.root(whole[:-1, :-1]).T  # of an orthonormal basis of what was fitted
+        turn = np.zeros((len(whole), root.shape[1] + 1))
+        turn[:-1, :-1], turn[-1, -1] = root, 1.0
+        turn[:-1, -1] = -root @ (root.T @ whole[:-1, -1])  # the residual off that basis
+        columns, self.beside = columns @ turn, turn.T @ beside @ turn
+        self.white = float((turn.T @ whole @ turn)[-1, -1])
         self.bright = float(np.mean(np.square(loads["lamp"]))) if len(residual) else 0.0
-        self.free = len(residual) - basis.shape[1]
+        self.free = len(residual) - root.shape[1]
         self.shared: list[tuple[str, np.ndarray, np.ndarray, np.ndarray]] = []  # kind, and what `_left` returns
-        if self.free < FEWEST or not self.white > 0:
+        if (self.free < FEWEST and not beside.any()) or not self.white > 0:
             return
-        columns, t = np.column_stack([basis, residual])[places], order[places].astype(float)
-        lengths = np.geomspace(SHORTEST, max(float(np.ptp(t)) / 2, 2 * SHORTEST), LENGTHS)
+        t = order[places].astype(float)
+        lengths = np.geomspace(shortest, max(float(np.ptp(t)) / 2, 2 * shortest), LENGTHS)
         self.power, self.length = (grid.ravel() for grid in np.meshgrid(POWERS, lengths))
         self.shared = [
-            (kind, *_left(columns, t, of_rms_1(load)[places], self.power, self.length)) for kind, load in loads.items()
+            (kind, *_left(columns, t, of_rms_1(load)[places], self.power, self.length, self.beside))
+            for kind, load in loads.items()
         ]
 
     def deviance(self, scale: float) -> float:
@@ -120,14 +138,20 @@ def of_rms_1(load: np.ndarray) -> np.ndarray:
 
 
 def _left(
-    columns: np.ndarray, t: np.ndarray, load: np.ndarray, power: np.ndarray, length: np.ndarray
+    columns: np.ndarray,
+    t: np.ndarray,
+    load: np.ndarray,
+    power: np.ndarray,
+    length: np.ndarray,
+    beside: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(r' V^-1 r after the fit, ln det V, ln det of the fit's normal equations), each (g,), by powers and lengths (g,).
 
     columns   (n, k + 1): an orthonormal basis of what was fitted, and the residual, in the order of t
+    beside    (k + 1, k + 1) products of the same among further values
     """
     white, logs = whitened(columns, t, load, power, length)
-    products = np.einsum("igj,igk->gjk", white, white, optimize=True)
+    products = np.einsum("igj,igk->gjk", white, white, optimize=True) + beside
     fitted, own, across = products[:, :-1, :-1], products[:, -1, -1], products[:, :-1, -1]
     if columns.shape[1] == 1:
         return own, logs, np.zeros(len(power))

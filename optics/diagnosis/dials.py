@@ -24,12 +24,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import linalg
+from scipy.sparse import csr_array
 
 from optics.diagnosis import statistics as st
+from optics.diagnosis.correlation import WANDER
 from optics.diagnosis.diagnose import choose
 from optics.diagnosis.evidence import Candidate, Evidence, measure, silent
-from optics.diagnosis.explanations import search
+from optics.diagnosis.explanations import leading
 from optics.diagnosis.refit import Case, refit_each
 from optics.diagnosis.score import score
 from optics.fit import calibrate
@@ -65,9 +66,10 @@ class Width:
 
 
 def unstated(model: SceneModel) -> list[str]:
-    """The dials that readings turn, and whose errors captures do not state; one that is stated as 0 is exact."""
+    """The dials of films and plates that readings or frames turn, and whose errors captures do not state; one that is
+    stated as 0 is exact."""
     turned: dict[str, set[float]] = {}
-    for frame in model.frames if model.captures.table is not None else ():
+    for frame in model.frames if model.renderer.layered else ():
         for key, values in {**frame.parameters, **frame.readings}.items():
             if model.parameters[key].unit == "deg" and model.parameters[key].how == "layer":
                 turned.setdefault(key, set()).update(np.unique(values).tolist())
@@ -87,7 +89,7 @@ def width_of(
     """The error that the settings of all unstated dials have; None where readings show none.
 
     It is sought about the calibrated base first. What a strong effect leaves beside its tangent would count as dial
-    error: so it is sought again about the best explanation of the readings, in the noise that is stated, and the
+    error: so it is sought again about the explanation that leads in the noise that is stated, and the
     smaller of the two is returned.
 
     fit, effects, variables_of, fitted, refit, seed   as of `optics.diagnosis.diagnose.diagnose`
@@ -102,7 +104,7 @@ def width_of(
         return None
     case = Case(model, fit, evidence, table, refit or calibrate.fit, [*fitted], [], variables_of, ROWS, seed, silent)
     chosen = choose(case, TOP)
-    leader = search(case, chosen, refit_each(case, chosen)).leader
+    leader = leading(case, chosen, refit_each(case, chosen))
     if not leader.members:
         return first
     held = {c.effect.name for c in leader.members}
@@ -119,56 +121,85 @@ def _width_about(
     model: SceneModel, evidence: Evidence, candidates: Sequence[Candidate], keys: Sequence[str]
 ) -> Width | None:
     """The width about calibrated values."""
-    images = [_waves(model, evidence)]
-    for c in candidates:
-        if not c.broken:
-            images += [evidence.dense(columns) * c.plausible for columns in c.forms.values()]
-    residual = np.concatenate([block.r for block in evidence.blocks])
-    errors = np.hstack([_errors(model, evidence, key) for key in keys])
-    return most_likely(residual, evidence.dense(evidence.base), LOOSE * np.hstack(images), errors)
+    acting = [c for c in candidates if not c.broken]
+    known = [i for c in acting for columns in c.forms.values() for i in columns]
+    # a strength of each frame, of its plausible size, would be any dial's error
+    sizes = [c.plausible * (1.0 if c.effect.scope == "frame" else LOOSE) for c in acting for _ in c.forms]
+    first, fitted = len(evidence.base), [*evidence.base]
+    beside, errors = [_slow(model, evidence)], [_errors(model, evidence, key) for key in keys]
+    ends = np.cumsum([0, *(len(block.r) for block in evidence.blocks)])
+    width = first + len(known) + sum(part.shape[1] for part in (*beside, *errors))
+    gram, score = np.zeros((width, width)), np.zeros(width)
+    for block, start, end in zip(evidence.blocks, ends, ends[1:]):
+        own = [block.columns([*fitted, *known]), *(part[start:end] for part in (*beside, *errors))]
+        columns = np.hstack([part if isinstance(part, np.ndarray) else part.toarray() for part in own])
+        there = np.flatnonzero(columns.any(0))
+        gram[np.ix_(there, there)] += columns[:, there].T @ columns[:, there]
+        score[there] += columns[:, there].T @ block.r
+    scale = np.ones(width)
+    scale[first : first + len(known)] = np.concatenate([*sizes, []])
+    square = sum(float(block.r @ block.r) for block in evidence.blocks)
+    found = Products(gram * np.outer(scale, scale), score * scale, square, int(ends[-1]))
+    return found.most_likely(first, first + len(known) + beside[0].shape[1])
 
 
-def most_likely(residual: np.ndarray, fitted: np.ndarray, beside: np.ndarray, errors: np.ndarray) -> Width | None:
-    """The width of largest likelihood, see the module.
+@dataclass(frozen=True)
+class Products:
+    """Of images X (n, k) and a residual r (n,), whitened: gram X'X, score X'r, square r'r, count n."""
 
-    residual  (n,) whitened;   fitted: (n, k) images of what was fitted;   beside: (n, l) L;   errors: (n, m) D
-    """
-    count = len(residual)
-    taken = st.orthonormal(fitted)
-    free = count - taken.shape[1]
-    if free < FEWEST or not errors.any():
-        return None
-    rest = linalg.qr(taken)[0][:, taken.shape[1] :] if taken.shape[1] else np.eye(count)
-    inner, spread = rest.T @ beside, rest.T @ errors
-    # V(w)/s^2 is diagonal where U'(1 + L L')U = 1 and U' D D' U = diag(shares)
-    shares, turn = linalg.eigh(spread @ spread.T, np.eye(free) + inner @ inner.T)
-    square = (turn.T @ (rest.T @ residual)) ** 2
-    widths = np.concatenate([[0.0], WIDTHS])
-    ratios = 1 + widths[:, None] ** 2 * np.maximum(shares, 0.0)
-    chi2, logs = (square / ratios).sum(1), np.log(ratios).sum(1)
-    scale = np.maximum(chi2 / free, 1.0)
-    likelihood = -(chi2 / scale + free * np.log(scale) + logs)
-    best = int(np.argmax(likelihood))
-    gain = float(likelihood[best] - likelihood[0])
-    if gain < NOTED:
-        return None
-    own = widths * np.sqrt(scale)
-    near = own[likelihood > likelihood[best] - 1]
-    return Width(float(own[best]), float(near.min()), float(near.max()), gain)
+    gram: np.ndarray
+    score: np.ndarray
+    square: float
+    count: int
+
+    @classmethod
+    def of(cls, images: np.ndarray, residual: np.ndarray) -> Products:
+        return cls(images.T @ images, images.T @ residual, float(residual @ residual), len(residual))
+
+    def most_likely(self, fitted: int, beside: int) -> Width | None:
+        """The width of largest likelihood, see the module: columns before `fitted` were fitted, those before `beside`
+        are L, the others D."""
+        inverse, rank = st.inverse(self.gram[:fitted, :fitted])
+        across = self.gram[fitted:, :fitted] @ inverse
+        information = self.gram[fitted:, fitted:] - across @ self.gram[:fitted, fitted:]
+        score = self.score[fitted:] - across @ self.score[:fitted]
+        chi2 = self.square - float(self.score[:fitted] @ inverse @ self.score[:fitted])
+        free, first = self.count - rank, beside - fitted
+        if free < FEWEST or not np.diag(information)[first:].any():
+            return None
+        mixed = np.linalg.solve(np.eye(first) + information[:first, :first], information[:first, first:])
+        chi2 -= float(score[:first] @ np.linalg.solve(np.eye(first) + information[:first, :first], score[:first]))
+        shares, turn = np.linalg.eigh(information[first:, first:] - information[first:, :first] @ mixed)
+        square = (turn.T @ (score[first:] - mixed.T @ score[:first])) ** 2
+        widths = np.concatenate([[0.0], WIDTHS])[:, None] ** 2
+        ratios = 1 + widths * np.maximum(shares, 0.0)
+        left, logs = chi2 - (square * widths / ratios).sum(1), np.log(ratios).sum(1)
+        scale = np.maximum(left / free, 1.0)
+        likelihood = -(left / scale + free * np.log(scale) + logs)
+        best = int(np.argmax(likelihood))
+        gain = float(likelihood[best] - likelihood[0])
+        if gain < NOTED:
+            return None
+        own = np.sqrt(widths[:, 0] * scale)
+        near = own[likelihood > likelihood[best] - 1]
+        return Width(float(own[best]), float(near.min()), float(near.max()), gain)
 
 
-def _waves(model: SceneModel, evidence: Evidence) -> np.ndarray:
-    """(n, k) slow changes along the session, rms 1 in all: of an amplifier, and of a lamp."""
+def _slow(model: SceneModel, evidence: Evidence) -> csr_array:
+    """(n, k) what a lamp or an amplifier may do besides. Of readings, slow waves along the session, rms 1 LOOSE noises
+    in all; of frames, a gain of each, of WANDER."""
     order, signal = evidence.order(model), evidence.lit(model)
     rows, place = np.unique(order, return_inverse=True)
+    if not evidence.is_table:
+        return csr_array((WANDER * signal, (np.arange(len(signal)), place)), shape=(len(signal), len(rows)))
     count = min(max(len(rows) // PER_WAVE, 1), WAVES)
     waves = np.cos(np.pi * (place[:, None] + 0.5) / len(rows) * np.arange(1, count + 1)) * np.sqrt(2 / count)
     rms = float(np.sqrt(np.mean(np.square(signal))))
-    return np.hstack([waves, waves * signal[:, None] / rms if rms > 0 else waves])
+    return csr_array(LOOSE * np.hstack([waves, waves * signal[:, None] / rms if rms > 0 else waves]))
 
 
-def _errors(model: SceneModel, evidence: Evidence, key: str) -> np.ndarray:
-    """(n, m) whitened slope of each reading per deg of a dial, one column for each time that it was set."""
+def _errors(model: SceneModel, evidence: Evidence, key: str) -> csr_array:
+    """(n, m) whitened slope of each value per deg of a dial, one column for each time that it was set."""
     settings, slopes = [], []
     for block in evidence.blocks:
         frame = model.frames[block.frame]
@@ -180,4 +211,4 @@ def _errors(model: SceneModel, evidence: Evidence, key: str) -> np.ndarray:
     places = np.argsort(evidence.order(model), kind="stable")
     made = np.empty(len(setting), int)
     made[places] = np.cumsum(np.diff(setting[places], prepend=np.nan) != 0) - 1
-    return np.where(made[:, None] == np.arange(made.max() + 1), slope[:, None], 0.0)
+    return csr_array((slope, (np.arange(len(slope)), made)), shape=(len(slope), int(made.max()) + 1))

@@ -28,6 +28,7 @@ EVEN = 0.05  # of the fall: what splitting may gain where the scatter of clutter
 # not its cause.
 SAME_PLACE = 0.5
 HAIR = 0.01  # of the fall: a split that gains less says nothing about what the effect is
+FRAMES = 6  # from which their scatter says something of a strength that all of them have
 PARTS = 16  # of the sensor or session: wider than clutter is correlated, enough for a variance
 
 
@@ -255,7 +256,8 @@ def _off_base(
 def variances(
     images: Sequence[np.ndarray], left: Sequence[np.ndarray], places: list[dict]
 ) -> list[tuple[np.ndarray, int]]:
-    """(B, G) for each of MAPS that there is: the variance of the score x'r of images x, by its scatter between G parts.
+    """(B, G) for each of MAPS that there is, and for frames: the variance of the score x'r of images x, by its scatter
+    between G parts.
 
     B = sum of w w' with w = (1 - V_g/V)^(-1/2) u_g, u_g = sum of x r over part g, V_g of x x', where r is the residual
     at the optimum. The fit has absorbed a share V_g/V of part g, so that without clutter the mean of B is V. Where a
@@ -270,9 +272,10 @@ def variances(
     back = np.linalg.pinv(root)
     rest = root.T @ root @ sum(x.T @ r for x, r in zip(images, left))
     left = [r - x @ rest for x, r in zip(images, left)]
-    for name in MAPS:
+    by_frame = () if "reading" in places[0] else ("frame",)  # of readings, those of a frame are no neighbours
+    for name in (*MAPS, *by_frame):
         edges = st.bin_edges(np.concatenate([p[name] for p in places]), PARTS) if name in places[0] else None
-        if edges is None:
+        if edges is None or (name == "frame" and len(places) < FRAMES):
             continue
         b, parts = np.zeros((k, k)), 0
         bins = [np.searchsorted(edges, place[name], side="right") - 1 for place in places]

@@ -13,7 +13,7 @@ from optics.diagnosis import statistics as st
 from optics.diagnosis.evidence import Candidate, Evidence, Progress, at_bound
 from optics.diagnosis.result import Refit
 from optics.diagnosis.score import Table
-from optics.diagnosis.session import Session
+from optics.diagnosis.session import FEWEST_FRAMES, Frames, Session
 from optics.diagnosis.thresholds import CLEAR
 from optics.fit import gauges
 from optics.fit.model import Model, value_of
@@ -55,6 +55,11 @@ class Case:
     def session(self) -> Session:
         """Of a table."""
         return Session(self.model, self.evidence)
+
+    @cached_property
+    def lamp(self) -> Frames | None:
+        """Of images; None where there are too few of them."""
+        return Frames(self.model, self.evidence) if len(self.evidence.frames) >= FEWEST_FRAMES else None
 
     @property
     def base(self) -> list[Variable]:

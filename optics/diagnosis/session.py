@@ -21,6 +21,8 @@ from optics.diagnosis.correlation import Correlation, Readings, of_rms_1, whiten
 from optics.diagnosis.evidence import Evidence
 from optics.fit.model import Model
 
+APART = 0.3  # frames: what they do not share is one of each
+FEWEST_FRAMES = 6  # from which it is asked what a lamp did in each
 LEAST = 1e-3  # of the noise of a reading: what its instrument brings, at least
 MOST = 64  # values that share an error, beyond which they are left as they are
 
@@ -62,6 +64,28 @@ class Session:
         found = np.empty_like(apart)
         found[places] = whitened(apart[places], self.order[places], load, power, length)[0][:, 0]
         return found
+
+
+class Frames:
+    """Images as a session: what the lamp, or an exposure, does to a whole frame is shared by its pixels.
+
+    The part of a residual along the signal of its frame is one reading, with the load |g| of its whitened signal g;
+    what is across shares nothing."""
+
+    def __init__(self, model: Model, evidence: Evidence):
+        signal = np.split(evidence.lit(model), np.cumsum([len(block.r) for block in evidence.blocks])[:-1])
+        self.signal = [g / max(float(np.linalg.norm(g)), 1e-12) for g in signal]
+        self.thinning = evidence.thinning
+        self.loads = {"lamp": np.array([np.linalg.norm(g) for g in signal]) * np.sqrt(evidence.thinning)}
+
+    def about(self, residual: np.ndarray, fitted: np.ndarray) -> Readings:
+        """As of `Session`."""
+        whole = np.column_stack([fitted, residual])
+        parts = np.split(whole, np.cumsum([len(g) for g in self.signal])[:-1])
+        along = np.array([g @ part for g, part in zip(self.signal, parts)]) * np.sqrt(self.thinning)
+        across = self.thinning * whole.T @ whole - along.T @ along
+        order = np.arange(len(along))
+        return Readings(along[:, -1], along[:, :-1], order, self.loads, across, APART)
 
 
 def _shared_errors(model: Model, evidence: Evidence) -> list[tuple[np.ndarray, np.ndarray]]:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from optics.captures.capture_set import Captures, Frame, cfa_channel, sweeps
+from optics.captures.capture_set import Captures, Frame, cfa_channel, sweeps, with_lasting_settings
 from optics.captures.noise import Noise
 from optics.errors import BadScene, UnknownKey
 from optics.fit import geometry
@@ -58,6 +58,8 @@ class SceneModel:
             noise = replace(noise, signed=True)  # of point readings, those below 0 are data
             self.cut_off = _cut_off([f.image for f in captures.frames])
             captures = sweeps(captures, scene.parameters, list(scene.lights))
+        else:
+            captures = with_lasting_settings(captures)
         captures = _with_files(captures, scene)
         self.scene, self.captures, self.noise = scene, captures, noise
         self.mosaic, self.frames = None, captures.frames

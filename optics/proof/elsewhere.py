@@ -1,7 +1,8 @@
 """The count on benches of other laboratories: what a stranger is told, by every diagnosis of his loop.
 
 claim      an effect that the loop names: claimed, or one of two that together leave nothing; right where it is
-           hidden, or is the same by its physics (`optics.proof.rigs.laboratory.SAME`)
+           hidden, or is the same by its physics (`optics.proof.rigs.laboratory.SAME`); neither right nor wrong where
+           everyday life brings it besides, as a lamp that wanders brings the gain drift of photographs
 set        effects that the last diagnosis does not tell apart; a member "a + b" stands for both together
 told apart whether the session can tell the hidden effect from every other: P(correct) as the diagnosis prints it;
            where it did not refit the hidden effect, by the maker's own formulas
@@ -61,33 +62,33 @@ def elsewhere(records: Sequence[dict], parts: bool = True) -> Elsewhere | None:
     single = [r for r in good if r["cell"]["kind"] == "library"]
     pairs = [r for r in good if r["cell"]["kind"] == "pair"]
     strong = [r for r in single if snr(r) >= STRONG]
-    claims = [(r, name) for r in good for name in sorted(named(r))]
+    claims = [(r, name) for r in good for name in sorted(_claimed(r))]
     right = [name in _true(r) for r, name in claims]
     needed = [r for r in pairs if min(r["facts"]["alone"].values()) >= CLEAR]
     none = [r for r in good if r["cell"]["kind"] == "none"]
     rates = [
         Rate("claims that are right", sum(right), len(right), 0.95, 0.95),
-        rate_of("claims where nothing is hidden", none, named, 0.01, 0.01, True),
+        rate_of("claims where nothing is hidden", none, _claimed, 0.01, 0.01, True),
         rate_of("two hidden: both named, or in a set with both", needed, _both, 0.9, 0.9),
         rate_of("one, SNR >= 1: named, or in the set", strong, _told, 0.9, 0.9),
         rate_of(
             "one, SNR >= 1, P(correct) >= .95: named alone",
             [r for r in strong if _apart(r) >= APART],
-            lambda r: bool(named(r)) and named(r) <= _true(r),
+            lambda r: bool(_claimed(r)) and _claimed(r) <= _true(r),
             0.8,
             0.8,
         ),
         rate_of(
             "the same, P(correct) by the maker's formulas",
             [r for r in strong if r["facts"]["correct"] >= APART],
-            lambda r: bool(named(r)) and named(r) <= _true(r),
+            lambda r: bool(_claimed(r)) and _claimed(r) <= _true(r),
             0.8,
             0.8,
         ),
         rate_of(
             "kinds that no library has: falsely claimed",
             [r for r in good if r["cell"]["kind"] == "unknown"],
-            named,
+            _claimed,
             0.1,
             0.1,
             True,
@@ -114,6 +115,11 @@ def elsewhere(records: Sequence[dict], parts: bool = True) -> Elsewhere | None:
         names = sorted({r["cell"]["rig"] for r in records})
         found.rigs = {n: one for n in names if (one := elsewhere([r for r in records if r["cell"]["rig"] == n], False))}
     return found
+
+
+def _claimed(r: dict) -> set[str]:
+    """What was named, but for what everyday life brings besides."""
+    return named(r) - set(r["facts"].get("besides", ()))
 
 
 def snr(r: dict) -> float:
@@ -144,18 +150,18 @@ def _true(r: dict) -> set[str]:
 
 def _members(r: dict) -> set[str]:
     """All effects that were named or stand in the last set."""
-    return named(r) | {part.strip() for member in ties(r) for part in member.split(" + ")}
+    return _claimed(r) | {part.strip() for member in ties(r) for part in member.split(" + ")}
 
 
 def _told(r: dict) -> bool:
     """The hidden effect was named, and nothing that is not there; or it stands in the set."""
-    return bool(_members(r) & _true(r)) and named(r) <= _true(r)
+    return bool(_members(r) & _true(r)) and _claimed(r) <= _true(r)
 
 
 def _both(r: dict) -> bool:
     said = _members(r)
     each = [{name, *r["facts"].get("same", {}).get(name, ())} for name in r["cell"]["hidden"]]
-    return all(names & said for names in each) and named(r) <= _true(r)
+    return all(names & said for names in each) and _claimed(r) <= _true(r)
 
 
 def _apart(r: dict) -> float:
@@ -172,11 +178,11 @@ def wrong(records: Sequence[dict]) -> dict[str, list[str]]:
             why = f"crash: {r['failed'].split(':')[0]} at {r.get('where', '')}"
         elif not r["steps"]:
             continue
-        elif false := sorted(named(r) - _true(r)):
+        elif false := sorted(_claimed(r) - _true(r)):
             why = f"false claim of {' and '.join(false)}"
         elif kind == "library" and snr(r) >= STRONG and not _told(r):
             why = f"{_hidden(r)} not found: {last(r)['word']}"
-        elif kind == "library" and snr(r) >= STRONG and _apart(r) >= APART and not named(r):
+        elif kind == "library" and snr(r) >= STRONG and _apart(r) >= APART and not _claimed(r):
             why = f"{_hidden(r)} not named alone: {last(r)['word']}"
         elif kind == "pair" and min(r["facts"]["alone"].values()) >= CLEAR and not _both(r):
             why = "two hidden, not both named"

@@ -196,9 +196,9 @@ def settings_in_doubt(model: SceneModel, frames: Sequence[int]) -> list[Variable
     """The settings of these frames whose error all pixels of a frame, or all readings of a sweep, share: a variable
     each, with the setting and its uncertainty as its prior.
 
-    One for all frames of what [parameters] sets; one for each image of what frames set; one for the sweeps that say
-    they share a setting (`Frame.made`). Errors that differ from reading to reading are in the variance
-    (`SceneModel.variance`). A light that a frame switches off is off."""
+    One for all frames of what [parameters] sets; one for the images, or the sweeps, that share a setting
+    (`Frame.made`). Errors that differ from reading to reading are in the variance (`SceneModel.variance`). A light that
+    a frame switches off is off."""
     captures, found = model.captures, []
     single = {key for f in model.frames for key in (*f.parameters, *f.readings)}
     for key, sd in captures.uncertainty.items():

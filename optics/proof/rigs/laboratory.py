@@ -37,6 +37,7 @@ from optics.study import loop
 TRIES = 30  # sessions that are drawn until one shows a cause as strongly as is asked
 LIKE = 0.01  # of chi2: a tenth in amplitude
 SEEN = 1.0  # the same, of both of two causes
+SURE = 3.0  # sd of a frame's mean by which a lamp wanders that is seen
 
 ONE_ANGLE = (
     "only the angle between the film's scale and the camera's analysers counts: turn both back together with the "
@@ -74,6 +75,7 @@ class Laboratory(Rig):
     weakest, strongest = 0.3, 30.0  # signal to noise per value
     nulls = 4  # of a round
     pair_cells = 3
+    frame_by_frame = False  # each frame is recorded at once: a lamp that wanders is a gain of each
     usual = False  # solves for what the scene declares free, no list of his own
 
     def __init__(self):
@@ -176,6 +178,8 @@ class Laboratory(Rig):
             "exclude": list(session.exclude),
             "numbers": dict(hidden),
         }
+        if self.frame_by_frame and "gain drift" not in cell.hidden and session.lamp_seen() > SURE:
+            found["besides"] = ["gain drift"]
         found["same"] = {name: list(SAME[name]) for name in cell.hidden if name in SAME}
         if cell.kind == "library":
             gaps = design.gaps(session, hidden, cell.hidden)
@@ -340,7 +344,7 @@ class Photographs(Laboratory):
     others = _known(effects)
     unknown = _odd("dichroic sample", "range step")
     weakest, strongest = 0.05, 5.0  # a set has some ten thousand values
-    nulls, pair_cells = 2, 2
+    nulls, pair_cells, frame_by_frame = 2, 2, True
 
 
 class PolarizationCamera(Laboratory):
@@ -363,4 +367,4 @@ class PolarizationCamera(Laboratory):
     others = _known(effects)
     unknown = _odd("dichroic sample", "range step")
     weakest, strongest = 0.05, 5.0  # a set has some thousand values
-    nulls, pair_cells, usual = 2, 2, True
+    nulls, pair_cells, frame_by_frame, usual = 2, 2, True, True

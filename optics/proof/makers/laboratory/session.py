@@ -135,6 +135,12 @@ class Session:
                 found[key][self.misread] += 10.0
         return found
 
+    def lamp_seen(self) -> float:
+        """How far the lamp wanders from frame to frame, in standard deviations of the mean of a frame."""
+        frames = len(np.unique(self.settings["frame"]))
+        lit = np.square(self.mean({}) / self.meter.sd(self.mean({})))
+        return self.wander * math.sqrt(float(lit.sum()) / frames)
+
     def take(self, hidden: Bench, rng: np.random.Generator) -> np.ndarray:
         """(n, C) DN as written down."""
         signal = self.mean(hidden, self.turned_off(rng))

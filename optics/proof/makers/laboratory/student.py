@@ -14,6 +14,7 @@ import numpy as np
 from optics.proof.makers.laboratory.bench import FILMS
 from optics.proof.makers.laboratory.session import Meter, Session
 
+DIMMEST = 0.003  # of the range: what is seen of a lamp of power 1 where films are crossed, at least
 PLANS = ("one film", "two films", "three films", "both turned", "two powers", "forth and back")
 
 
@@ -86,9 +87,10 @@ def everyday(found: Session, rng: np.random.Generator, *, dial_sd: float = 0.0, 
 
 
 def bright(found: Session) -> float:
-    """Power of the lamp at which the largest reading is at 0.7 of the range."""
+    """Power of the lamp at which the largest reading is at 0.7 of the range, as far as a lamp goes: of crossed films
+    the light that their dials let through is all there is."""
     top = float(replace(found, power=1.0).mean({}).max()) / found.meter.full
-    return 0.7 / max(top, 1e-6)
+    return 0.7 / max(top, DIMMEST)
 
 
 def known(found: Session, hidden: tuple[str, ...], rng: np.random.Generator) -> Session:
