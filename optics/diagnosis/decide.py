@@ -62,6 +62,7 @@ class Findings:
                  none that is significant; law_lead: of the best explanation's score over that law's
     fragile      an effect that other weights or masks prefer clearly, '' for none
     measured     whether repeats fix the size of the noise
+    misstated    whether the excess is that of images whose noise is stated a little too small: without structure
     """
 
     p_family: float
@@ -97,6 +98,7 @@ class Findings:
     law_lead: float = math.inf
     fragile: str = ""
     measured: bool = False
+    misstated: bool = False
 
     @property
     def another_law(self) -> bool:
@@ -111,7 +113,7 @@ class Findings:
     @property
     def weighed(self) -> bool:
         """Whether the base model leaves an excess, of which an effect or a curve explains a share."""
-        return self.excess_sd > EXCESS
+        return self.excess_sd > EXCESS and not self.misstated
 
 
 def decide(f: Findings) -> tuple[str, list[Condition]]:
@@ -246,7 +248,8 @@ def _against_causes_outside(f: Findings) -> list[Condition]:
             not f.weighed or f.share > SHARE,
             f"{f.share:.0%} of the excess explained, {SHARE:.0%} needed"
             if f.weighed
-            else f"not asked for: the excess is {f.excess_sd:.2g} sd, below {EXCESS:g}",
+            else f"not asked for: the excess is {f.excess_sd:.2g} sd, "
+            + ("without structure, as of a noise that is stated too small" if f.misstated else f"below {EXCESS:g}"),
         ),
         Condition(
             "near",
@@ -273,7 +276,7 @@ def _of_the_strength(f: Findings) -> list[Condition]:
             f.chance,
             LEVEL,
             not f.chance >= LEVEL,
-            "too few parts of the data to tell"
+            "not asked of readings, and too few parts of images to tell"
             if math.isnan(f.chance)
             else f"p {p_text(f.chance)} by the scatter between parts of the data, against {LEVEL:g}",
         ),

@@ -207,8 +207,8 @@ def _split(case: Case, outcome: Outcome, subject: Candidate | None) -> tuple[lis
             outcome.correlation if case.evidence.is_table else None,
         )
         splits += own
-        if not case.evidence.is_table:  # readings have had their noise that neighbours share as a rival
-            p = case.table.family.p(p)
+        # of readings, noise that neighbours share and errors of dials have been rivals, by their likelihood
+        p = math.nan if case.evidence.is_table else case.table.family.p(p)
         chance = p if main is subject else chance
         if len(trial.members) == 1 and main.row.refit is not None:
             main.row.refit = homogeneity.scattered(main.row.refitted, p, clutter)

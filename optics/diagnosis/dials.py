@@ -41,7 +41,8 @@ from optics.scene.parameter import Variable
 
 LOOSE = 10.0  # plausible sizes that every effect may have, before it counts as dial error
 WIDTHS = np.geomspace(1e-3, 10.0, 121)  # deg
-NOTED = 4.0  # twice the log likelihood that errors must gain: in one of forty exact benches chance brings as much
+NOTED = 1.0  # twice the log likelihood that errors must gain: chance brings as much on one of six exact benches, and
+# the width that it finds there is small
 PER_WAVE = 8  # readings per slow wave of the session
 WAVES = 40  # slow waves, at most
 ROWS = 400_000  # readings to keep: all

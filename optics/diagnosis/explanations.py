@@ -40,7 +40,7 @@ from optics.diagnosis.refit import FAILURES, START, Case, excess_of, known_of, w
 from optics.diagnosis.result import Explanation, leaves_nothing
 from optics.diagnosis.score import solve
 from optics.diagnosis.session import Frames
-from optics.diagnosis.thresholds import CLEAR, EACH, HALF, LEVEL, MARGIN, TOLD
+from optics.diagnosis.thresholds import CLEAR, EACH, HALF, LEVEL, MARGIN, MISSTATED, TOLD
 from optics.fit import calibrate
 from optics.fit.model import value_of
 from optics.fit.result import Fit
@@ -55,7 +55,6 @@ TRUSTED = 0.7  # of what a linearisation expects: an explanation that is expecte
 BLOCKS = 8  # pieces of a session, each left out once
 LEAST = 2  # values per number that is fitted, below which no set of effects is refitted
 CONTENDERS = 40  # explanations of a table whose shared noise is sought; others are behind without it
-MISSTATED = 2.0  # variance over the stated one above which what the best explanation leaves is misfit, not noise
 WIDTHS = np.geomspace(0.003, 3.0, 13)  # plausible sizes: of the prior of strengths of each frame
 LOOSE = 10.0  # plausible sizes: what keeps a strength that a left-out block alone determines near neutral
 

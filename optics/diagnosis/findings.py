@@ -16,7 +16,7 @@ from optics.diagnosis.evidence import Candidate, Evidence
 from optics.diagnosis.explanations import Outcome, fall_over_noise, lead_without
 from optics.diagnosis.refit import Case, clear
 from optics.diagnosis.result import Basis, Fingerprint, Law, Level, Split
-from optics.diagnosis.thresholds import AS_GOOD, LEVEL, UNEVEN
+from optics.diagnosis.thresholds import AS_GOOD, LEVEL, MISSTATED, UNEVEN
 from optics.fit.compare import led_label
 from optics.fit.model import Model, value_of
 from optics.fit.result import Fit
@@ -78,12 +78,13 @@ def findings_of(
     """
     table, subject, best = case.table, subject_of(outcome), outcome.best
     measured = case.model.captures is not None and case.model.captures.noise is None
+    misstated = basis.structure_p >= LEVEL and basis.phi < MISSTATED and not (measured or case.evidence.is_table)
     if subject is None:
         fall = max([t.fall - t.expectation for t in outcome.trials] + [0.0])
-        own = Findings(table.p_best, basis.structure_p, fall=fall, excess_sd=basis.excess_sd, measured=measured)
+        own = Findings(table.p_best, basis.structure_p, fall=fall, excess_sd=basis.excess_sd)
     else:
         own = _of_subject(case, outcome, subject, splits, chance, levels, basis)
-        own = replace(own, measured=measured)
+    own = replace(own, measured=measured, misstated=misstated)
     if laws and laws[0].p < LEVEL:
         # a law falls from what noise that neighbours share leaves without any effect
         lead = outcome.score(best) - outcome.score(outcome.base) - laws[0].score
@@ -92,10 +93,12 @@ def findings_of(
         return own
     followed = _followed(case, subject, best.fit, best.fall - best.expectation, fingerprints)
     complete = bool(best.members) and best.complete
-    fall = own.fall
-    if case.evidence.is_table:
-        places, scale = case.places or [], outcome.scale
-        fingerprints = prints.beside_shared_noise(case.model, case.evidence, places, fingerprints, case.session, scale)
+    fall, session = own.fall, case.session if case.evidence.is_table else case.lamp
+    if session is not None and not best.by_frame:
+        scale = outcome.scale
+        fingerprints = prints.beside_shared_noise(
+            case.model, case.evidence, case.places or [], fingerprints, session, scale
+        )
         fall = outcome.base.deviance - best.deviance - best.expectation if subject else own.fall / scale
         fingerprints = [replace(f, ratio=f.net / max(fall, 1.0)) for f in fingerprints]
     if not fingerprints:

@@ -18,7 +18,7 @@ from optics.diagnosis import statistics as st
 from optics.diagnosis.decide import ordered
 from optics.diagnosis.evidence import Evidence, Progress
 from optics.diagnosis.result import Family, Fingerprint
-from optics.diagnosis.session import Session
+from optics.diagnosis.session import Frames, Session
 from optics.diagnosis.thresholds import AS_GOOD, EXCESS, LEVEL, MIMICS, SHARE
 from optics.fit.compare import UNITS, led_label
 from optics.fit.model import Model
@@ -199,19 +199,24 @@ def beside_shared_noise(
     evidence: Evidence,
     found: list[dict],
     curves: Sequence[Fingerprint],
-    session: Session,
+    session: Session | Frames,
     scale: float,
 ) -> list[Fingerprint]:
-    """The significant curves of readings, with their falls of deviance (`optics.diagnosis.correlation`): beside noise
-    that neighbours share, a curve along what was turned slowly counts for less, as a lamp that wanders brings it too.
+    """The significant curves, with their falls of deviance (`optics.diagnosis.correlation`): beside noise that
+    neighbours share, a curve along what was turned slowly counts for less, as a lamp that wanders brings it too.
 
+    Of images these are curves along what is one number for each frame; others fall as they did.
     scale   variance over the stated one
     """
     named, carriers = _named(evidence, model), [np.concatenate(c) for c in zip(*_carriers(model, evidence))]
     base, r = evidence.dense(evidence.base), np.concatenate([block.r for block in evidence.blocks])
+    turned = settings(model, evidence)
     before, rank, judged = session.about(r, base).deviance(scale), st.orthonormal(base).shape[1], []
     for f in curves:
         if f.p > LEVEL:
+            continue
+        if not evidence.is_table and not (f.coordinate == "frame" or f.coordinate in turned):
+            judged.append(replace(f, fall=f.fall * evidence.thinning / scale, net=f.net / scale))
             continue
         index, count = _bins(evidence, f.coordinate, np.concatenate([p[f.coordinate] for p in found]), named)
         held = index[:, None] == np.arange(count)

@@ -41,6 +41,7 @@ class Added:
     change      (k,) of its strengths from where they started
     images      per block, the whitened difference (n,) that the effect makes
     net         fall of chi2 with it
+    scale       of the noise over the stated one, where what is left is noise
     apart       (n, k) of all kept values -> the same as of independent values, in which `own` is then given
     """
 
@@ -51,6 +52,7 @@ class Added:
     change: np.ndarray
     images: list[np.ndarray]
     net: float
+    scale: float = 1.0
     apart: Callable[[np.ndarray], np.ndarray] = np.asarray
 
 
@@ -79,6 +81,9 @@ def split(
     noise    of readings: what neighbours share of it
     """
     added = _added(model, evidence, rows_max, seed, say, c, found, net, beside)
+    dof = max(evidence.normal.count - evidence.projected.rank, 1)
+    if noise is None and left.structure_p >= LEVEL:
+        added.scale = max(1 + left.excess_sd * math.sqrt(2 / dof), 1.0)
     parts = _parts(model, added.own, places)
     results = _cuts(added, parts, places)
     if noise is not None:  # how sure a split is depends on what neighbours share, its share of the fall does not
@@ -86,7 +91,7 @@ def split(
         sure = {s.by: s for s in _cuts(added, parts, places)}
         results = [replace(sure[s.by], fall=s.fall, h=s.h) for s in results if s.by in sure]
     level = LEVEL / max(len(results), 1)  # Bonferroni
-    excess = left.excess_sd * math.sqrt(2 * max(evidence.normal.count - evidence.projected.rank, 1))
+    excess = left.excess_sd * math.sqrt(2 * dof)
 
     def most(s: Split) -> float:
         """The h that is allowed."""
@@ -201,7 +206,7 @@ def _cut(
         sd=sd.tolist(),
         fall=fall * k,
         dof=dof,
-        p=float(chdtrc(dof, fall)),
+        p=float(chdtrc(dof, fall / added.scale)),
         h=max(fall - dof, 0.0) * k / max(added.net, 1e-9),
         chance=by_clutter(projected.score, projected.information, found),
         limit=UNEVEN,

@@ -23,6 +23,7 @@ RIVAL_CURVE = 1.12
 SHARE = 0.05  # of the excess misfit that a claimed effect must explain ...
 EXCESS = 5.0  # ... where the excess is more than this many standard deviations
 UNEVEN = 0.1  # of the fall: what splitting the strength by channel, frame, ... may still gain
+MISSTATED = 2.0  # variance over the stated one above which what the best explanation leaves is misfit, not noise
 STRENGTH = 2.0  # standard deviations of a claimed strength from none: a fall without it has another cause
 FAR = 0.3  # misfit over the mean signal: more than the effects of a sensor leave
 # Misfit over the mean signal of the fixed pattern alone in a good sensor (optics.proof, clutter 1), whose coating adds

@@ -124,14 +124,15 @@ def _dial_error(model: SceneModel, setup: Setup) -> Width | None:
     """The error of dials that the captures do not state, by a first calibration; None where readings show none."""
     if setup.uncertainty is not None or not unstated(model):
         return None
-    fitted, _ = split(model, setup)
-    found = fit_base(model, variables_of_base(model, setup, fitted), fitted, Values(dict(setup.values)))
+    # of the noise, held-out readings tell too: of few settings each is needed
+    frames = list(range(len(model.frames))) if model.captures.table is not None else split(model, setup)[0]
+    found = fit_base(model, variables_of_base(model, setup, frames), frames, Values(dict(setup.values)))
     tested = candidates(model, None)
-    seek(model, found.values, tested, fitted)
+    seek(model, found.values, tested, frames)
     refit = Refits(model, setup, found, tested).of
     try:
         return width_of(
-            model, found, tested, lambda e: effect_variables(model, e), fitted, refit=refit, seed=setup.seed
+            model, found, tested, lambda e: effect_variables(model, e), frames, refit=refit, seed=setup.seed
         )
     except Underdetermined:  # a diagnosis will say why
         return None

@@ -462,7 +462,7 @@ def test_what_splits_a_strength_is_held_against_clutter_too(proxy):
         fit = mock_fit(model, [power, slope], Values(), [0])
         c = Candidate.at(model, Values(), effect, [slope])
         base = measure(model, fit.values, [power], [c], [0], 10**6, 0, lambda *a: None)
-        left = SimpleNamespace(complete=False, excess_sd=100.0)
+        left = SimpleNamespace(complete=False, excess_sd=100.0, structure_p=0.0)
         places = [{"place": place, "quadrant": quadrant, "channel": np.zeros(1024)}]
         fall = (fit.values.common["lamp.slope"] / fit.sd[1]) ** 2
         splits, _, _ = homogeneity.split(model, base, places, 10**6, 0, lambda *a: None, c, fit, left, fall)
