@@ -175,7 +175,13 @@ def compare(
         data, defines, plugins = _taken_from(fit, captures, defines, plugins)
         origin = data["sensor"]
         noise = noise_of(fit_file(fit), origin["noise"]) if origin.get("noise") else None
-    setup = setup_of(captures, defines=defines, plugins=plugins, flat_field=flat_field or origin.get("flat_field"))
+    setup = setup_of(
+        captures,
+        defines=defines,
+        plugins=plugins,
+        flat_field=flat_field or origin.get("flat_field"),
+        uncertainty=dict(origin.get("uncertainty", {})),
+    )
     model = open_model(setup, fitted=noise)
     present = values_of(model, fit, {**({} if fit is not None else setup.values), **(values or {})})
     comparison, notes = tested(model, present, fit, _listed(held_out))

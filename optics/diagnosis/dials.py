@@ -40,7 +40,8 @@ from optics.scene.declare import Effect
 from optics.scene.parameter import Variable
 
 LOOSE = 10.0  # plausible sizes that every effect may have, before it counts as dial error
-WIDTHS = np.geomspace(1e-3, 10.0, 121)  # deg
+WIDTHS = np.geomspace(1e-3, 10.0, 361)  # deg
+SCALES = 40  # sizes of the noise that are tried
 NOTED = 1.0  # twice the log likelihood that errors must gain: chance brings as much on one of six exact benches, and
 # the width that it finds there is small
 PER_WAVE = 8  # readings per slow wave of the session
@@ -175,14 +176,14 @@ class Products:
         widths = np.concatenate([[0.0], WIDTHS])[:, None] ** 2
         ratios = 1 + widths * np.maximum(shares, 0.0)
         left, logs = chi2 - (square * widths / ratios).sum(1), np.log(ratios).sum(1)
-        scale = np.maximum(left / free, 1.0)
-        likelihood = -(left / scale + free * np.log(scale) + logs)
-        best = int(np.argmax(likelihood))
-        gain = float(likelihood[best] - likelihood[0])
+        scales = np.geomspace(1.0, max(float(left[0]) / free, 1.0) * 2, SCALES)
+        likelihood = -(left / scales[:, None] + free * np.log(scales)[:, None] + logs)
+        best = np.unravel_index(int(np.argmax(likelihood)), likelihood.shape)
+        gain = float(likelihood[best] - likelihood[:, 0].max())
         if gain < NOTED:
             return None
-        own = np.sqrt(widths[:, 0] * scale)
-        near = own[likelihood > likelihood[best] - 1]
+        own = np.sqrt(widths[:, 0] * scales[:, None])
+        near = own[likelihood > likelihood[best] - 1]  # of any scale: the profile's interval
         return Width(float(own[best]), float(near.min()), float(near.max()), gain)
 
 

@@ -52,7 +52,8 @@ class SceneModel:
                 f"{captures.folder}: no noise model; give [noise] in captures.toml or repeats to estimate it from"
             )
         self.cut_off = False  # whether readings of 0 are limits
-        # settings whose error the captures state, be it none
+        self.assumed_errors: dict[str, float] = {}  # of settings, besides those that the captures state
+        # settings whose error is stated, be it none
         self.stated_errors = {*captures.uncertainty, *(key for f in captures.frames for key in f.uncertainty)}
         if captures.table is not None:
             noise = replace(noise, signed=True)  # of point readings, those below 0 are data

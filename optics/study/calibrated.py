@@ -7,6 +7,8 @@ fit.toml carries all that it takes. Besides the values it has
               settings, frames.NAME                                   what the captures set, in all frames and in each
               drive                                                   the level that frames drove each light with; the
                                                                       calibrated power multiplies it
+              uncertainty                                             errors of settings that were found, as nobody
+                                                                      states them (optics.diagnosis.dials)
               levels                                                  lights whose values in [frames] are such levels:
                                                                       they were set with an uncertainty
 """
@@ -57,6 +59,8 @@ def origin_of(
     if model.drives:
         scene["levels"] = sorted(model.drives)
     scene["noise"] = asdict(noise)
+    if model.assumed_errors:
+        scene["uncertainty"] = dict(model.assumed_errors)
     if captures.table is None:
         scene["frames"] = {f.name: dict(f.parameters) for f in model.frames if f.parameters}
     counted = {

@@ -118,7 +118,9 @@ def open_model(setup: Setup, model_class: type = SceneModel, fitted: Noise | Non
     if noise is None:
         noise = estimate(found, clocks=keys_with(loaded.parameters, "clock"))
     options = {} if setup.flat_field is None else {"flat_field": setup.flat_field}
-    return model_class(loaded, found, noise.in_scale_of(fitted), **options)
+    model = model_class(loaded, found, noise.in_scale_of(fitted), **options)
+    model.assumed_errors = dict(setup.uncertainty or {})
+    return model
 
 
 def split(model: SceneModel, setup: Setup) -> tuple[list[int], list[int]]:

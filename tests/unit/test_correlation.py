@@ -103,3 +103,23 @@ def test_of_few_readings_no_correlation_is_asked():
         % LENGTHS
         == 0
     )
+
+
+def test_what_shares_nothing_counts_beside():
+    """Values that no lamp moves, given by their products alone: the likelihood of both together."""
+    rng = np.random.default_rng(6)
+    more = rng.standard_normal((50, 2))
+    residual, further = drawn(rng, 2.0, 8.0, "lamp"), rng.standard_normal(50)
+    columns = np.column_stack([more, further])
+    found = Readings(residual, FITTED, np.arange(COUNT), LOADS, columns.T @ columns)
+    whole, rest = np.vstack([FITTED, more]), np.concatenate([residual, further])
+    fit = np.linalg.lstsq(whole, rest, rcond=None)[0]
+    assert found.white == pytest.approx(np.sum((rest - whole @ fit) ** 2), rel=1e-9)
+    kind, left, logs, _ = found.shared[1]
+    i = len(left) // 2
+    v = np.eye(COUNT + 50)
+    v[:COUNT, :COUNT] = covariance(found.power[i], found.length[i], kind)
+    inverse = np.linalg.inv(v)
+    fit = np.linalg.solve(whole.T @ inverse @ whole, whole.T @ inverse @ rest)
+    assert left[i] == pytest.approx((rest - whole @ fit) @ inverse @ (rest - whole @ fit), rel=1e-8)
+    assert logs[i] == pytest.approx(np.linalg.slogdet(v)[1], rel=1e-9)

@@ -185,6 +185,32 @@ def test_a_setting_that_lasts_is_one_variable_for_its_readings(model_of):
         assert {model.frames[i].parameters["polarizer.angle"] for i in v.frames} == {v.prior[0]}
 
 
+def test_images_that_follow_each_other_at_a_setting_share_its_error():
+    """Two films between crossed ones: the analyser stays for three frames, and is set anew in another group."""
+    angles, groups = [90.0, 90.0, 90.0, 0.0, 0.0, 0.0], [None, None, None, None, None, "again"]
+    frames = [
+        Frame(
+            f"{i}", np.zeros((2, 2, 1), np.float32), group=g, parameters={"analyzer.angle": a, "sample.angle": 10.0 * i}
+        )
+        for i, (a, g) in enumerate(zip(angles, groups))
+    ]
+    captures = Captures(Path("."), "polarizer_bench", frames, uncertainty={"analyzer.angle": 1.0, "sample.angle": 1.0})
+    made = [f.made for f in capture_files.with_lasting_settings(captures).frames]
+    assert [m["analyzer.angle"] for m in made] == [0, 0, 0, 1, 1, 2]
+    assert [m["sample.angle"] for m in made] == [0, 1, 2, 3, 4, 5]
+
+
+def test_readings_of_an_instrument_that_shows_nothing_below_0_are_limits(model_of):
+    """Three zeros, and none below, are left out; where a negative reading is among them, zeros are readings."""
+    values, angles = [0.0, 0.0, 0.0, 5.0, 90.0, 200.0, 300.0, 150.0], np.arange(0.0, 80.0, 10.0)
+    model = model_of(readings(angles, {}, values=values))
+    kept = np.concatenate([model.usable(i).ravel() for i in range(len(model.frames))])
+    assert model.cut_off and kept.sum() == 5
+    for others in ([-1.0, *values[1:]], [2.0, *values[1:]]):
+        model = model_of(readings(angles, {}, values=others))
+        assert not model.cut_off and all(model.usable(i).all() for i in range(len(model.frames)))
+
+
 SIZE = 6  # px
 
 

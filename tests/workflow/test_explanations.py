@@ -159,3 +159,41 @@ def test_what_shows_only_beside_another_effect_is_found_with_it(tmp_path):
     assert d.row("dispersive retardance").image == pytest.approx(0, abs=1e-6)
     assert d.missing == "retardance", d.sentence
     assert {"retardance", "dispersive retardance"} in [set(e.effects) for e in d.survivors], d.sentence
+
+
+def turned_by_hand(sd, seed=3):
+    """Every setting of a dial stops a little off what is written."""
+    return MALUS + sd * np.random.default_rng(seed).standard_normal(len(MALUS))
+
+
+def test_errors_of_dials_that_nobody_states_are_found_and_kept(tmp_path):
+    """Half a degree is more than the meter's noise nearly everywhere; by stated noise alone anything would stand out.
+    What the study takes is in its setup, its warnings and its values, and a comparison finds the same numbers."""
+    import optics
+
+    light = malus(turned_by_hand(0.5))
+    write(tmp_path / "captures", {"analyzer.angle": MALUS}, noisy(light))
+    study = optics.calibrate(tmp_path / "captures", folder=tmp_path / "study")
+    found = study.record.ladder["facts"]["setup"]["uncertainty"]["analyzer.angle"]
+    assert found == pytest.approx(0.5, abs=0.2)  # three standard deviations of a width of 37 settings
+    assert any(f'"analyzer.angle" = {found:g}' in warning for warning in study.record.ladder["warnings"])
+    assert study.diagnose().word == "NOTHING"
+    again = optics.compare(tmp_path / "captures", fit=tmp_path / "study")
+    step = study.record.steps[-1]
+    assert again.comparison.held_out.chi2_per_dof == pytest.approx(step["held_out"]["chi2_per_dof"], rel=1e-6)
+
+
+def test_an_effect_is_found_behind_errors_of_dials(tmp_path):
+    """A wobble of 15 % along a whole turn, where unstated errors make three times the meter's noise."""
+    dial = np.arange(-180.0, 180.0, 5.0)
+    turned = dial + 0.7 * np.random.default_rng(3).standard_normal(len(dial))
+    light = malus(turned) * (1 + 0.15 * np.cos(np.radians(dial)))
+    d = judged(tmp_path, noisy(light), {"analyzer.angle": dial}, 'absent = ["sample"]')
+    assert d.missing == "analyzer wobble", d.sentence
+
+
+def test_exact_dials_are_exact_where_that_is_stated(tmp_path):
+    light = malus(turned_by_hand(0.5))
+    write(tmp_path / "captures", {"analyzer.angle": MALUS}, noisy(light), '[uncertainty]\n"analyzer.angle" = 0')
+    record, _, _ = loop.begin(setup_for(tmp_path / "captures"), tmp_path / "study")
+    assert record.ladder["facts"]["setup"]["uncertainty"] is None
