@@ -575,11 +575,15 @@ def _lead(case: Case, outcome: Outcome, best: Trial, other: Trial) -> tuple[floa
     data = other.deviance - best.deviance
     if best.by_frame and not is_table:  # a lamp that wanders is no rival of a gain of each frame, but the same
         data = other.after / outcome.scale - best.deviance
+    shared = (other.after - best.after) / outcome.scale - data
     if not is_table:
         data = outcome.scale * data / _design_effect(case, outcome, best, other)
     lead, needed = data + cost, TOLD if data > TOLD else CLEAR  # what is plausible decides alone only where it is clear
     if other.keys < best.keys:
-        lead, needed, cost = data, _significant(case, best, other), 0.0
+        significant = data - _significant(case, best, other)
+        # noise that the simpler one shares, and the other does not need, is no part of that: a rival with a cost
+        if significant < lead - needed or shared < TOLD:
+            lead, needed, cost = data, data - significant, 0.0
     if best.complete or (is_table and outcome.scale < MISSTATED):
         return lead, needed
     fall = best.fall - other.fall
