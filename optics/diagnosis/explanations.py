@@ -524,15 +524,20 @@ def _with_survivors(case: Case, outcome: Outcome) -> Outcome:
     base = outcome.base
     lead, needed = _lead(case, outcome, best, base) if best.members else (0.0, 0.0)
     fall = (base.after - best.after) / outcome.scale
-    outcome.shared = (case.evidence.is_table or case.lamp is not None) and lead <= needed < fall
+    # what readings or frames share is a rival where it, and not chance, is what stands against an effect
+    able = (case.evidence.is_table or case.lamp is not None) and needed < fall
+    outcome.shared = able and lead <= needed
     while True:
         # what the leader rules out stays so beside a simpler one
         judges = [best] if best is outcome.leader else [best, outcome.leader]
         told = {id(t) for t in outcome.trials for j in judges if t is not j and _told(case, outcome, j, t)}
         alive = [best] + [t for t in outcome.trials if t is not best and id(t) not in told]
         alive += [t for t in _inherited(case, outcome, alive) if t not in alive]
-        if outcome.shared:  # a rival that is no explanation by effects
-            alive = [t for t in alive if t.members]
+        outcome.shared |= able and base in alive
+        if (
+            outcome.shared
+        ):  # a rival that is no explanation by effects; what is not worth its cost beside it adds nothing
+            alive = [t for t in alive if t is best or (t.members and t.deviance + t.cost < base.deviance)]
         # an explanation within another that is not told apart says the same with less
         kept = [t for t in alive if not any(o is not t and o.keys < t.keys for o in alive)]
         kept.sort(key=lambda t: t.deviance + t.cost)
