@@ -65,7 +65,7 @@ class Readings:
     loads     kind -> (n,) whitened: what an amplifier or a lamp moves, the latter the signal
     beside    (k + 1, k + 1) products of images and residual among further values, which share nothing; None: there are
               none
-    shortest  length, in readings
+    more      their number;   shortest   length, in readings
     """
 
     def __init__(
@@ -75,6 +75,7 @@ class Readings:
         order: np.ndarray,
         loads: Mapping[str, np.ndarray],
         beside: np.ndarray | None = None,
+        more: int = 0,
         shortest: float = SHORTEST,
     ):
         places = np.argsort(order, kind="stable")
@@ -88,9 +89,9 @@ class Readings:
         columns, self.beside = columns @ turn, turn.T @ beside @ turn
         self.white = float((turn.T @ whole @ turn)[-1, -1])
         self.bright = float(np.mean(np.square(loads["lamp"]))) if len(residual) else 0.0
-        self.free = len(residual) - root.shape[1]
+        self.free = len(residual) + more - root.shape[1]
         self.shared: list[tuple[str, np.ndarray, np.ndarray, np.ndarray]] = []  # kind, and what `_left` returns
-        if (self.free < FEWEST and not beside.any()) or not self.white > 0:
+        if self.free < FEWEST or not self.white > 0:
             return
         t = order[places].astype(float)
         lengths = np.geomspace(shortest, max(float(np.ptp(t)) / 2, 2 * shortest), LENGTHS)

@@ -99,7 +99,7 @@ def diagnose(
     )
     basis = basis_of(model, evidence, evidence.structure(evidence.whitened, evidence.base))
     case.places = places = prints.places(model, fit.values, evidence)
-    chosen = choose(case, top)
+    chosen = _choose(case, top)
     fits = refit_each(case, chosen)
     outcome = explanations.search(case, chosen, fits)
     subject, best = subject_of(outcome), outcome.best
@@ -154,7 +154,7 @@ def diagnose(
     )
 
 
-def choose(case: Case, top: int) -> list[Candidate]:
+def _choose(case: Case, top: int) -> list[Candidate]:
     """The effects to refit: those that cannot be told from the best by score; of a table all that stand out besides, as
     its refits are cheap; of images the best of them, and winners of other weights.
 

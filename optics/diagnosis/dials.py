@@ -28,11 +28,9 @@ from scipy.sparse import csr_array
 
 from optics.diagnosis import statistics as st
 from optics.diagnosis.correlation import WANDER
-from optics.diagnosis.diagnose import choose
 from optics.diagnosis.evidence import Candidate, Evidence, measure, silent
-from optics.diagnosis.explanations import leading
-from optics.diagnosis.refit import Case, refit_each
-from optics.diagnosis.score import score
+from optics.diagnosis.refit import FAILURES
+from optics.diagnosis.score import base_variables, candidates_of
 from optics.fit import calibrate
 from optics.fit.result import Fit
 from optics.fit.scene_model import SceneModel
@@ -47,7 +45,8 @@ NOTED = 1.0  # twice the log likelihood that errors must gain: chance brings as 
 PER_WAVE = 8  # readings per slow wave of the session
 WAVES = 40  # slow waves, at most
 ROWS = 400_000  # readings to keep: all
-TOP = 5  # effects that are refitted, besides all that stand out
+OFF = 0.1  # plausible sizes off neutral from which all effects start: some have no slope there
+STEPS = 5  # linearisations of that fit
 FEWEST = 8  # degrees of freedom from which a width is sought
 
 
@@ -84,37 +83,38 @@ def width_of(
     effects: Sequence[Effect],
     variables_of: Callable[[Effect], Sequence[Variable]],
     fitted: Sequence[int],
-    *,
-    refit: Callable[..., Fit] | None = None,
     seed: int = 0,
 ) -> Width | None:
     """The error that the settings of all unstated dials have; None where readings show none.
 
     It is sought about the calibrated base first. What a strong effect leaves beside its tangent would count as dial
-    error: so it is sought again about the explanation that leads in the noise that is stated, and the
-    smaller of the two is returned.
+    error there. So, of readings, it is sought again about a fit of all effects at once, each held by a prior of LOOSE
+    plausible sizes, and the smaller of the two is returned. Of images such a fit would take minutes.
 
-    fit, effects, variables_of, fitted, refit, seed   as of `optics.diagnosis.diagnose.diagnose`
+    fit, effects, variables_of, fitted, seed   as of `optics.diagnosis.diagnose.diagnose`
     """
     keys = unstated(model)
     if not keys:
         return None
-    scored = score(model, fit, effects, variables_of, fitted, seed=seed)
-    evidence, table = scored.evidence, scored.table
-    first = _width_about(model, evidence, table.order, keys)
-    if first is None:
-        return None
-    case = Case(model, fit, evidence, table, refit or calibrate.fit, [*fitted], [], variables_of, ROWS, seed, silent)
-    chosen = choose(case, TOP)
-    leader = leading(case, chosen, refit_each(case, chosen))
-    if not leader.members:
+    base, _ = base_variables(model, fit, fitted)
+    candidates, _ = candidates_of(model, fit, effects, variables_of, fitted)
+    first = _width_about(
+        model, measure(model, fit.values, base, candidates, fitted, ROWS, seed, silent), candidates, keys
+    )
+    if first is None or model.captures.table is None:
         return first
-    held = {c.effect.name for c in leader.members}
-    others = [
-        Candidate.at(model, leader.fit.values, c.effect, c.variables) for c in table.order if c.effect.name not in held
-    ]
-    base = [evidence.columns[i] for i in evidence.base] + [v for c in leader.members for v in c.variables]
-    again = measure(model, leader.fit.values, base, others, list(fitted), ROWS, seed, silent)
+    values, held = fit.values.copy(), {}
+    for c in [c for c in candidates if not c.broken]:
+        for v, start, size, usual in zip(c.variables, c.start, c.plausible, c.usual):
+            if v.name not in held:  # two effects may free the same variable
+                held[v.name] = v.with_prior(float(start), LOOSE * float(size))
+                values.put(v, float(np.clip(start + OFF * usual, *v.parameter.bounds)))
+    try:
+        found = calibrate.fit(model, [*base, *held.values()], values, fitted, max_iterations=STEPS)
+    except FAILURES:
+        return first
+    others = [Candidate.at(model, found.values, c.effect, c.variables) for c in candidates if not c.broken]
+    again = measure(model, found.values, base, others, fitted, ROWS, seed, silent)
     second = _width_about(model, again, others, keys)
     return second if second is None or second.sd < first.sd else first
 

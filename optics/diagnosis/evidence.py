@@ -267,6 +267,17 @@ class Evidence:
         )
 
 
+def known_products(precision: np.ndarray, pull: np.ndarray, columns: int) -> np.ndarray:
+    """(k + 1, k + 1) products of images and residual of what is known beforehand of the first of `columns` variables,
+    as if it had been read: an image 1/tau, a residual (mean - value)/tau (`priors`)."""
+    found = np.zeros((columns + 1, columns + 1))
+    count = len(precision)
+    found[range(count), range(count)] = precision
+    found[:count, -1] = found[-1, :count] = pull
+    found[-1, -1] = float(np.sum(pull[precision > 0] ** 2 / precision[precision > 0]))
+    return found
+
+
 def _padded(known: np.ndarray, base: Sequence[int]) -> np.ndarray:
     """Priors of the first base columns, none for those that follow."""
     return np.concatenate([known, np.zeros(len(base) - len(known))])
@@ -385,7 +396,7 @@ def _empty(
     columns = layout.columns
     total, used = values_in(model, frames), sum(int(model.usable(frame).sum()) for frame in frames)
     sweeps = all(model.frames[f].readings for f in frames)
-    precision, pull = _priors(model, values, columns[:base])
+    precision, pull = priors(model, values, columns[:base])
     evidence = Evidence(
         columns=columns,
         base=list(range(base)),
@@ -422,7 +433,7 @@ def _require_values(evidence: Evidence) -> None:
         )
 
 
-def _priors(model: Model, values: Values, base: Sequence[Variable]) -> tuple[np.ndarray, np.ndarray]:
+def priors(model: Model, values: Values, base: Sequence[Variable]) -> tuple[np.ndarray, np.ndarray]:
     """(1/tau^2, (mean - value)/tau^2) of the base's priors, 0 where there is none."""
     precision, pull = np.zeros(len(base)), np.zeros(len(base))
     for i, v in enumerate(base):

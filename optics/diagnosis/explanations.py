@@ -35,7 +35,7 @@ import numpy as np
 from optics.diagnosis import homogeneity, pairs
 from optics.diagnosis import statistics as st
 from optics.diagnosis.correlation import Correlation, Readings
-from optics.diagnosis.evidence import Candidate, at_bound, measure, silent
+from optics.diagnosis.evidence import Candidate, at_bound, measure, priors, silent
 from optics.diagnosis.refit import FAILURES, START, Case, excess_of, known_of, weighed, with_effects
 from optics.diagnosis.result import Explanation, leaves_nothing
 from optics.diagnosis.score import solve
@@ -256,14 +256,6 @@ def search(case: Case, chosen: Sequence[Candidate], fits: dict[str, Fit]) -> Out
     if race.exchange(outcome.survivors):
         outcome = compete(case, list(trials.values()))
     return _weighed_by_blocks(case, outcome)
-
-
-def leading(case: Case, chosen: Sequence[Candidate], fits: dict[str, Fit]) -> Trial:
-    """The explanation that leads after a first look: by single effects, and of a table by sets that extend the best."""
-    race = Race(case, _singly(case, chosen, fits))
-    if case.evidence.is_table:
-        race.widen()
-    return race.leader
 
 
 def _singly(case: Case, chosen: Sequence[Candidate], fits: dict[str, Fit]) -> dict[frozenset[str], Trial]:
@@ -648,7 +640,12 @@ def _kept(case: Case, images: Sequence[np.ndarray]) -> list[np.ndarray]:
 def _readings(case: Case, trial: Trial) -> Readings:
     """The readings about an explanation; whitened once, as it competes more than once."""
     if trial.readings is None:
-        trial.readings = case.session.about(np.concatenate(_kept(case, trial.images)), _measured(case, trial))
+        residual, base = (
+            np.concatenate(_kept(case, trial.images)),
+            [case.evidence.columns[i] for i in case.evidence.base],
+        )
+        known = priors(case.model, trial.fit.values, base)
+        trial.readings = case.session.about(residual, _measured(case, trial), known)
     return trial.readings
 
 

@@ -166,7 +166,7 @@ def hints_of(
         hints += [f"{c.effect.name} needs: {c.effect.needs}" for c in members if c.effect.needs and c not in single]
         if findings.shared:
             hints.append(
-                "take the readings in a shuffled order, or return to one setting again and again: what wanders with "
+                "take the settings in a shuffled order, or return to one of them again and again: what wanders with "
                 "the session then no longer follows the settings"
             )
     if "spread" in failed:

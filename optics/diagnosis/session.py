@@ -8,7 +8,7 @@ have the covariance that they really have, about one setting
 
 with u_i the share of the noise of a reading that comes from a dial, as it is weighed, and n readings at that setting.
 Residuals and images are whitened by it before neighbours are asked what they share besides
-(`optics.diagnosis.correlation`). What is known of variables beforehand are further readings, of no time."""
+(`optics.diagnosis.correlation`). What is known of variables beforehand counts as further readings."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ import numpy as np
 from scipy import linalg
 
 from optics.diagnosis.correlation import Correlation, Readings, of_rms_1, whitened
-from optics.diagnosis.evidence import Evidence
+from optics.diagnosis.evidence import Evidence, known_products
 from optics.fit.model import Model
 
 APART = 0.3  # frames: what they do not share is one of each
@@ -32,6 +32,7 @@ class Session:
 
     def __init__(self, model: Model, evidence: Evidence):
         self.order = evidence.order(model).astype(float)
+        self.known = evidence.precision, evidence.pull
         self.parts = _shared_errors(model, evidence)
         self.loads = {
             "amplifier": np.concatenate([1 / block.sigma for block in evidence.blocks]),
@@ -48,10 +49,16 @@ class Session:
             found[index] = turn @ found[index]
         return found
 
-    def about(self, residual: np.ndarray, fitted: np.ndarray) -> Readings:
-        """Readings about an explanation: residual (n,) and images (n, k), whitened."""
+    def about(
+        self, residual: np.ndarray, fitted: np.ndarray, known: tuple[np.ndarray, np.ndarray] | None = None
+    ) -> Readings:
+        """Readings about an explanation: residual (n,) and images (n, k), whitened.
+
+        known   precision and pull of the first columns (`optics.diagnosis.evidence.priors`); None: the base's"""
         whole = self.apart(np.column_stack([fitted, residual]))
-        return Readings(whole[:, -1], whole[:, :-1], self.order, self.loads)
+        precision, pull = known or self.known
+        beside = known_products(precision, pull, fitted.shape[1])
+        return Readings(whole[:, -1], whole[:, :-1], self.order, self.loads, beside, int(np.count_nonzero(precision)))
 
     def independent(self, columns: np.ndarray, noise: Correlation) -> np.ndarray:
         """(n, k) images as of readings that are independent, in units of their noise: what is new in each of them."""
@@ -79,13 +86,13 @@ class Frames:
         self.loads = {"lamp": np.array([np.linalg.norm(g) for g in signal]) * np.sqrt(evidence.thinning)}
 
     def about(self, residual: np.ndarray, fitted: np.ndarray) -> Readings:
-        """As of `Session`."""
+        """As of `Session`, whatever is known beforehand."""
         whole = np.column_stack([fitted, residual])
         parts = np.split(whole, np.cumsum([len(g) for g in self.signal])[:-1])
         along = np.array([g @ part for g, part in zip(self.signal, parts)]) * np.sqrt(self.thinning)
         across = self.thinning * whole.T @ whole - along.T @ along
-        order = np.arange(len(along))
-        return Readings(along[:, -1], along[:, :-1], order, self.loads, across, APART)
+        order, more = np.arange(len(along)), self.thinning * len(whole) - len(along)
+        return Readings(along[:, -1], along[:, :-1], order, self.loads, across, more, APART)
 
 
 def _shared_errors(model: Model, evidence: Evidence) -> list[tuple[np.ndarray, np.ndarray]]:

@@ -218,7 +218,7 @@ def _ambiguous(f: Findings, explanations: Sequence[Explanation]) -> str:
     names = ", or ".join(f"{e.name} ({e.fall:.4g})" for e in alive)
     if f.shared:
         return (
-            "noise that neighbouring readings share, such as a lamp that wanders, is not told apart from "
+            "noise that neighbours in the session share, such as a lamp that wanders, is not told apart from "
             f"{'this explanation' if len(alive) == 1 else f'these {len(alive)} explanations'} (fall of chi2): {names}."
         )
     if f.law_lead < TOLD:

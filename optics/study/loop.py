@@ -129,11 +129,8 @@ def _dial_error(model: SceneModel, setup: Setup) -> Width | None:
     found = fit_base(model, variables_of_base(model, setup, frames), frames, Values(dict(setup.values)))
     tested = candidates(model, None)
     seek(model, found.values, tested, frames)
-    refit = Refits(model, setup, found, tested).of
     try:
-        return width_of(
-            model, found, tested, lambda e: effect_variables(model, e), frames, refit=refit, seed=setup.seed
-        )
+        return width_of(model, found, tested, lambda e: effect_variables(model, e), frames, setup.seed)
     except Underdetermined:  # a diagnosis will say why
         return None
 

@@ -111,7 +111,7 @@ def test_what_shares_nothing_counts_beside():
     more = rng.standard_normal((50, 2))
     residual, further = drawn(rng, 2.0, 8.0, "lamp"), rng.standard_normal(50)
     columns = np.column_stack([more, further])
-    found = Readings(residual, FITTED, np.arange(COUNT), LOADS, columns.T @ columns)
+    found = Readings(residual, FITTED, np.arange(COUNT), LOADS, columns.T @ columns, 50)
     whole, rest = np.vstack([FITTED, more]), np.concatenate([residual, further])
     fit = np.linalg.lstsq(whole, rest, rcond=None)[0]
     assert found.white == pytest.approx(np.sum((rest - whole @ fit) ** 2), rel=1e-9)
