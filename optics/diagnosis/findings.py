@@ -94,7 +94,9 @@ def findings_of(
     followed = _followed(case, subject, best.fit, best.fall - best.expectation, fingerprints)
     complete = bool(best.members) and best.complete
     fall, session = own.fall, case.session if case.evidence.is_table else case.lamp
-    if session is not None and not best.by_frame:
+    if best.after > MISSTATED * basis.dof:  # shared beyond the noise itself: no noise, but structure that has a shape
+        own = replace(own, shared=False)
+    elif session is not None and not best.by_frame:
         scale = outcome.scale
         fingerprints = prints.beside_shared_noise(
             case.model, case.evidence, case.places or [], fingerprints, session, scale

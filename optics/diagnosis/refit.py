@@ -14,7 +14,7 @@ from optics.diagnosis.evidence import Candidate, Evidence, Progress, at_bound
 from optics.diagnosis.result import Refit
 from optics.diagnosis.score import Table
 from optics.diagnosis.session import FEWEST_FRAMES, Frames, Session
-from optics.diagnosis.thresholds import CLEAR
+from optics.diagnosis.thresholds import CLEAR, JUDGED
 from optics.fit import gauges
 from optics.fit.model import Model, value_of
 from optics.fit.result import Fit
@@ -58,8 +58,9 @@ class Case:
 
     @cached_property
     def lamp(self) -> Frames | None:
-        """Of images; None where there are too few of them."""
-        return Frames(self.model, self.evidence) if len(self.evidence.frames) >= FEWEST_FRAMES else None
+        """Of images; None where there are too few of them, or too few values in each."""
+        enough = len(self.evidence.frames) >= FEWEST_FRAMES and min(len(b.r) for b in self.evidence.blocks) >= JUDGED
+        return Frames(self.model, self.evidence) if enough else None
 
     @property
     def base(self) -> list[Variable]:

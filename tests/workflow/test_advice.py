@@ -31,7 +31,11 @@ def example():
 
 
 @pytest.mark.parametrize(
-    "hidden, family", [("depolarization", "film put in"), pytest.param("offset", "exposure", marks=pytest.mark.slow)]
+    "hidden, family",
+    [
+        pytest.param("depolarization", "film put in", marks=pytest.mark.slow),
+        pytest.param("offset", "exposure", marks=pytest.mark.slow),
+    ],
 )
 def test_a_tie_is_resolved_by_what_is_advised(example, hidden, family, tmp_path, capsys):
     """The readings are those of optics.proof.makers.bench, which knows nothing of the model: AMBIGUOUS, the advice, and

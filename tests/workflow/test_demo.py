@@ -43,6 +43,7 @@ def test_the_hidden_effect_is_named_added_and_the_noise_reached(mitsuba, tmp_pat
 SMALL = (64, 48)  # px: a quarter of the values of `make demo`, whose loop, maker and noise are otherwise the same
 
 
+@pytest.mark.slow
 def test_the_error_falls_to_the_noise_at_a_glance(mitsuba, tmp_path, monkeypatch):
     """What `make demo` shows, on small images: from ten times the noise's variance and more to the noise alone."""
     monkeypatch.setitem(demo.SENSORS, "gelsight", (SMALL, demo.SENSORS["gelsight"][1]))

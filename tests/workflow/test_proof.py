@@ -135,6 +135,7 @@ def test_the_set_and_its_size_are_counted_whether_or_not_something_stands_out():
 
 
 # -- the loop, blind -------------------------------------------------------------------------------------------------
+@pytest.mark.slow
 def test_the_bench_finds_what_is_hidden_and_predicts_what_comes(bench):
     effects = (*FOUND, "extinction leak", "retardance")  # these two have other images when weak than when strong
     found = judged(bench, effects)
@@ -151,7 +152,7 @@ def test_where_nothing_stands_out_the_set_is_that_of_the_scores(bench):
     assert 1 < len(step["set"]) < 12 and set(step["set"]) & set(step["score"]) >= {"source drift"}
 
 
-@pytest.mark.parametrize("seed", [3, 41])
+@pytest.mark.parametrize("seed", [3, pytest.param(41, marks=pytest.mark.slow)])
 def test_a_film_that_is_smeared_at_one_angle_is_no_polarized_source(bench, seed):
     """Five angles of the polarizer, a lamp that wanders: a polarized source, whose light goes with that angle too,
     explains nearly all of it, and with wobbles all: as many strengths as the five angles tell apart."""
