@@ -120,6 +120,7 @@ class Outcome:
     leads        explanation -> (lead of the best in score, lead needed)
     scale        chi2 per degree of freedom that the best leaves, at least 1; correlation: of the readings about it
     shared       whether noise that neighbouring readings share explains it as well as the best does
+    wander       rms of such noise over that of the signal, where nothing else explains it
     """
 
     leader: Trial
@@ -130,6 +131,7 @@ class Outcome:
     correlation: Correlation
     leads: dict[frozenset[str], tuple[float, float]] = field(default_factory=dict)
     shared: bool = False
+    wander: float = 0.0
 
     @property
     def core(self) -> list[str]:
@@ -505,10 +507,21 @@ def compete(case: Case, trials: list[Trial]) -> Outcome:
     # whether there is anything is a question of its own, which costs do not answer
     leader = next((t for t in order if t.members), order[0])
     outcome = Outcome(leader, leader, [leader], order, scale, correlation)
+    outcome.wander = _wander(case, outcome)
     for t in order:
         if t is not leader:
             outcome.leads[t.names] = _lead(case, outcome, leader, t)
     return _with_survivors(case, outcome)
+
+
+def _wander(case: Case, outcome: Outcome) -> float:
+    if case.evidence.is_table:
+        readings = _readings(case, outcome.base)
+    elif case.lamp is not None:
+        readings = _of_frames(case, case.lamp, outcome.base)
+    else:
+        return 0.0
+    return math.sqrt(readings.noise(outcome.scale).power * outcome.scale / max(readings.bright, 1e-12))
 
 
 def _with_survivors(case: Case, outcome: Outcome) -> Outcome:

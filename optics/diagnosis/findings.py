@@ -11,6 +11,7 @@ import numpy as np
 
 from optics.diagnosis import fingerprints as prints
 from optics.diagnosis import statistics as st
+from optics.diagnosis.correlation import WANDER
 from optics.diagnosis.decide import Findings, Opponent, rivals
 from optics.diagnosis.evidence import Candidate, Evidence
 from optics.diagnosis.explanations import Outcome, fall_over_noise, lead_without
@@ -94,7 +95,7 @@ def findings_of(
     followed = _followed(case, subject, best.fit, best.fall - best.expectation, fingerprints)
     complete = bool(best.members) and best.complete
     fall, session = own.fall, case.session if case.evidence.is_table else case.lamp
-    if best.after > MISSTATED * basis.dof:  # shared beyond the noise itself: no noise, but structure that has a shape
+    if outcome.wander > WANDER:  # more than a lamp may wander: no noise, but structure that has a shape
         own = replace(own, shared=False)
     elif session is not None and not best.by_frame:
         scale = outcome.scale
