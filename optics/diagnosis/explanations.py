@@ -65,7 +65,8 @@ class Trial:
 
     members    effects, none for the base;   fit, fall, after, expected, images   as of `optics.diagnosis.refit.Attempt`
     cost       see the module
-    deviance   see the module; NaN before the competition;   readings: of a table, about it; None before
+    deviance   see the module; NaN before the competition;   gain: what shared noise lowers it by
+    readings   of a table, about it; None before
     ahead      chi2 of the blocks that were left out in turn, less that of the base; NaN where it was not computed
     """
 
@@ -79,6 +80,7 @@ class Trial:
     excess_sd: float = 0.0
     structure_p: float = math.nan
     deviance: float = math.nan
+    gain: float = 0.0
     readings: Readings | None = None
     ahead: float = math.nan
 
@@ -497,12 +499,19 @@ def compete(case: Case, trials: list[Trial]) -> Outcome:
         correlation = _readings(case, best).noise(scale)
         for i, t in enumerate(order):
             # from what its refit reached: where that stopped short, images promise what no refit brings
-            near = i < CONTENDERS or len(t.members) < 2
-            t.deviance = t.after / scale - (_readings(case, t).noise(scale).gain if near else 0.0)
+            if i < CONTENDERS or len(t.members) < 2:
+                t.gain = _readings(case, t).noise(scale).gain
+                t.deviance = _readings(case, t).white / scale - t.gain
+        # whitened by what readings of one setting share, residuals are larger: of the others by as much as the base's
+        base = next(t for t in order if not t.members)
+        for t in order:
+            if t.readings is None:
+                t.deviance += (_readings(case, base).white - base.after) / scale
         order.sort(key=lambda t: t.deviance + t.cost)
     elif case.lamp is not None:
         for t in order:
-            t.deviance -= 0.0 if t.by_frame else _of_frames(case, case.lamp, t).noise(scale).gain
+            t.gain = 0.0 if t.by_frame else _of_frames(case, case.lamp, t).noise(scale).gain
+            t.deviance -= t.gain
         order.sort(key=lambda t: t.deviance + t.cost)
     # whether there is anything is a question of its own, which costs do not answer
     leader = next((t for t in order if t.members), order[0])
@@ -583,9 +592,9 @@ def _lead(case: Case, outcome: Outcome, best: Trial, other: Trial) -> tuple[floa
     and the fall that would be significant among so many effects."""
     cost, is_table = other.cost - best.cost, case.evidence.is_table
     data = other.deviance - best.deviance
+    shared = other.gain - best.gain
     if best.by_frame and not is_table:  # a lamp that wanders is no rival of a gain of each frame, but the same
-        data = other.after / outcome.scale - best.deviance
-    shared = (other.after - best.after) / outcome.scale - data
+        data, shared = data + other.gain, 0.0
     if not is_table:
         data = outcome.scale * data / _design_effect(case, outcome, best, other)
     lead, needed = data + cost, TOLD if data > TOLD else CLEAR  # what is plausible decides alone only where it is clear

@@ -92,10 +92,12 @@ def findings_of(
         own = replace(own, law=f"{laws[0].effect} along {laws[0].coordinate}", law_lead=lead)
     if not fingerprints:
         return own
+    whole = {f.coordinate: f.net for f in fingerprints}
     followed = _followed(case, subject, best.fit, best.fall - best.expectation, fingerprints)
     complete = bool(best.members) and best.complete
     fall, session = own.fall, case.session if case.evidence.is_table else case.lamp
-    if outcome.wander > WANDER:  # more than a lamp may wander: no noise, but structure that has a shape
+    # more than a lamp may wander, and left by the best explanation: no noise, but structure that has a shape
+    if outcome.wander > WANDER and best.after > MISSTATED * basis.dof:
         own = replace(own, shared=False)
     elif session is not None and not best.by_frame:
         scale = outcome.scale
@@ -115,6 +117,8 @@ def findings_of(
         complete or case.evidence.is_table,
     )
     better = [followed] if followed else rivals(fingerprints, opponent)
+    # beside noise that explains most, a curve of something else may seem to do better than an effect
+    better = [f for f in better if whole[f.coordinate] >= AS_GOOD * own.fall]
     best_curve = better[0] if better else fingerprints[0]
     return replace(
         own,
