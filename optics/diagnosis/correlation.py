@@ -82,6 +82,7 @@ class Readings:
         columns = np.column_stack([fitted, residual])[places]
         beside = np.zeros((columns.shape[1],) * 2) if beside is None else beside
         whole = columns.T @ columns + beside
+        self.reached = float(whole[-1, -1])  # as the fit left it, which may have stopped short of what images promise
         root = st.root(whole[:-1, :-1]).T  # of an orthonormal basis of what was fitted
         turn = np.zeros((len(whole), root.shape[1] + 1))
         turn[:-1, :-1], turn[-1, -1] = root, 1.0

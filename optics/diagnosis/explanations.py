@@ -501,12 +501,12 @@ def compete(case: Case, trials: list[Trial]) -> Outcome:
             # from what its refit reached: where that stopped short, images promise what no refit brings
             if i < CONTENDERS or len(t.members) < 2:
                 t.gain = _readings(case, t).noise(scale).gain
-                t.deviance = _readings(case, t).white / scale - t.gain
+                t.deviance = _readings(case, t).reached / scale - t.gain
         # whitened by what readings of one setting share, residuals are larger: of the others by as much as the base's
         base = next(t for t in order if not t.members)
         for t in order:
             if t.readings is None:
-                t.deviance += (_readings(case, base).white - base.after) / scale
+                t.deviance += (_readings(case, base).reached - base.after) / scale
         order.sort(key=lambda t: t.deviance + t.cost)
     elif case.lamp is not None:
         for t in order:
