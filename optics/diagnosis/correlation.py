@@ -87,7 +87,7 @@ class Readings:
         turn = np.zeros((len(whole), root.shape[1] + 1))
         turn[:-1, :-1], turn[-1, -1] = root, 1.0
         turn[:-1, -1] = -root @ (root.T @ whole[:-1, -1])  # the residual off that basis
-        columns, self.beside = columns @ turn, turn.T @ beside @ turn
+        columns, beside = columns @ turn, turn.T @ beside @ turn
         self.white = float((turn.T @ whole @ turn)[-1, -1])
         self.bright = float(np.mean(np.square(loads["lamp"]))) if len(residual) else 0.0
         self.free = len(residual) + more - root.shape[1]
@@ -98,7 +98,7 @@ class Readings:
         lengths = np.geomspace(shortest, max(float(np.ptp(t)) / 2, 2 * shortest), LENGTHS)
         self.power, self.length = (grid.ravel() for grid in np.meshgrid(POWERS, lengths))
         self.shared = [
-            (kind, *_left(columns, t, of_rms_1(load)[places], self.power, self.length, self.beside))
+            (kind, *_left(columns, t, of_rms_1(load)[places], self.power, self.length, beside))
             for kind, load in loads.items()
         ]
 

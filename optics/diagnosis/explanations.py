@@ -524,6 +524,7 @@ def compete(case: Case, trials: list[Trial]) -> Outcome:
 
 
 def _wander(case: Case, outcome: Outcome) -> float:
+    """`Outcome.wander`; 0 for images that are too few to tell."""
     if case.evidence.is_table:
         readings = _readings(case, outcome.base)
     elif case.lamp is not None:
@@ -548,9 +549,8 @@ def _with_survivors(case: Case, outcome: Outcome) -> Outcome:
         alive = [best] + [t for t in outcome.trials if t is not best and id(t) not in told]
         alive += [t for t in _inherited(case, outcome, alive) if t not in alive]
         outcome.shared |= able and base in alive
-        if (
-            outcome.shared
-        ):  # a rival that is no explanation by effects; what is not worth its cost beside it adds nothing
+        # noise is a rival that is no explanation by effects; what is not worth its cost beside it adds nothing
+        if outcome.shared:
             alive = [t for t in alive if t is best or (t.members and t.deviance + t.cost < base.deviance)]
         # an explanation within another that is not told apart says the same with less
         kept = [t for t in alive if not any(o is not t and o.keys < t.keys for o in alive)]
@@ -662,10 +662,8 @@ def _kept(case: Case, images: Sequence[np.ndarray]) -> list[np.ndarray]:
 def _readings(case: Case, trial: Trial) -> Readings:
     """The readings about an explanation; whitened once, as it competes more than once."""
     if trial.readings is None:
-        residual, base = (
-            np.concatenate(_kept(case, trial.images)),
-            [case.evidence.columns[i] for i in case.evidence.base],
-        )
+        residual = np.concatenate(_kept(case, trial.images))
+        base = [case.evidence.columns[i] for i in case.evidence.base]
         known = priors(case.model, trial.fit.values, base)
         trial.readings = case.session.about(residual, _measured(case, trial), known)
     return trial.readings

@@ -616,9 +616,8 @@ class SceneModel:
         own = values.frame.get(index, {})
         state = (index, *sorted(values.common.items()), None, *sorted(own.items()))
         if state not in self._dialled_kept:
-            first = self.errors_of_settings(values, index)
-            self._dialled_kept[state] = sum((error**2 for error in first.values()), np.zeros((1, 1, 1)))
-            self._dialled_kept[state] = self._dialled_kept[state] + self._bent(values, index)
+            first = self.errors_of_settings(values, index).values()
+            self._dialled_kept[state] = sum((error**2 for error in first), self._bent(values, index))
             while len(self._dialled_kept) > KEPT * len(self.frames):
                 self._dialled_kept.popitem(last=False)
         return self._dialled_kept[state]
