@@ -194,6 +194,7 @@ POLARIZER_POINT = {
     "source.dop_q": 0.1,
     "source.dop_u": -0.05,
     "source.drift": 0.02,
+    "source.settling": 0.3,
     "source.time": 3.0,
     "source.wavelength": 560.0,
     "source.fwhm": 150.0,

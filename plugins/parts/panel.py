@@ -1,7 +1,8 @@
 """Panel: a luminous area of up to four regions, each of which sends light of a polarization of its own.
 
 Definition
-    S = power power_c level_k (1, q_k, u_k, 0) (1 + drift time)      Stokes vector in the region k, level_0 = 1
+    S = power power_c level_k (1, q_k, u_k, 0) (1 + drift g(time))   Stokes vector in the region k, level_0 = 1
+    g(t) = (1 - exp(-settling t))/settling                           t where settling is 0
 with the power (radiance, relative), the shares of the first three bands, and the linear polarization q_k = `dop_q`,
 `dop_q_1` ... `dop_q_3` = p cos(2a), u_k = p sin(2a) of the degree p along the angle a, from the surface's x axis to its
 y axis. `region_map` says where the regions lie: even (region 0 alone), halves (0 left, 1 right), quarters (0 1 above 2
@@ -21,6 +22,7 @@ import math
 
 import numpy as np
 
+from optics.light.lamp import drifted
 from optics.polarization.mueller import where
 from optics.scene.checking import agree, ray
 from optics.scene.checking import stokes as sent
@@ -88,7 +90,17 @@ PARAMETERS = (
         for letter, along, across in (("q", 0, 90), ("u", 45, 135))
     ),
     Parameter(
-        "drift", "1", 0.0, (-1.0, 1.0), "relative change per unit of time", neutral=0.0, plausible=0.01, how="layer"
+        "drift", "1", 0.0, (-1.0, 1.0), "change per unit of time, at time 0", neutral=0.0, plausible=0.01, how="layer"
+    ),
+    Parameter(
+        "settling",
+        "1",
+        0.0,
+        (0.0, 1e3),
+        "rate at which a drift settles, per unit of time; 0: it never does",
+        neutral=0.0,
+        plausible=0.1,
+        how="layer",
     ),
     Parameter(
         "time",
@@ -114,16 +126,16 @@ PARAMETERS = (
 
 def stokes(crossing, panel):
     """Stokes vector at power 1, against the crossing's axes."""
-    level = 1.0 + panel.drift * panel.time + 0.0 * crossing.u
+    level = drifted(panel) + 0.0 * crossing.u
     dop_q, dop_u = panel.dop_q + 0.0 * level, panel.dop_u + 0.0 * level
     regions = getattr(panel, "regions", None)
     if regions is not None:
         number = regions(crossing.u, crossing.v)
-        drifted = level
+        first = level
         for k in range(1, REGIONS):
             here = number == k if k < REGIONS - 1 else number >= k
             own = [getattr(panel, f"{name}_{k}") + 0.0 * level for name in ("dop_q", "dop_u")]
-            level = where(here, drifted * getattr(panel, f"level_{k}"), level)
+            level = where(here, first * getattr(panel, f"level_{k}"), level)
             dop_q, dop_u = where(here, own[0], dop_q), where(here, own[1], dop_u)
     q, u = crossing.axis(0.0)  # of the surface's x axis, against the crossing's axes
     level = level + 0.0 * crossing.wavelengths
@@ -175,7 +187,7 @@ def build():
 
         def eval_direction(self, it, ds, active=True):
             # what it lights, it lights as if it were all like the region 0, unpolarized
-            level = mi.UnpolarizedSpectrum(self.power * (1 + self.drift * self.time))
+            level = mi.UnpolarizedSpectrum(self.power * drifted(self))
             level = dr.select(dr.dot(ds.d, ds.n) < 0, level, 0.0)
             return mi.mueller.depolarizer(level) if mi.is_polarized else mi.Spectrum(level)
 

@@ -2,7 +2,7 @@
 
 Definition
     S = L (1, q, u, 0)                    Stokes vector, the same in all directions
-    L = power power_c w(lambda) (1 + drift time)
+    L = power power_c w(lambda) (1 + drift g(time)),  g(t) = (1 - exp(-settling t))/settling, or t where settling is 0
 with the power (radiance, relative), the shares of the first three bands, the spectrum w of an LED (a Gaussian; 1 in
 every band when `wavelength` is 0), and the linear polarization q = `dop_q` = p cos(2a), u = `dop_u` = p sin(2a) of the
 degree p along the angle a, from the surface's x axis to its y axis. `time` is the experimenter's clock, a setting of a
@@ -20,6 +20,7 @@ References
 import math
 from dataclasses import replace
 
+from optics.light.lamp import drifted
 from optics.polarization.mueller import exp, real, where
 from optics.scene.checking import agree, ray
 from optics.scene.checking import stokes as sent
@@ -81,9 +82,20 @@ PARAMETERS = (
         "1",
         0.0,
         (-1.0, 1.0),
-        "relative change per unit of time",
+        "relative change per unit of time, at time 0",
         neutral=0.0,
         plausible=0.01,
+        through="time",
+        how="layer",
+    ),
+    Parameter(
+        "settling",
+        "1",
+        0.0,
+        (0.0, 1e3),
+        "rate at which a drift settles, per unit of time; 0: it never does",
+        neutral=0.0,
+        plausible=0.1,
         through="time",
         how="layer",
     ),
@@ -116,7 +128,7 @@ def stokes(crossing, source):
     """Stokes vector at power 1, against the crossing's axes."""
     u = (crossing.wavelengths - source.wavelength) / source.fwhm
     line = exp(-4 * math.log(2) * u * u)
-    level = where(real(source.wavelength) > 0, line, 1.0 + 0.0 * line) * (1 + source.drift * source.time)
+    level = where(real(source.wavelength) > 0, line, 1.0 + 0.0 * line) * drifted(source)
     q, u = crossing.axis(0.0)  # of the surface's x axis, against the crossing's axes
     return level, level * (source.dop_q * q - source.dop_u * u), level * (source.dop_q * u + source.dop_u * q), 0
 
@@ -166,9 +178,7 @@ def build(kind_of="source"):
         def level(self, wavelengths):
             bands = mi.UnpolarizedSpectrum(wavelengths) if mi.is_spectral else mi.UnpolarizedSpectrum(540.0)
             u = (bands - self.wavelength) / self.fwhm
-            return dr.select(self.wavelength > 0, dr.exp(-4 * math.log(2) * dr.square(u)), 1.0) * (
-                1 + self.drift * self.time
-            )
+            return dr.select(self.wavelength > 0, dr.exp(-4 * math.log(2) * dr.square(u)), 1.0) * drifted(self)
 
         def pdf_direction(self, it, ds, active=True):
             return dr.select(dr.dot(ds.d, ds.n) < 0, self.get_shape().pdf_direction(it, ds, active), 0.0)
