@@ -45,8 +45,11 @@ class Findings:
                  where misfit is left
     against      that explanation, in words
     ratio        the best curve's fall, less its cost, over that of the best explanation; coordinate: of that curve
-    rival        whether a curve does significantly better, by RIVAL (a map) or RIVAL_CURVE, where misfit is left
-    shared       whether noise that neighbouring readings share explains it as well as the best explanation
+    rival        whether a curve does significantly better, by RIVAL (a map) or RIVAL_CURVE, where misfit is left, or is
+                 not told apart from several effects; curve_lead: of its score over that of the best explanation,
+                 0 where that leaves nothing
+    shared       whether noise that neighbouring readings share explains it as well as the best explanation; wander:
+                 its rms over that of the signal
     share        of the excess that the best explanation explains, where excess_sd > EXCESS; curve_share: the best curve
     left         misfit over mean signal with the best explanation
     uneven       largest h of the winner's splits, by the split uneven_by (in words), uneven_limit allowed; even:
@@ -72,12 +75,14 @@ class Findings:
     fall: float = 0.0
     common: bool = True
     shared: bool = False
+    wander: float = 0.0
     survivors: int = 1
     lead: float = math.inf
     needed: float = TOLD
     against: str = ""
     ratio: float = 0.0
     rival: bool = False
+    curve_lead: float = math.inf
     coordinate: str = ""
     share: float = math.nan
     curve_share: float = math.nan
@@ -165,7 +170,11 @@ def _word_of_winner(f: Findings, failed: set[str]) -> str:
     if failed & {"significant", "strength"} and not f.structured and not f.weighed:
         # The refit did not bring the fall that the score promised, or the base's own calibration brought it.
         return "NOTHING"
-    alone = not failed & {"significant", "no better curve", "share", "beyond clutter", "near"}
+    # beside noise that neighbours share, what is significant is asked of both together
+    weak = set() if f.shared else {"significant"}
+    if f.rival and f.curve_lead > TOLD:
+        weak.add("no better curve")
+    alone = not failed & (weak | {"share", "beyond clutter", "near"})
     alone = alone and not f.another_law
     rivals = f.survivors > 1 or f.shared or LAW in failed
     if failed & {"lead", LAW} and alone and f.some_even and rivals:

@@ -111,7 +111,8 @@ def diagnose(
         model, evidence, places, added, variables_of, outcome.scale, case.session if evidence.is_table else None
     )
     splits, chance = _split(case, outcome, subject)
-    levels = held.levels(case, best.members, best.fit)
+    wander = 0.0 if case.evidence.is_table else explanations.wander_of(case, outcome, best)
+    levels = held.levels(case, best.members, best.fit, wander)
     shifts = held.shifts(case, best.members, best.fit) if subject else []
 
     findings = findings_of(case, outcome, fingerprints, laws, splits, chance, levels, basis)
@@ -204,7 +205,7 @@ def _split(case: Case, outcome: Outcome, subject: Candidate | None) -> tuple[lis
             told,
             net,
             beside,
-            outcome.correlation if case.evidence.is_table else None,
+            explanations.noise_of(case, outcome, trial) if case.evidence.is_table else None,
         )
         splits += own
         # of readings, noise that neighbours share and errors of dials have been rivals, by their likelihood

@@ -516,22 +516,28 @@ def compete(case: Case, trials: list[Trial]) -> Outcome:
     # whether there is anything is a question of its own, which costs do not answer
     leader = next((t for t in order if t.members), order[0])
     outcome = Outcome(leader, leader, [leader], order, scale, correlation)
-    outcome.wander = _wander(case, outcome)
+    outcome.wander = wander_of(case, outcome, outcome.base)
     for t in order:
         if t is not leader:
             outcome.leads[t.names] = _lead(case, outcome, leader, t)
     return _with_survivors(case, outcome)
 
 
-def _wander(case: Case, outcome: Outcome) -> float:
-    """`Outcome.wander`; 0 for images that are too few to tell."""
+def wander_of(case: Case, outcome: Outcome, trial: Trial) -> float:
+    """Rms of the noise that neighbours share about an explanation, over that of the signal; 0 for images that are too
+    few to tell, or where each frame has a strength."""
     if case.evidence.is_table:
-        readings = _readings(case, outcome.base)
-    elif case.lamp is not None:
-        readings = _of_frames(case, case.lamp, outcome.base)
+        readings = _readings(case, trial)
+    elif case.lamp is not None and not trial.by_frame:
+        readings = _of_frames(case, case.lamp, trial)
     else:
         return 0.0
     return math.sqrt(readings.noise(outcome.scale).power * outcome.scale / max(readings.bright, 1e-12))
+
+
+def noise_of(case: Case, outcome: Outcome, trial: Trial) -> Correlation:
+    """What neighbouring readings share about an explanation of a table."""
+    return _readings(case, trial).noise(outcome.scale)
 
 
 def _with_survivors(case: Case, outcome: Outcome) -> Outcome:
@@ -549,9 +555,9 @@ def _with_survivors(case: Case, outcome: Outcome) -> Outcome:
         alive = [best] + [t for t in outcome.trials if t is not best and id(t) not in told]
         alive += [t for t in _inherited(case, outcome, alive) if t not in alive]
         outcome.shared |= able and base in alive
-        # noise is a rival that is no explanation by effects; what is not worth its cost beside it adds nothing
+        # noise is a rival that is no explanation by effects; what is clearly not worth its cost beside it adds nothing
         if outcome.shared:
-            alive = [t for t in alive if t is best or (t.members and t.deviance + t.cost < base.deviance)]
+            alive = [t for t in alive if t is best or (t.members and t.deviance + t.cost < base.deviance + CLEAR)]
         # an explanation within another that is not told apart says the same with less
         kept = [t for t in alive if not any(o is not t and o.keys < t.keys for o in alive)]
         kept.sort(key=lambda t: t.deviance + t.cost)
@@ -559,6 +565,12 @@ def _with_survivors(case: Case, outcome: Outcome) -> Outcome:
             break
         best = next(t for t in kept if t.keys < best.keys) if any(t.keys < best.keys for t in kept) else kept[0]
     outcome.best, outcome.survivors = best, [best, *(t for t in kept if t is not best)]
+    # what the simplest is not ahead of survives, though a larger explanation rules it out: that one is not needed
+    for name in outcome.core:
+        rival, lead, needed = _without(case, outcome, next(c for c in best.members if c.effect.name == name))
+        if rival.members and rival not in outcome.survivors and lead <= needed:
+            outcome.survivors.append(rival)
+            break
     return outcome
 
 
@@ -640,10 +652,15 @@ def _design_effect(case: Case, outcome: Outcome, one: Trial, other: Trial) -> fl
 def lead_without(case: Case, outcome: Outcome, subject: Candidate) -> tuple[float, float, str]:
     """(lead, lead needed, rival in words) of the best explanation over the best one without an effect, and without one
     that contains it."""
+    rival, lead, needed = _without(case, outcome, subject)
+    return lead, needed, " with ".join(c.effect.name for c in rival.members)
+
+
+def _without(case: Case, outcome: Outcome, subject: Candidate) -> tuple[Trial, float, float]:
+    """(the best explanation that lacks an effect and what contains it, lead over it, lead needed)."""
     own = {(key, v.frames) for v in subject.variables for key in v.keys}
-    others = [t for t in outcome.trials if not own <= t.keys]
-    rival = min(others, key=lambda t: t.deviance + t.cost)
-    return (*_lead(case, outcome, outcome.best, rival), " with ".join(c.effect.name for c in rival.members))
+    rival = min((t for t in outcome.trials if not own <= t.keys), key=lambda t: t.deviance + t.cost)
+    return (rival, *_lead(case, outcome, outcome.best, rival))
 
 
 def fall_over_noise(case: Case, outcome: Outcome, name: str) -> float:

@@ -11,7 +11,6 @@ import numpy as np
 
 from optics.diagnosis import fingerprints as prints
 from optics.diagnosis import statistics as st
-from optics.diagnosis.correlation import WANDER
 from optics.diagnosis.decide import Findings, Opponent, rivals
 from optics.diagnosis.evidence import Candidate, Evidence
 from optics.diagnosis.explanations import Outcome, fall_over_noise, lead_without
@@ -94,25 +93,27 @@ def findings_of(
         return own
     whole = {f.coordinate: f.net for f in fingerprints}
     followed = _followed(case, subject, best.fit, best.fall - best.expectation, fingerprints)
-    complete = bool(best.members) and best.complete
-    fall, session = own.fall, case.session if case.evidence.is_table else case.lamp
-    # more than a lamp may wander, and left by the best explanation: no noise, but structure that has a shape
-    if outcome.wander > WANDER and best.after > MISSTATED * basis.dof:
-        own = replace(own, shared=False)
-    elif session is not None and not best.by_frame:
+    # a curve is no better than effects while any set of them does as well: the leader, not the simplest beside it
+    leader = outcome.leader
+    complete = bool(leader.members) and leader.complete
+    fall, session = leader.fall - leader.expectation, case.session if case.evidence.is_table else case.lamp
+    if not subject:
+        fall = own.fall
+    if session is not None and not leader.by_frame:
         scale = outcome.scale
         fingerprints = prints.beside_shared_noise(
             case.model, case.evidence, case.places or [], fingerprints, session, scale
         )
-        fall = outcome.base.deviance - best.deviance - best.expectation if subject else own.fall / scale
-        fingerprints = [replace(f, ratio=f.net / max(fall, 1.0)) for f in fingerprints]
+        gain = outcome.base.deviance - leader.deviance - leader.expectation
+        fall = max(gain, 0.0) if subject else fall / scale
+    fingerprints = [replace(f, ratio=f.net / max(fall, 1.0)) for f in fingerprints]
     if not fingerprints:
         return own
     opponent = Opponent(
         fall,
-        best.cost,
-        len(best.members),
-        sum(len(c.cone.live) for c in best.members),
+        leader.cost,
+        len(leader.members),
+        sum(len(c.cone.live) for c in leader.members),
         complete,
         complete or case.evidence.is_table,
     )
@@ -120,10 +121,12 @@ def findings_of(
     # beside noise that explains most, a curve of something else may seem to do better than an effect
     better = [f for f in better if whole[f.coordinate] >= AS_GOOD * own.fall]
     best_curve = better[0] if better else fingerprints[0]
+    lead = best_curve.net - best_curve.cost - (opponent.fall - opponent.cost)
     return replace(
         own,
         ratio=best_curve.net / max(fall, 1.0),
         rival=bool(better),
+        curve_lead=math.inf if followed else 0.0 if complete else lead,
         coordinate=best_curve.coordinate,
         curve_share=best_curve.share,
     )
@@ -156,6 +159,7 @@ def _of_subject(
         best.fall - best.expectation,
         common=name in outcome.core,
         shared=outcome.shared,
+        wander=outcome.wander,
         survivors=len(outcome.survivors),
         lead=lead,
         needed=needed,

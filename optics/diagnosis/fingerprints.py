@@ -205,30 +205,25 @@ def beside_shared_noise(
     """The significant curves, with their falls of deviance (`optics.diagnosis.correlation`): beside noise that
     neighbours share, a curve along what was turned slowly counts for less, as a lamp that wanders brings it too.
 
-    Of images these are curves along what is one number for each frame; others fall as they did.
     scale   variance over the stated one
     """
     named, carriers = _named(evidence, model), [np.concatenate(c) for c in zip(*_carriers(model, evidence))]
     base, r = evidence.dense(evidence.base), np.concatenate([block.r for block in evidence.blocks])
-    turned = settings(model, evidence)
-    before, rank, judged = session.about(r, base).deviance(scale), st.orthonormal(base).shape[1], []
+    before, judged = session.about(r, base), []
+    reached = before.deviance(scale)
     for f in curves:
         if f.p > LEVEL:
             continue
-        if not evidence.is_table and not (f.coordinate == "frame" or f.coordinate in turned):
-            judged.append(replace(f, fall=f.fall * evidence.thinning / scale, net=f.net / scale))
-            continue
         index, count = _bins(evidence, f.coordinate, np.concatenate([p[f.coordinate] for p in found]), named)
         held = index[:, None] == np.arange(count)
-        whole = np.hstack([base, *(held * carrier[:, None] for carrier in carriers)])
-        dof = st.orthonormal(whole).shape[1] - rank
-        free = len(r) - rank
-        if not 0 < dof < free:
+        after = session.about(r, np.hstack([base, *(held * carrier[:, None] for carrier in carriers)]))
+        dof = before.free - after.free
+        if not 0 < dof < before.free:
             continue
-        after = session.about(r, whole).deviance(scale)
-        fall = before - after
-        p = _chance(evidence, fall, dof, free, before)
-        judged.append(replace(f, fall=fall, dof=dof, p=p, net=fall - dof))
+        fall = reached - after.deviance(scale)
+        judged.append(
+            replace(f, fall=fall, dof=dof, p=_chance(evidence, fall, dof, before.free, reached), net=fall - dof)
+        )
     return judged
 
 

@@ -1,7 +1,8 @@
 """Held-out frames, and what had moved to hide an effect.
 
 On held-out frames the parameters that all frames share are frozen, and only what each frame has for itself is solved
-for, for the base and for the base with the winner alike."""
+for, for the base and for the base with the winner alike. A lamp that wanders by w (rms, relative) from frame to frame
+is such a thing: chi2 = r'(1 + w^2 g g')^-1 r of a frame, with its whitened signal g."""
 
 from __future__ import annotations
 
@@ -23,8 +24,9 @@ SQUARES = 4  # fields per side of a held-out frame that is judged in halves
 MOVED = 3.0  # standard deviations, of the fit or of the prior, that a parameter must have moved to be reported
 
 
-def levels(case: Case, members: Sequence[Candidate], with_them: Fit) -> list[Level]:
-    """Misfit of the base and, if there are any, of the base with effects, on fitted and on held-out frames.
+def levels(case: Case, members: Sequence[Candidate], with_them: Fit, wander: float = 0.0) -> list[Level]:
+    """Misfit of the base and, if there are any, of the base with effects, on fitted and on held-out frames, where the
+    lamp wanders.
 
     A strength per frame is found on one half of a held-out frame and judged on the other."""
     evidence, fit, held_out, say = case.evidence, case.fit, case.held_out, case.say
@@ -43,7 +45,7 @@ def levels(case: Case, members: Sequence[Candidate], with_them: Fit) -> list[Lev
         use = np.asarray(case.model.usable(f), bool) & np.isfinite(prediction)
         masks.append(use)
         sds.append(np.sqrt(np.where(use, variance, 1.0)))
-        base.append(_square(case.model, f, prediction, use, sds[-1]))
+        base.append(_square(case.model, f, prediction, use, sds[-1], wander))
     count = int(sum(m.sum() for m in masks))
     found = [_level(case, "base", before, sum(base), count)]
     if not members or not count:
@@ -63,7 +65,7 @@ def levels(case: Case, members: Sequence[Candidate], with_them: Fit) -> list[Lev
         found[0] = _level(case, "base", before, sum(base), count)
     else:
         with_effect = [
-            _square(case.model, f, prediction, use, sd)
+            _square(case.model, f, prediction, use, sd, wander)
             for f, prediction, use, sd in zip(held_out, predictions, masks, sds)
         ]
     better = int(sum(b > w for b, w in zip(base, with_effect)))
@@ -142,10 +144,14 @@ def _level(
     )
 
 
-def _square(model: Model, frame: int, prediction: np.ndarray, use: np.ndarray, sd: np.ndarray) -> float:
+def _square(
+    model: Model, frame: int, prediction: np.ndarray, use: np.ndarray, sd: np.ndarray, wander: float = 0.0
+) -> float:
     """chi2 of a frame; a prediction that is not finite counts as no residual, as its pixel was not used before."""
     residual = (np.asarray(model.frames[frame].image, float) - prediction) / sd
-    return float(np.sum(np.where(use & np.isfinite(residual), residual, 0.0) ** 2))
+    use = use & np.isfinite(residual)
+    r, g = residual[use], ((prediction - float(model.noise.black_level)) / sd)[use]
+    return float(r @ r - (wander * (r @ g)) ** 2 / (1 + wander**2 * (g @ g)))
 
 
 def shifts(case: Case, members: Sequence[Candidate], found: Fit) -> list[Shift]:

@@ -26,6 +26,7 @@ from optics.diagnosis.result import Diagnosis
 from optics.errors import BadCapture, Underdetermined, UnknownKey
 from optics.fit import calibrate
 from optics.fit.compare import Comparison
+from optics.fit.descent import prior_terms
 from optics.fit.model import values_in
 from optics.fit.result import Fit
 from optics.fit.scene_model import SceneModel
@@ -340,13 +341,20 @@ class Refits:
             return calibrate.fit_over_starts(model, variables, start, frames, over=over)
         names = tuple(v.name for v in extra)
         if names not in self.results:  # a diagnosis asks again from another start, which chord steps do not use
-            leader = max((base.chi2 - f.chi2 for f in self.results.values()), default=0.0)
+            leader = max(map(self.fall, self.results.values()), default=0.0)
             steps = {v.name: self.steps[v.name] for v in extra if v.name in self.steps}
             quick = calibrate.extended(model, base, extra, steps)
-            if not quick.converged and base.chi2 - quick.chi2 > PROMISING * leader:
+            if not quick.converged and self.fall(quick) > PROMISING * leader:
                 quick = self.afresh(variables, extra, frames, quick)
             self.results[names] = quick
         return self.results[names]
+
+    def fall(self, found: Fit) -> float:
+        """Of what is minimised, chi2 and priors: where each frame has its own angle, these may hold most of it."""
+        return self.minimised(self.base) - self.minimised(found)
+
+    def minimised(self, found: Fit) -> float:
+        return found.chi2 + prior_terms(self.model, found.variables, found.values)[2]
 
     def afresh(
         self, variables: Sequence[Variable], extra: Sequence[Variable], frames: Sequence[int], quick: Fit
@@ -355,7 +363,7 @@ class Refits:
         truth."""
         values = off_neutral(self.model, Values(dict(self.setup.values)), extra)
         best = fit_base(self.model, variables, frames, values, tolerance=ROUGH)
-        if best.chi2 < quick.chi2:
+        if self.minimised(best) < self.minimised(quick):
             return best
         return calibrate.fit(self.model, variables, quick.values, frames, max_iterations=FEW, tolerance=ROUGH)
 

@@ -293,6 +293,10 @@ GOOD = Findings(
         ({"law": "b along frame", "law_lead": -TOLD - 0.1, "structure_p": 0.5}, "CANNOT_TELL"),
         ({"law": "b along frame", "law_lead": -TOLD - 0.1, "p_family": 0.02, "structure_p": 0.5}, "NOTHING"),
         ({"shared": True}, "AMBIGUOUS"),
+        ({"shared": True, "lead": -5.0, "p_winner": 0.2}, "AMBIGUOUS"),
+        ({"rival": True, "ratio": 1.2, "common": False, "survivors": 2}, "UNKNOWN"),
+        ({"rival": True, "ratio": 1.2, "common": False, "survivors": 2, "curve_lead": TOLD - 1}, "AMBIGUOUS"),
+        ({"rival": True, "ratio": 1.2, "curve_lead": -1.0}, "UNKNOWN"),
         ({"shared": True, "share": 0.02}, "CANNOT_TELL"),
     ],
 )

@@ -30,11 +30,16 @@ SIZES = {
 }  # of one step; else 0.05
 
 
-def thinned(session: Session) -> Session:
-    """MOST readings of a session; itself where it has no more."""
+def kept(session: Session) -> np.ndarray:
+    """Indices of MOST readings of a session, or of all."""
     if session.count <= MOST:
-        return session
-    keep = np.sort(np.random.default_rng(17).permutation(session.count)[:MOST])
+        return np.arange(session.count)
+    return np.sort(np.random.default_rng(17).permutation(session.count)[:MOST])
+
+
+def thinned(session: Session) -> Session:
+    """The readings that are kept, as a session."""
+    keep = kept(session)
     return replace(session, settings={key: column[keep] for key, column in session.settings.items()})
 
 
@@ -42,9 +47,11 @@ def fit(session: Session, hidden: Bench, causes: Sequence[str] = (), sd: np.ndar
     """chi2 that the owner's bench leaves of a hidden bench's signal, with the causes in it: lamp, unknown zeros, and
     all strengths free.
 
-    sd   of the readings of `thinned(session)`; None: those of the hidden bench"""
+    sd   of the readings of `thinned(session)`, each by itself; None: the covariance of the hidden bench"""
     whole, session = session, thinned(session)
-    signal, sd = session.mean(hidden), session.sd(hidden) if sd is None else sd
+    signal = session.mean(hidden)
+    white = None if sd is not None else np.linalg.inv(np.linalg.cholesky(whole.covariance(hidden, kept(whole))))
+    sd = session.sd(hidden) if sd is None else sd
     groups: Groups = tuple((f"power_{band}",) for band in range(len(session.bands)))
     groups += tuple((name,) for name in session.free)
     low, high = [-math.inf] * len(groups), [math.inf] * len(groups)
@@ -62,6 +69,8 @@ def fit(session: Session, hidden: Bench, causes: Sequence[str] = (), sd: np.ndar
 
     def left(x: np.ndarray) -> np.ndarray:
         hidden = both(*({name: PLAIN[name] + value * s for name in g} for g, value, s in zip(groups, x, sizes)))
+        if white is not None:
+            return white @ np.ravel(session.mean(hidden) - signal)
         return np.ravel((session.mean(hidden) - signal) / sd)
 
     bounds = np.array(low) / sizes, np.array(high) / sizes
@@ -74,11 +83,11 @@ def fit(session: Session, hidden: Bench, causes: Sequence[str] = (), sd: np.ndar
         best = min(best, 2 * least_squares(left, start, bounds=bounds, max_nfev=40, xtol=1e-9, ftol=1e-9).cost)
         if best < DONE * signal.size:
             break
-    return best * whole.count / session.count
+    return best if white is not None else best * whole.count / session.count
 
 
 def snr(session: Session, hidden: Bench) -> float:
-    """Rms change per value after the best fit of the owner's bench, over the noise of a value."""
+    """Rms change per value after the best fit of the owner's bench, over the noise of a value by itself."""
     return math.sqrt(fit(session, hidden, sd=thinned(session).sd({})) / (session.count * len(session.bands)))
 
 

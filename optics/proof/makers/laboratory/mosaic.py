@@ -41,11 +41,14 @@ class Mosaic(Session):
         lamp = 1 + self.wander * wandering(self.frames, self.memory, rng)
         return self.meter.shown(signal * lamp[:, None, None], rng)
 
-    def turned_off(self, rng: np.random.Generator) -> dict[str, np.ndarray]:
+    @property
+    def dials(self) -> tuple[str, ...]:
         """The film stops off its scale; the analysers on the pixels stay."""
-        found = self.all_settings
-        moved = replace(self, settings={"middle.angle": found["middle.angle"]}, fixed={})
-        return {**found, "middle.angle": Session.turned_off(moved, rng)["middle.angle"]}
+        return ("middle.angle",)
+
+    @property
+    def clock(self) -> np.ndarray:
+        return self.settings["frame"]
 
 
 def session(rng: np.random.Generator) -> Mosaic:

@@ -46,6 +46,10 @@ class Photographs(Session):
 
     frames: int = 1
 
+    @property
+    def clock(self) -> np.ndarray:
+        return self.settings["frame"]
+
     def take(self, hidden, rng: np.random.Generator) -> np.ndarray:
         """(frames, H, W, 3) DN: the lamp wanders from photograph to photograph."""
         signal = self.mean(hidden, self.turned_off(rng)).reshape(self.frames, HEIGHT, WIDTH, 3)

@@ -123,14 +123,11 @@ class Session:
     def turned_off(self, rng: np.random.Generator) -> dict[str, np.ndarray]:
         """The settings as they really were: each time that a dial moves, it stops a little off what is written."""
         found = self.all_settings
-        for key in DIALS:
-            if key not in self.settings:
-                continue
-            moved = np.flatnonzero(np.diff(self.settings[key], prepend=np.nan) != 0)
-            error = self.dial_sd * rng.standard_normal(len(moved))
-            error = error + self.encoder * rng.uniform(-0.5, 0.5, len(moved))
-            stays = np.searchsorted(moved, np.arange(self.count), side="right") - 1
-            found[key] = found[key] + error[stays]
+        for key in self.dials:
+            stay = self.stays(key) - 1
+            error = self.dial_sd * rng.standard_normal(stay[-1] + 1)
+            error = error + self.encoder * rng.uniform(-0.5, 0.5, stay[-1] + 1)
+            found[key] = found[key] + error[stay]
             if self.misread is not None and key == f"{(self.turned or ('analyzer',))[0]}.angle":
                 found[key][self.misread] += 10.0
         return found
@@ -148,19 +145,50 @@ class Session:
         lamp = lamp + self.flicker * np.sin(2 * np.pi * (0.37 * np.arange(self.count) + rng.uniform()))
         return self.meter.shown(signal * lamp[:, None], rng)
 
-    def dial_noise(self, hidden: Bench) -> np.ndarray:
-        """(n, C) DN, 1 sd, by dials that stop off what is written."""
+    @property
+    def dials(self) -> tuple[str, ...]:
+        """Keys of the dials that stop off what is written."""
+        return tuple(key for key in DIALS if key in self.settings)
+
+    @property
+    def clock(self) -> np.ndarray:
+        """(n,) steps by which the lamp wanders."""
+        return np.arange(self.count, dtype=float)
+
+    def stays(self, key: str) -> np.ndarray:
+        """(n,) number of the setting of a dial at which each reading was taken."""
+        return np.cumsum(np.diff(self.settings[key], prepend=np.nan) != 0)
+
+    def off(self, hidden: Bench, key: str) -> tuple[np.ndarray, np.ndarray]:
+        """(n, C) DN each: what 1 sd of a dial's error does, in first and in second order."""
         sd = math.hypot(self.dial_sd, self.encoder / math.sqrt(12))
-        variance = np.zeros_like(self.mean(hidden))
-        for key in DIALS:
-            if sd and key in self.settings:
-                up, down = (self.mean(hidden, {**self.all_settings, key: self.settings[key] + d}) for d in (0.1, -0.1))
-                variance += (sd * (up - down) / 0.2) ** 2
-        return np.sqrt(variance)
+        here = self.mean(hidden)
+        up, down = (self.mean(hidden, {**self.all_settings, key: self.settings[key] + d}) for d in (sd, -sd))
+        return (up - down) / 2, (up + down - 2 * here) / math.sqrt(2)
 
     def sd(self, hidden: Bench) -> np.ndarray:
-        """(n, C) DN of a reading: the instrument and the dials, without what wanders slowly."""
-        return np.hypot(self.meter.sd(self.mean(hidden)), self.dial_noise(hidden))
+        """(n, C) DN of a reading: the instrument, the dials and the lamp, each reading by itself."""
+        signal = self.mean(hidden)
+        variance = self.meter.sd(signal) ** 2 + (self.wander * signal) ** 2
+        for key in self.dials:
+            variance += sum(np.square(part) for part in self.off(hidden, key))
+        return np.sqrt(variance)
+
+    def covariance(self, hidden: Bench, keep: np.ndarray) -> np.ndarray:
+        """(m C, m C) DN^2 of the readings `keep` (m,), which stand for all: with the errors that readings at one
+        setting share, and the lamp's, which is correlated over `memory`."""
+        signal = self.mean(hidden)[keep]
+        rows, channels = signal.shape
+        row = np.repeat(np.arange(rows), channels)
+        found = np.diag(np.ravel(self.meter.sd(signal)) ** 2) * rows / self.count
+        for key in self.dials:
+            stay = self.stays(key)
+            share = len(np.unique(stay[keep])) / len(np.unique(stay))
+            same = (stay[keep][:, None] == stay[keep])[row][:, row] * share
+            for part in self.off(hidden, key):
+                found += same * np.outer(part[keep], part[keep])
+        lamp = np.exp(-np.abs(self.clock[keep][:, None] - self.clock[keep]) / max(self.memory, 1e-6))
+        return found + self.wander**2 * lamp[row][:, row] * np.outer(signal, signal)
 
 
 def wandering(count: int, memory: float, rng: np.random.Generator) -> np.ndarray:

@@ -15,6 +15,7 @@ from optics.proof.makers.laboratory.bench import FILMS
 from optics.proof.makers.laboratory.session import Meter, Session
 
 DIMMEST = 0.003  # of the range: what is seen of a lamp of power 1 where films are crossed, at least
+STEADY = 0.03  # relative: a lamp that wanders by more is noticed, and mended
 PLANS = ("one film", "two films", "three films", "both turned", "two powers", "forth and back")
 
 
@@ -78,7 +79,7 @@ def everyday(found: Session, rng: np.random.Generator, *, dial_sd: float = 0.0, 
     noise = float(np.sqrt(np.mean(found.sd({}) ** 2)) / max(found.mean({}).mean(), 1e-9))
     return replace(
         found,
-        wander=noise * float(rng.uniform(0.0, 1.0)),
+        wander=min(noise, STEADY) * float(rng.uniform(0.0, 1.0)),
         memory=float(rng.uniform(3.0, 20.0)),
         misread=int(rng.integers(found.count)) if rng.random() < 0.08 else None,
         noise_said=float(rng.choice([1.0, 1.0, 0.85, 1.2])),
