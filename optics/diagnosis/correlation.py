@@ -10,10 +10,11 @@ a reading, as of an amplifier, or with the signal over it, as of a lamp (`kind`)
 imitates whatever changes slowly during a session. So each explanation of the readings is judged by its deviance with
 the shared noise that suits it best,
 
-    deviance = min over power >= 0, length, kind of (r' V^-1 r / scale + ln det V + 3 ln(1 + x^2/2))
+    deviance = min over power >= 0, length, kind of (r' V^-1 r / scale + ln det V + x^2)
 
 with the residual r after everything that was fitted is fitted again by these weights. x is the rms of the shared noise
-over that of the signal, in units of WANDER: like the strength of an effect, it pays for being far from plausible.
+over that of the signal, in units of WANDER. Its prior is a Gaussian's, not Student's as of an effect: whoever takes
+readings sees a lamp that wanders by 5 % and mends it, while an effect may be of any size.
 
 The exponential is an Ornstein-Uhlenbeck process, which is Markov: a Kalman filter whitens n readings in n steps. The
 scale is found by restricted maximum likelihood.
@@ -36,7 +37,7 @@ LENGTHS = 7  # tried, from SHORTEST to half of the session
 SHORTEST = 3.0  # readings: shared over fewer, it is hardly more than noise of a wrong size
 # What shared noise must gain in twice the log likelihood: few white sessions exceed it, and these lose little.
 NOTED = 4.0
-WANDER = 0.01  # of the signal: what a lamp or an amplifier may wander in a session
+WANDER = 0.015  # of the signal, rms: what a lamp or an amplifier may wander in a session
 KINDS = ("amplifier", "lamp")
 
 
@@ -112,9 +113,8 @@ class Readings:
         if not self.shared:
             return best
         x2 = self.power * scale / max(self.bright, 1e-12) / WANDER**2
-        cost = 3 * np.log1p(x2 / 2)
         for kind, left, logs, _ in self.shared:
-            gains = self.white / scale - (left / scale + logs + cost)
+            gains = self.white / scale - (left / scale + logs + x2)
             i = int(np.argmax(gains))
             if gains[i] > best.gain:
                 best = Correlation(scale, float(self.power[i]), float(self.length[i]), kind, float(gains[i]))

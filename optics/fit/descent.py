@@ -19,6 +19,10 @@ from optics.fit.model import Model, value_of
 from optics.scene.parameter import Values, Variable
 
 REACH = 4.0  # plausible sizes that one step may change a nonlinear parameter: beyond, a light may pass the sensor's rim
+# Times REACH, where no damping brings a gain: what the residual's own curvature holds back, as an angle at which its
+# image stands still, is not damped by what its image is worth.
+SHORT_OF = (0.1, 0.01)
+LITTLE = 0.01  # of what is promised: a gain that is as good as none
 MOST_TRUST = 1e3  # times REACH: where steps keep bringing what they promise, the reach no longer matters
 POOR = 0.25  # of the promised gain: a step that brings less has followed the linearisation too far
 GOOD = 0.5  # of the promised gain: a step that brings more may be followed by one twice as long
@@ -325,7 +329,9 @@ class Descent:
             if not gain > worst:
                 break
             self.theta, self.values, self.here = found
-            self.trust = min(2 * self.trust, MOST_TRUST) if gain > GOOD * expected else max(self.trust / 2, 1.0)
+            self.trust = (
+                min(2 * self.trust, MOST_TRUST) if gain > GOOD * expected else max(self.trust / 2, min(self.trust, 1.0))
+            )
             gained += gain
             self.damping = max(self.damping / EASING, LEAST_DAMPING)
             # a poor step that still gains ten times what is worth a step is better followed by new images
@@ -360,4 +366,12 @@ class Descent:
                 break
             self.damping, self.trust = max(self.damping * EASING, FIRST_DAMPING), max(self.trust / 2, 1.0)
         assert best is not None  # `most` is 1 or more
+        for self.trust in SHORT_OF if not best[1] > max(worst, LITTLE * self.promised) else ():
+            tried, self.damping = tried + 1, FIRST_DAMPING
+            target, expected = self.step(self.damping)
+            found = self._at(target)
+            gain = self.here.total - found[2].total
+            if gain > max(best[1], 0.0):
+                best = found, gain, expected
+                break
         return *best, tried
