@@ -100,7 +100,7 @@ SHOWN: dict[str, tuple[View, tuple[str, ...] | None]] = {
     "polarizer-misalignment": (BENCH, ("analyzer",)),
     "servo-scale": (FULL_TURN, ("analyzer",)),  # an error that grows with the angle
     "servo-backlash": (View("polarizer_bench", {}, {"analyzer.approach": 1.0}, "analyzer.angle"), None),
-    "source-drift": (View("polarizer_bench", {}, {}, "source.time", (0.0, 10.0)), None),
+    "source-drift": (View("polarizer_bench", {}, {}, "source.time", (0.0, 30.0)), None),
     "polarized-source": (View("polarizer_bench", {}, {"analyzer.inserted": 0.0}, "polarizer.angle"), None),
     "retardance": (CROSSED, None),
     "optical-rotation": (BENCH, None),

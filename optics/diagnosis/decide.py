@@ -337,14 +337,15 @@ def rivals(fingerprints: Sequence[Fingerprint], best: Opponent) -> list[Fingerpr
 
     Better by more than `allowed`, significantly, by more than the number of bins gives by noise alone (3 sd), and by
     more than bins could have fitted whatever the data are (`Fingerprint.cost`). Where small differences decide, a
-    curve is a rival of several effects if its score is better: one unknown cause is simpler. If it has no more than
-    twice as many numbers as they have strengths, or they are MANY, it is one if it is not told apart from them."""
+    curve is a rival of one effect if its score is better by TOLD, and of several if it is better: one unknown cause is
+    simpler. If it has no more than twice as many numbers as they have strengths, or they are MANY, it is one if it is
+    not told apart from them."""
     near = []
     for f in fingerprints:
         as_many = best.effects >= MANY or f.dof <= 2 * best.strengths
         behind = best.fall - best.cost - (f.net - f.cost)
-        slack = TOLD if as_many else 0.0
-        asked = best.decides and best.effects > 1 and f.coordinate not in MIMICS
+        slack = -TOLD if best.effects == 1 else TOLD if as_many else 0.0
+        asked = best.decides and not (best.effects == 1 and best.complete) and f.coordinate not in MIMICS
         if asked and f.p < LEVEL / len(fingerprints) and behind < slack:
             near.append(f)
     if best.complete or near:

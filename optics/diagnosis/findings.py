@@ -11,15 +11,18 @@ import numpy as np
 
 from optics.diagnosis import fingerprints as prints
 from optics.diagnosis import statistics as st
-from optics.diagnosis.decide import Findings, Opponent, rivals
+from optics.diagnosis.correlation import WANDER
+from optics.diagnosis.decide import Findings, Opponent, ordered, rivals
 from optics.diagnosis.evidence import Candidate, Evidence
 from optics.diagnosis.explanations import Outcome, fall_over_noise, lead_without
 from optics.diagnosis.refit import Case, clear
 from optics.diagnosis.result import Basis, Fingerprint, Law, Level, Split
-from optics.diagnosis.thresholds import AS_GOOD, LEVEL, MISSTATED, UNEVEN
+from optics.diagnosis.thresholds import AS_GOOD, LEVEL, MISSTATED, TOLD, UNEVEN
 from optics.fit.compare import led_label
 from optics.fit.model import Model, value_of
 from optics.fit.result import Fit
+
+NOTICED = 2 * WANDER  # of the signal, rms: a wander that nobody takes for noise
 
 
 def basis_of(model: Model, evidence: Evidence, structure: st.Structure) -> Basis:
@@ -91,7 +94,7 @@ def findings_of(
         own = replace(own, law=f"{laws[0].effect} along {laws[0].coordinate}", law_lead=lead)
     if not fingerprints:
         return own
-    whole = {f.coordinate: f.net for f in fingerprints}
+    raw, whole = fingerprints, {f.coordinate: f.net for f in fingerprints}
     followed = _followed(case, subject, best.fit, best.fall - best.expectation, fingerprints)
     # a curve is no better than effects while any set of them does as well: the leader, not the simplest beside it
     leader = outcome.leader
@@ -106,6 +109,8 @@ def findings_of(
         )
         gain = outcome.base.deviance - leader.deviance - leader.expectation
         fall = max(gain, 0.0) if subject else fall / scale
+    if swings := _swings(outcome, raw, basis):
+        return replace(own, rival=True, ratio=swings.ratio, coordinate=swings.coordinate, curve_share=swings.share)
     fingerprints = [replace(f, ratio=f.net / max(fall, 1.0)) for f in fingerprints]
     if not fingerprints:
         return own
@@ -130,6 +135,16 @@ def findings_of(
         coordinate=best_curve.coordinate,
         curve_share=best_curve.share,
     )
+
+
+def _swings(outcome: Outcome, fingerprints: Sequence[Fingerprint], basis: Basis) -> Fingerprint | None:
+    """The curve along a clock where a wander that is too large for noise explains the residual better than any effect
+    does: a lamp that swings by 7 % is no noise, but something that happens in the session."""
+    structure = outcome.wander > NOTICED and outcome.base.after > MISSTATED * basis.dof
+    if not structure or outcome.score(outcome.base) < outcome.score(outcome.leader) + TOLD:
+        return None
+    clocks = [f for f in fingerprints if f.family == "time" and f.p < LEVEL]
+    return ordered(clocks)[0] if clocks else None
 
 
 def _of_subject(

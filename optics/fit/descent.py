@@ -366,8 +366,8 @@ class Descent:
                 break
             self.damping, self.trust = max(self.damping * EASING, FIRST_DAMPING), max(self.trust / 2, 1.0)
         assert best is not None  # `most` is 1 or more
-        for self.trust in SHORT_OF if not best[1] > max(worst, LITTLE * self.promised) else ():
-            tried, self.damping = tried + 1, FIRST_DAMPING
+        for trust in SHORT_OF if not best[1] > max(worst, LITTLE * self.promised) else ():
+            tried, self.trust, self.damping = tried + 1, trust, FIRST_DAMPING
             target, expected = self.step(self.damping)
             found = self._at(target)
             gain = self.here.total - found[2].total

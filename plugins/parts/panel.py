@@ -22,7 +22,7 @@ import math
 
 import numpy as np
 
-from optics.light.lamp import drifted
+from optics.scene.lamp import drifted
 from optics.polarization.mueller import where
 from optics.scene.checking import agree, ray
 from optics.scene.checking import stokes as sent

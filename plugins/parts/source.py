@@ -20,7 +20,7 @@ References
 import math
 from dataclasses import replace
 
-from optics.light.lamp import drifted
+from optics.scene.lamp import drifted
 from optics.polarization.mueller import exp, real, where
 from optics.scene.checking import agree, ray
 from optics.scene.checking import stokes as sent

@@ -56,6 +56,7 @@ SURROUNDINGS = {  # parameter: what has to stand about it for it to be seen, and
         for axis in "xyz"
     },
     "gel.thickness": {"gel.absorption": 0.02},
+    **{f"{kind}.settling": {f"{kind}.drift": 0.02, f"{kind}.time": 3.0} for kind in ("source", "panel")},
     # the first direction of a carried film is constant in each triangle: a film that bends makes small jumps
     "gel.press_depth": {"film.inserted": 0.0},
     **{f"carried.{name}": {"skin.press_depth": 0.0} for name in ("width", "length", "depth")},

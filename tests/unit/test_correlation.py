@@ -8,7 +8,7 @@ from optics.diagnosis.correlation import FEWEST, KINDS, LENGTHS, NOTED, Readings
 
 COUNT = 160
 TURN = np.linspace(0, 2 * np.pi, COUNT)
-SIGNAL = 30 * np.cos(TURN) ** 2
+SIGNAL = 150 * np.cos(TURN) ** 2  # noise of 1 %
 LOADS = {"amplifier": np.ones(COUNT), "lamp": SIGNAL}
 FITTED = np.column_stack([SIGNAL, np.ones(COUNT)])
 

@@ -196,41 +196,41 @@ def test_a_perfect_bench_lacks_nothing(seed, tmp_path):
 
 
 def test_what_goes_with_a_setting_is_drafted_then_claimed_as_a_formula(tmp_path):
-    """A lamp that warms up as exp(-t/4 min), which no effect has: the curve along its clock, as a table, then as a
+    """A lamp whose supply swings as sin(t/3 min), which no effect has: the curve along its clock, as a table, then as a
     formula."""
     from optics.proof.rigs.bench import Bench, sweep
     from optics.study import draft
 
     rig = Bench()
-    capture_files.write(sweep(rig.light({}), rig.settings(), 5, {"warm-up": 0.1}), tmp_path / "captures")
+    capture_files.write(sweep(rig.light({}), rig.settings(), 5, {"swinging supply": 0.1}), tmp_path / "captures")
     setup = rig.setup(tmp_path / "captures", 5)
     study, model, fit = loop.begin(setup, tmp_path / "study")
     diagnosis = loop.examine(study, model, setup, fit, advised=False)
     assert diagnosis.word == "UNKNOWN" and diagnosis.families[0].coordinate == "source.time", diagnosis.sentence
-    text, plugins = draft.from_study(study.folder, None, "warm up")
-    file = draft.write(text, plugins, "warm up")
+    text, plugins = draft.from_study(study.folder, None, "swinging supply")
+    file = draft.write(text, plugins, "swinging supply")
     study, model, setup = loop.take_up(study.folder)
-    table, _ = loop.extend(study, model, setup, loop.restore(study, model), model.scene.registry.find_effect("warm-up"))
+    table, _ = loop.extend(study, model, setup, loop.restore(study, model), model.scene.registry.find_effect("swinging-supply"))
     assert table.chi2 - table.dof < 0.4 * (
         fit.chi2 - fit.dof
-    )  # straight lines between few points, where the lamp is steepest
+    )  # straight lines between few points, where the lamp turns
 
     file.write_text(
         "import numpy as np\n"
-        + text.replace("lookup(x, AT, CURVE)", "-np.exp(-np.asarray(x) / 4.0)").replace(
+        + text.replace("lookup(x, AT, CURVE)", "np.sin(np.asarray(x) / 3.0)").replace(
             "checks=(meets_its_table,),", ""
         )
     )
     # the edited file is taken up; the readings that it was drafted from would claim it whatever it says
-    capture_files.write(sweep(rig.light({}), rig.settings(), 6, {"warm-up": 0.1}), tmp_path / "another")
+    capture_files.write(sweep(rig.light({}), rig.settings(), 6, {"swinging supply": 0.1}), tmp_path / "another")
     setup = rig.setup(tmp_path / "another", 6)
     setup.plugins = str(plugins)
     study, model, fit = loop.begin(setup, tmp_path / "formula")
     diagnosis = loop.examine(study, model, setup, fit, advised=False)
-    assert diagnosis.missing == "warm up"
-    assert abs(diagnosis.row("warm up").refit.strength[0] - 0.1) < 4 * diagnosis.row("warm up").refit.sd[0]
+    assert diagnosis.missing == "swinging supply"
+    assert abs(diagnosis.row("swinging supply").refit.strength[0] - 0.1) < 4 * diagnosis.row("swinging supply").refit.sd[0]
     fit, _ = loop.extend(
-        study, model, setup, fit, model.scene.registry.find_effect("warm-up"), diagnosis.fits["warm up"].values
+        study, model, setup, fit, model.scene.registry.find_effect("swinging-supply"), diagnosis.fits["swinging supply"].values
     )
     assert at_the_noise(study.steps[-1]["held_out"]["chi2_per_dof"], 150)
     assert loop.examine(study, model, setup, fit, advised=False).word == "NOTHING"

@@ -29,7 +29,7 @@ WANDER, JITTER = 0.003, 0.05  # of the lamp, rms relative; deg rms of the analys
 # kind -> coordinates by any of which it is rightly named
 UNKNOWN = {
     "third harmonic": ("analyzer.angle",),
-    "warm-up": ("source.time",),
+    "swinging supply": ("source.time",),
     "lamp step": ("source.power",),
     "smeared film": ("polarizer.angle",),
 }
@@ -134,7 +134,7 @@ def gain(kind: str, settings: jones.Settings) -> np.ndarray:
     )
     return {
         "third harmonic": lambda: np.cos(3 * np.radians(analyzer)),
-        "warm-up": lambda: -np.exp(-time / 4.0),
+        "swinging supply": lambda: np.sin(time / 3.0),
         "lamp step": lambda: (power < 0.75).astype(float),
         "smeared film": lambda: -((polarizer > 80) & (polarizer < 120)).astype(float),
     }[kind]()
