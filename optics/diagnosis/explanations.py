@@ -15,7 +15,8 @@ where that is more; of readings, each explanation may have noise that neighbours
 
 Whether an explanation needs an effect that a simpler one lacks is a question of significance: family-wise; of images,
 with the design effect of what tells the two apart (`optics.diagnosis.homogeneity.variances`). Of two that are not
-nested, one is told apart from the best when its score is TOLD lower (CLEAR, where plausibility alone decides); when, of
+nested, one is told apart from the best when its score is TOLD lower (CLEAR, where plausibility alone decides; an effect
+is claimed when the best explanation without it is SURE lower); when, of
 images or of readings with MISSTATED noise, the difference of falls exceeds the smaller of HALF of what the best one
 leaves and MARGIN of its fall, as misfit that is left may lie along any direction; and, of readings, when it predicts
 blocks of the session worse that were left out. All others survive. An effect that is part of every explanation that
@@ -40,7 +41,7 @@ from optics.diagnosis.refit import FAILURES, START, Case, excess_of, known_of, w
 from optics.diagnosis.result import Explanation, leaves_nothing
 from optics.diagnosis.score import solve
 from optics.diagnosis.session import Frames
-from optics.diagnosis.thresholds import CLEAR, EACH, HALF, LEVEL, MARGIN, MISSTATED, TOLD
+from optics.diagnosis.thresholds import CLEAR, EACH, HALF, LEVEL, MARGIN, MISSTATED, SURE, TOLD
 from optics.fit import calibrate
 from optics.fit.model import value_of
 from optics.fit.result import Fit
@@ -565,12 +566,13 @@ def _with_survivors(case: Case, outcome: Outcome) -> Outcome:
             break
         best = next(t for t in kept if t.keys < best.keys) if any(t.keys < best.keys for t in kept) else kept[0]
     outcome.best, outcome.survivors = best, [best, *(t for t in kept if t is not best)]
-    # what the simplest is not ahead of survives, though a larger explanation rules it out: that one is not needed
+    # what the simplest is not clearly ahead of survives, though a larger explanation rules it out: that is not needed
     for name in outcome.core:
         rival, lead, needed = _without(case, outcome, next(c for c in best.members if c.effect.name == name))
-        if rival.members and rival not in outcome.survivors and lead <= needed:
+        if lead <= needed and rival.members and rival not in outcome.survivors:
             outcome.survivors.append(rival)
             break
+        outcome.shared |= able and lead <= needed and not rival.members
     return outcome
 
 
@@ -657,10 +659,12 @@ def lead_without(case: Case, outcome: Outcome, subject: Candidate) -> tuple[floa
 
 
 def _without(case: Case, outcome: Outcome, subject: Candidate) -> tuple[Trial, float, float]:
-    """(the best explanation that lacks an effect and what contains it, lead over it, lead needed)."""
+    """(the best explanation that lacks an effect and what contains it, lead over it, lead that a claim needs)."""
     own = {(key, v.frames) for v in subject.variables for key in v.keys}
-    rival = min((t for t in outcome.trials if not own <= t.keys), key=lambda t: t.deviance + t.cost)
-    return (rival, *_lead(case, outcome, outcome.best, rival))
+    rival, best = min((t for t in outcome.trials if not own <= t.keys), key=lambda t: t.deviance + t.cost), outcome.best
+    lead, needed = _lead(case, outcome, best, rival)
+    tested = rival.keys < best.keys and rival.gain - best.gain < TOLD  # by significance, in white noise
+    return rival, lead, needed if tested else max(needed, SURE)
 
 
 def fall_over_noise(case: Case, outcome: Outcome, name: str) -> float:

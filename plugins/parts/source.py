@@ -20,11 +20,11 @@ References
 import math
 from dataclasses import replace
 
-from optics.scene.lamp import drifted
 from optics.polarization.mueller import exp, real, where
 from optics.scene.checking import agree, ray
 from optics.scene.checking import stokes as sent
 from optics.scene.declare import Part
+from optics.scene.lamp import drifted
 from optics.scene.mitsuba_parts import Declared
 from optics.scene.parameter import Parameter
 

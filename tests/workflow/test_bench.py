@@ -210,16 +210,16 @@ def test_what_goes_with_a_setting_is_drafted_then_claimed_as_a_formula(tmp_path)
     text, plugins = draft.from_study(study.folder, None, "swinging supply")
     file = draft.write(text, plugins, "swinging supply")
     study, model, setup = loop.take_up(study.folder)
-    table, _ = loop.extend(study, model, setup, loop.restore(study, model), model.scene.registry.find_effect("swinging-supply"))
+    table, _ = loop.extend(
+        study, model, setup, loop.restore(study, model), model.scene.registry.find_effect("swinging-supply")
+    )
     assert table.chi2 - table.dof < 0.4 * (
         fit.chi2 - fit.dof
     )  # straight lines between few points, where the lamp turns
 
     file.write_text(
         "import numpy as np\n"
-        + text.replace("lookup(x, AT, CURVE)", "np.sin(np.asarray(x) / 3.0)").replace(
-            "checks=(meets_its_table,),", ""
-        )
+        + text.replace("lookup(x, AT, CURVE)", "np.sin(np.asarray(x) / 3.0)").replace("checks=(meets_its_table,),", "")
     )
     # the edited file is taken up; the readings that it was drafted from would claim it whatever it says
     capture_files.write(sweep(rig.light({}), rig.settings(), 6, {"swinging supply": 0.1}), tmp_path / "another")
@@ -228,9 +228,9 @@ def test_what_goes_with_a_setting_is_drafted_then_claimed_as_a_formula(tmp_path)
     study, model, fit = loop.begin(setup, tmp_path / "formula")
     diagnosis = loop.examine(study, model, setup, fit, advised=False)
     assert diagnosis.missing == "swinging supply"
-    assert abs(diagnosis.row("swinging supply").refit.strength[0] - 0.1) < 4 * diagnosis.row("swinging supply").refit.sd[0]
-    fit, _ = loop.extend(
-        study, model, setup, fit, model.scene.registry.find_effect("swinging-supply"), diagnosis.fits["swinging supply"].values
-    )
+    found = diagnosis.row("swinging supply").refit
+    assert abs(found.strength[0] - 0.1) < 4 * found.sd[0]
+    formula = model.scene.registry.find_effect("swinging-supply")
+    fit, _ = loop.extend(study, model, setup, fit, formula, diagnosis.fits["swinging supply"].values)
     assert at_the_noise(study.steps[-1]["held_out"]["chi2_per_dof"], 150)
     assert loop.examine(study, model, setup, fit, advised=False).word == "NOTHING"
