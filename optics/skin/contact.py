@@ -28,9 +28,11 @@ from pathlib import Path
 import numpy as np
 
 from optics.errors import UnknownKey
+from optics.files.heights import SUFFIXES as MAP_FILES
 
-SHAPES = ("sphere", "cylinder", "cube")
+SHAPES = ("sphere", "cylinder", "cube", "balls")
 MESH_FILES = (".stl", ".obj", ".ply")
+FILES = (*MESH_FILES, *MAP_FILES)
 FLATTEST = 0.05  # slope that softens the contact edge of flat faces: a twentieth of a pitch of height
 DETACHING = 0.3  # the weight of contact fades while the smoothed skin goes from 1 to 1.3 times the indenter's depth
 
@@ -160,18 +162,22 @@ def indenter_profile(
     extent: float = 4.0,
     pitch: float = 0.03,
     steepest: float = 75.0,
+    spacing: float = 1.0,
 ) -> Profile:
     """Height of an indenter's lower surface above its lowest point, around the indenter's own axis; cached.
 
     shape     'sphere' (size = radius), 'cylinder' (size = radius, length 4 size, lying along x), 'cube' (size = edge, a
-              face down), each centred on the axis; or a .stl, .obj or .ply file in mm (size = factor on it), whose axis
-              is the z axis of its own frame
+              face down), each centred on the axis; 'balls' (size = radius), a plate of balls without end, one on the
+              axis (optics.skin.patterns); a .stl, .obj or .ply file in mm (size = factor on it), whose axis is the z
+              axis of its own frame; or a height map (optics.files.heights), .tmd (size = factor on it), .npy or .png
+              (size = mm from sample to sample), whose middle is on the axis
     size      mm (mesh: 1), > 0
     rotation  deg about x, then y, then z
     extent    mm, half width of the local grid: at least the contact's half width plus three times the smoothing, over
               0.85, because maps fade out over the outer eighth
     pitch     mm of the local grid; 1/10 of the contact radius or less
     steepest  deg, see Profile.envelope; a sphere is exact down to depth = R (1 - cos(steepest)), 0.74 R
+    spacing   mm between the middles of balls
 
     Spheres, cubes and cylinders are closed forms. A mesh is sampled once per power of two of its size, at half the
     pitch, and carried to the size asked for by a C2 spline: smooth in size but for a change by interpolation error
@@ -189,18 +195,27 @@ def indenter_profile(
         raise ValueError(f"steepest = {steepest:g} deg; it must lie between 0 and 90 deg, 75 is usual")
     shape, stamp = str(shape), 0
     if shape not in SHAPES:
-        if not shape.lower().endswith(MESH_FILES):
-            raise UnknownKey(shape, SHAPES, "indenter shape", hint=f"a mesh must end in {', '.join(MESH_FILES)}")
+        if not shape.lower().endswith(FILES):
+            hint = f"a mesh must end in {', '.join(MESH_FILES)}, a height map in {', '.join(MAP_FILES)}"
+            raise UnknownKey(shape, SHAPES, "indenter shape", hint=hint)
         path = Path(shape).expanduser().resolve()
         if not path.is_file():
-            raise FileNotFoundError(f"indenter mesh {path}: no such file; give its path or one of {', '.join(SHAPES)}")
+            raise FileNotFoundError(f"indenter {path}: no such file; give its path or one of {', '.join(SHAPES)}")
         shape, stamp = str(path), path.stat().st_mtime_ns
-    numbers = (float(size), *map(float, rotation), float(extent), float(pitch), float(steepest))
+    if shape == "balls" and not (math.isfinite(spacing) and spacing >= 2 * size):
+        raise ValueError(
+            f"indenter balls: spacing = {spacing:g} mm for balls of radius {size:g} mm; it must be {2 * size:g} mm or "
+            "more, from middle to middle"
+        )
+    spacing = float(spacing) if shape == "balls" else 0.0
+    numbers = (float(size), *map(float, rotation), float(extent), float(pitch), float(steepest), spacing)
     return _profile(shape, stamp, *numbers)
 
 
 @lru_cache(maxsize=32)
-def _profile(shape, stamp, size, rx, ry, rz, extent, pitch, steepest) -> Profile:
+def _profile(shape, stamp, size, rx, ry, rz, extent, pitch, steepest, spacing) -> Profile:
+    from optics.skin import patterns
+
     n = 2 * math.ceil(extent / pitch - 1e-9) + 1
     axis, slope = local_axis(n, pitch), math.tan(math.radians(steepest))
     u, v = np.meshgrid(axis, axis)
@@ -211,6 +226,10 @@ def _profile(shape, stamp, size, rx, ry, rz, extent, pitch, steepest) -> Profile
         height, envelope = cube(u, v, size, turn, slope)
     elif shape == "cylinder":
         height, envelope = cylinder(u, v, size, turn, slope)
+    elif shape == "balls":
+        height, envelope = patterns.balls(u, v, size, spacing, turn, slope)
+    elif shape.lower().endswith(MAP_FILES):
+        height, envelope = patterns.height_map(axis, size, shape, stamp, turn, slope)
     else:
         height, envelope = mesh(axis, size, shape, stamp, (rx, ry, rz), extent, pitch, slope)
     for a in (height, envelope):

@@ -11,7 +11,9 @@ after each blur. Steep walls of h are cut to a slope, and the rim of D0 is round
 mesh on a graded grid that is fine around the contact and moves with it, so that images vary smoothly with the press.
 With `skirt` > 0 the skin beside the contact falls off as exp(-distance / skirt) before the smoothing: in place of D0
 stands the max over touched points p of D0(p) exp(-|x - p| / skirt). Indenters: sphere (`indenter_size` = radius),
-cylinder lying on its side (radius), cube face down (edge), or a mesh file (STL, OBJ, PLY; `indenter_size` = scale).
+cylinder lying on its side (radius), cube face down (edge), balls (radius) `indenter_spacing` apart on a plate without
+end, one of them at the press, a mesh file (STL, OBJ, PLY; `indenter_size` = scale) or a measured height map (TMD;
+`indenter_size` = scale; NPY in mm or 16 bit PNG in micrometres: mm from sample to sample).
 Fingerprint
     position and depth of the press move the dent; `smoothing` widens its skirt, `skirt` gives it a long tail.
 Validity
@@ -30,6 +32,7 @@ from optics.scene.checking import agree, made
 from optics.scene.declare import Part
 from optics.scene.mitsuba_parts import Declared
 from optics.scene.parameter import Parameter
+from optics.skin import contact
 
 STAGE = 0.05  # mm: how well a stage usually knows where it presses
 PARAMETERS = (
@@ -89,19 +92,28 @@ PARAMETERS = (
         "indenter",
         "-",
         "sphere",
-        choices=("sphere", "cylinder", "cube"),
-        doc="sphere, cylinder, cube or a mesh file",
-        files=(".stl", ".obj", ".ply"),
+        choices=contact.SHAPES,
+        doc="sphere, cylinder, cube, balls (on a square grid), a mesh file or a height map",
+        files=contact.FILES,
     ),
     Parameter(
         "indenter_size",
         "mm",
         1.5,
         (1e-3, 1000.0),
-        "radius, radius, edge, or scale of the mesh",
+        "radius, radius, edge, radius of the balls, scale of the mesh, or spacing of a map's samples",
         plausible=0.02,
         how="difference",
         step=0.8,
+    ),
+    Parameter(
+        "indenter_spacing",
+        "mm",
+        1.0,
+        (2e-3, 1000.0),
+        "from ball to ball of a plate of balls",
+        plausible=0.01,
+        how="difference",
     ),
     Parameter(
         "smoothing",
@@ -131,8 +143,6 @@ def build():
     import mitsuba as mi
     import numpy as np
 
-    from optics.skin import contact
-
     class Gel(Declared.on_mesh()):
         kind = "gel"
         pressing = (
@@ -144,6 +154,7 @@ def build():
             "press_rz",
             "indenter",
             "indenter_size",
+            "indenter_spacing",
             "smoothing",
             "skirt",
         )  # what does nothing while press_depth is 0
@@ -158,7 +169,8 @@ def build():
             faces = np.stack([a, d, c, a, c, b], -1).reshape(-1, 3)  # normals towards the camera (-z)
             mi.Mesh.__init__(self, "gel", index.size, len(faces), props, True, False)
             self.declare(props)
-            if self.indenter.endswith((".stl", ".obj", ".ply")):
+            self.seen_touch = None  # of which a texture was made
+            if self.indenter.lower().endswith(contact.FILES):
                 self.indenter = str(mi.file_resolver().resolve(self.indenter))
             params = mi.traverse(self)
             params["faces"] = mi.UInt32(faces.astype(np.uint32).ravel())
@@ -173,6 +185,7 @@ def build():
                 (n("press_rx"), n("press_ry"), n("press_rz")),
                 self.extent,
                 self.map_pitch,
+                spacing=n("indenter_spacing"),
             )
             return contact.displacement(profile, n("press_depth"), n("thickness"), n("smoothing"), skirt=n("skirt"))
 
@@ -215,6 +228,18 @@ def build():
                 (np.asarray(x) - self.number("press_x")) / pitch + middle,
             ]
             return map_coordinates(values, at, order=1, mode="constant")
+
+        def touched(self, p):
+            """1 where the indenter touches the face at the point p, 0 elsewhere; Dr.Jit."""
+            if self.seen_touch is not self.touch:
+                self.seen_touch = self.touch
+                values = np.ascontiguousarray(self.touch.values[..., None], np.float32)
+                self.touch_texture = mi.Texture2f(
+                    mi.TensorXf(values), filter_mode=dr.FilterMode.Linear, wrap_mode=dr.WrapMode.Clamp
+                )
+            n, pitch = len(self.touch.values), self.touch.pitch
+            u, v = (((x - self.number(key)) / pitch + n / 2) / n for x, key in ((p.x, "press_x"), (p.y, "press_y")))
+            return self.touch_texture.eval(mi.Point2f(u, v))[0]
 
         # -- the way of light in the gel ------------------------------------------------------------------------------
         def length_inside(self, p, q):

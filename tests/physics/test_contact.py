@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from optics.errors import UnknownKey
+from optics.errors import BadCapture, UnknownKey
 from optics.skin.contact import (
     LocalMap,
     cone_envelope,
@@ -15,6 +15,7 @@ from optics.skin.contact import (
     grid_normals,
     indenter_profile,
     ring_bulge,
+    rotation_matrix,
     surface,
 )
 
@@ -203,6 +204,69 @@ def test_lying_cylinder_and_its_turns():
     upright = indenter_profile("cylinder", 1.0, (0, 90, 0), 4.0, 0.05)
     disc = np.hypot(u, v) < 1 - 1e-9
     assert np.abs(upright.height[disc]).max() < 1e-12 and np.isinf(upright.height[np.hypot(u, v) > 1.001]).all()
+
+
+def test_balls_are_spheres_where_the_plate_holds_them():
+    """The ball on the axis and its neighbours, a plate that is turned in its plane and one that is tilted: each is the
+    closed form about its own middle."""
+    ball, spacing, extent, pitch = 0.25, 1.0, 2.4, 0.02
+    alone = indenter_profile("sphere", ball, (0, 0, 0), extent, pitch)
+    for rotation in ((0, 0, 0), (0, 0, 17), (1.5, -2.0, 17)):
+        plate = indenter_profile("balls", ball, rotation, extent, pitch, spacing=spacing)
+        turn = rotation_matrix(*rotation)
+        u, v = np.meshgrid(plate.axis, plate.axis)
+        for column, row in ((0, 0), (1, 0), (-1, 2), (2, -1)):
+            x, y, rise = turn @ (column * spacing, row * spacing, 0)
+            r = np.hypot(u - x, v - y)
+            near = r < ball - 1e-6
+            assert near.sum() > 100 or max(abs(x), abs(y)) > extent - ball
+            exact = ball - np.sqrt(ball**2 - r[near] ** 2) + rise
+            np.testing.assert_allclose(plate.height[near], exact, atol=1e-12)
+        seen = np.isfinite(plate.height)
+        assert (plate.height - plate.envelope)[seen].min() > -1e-12
+        middle = np.hypot(u, v) < spacing / 2 - 0.05
+        np.testing.assert_allclose(plate.envelope[middle], alone.envelope[middle], atol=1e-12)
+    with pytest.raises(ValueError, match=r"spacing = 0.4 mm for balls of radius 0.25 mm; it must be 0.5 mm"):
+        indenter_profile("balls", ball, spacing=0.4)
+
+
+@pytest.mark.parametrize("kind", ["tmd", "npy", "png"])
+def test_a_height_map_of_a_sphere_against_the_closed_form(tmp_path, kind):
+    """A cap of 1 mm radius, 0.01 mm from sample to sample, more along y than along x; turned, it is the same cap."""
+    from PIL import Image
+
+    step, file = 0.01, tmp_path / f"cap.{kind}"
+    x, y = (np.arange(n) * step - (n - 1) / 2 * step for n in (161, 201))
+    heights = np.sqrt(1.0 - np.add.outer(y**2, x**2).clip(0, 0.7)) - 0.5
+    size = step
+    if kind == "tmd":
+        sizes = np.array([161, 201], "<u4").tobytes() + np.array([161 * step, 201 * step, 0, 0], "<f4").tobytes()
+        file.write_bytes(b"Binary TrueMap Data File v2.0\r\n\0" + b"a cap\0" + sizes + heights.astype("<f4").tobytes())
+        size = 1.0
+    elif kind == "npy":
+        np.save(file, heights)
+    else:
+        Image.fromarray(np.round(heights * 1000).astype(np.uint16)).save(file)
+    exact = indenter_profile("sphere", 1.0, (0, 0, 0), 1.5, 0.02)
+    for turn in (0, 30):
+        found = indenter_profile(file, size, (0, 0, turn), 1.5, 0.02)
+        u, v = np.meshgrid(found.axis, found.axis)
+        near = np.hypot(u, v) < 0.7
+        # the curvature c is 2.7/mm at 0.7 mm: 0.02^2 c/8 between means, as much by the means; of PNG 1 um
+        limit = 1.5e-3 if kind == "png" else 5e-4
+        assert np.abs(found.height[near] - exact.height[near]).max() < limit
+        assert np.abs(found.envelope[near] - exact.envelope[near]).max() < limit
+    assert np.isinf(found.height[0, 0])
+
+
+def test_a_height_map_that_is_cut_off_is_refused(tmp_path):
+    file = tmp_path / "cut.tmd"
+    file.write_bytes(b"Binary TrueMap Data File v2.0\r\n\0\0" + np.array([9, 9], "<u4").tobytes() + b"\0" * 40)
+    with pytest.raises(BadCapture, match="9 x 9 heights over 0 x 0 mm"):
+        indenter_profile(file, 1.0)
+    np.save(tmp_path / "line.npy", np.zeros(5))
+    with pytest.raises(BadCapture, match=r"shape \(5,\); allowed: \(rows, columns\)"):
+        indenter_profile(tmp_path / "line.npy", 0.1)
 
 
 @pytest.mark.parametrize("kind", ["stl", "ply", "obj"])
