@@ -625,10 +625,13 @@ def _comment(text: str) -> str:
     return text.replace("--", "- -").replace("<", "(").replace(">", ")")
 
 
-def _write(folder: Path, frames, noise, flat, xml: str, facts: dict, bits: int | None, overwrite: bool) -> Path:
+def _write(
+    folder: Path, frames, noise, flat, xml: str, facts: dict, bits: int | None, overwrite: bool, text: str = ""
+) -> Path:
+    """flat: one for all frames, None where each has its own; text: of README.txt, that of presses without it."""
     folder = Path(os.path.abspath(folder))
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        ours = {*EXTRAS, "captures.toml", "frames"}
+        ours = {*EXTRAS, "captures.toml", "frames", "flat"}
         names = [p.name for p in folder.glob("*")] if folder.is_dir() else []
         extra = [name for name in names if name not in ours and not name.startswith("flat_field.")]
         if not overwrite or extra or not (folder / "import.json").is_file():
@@ -637,12 +640,12 @@ def _write(folder: Path, frames, noise, flat, xml: str, facts: dict, bits: int |
                 + ("" if extra or overwrite else ", or allow to overwrite what an import left there")
             )
     with new_folder(folder, replace=overwrite) as temporary:
-        flat = np.asarray(flat, np.float32)
+        flat = None if flat is None else np.asarray(flat, np.float32)
         captures = Captures(temporary, str(temporary / "scene.xml"), frames, {}, noise, flat)
         capture_sets.write(captures, temporary, bits=bits)
         (temporary / "scene.xml").write_text(xml, encoding="utf-8")
         (temporary / "import.json").write_text(json.dumps(facts, indent=1), encoding="utf-8")
-        (temporary / "README.txt").write_text(readme(facts), encoding="utf-8")
+        (temporary / "README.txt").write_text(text or readme(facts), encoding="utf-8")
     return folder
 
 

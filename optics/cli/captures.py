@@ -32,7 +32,8 @@ if TYPE_CHECKING:
 
 @app.command(
     "import",
-    help="Read a measured data set of ball presses, or raw frames of a polarization camera, into a capture folder.",
+    help="Read a measured data set of ball presses, scans under one LED at a time, or raw frames of a polarization "
+    "camera, into a capture folder.",
 )
 def import_(
     source: Annotated[Path, typer.Argument(metavar="SOURCE", help="An .npz calibration pack, or a folder of images.")],
@@ -93,8 +94,8 @@ def import_(
 ) -> None:
     """Read presses; write captures.toml, a scene, and a report of contradictions between labels, scale and images.
 
-    With --mosaic, read raw frames of a polarization camera."""
-    from optics.captures import importing, raw_frames
+    A folder of scan folders (scan.yaml) is read as such. With --mosaic, read raw frames of a polarization camera."""
+    from optics.captures import importing, raw_frames, scans
     from optics.polarization.mosaic import read_mosaic
 
     terminal.quiet, terminal.debug = quiet, debug
@@ -132,6 +133,16 @@ def import_(
         for text in read.warnings:
             terminal.note(f"warning: {one_line(text)}")
         print(read.folder)
+        return
+    if scans.is_scan_source(source):
+        stated = {"--circles": circles, "--ball-radius": ball_radius, "--mm-per-pixel": mm_per_pixel}
+        if given := [name for name, value in {**stated, "--untouched": untouched}.items() if value is not None]:
+            raise ValueError(f"{', '.join(given)}: scan.yaml says so; leave these out")
+        with terminal.progress() as progress:
+            found = scans.import_scans(source, output, bin=bin, overwrite=force, progress=progress)
+        for text in found.warnings:
+            terminal.note(f"warning: {one_line(text)}")
+        print(found.folder)
         return
     options: dict[str, Any] = {"leds": leds, "bin": bin, "every": every, "overwrite": force}
     if ball_radius is not None:

@@ -1,0 +1,474 @@
+"""Scan folders of a bench that lights one LED per picture: plates of balls pressed into the gel, and the flat field.
+
+    import_scans("scans", "captures/bench", bin=8)
+
+A scan folder holds `scan.yaml` and one image per LED; a folder of scans holds some with pressed balls, whose circles
+are annotated with their places in the grid (`GridCircle`: x, y in px, gx, gy), and one without, the flat field. What
+goes out is what `optics.captures.importing` writes, with a frame for each scan and LED: its flat field is that of its
+LED, its settings say which LED is on and where the plate is pressed.
+
+Derived, not measured, and said so:
+    plate      the similarity that maps (gx, gy) to (x, y): `gel.press_x`, `gel.press_y` of the ball nearest the middle
+               and `gel.press_rz`; it is compared with `calibspacing` and `mmperpixel`
+    depth      from a touched radius of CONTACT times the ball's
+    noise      variance against signal of half the squared differences of neighbours in image over flat field, where no
+               ball is near
+    lights     the direction of the least-squares fit I/F = l.n + c on the balls, at DISTANCE
+    masks      blemishes: values that miss the median around them, or on balls a linear shading, by BLEMISH standard
+               deviations"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from optics.captures.capture_set import Frame
+from optics.captures.importing import Imported, _comment, _write, binned
+from optics.captures.noise import Noise, photon_transfer
+from optics.errors import BadCapture
+from optics.files.images import read_image
+from optics.files.output import shipped
+
+FILE = "scan.yaml"
+DISTANCE = 30.0  # mm from the middle of the face to a light, where no better is known
+CAMERA = 200.0  # mm: nearly telecentric, as lenses for inspection are
+CONTACT = 0.85  # of the ball's radius: touched, where nothing tells
+BALL, NEAR = 0.7, 1.8  # of the ball's radius: of it within, of the level face beyond
+BLEMISH = 6.0  # standard deviations; noise alone reaches it in one of 5e8 values
+AROUND = 9  # px, of the median that a value is held against
+LEVELS = 12
+THICKNESS = 4.0  # mm of the gel
+ALIKE = 0.01  # relative: scales that differ by more are a contradiction
+POSE = ("gel.press_x", "gel.press_y", "gel.press_depth", "gel.press_rx", "gel.press_ry", "gel.press_rz")
+
+
+@dataclass
+class Scan:
+    """images (N, H, W, 1) DN, one for each LED;   circles (B, 4): x, y in px from the first pixel's middle, gx, gy
+
+    radius, spacing in mm and mm per pixel, as annotated; 0 where nothing is pressed"""
+
+    name: str
+    labels: list[str]
+    images: np.ndarray
+    circles: np.ndarray
+    radius: float
+    spacing: float
+    mm_per_pixel: float
+
+
+@dataclass(frozen=True)
+class Plate:
+    """Where a plate of balls lies: (x, y) mm of the ball nearest the middle, turn in deg, mm between balls as the
+    circles have it, rms in mm by which circles miss the similarity, and all balls (B, 2) in mm."""
+
+    x: float
+    y: float
+    turn: float
+    spacing: float
+    rms: float
+    balls: np.ndarray
+
+
+def is_scan_source(source: Path) -> bool:
+    """Whether a folder holds scan folders, or is one."""
+    return source.is_dir() and ((source / FILE).is_file() or any(source.glob(f"*/{FILE}")))
+
+
+# -- reading ---------------------------------------------------------------------------------------------------------
+def read_scan(folder: Path) -> Scan:
+    """A scan folder; raises BadCapture with the file, the key and what is allowed."""
+    import yaml
+
+    file = folder / FILE
+    if not file.is_file():
+        raise BadCapture(f"{file}: no such file; give a scan folder, or a folder of them")
+    try:
+        data = yaml.safe_load(file.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise BadCapture(f"{file}: no YAML ({error})") from error
+    names = data.get("images") if isinstance(data, dict) else None
+    if not isinstance(names, list) or not names or not all(isinstance(n, str) for n in names):
+        raise BadCapture(f"{file}: images = {names!r}; allowed: a list of file names, one for each LED")
+    images: list[np.ndarray] = []
+    for name in names:
+        if not (folder / name).is_file() or Path(name).name != name:
+            raise BadCapture(f"{file}: images: no file '{name}' in {folder}; allowed: names of images that lie there")
+        image, _ = read_image(folder / name, f"{folder / name}")
+        if image.shape[2] != 1 or (images and image.shape != images[0].shape):
+            raise BadCapture(
+                f"{folder / name}: (H, W, C) = {image.shape}; allowed: one channel, all images of one size"
+            )
+        images.append(image.astype(np.float64))
+    circles = [_circle(a, file) for a in data.get("annotations") or () if _of(a, "type") == "GridCircle"]
+    numbers = [_number(data, key, file) for key in ("calibradius", "calibspacing", "mmperpixel")]
+    if circles and min(numbers) <= 0:
+        raise BadCapture(
+            f"{file}: calibradius, calibspacing, mmperpixel = {', '.join(f'{n:g}' for n in numbers)}; allowed: above 0 "
+            "where circles are annotated"
+        )
+    labels = [Path(n).stem.removeprefix("image") for n in names]
+    return Scan(folder.name, labels, np.stack(images), np.array(circles, float).reshape(-1, 4), *numbers)
+
+
+def _of(table: Any, key: str) -> Any:
+    return table.get(key) if isinstance(table, dict) else None
+
+
+def _number(table: Any, key: str, file: Path, default: float | None = 0.0) -> float:
+    value = table.get(key, default)
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+        raise BadCapture(f"{file}: {key} = {value!r}; allowed: a number")
+    return float(value)
+
+
+def _circle(table: Any, file: Path) -> list[float]:
+    return [_number(table, key, file, None) for key in ("x", "y", "gx", "gy")]
+
+
+def scans_in(source: Path) -> tuple[list[Scan], Scan, list[str]]:
+    """(scans of pressed plates, the flat field, names of those that are not used) of a folder of scan folders."""
+    if not source.is_dir():
+        raise BadCapture(f"{source}: no such folder; give a folder that holds scan folders")
+    if (source / FILE).is_file():
+        raise BadCapture(f"{source}: is one scan; give the folder that holds it beside the flat field's")
+    folders = sorted(p.parent for p in source.glob(f"*/{FILE}"))
+    if not folders:
+        raise BadCapture(f"{source}: holds no folder with a {FILE}; allowed: scans of pressed balls and a flat field")
+    scans = [read_scan(folder) for folder in folders]
+    pressed, empty = [s for s in scans if len(s.circles)], [s for s in scans if not len(s.circles)]
+    if not pressed:
+        raise BadCapture(f"{source}: no scan has annotations of type GridCircle; needed: one of pressed balls or more")
+    first = pressed[0]
+    alike = [s for s in empty if s.images.shape == first.images.shape and s.labels == first.labels]
+    flats = [s for s in alike if "flat" in s.name.lower()] or alike
+    if not flats:
+        have = ", ".join(f"{s.name} {s.images.shape[2]} x {s.images.shape[1]} px" for s in empty) or "none"
+        raise BadCapture(
+            f"{source}: no flat field for {first.name} ({first.images.shape[2]} x {first.images.shape[1]} px, LEDs "
+            f"{', '.join(first.labels)}): scans without circles: {have}; needed: one of nothing pressed, with the same "
+            "camera and LEDs"
+        )
+    used = [s for s in pressed if s.images.shape == first.images.shape and s.labels == first.labels]
+    left = [s.name for s in scans if s is not flats[0] and not any(s is u for u in used)]
+    return used, flats[0], left
+
+
+# -- deriving --------------------------------------------------------------------------------------------------------
+def plate_of(scan: Scan) -> Plate:
+    """The similarity that maps places in the grid to circles; raises BadCapture where three balls do not fix it."""
+    place, number = scan.circles[:, :2] + 0.5, scan.circles[:, 2:]
+    height, width = scan.images.shape[1:3]
+    at = (place - (width / 2, height / 2)) * scan.mm_per_pixel
+    full = np.column_stack([number, np.ones(len(number))])
+    if np.linalg.matrix_rank(full) < 3:
+        raise BadCapture(f"{scan.name}: {len(number)} circles on one line; needed: three that span the plate")
+    flip = 1.0 if np.linalg.det(np.linalg.lstsq(full, at, rcond=None)[0][:2]) > 0 else -1.0
+    grid, where = (number * (1.0, flip)) @ (1, 1j), at @ (1, 1j)
+    (scale, shift), *_ = np.linalg.lstsq(np.column_stack([grid, np.ones(len(grid))]), where, rcond=None)
+    rms = float(np.sqrt(np.mean(np.abs(grid * scale + shift - where) ** 2)))
+    middle = where[np.argmin(np.abs(where))]
+    turn = (math.degrees(np.angle(scale)) + 45.0) % 90.0 - 45.0
+    return Plate(float(middle.real), float(middle.imag), turn, float(abs(scale)), rms, at)
+
+
+def nearest(shape: tuple[int, ...], balls: np.ndarray, mm_per_pixel: float) -> tuple[np.ndarray, np.ndarray]:
+    """((H, W, 2) mm from the nearest ball's middle to each pixel's, (H, W) their lengths)."""
+    from scipy.spatial import cKDTree
+
+    v, u = np.mgrid[: shape[0], : shape[1]] + 0.5
+    at = np.stack([u - shape[1] / 2, v - shape[0] / 2], -1) * mm_per_pixel
+    distance, index = cKDTree(balls).query(at.reshape(-1, 2))
+    return at - balls[index].reshape(*shape, 2), distance.reshape(shape)
+
+
+def neighbour_noise(ratios: np.ndarray, flats: np.ndarray, use: np.ndarray, saturation: float) -> Noise:
+    """Noise from neighbours along rows: half the squared difference of image over flat field, times the flat field.
+
+    ratios, flats (F, H, W);   use (F, H, W) bool: the level face. The coating's grain counts as noise."""
+    level = (flats[..., 1:] + flats[..., :-1]) / 2
+    square = (np.diff(ratios, axis=2) * level) ** 2 / 2
+    both = use[..., 1:] & use[..., :-1] & (level < 0.9 * saturation)
+    if both.sum() < 50 * LEVELS:
+        raise BadCapture(
+            f"{int(both.sum())} pixels of the level face are in view, {50 * LEVELS} needed to estimate the noise; "
+            "give scans of fewer balls, or --bin less"
+        )
+    order = np.argsort(level[both], kind="stable")
+    groups = [(level[both][g], square[both][g]) for g in np.array_split(order, LEVELS)]
+    light = np.array([g.mean() for g, _ in groups])
+    # of a squared Gaussian the mean is 2.2 times the median: a speck of dust does not move it
+    variance = np.array([np.median(s) / 0.4549 for _, s in groups])
+    (gain, floor), _ = photon_transfer(light, variance, np.array([float(len(g)) for g, _ in groups]))
+    if gain <= 0 or floor < 0:
+        gain, floor = (1e-3, float(variance.mean())) if gain <= 0 else (float(np.mean(variance / light)), 0.0)
+    return Noise(float(gain), math.sqrt(max(floor, 0.0)), 0.0, saturation, 0.0, 1.0)
+
+
+def blemishes(ratio: np.ndarray, sd: np.ndarray, offset: np.ndarray, radius: float) -> np.ndarray:
+    """(H, W) bool: dust, hair and glints, one pixel around them included.
+
+    On the balls values are held against a shading that is linear in the normal, on the level face against the median
+    around them; by `sd` of noise, or by how far half of the values scatter where that is more.
+    ratio, sd (H, W);   offset (H, W, 2) mm from the nearest ball's middle"""
+    from scipy.ndimage import binary_dilation, median_filter
+
+    distance, found = np.hypot(*np.moveaxis(offset, -1, 0)), np.zeros(ratio.shape, bool)
+    ball, level = distance < BALL * radius, distance > NEAR * radius
+    shading = _normals(offset[ball], radius)
+    residual = ratio - median_filter(np.where(level, ratio, np.median(ratio[level])), AROUND)
+    residual[ball] = ratio[ball] - shading @ np.linalg.lstsq(shading, ratio[ball], rcond=None)[0]
+    for area in (ball, level):
+        spread = np.median(np.abs(residual[area])) / 0.6745  # of a Gaussian, its standard deviation
+        found |= area & (np.abs(residual) > BLEMISH * np.maximum(sd, spread))
+    return binary_dilation(found, iterations=1)
+
+
+def _normals(offset: np.ndarray, radius: float) -> np.ndarray:
+    """(n, 4): x, y and z of balls' normals, towards the camera, and 1."""
+    x, y = (offset / radius).T
+    return np.column_stack([x, y, np.sqrt(1 - x * x - y * y), np.ones(len(x))])
+
+
+def light_of(ratio: np.ndarray, offset: np.ndarray, use: np.ndarray, radius: float) -> np.ndarray:
+    """(3,) l of the least-squares fit ratio = l.n + c on balls; n points to the camera (x right, y down)."""
+    return np.linalg.lstsq(_normals(offset[use], radius), ratio[use], rcond=None)[0][:3]
+
+
+# -- importing -------------------------------------------------------------------------------------------------------
+def import_scans(
+    source: str | Path,
+    folder: str | Path,
+    *,
+    bin: int = 4,
+    saturation: float = 255.0,
+    overwrite: bool = False,
+    progress: Callable[[str, int, int], None] | None = None,
+) -> Imported:
+    """Write scans of pressed plates as a capture set with its scene; see the module's text for what is derived.
+
+    bin   pixels per side that are averaged into one; rows and columns that fill no block are left out, as many on
+          both sides. Raises BadCapture, OutputExists."""
+    tick = progress or (lambda *_: None)
+    scans, flat, left = scans_in(Path(source))
+    first = scans[0]
+    height, width = first.images.shape[1:3]
+    if not 1 <= int(bin) == bin <= min(height, width) // 32:
+        raise BadCapture(f"{source}: bin = {bin}; allowed: whole numbers from 1 to {min(height, width) // 32}")
+    scale, warnings = first.mm_per_pixel * bin, []
+    if left:
+        warnings.append(f"not used: {', '.join(left)} (another camera or other LEDs, or nothing pressed)")
+    steps = len(scans) + 1
+    tick("import", 0, steps)
+    flats = np.stack([_cut(i, bin, saturation)[..., 0] for i in flat.images])
+    plates, cut, settings = [], [], []
+    for done, scan in enumerate(scans, 1):
+        plate = plate_of(scan)
+        warnings += _contradictions(scan, plate, first)
+        plates.append(plate)
+        cut.append(np.stack([_cut(i, bin, saturation)[..., 0] for i in scan.images]))
+        depth = scan.radius * (1 - math.sqrt(1 - CONTACT**2))
+        pose = dict(zip(POSE, (plate.x, plate.y, depth, 0.0, 0.0, plate.turn)))
+        settings.append({key: round(float(value), 6) for key, value in pose.items()})
+        tick("import", done, steps)
+    shape = flats.shape[1:]
+    offsets, distances = zip(*(nearest(shape, p.balls, scale) for p in plates))
+    ratios = [images / np.maximum(flats, 1.0) for images in cut]
+    level = np.stack([np.broadcast_to(d > NEAR * s.radius, flats.shape) for d, s in zip(distances, scans)])
+    noise = neighbour_noise(
+        np.concatenate(ratios), np.concatenate([flats] * len(scans)), level.reshape(-1, *shape), saturation
+    )
+    lights = _lights(scans, ratios, offsets, distances)
+    frames, masked = [], []
+    for scan, images, ratio, offset, pose in zip(scans, cut, ratios, offsets, settings):
+        for k, label in enumerate(scan.labels):
+            # a ratio has the noise of the image and of the flat field
+            sd = noise.sd(flats[k]) * math.sqrt(2) / np.maximum(flats[k], 1.0)
+            off = blemishes(ratio[k], sd, offset, scan.radius)
+            masked.append(float(off.mean()))
+            on = {f"led_{other}.power": float(other == label) for other in scan.labels}
+            frame = Frame(
+                f"{scan.name}_{label}", images[k][..., None].astype(np.float32), ~off, scan.name, {**pose, **on}
+            )
+            frame.flat_field = flats[k][..., None].astype(np.float32)
+            frames.append(frame)
+    if max(masked) > 0:
+        warnings.append(
+            f"dust, hair or glints: {100 * float(np.mean(masked)):.2g} % of the values are masked, up to "
+            f"{100 * max(masked):.2g} % of a frame"
+        )
+    facts = _facts(source, scans, flat, plates, bin, scale, shape, noise, lights, warnings)
+    path = _write(
+        Path(folder),
+        frames,
+        noise,
+        None,
+        _scene(facts, scans, lights),
+        facts,
+        bits=None,
+        overwrite=overwrite,
+        text=readme(facts),
+    )
+    tick("import", steps, steps)
+    return Imported(path, warnings, facts)
+
+
+def _cut(image: np.ndarray, bin: int, saturation: float) -> np.ndarray:
+    """Means of blocks, of the middle of the image that they fill."""
+    height, width = (n // bin * bin for n in image.shape[:2])
+    top, left = (image.shape[0] - height) // 2, (image.shape[1] - width) // 2
+    return binned(image[top : top + height, left : left + width], bin, saturation)
+
+
+def _contradictions(scan: Scan, plate: Plate, first: Scan) -> list[str]:
+    found = []
+    if abs(plate.spacing / scan.spacing - 1) > ALIKE:
+        found.append(
+            f"{scan.name}: balls are {plate.spacing:.4g} mm apart by their circles and mmperpixel, {scan.spacing:.4g} "
+            "mm by calibspacing: one of the two is wrong"
+        )
+    if plate.rms > 0.1 * scan.radius:
+        found.append(
+            f"{scan.name}: circles miss a square grid by {plate.rms:.2g} mm rms, {plate.rms / scan.radius:.0%} of a "
+            "ball's radius"
+        )
+    if abs(scan.mm_per_pixel / first.mm_per_pixel - 1) > ALIKE:
+        found.append(
+            f"{scan.name}: {scan.mm_per_pixel:.4g} mm/px, but {first.mm_per_pixel:.4g} in {first.name}: one camera has "
+            "one scale"
+        )
+    return found
+
+
+def _lights(
+    scans: Sequence[Scan], ratios: Sequence[np.ndarray], offsets: Sequence[np.ndarray], distances: Sequence[np.ndarray]
+) -> dict[str, np.ndarray]:
+    """Label -> mean of the directions that the scans show."""
+    found: dict[str, list[np.ndarray]] = {}
+    for scan, ratio, offset, distance in zip(scans, ratios, offsets, distances):
+        inside = distance < BALL * scan.radius
+        for label, one in zip(scan.labels, ratio):
+            found.setdefault(label, []).append(light_of(one, offset, inside, scan.radius))
+    return {label: np.mean(several, 0) for label, several in found.items()}
+
+
+def _facts(source, scans, flat, plates, bin, scale, shape, noise, lights, warnings) -> dict:
+    azimuths = {label: math.degrees(math.atan2(y, x)) for label, (x, y, _) in lights.items()}
+    return {
+        "source": str(source),
+        "scans": {
+            s.name: {
+                "balls": len(s.circles),
+                "x_mm": p.x,
+                "y_mm": p.y,
+                "turn_deg": p.turn,
+                "spacing_mm": p.spacing,
+                "circles_off_rms_mm": p.rms,
+            }
+            for s, p in zip(scans, plates)
+        },
+        "flat_field": flat.name,
+        "size_px": list(shape),
+        "bin": bin,
+        "ball_radius_mm": scans[0].radius,
+        "ball_spacing_mm": scans[0].spacing,
+        "mm_per_pixel": scans[0].mm_per_pixel,
+        "mm_per_pixel_after_binning": scale,
+        "camera_distance_mm": CAMERA,
+        "x_fov_deg": math.degrees(2 * math.atan(shape[1] * scale / 2 / CAMERA)),
+        "noise": {"system_gain": noise.system_gain, "dark_noise": noise.dark_noise},
+        "light_azimuths_deg": azimuths,
+        "setup": {
+            "free": ["led_*.[xyz]", "gel.skirt", "gel.smoothing"],
+            "per_group": list(POSE),
+            "flat_field": "multiplicative",
+            "priors": {
+                "led_*.[xyz]": [None, 15.0],
+                "gel.press_[xy]": [None, 0.02],
+                "gel.press_depth": [None, 0.3 * scans[0].radius],
+                "gel.press_r[xy]": [None, 1.0],
+                "gel.press_rz": [None, 0.2],
+                "gel.skirt": [None, 0.1],
+                "gel.smoothing": [None, 0.03],
+            },
+        },
+        "warnings": warnings,
+    }
+
+
+def _scene(facts: Mapping, scans: Sequence[Scan], lights: Mapping[str, np.ndarray]) -> str:
+    template = (shipped("scenes") / "templates" / "led_scans.xml").read_text(encoding="utf-8")
+    (height, width), scale = facts["size_px"], facts["mm_per_pixel_after_binning"]
+    view = max(height, width) * scale
+    ball = facts["ball_radius_mm"]
+    return template.format(
+        source=_comment(facts["source"]),
+        width=width,
+        height=height,
+        x_fov=f"{facts['x_fov_deg']:.6g}",
+        distance=f"{CAMERA:g}",
+        scale=f"{scale:.6g}",
+        ball=f"{ball:g}",
+        spacing=f"{facts['ball_spacing_mm']:g}",
+        thickness=f"{THICKNESS:g}",
+        gel_width=f"{1.15 * width * scale:.4g}",
+        gel_length=f"{1.15 * height * scale:.4g}",
+        extent=f"{1.2 * view:.4g}",
+        pitch=f"{ball / 8:.4g}",
+        map_pitch=f"{ball / 12:.4g}",
+        columns=2 * math.ceil(0.58 * width * scale / (ball / 8)) + 1,
+        rows=2 * math.ceil(0.58 * height * scale / (ball / 8)) + 1,
+        smoothing=f"{0.2 * ball:.3g}",
+        skirt=f"{0.4 * ball:.3g}",
+        leds="\n".join(_led(label, *direction) for label, direction in lights.items()),
+    )
+
+
+def _led(label: str, x: float, y: float, z: float) -> str:
+    azimuth, elevation = math.atan2(y, x), min(max(math.atan2(z, math.hypot(x, y)), 0.3), 1.2)
+    across = DISTANCE * math.cos(elevation)
+    place = f'x="{across * math.cos(azimuth):.4g}" y="{across * math.sin(azimuth):.4g}"'
+    return f"""    <emitter type="led" id="led_{label}">
+        <point name="position" {place} z="{-DISTANCE * math.sin(elevation):.4g}"/>
+        <point name="target" x="0" y="0" z="0"/>
+        <float name="mu" value="0"/>
+        <float name="power" value="0"/>
+    </emitter>"""
+
+
+def readme(facts: Mapping) -> str:
+    """The import in sentences, contradictions first."""
+    height, width = facts["size_px"]
+    places = [
+        f"- {name}: {s['balls']} balls, {s['spacing_mm']:.4f} mm apart, turned by {s['turn_deg']:.3f} deg; circles "
+        f"miss the grid by {1000 * s['circles_off_rms_mm']:.2g} um rms"
+        for name, s in facts["scans"].items()
+    ]
+    azimuths = ", ".join(f"{label} {a:.1f}" for label, a in facts["light_azimuths_deg"].items())
+    return "\n".join(
+        [
+            f"Plates of balls under one LED at a time, from {facts['source']}",
+            "",
+            "Contradictions and blemishes",
+            *([f"- {text}" for text in facts["warnings"]] or ["- none found"]),
+            "",
+            "Given",
+            f"- balls of {facts['ball_radius_mm']:g} mm radius, {facts['ball_spacing_mm']:g} mm apart; "
+            f"{facts['mm_per_pixel']:.6g} mm/px",
+            f"- flat field: {facts['flat_field']}, one for each LED",
+            "",
+            "Derived",
+            *places,
+            f"- images of {width} x {height} px, means of blocks of {facts['bin']} px",
+            f"- noise: {facts['noise']['system_gain']:.3g} DN/DN and {facts['noise']['dark_noise']:.3g} DN, by "
+            "neighbours of the level face; the coating's grain counts as noise",
+            f"- lights in scene.xml: azimuths {azimuths} deg by the balls' shading; elevation a guess, distance "
+            "assumed; calibrate them",
+            "",
+        ]
+    )

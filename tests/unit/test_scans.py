@@ -1,0 +1,163 @@
+"""Scan folders of a bench that lights one LED per picture: what an import derives from scans that were drawn with
+numpy, and what it refuses."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from PIL import Image
+
+from optics.captures import capture_set, scans
+from optics.errors import BadCapture
+from optics.light.rendering import RenderJob
+from optics.scene import loader
+
+HEIGHT, WIDTH, SCALE = 384, 512, 0.012  # px, px, mm/px
+RADIUS, SPACING = 0.25, 1.0
+AZIMUTHS = {"07": -90.0, "08": -150.0, "09": 145.0}
+GAIN = 0.02  # DN per DN of variance
+SHARED = Path(__file__).parents[3] / "shared" / "data" / "gelsight_single_led"
+
+
+def middles(x, y, turn):
+    """{(gx, gy): mm from the middle of the image} of all balls in view."""
+    c, s = np.cos(np.radians(turn)), np.sin(np.radians(turn))
+    grid = [(i, j) for i in range(-4, 5) for j in range(-4, 5)]
+    at = {(i, j): (x + SPACING * (c * i - s * j), y + SPACING * (s * i + c * j)) for i, j in grid}
+    edge = WIDTH * SCALE / 2 - 0.3, HEIGHT * SCALE / 2 - 0.3
+    return {k: p for k, p in at.items() if abs(p[0]) < edge[0] and abs(p[1]) < edge[1]}
+
+
+def shaded(balls, azimuth, rng, spots=()):
+    """A picture in DN: a far light 50 deg high over half balls on a plane, some light from all sides, a fall-off across
+    the face, shot noise; a dark speck at each of `spots`."""
+    v, u = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    x, y = (u - WIDTH / 2) * SCALE, (v - HEIGHT / 2) * SCALE
+    nx, ny = np.zeros_like(x), np.zeros_like(x)
+    for a, b in balls:
+        near = np.hypot(x - a, y - b) < 0.95 * RADIUS
+        nx[near], ny[near] = (x - a)[near] / RADIUS, (y - b)[near] / RADIUS
+    high, turn = np.radians(50), np.radians(azimuth)
+    direct = np.cos(high) * (nx * np.cos(turn) + ny * np.sin(turn)) + np.sin(high) * np.sqrt(1 - nx**2 - ny**2)
+    signal = 90 * (1 + 0.05 * (x * np.cos(turn) + y * np.sin(turn))) * (np.maximum(direct, 0) + 0.3)
+    for row, column in spots:
+        signal[row : row + 10, column : column + 10] *= 0.5
+    return np.clip(np.round(signal + np.sqrt(GAIN * signal) * rng.standard_normal(signal.shape)), 0, 255)
+
+
+def write_scan(folder, balls, rng, annotated=True, spots=(), **changed):
+    folder.mkdir(parents=True)
+    for label, azimuth in AZIMUTHS.items():
+        picture = shaded(list(balls.values()), azimuth, rng, spots)
+        Image.fromarray(picture.astype(np.uint8)).save(folder / f"image{label}.png")
+    at = {k: (float(a / SCALE + WIDTH / 2 - 0.5), float(b / SCALE + HEIGHT / 2 - 0.5)) for k, (a, b) in balls.items()}
+    circles = [{"type": "GridCircle", "gx": i, "gy": j, "x": x, "y": y} for (i, j), (x, y) in at.items()]
+    table = {
+        "images": [f"image{label}.png" for label in AZIMUTHS],
+        "calibradius": RADIUS if annotated else 0,
+        "calibspacing": SPACING if annotated else 0,
+        "mmperpixel": SCALE if annotated else 0,
+        "annotations": [*circles, {"type": "Note"}] if annotated else [],
+    }
+    (folder / "scan.yaml").write_text(yaml.safe_dump({**table, **changed}))
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory):
+    path, rng = tmp_path_factory.mktemp("bench"), np.random.default_rng(5)
+    write_scan(path / "one", middles(0.13, -0.21, 2.0), rng, spots=[(40, 60)])
+    write_scan(path / "two", middles(-0.3, 0.1, -1.0), rng)
+    write_scan(path / "flat", {}, rng, annotated=False)
+    return path
+
+
+@pytest.fixture(scope="module")
+def imported(source, tmp_path_factory):
+    return scans.import_scans(source, tmp_path_factory.mktemp("out") / "captures", bin=4)
+
+
+def test_plates_noise_and_lights_are_derived(imported):
+    facts = json.loads((imported.folder / "import.json").read_text())
+    for name, (x, y, turn) in {"one": (0.13, -0.21, 2.0), "two": (-0.3, 0.1, -1.0)}.items():
+        found = facts["scans"][name]
+        assert (found["x_mm"], found["y_mm"]) == pytest.approx((x, y), abs=1e-6)
+        assert (found["turn_deg"], found["spacing_mm"]) == pytest.approx((turn, SPACING), abs=1e-6)
+    # 1500 pixels a ball and 20 balls, a falling light: far below a degree
+    assert facts["light_azimuths_deg"] == pytest.approx(AZIMUTHS, abs=1.0)
+    # blocks of 16 pixels: a sixteenth of GAIN, and of the steps of 1 DN, as much again for the flat field
+    expected = 2 * (GAIN * 90 + 1 / 12) / 16
+    assert imported.facts["noise"]["system_gain"] * 90 + imported.facts["noise"]["dark_noise"] ** 2 == pytest.approx(
+        expected, rel=0.15
+    )
+
+
+def test_captures_have_a_flat_field_and_settings_for_each_led(imported):
+    found = capture_set.load(imported.folder)
+    assert [f.name for f in found.frames] == [f"{s}_{k}" for s in ("one", "two") for k in AZIMUTHS]
+    for frame in found.frames:
+        on = [key for key, value in frame.parameters.items() if key.endswith(".power") and value > 0]
+        assert on == [f"led_{frame.name[-2:]}.power"] and frame.flat_field is not None
+        assert frame.group == frame.name[:-3] and frame.image.shape == (HEIGHT // 4, WIDTH // 4, 1)
+    speck = found.frames[0].mask[10:13, 15:18]
+    assert not speck.any()  # 10 pixels at (40, 60)
+    assert all(f.mask.mean() > 0.99 for f in found.frames)
+    assert "dust, hair or glints" in imported.warnings[0]
+
+
+def test_the_scene_shows_the_balls_where_they_are(imported):
+    """Touched where the balls are, and nowhere else; the LEDs stand where the shading says."""
+    found = capture_set.load(imported.folder)
+    scene = loader.load(found.scene)
+    shot = RenderJob(scene).take({k: v for k, v in found.frames[0].parameters.items() if "press" in k})
+    touched = np.asarray(shot.channels["contact.Y"])
+    v, u = np.mgrid[: HEIGHT // 4, : WIDTH // 4] + 0.5
+    x, y = (u - WIDTH / 8) * 4 * SCALE, (v - HEIGHT / 8) * 4 * SCALE
+    distance = np.min([np.hypot(x - a, y - b) for a, b in middles(0.13, -0.21, 2.0).values()], 0)
+    inner = (np.abs(x) < 2.5) & (np.abs(y) < 1.8)
+    assert touched[inner & (distance < 0.5 * RADIUS)].all() and not touched[inner & (distance > 1.2 * RADIUS)].any()
+    for label, azimuth in AZIMUTHS.items():
+        x, y = (scene.values()[f"led_{label}.{axis}"] for axis in "xy")
+        assert np.degrees(np.arctan2(y, x)) == pytest.approx(azimuth, abs=1.0)
+
+
+@pytest.mark.parametrize(
+    "spoil, message",
+    [
+        ({"images": "image07.png"}, "images = 'image07.png'; allowed: a list of file names"),
+        ({"images": ["image07.png", "../two/image08.png"]}, "no file '../two/image08.png'"),
+        ({"calibradius": "a"}, "calibradius = 'a'; allowed: a number"),
+        ({"mmperpixel": 0}, "allowed: above 0 where circles are annotated"),
+        ({"annotations": [{"type": "GridCircle", "x": 1, "y": 2, "gx": 0}]}, "gy = None; allowed: a number"),
+    ],
+)
+def test_a_bad_scan_is_refused(tmp_path, spoil, message):
+    write_scan(tmp_path / "one", middles(0, 0, 0), np.random.default_rng(1), **spoil)
+    with pytest.raises(BadCapture) as error:
+        scans.import_scans(tmp_path, tmp_path / "out")
+    assert message in str(error.value) and "scan.yaml" in str(error.value)
+
+
+def test_scans_without_a_flat_field_or_of_another_scale(tmp_path, source):
+    rng = np.random.default_rng(2)
+    write_scan(tmp_path / "one", middles(0, 0, 0), rng)
+    with pytest.raises(BadCapture, match="no flat field for one \\(512 x 384 px, LEDs 07, 08, 09\\)"):
+        scans.import_scans(tmp_path, tmp_path / "out")
+    write_scan(tmp_path / "flat", {}, rng, annotated=False)
+    write_scan(tmp_path / "wide", middles(0, 0, 0), rng, calibspacing=1.1)
+    found = scans.import_scans(tmp_path, tmp_path / "out", bin=8)
+    assert any(
+        "wide: balls are 1 mm apart by their circles and mmperpixel, 1.1 mm by calib" in w for w in found.warnings
+    )
+
+
+@pytest.mark.skipif(not SHARED.is_dir(), reason="the measured scans are not here")
+def test_measured_scans_are_read(tmp_path):
+    """LEDs on a regular ring, by the shading alone; circles within 5 um of a grid of 1 mm; the groove is left out."""
+    found = scans.import_scans(SHARED, tmp_path / "out", bin=8)
+    azimuths = np.sort(list(found.facts["light_azimuths_deg"].values()))
+    assert np.diff(azimuths) == pytest.approx(60, abs=6)
+    for plate in found.facts["scans"].values():
+        assert plate["spacing_mm"] == pytest.approx(1, abs=2e-3) and plate["circles_off_rms_mm"] < 5e-3
+    assert any("not used: groove" in w for w in found.warnings)
