@@ -7,6 +7,7 @@ import math
 import os
 import re
 import sys
+import time
 import traceback
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -34,6 +35,9 @@ app = typer.Typer(
 )
 
 
+EVERY = 10.0  # seconds between lines of progress where there is no terminal
+
+
 class Terminal:
     """The terminal of a command: `note` writes remarks to stderr, `progress` draws a bar there. Results are printed."""
 
@@ -46,9 +50,13 @@ class Terminal:
 
     @contextmanager
     def progress(self) -> Iterator[Callable[[str, int, int], None] | None]:
-        """A function (what, done, total) that draws a bar; None where stderr is no terminal, or with --quiet."""
-        if self.quiet or not sys.stderr.isatty():
+        """A function (what, done, total) that draws a bar, or, where stderr is no terminal, writes a line now and then;
+        None with --quiet."""
+        if self.quiet:
             yield None
+            return
+        if not sys.stderr.isatty():
+            yield _lines()
             return
         from rich.console import Console
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -70,6 +78,19 @@ class Terminal:
 
         with bars:
             yield show
+
+
+def _lines() -> Callable[[str, int, int], None]:
+    """Progress as lines, one every EVERY seconds: quick work writes none."""
+    last = time.monotonic()
+
+    def show(what: str, done: int, total: int) -> None:
+        nonlocal last
+        if time.monotonic() - last >= EVERY:
+            last = time.monotonic()
+            print(f"{what}: {done} of {total}", file=sys.stderr, flush=True)
+
+    return show
 
 
 terminal = Terminal()

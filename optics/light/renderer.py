@@ -30,6 +30,8 @@ PAINTED = 0.05  # of the largest reflectance of a texture: a step from pixel to 
 BENT = 1e-3
 CREASE = 25.0  # deg from pixel to pixel: what is no smooth surface
 FLAT_FIELDS = ("multiplicative", "additive", "none")
+MEMORY = 4e9  # bytes of hits and images that are kept
+PER_RAY = 100  # bytes of a camera ray's end, as measured: its surface interaction, weight and origin
 BOUNCE_SAMPLES = 32  # directions per cell for the second bounce
 BOUNCE_CELL = 2  # px each way of a cell
 
@@ -144,7 +146,23 @@ class Renderer:
         self._hits[key] = hits
         while len(self._hits) > self.remember:
             self._hits.popitem(last=False)
+        self._make_room(hits)
         return hits
+
+    def _make_room(self, latest: Hits) -> None:
+        """Forget the oldest geometries while what is kept is larger than MEMORY: large images with many rims."""
+        kept = {
+            id(h): h
+            for h in (*(i.hits for i in self._images.values() if isinstance(i, LedImage)), *self._hits.values())
+        }
+        held = [h for h in kept.values() if h is not latest]
+        total = latest.bytes + sum(h.bytes for h in held)
+        for old in held:
+            if total <= MEMORY:
+                return
+            total -= old.bytes
+            self._hits = OrderedDict((k, h) for k, h in self._hits.items() if h is not old)
+            self._images = OrderedDict((k, i) for k, i in self._images.items() if getattr(i, "hits", None) is not old)
 
     def forget_hits(self) -> None:
         """Release the kept hits: a search over many geometries returns to none of them."""
@@ -205,6 +223,8 @@ class Renderer:
         self._images[key] = image
         while len(self._images) > self.remember * len(self.scene.lights):
             self._images.popitem(last=False)
+        image.hits.count(image, self.rim_samples)
+        self._make_room(image.hits)
         return image
 
     def _render_led(self, hits: Hits, led: str) -> LedImage:
@@ -585,6 +605,7 @@ class Hits:
         self.si, self.weight, self.origin, self.path = sample
         self.shape = (height, width)
         self.rims: dict = {}
+        self.rays = 0  # finer samples that images of it hold
         self.joint: np.ndarray | None = None
         self.valid = np.array(self.si.is_valid()).reshape(height, width)
         self.edges = _edges(self.valid)
@@ -597,6 +618,14 @@ class Hits:
             if self.path is not None
             else _bent(np.where(self.valid[..., None], self.normal, 0.0))
         )
+
+    def count(self, image: LedImage, samples: int) -> None:
+        """Note the finer samples, so many in each pixel, that an image of this geometry holds."""
+        self.rays += samples * len(image.index)
+
+    @property
+    def bytes(self) -> int:
+        return PER_RAY * (self.valid.size + self.rays)
 
     def image(self, values) -> np.ndarray:
         return np.array(values).reshape(self.shape)

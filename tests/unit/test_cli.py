@@ -431,3 +431,19 @@ def test_values_of_a_fit_hold_for_their_frames(measured, tmp_path):
     model = open_model(Setup(captures=str(measured)))
     values = values_of(model, tmp_path / "fit.toml", {"led_3.mu": 2.0})
     assert values == Values({"led_1.x": 10.5, "led_3.mu": 2.0}, {3: {"gel.press_x": 1.5}})
+
+
+def test_progress_is_lines_where_there_is_no_terminal(capsys, monkeypatch):
+    """One every ten seconds: none of quick work, none with --quiet."""
+    from optics.cli import shared
+
+    clock = iter([0.0, 3.0, 11.0, 11.0, 12.0, 30.0, 30.0])
+    monkeypatch.setattr(shared.time, "monotonic", lambda: next(clock))
+    with shared.Terminal().progress() as show:
+        for done in range(4):
+            show("calibrate", done, 10)
+    assert capsys.readouterr().err == "calibrate: 1 of 10\ncalibrate: 3 of 10\n"
+    silent = shared.Terminal()
+    silent.quiet = True
+    with silent.progress() as show:
+        assert show is None
