@@ -4,8 +4,8 @@ claim      an effect that the loop names: claimed, or one of two that together l
            hidden, or is the same by its physics (`optics.proof.rigs.laboratory.SAME`); neither right nor wrong where
            everyday life brings it besides, as a lamp that wanders brings the gain drift of photographs
 set        effects that the last diagnosis does not tell apart; a member "a + b" stands for both together
-told apart whether the session can tell the hidden effect from every other: P(correct) as the diagnosis prints it;
-           where it did not refit the hidden effect, by the maker's own formulas
+told apart whether the session can tell the hidden effect from every other: P(correct) by the maker's own formulas, and
+           as the diagnosis prints it where it refitted the hidden effect
 needed     of two hidden: neither alone, with lamp and zeros solved for, leaves less than CLEAR of chi2
 """
 
@@ -165,8 +165,8 @@ def _both(r: dict) -> bool:
 
 
 def _apart(r: dict) -> float:
-    said = next((s["correct"] for s in r["steps"] if s.get("correct") is not None), None)
-    return r["facts"]["correct"] if said is None else said
+    said = next((s["correct"] for s in r["steps"] if s.get("correct") is not None), 1.0)
+    return min(said, r["facts"]["correct"])
 
 
 def wrong(records: Sequence[dict]) -> dict[str, list[str]]:

@@ -183,6 +183,10 @@ class Laboratory(Rig):
         found["same"] = {name: list(SAME[name]) for name in cell.hidden if name in SAME}
         if cell.kind == "library":
             gaps = design.gaps(session, hidden, cell.hidden)
+            if "coloured leak" in cell.hidden:  # a freedom of colour is no evidence against what has none
+                grey = {name: value for name, value in hidden.items() if not name.endswith("_slope")}
+                plain = design.gaps(session, grey, (*cell.hidden, "extinction leak"))
+                gaps = {c: min(gap, plain.get(c, math.inf)) for c, gap in gaps.items()}
             nearest = sorted(gaps, key=lambda c: gaps[c])[:4]
             found["gaps"] = {c: gaps[c] for c in nearest}
             found["correct"] = design.correct(min(gaps.values(), default=math.inf))

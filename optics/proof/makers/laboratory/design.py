@@ -74,7 +74,7 @@ def fit(session: Session, hidden: Bench, causes: Sequence[str] = (), sd: np.ndar
         return np.ravel((session.mean(hidden) - signal) / sd)
 
     bounds = np.array(low) / sizes, np.array(high) / sizes
-    for turn in range(STARTS if causes else 1):
+    for turn in range(STARTS):
         start = np.zeros(len(groups))
         if turn or causes:
             start = start + (0.1 if not turn else 2.0) * np.abs(rng.standard_normal(len(groups)))

@@ -42,7 +42,7 @@ def session(rng: np.random.Generator) -> Session:
         settings = {"polarizer.angle": np.repeat([0.0, 40.0, 95.0], len(dial)), "analyzer.angle": np.tile(dial, 3)}
     count = len(next(iter(settings.values())))
     if count > 900:
-        keep = np.arange(count) % math.ceil(count / 900) == 0
+        keep = np.arange(count) // stay % math.ceil(count / 900) == 0  # whole places: what repeats there, repeats
         settings = {key: value[keep] for key, value in settings.items()}
         count = int(keep.sum())
     if rng.random() < 0.6:
