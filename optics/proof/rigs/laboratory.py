@@ -60,6 +60,12 @@ SAME: Mapping[str, Mapping[str, str]] = {
         "slope is named by the next step or not"
     },
 }
+# the same of causes by the maker's other law
+SAME_BY_OTHER_LAW: Mapping[str, Mapping[str, str]] = {
+    "residual response curve": {
+        "soft saturation": "the other law is a straight line that levels off beyond a knee: what the library calls so"
+    }
+}
 IN_SAMPLE = {"retardance", "stress birefringence", "depolarization", "dichroic sample"}
 
 
@@ -180,7 +186,7 @@ class Laboratory(Rig):
         }
         if self.frame_by_frame and "gain drift" not in cell.hidden and session.lamp_seen() > SURE:
             found["besides"] = ["gain drift"]
-        found["same"] = {name: list(SAME[name]) for name in cell.hidden if name in SAME}
+        found["same"] = {name: list(same) for name in cell.hidden if (same := _same(cell, name))}
         if cell.kind == "library":
             gaps = design.gaps(session, hidden, cell.hidden)
             if "coloured leak" in cell.hidden:  # a freedom of colour is no evidence against what has none
@@ -209,7 +215,7 @@ class Laboratory(Rig):
     write = staticmethod(folder.write)
 
     def says_the_same(self, cell: Cell) -> tuple[str, ...]:
-        return tuple(name for hidden in cell.hidden for name in SAME.get(hidden, {}))
+        return tuple(name for hidden in cell.hidden for name in _same(cell, hidden))
 
     def facts(self, cell: Cell) -> dict:
         return self.plan(cell)[2]
@@ -224,6 +230,11 @@ class Laboratory(Rig):
 
     def parameters(self, effect: str):
         return None
+
+
+def _same(cell: Cell, hidden: str) -> Mapping[str, str]:
+    """Names that say the same as a hidden cause, and why."""
+    return {**SAME.get(hidden, {}), **(SAME_BY_OTHER_LAW.get(hidden, {}) if cell.law == "other" else {})}
 
 
 def _known(names) -> tuple[str, ...]:
