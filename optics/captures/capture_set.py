@@ -364,8 +364,9 @@ def _check_levels(captures: Captures, where: str) -> None:
     flats = [("flat_field", captures.flat_field)] + [
         (f"frame {i} ('{f.file}'): flat_field", f.flat_field) for i, f in enumerate(captures.frames)
     ]
-    limited = captures.table is None or (captures.noise is not None and captures.noise.ends)
-    for what, values in used + [(what, flat) for what, flat in flats if flat is not None] if limited else []:
+    # of a table a frame is one reading: those at the end of the scale are not used, as pixels are not
+    whole = captures.table is None
+    for what, values in used + [(what, flat) for what, flat in flats if flat is not None] if whole else []:
         if np.all(values >= top):
             raise BadCapture(
                 f"{where}: {what}: all saturated, every value used is >= {top:g} DN; allowed: some values below; "

@@ -186,6 +186,13 @@ def test_of_a_table_the_noise_is_one_number_and_nothing_is_masked(folder):
     ends = load(folder, BENCH + "[noise]\ndark_noise = 2.0\nsaturation = 720\n")
     assert [bool(ends.noise.usable(f.image).all()) for f in ends.frames] == [False, True, True, True]
     assert not any("not known" in w for w in ends.warnings)
+    # a reading at the end of the scale is not used, and no reason to refuse the others; all of them are
+    cut = load(folder, BENCH + "[noise]\ndark_noise = 2.0\nsaturation = 700\n")
+    assert [bool(cut.noise.usable(f.image).all()) for f in cut.frames] == [False, True, True, True]
+    (folder / "malus.csv").write_text("a.b,reading\n0,705\n45,750\n")
+    with pytest.raises(BadCapture, match="none of the 2 values of .malus.csv. .* is usable"):
+        load(folder, BENCH + "[noise]\ndark_noise = 2.0\nsaturation = 700\n")
+    (folder / "malus.csv").write_text("a.b,reading\n0,705\n45,350\n90,0\n90,-2\n")
     with pytest.raises(BadCapture, match=r"dark_noise \(DN, rms\) missing; give the standard deviation of a reading"):
         load(folder, BENCH + "[noise]\nsaturation = 720\n")
 
