@@ -2,9 +2,9 @@
 
 Definition
     L' = L (1 + g c(x, y)),   c = 1 where the object touches the face, 0 elsewhere
-    g = rho_b (1 - rho)^2 / (rho (1 - rho rho_b))        of a coat that absorbs nothing, over an object of reflectance
-                                                         rho_b: series of reflections between the two
-with the coat's own reflectance rho. Behind a coat that is not touched lies air, to which what passes is lost.
+    g = rho_b (1 - rho)^2 / (rho (1 - rho rho_b))
+with the coat's own reflectance rho and that of the object behind it, rho_b: of a coat that absorbs nothing, the series
+of reflections between the two. Behind a coat that is not touched lies air, to which what passes is lost.
 Fingerprint
     the touched area is brighter than its slope explains by one factor, the same under every LED and at every height,
     and ends at the rim of the contact. Height fall-off and gel absorption grow with the depth of the dent instead.
