@@ -48,8 +48,7 @@ class Findings:
     rival        whether a curve does significantly better, by RIVAL (a map) or RIVAL_CURVE, where misfit is left, or is
                  not told apart from several effects; curve_lead: of its score over that of the best explanation,
                  0 where that leaves nothing
-    shared       whether noise that neighbouring readings share explains it as well as the best explanation; wander:
-                 its rms over that of the signal
+    shared       whether noise that neighbouring readings share explains it as well as the best explanation
     share        of the excess that the best explanation explains, where excess_sd > EXCESS; curve_share: the best curve
     left         misfit over mean signal with the best explanation
     uneven       largest h of the winner's splits, by the split uneven_by (in words), uneven_limit allowed; even:
@@ -75,7 +74,6 @@ class Findings:
     fall: float = 0.0
     common: bool = True
     shared: bool = False
-    wander: float = 0.0
     survivors: int = 1
     lead: float = math.inf
     needed: float = TOLD
@@ -170,11 +168,12 @@ def _word_of_winner(f: Findings, failed: set[str]) -> str:
     if failed & {"significant", "strength"} and not f.structured and not f.weighed:
         # The refit did not bring the fall that the score promised, or the base's own calibration brought it.
         return "NOTHING"
-    # beside noise that neighbours share, what is significant is asked of both together
-    weak = set() if f.shared else {"significant"}
-    if f.rival and f.curve_lead > TOLD:
-        weak.add("no better curve")
-    alone = not failed & (weak | {"share", "beyond clutter", "near"})
+    bars = {"share", "beyond clutter", "near"}  # what is no tie between causes
+    if not f.shared:  # where it is, noise is one of those that tie: that an effect gains little over it is no bar
+        bars.add("significant")
+    if f.curve_lead > TOLD:
+        bars.add("no better curve")
+    alone = not failed & bars
     alone = alone and not f.another_law
     rivals = f.survivors > 1 or f.shared or LAW in failed
     if failed & {"lead", LAW} and alone and f.some_even and rivals:

@@ -659,7 +659,8 @@ def lead_without(case: Case, outcome: Outcome, subject: Candidate) -> tuple[floa
 
 
 def _without(case: Case, outcome: Outcome, subject: Candidate) -> tuple[Trial, float, float]:
-    """(the best explanation that lacks an effect and what contains it, lead over it, lead that a claim needs)."""
+    """(the best explanation without an effect, and without any that contains it; lead over it; lead that a claim
+    needs)."""
     own = {(key, v.frames) for v in subject.variables for key in v.keys}
     rival, best = min((t for t in outcome.trials if not own <= t.keys), key=lambda t: t.deviance + t.cost), outcome.best
     lead, needed = _lead(case, outcome, best, rival)

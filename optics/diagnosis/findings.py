@@ -94,14 +94,15 @@ def findings_of(
         own = replace(own, law=f"{laws[0].effect} along {laws[0].coordinate}", law_lead=lead)
     if not fingerprints:
         return own
-    raw, whole = fingerprints, {f.coordinate: f.net for f in fingerprints}
+    if swings := _swings(outcome, fingerprints, basis):
+        return replace(own, rival=True, ratio=swings.ratio, coordinate=swings.coordinate, curve_share=swings.share)
+    whole = {f.coordinate: f.net for f in fingerprints}
     followed = _followed(case, subject, best.fit, best.fall - best.expectation, fingerprints)
     # a curve is no better than effects while any set of them does as well: the leader, not the simplest beside it
     leader = outcome.leader
     complete = bool(leader.members) and leader.complete
-    fall, session = leader.fall - leader.expectation, case.session if case.evidence.is_table else case.lamp
-    if not subject:
-        fall = own.fall
+    fall = leader.fall - leader.expectation if subject else own.fall
+    session = case.session if case.evidence.is_table else case.lamp
     if session is not None and not leader.by_frame:
         scale = outcome.scale
         fingerprints = prints.beside_shared_noise(
@@ -109,8 +110,6 @@ def findings_of(
         )
         gain = outcome.base.deviance - leader.deviance - leader.expectation
         fall = max(gain, 0.0) if subject else fall / scale
-    if swings := _swings(outcome, raw, basis):
-        return replace(own, rival=True, ratio=swings.ratio, coordinate=swings.coordinate, curve_share=swings.share)
     fingerprints = [replace(f, ratio=f.net / max(fall, 1.0)) for f in fingerprints]
     if not fingerprints:
         return own
@@ -174,7 +173,6 @@ def _of_subject(
         best.fall - best.expectation,
         common=name in outcome.core,
         shared=outcome.shared,
-        wander=outcome.wander,
         survivors=len(outcome.survivors),
         lead=lead,
         needed=needed,
