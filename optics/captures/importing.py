@@ -311,7 +311,7 @@ def import_presses(
     )
     tick("import", 3, 4)
     xml = _scene_xml(facts, gel_thickness, touched.max() + 5 * skirt, led_elements(directions, leds, flat.mean((0, 1))))
-    path = _write(Path(folder), frames, noise, flat, xml, facts, bits=8 if bin == 1 else None, overwrite=overwrite)
+    path = write_set(Path(folder), frames, noise, flat, xml, facts, bits=8 if bin == 1 else None, overwrite=overwrite)
     tick("import", 4, 4)
     return Imported(path, facts["warnings"], facts)
 
@@ -396,7 +396,7 @@ def _scene_xml(facts: dict, gel_thickness: float, extent: float, leds: str) -> s
     template = (shipped("scenes") / "templates" / "ball_presses.xml").read_text(encoding="utf-8")
     (height, width), scale = facts["size_px"], facts["mm_per_pixel_after_binning"]
     return template.format(
-        source=_comment(facts["source"]),
+        source=comment(facts["source"]),
         width=width,
         height=height,
         x_fov=f"{facts['x_fov_deg']:.5g}",
@@ -494,6 +494,12 @@ def far_noise(images: np.ndarray, far: np.ndarray, saturation: float) -> tuple[N
             {"channel": "rgb"[c], "signal": float(mean[:, c].mean()), "sd": float(np.sqrt(square[:, c].mean()))}
         )
     light, variance, weight = (np.array(v, float) for v in zip(*levels))
+    return noise_of_levels(light, variance, weight, saturation), channel
+
+
+def noise_of_levels(light: np.ndarray, variance: np.ndarray, weight: np.ndarray, saturation: float) -> Noise:
+    """Noise from variances (n,) at levels of light (n,), DN; where they show no photon transfer, one that has their
+    mean."""
     (gain, floor), _ = photon_transfer(light, variance, weight)
     if gain <= 0 or floor < 0:  # no photon transfer in these data: banding and drift rule
         gain, floor = (
@@ -501,7 +507,7 @@ def far_noise(images: np.ndarray, far: np.ndarray, saturation: float) -> tuple[N
             if gain <= 0
             else (float(np.average(variance / light, weights=weight)), 0.0)
         )
-    return Noise(float(gain), math.sqrt(max(floor, 0.0)), 0.0, saturation, 0.0, 1.0), channel
+    return Noise(float(gain), math.sqrt(max(floor, 0.0)), 0.0, saturation, 0.0, 1.0)
 
 
 def light_directions(images, backgrounds, circles, radius: float) -> list[list[float]]:
@@ -620,12 +626,12 @@ def _rgb(values, signed: bool = False) -> str:
     return " / ".join(f"{v:+.2g}" if signed else f"{v:.2g}" for v in values)
 
 
-def _comment(text: str) -> str:
+def comment(text: str) -> str:
     """Text that may stand in an XML comment and in a template's output."""
     return text.replace("--", "- -").replace("<", "(").replace(">", ")")
 
 
-def _write(
+def write_set(
     folder: Path, frames, noise, flat, xml: str, facts: dict, bits: int | None, overwrite: bool, text: str = ""
 ) -> Path:
     """flat: one for all frames, None where each has its own; text: of README.txt, that of presses without it."""

@@ -28,8 +28,8 @@ from typing import Any
 import numpy as np
 
 from optics.captures.capture_set import Frame
-from optics.captures.importing import Imported, _comment, _write, binned
-from optics.captures.noise import Noise, photon_transfer
+from optics.captures.importing import Imported, binned, comment, noise_of_levels, write_set
+from optics.captures.noise import Noise
 from optics.errors import BadCapture
 from optics.files.images import read_image
 from optics.files.output import shipped
@@ -204,10 +204,7 @@ def neighbour_noise(ratios: np.ndarray, flats: np.ndarray, use: np.ndarray, satu
     light = np.array([g.mean() for g, _ in groups])
     # of a squared Gaussian the mean is 2.2 times the median: a speck of dust does not move it
     variance = np.array([np.median(s) / 0.4549 for _, s in groups])
-    (gain, floor), _ = photon_transfer(light, variance, np.array([float(len(g)) for g, _ in groups]))
-    if gain <= 0 or floor < 0:
-        gain, floor = (1e-3, float(variance.mean())) if gain <= 0 else (float(np.mean(variance / light)), 0.0)
-    return Noise(float(gain), math.sqrt(max(floor, 0.0)), 0.0, saturation, 0.0, 1.0)
+    return noise_of_levels(light, variance, np.array([float(len(g)) for g, _ in groups]), saturation)
 
 
 def blemishes(ratio: np.ndarray, sd: np.ndarray, offset: np.ndarray, radius: float) -> np.ndarray:
@@ -303,7 +300,7 @@ def import_scans(
             f"{100 * max(masked):.2g} % of a frame"
         )
     facts = _facts(source, scans, flat, plates, bin, scale, shape, noise, lights, warnings)
-    path = _write(
+    path = write_set(
         Path(folder),
         frames,
         noise,
@@ -407,7 +404,7 @@ def _scene(facts: Mapping, scans: Sequence[Scan], lights: Mapping[str, np.ndarra
     view = max(height, width) * scale
     ball = facts["ball_radius_mm"]
     return template.format(
-        source=_comment(facts["source"]),
+        source=comment(facts["source"]),
         width=width,
         height=height,
         x_fov=f"{facts['x_fov_deg']:.6g}",

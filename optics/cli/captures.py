@@ -36,7 +36,9 @@ if TYPE_CHECKING:
     "camera, into a capture folder.",
 )
 def import_(
-    source: Annotated[Path, typer.Argument(metavar="SOURCE", help="An .npz calibration pack, or a folder of images.")],
+    source: Annotated[
+        Path, typer.Argument(metavar="SOURCE", help="An .npz calibration pack, a folder of images, or of scans.")
+    ],
     output: Annotated[Path, typer.Option("-o", "--output", metavar="CAPTURES", help="Folder of the new capture set.")],
     circles: Annotated[
         Path | None,
@@ -130,9 +132,7 @@ def import_(
             dark_noise=dark_noise,
             overwrite=force,
         )
-        for text in read.warnings:
-            terminal.note(f"warning: {one_line(text)}")
-        print(read.folder)
+        _tell(read.folder, read.warnings)
         return
     if scans.is_scan_source(source):
         stated = {"--circles": circles, "--ball-radius": ball_radius, "--mm-per-pixel": mm_per_pixel}
@@ -140,9 +140,7 @@ def import_(
             raise ValueError(f"{', '.join(given)}: scan.yaml says so; leave these out")
         with terminal.progress() as progress:
             found = scans.import_scans(source, output, bin=bin, overwrite=force, progress=progress)
-        for text in found.warnings:
-            terminal.note(f"warning: {one_line(text)}")
-        print(found.folder)
+        _tell(found.folder, found.warnings)
         return
     options: dict[str, Any] = {"leds": leds, "bin": bin, "every": every, "overwrite": force}
     if ball_radius is not None:
@@ -164,9 +162,14 @@ def import_(
                 "circles"
             )
         found = importing.import_circles(source, circles, output, untouched=untouched, **options)
-    for text in found.warnings:
+    _tell(found.folder, found.warnings)
+
+
+def _tell(folder: Path, warnings: list[str]) -> None:
+    """What an import left: remarks on stderr, the folder on stdout."""
+    for text in warnings:
         terminal.note(f"warning: {one_line(text)}")
-    print(found.folder)
+    print(folder)
 
 
 @command

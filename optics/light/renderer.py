@@ -31,7 +31,7 @@ BENT = 1e-3
 CREASE = 25.0  # deg from pixel to pixel: what is no smooth surface
 FLAT_FIELDS = ("multiplicative", "additive", "none")
 MEMORY = 4e9  # bytes of hits and images that are kept
-PER_RAY = 100  # bytes of a camera ray's end, as measured: its surface interaction, weight and origin
+PER_RAY = 100  # bytes of a camera ray's end, by the memory of a process that held ten million of them
 BOUNCE_SAMPLES = 32  # directions per cell for the second bounce
 BOUNCE_CELL = 2  # px each way of a cell
 
@@ -151,16 +151,18 @@ class Renderer:
 
     def _make_room(self, latest: Hits) -> None:
         """Forget the oldest geometries while what is kept is larger than MEMORY: large images with many rims."""
-        kept = {
-            id(h): h
-            for h in (*(i.hits for i in self._images.values() if isinstance(i, LedImage)), *self._hits.values())
-        }
-        held = [h for h in kept.values() if h is not latest]
-        total = latest.bytes + sum(h.bytes for h in held)
-        for old in held:
+        images = [i for i in self._images.values() if isinstance(i, LedImage)]
+        rays: dict[Hits, dict[int, int]] = {}  # geometry -> ends of camera rays by the samples that hold them
+        for hits in (*(i.hits for i in images), *self._hits.values()):
+            rays.setdefault(hits, {0: hits.valid.size})
+        for image in images:  # of one geometry, they may share their finer samples
+            rays[image.hits][id(image.samples)] = self.rim_samples * len(image.index)
+        size = {hits: PER_RAY * sum(own.values()) for hits, own in rays.items()}
+        total = sum(size.values())
+        for old in [hits for hits in size if hits is not latest]:
             if total <= MEMORY:
                 return
-            total -= old.bytes
+            total -= size[old]
             self._hits = OrderedDict((k, h) for k, h in self._hits.items() if h is not old)
             self._images = OrderedDict((k, i) for k, i in self._images.items() if getattr(i, "hits", None) is not old)
 
@@ -223,7 +225,6 @@ class Renderer:
         self._images[key] = image
         while len(self._images) > self.remember * len(self.scene.lights):
             self._images.popitem(last=False)
-        image.hits.count(image, self.rim_samples)
         self._make_room(image.hits)
         return image
 
@@ -605,7 +606,6 @@ class Hits:
         self.si, self.weight, self.origin, self.path = sample
         self.shape = (height, width)
         self.rims: dict = {}
-        self.rays = 0  # finer samples that images of it hold
         self.joint: np.ndarray | None = None
         self.valid = np.array(self.si.is_valid()).reshape(height, width)
         self.edges = _edges(self.valid)
@@ -618,14 +618,6 @@ class Hits:
             if self.path is not None
             else _bent(np.where(self.valid[..., None], self.normal, 0.0))
         )
-
-    def count(self, image: LedImage, samples: int) -> None:
-        """Note the finer samples, so many in each pixel, that an image of this geometry holds."""
-        self.rays += samples * len(image.index)
-
-    @property
-    def bytes(self) -> int:
-        return PER_RAY * (self.valid.size + self.rays)
 
     def image(self, values) -> np.ndarray:
         return np.array(values).reshape(self.shape)
