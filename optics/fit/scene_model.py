@@ -563,7 +563,7 @@ class SceneModel:
                     continue
                 for component in range(1 if self.developer.site is None else 3):
                     fine = image.raw[1] * self.renderer.weights(now, image, component)[1]
-                    across = across + power * (fine.max(1) - fine.min(1))
+                    across = across + power * image.finer.span(fine)
             known = np.ones(self.shape, bool)
             if np.ndim(across):
                 view = self.developer.view(now)

@@ -2,7 +2,7 @@
 
 Light is linear in every LED, so each LED is rendered once per geometry at power 1 and kept; powers, exposure, colour
 and response act on the kept images. One sample per pixel is exact away from edges: pixels at the rim of a shadow or of
-the gel are sampled 64 times. Derivative images come from Dr.Jit in forward mode through the shading, with the primary
+the gel are sampled 128 times, where the face bends 16 times. Derivative images come from Dr.Jit in forward mode through the shading, with the primary
 hits and shadows kept; at rims, where that misses the moving edge, and for everything that moves geometry they are
 central differences with common samples (`Parameter.how`)."""
 
@@ -28,6 +28,7 @@ PAINTED = 0.05  # of the largest reflectance of a texture: a step from pixel to 
 # difference of a pixel's mean normal from that at its middle, above which finer samples are taken: a fifth of a grey
 # level in 200
 BENT = 1e-3
+BENT_SIDE = 4  # finer samples each way where the face bends: the mean of what varies smoothly needs few
 CREASE = 25.0  # deg from pixel to pixel: what is no smooth surface
 FLAT_FIELDS = ("multiplicative", "additive", "none")
 MEMORY = 4e9  # bytes of hits and images that are kept
@@ -156,7 +157,7 @@ class Renderer:
         for hits in (*(i.hits for i in images), *self._hits.values()):
             rays.setdefault(hits, {0: hits.valid.size})
         for image in images:  # of one geometry, they may share their finer samples
-            rays[image.hits][id(image.samples)] = self.rim_samples * len(image.index)
+            rays[image.hits][id(image.finer)] = image.finer.size
         size = {hits: PER_RAY * sum(own.values()) for hits, own in rays.items()}
         total = sum(size.values())
         for old in [hits for hits in size if hits is not latest]:
@@ -232,20 +233,20 @@ class Renderer:
         if led in self.scene.sources:  # what it sends lies in the weights
             rim = self._joint_rim(hits)
             index = np.flatnonzero(rim)
-            image = LedImage(led, hits, rim, index, self._rim_samples(hits, index), None, None, hits.valid)
-            image.raw = (np.ones((1, self.bands)), np.ones((1, 1, self.bands)))
+            image = LedImage(led, hits, rim, index, self._finer(hits, index), None, None, hits.valid)
+            image.raw = (np.ones((1, self.bands)), np.ones((1, self.bands)))
             return image
         part = self.scene.leds[led]
         visible = self._visible(hits.si, part)
         rim = self._joint_rim(hits) if self.layered else self._rim(hits, visible)
         share = np.where(rim, 1.0, hits.bent)
         index = np.flatnonzero(share)
-        samples = self._rim_samples(hits, index)
-        rim_visible = self._visible(samples.si, part) if len(index) else None
-        image = LedImage(led, hits, rim, index, samples, visible, rim_visible, self._seen(visible).mean(0) > 0.5)
+        finer = self._finer(hits, index, np.flatnonzero(~rim.ravel()[index]))
+        rim_visible = self._visible(finer.sample.si, part) if len(index) else None
+        image = LedImage(led, hits, rim, index, finer, visible, rim_visible, self._seen(visible).mean(0) > 0.5)
         image.share = share.reshape(-1, 1)[index]
         image.raw = self._raw(
-            image, lambda: self._shade(hits.sample, part, visible), lambda: self._shade(samples, part, rim_visible)
+            image, lambda: self._shade(hits.sample, part, visible), lambda: self._shade(finer.sample, part, rim_visible)
         )
         if not self.layered:
             image.radiance = self._mix(image, image.raw)
@@ -306,24 +307,16 @@ class Renderer:
             yield tuple(
                 None
                 if path is None
-                else light
-                * paths.transmission(self.scene, path, values, self.wavelengths, component, name)[0].reshape(shape)
-                for path, shape in (
-                    (image.hits.path, (-1, self.bands)),
-                    (
-                        image.samples.path if len(image.index) else None,
-                        (len(image.index), self.rim_samples, self.bands),
-                    ),
-                )
+                else light * paths.transmission(self.scene, path, values, self.wavelengths, component, name)[0]
+                for path in (image.hits.path, image.finer.sample.path if len(image.index) else None)
             )
 
     def weights(self, values: Mapping, image: LedImage, component: int = 0) -> tuple:
-        """What the layers leave of a light: (H W, B) at the pixels' centres, (n, S, B) at the finer samples of rims."""
+        """What the layers leave of a light: (H W, B) at the pixels' centres, (N, B) at the finer samples of rims."""
         centre = self._weight(values, image.led, image.hits.path, component, ())
         fine = None
         if len(image.index):
-            fine = self._weight(values, image.led, image.samples.path, component, (image.index.tobytes(),))
-            fine = fine.reshape(len(image.index), self.rim_samples, self.bands)
+            fine = self._weight(values, image.led, image.finer.sample.path, component, (image.index.tobytes(),))
         return centre, fine
 
     def _weight(self, values: Mapping, light: str, path, component: int, where: tuple) -> np.ndarray:
@@ -372,18 +365,28 @@ class Renderer:
         plain = {**values, **paths.undetected(self.scene)}
         return np.stack([self.radiance(plain, seed, component) for component in range(4)])
 
-    def _rim_samples(self, hits: Hits, index: np.ndarray):
-        key = index.tobytes()
+    def _finer(self, hits: Hits, index: np.ndarray, bent: np.ndarray | tuple = ()) -> Finer:
+        """Finer samples of the pixels `index`; of `bent` among them, where no edge is, fewer."""
+        key = (index.tobytes(), np.asarray(bent).tobytes())
         if key not in hits.rims:
             # A Hammersley set, shifted from pixel to pixel: an edge in any direction crosses the samples one by one,
-            # and not in rows, so that a shadow that moves changes a pixel in small steps.
-            count = self.rim_samples
-            k = np.arange(count)
-            reversed_bits = sum(((k >> b) & 1) / 2 ** (b + 1) for b in range(count.bit_length() - 1))
-            shift = np.outer(index, (0.7548776662466927, 0.5698402909980532))  # the R2 sequence
-            u = (index % self.width)[:, None] + (k / count + shift[:, :1]) % 1.0
-            v = (index // self.width)[:, None] + (reversed_bits + shift[:, 1:]) % 1.0
-            hits.rims = {key: self._trace(u.ravel(), v.ravel()) if len(index) else None}  # only the latest is kept
+            # and not in rows, so that a shadow that moves changes a pixel in small steps. What only bends is smooth:
+            # the middles of a square grid.
+            counts = np.full(len(index), self.rim_samples)
+            counts[list(bent)] = BENT_SIDE**2
+            k = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+            here, bends = np.repeat(index, counts), np.repeat(counts < self.rim_samples, counts)
+            levels = self.rim_samples.bit_length() - 1
+            reversed_bits = sum(((k >> b) & 1) / 2 ** (b + 1) for b in range(levels))
+            places = (
+                ((k % BENT_SIDE + 0.5) / BENT_SIDE, k / self.rim_samples, 0.7548776662466927),  # the R2 sequence
+                ((k // BENT_SIDE + 0.5) / BENT_SIDE, reversed_bits, 0.5698402909980532),
+            )
+            u, v = (
+                corner + np.where(bends, middle, (place + here * shift) % 1.0)
+                for corner, (middle, place, shift) in zip((here % self.width, here // self.width), places)
+            )
+            hits.rims = {key: Finer(counts, self._trace(u, v) if len(index) else None)}  # only the latest is kept
         return hits.rims[key]
 
     def _discs(self, part) -> list:
@@ -428,15 +431,15 @@ class Renderer:
         return sum(parts[1:], parts[0]) / len(parts)
 
     def _raw(self, image: LedImage, centre: Callable, rim: Callable) -> tuple:
-        """Shading at pixel centres (H W, B) and at the finer samples of rims (n, S, B), None without rims."""
-        fine = self._bands(rim()).reshape(len(image.index), self.rim_samples, self.bands) if len(image.index) else None
+        """Shading at pixel centres (H W, B) and at the finer samples (N, B), None without any."""
+        fine = self._bands(rim()) if len(image.index) else None
         return self._bands(centre()).reshape(self.height * self.width, self.bands), fine
 
     def _mix(self, image: LedImage, raw: tuple, weights: tuple = (1.0, 1.0)) -> np.ndarray:
         """(H, W, B) from pixel centres and, where the rim is, from the mean of the finer samples, by its share."""
         result = raw[0] * weights[0] if self.layered else raw[0].copy()
         if len(image.index):
-            result[image.index] += image.share * ((raw[1] * weights[1]).mean(1) - result[image.index])
+            result[image.index] += image.share * (image.finer.mean(raw[1] * weights[1]) - result[image.index])
         return (
             result.reshape(-1, self.width, self.bands)
             if len(result) != self.height * self.width
@@ -493,7 +496,7 @@ class Renderer:
             for sign in (1, -1):
                 setattr(part, parameter, dr.opaque(mi.Float, float(value[0]) + sign * step))
                 try:
-                    sides.append(self._shade(image.samples, lamp, self._visible(image.samples.si, lamp)))
+                    sides.append(self._shade(image.finer.sample, lamp, self._visible(image.finer.sample.si, lamp)))
                 finally:
                     setattr(part, parameter, value)
             return (sides[0] - sides[1]) / (2 * step)
@@ -501,7 +504,7 @@ class Renderer:
         raw = self._raw(
             image,
             lambda: tangent(image.hits.sample, image.visible),
-            moved_rim if moves else lambda: tangent(image.samples, image.rim_visible),
+            moved_rim if moves else lambda: tangent(image.finer.sample, image.rim_visible),
         )
         if component and not self.layered:
             return np.zeros((self.height, self.width, self.bands))
@@ -569,12 +572,10 @@ class Renderer:
         hits = self.hits(values)
         rim = self._joint_rim(hits)
         index = np.flatnonzero(rim)
-        image = LedImage("", hits, rim, index, self._rim_samples(hits, index), None, None, hits.valid)
+        image = LedImage("", hits, rim, index, self._finer(hits, index), None, None, hits.valid)
         image.raw = (
             self._shone(values, hits.sample),
-            self._shone(values, image.samples).reshape(len(index), self.rim_samples, self.bands)
-            if len(index)
-            else None,
+            self._shone(values, image.finer.sample) if len(index) else None,
         )
         return image
 
@@ -631,11 +632,31 @@ class Hits:
         return np.array(self.si.sh_frame.n).T.reshape(*self.shape, 3)
 
 
+class Finer:
+    """Finer samples of some pixels, those of a pixel behind each other.
+
+    counts   (n,) of each pixel;   sample   their ends, N in all; None where no pixel has any
+    """
+
+    def __init__(self, counts: np.ndarray, sample: Sample | None):
+        self.counts, self.sample = counts, sample
+        self.size = int(counts.sum())
+        self._starts = np.cumsum(counts) - counts
+
+    def mean(self, values: np.ndarray) -> np.ndarray:
+        """(n, B) mean in each pixel of values (N, B)."""
+        return np.add.reduceat(values, self._starts) / self.counts[:, None]
+
+    def span(self, values: np.ndarray) -> np.ndarray:
+        """(n, B) largest less smallest of values (N, B) in each pixel."""
+        return np.maximum.reduceat(values, self._starts) - np.minimum.reduceat(values, self._starts)
+
+
 class LedImage:
     """One LED's image with the hits, rim pixels and shadows that it was made from."""
 
-    def __init__(self, led, hits, rim, index, samples, visible, rim_visible, lit):
-        self.led, self.hits, self.rim, self.index, self.samples = led, hits, rim, index, samples
+    def __init__(self, led, hits, rim, index, finer, visible, rim_visible, lit):
+        self.led, self.hits, self.rim, self.index, self.finer = led, hits, rim, index, finer
         self.visible, self.rim_visible, self.lit = visible, rim_visible, lit
         self.share: np.ndarray | float = 1.0  # (n, 1) of the finer samples in each of those pixels
         self.raw: tuple | None = None  # what the light makes before layers: at centres, at finer samples

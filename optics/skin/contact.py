@@ -21,7 +21,8 @@ Source of the deformation: the GelSight-type supplement, S1.2 (depth kept within
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from pathlib import Path
 
@@ -34,6 +35,7 @@ SHAPES = ("sphere", "cylinder", "cube", "balls")
 MESH_FILES = (".stl", ".obj", ".ply")
 FILES = (*MESH_FILES, *MAP_FILES)
 FLATTEST = 0.05  # slope that softens the contact edge of flat faces: a twentieth of a pitch of height
+NEWTON = 20  # steps to a contact line: from the steepest place six are enough for skirts of a tenth of the radius
 DETACHING = 0.3  # the weight of contact fades while the smoothed skin goes from 1 to 1.3 times the indenter's depth
 
 
@@ -116,6 +118,76 @@ def gaussian_blur(a: np.ndarray, sd: float) -> np.ndarray:
 
 # -- Indenters -------------------------------------------------------------------------------------------------------
 @dataclass(frozen=True, eq=False)
+class Balls:
+    """One ball on the axis, or a square grid of them on a turned plate.
+
+    radius   mm;   slope  beyond which each goes on as a cone (`Profile.envelope`)
+    spacing  mm from middle to middle; 0: one ball
+    turn     (3, 3) of the plate: balls stay balls, and stand where they are turned to
+    """
+
+    radius: float
+    slope: float
+    spacing: float = 0.0
+    turn: np.ndarray = field(default_factory=lambda: np.eye(3))
+
+    def nearby(self, u: np.ndarray, v: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """Of each ball that stands nearest to (u, v) on one of its four sides: (whole numbers along rows and columns
+        (2, ...), horizontal distance of its axis in mm)."""
+        if not self.spacing:
+            yield np.zeros((2, *u.shape), int), np.hypot(u, v)
+            return
+        plane = self.turn[:2, :2] * self.spacing
+        first = np.floor(np.einsum("ij,j...->i...", np.linalg.inv(plane), np.stack([u, v]))).astype(int)
+        for side in ((0, 0), (1, 0), (0, 1), (1, 1)):
+            number = first + np.reshape(side, (2, 1, 1))
+            x, y = np.einsum("ij,j...->i...", plane, number)
+            yield number, np.hypot(u - x, v - y)
+
+    def rise(self, number: np.ndarray) -> np.ndarray:
+        """mm by which the lowest points of balls stand above that of the ball on the axis, for their numbers (2, ...)"""
+        return np.einsum("j,j...->...", self.turn[2, :2] * self.spacing, number)
+
+    def lower(self, r: np.ndarray) -> np.ndarray:
+        """Height of a ball's lower side at the distance r from its axis, over its lowest point, mm."""
+        edge = self.radius * self.slope / math.hypot(1.0, self.slope)
+        inner = np.minimum(r, edge)
+        return self.radius - np.sqrt(self.radius**2 - inner**2) + self.slope * (r - inner)
+
+    def contact_line(self, depth: np.ndarray, skirt: float) -> np.ndarray:
+        """Radius (mm) at which a skirt leaves a ball, where depth - lower(r) = skirt d lower/dr; 0 where it is not
+        touched. On the ball r = R sin t, and
+
+            f(t) = depth - R + R cos t - skirt tan t = 0
+
+        falls ever faster, so that Newton's steps from beyond the root end there."""
+        steepest = math.atan(self.slope)
+        t = np.full(np.shape(depth), steepest)
+
+        def excess(t):
+            return depth - self.radius * (1 - np.cos(t)) - skirt * np.tan(t)
+
+        beyond = np.maximum(excess(t), 0.0) / self.slope  # of deep contacts, on the cone
+        for _ in range(NEWTON):
+            t = np.clip(t + excess(t) / (self.radius * np.sin(t) + skirt / np.cos(t) ** 2), 0.0, steepest)
+        return np.where(depth > 0, self.radius * np.sin(t) + beyond, 0.0)
+
+    def dragged(self, u: np.ndarray, v: np.ndarray, depth: float, skirt: float) -> np.ndarray:
+        """Displacement with an exponential skirt (mm) at (u, v) around the axis; see `dragged`."""
+        found = np.zeros(u.shape)
+        for number, r in self.nearby(u, v):
+            low = number.reshape(2, -1).min(1)
+            every = np.indices(np.ptp(number.reshape(2, -1), axis=1) + 1) + low.reshape(2, 1, 1)
+            deep = depth - self.rise(every)
+            line = self.contact_line(deep, skirt)
+            edge = np.where(deep > 0, deep - self.lower(line), 0.0)
+            place = tuple(number - low.reshape(2, 1, 1))
+            beyond = edge[place] * np.exp(-np.maximum(r - line[place], 0.0) / skirt)
+            found = np.maximum(found, np.where(r < line[place], deep[place] - self.lower(r), beyond))
+        return found
+
+
+@dataclass(frozen=True, eq=False)
 class Profile:
     """Lower surface of an indenter: height in mm above its lowest point, on [v, u] = `axis` x `axis`.
 
@@ -123,13 +195,13 @@ class Profile:
     envelope  (n, n) finite: the lowest surface of slope <= tan(steepest) that holds the indenter, which is `height` on
               all but steep parts: min over the indenter's points (u', v', h') of h' + tan(steepest) |(u, v) - (u', v')|
     pitch     mm
-    ball      (radius in mm, steepest slope) of a sphere, whose skirt is a closed form; None: another indenter
+    balls     of a sphere, or of a plate of them, whose skirt is a closed form; None: another indenter
     """
 
     height: np.ndarray
     envelope: np.ndarray
     pitch: float
-    ball: tuple[float, float] | None = None
+    balls: Balls | None = None
 
     @property
     def axis(self) -> np.ndarray:
@@ -234,7 +306,8 @@ def _profile(shape, stamp, size, rx, ry, rz, extent, pitch, steepest, spacing) -
         height, envelope = mesh(axis, size, shape, stamp, (rx, ry, rz), extent, pitch, slope)
     for a in (height, envelope):
         a.flags.writeable = False
-    return Profile(height, envelope, pitch, (size, slope) if shape == "sphere" else None)
+    found = {"sphere": Balls(size, slope), "balls": Balls(size, slope, spacing, turn)}
+    return Profile(height, envelope, pitch, found.get(shape))
 
 
 def rotation_matrix(rx: float, ry: float, rz: float) -> np.ndarray:
@@ -541,32 +614,13 @@ def dragged(profile: Profile, d0: np.ndarray, depth: float, thickness: float, sk
     Every touched point drags the skin around it, and the drag falls by 1/e over `skirt`; the strongest wins. The skin
     leaves the indenter where its slope is D0 / skirt, without a kink, and goes on as an exponential. (A membrane under
     tension T on a bed of stiffness k falls over sqrt(T/k) in the same way, but for the curvature of the contact line.)
-    For a sphere the contact line is the root of D0(r) = skirt D0'(r), a closed form otherwise; other indenters take the
+    For balls the contact line is the root of D0(r) = skirt D0'(r), a closed form otherwise; other indenters take the
     cone envelope of -log D0 on the grid, whose distances are up to 2.7 % too long.
     """
-    if profile.ball is None or depth >= thickness:
+    if profile.balls is None or depth >= thickness:
         low = -np.log(np.maximum(d0, 1e-12))
         return np.exp(-cone_envelope(low, profile.pitch / skirt))
-    from scipy.optimize import brentq
-
-    radius, steep = profile.ball
-    edge = radius * steep / math.hypot(1.0, steep)  # beyond, the envelope is a cone
-
-    def lower(r):
-        if r > edge:
-            return radius - math.sqrt(radius**2 - edge**2) + steep * (r - edge), steep
-        root = math.sqrt(radius**2 - r * r)
-        return radius - root, r / root
-
-    def excess(r):
-        height, slope = lower(r)
-        return depth - height - skirt * slope
-
-    outer = edge + depth / steep  # the envelope is above the depth here
-    line = brentq(excess, 0.0, outer, xtol=1e-14, rtol=1e-14)
-    height, _ = lower(line)
-    r = np.hypot(*np.meshgrid(profile.axis, profile.axis))
-    return np.where(r < line, depth - profile.envelope, (depth - height) * np.exp(-np.maximum(r - line, 0.0) / skirt))
+    return profile.balls.dragged(*np.meshgrid(profile.axis, profile.axis), depth, skirt)
 
 
 @lru_cache(maxsize=16)

@@ -10,6 +10,7 @@ from optics.skin.contact import (
     LocalMap,
     cone_envelope,
     displacement,
+    dragged,
     gaussian_blur,
     graded_axis,
     grid_normals,
@@ -228,6 +229,27 @@ def test_balls_are_spheres_where_the_plate_holds_them():
         np.testing.assert_allclose(plate.envelope[middle], alone.envelope[middle], atol=1e-12)
     with pytest.raises(ValueError, match=r"spacing = 0.4 mm for balls of radius 0.25 mm; it must be 0.5 mm"):
         indenter_profile("balls", ball, spacing=0.4)
+
+
+def test_the_skirts_of_a_tilted_plate_of_balls_are_the_largest_of_all_balls():
+    """Contact lines on a fine grid of radii, and every ball of the plate tried, not only those around a point."""
+    profile = indenter_profile("balls", 0.25, (0.5, -0.3, 1.0), 3.0, 0.03, spacing=1.0)
+    turn = rotation_matrix(0.5, -0.3, 1.0)
+    u, v = np.meshgrid(profile.axis, profile.axis)
+    radii = np.linspace(0, 0.24, 200_001)
+    cap = 0.25 - np.sqrt(0.25**2 - radii**2)
+    slope = radii / np.sqrt(0.25**2 - radii**2)
+    for depth, skirt in ((0.12, 0.1), (0.05, 0.02)):
+        expected = np.zeros(u.shape)
+        for number in np.ndindex(9, 9):
+            x, y, rise = turn[:, :2] @ (np.array(number) - 4.0)
+            at = np.argmin(np.abs(depth - rise - cap - skirt * slope))
+            r = np.hypot(u - x, v - y)
+            on_ball = depth - rise - 0.25 + np.sqrt(np.maximum(0.25**2 - r**2, 0.0))
+            beyond = (depth - rise - cap[at]) * np.exp(-(r - radii[at]) / skirt)
+            expected = np.maximum(expected, np.where(r < radii[at], on_ball, beyond))
+        found = dragged(profile, np.zeros(u.shape), depth, 2.0, skirt)
+        np.testing.assert_allclose(found, expected, atol=2e-7)  # the grid of radii, 1.2e-6 mm, along a slope below 1
 
 
 @pytest.mark.parametrize("kind", ["tmd", "npy", "png"])
