@@ -2,9 +2,9 @@
 
 Light is linear in every LED, so each LED is rendered once per geometry at power 1 and kept; powers, exposure, colour
 and response act on the kept images. One sample per pixel is exact away from edges: pixels at the rim of a shadow or of
-the gel are sampled 128 times, where the face bends 16 times. Derivative images come from Dr.Jit in forward mode through the shading, with the primary
-hits and shadows kept; at rims, where that misses the moving edge, and for everything that moves geometry they are
-central differences with common samples (`Parameter.how`)."""
+the gel are sampled 128 times, where the face bends 16 times. Derivative images come from Dr.Jit in forward mode through
+the shading, with the primary hits and shadows kept; at rims, where that misses the moving edge, and for everything that
+moves geometry they are central differences with common samples (`Parameter.how`)."""
 
 from __future__ import annotations
 
