@@ -10,7 +10,8 @@ LED, its settings say which LED is on and where the plate is pressed.
 Derived, not measured, and said so:
     plate      the similarity that maps (gx, gy) to (x, y): `gel.press_x`, `gel.press_y` of the ball nearest the middle
                and `gel.press_rz`; it is compared with `calibspacing` and `mmperpixel`
-    depth      from a touched radius of CONTACT times the ball's
+    depth      from where the balls' shadows end (`depth_by_shadows`); where they cast none, from a touched radius of
+               CONTACT times the ball's
     noise      variance against signal of half the squared differences of neighbours in image over flat field, where no
                ball is near
     lights     the direction of the least-squares fit I/F = l.n + c on the balls, at DISTANCE
@@ -21,7 +22,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +40,9 @@ DISTANCE = 30.0  # mm from the middle of the face to a light, where no better is
 CAMERA = 200.0  # mm: nearly telecentric, as lenses for inspection are
 CONTACT = 0.85  # of the ball's radius: touched, where nothing tells
 BALL, NEAR = 0.7, 1.8  # of the ball's radius: of it within, of the level face beyond
+BEHIND = 0.3  # of the ball's radius: half the width of the strip in which a shadow's end is sought
+DARK = 0.7  # of the level face, below which it is shadow
+STEP = 1.0  # DN from value to value
 BLEMISH = 6.0  # standard deviations; noise alone reaches it in one of 5e8 values
 AROUND = 9  # px, of the median that a value is held against
 LEVELS = 12
@@ -204,7 +208,9 @@ def neighbour_noise(ratios: np.ndarray, flats: np.ndarray, use: np.ndarray, satu
     light = np.array([g.mean() for g, _ in groups])
     # of a squared Gaussian the mean is 2.2 times the median: a speck of dust does not move it
     variance = np.array([np.median(s) / 0.4549 for _, s in groups])
-    return noise_of_levels(light, variance, np.array([float(len(g)) for g, _ in groups]), saturation)
+    found = noise_of_levels(light, variance, np.array([float(len(g)) for g, _ in groups]), saturation)
+    # in the dark neighbours round alike: the steps of a camera of 8 bit do not average in blocks
+    return replace(found, dark_noise=math.hypot(found.dark_noise, STEP / math.sqrt(12)))
 
 
 def blemishes(ratio: np.ndarray, sd: np.ndarray, offset: np.ndarray, radius: float) -> np.ndarray:
@@ -235,6 +241,40 @@ def _normals(offset: np.ndarray, radius: float) -> np.ndarray:
 def light_of(ratio: np.ndarray, offset: np.ndarray, use: np.ndarray, radius: float) -> np.ndarray:
     """(3,) l of the least-squares fit ratio = l.n + c on balls; n points to the camera (x right, y down)."""
     return np.linalg.lstsq(_normals(offset[use], radius), ratio[use], rcond=None)[0][:3]
+
+
+def depth_by_shadows(ratio: np.ndarray, offset: np.ndarray, radius: float, light: np.ndarray) -> float | None:
+    """Depth d (mm) of balls whose shadows, in light of the elevation e, end x mm from their middles:
+
+        x = R / sin e - (R - d) / tan e
+
+    a ray that touches the ball, from the height at which it does to the level face. The shadow ends half-way between
+    its darkest and the level face, in the mean over all balls. None where no shadow falls beyond the ball.
+
+    ratio (H, W) of image over flat field;   offset (H, W, 2) mm from the nearest ball;   light as `light_of` has it"""
+    flat = float(np.hypot(*light[:2]))
+    elevation = math.atan2(light[2], flat)
+    if not (flat > 0 and 0 < elevation < math.pi / 2):
+        return None
+    away = -offset @ (light[:2] / flat)
+    across = np.abs(offset @ (np.array([-light[1], light[0]]) / flat))
+    edges = np.arange(0.0, 2.0 + 1e-9, 0.05) * radius
+    near = (across < BEHIND * radius) & (away > 0) & (away < edges[-1])
+    count = np.histogram(away[near], edges)[0]
+    if (count == 0).any():
+        return None
+    profile = np.histogram(away[near], edges, weights=ratio[near])[0] / count
+    darkest, end = int(np.argmin(profile)), len(profile) - 1
+    half = (profile[darkest] + 1) / 2
+    if profile[darkest] > DARK or profile[end] < half:
+        return None
+    while profile[end - 1] > half:
+        end -= 1
+    share = (half - profile[end - 1]) / (profile[end] - profile[end - 1])
+    x = (edges[end] + (share - 0.5) * (edges[1] - edges[0])) if end else 0.0
+    depth = radius - (radius / math.sin(elevation) - x) * math.tan(elevation)
+    # a ball that stands lower than where the ray would touch it casts no shadow beyond itself
+    return depth if radius * (1 - math.cos(elevation)) < depth < 2 * radius else None
 
 
 # -- importing -------------------------------------------------------------------------------------------------------
@@ -269,8 +309,7 @@ def import_scans(
         warnings += _contradictions(scan, plate, first)
         plates.append(plate)
         cut.append(np.stack([_cut(i, bin, saturation)[..., 0] for i in scan.images]))
-        depth = scan.radius * (1 - math.sqrt(1 - CONTACT**2))
-        pose = dict(zip(POSE, (plate.x, plate.y, depth, 0.0, 0.0, plate.turn)))
+        pose = dict(zip(POSE, (plate.x, plate.y, 0.0, 0.0, 0.0, plate.turn)))
         settings.append({key: round(float(value), 6) for key, value in pose.items()})
         tick("import", done, steps)
     shape = flats.shape[1:]
@@ -281,6 +320,8 @@ def import_scans(
         np.concatenate(ratios), np.concatenate([flats] * len(scans)), level.reshape(-1, *shape), saturation
     )
     lights = _lights(scans, ratios, offsets, distances)
+    for pose, *shown in zip(settings, scans, ratios, offsets):
+        pose["gel.press_depth"] = round(_depth(*shown, lights), 6)
     frames, masked = [], []
     for scan, images, ratio, offset, pose in zip(scans, cut, ratios, offsets, settings):
         for k, label in enumerate(scan.labels):
@@ -354,6 +395,15 @@ def _lights(
     return {label: np.mean(several, 0) for label, several in found.items()}
 
 
+def _depth(scan: Scan, ratios: np.ndarray, offset: np.ndarray, lights: Mapping[str, np.ndarray]) -> float:
+    """Depth of a plate's balls, mm: the median over the LEDs, no more than the touched radius of a whole ball."""
+    found = [depth_by_shadows(one, offset, scan.radius, lights[label]) for label, one in zip(scan.labels, ratios)]
+    known = [depth for depth in found if depth is not None]
+    if not known:
+        return scan.radius * (1 - math.sqrt(1 - CONTACT**2))
+    return min(float(np.median(known)), scan.radius)
+
+
 def _facts(source, scans, flat, plates, bin, scale, shape, noise, lights, warnings) -> dict:
     azimuths = {label: math.degrees(math.atan2(y, x)) for label, (x, y, _) in lights.items()}
     return {
@@ -382,14 +432,13 @@ def _facts(source, scans, flat, plates, bin, scale, shape, noise, lights, warnin
         "light_azimuths_deg": azimuths,
         "setup": {
             "free": ["led_*.[xyz]", "gel.skirt", "gel.smoothing"],
-            "per_group": list(POSE),
+            # the circles give place and turn of a plate to a micrometre; its depth and tilt show in the shading only
+            "per_group": ["gel.press_depth", "gel.press_r[xy]"],
             "flat_field": "multiplicative",
             "priors": {
                 "led_*.[xyz]": [None, 15.0],
-                "gel.press_[xy]": [None, 0.02],
                 "gel.press_depth": [None, 0.3 * scans[0].radius],
                 "gel.press_r[xy]": [None, 1.0],
-                "gel.press_rz": [None, 0.2],
                 "gel.skirt": [None, 0.1],
                 "gel.smoothing": [None, 0.03],
             },
@@ -415,13 +464,14 @@ def _scene(facts: Mapping, scans: Sequence[Scan], lights: Mapping[str, np.ndarra
         thickness=f"{THICKNESS:g}",
         gel_width=f"{1.15 * width * scale:.4g}",
         gel_length=f"{1.15 * height * scale:.4g}",
-        extent=f"{1.2 * view:.4g}",
+        # the maps about the ball nearest to the middle reach beyond the gel, where they fade out over an eighth
+        extent=f"{(0.58 * view + facts['ball_spacing_mm'] / 2) / 0.85:.4g}",
         pitch=f"{ball / 8:.4g}",
         map_pitch=f"{ball / 12:.4g}",
         columns=2 * math.ceil(0.58 * width * scale / (ball / 8)) + 1,
         rows=2 * math.ceil(0.58 * height * scale / (ball / 8)) + 1,
-        smoothing=f"{0.2 * ball:.3g}",
-        skirt=f"{0.4 * ball:.3g}",
+        smoothing=f"{0.1 * ball:.3g}",
+        skirt=f"{0.1 * ball:.3g}",
         leds="\n".join(_led(label, *direction) for label, direction in lights.items()),
     )
 

@@ -119,6 +119,9 @@ class Renderer:
         }
         now.update(dict.fromkeys(self.power_keys, 1.0))
         self.scene.set(now)
+        gel = self.scene.gel
+        if hasattr(gel, "recall"):
+            gel.recall(None if move else {n: values[f"{gel.name}.{n}"] for n in (*gel.numbers, *gel.words)})
 
     def _trace(self, u: np.ndarray, v: np.ndarray) -> tuple:
         import drjit as dr

@@ -119,7 +119,7 @@ PARAMETERS = (
         "smoothing",
         "mm",
         0.25,
-        (0.01, 5.0),
+        (1e-3, 5.0),
         "standard deviation of the widest kernel of S1.6",
         plausible=0.05,
         how="difference",
@@ -170,17 +170,19 @@ def build():
             mi.Mesh.__init__(self, "gel", index.size, len(faces), props, True, False)
             self.declare(props)
             self.seen_touch = None  # of which a texture was made
+            self.recalled = None  # another geometry than the mesh is in, as `recall` has it
             if self.indenter.lower().endswith(contact.FILES):
                 self.indenter = str(mi.file_resolver().resolve(self.indenter))
             params = mi.traverse(self)
             params["faces"] = mi.UInt32(faces.astype(np.uint32).ravel())
             self.rebuild(params)
 
-        def press(self):
-            """Displacement and contact maps on the indenter's own grid (optics.skin.contact)."""
-            n = self.number
+        def press(self, now=None):
+            """Displacement and contact maps on the indenter's own grid (optics.skin.contact); of the values `now`, or
+            of the gel's own."""
+            n = self.number if now is None else now.__getitem__
             profile = contact.indenter_profile(
-                self.indenter,
+                self.indenter if now is None else now["indenter"],
                 n("indenter_size"),
                 (n("press_rx"), n("press_ry"), n("press_rz")),
                 self.extent,
@@ -229,16 +231,29 @@ def build():
             ]
             return map_coordinates(values, at, order=1, mode="constant")
 
+        def beside(self, p):
+            """1 where the plate between the balls touches the face at the point p, 0 on a ball, and where no plate of
+            balls is pressed; Dr.Jit."""
+            n = self.number if self.recalled is None else self.recalled.__getitem__
+            shape = self.indenter if self.recalled is None else self.recalled["indenter"]
+            return 1 - self.touched(p) if shape == "balls" and n("press_depth") > 0 else dr.zeros(mi.Float, 1)
+
+        def recall(self, values):
+            """Let `touched` answer for a geometry that the mesh has left: the gel's values by name; None: its own."""
+            self.recalled = values
+
         def touched(self, p):
             """1 where the indenter touches the face at the point p, 0 elsewhere; Dr.Jit."""
-            if self.seen_touch is not self.touch:
-                self.seen_touch = self.touch
-                values = np.ascontiguousarray(self.touch.values[..., None], np.float32)
+            n = self.number if self.recalled is None else self.recalled.__getitem__
+            touch = self.touch if self.recalled is None else self.press(self.recalled)[1]
+            if self.seen_touch is not touch:
+                self.seen_touch = touch
+                values = np.ascontiguousarray(touch.values[..., None], np.float32)
                 self.touch_texture = mi.Texture2f(
                     mi.TensorXf(values), filter_mode=dr.FilterMode.Linear, wrap_mode=dr.WrapMode.Clamp
                 )
-            n, pitch = len(self.touch.values), self.touch.pitch
-            u, v = (((x - self.number(key)) / pitch + n / 2) / n for x, key in ((p.x, "press_x"), (p.y, "press_y")))
+            count, pitch = len(touch.values), touch.pitch
+            u, v = (((x - n(key)) / pitch + count / 2) / count for x, key in ((p.x, "press_x"), (p.y, "press_y")))
             return self.touch_texture.eval(mi.Point2f(u, v))[0]
 
         # -- the way of light in the gel ------------------------------------------------------------------------------

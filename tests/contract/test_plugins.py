@@ -56,6 +56,7 @@ SURROUNDINGS = {  # parameter: what has to stand about it for it to be seen, and
         for axis in "xyz"
     },
     "gel.indenter_spacing": {"gel.indenter": "balls", "gel.indenter_size": 0.8, "gel.indenter_spacing": 1.8},
+    "gel.shown_between": {"gel.indenter": "balls", "gel.indenter_size": 0.8, "gel.indenter_spacing": 1.8},
     "gel.thickness": {"gel.absorption": 0.02},
     **{f"{kind}.settling": {f"{kind}.drift": 0.02, f"{kind}.time": 3.0} for kind in ("source", "panel")},
     # the first direction of a carried film is constant in each triangle: a film that bends makes small jumps

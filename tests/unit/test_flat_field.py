@@ -22,6 +22,7 @@ KEYS = {
     "gel.height_loss": 0.2,
     "gel.skirt": 0.4,
     "gel.press_depth": 0.4,
+    "gel.shown_through": 0.1,  # of the contact: at rest there is none, also where the mesh is still pressed
 }
 
 
