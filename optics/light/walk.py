@@ -223,13 +223,18 @@ class Walk:
         """Light that the gel and the membranes add by themselves at a surface: stages `volume` and `ambient`."""
         added = mi.UnpolarizedSpectrum(0.0)
         for led in self.lamps if self.glowing(scene) else ():
-            to_led = led.position() - si.p
-            distance = dr.norm(to_led)
-            clear = ~scene.ray_test(si.spawn_ray_to(led.position()), si.is_valid())
-            added += dr.select(clear, self.excited(scene, si, led, to_led / distance, distance), 0.0)
+            spots = self.spots(led)
+            for point in spots:
+                to_led = point - si.p
+                distance = dr.norm(to_led)
+                clear = ~scene.ray_test(si.spawn_ray_to(point), si.is_valid())
+                excited = self.excited(scene, si, led, to_led / distance, distance)
+                added += dr.select(clear, excited, 0.0) / len(spots)
         for function in self.veils:
             for led in self.lamps:
-                added += function(self.inside.path(si.p, origin, led.position(), led, si), self.inside)
+                spots = self.spots(led)
+                for point in spots:
+                    added += function(self.inside.path(si.p, origin, point, led, si), self.inside) / len(spots)
         for membrane in self.shining:
             added += self.ambient(scene, si, 1.0, membrane)
         return mi.mueller.depolarizer(added) if mi.is_polarized else mi.Spectrum(added)
