@@ -11,8 +11,11 @@ import pytest
 SMALL = {"width": "24", "height": "18"}
 GRID = {"columns": "4", "rows": "4", "layers": "2", "block_width": "3.6", "block_length": "3.6"}
 CASES = {  # every shipped scene: what replaces its <default>s, at rest and pressed
+    "9dtact": ({"depth": "0"}, {}),
     "digit": ({}, {"depth": "0.8"}),
     "gelsight": ({}, {"depth": "0.8"}),
+    "gelsight_bench": ({"depth": "0"}, {}),
+    "gelsight_mini": ({"depth": "0"}, {}),
     "grid_bench": ({}, {"distance": "0.5"}),
     "magictac": ({**GRID, "room": "1"}, {**GRID, "room": "1", "distance": "-0.5"}),
     "polariscope": ({"analyzer": "30"}, {"analyzer": "60", "polarizer": "30", "regions": "quarters"}),
