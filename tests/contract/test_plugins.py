@@ -373,10 +373,7 @@ def moves(bench, key):
     return (
         kind in ("gel", "camera", "interface", *MOVED)
         and bench.scene.parameters[key].how == "difference"
-        or (
-            bench.scene.registry.parts[kind].role == "led"
-            and name in ("x", "y", "z", "area", "length", "width", "roll")
-        )
+        or (kind in bench.scene.registry.kinds("led") and name in ("x", "y", "z", "area", "length", "width", "roll"))
     )
 
 
