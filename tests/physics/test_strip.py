@@ -206,6 +206,29 @@ def test_soft_shadows_are_those_of_stock_mitsuba(name, variant, load):
     assert least_p(images, ours.mean(0), ours.std(0, ddof=1) / SEEDS**0.5) > SIGNIFICANCE
 
 
+@pytest.mark.parametrize("more", [{"gel.haze": 0.1}, {"membrane.rho_r": 3.0, "integrator.interreflection": 1.0}])
+@pytest.mark.parametrize("variant", ["llvm_ad_mono"], indirect=True)
+def test_haze_and_a_second_bounce_are_in_both_renders(more, variant, load):
+    """The light of a strip in the gel and by two reflections: the prediction against the integrator's render, in the
+    mean."""
+    import mitsuba as mi
+
+    from optics.light.renderer import Renderer
+
+    scene = load("strip", depth=1.8, variant=variant)
+    values = {**scene.values(), **more}
+    renderer = Renderer(scene)
+    ours = [renderer.radiance(values, seed).mean() for seed in range(SEEDS)]
+    without = renderer.radiance({**values, "gel.haze": 0.0, "integrator.interreflection": 0.0}).mean()
+    scene.set(values)
+    scene.integrator.max_depth = 3 if values["integrator.interreflection"] else 2
+    means = [np.array(mi.render(scene.mitsuba, spp=512, seed=k), float)[..., 0].mean() for k in range(SEEDS)]
+    mean, found = np.mean(means), np.mean(ours)
+    error = np.hypot(np.std(means, ddof=1), np.std(ours, ddof=1)) / SEEDS**0.5
+    assert abs(found - without) > 8 * error, "they do nothing here"
+    assert abs(mean - found) < 4 * error + 5e-4 * found  # and the points' error
+
+
 def unshadowed(renderer, values):
     """(H, W) without cast shadows."""
     import drjit as dr
