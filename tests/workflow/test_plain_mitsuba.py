@@ -69,7 +69,7 @@ def both(mi, name, replaced, **options):
 
     path = loader.find(name)
     text = path.read_text(encoding="utf-8")
-    defines = {k: v for k, v in {**SMALL, **replaced}.items() if f'name="{k}"' in text}
+    defines = {k: v for k, v in {**SMALL, **replaced}.items() if f'<default name="{k}"' in text}
     return mi.load_file(str(path), **options, **defines), loader.load(name, defines)
 
 
@@ -157,7 +157,7 @@ def test_values_and_traverse_agree(name, mi):
 
     text = loader.find(name).read_text(encoding="utf-8")
     scene = loader.load(
-        name, {k: v for k, v in {**SMALL, **GRID}.items() if f'name="{k}"' in text and name != "grid_bench"}
+        name, {k: v for k, v in {**SMALL, **GRID}.items() if f'<default name="{k}"' in text and name != "grid_bench"}
     )
     paths = traverse_paths(scene.mitsuba)
     own = [f"{n}.{p}" for n, part in scene.parts.items() for p in part.numbers]
