@@ -231,8 +231,8 @@ def test_haze_and_a_second_bounce_are_in_both_renders(more, variant, load):
 
 @pytest.mark.parametrize("variant", ["llvm_ad_mono"], indirect=True)
 def test_a_calibration_finds_a_stock_rectangle(variant, load):
-    """Place, length and power of a strip from images of three presses by stock Mitsuba, from 1 mm, a third of the length
-    and 30 % away."""
+    """Place, length and power of a strip from images of three presses by stock Mitsuba, from 1 mm, a third of the
+    length and 30 % away."""
     from pathlib import Path
 
     import mitsuba as mi
@@ -259,7 +259,7 @@ def test_a_calibration_finds_a_stock_rectangle(variant, load):
     assert fit.converged, fit.reason
     off = np.array([e - truth[v.name.split(".")[1]] for v, e in zip(fit.variables, fit.estimate)])
     assert (np.abs(off) < 4 * fit.sd).all() and fit.sd.max() < 0.1, (off, fit.sd)
-    # 3538 values scatter by 0.024; the stock image's own noise, a tenth of the camera's, and the points add some percent
+    # 3538 values scatter by 0.024; the stock image's own noise and the points add some percent
     assert fit.chi2_per_dof == pytest.approx(1, abs=0.1)
 
 
