@@ -249,8 +249,27 @@ CAMERA_POINT = {
     "panel.time": 3.0,
 }
 
+# A press beside the middle; the red strip nearer than it ships, white and turned: its shadows are long and soft.
+MINI_POINT = {
+    "gel.press_x": 1.5,
+    "gel.press_y": -0.8,
+    "camera.exposure": 2000.0,
+    "strip_red.x": -16.0,
+    "strip_red.z": -6.0,
+    "strip_red.wavelength": 560.0,
+    "strip_red.fwhm": 150.0,
+    "strip_red.pan": 4.0,
+    "strip_red.tilt": -3.0,
+    "strip_red.mu": 1.2,
+    "strip_red.power": 0.9,
+    "strip_red.power_g": 0.7,
+    "strip_red.roll": 5.0,
+    "strip_green.power": 0.0,
+}
+
 POINTS = {  # scene: (what replaces its <default>s, values)
     "gelsight": ({"width": WIDTH, "height": HEIGHT, "depth": 0.5}, WORKING_POINT),
+    "gelsight_mini": ({"width": WIDTH, "height": HEIGHT, "depth": 0.5}, MINI_POINT),
     "polarizer_bench": (
         {"width": 8, "height": 6, "x_fov": 7, "bands": "620, 540, 460", "middle": 1, "pattern": "disc"},
         POLARIZER_POINT,

@@ -1,4 +1,4 @@
-"""Renders the four shipped sensors for README and the home page: renders/gallery/*.png, and side by side sensors.webp.
+"""Renders shipped sensors for the pages: renders/gallery/*.png, and four of them side by side, sensors.webp.
 
     python docs/tools/gallery.py [SENSOR ...]
 
@@ -27,6 +27,7 @@ COMMANDS = {
     " --set camera.exposure=1100 --png -o",
     "vi2tap": "optics render vi2tap -D x_fov=86 -D depth=2 --png -o",
 }
+BESIDE = {name: f"optics render {name} --png -o" for name in ("gelsight_mini", "gelsight_bench", "9dtact")}
 
 
 def render(name: str) -> None:
@@ -35,14 +36,14 @@ def render(name: str) -> None:
 
     with tempfile.TemporaryDirectory() as scratch:
         file = Path(scratch, f"{name}.exr")
-        if code := optics([*shlex.split(COMMANDS[name])[1:], str(file), "--quiet"]):
+        if code := optics([*shlex.split({**COMMANDS, **BESIDE}[name])[1:], str(file), "--quiet"]):
             raise SystemExit(code)
         Image.open(file.with_suffix(".png")).convert("RGB").save(FOLDER / f"{name}.png", optimize=True)
 
 
 def main(names: list[str]) -> None:
     FOLDER.mkdir(parents=True, exist_ok=True)
-    for name in names or COMMANDS:
+    for name in names or (*COMMANDS, *BESIDE):
         render(name)
     images = [Image.open(FOLDER / f"{name}.png") for name in COMMANDS]
     images = [i.resize((round(i.width * HEIGHT / i.height), HEIGHT), Image.Resampling.LANCZOS) for i in images]

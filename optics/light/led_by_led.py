@@ -7,8 +7,6 @@ is set."""
 
 from __future__ import annotations
 
-import math
-
 import drjit as dr
 import mitsuba as mi
 
@@ -44,8 +42,12 @@ class LedByLed:
 
     def windows(self, scene, led):
         """How many flat interfaces stand between an LED and the skin."""
-        reach = math.sqrt(led.numbered("light area") / math.pi)
-        return sum(1 for s in scene.shapes() if is_interface(s) and s.bbox().max.z > led.numbered("light z") - reach)
+        nearest = led.numbered("light z") - led.reach()
+        return sum(1 for s in scene.shapes() if is_interface(s) and s.bbox().max.z > nearest)
+
+    def spots(self, led):
+        """The points that stand for an LED, each for an equal share of its light."""
+        return [led.point(mi.Point2f(*place)) for place in led.places()] or [led.position()]
 
     def visible(self, scene, si, point, led):
         """Whether the straight line from the surface to a point of an LED meets nothing but windows (detached)."""
@@ -66,9 +68,10 @@ class LedByLed:
             total += dr.select(own, pigment.fluorescence(si, led, to_led, distance), 0.0)
         return total
 
-    def direct(self, scene, si, weight, origin, led, visibility, sample=None):
-        """Radiance per band that one LED sends to the camera by one reflection (S3, S5), and by the gel itself."""
-        point = led.position() if sample is None else led.point(sample)
+    def direct(self, scene, si, weight, origin, led, visibility, point=None):
+        """Radiance per band that one LED sends to the camera by one reflection (S3, S5), and by the gel itself; as a
+        point at its position, or at another."""
+        point = led.position() if point is None else point
         to_led = point - si.p
         distance = dr.norm(to_led)
         s = to_led / distance
@@ -96,7 +99,9 @@ class LedByLed:
         for _ in range(count):
             bs, factor = si.bsdf().sample(context, si, sampler.next_1d(), sampler.next_2d(), si.is_valid())
             second = scene.ray_intersect(si.spawn_ray(si.to_world(bs.wo)), si.is_valid())
-            light = self.direct(scene, second, 1.0, si.p, led, self.visible(scene, second, led.position(), led))
+            point = led.point(sampler.next_2d()) if led.reach() > 0 else led.position()
+            seen = self.visible(scene, second, point, led)
+            light = self.direct(scene, second, 1.0, si.p, led, seen, point)
             total += dr.select(second.is_valid(), mi.unpolarized_spectrum(factor) * light, 0.0)
         gel = self.gel(scene)
         if gel is not None:

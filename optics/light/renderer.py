@@ -2,9 +2,10 @@
 
 Light is linear in every LED, so each LED is rendered once per geometry at power 1 and kept; powers, exposure, colour
 and response act on the kept images. One sample per pixel is exact away from edges: pixels at the rim of a shadow or of
-the gel are sampled 128 times, where the face bends 16 times. Derivative images come from Dr.Jit in forward mode through
-the shading, with the primary hits and shadows kept; at rims, where that misses the moving edge, and for everything that
-moves geometry they are central differences with common samples (`Parameter.how`)."""
+the gel are sampled 128 times; where the face bends, and in the penumbra of a light of many points, 16 times. Derivative
+images come from Dr.Jit in forward mode through the shading, with the primary hits and shadows kept; at rims, where that
+misses the moving edge, and for everything that moves geometry they are central differences with common samples
+(`Parameter.how`)."""
 
 from __future__ import annotations
 
@@ -29,6 +30,7 @@ PAINTED = 0.05  # of the largest reflectance of a texture: a step from pixel to 
 # level in 200
 BENT = 1e-3
 BENT_SIDE = 4  # finer samples each way where the face bends: the mean of what varies smoothly needs few
+SOFT = 16  # points of a light, above which rims of its shadows take the samples of what bends, BENT_SIDE each way
 CREASE = 25.0  # deg from pixel to pixel: what is no smooth surface
 FLAT_FIELDS = ("multiplicative", "additive", "none")
 MEMORY = 4e9  # bytes of hits and images that are kept
@@ -244,7 +246,9 @@ class Renderer:
         rim = self._joint_rim(hits) if self.layered else self._rim(hits, visible)
         share = np.where(rim, 1.0, hits.bent)
         index = np.flatnonzero(share)
-        finer = self._finer(hits, index, np.flatnonzero(~rim.ravel()[index]))
+        # of a light of many points, an edge in the shadow of one is small
+        few = ~(hits.edges if len(part.places()) > SOFT else rim)
+        finer = self._finer(hits, index, np.flatnonzero(few.ravel()[index]))
         rim_visible = self._visible(finer.sample.si, part) if len(index) else None
         image = LedImage(led, hits, rim, index, finer, visible, rim_visible, self._seen(visible).mean(0) > 0.5)
         image.share = share.reshape(-1, 1)[index]
@@ -392,46 +396,25 @@ class Renderer:
             hits.rims = {key: Finer(counts, self._trace(u, v) if len(index) else None)}  # only the latest is kept
         return hits.rims[key]
 
-    def _discs(self, part) -> list:
-        """Sample positions on the emitting disc, as points of the unit square; [None] for a point source.
-
-        Four points stand for the inner quarter of the disc's area and twelve for the ring around it, each on the circle
-        that has its part's mean square radius, 1/8 and 5/8: the width of a penumbra is that of the whole disc.
-        """
-        if part.numbered("light area") == 0:
-            return [None]
-        at = [
-            0.5 + sign * (mean_square**0.5) / 2
-            for sign, mean_square in ((-1, 5 / 8), (-1, 1 / 8), (1, 1 / 8), (1, 5 / 8))
-        ]
-        return [(a, b) for a in at for b in at]
-
     def _visible(self, si, part):
         """Share of the LED that each hit sees; a Float (a mask for a point source)."""
         import drjit as dr
-        import mitsuba as mi
 
         integrator = self.scene.integrator
-        share = []
-        for place in self._discs(part):
-            point = part.position() if place is None else part.point(mi.Point2f(*place))
-            share.append(integrator.visible(self.scene.mitsuba, si, dr.detach(point), part))
+        share = [integrator.visible(self.scene.mitsuba, si, dr.detach(point), part) for point in integrator.spots(part)]
         dr.eval(share)
         return share[0] if len(share) == 1 else share
 
     def _shade(self, sample: Sample, part, visible):
         """Direct radiance per band at hits, an UnpolarizedSpectrum attached to whatever carries gradients."""
-        import mitsuba as mi
-
         integrator, scene = self.scene.integrator, self.scene.mitsuba
-        places = self._discs(part)
-        if len(places) == 1:
+        spots = integrator.spots(part)
+        if len(spots) == 1:
             return integrator.direct(scene, *sample[:3], part, visible)
-        parts = [
-            integrator.direct(scene, *sample[:3], part, seen, mi.Point2f(*place))
-            for place, seen in zip(places, visible)
-        ]
-        return sum(parts[1:], parts[0]) / len(parts)
+        total = 0.0
+        for point, seen in zip(spots, visible):
+            total += integrator.direct(scene, *sample[:3], part, seen, point)
+        return total / len(spots)
 
     def _raw(self, image: LedImage, centre: Callable, rim: Callable) -> tuple:
         """Shading at pixel centres (H W, B) and at the finer samples (N, B), None without any."""

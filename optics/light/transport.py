@@ -597,7 +597,7 @@ class Run:
     @staticmethod
     def chip(led, sample):
         """A point of an LED."""
-        return led.point(sample) if led.numbered("light area") > 0 else led.position()
+        return led.point(sample) if led.reach() > 0 else led.position()
 
     def _emitted(self, light: int, drawn: Sequence):
         """Where packets of a light start, which way they go, the power of all of them, and the weight of each, by five

@@ -128,8 +128,10 @@ class Walk:
         )
 
     def draws(self) -> list[type]:
-        """What `event` draws from the sampler, in its order: a point of each light, and the way on."""
-        return [mi.Point2f] * (self.points + self.others) + [mi.Float, mi.Point2f]
+        """What `event` draws from the sampler, in its order: a point of each LED with an area, for the light of
+        haze and pigments; a point of each light; and the way on."""
+        wide = sum(1 for led in self.lamps if led.reach() > 0)
+        return [mi.Point2f] * (wide + self.points + self.others) + [mi.Float, mi.Point2f]
 
     def event(self, scene, s: dict, times: int | None = None) -> dict:
         """The state after the next surface. `times`: surfaces that shadow rays meet, see `repeat`."""
@@ -169,7 +171,7 @@ class Walk:
         the surfaces that the longest shadow ray met."""
         ray, medium, throughput = s["ray"], s["medium"], s["throughput"]
         light, longest, si = s["light"], mi.UInt32(0), held(lit, si)
-        light = dr.select(lit, light + product(throughput, self.own_light(scene, si, ray.o)), light)
+        light = dr.select(lit, light + product(throughput, self.own_light(scene, si, ray.o, s["sampler"])), light)
         if self.points > 0:
             sent, longest = self.from_points(scene, s["sampler"], si, ray.o, medium, lit, times)
             light = light + product(throughput, sent)
@@ -219,17 +221,18 @@ class Walk:
             share *= function(self.inside.path(si.p, origin, point, None, si), self.inside)
         return scaled(share)
 
-    def own_light(self, scene, si, origin):
+    def own_light(self, scene, si, origin, sampler):
         """Light that the gel and the membranes add by themselves at a surface: stages `volume` and `ambient`."""
         added = mi.UnpolarizedSpectrum(0.0)
-        for led in self.lamps if self.glowing(scene) else ():
-            to_led = led.position() - si.p
+        spots = [led.point(sampler.next_2d()) if led.reach() > 0 else led.position() for led in self.lamps]
+        for led, point in zip(self.lamps, spots) if self.glowing(scene) else ():
+            to_led = point - si.p
             distance = dr.norm(to_led)
-            clear = ~scene.ray_test(si.spawn_ray_to(led.position()), si.is_valid())
+            clear = ~scene.ray_test(si.spawn_ray_to(point), si.is_valid())
             added += dr.select(clear, self.excited(scene, si, led, to_led / distance, distance), 0.0)
         for function in self.veils:
-            for led in self.lamps:
-                added += function(self.inside.path(si.p, origin, led.position(), led, si), self.inside)
+            for led, point in zip(self.lamps, spots):
+                added += function(self.inside.path(si.p, origin, point, led, si), self.inside)
         for membrane in self.shining:
             added += self.ambient(scene, si, 1.0, membrane)
         return mi.mueller.depolarizer(added) if mi.is_polarized else mi.Spectrum(added)

@@ -67,7 +67,7 @@ ROLES = {  # of parts: all that the library knows of them; a kind plays the role
     "camera": "images are developed by its gains, response and what it adds; one in a scene",
     "integrator": "renders, and names the bands",
     "gel": "the skin that a press dents: the parameters of a press, its map of displacements, paths of light in it",
-    "led": "a point light, of which images are made one by one; among dielectric bodies its lobe is that of `mu`",
+    "led": "a light at a point or of a small area with its own image; among dielectric bodies its lobe is that of `mu`",
     "membrane": "a matt coat of the skin",
     "interface": "a flat boundary that is passed without reflections",
     "clear": "the material of a dielectric body (`index`, `absorption`), where light is followed by Monte Carlo",

@@ -1,9 +1,10 @@
 """Gel haze: the gel scatters a little light, once, on its way.
 
 Definition
-    L' = L exp(-h (d_light + d_view)) + h/(4 pi) int_0^d_view kappa(x) exp(-h (s + |x - S|)) ds
-with the scattering coefficient h, isotropic single scattering, kappa of (S2) without the cosine, and the integral along
-the camera's ray inside the gel by Gauss-Legendre quadrature with eight nodes.
+    L' = L exp(-h (d_light + d_view)) + h/(4 pi) int_0^d_view kappa(x) exp(-h (s + l(x))) ds
+with the scattering coefficient h, isotropic single scattering, kappa of (S2) without the cosine, the length l(x) inside
+the gel of the way from the LED to x, and the integral along the camera's ray inside the gel by Gauss-Legendre
+quadrature with eight nodes.
 Fingerprint
     a veil that brightens towards the LEDs and fills shadows, without the structure of the face; it grows with the gel's
     thickness. Veiling glare is flat; ambient light follows the reflectance.
@@ -46,29 +47,29 @@ def veil(path, gel):
         distance = dr.maximum(dr.norm(to_led), NEAREST)
         total += (
             path.led.radiance(point, to_led / distance, distance)
-            * dr.exp(-gel.haze * (path.view - s + distance))
+            * dr.exp(-gel.haze * (path.view - s + gel.length_inside(point.p, path.lamp)))
             * float(weight / 2)
         )
     return total * path.view * gel.haze * (1 / (4 * dr.pi))
 
 
 def check_veil_along_the_axis():
-    """With an LED of kappa = 1 everywhere, D = 10 mm from the face on the camera's ray, |x - S| is D - d_view + s, the
-    exponent is -h (D - d_view + 2 s), and the integral is elementary; what crosses the gel is dimmed by exp(-h d)."""
+    """With an LED of kappa = 1 everywhere, on the camera's ray and outside the gel, l(x) is s, the exponent is -2 h s,
+    and the integral is elementary; what crosses the gel is dimmed by exp(-h d)."""
     import mitsuba as mi
 
-    h, view, distance = 0.03, 4.0, 10.0
+    h, view = 0.03, 4.0
     path = SimpleNamespace(
         p=mi.Point3f(0, 0, 0),
         camera=mi.Point3f(0, 0, -24),
-        lamp=mi.Point3f(0, 0, -distance),
+        lamp=mi.Point3f(0, 0, -10),
         led=SimpleNamespace(radiance=lambda point, to_led, far: mi.UnpolarizedSpectrum(1.0)),
         view=mi.Float(view),
         light=mi.Float(2.0),
         wavelengths=mi.Color0f() if not mi.is_spectral else mi.UnpolarizedSpectrum(540.0),
     )
-    gel = SimpleNamespace(haze=mi.Float(h))
-    integral = np.exp(-h * (distance - view)) * (1 - np.exp(-2 * h * view)) / (2 * h)
+    gel = SimpleNamespace(haze=mi.Float(h), length_inside=lambda p, lamp: view + p.z)
+    integral = (1 - np.exp(-2 * h * view)) / (2 * h)
     agree(np.array(veil(path, gel)).ravel(), h / (4 * np.pi) * integral, 1e-5)
     agree(np.array(dim(path, gel)), np.exp(-h * 6.0), 1e-5)
 

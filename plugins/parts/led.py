@@ -183,6 +183,24 @@ def build():
             side, up, _ = self.frame
             return self.position() + side * disc.x + up * disc.y
 
+        def places(self):
+            """Points of the unit square that stand for the emitting area, each for an equal share; none for a point.
+
+            Four of the 16 stand for the inner quarter of the disc's area and twelve for the ring around it, each on the
+            circle that has its part's mean square radius, 1/8 and 5/8: a penumbra is as wide as that of the disc.
+            """
+            if self.reach() == 0:
+                return []
+            at = [
+                0.5 + sign * (mean_square**0.5) / 2
+                for sign, mean_square in ((-1, 5 / 8), (-1, 1 / 8), (1, 1 / 8), (1, 5 / 8))
+            ]
+            return [(a, b) for a in at for b in at]
+
+        def reach(self):
+            """From the position to the farthest point of the emitting area, mm."""
+            return math.sqrt(self.numbered("light area") / math.pi)
+
         def kappa(self, it, to_led, distance):
             """kappa of (S2), for a unit vector from the lit point to the LED and their distance in mm; a Float."""
             cos = dr.dot(-to_led, self.axis())

@@ -374,7 +374,7 @@ def moves(bench, key):
     return (
         kind in ("gel", "camera", "interface", *MOVED)
         and bench.scene.parameters[key].how == "difference"
-        or (kind == "led" and name in ("x", "y", "z", "area"))
+        or (kind in bench.scene.registry.kinds("led") and name in ("x", "y", "z", "area", "length", "width", "roll"))
     )
 
 
@@ -552,7 +552,8 @@ def compare(found, reference, image, step, tolerance, keep=True, what=""):
 def check_forward_mode(bench, key):
     """Renderer.led_tangent against differences, per LED image: at neutral and away from it."""
     p = bench.scene.parameters[key]
-    led = key.rsplit(".", 1)[0] if bench.renderer.kind(key) == "led" else next(iter(bench.scene.leds))
+    part = key.rsplit(".", 1)[0]
+    led = part if part in bench.scene.leds else next(iter(bench.scene.leds))
     base = about(bench, key)
     r = bench.renderer
     for value in places(bench, key, p, base):

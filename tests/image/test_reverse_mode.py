@@ -25,6 +25,7 @@ CURVED = 0.2  # of the median change: second difference of a pixel that an edge 
 SCENES = {  # what replaces <default>s, surfaces of a path, parts that are looked at one parameter at a time
     "gelsight": ({"width": 16, "height": 12, "depth": 0.5}, 3, ("led_1", "membrane", "gel", "integrator", "camera")),
     "digit": ({"width": 12, "height": 16, "depth": 0.3}, 2, ("led_red",)),
+    "gelsight_mini": ({"width": 16, "height": 12}, 2, ("strip_red",)),
     "vi2tap": (
         {"width": 16, "height": 12, "x_fov": 45, "depth": 1, "wall_dark": 1},
         2,

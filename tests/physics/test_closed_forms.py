@@ -384,11 +384,12 @@ def test_haze_is_the_single_scattering_integral(bench):
     for share in (np.arange(500) + 0.5) / 500:  # s from the face to where the ray enters the gel
         s = way.view * share
         x = way.p + toward * s[..., None]
+        inside = np.minimum(1, (x[..., 2] + values["gel.thickness"]) / np.maximum(x[..., 2] - way.lamp[2], 1e-9))
         veil += (
             kappa(x, way.lamp, way.axis, 1.0, 1.2)
             * way.view
             / 500
-            * np.exp(-h * (way.view - s + np.linalg.norm(way.lamp - x, axis=-1)))
+            * np.exp(-h * (way.view - s + inside * np.linalg.norm(way.lamp - x, axis=-1)))
         )
     found = bench.renderer.led({**values, "gel.haze": h}, "led_1").radiance
     expected = clear * np.exp(-h * (way.light + way.view))[..., None] + h / (4 * np.pi) * veil[..., None]

@@ -11,8 +11,11 @@ import pytest
 SMALL = {"width": "24", "height": "18"}
 GRID = {"columns": "4", "rows": "4", "layers": "2", "block_width": "3.6", "block_length": "3.6"}
 CASES = {  # every shipped scene: what replaces its <default>s, at rest and pressed
+    "9dtact": ({"depth": "0"}, {}),
     "digit": ({}, {"depth": "0.8"}),
     "gelsight": ({}, {"depth": "0.8"}),
+    "gelsight_bench": ({"depth": "0"}, {}),
+    "gelsight_mini": ({"depth": "0"}, {}),
     "grid_bench": ({}, {"distance": "0.5"}),
     "magictac": ({**GRID, "room": "1"}, {**GRID, "room": "1", "distance": "-0.5"}),
     "polariscope": ({"analyzer": "30"}, {"analyzer": "60", "polarizer": "30", "regions": "quarters"}),
@@ -66,7 +69,7 @@ def both(mi, name, replaced, **options):
 
     path = loader.find(name)
     text = path.read_text(encoding="utf-8")
-    defines = {k: v for k, v in {**SMALL, **replaced}.items() if f'name="{k}"' in text}
+    defines = {k: v for k, v in {**SMALL, **replaced}.items() if f'<default name="{k}"' in text}
     return mi.load_file(str(path), **options, **defines), loader.load(name, defines)
 
 
@@ -154,7 +157,7 @@ def test_values_and_traverse_agree(name, mi):
 
     text = loader.find(name).read_text(encoding="utf-8")
     scene = loader.load(
-        name, {k: v for k, v in {**SMALL, **GRID}.items() if f'name="{k}"' in text and name != "grid_bench"}
+        name, {k: v for k, v in {**SMALL, **GRID}.items() if f'<default name="{k}"' in text and name != "grid_bench"}
     )
     paths = traverse_paths(scene.mitsuba)
     own = [f"{n}.{p}" for n, part in scene.parts.items() for p in part.numbers]

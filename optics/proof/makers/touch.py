@@ -298,7 +298,8 @@ class Maker:
                 x = point + toward * s[..., None]
                 d = np.maximum(np.linalg.norm(lamp - x, axis=-1), 0.2)
                 cos = np.maximum(((x - lamp) @ axis) / d, 1e-9)
-                veil = h / (4 * np.pi) * cos ** v[f"{led}.mu"] / d**2 * np.exp(-h * (view - s + d)) * view / steps
+                way = view - s + inside(x, np.broadcast_to(lamp, x.shape))
+                veil = h / (4 * np.pi) * cos ** v[f"{led}.mu"] / d**2 * np.exp(-h * way) * view / steps
                 out = out + veil[..., None]
         return out
 
