@@ -441,6 +441,13 @@ def binned(image: np.ndarray, bin: int, saturation: float = 255.0) -> np.ndarray
     return np.where(top >= SATURATED * saturation, top, blocks.mean((1, 3)))
 
 
+def filled(image: np.ndarray, bin: int, saturation: float = 255.0) -> np.ndarray:
+    """Means of blocks (`binned`), of the middle of the image that they fill."""
+    height, width = (n // bin * bin for n in image.shape[:2])
+    top, left = (image.shape[0] - height) // 2, (image.shape[1] - width) // 2
+    return binned(image[top : top + height, left : left + width], bin, saturation)
+
+
 def _binned_presses(presses: Presses, bin: int, saturation: float) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
     """Images, the image of the untouched sensor or None, and circles, in binned pixels whose centres are at +0.5."""
     images = np.stack([binned(i, bin, saturation) for i in presses.images])

@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 
 from optics.captures.capture_set import Frame
-from optics.captures.importing import Imported, binned, comment, noise_of_levels, write_set
+from optics.captures.importing import Imported, comment, filled, noise_of_levels, write_set
 from optics.captures.noise import Noise
 from optics.errors import BadCapture
 from optics.files.images import read_image
@@ -262,13 +262,13 @@ def import_scans(
         warnings.append(f"not used: {', '.join(left)} (another camera or other LEDs, or nothing pressed)")
     steps = len(scans) + 1
     tick("import", 0, steps)
-    flats = np.stack([_cut(i, bin, saturation)[..., 0] for i in flat.images])
+    flats = np.stack([filled(i, bin, saturation)[..., 0] for i in flat.images])
     plates, cut, settings = [], [], []
     for done, scan in enumerate(scans, 1):
         plate = plate_of(scan)
         warnings += _contradictions(scan, plate, first)
         plates.append(plate)
-        cut.append(np.stack([_cut(i, bin, saturation)[..., 0] for i in scan.images]))
+        cut.append(np.stack([filled(i, bin, saturation)[..., 0] for i in scan.images]))
         depth = scan.radius * (1 - math.sqrt(1 - CONTACT**2))
         pose = dict(zip(POSE, (plate.x, plate.y, depth, 0.0, 0.0, plate.turn)))
         settings.append({key: round(float(value), 6) for key, value in pose.items()})
@@ -313,13 +313,6 @@ def import_scans(
     )
     tick("import", steps, steps)
     return Imported(path, warnings, facts)
-
-
-def _cut(image: np.ndarray, bin: int, saturation: float) -> np.ndarray:
-    """Means of blocks, of the middle of the image that they fill."""
-    height, width = (n // bin * bin for n in image.shape[:2])
-    top, left = (image.shape[0] - height) // 2, (image.shape[1] - width) // 2
-    return binned(image[top : top + height, left : left + width], bin, saturation)
 
 
 def _contradictions(scan: Scan, plate: Plate, first: Scan) -> list[str]:
