@@ -1,6 +1,7 @@
 """Import: labelled ball presses of a tactile camera become a capture set, with a scene that repeats the measured facts.
 
     import_taxim("dataPack.npz", "captures/taxim", ball_radius=2.0, mm_per_pixel=0.1245)
+    import_taxim("calib/gelsight", "captures/taxim", bin=4)        a pack's folder: params.json says mm per pixel
     import_circles("images", "labels.csv", "captures/digit", ball_radius=3.0, mm_per_pixel=1 / 17.15)
 
 What comes in: images of one ball pressed at many places, and circles drawn around the contacts by hand. What goes out
@@ -14,6 +15,7 @@ Derived, not measured, and said so in these files:
     gain       of every frame and channel: median of frame over background, beyond three circle radii
     background per-pixel median of all presses, or a given image
     noise      variance against signal of half the squared differences of successive frames beyond three circle radii
+    black      values that are cut off below (`corrections.black_levels`): masked, of blocks the whole block
     lights     per channel the direction l of the least-squares fit I - B = l.(n - n0) on the labelled balls, at 16 mm
 A circle drawn by eye is a start: what to solve for from there stands in import.json under `setup`, and `optics
 calibrate` follows it: the lights, the skirt, and every press's position and depth, with priors about the imported
@@ -33,11 +35,15 @@ import numpy as np
 
 from optics.captures import capture_set as capture_sets
 from optics.captures.capture_set import Captures, Frame
+from optics.captures.corrections import at_black, black_levels, black_text, correction, drift_text, sentences
 from optics.captures.noise import SATURATED, Noise, photon_transfer
 from optics.errors import BadCapture, OutputExists, UnknownKey
 from optics.files.images import SUFFIXES, read_image
 from optics.files.output import new_folder, shipped
 
+PACK, TABLE, PARAMETERS = "dataPack.npz", "polycalib.npz", "params.json"  # of a Taxim calibration
+SMALL = 160  # px: width of the reduced images whose scale its authors give
+CROWDED = 0.5  # of the presses over one pixel: beyond, a median is of pressed values
 COLUMNS = ("file", "center_x_px", "center_y_px", "contact_radius_px")
 FAR = 3.0  # circle radii beyond which a press leaves the image alone, but for a skirt of a few per mille
 LED_DISTANCE = 16.0  # mm from the middle of the face, where no better is known
@@ -67,6 +73,7 @@ class Presses:
 
     images   (N, H, W, 3) DN;   circles (N, 3): centre x, y and radius in px, pixel centres count from 0
     given    (H, W, 3) DN, an image of the untouched sensor, or None
+    remarks  what reading them found
     """
 
     source: str
@@ -74,6 +81,7 @@ class Presses:
     images: np.ndarray
     circles: np.ndarray
     given: np.ndarray | None = None
+    remarks: list[str] = field(default_factory=list)
 
 
 @dataclass
@@ -89,18 +97,47 @@ def import_taxim(
     pack: str | Path,
     folder: str | Path,
     *,
-    ball_radius: float = 2.0,
-    mm_per_pixel: float = 0.1245,
-    mm_per_pixel_check: float | None = 0.12,
-    background: str = "median",
+    ball_radius: float | None = None,
+    mm_per_pixel: float | None = None,
+    mm_per_pixel_check: float | None = None,
+    background: str | None = None,
     **options,
 ) -> Imported:
-    """Import the calibration pack of Taxim (an .npz with imgs, touch_center, touch_radius and f0; never unpickled).
+    """Import the calibration pack of Taxim: an .npz with imgs, touch_center, touch_radius and f0, never unpickled, or
+    the folder that holds it as dataPack.npz.
 
-    Defaults are the numbers of its authors: ball of 4 mm diameter, 0.1245 mm/px, and 4 x 0.03 mm/px as a second route
-    to the same scale. Options as in `import_presses`. Raises BadCapture."""
+    ball_radius   mm; None: 2, half the diameter that its authors give
+    mm_per_pixel  None: `sensor: pixmm` of the params.json beside the pack; without one, for images SMALL px wide, the
+                  authors' 0.1245 mm/px, held against 4 x 0.03 mm/px as a second route to the same scale
+    background    None: the median, but f0 where presses crowd over half of the images and a median would show them
+    Options as in `import_presses`. Raises BadCapture."""
+    path = pack_of(Path(pack))
+    presses = read_taxim(path)
+    remarks, width = list(presses.remarks), presses.images.shape[2]
+    if mm_per_pixel is None:
+        mm_per_pixel = _scale_of(path)
+        if mm_per_pixel is None and width == SMALL:
+            mm_per_pixel, mm_per_pixel_check = 0.1245, mm_per_pixel_check or 0.12
+        elif mm_per_pixel is None:
+            raise BadCapture(
+                f"{path}: no {PARAMETERS} beside it with sensor: pixmm, mm per pixel of images {width} px wide; give "
+                "--mm-per-pixel"
+            )
+    if ball_radius is None:
+        ball_radius = 2.0
+        remarks.append("the pack does not say the ball's radius: 2 mm are assumed, as the authors of Taxim give")
+    if background is None:
+        crowd = _covered(presses)
+        crowded = presses.given is not None and (crowd > CROWDED or len(presses.images) < MEDIAN_OF)
+        background = "given" if crowded else "median"
+        if crowded:
+            remarks.append(
+                f"{crowd:.0%} of the presses lie over one pixel: their median would show the contact, so that f0 is "
+                "the background"
+            )
+    presses.remarks = remarks
     return import_presses(
-        read_taxim(pack),
+        presses,
         folder,
         ball_radius=ball_radius,
         mm_per_pixel=mm_per_pixel,
@@ -134,9 +171,46 @@ def import_circles(
 
 
 # -- Reading ---------------------------------------------------------------------------------------------------------
+def is_pack(source: Path) -> bool:
+    """Whether a folder is that of a calibration pack."""
+    return source.is_dir() and any((source / name).is_file() for name in (PACK, TABLE))
+
+
+def pack_of(source: Path) -> Path:
+    """The pack of a folder, or the file itself."""
+    if source.is_dir():
+        if not (source / PACK).is_file():
+            has = f"; {TABLE} is a table fitted to images, which it does not hold" if (source / TABLE).is_file() else ""
+            raise BadCapture(f"{source}: no {PACK} with the images of presses{has}; give a folder that has it")
+        return source / PACK
+    return source
+
+
+def _scale_of(pack: Path) -> float | None:
+    """mm per pixel by the parameter file beside a pack, None without one."""
+    file = pack.with_name(PARAMETERS)
+    if not file.is_file():
+        return None
+    try:
+        sensor = json.loads(file.read_text(encoding="utf-8")).get("sensor", {})
+        value = sensor.get("pixmm")
+    except (ValueError, AttributeError) as error:
+        raise BadCapture(f"{file}: no JSON table with sensor: pixmm ({error})") from error
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not (math.isfinite(value) and value > 0):
+        raise BadCapture(f"{file}: sensor: pixmm = {value!r} mm per pixel; allowed: a number above 0")
+    return float(value)
+
+
+def _covered(presses: Presses) -> float:
+    """Largest share of the presses that lie over one pixel, within 1.5 circle radii."""
+    step = max(1, presses.images.shape[2] // 80)  # of a coarse grid: circles are wide
+    height, width = (n // step for n in presses.images.shape[1:3])
+    return float(np.mean(_distances((height, width), _blocks(presses.circles, step)) < 1.5, 0).max())
+
+
 def read_taxim(pack: str | Path) -> Presses:
     """Presses of a Taxim calibration pack; raises BadCapture with the array, its shape and what is allowed."""
-    path = Path(pack)
+    path = pack_of(Path(pack))
     if not path.is_file():
         raise BadCapture(f"{path}: no such file; give the dataPack .npz of a Taxim calibration")
     wanted = ("imgs", "touch_center", "touch_radius")
@@ -170,11 +244,20 @@ def read_taxim(pack: str | Path) -> Presses:
     for key in ("imgs", "f0"):
         if key in arrays and arrays[key].dtype.kind not in "uif":
             raise BadCapture(f"{where}: {key} has the type {arrays[key].dtype}; allowed: numbers")
-    names = [Path(str(n)).stem for n in arrays.get("names", range(len(images)))]
+    listed = [str(n) for n in arrays.get("names", ())]
+    names, remarks = [Path(n).stem for n in listed], []
+    if any(n.lower().endswith((".jpg", ".jpeg")) for n in listed):
+        remarks.append(
+            "the images were JPEG files: neighbouring pixels share their noise, and fine shading is altered; averages "
+            "over 8 x 8 px (bin) suffer least"
+        )
+    if listed and len(listed) != len(images):
+        remarks.append(f"names has {len(listed)} entries for {len(images)} images: presses are numbered instead")
     if len(set(names)) < len(names) or len(names) != len(images):
         names = [f"{i:03d}" for i in range(len(images))]
-    given = arrays["f0"].astype(np.float64) if "f0" in arrays else None
-    return Presses(where, names, images.astype(np.float64), np.column_stack([centres, radii]).astype(np.float64), given)
+    given = arrays.get("f0")
+    circles = np.column_stack([centres, radii]).astype(np.float64)
+    return Presses(where, names, images, circles, given, remarks)
 
 
 def read_circles(images: str | Path, circles: str | Path) -> Presses:
@@ -275,10 +358,12 @@ def import_presses(
     tick = progress or (lambda *_: None)
     tick("import", 0, 4)
     scale = mm_per_pixel * bin
-    images, given, circles = _binned_presses(presses, bin, saturation)
+    black = black_levels(list(presses.images) + ([] if presses.given is None else [presses.given]))
+    images, given, circles = _binned_presses(presses, bin, saturation, black)
+    masks = _masks(images, black)
     median = np.median(images, 0)
     flat = median if background == "median" else given
-    far = _distances(images.shape[1:3], circles) > FAR
+    far = (_distances(images.shape[1:3], circles) > FAR) & ~at_black(images, black).any(-1)
     gains = np.array([_gain(image, flat, beyond) for image, beyond in zip(images, far)])
     tick("import", 1, 4)
     noise, levels = far_noise(images / gains[:, None, None], far, saturation)
@@ -286,7 +371,7 @@ def import_presses(
     touched = np.minimum(contact_share * circles[:, 2] * scale, STEEPEST * ball_radius)
     taken = slice(None, None, every)
     depths = [depth_of(a, ball_radius, skirt) for a in touched[taken]]
-    frames = _frames(presses.names[taken], images[taken], circles[taken], gains[taken], depths, scale)
+    frames = _frames(presses.names[taken], images[taken], circles[taken], gains[taken], depths, scale, masks[taken])
     directions = light_directions(images, flat * gains[:, None, None], circles, ball_radius / scale)
     facts = {
         "source": presses.source,
@@ -306,9 +391,12 @@ def import_presses(
         # ball, scale or labels are wrong where a circle is larger than the ball: the images decide
         "setup": _setup(leds, free_ball=bool(np.any(circles[taken, 2] * scale > ball_radius))),
     }
-    facts["warnings"] = contradictions(
+    facts["warnings"] = presses.remarks + contradictions(
         presses, facts, images, median, given, gains, noise, saturation, mm_per_pixel_check
     )
+    facts["corrections"] = _corrections(images, gains, black, bin, saturation)
+    if any(level is not None for level in black):
+        facts["warnings"].append(black_text(black, at_black(images, black).mean((0, 1, 2)).tolist())[0])
     tick("import", 3, 4)
     xml = _scene_xml(facts, gel_thickness, touched.max() + 5 * skirt, led_elements(directions, leds, flat.mean((0, 1))))
     path = write_set(Path(folder), frames, noise, flat, xml, facts, bits=8 if bin == 1 else None, overwrite=overwrite)
@@ -340,12 +428,49 @@ def _check_options(presses: Presses, lengths: dict[str, float], background: str,
         )
 
 
-def _frames(names, images, circles, gains, depths, scale: float) -> list[Frame]:
+def _masks(images: np.ndarray, black: Sequence[float | None]) -> list[np.ndarray | None]:
+    """(H, W) bool of every image, True = use, or None where all may be used.
+
+    Values cut off at 0 DN need none: a Noise without a pedestal leaves them out, channel by channel."""
+    above = [level if level is not None and level > 0 else None for level in black]
+    if not any(above):
+        return [None] * len(images)
+    masks = [~at_black(image, above).any(-1) for image in images]
+    return [None if mask.all() else mask for mask in masks]
+
+
+def _corrections(images, gains, black: Sequence[float | None], bin: int, saturation: float) -> list[dict[str, str]]:
+    """What was changed or left out, for import.json."""
+    found = []
+    if bin > 1:
+        found.append(correction("pixels are averaged", f"blocks of {bin} x {bin} px", "all images and the background"))
+    found.append(
+        correction(
+            "brightness of frames far from the contact, set as camera.gain_r, gain_g, gain_b",
+            f"sd {_rgb(100 * gains.std(0))} %, up to {np.abs(gains - 1).max():.1%}",
+            "every frame; values stay as they are",
+        )
+    )
+    share = np.mean(images >= SATURATED * saturation, (0, 1, 2))
+    if share.any():
+        found.append(
+            correction(
+                "saturated values are masked" + (", their blocks keep the largest value" if bin > 1 else ""),
+                f"{_rgb(100 * share)} % of R / G / B",
+                "all images",
+            )
+        )
+    if any(level is not None for level in black):
+        found.append(black_text(black, at_black(images, black).mean((0, 1, 2)).tolist())[1])
+    return found
+
+
+def _frames(names, images, circles, gains, depths, scale: float, masks) -> list[Frame]:
     """Frames with the press (mm) that their circles (px) tell, and with their gains."""
     height, width = images.shape[1:3]
     middle = np.array([width / 2, height / 2])
     frames = []
-    for name, image, circle, gain, depth in zip(names, images, circles, gains, depths):
+    for name, image, circle, gain, depth, mask in zip(names, images, circles, gains, depths, masks):
         x, y = (circle[:2] - middle) * scale
         settings = {
             "gel.press_x": x,
@@ -354,7 +479,7 @@ def _frames(names, images, circles, gains, depths, scale: float) -> list[Frame]:
             **{f"camera.gain_{c}": g for c, g in zip("rgb", gain)},
         }
         settings = {key: round(float(value), 6) for key, value in settings.items()}
-        frames.append(Frame(name, image.astype(np.float32), None, name, settings))
+        frames.append(Frame(name, image.astype(np.float32), mask, name, settings))
     return frames
 
 
@@ -430,15 +555,18 @@ def _check(presses: Presses, bin: int) -> None:
             )
 
 
-def binned(image: np.ndarray, bin: int, saturation: float = 255.0) -> np.ndarray:
-    """Means of blocks of bin x bin pixels; a block with a saturated value keeps its largest, so that it stays
-    masked."""
+def binned(
+    image: np.ndarray, bin: int, saturation: float = 255.0, black: Sequence[float | None] | None = None
+) -> np.ndarray:
+    """Means of blocks of bin x bin pixels; a block with a saturated value keeps its largest, one with a value at its
+    channel's black level that level, so that they stay masked."""
     if bin == 1:
         return np.asarray(image, np.float64)
     height, width, channels = image.shape
     blocks = np.asarray(image, np.float64).reshape(height // bin, bin, width // bin, bin, channels)
-    top = blocks.max((1, 3))
-    return np.where(top >= SATURATED * saturation, top, blocks.mean((1, 3)))
+    top, low = blocks.max((1, 3)), blocks.min((1, 3))
+    means = np.where(top >= SATURATED * saturation, top, blocks.mean((1, 3)))
+    return means if black is None else np.where(at_black(low, black), low, means)
 
 
 def filled(image: np.ndarray, bin: int, saturation: float = 255.0) -> np.ndarray:
@@ -448,11 +576,18 @@ def filled(image: np.ndarray, bin: int, saturation: float = 255.0) -> np.ndarray
     return binned(image[top : top + height, left : left + width], bin, saturation)
 
 
-def _binned_presses(presses: Presses, bin: int, saturation: float) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
+def _binned_presses(
+    presses: Presses, bin: int, saturation: float, black: Sequence[float | None]
+) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
     """Images, the image of the untouched sensor or None, and circles, in binned pixels whose centres are at +0.5."""
-    images = np.stack([binned(i, bin, saturation) for i in presses.images])
-    given = None if presses.given is None else binned(presses.given, bin, saturation)
-    return images, given, np.column_stack([(presses.circles[:, :2] + 0.5) / bin, presses.circles[:, 2] / bin])
+    images = np.stack([binned(i, bin, saturation, black).astype(np.float32) for i in presses.images])
+    given = None if presses.given is None else binned(presses.given, bin, saturation, black)
+    return images, given, _blocks(presses.circles, bin)
+
+
+def _blocks(circles: np.ndarray, bin: int) -> np.ndarray:
+    """Circles in px, pixel centres from 0, as circles in blocks, whose centres are at +0.5."""
+    return np.column_stack([(circles[:, :2] + 0.5) / bin, circles[:, 2] / bin])
 
 
 def depth_of(touched: float, ball_radius: float, skirt: float) -> float:
@@ -591,8 +726,10 @@ def contradictions(
         )
     scatter = np.sqrt([noise.variance(median[..., c].mean()) for c in range(median.shape[-1])])
     if given is not None:
-        rms = np.sqrt(np.mean((given - median) ** 2, (0, 1)))
-        shift = (median - given).mean((0, 1))
+        # where less than half of the presses are near: elsewhere the median is not of the untouched sensor
+        near = np.mean(_distances(images.shape[1:3], _blocks(presses.circles, facts["bin"])) < FAR, 0)
+        apart = (median - given)[near < CROWDED] if (near < CROWDED).any() else np.zeros((1, given.shape[-1]))
+        rms, shift = np.sqrt(np.mean(apart**2, 0)), apart.mean(0)
         facts["given_against_median_rms"] = rms.tolist()
         if np.any(rms > scatter):
             texts.append(
@@ -603,15 +740,11 @@ def contradictions(
     if np.abs(gains - 1).max() > 0.01:
         texts.append(
             f"frames differ in gain: sd {_rgb(100 * gains.std(0))} %, largest departure {np.abs(gains - 1).max():.1%}; "
-            "set as camera.gain_r, gain_g, gain_b in every frame"
+            f"set as camera.gain_r, gain_g, gain_b in every frame; {drift_text(gains, presses.names)}"
         )
     if facts["background"] == "median":
         covered = np.mean(
-            _distances(
-                images.shape[1:3],
-                np.column_stack([(presses.circles[:, :2] + 0.5) / facts["bin"], presses.circles[:, 2] / facts["bin"]]),
-            )
-            < 1.5,
+            _distances(images.shape[1:3], _blocks(presses.circles, facts["bin"])) < 1.5,
             0,
         )
         if covered.max() > 0.4:
@@ -668,6 +801,7 @@ def readme(facts: dict) -> str:
     levels = facts["noise"]["levels"]
     lines = [f"{facts['presses']} ball presses from {facts['source']}", "", "Contradictions"]
     lines += [f"- {text}" for text in facts["warnings"]] or ["- none found"]
+    lines += ["", "Corrections", *sentences(facts["corrections"])]
     lines += [
         "",
         "Given",

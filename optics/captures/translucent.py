@@ -69,7 +69,7 @@ DISTANCE = 20.0  # mm from the camera to the face
 LED_HEIGHT = 15.0  # mm from the face to the LEDs' board
 RING = 10.0  # mm: radius of the ring, where no board is given
 LEDS = 8
-HAZE, COAT = 0.05, 0.04  # 1/mm; reflectance
+HAZE, COAT = 0.1, 0.005  # 1/mm; reflectance: most of the light comes from the gel
 ALIKE = 0.1  # relative: depths that differ by more are a contradiction
 
 
@@ -518,13 +518,12 @@ def import_translucent(
         },
         "corrections": corrections,
         "setup": {
-            "free": ["gel.haze", "membrane.rho_?"],
+            "free": ["membrane.rho_?"],  # haze and coat make one ratio: one of them is held
             "per_group": ["gel.press_x", "gel.press_y", "gel.press_depth"],
             "flat_field": "multiplicative",
             "priors": {
                 "gel.press_[xy]": [None, 0.1],
                 "gel.press_depth": [None, 0.2 * depth],
-                "gel.haze": [None, HAZE],
                 "membrane.rho_?": [None, COAT],
             },
         },
@@ -659,9 +658,10 @@ def _scene(facts: Mapping, leds: np.ndarray, level: np.ndarray, given: bool) -> 
     template = (shipped("scenes") / "templates" / "translucent_press.xml").read_text(encoding="utf-8")
     (height, width), scale = facts["size_px"], facts["mm_per_pixel_after_binning"]
     far, thickness = facts["led_height_mm"], facts["gel_thickness_mm"]
-    # irradiance of one LED of power 1 at the middle of the face, by (S2), and what coat and haze send back of it
+    # irradiance of LEDs of power 1 at the middle of the face, by (S2), and what coat and haze send back of it
     one = sum((far / math.hypot(far, *place)) / (far**2 + place @ place) for place in leds)
-    back = COAT / math.pi + HAZE * thickness / (4 * math.pi)
+    path = math.hypot(far, *leds.std(0))
+    back = COAT / math.pi * math.exp(-2 * HAZE * thickness) + HAZE * thickness / (4 * math.pi) * math.exp(-HAZE * path)
     shares = level / level.mean()
     return template.format(
         source=comment(facts["source"]),

@@ -32,12 +32,16 @@ if TYPE_CHECKING:
 
 @app.command(
     "import",
-    help="Read a measured data set of ball presses, scans under one LED at a time, or raw frames of a polarization "
-    "camera, into a capture folder.",
+    help="Read a measured data set of ball presses, a calibration folder of 9DTact, scans under one LED at a time, or "
+    "raw frames of a polarization camera, into a capture folder.",
 )
 def import_(
     source: Annotated[
-        Path, typer.Argument(metavar="SOURCE", help="An .npz calibration pack, a folder of images, or of scans.")
+        Path,
+        typer.Argument(
+            metavar="SOURCE",
+            help="A calibration pack (.npz or its folder), a folder of images, of scans, or of 9DTact.",
+        ),
     ],
     output: Annotated[Path, typer.Option("-o", "--output", metavar="CAPTURES", help="Folder of the new capture set.")],
     circles: Annotated[
@@ -96,8 +100,9 @@ def import_(
 ) -> None:
     """Read presses; write captures.toml, a scene, and a report of contradictions between labels, scale and images.
 
-    A folder of scan folders (scan.yaml) is read as such. With --mosaic, read raw frames of a polarization camera."""
-    from optics.captures import importing, raw_frames, scans
+    A folder of scan folders (scan.yaml), of 9DTact (depth_calibration) or of a pack (dataPack.npz) is read as such.
+    With --mosaic, read raw frames of a polarization camera."""
+    from optics.captures import importing, raw_frames, scans, translucent
     from optics.polarization.mosaic import read_mosaic
 
     terminal.quiet, terminal.debug = quiet, debug
@@ -142,12 +147,19 @@ def import_(
             found = scans.import_scans(source, output, bin=bin, overwrite=force, progress=progress)
         _tell(found.folder, found.warnings)
         return
-    options: dict[str, Any] = {"leds": leds, "bin": bin, "every": every, "overwrite": force}
-    if ball_radius is not None:
-        options["ball_radius"] = ball_radius
-    if mm_per_pixel is not None:
-        options["mm_per_pixel"] = mm_per_pixel
-    if source.suffix == ".npz":
+    lengths = {"ball_radius": ball_radius, "mm_per_pixel": mm_per_pixel}
+    stated = {name: value for name, value in lengths.items() if value is not None}
+    if translucent.is_translucent_source(source):
+        if given := [name for name, value in {"--circles": circles, "--untouched": untouched}.items() if value]:
+            raise ValueError(f"{', '.join(given)}: the folder's images say so; leave these out")
+        with terminal.progress() as progress:
+            found = translucent.import_translucent(
+                source, output, bin=bin, overwrite=force, progress=progress, **stated
+            )
+        _tell(found.folder, found.warnings)
+        return
+    options: dict[str, Any] = {"leds": leds, "bin": bin, "every": every, "overwrite": force, **stated}
+    if source.suffix == ".npz" or importing.is_pack(source):
         found = importing.import_taxim(source, output, **options)
     else:
         if circles is None:
