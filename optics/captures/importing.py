@@ -569,11 +569,13 @@ def binned(
     return means if black is None else np.where(at_black(low, black), low, means)
 
 
-def filled(image: np.ndarray, bin: int, saturation: float = 255.0) -> np.ndarray:
+def filled(
+    image: np.ndarray, bin: int, saturation: float = 255.0, black: Sequence[float | None] | None = None
+) -> np.ndarray:
     """Means of blocks (`binned`), of the middle of the image that they fill."""
     height, width = (n // bin * bin for n in image.shape[:2])
     top, left = (image.shape[0] - height) // 2, (image.shape[1] - width) // 2
-    return binned(image[top : top + height, left : left + width], bin, saturation)
+    return binned(image[top : top + height, left : left + width], bin, saturation, black)
 
 
 def _binned_presses(
@@ -644,11 +646,12 @@ def noise_of_levels(light: np.ndarray, variance: np.ndarray, weight: np.ndarray,
     mean."""
     (gain, floor), _ = photon_transfer(light, variance, weight)
     if gain <= 0 or floor < 0:  # no photon transfer in these data: banding and drift rule
-        gain, floor = (
-            (1e-3, float(np.average(variance, weights=weight)))
-            if gain <= 0
-            else (float(np.average(variance / light, weights=weight)), 0.0)
-        )
+        mean = float(np.average(variance, weights=weight))
+        if gain <= 0:  # of the mean's hundredth, as a gain must be above 0
+            gain = 0.01 * mean / float(np.average(light, weights=weight))
+            floor = 0.99 * mean
+        else:
+            gain, floor = float(np.average(variance / light, weights=weight)), 0.0
     return Noise(float(gain), math.sqrt(max(floor, 0.0)), 0.0, saturation, 0.0, 1.0)
 
 
@@ -731,7 +734,7 @@ def contradictions(
         apart = (median - given)[near < CROWDED] if (near < CROWDED).any() else np.zeros((1, given.shape[-1]))
         rms, shift = np.sqrt(np.mean(apart**2, 0)), apart.mean(0)
         facts["given_against_median_rms"] = rms.tolist()
-        if np.any(rms > scatter):
+        if np.any(rms > 1.2 * scatter):  # the median's own noise adds a few per cent
             texts.append(
                 "the given image of the untouched sensor is not the background of these presses: rms difference to "
                 f"their median {_rgb(rms)} DN (mean {_rgb(shift, True)}), noise {_rgb(scatter)} DN; "
