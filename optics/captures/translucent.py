@@ -44,7 +44,7 @@ from optics.captures.importing import (
     comment,
     depth_of,
     filled,
-    noise_of_levels,
+    noise_of_channels,
     write_set,
 )
 from optics.captures.noise import SATURATED, Noise
@@ -372,22 +372,19 @@ def far_neighbour_noise(
         )
     ratio = pressed / np.maximum(untouched, 1.0)
     apart = (ratio[:, lag:-lag] - (ratio[:, : -2 * lag] + ratio[:, 2 * lag :]) / 2) * level
-    light, square, channels, groups = level[use], apart[use] ** 2 / 1.5, [], []
+    light, square = level[use], apart[use] ** 2 / 1.5
+    channels: list[dict] = []
+    laws: list[list[tuple]] = []
     for c in range(light.shape[1]):
         # a mean without dust; a median of whole numbers would be one of few values
         kept = square[:, c] <= CUT**2 * square[:, c].mean()
-        channels.append(
-            {
-                "channel": "rgb"[c],
-                "signal": float(light[kept, c].mean()),
-                "sd": math.sqrt(float(square[kept, c].mean())),
-            }
-        )
         order = np.flatnonzero(kept)[np.argsort(light[kept, c], kind="stable")]
-        groups += [(light[g, c].mean(), square[g, c].mean(), float(len(g))) for g in np.array_split(order, LEVELS)]
-    values, variance, weight = (np.array(v, float) for v in zip(*groups))
-    own = np.maximum(variance - step**2 / 12, 0.1 * variance)
-    return noise_of_levels(values, own, weight, saturation), channels
+        groups = [(light[g, c].mean(), square[g, c].mean(), len(g)) for g in np.array_split(order, LEVELS)]
+        laws.append(groups)
+        channels.append(
+            {"channel": "rgb"[c], "signal": float(light[kept, c].mean()), "sd": math.sqrt(square[kept, c].mean())}
+        )
+    return noise_of_channels(laws, channels, saturation, step), channels
 
 
 def specks(pressed: np.ndarray, untouched: np.ndarray, noise: Noise) -> np.ndarray:
@@ -510,8 +507,8 @@ def import_translucent(
         "background": "given",
         "frame_gain": [[round(float(g), 5) for g in gain]],
         "noise": {
-            "system_gain": noise.system_gain,
-            "dark_noise": noise.dark_noise,
+            "system_gain": noise.written("system_gain"),
+            "dark_noise": noise.written("dark_noise"),
             "levels": levels,
             "how": f"second differences of pixels {max(1, LAG // bin)} px apart, of the press over the untouched "
             f"sensor beyond {CLEAR:g} circle radii: the noise of both images",

@@ -148,7 +148,7 @@ def import_(
         _tell(found.folder, found.warnings)
         return
     lengths = {"ball_radius": ball_radius, "mm_per_pixel": mm_per_pixel}
-    stated = {name: value for name, value in lengths.items() if value is not None}
+    stated: dict[str, Any] = {name: value for name, value in lengths.items() if value is not None}
     if translucent.is_translucent_source(source):
         if given := [name for name, value in {"--circles": circles, "--untouched": untouched}.items() if value]:
             raise ValueError(f"{', '.join(given)}: the folder's images say so; leave these out")
