@@ -48,6 +48,7 @@ COLUMNS = ("file", "center_x_px", "center_y_px", "contact_radius_px")
 FAR = 3.0  # circle radii beyond which a press leaves the image alone, but for a skirt of a few per mille
 LED_DISTANCE = 16.0  # mm from the middle of the face, where no better is known
 ALIKE = 0.15  # relative: channels whose standard deviations one law misses by more have laws of their own
+LEAST = 0.01  # of the mean variance: what gain and dark noise have at least
 STEEPEST = 0.93  # of the ball's radius: largest touched radius, where the flank is 68 deg steep and the depth finite
 MEDIAN_OF = 5  # presses, from which on a per-pixel median is free of the ones that cover a pixel
 GEL_MARGIN = 1.15  # of the view: size of the gel, so that its edge is never seen
@@ -667,14 +668,13 @@ def noise_of_levels(light: np.ndarray, variance: np.ndarray, weight: np.ndarray,
     """Noise from variances (n,) at levels of light (n,), DN; where they show no photon transfer, one that has their
     mean."""
     (gain, floor), _ = photon_transfer(light, variance, weight)
-    if gain <= 0 or floor < 0:  # no photon transfer in these data: banding and drift rule
-        mean = float(np.average(variance, weights=weight))
-        if gain <= 0:  # of the mean's hundredth, as a gain must be above 0
-            gain = 0.01 * mean / float(np.average(light, weights=weight))
-            floor = 0.99 * mean
-        else:
-            gain, floor = float(np.average(variance / light, weights=weight)), 0.0
-    return Noise(float(gain), math.sqrt(max(floor, 0.0)), 0.0, saturation, 0.0, 1.0)
+    mean = float(np.average(variance, weights=weight))
+    if gain <= 0:  # no photon transfer in these data: banding and drift rule
+        gain, floor = LEAST * mean / float(np.average(light, weights=weight)), mean
+    elif floor < 0:
+        gain = float(np.average(variance / light, weights=weight))
+    # above 0, as in the dark it is all the noise that there is
+    return Noise(float(gain), math.sqrt(max(floor, LEAST * mean)), 0.0, saturation, 0.0, 1.0)
 
 
 def light_directions(images, backgrounds, circles, radius: float) -> list[list[float]]:
