@@ -79,7 +79,8 @@ class Press:
 
     missing   (H, W) bool: pixels that show no raw pixel, or one that another pixel shows as well
     earlier   a further image of the untouched sensor, or None
-    table     mm, the authors' depth by darkening in DN, or None"""
+    table     mm, the authors' depth by darkening in DN, or None
+    files     the configuration and the board's table that were found, by name"""
 
     source: str
     untouched: np.ndarray
@@ -91,6 +92,7 @@ class Press:
     ball_radius: float
     leds: np.ndarray | None
     remarks: list[str]
+    files: dict[str, str]
 
 
 @dataclass(frozen=True)
@@ -151,7 +153,10 @@ def read_press(source: Path, ball_radius: float | None = None, mm_per_pixel: flo
     if table is not None and (table.ndim != 1 or not table.size or not np.isfinite(table).all()):
         raise BadCapture(f"{table_file}: shape {table.shape}; allowed: (N,) finite depths in mm, by darkening in DN")
     leds = _board(folder)
-    return Press(str(folder), untouched, pressed, missing, earlier, table, mm_per_pixel, ball_radius, leds, remarks)
+    files = {name: str(file) for name in (CONFIG, BOARD) if (file := _near(folder, name)) is not None}
+    return Press(
+        str(folder), untouched, pressed, missing, earlier, table, mm_per_pixel, ball_radius, leds, remarks, files
+    )
 
 
 def _sensor(source: Path) -> Path:
@@ -483,6 +488,7 @@ def import_translucent(
     corrections = _corrections(press, speck, cut, black, bad, gain, bin)
     facts: dict[str, Any] = {
         "source": press.source,
+        "files": press.files,
         "presses": 1,
         "size_px": list(untouched.shape[:2]),
         "bin": bin,
@@ -711,6 +717,7 @@ def readme(facts: Mapping) -> str:
             "Given",
             f"- ball radius {facts['ball_radius_mm']:g} mm, {facts['mm_per_pixel']:.5g} mm/px",
             f"- LEDs: {len(facts['leds_mm'])}, {facts['leds_from']}",
+            *[f"- {file}" for file in facts["files"].values()],
             "",
             "Assumed",
             f"- camera at {facts['camera_distance_mm']:g} mm, LEDs at {facts['led_height_mm']:g} mm from the face, gel "

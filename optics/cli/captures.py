@@ -140,8 +140,8 @@ def import_(
         _tell(read.folder, read.warnings)
         return
     if scans.is_scan_source(source):
-        stated = {"--circles": circles, "--ball-radius": ball_radius, "--mm-per-pixel": mm_per_pixel}
-        if given := [name for name, value in {**stated, "--untouched": untouched}.items() if value is not None]:
+        own = {"--circles": circles, "--ball-radius": ball_radius, "--mm-per-pixel": mm_per_pixel}
+        if given := [name for name, value in {**own, "--untouched": untouched}.items() if value is not None]:
             raise ValueError(f"{', '.join(given)}: scan.yaml says so; leave these out")
         with terminal.progress() as progress:
             found = scans.import_scans(source, output, bin=bin, overwrite=force, progress=progress)
