@@ -1,6 +1,7 @@
 """Commands about captures: import a measured set, plan a session, hold a scene against captures."""
 
 import re
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -145,7 +146,7 @@ def import_(
             raise ValueError(f"{', '.join(given)}: scan.yaml says so; leave these out")
         with terminal.progress() as progress:
             found = scans.import_scans(source, output, bin=bin, overwrite=force, progress=progress)
-        _tell(found.folder, found.warnings)
+        _tell(found.folder, found.warnings, found.facts["corrections"])
         return
     lengths = {"ball_radius": ball_radius, "mm_per_pixel": mm_per_pixel}
     stated: dict[str, Any] = {name: value for name, value in lengths.items() if value is not None}
@@ -156,7 +157,7 @@ def import_(
             found = translucent.import_translucent(
                 source, output, bin=bin, overwrite=force, progress=progress, **stated
             )
-        _tell(found.folder, found.warnings)
+        _tell(found.folder, found.warnings, found.facts["corrections"])
         return
     options: dict[str, Any] = {"leds": leds, "bin": bin, "every": every, "overwrite": force, **stated}
     if source.suffix == ".npz" or importing.is_pack(source):
@@ -174,13 +175,15 @@ def import_(
                 "circles"
             )
         found = importing.import_circles(source, circles, output, untouched=untouched, **options)
-    _tell(found.folder, found.warnings)
+    _tell(found.folder, found.warnings, found.facts["corrections"])
 
 
-def _tell(folder: Path, warnings: list[str]) -> None:
-    """What an import left: remarks on stderr, the folder on stdout."""
+def _tell(folder: Path, warnings: list[str], corrections: Sequence[Mapping[str, str]] = ()) -> None:
+    """What an import left: remarks and corrections on stderr, the folder on stdout."""
     for text in warnings:
         terminal.note(f"warning: {one_line(text)}")
+    for c in corrections:
+        terminal.note(f"corrected: {one_line(c['what'])}: {c['how_much']}; {c['where']}")
     print(folder)
 
 

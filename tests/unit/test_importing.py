@@ -1,6 +1,8 @@
 """Importing labelled ball presses: what is derived, what is said, and what is refused."""
 
+import importlib.util
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ from optics.captures import importing
 from optics.errors import BadCapture, OutputExists
 
 H, W, R = 48, 64, 8  # px
+PACKAGE = importlib.util.find_spec("taxim")  # holds packs of 480 x 640 px; never imported
 
 
 @pytest.fixture
@@ -257,3 +260,17 @@ def test_a_bad_packs_folder_is_refused(large, tmp_path, spoil, words):
     spoil(large)
     with pytest.raises(BadCapture, match=words):
         importing.import_taxim(large, tmp_path / "set")
+
+
+@pytest.mark.skipif(PACKAGE is None, reason="the package taxim and its packs are not here")
+@pytest.mark.parametrize("sensor, presses, background", [("gelsight", 48, "median"), ("gelsight_mini", 24, "given")])
+def test_measured_packs_of_480_by_640_px(tmp_path, sensor, presses, background):
+    """Their own scale; the Mini is pressed at one place, so that a median would show the ball."""
+    pack = Path(PACKAGE.submodule_search_locations[0]) / "calib" / sensor
+    found = importing.import_taxim(pack, tmp_path / "set", bin=8)
+    assert found.facts["mm_per_pixel"] == 0.0295 and found.facts["background"] == background
+    assert found.facts["presses"] == presses and found.facts["size_px"] == [60, 80]
+    assert found.facts["labelled_radius_mm"][1] < 2.0  # no circle is larger than the ball
+    loaded = captures.load(found.folder)
+    assert np.abs(np.array(found.facts["frame_gain"]) - 1).max() < 0.05
+    assert loaded.noise.sd(np.full(3, 100.0)).max() < 2.0
