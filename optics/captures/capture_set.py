@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from optics.captures import readings
-from optics.captures.noise import DEMOSAICED, SATURATED, UNITS, UNLIMITED, Noise, repeated, step_of
+from optics.captures.noise import DEMOSAICED, PER_CHANNEL, SATURATED, UNITS, UNLIMITED, Noise, repeated, step_of
 from optics.captures.readings import DECIMALS, DELIMITERS, NAMES, Row, Table
 from optics.errors import BadCapture, OutputExists, UnknownKey
 from optics.files import toml_checks as checks
@@ -176,6 +176,7 @@ def load(path: str | Path) -> Captures:
             )
             _same_size(captures.flat_field, captures, here)
     images = [image for f in captures.frames for image in (f.image, *f.repeats)]
+    _check_channels(captures, where)
     if noise is not None:
         noise = captures.noise = replace(noise, quantisation=max(step, step_of(images)))
         if captures.table is not None and noise.saturation == math.inf:
@@ -225,11 +226,32 @@ def _noise(table: object, where: str, readings_: bool) -> Noise:
                 else f"all of {', '.join(NOISE_KEYS)}, or leave [noise] out to have it estimated from repeats"
             )
         )
-    numbers = {key: checks.number(table[key], key, UNITS[key], where) for key in NOISE_KEYS if key in table}
+    numbers = {key: _noise_number(table[key], key, where, readings_) for key in NOISE_KEYS if key in table}
     try:
         return Noise(**{**usual, **numbers}, signed=readings_, ends="saturation" in numbers or not readings_)
     except ValueError as error:
         raise BadCapture(f"{where}: {error}") from error
+
+
+def _noise_number(value: object, key: str, where: str, readings_: bool) -> Any:
+    """A number, or of what each channel may have its own, a number for each."""
+    if not isinstance(value, list) or key not in PER_CHANNEL:
+        return checks.number(value, key, UNITS[key], where)
+    if readings_:
+        raise BadCapture(f"{where}: {key} = {value!r}; allowed: one number, as a table has no R, G and B")
+    return tuple(checks.number(one, key, UNITS[key], where) for one in value)
+
+
+def _check_channels(captures: Captures, where: str) -> None:
+    """A number for each channel belongs to colour images, whose pixels have all of them."""
+    channels = captures.frames[0].image.shape[2]
+    for key in PER_CHANNEL:
+        if isinstance(own := getattr(captures.noise, key, None), tuple) and channels != len(own):
+            raise BadCapture(
+                f"{where}: [noise]: {key} = {list(own)}, but images have {channels} channel"
+                f"{'s' if channels > 1 else ''} per pixel; allowed: one number, or R, G, B of images that are "
+                "developed to colour"
+            )
 
 
 def _bands(data: Mapping, where: str) -> list[float]:
@@ -373,7 +395,9 @@ def _check_levels(captures: Captures, where: str) -> None:
                 "remove it or expose it shorter"
             )
     if captures.noise is not None and captures.table is None:
-        least = captures.noise.black_level - SUNK * float(captures.noise.sd(captures.noise.black_level))
+        least = captures.noise.black_level - SUNK * float(
+            np.max(captures.noise.sd(np.full(3, captures.noise.black_level)))
+        )
         for what, values in used:
             if values.size and (middle := float(np.median(values))) < least:
                 raise BadCapture(
@@ -782,7 +806,7 @@ def _fill(captures: Captures, folder: Path, final: Path, bits: int | None) -> No
         document["noise"] = tomlkit.table()
         for key in NOISE_KEYS:
             if key != "saturation" or captures.noise.ends:
-                document["noise"].add(key, tomlkit.item(float(getattr(captures.noise, key))).comment(UNITS[key]))
+                document["noise"].add(key, tomlkit.item(captures.noise.written(key)).comment(UNITS[key]))
     for name, content in (
         ("parameters", _plain(captures.parameters)),
         ("uncertainty", _plain(captures.uncertainty)),

@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Hashable, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -27,6 +27,7 @@ SATURATED = (
 DITHERED = (
     0.25  # temporal variance per step^2 from which the step acts as noise q^2/12 to 2.5 % (at 0.09: only to 45 %)
 )
+PER_CHANNEL = ("system_gain", "dark_noise")  # what may be a number for each channel
 UNITS = {
     "system_gain": "DN per electron",
     "dark_noise": "DN, rms",
@@ -51,12 +52,14 @@ SLOPED = 3.0  # standard deviations from 0 of a gain that readings determine
 class Noise:
     """Noise of a camera; every number as in the module's text, `saturation` in DN.
 
+    system_gain, dark_noise   a number, or one for each channel: of the last axis of a signal (H, W, C). A signal whose
+             last axis is no list of the channels has the mean of the gains and the rms of the dark noises
     signed   whether a value below 0 is a reading like any other, as of a volt meter, and not cut off there
     ends     whether values end at `saturation`; else it only sets the scale of what a camera makes of light
     """
 
-    system_gain: float
-    dark_noise: float
+    system_gain: float | tuple[float, ...]
+    dark_noise: float | tuple[float, ...]
     black_level: float
     saturation: float
     prnu: float
@@ -66,12 +69,21 @@ class Noise:
 
     def __post_init__(self):
         rules = {"black_level": "finite"} if self.signed else {"black_level": "finite", "system_gain": "> 0"}
+        for name in PER_CHANNEL:
+            if isinstance(values := getattr(self, name), (list, tuple)):
+                object.__setattr__(self, name, tuple(float(v) for v in values))
+        if len({len(v) for v in (self.system_gain, self.dark_noise) if isinstance(v, tuple)} | {3}) > 1:
+            raise ValueError(
+                f"system_gain = {self.system_gain}, dark_noise = {self.dark_noise}; allowed: a number, or three of "
+                "them, for R, G and B"
+            )
         for name, unit in UNITS.items():
-            value, allowed = getattr(self, name), rules.get(name, ">= 0")
-            if name == "saturation" and not self.ends and value == math.inf:
+            own, allowed = getattr(self, name), rules.get(name, ">= 0")
+            if name == "saturation" and not self.ends and own == math.inf:
                 continue
-            if not math.isfinite(value) or (allowed != "finite" and value < 0) or (allowed == "> 0" and value == 0):
-                raise ValueError(f"{name} = {value:g} {unit}; allowed: {allowed}; see the camera's EMVA 1288 sheet")
+            for value in own if isinstance(own, tuple) else (own,):
+                if not math.isfinite(value) or (allowed != "finite" and value < 0) or (allowed == "> 0" and value == 0):
+                    raise ValueError(f"{name} = {value:g} {unit}; allowed: {allowed}; see the camera's EMVA 1288 sheet")
         if self.saturation <= self.black_level:
             raise ValueError(f"saturation = {self.saturation:g} DN; allowed: > black_level = {self.black_level:g} DN")
 
@@ -79,11 +91,33 @@ class Noise:
         """Variance in DN^2 of a noise-free signal in DN (any shape), recorded as the mean of `frames_averaged`
         frames."""
         light = np.maximum(np.asarray(signal, float) - self.black_level, 0.0)
-        temporal = self.system_gain * light + self.dark_noise**2
+        gain, dark = self._numbers(light.shape)
+        temporal = gain * light + dark**2
         step = self.quantisation**2 / 12
         if frames_averaged > 1:  # the step averages down like the rest only where the temporal noise dithers it
             step = np.where(temporal >= DITHERED * self.quantisation**2, step / frames_averaged, step)
         return temporal / frames_averaged + step + (self.prnu * light) ** 2
+
+    def _numbers(self, shape: Sequence[int]) -> tuple[Any, Any]:
+        """(system_gain, dark_noise) for a signal of a shape: numbers, or arrays along its last axis."""
+
+        def of(value: float | tuple[float, ...], power: int) -> Any:
+            if not isinstance(value, tuple):
+                return value
+            numbers = np.array(value)
+            return numbers if shape and shape[-1] == len(value) else float(np.mean(numbers**power)) ** (1 / power)
+
+        return of(self.system_gain, 1), of(self.dark_noise, 2)
+
+    def written(self, name: str) -> float | list[float]:
+        """A number as files hold it: of each channel its own in a list."""
+        own = getattr(self, name)
+        return [float(v) for v in own] if isinstance(own, tuple) else float(own)
+
+    def of_channel(self, channel: int) -> Noise:
+        """The noise of one channel, for signals of any shape."""
+        own = {n: v[channel] for n in PER_CHANNEL if isinstance(v := getattr(self, n), tuple)}
+        return replace(self, **own)
 
     def sd(self, signal: np.ndarray, frames_averaged: int = 1) -> np.ndarray:
         """Standard deviation in DN: the root of `variance`."""
@@ -94,9 +128,11 @@ class Noise:
 
         The gain in DN per electron stays, the quantisation of all frames but one is counted as dark noise.
         """
+        own = self.dark_noise if isinstance(self.dark_noise, tuple) else (self.dark_noise,)
+        dark = tuple(math.sqrt(frames * d**2 + (frames - 1) * self.quantisation**2 / 12) for d in own)
         return replace(
             self,
-            dark_noise=math.sqrt(frames * self.dark_noise**2 + (frames - 1) * self.quantisation**2 / 12),
+            dark_noise=dark if isinstance(self.dark_noise, tuple) else dark[0],
             black_level=frames * self.black_level,
             saturation=frames * self.saturation,
         )
@@ -112,11 +148,12 @@ class Noise:
         light = np.maximum(np.asarray(signal, float) - self.black_level, 0.0)
         if fixed_pattern is not None:
             light = light * np.maximum(1.0 + fixed_pattern, 0.0)
-        if self.system_gain > 0:
-            light = self.system_gain * rng.poisson(light / self.system_gain)
+        gain, dark = self._numbers(light.shape)
+        if np.all(np.asarray(gain) > 0):
+            light = gain * rng.poisson(light / gain)
         if self.signed:  # what a camera adds may lie below its black level
             light = light + np.minimum(np.asarray(signal, float) - self.black_level, 0.0)
-        frame = self.black_level + light + self.dark_noise * rng.standard_normal(light.shape)
+        frame = self.black_level + light + dark * rng.standard_normal(light.shape)
         frame = np.clip(frame, -math.inf if self.signed else 0.0, self.saturation if self.ends else math.inf)
         return np.round(frame / self.quantisation) * self.quantisation if self.quantisation else frame
 
@@ -128,7 +165,7 @@ class Noise:
     @property
     def pedestal(self) -> bool:
         """Whether the black level stands three sigma above 0, so that dark noise is not clipped."""
-        return self.black_level >= 3 * float(self.sd(self.black_level))
+        return self.black_level >= 3 * float(np.max(self.sd(np.full(3, self.black_level))))
 
     def usable(self, image: np.ndarray, dilate: int = 1) -> np.ndarray:
         """Mask (H, W, C), True = use: not within `dilate` pixels of saturation, in each channel's own plane.

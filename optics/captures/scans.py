@@ -15,6 +15,7 @@ Derived, not measured, and said so:
     noise      variance against signal of half the squared differences of neighbours in image over flat field, where no
                ball is near
     lights     the direction of the least-squares fit I/F = l.n + c on the balls, at DISTANCE
+    black      values that are cut off below (`corrections.black_levels`): masked, of blocks the whole block
     masks      blemishes: values that miss the median around them, or on balls a linear shading, by BLEMISH standard
                deviations"""
 
@@ -29,7 +30,15 @@ from typing import Any
 import numpy as np
 
 from optics.captures.capture_set import Frame
-from optics.captures.importing import Imported, binned, comment, noise_of_levels, write_set
+from optics.captures.corrections import (
+    at_black,
+    black_levels,
+    black_text,
+    correction,
+    drift_text,
+    sentences,
+)
+from optics.captures.importing import Imported, comment, filled, noise_of_levels, write_set
 from optics.captures.noise import Noise
 from optics.errors import BadCapture
 from optics.files.images import read_image
@@ -302,13 +311,14 @@ def import_scans(
         warnings.append(f"not used: {', '.join(left)} (another camera or other LEDs, or nothing pressed)")
     steps = len(scans) + 1
     tick("import", 0, steps)
-    flats = np.stack([_cut(i, bin, saturation)[..., 0] for i in flat.images])
+    black = black_levels([i for s in (*scans, flat) for i in s.images])
+    flats = np.stack([filled(i, bin, saturation, black)[..., 0] for i in flat.images])
     plates, cut, settings = [], [], []
     for done, scan in enumerate(scans, 1):
         plate = plate_of(scan)
         warnings += _contradictions(scan, plate, first)
         plates.append(plate)
-        cut.append(np.stack([_cut(i, bin, saturation)[..., 0] for i in scan.images]))
+        cut.append(np.stack([filled(i, bin, saturation, black)[..., 0] for i in scan.images]))
         pose = dict(zip(POSE, (plate.x, plate.y, 0.0, 0.0, 0.0, plate.turn)))
         settings.append({key: round(float(value), 6) for key, value in pose.items()})
         tick("import", done, steps)
@@ -322,13 +332,18 @@ def import_scans(
     lights = _lights(scans, ratios, offsets, distances)
     for pose, *shown in zip(settings, scans, ratios, offsets):
         pose["gel.press_depth"] = round(_depth(*shown, lights), 6)
-    frames, masked = [], []
+    frames, masked, dark, drift = [], [], [], []
     for scan, images, ratio, offset, pose in zip(scans, cut, ratios, offsets, settings):
         for k, label in enumerate(scan.labels):
             # a ratio has the noise of the image and of the flat field
             sd = noise.sd(flats[k]) * math.sqrt(2) / np.maximum(flats[k], 1.0)
             off = blemishes(ratio[k], sd, offset, scan.radius)
             masked.append(float(off.mean()))
+            lost = at_black(images[k][..., None], black)[..., 0] | at_black(flats[k][..., None], black)[..., 0]
+            dark.append(float(lost.mean()))
+            level_face = np.hypot(*np.moveaxis(offset, -1, 0)) > NEAR * scan.radius
+            drift.append(float(np.median(ratio[k][level_face & ~lost])))
+            off = off | lost
             on = {f"led_{other}.power": float(other == label) for other in scan.labels}
             frame = Frame(
                 f"{scan.name}_{label}", images[k][..., None].astype(np.float32), ~off, scan.name, {**pose, **on}
@@ -340,7 +355,16 @@ def import_scans(
             f"dust, hair or glints: {100 * float(np.mean(masked)):.2g} % of the values are masked, up to "
             f"{100 * max(masked):.2g} % of a frame"
         )
+    corrections = _corrections(bin, masked)
+    if max(dark) > 0:
+        remark, entry = black_text(black, [float(np.mean(dark))])
+        warnings.append(remark)
+        corrections.append(entry)
+    remark = drift_text(np.array(drift)[:, None], [f.name for f in frames])
+    if remark:
+        warnings.append(f"{remark}; left as it is: light that the balls throw on the level face looks the same")
     facts = _facts(source, scans, flat, plates, bin, scale, shape, noise, lights, warnings)
+    facts["corrections"] = corrections
     path = write_set(
         Path(folder),
         frames,
@@ -356,11 +380,14 @@ def import_scans(
     return Imported(path, warnings, facts)
 
 
-def _cut(image: np.ndarray, bin: int, saturation: float) -> np.ndarray:
-    """Means of blocks, of the middle of the image that they fill."""
-    height, width = (n // bin * bin for n in image.shape[:2])
-    top, left = (image.shape[0] - height) // 2, (image.shape[1] - width) // 2
-    return binned(image[top : top + height, left : left + width], bin, saturation)
+def _corrections(bin: int, masked: Sequence[float]) -> list[dict[str, str]]:
+    found = []
+    if bin > 1:
+        found.append(correction("pixels are averaged", f"blocks of {bin} x {bin} px", "all images and flat fields"))
+    if max(masked) > 0:
+        share = f"{100 * float(np.mean(masked)):.2g} % of the values, up to {100 * max(masked):.2g} % of a frame"
+        found.append(correction("dust, hair and glints are masked", share, "each scan and LED"))
+    return found
 
 
 def _contradictions(scan: Scan, plate: Plate, first: Scan) -> list[str]:
@@ -503,6 +530,9 @@ def readme(facts: Mapping) -> str:
             "",
             "Contradictions and blemishes",
             *([f"- {text}" for text in facts["warnings"]] or ["- none found"]),
+            "",
+            "Corrections",
+            *(sentences(facts["corrections"]) or ["- none"]),
             "",
             "Given",
             f"- balls of {facts['ball_radius_mm']:g} mm radius, {facts['ball_spacing_mm']:g} mm apart; "

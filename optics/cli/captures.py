@@ -1,6 +1,7 @@
 """Commands about captures: import a measured set, plan a session, hold a scene against captures."""
 
 import re
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -32,12 +33,16 @@ if TYPE_CHECKING:
 
 @app.command(
     "import",
-    help="Read a measured data set of ball presses, scans under one LED at a time, or raw frames of a polarization "
-    "camera, into a capture folder.",
+    help="Read a measured data set of ball presses, a calibration folder of 9DTact, scans under one LED at a time, or "
+    "raw frames of a polarization camera, into a capture folder.",
 )
 def import_(
     source: Annotated[
-        Path, typer.Argument(metavar="SOURCE", help="An .npz calibration pack, a folder of images, or of scans.")
+        Path,
+        typer.Argument(
+            metavar="SOURCE",
+            help="A calibration pack (.npz or its folder), a folder of images, of scans, or of 9DTact.",
+        ),
     ],
     output: Annotated[Path, typer.Option("-o", "--output", metavar="CAPTURES", help="Folder of the new capture set.")],
     circles: Annotated[
@@ -96,8 +101,9 @@ def import_(
 ) -> None:
     """Read presses; write captures.toml, a scene, and a report of contradictions between labels, scale and images.
 
-    A folder of scan folders (scan.yaml) is read as such. With --mosaic, read raw frames of a polarization camera."""
-    from optics.captures import importing, raw_frames, scans
+    A folder of scan folders (scan.yaml), of 9DTact (depth_calibration) or of a pack (dataPack.npz) is read as such.
+    With --mosaic, read raw frames of a polarization camera."""
+    from optics.captures import importing, raw_frames, scans, translucent
     from optics.polarization.mosaic import read_mosaic
 
     terminal.quiet, terminal.debug = quiet, debug
@@ -135,19 +141,26 @@ def import_(
         _tell(read.folder, read.warnings)
         return
     if scans.is_scan_source(source):
-        stated = {"--circles": circles, "--ball-radius": ball_radius, "--mm-per-pixel": mm_per_pixel}
-        if given := [name for name, value in {**stated, "--untouched": untouched}.items() if value is not None]:
+        own = {"--circles": circles, "--ball-radius": ball_radius, "--mm-per-pixel": mm_per_pixel}
+        if given := [name for name, value in {**own, "--untouched": untouched}.items() if value is not None]:
             raise ValueError(f"{', '.join(given)}: scan.yaml says so; leave these out")
         with terminal.progress() as progress:
             found = scans.import_scans(source, output, bin=bin, overwrite=force, progress=progress)
-        _tell(found.folder, found.warnings)
+        _tell(found.folder, found.warnings, found.facts["corrections"])
         return
-    options: dict[str, Any] = {"leds": leds, "bin": bin, "every": every, "overwrite": force}
-    if ball_radius is not None:
-        options["ball_radius"] = ball_radius
-    if mm_per_pixel is not None:
-        options["mm_per_pixel"] = mm_per_pixel
-    if source.suffix == ".npz":
+    lengths = {"ball_radius": ball_radius, "mm_per_pixel": mm_per_pixel}
+    stated: dict[str, Any] = {name: value for name, value in lengths.items() if value is not None}
+    if translucent.is_translucent_source(source):
+        if given := [name for name, value in {"--circles": circles, "--untouched": untouched}.items() if value]:
+            raise ValueError(f"{', '.join(given)}: the folder's images say so; leave these out")
+        with terminal.progress() as progress:
+            found = translucent.import_translucent(
+                source, output, bin=bin, overwrite=force, progress=progress, **stated
+            )
+        _tell(found.folder, found.warnings, found.facts["corrections"])
+        return
+    options: dict[str, Any] = {"leds": leds, "bin": bin, "every": every, "overwrite": force, **stated}
+    if source.suffix == ".npz" or importing.is_pack(source):
         found = importing.import_taxim(source, output, **options)
     else:
         if circles is None:
@@ -162,13 +175,15 @@ def import_(
                 "circles"
             )
         found = importing.import_circles(source, circles, output, untouched=untouched, **options)
-    _tell(found.folder, found.warnings)
+    _tell(found.folder, found.warnings, found.facts["corrections"])
 
 
-def _tell(folder: Path, warnings: list[str]) -> None:
-    """What an import left: remarks on stderr, the folder on stdout."""
+def _tell(folder: Path, warnings: list[str], corrections: Sequence[Mapping[str, str]] = ()) -> None:
+    """What an import left: remarks and corrections on stderr, the folder on stdout."""
     for text in warnings:
         terminal.note(f"warning: {one_line(text)}")
+    for c in corrections:
+        terminal.note(f"corrected: {one_line(c['what'])}: {c['how_much']}; {c['where']}")
     print(folder)
 
 

@@ -675,7 +675,7 @@ def write(planned: Plan, folder: str | Path) -> Path:
     document["noise"] = tomlkit.table()
     for key in NOISE_KEYS:
         if key != "saturation" or planned.noise.ends:
-            document["noise"].add(key, tomlkit.item(float(getattr(planned.noise, key))).comment(UNITS[key]))
+            document["noise"].add(key, tomlkit.item(planned.noise.written(key)).comment(UNITS[key]))
     if planned.size == (1, 1):
         document["table"] = {"file": "readings.csv", "values": ["reading"]}
     else:

@@ -287,6 +287,13 @@ def test_the_step_is_read_off_the_images(folder):
     assert load(folder, 'scene = "bench"\n' + NOISE + FRAME.replace("000.png", "mean.npy")).noise.quantisation == 0.0
 
 
+def test_noise_of_each_channel_is_read_and_written(folder):
+    own = NOISE.replace("0.05", "[0.05, 0.04, 0.1]").replace("1.5", "[1.5, 0.7, 1.0]")
+    c = load(folder, 'scene = "bench"\n' + own + FRAME.replace("000.png", "rgb.png"))
+    assert c.noise.system_gain == (0.05, 0.04, 0.1) and c.noise.dark_noise == (1.5, 0.7, 1.0)
+    assert captures.load(captures.write(c, folder / "again", bits=8)).noise == c.noise
+
+
 # -- What is wrong ---------------------------------------------------------------------------------------------------
 def frames(extra="", image="frames/000.png", before=""):
     return f'scene = "bench"\n{before}{NOISE}[[frames]]\nimage = "{image}"\n{extra}'
@@ -317,6 +324,11 @@ BAD = {
     "noise infinite": (noise("255.0", "inf"), "saturation = inf DN; allowed: a finite number"),
     "saturation below black": (noise("255.0", "8.0"), "saturation = 8 DN; allowed: > black_level = 8 DN"),
     "saturation beyond the file": (noise("255.0", "4095"), "saturation = 4095 DN; allowed: <= 255 DN"),
+    "gains of a gray image": (noise("0.05", "[0.05, 0.04, 0.1]"), "but images have 1 channel per pixel; allowed: one"),
+    "two gains": (noise("0.05", "[0.05, 0.04]"), "allowed: a number, or three of them, for R, G and B"),
+    "a gain in words": (noise("0.05", '[0.05, 0.04, "b"]'), "system_gain = 'b' DN per electron; allowed: a finite"),
+    "saturation a list": (noise("255.0", "[255.0, 255.0, 255.0]"), "saturation = .255.0, 255.0, 255.0. DN; allowed"),
+    "gains of a table": (BENCH + "[noise]\ndark_noise = [1, 2, 3]\n", "allowed: one number, as a table has no R"),
     "noise no table": ('scene = "bench"\nnoise = 3\n' + FRAME, r"\[noise\] = 3 is no table"),
     "values_are": (frames(before='values_are = "lux"\n'), "values_are = 'lux'; allowed: DN, radiance"),
     "cfa pattern": (frames(before='cfa = "RGB"\n'), "cfa = 'RGB'; allowed: RGGB"),

@@ -447,3 +447,11 @@ def test_progress_is_lines_where_there_is_no_terminal(capsys, monkeypatch):
     silent.quiet = True
     with silent.progress() as show:
         assert show is None
+
+
+def test_a_calibration_folder_of_9dtact_is_known_by_its_layout(tmp_path, capsys):
+    (tmp_path / "sensor_1" / "depth_calibration").mkdir(parents=True)
+    assert cli.main(["import", str(tmp_path), "-o", str(tmp_path / "out")]) == 2
+    assert "give --ball-radius" in capsys.readouterr().err
+    assert cli.main(["import", str(tmp_path), "-o", str(tmp_path / "out"), "--circles", "a.csv"]) == 2
+    assert "--circles: the folder's images say so; leave these out" in capsys.readouterr().err

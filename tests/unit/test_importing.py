@@ -1,6 +1,8 @@
 """Importing labelled ball presses: what is derived, what is said, and what is refused."""
 
+import importlib.util
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ from optics.captures import importing
 from optics.errors import BadCapture, OutputExists
 
 H, W, R = 48, 64, 8  # px
+PACKAGE = importlib.util.find_spec("taxim")  # holds packs of 480 x 640 px; never imported
 
 
 @pytest.fixture
@@ -184,3 +187,90 @@ def test_circles_and_options_out_of_range_are_refused(presses, tmp_path):
     presses.circles[2, 0] = 500
     with pytest.raises(BadCapture, match=r"p2: circle at \(500"):
         importing.import_presses(presses, tmp_path / "set", **OPTIONS)
+
+
+def test_corrections_are_written_down(presses, tmp_path):
+    found = importing.import_presses(presses, tmp_path / "set", **OPTIONS, bin=2)
+    entries = json.loads((found.folder / "import.json").read_text())["corrections"]
+    assert [e["what"] for e in entries][0] == "pixels are averaged" and entries[0]["how_much"] == "blocks of 2 x 2 px"
+    assert any("camera.gain_r" in e["what"] for e in entries)
+    assert "blocks of 2 x 2 px" in (found.folder / "README.txt").read_text()
+    assert any("drifts: +" in text and "% in p5; largest step" in text for text in found.warnings)
+
+
+def test_values_clipped_at_black_are_masked(presses, tmp_path):
+    """A camera that ends at 80 DN: the dark side of the images is cut there in one channel."""
+    presses.images[..., 2] = np.maximum(presses.images[..., 2] - 15, 80)
+    found = importing.import_presses(presses, tmp_path / "set", **OPTIONS)
+    assert any("clipped at the black level" in text and "channel B at 80 DN" in text for text in found.warnings)
+    frame = captures.load(found.folder).frames[0]
+    assert np.array_equal(frame.mask, presses.images[0, ..., 2] > 80)
+    small = importing.binned(presses.images[0], 2, 255.0, [None, None, 80.0])
+    assert (small[:, 0, 2] == 80).all() and (small[:, 0, 0] != small[:, 0, 2]).all()
+
+
+@pytest.fixture
+def large(pack, tmp_path):
+    """A pack's folder with larger images and its own scale."""
+    folder = tmp_path / "gelsight"
+    folder.mkdir()
+    wide = {key: pack[key].repeat(2, -3).repeat(2, -2) for key in ("imgs", "f0")}
+    circles = {"touch_center": 2 * pack["touch_center"] + 0.5, "touch_radius": 2 * pack["touch_radius"]}
+    names = np.array([f"frame_{i}.jpg" for i in range(13)])
+    np.savez(folder / "dataPack.npz", **wide, **circles, names=names)
+    (folder / "params.json").write_text(json.dumps({"sensor": {"pixmm": 0.11, "w": 128, "h": 96}}))
+    return folder
+
+
+def test_a_packs_folder_says_its_own_scale(large, tmp_path):
+    found = importing.import_taxim(large, tmp_path / "set", bin=2)
+    assert found.facts["mm_per_pixel"] == 0.11 and found.facts["mm_per_pixel_after_binning"] == 0.22
+    assert found.facts["ball_radius_mm"] == 2.0 and found.facts["background"] == "median"
+    text = "\n".join(found.warnings)
+    assert "does not say the ball's radius" in text and "names has 13 entries for 12 images" in text
+    assert "JPEG" in text and "two routes" not in text
+    # the same presses as in the small pack, but for where pixel centres lie
+    first = captures.load(found.folder).frames[0]
+    assert first.name == "000" and first.image.shape == (H, W, 3)
+    own = importing.import_taxim(large / "dataPack.npz", tmp_path / "own", mm_per_pixel=0.2, ball_radius=3.0, bin=2)
+    assert own.facts["mm_per_pixel"] == 0.2 and "ball's radius" not in "\n".join(own.warnings)
+
+
+def test_crowded_presses_take_the_given_background(large, tmp_path):
+    with np.load(large / "dataPack.npz") as data:
+        arrays = dict(data)
+    arrays["touch_center"] = np.tile([64.0, 48.0], (12, 1))
+    np.savez(large / "dataPack.npz", **arrays)
+    found = importing.import_taxim(large, tmp_path / "set", bin=2)
+    assert found.facts["background"] == "given"
+    assert any(text.startswith("100% of the presses lie over one pixel") for text in found.warnings)
+
+
+@pytest.mark.parametrize(
+    "spoil, words",
+    [
+        (lambda f: (f / "dataPack.npz").rename(f / "polycalib.npz"), "polycalib.npz is a table fitted to images"),
+        (lambda f: (f / "dataPack.npz").unlink(), "no dataPack.npz with the images"),
+        (lambda f: (f / "params.json").unlink(), "sensor: pixmm, mm per pixel of images 128 px wide; give --mm-per"),
+        (lambda f: (f / "params.json").write_text('{"sensor": {"pixmm": "a"}}'), "pixmm = 'a' mm per pixel"),
+        (lambda f: (f / "params.json").write_text("[1]"), "no JSON table"),
+    ],
+)
+def test_a_bad_packs_folder_is_refused(large, tmp_path, spoil, words):
+    spoil(large)
+    with pytest.raises(BadCapture, match=words):
+        importing.import_taxim(large, tmp_path / "set")
+
+
+@pytest.mark.skipif(PACKAGE is None, reason="the package taxim and its packs are not here")
+@pytest.mark.parametrize("sensor, presses, background", [("gelsight", 48, "median"), ("gelsight_mini", 24, "given")])
+def test_measured_packs_of_480_by_640_px(tmp_path, sensor, presses, background):
+    """Their own scale; the Mini is pressed at one place, so that a median would show the ball."""
+    pack = Path(PACKAGE.submodule_search_locations[0]) / "calib" / sensor
+    found = importing.import_taxim(pack, tmp_path / "set", bin=8)
+    assert found.facts["mm_per_pixel"] == 0.0295 and found.facts["background"] == background
+    assert found.facts["presses"] == presses and found.facts["size_px"] == [60, 80]
+    assert found.facts["labelled_radius_mm"][1] < 2.0  # no circle is larger than the ball
+    loaded = captures.load(found.folder)
+    assert np.abs(np.array(found.facts["frame_gain"]) - 1).max() < 0.05
+    assert loaded.noise.sd(np.full(3, 100.0)).max() < 2.0
