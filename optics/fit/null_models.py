@@ -23,7 +23,7 @@ with the black level K, the mean level of B - K, and f of one of these kinds, of
     directional Lambert            max(0, l . n) + 1 - l_z, 1 where the face is level  3
     linear, quadratic, cubic       harmonics of the normal up to order 1, 2, 3         4, 9, 16
     ... with position              the same times (1, x, y)                            12, 27
-    polynomial table               a quadratic of the place in each bin of normals     6 in each bin"""
+    polynomial table               a quadratic of the place in each bin of normals     6 a bin"""
 
 from __future__ import annotations
 
@@ -326,7 +326,7 @@ class Polynomial(Table):
 class Lambert(Table):
     """f = max(0, l . n) + 1 - l_z: one light at infinity with its attached shadow, and light from everywhere."""
 
-    name = "directional Lambert, attached shadow, constant"
+    name = "directional Lambert with shadow"
     ROUNDS = 30
 
     def numbers(self) -> int:
@@ -364,7 +364,11 @@ class Binned(Table):
     pixels. Source: Si & Yuan, Taxim, RA-L 7, 2361 (2022)."""
 
     name = "polynomial table"
-    SLOPES, AZIMUTHS, RIDGE = 24, 48, 1.0
+    RIDGE = 1.0
+
+    def __init__(self, slopes: int = 24, azimuths: int = 48, added: bool = False):
+        super().__init__(added)
+        self.slopes, self.azimuths = slopes, azimuths
 
     def numbers(self) -> int:
         return 6 * int(self.filled.sum())
@@ -373,14 +377,14 @@ class Binned(Table):
         """(N,) number of the bin of each normal."""
         slope = np.arccos(np.clip(1 + tilt[:, 2], 0, 1)) / (np.pi / 2)
         turn = np.arctan2(tilt[:, 1], tilt[:, 0]) / (2 * np.pi) % 1
-        row = np.minimum((slope * self.SLOPES).astype(int), self.SLOPES - 1)
-        return row * self.AZIMUTHS + np.minimum((turn * self.AZIMUTHS).astype(int), self.AZIMUTHS - 1)
+        row = np.minimum((slope * self.slopes).astype(int), self.slopes - 1)
+        return row * self.azimuths + np.minimum((turn * self.azimuths).astype(int), self.azimuths - 1)
 
     def learn(self, tilt: np.ndarray, place: np.ndarray, values: np.ndarray, weight: np.ndarray) -> None:
         from scipy.ndimage import distance_transform_edt
 
         number, f = self.bins(tilt), np.stack(_monomials(*place.T, 2), -1)
-        count, size = self.SLOPES * self.AZIMUTHS, f.shape[1]
+        count, size = self.slopes * self.azimuths, f.shape[1]
         self.filled = np.bincount(number, weight.sum(1), count) > 0
         self.coefficients = np.zeros((count, values.shape[1], size))
         for c, (v, w) in enumerate(zip(values.T, weight.T)):
@@ -393,11 +397,11 @@ class Binned(Table):
             gram += self.RIDGE * np.mean(w[w > 0] if (w > 0).any() else 1) * np.eye(size)
             self.coefficients[:, c] = np.linalg.solve(gram, right[..., None])[..., 0]
             self.coefficients[:, c, 0] += mean
-        grid = ~self.filled.reshape(self.SLOPES, self.AZIMUTHS)
+        grid = ~self.filled.reshape(self.slopes, self.azimuths)
         around = np.concatenate([grid, grid, grid], 1)  # azimuths close
         row, column = distance_transform_edt(around, return_distances=False, return_indices=True)
-        middle = slice(self.AZIMUTHS, 2 * self.AZIMUTHS)
-        self.coefficients = self.coefficients[(row * self.AZIMUTHS + column % self.AZIMUTHS)[:, middle].ravel()]
+        middle = slice(self.azimuths, 2 * self.azimuths)
+        self.coefficients = self.coefficients[(row * self.azimuths + column % self.azimuths)[:, middle].ravel()]
 
     def evaluate(self, tilt: np.ndarray, place: np.ndarray) -> np.ndarray:
         return np.einsum("ncf,nf->nc", self.coefficients[self.bins(tilt)], np.stack(_monomials(*place.T, 2), -1))
@@ -417,16 +421,17 @@ def _least_squares(features: np.ndarray, values: np.ndarray, weight: np.ndarray)
     return np.linalg.lstsq(triangle[:, :-1], triangle[:, -1], rcond=1e-9)[0] / size
 
 
-def tables(added: bool = False) -> list[Table]:
-    """The tables that a model is held against, those of few numbers first."""
+def tables(added: bool = False) -> list[list[Table]]:
+    """The tables that a model is held against, those of few numbers first; of each, its variants, of which the best
+    counts."""
     return [
-        Polynomial("mean", 0, added=added),
-        Lambert(added),
-        Polynomial("linear in the normal", 1, added=added),
-        Polynomial("linear in the normal, with position", 1, 1, added=added),
-        Polynomial("cubic in the normal", 3, added=added),
-        Polynomial("quadratic in the normal, with position", 2, 1, added=added),
-        Binned(added),
+        [Polynomial("mean", 0, added=added)],
+        [Lambert(added)],
+        [Polynomial("linear in the normal", 1, added=added)],
+        [Polynomial("linear in the normal, with position", 1, 1, added=added)],
+        [Polynomial("cubic in the normal", 3, added=added)],
+        [Polynomial("quadratic in the normal, with position", 2, 1, added=added)],
+        [Binned(24, 48, added), Binned(12, 24, added)],
     ]
 
 

@@ -29,9 +29,9 @@ from optics.study.board import PUBLISHED, STEP, Board, Entry, Level
 from optics.words import figures, fixed, some
 
 SIDE_MAX = 360  # px; larger images are shown in blocks
-BAR = 22  # px, height of a bar with its gap
+BAR = 22  # px, height of a model's line
 QUANTILE = 98  # per cent of residuals within the range of colours
-LABELS = {"wide": 330, "narrow": 158}  # px beside the bars
+LABELS = {"wide": 330, "narrow": 158}  # px, of the models' names
 
 
 def render(boards: Sequence[Board]) -> str:
@@ -59,7 +59,7 @@ def _board(board: Board) -> dict[str, Any]:
     return {
         "board": board,
         "headline": headline(board),
-        "bars": {width: bars(board, size, LABELS[width]) for width, size in (("wide", 920), ("narrow", 360))},
+        "dots": {width: dots(board, size, LABELS[width]) for width, size in (("wide", 920), ("narrow", 360))},
         "curves": {width: curves(board, *size) for width, size in (("wide", (920, 330)), ("narrow", (360, 300)))},
         "legend": legend(board),
         "images": images(board),
@@ -149,8 +149,8 @@ def _cells(board: Board) -> dict[str, Any]:
 
 
 # -- charts ----------------------------------------------------------------------------------------------------------
-def bars(board: Board, width: int, label: int) -> str:
-    """The error in the contact of every model, with the span over lamps and channels, on a logarithmic axis."""
+def dots(board: Board, width: int, label: int) -> str:
+    """The error in the contact of every model as a dot, and its span over lamps and channels, on a logarithmic axis."""
     key = board.measure
     values = [float(getattr(e.contact, key)) for e in board.entries]
     spans = [e.contact.span(key) for e in board.entries]
@@ -159,7 +159,7 @@ def bars(board: Board, width: int, label: int) -> str:
     finite = [v for v in (*values, *(s for pair in spans for s in pair), noise) if math.isfinite(v) and v > 0]
     low, high = min(finite) * 0.85, max(finite) * 1.1
     x = scaled(math.log(low), math.log(high), label, width - 46)
-    height = BAR * len(values) + 44
+    height = BAR * len(values) + 64
     parts = []
     for tick in _few(log_ticks_between(low, high), width):
         at = x(math.log(tick))
@@ -167,7 +167,7 @@ def bars(board: Board, width: int, label: int) -> str:
         parts.append(f'<text class="tick" x="{at:.1f}" y="{height - 24}" text-anchor="middle">{number(tick)}</text>')
     at = x(math.log(noise))
     parts.append(f'<line class="floor" x1="{at:.1f}" x2="{at:.1f}" y1="4" y2="{height - 40}"/>')
-    parts.append(f'<text class="floorlabel" x="{at + 4:.1f}" y="{height - 44}">noise</text>')
+    parts.append(f'<text class="floorlabel" x="{at + 5:.1f}" y="{height - 44}">noise</text>')
     for k, (entry, value, (least, most)) in enumerate(zip(board.entries, values, spans)):
         y = 6 + BAR * k
         kind = "own" if entry.kind == STEP else "rival"
@@ -175,16 +175,16 @@ def bars(board: Board, width: int, label: int) -> str:
         parts.append(f'<text class="{kind}" x="{label - 8}" y="{y + 14}" text-anchor="end">{escaped(name)}</text>')
         if not value > 0:
             continue
-        end = x(math.log(value))
-        parts.append(
-            f'<rect class="{kind}" x="{label}" y="{y + 3}" width="{max(end - label, 1):.1f}" height="{BAR - 8}">'
-            f"<title>{escaped(entry.name)}: {number(value, 4)}</title></rect>"
-        )
-        right = end
+        at = right = x(math.log(value))
+        parts.append(f'<line class="guide" x1="{label}" x2="{at:.1f}" y1="{y + 10}" y2="{y + 10}"/>')
         if least > 0 and most > least:
-            a, right = x(math.log(least)), max(end, x(math.log(most)))
-            parts.append(f'<line class="span" x1="{a:.1f}" x2="{x(math.log(most)):.1f}" y1="{y + 10}" y2="{y + 10}"/>')
-        parts.append(f'<text class="tick" x="{right + 5:.1f}" y="{y + 14}">{number(value)}</text>')
+            left, right = x(math.log(least)), x(math.log(most))
+            parts.append(f'<line class="span {kind}" x1="{left:.1f}" x2="{right:.1f}" y1="{y + 10}" y2="{y + 10}"/>')
+        parts.append(
+            f'<circle class="{kind}" cx="{at:.1f}" cy="{y + 10}" r="5">'
+            f"<title>{escaped(entry.name)}: {number(value, 4)}</title></circle>"
+        )
+        parts.append(f'<text class="tick" x="{max(at + 5, right) + 5:.1f}" y="{y + 14}">{number(value)}</text>')
     what = "rms of the ratio to the flat field, in the contact" if key == "ratio" else "rms in the contact, DN"
     parts.append(f'<text class="axis" x="{width - 46}" y="{height - 6}" text-anchor="end">{what}</text>')
     return svg_chart(width, height, parts, f"{what}, of each model")

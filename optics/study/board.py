@@ -192,7 +192,7 @@ def _line(entry: Entry, level: Level) -> tuple[str, ...]:
     return (
         entry.name,
         "image" if entry.numbers is None else str(entry.numbers),
-        number(entry.each),
+        number(entry.each, 4),
         "-" if level.ratio is None else f"{level.ratio:.4f}",
         f"{low:.4f}-{high:.4f}" if math.isfinite(low) else "-",
         f"{level.rms:.2f}",

@@ -31,6 +31,7 @@ import math
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -40,7 +41,7 @@ from optics.captures import capture_set as capture_files
 from optics.errors import BadCapture, Underdetermined
 from optics.fit import calibrate
 from optics.fit.compare import Comparison, compare, led_label
-from optics.fit.null_models import Shape, Table, place_of, tables, tilt_of
+from optics.fit.null_models import Lambert, Shape, Table, place_of, tables, tilt_of
 from optics.fit.scene_model import SceneModel
 from optics.scene.parameter import Values
 from optics.study import loop
@@ -146,6 +147,8 @@ class _Score:
     """A rival's choice in a region: its error, what it was fitted as, and its predictions of the held-out frames."""
 
     error: float
+    kind: int
+    variant: int
     added: bool
     geometry: str
     predictions: list[np.ndarray]
@@ -380,33 +383,43 @@ class _Bench:
         return cells
 
     # -- rivals ------------------------------------------------------------------------------------------------------
-    def fitted_table(
-        self, kind: int, added: bool, geometry: str, frames: Sequence[int], inner: bool
+    def fitted_tables(
+        self, unfitted: Callable[[], Table], geometry: str, frames: Sequence[int], inner: bool
     ) -> dict[tuple, Table]:
         """A table for each group of lights, fitted to frames: least squares of the ratio, or of DN where it is an
-        addition."""
+        addition.
+
+        unfitted   makes a table"""
         found = {}
         for lights in dict.fromkeys(self.lights[i] for i in self.held):
             own = [i for i in frames if self.lights[i] == lights]
             rows = [(self.model.frames[i].image.astype(float), self.mask(i, inner).astype(float)) for i in own]
-            found[lights] = tables(added)[kind]
+            found[lights] = unfitted()
             found[lights].fit([self.shape(i, geometry) for i in own], rows)
         return found
+
+    def again(self, score: _Score, frames: Sequence[int]) -> dict[tuple, Table]:
+        """The tables of a choice in the contact, fitted to these frames."""
+        return self.fitted_tables(lambda: tables(score.added)[score.kind][score.variant], score.geometry, frames, True)
 
     def predictions(self, fitted: Mapping[tuple, Table], geometry: str) -> list[np.ndarray]:
         return [fitted[self.lights[i]].predict(self.shape(i, geometry)) for i in self.held]
 
     def choose(self, kind: int, inner: bool) -> _Score:
-        """The form and the geometry with which a table has the smaller held-out error."""
+        """The variant, the form and the geometry with which a table has the smallest held-out error."""
         best = None
-        for geometry in self.tilts:
-            for added in (False, True):
-                fitted = self.fitted_table(kind, added, geometry, self.fitted, inner)
-                guess = self.predictions(fitted, geometry)
-                error = self.error(guess, inner)
-                if best is None or error < best.error:
-                    numbers = sum(t.numbers() for t in fitted.values()) * self.model.shape[2]
-                    best = _Score(error, added, geometry, guess, numbers)
+        for geometry, added, variant in product(self.tilts, (False, True), range(len(tables()[kind]))):
+            fitted = self.fitted_tables(
+                lambda added=added, variant=variant: tables(added)[kind][variant],  # type: ignore[misc]
+                geometry,
+                self.fitted,
+                inner,
+            )
+            guess = self.predictions(fitted, geometry)
+            error = self.error(guess, inner)
+            if best is None or error < best.error:
+                numbers = sum(t.numbers() for t in fitted.values()) * self.model.shape[2]
+                best = _Score(error, kind, variant, added, geometry, guess, numbers)
         assert best is not None  # there is always a geometry
         return best
 
@@ -436,7 +449,7 @@ class _Bench:
             flat = [self.flats[i] for i in self.held]
             entries.append(Entry(BACKGROUND, RIVAL, 0, 0, self.level(flat, True), self.level(flat, False)))
             shown[BACKGROUND] = flat
-        for kind, model in enumerate(kinds):
+        for kind, (model, *_) in enumerate(kinds):
             inner, whole = chosen[kind] = (self.choose(kind, True), self.choose(kind, False))
             contact, image = self.level(inner.predictions, True), self.level(whole.predictions, False)
             how = {"contact": _said(inner), "whole": _said(whole)}
@@ -502,14 +515,12 @@ class _Bench:
 
     def azimuths(self, chosen: Mapping[int, tuple[_Score, _Score]]) -> dict[str, float]:
         """LED -> deg, of the directional table in the contact; of frames that one LED lights."""
-        kind = next(k for k, t in enumerate(tables()) if t.name.startswith("directional"))
-        score = chosen[kind][0]
-        fitted = self.fitted_table(kind, score.added, score.geometry, self.fitted, True)
+        kind = next(k for k, (t, *_) in enumerate(tables()) if isinstance(t, Lambert))
         found = {}
-        for lights, model in fitted.items():
+        for lights, model in self.again(chosen[kind][0], self.fitted).items():
             led = next(self.leds[i] for i in self.held if self.lights[i] == lights)
-            if led in self.model.scene.leds:
-                x, y, _ = np.mean(model.light, axis=0)  # type: ignore[attr-defined]
+            if led in self.model.scene.leds and isinstance(model, Lambert):
+                x, y, _ = np.mean(model.light, axis=0)
                 found[led] = math.degrees(math.atan2(y, x))
         return found
 
@@ -521,12 +532,9 @@ class _Bench:
         found: dict[str, list[dict[str, Any]]] = {}
         for count in counts:
             subsets = self._subsets(names, count)
-            for kind, model in enumerate(tables()):
+            for kind, (model, *_) in enumerate(tables()):
                 score = chosen[kind][0]
-                errors = []
-                for frames in subsets:
-                    fitted = self.fitted_table(kind, score.added, score.geometry, frames, True)
-                    errors.append(self.predictions(fitted, score.geometry))
+                errors = [self.predictions(self.again(score, frames), score.geometry) for frames in subsets]
                 if errors:
                     found.setdefault(model.name, []).append(self._mean_error(count, errors))
             if presses:
