@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from optics.fit.scene_model import SceneModel
 
 NEAR = 2.0  # labelled radii
+SEEN = 1e-6  # of a normal's components, which are of order 1: below is rounding
 STEPS = (0.02, 0.02, 0.02)  # mm, of the central differences of normals by the pose
 
 
@@ -413,12 +414,15 @@ def _monomials(x: np.ndarray, y: np.ndarray, degree: int) -> list[np.ndarray]:
 
 
 def _least_squares(features: np.ndarray, values: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """(F,) coefficients; of what the data do not tell, the smallest."""
+    """(F,) coefficients; of what the data do not tell, the smallest. Features of an rms below SEEN have none."""
     root = np.sqrt(weight)[:, None]
     a = features * root
-    size = np.maximum(np.sqrt((a * a).sum(0)), 1e-300)
-    triangle = np.linalg.qr(np.column_stack([a / size, values * root[:, 0]]), mode="r")
-    return np.linalg.lstsq(triangle[:, :-1], triangle[:, -1], rcond=1e-9)[0] / size
+    size = np.sqrt((a * a).sum(0))
+    seen = size > SEEN * np.sqrt(weight.sum())
+    triangle = np.linalg.qr(np.column_stack([a[:, seen] / size[seen], values * root[:, 0]]), mode="r")
+    found = np.zeros(features.shape[1])
+    found[seen] = np.linalg.lstsq(triangle[:, :-1], triangle[:, -1], rcond=1e-9)[0] / size[seen]
+    return found
 
 
 def tables(added: bool = False) -> list[list[Table]]:

@@ -93,15 +93,15 @@ def headline(board: Board) -> str:
     if rival is None:
         return "Nothing to compare with."
     if step is None:
-        return f"Without a calibrated model: in the contact the best rival, {rival.name}, misses by {said(rival)}."
+        return f"No calibrated model is given. The best rival in the contact, “{rival.name}”, misses by {said(rival)}."
     if board.beaten:
         return (
-            f"{rival.name[0].upper()}{rival.name[1:]} beats the physical model: in the contact it misses by "
-            f"{said(rival)}, the model ({step.name}) by {said(step)}."
+            f"A rival beats the physical model: in the contact “{rival.name}” misses by {said(rival)}, “{step.name}” by "
+            f"{said(step)}."
         )
     return (
-        f"The physical model ({step.name}) beats every rival: in the contact it misses by {said(step)}, the best rival "
-        f"({rival.name}) by {said(rival)}."
+        f"The physical model beats every rival: in the contact “{step.name}” misses by {said(step)}, the best rival, "
+        f"“{rival.name}”, by {said(rival)}."
     )
 
 
