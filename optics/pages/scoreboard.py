@@ -96,8 +96,8 @@ def headline(board: Board) -> str:
         return f"No calibrated model is given. The best rival in the contact, “{rival.name}”, misses by {said(rival)}."
     if board.beaten:
         return (
-            f"A rival beats the physical model: in the contact “{rival.name}” misses by {said(rival)}, “{step.name}” by "
-            f"{said(step)}."
+            f"A rival beats the physical model: in the contact “{rival.name}” misses by {said(rival)}, “{step.name}” "
+            f"by {said(step)}."
         )
     return (
         f"The physical model beats every rival: in the contact “{step.name}” misses by {said(step)}, the best rival, "
