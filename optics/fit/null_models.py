@@ -23,6 +23,7 @@ with the black level K, the mean level of B - K, and f of one of these kinds, of
     directional Lambert            max(0, l . n) + 1 - l_z, 1 where the face is level  3
     linear, quadratic, cubic       harmonics of the normal up to order 1, 2, 3         4, 9, 16
     ... with position              the same times (1, x, y)                            12, 27
+    ... with position squared      linear, times (1, x, y, x^2, xy, y^2)               24
     polynomial table               a quadratic of the place in each bin of normals     6 a bin"""
 
 from __future__ import annotations
@@ -434,6 +435,7 @@ def tables(added: bool = False) -> list[list[Table]]:
         [Polynomial("linear in the normal", 1, added=added)],
         [Polynomial("linear in the normal, with position", 1, 1, added=added)],
         [Polynomial("cubic in the normal", 3, added=added)],
+        [Polynomial("linear in the normal, with position squared", 1, 2, added=added)],
         [Polynomial("quadratic in the normal, with position", 2, 1, added=added)],
         [Binned(24, 48, added), Binned(12, 24, added)],
     ]

@@ -15,8 +15,9 @@ NUMBERS = {
     "linear in the normal": 4,
     "linear in the normal, with position": 12,
     "cubic in the normal": 16,
+    "linear in the normal, with position squared": 24,
     "quadratic in the normal, with position": 27,
-}  # harmonics 1, 4, 9, 16 up to order 0 to 3, times 1 or (1, x, y)
+}  # harmonics 1, 4, 9, 16 up to order 0 to 3, times 1, (1, x, y) or a quadratic
 
 
 def ball(x0, y0, radius=0.5, slope=0.95):
