@@ -205,7 +205,7 @@ def scoreboard(
     ],
     captures: Annotated[
         list[str] | None,
-        typer.Argument(metavar="CAPTURES...", help="Folders with captures.toml.", show_default="those of the studies"),
+        typer.Argument(metavar="CAPTURES", help="Folders with captures.toml.", show_default="those of the studies"),
     ] = None,
     study: Annotated[
         list[Path] | None,

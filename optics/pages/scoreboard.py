@@ -31,6 +31,7 @@ from optics.words import figures, fixed, some
 SIDE_MAX = 360  # px; larger images are shown in blocks
 BAR = 22  # px, height of a model's line
 QUANTILE = 98  # per cent of residuals within the range of colours
+SYMBOLS = ((", with position squared", " × place²"), (", with position", " × place"), ("in the normal", "in n"))
 LABELS = {"wide": 330, "narrow": 158}  # px, of the models' names
 
 
@@ -191,6 +192,9 @@ def dots(board: Board, width: int, label: int) -> str:
 
 
 def _short(name: str, most: int) -> str:
+    """A name in so many letters, by symbols where it is too long."""
+    for phrase, symbol in SYMBOLS if len(name) > most else ():
+        name = name.replace(phrase, symbol)
     return name if len(name) <= most else wrapped(name, most - 2)[0].rstrip(",:") + " …"
 
 
