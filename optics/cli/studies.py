@@ -198,6 +198,60 @@ def report(
 
 
 @command
+def scoreboard(
+    output: Annotated[
+        Path,
+        typer.Option("-o", "--output", metavar="FOLDER", help="Gets scoreboard.html and scoreboard.json."),
+    ],
+    captures: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="CAPTURES", help="Folders with captures.toml.", show_default="those of the studies"),
+    ] = None,
+    study: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--study",
+            metavar="STUDY",
+            help="A study, all of whose steps are scored; it says what is held out. Repeatable.",
+        ),
+    ] = None,
+    hold_out: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--hold-out",
+            metavar="GROUP",
+            help="Groups to test on, of captures without a study. Repeatable. Without it: one in four, the last of two "
+            "or three.",
+        ),
+    ] = None,
+    presses: Annotated[
+        bool, typer.Option("--presses", help="Also calibrate each study's last step on fewer presses (minutes each).")
+    ] = False,
+    as_json: AsJson = False,
+    force: Force = False,
+) -> None:
+    """Score studies, tables without physics and other photographs on the same held-out images, as a table and a page.
+
+    The exit code is 1 where a study is beaten by a model without physics in the contact, else 0.
+    """
+    from optics.files.output import claim, write_text
+    from optics.pages.scoreboard import render
+    from optics.study.board import text, to_json
+    from optics.study.scoreboard import scoreboard
+
+    files = [output / "scoreboard.html", output / "scoreboard.json"]
+    claim(files, force)
+    with terminal.progress() as progress:
+        boards = scoreboard(captures or (), study or (), held_out=hold_out, presses=presses, progress=progress)
+    record = to_json(boards)
+    for file, content in zip(files, (render(boards), record)):
+        write_text(file, content)
+    print(record if as_json else f"{text(boards)}\n\n{files[0]}")
+    if any(board.beaten for board in boards):
+        raise typer.Exit(1)
+
+
+@command
 def view(
     study: StudyFolder,
     step: Annotated[

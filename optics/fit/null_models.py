@@ -11,7 +11,20 @@ gains, split and geometry of the physical model. Poses are those of the physical
 Gauss-Newton on fitted and held-out frames; whichever gives the null the smaller held-out error counts.
 
 Errors are differences to the images in DN on usable pixels, predictions clipped to the camera's range: rms and L1,
-within `NEAR` labelled radii of the contact and in the whole image."""
+within `NEAR` labelled radii of the contact and in the whole image.
+
+A scoreboard (optics.study.scoreboard) holds models against the tables of `tables()`, whose level is free:
+
+    I = K + (B - K) f(n, x, y)    or    I = K + (B - K) + level (f(n, x, y) - 1)
+
+with the black level K, the mean level of B - K, and f of one of these kinds, of so many numbers per light and channel:
+
+    mean                           c                                                   1
+    directional Lambert            max(0, l . n) + 1 - l_z, 1 where the face is level  3
+    linear, quadratic, cubic       harmonics of the normal up to order 1, 2, 3         4, 9, 16
+    ... with position              the same times (1, x, y)                            12, 27
+    ... with position squared      linear, times (1, x, y, x^2, xy, y^2)               24
+    polynomial table               a quadratic of the place in each bin of normals     6 a bin"""
 
 from __future__ import annotations
 
@@ -22,12 +35,14 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from optics.captures.importing import POSE, PRIORS
+from optics.errors import Underdetermined
 from optics.scene.parameter import Values
 
 if TYPE_CHECKING:
     from optics.fit.scene_model import SceneModel
 
 NEAR = 2.0  # labelled radii
+SEEN = 1e-6  # of a normal's components, which are of order 1: below is rounding
 STEPS = (0.02, 0.02, 0.02)  # mm, of the central differences of normals by the pose
 
 
@@ -226,12 +241,217 @@ class Multiplicative:
 
 @dataclass
 class Shape:
-    """What a null knows of a frame: background (H, W, C) DN, n - n0 (H, W, 3), place x, y (H, W)."""
+    """What a null knows of a frame: background (H, W, C) DN, n - n0 (H, W, 3), place x, y (H, W), black level DN."""
 
     background: np.ndarray
     tilt: np.ndarray
     x: np.ndarray
     y: np.ndarray
+    black: float = 0.0
+
+
+# -- tables with a free level ----------------------------------------------------------------------------------------
+class Table:
+    """I = K + (B - K) f, or with `added` I = B + level (f - 1); a subclass says what f is.
+
+    A weight of `fit` is that of a value of f, 0 where it is not to be used."""
+
+    name = ""
+
+    def __init__(self, added: bool = False):
+        self.added = added
+
+    def numbers(self) -> int:
+        """How many numbers a fitted table has for each channel."""
+        raise NotImplementedError
+
+    def fit(self, shapes: Sequence[Shape], rows: Sequence[tuple[np.ndarray, np.ndarray]]) -> Null:
+        """Raises Underdetermined where no pixel has a weight."""
+        light = [s.background - s.black for s in shapes]
+        self.level = np.maximum(np.mean([b.mean((0, 1)) for b in light], 0), 1e-6)
+        values, weights = [], []
+        for s, b, (image, weight) in zip(shapes, light, rows):
+            unit = self.level if self.added else np.maximum(b, 1e-6)
+            values.append((1 + (image - s.background) / unit).reshape(-1, image.shape[2]))
+            weights.append(np.broadcast_to(weight, image.shape).reshape(-1, image.shape[2]))
+        tilt = np.concatenate([s.tilt.reshape(-1, 3) for s in shapes])
+        place = np.concatenate([np.stack([s.x.ravel(), s.y.ravel()], -1) for s in shapes])
+        w = np.concatenate(weights)
+        use = (w > 0).any(1)
+        if not use.any():
+            raise Underdetermined(f"{self.name}: no usable pixel to fit to; check the masks and the region")
+        self.learn(tilt[use], place[use], np.concatenate(values)[use], w[use])
+        return self
+
+    def learn(self, tilt: np.ndarray, place: np.ndarray, values: np.ndarray, weight: np.ndarray) -> None:
+        """Fit f to values (N, C) with weights (N, C), tilts n - n0 (N, 3) and places (N, 2)."""
+        raise NotImplementedError
+
+    def evaluate(self, tilt: np.ndarray, place: np.ndarray) -> np.ndarray:
+        """(N, C): f."""
+        raise NotImplementedError
+
+    def predict(self, shape: Shape) -> np.ndarray:
+        f = self.evaluate(shape.tilt.reshape(-1, 3), np.stack([shape.x.ravel(), shape.y.ravel()], -1))
+        f = f.reshape(shape.background.shape)
+        if self.added:
+            return shape.background + self.level * (f - 1)
+        return shape.black + (shape.background - shape.black) * f
+
+
+class Polynomial(Table):
+    """f: harmonics of the normal up to order `normal`, times a polynomial of the place of degree `place`.
+
+    On the sphere these are the polynomials in n_x, n_y of that order, and n_z times those of one order less."""
+
+    def __init__(self, name: str, normal: int, place: int = 0, added: bool = False):
+        super().__init__(added)
+        self.name, self.normal, self.place = name, normal, place
+
+    def features(self, tilt: np.ndarray, place: np.ndarray) -> np.ndarray:
+        """(N, F)."""
+        x, y, z = tilt.T
+        of_normal = [*_monomials(x, y, self.normal), *(z * m for m in _monomials(x, y, self.normal - 1))]
+        return np.stack([a * b for a in of_normal for b in _monomials(*place.T, self.place)], -1)
+
+    def numbers(self) -> int:
+        return len(self.coefficients)
+
+    def learn(self, tilt: np.ndarray, place: np.ndarray, values: np.ndarray, weight: np.ndarray) -> None:
+        f = self.features(tilt, place)
+        self.coefficients = np.stack([_least_squares(f, v, w) for v, w in zip(values.T, weight.T)], -1)
+
+    def evaluate(self, tilt: np.ndarray, place: np.ndarray) -> np.ndarray:
+        return self.features(tilt, place) @ self.coefficients
+
+
+class Lambert(Table):
+    """f = max(0, l . n) + 1 - l_z: one light at infinity with its attached shadow, and light from everywhere."""
+
+    name = "directional Lambert with shadow"
+    ROUNDS = 30
+
+    def numbers(self) -> int:
+        return 3
+
+    def learn(self, tilt: np.ndarray, place: np.ndarray, values: np.ndarray, weight: np.ndarray) -> None:
+        # linear while the lit pixels stay the same: solved, and asked again which are lit; the best of all rounds
+        self.light = np.zeros((values.shape[1], 3))
+        for c, (v, w) in enumerate(zip(values.T, weight.T)):
+            lit, best = np.ones(len(v), bool), np.inf
+            for _ in range(self.ROUNDS):
+                f = np.where(lit[:, None], tilt, (0.0, 0.0, -1.0))  # l.n - l_z = l.(n - n0), or -l_z in shadow
+                light = _least_squares(f, v - 1, w)
+                misfit = float((w * (self._of(tilt, light) - v) ** 2).sum())
+                if misfit < best:
+                    best, self.light[c] = misfit, light
+                now = tilt @ light + light[2] > 0
+                if (now == lit).all():
+                    break
+                lit = now
+
+    @staticmethod
+    def _of(tilt: np.ndarray, light: np.ndarray) -> np.ndarray:
+        return np.maximum(tilt @ light + light[2], 0) + 1 - light[2]
+
+    def evaluate(self, tilt: np.ndarray, place: np.ndarray) -> np.ndarray:
+        return np.stack([self._of(tilt, light) for light in self.light], -1)
+
+
+class Binned(Table):
+    """f: in every bin of normals, by slope and azimuth, a quadratic of the place; a bin without pixels takes the
+    nearest that has some.
+
+    This is the table of an example-based simulator. Few pixels in a bin hold its quadratic near its mean, by RIDGE
+    pixels. Source: Si & Yuan, Taxim, RA-L 7, 2361 (2022)."""
+
+    name = "polynomial table"
+    RIDGE = 1.0
+
+    def __init__(self, slopes: int = 24, azimuths: int = 48, added: bool = False):
+        super().__init__(added)
+        self.slopes, self.azimuths = slopes, azimuths
+
+    def numbers(self) -> int:
+        return 6 * int(self.filled.sum())
+
+    def bins(self, tilt: np.ndarray) -> np.ndarray:
+        """(N,) number of the bin of each normal."""
+        slope = np.arccos(np.clip(1 + tilt[:, 2], 0, 1)) / (np.pi / 2)
+        turn = np.arctan2(tilt[:, 1], tilt[:, 0]) / (2 * np.pi) % 1
+        row = np.minimum((slope * self.slopes).astype(int), self.slopes - 1)
+        return row * self.azimuths + np.minimum((turn * self.azimuths).astype(int), self.azimuths - 1)
+
+    def learn(self, tilt: np.ndarray, place: np.ndarray, values: np.ndarray, weight: np.ndarray) -> None:
+        from scipy.ndimage import distance_transform_edt
+
+        number, f = self.bins(tilt), np.stack(_monomials(*place.T, 2), -1)
+        count, size = self.slopes * self.azimuths, f.shape[1]
+        self.filled = np.bincount(number, weight.sum(1), count) > 0
+        self.coefficients = np.zeros((count, values.shape[1], size))
+        for c, (v, w) in enumerate(zip(values.T, weight.T)):
+            gram, right = np.zeros((count, size, size)), np.zeros((count, size))
+            mean = np.bincount(number, w * v, count) / np.maximum(np.bincount(number, w, count), 1e-300)
+            for i in range(size):
+                right[:, i] = np.bincount(number, w * f[:, i] * (v - mean[number]), count)
+                for j in range(i, size):
+                    gram[:, i, j] = gram[:, j, i] = np.bincount(number, w * f[:, i] * f[:, j], count)
+            gram += self.RIDGE * np.mean(w[w > 0] if (w > 0).any() else 1) * np.eye(size)
+            self.coefficients[:, c] = np.linalg.solve(gram, right[..., None])[..., 0]
+            self.coefficients[:, c, 0] += mean
+        grid = ~self.filled.reshape(self.slopes, self.azimuths)
+        around = np.concatenate([grid, grid, grid], 1)  # azimuths close
+        row, column = distance_transform_edt(around, return_distances=False, return_indices=True)
+        middle = slice(self.azimuths, 2 * self.azimuths)
+        self.coefficients = self.coefficients[(row * self.azimuths + column % self.azimuths)[:, middle].ravel()]
+
+    def evaluate(self, tilt: np.ndarray, place: np.ndarray) -> np.ndarray:
+        return np.einsum("ncf,nf->nc", self.coefficients[self.bins(tilt)], np.stack(_monomials(*place.T, 2), -1))
+
+
+def _monomials(x: np.ndarray, y: np.ndarray, degree: int) -> list[np.ndarray]:
+    """x^i y^j with i + j <= degree, the constant first; none below degree 0."""
+    return [x**i * y ** (d - i) for d in range(degree + 1) for i in range(d, -1, -1)]
+
+
+def _least_squares(features: np.ndarray, values: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """(F,) coefficients; of what the data do not tell, the smallest. Features of an rms below SEEN have none."""
+    root = np.sqrt(weight)[:, None]
+    a = features * root
+    size = np.sqrt((a * a).sum(0))
+    seen = size > SEEN * np.sqrt(weight.sum())
+    triangle = np.linalg.qr(np.column_stack([a[:, seen] / size[seen], values * root[:, 0]]), mode="r")
+    found = np.zeros(features.shape[1])
+    found[seen] = np.linalg.lstsq(triangle[:, :-1], triangle[:, -1], rcond=1e-9)[0] / size[seen]
+    return found
+
+
+def tables(added: bool = False) -> list[list[Table]]:
+    """The tables that a model is held against, those of few numbers first; of each, its variants, of which the best
+    counts."""
+    return [
+        [Polynomial("mean", 0, added=added)],
+        [Lambert(added)],
+        [Polynomial("linear in the normal", 1, added=added)],
+        [Polynomial("linear in the normal, with position", 1, 1, added=added)],
+        [Polynomial("cubic in the normal", 3, added=added)],
+        [Polynomial("linear in the normal, with position squared", 1, 2, added=added)],
+        [Polynomial("quadratic in the normal, with position", 2, 1, added=added)],
+        [Binned(24, 48, added), Binned(12, 24, added)],
+    ]
+
+
+def tilt_of(model: SceneModel, now: dict[str, Any]) -> np.ndarray:
+    """(H, W, 3): normal of the face towards the camera less (0, 0, 1), at all values of a frame; 0 beside the face."""
+    hits = model.renderer.hits(now)
+    normal = hits.normal * np.array([1, 1, -1])  # the camera stands at -z
+    return np.where(hits.valid[..., None], normal - np.array([0, 0, 1]), 0)
+
+
+def place_of(shape: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+    """(x, y), each (H, W): the place on the face in units of half the image's width."""
+    v, u = np.mgrid[: shape[0], : shape[1]] + 0.5
+    return (u - shape[1] / 2) / (shape[1] / 2), (v - shape[0] / 2) / (shape[1] / 2)
 
 
 class Bench:
@@ -245,7 +465,7 @@ class Bench:
         height, width = model.shape[:2]
         v, u = np.mgrid[:height, :width] + 0.5
         self.near = {i: np.hypot(u - x, v - y) < NEAR * r for i, (x, y, r) in enumerate(circles)}
-        self.x, self.y = (u - width / 2) / (width / 2), (v - height / 2) / (width / 2)
+        self.x, self.y = place_of(model.shape)
         self.rows: dict[int, tuple[np.ndarray, np.ndarray]] = {}
 
     def pose(self, index: int) -> tuple[float, ...]:
@@ -263,10 +483,7 @@ class Bench:
         pose = (*pose[:2], max(float(pose[2]), 1e-3))
         if (index, pose) not in self.kept:
             now = {**self.model.at(self.base, index), **dict(zip(POSE, pose))}
-            hits = self.model.renderer.hits(now)
-            normal = hits.normal * np.array([1, 1, -1])  # towards the camera, which stands at -z
-            tilt = np.where(hits.valid[..., None], normal - np.array([0, 0, 1]), 0)
-            self.kept[index, pose] = tilt.astype(np.float32)
+            self.kept[index, pose] = tilt_of(self.model, now).astype(np.float32)
             self.model.renderer.forget_hits()
         now = self.model.at(self.base, index)
         flat = self.model.noise.black_level + self.model.flat * self.model.gains(now)
