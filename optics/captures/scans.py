@@ -217,9 +217,11 @@ def neighbour_noise(ratios: np.ndarray, flats: np.ndarray, use: np.ndarray, satu
     light = np.array([g.mean() for g, _ in groups])
     # of a squared Gaussian the mean is 2.2 times the median: a speck of dust does not move it
     variance = np.array([np.median(s) / 0.4549 for _, s in groups])
-    found = noise_of_levels(light, variance, np.array([float(len(g)) for g, _ in groups]), saturation)
     # in the dark neighbours round alike: the steps of a camera of 8 bit do not average in blocks
-    return replace(found, dark_noise=math.hypot(found.dark_noise, STEP / math.sqrt(12)))
+    steps = STEP**2 / 12
+    weight = np.array([float(len(g)) for g, _ in groups])
+    found = noise_of_levels(light, np.maximum(variance - steps, 0.1 * variance), weight, saturation)
+    return replace(found, dark_noise=math.sqrt(found.dark_noise**2 + steps))
 
 
 def blemishes(ratio: np.ndarray, sd: np.ndarray, offset: np.ndarray, radius: float) -> np.ndarray:

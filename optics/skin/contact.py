@@ -145,7 +145,7 @@ class Balls:
             yield number, np.hypot(u - x, v - y)
 
     def rise(self, number: np.ndarray) -> np.ndarray:
-        """mm by which the lowest points of balls, by their numbers (2, ...), stand above that of the ball on the axis."""
+        """mm by which the lowest points of balls (2, ...) stand above that of the ball on the axis."""
         return np.einsum("j,j...->...", self.turn[2, :2] * self.spacing, number)
 
     def lower(self, r: np.ndarray) -> np.ndarray:
