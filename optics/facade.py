@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 from optics import words
 from optics.captures import capture_set as capture_files
-from optics.diagnosis.result import Diagnosis
+from optics.diagnosis.result import Diagnosis, Row
 from optics.fit.compare import Comparison
 from optics.fit.result import Fit
 from optics.fit.scene_model import SceneModel
@@ -316,19 +316,25 @@ class Study:
 
     # -- verbs --------------------------------------------------------------------------------------------------------
     def diagnose(
-        self, *, without: Sequence[str] = (), advised: bool = True, progress: Progress | None = None
+        self,
+        *,
+        without: Sequence[str] = (),
+        advised: bool = True,
+        progress: Progress | None = None,
+        ranked: Callable[[list[Row]], None] | None = None,
     ) -> Diagnosis:
         """Ask what the last step lacks: every effect scored, the best added and refitted, one of six verdicts.
 
         without   names of effects that are not tested
         advised   where effects tie, simulate further frames and say which would tell them apart
+        ranked    called with the ranking by score, before anything is refitted; the step's ranking.csv holds it too
 
         Raises UnknownKey for an unknown effect.
         """
         model = self.model
         left_out = _listed(without) or []
         loop.excluded(model, self.record, left_out)  # a wrong name costs no fit
-        self._verdict = loop.examine(self.record, model, self.setup, self.fit, progress, advised, left_out)
+        self._verdict = loop.examine(self.record, model, self.setup, self.fit, progress, advised, left_out, ranked)
         return self._verdict
 
     def add(self, effect: str, *, start: Values | None = None, progress: Progress | None = None) -> Fit:

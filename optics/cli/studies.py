@@ -155,12 +155,15 @@ def diagnose(
 
     The exit code is 1 where the verdict is UNKNOWN or CANNOT TELL, else 0.
     """
+    from optics.diagnosis.text import ranking
     from optics.facade import Study
     from optics.files.output import write_text
 
     found = Study.open(study)
     with terminal.progress() as progress:
-        result = found.diagnose(without=without or (), progress=progress)
+        result = found.diagnose(
+            without=without or (), progress=progress, ranked=lambda rows: terminal.note(ranking(rows))
+        )
     if csv is not None:
         write_text(csv, result.to_csv())
     print(result.to_json() if as_json else result.text())

@@ -30,7 +30,7 @@ from optics.diagnosis.explanations import Outcome
 from optics.diagnosis.findings import basis_of, findings_of, subject_of
 from optics.diagnosis.laws import other_laws
 from optics.diagnosis.refit import Case, refit_each
-from optics.diagnosis.result import Basis, Diagnosis, Family, Fingerprint, Split
+from optics.diagnosis.result import Basis, Diagnosis, Family, Fingerprint, Row, Split
 from optics.diagnosis.score import score
 from optics.diagnosis.text import sentence
 from optics.diagnosis.thresholds import EXCESS, LEVEL, MAX_SPLIT, close
@@ -57,6 +57,7 @@ def diagnose(
     seed: int = 0,
     top: int = 5,
     progress: Progress | None = None,
+    ranked: Callable[[list[Row]], None] | None = None,
     excluded: Mapping[str, str] | None = None,
     added: Sequence[Effect] = (),
 ) -> Diagnosis:
@@ -70,6 +71,7 @@ def diagnose(
     rows_max      values (pixel x channel) that curves, splits and alternative weights may use
     seed          of the simulations and of derivative images; the same seed gives the same table
     top           how many of the best effects are refitted, besides those that cannot be told from the best
+    ranked        called with the ranking by score, before anything is refitted: refits of images take minutes
     excluded      effect -> why it is not among `effects`, for the record
 
     added         effects that the model has already, whose laws may differ from the library's (optics.diagnosis.laws)
@@ -84,6 +86,8 @@ def diagnose(
         raise ValueError(f"diagnose: frames {both} are fitted and held out at once; a frame is one or the other")
     scored = score(model, fit, effects, variables_of, fitted, rows_max=rows_max, seed=seed, progress=progress)
     evidence, table = scored.evidence, scored.table
+    if ranked:
+        ranked([c.row for c in table.order])
     case = Case(
         model,
         fit,

@@ -19,6 +19,7 @@ import io
 import json
 import math
 import typing
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, fields, is_dataclass
 from typing import TYPE_CHECKING, Any, cast
 
@@ -504,17 +505,7 @@ class Diagnosis:
 
     def to_csv(self) -> str:
         """One line per effect, as in `text`; several strengths of an effect are separated by ';'."""
-        names = [f.name for f in fields(Row) if f.name != "refit"]
-        names += [f"refit_{f.name}" for f in fields(Refit)]
-        out = io.StringIO()
-        writer = csv.writer(out, lineterminator="\n")
-        writer.writerow(names)
-        for row in self.rows:
-            cells = {f.name: getattr(row, f.name) for f in fields(Row)}
-            if row.refit is not None:
-                cells.update({f"refit_{k}": v for k, v in asdict(row.refit).items()})
-            writer.writerow([_cell(cells.get(name)) for name in names])
-        return out.getvalue()
+        return table_of(self.rows)
 
     def text(self, width: int = 0) -> str:
         """The report for a terminal."""
@@ -532,6 +523,21 @@ class Diagnosis:
 
     def _repr_html_(self) -> str:
         return showing.html(self)
+
+
+def table_of(rows: Sequence[Row]) -> str:
+    """Rows as CSV, one line each."""
+    names = [f.name for f in fields(Row) if f.name != "refit"]
+    names += [f"refit_{f.name}" for f in fields(Refit)]
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(names)
+    for row in rows:
+        cells = {f.name: getattr(row, f.name) for f in fields(Row)}
+        if row.refit is not None:
+            cells.update({f"refit_{k}": v for k, v in asdict(row.refit).items()})
+        writer.writerow([_cell(cells.get(name)) for name in names])
+    return out.getvalue()
 
 
 def _record(value: Any) -> Any:

@@ -326,6 +326,15 @@ def _effect_lines(d: Diagnosis) -> list[str]:
     return lines
 
 
+def ranking(rows: Sequence[Row], most: int = 8) -> str:
+    """The best effects by score, while their refits are still to come."""
+    shown = [r for r in rows if r.net > 0][:most]
+    if not shown:
+        return "by score, before refits: no effect explains more than chance does"
+    lines = [f"  {r.name:<32} chi2 falls by {r.net:.3g}" for r in shown]
+    return "\n".join(["by score, before refits (ranking.csv in the step's folder has all):", *lines])
+
+
 def _cells(r: Row, d: Diagnosis) -> tuple[str, ...]:
     now, sd = (r.refit.strength, r.refit.sd) if r.refit else ([a + c for a, c in zip(r.start, r.change)], r.sd)
     reaches = [r.reach(i) for i in range(len(now))]

@@ -22,7 +22,7 @@ import numpy as np
 from optics.captures import capture_set as capture_files
 from optics.captures import identity
 from optics.diagnosis.dials import Width, unstated, width_of
-from optics.diagnosis.result import Diagnosis
+from optics.diagnosis.result import Diagnosis, Row
 from optics.errors import BadCapture, Underdetermined, UnknownKey
 from optics.fit import calibrate
 from optics.fit.compare import Comparison
@@ -273,10 +273,13 @@ def examine(
     progress: Progress | None = None,
     advised: bool = True,
     without: Sequence[str] = (),
+    ranked: Callable[[list[Row]], None] | None = None,
 ) -> Diagnosis:
-    """Diagnose the last step, and add the diagnosis with the best effects' fingerprints to its folder.
+    """Diagnose the last step, and add the diagnosis with the best effects' fingerprints to its folder. The ranking by
+    score is there before anything is refitted.
 
     without     effects that are not tested
+    ranked      called with the rows of that ranking
     advised     where effects tie, also advise what to measure next, which renders frames that nobody has taken yet
     """
     from optics.diagnosis.advice import advise
@@ -286,6 +289,12 @@ def examine(
     fitted, held = split(model, setup)
     tested, ruled_out = candidates(model, record, without), excluded(model, record, without)
     seek(model, found.values, tested, fitted)
+
+    def keep(rows: list[Row]) -> None:
+        record.put_ranking(len(record.steps) - 1, rows)
+        if ranked:
+            ranked(rows)
+
     result = diagnose(
         model,
         found,
@@ -296,6 +305,7 @@ def examine(
         refit=Refits(model, setup, found, tested).of,
         seed=setup.seed,
         progress=progress,
+        ranked=keep,
         added=effects_of(record, model.scene.registry),
         excluded=ruled_out,
     )

@@ -32,7 +32,8 @@ from typing import Any
 import numpy as np
 
 from optics import words
-from optics.diagnosis.result import Diagnosis
+from optics.diagnosis.result import Diagnosis, table_of
+from optics.diagnosis.result import Row as Ranked
 from optics.errors import BadCapture, OutputExists
 from optics.files.output import file_hash, input_hashes, new_folder, replacing, versions, write_text
 from optics.fit.compare import Comparison, Row, plain
@@ -288,6 +289,10 @@ class Record:
         entry.update(json.loads(_dumps({"fingerprints": items})))
         write_text(folder / "step.json", _dumps(entry))
         self._save()
+
+    def put_ranking(self, index: int, rows: Sequence[Ranked]) -> None:
+        """Keep the ranking by score of a step whose diagnosis is still under way."""
+        write_text(self.path(index) / "ranking.csv", table_of(rows))
 
     def _save(self) -> None:
         write_text(self.folder / "ladder.json", _dumps(self.ladder))
