@@ -601,7 +601,7 @@ def compare(
     for pair in (found[Background], directional, found[Linear]):
         scores += pair
     noise = [
-        float(np.sqrt(np.mean(model.noise.variance(model.flat[..., c] + model.noise.black_level))))
+        float(np.sqrt(np.mean(model.noise.of_channel(c).variance(model.flat[..., c] + model.noise.black_level))))
         for c in range(model.shape[2])
     ]
     return NullTable(scores, noise, [model.frames[i].name for i in fitted], [model.frames[i].name for i in held_out])
