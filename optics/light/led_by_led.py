@@ -87,10 +87,17 @@ class LedByLed:
                 light += dr.select(si.is_valid(), function(path, gel), 0.0)
         return light * weight
 
-    def ambient(self, scene, si, weight, membrane):
-        """Radiance per band that no LED made, of one membrane."""
+    def ambient(self, scene, si, weight, origin, membrane):
+        """Radiance per band that no LED made, of one membrane; the gel acts on it on the way to the camera."""
         own = si.is_valid() & (si.bsdf() == mi.BSDFPtr(membrane))
-        return dr.select(own, membrane.ambient_radiance(si), 0.0) * weight
+        return dr.select(own, membrane.ambient_radiance(si), 0.0) * weight * self.kept_to(scene, si, origin)
+
+    def kept_to(self, scene, si, origin, led=None):
+        """Share of the light that effects of the gel leave on its way from the surface to where a ray began."""
+        gel, share = self.gel(scene), mi.UnpolarizedSpectrum(1.0)
+        for function in gel.functions("segment") if gel is not None else ():
+            share *= function(gel.path(si.p, origin, si.p, led, si), gel)
+        return share
 
     def bounced(self, scene, si, weight, origin, led, count, sampler):
         """Radiance per band that one LED sends to the camera by two reflections, mean of `count` directions."""
@@ -103,9 +110,5 @@ class LedByLed:
             seen = self.visible(scene, second, point, led)
             light = self.direct(scene, second, 1.0, si.p, led, seen, point)
             total += dr.select(second.is_valid(), mi.unpolarized_spectrum(factor) * light, 0.0)
-        gel = self.gel(scene)
-        if gel is not None:
-            last = gel.path(si.p, origin, si.p, led, si)  # `direct` followed the light up to the first surface only
-            for function in gel.functions("segment"):
-                weight = weight * function(last, gel)
-        return total * weight / count
+        # `direct` followed the light up to the first surface only
+        return total * weight * self.kept_to(scene, si, origin, led) / count

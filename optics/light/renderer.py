@@ -569,9 +569,7 @@ class Renderer:
         """(N, B): radiance of the membranes that no LED made, at the ends of camera rays."""
         self.apply(values, move=False)
         return sum(
-            self._bands(
-                self.scene.integrator.ambient(self.scene.mitsuba, sample.si, sample.weight, m) + 0 * sample.si.t
-            )
+            self._bands(self.scene.integrator.ambient(self.scene.mitsuba, *sample[:3], m) + 0 * sample.si.t)
             for m in self.scene.membranes.values()
         )
 

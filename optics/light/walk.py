@@ -234,7 +234,7 @@ class Walk:
             for led, point in zip(self.lamps, spots):
                 added += function(self.inside.path(si.p, origin, point, led, si), self.inside)
         for membrane in self.shining:
-            added += self.ambient(scene, si, 1.0, membrane)
+            added += self.ambient(scene, si, 1.0, origin, membrane)
         return mi.mueller.depolarizer(added) if mi.is_polarized else mi.Spectrum(added)
 
     def transmittance(self, scene, si, ds, medium, active, times: int | None = None) -> tuple:

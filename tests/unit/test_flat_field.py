@@ -90,3 +90,21 @@ def test_a_power_per_band_scales_that_band_alone(models):
     assert dim[..., 1] == pytest.approx(full[..., 1] / 2, rel=1e-6) and np.array_equal(
         dim[..., [0, 2]], full[..., [0, 2]]
     )
+
+
+def test_the_gel_acts_on_light_from_all_sides_too(models):
+    """A coat that lets the object through is brighter where it is touched, whatever lights it; and gel that absorbs
+    takes its share of light that no LED made, by Beer-Lambert over the way to the camera."""
+    model = models[None]
+    dark = {**dict.fromkeys(model.scene.powers.values(), 0.0), "membrane.ambient": 1e-3, **PRESSED}
+    now = {**model.base, **dark}
+    plain = model.renderer.radiance(now)
+    ratio = model.renderer.radiance({**now, "gel.shown_through": 0.2}) / plain
+    touched = model.coordinates(Values(frame={0: dark}), 0)["contact"] > 0
+    far = np.hypot(*np.mgrid[-HEIGHT / 2 : HEIGHT / 2, -WIDTH / 2 : WIDTH / 2]) > 20  # px
+    assert touched.sum() > 5
+    np.testing.assert_allclose(np.median(ratio[touched]), 1.2, rtol=1e-5)
+    np.testing.assert_allclose(ratio[far & ~touched], 1.0, rtol=1e-5)
+    fading = model.renderer.radiance({**now, "gel.absorption": 0.05}) / plain
+    middle = fading[HEIGHT // 2, WIDTH // 2]
+    np.testing.assert_allclose(middle, np.exp(-0.05 * now["gel.thickness"]), rtol=0.03)  # at a slant, and pressed
