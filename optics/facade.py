@@ -183,7 +183,9 @@ def compare(
         uncertainty=dict(origin.get("uncertainty", {})),
     )
     model = open_model(setup, fitted=noise)
-    present = values_of(model, fit, {**({} if fit is not None else setup.values), **(values or {})})
+    present = values_of(
+        model, fit, {**({} if fit is not None else setup.values), **model.scene.spread(values or {}, "values")}
+    )
     comparison, notes = tested(model, present, fit, _listed(held_out))
     return Compared(model, present, comparison, notes)
 

@@ -74,7 +74,7 @@ def render(
     files = [output, record, *([preview] if png else []), *(maps if stokes else ())]
     claim(files, force)
     sensor = load_sensor(scene, fit, frame, define, plugins, variant)
-    values = {**sensor.values, **sensor.scene.check(settings(sets), "--set")}
+    values = {**sensor.values, **sensor.scene.check(sensor.scene.spread(settings(sets), "--set"), "--set")}
     clock = time.perf_counter()
     images = RenderJob(sensor.scene, spp=spp, stokes=stokes, black=sensor.black, saturation=sensor.saturation)
     with terminal.progress() as progress:

@@ -61,7 +61,7 @@ def mueller(
 
     sensor = load_sensor(scene, fit, frame, define, plugins, variant)
     loaded = sensor.scene
-    values = {**loaded.values(), **sensor.values, **loaded.check(settings(sets), "--set")}
+    values = {**loaded.values(), **sensor.values, **loaded.check(loaded.spread(settings(sets), "--set"), "--set")}
     u, v = polarimetry.pixel(loaded, at)
     own = loaded.integrator.bands if loaded.integrator is not None else ()
     bands = wavelength or list(own) or [DEFAULT_BAND]
@@ -255,7 +255,7 @@ def sweep(
     place = polarimetry.pixel(loaded, at)
     if reason := rendering.obstacle(loaded):
         raise ValueError(f"{loaded.path}: no prediction light by light: {reason}; `optics render` goes through Mitsuba")
-    chosen = loaded.check(settings(sets), "--set")
+    chosen = loaded.check(loaded.spread(settings(sets), "--set"), "--set")
     first, last = polarimetry.span(loaded, key, first, last)
     with terminal.progress() as progress:
         found = polarimetry.sweep(

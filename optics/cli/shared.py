@@ -117,7 +117,12 @@ Defines = Annotated[
 ]
 Settings = Annotated[
     list[str] | None,
-    typer.Option("--set", metavar="KEY=VALUE", help="Set a parameter (`optics params SCENE` lists them). Repeatable."),
+    typer.Option(
+        "--set",
+        metavar="KEY=VALUE",
+        help="Set a parameter, or all that match a pattern, 'led_*.mu=1' (`optics params SCENE` lists them). "
+        "Repeatable.",
+    ),
 ]
 Plugins = Annotated[Path | None, typer.Option("--plugins", metavar="DIR", help="A further folder of plugins.")]
 FitFile = Annotated[

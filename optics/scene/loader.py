@@ -7,6 +7,7 @@ and its parameters have the keys `id.name`. Parameters of stock Mitsuba plugins 
 from __future__ import annotations
 
 import difflib
+import fnmatch
 import re
 import warnings
 from collections.abc import Mapping
@@ -218,6 +219,19 @@ class Scene:
                 raise UnknownKey(key, self.parameters, "parameter", where, "`optics params SCENE` lists them")
             checked[key] = self.parameters[key].check(value, key, where)
         return checked
+
+    def spread(self, values: Mapping[str, float | str], where: str = "") -> dict[str, float | str]:
+        """The values with patterns such as `led_*.mu` replaced by the keys that they match; keys by name come last, and
+        so hold against a pattern. Raises UnknownKey for a pattern that matches none."""
+        found: dict[str, float | str] = {}
+        for pattern, value in values.items():
+            if not set(pattern) & set("*?["):
+                continue
+            matching = fnmatch.filter(self.parameters, pattern)
+            if not matching:
+                raise UnknownKey(pattern, self.parameters, "parameter", where, "`optics params SCENE` lists them")
+            found.update(dict.fromkeys(matching, value))
+        return {**found, **{key: value for key, value in values.items() if not set(key) & set("*?[")}}
 
     def set(self, values: Mapping[str, float | str], where: str = "") -> None:
         """Set parameters by key; geometry is rebuilt once, and only if it changed."""

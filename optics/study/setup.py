@@ -111,6 +111,7 @@ def open_model(setup: Setup, model_class: type = SceneModel, fitted: Noise | Non
             )
     plugins = plugins_of(setup)
     loaded = scenes.load(path, defines, plugins=plugins if setup.plugins or plugins.is_dir() else None)
+    setup.values = loaded.spread(setup.values, "start values")
     capture_files.check(found, loaded.parameters)
     found = capture_files.state(found, loaded.parts, {k: e.name for k, e in loaded.registry.effects.items()})
     found.uncertainty = {**(setup.uncertainty or {}), **found.uncertainty}

@@ -301,3 +301,20 @@ def test_a_calibration_starts_from_a_fit(read, optics, tmp_path):
     with pytest.raises(FileNotFoundError, match="neither a study nor a step"):
         package.calibrate(tmp_path / "captures", tmp_path / "never", fit=tmp_path)
     assert not (tmp_path / "never").exists()
+
+
+def test_what_a_study_found_is_listed_and_patterns_set_many(touched, optics):
+    code, out, error = optics("values", touched, "led_*.power", "--json")
+    assert code == 0, error
+    known = read_fit(touched)["parameters"]
+    assert {v["name"]: v["value"] for v in json.loads(out)} == {
+        key: pytest.approx(value) for key, value in known.items() if key.endswith(".power")
+    }
+    code, _, error = optics("values", touched, "lad_*")
+    assert code == 2 and "unknown parameter of this study 'lad_*'" in error
+    scene = package.load("gelsight")
+    assert scene.spread({"led_*.mu": 2.0, "led_2.mu": 3.0}) == {
+        f"led_{k}.mu": 3.0 if k == 2 else 2.0 for k in range(1, 7)
+    }
+    code, _, error = optics("compare", package.Study.open(touched).setup.captures, "--set", "lad_*.mu=1")
+    assert code == 2 and "unknown parameter 'lad_*.mu'" in error
