@@ -99,7 +99,8 @@ class Bench:
 
         self.scene = scene
         width, height = scene.camera.resolution
-        frame = Frame("bench", np.zeros((height, width, 3), np.float32))
+        channels = 1 if len(scene.integrator.bands or ()) == 1 else 3
+        frame = Frame("bench", np.zeros((height, width, channels), np.float32))
         noise = Noise(system_gain=0.1, dark_noise=1.0, black_level=0.0, saturation=FULL_SCALE, prnu=0.0)
         self.model = SceneModel(
             scene, Captures(Path("."), str(scene.path), [frame], noise=noise, flat_field=flat_field), flat_field=mode

@@ -261,7 +261,8 @@ def build():
             """Length (mm) of the part of the segment p-q that lies in the gel, z > -thickness, for p inside."""
             share = (p.z + self.thickness) / dr.maximum(p.z - q.z, 1e-6)
             share = dr.select(q.z >= -self.thickness, 1.0, dr.clip(share, 0, 1))
-            return dr.norm(q - p) * share
+            # of light from all around p is q, where the norm has no derivative
+            return dr.sqrt(dr.maximum(dr.squared_norm(q - p), 1e-12)) * share
 
         def path(self, p, camera, lamp, led, si):
             return Path(self, p, camera, lamp, led, si)
