@@ -331,12 +331,18 @@ class Study:
         advised   where effects tie, simulate further frames and say which would tell them apart
         ranked    called with the ranking by score, before anything is refitted; the step's ranking.csv holds it too
 
-        Raises UnknownKey for an unknown effect.
+        Images whose fitted frames have more than 60,000 values are diagnosed in cells of up to 4 x 4 pixels; a warning
+        says so. Raises UnknownKey for an unknown effect.
         """
         model = self.model
         left_out = _listed(without) or []
         loop.excluded(model, self.record, left_out)  # a wrong name costs no fit
-        self._verdict = loop.examine(self.record, model, self.setup, self.fit, progress, advised, left_out, ranked)
+        asked = (progress, advised, left_out, ranked)
+        cells = loop.cells_of(self.record, model)
+        if cells is None:
+            self._verdict = loop.examine(self.record, model, self.setup, self.fit, *asked)
+        else:
+            self._verdict = loop.examine_in_cells(self.record, model, self.setup, cells, *asked)
         return self._verdict
 
     def add(self, effect: str, *, start: Values | None = None, progress: Progress | None = None) -> Fit:

@@ -9,6 +9,7 @@ misses the moving edge, and for everything that moves geometry they are central 
 
 from __future__ import annotations
 
+import copy
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping
 from types import SimpleNamespace
@@ -33,8 +34,9 @@ BENT_SIDE = 4  # finer samples each way where the face bends: the mean of what v
 SOFT = 16  # points of a light, above which rims of its shadows take the samples of what bends, BENT_SIDE each way
 CREASE = 25.0  # deg from pixel to pixel: what is no smooth surface
 FLAT_FIELDS = ("multiplicative", "additive", "none")
-MEMORY = 4e9  # bytes of hits and images that are kept
-PER_RAY = 100  # bytes of a camera ray's end, by the memory of a process that held ten million of them
+MEMORY = 2e9  # bytes of hits, with what images need for their derivatives, that are kept
+IMAGES = 5e8  # bytes of images that are kept without them
+PER_RAY = 250  # bytes of a camera ray's end and its light, by the memory of processes that held ten million of them
 BOUNCE_SAMPLES = 32  # directions per cell for the second bounce
 BOUNCE_CELL = 2  # px each way of a cell
 
@@ -65,7 +67,8 @@ class Renderer:
         self._transmissions: OrderedDict = OrderedDict()
         self._recent: list[paths.Path] = []
         self._hits: OrderedDict = OrderedDict()
-        self._images: OrderedDict = OrderedDict()
+        self._images: OrderedDict[tuple, LedImage] = OrderedDict()
+        self._plain: OrderedDict[tuple, np.ndarray] = OrderedDict()  # of differences, which need nothing else
         image_keys = {k for k, p in scene.parameters.items() if p.how == "image"}
         self.layer_keys = {k for k, p in scene.parameters.items() if p.how == "layer"}
         words = {
@@ -157,7 +160,7 @@ class Renderer:
 
     def _make_room(self, latest: Hits) -> None:
         """Forget the oldest geometries while what is kept is larger than MEMORY: large images with many rims."""
-        images = [i for i in self._images.values() if isinstance(i, LedImage)]
+        images = self._images.values()
         rays: dict[Hits, dict[int, int]] = {}  # geometry -> ends of camera rays by the samples that hold them
         for hits in (*(i.hits for i in images), *self._hits.values()):
             rays.setdefault(hits, {0: hits.valid.size})
@@ -165,12 +168,16 @@ class Renderer:
             rays[image.hits][id(image.finer)] = image.finer.size
         size = {hits: PER_RAY * sum(own.values()) for hits, own in rays.items()}
         total = sum(size.values())
+        if total > MEMORY:
+            import drjit as dr
+
+            dr.flush_malloc_cache()  # Dr.Jit keeps what is released, in sizes that the next geometry does not ask for
         for old in [hits for hits in size if hits is not latest]:
             if total <= MEMORY:
                 return
             total -= size[old]
             self._hits = OrderedDict((k, h) for k, h in self._hits.items() if h is not old)
-            self._images = OrderedDict((k, i) for k, i in self._images.items() if getattr(i, "hits", None) is not old)
+            self._images = OrderedDict((k, i) for k, i in self._images.items() if i.hits is not old)
 
     def forget_hits(self) -> None:
         """Release the kept hits: a search over many geometries returns to none of them."""
@@ -217,21 +224,57 @@ class Renderer:
             self._images.move_to_end(key)
             return self._images[key]
         hits = self.hits(values)
+        if alike := self._placed_alike(key):
+            self.apply(values, move=False)
+            return self._keep(key, self._shaded_again(alike))
         self.apply(values)
         image = self._keep(key, self._render_led(hits, led))
         for other in self.together - {
             led
         }:  # moving the geometry costs more than an image: make what will be asked for next
             key = self._led_key(values, other)
-            if key not in self._images:
+            if key not in self._images and key not in self._plain:
                 self._keep(key, self._render_led(hits, other))
         return image
+
+    def _placed_alike(self, key: tuple) -> LedImage | None:
+        """A kept image of the same LED in the same place over the same geometry, which differs in shading alone: with
+        its shadows nothing needs to be traced. None where there is none, or shading is that of layers."""
+        led, geometry, _, own = key
+        if self.layered or led in self.scene.sources:
+            return None
+        alike = (i for k, i in reversed(self._images.items()) if (k[0], k[1], k[3]) == (led, geometry, own))
+        return next(alike, None)
+
+    def _shaded_again(self, alike: LedImage) -> LedImage:
+        """The image of an LED by the shadows of another."""
+        image = copy.copy(alike)
+        image.raw = self._direct(image)
+        image.radiance = self._mix(image, image.raw)
+        return image
+
+    def _direct(self, image: LedImage) -> tuple:
+        """Direct light of an image's LED at pixel centres and at the finer samples."""
+        part = self.scene.leds[image.led]
+        return self._raw(
+            image,
+            lambda: self._shade(image.hits.sample, part, image.visible),
+            lambda: self._shade(image.finer.sample, part, image.rim_visible),
+        )
 
     def _keep(self, key: tuple, image: LedImage) -> LedImage:
         self._images[key] = image
         while len(self._images) > self.remember * len(self.scene.lights):
             self._images.popitem(last=False)
         self._make_room(image.hits)
+        if image.radiance is not None:
+            self._keep_plain(key, image.radiance)
+        return image
+
+    def _keep_plain(self, key: tuple, image: np.ndarray) -> np.ndarray:
+        self._plain[key] = image
+        while len(self._plain) > max(2 * len(self.scene.lights), int(IMAGES / max(image.nbytes, 1))):
+            self._plain.popitem(last=False)
         return image
 
     def _render_led(self, hits: Hits, led: str) -> LedImage:
@@ -252,9 +295,7 @@ class Renderer:
         rim_visible = self._visible(finer.sample.si, part) if len(index) else None
         image = LedImage(led, hits, rim, index, finer, visible, rim_visible, self._seen(visible).mean(0) > 0.5)
         image.share = share.reshape(-1, 1)[index]
-        image.raw = self._raw(
-            image, lambda: self._shade(hits.sample, part, visible), lambda: self._shade(finer.sample, part, rim_visible)
-        )
+        image.raw = self._direct(image)
         if not self.layered:
             image.radiance = self._mix(image, image.raw)
         return image
@@ -280,9 +321,11 @@ class Renderer:
         component  of the Stokes vector in the camera's axes; 0: what the camera records, S0 unless its detector
                    prefers a polarization (stage `detector`)
         """
-        image = self.led(values, light)
         if not self.layered:
-            return image.radiance if component == 0 else np.zeros_like(image.radiance)
+            plain = self._plain.get(self._led_key(values, light))
+            plain = self.led(values, light).radiance if plain is None else plain
+            return plain if component == 0 else np.zeros_like(plain)
+        image = self.led(values, light)
         seen = [
             None if r is None or w is None else r * w for r, w in zip(image.raw, self.weights(values, image, component))
         ]
@@ -509,10 +552,26 @@ class Renderer:
         if led in self.scene.sources:  # it lights nothing
             return np.zeros((1, 1, self.bands))
         key = ("bounced", seed, *self._led_key(values, led))
-        if key in self._images:
-            self._images.move_to_end(key)
-            return self._bounced(values, led, self._images[key], component)
+        if key in self._plain:
+            return self._bounced(values, led, self._plain[key], component)
         self.apply(values)
+        sample, directions, count = self._spread_rays(seed)
+        for other in (led, *sorted(self.together - {led})):  # as for direct light: these will be asked for next
+            own = ("bounced", seed, *self._led_key(values, other))
+            if other in self.scene.sources or own in self._plain:
+                continue
+            sampler = mi.load_dict({"type": "independent"})
+            sampler.seed(directions, count)
+            light = self.scene.integrator.bounced(self.scene.mitsuba, *sample[:3], self.scene.leds[other], 1, sampler)
+            rows, columns = -(-self.height // BOUNCE_CELL), -(-self.width // BOUNCE_CELL)
+            coarse = self._bands(light).reshape(rows, columns, BOUNCE_SAMPLES, self.bands).mean(2)
+            image = zoom(coarse, (BOUNCE_CELL, BOUNCE_CELL, 1), order=1, mode="nearest", grid_mode=True)
+            self._keep_plain(own, image[: self.height, : self.width].astype(float))
+        return self._bounced(values, led, self._plain[key], component)
+
+    def _spread_rays(self, seed: int) -> tuple[Sample, int, int]:
+        """(ends of the camera rays that gather light from all around, seed of their second directions, their number):
+        the same for every geometry and LED."""
         rows, columns = -(-self.height // BOUNCE_CELL), -(-self.width // BOUNCE_CELL)
         v, u = np.mgrid[:rows, :columns]
         rng = np.random.default_rng([seed, 77])
@@ -521,13 +580,7 @@ class Renderer:
         sample = self._trace(
             *(np.minimum(a * BOUNCE_CELL, size - 1e-3) for a, size in zip(at, (self.width, self.height)))
         )
-        sampler = mi.load_dict({"type": "independent"})
-        sampler.seed(int(rng.integers(2**31)), count)
-        light = self.scene.integrator.bounced(self.scene.mitsuba, *sample[:3], self.scene.leds[led], 1, sampler)
-        coarse = self._bands(light).reshape(rows, columns, BOUNCE_SAMPLES, self.bands).mean(2)
-        image = zoom(coarse, (BOUNCE_CELL, BOUNCE_CELL, 1), order=1, mode="nearest", grid_mode=True)
-        self._images[key] = image[: self.height, : self.width].astype(float)
-        return self._bounced(values, led, self._images[key], component)
+        return sample, int(rng.integers(2**31)), count
 
     def _bounced(self, values: Mapping, led: str, image: np.ndarray, component: int) -> np.ndarray:
         """A bounced image behind the layers."""

@@ -3,11 +3,12 @@ parameters."""
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import math
 import sys
 import weakref
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextvars import ContextVar
 from functools import wraps
 from pathlib import Path
@@ -20,6 +21,7 @@ from optics.scene.registry import Registry, default, include
 
 DEFAULT_VARIANT = "llvm_ad_spectral_polarized"
 _loading: ContextVar[Registry | None] = ContextVar("registry", default=None)  # of the scene that is being loaded
+_coarseness: ContextVar[int] = ContextVar("coarseness", default=1)  # of the meshes that are being made
 _registered: dict[str, dict[str, str]] = {}  # variant -> kind -> category that Mitsuba knows it in
 _watching = False  # whether Mitsuba tells us when its variant changes
 _made = itertools.count()  # numbers the parts in the order in which they were made
@@ -121,6 +123,22 @@ class loading:
 
     def __exit__(self, *_):
         _loading.reset(self.token)
+
+
+@contextlib.contextmanager
+def coarser(times: int) -> Iterator[None]:
+    """Context in which scenes are loaded for an image of so many times fewer pixels each way: parts may make their
+    meshes as much coarser (`coarseness`)."""
+    token = _coarseness.set(times)
+    try:
+        yield
+    finally:
+        _coarseness.reset(token)
+
+
+def coarseness() -> int:
+    """How many times coarser a mesh may be than the scene says."""
+    return _coarseness.get()
 
 
 def _built(registry: Registry, part: Part) -> type:

@@ -23,10 +23,10 @@ from optics.captures import capture_set as capture_files
 from optics.captures import identity
 from optics.diagnosis.dials import Width, unstated, width_of
 from optics.diagnosis.result import Diagnosis, Row
+from optics.diagnosis.score import SETTLED
 from optics.errors import BadCapture, Underdetermined, UnknownKey
 from optics.fit import calibrate
 from optics.fit.compare import Comparison
-from optics.fit.descent import prior_terms
 from optics.fit.model import values_in
 from optics.fit.result import Fit
 from optics.fit.scene_model import SceneModel
@@ -35,7 +35,9 @@ from optics.scene.parameter import Values, Variable
 from optics.scene.registry import Registry
 from optics.study import checks
 from optics.study.calibrated import origin_of
+from optics.study.cells import Cells, cells_for, open_in_cells
 from optics.study.record import Record
+from optics.study.refits import Refits
 from optics.study.setup import (
     Setup,
     check_priors,
@@ -59,9 +61,6 @@ from optics.study.stages import (
 from optics.words import key_of
 
 AGAIN, FURTHER = 6, 30  # iterations of a restored fit: one that had converged only needs its derivatives again
-PROMISING = 0.7  # of the best fall of chi2 so far: an unconverged refit that falls by more is worth a fit of its own
-ROUGH = 0.5  # chi2 per variable at which a refit of a diagnosis, which compares falls far above 1, may stop
-FEW = 4  # iterations of a refit that continues one
 
 
 # -- begin, and continue ---------------------------------------------------------------------------------------------
@@ -274,6 +273,7 @@ def examine(
     advised: bool = True,
     without: Sequence[str] = (),
     ranked: Callable[[list[Row]], None] | None = None,
+    remark: str = "",
 ) -> Diagnosis:
     """Diagnose the last step, and add the diagnosis with the best effects' fingerprints to its folder. The ranking by
     score is there before anything is refitted.
@@ -281,6 +281,7 @@ def examine(
     without     effects that are not tested
     ranked      called with the rows of that ranking
     advised     where effects tie, also advise what to measure next, which renders frames that nobody has taken yet
+    remark      a warning that the diagnosis gets
     """
     from optics.diagnosis.advice import advise
     from optics.diagnosis.diagnose import diagnose
@@ -289,6 +290,8 @@ def examine(
     fitted, held = split(model, setup)
     tested, ruled_out = candidates(model, record, without), excluded(model, record, without)
     seek(model, found.values, tested, fitted)
+
+    refits = Refits(model, setup, found, tested, record.refits(len(record.steps) - 1))
 
     def keep(rows: list[Row]) -> None:
         record.put_ranking(len(record.steps) - 1, rows)
@@ -302,7 +305,8 @@ def examine(
         lambda e: effect_variables(model, e),
         held,
         fitted=fitted,
-        refit=Refits(model, setup, found, tested).of,
+        refit=refits.of,
+        foresee=refits.foresee,
         seed=setup.seed,
         progress=progress,
         ranked=keep,
@@ -310,11 +314,50 @@ def examine(
         excluded=ruled_out,
     )
     result.advice = advise(model, result, _freed_as_in(model, found.variables), setup.seed, progress) if advised else []
+    result.warnings += [remark] if remark else []
     if result.advice:
         result.hints = [hint for hint in result.hints if hint != USUALLY]
     worst = int(np.argmax(np.array(found.frame_chi2) / np.maximum(found.frame_n, 1)))
     record.put_diagnosis(len(record.steps) - 1, result, fingerprints_of(model, found, result, found.frames[worst]))
     return result
+
+
+def examine_in_cells(
+    record: Record,
+    model: SceneModel,
+    setup: Setup,
+    cells: Cells,
+    progress: Progress | None = None,
+    advised: bool = True,
+    without: Sequence[str] = (),
+    ranked: Callable[[list[Row]], None] | None = None,
+) -> Diagnosis:
+    """`examine` of large images, in cells of k x k pixels; the values of its refits are in pixels again."""
+    coarse, own = open_in_cells(setup, cells)
+    # as well as a diagnosis asks of its base
+    found = calibrate.fit(
+        coarse, *in_cells_of(record, coarse, cells), max_iterations=FURTHER, negligible=SETTLED / 4, progress=progress
+    )
+    k = cells.k
+    remark = (
+        f"images of {cells.width} x {cells.height} px were diagnosed in cells of {k} x {k} px: px of this diagnosis "
+        "are such cells, and what is finer, as a blur or the rim of a shadow, shows less than in the images"
+    )
+    result = examine(record, coarse, own, found, progress, advised, without, ranked, remark)
+    result.fits = {name: replace(fit, values=cells.values_back(fit.values)) for name, fit in result.fits.items()}
+    return result
+
+
+def cells_of(record: Record, model: SceneModel) -> Cells | None:
+    """The cells in which the last step is diagnosed; None: in pixels."""
+    variables, _, fitted = kept(record, model)
+    return cells_for(model, fitted, variables)
+
+
+def in_cells_of(record: Record, coarse: SceneModel, cells: Cells) -> tuple[list[Variable], Values, list[int]]:
+    """What a step's folder holds of its fit (`kept`), in cells."""
+    variables, values, fitted = kept(record, coarse)
+    return variables, cells.values_into(values), fitted
 
 
 def _freed_as_in(model: SceneModel, held: Sequence[Variable]) -> Callable[[Any, Effect], list[Variable]]:
@@ -326,56 +369,6 @@ def _freed_as_in(model: SceneModel, held: Sequence[Variable]) -> Callable[[Any, 
         return [v for v in effect_variables(imagined, effect, held) if v.frames is not None or v.name in present]
 
     return freed
-
-
-class Refits:
-    """The refits that a diagnosis asks for: chord steps on the base's derivative images where they will do, else a
-    fit."""
-
-    def __init__(self, model: SceneModel, setup: Setup, base: Fit, tested: Sequence[Effect]):
-        self.model, self.setup, self.base = model, setup, base
-        self.known = {v.name for v in base.variables}
-        curved = [v for e in tested if e.onset != "tangent" for v in effect_variables(model, e, base.variables)]
-        self.steps = {v.name: v.parameter.plausible for v in curved}  # of variables without a slope at neutral
-        self.results: dict[tuple[str, ...], Fit] = {}
-
-    def of(self, model: SceneModel, variables: Sequence[Variable], start: Values, frames: Sequence[int]) -> Fit:
-        """The fit of these variables from this start."""
-        base = self.base
-        extra = [v for v in variables if v.name not in self.known]
-        over = [v.name for v in extra]  # of the base the best start is known
-        if model.captures.table is not None:  # readings are predicted in milliseconds
-            return calibrate.fit_over_starts(model, variables, start, frames, over=over)
-        product = sum(v.name in self.steps for v in extra) > 1  # a chord per parameter misses their products
-        if base.normal is None or not extra or product or list(frames) != list(base.frames):
-            return calibrate.fit_over_starts(model, variables, start, frames, over=over)
-        names = tuple(v.name for v in extra)
-        if names not in self.results:  # a diagnosis asks again from another start, which chord steps do not use
-            leader = max(map(self.fall, self.results.values()), default=0.0)
-            steps = {v.name: self.steps[v.name] for v in extra if v.name in self.steps}
-            quick = calibrate.extended(model, base, extra, steps)
-            if not quick.converged and self.fall(quick) > PROMISING * leader:
-                quick = self.afresh(variables, extra, frames, quick)
-            self.results[names] = quick
-        return self.results[names]
-
-    def fall(self, found: Fit) -> float:
-        """Of what is minimised, chi2 and priors: where each frame has its own angle, these may hold most of it."""
-        return self.minimised(self.base) - self.minimised(found)
-
-    def minimised(self, found: Fit) -> float:
-        return found.chi2 + prior_terms(self.model, found.variables, found.values)[2]
-
-    def afresh(
-        self, variables: Sequence[Variable], extra: Sequence[Variable], frames: Sequence[int], quick: Fit
-    ) -> Fit:
-        """Calibrate from the study's start values: a strong effect may have bent the base's values far from the
-        truth."""
-        values = off_neutral(self.model, Values(dict(self.setup.values)), extra)
-        best = fit_base(self.model, variables, frames, values, tolerance=ROUGH)
-        if self.minimised(best) < self.minimised(quick):
-            return best
-        return calibrate.fit(self.model, variables, quick.values, frames, max_iterations=FEW, tolerance=ROUGH)
 
 
 # -- add -------------------------------------------------------------------------------------------------------------

@@ -294,6 +294,10 @@ class Record:
         """Keep the ranking by score of a step whose diagnosis is still under way."""
         write_text(self.path(index) / "ranking.csv", table_of(rows))
 
+    def refits(self, index: int) -> Path:
+        """The folder in which a diagnosis of a step keeps its refits while it is under way."""
+        return self.path(index) / "refits"
+
     def _save(self) -> None:
         write_text(self.folder / "ladder.json", _dumps(self.ladder))
 

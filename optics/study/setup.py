@@ -95,12 +95,8 @@ def open_model(setup: Setup, model_class: type = SceneModel, fitted: Noise | Non
     fitted   noise of the captures that the values to come were fitted to, if they are others"""
     found = capture_files.load(setup.captures)
     path = scenes.find(found.scene)
-    defines = capture_files.definitions(found, setup.defines, path)
     height, width = found.frames[0].image.shape[:2]
-    usual = dict(re.findall(r'<default name="(width|height)" value="(\d+)"', path.read_text(encoding="utf-8")))
-    for name, size in (("width", width), ("height", height)):
-        if name in usual:
-            defines.setdefault(name, str(size))
+    defines, usual = definitions_of(setup, found, path, (width, height)), _usual(path)
     if found.table is None and len(usual) == 2:
         own_width, own_height = int(usual["width"]), int(usual["height"])
         if abs(width * own_height / (height * own_width) - 1) > ASPECT:
@@ -122,6 +118,23 @@ def open_model(setup: Setup, model_class: type = SceneModel, fitted: Noise | Non
     model = model_class(loaded, found, noise.in_scale_of(fitted), **options)
     model.assumed_errors = dict(setup.uncertainty or {})
     return model
+
+
+def _usual(scene: Path) -> dict[str, str]:
+    """The width and height that a scene names by themselves, px."""
+    return dict(re.findall(r'<default name="(width|height)" value="(\d+)"', scene.read_text(encoding="utf-8")))
+
+
+def definitions_of(
+    setup: Setup, captures: capture_files.Captures, scene: Path, size: tuple[int, int]
+) -> dict[str, str]:
+    """-D of the scene, with the (width, height) of the images where it names them."""
+    defines = capture_files.definitions(captures, setup.defines, scene)
+    usual = _usual(scene)
+    for name, pixels in zip(("width", "height"), size):
+        if name in usual:
+            defines.setdefault(name, str(pixels))
+    return defines
 
 
 def split(model: SceneModel, setup: Setup) -> tuple[list[int], list[int]]:
