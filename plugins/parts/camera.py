@@ -28,8 +28,9 @@ XML
     cy float, half the height: principal point, px, in place of `principal_y`
     mosaic string: angles of the analysers on the pixels of a polarization camera, deg, row by row as the camera sees
         them: "90 45; 135 0"; none without it; `mosaic` in captures.toml replaces it
-    sensitivity string, identity: sensitivities of the channels: a camera of the colour-science library by its name, or
-        one channel per band
+    sensitivity string, identity: sensitivities of the channels: a camera of the colour-science library by its name, a
+        file (.csv) with the wavelength and a column for each of 1 or 3 channels, or one channel per band
+    filter string: transmittance before the sensor over the wavelength: a file, a name or a law
 """
 
 import math
@@ -39,6 +40,7 @@ from optics.scene.checking import agree, made
 from optics.scene.declare import Part
 from optics.scene.mitsuba_parts import Declared
 from optics.scene.parameter import Parameter
+from optics.spectra.reading import read_channels
 
 PARAMETERS = (
     Parameter(
@@ -190,6 +192,15 @@ def build():
             self.sensitivity = props.get("sensitivity", "identity")
             self.mosaic = read_mosaic(props.get("mosaic", ""))
             self.declare(props)
+            self.channels = ()  # curves; none where each channel is a band
+            if self.sensitivity != "identity":
+                self.channels = read_channels(self.sensitivity, self._folders, f"{self.name}.sensitivity")
+                if len(self.channels) not in (1, 3):
+                    raise ValueError(
+                        f"{self.name}.sensitivity = '{self.sensitivity}' has {len(self.channels)} columns; allowed: 1 or 3"
+                    )
+                self.curves.update(zip(channel_names(len(self.channels)), self.channels))
+            self.read_spectrum(props, "filter", "transmittance")
             self.resolution = (width, height)
             matrix = [[float(nominal.matrix[i, j]) for j in range(4)] for i in range(3)]
             self.columns = [dr.opaque(mi.Vector3f, [matrix[i][j] for i in range(3)]) for j in range(4)]
@@ -246,6 +257,11 @@ def build():
 
         # -- how images are developed: numpy; `own` has the parameters as numbers, complex ones for derivatives -----
 
+        def seen(self, nm):
+            """(C, N) sensitivities at wavelengths, behind the filter; of channels that are bands, the filter alone."""
+            through = self.curves["filter"](nm) if "filter" in self.curves else np.ones(len(nm))
+            return np.array([curve(nm) for curve in self.channels] or [np.ones(len(nm))]) * through
+
         def middle(self):
             """Where the optical axis meets the image, px."""
             width, height = self.resolution
@@ -295,6 +311,11 @@ def build():
             return f"Camera[{self.name}]"
 
     return Camera
+
+
+def channel_names(count):
+    """Names of the sensitivities of channels among a camera's curves."""
+    return [f"sensitivity {c}" for c in "RGB"] if count == 3 else ["sensitivity"]
 
 
 def check_field_of_view():

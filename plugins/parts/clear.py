@@ -62,6 +62,8 @@ def build():
         def __init__(self, props):
             self.outside = str(props.get("outside", ""))
             super().__init__(props)
+            self.read_spectrum(props, "index_spectrum", "index")
+            self.read_spectrum(props, "absorption_spectrum", "absorption")
             if self.outside:
                 self._waits = f"'{self.name}' lies inside '{self.outside}'"
             sides = mi.BSDFFlags.FrontSide | mi.BSDFFlags.BackSide

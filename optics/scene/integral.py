@@ -1,0 +1,328 @@
+"""Channels as integrals over the wavelength: which wavelengths are rendered, and what each counts in each channel.
+
+    I_c = exposure gain_c sum_k int S_k(nm) Q_c(nm) P_k(nm) d nm / N
+        ~ exposure gain_c sum_b M_cb L_b
+
+with the spectrum S_k of the light k (its integral is 1: `power` is all of its light), the sensitivity Q_c of the channel
+behind the camera's filter, and the radiance P_k that the light sends to the camera per unit of its own. N is the largest
+of all int S_k Q_c: light of one wavelength gives what a band at that wavelength gives.
+
+fixed bands  L_b is radiance per nm; M_cb = Q_c(nm_b) w_b/N with the weights w_b of the trapezium rule.
+auto         Lights have bands of their own: the nodes of Gauss rules for S_k sum_c Q_c, in each of the ranges in which
+             shares and reflectances are declared (EDGES); L_b = P_k(nm_b) and M_cb = int S_k Q_c l_b/N with the
+             Lagrange polynomial l_b of the node. What S_k and Q_c are, parameters among them, is in M alone: it is exact
+             whatever they are, and so are its derivatives. The number of nodes is the smallest with which what is known
+             of the paths (reflectances, the probes of `_probes`) has an error below TOLERANCE."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from optics.errors import BadScene
+from optics.scene import line
+from optics.scene.line import EDGES
+from optics.spectra.curve import VISIBLE, Curve, grid
+from optics.spectra.quadrature import gauss_nodes, lagrange, widths
+from optics.spectra.reading import overlap
+
+TOLERANCE = 1e-4  # of a channel's largest integral: a tenth of a grey level in 1000
+FEW = 4  # bands that one render carries, and that are read at their centres
+MOST = 12  # nodes of a light in one range
+NEGLIGIBLE = 1e-6  # share of a light's signal below which a range has no nodes of its own
+TILT = 0.3  # of the probe exp(+-TILT (nm - 540)/100): layers, whose matrices change with the wavelength
+
+
+def colour_index(nm: np.ndarray) -> np.ndarray:
+    """0, 1 or 2 for the first, second and third band of shares and reflectances at wavelengths."""
+    at = np.asarray(nm, float)
+    return np.where(at >= EDGES[0], 0, np.where(at >= EDGES[1], 1, 2))
+
+
+@dataclass(eq=False)
+class Group:
+    """Lights of one spectrum and the bands that are theirs.
+
+    lights     names of the lights;   glow  name of the pigment that they make shine, '' for their own light
+    spectrum   f(values) -> (N,) on the grid, integral 1 of a light's own
+    keys       the parameters that it depends on
+    seen       its share of the signal of the brightest group
+    bands      numbers of its bands;   polynomials  (n, N) Lagrange polynomials of its nodes, each in its own range
+    """
+
+    lights: tuple[str, ...]
+    glow: str
+    spectrum: Callable[[Mapping], np.ndarray]
+    keys: tuple[str, ...]
+    seen: float = 1.0
+    bands: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
+    polynomials: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
+
+
+class Integral:
+    """The wavelengths that a scene is rendered at, and the matrix from bands to channels.
+
+    nm       (B,) wavelengths;   auto  whether lights have bands of their own
+    colours  (B,) index of the share or reflectance (0, 1, 2) that a band belongs to
+    error    of auto bands, the largest error in a channel over its largest integral (see `Integral`'s module)
+    """
+
+    def __init__(self, scene, bands: Sequence[float] = (), count: int = 0):
+        self.scene, self.camera = scene, scene.camera
+        self.auto = not bands
+        channels = scene.camera.channels
+        if not channels:
+            raise BadScene(
+                f"{scene.path}: channels as integrals need the sensitivities of '{scene.camera.name}'; allowed: "
+                'sensitivity = a camera of colour-science such as "Nikon 5100 (NPL)", or a file (.csv) with a column '
+                "for each channel"
+            )
+        self.grid = grid(span=(min(c.span[0] for c in channels), max(c.span[1] for c in channels)))
+        self.step = widths(self.grid)
+        self.quantum = self.camera.seen(self.grid)
+        self.base = scene.values()
+        self._kept: tuple = (None, None)
+        contents = self._contents()
+        own = [c for c in contents if not c.glow] or contents
+        self.unit = max(float((self.quantum * c.spectrum(self.base) * self.step).sum(1).max()) for c in own)
+        if not self.unit > 0:
+            raise BadScene(
+                f"{scene.path}: no light of the scene is seen by '{self.camera.name}'; allowed: a light whose spectrum "
+                f"shares wavelengths with the sensitivities ({self.grid[0]:g} to {self.grid[-1]:g} nm)"
+            )
+        self.error = 0.0
+        if self.auto:
+            self.groups = self._placed([c for c in contents if c.seen > NEGLIGIBLE], count)
+        else:
+            self.nm = np.array(bands, float)
+            self.groups = []
+        self.colours = colour_index(self.nm)
+
+    # -- lights -------------------------------------------------------------------------------------------------------
+    def own(self, light: str, values: Mapping) -> SimpleNamespace:
+        """A light's parameters, as functions of its spectrum read them."""
+        part = self.scene.parts[light]
+        return SimpleNamespace(name=light, **{n: values[f"{light}.{n}"] for n in part.numbers})
+
+    def spectrum(self, light: str, values: Mapping, nm: np.ndarray | None = None) -> np.ndarray:
+        """(N,) power of a light per nm, its integral 1 over all wavelengths."""
+        part, own = self.scene.parts[light], self.own(light, values)
+        nm = self.grid if nm is None else nm
+        curve = part.curves.get("spectrum")
+        if curve is None and not hasattr(own, "wavelength"):
+            return np.full(len(nm), 1 / line.WHITE)
+        found = line.changed(line.relative(own, curve), part.active("spectrum", own), own)(nm)
+        return np.asarray(found / line.area(own, curve) + 0.0 * nm)
+
+    def width(self, light: str, values: Mapping):
+        """Area of a light's spectrum over its peak, nm."""
+        own, curve = self.own(light, values), self.scene.parts[light].curves.get("spectrum")
+        return line.area(own, curve) if curve is not None or hasattr(own, "wavelength") else line.WHITE
+
+    def spectral_keys(self, light: str) -> tuple[str, ...]:
+        """The parameters that a light's spectrum depends on."""
+        part = self.scene.parts[light]
+        names = [n for n, p in part.numbers.items() if p.role in ("light wavelength", "light width")]
+        for effect in self.scene.registry.at_stage(part.kind, "spectrum"):
+            names += effect.at_rest
+        return tuple(f"{light}.{n}" for n in dict.fromkeys(names) if n in part.numbers)
+
+    def _contents(self) -> list[Group]:
+        """What reaches the camera, without bands yet: the light of lamps, those of one spectrum together, and what each
+        pigment makes of the lamps that excite it."""
+        scene = self.scene
+        alike: dict[Any, list[str]] = {}
+        for light, part in scene.lights.items():
+            curve = part.curves.get("spectrum")
+            alone = curve is None and part.held.get("wavelength", 0.0) > 0
+            alike.setdefault(light if alone else curve.source if curve is not None else "", []).append(light)
+        found = [
+            Group(
+                tuple(lights),
+                "",
+                lambda values, first=lights[0]: self.spectrum(first, values),
+                tuple(key for light in lights for key in self.spectral_keys(light)),
+            )
+            for lights in alike.values()
+        ]
+        most = max(self._signal(group) for group in found)
+        found = [replace(group, seen=self._signal(group) / most if most > 0 else 0.0) for group in found]
+        exciting = tuple(n for n in scene.leds if scene.parts[n].held.get("wavelength", 0.0) > 0)
+        for pigment in [p for p in scene.parts.values() if hasattr(p, "fluorescence")] if exciting else ():
+            seen_too = [n for g in found for n in g.lights if n in exciting and g.seen > NEGLIGIBLE]
+            if seen_too and self.auto:
+                raise BadScene(
+                    f"{scene.path}: the camera sees the light of {', '.join(seen_too)} itself and what it makes of "
+                    f"'{pigment.name}'; auto bands follow one of them; allowed: fixed bands, such as 400:700:5"
+                )
+            keys = tuple(f"{pigment.name}.{n}" for n in ("emission_peak", "emission_fwhm"))
+            found.append(
+                Group(exciting, pigment.name, lambda values, name=pigment.name: self.emission(name, values), keys)
+            )
+        return found
+
+    def _signal(self, group: Group) -> float:
+        return float((self.quantum * np.real(group.spectrum(self.base)) * self.step).sum())
+
+    def emission(self, pigment: str, values: Mapping) -> np.ndarray:
+        """(N,) radiance of a pigment per nm, per photon that it sends."""
+        part = self.scene.parts[pigment]
+        return part.emission(SimpleNamespace(**{n: values[f"{pigment}.{n}"] for n in part.numbers}), self.grid)
+
+    # -- nodes --------------------------------------------------------------------------------------------------------
+    def _placed(self, contents: Sequence[Group], count: int) -> list[Group]:
+        """Groups with their nodes; sets `nm` and `error`."""
+        groups: list[Group] = []
+        nm: list[float] = []
+        errors = [0.0]
+        colours = colour_index(self.grid)
+        for group in contents:
+            power = np.real(group.spectrum(self.base))
+            weight = power * self.quantum.sum(0) * self.step
+            shares = np.array([weight[colours == c].sum() for c in range(3)])
+            kept = [c for c in range(3) if shares[c] > NEGLIGIBLE * shares.sum()]
+            nearest = np.array(kept)[np.abs(np.array(kept)[None] - colours[:, None]).argmin(1)]
+            largest = (self.quantum * power * self.step).sum(1).max()
+            polynomials, start = [], len(nm)
+            for c in kept:
+                inside = nearest == c
+                for n in range(count or 1, (count or MOST) + 1):
+                    nodes = gauss_nodes(self.grid[inside], weight[inside], n)
+                    rows = np.where(inside, lagrange(nodes, self.grid), 0.0)
+                    error = self._error(nodes, rows, inside, power) / largest
+                    if error <= TOLERANCE:
+                        break
+                errors.append(float(error))
+                nm.extend(nodes)
+                polynomials.append(rows)
+            groups.append(replace(group, bands=np.arange(start, len(nm)), polynomials=np.concatenate(polynomials)))
+        self.nm, self.error = np.array(nm), max(errors)
+        return groups
+
+    def _error(self, nodes: np.ndarray, rows: np.ndarray, inside: np.ndarray, power: np.ndarray) -> float:
+        """The largest error of the integrals of the probes over one range, of all channels."""
+        density = self.quantum * power * self.step * inside
+        worst = 0.0
+        for probe in self._probes():
+            exact = density @ probe(self.grid)
+            found = (density @ rows.T) @ probe(nodes)
+            worst = max(worst, float(np.abs(found - exact).max()))
+        return worst
+
+    def _probes(self) -> list[Callable[[np.ndarray], np.ndarray]]:
+        """What is known to be on the paths, as functions of the wavelength."""
+        found: list[Callable] = [
+            curve for part in self.scene.parts.values() for name, curve in part.curves.items() if name == "reflectance"
+        ]
+        if any(p.registry.parts[p.kind].mueller is not None for p in self.scene.parts.values()):
+            found += [lambda nm, s=s: np.exp(s * TILT * (nm - 540) / 100) for s in (1, -1)]
+        return found
+
+    # -- channels -----------------------------------------------------------------------------------------------------
+    def bands_of(self, light: str) -> np.ndarray:
+        """Numbers of the bands in which a light is rendered."""
+        if not self.auto:
+            return np.arange(len(self.nm))
+        own = [g.bands for g in self.groups if light in g.lights]
+        return np.concatenate(own) if own else np.zeros(0, int)
+
+    def lanes(self, light: str, pigment: str = "") -> np.ndarray:
+        """(B,) 1 in the bands of a light's own light, or of what a pigment makes of it; 0 in others."""
+        found = np.zeros(len(self.nm))
+        for group in self.groups:
+            if light in group.lights and group.glow == pigment:
+                found[group.bands] = 1.0
+        return found
+
+    def matrix(self, values: Mapping | None = None, quantum: np.ndarray | None = None) -> np.ndarray:
+        """M (C, B); of complex values complex, for derivatives. quantum: (C, N) other sensitivities."""
+        values = self.base if values is None else values
+        own = self.quantum if quantum is None else quantum
+        if not self.auto:
+            at = np.stack([np.interp(self.nm, self.grid, np.real(q), left=0.0, right=0.0) for q in own])
+            if np.iscomplexobj(own):
+                at = at + 1j * np.stack([np.interp(self.nm, self.grid, np.imag(q)) for q in own])
+            return at * widths(self.nm) / self.unit
+        state = tuple(values[k] for g in self.groups for k in g.keys)
+        if quantum is None and self._kept[0] == state:
+            return self._kept[1]
+        columns = []
+        for g in self.groups:
+            self._alike(g, values)
+            columns.append((own * self.step * g.spectrum(values)) @ g.polynomials.T)
+        found = np.concatenate(columns, 1) / self.unit
+        if quantum is None:
+            self._kept = (state, found)
+        return found
+
+    def _alike(self, group: Group, values: Mapping) -> None:
+        """Refuse lights that share bands and no longer have one spectrum."""
+        if group.glow or len(group.lights) < 2:
+            return
+        for name in {k.rpartition(".")[2] for k in group.keys}:
+            own = {values[f"{light}.{name}"] for light in group.lights if f"{light}.{name}" in values}
+            if len(own) > 1:
+                raise BadScene(
+                    f"{self.scene.path}: {', '.join(group.lights)} share the bands of one spectrum, and '{name}' "
+                    f"differs between them ({', '.join(f'{v:g}' for v in sorted(own, key=abs))}); allowed: one value, or "
+                    "fixed bands, such as bands = 400:700:5"
+                )
+
+    def colour_matrix(self, values: Mapping) -> np.ndarray:
+        """(3, B) from bands to CIE 1931 X, Y, Z, over the largest integral of a channel, as M."""
+        from optics.spectra.colours import matching
+
+        return self.matrix(values, matching(self.grid))
+
+    def describe(self) -> str:
+        """The bands in one line."""
+        if not self.auto:
+            return f"{len(self.nm)} bands from {self.nm.min():g} to {self.nm.max():g} nm"
+        each = "; ".join(
+            f"{', '.join(g.lights)}{f' on {g.glow}' if g.glow else ''}: "
+            f"{', '.join(f'{nm:.1f}' for nm in self.nm[g.bands])} nm"
+            for g in self.groups
+        )
+        return f"{len(self.nm)} bands, estimated error {self.error:.1e} of a channel ({each})"
+
+
+def parse(text: str, where: str) -> tuple[tuple[float, ...], int | None]:
+    """Bands that a text names, nm, and of "auto" and "auto N" the number of nodes (0: as many as it takes), else None.
+
+    Raises BadScene."""
+    text = str(text).strip()
+    allowed = "allowed: wavelengths in nm such as 610, 540, 460, a range such as 400:700:10, auto, or auto 3"
+    if text.split()[:1] == ["auto"]:
+        words = text.split()[1:]
+        if len(words) > 1 or words and not (words[0].isdigit() and 1 <= int(words[0]) <= MOST):
+            raise BadScene(f"{where}: bands = {text!r}; allowed: auto, or auto N with 1 to {MOST} nodes")
+        return (), int(words[0]) if words else 0
+    try:
+        if ":" in text:
+            low, high, step = (float(n) for n in text.split(":"))
+            count = round((high - low) / step) + 1 if step else 0
+            if not (step > 0 and high > low > 0 and count <= 1000):
+                raise ValueError
+            return tuple(low + step * k for k in range(count)), None
+        bands = tuple(float(w) for w in text.replace(",", " ").split())
+    except ValueError:
+        raise BadScene(f"{where}: bands = {text!r}; {allowed}") from None
+    if len(bands) > FEW and (min(bands) <= 0 or len(set(bands)) < len(bands) or sorted(bands) not in (list(bands), list(bands)[::-1])):
+        raise BadScene(f"{where}: bands = {text!r}; allowed: more than four bands above 0 nm in one order, each once")
+    return bands, None
+
+
+def refuse_unseen(scene) -> None:
+    """Refuse a light with a curve of its own that the camera's sensitivities do not see."""
+    channels = scene.camera.channels if scene.camera is not None else ()
+    for name, part in scene.lights.items() if channels else ():
+        curve: Curve | None = part.curves.get("spectrum")
+        if curve is not None:
+            overlap(curve, channels, f"{scene.path}: {name}.spectrum", f"'{scene.camera.name}'")
+
+
+__all__ = ["VISIBLE", "Integral", "colour_index", "parse", "refuse_unseen"]
