@@ -84,7 +84,7 @@ class Developer:
         """What an image function sees as `camera`: every parameter of the camera, and the geometry of its pixels.
 
         u, v (H, W) px; x, y (H, W) normalised coordinates; tan (H, W) tangent of the field angle; focal (px); width,
-        height (px); bands (nm); settings: all values by key, those of other parts too, (N, 1, 1) where readings were
+        height (px); bands (nm); white (B,) radiance per band of white light of radiance 1; settings: all values by key, those of other parts too, (N, 1, 1) where readings were
         swept."""
         own = {n: values[f"{self.name}.{n}"] for n in self.names}
         x, y, focal = self.camera.normalised(SimpleNamespace(**own), self.u, self.v)
@@ -99,6 +99,7 @@ class Developer:
             width=self.width,
             height=self.height,
             bands=np.array(self.bands),
+            white=np.ones(len(self.bands)) if self.integral is None else self.integral.white,
             site=self.site,
             settings=values,
         )

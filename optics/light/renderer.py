@@ -644,7 +644,8 @@ class Renderer:
             self._tune(sample.si)
             return self.scene.integrator.ambient(self.scene.mitsuba, *sample[:3], membrane) + 0 * sample.si.t
 
-        return sum(self._each_band(lambda m=m: shade(m)) for m in self.scene.membranes.values())
+        found = sum(self._each_band(lambda m=m: shade(m)) for m in self.scene.membranes.values())
+        return found if self.integral is None else found * self.integral.white
 
 
 class Sample(NamedTuple):

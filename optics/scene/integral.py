@@ -101,6 +101,7 @@ class Integral:
             self.nm = np.array(bands, float)
             self.groups = []
         self.colours = colour_index(self.nm)
+        self.white = self._white()
 
     # -- lights -------------------------------------------------------------------------------------------------------
     def own(self, light: str, values: Mapping) -> SimpleNamespace:
@@ -273,10 +274,27 @@ class Integral:
                 )
 
     def colour_matrix(self, values: Mapping) -> np.ndarray:
-        """(3, B) from bands to CIE 1931 X, Y, Z, over the largest integral of a channel, as M."""
+        """(3, B) from bands to CIE 1931 X, Y, Z; white light of radiance 1 has Y = 1."""
         from optics.spectra.colours import matching
 
-        return self.matrix(values, matching(self.grid))
+        functions = matching(self.grid)
+        return self.matrix(values, functions) * self.unit * line.WHITE / float((functions[1] * self.step).sum())
+
+    def _white(self) -> np.ndarray:
+        """(B,) radiance per band of white light of radiance 1, for what no lamp sends. Among auto bands those of white
+        lamps have it; without any, the bands share it so that every channel gets what it should."""
+        if not self.auto:
+            return np.full(len(self.nm), 1 / line.WHITE)
+        for group in self.groups:
+            part = self.scene.parts[group.lights[0]]
+            if not group.glow and "spectrum" not in part.curves and not part.held.get("wavelength", 0.0):
+                found = np.zeros(len(self.nm))
+                found[group.bands] = 1.0
+                return found
+        from scipy.optimize import nnls
+
+        found, _ = nnls(self.matrix(), (self.quantum * self.step).sum(1) / line.WHITE / self.unit)
+        return found
 
     def describe(self) -> str:
         """The bands in one line."""
