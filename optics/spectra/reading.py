@@ -11,7 +11,7 @@
     CIE D65, colour:dark skin      a curve of the colour-science library by its name
 
 The unit of a column stands in its header: nm, um or A for the wavelength, % for a share in per cent. A wavelength column
-without a unit is in nm. Nothing is guessed: a share above 1, wavelengths that do not ascend, values below 0 and units
+without a unit is in nm. An absorption is in 1/mm; a column with the title k is an index of extinction, 4 pi k/nm. Nothing is guessed: a share above 1, wavelengths that do not ascend, values below 0 and units
 that are unknown are errors that say what is allowed."""
 
 from __future__ import annotations
@@ -118,8 +118,11 @@ def read_table(
     for column in range(1, data.shape[1]):
         title = head[column] if head else ""
         percent = 0.01 if "%" in title or "percent" in title.lower() else 1.0
+        values = data[:, column] * percent
+        if kind == "absorption" and title.strip().lower() == "k":
+            values = values * 4 * np.pi / (data[:, 0] * scale * 1e-6)
         own = f"{file.name}{f' ({title})' if title and data.shape[1] > 2 else ''}{f', {source}' if source else ''}"
-        curves.append(checked(data[:, 0] * scale, data[:, column] * percent, kind, own, say))
+        curves.append(checked(data[:, 0] * scale, values, kind, own, say))
     return tuple(curves), file
 
 

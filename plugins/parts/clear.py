@@ -47,7 +47,7 @@ def build():
 
     from optics.errors import BadScene
     from optics.polarization.mueller import diattenuator, fresnel, fresnel_reflection
-    from optics.scene.surfaces import coefficient
+    from optics.scene.surfaces import MIDDLE, coefficient
 
     class Clear(passing(mi.BSDFFlags.DeltaTransmission)):
         kind = "clear"
@@ -63,7 +63,9 @@ def build():
             self.outside = str(props.get("outside", ""))
             super().__init__(props)
             self.read_spectrum(props, "index_spectrum", "index")
-            self.read_spectrum(props, "absorption_spectrum", "absorption")
+            absorption = self.read_spectrum(props, "absorption_spectrum", "absorption")
+            if absorption is not None and not absorption(MIDDLE) > 0:
+                raise ValueError(f"{self.name}.absorption_spectrum is 0 at {MIDDLE:g} nm, where `absorption` holds")
             if self.outside:
                 self._waits = f"'{self.name}' lies inside '{self.outside}'"
             sides = mi.BSDFFlags.FrontSide | mi.BSDFFlags.BackSide
