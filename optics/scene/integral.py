@@ -127,7 +127,10 @@ class Integral:
     def spectral_keys(self, light: str) -> tuple[str, ...]:
         """The parameters that a light's spectrum depends on."""
         part = self.scene.parts[light]
-        names = [n for n, p in part.numbers.items() if p.role in ("light wavelength", "light width")]
+        line_of_its_own = "spectrum" not in part.curves
+        names = [
+            n for n, p in part.numbers.items() if line_of_its_own and p.role in ("light wavelength", "light width")
+        ]
         for effect in self.scene.registry.at_stage(part.kind, "spectrum"):
             names += effect.at_rest
         return tuple(f"{light}.{n}" for n in dict.fromkeys(names) if n in part.numbers)

@@ -8,7 +8,8 @@
     blackbody(2856)                Planck's law at a temperature, K
     phosphor(450, 20, 560, 120, 4) a blue die and what its phosphor makes: peaks and widths, and the phosphor's power
                                    per power of the die that leaves
-    CIE D65, colour:dark skin      a curve of the colour-science library by its name
+    CIE D65, colour:dark skin      a curve of the colour-science library by its name, of several colour checkers as
+                                   "colour:ISO 17321-1/dark skin"
 
 The unit of a column stands in its header: nm, um or A for the wavelength, % for a share in per cent. A wavelength column
 without a unit is in nm. An absorption is in 1/mm; a column with the title k is an index of extinction, 4 pi k/nm. Nothing is guessed: a share above 1, wavelengths that do not ascend, values below 0 and units
@@ -19,6 +20,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -210,10 +212,12 @@ def _library(name: str, kind: str, where: str) -> Curve:
     """A curve of the colour-science library, interpolated to 1 nm as its authors recommend (CIE 167:2005)."""
     import colour
 
-    found = {}
+    found: dict[str, Any] = {}
     for table in LIBRARY.get(kind, ()):
         for key, entry in getattr(colour, table).items():
-            found.update(dict(entry) if isinstance(entry, dict) or hasattr(entry, "items") else {key: entry})
+            for patch, data in entry.items() if hasattr(entry, "items") else ((key, entry),):
+                found.setdefault(patch, data)  # of colour checkers, the first has the plain name
+                found[f"{key}/{patch}"] = data
     if name not in found:
         raise UnknownKey(name, found, f"{kind} of the colour-science library", where)
     data = found[name].copy()

@@ -1,0 +1,144 @@
+"""Channels as integrals over the wavelength: limits, agreement of few nodes with many bands, derivatives, closed forms."""
+
+import re
+
+import numpy as np
+import pytest
+
+from optics.errors import BadScene
+from optics.files import exr
+from optics.files.output import shipped
+from optics.light.renderer import Renderer
+from optics.light.rendering import RenderJob
+from optics.scene import loader
+from optics.scene.line import WHITE
+from optics.spectra.reading import gaussian, read_channels
+
+NIKON = "Nikon 5100 (NPL)"
+SIZE = {"width": "24", "height": "32", "depth": "0.5"}
+
+
+def digit(mitsuba, folder, bands, **attributes):
+    """DIGIT with other bands; attributes of LEDs in XML as {led_red: '<...>'}."""
+    text = (shipped("scenes") / "digit.xml").read_text(encoding="utf-8")
+    for part, xml in attributes.items():
+        text = re.sub(rf'(<(?:emitter|sensor|bsdf) type="\w+" id="{part}">)', rf"\1 {xml}", text)
+    file = folder / f"digit_{len(list(folder.iterdir()))}.xml"
+    file.write_text(text, encoding="utf-8")
+    return loader.load(file, {**SIZE, "bands": bands})
+
+
+def test_lines_give_what_bands_at_their_peaks_give(mitsuba, tmp_path):
+    """LEDs of 1 nm at the peaks: their integrals differ from the sensitivities there by the bend of these at 530 nm,
+    a kink of 3 % per 5 nm over a third of a nm."""
+    images = []
+    for bands in ("625, 530, 470", "auto"):
+        text = (shipped("scenes") / "digit.xml").read_text(encoding="utf-8")
+        text = re.sub(r'name="fwhm" value="\d+"', 'name="fwhm" value="1"', text)
+        file = tmp_path / "lines.xml"
+        file.write_text(text, encoding="utf-8")
+        images.append(RenderJob(loader.load(file, {**SIZE, "bands": bands})).take().camera)
+    assert images[0].max() > 100
+    assert images[1] == pytest.approx(images[0], abs=1e-3 * images[0].max())
+
+
+@pytest.fixture(scope="module")
+def auto(mitsuba, tmp_path_factory):
+    return digit(mitsuba, tmp_path_factory.mktemp("auto"), "auto")
+
+
+def test_few_nodes_give_what_many_bands_give(mitsuba, auto, tmp_path):
+    """Six bands in place of 161, whose trapezium rule of 2.5 nm errs by 3e-4 at the kinks of the sensitivities, which
+    are straight lines over 5 nm."""
+    assert len(auto.integral.nm) <= 7 and auto.integral.error < 1e-12  # nothing on the way depends on the wavelength
+    fine = digit(mitsuba, tmp_path, "380:780:2.5")
+    found, expected = (RenderJob(s).take() for s in (auto, fine))
+    assert found.camera == pytest.approx(expected.camera, abs=4e-4 * expected.camera.max())
+    for name in ("colour.X", "colour.Y", "colour.Z", "camera.G"):
+        assert found.channels[name] == pytest.approx(expected.channels[name], abs=4e-4 * expected.channels[name].max())
+    back, _ = exr.read(expected.write_exr(tmp_path / "bands.exr"))
+    bands, vectors = exr.spectral_image(back)
+    assert bands == pytest.approx(np.arange(380.0, 780.1, 2.5)) and vectors.shape == (32, 24, 161, 1)
+    assert not any(name.startswith("S0.") for name in found.channels)
+
+
+def test_reflectance_and_filter_are_integrated(mitsuba, tmp_path):
+    """A patch of a colour checker and a filter, by the estimated error and by many bands."""
+    xml = {
+        "membrane": '<string name="reflectance" value="colour:orange"/>',
+        "camera": '<string name="filter" value="400:0.1, 560:0.9, 700:0.4"/>',
+    }
+    few, many = (digit(mitsuba, tmp_path, bands, **xml) for bands in ("auto", "380:780:2.5"))
+    assert 6 < len(few.integral.nm) < 40 and few.integral.error < 1e-4
+    found, expected = (RenderJob(s).take().camera for s in (few, many))
+    assert np.abs(found - expected).max() < 5e-4 * expected.max()  # 3e-4 of the trapezium rule, see above
+
+
+@pytest.mark.parametrize("key", ["led_green.wavelength", "led_red.fwhm"])
+def test_derivatives_by_peak_and_width(auto, mitsuba, tmp_path, key):
+    """Auto bands: complex step through the matrix, against central differences, whose error is the third order: 1e-6
+    of a step of 0.05 nm over a width of 20 nm. Fixed bands: forward mode against 0.5 nm, 2e-3 of the largest."""
+    base = auto.values()
+    job = RenderJob(auto)
+    image = job.renderer.radiance(base)
+    found = job.developer.linearise(image, base).of_parameter((key,))
+    sides = [job.developer.develop(image, {**base, key: base[key] + s * 0.05}) for s in (1, -1)]
+    assert auto.parameters[key].how == "image" and np.abs(found).max() > 0.1
+    assert found == pytest.approx((sides[0] - sides[1]) / 0.1, rel=1e-4, abs=1e-5)
+    fine = digit(mitsuba, tmp_path, "400:700:5")
+    renderer = Renderer(fine)
+    own = fine.values()
+    led = key.split(".")[0]
+    tangent = renderer.led_tangent(own, led, key)
+    sides = [renderer.image({**own, key: own[key] + s * 0.5}, led) for s in (1, -1)]
+    assert tangent == pytest.approx(sides[0] - sides[1], abs=2e-3 * float(np.abs(tangent).max()))
+
+
+@pytest.mark.parametrize("bands", ["auto", "400:700:5"])
+def test_a_wave_plate_between_crossed_polarizers(mitsuba, tmp_path, bands):
+    """sum of S(nm) Q(nm) sin^2(delta/2), delta = 250 deg 540/nm, under a white lamp and under a line of 40 nm."""
+    text = (shipped("scenes") / "polarizer_bench.xml").read_text(encoding="utf-8")
+    text = text.replace('<float name="x_fov"', f'<string name="sensitivity" value="{NIKON}"/><float name="x_fov"')
+    file = tmp_path / "bench.xml"
+    file.write_text(text, encoding="utf-8")
+    plate = {"polarizer.angle": 45.0, "analyzer.angle": 135.0, "sample.retard_0": 250.0}
+    plate.update({f"{film}.{n}": v for film in ("polarizer", "analyzer") for n, v in (("transmittance", 1.0), ("leak", 0.0))})
+    nm = np.arange(380.0, 781.0)
+    passed = np.sin(np.radians(250 * 540 / nm) / 2) ** 2 / 2
+    quantum = np.array([q(nm) for q in read_channels(NIKON)])
+    for line in (0.0, 560.0):
+        text = file.read_text(encoding="utf-8")
+        own = tmp_path / f"bench_{line:g}.xml"
+        lamp = f'<emitter type="source" id="source"><float name="wavelength" value="{line}"/><float name="fwhm" value="40"/></emitter>'
+        own.write_text(text.replace('<emitter type="source" id="source"/>', lamp), encoding="utf-8")
+        scene = loader.load(own, {"bands": bands} if 'name="bands"' in text else {})
+        keys = {k: v for k, v in plate.items() if k in scene.parameters}
+        assert len(keys) == len(plate)
+        renderer = Renderer(scene)
+        values = {**scene.values(), **keys}
+        reading = (renderer.radiance(values) @ scene.integral.matrix(values).T)[0, 0]
+        power = gaussian(nm, line, 40.0) if line else np.ones(len(nm))
+        exact = (quantum * power) @ passed / (quantum * power).sum(1).max()
+        seen = reading / scene.integral.matrix(values).sum(1).max() if bands == "auto" else reading
+        tolerance = 2e-3 if bands == "auto" else 2e-2  # the probes are weaker than the plate; 400 to 700 nm alone
+        assert seen == pytest.approx(exact, abs=tolerance), line
+
+
+def test_what_has_no_integral_is_refused(mitsuba, auto):
+    with pytest.raises(BadScene, match="sensitivities.*Nikon"):
+        loader.load("gelsight", {"bands": "auto"})
+    with pytest.raises(BadScene, match="mi.render carries 4 bands"):
+        RenderJob(auto, spp=4)
+    for bands in ("auto 99", "700:400:10", "red", "400, 500, 450, 600, 700"):
+        with pytest.raises(BadScene, match="allowed"):
+            loader.load("digit", {"bands": bands})
+
+
+def test_lights_that_share_bands_keep_one_spectrum(mitsuba, tmp_path):
+    """Two lamps of one curve have one set of nodes."""
+    xml = dict.fromkeys(("led_red", "led_green", "led_blue"), '<string name="spectrum" value="CIE LED-B3"/>')
+    scene = digit(mitsuba, tmp_path, "auto", **xml)
+    assert len(scene.integral.groups) == 1 and len(scene.integral.nm) == 3
+    white = scene.integral.matrix() @ scene.integral.white  # what no lamp sends, in the bands of the lamps
+    exact = (scene.integral.quantum * scene.integral.step).sum(1) / WHITE / scene.integral.unit
+    assert white == pytest.approx(exact, rel=1e-9)
