@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from optics.scene.line import area
+from optics.scene.integral import spectrum_of
 from optics.scene.loader import Scene
 from optics.spectra.colours import linear_srgb, matching
 from optics.spectra.curve import KINDS
@@ -38,21 +38,6 @@ def records(scene: Scene) -> list[dict[str, Any]]:
     return found
 
 
-def light_of(scene: Scene, name: str, nm: np.ndarray) -> np.ndarray:
-    """(N,) power of a light per nm, its integral 1 over all wavelengths, with what effects make of it."""
-    from types import SimpleNamespace
-
-    from optics.scene import line
-
-    part, values = scene.parts[name], scene.values()
-    own = SimpleNamespace(**{n: values[f"{name}.{n}"] for n in part.numbers})
-    curve = part.curves.get("spectrum")
-    if curve is None and not hasattr(own, "wavelength"):
-        return np.full(len(nm), 1 / line.WHITE)
-    power = line.changed(line.relative(own, curve), part.active("spectrum", own), own)(nm)
-    return np.asarray(power / area(own, curve) + 0.0 * nm)
-
-
 def draw(scene: Scene) -> Any:
     """A chart (optics.files.charts.Chart): lights as areas, sensitivities as lines, losses dashed, bands as ticks."""
     from optics.files.charts import GREY, chart
@@ -64,13 +49,14 @@ def draw(scene: Scene) -> Any:
     low = min([380.0, *(p - AROUND for p in peaks), *(b - AROUND for b in bands)])
     high = max([730.0, *(p + AROUND for p in peaks), *(b + AROUND for b in bands)])
     if spans:
-        low, high = max(low, min([s[0] for s in spans] + peaks) - AROUND), min(high, max([s[1] for s in spans] + peaks) + AROUND)
+        low = max(low, min([s[0] for s in spans] + peaks) - AROUND)
+        high = min(high, max([s[1] for s in spans] + peaks) + AROUND)
     nm = np.arange(low, high + STEP / 2, STEP)
     figure, axis = chart(9.0, 4.6)
     drawn: dict[str, list[str]] = {}
     shapes: dict[str, np.ndarray] = {}
     for name in scene.lights:
-        power = light_of(scene, name, nm)
+        power = spectrum_of(scene, name, scene.values(), nm)
         key = np.round(power / max(power.max(), 1e-30), 6).tobytes()
         drawn.setdefault(key, []).append(name)
         shapes[key] = power / max(power.max(), 1e-30)
@@ -80,13 +66,15 @@ def draw(scene: Scene) -> Any:
         axis.fill_between(nm, shapes[key], color=colour, alpha=0.35, lw=0, label=f"{label}: light")
         axis.plot(nm, shapes[key], color=colour, lw=0.8)
     channels = scene.camera.seen(nm) if scene.camera is not None and scene.camera.channels else np.zeros((0, len(nm)))
-    for row, colour, name in zip(channels, ("#c03030", "#2a8a2a", "#2850c0") if len(channels) == 3 else ("#222222",), "RGB"):
+    colours = ("#c03030", "#2a8a2a", "#2850c0") if len(channels) == 3 else ("#222222",)
+    for row, colour, name in zip(channels, colours, "RGB"):
         title = f"{name}: sensitivity" if len(channels) == 3 else "sensitivity"
         axis.plot(nm, row / channels.max(), color=colour, lw=1.6, label=title)
     if scene.integral is not None and scene.integral.auto:
-        for q, colour in zip(scene.integral.quantum, ("#c03030", "#2a8a2a", "#2850c0")):
-            total = sum(np.interp(nm, scene.integral.grid, q, 0, 0) * light_of(scene, n, nm) for n in scene.lights)
-            axis.plot(nm, total / max(total.max(), 1e-30), color=colour, lw=0.8, ls=":")
+        for q, colour in zip(scene.integral.quantum, colours):
+            total = sum(np.interp(nm, scene.integral.grid, q, 0, 0) * spectrum_of(scene, n, scene.values(), nm) for n in scene.lights)
+            title = "light times sensitivity" if colour == colours[0] else None
+            axis.plot(nm, total / max(total.max(), 1e-30), color=colour, lw=0.8, ls=":", label=title)
     styles = iter(("--", "-.", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 1))))
     other = None
     for key, curve in scene.curves.items():
@@ -102,7 +90,7 @@ def draw(scene: Scene) -> Any:
         axis.plot([band, band], [-0.035, 0], color="black", lw=1.0, clip_on=False)
     axis.set_xlim(low, high)
     axis.set_ylim(0, 1.06)
-    axis.set_xlabel("wavelength, nm")
+    axis.set_xlabel("wavelength, nm (below the axis: the bands that are rendered)")
     axis.set_ylabel("relative to the peak; shares of light")
     handles, labels = axis.get_legend_handles_labels()
     if other is not None:
@@ -122,4 +110,4 @@ def _colour(nm: np.ndarray, power: np.ndarray) -> tuple[float, ...]:
     return tuple(float(c) for c in shown)
 
 
-__all__ = ["draw", "light_of", "records"]
+__all__ = ["draw", "records"]

@@ -37,6 +37,21 @@ NEGLIGIBLE = 1e-6  # share of a light's signal below which a range has no nodes 
 TILT = 0.3  # of the probe exp(+-TILT (nm - 540)/100): layers, whose matrices change with the wavelength
 
 
+def numbers_of(scene, part: str, values: Mapping) -> SimpleNamespace:
+    """A part's parameters, as functions of spectra read them."""
+    return SimpleNamespace(name=part, **{n: values[f"{part}.{n}"] for n in scene.parts[part].numbers})
+
+
+def spectrum_of(scene, light: str, values: Mapping, nm: np.ndarray) -> np.ndarray:
+    """(N,) power of a light per nm with what effects make of it, its integral 1 over all wavelengths."""
+    part, own = scene.parts[light], numbers_of(scene, light, values)
+    curve = part.curves.get("spectrum")
+    if curve is None and not hasattr(own, "wavelength"):
+        return np.full(len(nm), 1 / line.WHITE)
+    shape = line.changed(line.relative(own, curve), part.active("spectrum", own), own)
+    return np.asarray(shape(nm) / shape.area + 0.0 * nm)
+
+
 def colour_index(nm: np.ndarray) -> np.ndarray:
     """0, 1 or 2 for the first, second and third band of shares and reflectances at wavelengths."""
     at = np.asarray(nm, float)
@@ -104,25 +119,14 @@ class Integral:
         self.white = self._white()
 
     # -- lights -------------------------------------------------------------------------------------------------------
-    def own(self, light: str, values: Mapping) -> SimpleNamespace:
-        """A light's parameters, as functions of its spectrum read them."""
-        part = self.scene.parts[light]
-        return SimpleNamespace(name=light, **{n: values[f"{light}.{n}"] for n in part.numbers})
-
-    def spectrum(self, light: str, values: Mapping, nm: np.ndarray | None = None) -> np.ndarray:
-        """(N,) power of a light per nm, its integral 1 over all wavelengths."""
-        part, own = self.scene.parts[light], self.own(light, values)
-        nm = self.grid if nm is None else nm
-        curve = part.curves.get("spectrum")
-        if curve is None and not hasattr(own, "wavelength"):
-            return np.full(len(nm), 1 / line.WHITE)
-        found = line.changed(line.relative(own, curve), part.active("spectrum", own), own)(nm)
-        return np.asarray(found / line.area(own, curve) + 0.0 * nm)
+    def spectrum(self, light: str, values: Mapping) -> np.ndarray:
+        """(N,) power of a light per nm on the grid."""
+        return spectrum_of(self.scene, light, values, self.grid)
 
     def width(self, light: str, values: Mapping):
         """Area of a light's spectrum over its peak, nm."""
-        own, curve = self.own(light, values), self.scene.parts[light].curves.get("spectrum")
-        return line.area(own, curve) if curve is not None or hasattr(own, "wavelength") else line.WHITE
+        own, curve = numbers_of(self.scene, light, values), self.scene.parts[light].curves.get("spectrum")
+        return line.relative(own, curve).area if curve is not None or hasattr(own, "wavelength") else line.WHITE
 
     def spectral_keys(self, light: str) -> tuple[str, ...]:
         """The parameters that a light's spectrum depends on."""
@@ -175,7 +179,7 @@ class Integral:
     def emission(self, pigment: str, values: Mapping) -> np.ndarray:
         """(N,) radiance of a pigment per nm, per photon that it sends."""
         part = self.scene.parts[pigment]
-        return part.emission(SimpleNamespace(**{n: values[f"{pigment}.{n}"] for n in part.numbers}), self.grid)
+        return part.emission(numbers_of(self.scene, pigment, values), self.grid)
 
     # -- nodes --------------------------------------------------------------------------------------------------------
     def _placed(self, contents: Sequence[Group], count: int) -> list[Group]:

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from optics.polarization.mueller import exp, real, where
@@ -14,38 +15,52 @@ EDGES = (580.0, 500.0)  # nm: where the first band of shares and reflectances en
 WHITE = 470.0  # nm over which a white light spreads its power: 360 to 830
 
 
-def relative(own, curve=None) -> Callable[[Any], Any]:
-    """nm -> relative power, 1 at the peak: of a curve, else a Gaussian about `own.wavelength`, else 1 everywhere."""
+@dataclass(frozen=True)
+class Spectrum:
+    """nm -> relative power of a light, 1 at the peak; what effects of the stage `spectrum` are given.
+
+    power   the function
+    centre  mean wavelength, nm; of a white light 595
+    area    integral over the wavelength, nm
+    line    1 for a light with a line or a curve, 0 for a white one, on which a shift and a width do nothing
+    """
+
+    power: Callable[[Any], Any]
+    centre: Any
+    area: Any
+    line: Any
+
+    def __call__(self, nm):
+        return self.power(nm)
+
+
+def relative(own, curve=None) -> Spectrum:
+    """The spectrum of a curve, else a Gaussian about `own.wavelength`, else 1 everywhere."""
     if curve is not None:
         peak = float(curve.values.max())
-        return lambda nm: curve(nm) / peak
+        return Spectrum(lambda nm: curve(nm) / peak, curve.centre, curve.area / peak, 1.0)
 
     def line(nm):
         u = (nm - own.wavelength) / own.fwhm
         return where(real(own.wavelength) > 0, exp(-4 * math.log(2) * u * u), 1.0 + 0.0 * u)
 
-    return line
-
-
-def area(own, curve=None):
-    """Integral of `relative` over the wavelength, nm."""
-    if curve is not None:
-        return curve.area / float(curve.values.max())
+    coloured = real(own.wavelength) > 0
+    zero = 0.0 * own.wavelength
     width = math.sqrt(math.pi / (4 * math.log(2))) * own.fwhm
-    return where(real(own.wavelength) > 0, width, WHITE + 0.0 * width)
+    return Spectrum(
+        line,
+        where(coloured, own.wavelength + zero, 595.0 + zero),
+        where(coloured, width + zero, WHITE + zero),
+        where(coloured, 1.0 + zero, zero),
+    )
 
 
-def centre(own, curve=None):
-    """Mean wavelength, nm; of a white light 595."""
-    return curve.centre if curve is not None else where(real(own.wavelength) > 0, own.wavelength, 595.0)
-
-
-def changed(base: Callable[[Any], Any], functions: Sequence[Callable], own) -> Callable[[Any], Any]:
-    """nm -> what effects of the stage `spectrum` make of a spectrum, one after the other."""
+def changed(base: Spectrum, functions: Sequence[Callable], own) -> Spectrum:
+    """What effects of the stage `spectrum` make of a spectrum, one after the other. They keep its area."""
     for function in functions:
-        base = _after(base, function, own)
+        base = Spectrum(_after(base, function, own), base.centre, base.area, base.line)
     return base
 
 
-def _after(base: Callable, function: Callable, own) -> Callable[[Any], Any]:
+def _after(base: Spectrum, function: Callable, own) -> Callable[[Any], Any]:
     return lambda nm: function(base, nm, own)

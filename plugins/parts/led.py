@@ -30,7 +30,7 @@ import math
 
 from optics.scene.checking import agree, made
 from optics.scene.declare import Part
-from optics.scene.line import area, changed, relative
+from optics.scene.line import changed, relative
 from optics.scene.mitsuba_parts import Declared
 from optics.scene.parameter import Parameter
 
@@ -194,7 +194,7 @@ def build():
             if functions or curve is not None or self.integral is not None:
                 nm = mi.UnpolarizedSpectrum(wavelengths)
                 power = changed(relative(self, curve), functions, self)(nm)
-                return power if self.integral is None else power / area(self, curve)
+                return power if self.integral is None else power / relative(self, curve).area
             u = (mi.UnpolarizedSpectrum(wavelengths) - self.wavelength) / self.fwhm
             return dr.select(self.wavelength > 0, dr.exp(-4 * math.log(2) * dr.square(u)), 1.0)
 
