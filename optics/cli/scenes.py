@@ -9,7 +9,19 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from optics.cli.shared import AsJson, Defines, Force, Plugins, SceneName, Variant, command, load_scene, scan, show, terminal
+from optics.cli.shared import (
+    AsJson,
+    Defines,
+    Force,
+    Plugins,
+    SceneName,
+    Variant,
+    command,
+    load_scene,
+    scan,
+    show,
+    terminal,
+)
 from optics.words import key_of, number, table
 
 if TYPE_CHECKING:
@@ -60,7 +72,9 @@ def params(
     head = ("key", "value", "unit", "bounds", "neutral", "derivative", "meaning")
     print(table([head, *map(_parameter_line, rows)]))
     if not patterns and (loaded.curves or loaded.integral is not None):
-        print("\n" + table([("spectrum", "kind", "nm", "mean", "source"), *map(_spectrum_line, spectra.records(loaded))]))
+        print(
+            "\n" + table([("spectrum", "kind", "nm", "mean", "source"), *map(_spectrum_line, spectra.records(loaded))])
+        )
     if not patterns and loaded.integral is not None:
         print("\n" + loaded.integral.describe())
 
@@ -85,7 +99,9 @@ def plot_spectra(
     from optics.light import spectra
 
     if output.suffix.lower() not in PLOTS:
-        raise ValueError(f"-o {output}: '{output.suffix}' is no format of a plot; allowed: a name ending in .png, .pdf or .svg")
+        raise ValueError(
+            f"-o {output}: '{output.suffix}' is no format of a plot; allowed: a name ending in .png, .pdf or .svg"
+        )
     claim([output], force)
     loaded = load_scene(scene, define, plugins, variant)
     figure = spectra.draw(loaded)

@@ -122,8 +122,11 @@ class Developer:
         are integrals it depends on the lights' spectra."""
         own = self.integral
         found = self.matrix if own is None else own.matrix(view.settings)
-        active = [e for e in self.effects["sensitivity"] if any(
-            getattr(view, n) != self.neutral[n] for n in e.parameter_names)]
+        active = [
+            e
+            for e in self.effects["sensitivity"]
+            if any(getattr(view, n) != self.neutral[n] for n in e.parameter_names)
+        ]
         if not active:
             return found
         nm, quantum = (view.bands, found) if own is None else (own.grid, own.quantum)

@@ -55,7 +55,9 @@ class Renderer:
         self.bands = len(scene.integrator.bands or (0,))
         self.integral = scene.integral
         self.colours = np.arange(self.bands) if self.integral is None else self.integral.colours
-        self._lanes: np.ndarray | None = None  # numbers of the bands that a pass carries, of channels that are integrals
+        self._lanes: np.ndarray | None = (
+            None  # numbers of the bands that a pass carries, of channels that are integrals
+        )
         if self.bands > scene.integrator.lanes and self.integral is None:
             raise BadScene(
                 f"{scene.path}: {self.bands} bands, but the variant {scene.variant} carries {scene.integrator.lanes}; "
@@ -503,8 +505,10 @@ class Renderer:
         """(B,) power of an LED in each band, relative to its image."""
         own = [values[key] for key in self.scene.band_powers[led]]
         if self.integral is not None:
-            return values[self.scene.powers[led]] * np.array(own)[self.colours] if own else np.full(
-                self.bands, values[self.scene.powers[led]]
+            return (
+                values[self.scene.powers[led]] * np.array(own)[self.colours]
+                if own
+                else np.full(self.bands, values[self.scene.powers[led]])
             )
         shares = own + [1.0] * self.bands
         return values[self.scene.powers[led]] * np.array(shares[: self.bands])

@@ -441,9 +441,7 @@ def veiled(renderer: Renderer, values: Mapping) -> str:
                     scene.integrator.direct(scene.mitsuba, hits.si, 1.0, hits.origin, led, way)
                     for way in (seen, behind)
                 ]
-                direct, through = (
-                    np.array([float(np.array(a[i]).sum()) for i in range(count)]) for a in light
-                )
+                direct, through = (np.array([float(np.array(a[i]).sum()) for i in range(count)]) for a in light)
                 if np.any(through > 1e-3 * direct):
                     found.append(name)
     return f"the light of {' and '.join(found)} passes layers before it meets anything" if found else ""

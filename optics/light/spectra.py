@@ -72,7 +72,10 @@ def draw(scene: Scene) -> Any:
         axis.plot(nm, row / channels.max(), color=colour, lw=1.6, label=title)
     if scene.integral is not None and scene.integral.auto:
         for q, colour in zip(scene.integral.quantum, colours):
-            total = sum(np.interp(nm, scene.integral.grid, q, 0, 0) * spectrum_of(scene, n, scene.values(), nm) for n in scene.lights)
+            total = sum(
+                np.interp(nm, scene.integral.grid, q, 0, 0) * spectrum_of(scene, n, scene.values(), nm)
+                for n in scene.lights
+            )
             title = "light times sensitivity" if colour == colours[0] else None
             axis.plot(nm, total / max(total.max(), 1e-30), color=colour, lw=0.8, ls=":", label=title)
     styles = iter(("--", "-.", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 1))))

@@ -67,7 +67,9 @@ STAGES = {  # stage -> the role of the parts that it belongs to
     "response": "camera",
 }
 IMAGE_STAGES = ("sensitivity", "lens", "site", "sensor", "response")
-LED_BY_LED = frozenset(("spectrum", "emission", "segment", "volume", "reflection", "ambient"))  # Monte Carlo light passes none
+LED_BY_LED = frozenset(
+    ("spectrum", "emission", "segment", "volume", "reflection", "ambient")
+)  # Monte Carlo light passes none
 ROLES = {  # of parts: all that the library knows of them; a kind plays the role of its own name unless it says another
     "camera": "images are developed by its gains, response and what it adds; one in a scene",
     "integrator": "renders, and names the bands",

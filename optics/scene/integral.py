@@ -336,7 +336,9 @@ def parse(text: str, where: str) -> tuple[tuple[float, ...], int | None]:
         bands = tuple(float(w) for w in text.replace(",", " ").split())
     except ValueError:
         raise BadScene(f"{where}: bands = {text!r}; {allowed}") from None
-    if len(bands) > FEW and (min(bands) <= 0 or len(set(bands)) < len(bands) or sorted(bands) not in (list(bands), list(bands)[::-1])):
+    if len(bands) > FEW and (
+        min(bands) <= 0 or len(set(bands)) < len(bands) or sorted(bands) not in (list(bands), list(bands)[::-1])
+    ):
         raise BadScene(f"{where}: bands = {text!r}; allowed: more than four bands above 0 nm in one order, each once")
     return bands, None
 

@@ -137,7 +137,9 @@ class Scene:
     def _integrate(self) -> None:
         """Have channels be integrals over the wavelength (optics.scene.integral)."""
         if self.camera is None or not self.lights:
-            raise BadScene(f"{self.path}: bands of integrals need a part of the type 'camera' and a light of this program")
+            raise BadScene(
+                f"{self.path}: bands of integrals need a part of the type 'camera' and a light of this program"
+            )
         if self.monte_carlo:
             raise BadScene(
                 f"{self.path}: light through dielectric bodies is followed in up to {FEW} bands; allowed: bands such as "

@@ -302,9 +302,7 @@ class Declared:
         import mitsuba as mi
 
         if self.integral is None:
-            return mi.UnpolarizedSpectrum(
-                *(first, second, third, mi.Float(1.0))[: dr.size_v(mi.UnpolarizedSpectrum)]
-            )
+            return mi.UnpolarizedSpectrum(*(first, second, third, mi.Float(1.0))[: dr.size_v(mi.UnpolarizedSpectrum)])
         nm = mi.UnpolarizedSpectrum(wavelengths)
         return dr.select(nm >= EDGES[0], first, dr.select(nm >= EDGES[1], second, third))
 

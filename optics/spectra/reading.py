@@ -109,7 +109,9 @@ def read_table(
     rows = [[cell.strip().strip('"') for cell in line.split(delimiter)] for line in lines]
     head = [] if _is_number(rows[0][0]) else rows.pop(0)
     if not rows or any(len(row) != len(rows[0]) for row in rows) or len(rows[0]) < 2:
-        raise BadScene(f"{say}: rows of {file.name} differ in length, or have no value; allowed: a wavelength and values")
+        raise BadScene(
+            f"{say}: rows of {file.name} differ in length, or have no value; allowed: a wavelength and values"
+        )
     try:
         data = np.array([[float(cell) for cell in row] for row in rows])
     except ValueError:

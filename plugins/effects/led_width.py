@@ -41,9 +41,7 @@ effect = Effect(
     name="LED width",
     part="led",
     stages={"spectrum": widen},
-    parameters=(
-        Parameter("line_growth", "1", 0.0, (-0.8, 5.0), "growth g of the width", neutral=0.0, plausible=0.1),
-    ),
+    parameters=(Parameter("line_growth", "1", 0.0, (-0.8, 5.0), "growth g of the width", neutral=0.0, plausible=0.1),),
     acts=("channel", "led"),
     needs="coloured LEDs, or a measured spectrum, and several channels",
     checks=(check_power_is_kept,),

@@ -49,7 +49,13 @@ effect = Effect(
     stages={"spectrum": leak},
     parameters=(
         Parameter(
-            "phosphor_leak", "1", 0.0, (-0.05, 0.9), "share l of the light in the die's line", neutral=0.0, plausible=0.02
+            "phosphor_leak",
+            "1",
+            0.0,
+            (-0.05, 0.9),
+            "share l of the light in the die's line",
+            neutral=0.0,
+            plausible=0.02,
         ),
     ),
     shape=(

@@ -237,7 +237,9 @@ def build():
             """kappa of (S2) per band, with all that effects do to it."""
             cos = dr.dot(-to_led, self.axis())
             kappa = (
-                mi.UnpolarizedSpectrum(self.kappa(it, to_led, distance)) * self.spectrum(it.wavelengths) * self.colour(it.wavelengths)
+                mi.UnpolarizedSpectrum(self.kappa(it, to_led, distance))
+                * self.spectrum(it.wavelengths)
+                * self.colour(it.wavelengths)
             )
             for function in self.functions("emission"):
                 kappa *= function(Beam(cos, distance, to_led, it.p, it.wavelengths), self)

@@ -879,9 +879,7 @@ def check_image_function(effect, stage, bench):
         assert np.abs(function(0.3 * a + 0.7 * b, view) - 0.3 * out - 0.7 * function(b, view)).max() < 1e-12
 
 
-@pytest.mark.parametrize(
-    "key, stage", [(k, s) for k in EFFECTS for s in REGISTRY.effects[k].stages if s in OF_IMAGES]
-)
+@pytest.mark.parametrize("key, stage", [(k, s) for k in EFFECTS for s in REGISTRY.effects[k].stages if s in OF_IMAGES])
 def test_image_functions_are_affine_or_act_pixel_by_pixel(key, stage, bench_of):
     effect = REGISTRY.effects[key]
     check_image_function(effect, stage, bench_of(effect))

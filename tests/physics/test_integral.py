@@ -1,17 +1,23 @@
 """Channels as integrals over the wavelength: limits, agreement of few nodes with many bands, derivatives, closed forms."""
 
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from optics.errors import BadScene
+from optics.captures.capture_set import Captures, Frame, definitions, load
+from optics.captures.noise import Noise
+from optics.errors import BadCapture, BadScene
 from optics.files import exr
+from optics.files.images import write_image
 from optics.files.output import shipped
+from optics.fit.scene_model import SceneModel
 from optics.light.renderer import Renderer
 from optics.light.rendering import RenderJob
 from optics.scene import loader
 from optics.scene.line import WHITE
+from optics.scene.parameter import Values, Variable
 from optics.spectra.reading import gaussian, read_channels
 
 NIKON = "Nikon 5100 (NPL)"
@@ -102,7 +108,9 @@ def test_a_wave_plate_between_crossed_polarizers(mitsuba, tmp_path, bands):
     file = tmp_path / "bench.xml"
     file.write_text(text, encoding="utf-8")
     plate = {"polarizer.angle": 45.0, "analyzer.angle": 135.0, "sample.retard_0": 250.0}
-    plate.update({f"{film}.{n}": v for film in ("polarizer", "analyzer") for n, v in (("transmittance", 1.0), ("leak", 0.0))})
+    plate.update(
+        {f"{film}.{n}": v for film in ("polarizer", "analyzer") for n, v in (("transmittance", 1.0), ("leak", 0.0))}
+    )
     nm = np.arange(380.0, 781.0)
     passed = np.sin(np.radians(250 * 540 / nm) / 2) ** 2 / 2
     quantum = np.array([q(nm) for q in read_channels(NIKON)])
@@ -142,3 +150,36 @@ def test_lights_that_share_bands_keep_one_spectrum(mitsuba, tmp_path):
     white = scene.integral.matrix() @ scene.integral.white  # what no lamp sends, in the bands of the lamps
     exact = (scene.integral.quantum * scene.integral.step).sum(1) / WHITE / scene.integral.unit
     assert white == pytest.approx(exact, rel=1e-9)
+
+
+def test_a_fit_finds_the_wavelength_of_an_led(mitsuba, auto):
+    """Two Gauss-Newton steps with the model's own derivative undo a shift by 3 nm and one of the effect by as much."""
+    captures = Captures(
+        Path("."), "digit", [Frame("0", np.zeros((32, 24, 3)))], noise=Noise(0.05, 1.0, 0.0, 255.0, 0.0)
+    )
+    model = SceneModel(auto, captures)
+    for key, start in (("led_green.wavelength", 530.0), ("led_red.centre_shift", 0.0)):
+        parameter = auto.parameters[key]
+        variable = Variable(key, (key,), parameter)
+        values = Values()
+        values.put(variable, start + 3.0)
+        measured = model.predict(values)[0]
+        found = start
+        for _ in range(3):
+            values.put(variable, found)
+            now = model.at(values, 0)
+            slope = model.developer.linearise(model.radiance(now), now).of_parameter((key,))
+            found += float((slope * (measured - model.predict(values)[0])).sum() / (slope**2).sum())
+        assert found == pytest.approx(start + 3.0, abs=1e-3), key  # what is left of Gauss and Newton's steps
+
+
+def test_captures_name_auto_bands(mitsuba, tmp_path):
+    write_image(tmp_path / "0", np.zeros((32, 24, 3)), 8)
+    for bands in ("auto", "400:700:10"):
+        (tmp_path / "captures.toml").write_text(
+            f'scene = "digit"\nbands = "{bands}"\n[[frames]]\nimage = "0.png"\n', encoding="utf-8"
+        )
+        assert definitions(load(tmp_path), {}, shipped("scenes") / "digit.xml")["bands"] == bands
+    (tmp_path / "captures.toml").write_text('scene = "digit"\nbands = "auto 99"\n[[frames]]\nimage = "0.png"\n')
+    with pytest.raises(BadCapture, match="auto N with 1 to 12"):
+        load(tmp_path)

@@ -48,7 +48,9 @@ def test_a_bad_table_gets_one_error(text, tmp_path):
     assert BAD[text] in str(error.value) and "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize("text", ["nowhere.csv", "gaussian(530)", "blackbody(-3)", "400:0.1, x:2", "silver", "phosphor(1)"])
+@pytest.mark.parametrize(
+    "text", ["nowhere.csv", "gaussian(530)", "blackbody(-3)", "400:0.1, x:2", "silver", "phosphor(1)"]
+)
 def test_what_is_no_spectrum_says_what_is_allowed(text):
     with pytest.raises(BadScene, match="allowed|ship"):
         read_curve(text, "power")
