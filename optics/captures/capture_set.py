@@ -267,8 +267,8 @@ def _bands(data: Mapping, where: str) -> list[float] | str:
         return bands
     if not isinstance(bands, list) or not bands:
         raise BadCapture(
-            f"{where}: bands = {bands!r}; allowed: a list of wavelengths in nm, such as [470, 530, 625], a range such as "
-            '"400:700:10", or "auto"'
+            f"{where}: bands = {bands!r}; allowed: a list of wavelengths in nm, such as [470, 530, 625], a range such "
+            'as "400:700:10", or "auto"'
         )
     numbers = [checks.number(band, "bands", "nm", where) for band in bands]
     if min(numbers) <= 0 or len(set(numbers)) < len(numbers):

@@ -57,7 +57,6 @@ def params(
 ) -> None:
     """List the parameters of a scene: value, unit, bounds, neutral value, derivative, meaning."""
     from optics.errors import UnknownKey
-
     from optics.light import spectra
 
     loaded = load_scene(scene, define, plugins, variant)

@@ -2,7 +2,7 @@
 
     I_b  = lens(L_b)                        effects of the stage `lens`
          = sum_j w_j lens(S_j)_b            of a camera with a mosaic of analysers: what its pixels let through
-    I_c  = exposure gain gain_c sum_b M_cb I_b     M with effects of the stage `sensitivity`, then effects of the stage `sensor`
+    I_c  = exposure gain gain_c sum_b M_cb I_b     M with effects of the stage `sensitivity`; then those of `sensor`
     m_c  = G_c^-1(I_c)                      then effects of the stage `response`
     DN   = black + (saturation - black) m_c + offset
 
@@ -84,8 +84,8 @@ class Developer:
         """What an image function sees as `camera`: every parameter of the camera, and the geometry of its pixels.
 
         u, v (H, W) px; x, y (H, W) normalised coordinates; tan (H, W) tangent of the field angle; focal (px); width,
-        height (px); bands (nm); white (B,) radiance per band of white light of radiance 1; settings: all values by key, those of other parts too, (N, 1, 1) where readings were
-        swept."""
+        height (px); bands (nm); white (B,) radiance per band of white light of radiance 1; settings: all values by key,
+        those of other parts too, (N, 1, 1) where readings were swept."""
         own = {n: values[f"{self.name}.{n}"] for n in self.names}
         x, y, focal = self.camera.normalised(SimpleNamespace(**own), self.u, self.v)
         return SimpleNamespace(

@@ -11,8 +11,8 @@ layers as well. Every other Mitsuba scene, and a sensor beside stock lights or b
     normal.X, .Y, .Z             of the surface, in the scene's frame
     contact.Y                    1 where the indenter touches what is seen
     led_1.R, .G, .B ...          what one LED sends, in the first three bands; with the ambient light they add up to S0
-    camera.R, .G, .B             where channels are integrals over the wavelength: each before exposure and gain; led_1.R
-                                 ... are then shares of these. S0 is radiance per nm, and none has auto bands
+    camera.R, .G, .B             where channels are integrals over the wavelength: each before exposure and gain;
+                                 led_1.R ... are then shares of these. S0 is radiance per nm, and none has auto bands
     colour.X, .Y, .Z             CIE 1931 tristimulus values there; white light of radiance 1 has Y = 1
     variance.*                   variance of the mean of a Monte Carlo channel
 

@@ -3,21 +3,22 @@
     I_c = exposure gain_c sum_k int S_k(nm) Q_c(nm) P_k(nm) d nm / N
         ~ exposure gain_c sum_b M_cb L_b
 
-with the spectrum S_k of the light k (its integral is 1: `power` is all of its light), the sensitivity Q_c of the channel
-behind the camera's filter, and the radiance P_k that the light sends to the camera per unit of its own. N is the largest
-of all int S_k Q_c: light of one wavelength gives what a band at that wavelength gives.
+with the spectrum S_k of the light k (its integral is 1: `power` is all of its light), the sensitivity Q_c of the
+channel behind the camera's filter, and the radiance P_k that the light sends to the camera per unit of its own. N is
+the largest of all int S_k Q_c: light of one wavelength gives what a band at that wavelength gives.
 
 fixed bands  L_b is radiance per nm; M_cb = Q_c(nm_b) w_b/N with the weights w_b of the trapezium rule.
-auto         Lights have bands of their own: the nodes of Gauss rules for S_k sum_c Q_c, in each of the ranges in which
-             shares and reflectances are declared (EDGES); L_b = P_k(nm_b) and M_cb = int S_k Q_c l_b/N with the
-             Lagrange polynomial l_b of the node. What S_k and Q_c are, parameters among them, is in M alone: it is exact
-             whatever they are, and so are its derivatives. The number of nodes is the smallest with which what is known
-             of the paths (reflectances, the probes of `_probes`) has an error below TOLERANCE."""
+auto         Lights have bands of their own: the nodes of Gauss rules for S_k sum_c Q_c, in each range in which
+             shares and reflectances hold (EDGES); L_b = P_k(nm_b) and M_cb = int S_k Q_c l_b/N with the
+             Lagrange polynomial l_b of the node. What S_k and Q_c are, parameters among them, is in M alone: it is
+             exact whatever they are, and so are its derivatives. The number of nodes is the smallest with which what is
+             known of the paths (reflectances, the probes of `_probes`) has an error below TOLERANCE."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
@@ -147,12 +148,13 @@ class Integral:
         for light, part in scene.lights.items():
             curve = part.curves.get("spectrum")
             alone = curve is None and part.held.get("wavelength", 0.0) > 0
-            alike.setdefault(light if alone else curve.source if curve is not None else "", []).append(light)
+            own = light if alone else (curve.nm.tobytes(), curve.values.tobytes()) if curve is not None else ""
+            alike.setdefault(own, []).append(light)
         found = [
             Group(
                 tuple(lights),
                 "",
-                lambda values, first=lights[0]: self.spectrum(first, values),
+                partial(self.spectrum, lights[0]),
                 tuple(key for light in lights for key in self.spectral_keys(light)),
             )
             for lights in alike.values()
@@ -168,9 +170,7 @@ class Integral:
                     f"'{pigment.name}'; auto bands follow one of them; allowed: fixed bands, such as 400:700:5"
                 )
             keys = tuple(f"{pigment.name}.{n}" for n in ("emission_peak", "emission_fwhm"))
-            found.append(
-                Group(exciting, pigment.name, lambda values, name=pigment.name: self.emission(name, values), keys)
-            )
+            found.append(Group(exciting, pigment.name, partial(self.emission, pigment.name), keys))
         return found
 
     def _signal(self, group: Group) -> float:
@@ -255,7 +255,14 @@ class Integral:
             if np.iscomplexobj(own):
                 at = at + 1j * np.stack([np.interp(self.nm, self.grid, np.imag(q)) for q in own])
             return at * widths(self.nm) / self.unit
-        state = tuple(values[k] for g in self.groups for k in g.keys)
+        keys = [k for g in self.groups for k in g.keys]
+        swept = [k for k in keys if isinstance(values[k], np.ndarray)]
+        if swept:
+            raise BadScene(
+                f"{self.scene.path}: readings were swept over {', '.join(swept)}, and auto bands take one spectrum for "
+                "all readings of a sweep; allowed: fixed bands, such as 400:700:5"
+            )
+        state = tuple(values[k] for k in keys)
         if quantum is None and self._kept[0] == state:
             return self._kept[1]
         columns = []
@@ -271,13 +278,13 @@ class Integral:
         """Refuse lights that share bands and no longer have one spectrum."""
         if group.glow or len(group.lights) < 2:
             return
-        for name in {k.rpartition(".")[2] for k in group.keys}:
+        for name in sorted({k.rpartition(".")[2] for k in group.keys}):
             own = {values[f"{light}.{name}"] for light in group.lights if f"{light}.{name}" in values}
             if len(own) > 1:
                 raise BadScene(
                     f"{self.scene.path}: {', '.join(group.lights)} share the bands of one spectrum, and '{name}' "
-                    f"differs between them ({', '.join(f'{v:g}' for v in sorted(own, key=abs))}); allowed: one value, or "
-                    "fixed bands, such as bands = 400:700:5"
+                    f"differs between them ({', '.join(f'{v:g}' for v in sorted(own, key=abs))}); allowed: one value, "
+                    "or fixed bands, such as bands = 400:700:5"
                 )
 
     def colour_matrix(self, values: Mapping) -> np.ndarray:

@@ -142,8 +142,8 @@ class Scene:
             )
         if self.monte_carlo:
             raise BadScene(
-                f"{self.path}: light through dielectric bodies is followed in up to {FEW} bands; allowed: bands such as "
-                "620, 540, 460"
+                f"{self.path}: light through dielectric bodies is followed in up to {FEW} bands; allowed: bands such "
+                "as 620, 540, 460"
             )
         self.integral = Integral(self, self.integrator.bands, self.integrator.nodes or 0)
         self.integrator.bands = tuple(float(nm) for nm in self.integral.nm)

@@ -14,8 +14,8 @@ from pathlib import Path
 
 from optics.errors import BadPlugin, BadScene, UnknownKey
 from optics.scene.declare import IMAGE_STAGES, Part
-from optics.scene.parameter import Parameter
 from optics.scene.line import EDGES
+from optics.scene.parameter import Parameter
 from optics.scene.regions import found_file
 from optics.scene.registry import Registry, default, include
 from optics.spectra.curve import Curve

@@ -62,7 +62,7 @@ class Curve:
         start, table = self._table
         data = mi.Float(table)
         lanes = mi.UnpolarizedSpectrum(wavelengths)
-        found = mi.UnpolarizedSpectrum(0.0)
+        found: Any = mi.UnpolarizedSpectrum(0.0)
         for lane in range(dr.size_v(mi.UnpolarizedSpectrum)):
             place = dr.clip((lanes[lane] - start) / STEP, 0, len(table) - 1.001)
             low = mi.UInt32(dr.floor(dr.detach(place)))

@@ -2,10 +2,10 @@
 
     int w(nm) f(nm) d nm ~ sum_j W_j f(nm_j)
 
-The n nodes are those of the Gauss rule of a weight w0, by Lanczos' tridiagonalisation of its sum over a fine grid (Golub
-& Welsch, Math. Comp. 23, 221, 1969; Gragg & Harrod, Numer. Math. 44, 317, 1984): exact for polynomials f up to the
-order 2n - 1 where w is w0. Of any other weight w, W_j is the integral of w times the j-th Lagrange polynomial of the
-nodes: exact up to the order n - 1."""
+The n nodes are those of the Gauss rule of a weight w0, by Lanczos' tridiagonalisation of its sum over a fine grid
+(Golub & Welsch, Math. Comp. 23, 221, 1969; Gragg & Harrod, Numer. Math. 44, 317, 1984): exact for polynomials f up
+to the order 2n - 1 where w is w0. Of any other weight w, W_j is the integral of w times the j-th Lagrange polynomial of
+the nodes: exact up to the order n - 1."""
 
 from __future__ import annotations
 

@@ -11,9 +11,10 @@
     CIE D65, colour:dark skin      a curve of the colour-science library by its name, of several colour checkers as
                                    "colour:ISO 17321-1/dark skin"
 
-The unit of a column stands in its header: nm, um or A for the wavelength, % for a share in per cent. A wavelength column
-without a unit is in nm. An absorption is in 1/mm; a column with the title k is an index of extinction, 4 pi k/nm. Nothing is guessed: a share above 1, wavelengths that do not ascend, values below 0 and units
-that are unknown are errors that say what is allowed."""
+The unit of a column stands in its header: nm, um or A for the wavelength, % for a share in per cent. A wavelength
+column without a unit is in nm. An absorption is in 1/mm; a column with the title k is an index of extinction: 4 pi k
+over the wavelength. Nothing is guessed: a share above 1, wavelengths that do not ascend, values below 0 and units that
+are unknown are errors that say what is allowed."""
 
 from __future__ import annotations
 

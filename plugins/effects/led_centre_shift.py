@@ -2,8 +2,9 @@
 
 Definition
     S'(lambda) = S(lambda - d)                                   d = `centre_shift` in nm
-Junctions emit at longer waves when they are warm: red AlInGaP LEDs by 0.1 to 0.2 nm/K, blue and green InGaN ones by 0.03
-to 0.1 nm/K. Green and blue LEDs emit at shorter waves with more current, by up to 10 nm over the range of a data sheet.
+Junctions emit at longer waves when they are warm: red AlInGaP LEDs by 0.1 to 0.2 nm/K, blue and green InGaN ones by
+0.03 to 0.1 nm/K. Green and blue LEDs emit at shorter waves with more current, by up to 10 nm over the range of a data
+sheet.
 Fingerprint
     the channels on the flanks of whose sensitivity the LED stands change against the others, alike wherever that LED
     lights; white LEDs do not change. In bands that are read at their centres it is a change of the LED's power in each

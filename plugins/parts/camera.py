@@ -197,7 +197,8 @@ def build():
                 self.channels = read_channels(self.sensitivity, self._folders, f"{self.name}.sensitivity")
                 if len(self.channels) not in (1, 3):
                     raise ValueError(
-                        f"{self.name}.sensitivity = '{self.sensitivity}' has {len(self.channels)} columns; allowed: 1 or 3"
+                        f"{self.name}.sensitivity = '{self.sensitivity}' has {len(self.channels)} columns; allowed: 1 "
+                        "or 3"
                     )
                 self.curves.update(zip(channel_names(len(self.channels)), self.channels))
             self.read_spectrum(props, "filter", "transmittance")

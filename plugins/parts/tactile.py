@@ -131,8 +131,8 @@ def build():
         def sample(self, mode, scene, sampler, ray, δL=None, state_in=None, active=True, **_):
             if self.integrates:
                 raise ValueError(
-                    f"tactile: mi.render carries {self.lanes} bands; auto bands and more than {FEW} are rendered LED by "
-                    "LED (optics render); allowed here: up to four bands"
+                    f"tactile: mi.render carries {self.lanes} bands; auto bands and more than {FEW} are rendered LED "
+                    "by LED (optics render); allowed here: up to four bands"
                 )
             self.look_up(scene)
             light = self.walk(scene, self.start(ray, sampler, active))["light"]

@@ -1,4 +1,4 @@
-"""Channels as integrals over the wavelength: limits, agreement of few nodes with many bands, derivatives, closed forms."""
+"""Channels as integrals over the wavelength: limits, few nodes against many bands, derivatives, closed forms."""
 
 import re
 from pathlib import Path
@@ -117,7 +117,8 @@ def test_a_wave_plate_between_crossed_polarizers(mitsuba, tmp_path, bands):
     for line in (0.0, 560.0):
         text = file.read_text(encoding="utf-8")
         own = tmp_path / f"bench_{line:g}.xml"
-        lamp = f'<emitter type="source" id="source"><float name="wavelength" value="{line}"/><float name="fwhm" value="40"/></emitter>'
+        numbers = f'<float name="wavelength" value="{line}"/><float name="fwhm" value="40"/>'
+        lamp = f'<emitter type="source" id="source">{numbers}</emitter>'
         own.write_text(text.replace('<emitter type="source" id="source"/>', lamp), encoding="utf-8")
         scene = loader.load(own, {"bands": bands} if 'name="bands"' in text else {})
         keys = {k: v for k, v in plate.items() if k in scene.parameters}

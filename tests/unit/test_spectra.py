@@ -102,8 +102,10 @@ def test_widths_are_those_of_the_trapezium_rule():
     assert widths(np.array([430.0, 410.0, 400.0])) == pytest.approx([10, 15, 5])
 
 
-LIGHTS = ("white", "gaussian(625, 20)", "gaussian(530, 35)", "gaussian(470, 25)", "CIE A", "CIE D50", "CIE D65",
-          "CIE LED-B1", "CIE LED-B3", "CIE LED-V1", "CIE LED-RGB1", "blackbody(2856)", "phosphor(450, 20, 560, 120, 4)")  # fmt: skip
+LIGHTS = (
+    *("white", "gaussian(625, 20)", "gaussian(530, 35)", "gaussian(470, 25)", "CIE A", "CIE D50", "CIE D65"),
+    *("CIE LED-B1", "CIE LED-B3", "CIE LED-V1", "CIE LED-RGB1", "blackbody(2856)", "phosphor(450, 20, 560, 120, 4)"),
+)
 PATHS = {
     "tilt": lambda nm: np.exp(0.3 * (nm - 540) / 100),
     "fade": lambda nm: np.exp(-0.5 * np.exp(-(nm - 540) / 100)),  # a resin that turns yellow
