@@ -27,6 +27,7 @@ import numpy as np
 from optics.errors import BadScene
 from optics.scene import line
 from optics.scene.line import EDGES
+from optics.scene.mitsuba_parts import is_part
 from optics.spectra.curve import VISIBLE, Curve, grid
 from optics.spectra.quadrature import gauss_nodes, lagrange, widths
 from optics.spectra.reading import overlap
@@ -223,10 +224,15 @@ class Integral:
 
     def _probes(self) -> list[Callable[[np.ndarray], np.ndarray]]:
         """What is known to be on the paths, as functions of the wavelength."""
-        found: list[Callable] = [
-            curve for part in self.scene.parts.values() for name, curve in part.curves.items() if name == "reflectance"
-        ]
-        if any(p.registry.parts[p.kind].mueller is not None for p in self.scene.parts.values()):
+        found: list[Callable] = []
+        for name, part in self.scene.parts.items():
+            if "reflectance" in part.curves:
+                found.append(part.curves["reflectance"])
+            elif hasattr(part, "reflectance") and (own := texture_over(part.reflectance, self.grid)) is not None:
+                found.append(own)
+        stock = [shape for shape in self.scene.mitsuba.shapes() if not is_part(shape.bsdf())]
+        layers = [p for p in self.scene.parts.values() if p.registry.parts[p.kind].mueller is not None]
+        if stock or layers:
             found += [lambda nm, s=s: np.exp(s * TILT * (nm - 540) / 100) for s in (1, -1)]
         return found
 
@@ -348,6 +354,18 @@ def parse(text: str, where: str) -> tuple[tuple[float, ...], int | None]:
     ):
         raise BadScene(f"{where}: bands = {text!r}; allowed: more than four bands above 0 nm in one order, each once")
     return bands, None
+
+
+def texture_over(texture, nm: np.ndarray) -> Curve | None:
+    """What a texture of Mitsuba's has in its middle over the wavelength; None where that is the same everywhere."""
+    import drjit as dr
+    import mitsuba as mi
+
+    si = dr.zeros(mi.SurfaceInteraction3f, len(nm))
+    si.uv = mi.Point2f(0.5)
+    si.wavelengths = type(si.wavelengths)(mi.Float(nm.astype(np.float32)))
+    values = np.broadcast_to(np.array(texture.eval(si, mi.Bool(True))[0], float), len(nm))
+    return Curve(nm, values.copy(), "absorption") if np.ptp(values) > 1e-6 * np.abs(values).max() else None
 
 
 def refuse_unseen(scene) -> None:

@@ -68,10 +68,17 @@ def test_few_nodes_give_what_many_bands_give(mitsuba, auto, tmp_path):
     assert not any(name.startswith("S0.") for name in found.channels)
 
 
-def test_reflectance_and_filter_are_integrated(mitsuba, tmp_path):
-    """A patch of a colour checker and a filter, by the estimated error and by many bands."""
+@pytest.mark.parametrize(
+    "paint",
+    [
+        '<string name="reflectance" value="colour:orange"/>',
+        '<spectrum name="reflectance" value="380:0.1, 560:0.8, 780:0.2"/>',
+    ],
+)
+def test_reflectance_and_filter_are_integrated(mitsuba, tmp_path, paint):
+    """A patch of a colour checker, a spectrum of Mitsuba's, and a filter: by the estimated error and by many bands."""
     xml = {
-        "membrane": '<string name="reflectance" value="colour:orange"/>',
+        "membrane": paint,
         "camera": '<string name="filter" value="400:0.1, 560:0.9, 700:0.4"/>',
     }
     few, many = (digit(mitsuba, tmp_path, bands, **xml) for bands in ("auto", "380:780:2.5"))
