@@ -459,9 +459,11 @@ class Renderer:
         take, 0 in the bands of others."""
         if self.integral is None:
             return self._bands(shade())
-        found: np.ndarray | None = None
+        found = np.zeros((1, self.bands))
         own, lanes = self._own(led), self.scene.integrator.lanes
-        for start in range(0, max(len(own), 1), lanes):
+        seen = len(own) > 0
+        own = own if seen else np.zeros(1, int)  # a light that no channel sees
+        for start in range(0, len(own), lanes):
             self._lanes = own[start : start + lanes]
             self._light_lanes(led)
             try:
@@ -469,10 +471,10 @@ class Renderer:
             finally:
                 here, self._lanes = self._lanes, None
                 self._light_lanes("")
-            if found is None:
+            if not start:
                 found = np.zeros((len(raw), self.bands), raw.dtype)
-            found[:, here] = raw
-        return found if found is not None else np.zeros((1, self.bands))
+            found[:, here] = raw * seen
+        return found
 
     def _light_lanes(self, led: str) -> None:
         """Tell a light and the pigments which lanes of the present pass are theirs; where none is present, nothing."""

@@ -225,7 +225,7 @@ class Integral:
     def _probes(self) -> list[Callable[[np.ndarray], np.ndarray]]:
         """What is known to be on the paths, as functions of the wavelength."""
         found: list[Callable] = []
-        for name, part in self.scene.parts.items():
+        for part in self.scene.parts.values():
             if "reflectance" in part.curves:
                 found.append(part.curves["reflectance"])
             elif hasattr(part, "reflectance") and (own := texture_over(part.reflectance, self.grid)) is not None:

@@ -295,6 +295,12 @@ class Declared:
             self.curves[name] = read_curve(text, kind, self._folders, f"{self.name}.{name}")
         return self.curves.get(name)
 
+    def read_sensitivities(self, text: str, name: str) -> tuple[Curve, ...]:
+        """The curves of a camera's channels that an attribute names."""
+        from optics.spectra.reading import read_channels
+
+        return read_channels(text, self._folders, f"{self.name}.{name}")
+
     def by_colour(self, first, second, third, wavelengths):
         """A spectrum of three values: of the first three bands; where channels are integrals, of the wavelengths from
         580 nm on, from 500 nm on, and below. A fourth band has 1."""

@@ -9,8 +9,8 @@ Fingerprint
     red fades towards the corners, with the square of the field angle, the other channels stay: vignetting of one
     colour. Vignetting of the lens is alike in all channels.
 Validity
-    one edge; collimated light in each pixel, as before a lens or behind one of long focus. T is read at the bands: where
-    the edge lies within the spectrum of a light, fixed bands in steps of w/2 are needed.
+    one edge; collimated light in each pixel, as before a lens or behind one of long focus. T is read at the bands:
+    where the edge lies within the spectrum of a light, fixed bands in steps of w/2 are needed.
 References
     Macleod, Thin-Film Optical Filters, 4th ed., ch. 8 (tilted filters).
 """
@@ -55,7 +55,9 @@ effect = Effect(
     part="camera",
     stages={"lens": shade},
     parameters=(
-        Parameter("edge_tilt", "1", 0.0, (0.0, 0.9), "e = 1/n^2 of the filter", neutral=0.0, plausible=0.3, how="image"),
+        Parameter(
+            "edge_tilt", "1", 0.0, (0.0, 0.9), "e = 1/n^2 of the filter", neutral=0.0, plausible=0.3, how="image"
+        ),
     ),
     shape=(
         Parameter(

@@ -40,7 +40,6 @@ from optics.scene.checking import agree, made
 from optics.scene.declare import Part
 from optics.scene.mitsuba_parts import Declared
 from optics.scene.parameter import Parameter
-from optics.spectra.reading import read_channels
 
 PARAMETERS = (
     Parameter(
@@ -178,6 +177,7 @@ def build():
 
     class Camera(Declared.on(mi.Sensor)):
         kind = "camera"
+        bands = 3  # of the scene
 
         def __init__(self, props):
             nominal = props.get("to_world", mi.ScalarAffineTransform4f())
@@ -194,7 +194,7 @@ def build():
             self.declare(props)
             self.channels = ()  # curves; none where each channel is a band
             if self.sensitivity != "identity":
-                self.channels = read_channels(self.sensitivity, self._folders, f"{self.name}.sensitivity")
+                self.channels = self.read_sensitivities(self.sensitivity, "sensitivity")
                 if len(self.channels) not in (1, 3):
                     raise ValueError(
                         f"{self.name}.sensitivity = '{self.sensitivity}' has {len(self.channels)} columns; allowed: 1 "
@@ -207,9 +207,16 @@ def build():
             self.columns = [dr.opaque(mi.Vector3f, [matrix[i][j] for i in range(3)]) for j in range(4)]
             self.m_needs_sample_3 = False
 
+        def wire(self, scene):
+            self.bands = len(getattr(scene.integrator, "bands", ())) or 1
+
         def takes(self, name):
-            idle = "detector" if self.mosaic else "site"  # behind an analyser a pixel meets one polarization
-            return not any(name in effect.parameter_names for effect in self.registry.at_stage(self.kind, idle))
+            idle = ["detector" if self.mosaic else "site"]  # behind an analyser a pixel meets one polarization
+            if self.bands == 1 and self.integral is None:  # of one band a sensitivity is a gain
+                idle.append("sensitivity")
+            return not any(
+                name in effect.parameter_names for stage in idle for effect in self.registry.at_stage(self.kind, stage)
+            )
 
         def traverse(self, cb):
             mi.Sensor.traverse(self, cb)

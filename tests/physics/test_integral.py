@@ -15,7 +15,8 @@ from optics.files.output import shipped
 from optics.fit.scene_model import SceneModel
 from optics.light.renderer import Renderer
 from optics.light.rendering import RenderJob
-from optics.scene import loader
+from optics.light.transport import materials
+from optics.scene import checking, loader
 from optics.scene.line import WHITE
 from optics.scene.parameter import Values, Variable
 from optics.spectra.reading import gaussian, read_channels
@@ -140,6 +141,25 @@ def test_a_wave_plate_between_crossed_polarizers(mitsuba, tmp_path, bands):
         assert seen == pytest.approx(exact, abs=tolerance), line
 
 
+def test_measured_index_and_absorption_reach_the_paths_of_light(mitsuba):
+    """n of PDMS by Sellmeier's formula of its source, shifted to 1.41 at 540 nm; an absorption that doubles."""
+    body = (
+        '<bsdf type="clear" id="gel"><float name="index" value="1.41"/><float name="absorption" value="0.02"/>'
+        '<string name="index_spectrum" value="pdms_sylgard184.csv"/>'
+        '<string name="absorption_spectrum" value="440:2, 540:1, 640:0.5"/></bsdf>'
+    )
+    lamp = '<emitter type="led" id="led"><point name="position" x="5" y="0" z="-9"/></emitter>'
+    bands = np.array([640.0, 540.0, 440.0])
+    scene = checking.scene_of(f'<shape type="cube">{body}</shape>', lamp, bands="640, 540, 440")
+    found = materials(scene, bands)[1]
+    um2 = (bands / 1e3) ** 2
+    n = np.sqrt(1 + 1.0093 * um2 / (um2 - 0.013185))
+    assert found.index == pytest.approx(1.41 + n - n[1], abs=2e-5)  # a table in steps of 10 nm, to five digits
+    assert found.absorption == pytest.approx([0.01, 0.02, 0.04])
+    lanes = scene.parts["gel"].refractive(mitsuba.UnpolarizedSpectrum(640.0, 540.0, 440.0, 440.0))
+    assert [lanes[i][0] for i in range(3)] == pytest.approx(found.index, abs=1e-6)
+
+
 def test_what_has_no_integral_is_refused(mitsuba, auto):
     with pytest.raises(BadScene, match="sensitivities.*Nikon"):
         loader.load("gelsight", {"bands": "auto"})
@@ -148,6 +168,19 @@ def test_what_has_no_integral_is_refused(mitsuba, auto):
     for bands in ("auto 99", "700:400:10", "red", "400, 500, 450, 600, 700"):
         with pytest.raises(BadScene, match="allowed"):
             loader.load("digit", {"bands": bands})
+
+
+def test_a_light_that_no_channel_sees_is_dark(mitsuba, tmp_path):
+    """An infrared LED in place of the blue one; the others do not know of it."""
+    with pytest.raises(BadScene, match="is the unit nm"):
+        digit(mitsuba, tmp_path, "auto", led_blue='<string name="spectrum" value="900:1, 980:1"/>')
+    text = (shipped("scenes") / "digit.xml").read_text(encoding="utf-8")
+    (tmp_path / "infrared.xml").write_text(text.replace('value="470"/>', 'value="940"/>'), encoding="utf-8")
+    job = RenderJob(loader.load(tmp_path / "infrared.xml", {**SIZE, "bands": "auto"}))
+    found = job.take().channels
+    assert found["camera.R"].max() > 0 and found["led_blue.B"].max() < 1e-6 * found["camera.B"].max()
+    off = job.take({"led_blue.power": 0.0}).channels
+    assert np.array_equal(found["camera.R"], off["camera.R"])
 
 
 def test_lights_that_share_bands_keep_one_spectrum(mitsuba, tmp_path):
