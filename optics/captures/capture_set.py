@@ -25,8 +25,8 @@ from optics.files.images import SUFFIXES, read_image, read_mask, write_image
 from optics.files.output import new_folder
 from optics.polarization import mosaic as mosaics
 from optics.polarization.mosaic import Mosaic
-from optics.scene.integral import parse
 from optics.scene.parameter import Parameter
+from optics.spectra.bands import parse
 from optics.words import key_of
 
 FILE = "captures.toml"

@@ -28,13 +28,12 @@ from optics.errors import BadScene
 from optics.scene import line
 from optics.scene.line import EDGES
 from optics.scene.mitsuba_parts import is_part
+from optics.spectra.bands import FEW, MOST, parse
 from optics.spectra.curve import VISIBLE, Curve, grid
 from optics.spectra.quadrature import gauss_nodes, lagrange, widths
 from optics.spectra.reading import overlap
 
 TOLERANCE = 1e-4  # of a channel's largest integral: a tenth of a grey level in 1000
-FEW = 4  # bands that one render carries, and that are read at their centres
-MOST = 12  # nodes of a light in one range
 NEGLIGIBLE = 1e-6  # share of a light's signal below which a range has no nodes of its own
 TILT = 0.3  # of the probe exp(+-TILT (nm - 540)/100): layers, whose matrices change with the wavelength
 
@@ -328,34 +327,6 @@ class Integral:
         return f"{len(self.nm)} bands, estimated error {self.error:.1e} of a channel ({each})"
 
 
-def parse(text: str, where: str) -> tuple[tuple[float, ...], int | None]:
-    """Bands that a text names, nm, and of "auto" and "auto N" the number of nodes (0: as many as it takes), else None.
-
-    Raises BadScene."""
-    text = str(text).strip()
-    allowed = "allowed: wavelengths in nm such as 610, 540, 460, a range such as 400:700:10, auto, or auto 3"
-    if text.split()[:1] == ["auto"]:
-        words = text.split()[1:]
-        if len(words) > 1 or words and not (words[0].isdigit() and 1 <= int(words[0]) <= MOST):
-            raise BadScene(f"{where}: bands = {text!r}; allowed: auto, or auto N with 1 to {MOST} nodes")
-        return (), int(words[0]) if words else 0
-    try:
-        if ":" in text:
-            low, high, step = (float(n) for n in text.split(":"))
-            count = round((high - low) / step) + 1 if step else 0
-            if not (step > 0 and high > low > 0 and count <= 1000):
-                raise ValueError
-            return tuple(low + step * k for k in range(count)), None
-        bands = tuple(float(w) for w in text.replace(",", " ").split())
-    except ValueError:
-        raise BadScene(f"{where}: bands = {text!r}; {allowed}") from None
-    if len(bands) > FEW and (
-        min(bands) <= 0 or len(set(bands)) < len(bands) or sorted(bands) not in (list(bands), list(bands)[::-1])
-    ):
-        raise BadScene(f"{where}: bands = {text!r}; allowed: more than four bands above 0 nm in one order, each once")
-    return bands, None
-
-
 def texture_over(texture, nm: np.ndarray) -> Curve | None:
     """What a texture of Mitsuba's has in its middle over the wavelength; None where that is the same everywhere."""
     import drjit as dr
@@ -377,4 +348,4 @@ def refuse_unseen(scene) -> None:
             overlap(curve, channels, f"{scene.path}: {name}.spectrum", f"'{scene.camera.name}'")
 
 
-__all__ = ["VISIBLE", "Integral", "colour_index", "parse", "refuse_unseen"]
+__all__ = ["FEW", "VISIBLE", "Integral", "colour_index", "parse", "refuse_unseen"]
