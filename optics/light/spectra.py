@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from optics.scene.integral import spectrum_of
+from optics.scene.integral import numbers_of, spectrum_of
 from optics.scene.loader import Scene
 from optics.spectra.colours import linear_srgb, matching
 from optics.spectra.curve import KINDS
@@ -65,6 +65,11 @@ def draw(scene: Scene) -> Any:
         colour = _colour(nm, shapes[key])
         axis.fill_between(nm, shapes[key], color=colour, alpha=0.35, lw=0, label=f"{label}: light")
         axis.plot(nm, shapes[key], color=colour, lw=0.8)
+    for name, part in scene.parts.items():
+        if hasattr(part, "fluorescence"):
+            glow = part.emission(numbers_of(scene, name, scene.values()), nm)
+            colour = _colour(nm, glow)
+            axis.fill_between(nm, glow / glow.max(), color=colour, alpha=0.35, lw=0, label=f"{name}: emission")
     channels = scene.camera.seen(nm) if scene.camera is not None and scene.camera.channels else np.zeros((0, len(nm)))
     colours = ("#c03030", "#2a8a2a", "#2850c0") if len(channels) == 3 else ("#222222",)
     for row, colour, name in zip(channels, colours, "RGB"):
