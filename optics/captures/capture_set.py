@@ -19,13 +19,14 @@ import numpy as np
 from optics.captures import readings
 from optics.captures.noise import DEMOSAICED, PER_CHANNEL, SATURATED, UNITS, UNLIMITED, Noise, repeated, step_of
 from optics.captures.readings import DECIMALS, DELIMITERS, NAMES, Row, Table
-from optics.errors import BadCapture, OutputExists, UnknownKey
+from optics.errors import BadCapture, BadScene, OutputExists, UnknownKey
 from optics.files import toml_checks as checks
 from optics.files.images import SUFFIXES, read_image, read_mask, write_image
 from optics.files.output import new_folder
 from optics.polarization import mosaic as mosaics
 from optics.polarization.mosaic import Mosaic
 from optics.scene.parameter import Parameter
+from optics.spectra.bands import parse
 from optics.words import key_of
 
 FILE = "captures.toml"
@@ -95,7 +96,7 @@ class Captures:
     """A capture set.
 
     bits         8 or 16 for integer files, None for floats
-    bands        nm, the scene's definition `bands`; empty: the scene's own
+    bands        nm, the scene's definition `bands`, or its text: a range, or auto; empty: the scene's own
     absent       names of parts of the scene that were not there
     uncertainty  standard deviation of a setting by key, in its unit, where a frame says no other
     exclude      effect -> why it is ruled out
@@ -113,7 +114,7 @@ class Captures:
     table: Table | None = None
     warnings: list[str] = field(default_factory=list)
     bits: int | None = None
-    bands: list[float] = field(default_factory=list)
+    bands: list[float] | str = field(default_factory=list)
     absent: list[str] = field(default_factory=list)
     uncertainty: dict[str, float] = field(default_factory=dict)
     exclude: dict[str, str] = field(default_factory=dict)
@@ -254,12 +255,21 @@ def _check_channels(captures: Captures, where: str) -> None:
             )
 
 
-def _bands(data: Mapping, where: str) -> list[float]:
+def _bands(data: Mapping, where: str) -> list[float] | str:
     if "bands" not in data:
         return []
     bands = data["bands"]
+    if isinstance(bands, str) and re.match(r"auto\b|[\d.]+:", bands):  # a range, or nodes of integrals
+        try:
+            parse(bands, where)
+        except BadScene as error:
+            raise BadCapture(str(error)) from error
+        return bands
     if not isinstance(bands, list) or not bands:
-        raise BadCapture(f"{where}: bands = {bands!r}; allowed: a list of wavelengths in nm, such as [470, 530, 625]")
+        raise BadCapture(
+            f"{where}: bands = {bands!r}; allowed: a list of wavelengths in nm, such as [470, 530, 625], a range such "
+            'as "400:700:10", or "auto"'
+        )
     numbers = [checks.number(band, "bands", "nm", where) for band in bands]
     if min(numbers) <= 0 or len(set(numbers)) < len(numbers):
         raise BadCapture(f"{where}: bands = {bands!r} nm; allowed: wavelengths above 0, each once")
@@ -597,7 +607,8 @@ def definitions(captures: Captures, given: Mapping[str, str], scene: Path) -> di
             f'{captures.folder / FILE}: bands = {captures.bands} nm, but {scene} has no <default name="bands">; '
             "allowed: a scene whose integrator takes $bands; name it in the XML, or remove bands"
         )
-    return {**given, "bands": ", ".join(f"{band:g}" for band in captures.bands)}
+    named = captures.bands
+    return {**given, "bands": named if isinstance(named, str) else ", ".join(f"{band:g}" for band in named)}
 
 
 def stated(captures: Captures) -> dict[str, float | str]:
@@ -793,7 +804,9 @@ def _fill(captures: Captures, folder: Path, final: Path, bits: int | None) -> No
     if captures.values_are != "DN":
         document["values_are"] = captures.values_are
     if captures.bands:
-        document["bands"] = [int(band) if band == int(band) else band for band in captures.bands]
+        named = captures.bands
+        whole = named if isinstance(named, str) else [int(b) if b == int(b) else b for b in named]
+        document["bands"] = whole
     if captures.absent:
         document["absent"] = captures.absent
     if captures.flat_field is not None:

@@ -9,7 +9,19 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from optics.cli.shared import AsJson, Defines, Plugins, SceneName, Variant, command, load_scene, scan, show, terminal
+from optics.cli.shared import (
+    AsJson,
+    Defines,
+    Force,
+    Plugins,
+    SceneName,
+    Variant,
+    command,
+    load_scene,
+    scan,
+    show,
+    terminal,
+)
 from optics.words import key_of, number, table
 
 if TYPE_CHECKING:
@@ -45,6 +57,7 @@ def params(
 ) -> None:
     """List the parameters of a scene: value, unit, bounds, neutral value, derivative, meaning."""
     from optics.errors import UnknownKey
+    from optics.light import spectra
 
     loaded = load_scene(scene, define, plugins, variant)
     keys = list(loaded.values())
@@ -57,8 +70,51 @@ def params(
         return show(rows)
     head = ("key", "value", "unit", "bounds", "neutral", "derivative", "meaning")
     print(table([head, *map(_parameter_line, rows)]))
+    if not patterns and (loaded.curves or loaded.integral is not None):
+        print(
+            "\n" + table([("spectrum", "kind", "nm", "mean", "source"), *map(_spectrum_line, spectra.records(loaded))])
+        )
+    if not patterns and loaded.integral is not None:
+        print("\n" + loaded.integral.describe())
 
 
+def _spectrum_line(r: Mapping[str, Any]) -> tuple[str, ...]:
+    span = "-" if r["span"] is None else f"{r['span'][0]:g} .. {r['span'][1]:g}"
+    return (r["key"], r["kind"], span, "-" if r["centre"] is None else f"{r['centre']:.1f}", r["source"])
+
+
+@command
+def plot_spectra(
+    scene: SceneName,
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="FILE", help="FILE.png, .svg or .pdf.")],
+    define: Defines = None,
+    plugins: Plugins = None,
+    variant: Variant = None,
+    force: Force = False,
+    as_json: AsJson = False,
+) -> None:
+    """Draw the light of a scene, its losses and the camera's sensitivities over the wavelength, over each other."""
+    from optics.files.output import claim, replacing
+    from optics.light import spectra
+
+    if output.suffix.lower() not in PLOTS:
+        raise ValueError(
+            f"-o {output}: '{output.suffix}' is no format of a plot; allowed: a name ending in .png, .pdf or .svg"
+        )
+    claim([output], force)
+    loaded = load_scene(scene, define, plugins, variant)
+    figure = spectra.draw(loaded)
+    with replacing(output) as file:
+        figure.savefig(file, format=output.suffix[1:].lower(), dpi=130)
+    bands = None if loaded.integral is None else loaded.integral.describe()
+    if as_json:
+        return show({"files": [str(output)], "spectra": spectra.records(loaded), "bands": bands})
+    print(output)
+    if bands is not None:
+        terminal.note(bands)
+
+
+PLOTS = (".png", ".svg", ".pdf")
 # how a derivative image is made (`Parameter.how`), for the reader of a table
 DERIVATIVES = {
     "ad": "forward mode",

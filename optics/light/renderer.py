@@ -55,7 +55,12 @@ class Renderer:
         self.scene = scene
         self.width, self.height = scene.camera.resolution
         self.bands = len(scene.integrator.bands or (0,))
-        if self.bands > scene.integrator.lanes:
+        self.integral = scene.integral
+        self.colours = np.arange(self.bands) if self.integral is None else self.integral.colours
+        self._lanes: np.ndarray | None = (
+            None  # numbers of the bands that a pass carries, of channels that are integrals
+        )
+        if self.bands > scene.integrator.lanes and self.integral is None:
             raise BadScene(
                 f"{scene.path}: {self.bands} bands, but the variant {scene.variant} carries {scene.integrator.lanes}; "
                 f"load the scene with variant='{DEFAULT_VARIANT}' or name one band"
@@ -282,7 +287,9 @@ class Renderer:
             rim = self._joint_rim(hits)
             index = np.flatnonzero(rim)
             image = LedImage(led, hits, rim, index, self._finer(hits, index), None, None, hits.valid)
-            image.raw = (np.ones((1, self.bands)), np.ones((1, self.bands)))
+            own = np.zeros((1, self.bands))
+            own[:, self._own(led)] = 1.0
+            image.raw = (own, own)
             return image
         part = self.scene.leds[led]
         visible = self._visible(hits.si, part)
@@ -390,6 +397,8 @@ class Renderer:
         if light not in self.scene.sources:
             return row[0]
         sent = paths.emitted(self.scene, light, path, values, self.wavelengths)
+        if self.integral is not None and not self.integral.auto:
+            sent = tuple(s / self.integral.width(light, values) for s in sent)
         return sum(r * s for r, s in zip(row, sent) if not isinstance(s, int))
 
     # -- all lights ---------------------------------------------------------------------------------------------------
@@ -451,6 +460,7 @@ class Renderer:
     def _shade(self, sample: Sample, part, visible):
         """Direct radiance per band at hits, an UnpolarizedSpectrum attached to whatever carries gradients."""
         integrator, scene = self.scene.integrator, self.scene.mitsuba
+        self._tune(sample.si)
         spots = integrator.spots(part)
         if len(spots) == 1:
             return integrator.direct(scene, *sample[:3], part, visible)
@@ -461,8 +471,8 @@ class Renderer:
 
     def _raw(self, image: LedImage, centre: Callable, rim: Callable) -> tuple:
         """Shading at pixel centres (H W, B) and at the finer samples (N, B), None without any."""
-        fine = self._bands(rim()) if len(image.index) else None
-        return self._bands(centre()).reshape(self.height * self.width, self.bands), fine
+        fine = self._each_band(rim, image.led) if len(image.index) else None
+        return self._each_band(centre, image.led).reshape(self.height * self.width, self.bands), fine
 
     def _mix(self, image: LedImage, raw: tuple, weights: tuple = (1.0, 1.0)) -> np.ndarray:
         """(H, W, B) from pixel centres and, where the rim is, from the mean of the finer samples, by its share."""
@@ -475,15 +485,77 @@ class Renderer:
             else result.reshape(self.height, self.width, self.bands)
         )
 
-    def _bands(self, spectrum) -> np.ndarray:
+    def _bands(self, spectrum, count: int | None = None) -> np.ndarray:
         import drjit as dr
 
         dr.eval(spectrum)  # lane by lane: one array of all lanes would carry its size into the kernel
-        return np.stack([np.array(spectrum[i]) for i in range(self.bands)], -1)
+        return np.stack([np.array(spectrum[i]) for i in range(self.bands if count is None else count)], -1)
+
+    def _own(self, led: str) -> np.ndarray:
+        """Numbers of the bands in which a light is rendered; of no light, all."""
+        if self.integral is None or not led:
+            return np.arange(self.bands)
+        return self.integral.bands_of(led)
+
+    def _each_band(self, shade: Callable, led: str = "") -> np.ndarray:
+        """(N, B) of what `shade` gives per lane; of channels that are integrals in as many passes as the light's bands
+        take, 0 in the bands of others."""
+        if self.integral is None:
+            return self._bands(shade())
+        found = np.zeros((1, self.bands))
+        own, lanes = self._own(led), self.scene.integrator.lanes
+        seen = len(own) > 0
+        own = own if seen else np.zeros(1, int)  # a light that no channel sees
+        for start in range(0, len(own), lanes):
+            self._lanes = own[start : start + lanes]
+            self._light_lanes(led)
+            try:
+                raw = self._bands(shade(), len(self._lanes))
+            finally:
+                here, self._lanes = self._lanes, None
+                self._light_lanes("")
+            if not start:
+                found = np.zeros((len(raw), self.bands), raw.dtype)
+            found[:, here] = raw * seen
+        return found
+
+    def _light_lanes(self, led: str) -> None:
+        """Tell a light and the pigments which lanes of the present pass are theirs; where none is present, nothing."""
+        if not self.integral.auto:
+            return
+        for name, part in self.scene.parts.items():
+            pigment = hasattr(part, "fluorescence")
+            if self._lanes is None or not (name == led or pigment):
+                if name in self.scene.leds or pigment:
+                    part.lane = None
+                continue
+            part.lane = self._spectrum(self.integral.lanes(led, name if pigment else ""))
+
+    def _spectrum(self, per_band: np.ndarray):
+        """The lanes of the present pass of numbers (B,); those without a band repeat the last."""
+        import drjit as dr
+        import mitsuba as mi
+
+        lanes = self.scene.integrator.lanes
+        own = per_band[self._lanes] if len(self._lanes) else per_band[:1] * 0
+        padded = np.append(own, [own[-1]] * lanes)[:lanes]
+        return mi.UnpolarizedSpectrum(*(dr.opaque(mi.Float, float(v)) for v in padded))
+
+    def _tune(self, si) -> None:
+        """Give what camera rays met the wavelengths of the present pass."""
+        if self._lanes is not None:
+            si.wavelengths = type(si.wavelengths)(self._spectrum(self.integral.nm))
 
     def powers(self, values: Mapping, led: str) -> np.ndarray:
         """(B,) power of an LED in each band, relative to its image."""
-        shares = [values[key] for key in self.scene.band_powers[led]] + [1.0] * self.bands
+        own = [values[key] for key in self.scene.band_powers[led]]
+        if self.integral is not None:
+            return (
+                values[self.scene.powers[led]] * np.array(own)[self.colours]
+                if own
+                else np.full(self.bands, values[self.scene.powers[led]])
+            )
+        shares = own + [1.0] * self.bands
         return values[self.scene.powers[led]] * np.array(shares[: self.bands])
 
     def led_tangent_at_rest(self, values: Mapping, led: str, key: str, component: int = 0) -> np.ndarray:
@@ -560,11 +632,15 @@ class Renderer:
             own = ("bounced", seed, *self._led_key(values, other))
             if other in self.scene.sources or own in self._plain:
                 continue
-            sampler = mi.load_dict({"type": "independent"})
-            sampler.seed(directions, count)
-            light = self.scene.integrator.bounced(self.scene.mitsuba, *sample[:3], self.scene.leds[other], 1, sampler)
+
+            def shade(lamp=self.scene.leds[other]):
+                sampler = mi.load_dict({"type": "independent"})
+                sampler.seed(directions, count)
+                self._tune(sample.si)
+                return self.scene.integrator.bounced(self.scene.mitsuba, *sample[:3], lamp, 1, sampler)
+
             rows, columns = -(-self.height // BOUNCE_CELL), -(-self.width // BOUNCE_CELL)
-            coarse = self._bands(light).reshape(rows, columns, BOUNCE_SAMPLES, self.bands).mean(2)
+            coarse = self._each_band(shade, other).reshape(rows, columns, BOUNCE_SAMPLES, self.bands).mean(2)
             image = zoom(coarse, (BOUNCE_CELL, BOUNCE_CELL, 1), order=1, mode="nearest", grid_mode=True)
             self._keep_plain(own, image[: self.height, : self.width].astype(float))
         return self._bounced(values, led, self._plain[key], component)
@@ -621,10 +697,13 @@ class Renderer:
     def _shone(self, values: Mapping, sample: Sample) -> np.ndarray:
         """(N, B): radiance of the membranes that no LED made, at the ends of camera rays."""
         self.apply(values, move=False)
-        return sum(
-            self._bands(self.scene.integrator.ambient(self.scene.mitsuba, *sample[:3], m) + 0 * sample.si.t)
-            for m in self.scene.membranes.values()
-        )
+
+        def shade(membrane):
+            self._tune(sample.si)
+            return self.scene.integrator.ambient(self.scene.mitsuba, *sample[:3], membrane) + 0 * sample.si.t
+
+        found = sum(self._each_band(lambda m=m: shade(m)) for m in self.scene.membranes.values())
+        return found if self.integral is None else found * self.integral.white
 
 
 class Sample(NamedTuple):

@@ -12,16 +12,19 @@ import re
 import warnings
 from collections.abc import Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 from optics.errors import BadScene, UnknownKey
 from optics.files.output import shipped
 from optics.scene import showing
 from optics.scene.declare import LED_BY_LED, Effect, Part
+from optics.scene.integral import FEW, Integral, refuse_unseen
 from optics.scene.mitsuba_parts import DEFAULT_VARIANT, Declared, is_part, loading, move, use_variant
 from optics.scene.parameter import Parameter, Variable, keys_with
 from optics.scene.registry import Registry, known
 from optics.scene.wiring import wire
+from optics.spectra.curve import Curve
 
 KEEPS = "use 'interface', 'rough_interface' or 'sheet', which keep it"
 DEPOLARIZERS = {  # stock materials without a Mueller matrix, by the name that Mitsuba prints
@@ -122,9 +125,39 @@ class Scene:
             for p in self.registry.parameters_of(part.kind):
                 self.parameters[f"{name}.{p.name}"] = p
         self.powers, self.band_powers = self._light_powers()
+        with self._named():
+            refuse_unseen(self)
         self._stock = self._stock_parameters()
         self.parameters.update({k: p for k, (p, _) in self._stock.items() if k not in self.parameters})
         self._warn_of_depolarizers()
+        self.integral: Integral | None = None
+        if getattr(self.integrator, "integrates", False):
+            self._integrate()
+
+    def _integrate(self) -> None:
+        """Have channels be integrals over the wavelength (optics.scene.integral)."""
+        if self.camera is None or not self.lights:
+            raise BadScene(
+                f"{self.path}: bands of integrals need a part of the type 'camera' and a light of this program"
+            )
+        if self.monte_carlo:
+            raise BadScene(
+                f"{self.path}: light through dielectric bodies is followed in up to {FEW} bands; allowed: bands such "
+                "as 620, 540, 460"
+            )
+        self.integral = Integral(self, self.integrator.bands, self.integrator.nodes or 0)
+        self.integrator.bands = tuple(float(nm) for nm in self.integral.nm)
+        for part in self.parts.values():
+            part.integral = self.integral
+        if self.integral.auto:  # what a spectrum depends on acts in the matrix from bands to channels alone
+            for group in self.integral.groups:
+                for key in group.keys:
+                    self.parameters[key] = replace(self.parameters[key], how="image")
+
+    @property
+    def curves(self) -> dict[str, Curve]:
+        """The spectra that parts were given, by `part.attribute`."""
+        return {f"{n}.{name}": curve for n, part in self.parts.items() for name, curve in part.curves.items()}
 
     @contextmanager
     def _named(self):

@@ -324,6 +324,8 @@ def _imagined(scene: Scene, pool: Sequence[Choice], noise: Noise) -> SceneModel:
     swept = width * height == 1
     bands = scene.integrator.bands if scene.integrator is not None else ()
     channels = 1 if len(bands or (0,)) == 1 else 3
+    if scene.integral is not None:
+        channels = len(scene.integral.quantum)
     blank = np.zeros((height, width, channels), np.float32)
     first = Frame("first", blank, parameters=dict(pool[0].readings[0]), file="design")
     table = Table("readings.csv", ["reading"]) if swept else None

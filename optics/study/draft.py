@@ -51,6 +51,7 @@ VIEW = (
     "width",
     "height",
     "bands",
+    "white",
     "settings",
 )  # what functions see as `camera` beside its parameters
 

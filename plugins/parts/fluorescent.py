@@ -48,6 +48,7 @@ WIDTH = 2 * math.sqrt(2 * math.log(2))  # fwhm over standard deviation
 def build():
     import drjit as dr
     import mitsuba as mi
+    import numpy as np
 
     class Fluorescent(matt()):
         kind = "fluorescent"
@@ -67,6 +68,8 @@ def build():
                 * middle
             )
             cos = dr.maximum(dr.dot(si.sh_frame.n, to_led), 0.0)
+            if self.integral is not None:  # the power of a light is that of all its wavelengths
+                overlap /= math.sqrt(2 * math.pi) * s1
             absorbed = dr.select(led.wavelength > 0, led.kappa(si, to_led, distance) * cos * overlap, 0.0)
             bands = (
                 mi.UnpolarizedSpectrum(si.wavelengths) if mi.is_spectral else mi.UnpolarizedSpectrum(self.band or 540.0)
@@ -74,10 +77,17 @@ def build():
             s = self.emission_fwhm / WIDTH
             photons = dr.exp(-dr.square((bands - self.emission_peak) / s) / 2) / (math.sqrt(2 * math.pi) * s)
             seen = mi.Frame3f.cos_theta(si.wi) > 0
+            if self.lane is not None:
+                return dr.select(seen, getattr(self, "yield") * absorbed * self.lane / math.pi, 0.0)
             return dr.select(seen, getattr(self, "yield") * absorbed * photons / (bands * math.pi), 0.0)
 
+        def emission(self, own, nm):
+            """Power per nm that is emitted, per photon, at wavelengths; numpy."""
+            s = own.emission_fwhm / WIDTH
+            return np.exp(-(((nm - own.emission_peak) / s) ** 2) / 2) / (math.sqrt(2 * math.pi) * s * nm)
+
         def brdf(self, si, wo, active=True):
-            return self.rho() * dr.inv_pi
+            return self.rho(si) * dr.inv_pi
 
     return Fluorescent
 

@@ -593,6 +593,9 @@ def test_names_that_functions_of_a_camera_see_are_those_that_no_effect_may_take(
         registry=known(),
         resolution=(4, 3),
         sensitivity="identity",
+        channels=(),
+        curves={},
+        integral=None,
         numbers={n: SimpleNamespace(neutral=None) for n in own},
         normalised=lambda own, u, v: (u, v, 1.0),
     )
