@@ -15,6 +15,7 @@ from optics.cli.shared import (
     FitFile,
     FlatField,
     Force,
+    Outside,
     Plugins,
     Quiet,
     Settings,
@@ -260,6 +261,7 @@ def compare(
     sets: Settings = None,
     flat_field: FlatField = None,
     plugins: Plugins = None,
+    outside: Outside = False,
     as_json: AsJson = False,
 ) -> None:
     """Compare a scene with captures: misfit by frame, LED, region and channel."""
@@ -277,6 +279,7 @@ def compare(
         defines=pairs(define, "-D"),
         plugins=plugins,
         flat_field=flat_field,
+        outside=outside,
     )
     comparison = found.comparison
     for text in found.notes:

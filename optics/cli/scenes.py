@@ -114,7 +114,7 @@ def _span(bounds: Sequence[float]) -> str:
     return "any" if math.inf in bounds else " .. ".join(f"{b:g}" for b in bounds)
 
 
-def _new_effect(name: str | None, plugins: Path | None, **given: Any) -> None:
+def _new_effect(name: str | None, plugins: Sequence[Path] | None, **given: Any) -> None:
     """Write a plugin file, print its path, and note what comes next."""
     from optics.scene.declare import STAGES
     from optics.study import draft
@@ -128,7 +128,7 @@ def _new_effect(name: str | None, plugins: Path | None, **given: Any) -> None:
             raise ValueError(f"--along {given['along']}: of which study? Add --from STUDY")
         stage = draft.stage_of(given["part"], given["stage"])
         draft.check_name(name, STAGES[stage], registry)
-        text, folder = draft.new_effect(name, stage), plugins or Path("plugins")
+        text, folder = draft.new_effect(name, stage), plugins[0] if plugins else Path("plugins")
     else:
         if given["stage"] or given["part"]:
             raise ValueError(
@@ -139,8 +139,7 @@ def _new_effect(name: str | None, plugins: Path | None, **given: Any) -> None:
     terminal.note(
         f"next: optics add {given['from']} '{name}', then put a formula in place of the table"
         if given["from"]
-        else "next: fill in the formula; a folder 'plugins' beside captures or scene is found, any other by "
-        f"--plugins {file.parent}"
+        else f"next: fill in the formula; commands run it with --plugins {file.parent}"
     )
     print(file)
 

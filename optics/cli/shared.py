@@ -124,7 +124,24 @@ Settings = Annotated[
         "Repeatable.",
     ),
 ]
-Plugins = Annotated[Path | None, typer.Option("--plugins", metavar="DIR", help="A further folder of plugins.")]
+Plugins = Annotated[
+    list[Path] | None,
+    typer.Option(
+        "--plugins",
+        metavar="PATH",
+        help="Run the plugins of this folder, or this file. Repeatable. 'none': none but those that ship. Without it, "
+        "plugins that lie beside scene or captures run once you have agreed.",
+    ),
+]
+CapturesNow = Annotated[
+    Path | None,
+    typer.Option(
+        "--captures", metavar="DIR", help="Where the study's captures are now, if they are not found where they were."
+    ),
+]
+Outside = Annotated[
+    bool, typer.Option("--allow-outside", help="Let captures.toml name images and tables outside its folder.")
+]
 FitFile = Annotated[
     Path | None,
     typer.Option(
@@ -166,6 +183,7 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
     def run(*args: Any, quiet: bool = False, debug: bool = False, **options: Any) -> None:
         terminal.quiet, terminal.debug = quiet, debug
         try:
+            _let_ask()
             function(*args, **options)
             sys.stdout.flush()
         except BrokenPipeError:  # whoever read our output has seen enough
@@ -186,6 +204,14 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
     run.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
     run.__annotations__ = {**function.__annotations__, "quiet": Quiet, "debug": Debug}
     return app.command()(run)
+
+
+def _let_ask() -> None:
+    """Where there is a terminal, plugins that came with data are asked about."""
+    if sys.stdin is not None and sys.stdin.isatty() and sys.stderr.isatty():
+        from optics.scene import trust
+
+        trust.ask = agree
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -291,7 +317,9 @@ def priors(items: Sequence[str] | None) -> dict[str, tuple[float | None, float]]
     return found
 
 
-def load_scene(name: str, defines: Sequence[str] | None, plugins: Path | None, variant: str | None = None) -> "Scene":
+def load_scene(
+    name: str, defines: Sequence[str] | None, plugins: Sequence[Path] | None, variant: str | None = None
+) -> "Scene":
     """The scene of a command line."""
     from optics import facade
 
@@ -303,7 +331,7 @@ def load_sensor(
     fit: Path | None,
     frame: str | None,
     defines: Sequence[str] | None,
-    plugins: Path | None,
+    plugins: Sequence[Path] | None,
     variant: str | None = None,
     driven: bool = True,
 ) -> "Calibrated":
@@ -331,11 +359,30 @@ def load_sensor(
     return found
 
 
-def scan(plugins: Path | None) -> "Registry":
-    """The registry of the shipped plugins, with a further folder."""
+def scan(plugins: Sequence[Path] | None) -> "Registry":
+    """The registry of the shipped plugins, with further folders or files."""
+    from optics.scene import trust
     from optics.scene.registry import known
 
-    return known(plugins)
+    return known(*(trust.named(plugins) or ()))
+
+
+def agree(files: Sequence[Path], where: str) -> bool:
+    """Ask whether plugins that came with data may run, and say what follows."""
+    from optics.scene.trust import store
+
+    names = ", ".join(map(str, files))
+    print(
+        f"{names}: code {where}. It would run with all your rights. Run it, now and whenever its content is the same? "
+        "[y/N] ",
+        end="",
+        file=sys.stderr,
+        flush=True,
+    )
+    if sys.stdin.readline().strip().lower() not in ("y", "yes"):
+        return False
+    print(f"trusted from now on: {names} (remembered in {store()})", file=sys.stderr)
+    return True
 
 
 @app.callback(invoke_without_command=True)

@@ -438,12 +438,7 @@ def scene_record(scene: Scene) -> dict:
 
 def plugins_record(registry: Registry) -> dict[str, str]:
     """Plugin file, relative to its folder, -> hash."""
-    return {
-        file.relative_to(folder).as_posix(): file_hash(file)
-        for folder in registry.folders
-        for file in sorted(folder.rglob("*.py"))
-        if not file.name.startswith("_")
-    }
+    return {registry.name_of(file): file_hash(file) for file in registry.files}
 
 
 # -- files -----------------------------------------------------------------------------------------------------------

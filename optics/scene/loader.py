@@ -10,17 +10,18 @@ import difflib
 import fnmatch
 import re
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
 from optics.errors import BadScene, UnknownKey
 from optics.files.output import shipped
-from optics.scene import showing
+from optics.scene import showing, trust
 from optics.scene.declare import LED_BY_LED, Effect, Part
 from optics.scene.mitsuba_parts import DEFAULT_VARIANT, Declared, is_part, loading, move, use_variant
 from optics.scene.parameter import Parameter, Variable, keys_with
 from optics.scene.registry import Registry, known
+from optics.scene.trust import Named
 from optics.scene.wiring import wire
 
 KEEPS = "use 'interface', 'rough_interface' or 'sheet', which keep it"
@@ -57,16 +58,22 @@ def load(
     name: str | Path,
     defines: Mapping[str, str] | None = None,
     variant: str = DEFAULT_VARIANT,
-    plugins: Path | None = None,
+    plugins: Named = None,
+    found: Sequence[Path] = (),
 ) -> Scene:
-    """Load a scene by its name or path; `defines` replace the XML's <default>s; `plugins` is a further folder of
-    plugins.
+    """Load a scene by its name or path; `defines` replace the XML's <default>s.
 
-    A folder `plugins` beside the user's scene is scanned as well.
+    plugins   folders of plugins, or files, beside the shipped ones; "none": no others. None: those that lie in a folder
+              `plugins` beside the user's scene, which must be trusted (optics.scene.trust)
+    found     further plugin files that may run, whatever `plugins` says
     """
-    path = find(name)
-    beside = path.parent / "plugins"
-    return Scene(path, dict(defines or {}), variant, known(plugins, beside if beside.is_dir() else None))
+    path, given = find(name), trust.named(plugins)
+    more = trust.admit(trust.beside(path.parent), f"beside the scene {path.name}") if given is None else given
+    code = trust.compiled(path, dict(defines or {}))
+    if given is not None:
+        code = [file for file in code if not any(file.resolve().is_relative_to(p.resolve()) for p in given)]
+    trust.admit_files(code, "that Mitsuba would load")
+    return Scene(path, dict(defines or {}), variant, known(*trust.once(more, found)))
 
 
 class Scene:
@@ -322,6 +329,8 @@ def _reason(error: Exception, path: Path, registry: Registry) -> str:
             if near
             else f" Own types are {', '.join(sorted(parts))}; others are Mitsuba's."
         )
+        if (beside := trust.beside(path.parent)) and not set(trust.plugin_files(beside[0])) & set(registry.files):
+            text += f" The plugins beside the scene are not used; add --plugins {beside[0]}"
     unused = re.search(r'unreferenced propert.* plugin of type "([^"]+)": - \w+ "([^"]+)"', text)
     if unused is not None and unused[1] in parts:
         near = difflib.get_close_matches(unused[2], [p.name for p in registry.parameters_of(unused[1])], n=1)

@@ -24,6 +24,7 @@ from optics.errors import BadPlugin, UnknownKey
 from optics.files.output import shipped
 from optics.scene.declare import CATEGORIES, STAGES, Effect, Part
 from optics.scene.parameter import Parameter
+from optics.scene.trust import plugin_files
 from optics.words import key_of
 
 EARLIER = {  # names that modules once had, which plugin files may still import
@@ -46,6 +47,7 @@ class Registry:
     parts: Mapping[str, Part]
     effects: Mapping[str, Effect]
     folders: tuple[Path, ...] = ()
+    files: tuple[Path, ...] = ()  # that were executed
     classes: dict = field(default_factory=dict, repr=False)  # variant -> kind -> class, built when first needed
 
     @classmethod
@@ -53,28 +55,40 @@ class Registry:
         """The registry of the plugin files in these folders and their subfolders; raises BadPlugin and leaves nothing
         behind.
 
-        Names that start with _ or . are passed over. The same folders with the same contents give the same registry.
+        A path may also be that of one plugin file. Names that start with _ or . are passed over. The same folders with
+        the same contents give the same registry.
         """
         folders = tuple(dict.fromkeys(Path(folder).resolve() for folder in folders))
-        files = tuple((file, _content(file)) for folder in folders for file in _files(folder))
+        found = dict.fromkeys(file for folder in folders for file in plugin_files(folder))
+        files = tuple((file, _content(file.read_bytes())) for file in found)
         known = _registries.get(folders)
         if known is not None and known[0] == files:
             return known[1]
         items = [(file, item) for file, content in files for item in declared(file, content)]
-        made = cls.holding(items, folders)
+        made = cls.holding(items, folders, tuple(file for file, _ in files))
         _registries[folders] = files, made
         return made
 
     @classmethod
-    def holding(cls, items: Iterable[tuple[Path | str, Part | Effect]], folders: Sequence[Path] = ()) -> Registry:
+    def holding(
+        cls,
+        items: Iterable[tuple[Path | str, Part | Effect]],
+        folders: Sequence[Path] = (),
+        files: Sequence[Path] = (),
+    ) -> Registry:
         """The registry of declarations, each with the file that messages name."""
         parts: dict[str, Part] = {}
         effects: dict[str, Effect] = {}
         for file, item in items:
             _add(parts, effects, item, str(file))
-        made = cls(MappingProxyType(parts), MappingProxyType(effects), tuple(folders))
+        made = cls(MappingProxyType(parts), MappingProxyType(effects), tuple(folders), tuple(files))
         made.check()
         return made
+
+    def name_of(self, file: Path) -> str:
+        """A plugin file's path relative to the folder that it was found in; of a file that was named, its name."""
+        home = next((folder for folder in self.folders if folder in file.parents), file.parent)
+        return file.relative_to(home).as_posix()
 
     def kinds(self, part: str) -> tuple[str, ...]:
         """The kinds that a name stands for: the part of that kind, and all that play that role."""
@@ -231,19 +245,8 @@ def default() -> Registry:
 
 
 # -- one file --------------------------------------------------------------------------------------------------------
-def _files(folder: Path) -> list[Path]:
-    """The plugin files of a folder and its subfolders, in order."""
-    if not folder.is_dir():
-        raise BadPlugin(f"{folder}: no such folder of plugins")
-    return [
-        file
-        for file in sorted(folder.rglob("*.py"))
-        if not any(piece.startswith(("_", ".")) for piece in file.relative_to(folder).parts)
-    ]
-
-
-def _content(file: Path) -> str:
-    return hashlib.sha256(file.read_bytes()).hexdigest()
+def _content(source: bytes) -> str:
+    return hashlib.sha256(source).hexdigest()
 
 
 _declared: dict[Path, tuple[str, tuple[Part | Effect, ...]]] = {}  # file -> its hash, and what it declares
@@ -254,7 +257,11 @@ def declared(file: Path, content: str | None = None) -> tuple[Part | Effect, ...
 
     A file is executed again when its content (a hash) has changed."""
     file = Path(file).resolve()
-    content = content or _content(file)
+    source = file.read_bytes()
+    if content is None:
+        content = _content(source)
+    elif content != _content(source):
+        raise BadPlugin(f"{file}: changed while it was read; try again")
     if file in _declared and _declared[file][0] == content:
         return _declared[file][1]
     for name, now in EARLIER.items():
@@ -266,8 +273,8 @@ def declared(file: Path, content: str | None = None) -> tuple[Part | Effect, ...
     sys.modules[name] = module
     try:
         # compiled here: the interpreter's own cache tells versions of a file apart by whole seconds and its size
-        exec(compile(file.read_text(encoding="utf-8"), str(file), "exec", dont_inherit=True), vars(module))
-    except Exception as error:
+        exec(compile(source, str(file), "exec", dont_inherit=True), vars(module))
+    except (Exception, SystemExit) as error:
         if before is None:
             del sys.modules[name]
         else:

@@ -49,6 +49,7 @@ from optics.files.output import check_folder, file_hash, replacing, write_text
 from optics.light.rendering import LAYERS, RenderJob
 from optics.scene import loader as scenes
 from optics.scene.mitsuba_parts import DEFAULT_VARIANT
+from optics.scene.trust import Named
 from optics.study.calibrated import Calibrated, calibrated
 
 Progress = Callable[[str, int, int], None]
@@ -258,7 +259,7 @@ def _explained(error: ValidationError, file: Path) -> Exception:
     )
 
 
-def _sensor(job: Job, file: Path, plugins: Path | None) -> Calibrated:
+def _sensor(job: Job, file: Path, plugins: Named) -> Calibrated:
     """The scene of a job, and the values of its fit."""
     given = None
     if job.scene is not None:
@@ -274,7 +275,7 @@ def _sensor(job: Job, file: Path, plugins: Path | None) -> Calibrated:
 class Maker:
     """Makes the files of one sample after the other."""
 
-    def __init__(self, job: Job, file: Path, plugins: Path | None):
+    def __init__(self, job: Job, file: Path, plugins: Named):
         self.job, self.file = job, Path(file)
         sensor = _sensor(job, self.file, plugins)
         sensor.noise = job.camera_noise() or sensor.noise
@@ -519,7 +520,7 @@ def run(
     file: str | Path,
     shard: tuple[int, int] = (1, 1),
     workers: int | None = None,
-    plugins: Path | None = None,
+    plugins: Named = None,
     progress: Progress | None = None,
     *,
     fit: str | Path | None = None,
@@ -616,7 +617,7 @@ def _cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _crew(job: Job, file: Path, plugins: Path | None, todo: Sequence[int], workers: int) -> Iterator[dict]:
+def _crew(job: Job, file: Path, plugins: Named, todo: Sequence[int], workers: int) -> Iterator[dict]:
     """Records from worker processes, in the order in which they finish.
 
     Each holds one end of a pipe and nothing else of this process, so that it ends when this one is killed.
@@ -662,7 +663,7 @@ def _crew(job: Job, file: Path, plugins: Path | None, todo: Sequence[int], worke
             process.join(10)
 
 
-def _work(connection, job: Job, file: Path, plugins: Path | None) -> None:
+def _work(connection, job: Job, file: Path, plugins: Named) -> None:
     """The loop of a worker: it receives an index, and sends a record or the text of an error."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent decides
     try:

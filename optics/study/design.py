@@ -36,6 +36,7 @@ from optics.files.output import new_folder, shipped
 from optics.fit.scene_model import SceneModel
 from optics.scene.loader import Scene
 from optics.scene.parameter import Parameter, Values, beside, keys_with
+from optics.scene.trust import Named
 from optics.study.setup import Setup, effect_variables, variables_of_base
 from optics.words import spaced, table
 
@@ -433,7 +434,7 @@ def session(
     frames: int,
     effects: Sequence[str] = (),
     defines: dict | None = None,
-    plugins: Path | None = None,
+    plugins: Named = None,
     noise: dict | None = None,
     share: float = SHARE,
     fixed_exposure: bool = False,
@@ -450,8 +451,8 @@ def session(
     _require(frames, share)  # before anything is loaded
     path = Path(subject)
     if (path / "ladder.json").is_file():
-        study, model, setup = loop.take_up(path)
-        scene = scenes.load(model.scene.path, {**model.scene.defines, **(defines or {})}, plugins=plugins)
+        study, model, setup = loop.take_up(path, plugins)
+        scene = scenes.load(model.scene.path, {**model.scene.defines, **(defines or {})}, plugins=setup.plugins)
         scene.set(model.captures.parameters)  # what was set in all frames stays so
         chosen = [scene.registry.find_effect(name) for name in effects] or loop.candidates(model, study)
         return plan(

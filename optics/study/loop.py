@@ -11,6 +11,7 @@ Each step is a folder of the study (optics.study.record), from which another pro
 from __future__ import annotations
 
 import math
+import os
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
@@ -24,16 +25,19 @@ from optics.captures import identity
 from optics.diagnosis.dials import Width, unstated, width_of
 from optics.diagnosis.result import Diagnosis, Row
 from optics.errors import BadCapture, Underdetermined, UnknownKey
+from optics.files.output import file_hash
 from optics.fit import calibrate
 from optics.fit.compare import Comparison
 from optics.fit.descent import prior_terms
 from optics.fit.model import values_in
 from optics.fit.result import Fit
 from optics.fit.scene_model import SceneModel
+from optics.scene import trust
 from optics.scene.declare import Effect
 from optics.scene.parameter import Values, Variable
 from optics.scene.registry import Registry
-from optics.study import checks
+from optics.scene.trust import Named
+from optics.study import checks, places
 from optics.study.calibrated import origin_of
 from optics.study.record import Record
 from optics.study.setup import (
@@ -92,7 +96,8 @@ def begin(
         folder,
         scene=str(model.captures.scene),
         captures=str(setup.captures),
-        inputs=[setup.captures, model.scene.path, *model.scene.registry.folders],
+        inputs=places.inputs_of(model),
+        near={"captures": os.path.relpath(setup.captures, os.path.abspath(folder))},
         seed=setup.seed,
         command=command,
         title=title,
@@ -109,6 +114,7 @@ def begin(
         },
         prints=identity.sketch_of(model.captures),
     )
+    trust.remember(places.own_files(model.scene.registry))  # named, or agreed to: the study goes on with them
     if record.steps:
         return record, model, restore(record, model)
     clock = time.perf_counter()
@@ -136,14 +142,32 @@ def _dial_error(model: SceneModel, setup: Setup) -> Width | None:
         return None
 
 
-def take_up(folder: str | Path) -> tuple[Record, SceneModel, Setup]:
-    """The record, model and setup of an existing study. Raises BadCapture where an input has changed since it began."""
+def take_up(
+    folder: str | Path, plugins: Named = None, captures: str | Path | None = None
+) -> tuple[Record, SceneModel, Setup]:
+    """The record, model and setup of an existing study, wherever it and its inputs lie. Raises BadCapture where an
+    input is gone or has changed since it began.
+
+    plugins    folders or files that are known besides those that the study was made with; None: those that are found
+               with it. What is not named must be trusted (optics.scene.trust)
+    captures   where its captures are, if they are not found"""
     record = Record.open(folder)
     setup = recorded(record.ladder["facts"]["setup"])
-    changed = record.changed_inputs()
+    found = places.captures_of(record.folder, record.ladder, setup, captures)
+    scene = places.scene_named(found)
+    around = places.plugin_places(record.folder, setup, found, scene)
+    own = [*around, *(trust.named(plugins) or ())]
+    changed = places.changed(
+        record.ladder, setup, found, scene, [file for place in own for file in trust.plugin_files(place)]
+    )
     if changed:
-        raise BadCapture(f"{folder}: changed since the study began: {', '.join(changed[:5])}; start a new study")
-    return record, open_model(setup), setup
+        raise BadCapture(
+            f"{folder}: changed since the study began: {', '.join(changed[:5])}{' ...' if len(changed) > 5 else ''} "
+            f"(captures: {found}); start a new study"
+        )
+    code = places.code_of(record.folder, record.ladder, setup, around, plugins)
+    setup = replace(setup, captures=str(found), plugins=[str(file) for file in code])
+    return record, open_model(setup, code=code), setup
 
 
 def kept(record: Record, model: SceneModel, index: int = -1) -> tuple[list[Variable], Values, list[int]]:
@@ -423,7 +447,11 @@ def extend(
         model, variables, start, fitted, robust=setup.robust, progress=progress, over=[v.name for v in extra]
     )
     best = settled(model, best, setup.robust, progress)
-    record.note_inputs([effect.file] if effect.file else [])  # a draft is written after the study began
+    if effect.file:  # a draft is written after the study began
+        own = places.own_plugins(model.scene.registry)
+        file = Path(effect.file).resolve()
+        digest = file_hash(file)
+        record.note_inputs({name: h for name, h in own.items() if h == digest})
     comparison = write_step(record, model, effect.name, effect, best, held, time.perf_counter() - clock)
     before, after = (step["held_out"]["chi2_per_dof"] if step["held_out"] else math.nan for step in record.steps[-2:])
     if after > before:

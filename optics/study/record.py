@@ -39,6 +39,7 @@ from optics.files.output import file_hash, input_hashes, new_folder, replacing, 
 from optics.fit.compare import Comparison, Row, plain
 from optics.fit.result import Fit
 from optics.study.fit_files import fit_record, fit_toml, read_fit
+from optics.study.places import portable
 from optics.study.shown import Fingerprint, Shown
 
 FORMAT = 1
@@ -63,7 +64,8 @@ class Record:
         *,
         scene: str,
         captures: str,
-        inputs: Sequence[str | Path] = (),
+        inputs: Sequence[str | Path] | Mapping[str, str] = (),
+        near: Mapping[str, str] | None = None,
         seed: int = 0,
         command: Sequence[str] = (),
         title: str = "",
@@ -77,7 +79,9 @@ class Record:
     ) -> Record:
         """Start a study in a folder that does not exist yet, or is empty.
 
-        inputs       files and folders that the result depends on; each file is recorded by SHA-256
+        inputs       files and folders that the result depends on, each file recorded by SHA-256; or name -> hash, as
+                     `optics.study.places.inputs_of` gives them
+        near         where inputs lie, relative to the study: it may be moved together with them
         noise        optics.captures.noise.Noise, or a dictionary; facts: plain values to print (frames, image size ...)
         prints       of the captures (optics.captures.identity), by which a draft knows them again
         noise_floor  chi2/dof of a perfect model: 1, unless repeated frames say otherwise
@@ -86,7 +90,7 @@ class Record:
         Raises OutputExists, or BadCapture when the study to resume was made from something else.
         """
         folder = Path(folder)
-        hashes = input_hashes(inputs)
+        hashes = dict(inputs) if isinstance(inputs, Mapping) else input_hashes(inputs)
         if (folder / "ladder.json").exists():
             if not resume:
                 raise OutputExists(
@@ -94,8 +98,10 @@ class Record:
                 )
             study = cls.open(folder, empty=True)
             old = study.ladder
-            changed = [k for k, new in (("scene", scene), ("seed", seed)) if old[k] != new]
-            changed += sorted(k for k in hashes.keys() | old["inputs"].keys() if hashes.get(k) != old["inputs"].get(k))
+            changed = [] if Path(old["scene"]).name == Path(scene).name else ["scene"]
+            changed += ["seed"] if old["seed"] != seed else []
+            before = portable(old["inputs"], old["captures"]) if isinstance(inputs, Mapping) else old["inputs"]
+            changed += sorted(k for k in hashes.keys() | before.keys() if hashes.get(k) != before.get(k))
             if changed:
                 raise BadCapture(
                     f"{folder}: cannot resume, changed since the study began: {', '.join(changed[:5])}"
@@ -116,6 +122,8 @@ class Record:
             "command": list(map(str, command)),
             "versions": versions(),
             "inputs": hashes,
+            "near": dict(near or {}),
+            "drafts": {},
             "noise": _as_dict(noise) or {},
             "noise_floor": {"chi2_per_dof": float(noise_floor), "source": noise_floor_source},
             "warnings": list(warnings),
@@ -183,9 +191,15 @@ class Record:
     def has(self, effect: str | None) -> bool:
         return any(step["effect"] == effect for step in self.steps)
 
-    def note_inputs(self, files: Sequence[str | Path]) -> None:
-        """Record files that the next steps depend on besides the inputs that the study began with."""
-        self.ladder["inputs"] = {**input_hashes(files), **self.ladder["inputs"]}
+    def note_inputs(self, hashes: Mapping[str, str]) -> None:
+        """Record what the next steps depend on besides the inputs that the study began with: name -> hash."""
+        self.ladder["inputs"] = {**hashes, **self.ladder["inputs"]}
+        self._save()
+
+    def note_draft(self, file: Path) -> None:
+        """Record a plugin that was drafted from this study and lies in it."""
+        name = file.resolve().relative_to(self.folder.resolve()).as_posix()
+        self.ladder["drafts"] = {**self.ladder.get("drafts", {}), name: file_hash(file)}
         self._save()
 
     def changed_inputs(self) -> list[str]:

@@ -109,7 +109,9 @@ def ask(server):
         connection = http.client.HTTPConnection(*server.server_address, timeout=60)
         with contextlib.closing(connection):
             body = (json.dumps(question) if text is None else text) if method == "POST" else None
-            connection.request(method, path, body, {"Content-Type": "application/json", **(headers or {})})
+            connection.request(
+                method, f"/{server.token}{path}", body, {"Content-Type": "application/json", **(headers or {})}
+            )
             answer = connection.getresponse()
             return answer.status, answer.read(), answer.headers
 
@@ -435,7 +437,8 @@ def test_the_command_serves_until_it_is_interrupted(study):
     try:
         url = child.stdout.readline().strip()
         assert url.startswith("http://127.0.0.1:"), child.stderr.read()
-        connection = http.client.HTTPConnection(url.removeprefix("http://").rstrip("/"), timeout=60)
+        address, token = url.removeprefix("http://").rstrip("/").split("/")
+        connection = http.client.HTTPConnection(address, timeout=60)
         with contextlib.closing(connection):
             connection.request("GET", "/")
             page = connection.getresponse().read().decode()
