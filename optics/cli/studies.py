@@ -163,8 +163,11 @@ def diagnose(
     """
     from optics.diagnosis.text import ranking
     from optics.facade import Study
-    from optics.files.output import write_text
+    from optics.files.output import check_folder, spare_records, write_text
 
+    if csv is not None:
+        spare_records(csv)
+        check_folder(csv.parent)
     found = Study.open(study, plugins=plugins, captures=captures)
     with terminal.progress() as progress:
         result = found.diagnose(
@@ -269,7 +272,7 @@ def scoreboard(
 
     The exit code is 1 where a study is beaten by a model without physics in the contact, else 0.
     """
-    from optics.files.output import claim, write_text
+    from optics.files.output import claim, together, write_text
     from optics.pages.scoreboard import render
     from optics.study.board import text, to_json
     from optics.study.scoreboard import scoreboard
@@ -281,8 +284,9 @@ def scoreboard(
             captures or (), study or (), held_out=hold_out, presses=presses, plugins=plugins, progress=progress
         )
     record = to_json(boards)
-    for file, content in zip(files, (render(boards), record)):
-        write_text(file, content)
+    with together(files):
+        for file, content in zip(files, (render(boards), record)):
+            write_text(file, content)
     print(record if as_json else f"{text(boards)}\n\n{files[0]}")
     if any(board.beaten for board in boards):
         raise typer.Exit(1)

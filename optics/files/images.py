@@ -11,6 +11,7 @@ import numpy as np
 
 from optics.errors import BadCapture
 from optics.files import exr
+from optics.files.output import replacing
 
 SUFFIXES = (".png", ".tif", ".tiff", ".exr", ".npy")
 CHANNELS_MOST = 64
@@ -156,16 +157,18 @@ def write_image(stem: Path, image: np.ndarray, bits: int | None) -> Path:
         values, suffix = image.astype({8: np.uint8, 16: np.uint16}[bits]), ".png"
     count = image.shape[2]
     file = stem.parent / (stem.name + (suffix if count in (1, 3) else ".npy"))
-    if count not in (1, 3):
-        np.save(file, values, allow_pickle=False)
-    elif bits is None:
-        exr.write(file, {name: values[..., i] for i, name in enumerate("RGB" if count == 3 else "Y")}, {"units": "DN"})
-    elif bits == 16 and count == 3:
-        import mitsuba as mi
+    with replacing(file) as temporary:
+        if count not in (1, 3):
+            np.save(temporary, values, allow_pickle=False)
+        elif bits is None:
+            names = "RGB" if count == 3 else "Y"
+            exr.write(temporary, {name: values[..., i] for i, name in enumerate(names)}, {"units": "DN"})
+        elif bits == 16 and count == 3:
+            import mitsuba as mi
 
-        mi.Bitmap(np.ascontiguousarray(values)).write(str(file))
-    else:
-        from PIL import Image
+            mi.Bitmap(np.ascontiguousarray(values)).write(str(temporary))
+        else:
+            from PIL import Image
 
-        Image.fromarray(values if count == 3 else values[..., 0]).save(file)
+            Image.fromarray(values if count == 3 else values[..., 0]).save(temporary)
     return file

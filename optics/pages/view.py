@@ -31,6 +31,7 @@ import numpy as np
 
 from optics.captures import capture_set as capture_files
 from optics.errors import UnknownKey
+from optics.files.output import write_text
 from optics.fit import calibrate, descent
 from optics.fit.compare import led_label
 from optics.fit.model import value_of
@@ -39,6 +40,7 @@ from optics.scene.parameter import Values, Variable
 from optics.scene.trust import Named
 from optics.study import loop
 from optics.study.calibrated import origin_toml
+from optics.study.fit_files import END, WHOLE
 from optics.study.setup import effect_variables
 from optics.words import spaced
 
@@ -450,7 +452,7 @@ class View:
             unit = spaced(self.model.parameters[key].unit) if key in self.model.parameters else ""
             return f"{quoted(key)} = {quoted(value)}" + (f"  #{unit}" if unit else "")
 
-        lines += ["", "[parameters]", *(entry(k, v) for k, v in values.common.items())]
+        lines += [f"# {WHOLE}", "", "[parameters]", *(entry(k, v) for k, v in values.common.items())]
         for index, own in sorted(values.frame.items()):
             if own:
                 lines += [
@@ -458,19 +460,17 @@ class View:
                     f"[frames.{quoted(self.model.frames[index].name)}]",
                     *(entry(k, v) for k, v in own.items()),
                 ]
-        return "\n".join(lines) + "\n" + origin_toml(self.study.fit(self.step["index"]))
+        return "\n".join(lines) + "\n" + origin_toml(self.study.fit(self.step["index"])) + f"\n{END}\n"
 
     def write(self, changes: Mapping[str, float]) -> dict:
         """Write values into a new file of the study's folder; the file, its text, and the command that uses it."""
         text, number = self._do(lambda: self._toml(changes)), 1
         while True:
             file = Path(self.study.folder) / f"view-{number:02d}.toml"
-            try:
-                with open(file, "x", encoding="utf-8") as new:
-                    new.write(text)
+            if not file.exists():
+                write_text(file, text)
                 break
-            except FileExistsError:
-                number += 1
+            number += 1
         s, groups = (
             self.setup,
             [name for name, own in capture_files.groups(self.model.captures).items() if own[0] in self.held],

@@ -45,7 +45,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 from optics.captures.noise import Noise
 from optics.errors import OutOfBounds, OutputExists, UnknownKey
 from optics.files import toml_checks as checks
-from optics.files.output import check_folder, file_hash, replacing, write_text
+from optics.files.output import alone, check_folder, file_hash, replacing, write_text
 from optics.light.rendering import LAYERS, RenderJob
 from optics.scene import loader as scenes
 from optics.scene.mitsuba_parts import DEFAULT_VARIANT
@@ -424,18 +424,9 @@ def _changes(before, now, name: str = "") -> list[str]:
 @contextmanager
 def _alone(folder: Path, shard: tuple[int, int]) -> Iterator[None]:
     """Lock a shard against a second process; the system frees the lock however the process ends."""
-    try:
-        import fcntl
-    except ImportError:  # Windows: two processes would do the same work twice, with the same result
-        yield
-        return
-    with open(folder / f".lock-{shard[0]}-of-{shard[1]}", "w") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            raise OutputExists(
-                f"{folder}: another process works on shard {shard[0]}/{shard[1]}; wait for it, or take another shard"
-            ) from error
+    lock = folder / f".lock-{shard[0]}-of-{shard[1]}"
+    said = f"{folder}: another process works on shard {shard[0]}/{shard[1]}; wait for it, or take another shard"
+    with alone(lock, said):
         yield
 
 

@@ -31,6 +31,7 @@ import numpy as np
 from optics.diagnosis.fingerprints import SIDE, family_of
 from optics.diagnosis.result import Diagnosis, Fingerprint
 from optics.errors import OutputExists, UnknownKey
+from optics.files.output import write_text
 from optics.scene import loader as scenes
 from optics.scene import trust
 from optics.scene.declare import STAGES
@@ -239,16 +240,21 @@ def write(text: str, folder: Path, name: str) -> Path:
 
     file = Path(folder) / f"{identifier(name)}.py"
     check_folder(file.parent)
-    file.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        with file.open("x", encoding="utf-8") as out:  # fails as well where another process was first
-            out.write(text)
-    except FileExistsError as error:
-        raise OutputExists(f"{file} exists; choose another name, or change that file") from error
     study = file.absolute().parent.parent
-    if (study / "ladder.json").is_file() and file.parent.name == trust.BESIDE:  # the study's own: it runs from there
-        Record.open(study).note_draft(file)
-        trust.remember([file])
+    if file.parent.name != trust.BESIDE or not (study / "ladder.json").is_file():
+        return _written(file, text)
+    record = Record.open(study, empty=True)
+    with record.alone():  # the study's own: it runs from there
+        _written(file, text)
+        record.note_draft(file)
+    trust.remember([file])
+    return file
+
+
+def _written(file: Path, text: str) -> Path:
+    if file.exists():
+        raise OutputExists(f"{file} exists; choose another name, or change that file")
+    write_text(file, text)
     return file
 
 

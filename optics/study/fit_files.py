@@ -93,6 +93,7 @@ def fit_toml(record: Mapping, name: str = "", origin: Mapping[str, Mapping] | No
             "compare, render, batch and sweep takes them."
         )
     )
+    document.add(tomlkit.comment(WHOLE))
 
     def table(values: Mapping) -> Any:
         out = tomlkit.table()
@@ -131,9 +132,11 @@ def fit_toml(record: Mapping, name: str = "", origin: Mapping[str, Mapping] | No
     document.add("fit", fit)
     if origin.get("sensor"):
         document.add("sensor", tomlkit.item(dict(origin["sensor"])))
-    return tomlkit.dumps(document)
+    return f"{tomlkit.dumps(document).rstrip()}\n\n{END}\n"
 
 
+WHOLE = "Whole only with its last line."  # begins a file that ends with END
+END = "# end"
 TABLES = ("parameters", "uncertainty", "frames", "frames_uncertainty", "fit", "sensor")
 
 
@@ -142,15 +145,20 @@ def read_fit(file: str | Path) -> dict[str, dict]:
 
     file   a fit.toml, or the folder of a study, whose last step is taken
 
-    Raises FileNotFoundError, and ValueError for what is not TOML.
+    Raises FileNotFoundError, and ValueError for what is not TOML, or was cut off.
     """
     import tomlkit
 
     file = fit_file(file)
     try:
-        data = tomlkit.parse(file.read_text(encoding="utf-8")).unwrap()
+        text = file.read_text(encoding="utf-8-sig")
+        data = tomlkit.parse(text).unwrap()
     except ValueError as error:
         raise ValueError(f"{file}: not valid TOML: {error}") from error
+    head = text.lstrip().splitlines()[:3]
+    cut = f"# {WHOLE}" in head and text.rstrip().splitlines()[-1] != END
+    if cut or not text.strip() or (any(line.startswith("# Calibrated values") for line in head) and "fit" not in data):
+        raise ValueError(f"{file}: cut off: its end is missing; restore the file, or take another step's")
     for key in TABLES:
         if not isinstance(data.get(key, {}), dict):
             raise ValueError(f"{file}: {key} = {data[key]!r}; allowed: a table, [{key}]")

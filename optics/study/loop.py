@@ -118,12 +118,13 @@ def begin(
     if record.steps:
         return record, model, restore(record, model)
     clock = time.perf_counter()
-    try:
-        found = fit_base(model, variables, fitted, Values(dict(setup.values)), progress, robust=setup.robust)
-        write_step(record, model, "base", None, found, held, time.perf_counter() - clock)
-    except BaseException:
-        record.discard()
-        raise
+    with record.alone():
+        try:
+            found = fit_base(model, variables, fitted, Values(dict(setup.values)), progress, robust=setup.robust)
+            write_step(record, model, "base", None, found, held, time.perf_counter() - clock)
+        except BaseException:
+            record.discard()
+            raise
     return record, model, found
 
 
@@ -166,7 +167,9 @@ def take_up(
             f"(captures: {found}); start a new study"
         )
     code = places.code_of(record.folder, record.ladder, setup, around, plugins)
-    setup = replace(setup, captures=str(found), plugins=[str(file) for file in code])
+    if code or plugins is not None:
+        setup = replace(setup, plugins=[str(file) for file in code])
+    setup = replace(setup, captures=str(found))
     return record, open_model(setup, code=code), setup
 
 
@@ -305,7 +308,23 @@ def examine(
     without     effects that are not tested
     ranked      called with the rows of that ranking
     advised     where effects tie, also advise what to measure next, which renders frames that nobody has taken yet
+
+    Raises OutputExists where another process works on the study.
     """
+    with record.alone():
+        return _examined(record, model, setup, found, progress, advised, without, ranked)
+
+
+def _examined(
+    record: Record,
+    model: SceneModel,
+    setup: Setup,
+    found: Fit,
+    progress: Progress | None,
+    advised: bool,
+    without: Sequence[str],
+    ranked: Callable[[list[Row]], None] | None,
+) -> Diagnosis:
     from optics.diagnosis.advice import advise
     from optics.diagnosis.diagnose import diagnose
     from optics.diagnosis.remarks import USUALLY
@@ -416,7 +435,22 @@ def extend(
 
     start   values to begin from, such as those of a diagnosis's refit; None: the present ones, with the effect a little
             off neutral
+
+    Raises OutputExists where another process works on the study, or has added a step since it was opened.
     """
+    with record.alone():
+        return _extended(record, model, setup, found, effect, start, progress)
+
+
+def _extended(
+    record: Record,
+    model: SceneModel,
+    setup: Setup,
+    found: Fit,
+    effect: Effect,
+    start: Values | None,
+    progress: Progress | None,
+) -> tuple[Fit, Comparison]:
     fitted, held = split(model, setup)
     if not model.scene.can_express(effect):
         missing = [n for n, keys in model.scene.keys_of(effect).items() if not keys]

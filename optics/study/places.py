@@ -97,10 +97,10 @@ def portable(inputs: Mapping[str, str], captures: str) -> dict[str, str]:
 
 # -- where it is now -------------------------------------------------------------------------------------------------
 def candidates(study: Path, recorded: str | Path, near: str | None = None) -> list[Path]:
-    """Where a file or folder may be that a study knew at an absolute path: there; as far from the study as it was;
+    """Where a file or folder may be that a study knew at an absolute path: as far from the study as it was; there;
     beside the study, or in it, by its name."""
     recorded, study = Path(recorded), Path(os.path.abspath(study))
-    found = [recorded, *([study / near] if near else []), study.parent / recorded.name, study / recorded.name]
+    found = [*([study / near] if near else []), recorded, study.parent / recorded.name, study / recorded.name]
     return list(dict.fromkeys(Path(os.path.normpath(p)) for p in found))
 
 
@@ -120,7 +120,8 @@ def captures_of(study: Path, ladder: Mapping[str, Any], setup: Setup, given: str
             f"{study}: its captures are gone: no {capture_files.FILE} in {', '.join(map(str, places))}; say where they "
             "are: --captures DIR (in Python: captures=...)"
         )
-    return next((p for p in there if file_hash(files[p]) == wanted), there[0]).absolute()
+    same = next((p for p in there if file_hash(files[p]) == wanted), None)
+    return (same or (Path(setup.captures) if Path(setup.captures) in there else there[0])).absolute()
 
 
 def plugin_places(study: Path, setup: Setup, captures: Path, scene: Path | None) -> list[Path]:

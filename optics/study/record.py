@@ -24,7 +24,9 @@ import dataclasses
 import json
 import math
 import shutil
-from collections.abc import Mapping, Sequence
+import zipfile
+import zlib
+from collections.abc import Iterator, Mapping, Sequence
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
@@ -35,7 +37,7 @@ from optics import words
 from optics.diagnosis.result import Diagnosis, table_of
 from optics.diagnosis.result import Row as Ranked
 from optics.errors import BadCapture, OutputExists
-from optics.files.output import file_hash, input_hashes, new_folder, replacing, versions, write_text
+from optics.files.output import alone, file_hash, input_hashes, new_folder, replacing, versions, write_text
 from optics.fit.compare import Comparison, Row, plain
 from optics.fit.result import Fit
 from optics.study.fit_files import fit_record, fit_toml, read_fit
@@ -44,6 +46,7 @@ from optics.study.shown import Fingerprint, Shown
 
 FORMAT = 1
 SHOWN_MAX = 8  # frames whose images a step keeps
+LOCK = ".lock"  # held by the process that writes
 SETTING = "setting "  # begins the names of a sweep's settings in its file
 
 
@@ -55,6 +58,7 @@ class Record:
 
     def __init__(self, folder: Path, ladder: dict[str, Any]):
         self.folder, self.ladder = Path(folder), ladder
+        self._held = 0  # how often this object holds the lock
 
     # -- life ---------------------------------------------------------------------------------------------------------
     @classmethod
@@ -108,7 +112,7 @@ class Record:
                     f"{' ...' if len(changed) > 5 else ''}; start a study in a new folder"
                 )
             return study
-        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        if folder.exists() and (not folder.is_dir() or any(p.name != LOCK for p in folder.iterdir())):
             raise OutputExists(f"{folder} exists and holds no study; choose another folder")
         if not (math.isfinite(noise_floor) and noise_floor > 0):
             raise ValueError(f"noise_floor = {noise_floor} (chi2/dof) is not above 0")
@@ -132,9 +136,17 @@ class Record:
             "shown": [],
             "steps": [],
         }
-        (folder / "steps").mkdir(parents=True, exist_ok=True)
+        folder.mkdir(parents=True, exist_ok=True)
         study = cls(folder, json.loads(_dumps(record)))
-        study._save()
+        with study.alone():
+            if (folder / "ladder.json").exists():
+                raise OutputExists(f"{folder} holds a study already, which another process has begun")
+            try:
+                (folder / "steps").mkdir(exist_ok=True)
+                study._save()
+            except BaseException:
+                study.discard()
+                raise
         return study
 
     @classmethod
@@ -158,7 +170,11 @@ class Record:
                 raise ValueError(f"format {record['format']}, this program reads {FORMAT}")
             record["steps"] = []
             for path in sorted(folder.glob("steps/[0-9][0-9]-*/step.json")):
-                record["steps"].append(json.loads(path.read_text(encoding="utf-8")))
+                file = path
+                record["steps"].append(_step(json.loads(path.read_text(encoding="utf-8"))))
+            file = folder / "ladder.json"
+            for name in ("scene", "inputs", "shown"):
+                record[name]
         except (ValueError, KeyError, TypeError) as error:
             raise ValueError(f"{file}: not a readable study ({error}); restore it or start a new one") from error
         wanted = list(range(len(record["steps"])))
@@ -181,8 +197,35 @@ class Record:
         if not self.steps:
             shutil.rmtree(self.folder / "steps", ignore_errors=True)
             (self.folder / "ladder.json").unlink(missing_ok=True)
+            (self.folder / LOCK).unlink(missing_ok=True)
             with contextlib.suppress(OSError):  # it may hold other things
                 self.folder.rmdir()
+
+    @contextlib.contextmanager
+    def alone(self) -> Iterator[None]:
+        """Keep other processes from writing to the study. Raises OutputExists where one does, or has added a step since
+        this record was read."""
+        if self._held:
+            self._held += 1
+            try:
+                yield
+            finally:
+                self._held -= 1
+            return
+        with alone(
+            self.folder / LOCK,
+            f"{self.folder}: another process works on this study; wait until it ends, then try again",
+        ):
+            there = sorted(p.parent.name for p in self.folder.glob("steps/[0-9][0-9]-*/step.json"))
+            if there != [s["folder"] for s in self.steps]:
+                raise OutputExists(
+                    f"{self.folder}: another process has added a step since this study was opened; open it again"
+                )
+            self._held = 1
+            try:
+                yield
+            finally:
+                self._held = 0
 
     @property
     def steps(self) -> list[dict]:
@@ -193,14 +236,16 @@ class Record:
 
     def note_inputs(self, hashes: Mapping[str, str]) -> None:
         """Record what the next steps depend on besides the inputs that the study began with: name -> hash."""
-        self.ladder["inputs"] = {**hashes, **self.ladder["inputs"]}
-        self._save()
+        with self.alone():
+            self.ladder["inputs"] = {**hashes, **self.ladder["inputs"]}
+            self._save()
 
     def note_draft(self, file: Path) -> None:
         """Record a plugin that was drafted from this study and lies in it."""
         name = file.resolve().relative_to(self.folder.resolve()).as_posix()
-        self.ladder["drafts"] = {**self.ladder.get("drafts", {}), name: file_hash(file)}
-        self._save()
+        with self.alone():
+            self.ladder["drafts"] = {**self.ladder.get("drafts", {}), name: file_hash(file)}
+            self._save()
 
     def changed_inputs(self) -> list[str]:
         """Input files that are gone or differ from the recorded hash."""
@@ -271,7 +316,7 @@ class Record:
         path = self.folder / "steps" / folder
         if path.exists():
             raise OutputExists(f"{path} exists; open the study again to go on after its last step")
-        with new_folder(path) as new:
+        with self.alone(), new_folder(path) as new:
             (new / "images").mkdir()
             (new / "fit.toml").write_text(fit_toml(record, name, origin), encoding="utf-8")
             (new / "metrics.json").write_text(
@@ -294,6 +339,10 @@ class Record:
         self, index: int, diagnosis: Diagnosis | Mapping, fingerprints: Sequence[Fingerprint] = ()
     ) -> None:
         """Add a diagnosis to a recorded step, with what its best effects would explain. A later one replaces it."""
+        with self.alone():
+            self._put_diagnosis(index, diagnosis, fingerprints)
+
+    def _put_diagnosis(self, index: int, diagnosis: Diagnosis | Mapping, fingerprints: Sequence[Fingerprint]) -> None:
         folder, entry = self.path(index), self.steps[index]
         items = [_fingerprint_entry(i, f) for i, f in enumerate(fingerprints)]
         for item, f in zip(items, fingerprints):
@@ -316,19 +365,19 @@ class Record:
         return self.folder / "steps" / self.steps[index]["folder"]
 
     def metrics(self, index: int) -> dict:
-        return json.loads((self.path(index) / "metrics.json").read_text(encoding="utf-8"))
+        return _read(self.path(index) / "metrics.json")
 
     def comparison(self, index: int) -> Comparison:
         file = self.path(index) / "images/maps.npz"
         maps = {}
         if file.exists():
-            with np.load(file) as arrays:
+            with _arrays(file) as arrays:
                 maps = {"rms_map": arrays["rms"], "mean_map": arrays["mean"]}
         return Comparison.from_dict(self.metrics(index), **maps)
 
     def diagnosis(self, index: int) -> dict | None:
         file = self.path(index) / "diagnosis.json"
-        return json.loads(file.read_text(encoding="utf-8")) if file.exists() else None
+        return _read(file) if file.exists() else None
 
     def fit(self, index: int) -> dict:
         return read_fit(self.path(index) / "fit.toml")
@@ -336,7 +385,7 @@ class Record:
     def frames(self, index: int) -> list[Shown]:
         out = []
         for f in self.steps[index]["frames"]:
-            with np.load(self.path(index) / f["file"]) as a:
+            with _arrays(self.path(index) / f["file"]) as a:
                 settings = {k.removeprefix(SETTING): a[k] for k in a.files if k.startswith(SETTING)}
                 out.append(
                     Shown(
@@ -357,7 +406,7 @@ class Record:
     def fingerprints(self, index: int) -> list[Fingerprint]:
         out = []
         for f in self.steps[index]["fingerprints"]:
-            with np.load(self.path(index) / f["file"]) as a:
+            with _arrays(self.path(index) / f["file"]) as a:
                 strength = math.nan if f["strength"] is None else f["strength"]
                 out.append(Fingerprint(f["effect"], f["frame"], a["image"], a["residual"], strength))
         return out
@@ -383,6 +432,34 @@ class Record:
         return "\n".join(
             [words.table(lines, left=(0, 6)), f"noise floor: chi2/dof {floor['chi2_per_dof']:.3f} ({floor['source']})"]
         )
+
+
+def _step(entry: dict[str, Any]) -> dict[str, Any]:
+    """What a step.json holds; raises KeyError or TypeError where it is something else."""
+    for name in ("index", "name", "effect", "folder", "frames", "fingerprints"):
+        entry[name]
+    return entry
+
+
+def _read(file: Path) -> dict:
+    """A JSON file of a step. Raises ValueError, which names it."""
+    try:
+        found = json.loads(file.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(f"{file}: damaged or cut off ({error}); restore it, or start a new study") from error
+    if not isinstance(found, dict):
+        raise ValueError(f"{file}: holds no table; restore it, or start a new study")
+    return found
+
+
+@contextlib.contextmanager
+def _arrays(file: Path) -> Iterator[Any]:
+    """The arrays of a step's file. Raises ValueError, which names it."""
+    try:
+        with np.load(file, allow_pickle=False) as arrays:
+            yield arrays
+    except (ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        raise ValueError(f"{file}: damaged or cut off ({error}); restore it, or start a new study") from error
 
 
 def _frame_entry(index: int, f: Shown) -> dict[str, Any]:
