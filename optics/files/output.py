@@ -39,8 +39,8 @@ def naming(path: Path, temporary: Path | None = None) -> Iterator[None]:
         name = str(path) if file is None else str(file).replace(str(temporary or path), str(path))
         raise OSError(
             code or errno.ENOSPC,
-            f"{os.strerror(code or errno.ENOSPC)}: it is not written, nothing of it is kept; free some space, or choose "
-            "another place",
+            f"{os.strerror(code or errno.ENOSPC)}: it is not written, nothing of it is kept; free some space, or "
+            "choose another place",
             name,
         ) from error
 
