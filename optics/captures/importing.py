@@ -38,7 +38,7 @@ from optics.captures.capture_set import Captures, Frame
 from optics.captures.corrections import at_black, black_levels, black_text, correction, drift_text, sentences
 from optics.captures.noise import SATURATED, Noise, photon_transfer
 from optics.errors import BadCapture, OutputExists, UnknownKey
-from optics.files.images import SUFFIXES, read_image
+from optics.files.images import SUFFIXES, read_image, varied
 from optics.files.output import new_folder, shipped
 
 PACK, TABLE, PARAMETERS = "dataPack.npz", "polycalib.npz", "params.json"  # of a Taxim calibration
@@ -308,6 +308,7 @@ def read_circles(images: str | Path, circles: str | Path) -> Presses:
 
 def _colour_image(file: Path, where: str, shape: tuple | None) -> np.ndarray:
     image, _ = read_image(file, where)
+    varied(image, where)
     if image.shape[-1] != 3 or (shape is not None and image.shape != shape):
         raise BadCapture(
             f"{where}: (H, W, C) = {image.shape}; allowed: {shape or '(H, W, 3)'}, one camera, one size, colour"
@@ -549,6 +550,8 @@ def _check(presses: Presses, bin: int) -> None:
         raise BadCapture(f"{presses.source}: images of {width} x {height} px do not divide into blocks of {bin} px")
     if not np.isfinite(presses.images).all():
         raise BadCapture(f"{presses.source}: the images hold values that are not finite")
+    for name, image in zip(presses.names, presses.images):
+        varied(image, f"{presses.source}: {name}")
     for name, (x, y, r) in zip(presses.names, presses.circles):
         if not (np.isfinite([x, y, r]).all() and r > 0 and 0 <= x < width and 0 <= y < height):
             raise BadCapture(

@@ -64,9 +64,13 @@ def import_(
             help="For a folder: the sensor without contact; without it the median of the presses.",
         ),
     ] = None,
-    leds: Annotated[int, typer.Option("--leds", help="LEDs of the scene to start from: 3 or 6.")] = 3,
+    leds: Annotated[
+        int | None, typer.Option("--leds", help="LEDs of the scene to start from: 3 or 6.", show_default="3")
+    ] = None,
     bin: Annotated[int, typer.Option("--bin", min=1, help="Average this many pixels each way.")] = 1,
-    every: Annotated[int, typer.Option("--every", min=1, help="Take every n-th press.")] = 1,
+    every: Annotated[
+        int | None, typer.Option("--every", min=1, help="Take every n-th press.", show_default="1")
+    ] = None,
     mosaic: Annotated[
         str | None,
         typer.Option(
@@ -122,7 +126,13 @@ def import_(
             f'{", ".join(given)}: for raw frames of a polarization camera only; give --mosaic "90 45 135 0" as well'
         )
     if mosaic is not None:
-        presses = {"--circles": circles, "--ball-radius": ball_radius, "--mm-per-pixel": mm_per_pixel}
+        presses = {
+            "--circles": circles,
+            "--ball-radius": ball_radius,
+            "--mm-per-pixel": mm_per_pixel,
+            "--leds": leds,
+            "--every": every,
+        }
         if given := [name for name, value in {**presses, "--untouched": untouched}.items() if value is not None]:
             raise ValueError(f"{', '.join(given)}: for presses only; leave out --mosaic, or these")
         read = raw_frames.import_frames(
@@ -142,7 +152,13 @@ def import_(
         _tell(read.folder, read.warnings)
         return
     if scans.is_scan_source(source):
-        own = {"--circles": circles, "--ball-radius": ball_radius, "--mm-per-pixel": mm_per_pixel}
+        own = {
+            "--circles": circles,
+            "--ball-radius": ball_radius,
+            "--mm-per-pixel": mm_per_pixel,
+            "--leds": leds,
+            "--every": every,
+        }
         if given := [name for name, value in {**own, "--untouched": untouched}.items() if value is not None]:
             raise ValueError(f"{', '.join(given)}: scan.yaml says so; leave these out")
         with terminal.progress() as progress:
@@ -152,7 +168,8 @@ def import_(
     lengths = {"ball_radius": ball_radius, "mm_per_pixel": mm_per_pixel}
     stated: dict[str, Any] = {name: value for name, value in lengths.items() if value is not None}
     if translucent.is_translucent_source(source):
-        if given := [name for name, value in {"--circles": circles, "--untouched": untouched}.items() if value]:
+        unused = {"--circles": circles, "--untouched": untouched, "--leds": leds, "--every": every}
+        if given := [name for name, value in unused.items() if value is not None]:
             raise ValueError(f"{', '.join(given)}: the folder's images say so; leave these out")
         with terminal.progress() as progress:
             found = translucent.import_translucent(
@@ -160,8 +177,10 @@ def import_(
             )
         _tell(found.folder, found.warnings, found.facts["corrections"])
         return
-    options: dict[str, Any] = {"leds": leds, "bin": bin, "every": every, "overwrite": force, **stated}
+    options: dict[str, Any] = {"leds": leds or 3, "bin": bin, "every": every or 1, "overwrite": force, **stated}
     if source.suffix == ".npz" or importing.is_pack(source):
+        if given := [name for name, value in {"--circles": circles, "--untouched": untouched}.items() if value]:
+            raise ValueError(f"{', '.join(given)}: the pack holds circles and background; leave these out")
         found = importing.import_taxim(source, output, **options)
     else:
         if circles is None:

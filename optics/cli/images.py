@@ -74,7 +74,10 @@ def render(
     files = [output, record, *([preview] if png else []), *(maps if stokes else ())]
     claim(files, force)
     sensor = load_sensor(scene, fit, frame, define, plugins, variant)
-    values = {**sensor.values, **sensor.scene.check(sensor.scene.spread(settings(sets), "--set"), "--set")}
+    chosen = sensor.scene.check(sensor.scene.spread(settings(sets), "--set"), "--set")
+    values = {**sensor.values, **chosen}
+    if chosen:
+        sensor.scene.check_press(values, "--set")
     clock = time.perf_counter()
     images = RenderJob(sensor.scene, spp=spp, stokes=stokes, black=sensor.black, saturation=sensor.saturation)
     with terminal.progress() as progress:

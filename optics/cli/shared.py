@@ -237,7 +237,9 @@ def _ctrl_c(error: BaseException | None) -> KeyboardInterrupt | None:
 
 def _report(error: Exception) -> int:
     """Report an error in one line; a bug with its traceback."""
-    expected = isinstance(error, (ValueError, LookupError, OSError, RuntimeError)) or hasattr(error, "format_message")
+    expected = isinstance(error, (ValueError, LookupError, OSError, RuntimeError, MemoryError)) or hasattr(
+        error, "format_message"
+    )
     if terminal.debug or not expected:
         traceback.print_exception(error, file=sys.stderr)
     text = _usage(error) if hasattr(error, "format_message") else _text(error)
@@ -257,6 +259,10 @@ def _usage(error: Any) -> str:
 def _text(error: Exception) -> str:
     if isinstance(error, OSError) and error.strerror:
         return f"{error.filename}: {error.strerror}" if error.filename else error.strerror
+    if isinstance(error, MemoryError):
+        return (
+            f"not enough memory: {error or 'the system gave none'}; take fewer pixels (-D width=..., --bin) or frames"
+        )
     if type(error) is KeyError:
         return f"no entry {error}"
     return str(error) or type(error).__name__

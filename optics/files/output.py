@@ -141,6 +141,10 @@ def check_new_folder(folder: str | Path) -> None:
 
 def claim(paths: Sequence[Path], force: bool = False) -> None:
     """Check, before any work, that files can be written: none exists (unless `force`), and every folder is writable."""
+    places = [Path(os.path.abspath(path)) for path in paths]
+    for path in places:
+        if places.count(path) > 1:
+            raise OutputExists(f"{path} is named for two outputs; give each a name of its own")
     for path in map(Path, paths):
         spare_records(path)
         if path.is_dir() or (path.exists() and not force):

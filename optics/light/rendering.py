@@ -74,6 +74,10 @@ class Rendering:
         return exr.write_png(path, np.nan_to_num(np.stack([self.channels[n] for n in names], -1)))
 
 
+SPP_MOST = 1_000_000  # hours for the smallest image
+LANES_MOST = 2**32 - 1  # rays of one pass
+
+
 class RenderJob:
     """Makes images of one scene, with other values each time.
 
@@ -94,8 +98,8 @@ class RenderJob:
         layers: Sequence[str] = LAYERS,
         stokes: bool = False,
     ):
-        if spp is not None and spp < 1:
-            raise ValueError(f"spp = {spp}; allowed: whole numbers from 1 on (samples per pixel)")
+        if spp is not None and not 1 <= spp <= SPP_MOST:
+            raise ValueError(f"spp = {spp}; allowed: whole numbers from 1 to {SPP_MOST:,} (samples per pixel)")
         self.scene, self.spp, self.layers = scene, spp, tuple(layers)
         self.base = scene.values()
         sensors = scene.mitsuba.sensors()
@@ -134,8 +138,8 @@ class RenderJob:
             else "LED by LED"
         )
         self.developer = None
+        self.bands = scene.integrator.bands if scene.integrator is not None else ()
         if scene.camera is not None and scene.integrator is not None:
-            self.bands = scene.integrator.bands
             self.developer = Developer(scene.camera, self.bands or (0.0,), black, saturation)
         self.record = {
             "scene": scene_record(scene),
@@ -231,7 +235,7 @@ class RenderJob:
             **(exr.spectral_header(self.stokes, UNITS) if vectors and self.bands else {}),
             "samplesPerPixel": spp,
         }
-        camera = self._developed(vectors, now) if vectors else None
+        camera = self._developed(vectors, now) if vectors and self.developer is not None else None
         return Rendering(channels, header, camera)
 
     def _passes(self, seed: int) -> tuple[dict, dict, int]:
@@ -241,6 +245,13 @@ class RenderJob:
 
         sensor = self.scene.mitsuba.sensors()[0]
         spp = self.spp or int(sensor.sampler().sample_count())
+        width, height = (int(n) for n in sensor.film().crop_size())
+        most = LANES_MOST // (width * height)
+        if spp > PASSES * most:
+            raise ValueError(
+                f"spp = {spp} of {width} x {height} pixels; allowed: up to {PASSES * most} (samples per pixel), as "
+                "Dr.Jit traces at most 2^32 rays at once; add images of several seeds"
+            )
         passes = min(PASSES, spp)
         per_pass = spp // passes
         seeds = np.random.SeedSequence(seed).generate_state(passes)
@@ -266,7 +277,9 @@ class RenderJob:
         if not self.bands:
             parts = radiance[..., 0, :] if radiance.ndim == 4 and radiance.shape[3] == 4 else ()
             return {"Y": s0[..., 0], **{f"S{i}.Y": parts[..., i] for i in range(4) if len(parts)}}
-        channels = exr.preview_channels(self.bands, s0 * now[self.scene.key(self.scene.camera.name, "exposure")])
+        camera = self.scene.camera
+        exposure = 1.0 if camera is None else now[self.scene.key(camera.name, "exposure")]
+        channels = exr.preview_channels(self.bands, s0 * exposure)
         if "spectral" in self.layers:
             parts = radiance[..., 0] if radiance.ndim == 4 and radiance.shape[3] == 1 else radiance
             channels.update(exr.spectral_channels(self.bands, parts))

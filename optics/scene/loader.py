@@ -14,7 +14,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from optics.errors import BadScene, UnknownKey
+from optics.errors import BadScene, OutOfBounds, UnknownKey
 from optics.files.output import shipped
 from optics.scene import showing, trust
 from optics.scene.declare import LED_BY_LED, Effect, Part
@@ -24,6 +24,7 @@ from optics.scene.registry import Registry, known
 from optics.scene.trust import Named
 from optics.scene.wiring import wire
 
+PIXELS_MOST = 50_000_000  # of a camera: a render keeps some hundred bytes for each
 KEEPS = "use 'interface', 'rough_interface' or 'sheet', which keep it"
 DEPOLARIZERS = {  # stock materials without a Mueller matrix, by the name that Mitsuba prints
     "ThinDielectric": KEEPS,
@@ -123,6 +124,13 @@ class Scene:
         self.sources = {n: p for n, p in lights.items() if n not in self.leds}
         self.lights = {**self.leds, **self.sources}
         self.membranes = {n: p for n, p in self.parts.items() if hasattr(p, "ambient_radiance")}
+        for sensor in self.mitsuba.sensors():
+            width, height = (int(n) for n in sensor.film().size())
+            if width * height > PIXELS_MOST:
+                raise BadScene(
+                    f"{self.path}: a camera of {width} x {height} pixels; allowed: up to {PIXELS_MOST:,}; make width "
+                    "and height smaller"
+                )
         self.monte_carlo = any(p.role == "clear" for p in self.parts.values())
         self.parameters: dict[str, Parameter] = {}
         for name, part in self.parts.items():
@@ -265,6 +273,20 @@ class Scene:
         with self._named():
             if move([self.parts[n] for n in moved]):
                 self.mitsuba.parameters_changed([])
+
+    def check_press(self, values: Mapping[str, float | str], where: str) -> None:
+        """Raises OutOfBounds for a press that is deeper than its gel is thick, of values that someone states.
+
+        values   by key, above those of the scene"""
+        if self.gel is None:
+            return
+        depth, thickness = (self.key(self.gel.name, role) for role in ("press depth", "thickness"))
+        if depth is None or thickness is None or depth not in values:
+            return
+        stated = self.parameters[depth].check(values[depth], depth, where)
+        thick = float({**self.values(), **values}[thickness])
+        if not isinstance(stated, str) and stated > thick:
+            raise OutOfBounds(depth, stated, "mm", (0.0, thick), f"{where}: the gel is {thick:g} mm thick")
 
     def moves(self, key: str) -> bool:
         """Whether a parameter moves geometry, or camera rays: then the places that they meet are found anew."""

@@ -16,13 +16,15 @@ import re
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, wraps
 from pathlib import Path
 from types import MappingProxyType, ModuleType
 
-from optics.errors import BadPlugin, UnknownKey
+import numpy as np
+
+from optics.errors import BadCapture, BadPlugin, BadScene, OutOfBounds, UnknownKey
 from optics.files.output import shipped
-from optics.scene.declare import CATEGORIES, STAGES, Effect, Part
+from optics.scene.declare import CATEGORIES, IMAGE_STAGES, STAGES, Effect, Part
 from optics.scene.parameter import Parameter
 from optics.scene.trust import plugin_files
 from optics.words import key_of
@@ -244,6 +246,62 @@ def default() -> Registry:
     return _default
 
 
+# -- what a plugin does wrong when it runs ----------------------------------------------------------------------------
+OURS = (BadPlugin, BadScene, BadCapture, UnknownKey, OutOfBounds)  # errors that say by themselves what is wrong
+
+
+def _guarded(item: Part | Effect) -> Part | Effect:
+    """The declaration with functions that name their file where they fail, or give something of another shape."""
+    if isinstance(item, Part) or not isinstance(item.stages, Mapping):
+        return item
+    stages = {stage: _named(f, stage, item) if callable(f) else f for stage, f in item.stages.items()}
+    return replace(item, stages=stages)
+
+
+def _named(function: Callable, stage: str, effect: Effect) -> Callable:
+    where = f"{effect.file}: the effect '{effect.name}', stage '{stage}'"
+    own = not Path(effect.file).is_relative_to(shipped("plugins").resolve())  # what ships is held to it by tests
+
+    @wraps(function)
+    def act(given, *more):
+        try:
+            found = function(given, *more)
+        except OURS:
+            raise
+        except Exception as error:
+            if _interrupted(error):
+                raise
+            raise BadPlugin(f"{where}: {type(error).__name__}: {error}") from error
+        if stage in IMAGE_STAGES:
+            _check_image(found, given, where, own)
+        return found
+
+    return act
+
+
+def _interrupted(error: BaseException | None) -> bool:
+    """Whether Ctrl-C is behind an error: within a render, Dr.Jit wraps it in one of its own."""
+    while error is not None:
+        if isinstance(error, KeyboardInterrupt):
+            return True
+        error = error.__cause__ or error.__context__
+    return False
+
+
+def _check_image(found: object, given: object, where: str, finite: bool) -> None:
+    """An image stage gives numbers of the image's shape; of one pixel in many settings, one for each setting."""
+    shape, before = np.shape(found), np.shape(given)  # type: ignore[arg-type]
+    kind = np.asarray(found).dtype.kind
+    same = len(shape) == len(before) and all(a in (b, 1) for a, b in zip(before, shape))
+    if kind not in "fciu" or not same or shape[-1:] != before[-1:]:
+        raise BadPlugin(
+            f"{where}: gives {'an array of shape ' + str(shape) if kind in 'fciu' else type(found).__name__}; allowed: "
+            f"numbers of the shape {before}, as it was given"
+        )
+    if finite and not np.isfinite(found).all() and np.isfinite(given).all():  # type: ignore[call-overload, arg-type]
+        raise BadPlugin(f"{where}: gives NaN or infinity for an image of finite numbers; allowed: finite numbers")
+
+
 # -- one file --------------------------------------------------------------------------------------------------------
 def _content(source: bytes) -> str:
     return hashlib.sha256(source).hexdigest()
@@ -283,6 +341,6 @@ def declared(file: Path, content: str | None = None) -> tuple[Part | Effect, ...
     found = [v for k, v in vars(module).items() if isinstance(v, (Part, Effect)) and not k.startswith("_")]
     if not found:
         raise BadPlugin(f"{file}: declares neither a part nor an effect; files that only help begin with '_'")
-    items = tuple(replace(item, doc=module.__doc__ or "", file=str(file)) for item in found)
+    items = tuple(_guarded(replace(item, doc=module.__doc__ or "", file=str(file))) for item in found)
     _declared[file] = content, items
     return items

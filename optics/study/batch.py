@@ -59,6 +59,9 @@ Value = Finite | str
 Pair = Annotated[list[Finite], Field(min_length=2, max_length=2)]
 
 
+SAMPLES_MOST = 10_000_000  # of one job, whose manifest is one file
+
+
 class BadJob(ValueError):
     """A job file that contradicts its format or its scene."""
 
@@ -166,6 +169,8 @@ class Job(Strict):
             raise ValueError("count is missing; allowed: a whole number from 1 on, or a grid in [sample]")
         if "dn" in self.outputs and self.noise is None and self.fit is None:
             raise ValueError('outputs names "dn", but [noise] is missing; give ' + ", ".join(Camera.model_fields))
+        if self.total > SAMPLES_MOST:
+            raise ValueError(f"{self.total:.3g} samples; allowed: up to {SAMPLES_MOST:,} in one job; split it")
         twice = sorted(set(self.parameters) & set(self.sample))
         if twice:
             raise ValueError(f"{twice[0]} stands in [parameters] and in [sample]; allowed: one of them")
@@ -299,6 +304,8 @@ class Maker:
                 "exr, png"
             )
         scene.check(job.parameters, f"{self.file}: [parameters]")
+        if job.parameters:
+            scene.check_press(self.values, f"{self.file}: [parameters]")
         for key, d in job.sample.items():
             where = f"{self.file}: [sample]"
             if key not in scene.parameters:
@@ -310,6 +317,7 @@ class Maker:
                 )
             for value in d.extremes:
                 parameter.check(value, key, where)
+                scene.check_press({**self.values, key: value}, where)
             if d.normal is not None:
                 self._check_normal(key, d)
 

@@ -42,6 +42,7 @@ from optics.words import spaced, table
 
 SHARE = 0.1  # of the plausible strength
 FEWEST = 2  # frames: with one, nothing can be held out and nothing be compared
+FRAMES_MOST = 1000  # of a planned session
 GROUPS = 4  # below, a calibration holds nothing out by itself
 FULL = 0.8  # of full scale: where an exposure puts the brightest half per cent of an image
 LONG_SIDE = 64  # px of the images that are rendered for a plan, where -D does not say otherwise
@@ -494,6 +495,8 @@ def _require(frames: int, share: float) -> None:
             f"design: {frames} frames; allowed: {FEWEST} or more, as with one nothing can be held out and nothing "
             "compared"
         )
+    if frames > FRAMES_MOST:
+        raise ValueError(f"design: {frames} frames; allowed: {FEWEST} to {FRAMES_MOST}; a session of more repeats them")
     if not 0 < share < math.inf:
         raise ValueError(f"design: strength of {share:g} plausible sizes; allowed: > 0, finite")
 

@@ -159,6 +159,9 @@ def read_fit(file: str | Path) -> dict[str, dict]:
     cut = f"# {WHOLE}" in head and text.rstrip().splitlines()[-1] != END
     if cut or not text.strip() or (any(line.startswith("# Calibrated values") for line in head) and "fit" not in data):
         raise ValueError(f"{file}: cut off: its end is missing; restore the file, or take another step's")
+    for key in data:
+        if key not in TABLES:
+            raise UnknownKey(key, TABLES, "table", str(file), f"(allowed: {', '.join(TABLES)})")
     for key in TABLES:
         if not isinstance(data.get(key, {}), dict):
             raise ValueError(f"{file}: {key} = {data[key]!r}; allowed: a table, [{key}]")

@@ -103,6 +103,7 @@ class Record:
             study = cls.open(folder, empty=True)
             old = study.ladder
             changed = [] if Path(old["scene"]).name == Path(scene).name else ["scene"]
+            changed += _other_setup(old.get("facts", {}).get("setup"), dict(facts or {}).get("setup"))
             changed += ["seed"] if old["seed"] != seed else []
             before = portable(old["inputs"], old["captures"]) if isinstance(inputs, Mapping) else old["inputs"]
             changed += sorted(k for k in hashes.keys() | before.keys() if hashes.get(k) != before.get(k))
@@ -432,6 +433,15 @@ class Record:
         return "\n".join(
             [words.table(lines, left=(0, 6)), f"noise floor: chi2/dof {floor['chi2_per_dof']:.3f} ({floor['source']})"]
         )
+
+
+def _other_setup(before: Mapping | None, now: Mapping | None) -> list[str]:
+    """The choices in which two setups differ, but for places; none where a record has no setup."""
+    if before is None or now is None:
+        return []
+    now = json.loads(_dumps(now))
+    apart = ("captures", "plugins", "uncertainty")  # an error of dials that was found stands in the record alone
+    return sorted(name for name in before if name not in apart and before[name] != now.get(name))
 
 
 def _step(entry: dict[str, Any]) -> dict[str, Any]:

@@ -15,7 +15,7 @@ import numpy as np
 
 from optics.captures import capture_set as capture_files
 from optics.captures.noise import Noise, estimate
-from optics.errors import BadCapture, Underdetermined, UnknownKey
+from optics.errors import BadCapture, OutOfBounds, Underdetermined, UnknownKey
 from optics.fit import calibrate
 from optics.fit.gauges import acting
 from optics.fit.model import value_of
@@ -24,6 +24,7 @@ from optics.scene import loader as scenes
 from optics.scene import trust
 from optics.scene.declare import Effect
 from optics.scene.parameter import Values, Variable, keys_with
+from optics.words import some
 
 ASPECT = 0.02  # relative difference of aspect ratio between images and scene beyond which they are said to be cut
 GROUPS = 4  # with at least this many groups of frames, every fourth is held out
@@ -164,6 +165,9 @@ def open_model(
     loaded = scenes.load(path, defines, plugins=named, found=beside)
     setup.values = loaded.spread(setup.values, "start values")
     capture_files.check(found, loaded.parameters)
+    for index, f in enumerate(found.frames):
+        where = f"{found.folder / capture_files.FILE}: frame {index} ('{f.file or f.name}')"
+        loaded.check_press({**found.parameters, **f.parameters}, where)
     found = capture_files.state(found, loaded.parts, {k: e.name for k, e in loaded.registry.effects.items()})
     found.uncertainty = {**(setup.uncertainty or {}), **found.uncertainty}
     noise = found.noise
@@ -225,6 +229,12 @@ def variables_of_base(model: SceneModel, setup: Setup, frames: Sequence[int]) ->
             per_group = [k for k, p in model.parameters.items() if p.free == "press"]
             own = {f"{k}*": model.parameters[k].prior_sd for k in per_group}
             priors = {**{k: (None, sd) for k, sd in own.items() if sd is not None}, **priors}
+    twice = _twice(model, setup.free, setup.per_group or ())
+    if twice:
+        raise ValueError(
+            f"{some(twice, 4)}: free for all frames and for each group at once, which no frame can tell apart; "
+            "allowed: one of --free and --per-group"
+        )
     variables = calibrate.variables_from(model, setup.free or default_free(model), per_group, None, frames)
     if setup.per_group is None:
         variables = [v for v in variables if v.frames is None or not _untouched(model, v.frames)]
@@ -237,6 +247,15 @@ def variables_of_base(model: SceneModel, setup: Setup, frames: Sequence[int]) ->
             variables[i] = v.with_prior(*known[0])
     free = {(key, frame) for v in variables for key in v.keys for frame in v.frames or (None,)}
     return variables + [d for d in doubts if not free & {(d.keys[0], frame) for frame in d.frames or (None,)}]
+
+
+def _twice(model: SceneModel, free: Sequence[str], per_group: Sequence[str]) -> list[str]:
+    """The parameters that patterns of both kinds match."""
+
+    def matched(patterns: Sequence[str]) -> set[str]:
+        return {key for key in model.parameters for pattern in patterns if fnmatch(key, pattern)}
+
+    return sorted(matched(free) & matched(per_group))
 
 
 def _within(inner: Variable, outer: Variable) -> bool:
@@ -275,7 +294,15 @@ def settings_in_doubt(model: SceneModel, frames: Sequence[int]) -> list[Variable
 def check_priors(model: SceneModel, setup: Setup) -> None:
     """Raises UnknownKey for a prior on something that the setup does not solve for."""
     everywhere = variables_of_base(model, setup, range(len(model.frames)))
-    for pattern in setup.priors:
+    for pattern, (mean, _) in setup.priors.items():
+        for v in everywhere:
+            low, high = v.parameter.bounds
+            if (
+                mean is not None
+                and (fnmatch(v.keys[0], pattern) or fnmatch(v.name, pattern))
+                and not low <= mean <= high
+            ):
+                raise OutOfBounds(v.name, mean, v.parameter.unit, (low, high), f"prior {pattern}")
         if not any(fnmatch(name, pattern) for v in everywhere for name in (v.keys[0], v.name)):
             raise UnknownKey(pattern, [v.name for v in everywhere], "free parameter for a prior")
 
