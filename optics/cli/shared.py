@@ -1,11 +1,13 @@
 """What every command shares: the terminal, common options, reading arguments, and how errors are reported."""
 
+import atexit
 import functools
 import inspect
 import json
 import math
 import os
 import re
+import signal
 import sys
 import time
 import traceback
@@ -43,6 +45,7 @@ class Terminal:
 
     quiet = False
     debug = False
+    interrupted = False  # whether that was said
 
     def note(self, text: str) -> None:
         if not self.quiet:
@@ -192,8 +195,7 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
             stopped = _ctrl_c(error)  # typer would end silently
             if stopped is None:
                 raise
-            print(": ".join(["interrupted", *map(str, stopped.args)]), file=sys.stderr)
-            raise typer.Exit(INTERRUPTED) from None
+            raise typer.Exit(_interrupted(*stopped.args)) from None
 
     shared = [
         inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=False, annotation=kind)
@@ -215,13 +217,39 @@ def _let_ask() -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command line and return its exit code."""
-    arguments = list(sys.argv[1:] if arguments is None else arguments) or ["--help"]
-    terminal.quiet, terminal.debug = False, "--debug" in arguments
+    """Run a command line and return its exit code; without arguments, that of this program."""
+    if arguments is None:
+        try:
+            code = _run(sys.argv[1:])
+        except KeyboardInterrupt:
+            code = _interrupted()
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # what is left is to end
+        if code == INTERRUPTED:
+            # Python remembers an interrupt within `exec`, as imports use it, and would end by the signal instead
+            atexit._run_exitfuncs()
+            sys.stdout.flush()
+            sys.stderr.flush()
+            os._exit(code)
+        return code
+    return _run(arguments)
+
+
+def _interrupted(*what: object) -> int:
+    """Say once that the program was interrupted; returns its exit code."""
+    if not terminal.interrupted:
+        terminal.interrupted = True
+        print(": ".join(["interrupted", *map(str, what)]), file=sys.stderr)
+    return INTERRUPTED
+
+
+def _run(arguments: Sequence[str]) -> int:
+    arguments = list(arguments) or ["--help"]
+    terminal.quiet, terminal.debug, terminal.interrupted = False, "--debug" in arguments, False
     with warnings.catch_warnings():
         warnings.showwarning = lambda text, *_: terminal.note(f"warning: {one_line(text)}")
         try:
-            return int(app(args=arguments, prog_name="optics", standalone_mode=False) or 0)
+            code = int(app(args=arguments, prog_name="optics", standalone_mode=False) or 0)
+            return _interrupted() if code == INTERRUPTED else code  # typer says nothing of one outside a command
         except Exception as error:
             return _report(error)
 
