@@ -35,7 +35,7 @@ from optics.scene.trust import Named
 from optics.study import loop
 from optics.study.calibrated import noise_of, plugins_of_fit, scene_of, tested
 from optics.study.fit_files import fit_file, read_fit, values_of
-from optics.study.record import Record
+from optics.study.record import Record, readable
 from optics.study.setup import Setup, open_model, recorded, setup_for, split
 from optics.study.shown import Shown, shown_frames
 
@@ -273,7 +273,8 @@ class Study:
                    it, where they are trusted (optics.scene.trust)
         captures   where its captures are by now, if they are not found where they were, as seen from the study
         """
-        study = cls(Record.open(folder))
+        with readable(Path(folder)):
+            study = cls(Record.open(folder))
         study._plugins, study._captures = plugins, captures
         return study
 
@@ -300,7 +301,8 @@ class Study:
     def model(self) -> SceneModel:
         """The scene with its captures; loaded when first asked for. Raises BadCapture where an input has changed."""
         if self._model is None:
-            self.record, self._model, self.setup = loop.take_up(self.folder, self._plugins, self._captures)
+            with readable(self.folder):
+                self.record, self._model, self.setup = loop.take_up(self.folder, self._plugins, self._captures)
         return self._model
 
     @property
@@ -414,7 +416,8 @@ class Study:
         """Write the study as one HTML page; returns its path (None: report.html in the study's folder)."""
         from optics.pages.report import report
 
-        return report(self.folder, file or self.folder / "report.html", overwrite=overwrite)
+        with readable(self.folder):
+            return report(self.folder, file or self.folder / "report.html", overwrite=overwrite)
 
     def view(self, step: int | None = None, *, port: int = 0, ready: Callable[[str], None] = lambda url: None) -> None:
         """Serve the live page of a step (None: the last) on this machine until Ctrl-C; `ready` is told its address."""

@@ -9,7 +9,19 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from optics.cli.shared import AsJson, Defines, Plugins, SceneName, Variant, command, load_scene, scan, show, terminal
+from optics.cli.shared import (
+    AsJson,
+    Defines,
+    Plugins,
+    SceneName,
+    Variant,
+    columns,
+    command,
+    load_scene,
+    scan,
+    show,
+    terminal,
+)
 from optics.words import key_of, number, table
 
 if TYPE_CHECKING:
@@ -29,7 +41,7 @@ def scenes(as_json: AsJson = False) -> None:
         comment = re.search(r"<!--(.*?)-->", path.read_text(encoding="utf-8"), re.DOTALL)
         title = next((line.strip() for line in (comment[1] if comment else "").splitlines() if line.strip()), "")
         rows.append({"name": name, "title": title, "file": str(path)})
-    show(rows) if as_json else print(table([(r["name"], r["title"]) for r in rows]))
+    show(rows) if as_json else print(table([(r["name"], r["title"]) for r in rows], width=columns()))
 
 
 @command
@@ -56,7 +68,7 @@ def params(
     if as_json:
         return show(rows)
     head = ("key", "value", "unit", "bounds", "neutral", "derivative", "meaning")
-    print(table([head, *map(_parameter_line, rows)]))
+    print(table([head, *map(_parameter_line, rows)], width=columns()))
 
 
 # how a derivative image is made (`Parameter.how`), for the reader of a table
@@ -202,7 +214,7 @@ def effects(
         (r["key"], r["part"], ", ".join(p["name"] for p in r["parameters"]), r["onset"], r["needs"] or "-")
         for r in records
     ]
-    print(f"{table([head, *lines])}\n\nparts, each with a page too: {', '.join(sorted(found.parts))}")
+    print(f"{table([head, *lines], width=columns())}\n\nparts, each with a page too: {', '.join(sorted(found.parts))}")
 
 
 def _effect_record(found: "Registry", e: "Effect") -> dict[str, Any]:
@@ -250,8 +262,8 @@ def _effect_page(found: "Registry", e: "Effect", as_json: bool) -> None:
         for p in r["parameters"]
     ]
     print(f"{r['page'].strip()}\n\n{r['name']}: `{r['key']}`, {r['file']}")
-    print(table(facts))
-    print("\n" + table([("parameter", "unit", "neutral", "bounds", "meaning"), *lines]))
+    print(table(facts, width=columns()))
+    print("\n" + table([("parameter", "unit", "neutral", "bounds", "meaning"), *lines], width=columns()))
 
 
 def _part_page(found: "Registry", kind: str, as_json: bool) -> None:
@@ -300,6 +312,7 @@ def _part_page(found: "Registry", kind: str, as_json: bool) -> None:
                     )
                     for r in rows
                 ),
-            ]
+            ],
+            width=columns(),
         )
     )

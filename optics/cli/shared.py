@@ -7,6 +7,7 @@ import json
 import math
 import os
 import re
+import shutil
 import signal
 import sys
 import time
@@ -294,6 +295,11 @@ def _text(error: Exception) -> str:
     if type(error) is KeyError:
         return f"no entry {error}"
     return str(error) or type(error).__name__
+
+
+def columns() -> int | None:
+    """How wide a table may be: the terminal's width; None where results go to a file or a program."""
+    return shutil.get_terminal_size().columns if sys.stdout.isatty() else None
 
 
 def one_line(text: object) -> str:

@@ -224,13 +224,15 @@ def values(
 
     from optics.errors import UnknownKey
     from optics.facade import Study
+    from optics.study.record import readable
     from optics.words import table
 
-    found = Study.open(study).record.steps[-1]["variables"]
-    chosen = [v for v in found if not patterns or any(fnmatch(v["name"], p) for p in patterns)]
-    if patterns and not chosen:
-        raise UnknownKey(patterns[0], [v["name"] for v in found], "parameter of this study")
-    lines = [(v["name"], f"{v['value']:.6g}", f"+- {v['sd']:.2g}" if v["sd"] else "", v["unit"]) for v in chosen]
+    with readable(study):
+        found = Study.open(study).record.steps[-1]["variables"]
+        chosen = [v for v in found if not patterns or any(fnmatch(v["name"], p) for p in patterns)]
+        if patterns and not chosen:
+            raise UnknownKey(patterns[0], [v["name"] for v in found], "parameter of this study")
+        lines = [(v["name"], f"{v['value']:.6g}", f"+- {v['sd']:.2g}" if v["sd"] else "", v["unit"]) for v in chosen]
     show(chosen) if as_json else print(table([("parameter", "value", "1 sd", "unit"), *lines], left=(0, 3)))
 
 

@@ -22,7 +22,7 @@ def parse(file: Path) -> dict:
     """The file's content, with or without a byte order mark; raises BadCapture with line and column."""
     try:
         return tomllib.loads(file.read_text(encoding="utf-8-sig"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:  # TOMLDecodeError, UnicodeDecodeError, a number too long
         raise BadCapture(f"{file}: not valid TOML: {error}; correct this line (text stands in quotes)") from error
 
 

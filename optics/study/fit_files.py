@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from optics.errors import UnknownKey
+from optics.files.toml_checks import tomllib
 from optics.fit.result import Fit
 from optics.fit.scene_model import SceneModel
 from optics.scene.parameter import Values
@@ -147,13 +148,11 @@ def read_fit(file: str | Path) -> dict[str, dict]:
 
     Raises FileNotFoundError, and ValueError for what is not TOML, or was cut off.
     """
-    import tomlkit
-
     file = fit_file(file)
     try:
         text = file.read_text(encoding="utf-8-sig")
-        data = tomlkit.parse(text).unwrap()
-    except ValueError as error:
+        data = tomllib.loads(text)
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"{file}: not valid TOML: {error}") from error
     head = text.lstrip().splitlines()[:3]
     cut = f"# {WHOLE}" in head and text.rstrip().splitlines()[-1] != END

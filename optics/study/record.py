@@ -36,7 +36,7 @@ import numpy as np
 from optics import words
 from optics.diagnosis.result import Diagnosis, table_of
 from optics.diagnosis.result import Row as Ranked
-from optics.errors import BadCapture, OutputExists
+from optics.errors import BadCapture, OutputExists, UnknownKey
 from optics.files.output import alone, file_hash, input_hashes, new_folder, replacing, versions, write_text
 from optics.fit.compare import Comparison, Row, plain
 from optics.fit.result import Fit
@@ -442,6 +442,20 @@ def _other_setup(before: Mapping | None, now: Mapping | None) -> list[str]:
     now = json.loads(_dumps(now))
     apart = ("captures", "plugins", "uncertainty")  # an error of dials that was found stands in the record alone
     return sorted(name for name in before if name not in apart and before[name] != now.get(name))
+
+
+@contextlib.contextmanager
+def readable(folder: Path) -> Iterator[None]:
+    """What a study's files hold that no study writes is said of the study: a key that is missing, another type."""
+    try:
+        yield
+    except (KeyError, TypeError, AttributeError, IndexError) as error:
+        if isinstance(error, UnknownKey):
+            raise
+        raise ValueError(
+            f"{folder}: its record is damaged ({type(error).__name__}: {error}); restore it, or start a new study; "
+            "--debug shows where"
+        ) from error
 
 
 def _step(entry: dict[str, Any]) -> dict[str, Any]:
