@@ -414,9 +414,11 @@ class Study:
 
     def report(self, file: str | Path | None = None, *, overwrite: bool = False) -> Path:
         """Write the study as one HTML page; returns its path (None: report.html in the study's folder)."""
+        from jinja2 import UndefinedError
+
         from optics.pages.report import report
 
-        with readable(self.folder):
+        with readable(self.folder, UndefinedError):
             return report(self.folder, file or self.folder / "report.html", overwrite=overwrite)
 
     def view(self, step: int | None = None, *, port: int = 0, ready: Callable[[str], None] = lambda url: None) -> None:

@@ -308,7 +308,6 @@ def read_circles(images: str | Path, circles: str | Path) -> Presses:
 
 def _colour_image(file: Path, where: str, shape: tuple | None) -> np.ndarray:
     image, _ = read_image(file, where)
-    varied(image, where)
     if image.shape[-1] != 3 or (shape is not None and image.shape != shape):
         raise BadCapture(
             f"{where}: (H, W, C) = {image.shape}; allowed: {shape or '(H, W, 3)'}, one camera, one size, colour"

@@ -164,7 +164,57 @@ def read_fit(file: str | Path) -> dict[str, dict]:
     for key in TABLES:
         if not isinstance(data.get(key, {}), dict):
             raise ValueError(f"{file}: {key} = {data[key]!r}; allowed: a table, [{key}]")
+    for key, kind in KINDS.items():
+        table, _, name = key.partition(".")
+        value = data.get(table, {}).get(name)
+        if value is not None and not _is(value, kind):
+            raise ValueError(f"{file}: [{table}] {name} = {value!r}; allowed: {kind}")
+    for table in ("frames", "frames_uncertainty"):
+        if not _is(data.get(table, {}), "a table of tables"):
+            raise ValueError(f"{file}: [{table}]: allowed: a table for each frame")
     return {key: data.get(key, {}) for key in TABLES}
+
+
+KINDS = {  # of entries that the program reads
+    "fit.captures": "text",
+    "fit.held_out": "a list of texts",
+    "fit.parameters": "a whole number",
+    "fit.held_out_parameters": "a whole number",
+    "sensor.scene": "text",
+    "sensor.scene_hash": "text",
+    "sensor.plugins": "a list of texts",
+    "sensor.plugin_files": "a table of texts",
+    "sensor.flat_field": "text",
+    "sensor.defines": "a table of texts",
+    "sensor.noise": "a table of numbers",
+    "sensor.settings": "a table of numbers or texts",
+    "sensor.frames": "a table of tables",
+    "sensor.drive": "a table of numbers",
+    "sensor.levels": "a list of texts",
+    "sensor.uncertainty": "a table of numbers",
+}
+
+
+def _is(value: object, kind: str) -> bool:
+    if kind == "text":
+        return isinstance(value, str)
+    if kind == "a whole number":
+        return isinstance(value, int) and not isinstance(value, bool)
+    if kind == "a list of texts":
+        return isinstance(value, str) or (isinstance(value, list) and all(isinstance(v, str) for v in value))
+    if not isinstance(value, dict):
+        return False
+    if kind == "a table of tables":
+        return all(isinstance(v, dict) for v in value.values())
+    if kind == "a table of numbers":
+        return all(isinstance(v, (int, float)) or _is_numbers(v) for v in value.values())
+    words = kind == "a table of numbers or texts"
+    return all(isinstance(v, str) or (words and isinstance(v, (int, float))) for v in value.values())
+
+
+def _is_numbers(value: object) -> bool:
+    """Of a noise that each channel has its own."""
+    return isinstance(value, list) and all(isinstance(v, (int, float)) for v in value)
 
 
 def fit_file(path: str | Path) -> Path:

@@ -445,11 +445,13 @@ def _other_setup(before: Mapping | None, now: Mapping | None) -> list[str]:
 
 
 @contextlib.contextmanager
-def readable(folder: Path) -> Iterator[None]:
-    """What a study's files hold that no study writes is said of the study: a key that is missing, another type."""
+def readable(folder: Path, *more: type[Exception]) -> Iterator[None]:
+    """What a study's files hold that no study writes is said of the study: a key that is missing, another type.
+
+    more   further errors that mean the same"""
     try:
         yield
-    except (KeyError, TypeError, AttributeError, IndexError) as error:
+    except (KeyError, TypeError, AttributeError, IndexError, ArithmeticError, *more) as error:
         if isinstance(error, UnknownKey):
             raise
         raise ValueError(

@@ -103,7 +103,7 @@ def within(seconds: int = LIMIT):
 
 @pytest.fixture(scope="session")
 def material(tmp_path_factory, mitsuba):
-    """A folder with good input of every kind: captures of images and of readings, a scene, a job, a study of readings."""
+    """Good input of every kind: captures of images and of readings, a scene, a job, a study of readings."""
     import optics as package
     from optics.scene import loader
 
@@ -143,7 +143,7 @@ def place(material, tmp_path):
 
 @pytest.fixture
 def met(capsys):
-    """Run a command line; fails unless it works or is refused in one line: no traceback, no hang, no other exit code."""
+    """Run a command line; fails unless it works or is refused in one line: no traceback, no hang, no other code."""
     from optics.cli import main
 
     def run(*words, seconds: int = LIMIT) -> tuple[int, str]:

@@ -17,7 +17,14 @@ from optics.files import exr
 from optics.files.images import read_image, read_mask
 from optics.study.fit_files import read_fit
 
-VALUES = ["nan", "inf", "-inf", "1e400", "-1", "0", "1", "-0.0", "1e-300", "1e300", "9223372036854775808", "999999999999999999999999", "true", "false", "[]", "{}", "[[]]", '""', '"x"', '"\\u0000"', '"../../../etc/passwd"', '"/etc/passwd"', '"/dev/zero"', '"/dev/stdin"', '"."', '["a.png"]', '[1,"x"]', "[nan]", "{a=1}", "1979-05-27", "12:00:00", "0x10", "1_0", "'''\n'''", '"\\U0001F600"'] + ['"' + "long" * 5000 + '"', "[" * 50 + "]" * 50]
+# fmt: off
+VALUES = [
+    "nan", "inf", "-inf", "1e400", "-1", "0", "1", "-0.0", "1e-300", "1e300", "9223372036854775808", "9" * 5000, "true",
+    "false", "[]", "{}", "[[]]", "[nan]", '[1,"x"]', '["a.png"]', "{a=1}", "1979-05-27", "12:00:00", "0x10", "1_0",
+    '""', '"x"', '"."', r'"\u0000"', '"../../../etc/passwd"', '"/etc/passwd"', '"/dev/zero"', '"/dev/stdin"',
+    '"' + "long" * 5000 + '"', "[" * 50 + "]" * 50, "[" * 3000,
+]
+# fmt: on
 
 
 @st.composite
@@ -82,9 +89,6 @@ def test_a_job(material, met, tmp_path_factory, data):
     folder = tmp_path_factory.mktemp("job")
     shutil.copy(material / "small.xml", folder)
     write(folder / "job.toml", data.draw(mutations((material / "job.toml").read_text())))
-    text = (folder / "job.toml").read_text(errors="replace")
-    if any(big in text for big in ("9223372036854775808", "99999999999", "1e300", "count = 0x10")):
-        text = text.replace("width", "width")  # a count that is allowed and long is not tried
     met("batch", folder / "job.toml", "--workers", "1")
 
 
