@@ -449,9 +449,10 @@ def readable(folder: Path, *more: type[Exception]) -> Iterator[None]:
     """What a study's files hold that no study writes is said of the study: a key that is missing, another type.
 
     more   further errors that mean the same"""
+    meant: tuple[type[Exception], ...] = (KeyError, TypeError, AttributeError, IndexError, ArithmeticError, *more)
     try:
         yield
-    except (KeyError, TypeError, AttributeError, IndexError, ArithmeticError, *more) as error:
+    except meant as error:
         if isinstance(error, UnknownKey):
             raise
         raise ValueError(
