@@ -72,6 +72,11 @@ def replacing(path: str | Path) -> Iterator[Path]:
     """A temporary file beside `path` that replaces it when the block ends without an error; removed otherwise."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
+    if path.is_dir():
+        raise IsADirectoryError(errno.EISDIR, "is a folder; choose the name of a file", str(path))
+    if path.exists() and not path.is_file():  # /dev/null, /dev/stdout: written to, never replaced
+        yield path
+        return
     temporary = path.parent / f".{path.stem}.{uuid.uuid4().hex}{path.suffix}"
     try:
         with naming(path, temporary):

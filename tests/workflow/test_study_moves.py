@@ -264,3 +264,19 @@ def test_a_full_disk_is_said_with_the_file(tmp_path):
     with pytest.raises(OSError, match="no reason of ours"), output.replacing(tmp_path / "a.txt"):
         raise OSError("no reason of ours")
     assert not list(tmp_path.iterdir())
+
+
+def test_a_device_is_written_to_and_never_replaced(tmp_path):
+    """As root, a file put in the place of /dev/null would be found by every other program."""
+    import os
+    import threading
+
+    pipe, read = tmp_path / "pipe", []
+    os.mkfifo(pipe)
+    reader = threading.Thread(target=lambda: read.append(pipe.read_text()))
+    reader.start()
+    output.write_text(pipe, "text")
+    reader.join(10)
+    assert read == ["text"] and pipe.is_fifo()
+    with pytest.raises(IsADirectoryError, match="is a folder"):
+        output.write_text(tmp_path, "text")
