@@ -14,9 +14,9 @@ import pytest
 
 pytestmark = pytest.mark.slow
 
-# Python itself, before it runs the program, ends by the signal: its first moments are not ours
+# Python ends by the signal while it starts and looks for the program: those first milliseconds are not the program's
 BEGUN = "import sys; print('begun', flush=True); from optics.cli import main; sys.exit(main())"
-MOMENTS = np.linspace(0.0, 2.5, 12)  # s after the program begins: imports, loading, work, the end
+MOMENTS = np.linspace(0.05, 2.5, 12)  # s after the program begins: imports, loading, work, the end
 COMMANDS = {
     "render": "render small.xml -o out/x.exr --png",
     "calibrate": "calibrate readings -o out/study",
