@@ -1,6 +1,7 @@
 """Every file format, mutated: values replaced by hostile ones, keys misspelt, lines lost or doubled, texts cut off,
 bytes flipped. Nothing raises what is not ours, hangs, or is taken for something else without a word."""
 
+import copy
 import io
 import json
 import shutil
@@ -131,7 +132,7 @@ def test_a_study(material, met, tmp_path_factory, name, data):
                 if isinstance(at, dict) and data.draw(st.booleans()):
                     del at[key]
                 else:
-                    at[key] = data.draw(value)
+                    at[key] = copy.deepcopy(data.draw(value))
                 break
             at = at[key]
     text = json.dumps(record)
