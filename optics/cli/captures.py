@@ -20,6 +20,7 @@ from optics.cli.shared import (
     Quiet,
     Settings,
     app,
+    check_finite,
     command,
     one_line,
     pairs,
@@ -112,6 +113,8 @@ def import_(
     from optics.polarization.mosaic import read_mosaic
 
     terminal.quiet, terminal.debug = quiet, debug
+    lengths = {"ball_radius": ball_radius, "mm_per_pixel": mm_per_pixel}
+    check_finite(import_, {**lengths, "black_level": black_level, "system_gain": system_gain, "dark_noise": dark_noise})
     raw = {
         "--settings": listed,
         "--rename": rename,
@@ -165,7 +168,6 @@ def import_(
             found = scans.import_scans(source, output, bin=bin, overwrite=force, progress=progress)
         _tell(found.folder, found.warnings, found.facts["corrections"])
         return
-    lengths = {"ball_radius": ball_radius, "mm_per_pixel": mm_per_pixel}
     stated: dict[str, Any] = {name: value for name, value in lengths.items() if value is not None}
     if translucent.is_translucent_source(source):
         unused = {"--circles": circles, "--untouched": untouched, "--leds": leds, "--every": every}

@@ -188,6 +188,7 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
         terminal.quiet, terminal.debug = quiet, debug
         try:
             _let_ask()
+            check_finite(function, options)
             function(*args, **options)
             sys.stdout.flush()
         except BrokenPipeError:  # whoever read our output has seen enough
@@ -207,6 +208,18 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
     run.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
     run.__annotations__ = {**function.__annotations__, "quiet": Quiet, "debug": Debug}
     return app.command()(run)
+
+
+def check_finite(function: Callable[..., None], options: Mapping[str, Any]) -> None:
+    """Raises ValueError for an option that is infinite or no number: what is asked for is a size."""
+    for name, value in options.items():
+        for number in value if isinstance(value, list) else [value]:
+            if isinstance(number, float) and not math.isfinite(number):
+                told = getattr(function.__annotations__.get(name), "__metadata__", [None])[0]
+                names = (getattr(told, "default", None), *(getattr(told, "param_decls", None) or ()))
+                named = [n for n in names if isinstance(n, str) and n.startswith("--")]  # typer keeps the first apart
+                option = named[0] if named else f"--{name.replace('_', '-')}"
+                raise ValueError(f"{option} {number}: not finite; allowed: a finite number")
 
 
 def _let_ask() -> None:
