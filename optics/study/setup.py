@@ -236,6 +236,12 @@ def variables_of_base(model: SceneModel, setup: Setup, frames: Sequence[int]) ->
             "allowed: one of --free and --per-group"
         )
     variables = calibrate.variables_from(model, setup.free or default_free(model), per_group, None, frames)
+    swept = {v.keys[0] for v in variables for i in v.frames or () if v.keys[0] in model.frames[i].readings}
+    if swept:
+        raise ValueError(
+            f"{some(sorted(swept), 4)}: set anew in the readings of a group, so that a group has no one value; "
+            "allowed: per group what the table does not set; what is known of a setting's error stands under [uncertainty]"
+        )
     if setup.per_group is None:
         variables = [v for v in variables if v.frames is None or not _untouched(model, v.frames)]
     for pattern, prior in priors.items():

@@ -147,6 +147,8 @@ def test_a_plugin_that_ends_the_program_is_named(place, met, monkeypatch):
 REFUSED = {
     "calibrate readings -o s --free source.power --per-group source.power": "source.power: free for all frames and for",
     "calibrate readings -o s --prior source.power=-5+-1": r"prior source\.power: source\.power = -5 is outside",
+    "calibrate readings -o s --per-group analyzer.angle": r"analyzer\.angle: set anew in the readings of a group",
+    "sweep polarizer_bench --to=1e400": "--to inf: not finite",
     "calibrate readings -o study --resume --seed 3": "cannot resume, changed since the study began: seed",
     "calibrate readings -o study --resume --robust": "cannot resume, changed since the study began: robust",
     "render small.xml -o x.exr --set gel.press_depth=30": r"the gel is 4 mm thick: gel\.press_depth = 30 mm",
@@ -228,7 +230,7 @@ WRITING = [
     "diagnose study",
     "add study vignetting",
     "effects new ripple -o out/own",
-    "effects new ripple --from study",
+    "effects new ripple --from study --along signal",
 ]
 
 
