@@ -240,7 +240,8 @@ def variables_of_base(model: SceneModel, setup: Setup, frames: Sequence[int]) ->
     if swept:
         raise ValueError(
             f"{some(sorted(swept), 4)}: set anew in the readings of a group, so that a group has no one value; "
-            "allowed: per group what the table does not set; what is known of a setting's error stands under [uncertainty]"
+            "allowed: per group what the table does not set; what is known of a setting's error stands under "
+            "[uncertainty]"
         )
     if setup.per_group is None:
         variables = [v for v in variables if v.frames is None or not _untouched(model, v.frames)]
