@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -62,6 +62,7 @@ TABLE_KEYS = (
 NOISE_KEYS = tuple(name for name in UNITS if name != "quantisation")  # the step is read off the images
 UNMOVED = 8  # readings in a row at one setting, on average, from which its error is solved for and not weighed
 SUNK = 5.0  # sd of the dark noise that the median of a frame may lie below the black level
+Find = Callable[[str, str], Path]  # (name, where it stands) -> the file, or BadCapture
 CFA = ("RGGB", "BGGR", "GRBG", "GBRG")
 
 
@@ -120,6 +121,7 @@ class Captures:
     exclude: dict[str, str] = field(default_factory=dict)
     step: float = 0.0
     mosaic: Mosaic | None = None  # of analysers (deg), row by row: image is (H, W, 1), each pixel seen through its own
+    files: dict[str, Path] = field(default_factory=dict)  # all that was read, by the name that captures.toml has for it
 
     def uncertainty_of(self, frame: Frame) -> dict[str, Any]:
         """Standard deviations of what a frame sets, by key; those of 0 are left out."""
@@ -128,8 +130,10 @@ class Captures:
 
 
 # -- Loading ---------------------------------------------------------------------------------------------------------
-def load(path: str | Path) -> Captures:
+def load(path: str | Path, outside: bool = False) -> Captures:
     """Read and check a capture set, given its folder or its `captures.toml`.
+
+    outside   its images and tables may lie anywhere, and not only in its folder
 
     Raises BadCapture (UnknownKey for a key that the format lacks). Settings are held against a scene by `check`.
     """
@@ -160,21 +164,26 @@ def load(path: str | Path) -> Captures:
     captures.absent = checks.texts(data, "absent", where)
     captures.uncertainty = _uncertainty(data.get("uncertainty", {}), f"{where}: [uncertainty]")
     captures.exclude = _exclude(data.get("exclude", {}), f"{where}: [exclude]")
+    captures.files[FILE] = path
+
+    def find(name: str, what: str) -> Path:
+        file = (checks.existing if outside else checks.inside)(folder, name, what)
+        captures.files[name] = file
+        return file
+
     step = 0.0
     if "table" in data:
         for key in ("cfa", "mosaic", "flat_field"):
             if key in data:
                 raise BadCapture(f"{where}: {key} belongs to images, not to a [table]; remove it")
-        captures.table, captures.frames, step = _read_table(folder, data["table"], f"{where}: [table]")
+        captures.table, captures.frames, step = _read_table(find, data["table"], f"{where}: [table]")
     else:
-        _read_frames(captures, data["frames"], where)
+        _read_frames(captures, find, data["frames"], where)
         if values_are == "DN" and cfa is None and captures.frames[0].image.shape[2] == 3:
             captures.warnings.append(DEMOSAICED)
         if "flat_field" in data:
             here = f"{where}: flat_field"
-            captures.flat_field, _ = read_image(
-                checks.existing(folder, checks.text(data, "flat_field", where), here), here
-            )
+            captures.flat_field, _ = read_image(find(checks.text(data, "flat_field", where) or "", here), here)
             _same_size(captures.flat_field, captures, here)
     images = [image for f in captures.frames for image in (f.image, *f.repeats)]
     _check_channels(captures, where)
@@ -300,7 +309,7 @@ def _top(captures: Captures, black: float) -> float:
     return top if top > black else black + 1.0
 
 
-def _read_frames(captures: Captures, tables: object, where: str) -> None:
+def _read_frames(captures: Captures, find: Find, tables: object, where: str) -> None:
     if not isinstance(tables, list) or not tables:
         raise BadCapture(
             f"{where}: frames = {tables!r}: zero frames; allowed: one [[frames]] or more, each with an image"
@@ -313,10 +322,8 @@ def _read_frames(captures: Captures, tables: object, where: str) -> None:
         if image is None:
             raise BadCapture(f"{here}: image is missing; give the path of a {', '.join(SUFFIXES)} file")
         here += f" ('{image}')"
-        files = [checks.existing(captures.folder, image, f"{here}: image")]
-        files += [
-            checks.existing(captures.folder, name, f"{here}: repeats") for name in checks.texts(table, "repeats", here)
-        ]
+        files = [find(image, f"{here}: image")]
+        files += [find(name, f"{here}: repeats") for name in checks.texts(table, "repeats", here)]
         for file in files:
             if (same := file.resolve()) in seen:
                 raise BadCapture(
@@ -325,11 +332,11 @@ def _read_frames(captures: Captures, tables: object, where: str) -> None:
                 )
             seen[same] = index
         mask = checks.text(table, "mask", here)
-        mask = checks.existing(captures.folder, mask, f"{here}: mask") if mask else None
+        mask = find(mask, f"{here}: mask") if mask else None
         settings = checks.settings(table.get("parameters", {}), f"{here}: parameters")
         spread = _uncertainty(table.get("uncertainty", {}), f"{here}: uncertainty")
         flat = checks.text(table, "flat_field", here)
-        flat = checks.existing(captures.folder, flat, f"{here}: flat_field") if flat else None
+        flat = find(flat, f"{here}: flat_field") if flat else None
         specs.append((here, image, files, mask, checks.text(table, "group", here), settings, spread, flat))
     stems = [Path(image).stem for _, image, *_ in specs]
     depths = {}
@@ -458,7 +465,7 @@ def _unusable(captures: Captures) -> str:
     )
 
 
-def _read_table(folder: Path, data: object, where: str) -> tuple[Table, list[Frame], float]:
+def _read_table(find: Find, data: object, where: str) -> tuple[Table, list[Frame], float]:
     """(table, a frame per row, step of the readings)."""
     checks.keys(data, TABLE_KEYS, where)
     assert isinstance(data, Mapping)
@@ -501,7 +508,7 @@ def _read_table(folder: Path, data: object, where: str) -> tuple[Table, list[Fra
         numbers["offset"],
         words["uncertainty"],
     )
-    rows, step = readings.read(checks.existing(folder, name, f"{where}: file"), table, where)
+    rows, step = readings.read(find(name, f"{where}: file"), table, where)
     frames = [
         Frame(
             f"row {index}",

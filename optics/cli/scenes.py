@@ -16,6 +16,7 @@ from optics.cli.shared import (
     Plugins,
     SceneName,
     Variant,
+    columns,
     command,
     load_scene,
     scan,
@@ -41,7 +42,7 @@ def scenes(as_json: AsJson = False) -> None:
         comment = re.search(r"<!--(.*?)-->", path.read_text(encoding="utf-8"), re.DOTALL)
         title = next((line.strip() for line in (comment[1] if comment else "").splitlines() if line.strip()), "")
         rows.append({"name": name, "title": title, "file": str(path)})
-    show(rows) if as_json else print(table([(r["name"], r["title"]) for r in rows]))
+    show(rows) if as_json else print(table([(r["name"], r["title"]) for r in rows], width=columns()))
 
 
 @command
@@ -69,7 +70,7 @@ def params(
     if as_json:
         return show(rows)
     head = ("key", "value", "unit", "bounds", "neutral", "derivative", "meaning")
-    print(table([head, *map(_parameter_line, rows)]))
+    print(table([head, *map(_parameter_line, rows)], width=columns()))
     if not patterns and (loaded.curves or loaded.integral is not None):
         print(
             "\n" + table([("spectrum", "kind", "nm", "mean", "source"), *map(_spectrum_line, spectra.records(loaded))])
@@ -170,7 +171,7 @@ def _span(bounds: Sequence[float]) -> str:
     return "any" if math.inf in bounds else " .. ".join(f"{b:g}" for b in bounds)
 
 
-def _new_effect(name: str | None, plugins: Path | None, **given: Any) -> None:
+def _new_effect(name: str | None, plugins: Sequence[Path] | None, **given: Any) -> None:
     """Write a plugin file, print its path, and note what comes next."""
     from optics.scene.declare import STAGES
     from optics.study import draft
@@ -184,7 +185,7 @@ def _new_effect(name: str | None, plugins: Path | None, **given: Any) -> None:
             raise ValueError(f"--along {given['along']}: of which study? Add --from STUDY")
         stage = draft.stage_of(given["part"], given["stage"])
         draft.check_name(name, STAGES[stage], registry)
-        text, folder = draft.new_effect(name, stage), plugins or Path("plugins")
+        text, folder = draft.new_effect(name, stage), plugins[0] if plugins else Path("plugins")
     else:
         if given["stage"] or given["part"]:
             raise ValueError(
@@ -195,8 +196,7 @@ def _new_effect(name: str | None, plugins: Path | None, **given: Any) -> None:
     terminal.note(
         f"next: optics add {given['from']} '{name}', then put a formula in place of the table"
         if given["from"]
-        else "next: fill in the formula; a folder 'plugins' beside captures or scene is found, any other by "
-        f"--plugins {file.parent}"
+        else f"next: fill in the formula; commands run it with --plugins {file.parent}"
     )
     print(file)
 
@@ -259,7 +259,7 @@ def effects(
         (r["key"], r["part"], ", ".join(p["name"] for p in r["parameters"]), r["onset"], r["needs"] or "-")
         for r in records
     ]
-    print(f"{table([head, *lines])}\n\nparts, each with a page too: {', '.join(sorted(found.parts))}")
+    print(f"{table([head, *lines], width=columns())}\n\nparts, each with a page too: {', '.join(sorted(found.parts))}")
 
 
 def _effect_record(found: "Registry", e: "Effect") -> dict[str, Any]:
@@ -307,8 +307,8 @@ def _effect_page(found: "Registry", e: "Effect", as_json: bool) -> None:
         for p in r["parameters"]
     ]
     print(f"{r['page'].strip()}\n\n{r['name']}: `{r['key']}`, {r['file']}")
-    print(table(facts))
-    print("\n" + table([("parameter", "unit", "neutral", "bounds", "meaning"), *lines]))
+    print(table(facts, width=columns()))
+    print("\n" + table([("parameter", "unit", "neutral", "bounds", "meaning"), *lines], width=columns()))
 
 
 def _part_page(found: "Registry", kind: str, as_json: bool) -> None:
@@ -357,6 +357,7 @@ def _part_page(found: "Registry", kind: str, as_json: bool) -> None:
                     )
                     for r in rows
                 ),
-            ]
+            ],
+            width=columns(),
         )
     )

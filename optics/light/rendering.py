@@ -79,6 +79,10 @@ class Rendering:
         return exr.write_png(path, np.nan_to_num(np.stack([self.channels[n] for n in names], -1)))
 
 
+SPP_MOST = 1_000_000  # hours for the smallest image
+LANES_MOST = 2**32 - 1  # rays of one pass
+
+
 class RenderJob:
     """Makes images of one scene, with other values each time.
 
@@ -99,8 +103,8 @@ class RenderJob:
         layers: Sequence[str] = LAYERS,
         stokes: bool = False,
     ):
-        if spp is not None and spp < 1:
-            raise ValueError(f"spp = {spp}; allowed: whole numbers from 1 on (samples per pixel)")
+        if spp is not None and not 1 <= spp <= SPP_MOST:
+            raise ValueError(f"spp = {spp}; allowed: whole numbers from 1 to {SPP_MOST:,} (samples per pixel)")
         self.scene, self.spp, self.layers = scene, spp, tuple(layers)
         self.base = scene.values()
         sensors = scene.mitsuba.sensors()
@@ -144,8 +148,9 @@ class RenderJob:
             else "LED by LED"
         )
         self.developer, self.integral, self.auto = None, None, False
+        self.bands = scene.integrator.bands if scene.integrator is not None else ()
         if scene.camera is not None and scene.integrator is not None:
-            self.bands, self.integral = scene.integrator.bands, scene.integral
+            self.integral = scene.integral
             self.auto = self.integral is not None and self.integral.auto
             self.developer = Developer(scene.camera, self.bands or (0.0,), black, saturation)
         self.record = {
@@ -246,7 +251,7 @@ class RenderJob:
             **(exr.spectral_header(self.stokes, UNITS) if vectors and self.bands else {}),
             "samplesPerPixel": spp,
         }
-        camera = self._developed(vectors, now) if vectors else None
+        camera = self._developed(vectors, now) if vectors and self.developer is not None else None
         return Rendering(channels, header, camera)
 
     def _passes(self, seed: int) -> tuple[dict, dict, int]:
@@ -256,6 +261,13 @@ class RenderJob:
 
         sensor = self.scene.mitsuba.sensors()[0]
         spp = self.spp or int(sensor.sampler().sample_count())
+        width, height = (int(n) for n in sensor.film().crop_size())
+        most = LANES_MOST // (width * height)
+        if spp > PASSES * most:
+            raise ValueError(
+                f"spp = {spp} of {width} x {height} pixels; allowed: up to {PASSES * most} (samples per pixel), as "
+                "Dr.Jit traces at most 2^32 rays at once; add images of several seeds"
+            )
         passes = min(PASSES, spp)
         per_pass = spp // passes
         seeds = np.random.SeedSequence(seed).generate_state(passes)
@@ -285,7 +297,9 @@ class RenderJob:
             return {"Y": s0[..., 0], **{f"S{i}.Y": parts[..., i] for i in range(4) if len(parts)}}
         if self.integral is not None:
             return self._colours(radiance, now)
-        channels = exr.preview_channels(self.bands, s0 * now[self.scene.key(self.scene.camera.name, "exposure")])
+        camera = self.scene.camera
+        exposure = 1.0 if camera is None else now[self.scene.key(camera.name, "exposure")]
+        channels = exr.preview_channels(self.bands, s0 * exposure)
         if "spectral" in self.layers:
             parts = radiance[..., 0] if radiance.ndim == 4 and radiance.shape[3] == 1 else radiance
             channels.update(exr.spectral_channels(self.bands, parts))
@@ -469,12 +483,7 @@ def scene_record(scene: Scene) -> dict:
 
 def plugins_record(registry: Registry) -> dict[str, str]:
     """Plugin file, relative to its folder, -> hash."""
-    return {
-        file.relative_to(folder).as_posix(): file_hash(file)
-        for folder in registry.folders
-        for file in sorted(folder.rglob("*.py"))
-        if not file.name.startswith("_")
-    }
+    return {registry.name_of(file): file_hash(file) for file in registry.files}
 
 
 # -- files -----------------------------------------------------------------------------------------------------------

@@ -13,10 +13,10 @@ from typing import Any
 
 from optics.captures.cells import in_cells
 from optics.fit.scene_model import SceneModel
-from optics.scene import loader as scenes
+from optics.scene.loader import Scene
 from optics.scene.mitsuba_parts import coarser
 from optics.scene.parameter import Values, Variable
-from optics.study.setup import Setup, definitions_of, plugins_of
+from optics.study.setup import Setup, definitions_of
 
 LARGE = 60_000  # values of the fitted frames, above which they are put into cells: some minutes of a diagnosis
 LARGEST_CELL = 4  # px each way: the dent of a ball that covers fifty pixels still covers a hundred cells
@@ -115,9 +115,8 @@ def open_in_cells(setup: Setup, cells: Cells) -> tuple[SceneModel, Setup]:
     captures = replace(captures, parameters={**captures.parameters, **stated})
     sized = replace(setup, defines={k: v for k, v in setup.defines.items() if k not in ("width", "height")})
     defines = definitions_of(sized, captures, whole.scene.path, (cells.columns, cells.rows))
-    plugins = plugins_of(setup)
     with coarser(cells.k):
-        loaded = scenes.load(whole.scene.path, defines, plugins=plugins if setup.plugins or plugins.is_dir() else None)
+        loaded = Scene(whole.scene.path, defines, whole.scene.variant, whole.scene.registry)
     model = type(whole)(loaded, captures, captures.noise, flat_field=whole.flat_field)
     model.assumed_errors = dict(whole.assumed_errors)
     return model, replace(setup, values=cells.all_into(setup.values))

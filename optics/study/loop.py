@@ -11,6 +11,7 @@ Each step is a folder of the study (optics.study.record), from which another pro
 from __future__ import annotations
 
 import math
+import os
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
@@ -25,15 +26,18 @@ from optics.diagnosis.dials import Width, unstated, width_of
 from optics.diagnosis.result import Diagnosis, Row
 from optics.diagnosis.score import SETTLED
 from optics.errors import BadCapture, Underdetermined, UnknownKey
+from optics.files.output import file_hash
 from optics.fit import calibrate
 from optics.fit.compare import Comparison
 from optics.fit.model import values_in
 from optics.fit.result import Fit
 from optics.fit.scene_model import SceneModel
+from optics.scene import trust
 from optics.scene.declare import Effect
 from optics.scene.parameter import Values, Variable
 from optics.scene.registry import Registry
-from optics.study import checks
+from optics.scene.trust import Named
+from optics.study import checks, places
 from optics.study.calibrated import origin_of
 from optics.study.cells import Cells, cells_for, open_in_cells
 from optics.study.record import Record
@@ -91,7 +95,8 @@ def begin(
         folder,
         scene=str(model.captures.scene),
         captures=str(setup.captures),
-        inputs=[setup.captures, model.scene.path, *model.scene.registry.folders],
+        inputs=places.inputs_of(model),
+        near={"captures": os.path.relpath(setup.captures, os.path.abspath(folder))},
         seed=setup.seed,
         command=command,
         title=title,
@@ -108,15 +113,17 @@ def begin(
         },
         prints=identity.sketch_of(model.captures),
     )
+    trust.remember(places.own_files(model.scene.registry))  # named, or agreed to: the study goes on with them
     if record.steps:
         return record, model, restore(record, model)
     clock = time.perf_counter()
-    try:
-        found = fit_base(model, variables, fitted, Values(dict(setup.values)), progress, robust=setup.robust)
-        write_step(record, model, "base", None, found, held, time.perf_counter() - clock)
-    except BaseException:
-        record.discard()
-        raise
+    with record.alone():
+        try:
+            found = fit_base(model, variables, fitted, Values(dict(setup.values)), progress, robust=setup.robust)
+            write_step(record, model, "base", None, found, held, time.perf_counter() - clock)
+        except BaseException:
+            record.discard()
+            raise
     return record, model, found
 
 
@@ -135,14 +142,34 @@ def _dial_error(model: SceneModel, setup: Setup) -> Width | None:
         return None
 
 
-def take_up(folder: str | Path) -> tuple[Record, SceneModel, Setup]:
-    """The record, model and setup of an existing study. Raises BadCapture where an input has changed since it began."""
+def take_up(
+    folder: str | Path, plugins: Named = None, captures: str | Path | None = None
+) -> tuple[Record, SceneModel, Setup]:
+    """The record, model and setup of an existing study, wherever it and its inputs lie. Raises BadCapture where an
+    input is gone or has changed since it began.
+
+    plugins    folders or files that are known besides those that the study was made with; None: those that are found
+               with it. What is not named must be trusted (optics.scene.trust)
+    captures   where its captures are, if they are not found"""
     record = Record.open(folder)
     setup = recorded(record.ladder["facts"]["setup"])
-    changed = record.changed_inputs()
+    found = places.captures_of(record.folder, record.ladder, setup, captures)
+    scene = places.scene_named(found)
+    around = places.plugin_places(record.folder, setup, found, scene)
+    own = [*around, *(trust.named(plugins) or ())]
+    changed = places.changed(
+        record.ladder, setup, found, scene, [file for place in own for file in trust.plugin_files(place)]
+    )
     if changed:
-        raise BadCapture(f"{folder}: changed since the study began: {', '.join(changed[:5])}; start a new study")
-    return record, open_model(setup), setup
+        raise BadCapture(
+            f"{folder}: changed since the study began: {', '.join(changed[:5])}{' ...' if len(changed) > 5 else ''} "
+            f"(captures: {found}); start a new study"
+        )
+    code = places.code_of(record.folder, record.ladder, setup, around, plugins)
+    if code or plugins is not None:
+        setup = replace(setup, plugins=[str(file) for file in code])
+    setup = replace(setup, captures=str(found))
+    return record, open_model(setup, code=code), setup
 
 
 def kept(record: Record, model: SceneModel, index: int = -1) -> tuple[list[Variable], Values, list[int]]:
@@ -282,7 +309,24 @@ def examine(
     ranked      called with the rows of that ranking
     advised     where effects tie, also advise what to measure next, which renders frames that nobody has taken yet
     remark      a warning that the diagnosis gets
+
+    Raises OutputExists where another process works on the study.
     """
+    with record.alone():
+        return _examined(record, model, setup, found, progress, advised, without, ranked, remark)
+
+
+def _examined(
+    record: Record,
+    model: SceneModel,
+    setup: Setup,
+    found: Fit,
+    progress: Progress | None,
+    advised: bool,
+    without: Sequence[str],
+    ranked: Callable[[list[Row]], None] | None,
+    remark: str,
+) -> Diagnosis:
     from optics.diagnosis.advice import advise
     from optics.diagnosis.diagnose import diagnose
     from optics.diagnosis.remarks import USUALLY
@@ -385,7 +429,22 @@ def extend(
 
     start   values to begin from, such as those of a diagnosis's refit; None: the present ones, with the effect a little
             off neutral
+
+    Raises OutputExists where another process works on the study, or has added a step since it was opened.
     """
+    with record.alone():
+        return _extended(record, model, setup, found, effect, start, progress)
+
+
+def _extended(
+    record: Record,
+    model: SceneModel,
+    setup: Setup,
+    found: Fit,
+    effect: Effect,
+    start: Values | None,
+    progress: Progress | None,
+) -> tuple[Fit, Comparison]:
     fitted, held = split(model, setup)
     if not model.scene.can_express(effect):
         missing = [n for n, keys in model.scene.keys_of(effect).items() if not keys]
@@ -416,7 +475,11 @@ def extend(
         model, variables, start, fitted, robust=setup.robust, progress=progress, over=[v.name for v in extra]
     )
     best = settled(model, best, setup.robust, progress)
-    record.note_inputs([effect.file] if effect.file else [])  # a draft is written after the study began
+    if effect.file:  # a draft is written after the study began
+        own = places.own_plugins(model.scene.registry)
+        file = Path(effect.file).resolve()
+        digest = file_hash(file)
+        record.note_inputs({name: h for name, h in own.items() if h == digest})
     comparison = write_step(record, model, effect.name, effect, best, held, time.perf_counter() - clock)
     before, after = (step["held_out"]["chi2_per_dof"] if step["held_out"] else math.nan for step in record.steps[-2:])
     if after > before:

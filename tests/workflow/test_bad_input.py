@@ -273,7 +273,7 @@ CASES = [
     (f"{RENDER} --set camera.exposure=inf", r"--set: camera\.exposure = inf is not finite"),
     (f"{RENDER} --set camera.exposure=nan", r"--set: camera\.exposure = nan is not finite"),
     (f"{RENDER} --set gel.indenter=cone", r"--set: unknown choice for gel\.indenter 'cone'"),
-    (f"{RENDER} --spp 0", r"spp = 0; allowed: whole numbers from 1 on"),
+    (f"{RENDER} --spp 0", r"spp = 0; allowed: whole numbers from 1 to"),
     (f"{RENDER} --seed=-1", r"'--seed'.*greater than or equal to 0; see `optics render --help`"),
     (f"{RENDER} --sede=1", r"--sede.*--se"),
     ("render small.xml", r"Missing option '-o'.*--help"),
