@@ -38,6 +38,7 @@ BASE = {
     "add": "study vignetting",
     "report": "study -o out/page.html",
     "values": "study",
+    "plot-spectra": "digit -o out/spectra.png",
     "scoreboard": "-o out/board --study study",
     "rehearse": "study",
     "imitate": "study -o out/set",
