@@ -10,7 +10,8 @@ is half a pixel) and the published one; the condition number kappa of the recons
 force when the motions have noise.
 
 The published table of constants is lost. Those used here were found from Table 2 itself: d = 20 mm, f/E = 2600
-px mm^2/N, nu = 1/2, 3000 beads. Only f/E and d are identified: to first order the thresholds depend on f and E through f/E alone, nu
+px mm^2/N, nu = 1/2, 3000 beads. Only f/E and d are identified: to first order the thresholds depend on f and E
+through f/E alone, nu
 changes them by a few per cent, and the number of beads by its logarithm."""
 
 import numpy as np

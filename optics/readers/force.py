@@ -2,7 +2,7 @@
 
     moved = image_motion(points, u, focal, distance)          dp of (3), px
     force = reconstruct(points, moved, unit, focal, distance) (8), N: by the pseudo-inverse
-    kappa = condition(points, force, unit, focal, distance)   (10), N/px: how much noise in dp becomes error of the force
+    kappa = condition(points, force, unit, focal, distance)   (10), N/px: error of the force per noise in dp
 
 A point force F at the origin moves bead j at (x, y, h) by H_j F (`unit`: optics.skin.forces.unit_displacements). The
 camera looks at the skin from a distance d below its face, so that a bead stands d - h in front of it, and its focal

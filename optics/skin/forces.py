@@ -1,4 +1,4 @@
-"""How forces on the face of a soft half-space move what lies in it: point forces, pressures, and a ball that is pressed.
+"""How forces on the face of a soft half-space move what lies in it: point forces, pressures, a ball that is pressed.
 
     u = displacements(points, places, forces, young)          any number of point forces, superposed
     load = ball(depth, radius)                                contact of a rigid ball: size, force, pressure, face

@@ -1,4 +1,4 @@
-"""Forces on a half-space: the solution obeys the equations of elasticity, and a ball's contact is Hertz' and Sneddon's."""
+"""Forces on a half-space: it obeys the equations of elasticity, and a ball's contact is Hertz' and Sneddon's."""
 
 import math
 
