@@ -152,6 +152,8 @@ class Renderer:
         self.apply(values)
         v, u = np.mgrid[: self.height, : self.width] + 0.5
         hits = Hits(self._trace(u.ravel(), v.ravel()), self.height, self.width)
+        if self.crowded:
+            hits.edges |= _creases(np.where(hits.valid[..., None], hits.normal, 0.0))
         hits.edges |= self._painted(hits)
         self._hits[key] = hits
         while len(self._hits) > self.remember:
@@ -257,7 +259,9 @@ class Renderer:
         image = LedImage(led, hits, rim, index, finer, visible, rim_visible, self._seen(visible).mean(0) > 0.5)
         image.share = share.reshape(-1, 1)[index]
         image.raw = self._raw(
-            image, lambda: self._shade(hits.sample, part, visible), lambda: self._shade(finer.sample, part, rim_visible, finer)
+            image,
+            lambda: self._shade(hits.sample, part, visible),
+            lambda: self._shade(finer.sample, part, rim_visible, finer),
         )
         if not self.layered:
             image.radiance = self._mix(image, image.raw)

@@ -30,7 +30,9 @@ from optics.scene.mitsuba_parts import Declared
 from optics.scene.parameter import Parameter
 
 PARAMETERS = (
-    Parameter("width", "mm", 30.0, (0.1, 1000.0), "of the body that holds them, along x", plausible=0.1, how="difference"),
+    Parameter(
+        "width", "mm", 30.0, (0.1, 1000.0), "of the body that holds them, along x", plausible=0.1, how="difference"
+    ),
     Parameter("length", "mm", 30.0, (0.1, 1000.0), "of that body, along y", plausible=0.1, how="difference"),
     Parameter(
         "top", "mm", 0.4, (0.0, 100.0), "depth of the highest middles below the face", plausible=0.1, how="difference"
@@ -161,7 +163,7 @@ def check_places():
     agree(one, same)
     assert cKDTree(one).query(one, 2)[0][:, 1].min() >= 0.6 - 1e-9
     assert np.all(np.abs(one[:, 0]) <= 2.7) and np.all(np.abs(one[:, 1]) <= 2.2)
-    assert np.all((-3.6 <= one[:, 2]) & (one[:, 2] <= -0.4))
+    assert np.all((one[:, 2] >= -3.6) & (one[:, 2] <= -0.4))
 
 
 def random(rng):

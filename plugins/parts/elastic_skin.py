@@ -4,8 +4,8 @@ Definition
     z(x, y) = -u_h(x - press_x, y - press_y, cover)              the gel's face, under the cover; flat at z = 0
     u = H * p                                                    an elastic half-space under the pressure p of a ball
                                                                  (optics.skin.forces; eqs. (1) and (2) of the source)
-    delta = press_depth + delta(press_force)                     how deep the ball of `tip_radius` sinks in
-    F = E* f(delta)                                              Sneddon's force, E* = young/(1 - poisson^2)
+    F = E* f(press_depth) + press_force                          normal force on the ball of `tip_radius`: Sneddon's f,
+                                                                 E* = young/(1 - poisson^2)
 The half-space begins at the cover's outer face, z = +cover, and has the same material everywhere: the cover, the gel
 and what is below. The gel fills -thickness < z < 0. The contact drags the skin along with `drag_x` and `drag_y` times
 its normal force, spread as the pressure is. `young` sets the force that a depth takes, and nothing that is seen, unless
@@ -51,13 +51,15 @@ PARAMETERS = (
         plausible=0.1,
         how="difference",
     ),
-    Parameter("tip_radius", "mm", 0.6, (0.05, 50.0), "radius of the ball that presses", plausible=0.05, how="difference"),
+    Parameter(
+        "tip_radius", "mm", 0.6, (0.05, 50.0), "radius of the ball that presses", plausible=0.05, how="difference"
+    ),
     Parameter(
         "press_force",
         "N",
         0.0,
         (0.0, 100.0),
-        "normal force; the depth that it takes adds to press_depth",
+        "normal force beyond the one that press_depth takes",
         neutral=0.0,
         plausible=0.1,
         how="difference",
@@ -81,6 +83,9 @@ PARAMETERS = (
 
 
 def build():
+    import drjit as dr
+    import mitsuba as mi
+
     class ElasticSkin(known().parts["gel"].build()):
         kind = "elastic_skin"
         indenter = "sphere"
@@ -100,8 +105,11 @@ def build():
         def ball(self, now=None):
             """The contact of the tip (optics.skin.forces.Ball)."""
             n = self.number if now is None else now.__getitem__
-            by_force = forces.ball_by_force(n("press_force"), n("tip_radius"), n("young"), n("poisson"))
-            return forces.ball(n("press_depth") + by_force.depth, n("tip_radius"))
+            elastic = n("young"), n("poisson")
+            found = forces.ball(n("press_depth"), n("tip_radius"))
+            if n("press_force") == 0:
+                return found
+            return forces.ball_by_force(found.force(*elastic) + n("press_force"), n("tip_radius"), *elastic)
 
         def force(self):
             """(3,) force of the press along x, y and into the skin, N."""
@@ -130,6 +138,9 @@ def build():
             dent = np.interp(r, radius, found.face(radius)) * fade * fade[:, None]
             touch = np.clip((found.a - r) / self.map_pitch + 0.5, 0, 1) if found.a else np.zeros_like(r)
             return contact.LocalMap(dent, self.map_pitch), contact.LocalMap(touch, self.map_pitch)
+
+        def beside(self, p):
+            return dr.zeros(mi.Float, 1)  # no plate of balls presses it
 
         def heights(self, x, y):
             self.map, self.touch = self.press()

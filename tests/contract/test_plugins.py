@@ -25,12 +25,19 @@ PARTS = sorted(REGISTRY.parts)
 # parts that light is followed through by Monte Carlo: their contract is in test_monte_carlo.py
 MONTE_CARLO = ("clear", "cells", "block", "room")
 EFFECTS = sorted(k for k, e in REGISTRY.effects.items() if e.part not in MONTE_CARLO)
-NUMBERS = [
-    (kind, p.name) for kind in PARTS if kind not in MONTE_CARLO for p in REGISTRY.parameters_of(kind) if p.is_number
-]
+
+
+def tested(kind):
+    """The parameters that are tested on a kind of part: of one that stands in for another, its own; what effects bring
+    to both is tested on the other."""
+    part = REGISTRY.parts[kind]
+    return part.parameters if part.role in ("camera", "gel") and part.role != kind else REGISTRY.parameters_of(kind)
+
+
+NUMBERS = [(kind, p.name) for kind in PARTS if kind not in MONTE_CARLO for p in tested(kind) if p.is_number]
 LAYERS = [kind for kind in PARTS if REGISTRY.parts[kind].mueller is not None]
 POWERS = ("power", "band power")  # roles
-MOVED = ("carried", "markers", "target")  # kinds of shapes that a scene moves besides the gel
+MOVED = ("carried", "markers", "target", "beads")  # kinds of shapes that a scene moves besides the gel
 LAYERED = ("layer", "detector", "glow")  # stages whose functions are differentiated by complex step
 SECTIONS = ("Definition", "Fingerprint", "Validity", "References")
 UNITS = {"1", "N", "mm", "mm^2", "deg", "rad", "nm", "px", "px^2", "DN", "1/mm", "1/mm^2", "MPa", "1e-12/Pa", "-"}
@@ -58,6 +65,9 @@ SURROUNDINGS = {  # parameter: what has to stand about it for it to be seen, and
     "gel.indenter_spacing": {"gel.indenter": "balls", "gel.indenter_size": 0.8, "gel.indenter_spacing": 1.8},
     "gel.shown_between": {"gel.indenter": "balls", "gel.indenter_size": 0.8, "gel.indenter_spacing": 1.8},
     "gel.thickness": {"gel.absorption": 0.02},
+    "elastic_skin.thickness": {"gel.absorption": 0.02},
+    "beads.gravity": {"beads.settling": 0.3},
+    **{f"elastic_skin.{name}": {f"gel.{name}": 8.0} for name in ("width", "length")},  # its rim in view
     **{f"{kind}.settling": {f"{kind}.drift": 0.02, f"{kind}.time": 3.0} for kind in ("source", "panel")},
     # the first direction of a carried film is constant in each triangle: a film that bends makes small jumps
     "gel.press_depth": {"film.inserted": 0.0},
@@ -372,9 +382,12 @@ def moves(bench, key):
     """Whether the parameter moves geometry, and with it the rims of shadows."""
     kind, name = bench.renderer.kind(key), key.rsplit(".", 1)[1]
     return (
-        kind in ("gel", "camera", "interface", *MOVED)
+        (bench.scene.registry.parts[kind].role in ("gel", "camera", "interface") or kind in MOVED)
         and bench.scene.parameters[key].how == "difference"
-        or (kind in bench.scene.registry.kinds("led") and name in ("x", "y", "z", "area", "length", "width", "roll"))
+        or (
+            kind in bench.scene.registry.kinds("led")
+            and name in ("x", "y", "z", "area", "length", "width", "roll", "radius")
+        )
     )
 
 
