@@ -3,10 +3,10 @@
     python examples/particle_flow.py [pixels]
 
 Renders the particle gel at rest and pressed by 1.5 mm (480 x 480 px, or as many as asked for), at several
-places, finds the beads and their motion as a robot would, and holds it to the motion that the beads were given, projected
-by the fisheye. A bead counts where another one hides less than half of it: the others have no motion of their own to
-be seen. Prints the median error in px of the sparse and the dense reader by depth of the bead, the share of the beads
-that was found, and the error of the features (11) in 20 x 20 bins."""
+places, finds the beads and their motion as a robot would, and holds it to the motion that the beads were given,
+projected by the fisheye. A bead counts where its middle shows: what is hidden has no motion to be seen. Prints the
+median error in px of the sparse and the dense reader by depth of the bead, the share of the keypoints that was lost, and the
+error of the features (11) in 20 x 20 bins."""
 
 import sys
 import time
@@ -42,7 +42,7 @@ def take(job, values: dict, seed: int) -> np.ndarray:
 
 
 def measure(size: int = 480, presses=PRESSES, spp: int | None = None) -> dict:
-    """Errors in px of each reader's motions: {"sparse": (N, 2) depth and error, "dense": ..., "shift": true motions}."""
+    """Errors in px of each reader's motions: "sparse", "dense" (N, 2) depth and error; "shift" the true motions."""
     scene = loader.load("particle_gel", {"width": str(size), "height": str(size)})
     job = RenderJob(scene, layers=(), spp=spp)
     beads = scene.parts["beads"]
@@ -103,9 +103,7 @@ def main() -> None:
                 f"  depth {low:g} to {high:g} mm: {np.median(own):.3f}  {np.quantile(own, 0.9):.3f}  ({len(own)} beads)"
             )
         bins = np.concatenate(found["bins"][name])
-        print(
-            f"  mean size in 20 x 20 bins (11): median error {np.median(bins):.3f} px, 90 % {np.quantile(bins, 0.9):.3f}"
-        )
+        print(f"  size (11) in 20 x 20 bins: median error {np.median(bins):.3f} px, 90 % {np.quantile(bins, 0.9):.3f}")
     print("\nseconds per image pair: sparse {:.4f}, dense {:.4f}".format(*found["seconds"]))
 
 

@@ -56,7 +56,7 @@ def draw(
         else:
             filled = float((np.pi / 6 * diameters**3).sum() / np.prod(box + cell))
             raise ValueError(
-                f"'{name}': {count} beads of {diameters.mean():.3g} mm do not fit without overlaps: the {n + 1}th found "
+                f"'{name}': {count} beads of {diameters.mean():.3g} mm do not fit without overlaps: number {n + 1} found "
                 f"no place in {tries} draws; they would fill {filled:.0%} of the body, and a random draw ends at about "
                 "35 %; allowed: fewer or smaller beads, or a larger body"
             )

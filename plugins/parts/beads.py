@@ -105,8 +105,8 @@ def build():
             own = self.number
             if not own("top") < own("bottom"):
                 raise ValueError(
-                    f"beads '{self.name}': top = {own('top'):g} mm, bottom = {own('bottom'):g} mm; allowed: a top above "
-                    "the bottom"
+                    f"beads '{self.name}': top = {own('top'):g} mm, bottom = {own('bottom'):g} mm; allowed: a "
+                    "top above the bottom"
                 )
             self.drawn = draw(self.count, self.box(), self.diameters(), self.seed, self.name, TRIES)
             params = mi.traverse(self)

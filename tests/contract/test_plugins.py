@@ -67,6 +67,8 @@ SURROUNDINGS = {  # parameter: what has to stand about it for it to be seen, and
     "gel.thickness": {"gel.absorption": 0.02},
     "elastic_skin.thickness": {"gel.absorption": 0.02},
     "beads.gravity": {"beads.settling": 0.3},
+    "fluorescent.bleaching": {"dye.time": 3.0},
+    "fluorescent.time": {"dye.bleaching": 0.05},
     **{f"elastic_skin.{name}": {f"gel.{name}": 8.0} for name in ("width", "length")},  # its rim in view
     **{f"{kind}.settling": {f"{kind}.drift": 0.02, f"{kind}.time": 3.0} for kind in ("source", "panel")},
     # the first direction of a carried film is constant in each triangle: a film that bends makes small jumps
@@ -692,7 +694,7 @@ IN_THE_FINGER = (
 
 @pytest.mark.parametrize("key", IN_THE_FINGER)
 def test_derivatives_behind_layers(key, bench_of):
-    bench = bench_of("fluorescent")
+    bench = bench_of("markers")
     checks = {
         "layer": (check_layer_step,),
         "image": (check_complex_step,),
@@ -716,7 +718,7 @@ def test_derivatives_behind_layers(key, bench_of):
 )
 def test_derivatives_of_light_that_no_lamp_made(key, bench_of, monkeypatch):
     """With every lamp off, the ambient light of the paints is still seen through the layers."""
-    bench = bench_of("fluorescent")
+    bench = bench_of("markers")
     for light in bench.scene.lights:
         monkeypatch.setitem(bench.values, f"{light}.power", 0.0)
     layer = bench.scene.parameters[key].how == "layer"
@@ -940,7 +942,7 @@ def test_everything_drawn_at_once_gives_images(seed, bench):
         assert np.isfinite(bench.derivative(key, values)).all(), key
 
 
-@pytest.mark.parametrize("kind, seed", [("source", 0), ("source", 1), ("fluorescent", 0)])
+@pytest.mark.parametrize("kind, seed", [("source", 0), ("source", 1), ("markers", 0)])
 def test_all_layers_drawn_at_once_give_derivatives(kind, seed, bench_of):
     """All parameters of a layered scene within a plausible change: an image, and the right derivatives by those of
     layers."""
