@@ -2,11 +2,11 @@
 
     python examples/particle_flow.py [pixels]
 
-Renders the particle gel at rest and pressed by 1.5 mm (480 x 480 px, or as many as asked for), at several
-places, finds the beads and their motion as a robot would, and holds it to the motion that the beads were given,
-projected by the fisheye. A bead counts where its middle shows: what is hidden has no motion to be seen. Prints the
-median error in px of the sparse and the dense reader by depth of the bead, the share of the keypoints that was lost, and the
-error of the features (11) in 20 x 20 bins."""
+Renders the particle gel at rest and pressed by 1.5 mm (480 x 480 px, or as many as asked for), at several places, finds
+the beads and their motion as a robot would, and holds it to the motion that the beads were given, projected by the
+fisheye. A bead counts where its middle shows: what is hidden has no motion to be seen. Prints the median error in px of
+the sparse and the dense reader by depth of the bead, the share of the keypoints that was lost, and the error of the
+features (11) in 20 x 20 bins."""
 
 import sys
 import time

@@ -56,9 +56,9 @@ def draw(
         else:
             filled = float((np.pi / 6 * diameters**3).sum() / np.prod(box + cell))
             raise ValueError(
-                f"'{name}': {count} beads of {diameters.mean():.3g} mm do not fit without overlaps: number {n + 1} found "
-                f"no place in {tries} draws; they would fill {filled:.0%} of the body, and a random draw ends at about "
-                "35 %; allowed: fewer or smaller beads, or a larger body"
+                f"'{name}': {count} beads of {diameters.mean():.3g} mm do not fit without overlaps: number {n + 1} "
+                f"found no place in {tries} draws; they would fill {filled:.0%} of the body, and a random draw ends "
+                "at about 35 %; allowed: fewer or smaller beads, or a larger body"
             )
         unit[n], places[n] = at, p
         grid.setdefault(c, []).append(n)

@@ -22,7 +22,8 @@ A rigid ball of the radius R, frictionless, that sinks in by delta touches up to
 which is Hertz' contact for a << R and holds beyond it: a needle with a round end touches nothing but its end while
 a < R. Every ring of the contact is the pressure of a flat punch, E* d delta/(pi sqrt(c^2 - r^2)).
 
-Validity: small strains, one material without end. A layer on a rigid base gives way less.
+Validity: small strains, one material without end. A layer on a rigid base gives way less:
+optics/skin/layer.py.
 Source: Design, Motivation and Evaluation of a Full-Resolution Optical Tactile Sensor, Sensors 19 (2019) 928, eqs. (1)
 and (2); Johnson, Contact Mechanics (1985), 3.2, 3.6, 4.2; Sneddon, Int. J. Eng. Sci. 3 (1965) 47.
 """
@@ -153,23 +154,27 @@ class Ball:
         cap = self.depth - self.radius + np.sqrt(np.maximum(self.radius**2 - r**2, 0))
         return np.where(inside, cap, beyond)
 
-    def nodes(self, young: float, poisson: float = 0.5, shear: tuple[float, float] = (0.0, 0.0)) -> tuple:
-        """The pressure as point forces: places (K, 2) mm, forces (K, 3) N.
+    def rings(self) -> tuple[np.ndarray, np.ndarray]:
+        """Radii, mm, of rings that stand for the pressure, and the share of the force of each.
 
-        shear   tangential force along x and y over the normal force, spread as the pressure is
-
-        The radii are Gauss' for the pressure's own weight, so that its moments up to r^14 are true."""
+        They are Gauss' for the pressure's own weight, so that its moments up to r^14 are true."""
         if self.a == 0:
-            return np.zeros((0, 2)), np.zeros((0, 3))
+            return np.zeros(0), np.zeros(0)
         c, d = self._rings()
         t, w = _gauss(FINE)
         square = (c[:, None] ** 2 * (1 - t**2)).ravel() / self.a**2
         share = (2 * c * d)[:, None] * w  # of a punch: uniform in t = sqrt(1 - r^2/c^2)
         q, weight = _condensed(square, share.ravel(), RADII)
-        angle = 2 * np.pi * (np.arange(ANGLES) + np.arange(RADII)[:, None] / 2) / ANGLES
-        r = self.a * np.sqrt(q)[:, None]
-        places = np.stack([r * np.cos(angle), r * np.sin(angle)], -1).reshape(-1, 2)
-        normal = np.repeat(weight / weight.sum() * self.force(young, poisson), ANGLES) / ANGLES
+        return self.a * np.sqrt(q), weight / weight.sum()
+
+    def nodes(self, young: float, poisson: float = 0.5, shear: tuple[float, float] = (0.0, 0.0)) -> tuple:
+        """The pressure as point forces: places (K, 2) mm, forces (K, 3) N.
+
+        shear   tangential force along x and y over the normal force, spread as the pressure is"""
+        r, share = self.rings()
+        angle = 2 * np.pi * (np.arange(ANGLES) + np.arange(len(r))[:, None] / 2) / ANGLES
+        places = np.stack([r[:, None] * np.cos(angle), r[:, None] * np.sin(angle)], -1).reshape(-1, 2)
+        normal = np.repeat(share * self.force(young, poisson), ANGLES) / ANGLES
         return places, normal[:, None] * np.array([*shear, 1.0])
 
 

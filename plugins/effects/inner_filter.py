@@ -4,8 +4,8 @@ Definition
     L' = L exp(-a(lambda_led) d_light - a(lambda) d_view)        Beer-Lambert, each way at its own wavelength
     a(lambda) = dye exp(-4 ln 2 ((lambda - dye_peak)/dye_fwhm)^2)
 with the lengths d of both ways inside the gel, -thickness < z < 0, the peak lambda_led of the LED's spectrum (of a
-white LED, whose `wavelength` is 0, the band) and the band lambda. Fluorescence comes to the camera at another wavelength than
-the one that made it: what dims its way in need not dim its way out.
+white LED, whose `wavelength` is 0, the band) and the band lambda. Fluorescence comes to the camera at another
+wavelength than the one that made it: what dims its way in need not dim its way out.
 Fingerprint
     beads fade with their distance from the LEDs and with the depth of gel above the rays, in the colour of the
     emission, where that colour itself is not absorbed. Gel absorption takes all bands alike, and both ways.

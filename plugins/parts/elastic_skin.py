@@ -9,13 +9,15 @@ Definition
 The half-space begins at the cover's outer face, z = +cover, and has the same material everywhere: the cover, the gel
 and what is below. The gel fills -thickness < z < 0. The contact drags the skin along with `drag_x` and `drag_y` times
 its normal force, spread as the pressure is. `young` sets the force that a depth takes, and nothing that is seen, unless
-`press_force` presses. Sheets, markers and beads in the gel move with the same displacement u, sideways too.
+`press_force` presses. `stiff_base` leads over to a layer of cover and gel on a rigid base at z = -thickness, under the
+same normal force (optics.skin.layer). Sheets, markers and beads in the gel move with the same displacement
+u, sideways too.
 Fingerprint
     beads near the press move away from it and towards the camera; the motion fades as 1/distance, far wider than a
     smoothed dent. A drag moves them all one way.
 Validity
-    small strains; a dent of a tenth of a millimetre at the face is within. The real base is stiff, the real cover
-    stiffer than the gel: the motion near the base is too large here.
+    small strains: a dent of the face by a tenth of its depth. The real base is stiff, which `stiff_base` gives; the
+    real cover is stiffer than the gel, which nothing here gives.
 References
     Sensors 19 (2019) 928, sections 2 and 3.1; Johnson, Contact Mechanics (1985), ch. 3.
 XML
@@ -36,6 +38,7 @@ from optics.scene.declare import Part
 from optics.scene.parameter import Parameter
 from optics.scene.registry import declared, known
 from optics.skin import contact, forces
+from optics.skin.layer import base_correction
 
 _GEL = declared(Path(__file__).with_name("gel.py"))[0]
 SIZES = {"width": 30.0, "length": 30.0, "thickness": 4.5}  # mm
@@ -76,6 +79,16 @@ PARAMETERS = (
             how="difference",
         )
         for axis in "xy"
+    ),
+    Parameter(
+        "stiff_base",
+        "1",
+        0.0,
+        (0.0, 1.0),
+        "share of the way from a half-space (0) to a layer on a rigid base (1)",
+        neutral=0.0,
+        plausible=0.5,
+        how="difference",
     ),
     Parameter("poisson", "1", 0.5, (0.0, 0.5), "Poisson's ratio", plausible=0.02, how="difference"),
     Parameter("young", "MPa", 0.12, (1e-4, 100.0), "Young's modulus", plausible=0.02, how="difference"),
@@ -125,8 +138,14 @@ def build():
             if not len(places):
                 return rest
             at = np.stack([x - n("press_x"), y - n("press_y"), depth + n("cover")], -1).reshape(-1, 3)
-            moved = forces.displacements(at, places, loads, n("young"), n("poisson")).reshape(rest.shape)
-            return rest + moved * [1.0, 1.0, -1.0]
+            moved = forces.displacements(at, places, loads, n("young"), n("poisson"))
+            if n("stiff_base") != 0:
+                thick = n("cover") + n("thickness")
+                at[:, 2] = np.minimum(at[:, 2], thick)
+                elastic = n("young"), n("poisson")
+                less = base_correction(at, *self.ball().rings(), self.force()[2], *elastic, thick)
+                moved = moved + n("stiff_base") * less
+            return rest + moved.reshape(rest.shape) * [1.0, 1.0, -1.0]
 
         def press(self, now=None):
             """Dent of the outer face and contact on a grid around the press axis."""

@@ -109,3 +109,42 @@ def test_bad_loads_are_refused():
         ball_by_force(-1.0, 0.6, E)
     with pytest.raises(ValueError, match="lift off"):
         pressure_nodes(np.full((3, 3), -1.0), 0.1)
+
+
+def test_a_layer_on_a_rigid_base_obeys_its_boundary_conditions_and_the_equations_inside():
+    """Half-space and correction together, by central differences: nothing moves at the base, no stress on the face
+    beside the load, no net force on a bit of the body; and a thick layer is a half-space."""
+    from optics.skin.layer import base_correction
+
+    t, rings = 3.0, (np.array([0.0]), np.array([1.0]))
+
+    def field(points, thickness=t):
+        place, force = np.zeros((1, 2)), np.array([[0.0, 0.0, 1.0]])
+        return displacements(points, place, force, E, NU) + base_correction(points, *rings, 1.0, E, NU, thickness)
+
+    base = np.array([[0.0, 0.0, t], [1.0, 0.5, t], [-4.0, 2.0, t]])
+    below = displacements(base, np.zeros((1, 2)), np.array([[0.0, 0.0, 1.0]]), E, NU)
+    assert np.abs(below).max() > 0.2
+    np.testing.assert_allclose(field(base), 0, atol=1e-5)
+
+    def gradient(at, h=2e-3):
+        steps = h * np.eye(3)
+        return np.stack([(field(at + s) - field(at - s)) / (2 * h) for s in steps], -1)
+
+    def stresses(at):
+        g = gradient(at)
+        lame, shear = E * NU / ((1 + NU) * (1 - 2 * NU)), E / (2 * (1 + NU))
+        strain = (g + g.transpose(0, 2, 1)) / 2
+        return lame * np.trace(strain, axis1=1, axis2=2)[:, None, None] * np.eye(3) + 2 * shear * strain
+
+    face = np.array([[1.5, 0.7, 2.5e-3], [0.0, 3.0, 2.5e-3]])
+    scale = np.abs(stresses(np.array([[1.5, 0.7, 1.0]]))).max()
+    # 2.5e-3 mm below the face: so much of the stress per mm, and the steps' square
+    np.testing.assert_allclose(stresses(face)[:, :, 2], 0, atol=0.01 * scale)
+    inside, h = np.array([[1.0, 0.4, 1.2], [0.3, -2.0, 2.2]]), 0.02
+    pull = sum((stresses(inside + h * e) - stresses(inside - h * e))[:, :, j] for j, e in enumerate(np.eye(3))) / (
+        2 * h
+    )
+    np.testing.assert_allclose(pull, 0, atol=5e-3 * scale)  # h^2 of a third derivative of a field that bends in 1 mm
+    thick = base_correction(inside, *rings, 1.0, E, NU, 300.0)
+    assert np.abs(thick).max() < 0.02 * np.abs(field(inside)).max()
