@@ -1,6 +1,6 @@
 """A soft layer on a rigid base: what the base takes from the motion that a half-space would have.
 
-    less = base_correction(points, radii, shares, force, young, poisson, thickness)    (N, 3) mm, added to a half-space's
+    less = base_correction(points, radii, shares, force, young, poisson, thickness)  (N, 3) mm, added to a half-space's
 
 A normal load with the symmetry of a circle presses the face h = 0; the layer sticks to the base at h = t. In Hankel
 space, with u = grad(phi + h psi) - 4 (1 - nu) psi e_h (Papkovich and Neuber) and harmonic phi, psi,
