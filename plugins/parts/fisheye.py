@@ -25,7 +25,7 @@ XML
     cx float, half the width: principal point, px, in place of `principal_x`
     cy float, half the height: principal point, px, in place of `principal_y`
     distortion string: k1 k2 k3 k4, in place of the four parameters
-    image_circle float, 0: radius of the image circle, px, about the principal point; 0: the whole image is lit
+    image_circle float, 0.0: radius of the image circle, px, about the principal point; 0: the whole image is lit
     mosaic string: as of the part `camera`
     sensitivity string, identity: as of the part `camera`
 """
@@ -94,6 +94,12 @@ def build():
                 raise ValueError(
                     f"fisheye: distortion has {len(numbers)} numbers; allowed: the four of OpenCV's fisheye model, "
                     "k1 k2 k3 k4"
+                )
+            given = {"fy": props.get("fy", None), "cx": props.get("cx", None), "cy": props.get("cy", None)}
+            alone = [name for name, value in given.items() if value is not None]
+            if alone and "fx" not in props:
+                raise ValueError(
+                    f"fisheye: {', '.join(alone)} without fx; allowed: fx beside them, in px, or x_fov in their place"
                 )
             for i, number in enumerate(numbers, 1):
                 props[f"k{i}"] = float(number)

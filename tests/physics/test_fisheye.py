@@ -109,6 +109,7 @@ def test_derivatives_of_rays_by_the_calibration(name, mitsuba):
         ({"distortion": "-0.6 0 0 0", "x_fov": 140.0}, "folds over at 42.71 deg"),
         ({"distortion": "0.1 0.2"}, "four of OpenCV"),
         ({"fx": 60.0, "law": "equisolid"}, "too short"),
+        ({"cx": 243.0, "cy": 236.0}, "cx, cy without fx"),
         ({"law": "orthographic"}, "unknown choice for"),
     ],
 )
