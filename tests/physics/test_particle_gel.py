@@ -80,7 +80,7 @@ def test_a_path_tracer_sees_the_same_light(load):
     one, other = (image.camera.reshape(6, 10, 6, 10, 3).mean((1, 3)) for image in (exact, traced))
     for channel in (1, 2):
         assert other[..., channel].max() > 0.02
-        # blocks of 100 px, whose rims of 16 samples err by up to a tenth of the contrast, some in the same way
+        # blocks of 100 px, whose rims of 32 samples err by up to a tenth of the contrast, some in the same way
         np.testing.assert_allclose(one[..., channel], other[..., channel], atol=0.02 * other[..., channel].max())
     assert np.abs(one - other)[..., 1].mean() < 0.005 * other[..., 1].max()
 
