@@ -9,8 +9,8 @@ Fingerprint
     in the emission's channel appears what the excitation's shows: reflections without fluorescence, such as a cover
     that should be black. Colour crosstalk goes both ways and between all channels.
 Validity
-    one share over the field; bands that are channels (`sensitivity` identity). One band alone has no other to leak
-    from.
+    beads that shine (where nothing does, this is colour crosstalk); one share over the field; bands that are channels
+    (`sensitivity` identity). One band alone has no other to leak from.
 References
     Lakowicz, Principles of Fluorescence Spectroscopy, 3rd ed., 2.4 (filters); EMVA 1288 release 4.0, 4.2.
 """
@@ -56,6 +56,7 @@ effect = Effect(
             how="image",
         ),
     ),
+    requires=("beads",),
     acts=("channel",),
     needs="a channel that sees the excitation alone",
     checks=(check_share,),

@@ -63,7 +63,7 @@ def check_two_ways():
 
 effect = Effect(
     name="inner filter",
-    part="gel",
+    part="elastic_skin",
     stages={"segment": filtered},
     parameters=(
         Parameter("dye", "1/mm", 0.0, (0.0, 10.0), "absorption coefficient at the peak", neutral=0.0, plausible=0.02),

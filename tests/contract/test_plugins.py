@@ -28,10 +28,12 @@ EFFECTS = sorted(k for k, e in REGISTRY.effects.items() if e.part not in MONTE_C
 
 
 def tested(kind):
-    """The parameters that are tested on a kind of part: of one that stands in for another, its own; what effects bring
-    to both is tested on the other."""
-    part = REGISTRY.parts[kind]
-    return part.parameters if part.role in ("camera", "gel") and part.role != kind else REGISTRY.parameters_of(kind)
+    """The parameters that are tested on a kind of part: of one that stands in for another camera or gel, those that the
+    other has not been brought as well."""
+    part, all_of_it = REGISTRY.parts[kind], REGISTRY.parameters_of(kind)
+    if part.role not in ("camera", "gel") or part.role == kind:
+        return all_of_it
+    return [p for p in all_of_it if p in part.parameters or p not in REGISTRY.parameters_of(part.role)]
 
 
 NUMBERS = [(kind, p.name) for kind in PARTS if kind not in MONTE_CARLO for p in tested(kind) if p.is_number]
@@ -283,15 +285,20 @@ def bench_of(benches, mitsuba):
             brought = [p.name for p in (*effect.parameters, *effect.shape) if not isinstance(p, str)]
             if effect.part == part.kind and name in brought:
                 kinds += effect.requires
-        for shipped_scene in sorted(
+        order = sorted(
             scene.shipped_scenes(),
             key=lambda n: (n != "gelsight", n.startswith("polari") and n != "polarizer_bench", n),
-        ):
-            text = scene.find(shipped_scene).read_text(encoding="utf-8")
-            if 'type="clear"' not in text and all(f'type="{kind}"' in text for kind in kinds):
+        )
+        # scenes with these kinds, then those where others play their roles
+        for meant in (lambda kind: (kind,), REGISTRY.kinds):
+            for shipped_scene in order:
+                text = scene.find(shipped_scene).read_text(encoding="utf-8")
+                present = [any(f'type="{k}"' in text for k in meant(kind)) for kind in kinds]
+                if 'type="clear"' in text or not all(present):
+                    continue
                 bench = benches(shipped_scene)
                 named = thing.parameter_names if isinstance(thing, Effect) else (name,) if name else ()
-                holders = [p for p in bench.scene.parts.values() if p.kind == kinds[0]]
+                holders = [p for p in bench.scene.parts.values() if p.kind in meant(kinds[0])]
                 if all(any(p.takes(n) for p in holders) for n in named):
                     used.append(bench)
                     return bench
@@ -308,7 +315,9 @@ def bench_of(benches, mitsuba):
 
 
 def keys(bench, kind, name):
-    return [f"{n}.{name}" for n, p in bench.scene.parts.items() if p.kind == kind]
+    own = [n for n, p in bench.scene.parts.items() if p.kind == kind]
+    own = own or [n for n, p in bench.scene.parts.items() if p.role == kind]
+    return [f"{n}.{name}" for n in own]
 
 
 def key_of(bench, kind, name):
