@@ -55,6 +55,14 @@ def test_a_press_moves_beads_as_the_half_space_does(load):
     np.testing.assert_allclose(beads.centres(), expected, atol=1e-9)
 
 
+def test_an_image_says_the_force_of_its_press(load):
+    from optics.light.rendering import RenderJob
+
+    job = RenderJob(load(beads=20, detail=1, width=24, height=24), layers=())
+    press = job.take({"gel.press_force": 0.05, "gel.drag_x": 0.1}).header["provenance"]["press"]
+    np.testing.assert_allclose(press["force"], [0.005, 0.0, 0.05], rtol=1e-9)
+
+
 def test_beads_follow_a_dented_gel_of_any_kind(mitsuba):
     """In a gel that knows its dent alone, between the depths at which sheets are carried."""
     from optics.scene.checking import made
