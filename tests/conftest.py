@@ -313,7 +313,7 @@ POINTS = {  # scene: (what replaces its <default>s, values)
         CAMERA_POINT,
     ),
     "particle_gel": (
-        {"width": 60, "height": 50, "x_fov": 40, "beads": 40, "diameter": 2.4, "depth": 0.4, "x": 1.0},
+        {"width": 48, "height": 40, "x_fov": 40, "beads": 40, "detail": 1, "diameter": 2.4, "depth": 0.4, "x": 1.0},
         PARTICLE_POINT,
     ),
     "vi2tap": ({"width": 32, "height": 24, "x_fov": 45, "depth": 1, "wall_dark": 1}, FINGER_POINT),
