@@ -12,6 +12,8 @@ import math
 
 import numpy as np
 
+JAMMED = 0.384  # of the volume: where random sequential addition of equal balls ends (Widom's problem)
+
 
 def sizes(count: int, diameter: float, spread: float, seed: int) -> np.ndarray:
     """(N,) diameters in mm: log-normal about a mean, with the relative standard deviation `spread`."""
@@ -39,6 +41,14 @@ def draw(
             f"'{name}': the middles of the beads have {box[0]:g} x {box[1]:g} x {box[2]:g} mm; allowed: a body larger "
             "than a bead, a top above the bottom"
         )
+    filled = float((np.pi / 6 * diameters**3).sum() / np.prod(box + diameters.max()))
+    refusal = (
+        f"'{name}': {count} beads of {diameters.mean():.3g} mm do not fit without overlaps: they would fill "
+        f"{filled:.0%} of the body, and a random draw ends at {JAMMED:.0%} at most"
+    )
+    advice = "allowed: fewer or smaller beads, or a larger body"
+    if filled > JAMMED:
+        raise ValueError(f"{refusal}; {advice}")
     rng = np.random.default_rng([seed, 0])
     cell = float(diameters.max())
     grid: dict[tuple[int, int, int], list[int]] = {}
@@ -54,12 +64,7 @@ def draw(
             if not near or (((places[near] - p) ** 2).sum(-1) >= apart**2).all():
                 break
         else:
-            filled = float((np.pi / 6 * diameters**3).sum() / np.prod(box + cell))
-            raise ValueError(
-                f"'{name}': {count} beads of {diameters.mean():.3g} mm do not fit without overlaps: number {n + 1} "
-                f"found no place in {tries} draws; they would fill {filled:.0%} of the body, and a random draw ends "
-                "at about 35 %; allowed: fewer or smaller beads, or a larger body"
-            )
+            raise ValueError(refusal + f"; number {n + 1} found no place in {tries} draws; {advice}")
         unit[n], places[n] = at, p
         grid.setdefault(c, []).append(n)
     return unit
