@@ -20,7 +20,7 @@ endif
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test test-all lint docs bench proof lock clean
+.PHONY: help setup demo test test-all torture lint docs bench proof lock clean
 
 help:  ## list these targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /  make \1\t/' | expand -t 16
@@ -48,6 +48,10 @@ test: setup  ## run the tests, but for the slow ones (ARGS="-n 0": in one proces
 
 test-all: setup  ## run all tests, the slow ones too
 	@$(PYTEST) $(ARGS)
+
+torture: setup  ## try all hostile input: files, options, plugins, Ctrl-C, kill -9, full and read-only disks (half an hour)
+	@OPTICS_TORTURE=1 $(PYTEST) tests/torture tests/workflow/test_trust.py tests/workflow/test_study_moves.py \
+	    tests/workflow/test_bad_input.py $(ARGS)
 
 lint: setup  ## check format, style, types, and that imports run one way
 	@$(BIN)/ruff format --check -q . && $(BIN)/ruff check -q . && $(BIN)/mypy && $(BIN)/lint-imports --no-cache >/dev/null

@@ -13,9 +13,8 @@ that is what you would type with captures of your own:
     curve
     optics effects new 'row curve' --from study                  the curve as an effect, in a file
     optics add study 'row curve'                                 held-out error falls: the coordinate is right
-    optics effects new 'shutter ripple' --stage lens -o captures/plugins      the cause is found: a stub, and its
-    formula
-    optics calibrate captures -o answer ...                      a fresh study, in which the new effect takes part
+    optics effects new 'shutter ripple' --stage lens -o plugins  the cause is found: a stub, and its formula
+    optics calibrate captures -o answer --plugins plugins ...    a fresh study, in which the new effect takes part
     optics diagnose answer; optics add answer 'shutter ripple'; optics diagnose answer
 
 OUTPUT gets the captures, both studies with a report each, the images, and `index.html`, which tells the story.
@@ -289,11 +288,11 @@ def main(output: Path) -> dict:
         f"{1e6 * LINE:g} us apart give "
         f"a period of {period:.2f} rows; the curve then has a phase of {phase:.2f} rad and an amplitude of {size:.2%}"
     )
-    Path(drafted).unlink()  # the formula takes its place
-    stub = Path(optics("effects", "new", "shutter ripple", "--stage", "lens", "-o", f"{captures}/plugins").strip())
+    own = f"{output}/plugins"
+    stub = Path(optics("effects", "new", "shutter ripple", "--stage", "lens", "-o", own).strip())
     stub.write_text(filled_in(stub.read_text(encoding="utf-8"), phase), encoding="utf-8")
 
-    optics("calibrate", captures, "-o", answer, *FREE)
+    optics("calibrate", captures, "-o", answer, "--plugins", own, *FREE)
     second = told(Path(answer))
     optics("add", answer, "shutter ripple")
     with_formula = held_out(Path(answer))[-1]

@@ -53,6 +53,10 @@ class BadPlugin(ValueError):
     """A plugin file whose declaration is incomplete or contradicts another one."""
 
 
+class Untrusted(BadPlugin):
+    """Code that came with data, which the user has not agreed to run."""
+
+
 class Underdetermined(ValueError):
     """The captures cannot decide what was asked of them."""
 

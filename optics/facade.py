@@ -26,14 +26,16 @@ from optics.diagnosis.result import Diagnosis, Row
 from optics.fit.compare import Comparison
 from optics.fit.result import Fit
 from optics.fit.scene_model import SceneModel
+from optics.scene import trust
 from optics.scene.declare import Effect
 from optics.scene.loader import Scene
 from optics.scene.mitsuba_parts import DEFAULT_VARIANT
 from optics.scene.parameter import Values
+from optics.scene.trust import Named
 from optics.study import loop
 from optics.study.calibrated import noise_of, plugins_of_fit, scene_of, tested
 from optics.study.fit_files import fit_file, read_fit, values_of
-from optics.study.record import Record
+from optics.study.record import Record, readable
 from optics.study.setup import Setup, open_model, recorded, setup_for, split
 from optics.study.shown import Shown, shown_frames
 
@@ -53,7 +55,7 @@ def load(
     fit: str | Path | None = None,
     frame: str | None = None,
     variant: str = DEFAULT_VARIANT,
-    plugins: str | Path | None = None,
+    plugins: Named = None,
 ) -> Scene:
     """A scene by its shipped name or the path of its XML; or the calibrated sensor that a study found.
 
@@ -61,7 +63,10 @@ def load(
     fit       a study's folder (its last step) or a fit.toml: the scene that it belongs to, with the values that were
               found; `scene` may be left out
     frame     of the fit's captures: with what was set and found in it. None: with the values that all frames share
-    variant   of Mitsuba, which is set; plugins: a further folder of plugins
+    variant   of Mitsuba, which is set
+    plugins   further folders of plugins, or files: what is named runs. None: those that lie in a folder `plugins`
+              beside the scene, or that the fit names, where they are trusted (optics.scene.trust); "none": only what
+              ships
 
     Raises UnknownKey for an unknown name, definition or frame, BadScene for what cannot be loaded or where the fit
     belongs to another scene.
@@ -81,7 +86,7 @@ def load(
         raise ValueError("no scene; allowed: a shipped scene's name, the path of an XML file, or fit=STUDY")
     if frame is not None:
         raise ValueError(f"frame = {frame!r} without a fit; a scene alone has no frames: add fit=STUDY")
-    return loader.load(scene, given, variant, None if plugins is None else Path(plugins))
+    return loader.load(scene, given, variant, plugins)
 
 
 def calibrate(
@@ -95,8 +100,9 @@ def calibrate(
     held_out: Sequence[str] | None = None,
     values: Mapping[str, float | str] | None = None,
     defines: Mapping[str, object] | None = None,
-    plugins: str | Path | None = None,
+    plugins: Named = None,
     flat_field: str | None = None,
+    outside: bool = False,
     robust: bool = False,
     seed: int = 0,
     title: str = "",
@@ -118,6 +124,7 @@ def calibrate(
     held_out    groups of frames to test on and not to fit. None: every fourth, where there are four or more; []: none
     values      start values, by key, above those of the fit;   defines, plugins: as in `load`
     flat_field  how a background image enters: "multiplicative", "additive" or "none"; None: as the captures ask
+    outside     images and tables that captures.toml names may lie outside its folder
     robust      residuals beyond three sigmas count less (Huber)
     resume      continue the study in `folder`, if its inputs are the same
     command     what a report says the study was made by
@@ -130,7 +137,7 @@ def calibrate(
     check_folder(Path(folder))
     start: Mapping[str, float | str] = {}
     if fit is not None:
-        origin, defines, plugins = _taken_from(fit, captures, defines, plugins)
+        origin, defines, plugins = _taken_from(fit, captures, defines, plugins, outside)
         start = origin["parameters"]
     setup = setup_of(
         captures,
@@ -142,6 +149,7 @@ def calibrate(
         defines=defines,
         plugins=plugins,
         flat_field=flat_field,
+        outside=outside,
         robust=robust,
         seed=seed,
     )
@@ -156,8 +164,9 @@ def compare(
     values: Mapping[str, float | str] | None = None,
     held_out: Sequence[str] | None = None,
     defines: Mapping[str, object] | None = None,
-    plugins: str | Path | None = None,
+    plugins: Named = None,
     flat_field: str | None = None,
+    outside: bool = False,
 ) -> Compared:
     """Captures measured against a scene's predictions, without fitting anything.
 
@@ -166,13 +175,14 @@ def compare(
     values     by key, above those of the fit
     held_out   groups that the fit has not seen; None: those that it held out
     defines, plugins, flat_field   replace those of the fit
+    outside    images and tables that captures.toml names may lie outside its folder
 
     Raises BadScene where the fit belongs to another scene than the captures.
     """
     origin: Mapping[str, Any] = {}
     noise = None
     if fit is not None:
-        data, defines, plugins = _taken_from(fit, captures, defines, plugins)
+        data, defines, plugins = _taken_from(fit, captures, defines, plugins, outside)
         origin = data["sensor"]
         noise = noise_of(fit_file(fit), origin["noise"]) if origin.get("noise") else None
     setup = setup_of(
@@ -180,6 +190,7 @@ def compare(
         defines=defines,
         plugins=plugins,
         flat_field=flat_field or origin.get("flat_field"),
+        outside=outside,
         uncertainty=dict(origin.get("uncertainty", {})),
     )
     model = open_model(setup, fitted=noise)
@@ -194,26 +205,25 @@ def _taken_from(
     fit: str | Path,
     captures: str | Path,
     defines: Mapping[str, object] | None,
-    plugins: str | Path | None,
-) -> tuple[dict[str, dict], Mapping[str, object], str | Path | None]:
-    """(a fit's tables, definitions, folder of plugins) for captures; what is given stands above the fit's, and images
+    plugins: Named,
+    outside: bool = False,
+) -> tuple[dict[str, dict], Mapping[str, object], Named]:
+    """(a fit's tables, definitions, plugins) for captures; what is given stands above the fit's, and images
     have the size that they have. Raises BadScene where the fit belongs to another scene than the captures."""
     file = fit_file(fit)
     data = read_fit(file)
     origin = data["sensor"]
-    scene_of(file, origin, capture_files.load(captures).scene)
+    scene, _ = scene_of(file, origin, capture_files.load(captures, outside).scene)
     found = {k: v for k, v in origin.get("defines", {}).items() if k not in ("width", "height")}
-    return data, {**found, **(defines or {})}, plugins_of_fit(file, origin) if plugins is None else plugins
+    return data, {**found, **(defines or {})}, plugins_of_fit(file, origin, scene) if plugins is None else plugins
 
 
-def setup_of(
-    captures: str | Path, *, defines: Mapping[str, object] | None, plugins: str | Path | None, **more: Any
-) -> Setup:
+def setup_of(captures: str | Path, *, defines: Mapping[str, object] | None, plugins: Named, **more: Any) -> Setup:
     """The setup of a study; its paths are absolute, so that it can be continued from any folder."""
     return setup_for(
         os.path.abspath(captures),
         defines={name: str(value) for name, value in (defines or {}).items()},
-        plugins=os.path.abspath(plugins) if plugins else None,
+        plugins=None if plugins is None else [os.path.abspath(p) for p in trust.named(plugins) or ()],
         **more,
     )
 
@@ -251,12 +261,22 @@ class Study:
         self.record = record
         self.setup = recorded(record.ladder["facts"]["setup"]) if "setup" in record.ladder["facts"] else Setup("")
         self._model, self._fit = model, fit
+        self._plugins: Named = None
+        self._captures: str | Path | None = None
         self._verdict: Diagnosis | None = None  # of the last step, with its refits
 
     @classmethod
-    def open(cls, folder: str | Path) -> Study:
-        """An existing study. Raises FileNotFoundError, or ValueError where it cannot be read."""
-        return cls(Record.open(folder))
+    def open(cls, folder: str | Path, *, plugins: Named = None, captures: str | Path | None = None) -> Study:
+        """An existing study. Raises FileNotFoundError, or ValueError where it cannot be read.
+
+        plugins    folders or files that run besides those that the study was made with; None: those that are found with
+                   it, where they are trusted (optics.scene.trust)
+        captures   where its captures are by now, if they are not found where they were, as seen from the study
+        """
+        with readable(Path(folder)):
+            study = cls(Record.open(folder))
+        study._plugins, study._captures = plugins, captures
+        return study
 
     # -- what it holds ------------------------------------------------------------------------------------------------
     @property
@@ -281,7 +301,8 @@ class Study:
     def model(self) -> SceneModel:
         """The scene with its captures; loaded when first asked for. Raises BadCapture where an input has changed."""
         if self._model is None:
-            self.record, self._model, self.setup = loop.take_up(self.folder)
+            with readable(self.folder):
+                self.record, self._model, self.setup = loop.take_up(self.folder, self._plugins, self._captures)
         return self._model
 
     @property
@@ -331,12 +352,18 @@ class Study:
         advised   where effects tie, simulate further frames and say which would tell them apart
         ranked    called with the ranking by score, before anything is refitted; the step's ranking.csv holds it too
 
-        Raises UnknownKey for an unknown effect.
+        Images whose fitted frames have more than 60,000 values are diagnosed in cells of up to 4 x 4 pixels; a warning
+        says so. Raises UnknownKey for an unknown effect.
         """
         model = self.model
         left_out = _listed(without) or []
         loop.excluded(model, self.record, left_out)  # a wrong name costs no fit
-        self._verdict = loop.examine(self.record, model, self.setup, self.fit, progress, advised, left_out, ranked)
+        asked = (progress, advised, left_out, ranked)
+        cells = loop.cells_of(self.record, model)
+        if cells is None:
+            self._verdict = loop.examine(self.record, model, self.setup, self.fit, *asked)
+        else:
+            self._verdict = loop.examine_in_cells(self.record, model, self.setup, cells, *asked)
         return self._verdict
 
     def add(self, effect: str, *, start: Values | None = None, progress: Progress | None = None) -> Fit:
@@ -393,15 +420,18 @@ class Study:
 
     def report(self, file: str | Path | None = None, *, overwrite: bool = False) -> Path:
         """Write the study as one HTML page; returns its path (None: report.html in the study's folder)."""
+        from jinja2 import UndefinedError
+
         from optics.pages.report import report
 
-        return report(self.folder, file or self.folder / "report.html", overwrite=overwrite)
+        with readable(self.folder, UndefinedError):
+            return report(self.folder, file or self.folder / "report.html", overwrite=overwrite)
 
     def view(self, step: int | None = None, *, port: int = 0, ready: Callable[[str], None] = lambda url: None) -> None:
         """Serve the live page of a step (None: the last) on this machine until Ctrl-C; `ready` is told its address."""
         from optics.pages import view
 
-        view.serve(self.folder, port, step, ready)
+        view.serve(self.folder, port, step, ready, plugins=self._plugins, captures=self._captures)
 
     # -- the ladder ---------------------------------------------------------------------------------------------------
     def records(self) -> list[dict[str, Any]]:

@@ -5,15 +5,27 @@ from __future__ import annotations
 import html
 import math
 import re
+import textwrap
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+NARROWEST = 12  # characters of a column that is broken over lines
 
-def table(rows: Sequence[Sequence[str]], left: Collection[int] | None = None) -> str:
+
+def table(rows: Sequence[Sequence[str]], left: Collection[int] | None = None, width: int | None = None) -> str:
     """Aligned columns, two spaces apart; `left`: columns that begin at the left (None: all), the others end at the
-    right."""
+    right.
+
+    width   of the terminal: cells of the widest columns go over several lines, so that a row fits; None: never"""
     widths = [max(len(cell) for cell in column) for column in zip(*rows)]
+    if width is not None and sum(widths) + 2 * (len(widths) - 1) > width:
+        room = width - 2 * (len(widths) - 1)
+        cap = max((c for c in range(NARROWEST, max(widths) + 1) if sum(min(w, c) for w in widths) <= room), default=0)
+        cap = max(cap, NARROWEST)
+        lines = [[textwrap.wrap(cell, cap) or [""] for cell in row] for row in rows]
+        rows = [[cell[i] if i < len(cell) else "" for cell in row] for row in lines for i in range(max(map(len, row)))]
+        widths = [min(w, cap) for w in widths]
     return "\n".join(
         "  ".join(
             cell.ljust(w) if left is None or i in left else cell.rjust(w)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import re
+import tempfile
 from functools import lru_cache
 from pathlib import Path
 from types import SimpleNamespace
@@ -14,6 +15,9 @@ from types import SimpleNamespace
 # Before numpy is imported. The matrices of the tests are small: a second thread of BLAS only waits, and takes the core
 # from Dr.Jit or from the other worker (test_lattice.py: 13 s of processor time in place of 24).
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+# What a test trusts is nobody's: the user's own list of trusted plugins is neither read nor written.
+os.environ["XDG_CONFIG_HOME"] = tempfile.mkdtemp(prefix="optics-tests-config-")
 
 import numpy as np
 import pytest

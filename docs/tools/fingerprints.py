@@ -63,6 +63,8 @@ ONE_SIDE = View(
     "gelsight", {"width": "240", "height": "180", "depth": "0.7"}, {f"led_{i}.power": 0.0 for i in (2, 3, 4, 5, 6)}
 )
 COLOURED = View("digit", {"width": "240", "height": "240", "x_fov": "40", "depth": "1.0"})
+SPECTRAL = View("digit", {**COLOURED.defines, "bands": "auto"})
+WHITE = View("gelsight", {**PRESSED.defines, "bands": "auto", "sensitivity": "Nikon 5100 (NPL)"}, SIDES)
 BENCH = View("polarizer_bench", along="analyzer.angle")
 FULL_TURN = View("polarizer_bench", along="analyzer.angle", span=(0.0, 360.0))
 CROSSED = View("polarizer_bench", {"analyzer": "90"}, along="sample.angle")
@@ -88,6 +90,8 @@ SHOWN: dict[str, tuple[View, tuple[str, ...] | None]] = {
     "bleaching": (BEADS, None),  # a setting of time
     "inner-filter": (BEADS, None),  # light that comes back in another colour
     "excitation-leak": (BEADS, None),
+    **dict.fromkeys(("led-centre-shift", "led-width", "sensitivity-tail", "filter-edge-shift"), (SPECTRAL, None)),
+    "phosphor-leak": (WHITE, None),
     "dark-offset": (ONE_SIDE, None),
     "veiling-glare": (ONE_SIDE, None),
     # a shallow dent, whose long skirt ends within the fine part of the mesh

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -19,13 +19,14 @@ import numpy as np
 from optics.captures import readings
 from optics.captures.noise import DEMOSAICED, PER_CHANNEL, SATURATED, UNITS, UNLIMITED, Noise, repeated, step_of
 from optics.captures.readings import DECIMALS, DELIMITERS, NAMES, Row, Table
-from optics.errors import BadCapture, OutputExists, UnknownKey
+from optics.errors import BadCapture, BadScene, OutputExists, UnknownKey
 from optics.files import toml_checks as checks
 from optics.files.images import SUFFIXES, read_image, read_mask, write_image
 from optics.files.output import new_folder
 from optics.polarization import mosaic as mosaics
 from optics.polarization.mosaic import Mosaic
 from optics.scene.parameter import Parameter
+from optics.spectra.bands import parse
 from optics.words import key_of
 
 FILE = "captures.toml"
@@ -61,6 +62,7 @@ TABLE_KEYS = (
 NOISE_KEYS = tuple(name for name in UNITS if name != "quantisation")  # the step is read off the images
 UNMOVED = 8  # readings in a row at one setting, on average, from which its error is solved for and not weighed
 SUNK = 5.0  # sd of the dark noise that the median of a frame may lie below the black level
+Find = Callable[[str, str], Path]  # (name, where it stands) -> the file, or BadCapture
 CFA = ("RGGB", "BGGR", "GRBG", "GBRG")
 
 
@@ -95,7 +97,7 @@ class Captures:
     """A capture set.
 
     bits         8 or 16 for integer files, None for floats
-    bands        nm, the scene's definition `bands`; empty: the scene's own
+    bands        nm, the scene's definition `bands`, or its text: a range, or auto; empty: the scene's own
     absent       names of parts of the scene that were not there
     uncertainty  standard deviation of a setting by key, in its unit, where a frame says no other
     exclude      effect -> why it is ruled out
@@ -113,12 +115,13 @@ class Captures:
     table: Table | None = None
     warnings: list[str] = field(default_factory=list)
     bits: int | None = None
-    bands: list[float] = field(default_factory=list)
+    bands: list[float] | str = field(default_factory=list)
     absent: list[str] = field(default_factory=list)
     uncertainty: dict[str, float] = field(default_factory=dict)
     exclude: dict[str, str] = field(default_factory=dict)
     step: float = 0.0
     mosaic: Mosaic | None = None  # of analysers (deg), row by row: image is (H, W, 1), each pixel seen through its own
+    files: dict[str, Path] = field(default_factory=dict)  # all that was read, by the name that captures.toml has for it
 
     def uncertainty_of(self, frame: Frame) -> dict[str, Any]:
         """Standard deviations of what a frame sets, by key; those of 0 are left out."""
@@ -127,8 +130,10 @@ class Captures:
 
 
 # -- Loading ---------------------------------------------------------------------------------------------------------
-def load(path: str | Path) -> Captures:
+def load(path: str | Path, outside: bool = False) -> Captures:
     """Read and check a capture set, given its folder or its `captures.toml`.
+
+    outside   its images and tables may lie anywhere, and not only in its folder
 
     Raises BadCapture (UnknownKey for a key that the format lacks). Settings are held against a scene by `check`.
     """
@@ -159,21 +164,26 @@ def load(path: str | Path) -> Captures:
     captures.absent = checks.texts(data, "absent", where)
     captures.uncertainty = _uncertainty(data.get("uncertainty", {}), f"{where}: [uncertainty]")
     captures.exclude = _exclude(data.get("exclude", {}), f"{where}: [exclude]")
+    captures.files[FILE] = path
+
+    def find(name: str, what: str) -> Path:
+        file = (checks.existing if outside else checks.inside)(folder, name, what)
+        captures.files[name] = file
+        return file
+
     step = 0.0
     if "table" in data:
         for key in ("cfa", "mosaic", "flat_field"):
             if key in data:
                 raise BadCapture(f"{where}: {key} belongs to images, not to a [table]; remove it")
-        captures.table, captures.frames, step = _read_table(folder, data["table"], f"{where}: [table]")
+        captures.table, captures.frames, step = _read_table(find, data["table"], f"{where}: [table]")
     else:
-        _read_frames(captures, data["frames"], where)
+        _read_frames(captures, find, data["frames"], where)
         if values_are == "DN" and cfa is None and captures.frames[0].image.shape[2] == 3:
             captures.warnings.append(DEMOSAICED)
         if "flat_field" in data:
             here = f"{where}: flat_field"
-            captures.flat_field, _ = read_image(
-                checks.existing(folder, checks.text(data, "flat_field", where), here), here
-            )
+            captures.flat_field, _ = read_image(find(checks.text(data, "flat_field", where) or "", here), here)
             _same_size(captures.flat_field, captures, here)
     images = [image for f in captures.frames for image in (f.image, *f.repeats)]
     _check_channels(captures, where)
@@ -254,12 +264,21 @@ def _check_channels(captures: Captures, where: str) -> None:
             )
 
 
-def _bands(data: Mapping, where: str) -> list[float]:
+def _bands(data: Mapping, where: str) -> list[float] | str:
     if "bands" not in data:
         return []
     bands = data["bands"]
+    if isinstance(bands, str) and re.match(r"auto\b|[\d.]+:", bands):  # a range, or nodes of integrals
+        try:
+            parse(bands, where)
+        except BadScene as error:
+            raise BadCapture(str(error)) from error
+        return bands
     if not isinstance(bands, list) or not bands:
-        raise BadCapture(f"{where}: bands = {bands!r}; allowed: a list of wavelengths in nm, such as [470, 530, 625]")
+        raise BadCapture(
+            f"{where}: bands = {bands!r}; allowed: a list of wavelengths in nm, such as [470, 530, 625], a range such "
+            'as "400:700:10", or "auto"'
+        )
     numbers = [checks.number(band, "bands", "nm", where) for band in bands]
     if min(numbers) <= 0 or len(set(numbers)) < len(numbers):
         raise BadCapture(f"{where}: bands = {bands!r} nm; allowed: wavelengths above 0, each once")
@@ -290,7 +309,7 @@ def _top(captures: Captures, black: float) -> float:
     return top if top > black else black + 1.0
 
 
-def _read_frames(captures: Captures, tables: object, where: str) -> None:
+def _read_frames(captures: Captures, find: Find, tables: object, where: str) -> None:
     if not isinstance(tables, list) or not tables:
         raise BadCapture(
             f"{where}: frames = {tables!r}: zero frames; allowed: one [[frames]] or more, each with an image"
@@ -303,10 +322,8 @@ def _read_frames(captures: Captures, tables: object, where: str) -> None:
         if image is None:
             raise BadCapture(f"{here}: image is missing; give the path of a {', '.join(SUFFIXES)} file")
         here += f" ('{image}')"
-        files = [checks.existing(captures.folder, image, f"{here}: image")]
-        files += [
-            checks.existing(captures.folder, name, f"{here}: repeats") for name in checks.texts(table, "repeats", here)
-        ]
+        files = [find(image, f"{here}: image")]
+        files += [find(name, f"{here}: repeats") for name in checks.texts(table, "repeats", here)]
         for file in files:
             if (same := file.resolve()) in seen:
                 raise BadCapture(
@@ -315,11 +332,11 @@ def _read_frames(captures: Captures, tables: object, where: str) -> None:
                 )
             seen[same] = index
         mask = checks.text(table, "mask", here)
-        mask = checks.existing(captures.folder, mask, f"{here}: mask") if mask else None
+        mask = find(mask, f"{here}: mask") if mask else None
         settings = checks.settings(table.get("parameters", {}), f"{here}: parameters")
         spread = _uncertainty(table.get("uncertainty", {}), f"{here}: uncertainty")
         flat = checks.text(table, "flat_field", here)
-        flat = checks.existing(captures.folder, flat, f"{here}: flat_field") if flat else None
+        flat = find(flat, f"{here}: flat_field") if flat else None
         specs.append((here, image, files, mask, checks.text(table, "group", here), settings, spread, flat))
     stems = [Path(image).stem for _, image, *_ in specs]
     depths = {}
@@ -448,7 +465,7 @@ def _unusable(captures: Captures) -> str:
     )
 
 
-def _read_table(folder: Path, data: object, where: str) -> tuple[Table, list[Frame], float]:
+def _read_table(find: Find, data: object, where: str) -> tuple[Table, list[Frame], float]:
     """(table, a frame per row, step of the readings)."""
     checks.keys(data, TABLE_KEYS, where)
     assert isinstance(data, Mapping)
@@ -491,7 +508,7 @@ def _read_table(folder: Path, data: object, where: str) -> tuple[Table, list[Fra
         numbers["offset"],
         words["uncertainty"],
     )
-    rows, step = readings.read(checks.existing(folder, name, f"{where}: file"), table, where)
+    rows, step = readings.read(find(name, f"{where}: file"), table, where)
     frames = [
         Frame(
             f"row {index}",
@@ -597,7 +614,8 @@ def definitions(captures: Captures, given: Mapping[str, str], scene: Path) -> di
             f'{captures.folder / FILE}: bands = {captures.bands} nm, but {scene} has no <default name="bands">; '
             "allowed: a scene whose integrator takes $bands; name it in the XML, or remove bands"
         )
-    return {**given, "bands": ", ".join(f"{band:g}" for band in captures.bands)}
+    named = captures.bands
+    return {**given, "bands": named if isinstance(named, str) else ", ".join(f"{band:g}" for band in named)}
 
 
 def stated(captures: Captures) -> dict[str, float | str]:
@@ -793,7 +811,9 @@ def _fill(captures: Captures, folder: Path, final: Path, bits: int | None) -> No
     if captures.values_are != "DN":
         document["values_are"] = captures.values_are
     if captures.bands:
-        document["bands"] = [int(band) if band == int(band) else band for band in captures.bands]
+        named = captures.bands
+        whole = named if isinstance(named, str) else [int(b) if b == int(b) else b for b in named]
+        document["bands"] = whole
     if captures.absent:
         document["absent"] = captures.absent
     if captures.flat_field is not None:

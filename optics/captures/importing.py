@@ -38,7 +38,7 @@ from optics.captures.capture_set import Captures, Frame
 from optics.captures.corrections import at_black, black_levels, black_text, correction, drift_text, sentences
 from optics.captures.noise import SATURATED, Noise, photon_transfer
 from optics.errors import BadCapture, OutputExists, UnknownKey
-from optics.files.images import SUFFIXES, read_image
+from optics.files.images import SUFFIXES, read_image, varied
 from optics.files.output import new_folder, shipped
 
 PACK, TABLE, PARAMETERS = "dataPack.npz", "polycalib.npz", "params.json"  # of a Taxim calibration
@@ -549,6 +549,8 @@ def _check(presses: Presses, bin: int) -> None:
         raise BadCapture(f"{presses.source}: images of {width} x {height} px do not divide into blocks of {bin} px")
     if not np.isfinite(presses.images).all():
         raise BadCapture(f"{presses.source}: the images hold values that are not finite")
+    for name, image in zip(presses.names, presses.images):
+        varied(image, f"{presses.source}: {name}")
     for name, (x, y, r) in zip(presses.names, presses.circles):
         if not (np.isfinite([x, y, r]).all() and r > 0 and 0 <= x < width and 0 <= y < height):
             raise BadCapture(

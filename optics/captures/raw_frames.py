@@ -27,7 +27,7 @@ from optics.captures import capture_set as capture_sets
 from optics.captures.capture_set import Captures, Frame
 from optics.captures.noise import Noise
 from optics.errors import BadCapture, UnknownKey
-from optics.files.images import SUFFIXES, read_image, read_mask
+from optics.files.images import SUFFIXES, read_image, read_mask, varied
 from optics.polarization.mosaic import Mosaic, checked
 
 DEPTHS = (10, 12, 14, 16)
@@ -188,6 +188,8 @@ def _read(rows: Sequence[tuple[Path, Mapping]], mosaic: Mosaic) -> tuple[list[np
         images.append(image)
         mask = own.get("mask")
         masks.append(None if mask is None else read_mask(file.parent / str(mask), image.shape, f"{file}: mask"))
+    if all(image.min() == image.max() for image in images):
+        varied(images[0], str(rows[0][0]))
     height, width = images[0].shape[:2]
     if height < len(mosaic) or width < len(mosaic[0]):
         raise BadCapture(f"{rows[0][0]}: {height} x {width} pixels are less than a cell of the mosaic")

@@ -41,7 +41,7 @@ from optics.captures.corrections import (
 from optics.captures.importing import Imported, comment, filled, noise_of_levels, write_set
 from optics.captures.noise import Noise
 from optics.errors import BadCapture
-from optics.files.images import read_image
+from optics.files.images import read_image, varied
 from optics.files.output import shipped
 
 FILE = "scan.yaml"
@@ -113,6 +113,7 @@ def read_scan(folder: Path) -> Scan:
         if not (folder / name).is_file() or Path(name).name != name:
             raise BadCapture(f"{file}: images: no file '{name}' in {folder}; allowed: names of images that lie there")
         image, _ = read_image(folder / name, f"{folder / name}")
+        varied(image, f"{folder / name}")
         if image.shape[2] != 1 or (images and image.shape != images[0].shape):
             raise BadCapture(
                 f"{folder / name}: (H, W, C) = {image.shape}; allowed: one channel, all images of one size"

@@ -49,7 +49,7 @@ from optics.captures.importing import (
 )
 from optics.captures.noise import SATURATED, Noise
 from optics.errors import BadCapture
-from optics.files.images import read_image
+from optics.files.images import read_image, varied
 from optics.files.output import shipped
 
 DEPTH, CAMERA = "depth_calibration", "camera_calibration"
@@ -249,6 +249,7 @@ def _maps(
 
 def _raw(file: Path, maps_shape: tuple[int, ...]) -> np.ndarray:
     image, _ = read_image(file, str(file))
+    varied(image, str(file))
     if image.shape != (*maps_shape, 3):
         raise BadCapture(f"{file}: (H, W, C) = {image.shape}; allowed: {(*maps_shape, 3)}, as the rectification maps")
     return image.astype(np.float64)
@@ -286,6 +287,7 @@ def _rectified(folder: Path, name: str, maps, origin, remarks: list[str]) -> np.
         remarks.append(f"{file.name} is missing: made from {raw.name} by the rectification maps")
         return _crop(made, origin, origin[2:])
     image, _ = read_image(file, str(file))
+    varied(image, str(file))
     if image.shape[2] != 3:
         raise BadCapture(f"{file}: {image.shape[2]} channels; allowed: 3, a colour image")
     if made is not None and np.any(_crop(made, origin, image.shape) != image):

@@ -4,12 +4,30 @@ Results go to stdout (`--json` for programs); progress and remarks to stderr, pr
 done, 1 done with a negative finding, 2 an error of the input, reported in one line. Heavy imports stand inside the
 commands, so that `optics --help` answers at once. Commands are listed in the order of these imports."""
 
-from optics.cli import scenes  # isort: skip
-from optics.cli import images  # isort: skip
-from optics.cli import polarized  # isort: skip
-from optics.cli import captures  # isort: skip
-from optics.cli import studies  # isort: skip
-from optics.cli import machine  # isort: skip
-from optics.cli.shared import app, main, terminal
+import os
+import signal
+import threading
+from types import FrameType
+
+
+def _leave(number: int, frame: FrameType | None) -> None:
+    """Ctrl-C while commands are still being imported: nothing has begun."""
+    os.write(2, b"interrupted\n")
+    os._exit(128 + number)
+
+
+_first = threading.current_thread() is threading.main_thread()
+_before = signal.signal(signal.SIGINT, _leave) if _first else None
+
+from optics.cli import scenes  # noqa: E402  # isort: skip
+from optics.cli import images  # noqa: E402  # isort: skip
+from optics.cli import polarized  # noqa: E402  # isort: skip
+from optics.cli import captures  # noqa: E402  # isort: skip
+from optics.cli import studies  # noqa: E402  # isort: skip
+from optics.cli import machine  # noqa: E402  # isort: skip
+from optics.cli.shared import app, main, terminal  # noqa: E402
+
+if _first:
+    signal.signal(signal.SIGINT, _before)
 
 __all__ = ["app", "captures", "images", "machine", "main", "polarized", "scenes", "studies", "terminal"]

@@ -15,10 +15,12 @@ from optics.cli.shared import (
     FitFile,
     FlatField,
     Force,
+    Outside,
     Plugins,
     Quiet,
     Settings,
     app,
+    check_finite,
     command,
     one_line,
     pairs,
@@ -63,9 +65,13 @@ def import_(
             help="For a folder: the sensor without contact; without it the median of the presses.",
         ),
     ] = None,
-    leds: Annotated[int, typer.Option("--leds", help="LEDs of the scene to start from: 3 or 6.")] = 3,
+    leds: Annotated[
+        int | None, typer.Option("--leds", help="LEDs of the scene to start from: 3 or 6.", show_default="3")
+    ] = None,
     bin: Annotated[int, typer.Option("--bin", min=1, help="Average this many pixels each way.")] = 1,
-    every: Annotated[int, typer.Option("--every", min=1, help="Take every n-th press.")] = 1,
+    every: Annotated[
+        int | None, typer.Option("--every", min=1, help="Take every n-th press.", show_default="1")
+    ] = None,
     mosaic: Annotated[
         str | None,
         typer.Option(
@@ -107,6 +113,8 @@ def import_(
     from optics.polarization.mosaic import read_mosaic
 
     terminal.quiet, terminal.debug = quiet, debug
+    lengths = {"ball_radius": ball_radius, "mm_per_pixel": mm_per_pixel}
+    check_finite(import_, {**lengths, "black_level": black_level, "system_gain": system_gain, "dark_noise": dark_noise})
     raw = {
         "--settings": listed,
         "--rename": rename,
@@ -121,7 +129,13 @@ def import_(
             f'{", ".join(given)}: for raw frames of a polarization camera only; give --mosaic "90 45 135 0" as well'
         )
     if mosaic is not None:
-        presses = {"--circles": circles, "--ball-radius": ball_radius, "--mm-per-pixel": mm_per_pixel}
+        presses = {
+            "--circles": circles,
+            "--ball-radius": ball_radius,
+            "--mm-per-pixel": mm_per_pixel,
+            "--leds": leds,
+            "--every": every,
+        }
         if given := [name for name, value in {**presses, "--untouched": untouched}.items() if value is not None]:
             raise ValueError(f"{', '.join(given)}: for presses only; leave out --mosaic, or these")
         read = raw_frames.import_frames(
@@ -141,17 +155,23 @@ def import_(
         _tell(read.folder, read.warnings)
         return
     if scans.is_scan_source(source):
-        own = {"--circles": circles, "--ball-radius": ball_radius, "--mm-per-pixel": mm_per_pixel}
+        own = {
+            "--circles": circles,
+            "--ball-radius": ball_radius,
+            "--mm-per-pixel": mm_per_pixel,
+            "--leds": leds,
+            "--every": every,
+        }
         if given := [name for name, value in {**own, "--untouched": untouched}.items() if value is not None]:
             raise ValueError(f"{', '.join(given)}: scan.yaml says so; leave these out")
         with terminal.progress() as progress:
             found = scans.import_scans(source, output, bin=bin, overwrite=force, progress=progress)
         _tell(found.folder, found.warnings, found.facts["corrections"])
         return
-    lengths = {"ball_radius": ball_radius, "mm_per_pixel": mm_per_pixel}
     stated: dict[str, Any] = {name: value for name, value in lengths.items() if value is not None}
     if translucent.is_translucent_source(source):
-        if given := [name for name, value in {"--circles": circles, "--untouched": untouched}.items() if value]:
+        unused = {"--circles": circles, "--untouched": untouched, "--leds": leds, "--every": every}
+        if given := [name for name, value in unused.items() if value is not None]:
             raise ValueError(f"{', '.join(given)}: the folder's images say so; leave these out")
         with terminal.progress() as progress:
             found = translucent.import_translucent(
@@ -159,8 +179,10 @@ def import_(
             )
         _tell(found.folder, found.warnings, found.facts["corrections"])
         return
-    options: dict[str, Any] = {"leds": leds, "bin": bin, "every": every, "overwrite": force, **stated}
+    options: dict[str, Any] = {"leds": leds or 3, "bin": bin, "every": every or 1, "overwrite": force, **stated}
     if source.suffix == ".npz" or importing.is_pack(source):
+        if given := [name for name, value in {"--circles": circles, "--untouched": untouched}.items() if value]:
+            raise ValueError(f"{', '.join(given)}: the pack holds circles and background; leave these out")
         found = importing.import_taxim(source, output, **options)
     else:
         if circles is None:
@@ -260,6 +282,7 @@ def compare(
     sets: Settings = None,
     flat_field: FlatField = None,
     plugins: Plugins = None,
+    outside: Outside = False,
     as_json: AsJson = False,
 ) -> None:
     """Compare a scene with captures: misfit by frame, LED, region and channel."""
@@ -277,6 +300,7 @@ def compare(
         defines=pairs(define, "-D"),
         plugins=plugins,
         flat_field=flat_field,
+        outside=outside,
     )
     comparison = found.comparison
     for text in found.notes:

@@ -62,7 +62,7 @@ def render(
 
     The channels are radiance (with layers: Stokes vectors) per band, depth, normals, contact, one image per LED,
     variances; optics.light.rendering lists them."""
-    from optics.files.output import claim, write_json
+    from optics.files.output import claim, together, write_json
     from optics.light.rendering import RenderJob
 
     if output.suffix.lower() != ".exr":
@@ -74,22 +74,26 @@ def render(
     files = [output, record, *([preview] if png else []), *(maps if stokes else ())]
     claim(files, force)
     sensor = load_sensor(scene, fit, frame, define, plugins, variant)
-    values = {**sensor.values, **sensor.scene.check(sensor.scene.spread(settings(sets), "--set"), "--set")}
+    chosen = sensor.scene.check(sensor.scene.spread(settings(sets), "--set"), "--set")
+    values = {**sensor.values, **chosen}
+    if chosen:
+        sensor.scene.check_press(values, "--set")
     clock = time.perf_counter()
     images = RenderJob(sensor.scene, spp=spp, stokes=stokes, black=sensor.black, saturation=sensor.saturation)
     with terminal.progress() as progress:
         image = images.take(values, seed, progress=progress)
     seconds = time.perf_counter() - clock
-    if png:
-        image.write_png(preview, sensor.saturation)
-    if stokes:
-        from optics.light.polarimetry import write_maps
+    with together(files):
+        if png:
+            image.write_png(preview, sensor.saturation)
+        if stokes:
+            from optics.light.polarimetry import write_maps
 
-        bands, vectors = image.stokes()
-        write_maps(maps, list(bands), vectors)
-    provenance: Any = image.header["provenance"]
-    write_json(record, {**provenance, "command": ["optics", *sys.argv[1:]]})
-    image.write_exr(output)
+            bands, vectors = image.stokes()
+            write_maps(maps, list(bands), vectors)
+        provenance: Any = image.header["provenance"]
+        write_json(record, {**provenance, "command": ["optics", *sys.argv[1:]]})
+        image.write_exr(output)
     if as_json:
         return show(
             {

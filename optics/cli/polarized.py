@@ -14,6 +14,7 @@ from optics.cli.shared import (
     FitFile,
     Force,
     FrameName,
+    Outside,
     Plugins,
     SceneOrFit,
     Settings,
@@ -216,6 +217,7 @@ def sweep(
     define: Defines = None,
     sets: Settings = None,
     plugins: Plugins = None,
+    outside: Outside = False,
     variant: Variant = None,
     force: Force = False,
     as_json: AsJson = False,
@@ -241,7 +243,7 @@ def sweep(
         raise ValueError("--radiance and --captures: readings are DN; leave out one of them")
     if frame is not None and captures is not None:
         raise ValueError("--frame and --captures: the readings have their own settings; leave out one of them")
-    readings = capture_files.load(captures) if captures is not None else None
+    readings = capture_files.load(captures, outside) if captures is not None else None
     if readings is not None:
         own = capture_files.definitions(readings, pairs(define, "-D"), find(scene or readings.scene))
         define = [f"{name}={text}" for name, text in own.items()]

@@ -9,7 +9,20 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from optics.cli.shared import AsJson, Defines, Plugins, SceneName, Variant, command, load_scene, scan, show, terminal
+from optics.cli.shared import (
+    AsJson,
+    Defines,
+    Force,
+    Plugins,
+    SceneName,
+    Variant,
+    columns,
+    command,
+    load_scene,
+    scan,
+    show,
+    terminal,
+)
 from optics.words import key_of, number, table
 
 if TYPE_CHECKING:
@@ -29,7 +42,7 @@ def scenes(as_json: AsJson = False) -> None:
         comment = re.search(r"<!--(.*?)-->", path.read_text(encoding="utf-8"), re.DOTALL)
         title = next((line.strip() for line in (comment[1] if comment else "").splitlines() if line.strip()), "")
         rows.append({"name": name, "title": title, "file": str(path)})
-    show(rows) if as_json else print(table([(r["name"], r["title"]) for r in rows]))
+    show(rows) if as_json else print(table([(r["name"], r["title"]) for r in rows], width=columns()))
 
 
 @command
@@ -45,6 +58,7 @@ def params(
 ) -> None:
     """List the parameters of a scene: value, unit, bounds, neutral value, derivative, meaning."""
     from optics.errors import UnknownKey
+    from optics.light import spectra
 
     loaded = load_scene(scene, define, plugins, variant)
     keys = list(loaded.values())
@@ -56,9 +70,52 @@ def params(
     if as_json:
         return show(rows)
     head = ("key", "value", "unit", "bounds", "neutral", "derivative", "meaning")
-    print(table([head, *map(_parameter_line, rows)]))
+    print(table([head, *map(_parameter_line, rows)], width=columns()))
+    if not patterns and (loaded.curves or loaded.integral is not None):
+        print(
+            "\n" + table([("spectrum", "kind", "nm", "mean", "source"), *map(_spectrum_line, spectra.records(loaded))])
+        )
+    if not patterns and loaded.integral is not None:
+        print("\n" + loaded.integral.describe())
 
 
+def _spectrum_line(r: Mapping[str, Any]) -> tuple[str, ...]:
+    span = "-" if r["span"] is None else f"{r['span'][0]:g} .. {r['span'][1]:g}"
+    return (r["key"], r["kind"], span, "-" if r["centre"] is None else f"{r['centre']:.1f}", r["source"])
+
+
+@command
+def plot_spectra(
+    scene: SceneName,
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="FILE", help="FILE.png, .svg or .pdf.")],
+    define: Defines = None,
+    plugins: Plugins = None,
+    variant: Variant = None,
+    force: Force = False,
+    as_json: AsJson = False,
+) -> None:
+    """Draw the light of a scene, its losses and the camera's sensitivities over the wavelength, over each other."""
+    from optics.files.output import claim, replacing
+    from optics.light import spectra
+
+    if output.suffix.lower() not in PLOTS:
+        raise ValueError(
+            f"-o {output}: '{output.suffix}' is no format of a plot; allowed: a name ending in .png, .pdf or .svg"
+        )
+    claim([output], force)
+    loaded = load_scene(scene, define, plugins, variant)
+    figure = spectra.draw(loaded)
+    with replacing(output) as file:
+        figure.savefig(file, format=output.suffix[1:].lower(), dpi=130)
+    bands = None if loaded.integral is None else loaded.integral.describe()
+    if as_json:
+        return show({"files": [str(output)], "spectra": spectra.records(loaded), "bands": bands})
+    print(output)
+    if bands is not None:
+        terminal.note(bands)
+
+
+PLOTS = (".png", ".svg", ".pdf")
 # how a derivative image is made (`Parameter.how`), for the reader of a table
 DERIVATIVES = {
     "ad": "forward mode",
@@ -114,7 +171,7 @@ def _span(bounds: Sequence[float]) -> str:
     return "any" if math.inf in bounds else " .. ".join(f"{b:g}" for b in bounds)
 
 
-def _new_effect(name: str | None, plugins: Path | None, **given: Any) -> None:
+def _new_effect(name: str | None, plugins: Sequence[Path] | None, **given: Any) -> None:
     """Write a plugin file, print its path, and note what comes next."""
     from optics.scene.declare import STAGES
     from optics.study import draft
@@ -128,7 +185,7 @@ def _new_effect(name: str | None, plugins: Path | None, **given: Any) -> None:
             raise ValueError(f"--along {given['along']}: of which study? Add --from STUDY")
         stage = draft.stage_of(given["part"], given["stage"])
         draft.check_name(name, STAGES[stage], registry)
-        text, folder = draft.new_effect(name, stage), plugins or Path("plugins")
+        text, folder = draft.new_effect(name, stage), plugins[0] if plugins else Path("plugins")
     else:
         if given["stage"] or given["part"]:
             raise ValueError(
@@ -139,8 +196,7 @@ def _new_effect(name: str | None, plugins: Path | None, **given: Any) -> None:
     terminal.note(
         f"next: optics add {given['from']} '{name}', then put a formula in place of the table"
         if given["from"]
-        else "next: fill in the formula; a folder 'plugins' beside captures or scene is found, any other by "
-        f"--plugins {file.parent}"
+        else f"next: fill in the formula; commands run it with --plugins {file.parent}"
     )
     print(file)
 
@@ -203,7 +259,7 @@ def effects(
         (r["key"], r["part"], ", ".join(p["name"] for p in r["parameters"]), r["onset"], r["needs"] or "-")
         for r in records
     ]
-    print(f"{table([head, *lines])}\n\nparts, each with a page too: {', '.join(sorted(found.parts))}")
+    print(f"{table([head, *lines], width=columns())}\n\nparts, each with a page too: {', '.join(sorted(found.parts))}")
 
 
 def _effect_record(found: "Registry", e: "Effect") -> dict[str, Any]:
@@ -251,8 +307,8 @@ def _effect_page(found: "Registry", e: "Effect", as_json: bool) -> None:
         for p in r["parameters"]
     ]
     print(f"{r['page'].strip()}\n\n{r['name']}: `{r['key']}`, {r['file']}")
-    print(table(facts))
-    print("\n" + table([("parameter", "unit", "neutral", "bounds", "meaning"), *lines]))
+    print(table(facts, width=columns()))
+    print("\n" + table([("parameter", "unit", "neutral", "bounds", "meaning"), *lines], width=columns()))
 
 
 def _part_page(found: "Registry", kind: str, as_json: bool) -> None:
@@ -301,6 +357,7 @@ def _part_page(found: "Registry", kind: str, as_json: bool) -> None:
                     )
                     for r in rows
                 ),
-            ]
+            ],
+            width=columns(),
         )
     )

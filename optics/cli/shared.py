@@ -1,11 +1,14 @@
 """What every command shares: the terminal, common options, reading arguments, and how errors are reported."""
 
+import atexit
 import functools
 import inspect
 import json
 import math
 import os
 import re
+import shutil
+import signal
 import sys
 import time
 import traceback
@@ -43,6 +46,7 @@ class Terminal:
 
     quiet = False
     debug = False
+    interrupted = False  # whether that was said
 
     def note(self, text: str) -> None:
         if not self.quiet:
@@ -124,7 +128,24 @@ Settings = Annotated[
         "Repeatable.",
     ),
 ]
-Plugins = Annotated[Path | None, typer.Option("--plugins", metavar="DIR", help="A further folder of plugins.")]
+Plugins = Annotated[
+    list[Path] | None,
+    typer.Option(
+        "--plugins",
+        metavar="PATH",
+        help="Run the plugins of this folder, or this file. Repeatable. 'none': none but those that ship. Without it, "
+        "plugins that lie beside scene or captures run once you have agreed.",
+    ),
+]
+CapturesNow = Annotated[
+    Path | None,
+    typer.Option(
+        "--captures", metavar="DIR", help="Where the study's captures are now, if they are not found where they were."
+    ),
+]
+Outside = Annotated[
+    bool, typer.Option("--allow-outside", help="Let captures.toml name images and tables outside its folder.")
+]
 FitFile = Annotated[
     Path | None,
     typer.Option(
@@ -166,6 +187,8 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
     def run(*args: Any, quiet: bool = False, debug: bool = False, **options: Any) -> None:
         terminal.quiet, terminal.debug = quiet, debug
         try:
+            _let_ask()
+            check_finite(function, options)
             function(*args, **options)
             sys.stdout.flush()
         except BrokenPipeError:  # whoever read our output has seen enough
@@ -174,8 +197,7 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
             stopped = _ctrl_c(error)  # typer would end silently
             if stopped is None:
                 raise
-            print(": ".join(["interrupted", *map(str, stopped.args)]), file=sys.stderr)
-            raise typer.Exit(INTERRUPTED) from None
+            raise typer.Exit(_interrupted(*stopped.args)) from None
 
     shared = [
         inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=False, annotation=kind)
@@ -188,14 +210,60 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
     return app.command()(run)
 
 
+def check_finite(function: Callable[..., None], options: Mapping[str, Any]) -> None:
+    """Raises ValueError for an option that is infinite or no number: what is asked for is a size."""
+    for name, value in options.items():
+        for number in value if isinstance(value, list) else [value]:
+            if isinstance(number, float) and not math.isfinite(number):
+                told = getattr(function.__annotations__.get(name), "__metadata__", [None])[0]
+                names = (getattr(told, "default", None), *(getattr(told, "param_decls", None) or ()))
+                named = [n for n in names if isinstance(n, str) and n.startswith("--")]  # typer keeps the first apart
+                option = named[0] if named else f"--{name.replace('_', '-')}"
+                raise ValueError(f"{option} {number}: not finite; allowed: a finite number")
+
+
+def _let_ask() -> None:
+    """Where there is a terminal, plugins that came with data are asked about."""
+    if sys.stdin is not None and sys.stdin.isatty() and sys.stderr.isatty():
+        from optics.scene import trust
+
+        trust.ask = agree
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command line and return its exit code."""
-    arguments = list(sys.argv[1:] if arguments is None else arguments) or ["--help"]
-    terminal.quiet, terminal.debug = False, "--debug" in arguments
+    """Run a command line and return its exit code; without arguments, that of this program."""
+    if arguments is None:
+        try:
+            code = _run(sys.argv[1:])
+        except KeyboardInterrupt:
+            code = _interrupted()
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # what is left is to end
+        if code == INTERRUPTED:
+            # Python remembers an interrupt within `exec`, as imports use it, and would end by the signal instead
+            atexit._run_exitfuncs()
+            sys.stdout.flush()
+            sys.stderr.flush()
+            os._exit(code)
+        return code
+    return _run(arguments)
+
+
+def _interrupted(*what: object) -> int:
+    """Say once that the program was interrupted; returns its exit code."""
+    if not terminal.interrupted:
+        terminal.interrupted = True
+        print(": ".join(["interrupted", *map(str, what)]), file=sys.stderr)
+    return INTERRUPTED
+
+
+def _run(arguments: Sequence[str]) -> int:
+    arguments = list(arguments) or ["--help"]
+    terminal.quiet, terminal.debug, terminal.interrupted = False, "--debug" in arguments, False
     with warnings.catch_warnings():
         warnings.showwarning = lambda text, *_: terminal.note(f"warning: {one_line(text)}")
         try:
-            return int(app(args=arguments, prog_name="optics", standalone_mode=False) or 0)
+            code = int(app(args=arguments, prog_name="optics", standalone_mode=False) or 0)
+            return _interrupted() if code == INTERRUPTED else code  # typer says nothing of one outside a command
         except Exception as error:
             return _report(error)
 
@@ -211,7 +279,9 @@ def _ctrl_c(error: BaseException | None) -> KeyboardInterrupt | None:
 
 def _report(error: Exception) -> int:
     """Report an error in one line; a bug with its traceback."""
-    expected = isinstance(error, (ValueError, LookupError, OSError, RuntimeError)) or hasattr(error, "format_message")
+    expected = isinstance(error, (ValueError, LookupError, OSError, RuntimeError, MemoryError)) or hasattr(
+        error, "format_message"
+    )
     if terminal.debug or not expected:
         traceback.print_exception(error, file=sys.stderr)
     text = _usage(error) if hasattr(error, "format_message") else _text(error)
@@ -231,9 +301,18 @@ def _usage(error: Any) -> str:
 def _text(error: Exception) -> str:
     if isinstance(error, OSError) and error.strerror:
         return f"{error.filename}: {error.strerror}" if error.filename else error.strerror
+    if isinstance(error, MemoryError):
+        return (
+            f"not enough memory: {error or 'the system gave none'}; take fewer pixels (-D width=..., --bin) or frames"
+        )
     if type(error) is KeyError:
         return f"no entry {error}"
     return str(error) or type(error).__name__
+
+
+def columns() -> int | None:
+    """How wide a table may be: the terminal's width; None where results go to a file or a program."""
+    return shutil.get_terminal_size().columns if sys.stdout.isatty() else None
 
 
 def one_line(text: object) -> str:
@@ -291,7 +370,9 @@ def priors(items: Sequence[str] | None) -> dict[str, tuple[float | None, float]]
     return found
 
 
-def load_scene(name: str, defines: Sequence[str] | None, plugins: Path | None, variant: str | None = None) -> "Scene":
+def load_scene(
+    name: str, defines: Sequence[str] | None, plugins: Sequence[Path] | None, variant: str | None = None
+) -> "Scene":
     """The scene of a command line."""
     from optics import facade
 
@@ -303,7 +384,7 @@ def load_sensor(
     fit: Path | None,
     frame: str | None,
     defines: Sequence[str] | None,
-    plugins: Path | None,
+    plugins: Sequence[Path] | None,
     variant: str | None = None,
     driven: bool = True,
 ) -> "Calibrated":
@@ -331,11 +412,30 @@ def load_sensor(
     return found
 
 
-def scan(plugins: Path | None) -> "Registry":
-    """The registry of the shipped plugins, with a further folder."""
+def scan(plugins: Sequence[Path] | None) -> "Registry":
+    """The registry of the shipped plugins, with further folders or files."""
+    from optics.scene import trust
     from optics.scene.registry import known
 
-    return known(plugins)
+    return known(*(trust.named(plugins) or ()))
+
+
+def agree(files: Sequence[Path], where: str) -> bool:
+    """Ask whether plugins that came with data may run, and say what follows."""
+    from optics.scene.trust import store
+
+    names = ", ".join(map(str, files))
+    print(
+        f"{names}: code {where}. It would run with all your rights. Run it, now and whenever its content is the same? "
+        "[y/N] ",
+        end="",
+        file=sys.stderr,
+        flush=True,
+    )
+    if sys.stdin.readline().strip().lower() not in ("y", "yes"):
+        return False
+    print(f"trusted from now on: {names} (remembered in {store()})", file=sys.stderr)
+    return True
 
 
 @app.callback(invoke_without_command=True)

@@ -9,9 +9,11 @@ import typer
 from optics.cli.shared import (
     AsJson,
     CaptureSet,
+    CapturesNow,
     Defines,
     FlatField,
     Force,
+    Outside,
     Plugins,
     Settings,
     StudyFolder,
@@ -78,6 +80,7 @@ def calibrate(
     sets: Settings = None,
     flat_field: FlatField = None,
     plugins: Plugins = None,
+    outside: Outside = False,
     robust: Annotated[
         bool, typer.Option("--robust", help="Let residuals beyond three sigmas count less (Huber).")
     ] = False,
@@ -102,6 +105,7 @@ def calibrate(
             defines=pairs(define, "-D"),
             plugins=plugins,
             flat_field=flat_field,
+            outside=outside,
             robust=robust,
             seed=seed,
             title=title,
@@ -147,6 +151,8 @@ def diagnose(
         list[str] | None,
         typer.Option("--without", metavar="EFFECT", help="Do not test this effect (`optics effects`). Repeatable."),
     ] = None,
+    plugins: Plugins = None,
+    captures: CapturesNow = None,
     as_json: AsJson = False,
     csv: Annotated[Path | None, typer.Option("--csv", metavar="FILE", help="Write the table of effects here.")] = None,
 ) -> None:
@@ -157,9 +163,12 @@ def diagnose(
     """
     from optics.diagnosis.text import ranking
     from optics.facade import Study
-    from optics.files.output import write_text
+    from optics.files.output import check_folder, spare_records, write_text
 
-    found = Study.open(study)
+    if csv is not None:
+        spare_records(csv)
+        check_folder(csv.parent)
+    found = Study.open(study, plugins=plugins, captures=captures)
     with terminal.progress() as progress:
         result = found.diagnose(
             without=without or (), progress=progress, ranked=lambda rows: terminal.note(ranking(rows))
@@ -175,12 +184,14 @@ def diagnose(
 def add(
     study: StudyFolder,
     effect: Annotated[str, typer.Argument(metavar="EFFECT", help="Its name (`optics effects`).")],
+    plugins: Plugins = None,
+    captures: CapturesNow = None,
     as_json: AsJson = False,
 ) -> None:
     """Free an effect, calibrate everything again, and record it as the next step of the study."""
     from optics.facade import Study
 
-    found = Study.open(study)
+    found = Study.open(study, plugins=plugins, captures=captures)
     with terminal.progress() as progress:
         fit = found.add(effect, progress=progress)
     show(found.record.steps[-1]) if as_json else print(f"{fit.table()}\n\n{found.table()}{null_text(found)}")
@@ -213,13 +224,15 @@ def values(
 
     from optics.errors import UnknownKey
     from optics.facade import Study
+    from optics.study.record import readable
     from optics.words import table
 
-    found = Study.open(study).record.steps[-1]["variables"]
-    chosen = [v for v in found if not patterns or any(fnmatch(v["name"], p) for p in patterns)]
-    if patterns and not chosen:
-        raise UnknownKey(patterns[0], [v["name"] for v in found], "parameter of this study")
-    lines = [(v["name"], f"{v['value']:.6g}", f"+- {v['sd']:.2g}" if v["sd"] else "", v["unit"]) for v in chosen]
+    with readable(study):
+        found = Study.open(study).record.steps[-1]["variables"]
+        chosen = [v for v in found if not patterns or any(fnmatch(v["name"], p) for p in patterns)]
+        if patterns and not chosen:
+            raise UnknownKey(patterns[0], [v["name"] for v in found], "parameter of this study")
+        lines = [(v["name"], f"{v['value']:.6g}", f"+- {v['sd']:.2g}" if v["sd"] else "", v["unit"]) for v in chosen]
     show(chosen) if as_json else print(table([("parameter", "value", "1 sd", "unit"), *lines], left=(0, 3)))
 
 
@@ -253,6 +266,7 @@ def scoreboard(
     presses: Annotated[
         bool, typer.Option("--presses", help="Also calibrate each study's last step on fewer presses (minutes each).")
     ] = False,
+    plugins: Plugins = None,
     as_json: AsJson = False,
     force: Force = False,
 ) -> None:
@@ -260,7 +274,7 @@ def scoreboard(
 
     The exit code is 1 where a study is beaten by a model without physics in the contact, else 0.
     """
-    from optics.files.output import claim, write_text
+    from optics.files.output import claim, together, write_text
     from optics.pages.scoreboard import render
     from optics.study.board import text, to_json
     from optics.study.scoreboard import scoreboard
@@ -268,10 +282,13 @@ def scoreboard(
     files = [output / "scoreboard.html", output / "scoreboard.json"]
     claim(files, force)
     with terminal.progress() as progress:
-        boards = scoreboard(captures or (), study or (), held_out=hold_out, presses=presses, progress=progress)
+        boards = scoreboard(
+            captures or (), study or (), held_out=hold_out, presses=presses, plugins=plugins, progress=progress
+        )
     record = to_json(boards)
-    for file, content in zip(files, (render(boards), record)):
-        write_text(file, content)
+    with together(files):
+        for file, content in zip(files, (render(boards), record)):
+            write_text(file, content)
     print(record if as_json else f"{text(boards)}\n\n{files[0]}")
     if any(board.beaten for board in boards):
         raise typer.Exit(1)
@@ -287,6 +304,8 @@ def view(
         int, typer.Option("--port", min=0, max=65535, help="Of the page, on this machine alone.", show_default="any")
     ] = 0,
     browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the page in the browser.")] = True,
+    plugins: Plugins = None,
+    captures: CapturesNow = None,
 ) -> None:
     """Open a page to switch effects and slide parameters, while prediction, residual and misfit follow. Ctrl-C ends
     it."""
@@ -300,7 +319,7 @@ def view(
 
             webbrowser.open(url)
 
-    Study.open(study).view(step, port=port, ready=ready)
+    Study.open(study, plugins=plugins, captures=captures).view(step, port=port, ready=ready)
 
 
 @command
@@ -313,12 +332,14 @@ def rehearse(
             help="How much each hidden effect changes the images: rms over the mean signal, before any calibration.",
         ),
     ] = 0.5,
+    plugins: Plugins = None,
+    captures: CapturesNow = None,
     as_json: AsJson = False,
 ) -> None:
     """Report which effects would be found if they were hidden in these captures, and what each would be taken for."""
     from optics.facade import Study
 
-    found = Study.open(study)
+    found = Study.open(study, plugins=plugins, captures=captures)
     with terminal.progress() as progress:
         result = found.rehearse(change / 100, progress=progress)
     print(result.to_json() if as_json else result.text(), end="")
@@ -330,6 +351,8 @@ def imitate(
     output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="A new capture folder.")],
     sets: Settings = None,
     seed: Annotated[int, typer.Option(help="Of the noise.")] = 1,
+    plugins: Plugins = None,
+    captures: CapturesNow = None,
 ) -> None:
     """Write captures as the study's model would take them, with an effect put in: --set camera.vignetting=0.3 shows
     what that would look like."""
@@ -337,5 +360,5 @@ def imitate(
     from optics.files.output import check_new_folder
 
     check_new_folder(output)
-    folder = Study.open(study).imitate(output, settings(sets), seed=seed)
+    folder = Study.open(study, plugins=plugins, captures=captures).imitate(output, settings(sets), seed=seed)
     print(f"{folder}: optics calibrate {output} -o ANOTHER_STUDY")

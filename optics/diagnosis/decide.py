@@ -293,7 +293,9 @@ def _of_the_strength(f: Findings) -> list[Condition]:
             f.uneven,
             f.uneven_limit,
             f.even,
-            f"splitting its strength{f.uneven_by} gains {f.uneven:.2f} of the fall, {f.uneven_limit:.2g} allowed",
+            "not asked: it explains too little, or the data have no parts to compare"
+            if math.isnan(f.uneven)
+            else f"splitting its strength{f.uneven_by} gains {f.uneven:.2f} of the fall, {f.uneven_limit:.2g} allowed",
         ),
         Condition(
             "held out",

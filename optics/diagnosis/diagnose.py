@@ -33,7 +33,7 @@ from optics.diagnosis.refit import Case, refit_each
 from optics.diagnosis.result import Basis, Diagnosis, Family, Fingerprint, Row, Split
 from optics.diagnosis.score import score
 from optics.diagnosis.text import sentence
-from optics.diagnosis.thresholds import EXCESS, LEVEL, MAX_SPLIT, close
+from optics.diagnosis.thresholds import EXCESS, LEVEL, MAX_SPLIT, SHARE, close
 from optics.fit import calibrate
 from optics.fit.model import Model
 from optics.fit.result import Fit
@@ -53,6 +53,7 @@ def diagnose(
     *,
     fitted: Sequence[int],
     refit: Callable[..., Fit] | None = None,
+    foresee: Callable[[Sequence[Sequence[Variable]], Progress], None] | None = None,
     rows_max: int = 400_000,
     seed: int = 0,
     top: int = 5,
@@ -68,6 +69,7 @@ def diagnose(
     variables_of  the variables that an effect frees; one per frame for the scope 'frame'
     held_out      frames that were not fitted; only what each frame has for itself is fitted there
     refit         `optics.fit.calibrate.fit` unless given; called as refit(model, variables, start, frames=[...])
+    foresee       called before the refits, with the variables of each effect that is refitted
     rows_max      values (pixel x channel) that curves, splits and alternative weights may use
     seed          of the simulations and of derivative images; the same seed gives the same table
     top           how many of the best effects are refitted, besides those that cannot be told from the best
@@ -100,6 +102,7 @@ def diagnose(
         rows_max,
         seed,
         say,
+        foresee=foresee,
     )
     basis = basis_of(model, evidence, evidence.structure(evidence.whitened, evidence.base))
     case.places = places = prints.places(model, fit.values, evidence)
@@ -195,8 +198,10 @@ def _split(case: Case, outcome: Outcome, subject: Candidate | None) -> tuple[lis
         if main is None or main.effect.name in done:
             continue
         done.add(main.effect.name)
-        beside = [v for c in trial.members if c is not main for v in c.variables]
         net = outcome.own_fall(trial, main.effect.name) - main.cone.expectation
+        if not case.evidence.is_table and trial.fall < SHARE * _excess(case):
+            continue  # too little for a claim, and a split takes as long as a score
+        beside = [v for c in trial.members if c is not main for v in c.variables]
         own, p, clutter = homogeneity.split(
             case.model,
             case.evidence,
@@ -218,6 +223,12 @@ def _split(case: Case, outcome: Outcome, subject: Candidate | None) -> tuple[lis
         if len(trial.members) == 1 and main.row.refit is not None:
             main.row.refit = homogeneity.scattered(main.row.refitted, p, clutter)
     return splits, chance
+
+
+def _excess(case: Case) -> float:
+    """The misfit of the base beyond noise, where it is more than noise may make; else 0."""
+    square, dof = case.evidence.normal.square, case.evidence.normal.count - case.evidence.projected.rank
+    return square - dof if square - dof > EXCESS * math.sqrt(2 * max(dof, 1)) else 0.0
 
 
 def _gaps(evidence: Evidence, chosen: Sequence[Candidate]) -> tuple[list[list[float]], list[list[float]]]:

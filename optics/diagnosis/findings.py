@@ -180,7 +180,7 @@ def _of_subject(
         share=(best.fall - best.expectation) / excess if excess > 0 else math.nan,
         excess_sd=basis.excess_sd,
         left=basis.misfit * math.sqrt(max(1 - best.fall / basis.chi2, 0.0)),
-        uneven=worst.h if worst else 0.0,
+        uneven=worst.h if worst else math.nan,
         uneven_by=f" by {worst.by} ({_extremes(worst)})" if worst else "",
         uneven_limit=worst.limit if worst else UNEVEN,
         even=all(s.holds for s in mine),

@@ -50,6 +50,7 @@ class Case:
     seed: int
     say: Progress
     places: list[dict[str, np.ndarray]] | None = None
+    foresee: Callable[[Sequence[Sequence[Variable]], Progress], None] | None = None
 
     @cached_property
     def session(self) -> Session:
@@ -99,6 +100,8 @@ class Attempt:
 def refit_each(case: Case, chosen: Sequence[Candidate]) -> dict[str, Fit]:
     """Refit with each chosen effect and write the result into its row; {effect: fit} of those that had one."""
     fits = {}
+    if case.foresee is not None:
+        case.foresee([c.variables for c in chosen], case.say)
     for n, c in enumerate(chosen):
         case.say("refit", n, len(chosen))
         predicted, linear = _look_again(case, c)

@@ -5,15 +5,20 @@ BadCapture with the place, what is allowed and the next step."""
 
 from __future__ import annotations
 
+import math
+import warnings
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from optics.errors import BadCapture
 from optics.files import exr
+from optics.files.output import replacing
 
 SUFFIXES = (".png", ".tif", ".tiff", ".exr", ".npy")
 CHANNELS_MOST = 64
+PIXELS_MOST = 200_000_000  # of one image: beyond any camera, below what 32-bit sizes and a few GB hold
 
 
 def read_image(file: Path, where: str) -> tuple[np.ndarray, int | None]:
@@ -61,13 +66,35 @@ def read_array(file: Path, where: str) -> np.ndarray:
         hint = "; JPEG alters every pixel: record PNG or raw" if file.suffix.lower() in (".jpg", ".jpeg") else ""
         raise BadCapture(f"{where}: '{file.suffix}' files are not read; allowed: {', '.join(SUFFIXES)}{hint}")
     try:
-        return reader(file, where)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # Pillow's about large images: the limit here is stated
+            return reader(file, where)
     except BadCapture:
         raise
+    except MemoryError as error:
+        raise BadCapture(f"{where}: not enough memory to read it ({error}); crop or bin the image") from error
     except Exception as error:  # decoders raise whatever they like on a damaged file
         raise BadCapture(
             f"{where}: unreadable as {file.suffix} ({type(error).__name__}: {error}); write it again"
         ) from error
+
+
+def varied(image: np.ndarray, where: str) -> None:
+    """Raises BadCapture for an image without any: all black, all saturated, or one value."""
+    low, high = (image.min(), image.max()) if image.size else (0, 0)
+    if low == high:
+        what = "black" if low == 0 else f"{high:g} DN"
+        raise BadCapture(
+            f"{where}: every value is {what}; allowed: an image with some shading; record it with another exposure, or "
+            "leave the file out"
+        )
+
+
+def _fits(shape: Sequence[int], where: str) -> None:
+    if math.prod(shape[:2]) > PIXELS_MOST:
+        raise BadCapture(
+            f"{where}: {shape[0]} x {shape[1]} pixels; allowed: up to {PIXELS_MOST:,} pixels; crop or bin the image"
+        )
 
 
 def _png(file: Path, where: str) -> np.ndarray:
@@ -77,6 +104,8 @@ def _png(file: Path, where: str) -> np.ndarray:
         head = begin.read(26)
     if head[:2] == b"\xff\xd8":
         raise BadCapture(f"{where}: a JPEG by the name of .png; JPEG alters every pixel: record PNG or raw")
+    if head[12:16] == b"IHDR":  # before Pillow, whose own limit says nothing of the file
+        _fits((int.from_bytes(head[20:24], "big"), int.from_bytes(head[16:20], "big")), where)
     with Image.open(file, formats=["PNG"]) as image:
         depth, colour = head[24:]  # of the header chunk: bits per value, kind of colour
         if colour in (4, 6) or "transparency" in image.info:
@@ -105,6 +134,7 @@ def _tiff(file: Path, where: str) -> np.ndarray:
             raise BadCapture(
                 f"{where}: {len(tiff.pages)} pages of axes {page.axes}; allowed: one page; one file per reading"
             )
+        _fits(page.shape if page.axes != "SYX" else page.shape[1:], where)
         if page.extrasamples:
             raise BadCapture(f"{where}: has an alpha or extra channel; allowed: gray or RGB; remove it")
         if page.photometric not in (1, 2):  # min-is-black, RGB
@@ -137,7 +167,10 @@ def _exr(file: Path, where: str) -> np.ndarray:
 
 
 def _npy(file: Path, where: str) -> np.ndarray:
-    return np.load(file, allow_pickle=False)
+    values = np.load(file, mmap_mode="r", allow_pickle=False)  # a header that says more than the file holds is refused
+    if values.ndim > 1:
+        _fits(values.shape, where)
+    return np.array(values)
 
 
 def write_image(stem: Path, image: np.ndarray, bits: int | None) -> Path:
@@ -156,16 +189,18 @@ def write_image(stem: Path, image: np.ndarray, bits: int | None) -> Path:
         values, suffix = image.astype({8: np.uint8, 16: np.uint16}[bits]), ".png"
     count = image.shape[2]
     file = stem.parent / (stem.name + (suffix if count in (1, 3) else ".npy"))
-    if count not in (1, 3):
-        np.save(file, values, allow_pickle=False)
-    elif bits is None:
-        exr.write(file, {name: values[..., i] for i, name in enumerate("RGB" if count == 3 else "Y")}, {"units": "DN"})
-    elif bits == 16 and count == 3:
-        import mitsuba as mi
+    with replacing(file) as temporary:
+        if count not in (1, 3):
+            np.save(temporary, values, allow_pickle=False)
+        elif bits is None:
+            names = "RGB" if count == 3 else "Y"
+            exr.write(temporary, {name: values[..., i] for i, name in enumerate(names)}, {"units": "DN"})
+        elif bits == 16 and count == 3:
+            import mitsuba as mi
 
-        mi.Bitmap(np.ascontiguousarray(values)).write(str(file))
-    else:
-        from PIL import Image
+            mi.Bitmap(np.ascontiguousarray(values)).write(str(temporary))
+        else:
+            from PIL import Image
 
-        Image.fromarray(values if count == 3 else values[..., 0]).save(file)
+            Image.fromarray(values if count == 3 else values[..., 0]).save(temporary)
     return file

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import os
 import platform
+import re
 import shutil
 import uuid
 from collections.abc import Iterator, Mapping, Sequence
@@ -19,17 +21,81 @@ from optics.version import __version__
 PACKAGES = ("mitsuba", "drjit", "numpy", "scipy", "scikit-image")
 
 
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+
+
+@contextmanager
+def naming(path: Path, temporary: Path | None = None) -> Iterator[None]:
+    """A disk that is full is said with the file that was to be written: writers name none, or a temporary one."""
+    try:
+        yield
+    except (OSError, RuntimeError) as error:
+        code, file = getattr(error, "errno", None), getattr(error, "filename", None)
+        said = str(error)
+        if code not in FULL and not (
+            code is None and (_NO_SPACE in said or re.search(r"requested and \d+ written", said))
+        ):
+            raise
+        name = str(path) if file is None else str(file).replace(str(temporary or path), str(path))
+        raise OSError(
+            code or errno.ENOSPC,
+            f"{os.strerror(code or errno.ENOSPC)}: it is not written, nothing of it is kept; free some space, or "
+            "choose another place",
+            name,
+        ) from error
+
+
+_NO_SPACE = os.strerror(errno.ENOSPC)
+
+
+@contextmanager
+def alone(file: Path, said: str) -> Iterator[None]:
+    """Hold a lock file against other processes; the system frees the lock however the process ends. Raises OutputExists
+    with what is said where another one has it."""
+    try:
+        import fcntl
+    except ImportError:  # Windows
+        yield
+        return
+    with open(file, "w") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise OutputExists(said) from error
+        except OSError:  # a file system without locks
+            pass
+        yield
+
+
 @contextmanager
 def replacing(path: str | Path) -> Iterator[Path]:
     """A temporary file beside `path` that replaces it when the block ends without an error; removed otherwise."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
+    if path.is_dir():
+        raise IsADirectoryError(errno.EISDIR, "is a folder; choose the name of a file", str(path))
+    if path.exists() and not path.is_file():  # /dev/null, /dev/stdout: written to, never replaced
+        yield path
+        return
     temporary = path.parent / f".{path.stem}.{uuid.uuid4().hex}{path.suffix}"
     try:
-        yield temporary
-        os.replace(temporary, path)
+        with naming(path, temporary):
+            yield temporary
+            os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def together(files: Sequence[Path]) -> Iterator[None]:
+    """Write several files of one result: where the block ends with an error, those that it made are removed again."""
+    before = {file for file in files if file.exists()}
+    try:
+        yield
+    except BaseException:
+        for file in set(files) - before:
+            file.unlink(missing_ok=True)
+        raise
 
 
 def write_text(path: str | Path, text: str) -> Path:
@@ -49,11 +115,14 @@ def new_folder(folder: str | Path, *, replace: bool = False) -> Iterator[Path]:
     folder = Path(os.path.abspath(folder))
     if not replace:
         check_new_folder(folder)
+    elif (folder / RECORD).is_file():
+        raise OutputExists(f"{folder} holds a study, which is never replaced; choose another folder")
     temporary = folder.parent / f".{folder.name}.{uuid.uuid4().hex}"
     old = temporary.with_name(temporary.name + ".old")
     temporary.mkdir(parents=True)
     try:
-        yield temporary
+        with naming(folder, temporary):
+            yield temporary
         if folder.exists():
             folder.rename(old)
         try:
@@ -77,12 +146,28 @@ def check_new_folder(folder: str | Path) -> None:
 
 def claim(paths: Sequence[Path], force: bool = False) -> None:
     """Check, before any work, that files can be written: none exists (unless `force`), and every folder is writable."""
+    places = [Path(os.path.abspath(path)) for path in paths]
+    for path in places:
+        if places.count(path) > 1:
+            raise OutputExists(f"{path} is named for two outputs; give each a name of its own")
     for path in map(Path, paths):
+        spare_records(path)
         if path.is_dir() or (path.exists() and not force):
             raise OutputExists(
                 f"{path} exists; choose another name" + ("" if path.is_dir() else ", or --force to replace it")
             )
         check_folder(path.parent)
+
+
+RECORD = "ladder.json"  # what makes a folder a study
+
+
+def spare_records(path: Path) -> None:
+    """Raises OutputExists for a file of a study's record: its ladder.json, and all in its folder `steps`."""
+    path = Path(os.path.abspath(path))
+    for study in path.parents:
+        if (study / RECORD).is_file() and (path == study / RECORD or study / "steps" in path.parents):
+            raise OutputExists(f"{path} belongs to the record of the study {study}; choose another name")
 
 
 def check_folder(folder: Path) -> None:

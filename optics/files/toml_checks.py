@@ -19,10 +19,10 @@ else:
 
 
 def parse(file: Path) -> dict:
-    """The file's content; raises BadCapture with line and column."""
+    """The file's content, with or without a byte order mark; raises BadCapture with line and column."""
     try:
-        return tomllib.loads(file.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        return tomllib.loads(file.read_text(encoding="utf-8-sig"))
+    except (ValueError, RecursionError) as error:  # TOMLDecodeError, UnicodeDecodeError, a number too long
         raise BadCapture(f"{file}: not valid TOML: {error}; correct this line (text stands in quotes)") from error
 
 
@@ -76,6 +76,8 @@ def settings(table: Any, where: str) -> dict[str, float | str]:
 
 def existing(folder: Path, name: str, where: str) -> Path:
     """The file of this name, relative to `folder`."""
+    if "\0" in name:
+        raise BadCapture(f"{where} = {name!r}: has a zero byte; allowed: the path of a file")
     file = folder / name
     if not file.is_file():
         there = [Path(name).with_name(p.name).as_posix() for p in (folder / Path(name).parent).glob("*")]
@@ -85,3 +87,14 @@ def existing(folder: Path, name: str, where: str) -> Path:
             + (f"; did you mean '{near[0]}'?" if near else "; correct the path or add the file")
         )
     return file
+
+
+def inside(folder: Path, name: str, where: str) -> Path:
+    """As `existing`, of a file that lies in `folder` when all links are followed; another one is refused unread."""
+    file = folder / name if "\0" not in name else existing(folder, name, where)
+    if not file.resolve().is_relative_to(folder.resolve()):
+        raise BadCapture(
+            f"{where} = '{name}': lies outside {folder}, at {file.resolve()}; allowed: files of the capture folder, or "
+            "any with '--allow-outside' (in Python: outside=True), where you know who wrote the file"
+        )
+    return existing(folder, name, where)

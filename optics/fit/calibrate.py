@@ -159,13 +159,16 @@ def fit(
     max_iterations: int = 40,
     robust: bool = False,
     tolerance: float = 0.05,
+    negligible: float | None = None,
+    asked: float = math.inf,
     progress: Callable[[str, int, int], None] | None = None,
 ) -> Fit:
     """Levenberg-Marquardt within bounds.
 
     Stops when the fall of chi2 that the linearisation still predicts is below `tolerance` per variable or below
-    NEGLIGIBLE of the excess, or when no damping lowers chi2; `Fit.reason` says which. Raises OutOfBounds for a start
-    value outside of its bounds, Underdetermined when no value is usable or no variable changes anything."""
+    `negligible` of the excess (None: NEGLIGIBLE), or when no damping lowers chi2; `Fit.reason` says which. It gives up
+    where even the fall that is promised leaves more than `asked`. Raises OutOfBounds for a start value outside of its
+    bounds, Underdetermined when no value is usable or no variable changes anything."""
     variables = list(variables)
     frames = list(range(len(model.frames))) if frames is None else list(frames)
     filled = with_start(model, variables, start or Values())
@@ -181,7 +184,8 @@ def fit(
         if progress:
             progress("calibrate", done, max_iterations * len(frames))
 
-    history, reason = _descend(descent, max_iterations, tolerance * max(len(variables), 1), tick)
+    share = NEGLIGIBLE if negligible is None else negligible
+    history, reason = _descend(descent, max_iterations, tolerance * max(len(variables), 1), share, asked, tick)
     if descent.at is not descent.theta:  # the last steps moved on from where the derivative images were made
         descent.linearise()
     return _fit_at(descent, history, reason, first)
@@ -196,6 +200,7 @@ def fit_over_starts(
     max_iterations: int = 40,
     robust: bool = False,
     tolerance: float = 0.05,
+    negligible: float | None = None,
     progress: Callable[[str, int, int], None] | None = None,
     over: Sequence[str] | None = None,
 ) -> Fit:
@@ -209,7 +214,9 @@ def fit_over_starts(
     Underdetermined only after the starts: at 0 a retardance between crossed polarizers has no slope."""
     frames = list(range(len(model.frames))) if frames is None else list(frames)
     filled = with_start(model, variables, start or Values())
-    follow = functools.partial(fit, model, variables, frames=frames, robust=robust, progress=progress)
+    follow = functools.partial(
+        fit, model, variables, frames=frames, robust=robust, negligible=negligible, progress=progress
+    )
     first: Fit | None = None
     error = Underdetermined("no start")
     try:
@@ -279,7 +286,7 @@ def _elsewhere(
 
 
 def _descend(
-    descent: Descent, max_iterations: int, accuracy: float, tick: Callable[[], None]
+    descent: Descent, max_iterations: int, accuracy: float, negligible: float, asked: float, tick: Callable[[], None]
 ) -> tuple[list[float], str]:
     """Linearise and step until nothing worth a linearisation is promised: (misfit at each linearisation, why it
     stopped). Leaves the descent at the best point."""
@@ -295,8 +302,10 @@ def _descend(
             normal = descent.linearise(tick)
         history.append(normal.total)
         promise, excess = descent.promised, max(normal.chi2 - sum(normal.frame_n) + count, 0.0)
-        if promise < max(accuracy, NEGLIGIBLE * excess):
+        if promise < max(accuracy, negligible * excess):
             return history, f"converged after {iteration} linearisations"
+        if normal.total - promise > asked:
+            return history, f"not followed: the linear model promised a fall of {promise:.3g}, and more was asked for"
         near = promise < NEAR * count
         if near:
             tries += 1
@@ -308,6 +317,8 @@ def _descend(
             if (tries > TRIES and stuck) or (tries > 1 and best[0] < count / 2):
                 break
         gained = descent.chord(STEPS_NEAR if near else STEPS, WORTH * accuracy, NEAR * count if near else 0.0, PART)
+        if negligible > NEGLIGIBLE and gained < negligible * excess:
+            return history, f"converged to {negligible:.2g} of the misfit after {iteration + 1} linearisations"
         if gained < accuracy and not near:
             return history, f"no lower misfit within reach; the linear model still promised {promise:.3g}"
     else:
@@ -405,7 +416,7 @@ def extended(
     a[first:, first:] += np.diag(curvature[first:])
     descent = Descent(model, variables, values, base.frames, damping=CHORD_DAMPING)
     descent.take(Normal(a, b + pull, base.chi2, prior, base.frame_chi2, base.frame_n, rows))
-    before = descent.here.total
+    before, promised = descent.here.total, descent.promised
     descent.chord(steps, WORTH * p)
     here = descent.here
     return Fit(
@@ -421,4 +432,5 @@ def extended(
         descent.promised < p,
         "chord steps",
         [before, here.total],
+        promised=promised,
     )

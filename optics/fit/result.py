@@ -40,6 +40,7 @@ class Fit:
                  chi2 that noise does not explain; `reason` says why the fit stopped
     warnings     sentences: degenerate modes, variables without effect, variables at a bound
     normal       the last linearisation, for `optics.fit.calibrate.extended`
+    promised     of `extended`: the fall of what is minimised that the base's derivative images promised; else NaN
     """
 
     values: Values
@@ -58,6 +59,7 @@ class Fit:
     start: np.ndarray | None = None
     at_bound: list[str] = field(default_factory=list)
     normal: Normal | None = None
+    promised: float = float("nan")
 
     @property
     def sd(self) -> np.ndarray:

@@ -487,7 +487,7 @@ class SceneModel:
             others = self.renderer.powers({**now, key: 1.0}, name)
             if key != self.scene.powers[name]:
                 band = self.scene.band_powers[name].index(key)
-                others = np.where(np.arange(self.renderer.bands) == band, others, 0.0)
+                others = np.where(self.renderer.colours == band, others, 0.0)
             factor = factor * others
             if not np.any(factor):
                 return None

@@ -2,7 +2,7 @@
 
     I_b  = lens(L_b)                        effects of the stage `lens`
          = sum_j w_j lens(S_j)_b            of a camera with a mosaic of analysers: what its pixels let through
-    I_c  = exposure gain gain_c sum_b M_cb I_b     then effects of the stage `sensor`
+    I_c  = exposure gain gain_c sum_b M_cb I_b     M with effects of the stage `sensitivity`; then those of `sensor`
     m_c  = G_c^-1(I_c)                      then effects of the stage `response`
     DN   = black + (saturation - black) m_c + offset
 
@@ -21,7 +21,9 @@ from typing import Any
 
 import numpy as np
 
+from optics.errors import BadScene
 from optics.scene.declare import IMAGE_STAGES
+from optics.spectra.reading import FILES, read_channels
 
 STEP = 1e-30  # of the complex step; far below rounding, far above underflow
 
@@ -30,15 +32,24 @@ def sensitivities(name: str, bands: tuple[float, ...], channels: int = 3) -> np.
     """M (channels, bands): the identity, or a measured camera of colour-science at the bands, largest entry 1."""
     if name == "identity":
         return np.eye(channels, len(bands)) if len(bands) > 1 else np.ones((1, 1))
-    import colour
+    matrix = np.stack([np.interp(bands, c.nm, c.values) for c in read_channels(name)])
+    return matrix / matrix.max()
 
-    from optics.errors import UnknownKey
 
-    cameras = colour.MSDS_CAMERA_SENSITIVITIES
-    if name not in cameras:
-        raise UnknownKey(name, ["identity", *cameras], "camera sensitivity")
-    data = cameras[name]
-    matrix = np.stack([np.interp(bands, data.wavelengths, data.values[:, c]) for c in range(3)])
+def channel_matrix(camera, bands: tuple[float, ...]) -> np.ndarray:
+    """M (C, B) of bands that are read at their centres: of a camera's curves behind its filter, largest entry 1."""
+    if not camera.channels:
+        matrix = sensitivities("identity", bands)
+        return matrix * camera.curves["filter"](bands) if "filter" in camera.curves else matrix
+    if "filter" not in camera.curves and not camera.sensitivity.lower().endswith(FILES):
+        return sensitivities(camera.sensitivity, bands)
+    matrix = camera.seen(np.array(bands))
+    if not matrix.any():
+        low, high = min(c.span[0] for c in camera.channels), max(c.span[1] for c in camera.channels)
+        raise BadScene(
+            f"'{camera.name}' sees none of the bands {', '.join(f'{b:g}' for b in bands)} nm; allowed: bands between "
+            f"{low:g} and {high:g} nm that its filter passes"
+        )
     return matrix / matrix.max()
 
 
@@ -56,7 +67,8 @@ class Developer:
         self.camera, self.name = camera, camera.name
         self.width, self.height = camera.resolution
         self.bands = tuple(bands)
-        self.matrix = sensitivities(camera.sensitivity, self.bands)
+        self.integral = camera.integral
+        self.matrix = channel_matrix(camera, self.bands) if self.integral is None else self.integral.matrix()
         self.black, self.saturation = float(black), float(saturation)
         self.names = tuple(camera.numbers)
         self.neutral = {n: p.neutral for n, p in camera.numbers.items()}
@@ -72,8 +84,8 @@ class Developer:
         """What an image function sees as `camera`: every parameter of the camera, and the geometry of its pixels.
 
         u, v (H, W) px; x, y (H, W) normalised coordinates; tan (H, W) tangent of the field angle; focal (px); width,
-        height (px); bands (nm); settings: all values by key, those of other parts too, (N, 1, 1) where readings were
-        swept."""
+        height (px); bands (nm); white (B,) radiance per band of white light of radiance 1; settings: all values by key,
+        those of other parts too, (N, 1, 1) where readings were swept."""
         own = {n: values[f"{self.name}.{n}"] for n in self.names}
         x, y, focal = self.camera.normalised(SimpleNamespace(**own), self.u, self.v)
         return SimpleNamespace(
@@ -87,6 +99,7 @@ class Developer:
             width=self.width,
             height=self.height,
             bands=np.array(self.bands),
+            white=np.ones(len(self.bands)) if self.integral is None else self.integral.white,
             site=self.site,
             settings=values,
         )
@@ -101,8 +114,25 @@ class Developer:
     def channels(self, image, view):
         """Irradiance per channel, 1 = full scale, of an image per band (H, W, B)."""
         image = self._stage("lens", image, view) if self.site is None else self.behind_analysers(image, view)
-        image = image @ self.matrix.T
+        image = image @ self.mixing(view).T
         return self._stage("sensor", image * self.scale(view), view)
+
+    def mixing(self, view) -> np.ndarray:
+        """M (C, B) from bands to channels, with what effects of the stage `sensitivity` make of it; of channels that
+        are integrals it depends on the lights' spectra."""
+        own = self.integral
+        found = self.matrix if own is None else own.matrix(view.settings)
+        active = [
+            e
+            for e in self.effects["sensitivity"]
+            if any(getattr(view, n) != self.neutral[n] for n in e.parameter_names)
+        ]
+        if not active:
+            return found
+        nm, quantum = (view.bands, found) if own is None else (own.grid, own.quantum)
+        for effect in active:
+            quantum = effect.stages["sensitivity"](quantum, nm, view)
+        return quantum if own is None else own.matrix(view.settings, quantum)
 
     def behind_analysers(self, stokes, view) -> np.ndarray:
         """Irradiance per band (H, W, B) behind the analyser of each pixel, of Stokes vectors (3, H, W, B).

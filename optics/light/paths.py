@@ -365,7 +365,10 @@ def emitted(scene, name: str, path: Path, values: Mapping, bands: np.ndarray) ->
     source = scene.parts[name]
     on = np.array(path.si.emitter(scene.mitsuba) == mi.EmitterPtr(source)) & (path.end.k[:, 2] > 0)
     crossing = crossing_at(path.end, slice(None), bands)
-    vector = scene.declaration(name).stokes(crossing, part_values(scene, name, values, {}))
+    own = part_values(scene, name, values, {})
+    if scene.integral is not None and scene.integral.auto:  # its spectrum is in the matrix from bands to channels
+        own.curve, own.wavelength = None, 0.0
+    vector = scene.declaration(name).stokes(crossing, own)
     return tuple(0 if isinstance(c, int) else c * on[:, None] for c in vector)
 
 

@@ -9,6 +9,7 @@ misses the moving edge, and for everything that moves geometry they are central 
 
 from __future__ import annotations
 
+import copy
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping
 from types import SimpleNamespace
@@ -36,8 +37,9 @@ BENT_SIDE = 4  # finer samples each way where the face bends: the mean of what v
 SOFT = 16  # points of a light, above which rims of its shadows take the samples of what bends, BENT_SIDE each way
 CREASE = 25.0  # deg from pixel to pixel: what is no smooth surface
 FLAT_FIELDS = ("multiplicative", "additive", "none")
-MEMORY = 4e9  # bytes of hits and images that are kept
-PER_RAY = 100  # bytes of a camera ray's end, by the memory of a process that held ten million of them
+MEMORY = 2e9  # bytes of hits, with what images need for their derivatives, that are kept
+IMAGES = 5e8  # bytes of images that are kept without them
+PER_RAY = 250  # bytes of a camera ray's end and its light, by the memory of processes that held ten million of them
 BOUNCE_SAMPLES = 32  # directions per cell for the second bounce
 BOUNCE_CELL = 2  # px each way of a cell
 
@@ -56,7 +58,12 @@ class Renderer:
         self.scene = scene
         self.width, self.height = scene.camera.resolution
         self.bands = len(scene.integrator.bands or (0,))
-        if self.bands > scene.integrator.lanes:
+        self.integral = scene.integral
+        self.colours = np.arange(self.bands) if self.integral is None else self.integral.colours
+        self._lanes: np.ndarray | None = (
+            None  # numbers of the bands that a pass carries, of channels that are integrals
+        )
+        if self.bands > scene.integrator.lanes and self.integral is None:
             raise BadScene(
                 f"{scene.path}: {self.bands} bands, but the variant {scene.variant} carries {scene.integrator.lanes}; "
                 f"load the scene with variant='{DEFAULT_VARIANT}' or name one band"
@@ -71,7 +78,8 @@ class Renderer:
         self._transmissions: OrderedDict = OrderedDict()
         self._recent: list[paths.Path] = []
         self._hits: OrderedDict = OrderedDict()
-        self._images: OrderedDict = OrderedDict()
+        self._images: OrderedDict[tuple, LedImage] = OrderedDict()
+        self._plain: OrderedDict[tuple, np.ndarray] = OrderedDict()  # of differences, which need nothing else
         image_keys = {k for k, p in scene.parameters.items() if p.how == "image"}
         self.layer_keys = {k for k, p in scene.parameters.items() if p.how == "layer"}
         words = {
@@ -165,7 +173,7 @@ class Renderer:
 
     def _make_room(self, latest: Hits) -> None:
         """Forget the oldest geometries while what is kept is larger than MEMORY: large images with many rims."""
-        images = [i for i in self._images.values() if isinstance(i, LedImage)]
+        images = self._images.values()
         rays: dict[Hits, dict[int, int]] = {}  # geometry -> ends of camera rays by the samples that hold them
         for hits in (*(i.hits for i in images), *self._hits.values()):
             rays.setdefault(hits, {0: hits.valid.size})
@@ -173,12 +181,16 @@ class Renderer:
             rays[image.hits][id(image.finer)] = image.finer.size
         size = {hits: PER_RAY * sum(own.values()) for hits, own in rays.items()}
         total = sum(size.values())
+        if total > MEMORY:
+            import drjit as dr
+
+            dr.flush_malloc_cache()  # Dr.Jit keeps what is released, in sizes that the next geometry does not ask for
         for old in [hits for hits in size if hits is not latest]:
             if total <= MEMORY:
                 return
             total -= size[old]
             self._hits = OrderedDict((k, h) for k, h in self._hits.items() if h is not old)
-            self._images = OrderedDict((k, i) for k, i in self._images.items() if getattr(i, "hits", None) is not old)
+            self._images = OrderedDict((k, i) for k, i in self._images.items() if i.hits is not old)
 
     def forget_hits(self) -> None:
         """Release the kept hits: a search over many geometries returns to none of them."""
@@ -225,21 +237,57 @@ class Renderer:
             self._images.move_to_end(key)
             return self._images[key]
         hits = self.hits(values)
+        if alike := self._placed_alike(key):
+            self.apply(values, move=False)
+            return self._keep(key, self._shaded_again(alike))
         self.apply(values)
         image = self._keep(key, self._render_led(hits, led))
         for other in self.together - {
             led
         }:  # moving the geometry costs more than an image: make what will be asked for next
             key = self._led_key(values, other)
-            if key not in self._images:
+            if key not in self._images and key not in self._plain:
                 self._keep(key, self._render_led(hits, other))
         return image
+
+    def _placed_alike(self, key: tuple) -> LedImage | None:
+        """A kept image of the same LED in the same place over the same geometry, which differs in shading alone: with
+        its shadows nothing needs to be traced. None where there is none, or shading is that of layers."""
+        led, geometry, _, own = key
+        if self.layered or led in self.scene.sources:
+            return None
+        alike = (i for k, i in reversed(self._images.items()) if (k[0], k[1], k[3]) == (led, geometry, own))
+        return next(alike, None)
+
+    def _shaded_again(self, alike: LedImage) -> LedImage:
+        """The image of an LED by the shadows of another."""
+        image = copy.copy(alike)
+        image.raw = self._direct(image)
+        image.radiance = self._mix(image, image.raw)
+        return image
+
+    def _direct(self, image: LedImage) -> tuple:
+        """Direct light of an image's LED at pixel centres and at the finer samples."""
+        part = self.scene.leds[image.led]
+        return self._raw(
+            image,
+            lambda: self._shade(image.hits.sample, part, image.visible),
+            lambda: self._shade(image.finer.sample, part, image.rim_visible, image.finer),
+        )
 
     def _keep(self, key: tuple, image: LedImage) -> LedImage:
         self._images[key] = image
         while len(self._images) > self.remember * len(self.scene.lights):
             self._images.popitem(last=False)
         self._make_room(image.hits)
+        if image.radiance is not None:
+            self._keep_plain(key, image.radiance)
+        return image
+
+    def _keep_plain(self, key: tuple, image: np.ndarray) -> np.ndarray:
+        self._plain[key] = image
+        while len(self._plain) > max(2 * len(self.scene.lights), int(IMAGES / max(image.nbytes, 1))):
+            self._plain.popitem(last=False)
         return image
 
     def _render_led(self, hits: Hits, led: str) -> LedImage:
@@ -247,7 +295,9 @@ class Renderer:
             rim = self._joint_rim(hits)
             index = np.flatnonzero(rim)
             image = LedImage(led, hits, rim, index, self._finer(hits, index), None, None, hits.valid)
-            image.raw = (np.ones((1, self.bands)), np.ones((1, self.bands)))
+            own = np.zeros((1, self.bands))
+            own[:, self._own(led)] = 1.0
+            image.raw = (own, own)
             return image
         part = self.scene.leds[led]
         visible = self._visible(hits.si, part)
@@ -260,11 +310,7 @@ class Renderer:
         rim_visible = self._visible(finer.sample.si, part, finer) if len(index) else None
         image = LedImage(led, hits, rim, index, finer, visible, rim_visible, self._seen(visible).mean(0) > 0.5)
         image.share = share.reshape(-1, 1)[index]
-        image.raw = self._raw(
-            image,
-            lambda: self._shade(hits.sample, part, visible),
-            lambda: self._shade(finer.sample, part, rim_visible, finer),
-        )
+        image.raw = self._direct(image)
         if not self.layered:
             image.radiance = self._mix(image, image.raw)
         return image
@@ -290,9 +336,11 @@ class Renderer:
         component  of the Stokes vector in the camera's axes; 0: what the camera records, S0 unless its detector
                    prefers a polarization (stage `detector`)
         """
-        image = self.led(values, light)
         if not self.layered:
-            return image.radiance if component == 0 else np.zeros_like(image.radiance)
+            plain = self._plain.get(self._led_key(values, light))
+            plain = self.led(values, light).radiance if plain is None else plain
+            return plain if component == 0 else np.zeros_like(plain)
+        image = self.led(values, light)
         seen = [
             None if r is None or w is None else r * w for r, w in zip(image.raw, self.weights(values, image, component))
         ]
@@ -357,6 +405,8 @@ class Renderer:
         if light not in self.scene.sources:
             return row[0]
         sent = paths.emitted(self.scene, light, path, values, self.wavelengths)
+        if self.integral is not None and not self.integral.auto:
+            sent = tuple(s / self.integral.width(light, values) for s in sent)
         return sum(r * s for r, s in zip(row, sent) if not isinstance(s, int))
 
     # -- all lights ---------------------------------------------------------------------------------------------------
@@ -430,6 +480,7 @@ class Renderer:
     def _shade(self, sample: Sample, part, visible, finer: Finer | None = None):
         """Direct radiance per band at hits, an UnpolarizedSpectrum attached to whatever carries gradients."""
         integrator, scene = self.scene.integrator, self.scene.mitsuba
+        self._tune(sample.si)
         spots = self._spots(part, finer)
         if len(spots) == 1:
             return integrator.direct(scene, *sample[:3], part, visible, spots[0])
@@ -440,8 +491,8 @@ class Renderer:
 
     def _raw(self, image: LedImage, centre: Callable, rim: Callable) -> tuple:
         """Shading at pixel centres (H W, B) and at the finer samples (N, B), None without any."""
-        fine = self._bands(rim()) if len(image.index) else None
-        return self._bands(centre()).reshape(self.height * self.width, self.bands), fine
+        fine = self._each_band(rim, image.led) if len(image.index) else None
+        return self._each_band(centre, image.led).reshape(self.height * self.width, self.bands), fine
 
     def _mix(self, image: LedImage, raw: tuple, weights: tuple = (1.0, 1.0)) -> np.ndarray:
         """(H, W, B) from pixel centres and, where the rim is, from the mean of the finer samples, by its share."""
@@ -454,15 +505,77 @@ class Renderer:
             else result.reshape(self.height, self.width, self.bands)
         )
 
-    def _bands(self, spectrum) -> np.ndarray:
+    def _bands(self, spectrum, count: int | None = None) -> np.ndarray:
         import drjit as dr
 
         dr.eval(spectrum)  # lane by lane: one array of all lanes would carry its size into the kernel
-        return np.stack([np.array(spectrum[i]) for i in range(self.bands)], -1)
+        return np.stack([np.array(spectrum[i]) for i in range(self.bands if count is None else count)], -1)
+
+    def _own(self, led: str) -> np.ndarray:
+        """Numbers of the bands in which a light is rendered; of no light, all."""
+        if self.integral is None or not led:
+            return np.arange(self.bands)
+        return self.integral.bands_of(led)
+
+    def _each_band(self, shade: Callable, led: str = "") -> np.ndarray:
+        """(N, B) of what `shade` gives per lane; of channels that are integrals in as many passes as the light's bands
+        take, 0 in the bands of others."""
+        if self.integral is None:
+            return self._bands(shade())
+        found = np.zeros((1, self.bands))
+        own, lanes = self._own(led), self.scene.integrator.lanes
+        seen = len(own) > 0
+        own = own if seen else np.zeros(1, int)  # a light that no channel sees
+        for start in range(0, len(own), lanes):
+            self._lanes = own[start : start + lanes]
+            self._light_lanes(led)
+            try:
+                raw = self._bands(shade(), len(self._lanes))
+            finally:
+                here, self._lanes = self._lanes, None
+                self._light_lanes("")
+            if not start:
+                found = np.zeros((len(raw), self.bands), raw.dtype)
+            found[:, here] = raw * seen
+        return found
+
+    def _light_lanes(self, led: str) -> None:
+        """Tell a light and the pigments which lanes of the present pass are theirs; where none is present, nothing."""
+        if not self.integral.auto:
+            return
+        for name, part in self.scene.parts.items():
+            pigment = hasattr(part, "fluorescence")
+            if self._lanes is None or not (name == led or pigment):
+                if name in self.scene.leds or pigment:
+                    part.lane = None
+                continue
+            part.lane = self._spectrum(self.integral.lanes(led, name if pigment else ""))
+
+    def _spectrum(self, per_band: np.ndarray):
+        """The lanes of the present pass of numbers (B,); those without a band repeat the last."""
+        import drjit as dr
+        import mitsuba as mi
+
+        lanes = self.scene.integrator.lanes
+        own = per_band[self._lanes] if len(self._lanes) else per_band[:1] * 0
+        padded = np.append(own, [own[-1]] * lanes)[:lanes]
+        return mi.UnpolarizedSpectrum(*(dr.opaque(mi.Float, float(v)) for v in padded))
+
+    def _tune(self, si) -> None:
+        """Give what camera rays met the wavelengths of the present pass."""
+        if self._lanes is not None:
+            si.wavelengths = type(si.wavelengths)(self._spectrum(self.integral.nm))
 
     def powers(self, values: Mapping, led: str) -> np.ndarray:
         """(B,) power of an LED in each band, relative to its image."""
-        shares = [values[key] for key in self.scene.band_powers[led]] + [1.0] * self.bands
+        own = [values[key] for key in self.scene.band_powers[led]]
+        if self.integral is not None:
+            return (
+                values[self.scene.powers[led]] * np.array(own)[self.colours]
+                if own
+                else np.full(self.bands, values[self.scene.powers[led]])
+            )
+        shares = own + [1.0] * self.bands
         return values[self.scene.powers[led]] * np.array(shares[: self.bands])
 
     def led_tangent_at_rest(self, values: Mapping, led: str, key: str, component: int = 0) -> np.ndarray:
@@ -533,10 +646,30 @@ class Renderer:
         if led in self.scene.sources:  # it lights nothing
             return np.zeros((1, 1, self.bands))
         key = ("bounced", seed, *self._led_key(values, led))
-        if key in self._images:
-            self._images.move_to_end(key)
-            return self._bounced(values, led, self._images[key], component)
+        if key in self._plain:
+            return self._bounced(values, led, self._plain[key], component)
         self.apply(values)
+        sample, directions, count = self._spread_rays(seed)
+        for other in (led, *sorted(self.together - {led})):  # as for direct light: these will be asked for next
+            own = ("bounced", seed, *self._led_key(values, other))
+            if other in self.scene.sources or own in self._plain:
+                continue
+
+            def shade(lamp=self.scene.leds[other]):
+                sampler = mi.load_dict({"type": "independent"})
+                sampler.seed(directions, count)
+                self._tune(sample.si)
+                return self.scene.integrator.bounced(self.scene.mitsuba, *sample[:3], lamp, 1, sampler)
+
+            rows, columns = -(-self.height // BOUNCE_CELL), -(-self.width // BOUNCE_CELL)
+            coarse = self._each_band(shade, other).reshape(rows, columns, BOUNCE_SAMPLES, self.bands).mean(2)
+            image = zoom(coarse, (BOUNCE_CELL, BOUNCE_CELL, 1), order=1, mode="nearest", grid_mode=True)
+            self._keep_plain(own, image[: self.height, : self.width].astype(float))
+        return self._bounced(values, led, self._plain[key], component)
+
+    def _spread_rays(self, seed: int) -> tuple[Sample, int, int]:
+        """(ends of the camera rays that gather light from all around, seed of their second directions, their number):
+        the same for every geometry and LED."""
         rows, columns = -(-self.height // BOUNCE_CELL), -(-self.width // BOUNCE_CELL)
         v, u = np.mgrid[:rows, :columns]
         rng = np.random.default_rng([seed, 77])
@@ -545,13 +678,7 @@ class Renderer:
         sample = self._trace(
             *(np.minimum(a * BOUNCE_CELL, size - 1e-3) for a, size in zip(at, (self.width, self.height)))
         )
-        sampler = mi.load_dict({"type": "independent"})
-        sampler.seed(int(rng.integers(2**31)), count)
-        light = self.scene.integrator.bounced(self.scene.mitsuba, *sample[:3], self.scene.leds[led], 1, sampler)
-        coarse = self._bands(light).reshape(rows, columns, BOUNCE_SAMPLES, self.bands).mean(2)
-        image = zoom(coarse, (BOUNCE_CELL, BOUNCE_CELL, 1), order=1, mode="nearest", grid_mode=True)
-        self._images[key] = image[: self.height, : self.width].astype(float)
-        return self._bounced(values, led, self._images[key], component)
+        return sample, int(rng.integers(2**31)), count
 
     def _bounced(self, values: Mapping, led: str, image: np.ndarray, component: int) -> np.ndarray:
         """A bounced image behind the layers."""
@@ -592,10 +719,13 @@ class Renderer:
     def _shone(self, values: Mapping, sample: Sample) -> np.ndarray:
         """(N, B): radiance of the membranes that no LED made, at the ends of camera rays."""
         self.apply(values, move=False)
-        return sum(
-            self._bands(self.scene.integrator.ambient(self.scene.mitsuba, *sample[:3], m) + 0 * sample.si.t)
-            for m in self.scene.membranes.values()
-        )
+
+        def shade(membrane):
+            self._tune(sample.si)
+            return self.scene.integrator.ambient(self.scene.mitsuba, *sample[:3], membrane) + 0 * sample.si.t
+
+        found = sum(self._each_band(lambda m=m: shade(m)) for m in self.scene.membranes.values())
+        return found if self.integral is None else found * self.integral.white
 
 
 class Sample(NamedTuple):

@@ -11,6 +11,9 @@ layers as well. Every other Mitsuba scene, and a sensor beside stock lights or b
     normal.X, .Y, .Z             of the surface, in the scene's frame
     contact.Y                    1 where the indenter touches what is seen
     led_1.R, .G, .B ...          what one LED sends, in the first three bands; with the ambient light they add up to S0
+    camera.R, .G, .B             where channels are integrals over the wavelength: each before exposure and gain;
+                                 led_1.R ... are then shares of these. S0 is radiance per nm, and none has auto bands
+    colour.X, .Y, .Z             CIE 1931 tristimulus values there; white light of radiance 1 has Y = 1
     variance.*                   variance of the mean of a Monte Carlo channel
 
 and its provenance: scene and plugins by hash, every parameter, versions, seed. It names no place and no time, so that
@@ -33,9 +36,11 @@ from optics.light import paths
 from optics.light.development import Developer
 from optics.light.monte_carlo import renderer_of
 from optics.light.renderer import Hits, Renderer, Sample
+from optics.scene.integral import FEW
 from optics.scene.loader import Scene
 from optics.scene.mitsuba_parts import is_part
 from optics.scene.registry import Registry
+from optics.spectra.colours import linear_srgb
 
 UNITS = "W.mm^-2.sr^-1"  # of S0, for LED powers in W/sr
 PASSES = 8  # of a Monte Carlo render: their scatter is its variance
@@ -74,6 +79,10 @@ class Rendering:
         return exr.write_png(path, np.nan_to_num(np.stack([self.channels[n] for n in names], -1)))
 
 
+SPP_MOST = 1_000_000  # hours for the smallest image
+LANES_MOST = 2**32 - 1  # rays of one pass
+
+
 class RenderJob:
     """Makes images of one scene, with other values each time.
 
@@ -94,8 +103,8 @@ class RenderJob:
         layers: Sequence[str] = LAYERS,
         stokes: bool = False,
     ):
-        if spp is not None and spp < 1:
-            raise ValueError(f"spp = {spp}; allowed: whole numbers from 1 on (samples per pixel)")
+        if spp is not None and not 1 <= spp <= SPP_MOST:
+            raise ValueError(f"spp = {spp}; allowed: whole numbers from 1 to {SPP_MOST:,} (samples per pixel)")
         self.scene, self.spp, self.layers = scene, spp, tuple(layers)
         self.base = scene.values()
         sensors = scene.mitsuba.sensors()
@@ -115,6 +124,11 @@ class RenderJob:
         reason = "samples per pixel were asked for" if spp is not None else obstacle(scene, chance=True)
         if not reason and stokes and (scene.monte_carlo or not paths.layered(scene)):
             reason = "Stokes vectors were asked for of a scene without layers"
+        if reason and scene.integral is not None:
+            raise BadScene(
+                f"{scene.path}: {reason}, and mi.render carries {FEW} bands; allowed: bands such as 620, 540, 460, or "
+                "without it"
+            )
         if reason and scene.monte_carlo and scene.leds:
             raise BadScene(
                 f"{scene.path}: {reason}, but mi.render brings no light of an LED, which is a point, through "
@@ -133,9 +147,11 @@ class RenderJob:
             if self.renderer.monte_carlo
             else "LED by LED"
         )
-        self.developer = None
+        self.developer, self.integral, self.auto = None, None, False
+        self.bands = scene.integrator.bands if scene.integrator is not None else ()
         if scene.camera is not None and scene.integrator is not None:
-            self.bands = scene.integrator.bands
+            self.integral = scene.integral
+            self.auto = self.integral is not None and self.integral.auto
             self.developer = Developer(scene.camera, self.bands or (0.0,), black, saturation)
         self.record = {
             "scene": scene_record(scene),
@@ -183,13 +199,17 @@ class RenderJob:
         if "aov" in self.layers:
             channels.update(self._surface(renderer.hits(now), now))
         if "leds" in self.layers:
+            if self.integral is not None:
+                mixing = self.developer.mixing(self.developer.view(now))
+                alone = {light: image @ mixing.T for light, image in alone.items()}
             for light, image in alone.items():
                 channels.update(zip((f"{light}.{n}" for n in self._band_names()), np.moveaxis(image, -1, 0)))
         if renderer.monte_carlo:
             scatter = renderer.error(now) ** 2
             scatter = exr.spectral_channels(self.bands, scatter) if self.bands else {"Y": scatter[..., 0]}
             channels.update({f"variance.{name}": image for name, image in scatter.items() if name in channels})
-        header = exr.spectral_header(renderer.layered, UNITS) if self.bands else {}
+        header = exr.spectral_header(renderer.layered, UNITS if self.integral is None else UNITS + ".nm^-1")
+        header = header if self.bands and not self.auto else {}
         self.scene.set(now)  # the renderer leaves the LEDs at power 1
         return Rendering(channels, header, self._developed(totals, now))
 
@@ -233,7 +253,7 @@ class RenderJob:
             **(exr.spectral_header(self.stokes, UNITS) if vectors and self.bands else {}),
             "samplesPerPixel": spp,
         }
-        camera = self._developed(vectors, now) if vectors else None
+        camera = self._developed(vectors, now) if vectors and self.developer is not None else None
         return Rendering(channels, header, camera)
 
     def _passes(self, seed: int) -> tuple[dict, dict, int]:
@@ -243,6 +263,13 @@ class RenderJob:
 
         sensor = self.scene.mitsuba.sensors()[0]
         spp = self.spp or int(sensor.sampler().sample_count())
+        width, height = (int(n) for n in sensor.film().crop_size())
+        most = LANES_MOST // (width * height)
+        if spp > PASSES * most:
+            raise ValueError(
+                f"spp = {spp} of {width} x {height} pixels; allowed: up to {PASSES * most} (samples per pixel), as "
+                "Dr.Jit traces at most 2^32 rays at once; add images of several seeds"
+            )
         passes = min(PASSES, spp)
         per_pass = spp // passes
         seeds = np.random.SeedSequence(seed).generate_state(passes)
@@ -260,6 +287,8 @@ class RenderJob:
         return split[0], split[1] if passes > 1 else {}, per_pass * passes
 
     def _band_names(self) -> list[str]:
+        if self.integral is not None:
+            return list("RGB") if len(self.integral.quantum) == 3 else ["Y"]
         return list("RGB") if len(self.bands) == 3 else [exr.spectral_name(b)[3:] for b in self.bands] or ["Y"]
 
     def _radiance_channels(self, radiance: np.ndarray, now: Mapping) -> dict[str, np.ndarray]:
@@ -268,10 +297,28 @@ class RenderJob:
         if not self.bands:
             parts = radiance[..., 0, :] if radiance.ndim == 4 and radiance.shape[3] == 4 else ()
             return {"Y": s0[..., 0], **{f"S{i}.Y": parts[..., i] for i in range(4) if len(parts)}}
-        channels = exr.preview_channels(self.bands, s0 * now[self.scene.key(self.scene.camera.name, "exposure")])
+        if self.integral is not None:
+            return self._colours(radiance, now)
+        camera = self.scene.camera
+        exposure = 1.0 if camera is None else now[self.scene.key(camera.name, "exposure")]
+        channels = exr.preview_channels(self.bands, s0 * exposure)
         if "spectral" in self.layers:
             parts = radiance[..., 0] if radiance.ndim == 4 and radiance.shape[3] == 1 else radiance
             channels.update(exr.spectral_channels(self.bands, parts))
+        return channels
+
+    def _colours(self, radiance: np.ndarray, now: Mapping) -> dict[str, np.ndarray]:
+        """Preview, linear channels and XYZ of Stokes vectors (H, W, B, S), by integrals over the wavelength; spectral
+        channels of fixed bands."""
+        s0 = radiance[..., 0]
+        tristimulus = s0 @ self.integral.colour_matrix(now).T
+        full = now[self.scene.key(self.scene.camera.name, "exposure")]
+        channels = dict(zip("RGB", np.moveaxis(np.maximum(linear_srgb(tristimulus * full), 0.0), -1, 0)))
+        channels.update({f"colour.{n}": tristimulus[..., i] for i, n in enumerate("XYZ")})
+        linear = s0 @ self.developer.mixing(self.developer.view(now)).T
+        channels.update({f"camera.{n}": linear[..., i] for i, n in enumerate(self._band_names())})
+        if "spectral" in self.layers and not self.auto:
+            channels.update(exr.spectral_channels(self.bands, s0 if radiance.shape[3] == 1 else radiance))
         return channels
 
     def _hits(self) -> Hits:
@@ -391,7 +438,7 @@ def veiled(renderer: Renderer, values: Mapping) -> str:
     hits, scene = renderer.hits(values), renderer.scene
     scene.set({**values, **dict.fromkeys(scene.power_keys(*scene.lights), 1.0)})
     passing = int(mi.BSDFFlags.Null | mi.BSDFFlags.DeltaTransmission)
-    found = []
+    found, count = [], min(renderer.bands, scene.integrator.lanes)
     with dr.suspend_grad():
         for name, led in scene.leds.items():
             point = led.position()
@@ -410,9 +457,7 @@ def veiled(renderer: Renderer, values: Mapping) -> str:
                     scene.integrator.direct(scene.mitsuba, hits.si, 1.0, hits.origin, led, way)
                     for way in (seen, behind)
                 ]
-                direct, through = (
-                    np.array([float(np.array(a[i]).sum()) for i in range(renderer.bands)]) for a in light
-                )
+                direct, through = (np.array([float(np.array(a[i]).sum()) for i in range(count)]) for a in light)
                 if np.any(through > 1e-3 * direct):
                     found.append(name)
     return f"the light of {' and '.join(found)} passes layers before it meets anything" if found else ""
@@ -440,12 +485,7 @@ def scene_record(scene: Scene) -> dict:
 
 def plugins_record(registry: Registry) -> dict[str, str]:
     """Plugin file, relative to its folder, -> hash."""
-    return {
-        file.relative_to(folder).as_posix(): file_hash(file)
-        for folder in registry.folders
-        for file in sorted(folder.rglob("*.py"))
-        if not file.name.startswith("_")
-    }
+    return {registry.name_of(file): file_hash(file) for file in registry.files}
 
 
 # -- files -----------------------------------------------------------------------------------------------------------

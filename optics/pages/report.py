@@ -18,7 +18,7 @@ import numpy as np
 
 from optics import words
 from optics.errors import OutputExists
-from optics.files.output import write_text
+from optics.files.output import spare_records, write_text
 from optics.fit.compare import UNITS, Comparison, Curve
 from optics.pages.drawing import (
     CODES_PER_SIGMA,
@@ -94,6 +94,7 @@ def report(study_folder: str | Path, out: str | Path, *, overwrite: bool = False
     """
     out = Path(out)
     out = out / "report.html" if out.is_dir() or not out.suffix else out
+    spare_records(out)
     if out.exists() and not overwrite:
         raise OutputExists(f"{out} exists; name another file, or --force to replace it")
     return write_text(out, render(Record.open(study_folder)))

@@ -13,8 +13,10 @@ machine."""
 
 from __future__ import annotations
 
+import hmac
 import json
 import math
+import secrets
 import shlex
 import threading
 from collections import OrderedDict
@@ -29,13 +31,16 @@ import numpy as np
 
 from optics.captures import capture_set as capture_files
 from optics.errors import UnknownKey
+from optics.files.output import write_text
 from optics.fit import calibrate, descent
 from optics.fit.compare import led_label
 from optics.fit.model import value_of
 from optics.pages.drawing import DIVERGING, MASKED, SIGMA_RANGE, colour_bar, ramp
 from optics.scene.parameter import Values, Variable
+from optics.scene.trust import Named
 from optics.study import loop
 from optics.study.calibrated import origin_toml
+from optics.study.fit_files import END, WHOLE
 from optics.study.setup import effect_variables
 from optics.words import spaced
 
@@ -97,10 +102,16 @@ class View:
               every effect would free that the scene can express
     """
 
-    def __init__(self, folder: str | Path, step: int | None = None):
+    def __init__(
+        self,
+        folder: str | Path,
+        step: int | None = None,
+        plugins: Named = None,
+        captures: str | Path | None = None,
+    ):
         self.worker, self.kept = ThreadPoolExecutor(1, "model"), Kept()
         try:
-            self._do(lambda: self._open(folder, step))
+            self._do(lambda: self._open(folder, step, plugins, captures))
         except BaseException:
             self.close()
             raise
@@ -114,8 +125,10 @@ class View:
         begins."""
         return self.worker.submit(job).result()
 
-    def _open(self, folder: str | Path, step: int | None) -> None:
-        self.study, self.model, self.setup = loop.take_up(folder)
+    def _open(
+        self, folder: str | Path, step: int | None, plugins: Named = None, captures: str | Path | None = None
+    ) -> None:
+        self.study, self.model, self.setup = loop.take_up(folder, plugins, captures)
         count = len(self.study.steps)
         if step is not None and not 0 <= step < count:
             steps = ", ".join(f"{s['index']} ({s['name']})" for s in self.study.steps)
@@ -439,7 +452,7 @@ class View:
             unit = spaced(self.model.parameters[key].unit) if key in self.model.parameters else ""
             return f"{quoted(key)} = {quoted(value)}" + (f"  #{unit}" if unit else "")
 
-        lines += ["", "[parameters]", *(entry(k, v) for k, v in values.common.items())]
+        lines += [f"# {WHOLE}", "", "[parameters]", *(entry(k, v) for k, v in values.common.items())]
         for index, own in sorted(values.frame.items()):
             if own:
                 lines += [
@@ -447,19 +460,17 @@ class View:
                     f"[frames.{quoted(self.model.frames[index].name)}]",
                     *(entry(k, v) for k, v in own.items()),
                 ]
-        return "\n".join(lines) + "\n" + origin_toml(self.study.fit(self.step["index"]))
+        return "\n".join(lines) + "\n" + origin_toml(self.study.fit(self.step["index"])) + f"\n{END}\n"
 
     def write(self, changes: Mapping[str, float]) -> dict:
         """Write values into a new file of the study's folder; the file, its text, and the command that uses it."""
         text, number = self._do(lambda: self._toml(changes)), 1
         while True:
             file = Path(self.study.folder) / f"view-{number:02d}.toml"
-            try:
-                with open(file, "x", encoding="utf-8") as new:
-                    new.write(text)
+            if not file.exists():
+                write_text(file, text)
                 break
-            except FileExistsError:
-                number += 1
+            number += 1
         s, groups = (
             self.setup,
             [name for name, own in capture_files.groups(self.model.captures).items() if own[0] in self.held],
@@ -473,7 +484,7 @@ class View:
             *(w for k, v in s.defines.items() for w in ("-D", f"{k}={v}")),
             *(w for g in groups for w in ("--hold-out", g)),
             *(["--flat-field", s.flat_field] if s.flat_field else []),
-            *(["--plugins", s.plugins] if s.plugins else []),
+            *(w for p in s.plugins or () for w in ("--plugins", p)),
         ]
         return {"file": str(file), "text": text, "command": shlex.join(words)}
 
@@ -515,15 +526,16 @@ class Server(ThreadingHTTPServer):
                 "free"
             ) from error
         self.hosts = {f"{name}:{self.server_address[1]}" for name in (HOST, "localhost")}
+        self.token = secrets.token_urlsafe(16)  # other users of this machine reach the port, and do not know it
 
     @property
     def url(self) -> str:
-        return f"http://{HOST}:{self.server_address[1]}/"
+        return f"http://{HOST}:{self.server_address[1]}/{self.token}/"
 
 
 class Handler(BaseHTTPRequestHandler):
-    """GET / and /study; POST questions as JSON, answered by float32 or JSON. There are no other places, and no files
-    are served."""
+    """GET / and /study; POST questions as JSON, answered by float32 or JSON; all behind the server's token. There are
+    no other places, and no files are served."""
 
     protocol_version = "HTTP/1.1"
     server: Server
@@ -579,8 +591,14 @@ class Handler(BaseHTTPRequestHandler):
             # A page of another site may send its visitor's browser here under a name of its own, or post what needs no
             # leave.
             if self.headers.get("Host") not in self.server.hosts:
-                return self._error(HTTPStatus.FORBIDDEN, f"this page is at {self.server.url} and nowhere else")
-            if self.path not in routes:
+                return self._error(HTTPStatus.FORBIDDEN, f"this page is at {HOST} and nowhere else")
+            begin = f"/{self.server.token}"
+            if not hmac.compare_digest(self.path[: len(begin)].encode(), begin.encode()):
+                return self._error(
+                    HTTPStatus.FORBIDDEN, "the address lacks its token; `optics view` printed the whole of it"
+                )
+            place = self.path.removeprefix(begin)
+            if place not in routes:
                 return self._error(HTTPStatus.NOT_FOUND, f"nothing is at this place; the page is at {self.server.url}")
             if body is not None:
                 origin = self.headers.get("Origin")
@@ -594,7 +612,7 @@ class Handler(BaseHTTPRequestHandler):
                 if not isinstance(given, dict):
                     raise ValueError("the question is not a JSON object")
                 body.update(given)
-            routes[self.path]()
+            routes[place]()
         except (ConnectionError, CancelledError):  # the page is gone, or the server ends
             self.close_connection = True
         except Exception as error:  # whoever asked is told, of a plugin's mistakes as well
@@ -632,9 +650,17 @@ class Handler(BaseHTTPRequestHandler):
 
 
 def serve(
-    folder: str | Path, port: int = 0, step: int | None = None, ready: Callable[[str], None] = lambda url: None
+    folder: str | Path,
+    port: int = 0,
+    step: int | None = None,
+    ready: Callable[[str], None] = lambda url: None,
+    *,
+    plugins: Named = None,
+    captures: str | Path | None = None,
 ) -> None:
     """Serve the page of a study until Ctrl-C; `ready` is told its address.
+
+    plugins, captures   as `optics.study.loop.take_up` takes them
 
     Raises what `optics.study.loop.take_up` raises, ValueError for a study or a step that is not there, OSError for a
     port in use."""
@@ -642,7 +668,7 @@ def serve(
         raise FileNotFoundError(f"{PAGE}: the page is missing from this installation; install the package again")
     server = Server(port)
     try:
-        server.view = View(folder, step)
+        server.view = View(folder, step, plugins, captures)
         try:
             ready(server.url)
             server.serve_forever(poll_interval=0.2)

@@ -7,6 +7,8 @@ scanning folders, never imported by name, so that what ships has no privilege ov
 Where an effect enters, in the order that light takes (`STAGES`):
 
     surface     gel       dz = f(x, y, gel)           mm, added to the gel surface; numpy, (N,) arrays
+    spectrum    led       s  = f(spectrum, nm, led)   power per nm, of a function of the wavelength; arithmetic of
+                optics.polarization.mueller
     emission    led       k  = f(beam, led)           factor on the radiance that an LED sends to a point; Dr.Jit
     segment     gel       k  = f(path, gel)           factor on the light along its path in the gel; Dr.Jit
     reflection  membrane  fr = f(geometry, membrane)  added to the BRDF, 1/sr; Dr.Jit
@@ -22,6 +24,7 @@ Where an effect enters, in the order that light takes (`STAGES`):
                 (optics.polarization.layers)
     detector    camera    r  = f(row, camera)         the row (r0, r1, r2, r3) by which the detector weighs S0 ... S3,
                 (1, 0, 0, 0) before; numpy
+    sensitivity camera    q  = f(q, nm, camera)       sensitivities of the channels, (C, N); numpy
     lens        camera    I  = f(image, camera)       irradiance per band, (H, W, B); numpy
     site        camera    w  = f(weights, camera)     share of S0, S1, S2 that a pixel of a mosaic of analysers
                 records, (H, W, 3); numpy
@@ -46,6 +49,7 @@ from optics.words import key_of
 
 STAGES = {  # stage -> the role of the parts that it belongs to
     "surface": "gel",
+    "spectrum": "led",
     "emission": "led",
     "segment": "gel",
     "reflection": "membrane",
@@ -56,13 +60,16 @@ STAGES = {  # stage -> the role of the parts that it belongs to
     "absorption": "clear",
     "layer": "",
     "detector": "camera",
+    "sensitivity": "camera",
     "lens": "camera",
     "site": "camera",
     "sensor": "camera",
     "response": "camera",
 }
-IMAGE_STAGES = ("lens", "site", "sensor", "response")
-LED_BY_LED = frozenset(("emission", "segment", "volume", "reflection", "ambient"))  # Monte Carlo light passes none
+IMAGE_STAGES = ("sensitivity", "lens", "site", "sensor", "response")
+LED_BY_LED = frozenset(
+    ("spectrum", "emission", "segment", "volume", "reflection", "ambient")
+)  # Monte Carlo light passes none
 ROLES = {  # of parts: all that the library knows of them; a kind plays the role of its own name unless it says another
     "camera": "images are developed by its gains, response and what it adds; one in a scene",
     "integrator": "renders, and names the bands",

@@ -10,19 +10,24 @@ import difflib
 import fnmatch
 import re
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
-from optics.errors import BadScene, UnknownKey
+from optics.errors import BadScene, OutOfBounds, UnknownKey
 from optics.files.output import shipped
-from optics.scene import showing
+from optics.scene import showing, trust
 from optics.scene.declare import LED_BY_LED, Effect, Part
+from optics.scene.integral import FEW, Integral, refuse_unseen
 from optics.scene.mitsuba_parts import DEFAULT_VARIANT, Declared, is_part, loading, move, use_variant
 from optics.scene.parameter import Parameter, Variable, keys_with
 from optics.scene.registry import Registry, known
+from optics.scene.trust import Named
 from optics.scene.wiring import wire
+from optics.spectra.curve import Curve
 
+PIXELS_MOST = 50_000_000  # of a camera: a render keeps some hundred bytes for each
 KEEPS = "use 'interface', 'rough_interface' or 'sheet', which keep it"
 DEPOLARIZERS = {  # stock materials without a Mueller matrix, by the name that Mitsuba prints
     "ThinDielectric": KEEPS,
@@ -57,16 +62,22 @@ def load(
     name: str | Path,
     defines: Mapping[str, str] | None = None,
     variant: str = DEFAULT_VARIANT,
-    plugins: Path | None = None,
+    plugins: Named = None,
+    found: Sequence[Path] = (),
 ) -> Scene:
-    """Load a scene by its name or path; `defines` replace the XML's <default>s; `plugins` is a further folder of
-    plugins.
+    """Load a scene by its name or path; `defines` replace the XML's <default>s.
 
-    A folder `plugins` beside the user's scene is scanned as well.
+    plugins   folders of plugins, or files, beside the shipped ones; "none": no others. None: those that lie in a folder
+              `plugins` beside the user's scene, which must be trusted (optics.scene.trust)
+    found     further plugin files that may run, whatever `plugins` says
     """
-    path = find(name)
-    beside = path.parent / "plugins"
-    return Scene(path, dict(defines or {}), variant, known(plugins, beside if beside.is_dir() else None))
+    path, given = find(name), trust.named(plugins)
+    more = trust.admit(trust.beside(path.parent), f"beside the scene {path.name}") if given is None else given
+    code = trust.compiled(path, dict(defines or {}))
+    if given is not None:
+        code = [file for file in code if not any(file.resolve().is_relative_to(p.resolve()) for p in given)]
+    trust.admit_files(code, "that Mitsuba would load")
+    return Scene(path, dict(defines or {}), variant, known(*trust.once(more, found)))
 
 
 class Scene:
@@ -116,15 +127,52 @@ class Scene:
         self.sources = {n: p for n, p in lights.items() if n not in self.leds}
         self.lights = {**self.leds, **self.sources}
         self.membranes = {n: p for n, p in self.parts.items() if hasattr(p, "ambient_radiance")}
+        for sensor in self.mitsuba.sensors():
+            width, height = (int(n) for n in sensor.film().size())
+            if width * height > PIXELS_MOST:
+                raise BadScene(
+                    f"{self.path}: a camera of {width} x {height} pixels; allowed: up to {PIXELS_MOST:,}; make width "
+                    "and height smaller"
+                )
         self.monte_carlo = any(p.role == "clear" for p in self.parts.values())
         self.parameters: dict[str, Parameter] = {}
         for name, part in self.parts.items():
             for p in self.registry.parameters_of(part.kind):
                 self.parameters[f"{name}.{p.name}"] = p
         self.powers, self.band_powers = self._light_powers()
+        with self._named():
+            refuse_unseen(self)
         self._stock = self._stock_parameters()
         self.parameters.update({k: p for k, (p, _) in self._stock.items() if k not in self.parameters})
         self._warn_of_depolarizers()
+        self.integral: Integral | None = None
+        if getattr(self.integrator, "integrates", False):
+            self._integrate()
+
+    def _integrate(self) -> None:
+        """Have channels be integrals over the wavelength (optics.scene.integral)."""
+        if self.camera is None or not self.lights:
+            raise BadScene(
+                f"{self.path}: bands of integrals need a part of the type 'camera' and a light of this program"
+            )
+        if self.monte_carlo:
+            raise BadScene(
+                f"{self.path}: light through dielectric bodies is followed in up to {FEW} bands; allowed: bands such "
+                "as 620, 540, 460"
+            )
+        self.integral = Integral(self, self.integrator.bands, self.integrator.nodes or 0)
+        self.integrator.bands = tuple(float(nm) for nm in self.integral.nm)
+        for part in self.parts.values():
+            part.integral = self.integral
+        if self.integral.auto:  # what a spectrum depends on acts in the matrix from bands to channels alone
+            for group in self.integral.groups:
+                for key in group.keys:
+                    self.parameters[key] = replace(self.parameters[key], how="image")
+
+    @property
+    def curves(self) -> dict[str, Curve]:
+        """The spectra that parts were given, by `part.attribute`."""
+        return {f"{n}.{name}": curve for n, part in self.parts.items() for name, curve in part.curves.items()}
 
     @contextmanager
     def _named(self):
@@ -259,6 +307,20 @@ class Scene:
             if move([self.parts[n] for n in moved]):
                 self.mitsuba.parameters_changed([])
 
+    def check_press(self, values: Mapping[str, float | str], where: str) -> None:
+        """Raises OutOfBounds for a press that is deeper than its gel is thick, of values that someone states.
+
+        values   by key, above those of the scene"""
+        if self.gel is None:
+            return
+        depth, thickness = (self.key(self.gel.name, role) for role in ("press depth", "thickness"))
+        if depth is None or thickness is None or depth not in values:
+            return
+        stated = self.parameters[depth].check(values[depth], depth, where)
+        thick = float({**self.values(), **values}[thickness])
+        if not isinstance(stated, str) and stated > thick:
+            raise OutOfBounds(depth, stated, "mm", (0.0, thick), f"{where}: the gel is {thick:g} mm thick")
+
     def moves(self, key: str) -> bool:
         """Whether a parameter moves geometry, or camera rays: then the places that they meet are found anew."""
         name, _, parameter = key.rpartition(".")
@@ -322,6 +384,8 @@ def _reason(error: Exception, path: Path, registry: Registry) -> str:
             if near
             else f" Own types are {', '.join(sorted(parts))}; others are Mitsuba's."
         )
+        if (beside := trust.beside(path.parent)) and not set(trust.plugin_files(beside[0])) & set(registry.files):
+            text += f" The plugins beside the scene are not used; add --plugins {beside[0]}"
     unused = re.search(r'unreferenced propert.* plugin of type "([^"]+)": - \w+ "([^"]+)"', text)
     if unused is not None and unused[1] in parts:
         near = difflib.get_close_matches(unused[2], [p.name for p in registry.parameters_of(unused[1])], n=1)

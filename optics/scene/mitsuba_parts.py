@@ -3,23 +3,27 @@ parameters."""
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import math
 import sys
 import weakref
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextvars import ContextVar
 from functools import wraps
 from pathlib import Path
 
 from optics.errors import BadPlugin, BadScene, UnknownKey
 from optics.scene.declare import IMAGE_STAGES, Part
+from optics.scene.line import EDGES
 from optics.scene.parameter import Parameter
 from optics.scene.regions import found_file
 from optics.scene.registry import Registry, default, include
+from optics.spectra.curve import Curve
 
 DEFAULT_VARIANT = "llvm_ad_spectral_polarized"
 _loading: ContextVar[Registry | None] = ContextVar("registry", default=None)  # of the scene that is being loaded
+_coarseness: ContextVar[int] = ContextVar("coarseness", default=1)  # of the meshes that are being made
 _registered: dict[str, dict[str, str]] = {}  # variant -> kind -> category that Mitsuba knows it in
 _watching = False  # whether Mitsuba tells us when its variant changes
 _made = itertools.count()  # numbers the parts in the order in which they were made
@@ -123,6 +127,22 @@ class loading:
         _loading.reset(self.token)
 
 
+@contextlib.contextmanager
+def coarser(times: int) -> Iterator[None]:
+    """Context in which scenes are loaded for an image of so many times fewer pixels each way: parts may make their
+    meshes as much coarser (`coarseness`)."""
+    token = _coarseness.set(times)
+    try:
+        yield
+    finally:
+        _coarseness.reset(token)
+
+
+def coarseness() -> int:
+    """How many times coarser a mesh may be than the scene says."""
+    return _coarseness.get()
+
+
 def _built(registry: Registry, part: Part) -> type:
     """The Mitsuba class of a part, which parameters must not hide anything of."""
     cls = part.build()
@@ -207,6 +227,9 @@ class Declared:
     role: str
     band: float | None = None  # nm: what a mono variant renders, where the scene's integrator names one band
     unrendered: Mapping[str, str] = {}  # parameters without a derivative through mi.render, and why
+    curves: Mapping[str, Curve] = {}  # spectra that it was given, by the name of the attribute in XML
+    integral = None  # of scenes whose channels are integrals: optics.scene.integral.Integral
+    lane = None  # of lights and pigments whose spectrum is in the integral's matrix: 1 in the lanes that are theirs
     region_size = 0.0  # mm across a map of regions; 0: as wide as the camera sees
     _wired = False
     _waits = ""  # of a material: why it cannot be asked before its scene is wired
@@ -265,6 +288,7 @@ class Declared:
         self.held: dict[str, float] = {}  # the numbers as Python floats, to ask without waiting for the device
         self._order = next(_made)
         self._folders = tuple(str(folder) for folder in mi.file_resolver())
+        self.curves = {}
         if any(p.role == "regions" for p in self.registry.parameters_of(self.kind)):
             self.read_map_size(props)
         for p in self.registry.parameters_of(self.kind):
@@ -279,6 +303,32 @@ class Declared:
     def find_file(self, name: str) -> Path:
         """A file that the scene names, beside the scene's file or where Mitsuba looks for files."""
         return found_file(self._folders, name)
+
+    def read_spectrum(self, props, name: str, kind: str) -> Curve | None:
+        """The curve that an attribute names (optics.spectra.reading), kept in `curves`; None without it."""
+        from optics.spectra.reading import read_curve
+
+        text = str(props.get(name, "")).strip()
+        if text:
+            self.curves[name] = read_curve(text, kind, self._folders, f"{self.name}.{name}")
+        return self.curves.get(name)
+
+    def read_sensitivities(self, text: str, name: str) -> tuple[Curve, ...]:
+        """The curves of a camera's channels that an attribute names."""
+        from optics.spectra.reading import read_channels
+
+        return read_channels(text, self._folders, f"{self.name}.{name}")
+
+    def by_colour(self, first, second, third, wavelengths):
+        """A spectrum of three values: of the first three bands; where channels are integrals, of the wavelengths from
+        580 nm on, from 500 nm on, and below. A fourth band has 1."""
+        import drjit as dr
+        import mitsuba as mi
+
+        if self.integral is None:
+            return mi.UnpolarizedSpectrum(*(first, second, third, mi.Float(1.0))[: dr.size_v(mi.UnpolarizedSpectrum)])
+        nm = mi.UnpolarizedSpectrum(wavelengths)
+        return dr.select(nm >= EDGES[0], first, dr.select(nm >= EDGES[1], second, third))
 
     # -- neighbours ---------------------------------------------------------------------------------------------------
     def wire(self, scene) -> None:
@@ -400,6 +450,15 @@ class Declared:
     def takes(self, name: str) -> bool:
         """Whether a parameter does anything where the part stands in its scene."""
         return True
+
+    def active(self, stage: str, own) -> tuple[Callable, ...]:
+        """The functions of effects at a stage that do not rest at neutral at the parameters `own`, complex ones among
+        them."""
+        return tuple(
+            e.stages[stage]
+            for e in self.registry.at_stage(self.kind, stage)
+            if any(getattr(own, n) != self.numbers[n].neutral for n in e.at_rest)
+        )
 
     def functions(self, stage: str) -> tuple[Callable, ...]:
         """The functions of effects at a stage, but for those that rest at neutral and carry no derivative.

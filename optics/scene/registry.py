@@ -16,14 +16,17 @@ import re
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, wraps
 from pathlib import Path
 from types import MappingProxyType, ModuleType
 
-from optics.errors import BadPlugin, UnknownKey
+import numpy as np
+
+from optics.errors import BadCapture, BadPlugin, BadScene, OutOfBounds, UnknownKey
 from optics.files.output import shipped
-from optics.scene.declare import CATEGORIES, STAGES, Effect, Part
+from optics.scene.declare import CATEGORIES, IMAGE_STAGES, STAGES, Effect, Part
 from optics.scene.parameter import Parameter
+from optics.scene.trust import plugin_files
 from optics.words import key_of
 
 EARLIER = {  # names that modules once had, which plugin files may still import
@@ -46,6 +49,7 @@ class Registry:
     parts: Mapping[str, Part]
     effects: Mapping[str, Effect]
     folders: tuple[Path, ...] = ()
+    files: tuple[Path, ...] = ()  # that were executed
     classes: dict = field(default_factory=dict, repr=False)  # variant -> kind -> class, built when first needed
 
     @classmethod
@@ -53,28 +57,40 @@ class Registry:
         """The registry of the plugin files in these folders and their subfolders; raises BadPlugin and leaves nothing
         behind.
 
-        Names that start with _ or . are passed over. The same folders with the same contents give the same registry.
+        A path may also be that of one plugin file. Names that start with _ or . are passed over. The same folders with
+        the same contents give the same registry.
         """
         folders = tuple(dict.fromkeys(Path(folder).resolve() for folder in folders))
-        files = tuple((file, _content(file)) for folder in folders for file in _files(folder))
+        found = dict.fromkeys(file for folder in folders for file in plugin_files(folder))
+        files = tuple((file, _content(file.read_bytes())) for file in found)
         known = _registries.get(folders)
         if known is not None and known[0] == files:
             return known[1]
         items = [(file, item) for file, content in files for item in declared(file, content)]
-        made = cls.holding(items, folders)
+        made = cls.holding(items, folders, tuple(file for file, _ in files))
         _registries[folders] = files, made
         return made
 
     @classmethod
-    def holding(cls, items: Iterable[tuple[Path | str, Part | Effect]], folders: Sequence[Path] = ()) -> Registry:
+    def holding(
+        cls,
+        items: Iterable[tuple[Path | str, Part | Effect]],
+        folders: Sequence[Path] = (),
+        files: Sequence[Path] = (),
+    ) -> Registry:
         """The registry of declarations, each with the file that messages name."""
         parts: dict[str, Part] = {}
         effects: dict[str, Effect] = {}
         for file, item in items:
             _add(parts, effects, item, str(file))
-        made = cls(MappingProxyType(parts), MappingProxyType(effects), tuple(folders))
+        made = cls(MappingProxyType(parts), MappingProxyType(effects), tuple(folders), tuple(files))
         made.check()
         return made
+
+    def name_of(self, file: Path) -> str:
+        """A plugin file's path relative to the folder that it was found in; of a file that was named, its name."""
+        home = next((folder for folder in self.folders if folder in file.parents), file.parent)
+        return file.relative_to(home).as_posix()
 
     def kinds(self, part: str) -> tuple[str, ...]:
         """The kinds that a name stands for: the part of that kind, and all that play that role."""
@@ -230,20 +246,65 @@ def default() -> Registry:
     return _default
 
 
+# -- what a plugin does wrong when it runs ----------------------------------------------------------------------------
+OURS = (BadPlugin, BadScene, BadCapture, UnknownKey, OutOfBounds)  # errors that say by themselves what is wrong
+
+
+def _guarded(item: Part | Effect) -> Part | Effect:
+    """The declaration with functions that name their file where they fail, or give something of another shape."""
+    if isinstance(item, Part) or not isinstance(item.stages, Mapping):
+        return item
+    stages = {stage: _named(f, stage, item) if callable(f) else f for stage, f in item.stages.items()}
+    return replace(item, stages=stages)
+
+
+def _named(function: Callable, stage: str, effect: Effect) -> Callable:
+    where = f"{effect.file}: the effect '{effect.name}', stage '{stage}'"
+    own = not Path(effect.file).is_relative_to(shipped("plugins").resolve())  # what ships is held to it by tests
+
+    @wraps(function)
+    def act(given, *more):
+        try:
+            found = function(given, *more)
+        except OURS:
+            raise
+        except Exception as error:
+            if _interrupted(error):
+                raise
+            raise BadPlugin(f"{where}: {type(error).__name__}: {error}") from error
+        if stage in IMAGE_STAGES:
+            _check_image(found, given, where, own)
+        return found
+
+    return act
+
+
+def _interrupted(error: BaseException | None) -> bool:
+    """Whether Ctrl-C is behind an error: within a render, Dr.Jit wraps it in one of its own."""
+    while error is not None:
+        if isinstance(error, KeyboardInterrupt):
+            return True
+        error = error.__cause__ or error.__context__
+    return False
+
+
+def _check_image(found: object, given: object, where: str, finite: bool) -> None:
+    """An image stage gives numbers of the image's shape; of one pixel in many settings, one for each setting."""
+    shape, before = np.shape(found), np.shape(given)  # type: ignore[arg-type]
+    kind = np.asarray(found).dtype.kind
+    same = len(shape) == len(before) and all(a in (b, 1) for a, b in zip(before, shape))
+    if kind not in "fciu" or not same or shape[-1:] != before[-1:]:
+        raise BadPlugin(
+            f"{where}: gives {'an array of shape ' + str(shape) if kind in 'fciu' else type(found).__name__}; allowed: "
+            f"numbers of the shape {before}, as it was given"
+        )
+    if finite and not np.isfinite(found).all() and np.isfinite(given).all():  # type: ignore[call-overload, arg-type]
+        raise BadPlugin(f"{where}: gives NaN or infinity for an image of finite numbers; allowed: finite numbers")
+
+
 # -- one file --------------------------------------------------------------------------------------------------------
-def _files(folder: Path) -> list[Path]:
-    """The plugin files of a folder and its subfolders, in order."""
-    if not folder.is_dir():
-        raise BadPlugin(f"{folder}: no such folder of plugins")
-    return [
-        file
-        for file in sorted(folder.rglob("*.py"))
-        if not any(piece.startswith(("_", ".")) for piece in file.relative_to(folder).parts)
-    ]
-
-
-def _content(file: Path) -> str:
-    return hashlib.sha256(file.read_bytes()).hexdigest()
+def _content(source: bytes) -> str:
+    return hashlib.sha256(source).hexdigest()
 
 
 _declared: dict[Path, tuple[str, tuple[Part | Effect, ...]]] = {}  # file -> its hash, and what it declares
@@ -254,7 +315,11 @@ def declared(file: Path, content: str | None = None) -> tuple[Part | Effect, ...
 
     A file is executed again when its content (a hash) has changed."""
     file = Path(file).resolve()
-    content = content or _content(file)
+    source = file.read_bytes()
+    if content is None:
+        content = _content(source)
+    elif content != _content(source):
+        raise BadPlugin(f"{file}: changed while it was read; try again")
     if file in _declared and _declared[file][0] == content:
         return _declared[file][1]
     for name, now in EARLIER.items():
@@ -266,8 +331,8 @@ def declared(file: Path, content: str | None = None) -> tuple[Part | Effect, ...
     sys.modules[name] = module
     try:
         # compiled here: the interpreter's own cache tells versions of a file apart by whole seconds and its size
-        exec(compile(file.read_text(encoding="utf-8"), str(file), "exec", dont_inherit=True), vars(module))
-    except Exception as error:
+        exec(compile(source, str(file), "exec", dont_inherit=True), vars(module))
+    except (Exception, SystemExit) as error:
         if before is None:
             del sys.modules[name]
         else:
@@ -276,6 +341,6 @@ def declared(file: Path, content: str | None = None) -> tuple[Part | Effect, ...
     found = [v for k, v in vars(module).items() if isinstance(v, (Part, Effect)) and not k.startswith("_")]
     if not found:
         raise BadPlugin(f"{file}: declares neither a part nor an effect; files that only help begin with '_'")
-    items = tuple(replace(item, doc=module.__doc__ or "", file=str(file)) for item in found)
+    items = tuple(_guarded(replace(item, doc=module.__doc__ or "", file=str(file))) for item in found)
     _declared[file] = content, items
     return items

@@ -8,6 +8,9 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from optics.scene.mitsuba_parts import Declared
+from optics.spectra.curve import VISIBLE
+
+MIDDLE = 540.0  # nm: where `index` and `absorption` of a clear material hold
 
 
 def matt() -> type:
@@ -26,10 +29,9 @@ def matt() -> type:
             self.m_components = [mi.BSDFFlags.DiffuseReflection | mi.BSDFFlags.FrontSide]
             self.m_flags = self.m_components[0]
 
-        def rho(self):
+        def rho(self, si):
             """Reflectance in each band: rho_r, rho_g, rho_b, 1."""
-            rho = (self.rho_r, self.rho_g, self.rho_b, mi.Float(1.0))
-            return mi.UnpolarizedSpectrum(*rho[: dr.size_v(mi.UnpolarizedSpectrum)])
+            return self.by_colour(self.rho_r, self.rho_g, self.rho_b, si.wavelengths)
 
         def sample(self, ctx, si, sample1, sample2, active=True):
             bs = dr.zeros(mi.BSDFSample3f)
@@ -56,6 +58,25 @@ def matt() -> type:
             return f"{type(self).__name__}[{self.name}]"
 
     return Matt
+
+
+def texture_of(curve, band: float | None = None):
+    """A curve over the wavelength as a texture of Mitsuba's; in a mono variant its value at a band, or in the middle of
+    the visible."""
+    import mitsuba as mi
+
+    if not mi.is_spectral:
+        return mi.load_dict({"type": "uniform", "value": float(curve(band or MIDDLE))})
+    low, high = VISIBLE
+    inside = (curve.nm > low) & (curve.nm < high)
+    nm = [low, *curve.nm[inside], high]
+    return mi.load_dict(
+        {
+            "type": "irregular",
+            "wavelengths": ", ".join(f"{w:.6g}" for w in nm),
+            "values": ", ".join(f"{v:.8g}" for v in curve(nm)),
+        }
+    )
 
 
 def unpolarized(value):
@@ -109,6 +130,10 @@ def coefficient(clear, stage: str, wavelengths, functions: Sequence[Callable]):
     """`index` or `absorption` (1/mm) of a clear material per band, with what the functions of effects of that stage
     make of it; for numpy, complex numbers among them, and for Dr.Jit."""
     value = getattr(clear, stage) + 0 * wavelengths
+    curve = getattr(clear, "curves", {}).get(f"{stage}_spectrum")
+    if curve is not None:
+        own, middle = curve(wavelengths), float(curve(MIDDLE))
+        value = value + (own - middle) if stage == "index" else value * (own / middle)
     for function in functions:
         value = function(value, wavelengths, clear)
     return value

@@ -45,10 +45,11 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 from optics.captures.noise import Noise
 from optics.errors import OutOfBounds, OutputExists, UnknownKey
 from optics.files import toml_checks as checks
-from optics.files.output import check_folder, file_hash, replacing, write_text
+from optics.files.output import alone, check_folder, file_hash, replacing, write_text
 from optics.light.rendering import LAYERS, RenderJob
 from optics.scene import loader as scenes
 from optics.scene.mitsuba_parts import DEFAULT_VARIANT
+from optics.scene.trust import Named
 from optics.study.calibrated import Calibrated, calibrated
 
 Progress = Callable[[str, int, int], None]
@@ -56,6 +57,9 @@ Progress = Callable[[str, int, int], None]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Value = Finite | str
 Pair = Annotated[list[Finite], Field(min_length=2, max_length=2)]
+
+
+SAMPLES_MOST = 10_000_000  # of one job, whose manifest is one file
 
 
 class BadJob(ValueError):
@@ -165,6 +169,8 @@ class Job(Strict):
             raise ValueError("count is missing; allowed: a whole number from 1 on, or a grid in [sample]")
         if "dn" in self.outputs and self.noise is None and self.fit is None:
             raise ValueError('outputs names "dn", but [noise] is missing; give ' + ", ".join(Camera.model_fields))
+        if self.total > SAMPLES_MOST:
+            raise ValueError(f"{self.total:.3g} samples; allowed: up to {SAMPLES_MOST:,} in one job; split it")
         twice = sorted(set(self.parameters) & set(self.sample))
         if twice:
             raise ValueError(f"{twice[0]} stands in [parameters] and in [sample]; allowed: one of them")
@@ -258,7 +264,7 @@ def _explained(error: ValidationError, file: Path) -> Exception:
     )
 
 
-def _sensor(job: Job, file: Path, plugins: Path | None) -> Calibrated:
+def _sensor(job: Job, file: Path, plugins: Named) -> Calibrated:
     """The scene of a job, and the values of its fit."""
     given = None
     if job.scene is not None:
@@ -274,7 +280,7 @@ def _sensor(job: Job, file: Path, plugins: Path | None) -> Calibrated:
 class Maker:
     """Makes the files of one sample after the other."""
 
-    def __init__(self, job: Job, file: Path, plugins: Path | None):
+    def __init__(self, job: Job, file: Path, plugins: Named):
         self.job, self.file = job, Path(file)
         sensor = _sensor(job, self.file, plugins)
         sensor.noise = job.camera_noise() or sensor.noise
@@ -298,6 +304,8 @@ class Maker:
                 "exr, png"
             )
         scene.check(job.parameters, f"{self.file}: [parameters]")
+        if job.parameters:
+            scene.check_press(self.values, f"{self.file}: [parameters]")
         for key, d in job.sample.items():
             where = f"{self.file}: [sample]"
             if key not in scene.parameters:
@@ -309,6 +317,7 @@ class Maker:
                 )
             for value in d.extremes:
                 parameter.check(value, key, where)
+                scene.check_press({**self.values, key: value}, where)
             if d.normal is not None:
                 self._check_normal(key, d)
 
@@ -423,18 +432,9 @@ def _changes(before, now, name: str = "") -> list[str]:
 @contextmanager
 def _alone(folder: Path, shard: tuple[int, int]) -> Iterator[None]:
     """Lock a shard against a second process; the system frees the lock however the process ends."""
-    try:
-        import fcntl
-    except ImportError:  # Windows: two processes would do the same work twice, with the same result
-        yield
-        return
-    with open(folder / f".lock-{shard[0]}-of-{shard[1]}", "w") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            raise OutputExists(
-                f"{folder}: another process works on shard {shard[0]}/{shard[1]}; wait for it, or take another shard"
-            ) from error
+    lock = folder / f".lock-{shard[0]}-of-{shard[1]}"
+    said = f"{folder}: another process works on shard {shard[0]}/{shard[1]}; wait for it, or take another shard"
+    with alone(lock, said):
         yield
 
 
@@ -519,7 +519,7 @@ def run(
     file: str | Path,
     shard: tuple[int, int] = (1, 1),
     workers: int | None = None,
-    plugins: Path | None = None,
+    plugins: Named = None,
     progress: Progress | None = None,
     *,
     fit: str | Path | None = None,
@@ -616,7 +616,7 @@ def _cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _crew(job: Job, file: Path, plugins: Path | None, todo: Sequence[int], workers: int) -> Iterator[dict]:
+def _crew(job: Job, file: Path, plugins: Named, todo: Sequence[int], workers: int) -> Iterator[dict]:
     """Records from worker processes, in the order in which they finish.
 
     Each holds one end of a pipe and nothing else of this process, so that it ends when this one is killed.
@@ -662,7 +662,7 @@ def _crew(job: Job, file: Path, plugins: Path | None, todo: Sequence[int], worke
             process.join(10)
 
 
-def _work(connection, job: Job, file: Path, plugins: Path | None) -> None:
+def _work(connection, job: Job, file: Path, plugins: Named) -> None:
     """The loop of a worker: it receives an index, and sends a record or the text of an error."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent decides
     try:

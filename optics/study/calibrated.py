@@ -4,6 +4,7 @@ fit.toml carries all that it takes. Besides the values it has
 
     [fit]     captures, held_out, parameters, held_out_parameters     what the misfit was counted with
     [sensor]  scene, scene_hash, plugins, flat_field, defines, noise  what the values belong to
+              plugin_files                                            plugins that do not ship: name -> hash
               settings, frames.NAME                                   what the captures set, in all frames and in each
               drive                                                   the level that frames drove each light with; the
                                                                       calibrated power multiplies it
@@ -15,6 +16,7 @@ fit.toml carries all that it takes. Besides the values it has
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, asdict, dataclass, field, fields
 from pathlib import Path
@@ -26,13 +28,16 @@ from optics.captures import capture_set as capture_files
 from optics.captures import identity
 from optics.captures.noise import Noise
 from optics.errors import BadScene, UnknownKey
-from optics.files.output import file_hash, shipped
+from optics.files.output import file_hash
 from optics.fit.compare import Comparison
 from optics.fit.scene_model import SceneModel
 from optics.scene import loader as scenes
+from optics.scene import trust
 from optics.scene.loader import Scene
 from optics.scene.mitsuba_parts import DEFAULT_VARIANT
 from optics.scene.parameter import Values
+from optics.scene.trust import Named
+from optics.study import places
 from optics.study.fit_files import fit_file, read_fit
 from optics.study.stages import comparison_of
 
@@ -48,9 +53,12 @@ def origin_of(
     captures, noise = model.captures, model.noise
     held_groups = [name for name, own in capture_files.groups(captures).items() if own[0] in set(held)]
     scene: dict[str, Any] = {"scene": str(captures.scene), "scene_hash": file_hash(model.scene.path)}
-    further = _further_plugins(model.scene)
-    if further is not None:
-        scene["plugins"] = str(further)
+    own = places.own_files(model.scene.registry)
+    if own:
+        scene["plugins"] = list(dict.fromkeys(str(file.parent) for file in own))
+        scene["plugin_files"] = {
+            n.removeprefix(places.OWN): h for n, h in places.own_plugins(model.scene.registry).items()
+        }
     flat = any(model.flat_of(index) is not None for index in range(len(model.frames)))
     scene["flat_field"] = str(model.flat_field) if flat else "none"
     scene["defines"] = {name: str(value) for name, value in model.scene.defines.items()}
@@ -85,12 +93,6 @@ def origin_toml(data: Mapping[str, Mapping]) -> str:
     counted = {key: data["fit"][key] for key in COUNTED if key in data["fit"]}
     tables = {"fit": counted, "sensor": dict(data["sensor"])}
     return "".join("\n" + tomlkit.dumps({name: table}) for name, table in tables.items() if table)
-
-
-def _further_plugins(scene: Scene) -> Path | None:
-    """The folder of plugins that a scene was loaded with, besides the shipped ones and those beside its file."""
-    known = {Path(shipped("plugins")).resolve(), (scene.path.parent / "plugins").resolve()}
-    return next((folder for folder in reversed(scene.registry.folders) if folder.resolve() not in known), None)
 
 
 def _drives(model: SceneModel) -> dict[str, float]:
@@ -140,7 +142,7 @@ def calibrated(
     scene: str | Path | None = None,
     defines: Mapping[str, str] | None = None,
     variant: str = DEFAULT_VARIANT,
-    plugins: str | Path | None = None,
+    plugins: Named = None,
     driven: bool = True,
 ) -> Calibrated:
     """The sensor that a fit describes.
@@ -163,7 +165,7 @@ def calibrated(
         path,
         {**sensor.get("defines", {}), **(defines or {})},
         variant,
-        plugins_of_fit(file, sensor) if plugins is None else Path(plugins),
+        plugins_of_fit(file, sensor, path) if plugins is None else plugins,
     )
     values = _values(file, data, frame, driven)
     noise = noise_of(file, sensor["noise"]) if sensor.get("noise") else None
@@ -177,9 +179,9 @@ def scene_of(file: Path, sensor: Mapping, given: str | Path | None = None) -> tu
     named = str(sensor.get("scene", ""))
     if given is None and not named:
         raise BadScene(f"{file}: it does not name its scene ([sensor] scene); give it: SCENE --fit {file}")
-    if given is None and not _exists(named):
+    path = scenes.find(given) if given is not None else _scene_now(file, named, sensor.get("scene_hash"))
+    if path is None:
         raise BadScene(f"{file}: its scene {named} is gone; give the file where it is now: SCENE.xml --fit {file}")
-    path = scenes.find(named if given is None else given)
     if not named:
         return path, []
     same_content = file_hash(path) == sensor.get("scene_hash")
@@ -189,6 +191,19 @@ def scene_of(file: Path, sensor: Mapping, given: str | Path | None = None) -> tu
             f"{given}"
         )
     return path, [] if same_content else [f"{path} has changed since it was calibrated"]
+
+
+def _scene_now(file: Path, named: str, digest: str | None) -> Path | None:
+    """A fit's scene: the file of its name, or, where that is gone, one of the same content and name near the study."""
+    if _exists(named):
+        return scenes.find(named)
+    study = places.study_of(file)
+    near = [study, study.parent, *study.parent.glob("*/"), *study.glob("*/")]
+    if (study / "ladder.json").is_file():
+        ladder = json.loads((study / "ladder.json").read_text(encoding="utf-8"))
+        near.insert(0, study / ladder.get("near", {}).get("captures", "."))
+    files = [folder / Path(named).name for folder in near]
+    return next((scenes.find(f) for f in files if f.is_file() and file_hash(f) == digest), None)
 
 
 def noise_of(file: Path, given: Mapping[str, float]) -> Noise:
@@ -205,16 +220,38 @@ def _exists(name: str) -> bool:
     return Path(name).is_file() if name.endswith(".xml") else name in scenes.shipped_scenes()
 
 
-def plugins_of_fit(file: Path, sensor: Mapping) -> Path | None:
-    """The folder of plugins of a fit. Raises FileNotFoundError where it is gone."""
-    folder = sensor.get("plugins")
-    if folder is None:
+def plugins_of_fit(file: Path, sensor: Mapping, scene: Path | None = None) -> list[Path] | None:
+    """The plugin files of a fit, by their content, where they were or near the study; None where it has none of its
+    own, so that what lies beside the scene is looked at. Raises FileNotFoundError where one is gone, Untrusted."""
+    folders = sensor.get("plugins")
+    if folders is None:
         return None
-    if not Path(folder).is_dir():
-        raise FileNotFoundError(
-            f"{file}: its plugins were in {folder}, which is gone; give the folder by --plugins DIR"
-        )
-    return Path(folder)
+    folders = [folders] if isinstance(folders, str) else list(folders)
+    study, wanted = places.study_of(file), sensor.get("plugin_files")
+    near = [place for folder in folders for place in places.candidates(study, folder)]
+    near += [f for place in (study, *([scene.parent] if scene is not None else [])) for f in trust.beside(place)]
+    found = {file_hash(f): f for place in near if place.exists() for f in trust.plugin_files(place)}
+    if wanted is None:  # as earlier versions wrote it: all that the folder holds
+        if not Path(folders[0]).exists():
+            raise FileNotFoundError(_gone(file, folders[0]))
+        chosen = trust.plugin_files(folders[0])
+    else:
+        lost = next((name for name, digest in wanted.items() if digest not in found), None)
+        if lost is not None:
+            there = next((f for f in folders if Path(f).exists()), None)
+            raise FileNotFoundError(
+                _gone(file, folders[0])
+                if there is None
+                else f"{file}: its plugin {lost} is gone, or has another content than when the fit was made; give the "
+                "folder that holds it by --plugins DIR"
+            )
+        chosen = [found[digest] for digest in wanted.values()]
+    trust.admit_files(chosen, f"that {file} names")
+    return chosen
+
+
+def _gone(file: Path, folder: str) -> str:
+    return f"{file}: its plugins were in {folder}, which is gone; give the folder by --plugins DIR"
 
 
 def _values(file: Path, data: Mapping[str, Mapping], frame: str | None, driven: bool) -> dict[str, Any]:

@@ -36,11 +36,13 @@ from optics.files.output import new_folder, shipped
 from optics.fit.scene_model import SceneModel
 from optics.scene.loader import Scene
 from optics.scene.parameter import Parameter, Values, beside, keys_with
+from optics.scene.trust import Named
 from optics.study.setup import Setup, effect_variables, variables_of_base
 from optics.words import spaced, table
 
 SHARE = 0.1  # of the plausible strength
 FEWEST = 2  # frames: with one, nothing can be held out and nothing be compared
+FRAMES_MOST = 1000  # of a planned session
 GROUPS = 4  # below, a calibration holds nothing out by itself
 FULL = 0.8  # of full scale: where an exposure puts the brightest half per cent of an image
 LONG_SIDE = 64  # px of the images that are rendered for a plan, where -D does not say otherwise
@@ -324,6 +326,8 @@ def _imagined(scene: Scene, pool: Sequence[Choice], noise: Noise) -> SceneModel:
     swept = width * height == 1
     bands = scene.integrator.bands if scene.integrator is not None else ()
     channels = 1 if len(bands or (0,)) == 1 else 3
+    if scene.integral is not None:
+        channels = len(scene.integral.quantum)
     blank = np.zeros((height, width, channels), np.float32)
     first = Frame("first", blank, parameters=dict(pool[0].readings[0]), file="design")
     table = Table("readings.csv", ["reading"]) if swept else None
@@ -433,7 +437,7 @@ def session(
     frames: int,
     effects: Sequence[str] = (),
     defines: dict | None = None,
-    plugins: Path | None = None,
+    plugins: Named = None,
     noise: dict | None = None,
     share: float = SHARE,
     fixed_exposure: bool = False,
@@ -450,8 +454,8 @@ def session(
     _require(frames, share)  # before anything is loaded
     path = Path(subject)
     if (path / "ladder.json").is_file():
-        study, model, setup = loop.take_up(path)
-        scene = scenes.load(model.scene.path, {**model.scene.defines, **(defines or {})}, plugins=plugins)
+        study, model, setup = loop.take_up(path, plugins)
+        scene = scenes.load(model.scene.path, {**model.scene.defines, **(defines or {})}, plugins=setup.plugins)
         scene.set(model.captures.parameters)  # what was set in all frames stays so
         chosen = [scene.registry.find_effect(name) for name in effects] or loop.candidates(model, study)
         return plan(
@@ -493,6 +497,8 @@ def _require(frames: int, share: float) -> None:
             f"design: {frames} frames; allowed: {FEWEST} or more, as with one nothing can be held out and nothing "
             "compared"
         )
+    if frames > FRAMES_MOST:
+        raise ValueError(f"design: {frames} frames; allowed: {FEWEST} to {FRAMES_MOST}; a session of more repeats them")
     if not 0 < share < math.inf:
         raise ValueError(f"design: strength of {share:g} plausible sizes; allowed: > 0, finite")
 

@@ -31,12 +31,16 @@ import numpy as np
 from optics.diagnosis.fingerprints import SIDE, family_of
 from optics.diagnosis.result import Diagnosis, Fingerprint
 from optics.errors import OutputExists, UnknownKey
+from optics.files.output import write_text
 from optics.scene import loader as scenes
+from optics.scene import trust
 from optics.scene.declare import STAGES
 from optics.scene.mitsuba_parts import is_taken
 from optics.scene.registry import Registry, known
+from optics.scene.trust import Named
+from optics.study import places
 from optics.study.record import Record
-from optics.study.setup import plugins_of, recorded
+from optics.study.setup import recorded
 
 BENT = 0.5  # the largest relative change that a strength of 1 is called plausible for
 CELLS = ("place", "channel")  # coordinates of cells, each with a value of its own: none lies between two of them
@@ -51,6 +55,7 @@ VIEW = (
     "width",
     "height",
     "bands",
+    "white",
     "settings",
 )  # what functions see as `camera` beside its parameters
 
@@ -236,12 +241,21 @@ def write(text: str, folder: Path, name: str) -> Path:
 
     file = Path(folder) / f"{identifier(name)}.py"
     check_folder(file.parent)
-    file.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        with file.open("x", encoding="utf-8") as out:  # fails as well where another process was first
-            out.write(text)
-    except FileExistsError as error:
-        raise OutputExists(f"{file} exists; choose another name, or change that file") from error
+    study = file.absolute().parent.parent
+    if file.parent.name != trust.BESIDE or not (study / "ladder.json").is_file():
+        return _written(file, text)
+    record = Record.open(study, empty=True)
+    with record.alone():  # the study's own: it runs from there
+        _written(file, text)
+        record.note_draft(file)
+    trust.remember([file])
+    return file
+
+
+def _written(file: Path, text: str) -> Path:
+    if file.exists():
+        raise OutputExists(f"{file} exists; choose another name, or change that file")
+    write_text(file, text)
     return file
 
 
@@ -392,6 +406,7 @@ def draft_effect(
     Raises ValueError or UnknownKey for a coordinate that no draft can carry.
     """
     f = fingerprint_of(diagnosis, along)
+    _check_words([f.coordinate, f.kind, f.family or "", *prints])
     word, carrier, family = identifier(name), _carried(f), f.family or family_of(f.coordinate)
     stage, part = carrier.stage, STAGES[carrier.stage]
     dark, exact = f.kind == "offset" and part == "camera", f.coordinate in CELLS
@@ -471,10 +486,17 @@ def draft_effect(
     )
 
 
-def from_study(folder: str | Path, along: str | None, name: str, further: str | Path | None = None) -> tuple[str, Path]:
-    """The text of a draft from the last diagnosis of a study, and the folder of plugins where the study will find it.
+def _check_words(words: Sequence[str]) -> None:
+    """Words that a draft takes over from a study's record, which is data, must not be able to be code."""
+    for word in words:
+        if not re.fullmatch(r"[\w .,\[\]()/+-]*", word):
+            raise ValueError(f"the diagnosis holds {word!r} where a name is meant; diagnose the study again")
 
-    further   a folder of plugins that the name must not clash with, besides the study's own
+
+def from_study(folder: str | Path, along: str | None, name: str, further: Named = None) -> tuple[str, Path]:
+    """The text of a draft from the last diagnosis of a study, and the study's own folder of plugins.
+
+    further   plugins that the name must not clash with, besides those that are found with the study
 
     Raises ValueError where there is no diagnosis, or where the scene cannot carry the draft.
     """
@@ -485,9 +507,13 @@ def from_study(folder: str | Path, along: str | None, name: str, further: str | 
     diagnosis = Diagnosis.from_json(json.dumps(study.diagnosis(index)))
     f = fingerprint_of(diagnosis, along)
     part = STAGES[_carried(f).stage]
-    plugins = plugins_of(recorded(study.ladder["facts"]["setup"]))
-    registry = known(further, plugins if plugins.is_dir() else None)
-    text = scenes.find(study.ladder["scene"]).read_text(encoding="utf-8")
+    setup = recorded(study.ladder["facts"]["setup"])
+    captures = next((p for p in places.candidates(study.folder, setup.captures) if p.exists()), Path(setup.captures))
+    named = study.ladder["scene"]
+    scene = (places.scene_named(captures) if captures.exists() else None) or scenes.find(named)
+    around = places.plugin_places(study.folder, setup, captures, scene)
+    registry = known(*places.code_of(study.folder, study.ladder, setup, around, further))
+    text = scene.read_text(encoding="utf-8")
 
     def holds(role: str) -> bool:
         """Whether the scene's file has a part that plays a role."""
@@ -514,8 +540,8 @@ def from_study(folder: str | Path, along: str | None, name: str, further: str | 
         black_level=noise["black_level"],
         saturation=noise["saturation"],
         source=f"{folder}, step '{study.steps[index]['name']}'",
-        prints=study.ladder.get("prints") or _sketch(study),
-    ), plugins
+        prints=[str(p) for p in study.ladder.get("prints") or _sketch(study)],
+    ), study.folder / trust.BESIDE
 
 
 def _sketch(study: Record) -> list[str]:
@@ -523,7 +549,8 @@ def _sketch(study: Record) -> list[str]:
     from optics.captures import capture_set as capture_files
     from optics.captures import identity
 
-    return identity.sketch_of(capture_files.load(recorded(study.ladder["facts"]["setup"]).captures))
+    setup = recorded(study.ladder["facts"]["setup"])
+    return identity.sketch_of(capture_files.load(places.captures_of(study.folder, study.ladder, setup), setup.outside))
 
 
 def _points(f: Fingerprint) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -592,6 +619,7 @@ def _file(
     sections = {"Definition": definition, "Fingerprint": fingerprint, "Validity": validity, "References": references}
     doc = [f'"""{title}', ""]
     for name, text in sections.items():
+        text = text.replace("\\", "/").replace('"', "'")  # folders and steps may be called anything
         doc += [name, *(f"    {line}" for piece in text.split("\n") for line in textwrap.wrap(piece, 125))]
     declaration = [
         "effect = Effect(",

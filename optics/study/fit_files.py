@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from optics.errors import UnknownKey
+from optics.files.toml_checks import tomllib
 from optics.fit.result import Fit
 from optics.fit.scene_model import SceneModel
 from optics.scene.parameter import Values
@@ -93,6 +94,7 @@ def fit_toml(record: Mapping, name: str = "", origin: Mapping[str, Mapping] | No
             "compare, render, batch and sweep takes them."
         )
     )
+    document.add(tomlkit.comment(WHOLE))
 
     def table(values: Mapping) -> Any:
         out = tomlkit.table()
@@ -131,9 +133,11 @@ def fit_toml(record: Mapping, name: str = "", origin: Mapping[str, Mapping] | No
     document.add("fit", fit)
     if origin.get("sensor"):
         document.add("sensor", tomlkit.item(dict(origin["sensor"])))
-    return tomlkit.dumps(document)
+    return f"{tomlkit.dumps(document).rstrip()}\n\n{END}\n"
 
 
+WHOLE = "Whole only with its last line."  # begins a file that ends with END
+END = "# end"
 TABLES = ("parameters", "uncertainty", "frames", "frames_uncertainty", "fit", "sensor")
 
 
@@ -142,19 +146,75 @@ def read_fit(file: str | Path) -> dict[str, dict]:
 
     file   a fit.toml, or the folder of a study, whose last step is taken
 
-    Raises FileNotFoundError, and ValueError for what is not TOML.
+    Raises FileNotFoundError, and ValueError for what is not TOML, or was cut off.
     """
-    import tomlkit
-
     file = fit_file(file)
     try:
-        data = tomlkit.parse(file.read_text(encoding="utf-8")).unwrap()
-    except ValueError as error:
+        text = file.read_text(encoding="utf-8-sig")
+        data = tomllib.loads(text)
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"{file}: not valid TOML: {error}") from error
+    head = text.lstrip().splitlines()[:3]
+    cut = f"# {WHOLE}" in head and text.rstrip().splitlines()[-1] != END
+    if cut or not text.strip() or (any(line.startswith("# Calibrated values") for line in head) and "fit" not in data):
+        raise ValueError(f"{file}: cut off: its end is missing; restore the file, or take another step's")
+    for key in data:
+        if key not in TABLES:
+            raise UnknownKey(key, TABLES, "table", str(file), f"(allowed: {', '.join(TABLES)})")
     for key in TABLES:
         if not isinstance(data.get(key, {}), dict):
             raise ValueError(f"{file}: {key} = {data[key]!r}; allowed: a table, [{key}]")
+    for key, kind in KINDS.items():
+        table, _, name = key.partition(".")
+        value = data.get(table, {}).get(name)
+        if value is not None and not _is(value, kind):
+            raise ValueError(f"{file}: [{table}] {name} = {value!r}; allowed: {kind}")
+    for table in ("frames", "frames_uncertainty"):
+        if not _is(data.get(table, {}), "a table of tables"):
+            raise ValueError(f"{file}: [{table}]: allowed: a table for each frame")
     return {key: data.get(key, {}) for key in TABLES}
+
+
+KINDS = {  # of entries that the program reads
+    "fit.captures": "text",
+    "fit.held_out": "a list of texts",
+    "fit.parameters": "a whole number",
+    "fit.held_out_parameters": "a whole number",
+    "sensor.scene": "text",
+    "sensor.scene_hash": "text",
+    "sensor.plugins": "a list of texts",
+    "sensor.plugin_files": "a table of texts",
+    "sensor.flat_field": "text",
+    "sensor.defines": "a table of texts",
+    "sensor.noise": "a table of numbers",
+    "sensor.settings": "a table of numbers or texts",
+    "sensor.frames": "a table of tables",
+    "sensor.drive": "a table of numbers",
+    "sensor.levels": "a list of texts",
+    "sensor.uncertainty": "a table of numbers",
+}
+
+
+def _is(value: object, kind: str) -> bool:
+    if kind == "text":
+        return isinstance(value, str)
+    if kind == "a whole number":
+        return isinstance(value, int) and not isinstance(value, bool)
+    if kind == "a list of texts":
+        return isinstance(value, str) or (isinstance(value, list) and all(isinstance(v, str) for v in value))
+    if not isinstance(value, dict):
+        return False
+    if kind == "a table of tables":
+        return all(isinstance(v, dict) for v in value.values())
+    if kind == "a table of numbers":
+        return all(isinstance(v, (int, float)) or _is_numbers(v) for v in value.values())
+    words = kind == "a table of numbers or texts"
+    return all(isinstance(v, str) or (words and isinstance(v, (int, float))) for v in value.values())
+
+
+def _is_numbers(value: object) -> bool:
+    """Of a noise that each channel has its own."""
+    return isinstance(value, list) and all(isinstance(v, (int, float)) for v in value)
 
 
 def fit_file(path: str | Path) -> Path:

@@ -11,6 +11,7 @@ Each step is a folder of the study (optics.study.record), from which another pro
 from __future__ import annotations
 
 import math
+import os
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
@@ -23,19 +24,24 @@ from optics.captures import capture_set as capture_files
 from optics.captures import identity
 from optics.diagnosis.dials import Width, unstated, width_of
 from optics.diagnosis.result import Diagnosis, Row
+from optics.diagnosis.score import SETTLED
 from optics.errors import BadCapture, Underdetermined, UnknownKey
+from optics.files.output import file_hash
 from optics.fit import calibrate
 from optics.fit.compare import Comparison
-from optics.fit.descent import prior_terms
 from optics.fit.model import values_in
 from optics.fit.result import Fit
 from optics.fit.scene_model import SceneModel
+from optics.scene import trust
 from optics.scene.declare import Effect
 from optics.scene.parameter import Values, Variable
 from optics.scene.registry import Registry
-from optics.study import checks
+from optics.scene.trust import Named
+from optics.study import checks, places
 from optics.study.calibrated import origin_of
+from optics.study.cells import Cells, cells_for, open_in_cells
 from optics.study.record import Record
+from optics.study.refits import Refits
 from optics.study.setup import (
     Setup,
     check_priors,
@@ -59,9 +65,6 @@ from optics.study.stages import (
 from optics.words import key_of
 
 AGAIN, FURTHER = 6, 30  # iterations of a restored fit: one that had converged only needs its derivatives again
-PROMISING = 0.7  # of the best fall of chi2 so far: an unconverged refit that falls by more is worth a fit of its own
-ROUGH = 0.5  # chi2 per variable at which a refit of a diagnosis, which compares falls far above 1, may stop
-FEW = 4  # iterations of a refit that continues one
 
 
 # -- begin, and continue ---------------------------------------------------------------------------------------------
@@ -92,7 +95,8 @@ def begin(
         folder,
         scene=str(model.captures.scene),
         captures=str(setup.captures),
-        inputs=[setup.captures, model.scene.path, *model.scene.registry.folders],
+        inputs=places.inputs_of(model),
+        near={"captures": os.path.relpath(setup.captures, os.path.abspath(folder))},
         seed=setup.seed,
         command=command,
         title=title,
@@ -109,15 +113,17 @@ def begin(
         },
         prints=identity.sketch_of(model.captures),
     )
+    trust.remember(places.own_files(model.scene.registry))  # named, or agreed to: the study goes on with them
     if record.steps:
         return record, model, restore(record, model)
     clock = time.perf_counter()
-    try:
-        found = fit_base(model, variables, fitted, Values(dict(setup.values)), progress, robust=setup.robust)
-        write_step(record, model, "base", None, found, held, time.perf_counter() - clock)
-    except BaseException:
-        record.discard()
-        raise
+    with record.alone():
+        try:
+            found = fit_base(model, variables, fitted, Values(dict(setup.values)), progress, robust=setup.robust)
+            write_step(record, model, "base", None, found, held, time.perf_counter() - clock)
+        except BaseException:
+            record.discard()
+            raise
     return record, model, found
 
 
@@ -136,14 +142,34 @@ def _dial_error(model: SceneModel, setup: Setup) -> Width | None:
         return None
 
 
-def take_up(folder: str | Path) -> tuple[Record, SceneModel, Setup]:
-    """The record, model and setup of an existing study. Raises BadCapture where an input has changed since it began."""
+def take_up(
+    folder: str | Path, plugins: Named = None, captures: str | Path | None = None
+) -> tuple[Record, SceneModel, Setup]:
+    """The record, model and setup of an existing study, wherever it and its inputs lie. Raises BadCapture where an
+    input is gone or has changed since it began.
+
+    plugins    folders or files that are known besides those that the study was made with; None: those that are found
+               with it. What is not named must be trusted (optics.scene.trust)
+    captures   where its captures are, if they are not found"""
     record = Record.open(folder)
     setup = recorded(record.ladder["facts"]["setup"])
-    changed = record.changed_inputs()
+    found = places.captures_of(record.folder, record.ladder, setup, captures)
+    scene = places.scene_named(found)
+    around = places.plugin_places(record.folder, setup, found, scene)
+    own = [*around, *(trust.named(plugins) or ())]
+    changed = places.changed(
+        record.ladder, setup, found, scene, [file for place in own for file in trust.plugin_files(place)]
+    )
     if changed:
-        raise BadCapture(f"{folder}: changed since the study began: {', '.join(changed[:5])}; start a new study")
-    return record, open_model(setup), setup
+        raise BadCapture(
+            f"{folder}: changed since the study began: {', '.join(changed[:5])}{' ...' if len(changed) > 5 else ''} "
+            f"(captures: {found}); start a new study"
+        )
+    code = places.code_of(record.folder, record.ladder, setup, around, plugins)
+    if code or plugins is not None:
+        setup = replace(setup, plugins=[str(file) for file in code])
+    setup = replace(setup, captures=str(found))
+    return record, open_model(setup, code=code), setup
 
 
 def kept(record: Record, model: SceneModel, index: int = -1) -> tuple[list[Variable], Values, list[int]]:
@@ -274,6 +300,7 @@ def examine(
     advised: bool = True,
     without: Sequence[str] = (),
     ranked: Callable[[list[Row]], None] | None = None,
+    remark: str = "",
 ) -> Diagnosis:
     """Diagnose the last step, and add the diagnosis with the best effects' fingerprints to its folder. The ranking by
     score is there before anything is refitted.
@@ -281,7 +308,25 @@ def examine(
     without     effects that are not tested
     ranked      called with the rows of that ranking
     advised     where effects tie, also advise what to measure next, which renders frames that nobody has taken yet
+    remark      a warning that the diagnosis gets
+
+    Raises OutputExists where another process works on the study.
     """
+    with record.alone():
+        return _examined(record, model, setup, found, progress, advised, without, ranked, remark)
+
+
+def _examined(
+    record: Record,
+    model: SceneModel,
+    setup: Setup,
+    found: Fit,
+    progress: Progress | None,
+    advised: bool,
+    without: Sequence[str],
+    ranked: Callable[[list[Row]], None] | None,
+    remark: str,
+) -> Diagnosis:
     from optics.diagnosis.advice import advise
     from optics.diagnosis.diagnose import diagnose
     from optics.diagnosis.remarks import USUALLY
@@ -289,6 +334,8 @@ def examine(
     fitted, held = split(model, setup)
     tested, ruled_out = candidates(model, record, without), excluded(model, record, without)
     seek(model, found.values, tested, fitted)
+
+    refits = Refits(model, setup, found, tested, record.refits(len(record.steps) - 1))
 
     def keep(rows: list[Row]) -> None:
         record.put_ranking(len(record.steps) - 1, rows)
@@ -302,7 +349,8 @@ def examine(
         lambda e: effect_variables(model, e),
         held,
         fitted=fitted,
-        refit=Refits(model, setup, found, tested).of,
+        refit=refits.of,
+        foresee=refits.foresee,
         seed=setup.seed,
         progress=progress,
         ranked=keep,
@@ -310,11 +358,50 @@ def examine(
         excluded=ruled_out,
     )
     result.advice = advise(model, result, _freed_as_in(model, found.variables), setup.seed, progress) if advised else []
+    result.warnings += [remark] if remark else []
     if result.advice:
         result.hints = [hint for hint in result.hints if hint != USUALLY]
     worst = int(np.argmax(np.array(found.frame_chi2) / np.maximum(found.frame_n, 1)))
     record.put_diagnosis(len(record.steps) - 1, result, fingerprints_of(model, found, result, found.frames[worst]))
     return result
+
+
+def examine_in_cells(
+    record: Record,
+    model: SceneModel,
+    setup: Setup,
+    cells: Cells,
+    progress: Progress | None = None,
+    advised: bool = True,
+    without: Sequence[str] = (),
+    ranked: Callable[[list[Row]], None] | None = None,
+) -> Diagnosis:
+    """`examine` of large images, in cells of k x k pixels; the values of its refits are in pixels again."""
+    coarse, own = open_in_cells(setup, cells)
+    # as well as a diagnosis asks of its base
+    found = calibrate.fit(
+        coarse, *in_cells_of(record, coarse, cells), max_iterations=FURTHER, negligible=SETTLED / 4, progress=progress
+    )
+    k = cells.k
+    remark = (
+        f"images of {cells.width} x {cells.height} px were diagnosed in cells of {k} x {k} px: px of this diagnosis "
+        "are such cells, and what is finer, as a blur or the rim of a shadow, shows less than in the images"
+    )
+    result = examine(record, coarse, own, found, progress, advised, without, ranked, remark)
+    result.fits = {name: replace(fit, values=cells.values_back(fit.values)) for name, fit in result.fits.items()}
+    return result
+
+
+def cells_of(record: Record, model: SceneModel) -> Cells | None:
+    """The cells in which the last step is diagnosed; None: in pixels."""
+    variables, _, fitted = kept(record, model)
+    return cells_for(model, fitted, variables)
+
+
+def in_cells_of(record: Record, coarse: SceneModel, cells: Cells) -> tuple[list[Variable], Values, list[int]]:
+    """What a step's folder holds of its fit (`kept`), in cells."""
+    variables, values, fitted = kept(record, coarse)
+    return variables, cells.values_into(values), fitted
 
 
 def _freed_as_in(model: SceneModel, held: Sequence[Variable]) -> Callable[[Any, Effect], list[Variable]]:
@@ -326,56 +413,6 @@ def _freed_as_in(model: SceneModel, held: Sequence[Variable]) -> Callable[[Any, 
         return [v for v in effect_variables(imagined, effect, held) if v.frames is not None or v.name in present]
 
     return freed
-
-
-class Refits:
-    """The refits that a diagnosis asks for: chord steps on the base's derivative images where they will do, else a
-    fit."""
-
-    def __init__(self, model: SceneModel, setup: Setup, base: Fit, tested: Sequence[Effect]):
-        self.model, self.setup, self.base = model, setup, base
-        self.known = {v.name for v in base.variables}
-        curved = [v for e in tested if e.onset != "tangent" for v in effect_variables(model, e, base.variables)]
-        self.steps = {v.name: v.parameter.plausible for v in curved}  # of variables without a slope at neutral
-        self.results: dict[tuple[str, ...], Fit] = {}
-
-    def of(self, model: SceneModel, variables: Sequence[Variable], start: Values, frames: Sequence[int]) -> Fit:
-        """The fit of these variables from this start."""
-        base = self.base
-        extra = [v for v in variables if v.name not in self.known]
-        over = [v.name for v in extra]  # of the base the best start is known
-        if model.captures.table is not None:  # readings are predicted in milliseconds
-            return calibrate.fit_over_starts(model, variables, start, frames, over=over)
-        product = sum(v.name in self.steps for v in extra) > 1  # a chord per parameter misses their products
-        if base.normal is None or not extra or product or list(frames) != list(base.frames):
-            return calibrate.fit_over_starts(model, variables, start, frames, over=over)
-        names = tuple(v.name for v in extra)
-        if names not in self.results:  # a diagnosis asks again from another start, which chord steps do not use
-            leader = max(map(self.fall, self.results.values()), default=0.0)
-            steps = {v.name: self.steps[v.name] for v in extra if v.name in self.steps}
-            quick = calibrate.extended(model, base, extra, steps)
-            if not quick.converged and self.fall(quick) > PROMISING * leader:
-                quick = self.afresh(variables, extra, frames, quick)
-            self.results[names] = quick
-        return self.results[names]
-
-    def fall(self, found: Fit) -> float:
-        """Of what is minimised, chi2 and priors: where each frame has its own angle, these may hold most of it."""
-        return self.minimised(self.base) - self.minimised(found)
-
-    def minimised(self, found: Fit) -> float:
-        return found.chi2 + prior_terms(self.model, found.variables, found.values)[2]
-
-    def afresh(
-        self, variables: Sequence[Variable], extra: Sequence[Variable], frames: Sequence[int], quick: Fit
-    ) -> Fit:
-        """Calibrate from the study's start values: a strong effect may have bent the base's values far from the
-        truth."""
-        values = off_neutral(self.model, Values(dict(self.setup.values)), extra)
-        best = fit_base(self.model, variables, frames, values, tolerance=ROUGH)
-        if self.minimised(best) < self.minimised(quick):
-            return best
-        return calibrate.fit(self.model, variables, quick.values, frames, max_iterations=FEW, tolerance=ROUGH)
 
 
 # -- add -------------------------------------------------------------------------------------------------------------
@@ -392,7 +429,22 @@ def extend(
 
     start   values to begin from, such as those of a diagnosis's refit; None: the present ones, with the effect a little
             off neutral
+
+    Raises OutputExists where another process works on the study, or has added a step since it was opened.
     """
+    with record.alone():
+        return _extended(record, model, setup, found, effect, start, progress)
+
+
+def _extended(
+    record: Record,
+    model: SceneModel,
+    setup: Setup,
+    found: Fit,
+    effect: Effect,
+    start: Values | None,
+    progress: Progress | None,
+) -> tuple[Fit, Comparison]:
     fitted, held = split(model, setup)
     if not model.scene.can_express(effect):
         missing = [n for n, keys in model.scene.keys_of(effect).items() if not keys]
@@ -423,7 +475,11 @@ def extend(
         model, variables, start, fitted, robust=setup.robust, progress=progress, over=[v.name for v in extra]
     )
     best = settled(model, best, setup.robust, progress)
-    record.note_inputs([effect.file] if effect.file else [])  # a draft is written after the study began
+    if effect.file:  # a draft is written after the study began
+        own = places.own_plugins(model.scene.registry)
+        file = Path(effect.file).resolve()
+        digest = file_hash(file)
+        record.note_inputs({name: h for name, h in own.items() if h == digest})
     comparison = write_step(record, model, effect.name, effect, best, held, time.perf_counter() - clock)
     before, after = (step["held_out"]["chi2_per_dof"] if step["held_out"] else math.nan for step in record.steps[-2:])
     if after > before:

@@ -24,7 +24,9 @@ import dataclasses
 import json
 import math
 import shutil
-from collections.abc import Mapping, Sequence
+import zipfile
+import zlib
+from collections.abc import Iterator, Mapping, Sequence
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
@@ -34,15 +36,17 @@ import numpy as np
 from optics import words
 from optics.diagnosis.result import Diagnosis, table_of
 from optics.diagnosis.result import Row as Ranked
-from optics.errors import BadCapture, OutputExists
-from optics.files.output import file_hash, input_hashes, new_folder, replacing, versions, write_text
+from optics.errors import BadCapture, OutputExists, UnknownKey
+from optics.files.output import alone, file_hash, input_hashes, new_folder, replacing, versions, write_text
 from optics.fit.compare import Comparison, Row, plain
 from optics.fit.result import Fit
 from optics.study.fit_files import fit_record, fit_toml, read_fit
+from optics.study.places import portable
 from optics.study.shown import Fingerprint, Shown
 
 FORMAT = 1
 SHOWN_MAX = 8  # frames whose images a step keeps
+LOCK = ".lock"  # held by the process that writes
 SETTING = "setting "  # begins the names of a sweep's settings in its file
 
 
@@ -54,6 +58,7 @@ class Record:
 
     def __init__(self, folder: Path, ladder: dict[str, Any]):
         self.folder, self.ladder = Path(folder), ladder
+        self._held = 0  # how often this object holds the lock
 
     # -- life ---------------------------------------------------------------------------------------------------------
     @classmethod
@@ -63,7 +68,8 @@ class Record:
         *,
         scene: str,
         captures: str,
-        inputs: Sequence[str | Path] = (),
+        inputs: Sequence[str | Path] | Mapping[str, str] = (),
+        near: Mapping[str, str] | None = None,
         seed: int = 0,
         command: Sequence[str] = (),
         title: str = "",
@@ -77,7 +83,9 @@ class Record:
     ) -> Record:
         """Start a study in a folder that does not exist yet, or is empty.
 
-        inputs       files and folders that the result depends on; each file is recorded by SHA-256
+        inputs       files and folders that the result depends on, each file recorded by SHA-256; or name -> hash, as
+                     `optics.study.places.inputs_of` gives them
+        near         where inputs lie, relative to the study: it may be moved together with them
         noise        optics.captures.noise.Noise, or a dictionary; facts: plain values to print (frames, image size ...)
         prints       of the captures (optics.captures.identity), by which a draft knows them again
         noise_floor  chi2/dof of a perfect model: 1, unless repeated frames say otherwise
@@ -86,7 +94,7 @@ class Record:
         Raises OutputExists, or BadCapture when the study to resume was made from something else.
         """
         folder = Path(folder)
-        hashes = input_hashes(inputs)
+        hashes = dict(inputs) if isinstance(inputs, Mapping) else input_hashes(inputs)
         if (folder / "ladder.json").exists():
             if not resume:
                 raise OutputExists(
@@ -94,15 +102,18 @@ class Record:
                 )
             study = cls.open(folder, empty=True)
             old = study.ladder
-            changed = [k for k, new in (("scene", scene), ("seed", seed)) if old[k] != new]
-            changed += sorted(k for k in hashes.keys() | old["inputs"].keys() if hashes.get(k) != old["inputs"].get(k))
+            changed = [] if Path(old["scene"]).name == Path(scene).name else ["scene"]
+            changed += _other_setup(old.get("facts", {}).get("setup"), dict(facts or {}).get("setup"))
+            changed += ["seed"] if old["seed"] != seed else []
+            before = portable(old["inputs"], old["captures"]) if isinstance(inputs, Mapping) else old["inputs"]
+            changed += sorted(k for k in hashes.keys() | before.keys() if hashes.get(k) != before.get(k))
             if changed:
                 raise BadCapture(
                     f"{folder}: cannot resume, changed since the study began: {', '.join(changed[:5])}"
                     f"{' ...' if len(changed) > 5 else ''}; start a study in a new folder"
                 )
             return study
-        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        if folder.exists() and (not folder.is_dir() or any(p.name != LOCK for p in folder.iterdir())):
             raise OutputExists(f"{folder} exists and holds no study; choose another folder")
         if not (math.isfinite(noise_floor) and noise_floor > 0):
             raise ValueError(f"noise_floor = {noise_floor} (chi2/dof) is not above 0")
@@ -116,6 +127,8 @@ class Record:
             "command": list(map(str, command)),
             "versions": versions(),
             "inputs": hashes,
+            "near": dict(near or {}),
+            "drafts": {},
             "noise": _as_dict(noise) or {},
             "noise_floor": {"chi2_per_dof": float(noise_floor), "source": noise_floor_source},
             "warnings": list(warnings),
@@ -124,9 +137,17 @@ class Record:
             "shown": [],
             "steps": [],
         }
-        (folder / "steps").mkdir(parents=True, exist_ok=True)
+        folder.mkdir(parents=True, exist_ok=True)
         study = cls(folder, json.loads(_dumps(record)))
-        study._save()
+        with study.alone():
+            if (folder / "ladder.json").exists():
+                raise OutputExists(f"{folder} holds a study already, which another process has begun")
+            try:
+                (folder / "steps").mkdir(exist_ok=True)
+                study._save()
+            except BaseException:
+                study.discard()
+                raise
         return study
 
     @classmethod
@@ -150,7 +171,11 @@ class Record:
                 raise ValueError(f"format {record['format']}, this program reads {FORMAT}")
             record["steps"] = []
             for path in sorted(folder.glob("steps/[0-9][0-9]-*/step.json")):
-                record["steps"].append(json.loads(path.read_text(encoding="utf-8")))
+                file = path
+                record["steps"].append(_step(json.loads(path.read_text(encoding="utf-8"))))
+            file = folder / "ladder.json"
+            for name in ("scene", "inputs", "shown"):
+                record[name]
         except (ValueError, KeyError, TypeError) as error:
             raise ValueError(f"{file}: not a readable study ({error}); restore it or start a new one") from error
         wanted = list(range(len(record["steps"])))
@@ -173,8 +198,35 @@ class Record:
         if not self.steps:
             shutil.rmtree(self.folder / "steps", ignore_errors=True)
             (self.folder / "ladder.json").unlink(missing_ok=True)
+            (self.folder / LOCK).unlink(missing_ok=True)
             with contextlib.suppress(OSError):  # it may hold other things
                 self.folder.rmdir()
+
+    @contextlib.contextmanager
+    def alone(self) -> Iterator[None]:
+        """Keep other processes from writing to the study. Raises OutputExists where one does, or has added a step since
+        this record was read."""
+        if self._held:
+            self._held += 1
+            try:
+                yield
+            finally:
+                self._held -= 1
+            return
+        with alone(
+            self.folder / LOCK,
+            f"{self.folder}: another process works on this study; wait until it ends, then try again",
+        ):
+            there = sorted(p.parent.name for p in self.folder.glob("steps/[0-9][0-9]-*/step.json"))
+            if there != [s["folder"] for s in self.steps]:
+                raise OutputExists(
+                    f"{self.folder}: another process has added a step since this study was opened; open it again"
+                )
+            self._held = 1
+            try:
+                yield
+            finally:
+                self._held = 0
 
     @property
     def steps(self) -> list[dict]:
@@ -183,10 +235,18 @@ class Record:
     def has(self, effect: str | None) -> bool:
         return any(step["effect"] == effect for step in self.steps)
 
-    def note_inputs(self, files: Sequence[str | Path]) -> None:
-        """Record files that the next steps depend on besides the inputs that the study began with."""
-        self.ladder["inputs"] = {**input_hashes(files), **self.ladder["inputs"]}
-        self._save()
+    def note_inputs(self, hashes: Mapping[str, str]) -> None:
+        """Record what the next steps depend on besides the inputs that the study began with: name -> hash."""
+        with self.alone():
+            self.ladder["inputs"] = {**hashes, **self.ladder["inputs"]}
+            self._save()
+
+    def note_draft(self, file: Path) -> None:
+        """Record a plugin that was drafted from this study and lies in it."""
+        name = file.resolve().relative_to(self.folder.resolve()).as_posix()
+        with self.alone():
+            self.ladder["drafts"] = {**self.ladder.get("drafts", {}), name: file_hash(file)}
+            self._save()
 
     def changed_inputs(self) -> list[str]:
         """Input files that are gone or differ from the recorded hash."""
@@ -257,7 +317,7 @@ class Record:
         path = self.folder / "steps" / folder
         if path.exists():
             raise OutputExists(f"{path} exists; open the study again to go on after its last step")
-        with new_folder(path) as new:
+        with self.alone(), new_folder(path) as new:
             (new / "images").mkdir()
             (new / "fit.toml").write_text(fit_toml(record, name, origin), encoding="utf-8")
             (new / "metrics.json").write_text(
@@ -280,6 +340,10 @@ class Record:
         self, index: int, diagnosis: Diagnosis | Mapping, fingerprints: Sequence[Fingerprint] = ()
     ) -> None:
         """Add a diagnosis to a recorded step, with what its best effects would explain. A later one replaces it."""
+        with self.alone():
+            self._put_diagnosis(index, diagnosis, fingerprints)
+
+    def _put_diagnosis(self, index: int, diagnosis: Diagnosis | Mapping, fingerprints: Sequence[Fingerprint]) -> None:
         folder, entry = self.path(index), self.steps[index]
         items = [_fingerprint_entry(i, f) for i, f in enumerate(fingerprints)]
         for item, f in zip(items, fingerprints):
@@ -294,6 +358,10 @@ class Record:
         """Keep the ranking by score of a step whose diagnosis is still under way."""
         write_text(self.path(index) / "ranking.csv", table_of(rows))
 
+    def refits(self, index: int) -> Path:
+        """The folder in which a diagnosis of a step keeps its refits while it is under way."""
+        return self.path(index) / "refits"
+
     def _save(self) -> None:
         write_text(self.folder / "ladder.json", _dumps(self.ladder))
 
@@ -302,19 +370,19 @@ class Record:
         return self.folder / "steps" / self.steps[index]["folder"]
 
     def metrics(self, index: int) -> dict:
-        return json.loads((self.path(index) / "metrics.json").read_text(encoding="utf-8"))
+        return _read(self.path(index) / "metrics.json")
 
     def comparison(self, index: int) -> Comparison:
         file = self.path(index) / "images/maps.npz"
         maps = {}
         if file.exists():
-            with np.load(file) as arrays:
+            with _arrays(file) as arrays:
                 maps = {"rms_map": arrays["rms"], "mean_map": arrays["mean"]}
         return Comparison.from_dict(self.metrics(index), **maps)
 
     def diagnosis(self, index: int) -> dict | None:
         file = self.path(index) / "diagnosis.json"
-        return json.loads(file.read_text(encoding="utf-8")) if file.exists() else None
+        return _read(file) if file.exists() else None
 
     def fit(self, index: int) -> dict:
         return read_fit(self.path(index) / "fit.toml")
@@ -322,7 +390,7 @@ class Record:
     def frames(self, index: int) -> list[Shown]:
         out = []
         for f in self.steps[index]["frames"]:
-            with np.load(self.path(index) / f["file"]) as a:
+            with _arrays(self.path(index) / f["file"]) as a:
                 settings = {k.removeprefix(SETTING): a[k] for k in a.files if k.startswith(SETTING)}
                 out.append(
                     Shown(
@@ -343,7 +411,7 @@ class Record:
     def fingerprints(self, index: int) -> list[Fingerprint]:
         out = []
         for f in self.steps[index]["fingerprints"]:
-            with np.load(self.path(index) / f["file"]) as a:
+            with _arrays(self.path(index) / f["file"]) as a:
                 strength = math.nan if f["strength"] is None else f["strength"]
                 out.append(Fingerprint(f["effect"], f["frame"], a["image"], a["residual"], strength))
         return out
@@ -369,6 +437,60 @@ class Record:
         return "\n".join(
             [words.table(lines, left=(0, 6)), f"noise floor: chi2/dof {floor['chi2_per_dof']:.3f} ({floor['source']})"]
         )
+
+
+def _other_setup(before: Mapping | None, now: Mapping | None) -> list[str]:
+    """The choices in which two setups differ, but for places; none where a record has no setup."""
+    if before is None or now is None:
+        return []
+    now = json.loads(_dumps(now))
+    apart = ("captures", "plugins", "uncertainty")  # an error of dials that was found stands in the record alone
+    return sorted(name for name in before if name not in apart and before[name] != now.get(name))
+
+
+@contextlib.contextmanager
+def readable(folder: Path, *more: type[Exception]) -> Iterator[None]:
+    """What a study's files hold that no study writes is said of the study: a key that is missing, another type.
+
+    more   further errors that mean the same"""
+    meant: tuple[type[Exception], ...] = (KeyError, TypeError, AttributeError, IndexError, ArithmeticError, *more)
+    try:
+        yield
+    except meant as error:
+        if isinstance(error, UnknownKey):
+            raise
+        raise ValueError(
+            f"{folder}: its record is damaged ({type(error).__name__}: {error}); restore it, or start a new study; "
+            "--debug shows where"
+        ) from error
+
+
+def _step(entry: dict[str, Any]) -> dict[str, Any]:
+    """What a step.json holds; raises KeyError or TypeError where it is something else."""
+    for name in ("index", "name", "effect", "folder", "frames", "fingerprints"):
+        entry[name]
+    return entry
+
+
+def _read(file: Path) -> dict:
+    """A JSON file of a step. Raises ValueError, which names it."""
+    try:
+        found = json.loads(file.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(f"{file}: damaged or cut off ({error}); restore it, or start a new study") from error
+    if not isinstance(found, dict):
+        raise ValueError(f"{file}: holds no table; restore it, or start a new study")
+    return found
+
+
+@contextlib.contextmanager
+def _arrays(file: Path) -> Iterator[Any]:
+    """The arrays of a step's file. Raises ValueError, which names it."""
+    try:
+        with np.load(file, allow_pickle=False) as arrays:
+            yield arrays
+    except (ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        raise ValueError(f"{file}: damaged or cut off ({error}); restore it, or start a new study") from error
 
 
 def _frame_entry(index: int, f: Shown) -> dict[str, Any]:

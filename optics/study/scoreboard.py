@@ -43,7 +43,9 @@ from optics.fit import calibrate
 from optics.fit.compare import Comparison, compare, led_label
 from optics.fit.null_models import Lambert, Shape, Table, place_of, tables, tilt_of
 from optics.fit.scene_model import SceneModel
+from optics.scene import trust
 from optics.scene.parameter import Values
+from optics.scene.trust import Named
 from optics.study import loop
 from optics.study.board import RIVAL, STEP, Board, Entry, Images, Level, Ring
 from optics.study.fit_files import read_fit
@@ -74,8 +76,8 @@ class Ladder:
     poses: list[int]
 
     @classmethod
-    def open(cls, folder: Path, name: str) -> Ladder:
-        record, model, setup = loop.take_up(folder)
+    def open(cls, folder: Path, name: str, plugins: Named = None) -> Ladder:
+        record, model, setup = loop.take_up(folder, plugins)
         values, common, poses = [], [], []
         for index in range(len(record.steps)):
             values.append(loop.kept(record, model, index)[1])
@@ -94,6 +96,7 @@ def scoreboard(
     *,
     held_out: Sequence[str] | None = None,
     presses: bool = False,
+    plugins: Named = None,
     progress: Progress | None = None,
 ) -> list[Board]:
     """Score studies and rivals on held-out frames, a board for each capture set and choice of held-out groups.
@@ -102,31 +105,32 @@ def scoreboard(
     studies    folders of studies: all their steps are scored; they say which groups are held out
     held_out   groups of captures that no study is of; None: every fourth of four or more, else the last one
     presses    also calibrate the last step of each study on fewer presses: minutes each
+    plugins    as `optics.facade.calibrate` takes them
 
     Raises BadCapture for captures that cannot be scored, ValueError where nothing is given.
     """
     if not captures and not studies:
         raise ValueError("nothing to score; allowed: capture folders, studies (--study STUDY), or both")
-    jobs = _jobs(captures, studies, held_out)
+    jobs = _jobs(captures, studies, plugins)
     boards = []
     for done, (folder, ladders) in enumerate(jobs):
         if progress:
             progress("scoreboard", done, len(jobs))
-        boards.append(_Bench(folder, ladders, held_out, progress).board(presses))
+        boards.append(_Bench(folder, ladders, held_out, progress, plugins).board(presses))
     if progress:
         progress("scoreboard", len(jobs), len(jobs))
     return boards
 
 
 def _jobs(
-    captures: Sequence[str | Path], studies: Sequence[str | Path], held_out: Sequence[str] | None
+    captures: Sequence[str | Path], studies: Sequence[str | Path], plugins: Named
 ) -> list[tuple[Path, list[Ladder]]]:
     """Each capture folder with its studies; twice, where studies of it hold out different groups."""
     names = [Path(os.path.abspath(s)).name for s in studies]
     found: dict[tuple[Path, tuple[int, ...]], list[Ladder]] = {}
     for folder, name in zip(map(Path, studies), names):
         own = name if names.count(name) == 1 else f"{Path(os.path.abspath(folder)).parent.name}/{name}"
-        ladder = Ladder.open(folder, own)
+        ladder = Ladder.open(folder, own, plugins)
         of = Path(ladder.setup.captures).resolve()
         held = split(ladder.model, ladder.setup)[1]
         if not held:
@@ -158,13 +162,25 @@ class _Score:
 class _Bench:
     """Frames, regions and geometries of one board."""
 
-    def __init__(self, folder: Path, ladders: list[Ladder], held_out: Sequence[str] | None, progress: Progress | None):
+    def __init__(
+        self,
+        folder: Path,
+        ladders: list[Ladder],
+        held_out: Sequence[str] | None,
+        progress: Progress | None,
+        plugins: Named = None,
+    ):
         self.folder, self.ladders, self.progress = folder, ladders, progress or (lambda *_: None)
         if ladders:
             self.model, setup = ladders[0].model, ladders[0].setup
             self.fitted, self.held = split(self.model, setup)
         else:
-            setup = setup_for(folder, held_out=list(held_out) if held_out is not None else None)
+            named = trust.named(plugins)
+            setup = setup_for(
+                folder,
+                held_out=list(held_out) if held_out is not None else None,
+                plugins=None if named is None else [str(p) for p in named],
+            )
             self.model = open_model(setup)
             self.fitted, self.held = _split(self.model, setup)
         model = self.model

@@ -3,24 +3,28 @@
 from __future__ import annotations
 
 import json
+import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatch
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from optics.captures import capture_set as capture_files
 from optics.captures.noise import Noise, estimate
-from optics.errors import Underdetermined, UnknownKey
+from optics.errors import BadCapture, OutOfBounds, Underdetermined, UnknownKey
 from optics.fit import calibrate
 from optics.fit.gauges import acting
 from optics.fit.model import value_of
 from optics.fit.scene_model import SceneModel
 from optics.scene import loader as scenes
+from optics.scene import trust
 from optics.scene.declare import Effect
 from optics.scene.parameter import Values, Variable, keys_with
+from optics.words import some
 
 ASPECT = 0.02  # relative difference of aspect ratio between images and scene beyond which they are said to be cut
 GROUPS = 4  # with at least this many groups of frames, every fourth is held out
@@ -33,7 +37,9 @@ class Setup:
 
     captures    folder of the capture set
     defines     -D of the scene; the size of the images is added where the scene names width and height
-    plugins     a further folder of plugins; None: `plugins` beside the captures, where there is one
+    plugins     further folders of plugins, or files; empty: none. None: `plugins` beside captures and scene, where
+                there are such folders and they are trusted (optics.scene.trust)
+    outside     images and tables may lie outside the folder of the captures
     free        key patterns of the parameters to solve for, one value for all frames; empty: position, axis, lobe and
                 power of every LED, reflectance and roughness of every membrane, power of every source
     per_group   key patterns of parameters with a value per group of frames; None: the press, where groups are given
@@ -49,7 +55,8 @@ class Setup:
 
     captures: str
     defines: dict[str, str] = field(default_factory=dict)
-    plugins: str | None = None
+    plugins: list[str] | None = None
+    outside: bool = False
     free: list[str] = field(default_factory=list)
     per_group: list[str] | None = None
     priors: dict[str, tuple[float | None, float]] = field(default_factory=dict)
@@ -65,42 +72,84 @@ def setup_for(captures: str | Path, **given: object) -> Setup:
     """The setup of the given fields; what an imported set advises stands for None and empty.
 
     An importer writes its advice to import.json. Where `free` or `per_group` is given, the advised priors belong to
-    other parameters and are left out.
+    other parameters and are left out. Raises BadCapture for advice that is none: a file of data names no code.
     """
-    note = Path(captures) / "import.json"
-    advised = json.loads(note.read_text(encoding="utf-8")).get("setup", {}) if note.is_file() else {}
-    own = {name: value for name, value in given.items() if value or (value == [] and name in ("per_group", "held_out"))}
+    advised = _advised(Path(captures) / "import.json")
+    kept = ("per_group", "held_out", "plugins")  # of which an empty list says something
+    own = {name: value for name, value in given.items() if value or (value == [] and name in kept)}
     if {"free", "per_group"} & set(own):
         advised = {name: value for name, value in advised.items() if name == "flat_field"}
     return recorded({**advised, **own, "captures": str(captures)})
 
 
-def recorded(facts: dict) -> Setup:
-    """The setup of a study's record, which keeps pairs as lists."""
+ADVICE = ("free", "per_group", "priors", "held_out", "values", "flat_field", "uncertainty", "robust", "defines")
+
+
+def _advised(file: Path) -> dict[str, Any]:
+    """The fields of a setup that an imported set advises; none without the file."""
+    if not file.is_file():
+        return {}
+    try:
+        note = json.loads(file.read_text(encoding="utf-8-sig"))
+        advised = note.get("setup", {}) if isinstance(note, dict) else None
+    except ValueError as error:
+        raise BadCapture(f"{file}: not valid JSON: {error}; import the set again") from error
+    if not isinstance(advised, dict):
+        raise BadCapture(f"{file}: setup is no table; allowed: {', '.join(ADVICE)}; import the set again")
+    if "plugins" in advised:
+        raise BadCapture(
+            f"{file}: setup: plugins = {advised['plugins']!r}: a capture set is data and names no code; remove it, and "
+            "give the folder by '--plugins' if you trust it"
+        )
+    for name in advised:
+        if name not in ADVICE:
+            raise UnknownKey(name, ADVICE, "key", f"{file}: setup")
+    priors = advised.get("priors", {})
+    if not isinstance(priors, dict) or not all(_is_prior(prior) for prior in priors.values()):
+        raise BadCapture(f"{file}: setup: priors = {priors!r}; allowed: pattern -> [mean or null, standard deviation]")
+    for name, kind in (("free", list), ("per_group", list), ("held_out", list), ("values", dict), ("defines", dict)):
+        if not isinstance(advised.get(name, kind()), kind):
+            raise BadCapture(f"{file}: setup: {name} = {advised[name]!r}; allowed: a {kind.__name__}")
+    return advised
+
+
+def _is_prior(prior: object) -> bool:
+    def number(value: object) -> bool:
+        return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+
+    pair = isinstance(prior, list) and len(prior) == 2
+    return pair and (prior[0] is None or number(prior[0])) and number(prior[1]) and prior[1] > 0  # type: ignore[index]
+
+
+def recorded(facts: Mapping[str, Any]) -> Setup:
+    """The setup of a study's record, which keeps pairs as lists, and in earlier versions one folder of plugins."""
     setup = Setup(**facts)
+    if isinstance(setup.plugins, str):
+        setup.plugins = [setup.plugins]
     setup.priors = {pattern: (prior[0], prior[1]) for pattern, prior in setup.priors.items()}
     return setup
 
 
-def plugins_of(setup: Setup) -> Path:
-    """The plugin folder of a setup, which need not exist: the one it names, or `plugins` beside the captures."""
-    return Path(setup.plugins) if setup.plugins else Path(setup.captures) / "plugins"
-
-
 # -- the model -------------------------------------------------------------------------------------------------------
-def open_model(setup: Setup, model_class: type = SceneModel, fitted: Noise | None = None) -> SceneModel:
+def open_model(
+    setup: Setup,
+    model_class: type = SceneModel,
+    fitted: Noise | None = None,
+    code: Sequence[Path] | None = None,
+) -> SceneModel:
     """Captures and scene of a setup as a model; raises, before anything is rendered, where they contradict each
     other.
 
-    fitted   noise of the captures that the values to come were fitted to, if they are others"""
-    found = capture_files.load(setup.captures)
+    fitted   noise of the captures that the values to come were fitted to, if they are others
+    code     the plugin files that are known besides the shipped ones, which may run; None: as the setup says"""
+    named = setup.plugins if code is None else [str(file) for file in code]
+    beside: list[Path] = []
+    if named is None:
+        beside = trust.admit(trust.beside(Path(setup.captures)), "beside the captures")
+    found = capture_files.load(setup.captures, setup.outside)
     path = scenes.find(found.scene)
-    defines = capture_files.definitions(found, setup.defines, path)
     height, width = found.frames[0].image.shape[:2]
-    usual = dict(re.findall(r'<default name="(width|height)" value="(\d+)"', path.read_text(encoding="utf-8")))
-    for name, size in (("width", width), ("height", height)):
-        if name in usual:
-            defines.setdefault(name, str(size))
+    defines, usual = definitions_of(setup, found, path, (width, height)), _usual(path)
     if found.table is None and len(usual) == 2:
         own_width, own_height = int(usual["width"]), int(usual["height"])
         if abs(width * own_height / (height * own_width) - 1) > ASPECT:
@@ -109,10 +158,12 @@ def open_model(setup: Setup, model_class: type = SceneModel, fitted: Noise | Non
                 "turned images show another part of the sensor than the scene's camera; give them whole, row 0 at the "
                 "top, or correct x_fov and the principal point in the scene"
             )
-    plugins = plugins_of(setup)
-    loaded = scenes.load(path, defines, plugins=plugins if setup.plugins or plugins.is_dir() else None)
+    loaded = scenes.load(path, defines, plugins=named, found=beside)
     setup.values = loaded.spread(setup.values, "start values")
     capture_files.check(found, loaded.parameters)
+    for index, f in enumerate(found.frames):
+        where = f"{found.folder / capture_files.FILE}: frame {index} ('{f.file or f.name}')"
+        loaded.check_press({**found.parameters, **f.parameters}, where)
     found = capture_files.state(found, loaded.parts, {k: e.name for k, e in loaded.registry.effects.items()})
     found.uncertainty = {**(setup.uncertainty or {}), **found.uncertainty}
     noise = found.noise
@@ -122,6 +173,23 @@ def open_model(setup: Setup, model_class: type = SceneModel, fitted: Noise | Non
     model = model_class(loaded, found, noise.in_scale_of(fitted), **options)
     model.assumed_errors = dict(setup.uncertainty or {})
     return model
+
+
+def _usual(scene: Path) -> dict[str, str]:
+    """The width and height that a scene names by themselves, px."""
+    return dict(re.findall(r'<default name="(width|height)" value="(\d+)"', scene.read_text(encoding="utf-8")))
+
+
+def definitions_of(
+    setup: Setup, captures: capture_files.Captures, scene: Path, size: tuple[int, int]
+) -> dict[str, str]:
+    """-D of the scene, with the (width, height) of the images where it names them."""
+    defines = capture_files.definitions(captures, setup.defines, scene)
+    usual = _usual(scene)
+    for name, pixels in zip(("width", "height"), size):
+        if name in usual:
+            defines.setdefault(name, str(pixels))
+    return defines
 
 
 def split(model: SceneModel, setup: Setup) -> tuple[list[int], list[int]]:
@@ -174,7 +242,20 @@ def variables_of_base(model: SceneModel, setup: Setup, frames: Sequence[int]) ->
             per_group = [k for k, p in model.parameters.items() if p.free == "press"]
             own = {f"{k}*": model.parameters[k].prior_sd for k in per_group}
             priors = {**{k: (None, sd) for k, sd in own.items() if sd is not None}, **priors}
+    twice = _twice(model, setup.free, setup.per_group or ())
+    if twice:
+        raise ValueError(
+            f"{some(twice, 4)}: free for all frames and for each group at once, which no frame can tell apart; "
+            "allowed: one of --free and --per-group"
+        )
     variables = calibrate.variables_from(model, setup.free or default_free(model), per_group, None, frames)
+    swept = {v.keys[0] for v in variables for i in v.frames or () if v.keys[0] in model.frames[i].readings}
+    if swept:
+        raise ValueError(
+            f"{some(sorted(swept), 4)}: set anew in the readings of a group, so that a group has no one value; "
+            "allowed: per group what the table does not set; what is known of a setting's error stands under "
+            "[uncertainty]"
+        )
     if setup.per_group is None:
         variables = [v for v in variables if v.frames is None or not _untouched(model, v.frames)]
     for pattern, prior in priors.items():
@@ -186,6 +267,15 @@ def variables_of_base(model: SceneModel, setup: Setup, frames: Sequence[int]) ->
             variables[i] = v.with_prior(*known[0])
     free = {(key, frame) for v in variables for key in v.keys for frame in v.frames or (None,)}
     return variables + [d for d in doubts if not free & {(d.keys[0], frame) for frame in d.frames or (None,)}]
+
+
+def _twice(model: SceneModel, free: Sequence[str], per_group: Sequence[str]) -> list[str]:
+    """The parameters that patterns of both kinds match."""
+
+    def matched(patterns: Sequence[str]) -> set[str]:
+        return {key for key in model.parameters for pattern in patterns if fnmatch(key, pattern)}
+
+    return sorted(matched(free) & matched(per_group))
 
 
 def _within(inner: Variable, outer: Variable) -> bool:
@@ -224,7 +314,15 @@ def settings_in_doubt(model: SceneModel, frames: Sequence[int]) -> list[Variable
 def check_priors(model: SceneModel, setup: Setup) -> None:
     """Raises UnknownKey for a prior on something that the setup does not solve for."""
     everywhere = variables_of_base(model, setup, range(len(model.frames)))
-    for pattern in setup.priors:
+    for pattern, (mean, _) in setup.priors.items():
+        for v in everywhere:
+            low, high = v.parameter.bounds
+            if (
+                mean is not None
+                and (fnmatch(v.keys[0], pattern) or fnmatch(v.name, pattern))
+                and not low <= mean <= high
+            ):
+                raise OutOfBounds(v.name, mean, v.parameter.unit, (low, high), f"prior {pattern}")
         if not any(fnmatch(name, pattern) for v in everywhere for name in (v.keys[0], v.name)):
             raise UnknownKey(pattern, [v.name for v in everywhere], "free parameter for a prior")
 

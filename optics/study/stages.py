@@ -32,6 +32,7 @@ def fit_base(
     progress: Progress | None = None,
     tolerance: float = TOGETHER,
     robust: bool = False,
+    negligible: float | None = None,
 ) -> Fit:
     """Calibrate in three stages: what all frames share, then the poses of one press at a time, then everything
     together."""
@@ -56,7 +57,7 @@ def fit_base(
             for index in frames:
                 start.frame.setdefault(index, {}).update(found.values.frame[index])
     found = calibrate.fit_over_starts(
-        model, variables, start, fitted, tolerance=tolerance, robust=robust, progress=progress
+        model, variables, start, fitted, tolerance=tolerance, negligible=negligible, robust=robust, progress=progress
     )
     found = settled(model, found, robust, progress, tolerance)
     found.start = begun

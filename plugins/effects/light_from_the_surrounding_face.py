@@ -29,8 +29,12 @@ def from_the_side(geometry, membrane):
     import mitsuba as mi
 
     share = (1 + geometry.si.sh_frame.n.z) / 2  # the camera stands at -z
-    colours = (membrane.ground_r, membrane.ground_g, membrane.ground_b, mi.Float(0.0))
-    return geometry.albedo * mi.UnpolarizedSpectrum(*colours[: dr.size_v(mi.UnpolarizedSpectrum)]) * (share * dr.inv_pi)
+    colours = (membrane.ground_r, membrane.ground_g, membrane.ground_b)
+    if getattr(membrane, "integral", None) is not None:
+        ground = membrane.by_colour(*colours, geometry.si.wavelengths)
+    else:
+        ground = mi.UnpolarizedSpectrum(*(*colours, mi.Float(0.0))[: dr.size_v(mi.UnpolarizedSpectrum)])
+    return geometry.albedo * ground * (share * dr.inv_pi)
 
 
 def check_view_factors():

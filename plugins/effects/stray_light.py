@@ -21,7 +21,7 @@ from optics.scene.parameter import Parameter
 
 
 def add(image, camera):
-    return image + camera.stray
+    return image + camera.stray * getattr(camera, "white", 1.0)
 
 
 def check_floor():

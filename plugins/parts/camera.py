@@ -28,8 +28,9 @@ XML
     cy float, half the height: principal point, px, in place of `principal_y`
     mosaic string: angles of the analysers on the pixels of a polarization camera, deg, row by row as the camera sees
         them: "90 45; 135 0"; none without it; `mosaic` in captures.toml replaces it
-    sensitivity string, identity: sensitivities of the channels: a camera of the colour-science library by its name, or
-        one channel per band
+    sensitivity string, identity: sensitivities of the channels: a camera of the colour-science library by its name, a
+        file (.csv) with the wavelength and a column for each of 1 or 3 channels, or one channel per band
+    filter string: transmittance before the sensor over the wavelength: a file, a name or a law
 """
 
 import math
@@ -176,6 +177,7 @@ def build():
 
     class Camera(Declared.on(mi.Sensor)):
         kind = "camera"
+        bands = 3  # of the scene
 
         def __init__(self, props):
             nominal = props.get("to_world", mi.ScalarAffineTransform4f())
@@ -190,14 +192,31 @@ def build():
             self.sensitivity = props.get("sensitivity", "identity")
             self.mosaic = read_mosaic(props.get("mosaic", ""))
             self.declare(props)
+            self.channels = ()  # curves; none where each channel is a band
+            if self.sensitivity != "identity":
+                self.channels = self.read_sensitivities(self.sensitivity, "sensitivity")
+                if len(self.channels) not in (1, 3):
+                    raise ValueError(
+                        f"{self.name}.sensitivity = '{self.sensitivity}' has {len(self.channels)} columns; allowed: 1 "
+                        "or 3"
+                    )
+                self.curves.update(zip(channel_names(len(self.channels)), self.channels))
+            self.read_spectrum(props, "filter", "transmittance")
             self.resolution = (width, height)
             matrix = [[float(nominal.matrix[i, j]) for j in range(4)] for i in range(3)]
             self.columns = [dr.opaque(mi.Vector3f, [matrix[i][j] for i in range(3)]) for j in range(4)]
             self.m_needs_sample_3 = False
 
+        def wire(self, scene):
+            self.bands = len(getattr(scene.integrator, "bands", ())) or 1
+
         def takes(self, name):
-            idle = "detector" if self.mosaic else "site"  # behind an analyser a pixel meets one polarization
-            return not any(name in effect.parameter_names for effect in self.registry.at_stage(self.kind, idle))
+            idle = ["detector" if self.mosaic else "site"]  # behind an analyser a pixel meets one polarization
+            if self.bands == 1 and self.integral is None:  # of one band a sensitivity is a gain
+                idle.append("sensitivity")
+            return not any(
+                name in effect.parameter_names for stage in idle for effect in self.registry.at_stage(self.kind, stage)
+            )
 
         def traverse(self, cb):
             mi.Sensor.traverse(self, cb)
@@ -250,6 +269,11 @@ def build():
 
         # -- how images are developed: numpy; `own` has the parameters as numbers, complex ones for derivatives -----
 
+        def seen(self, nm):
+            """(C, N) sensitivities at wavelengths, behind the filter; of channels that are bands, the filter alone."""
+            through = self.curves["filter"](nm) if "filter" in self.curves else np.ones(len(nm))
+            return np.array([curve(nm) for curve in self.channels] or [np.ones(len(nm))]) * through
+
         def middle(self):
             """Where the optical axis meets the image, px."""
             width, height = self.resolution
@@ -299,6 +323,11 @@ def build():
             return f"Camera[{self.name}]"
 
     return Camera
+
+
+def channel_names(count):
+    """Names of the sensitivities of channels among a camera's curves."""
+    return [f"sensitivity {c}" for c in "RGB"] if count == 3 else ["sensitivity"]
 
 
 def check_field_of_view():

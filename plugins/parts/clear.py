@@ -7,8 +7,8 @@ Definition
     mu'' of (25, 26)
     I exp(-alpha d)                                              Beer-Lambert along every stretch d inside (27-29)
 `index` and `absorption` hold at 540 nm; how they change with the wavelength are effects (`dispersion`, `coloured
-absorption`). The surface's normals point out of the body. `outside` (XML) names the clear material around it, as the
-wall around a cell's filling; without it that is air.
+absorption`) or measured curves (XML). The surface's normals point out of the body. `outside` (XML) names the clear
+material around it, as the wall around a cell's filling; without it that is air.
 Fingerprint
     walls show as bright and dark lines, totally reflecting where they are met at grazing incidence; absorption darkens
     long ways.
@@ -19,6 +19,8 @@ References
     Fan, Li, Cong & Zhang, MagicGripper, supplementary VII-A, eqs. (18)-(29); Born & Wolf, Principles of Optics, 1.5.
 XML
     outside string: id of the clear material around the body; without it, air
+    index_spectrum string: form of the index over the wavelength, which `index` shifts: a file, a name or a law
+    absorption_spectrum string: form of the absorption over the wavelength, which `absorption` scales
 """
 
 from optics.scene.checking import agree, made
@@ -47,7 +49,7 @@ def build():
 
     from optics.errors import BadScene
     from optics.polarization.mueller import diattenuator, fresnel, fresnel_reflection
-    from optics.scene.surfaces import coefficient
+    from optics.scene.surfaces import MIDDLE, coefficient
 
     class Clear(passing(mi.BSDFFlags.DeltaTransmission)):
         kind = "clear"
@@ -62,6 +64,10 @@ def build():
         def __init__(self, props):
             self.outside = str(props.get("outside", ""))
             super().__init__(props)
+            self.read_spectrum(props, "index_spectrum", "index")
+            absorption = self.read_spectrum(props, "absorption_spectrum", "absorption")
+            if absorption is not None and not absorption(MIDDLE) > 0:
+                raise ValueError(f"{self.name}.absorption_spectrum is 0 at {MIDDLE:g} nm, where `absorption` holds")
             if self.outside:
                 self._waits = f"'{self.name}' lies inside '{self.outside}'"
             sides = mi.BSDFFlags.FrontSide | mi.BSDFFlags.BackSide
@@ -86,6 +92,9 @@ def build():
             if name in ("dispersion", "absorption_slope"):  # of one band they say no more than the coefficient itself
                 return self.bands > 1
             return name != "scattering" or self.fills_cells
+
+        def context(self, words):
+            return {"curves": self.curves}
 
         def fading(self, wavelengths):
             """alpha per band, 1/mm."""

@@ -68,6 +68,7 @@ WIDTH = 2 * math.sqrt(2 * math.log(2))  # fwhm over standard deviation
 def build():
     import drjit as dr
     import mitsuba as mi
+    import numpy as np
 
     class Fluorescent(matt()):
         kind = "fluorescent"
@@ -87,6 +88,8 @@ def build():
                 * middle
             )
             cos = dr.maximum(dr.dot(si.sh_frame.n, to_led), 0.0)
+            if self.integral is not None:  # the power of a light is that of all its wavelengths
+                overlap /= math.sqrt(2 * math.pi) * s1
             absorbed = dr.select(led.wavelength > 0, led.kappa(si, to_led, distance) * cos * overlap, 0.0)
             bands = (
                 mi.UnpolarizedSpectrum(si.wavelengths) if mi.is_spectral else mi.UnpolarizedSpectrum(self.band or 540.0)
@@ -95,10 +98,17 @@ def build():
             photons = dr.exp(-dr.square((bands - self.emission_peak) / s) / 2) / (math.sqrt(2 * math.pi) * s)
             seen = mi.Frame3f.cos_theta(si.wi) > 0
             left = getattr(self, "yield") * dr.exp(-self.bleaching * self.time)
+            if self.lane is not None:
+                return dr.select(seen, left * absorbed * self.lane / math.pi, 0.0)
             return dr.select(seen, left * absorbed * photons / (bands * math.pi), 0.0)
 
+        def emission(self, own, nm):
+            """Power per nm that is emitted, per photon, at wavelengths; numpy."""
+            s = own.emission_fwhm / WIDTH
+            return np.exp(-(((nm - own.emission_peak) / s) ** 2) / 2) / (math.sqrt(2 * math.pi) * s * nm)
+
         def brdf(self, si, wo, active=True):
-            return self.rho() * dr.inv_pi
+            return self.rho(si) * dr.inv_pi
 
     return Fluorescent
 

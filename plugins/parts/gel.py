@@ -30,7 +30,7 @@ XML
 
 from optics.scene.checking import agree, made
 from optics.scene.declare import Part
-from optics.scene.mitsuba_parts import Declared
+from optics.scene.mitsuba_parts import Declared, coarseness
 from optics.scene.parameter import Parameter
 from optics.skin import contact
 
@@ -164,6 +164,9 @@ def build():
             self.map_pitch = float(props.get("map_pitch", 0.03))  # mm, of the maps that hold the dent's shape
             self.extent = float(props.get("extent", 3.0))  # mm, half width of the fine part
             self.columns, self.rows = int(props.get("columns", 181)), int(props.get("rows", 161))
+            if (times := coarseness()) > 1:
+                self.pitch *= times
+                self.columns, self.rows = -(-self.columns // times), -(-self.rows // times)
             index = np.arange(self.columns * self.rows).reshape(self.rows, self.columns)
             a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]
             faces = np.stack([a, d, c, a, c, b], -1).reshape(-1, 3)  # normals towards the camera (-z)

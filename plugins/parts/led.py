@@ -22,12 +22,15 @@ References
 XML
     position point: where it stands, mm, in place of `x`, `y`, `z`
     target point, (0, 0, 0): what the axis looks at, mm: its nominal direction is from the position to here
+    spectrum string: measured power over the wavelength, in place of the Gaussian: a file, a name or a law (see
+        "Spectra" in the guide); relative to its peak, of channels as integrals to its area
 """
 
 import math
 
 from optics.scene.checking import agree, made
 from optics.scene.declare import Part
+from optics.scene.line import changed, relative
 from optics.scene.mitsuba_parts import Declared
 from optics.scene.parameter import Parameter
 
@@ -125,8 +128,24 @@ PARAMETERS = (
         how="difference",
         role="light area",
     ),
-    Parameter("wavelength", "nm", 0.0, (0.0, 2000.0), "peak wavelength; 0: the same in every band", plausible=3.0),
-    Parameter("fwhm", "nm", 30.0, (1.0, 1000.0), "full width at half maximum of the spectrum", plausible=5.0),
+    Parameter(
+        "wavelength",
+        "nm",
+        0.0,
+        (0.0, 2000.0),
+        "peak wavelength; 0: the same in every band",
+        plausible=3.0,
+        role="light wavelength",
+    ),
+    Parameter(
+        "fwhm",
+        "nm",
+        30.0,
+        (1.0, 1000.0),
+        "full width at half maximum of the spectrum",
+        plausible=5.0,
+        role="light width",
+    ),
 )
 
 
@@ -145,6 +164,7 @@ def build():
                 for name, value in zip("xyz", position):
                     props[name] = float(value)
             self.declare(props)
+            self.read_spectrum(props, "spectrum", "power")
             nominal = [float(t) - self.number(n) for t, n in zip(target, "xyz")]
             if not any(nominal):
                 raise ValueError(
@@ -168,13 +188,19 @@ def build():
                 if self.band is None:
                     return mi.UnpolarizedSpectrum(1.0)
                 wavelengths = self.band
+            if self.lane is not None:
+                return self.lane
+            functions, curve = self.functions("spectrum"), self.curves.get("spectrum")
+            if functions or curve is not None or self.integral is not None:
+                nm = mi.UnpolarizedSpectrum(wavelengths)
+                power = changed(relative(self, curve), functions, self)(nm)
+                return power if self.integral is None else power / relative(self, curve).area
             u = (mi.UnpolarizedSpectrum(wavelengths) - self.wavelength) / self.fwhm
             return dr.select(self.wavelength > 0, dr.exp(-4 * math.log(2) * dr.square(u)), 1.0)
 
-        def colour(self):
+        def colour(self, wavelengths=None):
             """Share of the power in each band."""
-            shares = (self.power_r, self.power_g, self.power_b, mi.Float(1.0))
-            return mi.UnpolarizedSpectrum(*shares[: dr.size_v(mi.UnpolarizedSpectrum)])
+            return self.by_colour(self.power_r, self.power_g, self.power_b, wavelengths)
 
         def point(self, sample):
             """A point of the emitting disc for a sample of the unit square; the centre when the area is 0."""
@@ -211,7 +237,9 @@ def build():
             """kappa of (S2) per band, with all that effects do to it."""
             cos = dr.dot(-to_led, self.axis())
             kappa = (
-                mi.UnpolarizedSpectrum(self.kappa(it, to_led, distance)) * self.spectrum(it.wavelengths) * self.colour()
+                mi.UnpolarizedSpectrum(self.kappa(it, to_led, distance))
+                * self.spectrum(it.wavelengths)
+                * self.colour(it.wavelengths)
             )
             for function in self.functions("emission"):
                 kappa *= function(Beam(cos, distance, to_led, it.p, it.wavelengths), self)
@@ -253,7 +281,7 @@ def build():
                 if mi.is_spectral
                 else (mi.Color0f(), mi.UnpolarizedSpectrum(1.0))
             )
-            return wavelengths, weight * self.spectrum(wavelengths) * self.colour()
+            return wavelengths, weight * self.spectrum(wavelengths) * self.colour(wavelengths)
 
         def to_string(self):
             return f"LED[{self.name}]"

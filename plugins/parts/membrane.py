@@ -16,13 +16,14 @@ Validity
 References
     F-TAC Hand supplementary information, S1.4, eq. (S3); Oren & Nayar, IJCV 14, 227 (1995).
 XML
-    reflectance texture, 1.0: a factor of the reflectance that varies over the surface
+    reflectance texture, 1.0: a factor of the reflectance that varies over the surface; as a string, one that varies
+        with the wavelength: a file, a name or pairs, such as "colour:dark skin"
 """
 
 from optics.scene.checking import agree, made
 from optics.scene.declare import Part
 from optics.scene.parameter import Parameter
-from optics.scene.surfaces import matt
+from optics.scene.surfaces import matt, texture_of
 
 PARAMETERS = (
     Parameter(
@@ -81,7 +82,12 @@ def build():
 
         def __init__(self, props):
             super().__init__(props)
-            self.reflectance = props.get_texture("reflectance", 1.0)
+            named = props.get("reflectance") if "reflectance" in props else None
+            if isinstance(named, str):  # a measured curve, as a spectrum of Mitsuba's
+                curve = self.read_spectrum(props, "reflectance", "reflectance")
+                self.reflectance = texture_of(curve, self.band)
+            else:
+                self.reflectance = props.get_texture("reflectance", 1.0)
 
         def traverse(self, cb):
             self.put_parameters(cb)
@@ -89,7 +95,7 @@ def build():
 
         def albedo(self, si, active=True):
             """rho_c times the texture, per band."""
-            return self.rho() * self.reflectance.eval(si, active)
+            return self.rho(si) * self.reflectance.eval(si, active)
 
         def rough(self):
             """(A, B) of the facets' roughness."""

@@ -15,16 +15,18 @@ Validity
 A `room` is such a surface before the sensor, off (power 0) until somebody adds it: the light of the surroundings.
 References
     Goldstein, Polarized Light, 3rd ed., ch. 4.
+XML
+    spectrum string: measured power over the wavelength, in place of the Gaussian: a file, a name or a law
 """
 
 import math
 from dataclasses import replace
 
-from optics.polarization.mueller import exp, real, where
 from optics.scene.checking import agree, ray
 from optics.scene.checking import stokes as sent
 from optics.scene.declare import Part
 from optics.scene.lamp import drifted
+from optics.scene.line import relative
 from optics.scene.mitsuba_parts import Declared
 from optics.scene.parameter import Parameter
 
@@ -110,10 +112,24 @@ PARAMETERS = (
         how="layer",
     ),
     Parameter(
-        "wavelength", "nm", 0.0, (0.0, 2000.0), "peak wavelength; 0: the same in every band", plausible=3.0, how="layer"
+        "wavelength",
+        "nm",
+        0.0,
+        (0.0, 2000.0),
+        "peak wavelength; 0: the same in every band",
+        plausible=3.0,
+        how="layer",
+        role="light wavelength",
     ),
     Parameter(
-        "fwhm", "nm", 30.0, (1.0, 1000.0), "full width at half maximum of the spectrum", plausible=5.0, how="layer"
+        "fwhm",
+        "nm",
+        30.0,
+        (1.0, 1000.0),
+        "full width at half maximum of the spectrum",
+        plausible=5.0,
+        how="layer",
+        role="light width",
     ),
 )
 ROOM = (
@@ -126,9 +142,7 @@ ROOM = (
 
 def stokes(crossing, source):
     """Stokes vector at power 1, against the crossing's axes."""
-    u = (crossing.wavelengths - source.wavelength) / source.fwhm
-    line = exp(-4 * math.log(2) * u * u)
-    level = where(real(source.wavelength) > 0, line, 1.0 + 0.0 * line) * drifted(source)
+    level = relative(source, getattr(source, "curve", None))(crossing.wavelengths) * drifted(source)
     q, u = crossing.axis(0.0)  # of the surface's x axis, against the crossing's axes
     return level, level * (source.dop_q * q - source.dop_u * u), level * (source.dop_q * u + source.dop_u * q), 0
 
@@ -145,8 +159,12 @@ def build(kind_of="source"):
         def __init__(self, props):
             mi.Emitter.__init__(self, props)
             self.declare(props)
+            self.read_spectrum(props, "spectrum", "power")
             self.m_flags = +mi.EmitterFlags.Surface
             self.m_needs_sample_3 = True
+
+        def context(self, words):
+            return {"curve": self.curves.get("spectrum")}
 
         def colour(self):
             shares = (self.power_r, self.power_g, self.power_b, mi.Float(1.0))
@@ -177,8 +195,7 @@ def build(kind_of="source"):
 
         def level(self, wavelengths):
             bands = mi.UnpolarizedSpectrum(wavelengths) if mi.is_spectral else mi.UnpolarizedSpectrum(540.0)
-            u = (bands - self.wavelength) / self.fwhm
-            return dr.select(self.wavelength > 0, dr.exp(-4 * math.log(2) * dr.square(u)), 1.0) * drifted(self)
+            return relative(self, self.curves.get("spectrum"))(bands) * drifted(self)
 
         def pdf_direction(self, it, ds, active=True):
             return dr.select(dr.dot(ds.d, ds.n) < 0, self.get_shape().pdf_direction(it, ds, active), 0.0)

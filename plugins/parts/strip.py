@@ -26,6 +26,7 @@ XML
     position point: where its middle stands, mm, in place of `x`, `y`, `z`
     target point, (0, 0, 0): what it faces, mm: the axis is from the position to here
     along vector: the direction of its long side, as far as that lies across the axis
+    spectrum string: measured power over the wavelength, as of the part `led`
     points integer, 0: number n of points, a multiple of 4; 0: by its size
 """
 

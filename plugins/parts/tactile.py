@@ -3,7 +3,7 @@
 Definition
     L(x -> camera) = sum_k V(x, S_k) T_gel f(wi, s_k) cos(theta_k) kappa_k + ambient + volume            (S5)
                    + s sum (one more bounce), s = `interreflection`
-in the bands given by `bands` (nm, at most four; red first), so that a spectral render has no spectral noise. The
+in the bands given by `bands` (nm; red first), so that a spectral render has no spectral noise. The
 camera's ray passes flat interfaces (part `interface`) by Snell's law with the transmitted share as weight; LEDs are
 sampled through null and index-matched surfaces; homogeneous media are followed analytically, exp(-sigma_a d) per
 segment; the gel's own effects (stages `segment` and `volume`) act on the path inside -thickness < z < 0. Every surface
@@ -18,7 +18,8 @@ References
     F-TAC Hand supplementary information, S1.4-S1.5, eq. (S5); Veach, thesis (1997), ch. 8, for the direct-light
     estimator.
 XML
-    bands string: wavelengths of the camera's bands, nm, red first, at most four: "610, 540, 460"
+    bands string: wavelengths of the camera's bands, nm, red first: "610, 540, 460"; with more than four, a range
+        "400:700:10" or "auto", channels are integrals over the wavelength (optics.scene.integral)
     stokes boolean, False: whether S1 to S3 are rendered as further channels
     max_depth integer, 2: edges of a path between scattering surfaces; 2 is direct light
     max_null integer, 8: flat or index-matched faces that a path may pass beyond that
@@ -29,7 +30,8 @@ XML
 
 from optics.scene.checking import agree
 from optics.scene.declare import Part
-from optics.scene.mitsuba_parts import Declared
+from optics.scene.integral import FEW, parse
+from optics.scene.mitsuba_parts import DEFAULT_VARIANT, Declared
 from optics.scene.parameter import Parameter
 from optics.scene.wiring import ensure_wired
 
@@ -67,13 +69,12 @@ def build():
             self.max_depth = props.get("max_depth", 2)  # edges of a path between surfaces: 2 is direct light
             self.max_null = props.get("max_null", 8)
             self.rays, self.packets = props.get("rays", 64), props.get("packets", 100_000)  # of optics.light.transport
-            text = str(props.get("bands", ""))
-            self.bands = tuple(float(w) for w in text.replace(",", " ").split())
+            self.bands, self.nodes = parse(str(props.get("bands", "")), "tactile")
             self.lanes = dr.size_v(mi.UnpolarizedSpectrum)
-            if len(self.bands) > self.lanes and mi.is_spectral:
+            self.integrates = self.nodes is not None or len(self.bands) > FEW
+            if self.integrates and not mi.is_spectral:
                 raise ValueError(
-                    f"tactile: {len(self.bands)} bands, but a render carries at most {self.lanes}; "
-                    "render the others in a second scene"
+                    f"tactile: auto bands and more than {FEW} need a spectral variant; allowed: {DEFAULT_VARIANT}"
                 )
             self.declare(props)
             self.gel_of = {}
@@ -128,6 +129,11 @@ def build():
             return [vector[i, 0][j] for i in range(4) for j in range(self.lanes)]
 
         def sample(self, mode, scene, sampler, ray, δL=None, state_in=None, active=True, **_):
+            if self.integrates:
+                raise ValueError(
+                    f"tactile: mi.render carries {self.lanes} bands; auto bands and more than {FEW} are rendered LED "
+                    "by LED (optics render); allowed here: up to four bands"
+                )
             self.look_up(scene)
             light = self.walk(scene, self.start(ray, sampler, active))["light"]
             return light, mi.Bool(True), self.channels(light, mi.Vector3f(ray.d), self.vertical), None

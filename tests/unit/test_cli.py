@@ -58,7 +58,9 @@ def test_help_needs_nothing_heavy():
     assert child.stdout.splitlines()[-1] == "[]", child.stdout + child.stderr
 
 
-@pytest.mark.parametrize("name", [c.name or c.callback.__name__ for c in cli.app.registered_commands])
+@pytest.mark.parametrize(
+    "name", [(c.name or c.callback.__name__).replace("_", "-") for c in cli.app.registered_commands]
+)
 def test_every_command_has_help(optics, name):
     code, out, err = optics(name, "--help")
     assert code == 0 and "--quiet" in out and "--debug" in out and err == ""
@@ -120,6 +122,21 @@ def test_params_of_every_scene(optics, name):
         "derivative",
         "meaning",
     ]
+
+
+def test_spectra_are_listed_and_drawn(optics, tmp_path):
+    """Sources, bands and error in the list; a picture whose size says that something is in it."""
+    auto = ("digit", *SIZE, "-D", "bands=auto")
+    code, text, _ = optics("params", *auto)
+    assert code == 0 and "gaussian(625, 20)" in text and "Nikon 5100" in text and "estimated error" in text
+    code, text, err = optics("plot-spectra", *auto, "-o", str(tmp_path / "spectra.png"))
+    assert (code, text.strip()) == (0, str(tmp_path / "spectra.png")) and "623.4 nm" in err
+    assert np.std(Image.open(tmp_path / "spectra.png").convert("L")) > 10
+    drawn = json.loads(optics("plot-spectra", "gelsight", "-o", str(tmp_path / "plain.svg"), "--json")[1])
+    assert [s["source"] for s in drawn["spectra"]] == ["white"] * 6 and drawn["bands"] is None
+    assert (tmp_path / "plain.svg").read_text().startswith("<?xml")
+    code, _, err = optics("plot-spectra", "digit", "-o", str(tmp_path / "spectra.gif"))
+    assert code == 2 and ".svg" in err
 
 
 def test_params_by_pattern_and_definition(optics):

@@ -500,9 +500,9 @@ def study(tmp_path):
     return folder
 
 
-def test_effects_new_writes_a_draft_beside_the_captures_and_never_twice(study, optics):
+def test_effects_new_writes_a_draft_into_the_study_and_never_twice(study, optics):
     code, said, noted = optics("effects", "new", "Row bands", "--from", study)
-    file = study.parent / "captures" / "plugins" / "row_bands.py"
+    file = study / "plugins" / "row_bands.py"
     assert code == 0 and said.strip() == str(file) and f"optics add {study}" in noted
     text = file.read_text()
     code, _, error = optics("effects", "new", "row bands", "--from", study)
@@ -513,10 +513,7 @@ def test_effects_new_writes_a_draft_beside_the_captures_and_never_twice(study, o
     assert code == 0 and "REPLACE the table" in page and "row_bands.py" in page
 
 
-def test_a_draft_is_of_the_last_diagnosis_and_goes_where_the_study_looks(study, optics):
-    record = json.loads((study / "ladder.json").read_text())
-    record["facts"]["setup"]["plugins"] = str(study.parent / "own")
-    (study / "ladder.json").write_text(json.dumps(record))
+def test_a_draft_is_of_the_last_diagnosis(study, optics):
     base = study / "steps" / "00-base"
     later = base.with_name("01-more")
     later.mkdir()
@@ -528,7 +525,7 @@ def test_a_draft_is_of_the_last_diagnosis_and_goes_where_the_study_looks(study, 
         json.dumps({**told, "fingerprints": [{**told["fingerprints"][0], "coordinate": "column"}]})
     )
     code, said, _ = optics("effects", "new", "stripes", "--from", study)
-    assert code == 0 and Path(said.strip()) == study.parent / "own" / "stripes.py"
+    assert code == 0 and Path(said.strip()) == study / "plugins" / "stripes.py"
     assert "along 'column'" in Path(said.strip()).read_text() and "step 'more'" in Path(said.strip()).read_text()
 
 
@@ -593,6 +590,9 @@ def test_names_that_functions_of_a_camera_see_are_those_that_no_effect_may_take(
         registry=known(),
         resolution=(4, 3),
         sensitivity="identity",
+        channels=(),
+        curves={},
+        integral=None,
         numbers={n: SimpleNamespace(neutral=None) for n in own},
         normalised=lambda own, u, v: (u, v, 1.0),
     )

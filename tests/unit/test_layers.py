@@ -29,7 +29,7 @@ def test_a_pattern_from_a_file_is_the_formula_that_it_was_made_from(tmp_path):
     disc = (
         next(e for e in known().effects.values() if e.name == "stress birefringence")
         .stages["layer"]
-        .__globals__["disc"]
+        .__wrapped__.__globals__["disc"]
     )
     n = 480
     x, y = np.meshgrid((np.arange(n) + 0.5) / n * 24 - 12, 12 - (np.arange(n) + 0.5) / n * 24)  # row 0 at +y

@@ -193,7 +193,7 @@ def test_a_session_of_images(tmp_path, capsys):
         (["design", "gelsigt"], "unknown scene 'gelsigt'; did you mean 'gelsight'"),
         (["design", "gelsight", "--effects", "unfilled cell"], "cannot express the effect 'unfilled cell'"),
         (["design", "gelsight", "--strength", "0"], "strength of 0 plausible sizes; allowed: > 0"),
-        (["design", "gelsight", "--strength", "inf"], "strength of inf plausible sizes; allowed: > 0"),
+        (["design", "gelsight", "--strength", "inf"], "--strength inf: not finite; allowed: a finite number"),
         (["design", "gelsight", "--saturation", "5"], "saturation = 5 DN; allowed: > black_level = 8 DN"),
     ],
 )

@@ -13,6 +13,7 @@ from optics.fit import calibrate
 from optics.scene.parameter import Values
 from optics.study import loop, stages
 from optics.study import setup as studies
+from optics.study.refits import Refits
 
 NOISE = 0.002  # V, of readings of up to a few volts
 BLACK = 0.5  # V: without light
@@ -152,7 +153,7 @@ def test_a_refit_finds_the_order_of_an_effect(mitsuba, tmp_path):
     assert base.chi2_per_dof > 1000
     effect = model.scene.registry.find_effect("retardance")
     extra = studies.effect_variables(model, effect, base.variables)
-    refits = loop.Refits(model, studies.Setup(captures=str(folder)), base, [effect])
+    refits = Refits(model, studies.Setup(captures=str(folder)), base, [effect])
     near = stages.off_neutral(model, base.values, extra)
     found = refits.of(model, [*base.variables, *extra], near, frames)
     assert found.chi2_per_dof < 1 + 5 * np.sqrt(2 / found.dof)

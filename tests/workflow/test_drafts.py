@@ -48,18 +48,19 @@ def test_the_same_data_do_not_test_a_draft(drawn, tmp_path):
     again = package.Study.open(study).diagnose(advised=False)
     assert again.not_tested["lamp ripple"] == WHY and again.claimed != "lamp ripple"
     assert f"lamp ripple ({WHY})" in again.text()
-    # another folder, another description of the same table, the draft beside it: the same data still
+    # another folder, another description of the same table: the same data still
     shutil.copytree(study.parent / "captures", tmp_path / "set")
     (tmp_path / "set" / "captures.toml").write_text(
         (tmp_path / "set" / "captures.toml").read_text(encoding="utf-8").replace("readings.csv", "moved.csv")
     )
     (tmp_path / "set" / "readings.csv").rename(tmp_path / "set" / "moved.csv")
-    copied = package.calibrate(tmp_path / "set", tmp_path / "study")
+    copied = package.calibrate(tmp_path / "set", tmp_path / "study", plugins=file)
+    assert "lamp-ripple" in copied.model.scene.registry.effects
     assert "lamp-ripple" not in {e.key for e in copied.candidates()}
     # one half of it
     rows = (tmp_path / "set" / "moved.csv").read_text(encoding="utf-8").splitlines()
     (tmp_path / "set" / "moved.csv").write_text("\n".join(rows[:65]) + "\n")
-    part = package.calibrate(tmp_path / "set", tmp_path / "part")
+    part = package.calibrate(tmp_path / "set", tmp_path / "part", plugins=file)
     assert "lamp-ripple" not in {e.key for e in part.candidates()}
 
 

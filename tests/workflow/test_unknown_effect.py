@@ -109,7 +109,7 @@ def test_a_curve_along_geometry_becomes_an_effect_as_well(mitsuba, tmp_path, opt
     for role in ("fitted", "held_out"):
         excess = [step[role]["chi2_per_dof"] - 1 for step in (base, drafted)]
         assert excess[0] > 0.1 and excess[1] < 0.3 * excess[0]
-    file = tmp_path / "captures" / "plugins" / "tilt_shade.py"
+    file = study / "plugins" / "tilt_shade.py"
     file.write_text(file.read_text() + "# changed\n")
     code, _, error = optics("diagnose", study)
     assert code == 2 and "tilt_shade.py" in error and "start a new study" in error

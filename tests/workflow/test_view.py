@@ -109,7 +109,9 @@ def ask(server):
         connection = http.client.HTTPConnection(*server.server_address, timeout=60)
         with contextlib.closing(connection):
             body = (json.dumps(question) if text is None else text) if method == "POST" else None
-            connection.request(method, path, body, {"Content-Type": "application/json", **(headers or {})})
+            connection.request(
+                method, f"/{server.token}{path}", body, {"Content-Type": "application/json", **(headers or {})}
+            )
             answer = connection.getresponse()
             return answer.status, answer.read(), answer.headers
 
@@ -320,6 +322,11 @@ def test_no_other_place_is_served(ask, study, server):
     ):
         assert ask("/write", headers=headers)[0] == 403, headers
     assert ask("/study", "GET", {"Host": "evil.example"})[0] == 403
+    for path in ("/", "/study", f"/{'x' * len(server.token)}/study"):  # another user of this machine finds the port
+        with contextlib.closing(http.client.HTTPConnection(*server.server_address, timeout=10)) as connection:
+            connection.request("GET", path)
+            answer = connection.getresponse()
+            assert answer.status == 403 and server.token not in answer.read().decode()
     assert not list(study.glob("view-*.toml"))
     with contextlib.closing(http.client.HTTPConnection(*server.server_address, timeout=10)) as connection:
         connection.putrequest("POST", "/predict")
@@ -435,9 +442,10 @@ def test_the_command_serves_until_it_is_interrupted(study):
     try:
         url = child.stdout.readline().strip()
         assert url.startswith("http://127.0.0.1:"), child.stderr.read()
-        connection = http.client.HTTPConnection(url.removeprefix("http://").rstrip("/"), timeout=60)
+        address, token = url.removeprefix("http://").rstrip("/").split("/")
+        connection = http.client.HTTPConnection(address, timeout=60)
         with contextlib.closing(connection):
-            connection.request("GET", "/")
+            connection.request("GET", f"/{token}/")
             page = connection.getresponse().read().decode()
         assert "<!doctype html>" in page and "http://" not in page and "https://" not in page  # asks nothing of others
         child.send_signal(signal.SIGINT)

@@ -1,0 +1,182 @@
+"""The refits of a diagnosis: chord steps on the base's derivative images where these will do, else a calibration; each
+is kept in the study as soon as it is there, so that a diagnosis that was stopped goes on where it was.
+
+A calibration of images with one more effect takes many times as long as chord steps (`optics.fit.calibrate.extended`).
+Chord steps of all effects come first; those that come near the best are calibrated."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from optics.files.output import write_text
+from optics.fit import calibrate
+from optics.fit.descent import prior_terms
+from optics.fit.result import Fit
+from optics.fit.scene_model import SceneModel
+from optics.scene.declare import Effect
+from optics.scene.parameter import Values, Variable
+from optics.study.setup import Setup, effect_variables
+from optics.study.stages import fit_base, off_neutral
+from optics.version import __version__
+
+PROMISING = 0.7  # of the best fall of chi2: an unconverged refit that falls by more is worth a calibration
+ROUGH = 0.5  # chi2 per variable at which a refit of a diagnosis, which compares falls far above 1, may stop
+# Of what a refit leaves beyond noise: a promised fall below it is not worth another linearisation. Where misfit is
+# left, falls that differ by less than a fifth decide nothing (`optics.diagnosis.thresholds.MARGIN`).
+COARSE = 0.01
+AS_PROMISED = 0.7  # of the promised fall: a calibration that falls by more has not ended in another minimum
+FEW = 4  # iterations of a refit that continues one
+
+
+class Refits:
+    """Refits of one base.
+
+    tested   the effects of the diagnosis;   folder: where refits are kept; None: nowhere
+    """
+
+    def __init__(
+        self, model: SceneModel, setup: Setup, base: Fit, tested: Sequence[Effect], folder: Path | None = None
+    ):
+        self.model, self.setup, self.base, self.folder = model, setup, base, folder
+        self.known = {v.name for v in base.variables}
+        curved = [v for e in tested if e.onset != "tangent" for v in effect_variables(model, e, base.variables)]
+        self.steps = {v.name: v.parameter.plausible for v in curved}  # of variables without a slope at neutral
+        self.chords: dict[tuple[str, ...], Fit] = {}
+        self.results: dict[tuple[str, ...], Fit] = {}
+
+    def foresee(self, sets: Sequence[Sequence[Variable]], say: Callable[[str, int, int], None]) -> None:
+        """Chord steps of each set of variables, so that the best is known before any is calibrated."""
+        if not self.by_chords():
+            return
+        for n, extra in enumerate(sets):
+            say("chord steps", n, len(sets))
+            if self.curved(extra) < 2 and self.taken_up(extra) is None:
+                self.chord(extra)
+        say("chord steps", len(sets), len(sets))
+
+    def of(self, model: SceneModel, variables: Sequence[Variable], start: Values, frames: Sequence[int]) -> Fit:
+        """The fit of these variables from this start."""
+        extra = [v for v in variables if v.name not in self.known]
+        over = [v.name for v in extra]  # of the base the best start is known
+        if not self.by_chords() or not extra or list(frames) != list(self.base.frames):
+            return calibrate.fit_over_starts(model, variables, start, frames, over=over)
+        names = tuple(over)
+        found = self.taken_up(extra)  # a diagnosis asks again from another start, which chord steps do not use
+        if found is None:
+            if self.curved(extra) < 2:
+                found = self.calibrated(variables, extra, frames)
+            else:  # a chord per parameter misses their products
+                found = calibrate.fit_over_starts(
+                    model, variables, start, frames, tolerance=ROUGH, over=over, negligible=COARSE
+                )
+            self.results[names] = found
+            self.keep(found, extra)
+        return found
+
+    def by_chords(self) -> bool:
+        """Whether chord steps are worth it: readings of a table are predicted in milliseconds."""
+        return self.model.captures.table is None and self.base.normal is not None
+
+    def curved(self, extra: Sequence[Variable]) -> int:
+        """How many of these have no slope at neutral."""
+        return sum(v.name in self.steps for v in extra)
+
+    def chord(self, extra: Sequence[Variable]) -> Fit:
+        """The fit by chord steps."""
+        names = tuple(v.name for v in extra)
+        if names not in self.chords:
+            steps = {n: self.steps[n] for n in names if n in self.steps}
+            self.chords[names] = calibrate.extended(self.model, self.base, extra, steps)
+        return self.chords[names]
+
+    def calibrated(self, variables: Sequence[Variable], extra: Sequence[Variable], frames: Sequence[int]) -> Fit:
+        """The fit by chord steps, and where these come near the best without an end, a calibration that continues them;
+        where that falls short of what was promised, one from the study's start values: a strong effect may have bent
+        the base's values far from the truth."""
+        quick = self.chord(extra)
+        leader = max(map(self.fall, (*self.chords.values(), *self.results.values())))
+        if quick.converged or not self.fall(quick) > PROMISING * leader:
+            return quick
+        asked = self.minimised(self.base) - PROMISING * leader
+        further = calibrate.fit(
+            self.model,
+            variables,
+            quick.values,
+            frames,
+            max_iterations=FEW,
+            tolerance=ROUGH,
+            negligible=COARSE,
+            asked=asked,
+        )
+        best = min((further, quick), key=self.minimised)
+        if self.fall(best) > AS_PROMISED * quick.promised or self.minimised(best) > asked:
+            return best
+        values = off_neutral(self.model, Values(dict(self.setup.values)), extra)
+        afresh = fit_base(self.model, variables, frames, values, tolerance=ROUGH, negligible=COARSE)
+        return min((best, afresh), key=self.minimised)
+
+    def fall(self, found: Fit) -> float:
+        """Of what is minimised, chi2 and priors: where each frame has its own angle, these may hold most of it."""
+        return self.minimised(self.base) - self.minimised(found)
+
+    def minimised(self, found: Fit) -> float:
+        return found.chi2 + prior_terms(self.model, found.variables, found.values)[2]
+
+    # -- kept in the study --------------------------------------------------------------------------------------------
+    def taken_up(self, extra: Sequence[Variable]) -> Fit | None:
+        """A refit that was made before, now or by a diagnosis that was stopped; None where there is none."""
+        names = tuple(v.name for v in extra)
+        if names not in self.results and self.folder is not None:
+            file = self.file_of(names)
+            if file.is_file():
+                found = self.read(file, extra)
+                if found is not None:
+                    self.results[names] = found
+        return self.results.get(names)
+
+    def file_of(self, names: Sequence[str]) -> Path:
+        """Where a refit of these variables is kept: it belongs to the base's values and to the program's version."""
+        assert self.folder is not None
+        whole = json.dumps([names, [float(e) for e in self.base.estimate], self.base.frames, __version__])
+        return self.folder / f"{hashlib.sha256(whole.encode()).hexdigest()[:16]}.json"
+
+    def keep(self, found: Fit, extra: Sequence[Variable]) -> None:
+        """Write a refit."""
+        if self.folder is None:
+            return
+        self.folder.mkdir(parents=True, exist_ok=True)
+        record = {
+            "variables": [v.name for v in found.variables],
+            "estimate": [float(e) for e in found.estimate],
+            "covariance": [[float(c) for c in row] for row in found.covariance],
+            "common": found.values.common,
+            "frame": {str(i): own for i, own in found.values.frame.items()},
+            **{k: getattr(found, k) for k in ("chi2", "dof", "frame_chi2", "frame_n", "converged", "reason")},
+        }
+        write_text(self.file_of([v.name for v in extra]), json.dumps(record))
+
+    def read(self, file: Path, extra: Sequence[Variable]) -> Fit | None:
+        """A refit as it was kept, without derivative images; None where the file is cut off."""
+        variables = {v.name: v for v in (*self.base.variables, *extra)}
+        try:
+            record = json.loads(file.read_text(encoding="utf-8"))
+            return Fit(
+                Values(dict(record["common"]), {int(i): dict(own) for i, own in record["frame"].items()}),
+                [variables[name] for name in record["variables"]],
+                np.array(record["estimate"], float),
+                np.array(record["covariance"], float),
+                record["chi2"],
+                record["dof"],
+                list(self.base.frames),
+                record["frame_chi2"],
+                record["frame_n"],
+                record["converged"],
+                record["reason"],
+            )
+        except (ValueError, KeyError, TypeError):
+            return None

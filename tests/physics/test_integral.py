@@ -1,0 +1,226 @@
+"""Channels as integrals over the wavelength: limits, few nodes against many bands, derivatives, closed forms."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from optics.captures.capture_set import Captures, Frame, definitions, load
+from optics.captures.noise import Noise
+from optics.errors import BadCapture, BadScene
+from optics.files import exr
+from optics.files.images import write_image
+from optics.files.output import shipped
+from optics.fit.scene_model import SceneModel
+from optics.light.renderer import Renderer
+from optics.light.rendering import RenderJob
+from optics.light.transport import materials
+from optics.scene import checking, loader
+from optics.scene.line import WHITE
+from optics.scene.parameter import Values, Variable
+from optics.spectra.reading import gaussian, read_channels
+
+NIKON = "Nikon 5100 (NPL)"
+SIZE = {"width": "24", "height": "32", "depth": "0.5"}
+
+
+def digit(mitsuba, folder, bands, **attributes):
+    """DIGIT with other bands; attributes of LEDs in XML as {led_red: '<...>'}."""
+    text = (shipped("scenes") / "digit.xml").read_text(encoding="utf-8")
+    for part, xml in attributes.items():
+        text = re.sub(rf'(<(?:emitter|sensor|bsdf) type="\w+" id="{part}">)', rf"\1 {xml}", text)
+    file = folder / f"digit_{len(list(folder.iterdir()))}.xml"
+    file.write_text(text, encoding="utf-8")
+    return loader.load(file, {**SIZE, "bands": bands})
+
+
+def test_lines_give_what_bands_at_their_peaks_give(mitsuba, tmp_path):
+    """LEDs of 1 nm at the peaks: their integrals differ from the sensitivities there by the bend of these at 530 nm,
+    a kink of 3 % per 5 nm over a third of a nm."""
+    images = []
+    for bands in ("625, 530, 470", "auto"):
+        text = (shipped("scenes") / "digit.xml").read_text(encoding="utf-8")
+        text = re.sub(r'name="fwhm" value="\d+"', 'name="fwhm" value="1"', text)
+        file = tmp_path / "lines.xml"
+        file.write_text(text, encoding="utf-8")
+        images.append(RenderJob(loader.load(file, {**SIZE, "bands": bands})).take().camera)
+    assert images[0].max() > 100
+    assert images[1] == pytest.approx(images[0], abs=1e-3 * images[0].max())
+
+
+@pytest.fixture(scope="module")
+def auto(mitsuba, tmp_path_factory):
+    return digit(mitsuba, tmp_path_factory.mktemp("auto"), "auto")
+
+
+def test_few_nodes_give_what_many_bands_give(mitsuba, auto, tmp_path):
+    """Six bands in place of 161, whose trapezium rule of 2.5 nm errs by 3e-4 at the kinks of the sensitivities, which
+    are straight lines over 5 nm."""
+    assert len(auto.integral.nm) <= 7 and auto.integral.error < 1e-12  # nothing on the way depends on the wavelength
+    fine = digit(mitsuba, tmp_path, "380:780:2.5")
+    found, expected = (RenderJob(s).take() for s in (auto, fine))
+    assert found.camera == pytest.approx(expected.camera, abs=4e-4 * expected.camera.max())
+    for name in ("colour.X", "colour.Y", "colour.Z", "camera.G"):
+        assert found.channels[name] == pytest.approx(expected.channels[name], abs=4e-4 * expected.channels[name].max())
+    back, _ = exr.read(expected.write_exr(tmp_path / "bands.exr"))
+    bands, vectors = exr.spectral_image(back)
+    assert bands == pytest.approx(np.arange(380.0, 780.1, 2.5)) and vectors.shape == (32, 24, 161, 1)
+    assert not any(name.startswith("S0.") for name in found.channels)
+
+
+@pytest.mark.parametrize(
+    "paint",
+    [
+        '<string name="reflectance" value="colour:orange"/>',
+        '<spectrum name="reflectance" value="380:0.1, 560:0.8, 780:0.2"/>',
+    ],
+)
+def test_reflectance_and_filter_are_integrated(mitsuba, tmp_path, paint):
+    """A patch of a colour checker, a spectrum of Mitsuba's, and a filter: by the estimated error and by many bands."""
+    xml = {
+        "membrane": paint,
+        "camera": '<string name="filter" value="400:0.1, 560:0.9, 700:0.4"/>',
+    }
+    few, many = (digit(mitsuba, tmp_path, bands, **xml) for bands in ("auto", "380:780:2.5"))
+    assert 6 < len(few.integral.nm) < 40 and few.integral.error < 1e-4
+    found, expected = (RenderJob(s).take().camera for s in (few, many))
+    assert np.abs(found - expected).max() < 5e-4 * expected.max()  # 3e-4 of the trapezium rule, see above
+
+
+@pytest.mark.parametrize("key", ["led_green.wavelength", "led_red.fwhm"])
+def test_derivatives_by_peak_and_width(auto, mitsuba, tmp_path, key):
+    """Auto bands: complex step through the matrix, against central differences, whose error is the third order: 1e-6
+    of a step of 0.05 nm over a width of 20 nm. Fixed bands: forward mode against 0.5 nm, 2e-3 of the largest."""
+    base = auto.values()
+    job = RenderJob(auto)
+    image = job.renderer.radiance(base)
+    found = job.developer.linearise(image, base).of_parameter((key,))
+    sides = [job.developer.develop(image, {**base, key: base[key] + s * 0.05}) for s in (1, -1)]
+    assert auto.parameters[key].how == "image" and np.abs(found).max() > 0.1
+    assert found == pytest.approx((sides[0] - sides[1]) / 0.1, rel=1e-4, abs=1e-5)
+    fine = digit(mitsuba, tmp_path, "400:700:5")
+    renderer = Renderer(fine)
+    own = fine.values()
+    led = key.split(".")[0]
+    tangent = renderer.led_tangent(own, led, key)
+    sides = [renderer.image({**own, key: own[key] + s * 0.5}, led) for s in (1, -1)]
+    assert tangent == pytest.approx(sides[0] - sides[1], abs=2e-3 * float(np.abs(tangent).max()))
+
+
+@pytest.mark.parametrize("bands", ["auto", "400:700:5"])
+def test_a_wave_plate_between_crossed_polarizers(mitsuba, tmp_path, bands):
+    """sum of S(nm) Q(nm) sin^2(delta/2), delta = 250 deg 540/nm, under a white lamp and under a line of 40 nm."""
+    text = (shipped("scenes") / "polarizer_bench.xml").read_text(encoding="utf-8")
+    text = text.replace('<float name="x_fov"', f'<string name="sensitivity" value="{NIKON}"/><float name="x_fov"')
+    file = tmp_path / "bench.xml"
+    file.write_text(text, encoding="utf-8")
+    plate = {"polarizer.angle": 45.0, "analyzer.angle": 135.0, "sample.retard_0": 250.0}
+    plate.update(
+        {f"{film}.{n}": v for film in ("polarizer", "analyzer") for n, v in (("transmittance", 1.0), ("leak", 0.0))}
+    )
+    nm = np.arange(380.0, 781.0)
+    passed = np.sin(np.radians(250 * 540 / nm) / 2) ** 2 / 2
+    quantum = np.array([q(nm) for q in read_channels(NIKON)])
+    for line in (0.0, 560.0):
+        text = file.read_text(encoding="utf-8")
+        own = tmp_path / f"bench_{line:g}.xml"
+        numbers = f'<float name="wavelength" value="{line}"/><float name="fwhm" value="40"/>'
+        lamp = f'<emitter type="source" id="source">{numbers}</emitter>'
+        own.write_text(text.replace('<emitter type="source" id="source"/>', lamp), encoding="utf-8")
+        scene = loader.load(own, {"bands": bands} if 'name="bands"' in text else {})
+        keys = {k: v for k, v in plate.items() if k in scene.parameters}
+        assert len(keys) == len(plate)
+        renderer = Renderer(scene)
+        values = {**scene.values(), **keys}
+        reading = (renderer.radiance(values) @ scene.integral.matrix(values).T)[0, 0]
+        power = gaussian(nm, line, 40.0) if line else np.ones(len(nm))
+        exact = (quantum * power) @ passed / (quantum * power).sum(1).max()
+        seen = reading / scene.integral.matrix(values).sum(1).max() if bands == "auto" else reading
+        tolerance = 2e-3 if bands == "auto" else 2e-2  # the probes are weaker than the plate; 400 to 700 nm alone
+        assert seen == pytest.approx(exact, abs=tolerance), line
+
+
+def test_measured_index_and_absorption_reach_the_paths_of_light(mitsuba):
+    """n of PDMS by Sellmeier's formula of its source, shifted to 1.41 at 540 nm; an absorption that doubles."""
+    body = (
+        '<bsdf type="clear" id="gel"><float name="index" value="1.41"/><float name="absorption" value="0.02"/>'
+        '<string name="index_spectrum" value="pdms_sylgard184.csv"/>'
+        '<string name="absorption_spectrum" value="440:2, 540:1, 640:0.5"/></bsdf>'
+    )
+    lamp = '<emitter type="led" id="led"><point name="position" x="5" y="0" z="-9"/></emitter>'
+    bands = np.array([640.0, 540.0, 440.0])
+    scene = checking.scene_of(f'<shape type="cube">{body}</shape>', lamp, bands="640, 540, 440")
+    found = materials(scene, bands)[1]
+    um2 = (bands / 1e3) ** 2
+    n = np.sqrt(1 + 1.0093 * um2 / (um2 - 0.013185))
+    assert found.index == pytest.approx(1.41 + n - n[1], abs=2e-5)  # a table in steps of 10 nm, to five digits
+    assert found.absorption == pytest.approx([0.01, 0.02, 0.04])
+    lanes = scene.parts["gel"].refractive(mitsuba.UnpolarizedSpectrum(640.0, 540.0, 440.0, 440.0))
+    assert [lanes[i][0] for i in range(3)] == pytest.approx(found.index, abs=1e-6)
+
+
+def test_what_has_no_integral_is_refused(mitsuba, auto):
+    with pytest.raises(BadScene, match="sensitivities.*Nikon"):
+        loader.load("gelsight", {"bands": "auto"})
+    with pytest.raises(BadScene, match="mi.render carries 4 bands"):
+        RenderJob(auto, spp=4)
+    for bands in ("auto 99", "700:400:10", "red", "400, 500, 450, 600, 700"):
+        with pytest.raises(BadScene, match="allowed"):
+            loader.load("digit", {"bands": bands})
+
+
+def test_a_light_that_no_channel_sees_is_dark(mitsuba, tmp_path):
+    """An infrared LED in place of the blue one; the others do not know of it."""
+    with pytest.raises(BadScene, match="is the unit nm"):
+        digit(mitsuba, tmp_path, "auto", led_blue='<string name="spectrum" value="900:1, 980:1"/>')
+    text = (shipped("scenes") / "digit.xml").read_text(encoding="utf-8")
+    (tmp_path / "infrared.xml").write_text(text.replace('value="470"/>', 'value="940"/>'), encoding="utf-8")
+    job = RenderJob(loader.load(tmp_path / "infrared.xml", {**SIZE, "bands": "auto"}))
+    found = job.take().channels
+    assert found["camera.R"].max() > 0 and found["led_blue.B"].max() < 1e-6 * found["camera.B"].max()
+    off = job.take({"led_blue.power": 0.0}).channels
+    assert np.array_equal(found["camera.R"], off["camera.R"])
+
+
+def test_lights_that_share_bands_keep_one_spectrum(mitsuba, tmp_path):
+    """Two lamps of one curve have one set of nodes."""
+    xml = dict.fromkeys(("led_red", "led_green", "led_blue"), '<string name="spectrum" value="CIE LED-B3"/>')
+    scene = digit(mitsuba, tmp_path, "auto", **xml)
+    assert len(scene.integral.groups) == 1 and len(scene.integral.nm) == 3
+    white = scene.integral.matrix() @ scene.integral.white  # what no lamp sends, in the bands of the lamps
+    exact = (scene.integral.quantum * scene.integral.step).sum(1) / WHITE / scene.integral.unit
+    assert white == pytest.approx(exact, rel=1e-9)
+
+
+def test_a_fit_finds_the_wavelength_of_an_led(mitsuba, auto):
+    """Two Gauss-Newton steps with the model's own derivative undo a shift by 3 nm and one of the effect by as much."""
+    captures = Captures(
+        Path("."), "digit", [Frame("0", np.zeros((32, 24, 3)))], noise=Noise(0.05, 1.0, 0.0, 255.0, 0.0)
+    )
+    model = SceneModel(auto, captures)
+    for key, start in (("led_green.wavelength", 530.0), ("led_red.centre_shift", 0.0)):
+        parameter = auto.parameters[key]
+        variable = Variable(key, (key,), parameter)
+        values = Values()
+        values.put(variable, start + 3.0)
+        measured = model.predict(values)[0]
+        found = start
+        for _ in range(3):
+            values.put(variable, found)
+            now = model.at(values, 0)
+            slope = model.developer.linearise(model.radiance(now), now).of_parameter((key,))
+            found += float((slope * (measured - model.predict(values)[0])).sum() / (slope**2).sum())
+        assert found == pytest.approx(start + 3.0, abs=1e-3), key  # what is left of Gauss and Newton's steps
+
+
+def test_captures_name_auto_bands(mitsuba, tmp_path):
+    write_image(tmp_path / "0", np.zeros((32, 24, 3)), 8)
+    for bands in ("auto", "400:700:10"):
+        (tmp_path / "captures.toml").write_text(
+            f'scene = "digit"\nbands = "{bands}"\n[[frames]]\nimage = "0.png"\n', encoding="utf-8"
+        )
+        assert definitions(load(tmp_path), {}, shipped("scenes") / "digit.xml")["bands"] == bands
+    (tmp_path / "captures.toml").write_text('scene = "digit"\nbands = "auto 99"\n[[frames]]\nimage = "0.png"\n')
+    with pytest.raises(BadCapture, match="auto N with 1 to 12"):
+        load(tmp_path)

@@ -1,0 +1,161 @@
+"""Hostile input by the hundred: `make torture` tries all of it, the usual run a small part.
+
+What may happen is the same everywhere (`met`): the command works, or it ends with one line that says what is wrong."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import signal
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, Phase, settings
+from PIL import Image
+
+LIMIT = 60  # s: nothing here takes longer than a second or two; what does, hangs
+COMMON = {
+    "deadline": None,
+    "derandomize": True,  # the same cases in every run: a failure can be looked at
+    "database": None,
+    "phases": [Phase.explicit, Phase.generate],  # a case is a command: shrinking it takes minutes and tells little
+    "suppress_health_check": list(HealthCheck),
+}
+settings.register_profile("few", max_examples=6, **COMMON)
+settings.register_profile("torture", max_examples=100, **COMMON)
+settings.load_profile("torture" if os.environ.get("OPTICS_TORTURE") else "few")
+
+NOISE = "[noise]\nsystem_gain = 0.05\ndark_noise = 1.0\nblack_level = 8.0\nsaturation = 255.0\nprnu = 0.0\n"
+IMAGES = f"""scene = "small.xml"
+values_are = "DN"
+{NOISE}[parameters]
+"camera.exposure" = 100.0
+[uncertainty]
+"gel.press_x" = 0.1
+[exclude]
+"gain drift" = "fixed"
+[[frames]]
+image = "a.png"
+mask = "mask.png"
+group = "one"
+[frames.parameters]
+"led_1.power" = 1.0
+"gel.press_depth" = 0.4
+[[frames]]
+image = "b.png"
+group = "two"
+repeats = ["c.png"]
+[frames.parameters]
+"gel.press_x" = 1.0
+"gel.press_depth" = 0.3
+"""
+READINGS = """scene = "polarizer_bench"
+absent = ["sample", "middle"]
+bands = [540]
+[noise]
+dark_noise = 0.5
+[parameters]
+"polarizer.angle" = 0.0
+[uncertainty]
+"analyzer.angle" = 0.0
+"polarizer.angle" = 0.0
+[table]
+file = "readings.csv"
+values = ["volts"]
+delimiter = ";"
+decimal = ","
+skip = 1
+group = "run"
+rename = { "angle" = "analyzer.angle" }
+scale = { "volts" = 100.0 }
+offset = { "volts" = 1.5 }
+"""
+JOB = """scene = "small.xml"
+out = "out"
+count = 1
+seed = 3
+lights = "together"
+outputs = ["png"]
+[parameters]
+"gel.press_depth" = 0.4
+[sample]
+"gel.press_x" = { uniform = [-1.0, 1.0] }
+"led_1.power" = { choice = [0.5, 1.0] }
+"""
+
+
+@contextlib.contextmanager
+def within(seconds: int = LIMIT):
+    """Fail, and do not wait, where something hangs."""
+
+    def late(*_):
+        raise AssertionError(f"still busy after {seconds} s")
+
+    before = signal.signal(signal.SIGALRM, late)
+    signal.alarm(seconds)
+    try:
+        yield
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, before)
+
+
+@pytest.fixture(scope="session")
+def material(tmp_path_factory, mitsuba):
+    """Good input of every kind: captures of images and of readings, a scene, a job, a study of readings."""
+    import optics as package
+    from optics.scene import loader
+
+    folder = tmp_path_factory.mktemp("torture")
+    rng = np.random.default_rng(0)
+    text = loader.find("gelsight").read_text(encoding="utf-8")
+    for name, old, new in (("width", 320, 16), ("height", 240, 12)):
+        text = text.replace(f'name="{name}" value="{old}"', f'name="{name}" value="{new}"')
+    images = folder / "images"
+    images.mkdir()
+    for place in (folder, images):
+        (place / "small.xml").write_text(text, encoding="utf-8")
+    for name in "abc":
+        Image.fromarray(rng.integers(60, 70, (12, 16, 3)).astype(np.uint8)).save(images / f"{name}.png")
+    Image.fromarray(np.full((12, 16), 255, np.uint8)).save(images / "mask.png")
+    (images / "captures.toml").write_text(IMAGES)
+    (images / "import.json").write_text('{"setup": {"free": ["led_1.power"], "priors": {"led_1.power": [1.0, 0.3]}}}')
+    readings = folder / "readings"
+    readings.mkdir()
+    rows = [
+        f"{a},0;{np.cos(np.radians(a)) ** 2 + rng.normal(0, 0.005):.5f}".replace(".", ",") for a in range(0, 180, 6)
+    ]
+    lines = [f"{row};r{i % 5}" for i, row in enumerate(rows)]
+    (readings / "readings.csv").write_text("Bench 3\nangle;volts;run\n" + "\n".join(lines) + "\n")
+    (readings / "captures.toml").write_text(READINGS)
+    (folder / "job.toml").write_text(JOB)
+    package.calibrate(readings, folder / "study")
+    package.Study.open(folder / "study").diagnose(advised=False)
+    return folder
+
+
+@pytest.fixture
+def place(material, tmp_path):
+    """A copy of the good input, which a test may spoil."""
+    return shutil.copytree(material, tmp_path / "place")
+
+
+@pytest.fixture
+def met(capsys):
+    """Run a command line; fails unless it works or is refused in one line: no traceback, no hang, no other code."""
+    from optics.cli import main
+
+    def run(*words, seconds: int = LIMIT) -> tuple[int, str]:
+        capsys.readouterr()
+        with within(seconds):
+            code = main([str(w) for w in words])
+        said = capsys.readouterr()
+        told = [line for line in said.err.splitlines() if line.startswith("error: ")]
+        assert code in (0, 1, 2), (words, code, said.err)
+        assert "Traceback" not in said.err and "(a bug" not in said.err, (words, said.err)
+        assert code != 2 or len(told) == 1, (words, said.err)
+        assert code != 2 or len(told[0]) > len("error: ") + 8, (words, said.err)
+        return code, told[0] if told else ""
+
+    return run

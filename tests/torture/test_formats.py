@@ -1,0 +1,196 @@
+"""Every file format, mutated: values replaced by hostile ones, keys misspelt, lines lost or doubled, texts cut off,
+bytes flipped. Nothing raises what is not ours, hangs, or is taken for something else without a word."""
+
+import copy
+import io
+import json
+import shutil
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from PIL import Image
+
+from optics.captures import capture_set, readings
+from optics.errors import BadCapture
+from optics.files import exr
+from optics.files.images import read_image, read_mask
+from optics.study.fit_files import read_fit
+
+# fmt: off
+VALUES = [
+    "nan", "inf", "-inf", "1e400", "-1", "0", "1", "-0.0", "1e-300", "1e300", "9223372036854775808", "9" * 5000, "true",
+    "false", "[]", "{}", "[[]]", "[nan]", '[1,"x"]', '["a.png"]', "{a=1}", "1979-05-27", "12:00:00", "0x10", "1_0",
+    '""', '"x"', '"."', r'"\u0000"', '"../../../etc/passwd"', '"/etc/passwd"', '"/dev/zero"', '"/dev/stdin"',
+    '"' + "long" * 5000 + '"', "[" * 50 + "]" * 50, "[" * 3000,
+]
+# fmt: on
+
+
+@st.composite
+def mutations(draw, text):
+    """A text with one to three mutations of a file's own lines and values."""
+    for _ in range(draw(st.integers(1, 3))):
+        lines = text.split("\n")
+        n = draw(st.integers(0, max(len(lines) - 1, 0)))
+        kind = draw(st.sampled_from(("value", "value", "value", "drop", "double", "key", "cut", "junk", "swap", "bom")))
+        if kind == "value" and "=" in lines[n]:
+            lines[n] = lines[n].split("=")[0] + "= " + draw(st.sampled_from(VALUES))
+        elif kind == "drop":
+            del lines[n]
+        elif kind == "double":
+            lines.insert(n, lines[n])
+        elif kind == "key" and len(lines[n]) > 2:
+            at = draw(st.integers(0, len(lines[n]) - 2))
+            lines[n] = lines[n][:at] + lines[n][at + 1] + lines[n][at] + lines[n][at + 2 :]
+        elif kind == "swap" and lines:
+            m = draw(st.integers(0, len(lines) - 1))
+            lines[n], lines[m] = lines[m], lines[n]
+        elif kind == "junk":
+            lines.insert(n, draw(st.text(max_size=20)))
+        text = "\n".join(lines)
+        if kind == "cut":
+            text = text[: draw(st.integers(0, len(text)))]
+        if kind == "bom":
+            text = "\ufeff" + text.replace("\n", "\r\n")
+    return text
+
+
+def write(file, text):
+    file.write_bytes(text.encode("utf-8", errors="surrogatepass"))
+
+
+@given(data=st.data())
+@pytest.mark.parametrize("kind", ["images", "readings"])
+def test_captures_toml(material, met, tmp_path_factory, kind, data):
+    folder = shutil.copytree(material / kind, tmp_path_factory.mktemp("set") / kind)
+    write(folder / "captures.toml", data.draw(mutations((folder / "captures.toml").read_text())))
+    met("compare", folder)
+
+
+@given(data=st.data())
+def test_a_table_of_readings(material, met, tmp_path_factory, data):
+    folder = shutil.copytree(material / "readings", tmp_path_factory.mktemp("set") / "readings")
+    text = (folder / "readings.csv").read_text()
+    cells = ["", "nan", "inf", "1e400", "x", '"', "-1", "9" * 400, "1,5", "1.5", "\0", "=1+1", "é", "0x1"]
+    for _ in range(data.draw(st.integers(1, 4))):
+        lines = text.split("\n")
+        n = data.draw(st.integers(0, len(lines) - 1))
+        row = lines[n].split(";")
+        row[data.draw(st.integers(0, len(row) - 1))] = data.draw(st.sampled_from(cells))
+        lines[n] = ";".join(row)
+        text = "\n".join(lines)
+    write(folder / "readings.csv", text[: data.draw(st.sampled_from([len(text), len(text) // 2, 3, 0]))])
+    met("compare", folder)
+
+
+@given(data=st.data())
+def test_a_job(material, met, tmp_path_factory, data):
+    folder = tmp_path_factory.mktemp("job")
+    shutil.copy(material / "small.xml", folder)
+    write(folder / "job.toml", data.draw(mutations((material / "job.toml").read_text())))
+    met("batch", folder / "job.toml", "--workers", "1")
+
+
+@given(data=st.data())
+def test_advice_of_an_import(material, met, tmp_path_factory, data):
+    folder = shutil.copytree(material / "images", tmp_path_factory.mktemp("set") / "images")
+    known = st.sampled_from(["free", "per_group", "priors", "held_out", "values", "flat_field", "plugins", "seed", "x"])
+    value = st.recursive(
+        st.one_of(
+            st.none(), st.booleans(), st.integers(), st.floats(), st.sampled_from(["led_1.power", "*", "", "none"])
+        ),
+        lambda inner: st.one_of(st.lists(inner, max_size=2), st.dictionaries(known, inner, max_size=2)),
+        max_leaves=4,
+    )
+    advice = data.draw(st.one_of(value, st.dictionaries(known, value, max_size=3)))
+    (folder / "import.json").write_text(json.dumps({"setup": advice}))
+    met("compare", folder)
+
+
+@given(data=st.data())
+def test_a_fit(material, met, tmp_path_factory, data):
+    file = tmp_path_factory.mktemp("fit") / "fit.toml"
+    write(file, data.draw(mutations((material / "study" / "steps" / "00-base" / "fit.toml").read_text())))
+    met("mueller", "--fit", file)
+    met("compare", material / "readings", "--fit", file)
+
+
+@given(data=st.data())
+@pytest.mark.parametrize("name", ["ladder.json", "step.json", "metrics.json", "diagnosis.json"])
+def test_a_study(material, met, tmp_path_factory, name, data):
+    study = shutil.copytree(material / "study", tmp_path_factory.mktemp("study") / "study")
+    file = study / name if name == "ladder.json" else study / "steps" / "00-base" / name
+    record = json.loads(file.read_text())
+    value = st.sampled_from([None, -1, 0, 1e300, True, "", "x", "../..", [], {}, [1], {"a": 1}, ["x"], [[]]])
+    for _ in range(data.draw(st.integers(1, 2))):
+        at = record
+        while isinstance(at, (dict, list)) and at:
+            key = data.draw(st.sampled_from(sorted(at) if isinstance(at, dict) else range(len(at))))
+            if not isinstance(at[key], (dict, list)) or not at[key] or data.draw(st.booleans()):
+                if isinstance(at, dict) and data.draw(st.booleans()):
+                    del at[key]
+                else:
+                    at[key] = copy.deepcopy(data.draw(value))
+                break
+            at = at[key]
+    text = json.dumps(record)
+    file.write_text(text[: data.draw(st.sampled_from([len(text), len(text), len(text), len(text) // 2, 0]))])
+    met("report", study, "-o", study / "page.html")
+    met("values", study)
+
+
+# -- images ----------------------------------------------------------------------------------------------------------
+def encoded():
+    """A small image in every format that is read."""
+    rng = np.random.default_rng(0)
+    image = rng.integers(0, 255, (9, 11, 3)).astype(np.uint8)
+    found = {}
+    for name, kind in ((".png", "PNG"), (".tif", "TIFF")):
+        stream = io.BytesIO()
+        Image.fromarray(image).save(stream, kind)
+        found[name] = stream.getvalue()
+    stream = io.BytesIO()
+    np.save(stream, image.astype(np.float32))
+    return {**found, ".npy": stream.getvalue()}
+
+
+ENCODED = encoded()
+
+
+@given(data=st.data())
+@pytest.mark.parametrize("suffix", [*ENCODED, ".exr"])
+def test_an_image(mitsuba, tmp_path_factory, suffix, data):
+    file = tmp_path_factory.mktemp("image") / f"a{suffix}"
+    if suffix == ".exr":
+        exr.write(file, {n: np.ones((9, 11), np.float32) for n in "RGB"}, {})
+    raw = bytearray(ENCODED[suffix] if suffix in ENCODED else file.read_bytes())
+    for _ in range(data.draw(st.integers(1, 6))):
+        raw[data.draw(st.integers(0, min(len(raw) - 1, 300)))] = data.draw(st.integers(0, 255))
+    file.write_bytes(bytes(raw[: data.draw(st.sampled_from([len(raw), len(raw), len(raw) // 2, 20, 1, 0]))]))
+    for read in (lambda: read_image(file, "here"), lambda: read_mask(file, (9, 11), "here")):
+        try:
+            read()
+        except BadCapture as error:
+            assert "here" in str(error)
+
+
+@given(st.binary(max_size=200))
+def test_bytes_that_are_nothing(tmp_path_factory, data):
+    folder = tmp_path_factory.mktemp("bytes")
+    for name in ("captures.toml", "fit.toml", "a.csv", "a.png", "a.tif", "a.exr", "a.npy"):
+        (folder / name).write_bytes(data)
+    with pytest.raises(BadCapture):
+        capture_set.load(folder)
+    try:
+        read_fit(folder / "fit.toml")
+    except (ValueError, KeyError) as error:
+        assert "fit.toml" in str(error)
+    try:
+        readings.read(folder / "a.csv", readings.Table("a.csv", ["v"]), "here")
+    except (BadCapture, KeyError) as error:
+        assert "a.csv" in str(error)
+    for suffix in (".png", ".tif", ".exr", ".npy"):
+        with pytest.raises(BadCapture):
+            read_image(folder / f"a{suffix}", "here")

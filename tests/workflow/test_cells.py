@@ -1,0 +1,95 @@
+"""Large images are diagnosed in cells: their noise, the same scene in cells, and refits that are taken up again."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from optics.captures.capture_set import Captures, Frame
+from optics.captures.cells import in_cells, noise_of_cells
+from optics.captures.noise import Noise
+from optics.fit.result import Fit
+from optics.scene.parameter import Values, Variable
+from optics.study.cells import Cells
+from optics.study.refits import Refits
+from optics.study.setup import Setup
+
+
+def test_cells_have_the_noise_of_means(tmp_path):
+    """Counted over 20,000 cells: the variance of a mean is known to 1 %, so 4 % is four standard deviations."""
+    noise = Noise(system_gain=0.2, dark_noise=3.0, black_level=20.0, saturation=4095.0, prnu=0.01)
+    rng = np.random.default_rng(1)
+    signal = np.full((300, 600, 1), 500.0)
+    image = np.round(signal + rng.normal(0, 1, signal.shape) * noise.sd(signal)).astype(np.float32)
+    mask = np.ones(image.shape[:2], bool)
+    mask[10, 10] = False
+    image[100, 301] = 4095.0
+    captures = Captures(tmp_path, "gelsight", [Frame("f", image, mask=mask)], noise=noise)
+    found = in_cells(captures, noise, 3)
+    cells = found.frames[0]
+    assert cells.image.shape == (100, 200, 1) and np.argwhere(~cells.mask).tolist() == [[3, 3], [33, 100]]
+    spread = float(np.var(cells.image[cells.mask]))
+    assert spread == pytest.approx(float(noise_of_cells(noise, 3).variance(np.array(500.0))), rel=0.04)
+    with pytest.raises(ValueError, match="raw mosaics have no cells"):
+        in_cells(replace(captures, cfa="RGGB"), noise, 2)
+
+
+@pytest.mark.parametrize("size", [(84, 60), (85, 61)])
+def test_a_scene_in_cells_looks_the_same(mitsuba, size):
+    """The untouched face, away from rims: the mean of 4 pixels against the middle of a cell, whose second derivatives
+    are below a grey level. A field of view that ignored the cut column would be 1 % off, and a principal point half a
+    pixel."""
+    from optics.light.renderer import Renderer
+    from optics.scene import loader
+
+    width, height = size
+    scene = loader.load("gelsight", {"width": str(width), "height": str(height)})
+    values = {**scene.values(), "camera.principal_x": 3.0, "camera.principal_y": -2.0, "led_1.power": 1.0}
+    whole = SimpleNamespace(scene=scene, parameters=scene.parameters)
+    cells = Cells(whole, 2)
+    coarse = loader.load("gelsight", {"width": str(cells.columns), "height": str(cells.rows)})
+    moved = {k: cells.into(k, v) if cells.turns(k) else v for k, v in values.items() if k in coarse.parameters}
+    fine, rough = Renderer(scene).radiance(values), Renderer(coarse).radiance(moved)
+    means = fine[: cells.rows * 2, : cells.columns * 2].reshape(cells.rows, 2, cells.columns, 2, -1).mean((1, 3))
+    inner = (slice(3, -3), slice(3, -3))
+    assert np.abs(rough[inner] / means[inner] - 1).max() < 2e-3
+    back = cells.values_back(cells.values_into(Values({k: v for k, v in values.items() if cells.turns(k)})))
+    for key, value in back.common.items():
+        assert value == pytest.approx(values[key], abs=1e-9)
+
+
+def test_a_refit_is_taken_up_again(tmp_path, monkeypatch):
+    """What was refitted before a diagnosis was stopped is read, and belongs to its base alone."""
+    from optics.scene.parameter import Parameter
+
+    p = Parameter("a", "1", 0.0, (-1.0, 1.0), "a number", plausible=1.0)
+    known, extra = Variable("a", ("m.a",), p), Variable("b", ("m.b",), p)
+    base = Fit(Values({"m.a": 0.5}), [known], np.array([0.5]), np.eye(1), 9.0, 8, [0], [9.0], [9], True, "")
+    base.normal = object()  # chord steps are possible
+    model = SimpleNamespace(captures=SimpleNamespace(table=None))
+    first = Refits(model, Setup("captures"), base, [], tmp_path / "refits")
+    made = Fit(
+        Values({"m.a": 0.25, "m.b": 0.125}, {3: {"m.c": 1.5}}),
+        [known, extra],
+        np.array([0.25, 0.125]),
+        np.array([[1.0, 0.5], [0.5, np.inf]]),
+        4.0,
+        7,
+        [0],
+        [4.0],
+        [9],
+        True,
+        "as it was",
+    )
+    first.keep(made, [extra])
+    monkeypatch.setattr(Refits, "calibrated", lambda *_: pytest.fail("calibrated again"))
+    again = Refits(model, Setup("captures"), base, [], tmp_path / "refits")
+    found = again.of(model, [known, extra], Values(), [0])
+    assert found.values == made.values and found.reason == "as it was" and found.chi2 == 4.0
+    np.testing.assert_array_equal(found.covariance, made.covariance)
+    other = replace(base, estimate=np.array([0.6]))
+    assert Refits(model, Setup("captures"), other, [], tmp_path / "refits").taken_up([extra]) is None
+    file = next((tmp_path / "refits").iterdir())
+    file.write_text(file.read_text()[:40])
+    assert Refits(model, Setup("captures"), base, [], tmp_path / "refits").taken_up([extra]) is None
