@@ -272,6 +272,28 @@ MINI_POINT = {
     "strip_green.power": 0.0,
 }
 
+# Few beads, large in view, so that most pixels hold no rim; a ring whose light reaches every band.
+PARTICLE_POINT = {
+    "beads.top": 1.3,
+    "beads.bottom": 3.1,
+    "gel.press_force": 0.05,
+    "gel.press_y": -0.7,
+    "gel.drag_x": 0.2,
+    "gel.poisson": 0.45,
+    "gel.absorption": 0.01,
+    "inner_ring.wavelength": 500.0,
+    "inner_ring.fwhm": 150.0,
+    "inner_ring.pan": 4.0,
+    "inner_ring.tilt": -3.0,
+    "inner_ring.mu": 1.2,
+    "inner_ring.power_g": 0.7,
+    "inner_ring.roll": 5.0,
+    "outer_ring.power": 0.0,
+    "cover.rho_r": 0.2,
+    "cover.rho_g": 0.3,
+    "cover.rho_b": 0.25,
+}
+
 POINTS = {  # scene: (what replaces its <default>s, values)
     "gelsight": ({"width": WIDTH, "height": HEIGHT, "depth": 0.5}, WORKING_POINT),
     "gelsight_mini": ({"width": WIDTH, "height": HEIGHT, "depth": 0.5}, MINI_POINT),
@@ -293,6 +315,10 @@ POINTS = {  # scene: (what replaces its <default>s, values)
     "polarization_camera": (
         {"width": 8, "height": 6, "x_fov": 7, "bands": "620, 540, 460", "polarizer": 1, "sample_regions": "halves"},
         CAMERA_POINT,
+    ),
+    "particle_gel": (
+        {"width": 48, "height": 40, "x_fov": 40, "beads": 40, "detail": 1, "diameter": 2.4, "depth": 0.4, "x": 1.0},
+        PARTICLE_POINT,
     ),
     "vi2tap": ({"width": 32, "height": 24, "x_fov": 45, "depth": 1, "wall_dark": 1}, FINGER_POINT),
 }

@@ -81,11 +81,15 @@ MIRROR = View(
     "reflection_bench", {}, {"polarizer.angle": 0.0, "analyzer.inserted": 0.0, "source.power": 4.0}, "plate.incidence",
     (5.0, 80.0),
 )  # fmt: skip
-VIEWS = (PRESSED, COLOURED, BENCH, FINGER, MOSAIC, MIRROR, GRID)  # the first that can express an effect shows it
+BEADS = View("particle_gel", {"width": "240", "height": "240", "x_fov": "50", "depth": "1.5"}, {"dye.time": 3.0})
+VIEWS = (PRESSED, COLOURED, BENCH, FINGER, MOSAIC, MIRROR, GRID, BEADS)  # the first that can express an effect shows it
 
 # effect -> (view, holders of the effect; None: every part of its kind)
 SHOWN: dict[str, tuple[View, tuple[str, ...] | None]] = {
     "colour-crosstalk": (COLOURED, None),  # white light on a grey skin has no colour to mix
+    "bleaching": (BEADS, None),  # a setting of time
+    "inner-filter": (BEADS, None),  # light that comes back in another colour
+    "excitation-leak": (BEADS, None),
     **dict.fromkeys(("led-centre-shift", "led-width", "sensitivity-tail", "filter-edge-shift"), (SPECTRAL, None)),
     "phosphor-leak": (WHITE, None),
     "dark-offset": (ONE_SIDE, None),

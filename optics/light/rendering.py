@@ -182,8 +182,10 @@ class RenderJob:
         image = self._exact(now, seed) if self.renderer is not None else self._monte_carlo(now, seed)
         image.header["provenance"] = {**self.record, "seed": seed, "parameters": now}
         pressed = None if self.scene.block is None else self.scene.block.press()
-        if pressed is not None:
-            image.header["provenance"]["press"] = {"force": [float(f) for f in pressed.force], "unit": "N"}
+        force = getattr(self.scene.gel, "force", None)  # of a skin that knows it
+        if pressed is not None or force is not None:
+            newtons = pressed.force if pressed is not None else force()
+            image.header["provenance"]["press"] = {"force": [float(f) for f in newtons], "unit": "N"}
         return image
 
     def _exact(self, now: Mapping, seed: int) -> Rendering:

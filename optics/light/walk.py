@@ -229,7 +229,10 @@ class Walk:
             to_led = point - si.p
             distance = dr.norm(to_led)
             clear = ~scene.ray_test(si.spawn_ray_to(point), si.is_valid())
-            added += dr.select(clear, self.excited(scene, si, led, to_led / distance, distance), 0.0)
+            shone = self.excited(scene, si, led, to_led / distance, distance)
+            for function in self.fading:
+                shone *= function(self.inside.path(si.p, origin, point, led, si), self.inside)
+            added += dr.select(clear, shone, 0.0)
         for function in self.veils:
             for led, point in zip(self.lamps, spots):
                 added += function(self.inside.path(si.p, origin, point, led, si), self.inside)

@@ -44,6 +44,7 @@ from optics.skin.contact import LocalMap, local_axis, surface, window
 REACH = 10.0  # depths by which maps are wider than the dent on each side: what is cut off there is 1e-4 of the largest
 NODES = 8  # per depth: exp(-kh) leaves little that is finer; a cubic spline errs by 1e-4 of the largest at most
 WIDEST = 1001  # nodes a side
+LEVELS = 9  # of points at many depths: a linear step between them leaves (0.5 mm / depth)^2 / 8 of a dent
 
 
 def carried(
@@ -98,11 +99,30 @@ def displaced(gel, x: np.ndarray, y: np.ndarray, depth: float) -> np.ndarray:
     x, y  mm, broadcast together; fastest as a grid, x of shape (1, nx) and y of shape (ny, 1). gel: None for an
           untouched skin
     """
+    if hasattr(gel, "carry"):  # a skin that knows better than its dent
+        return gel.carry(x, y, depth)
     ux = uy = uz = 0.0
     if gel is not None and gel.map.values.any():
         press = gel.numbered("press x"), gel.numbered("press y")
         ux, uy, uz = (surface(x, y, *press, m) for m in _carried(gel.map, depth))
     return np.stack(np.broadcast_arrays(x + ux, y + uy, -depth - uz), -1)
+
+
+def carried_points(gel, points: np.ndarray) -> np.ndarray:
+    """(N, 3) world mm: where the points that rest at `points` (N, 3), z < 0 in the skin, are under the present dent.
+
+    Of a dent alone the displacement is found at LEVELS depths, and is linear in between."""
+    x, y, depth = points[:, 0], points[:, 1], -points[:, 2]
+    if gel is None or not (hasattr(gel, "carry") or gel.map.values.any()):
+        return points.copy()
+    if hasattr(gel, "carry"):
+        return gel.carry(x, y, depth)
+    levels = np.linspace(depth.min(), depth.max(), LEVELS)
+    moved = np.stack([displaced(gel, x, y, float(level)) - [0, 0, -level] for level in levels])
+    place = np.interp(depth, levels, np.arange(LEVELS)) if levels[-1] > levels[0] else np.zeros(len(depth))
+    low = np.minimum(place.astype(int), LEVELS - 2)
+    share, each = (place - low)[:, None], np.arange(len(points))
+    return (1 - share) * moved[low, each] + share * moved[low + 1, each] + np.stack([0 * x, 0 * x, -depth], -1)
 
 
 @lru_cache(maxsize=8)

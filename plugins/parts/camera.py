@@ -17,7 +17,7 @@ departs from it.
 Fingerprint
     principal point and pose shift the image; distortion grows with the third power of the radius; exposure scales all.
 Validity
-    central projection; a fisheye needs another part. Monotone response: G'(m) > 0 on [0, 1].
+    central projection; a fisheye is the part `fisheye`. Monotone response: G'(m) > 0 on [0, 1].
 References
     F-TAC Hand supplementary information, S1.1, eq. (S1); Mitsunaga & Nayar, CVPR 1999.
 XML
@@ -185,7 +185,7 @@ def build():
             width, height = (int(v) for v in self.film().size())
             if "fx" in props:
                 fx = float(props.get("fx", 1.0))
-                props["x_fov"] = math.degrees(2 * math.atan(width / 2 / fx))
+                props["x_fov"] = self.field_of(width, fx, props)
                 props["aspect"] = float(props.get("fy", fx)) / fx
                 props["principal_x"] = float(props.get("cx", width / 2)) - width / 2
                 props["principal_y"] = float(props.get("cy", height / 2)) - height / 2
@@ -224,6 +224,10 @@ def build():
 
         def parameters_changed(self, keys=()):
             self.reread(keys)
+
+        def field_of(self, width, fx, props):
+            """Horizontal field of view, deg, of an image so wide, px, with a focal length in px."""
+            return math.degrees(2 * math.atan(width / 2 / fx))
 
         def focal(self):
             """f_x, f_y in px."""

@@ -3,6 +3,7 @@
 Definition
     E_abs = int kappa cos(theta) w(l) a(l) l dl                  absorbed light of an LED, as a number of photons
     L(lambda) = yield E_abs f(lambda)/(pi lambda)                radiance of the fluorescence, Lambertian, unpolarized
+        exp(-bleaching time)                                     less, the longer it was lit; `time`: of the frame
     f_r = rho/pi                                                 and what is reflected
 with kappa and the spectrum w of the LED (S2), the absorptance a (a Gaussian of peak `absorptance` at
 `absorption_peak`), the quantum `yield`, and the emission's photon spectrum f (a Gaussian of unit area at
@@ -35,6 +36,25 @@ PARAMETERS = (
     Parameter("absorption_fwhm", "nm", 120.0, (1.0, 1000.0), "full width at half maximum", plausible=10.0),
     Parameter("emission_peak", "nm", 525.0, (200.0, 2000.0), "wavelength emitted most", plausible=5.0),
     Parameter("emission_fwhm", "nm", 70.0, (1.0, 1000.0), "full width at half maximum", plausible=5.0),
+    Parameter(
+        "bleaching",
+        "1",
+        0.0,
+        (0.0, 1e3),
+        "rate at which the fluorescence falls, per unit of time",
+        neutral=0.0,
+        plausible=0.02,
+        through="time",
+    ),
+    Parameter(
+        "time",
+        "1",
+        0.0,
+        (-1e6, 1e6),
+        "the clock: minutes, or any unit that `bleaching` is meant in",
+        role="clock",
+        plausible=1.0,
+    ),
     *(
         Parameter(
             f"rho_{c}", "1", 0.3, (0.0, 10.0), f"reflectance in the {word} band ({colour})", plausible=0.1, linear=True
@@ -77,9 +97,10 @@ def build():
             s = self.emission_fwhm / WIDTH
             photons = dr.exp(-dr.square((bands - self.emission_peak) / s) / 2) / (math.sqrt(2 * math.pi) * s)
             seen = mi.Frame3f.cos_theta(si.wi) > 0
+            left = getattr(self, "yield") * dr.exp(-self.bleaching * self.time)
             if self.lane is not None:
-                return dr.select(seen, getattr(self, "yield") * absorbed * self.lane / math.pi, 0.0)
-            return dr.select(seen, getattr(self, "yield") * absorbed * photons / (bands * math.pi), 0.0)
+                return dr.select(seen, left * absorbed * self.lane / math.pi, 0.0)
+            return dr.select(seen, left * absorbed * photons / (bands * math.pi), 0.0)
 
         def emission(self, own, nm):
             """Power per nm that is emitted, per photon, at wavelengths; numpy."""

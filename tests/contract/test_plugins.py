@@ -25,16 +25,25 @@ PARTS = sorted(REGISTRY.parts)
 # parts that light is followed through by Monte Carlo: their contract is in test_monte_carlo.py
 MONTE_CARLO = ("clear", "cells", "block", "room")
 EFFECTS = sorted(k for k, e in REGISTRY.effects.items() if e.part not in MONTE_CARLO)
-NUMBERS = [
-    (kind, p.name) for kind in PARTS if kind not in MONTE_CARLO for p in REGISTRY.parameters_of(kind) if p.is_number
-]
+
+
+def tested(kind):
+    """The parameters that are tested on a kind of part: of one that stands in for another camera or gel, those that the
+    other has not been brought as well."""
+    part, all_of_it = REGISTRY.parts[kind], REGISTRY.parameters_of(kind)
+    if part.role not in ("camera", "gel") or part.role == kind:
+        return all_of_it
+    return [p for p in all_of_it if p in part.parameters or p not in REGISTRY.parameters_of(part.role)]
+
+
+NUMBERS = [(kind, p.name) for kind in PARTS if kind not in MONTE_CARLO for p in tested(kind) if p.is_number]
 LAYERS = [kind for kind in PARTS if REGISTRY.parts[kind].mueller is not None]
 POWERS = ("power", "band power")  # roles
-MOVED = ("carried", "markers", "target")  # kinds of shapes that a scene moves besides the gel
+MOVED = ("carried", "markers", "target", "beads")  # kinds of shapes that a scene moves besides the gel
 OF_IMAGES = tuple(s for s in IMAGE_STAGES if s != "sensitivity")  # stages whose functions are given an image
 LAYERED = ("layer", "detector", "glow")  # stages whose functions are differentiated by complex step
 SECTIONS = ("Definition", "Fingerprint", "Validity", "References")
-UNITS = {"1", "mm", "mm^2", "deg", "rad", "nm", "px", "px^2", "DN", "1/mm", "1/mm^2", "MPa", "1e-12/Pa", "-"}
+UNITS = {"1", "N", "mm", "mm^2", "deg", "rad", "nm", "px", "px^2", "DN", "1/mm", "1/mm^2", "MPa", "1e-12/Pa", "-"}
 
 IDENTITY = 1e-6  # of full scale: ten roundings of float32
 FLOAT = 3e-7  # relative rounding of an image in float32: what a difference of two images cannot resolve
@@ -59,6 +68,11 @@ SURROUNDINGS = {  # parameter: what has to stand about it for it to be seen, and
     "gel.indenter_spacing": {"gel.indenter": "balls", "gel.indenter_size": 0.8, "gel.indenter_spacing": 1.8},
     "gel.shown_between": {"gel.indenter": "balls", "gel.indenter_size": 0.8, "gel.indenter_spacing": 1.8},
     "gel.thickness": {"gel.absorption": 0.02},
+    "elastic_skin.thickness": {"gel.absorption": 0.02},
+    "beads.gravity": {"beads.settling": 0.3},
+    "fluorescent.bleaching": {"dye.time": 3.0},
+    "fluorescent.time": {"dye.bleaching": 0.05},
+    **{f"elastic_skin.{name}": {f"gel.{name}": 8.0} for name in ("width", "length")},  # its rim in view
     **{f"strip.{name}": {"strip_red.phosphor_leak": 0.1} for name in ("die_wavelength", "die_width")},
     **{f"{kind}.settling": {f"{kind}.drift": 0.02, f"{kind}.time": 3.0} for kind in ("source", "panel")},
     # the first direction of a carried film is constant in each triangle: a film that bends makes small jumps
@@ -273,15 +287,20 @@ def bench_of(benches, mitsuba):
             brought = [p.name for p in (*effect.parameters, *effect.shape) if not isinstance(p, str)]
             if effect.part == part.kind and name in brought:
                 kinds += effect.requires
-        for shipped_scene in sorted(
+        order = sorted(
             scene.shipped_scenes(),
             key=lambda n: (n != "gelsight", n.startswith("polari") and n != "polarizer_bench", n),
-        ):
-            text = scene.find(shipped_scene).read_text(encoding="utf-8")
-            if 'type="clear"' not in text and all(f'type="{kind}"' in text for kind in kinds):
+        )
+        # scenes with these kinds, then those where others play their roles
+        for meant in (lambda kind: (kind,), REGISTRY.kinds):
+            for shipped_scene in order:
+                text = scene.find(shipped_scene).read_text(encoding="utf-8")
+                present = [any(f'type="{k}"' in text for k in meant(kind)) for kind in kinds]
+                if 'type="clear"' in text or not all(present):
+                    continue
                 bench = benches(shipped_scene)
                 named = thing.parameter_names if isinstance(thing, Effect) else (name,) if name else ()
-                holders = [p for p in bench.scene.parts.values() if p.kind == kinds[0]]
+                holders = [p for p in bench.scene.parts.values() if p.kind in meant(kinds[0])]
                 if all(any(p.takes(n) for p in holders) for n in named):
                     used.append(bench)
                     return bench
@@ -298,7 +317,9 @@ def bench_of(benches, mitsuba):
 
 
 def keys(bench, kind, name):
-    return [f"{n}.{name}" for n, p in bench.scene.parts.items() if p.kind == kind]
+    own = [n for n, p in bench.scene.parts.items() if p.kind == kind]
+    own = own or [n for n, p in bench.scene.parts.items() if p.role == kind]
+    return [f"{n}.{name}" for n in own]
 
 
 def key_of(bench, kind, name):
@@ -374,9 +395,12 @@ def moves(bench, key):
     """Whether the parameter moves geometry, and with it the rims of shadows."""
     kind, name = bench.renderer.kind(key), key.rsplit(".", 1)[1]
     return (
-        kind in ("gel", "camera", "interface", *MOVED)
+        (bench.scene.registry.parts[kind].role in ("gel", "camera", "interface") or kind in MOVED)
         and bench.scene.parameters[key].how == "difference"
-        or (kind in bench.scene.registry.kinds("led") and name in ("x", "y", "z", "area", "length", "width", "roll"))
+        or (
+            kind in bench.scene.registry.kinds("led")
+            and name in ("x", "y", "z", "area", "length", "width", "roll", "radius")
+        )
     )
 
 
@@ -681,7 +705,7 @@ IN_THE_FINGER = (
 
 @pytest.mark.parametrize("key", IN_THE_FINGER)
 def test_derivatives_behind_layers(key, bench_of):
-    bench = bench_of("fluorescent")
+    bench = bench_of("markers")
     checks = {
         "layer": (check_layer_step,),
         "image": (check_complex_step,),
@@ -705,7 +729,7 @@ def test_derivatives_behind_layers(key, bench_of):
 )
 def test_derivatives_of_light_that_no_lamp_made(key, bench_of, monkeypatch):
     """With every lamp off, the ambient light of the paints is still seen through the layers."""
-    bench = bench_of("fluorescent")
+    bench = bench_of("markers")
     for light in bench.scene.lights:
         monkeypatch.setitem(bench.values, f"{light}.power", 0.0)
     layer = bench.scene.parameters[key].how == "layer"
@@ -927,7 +951,7 @@ def test_everything_drawn_at_once_gives_images(seed, bench):
         assert np.isfinite(bench.derivative(key, values)).all(), key
 
 
-@pytest.mark.parametrize("kind, seed", [("source", 0), ("source", 1), ("fluorescent", 0)])
+@pytest.mark.parametrize("kind, seed", [("source", 0), ("source", 1), ("markers", 0)])
 def test_all_layers_drawn_at_once_give_derivatives(kind, seed, bench_of):
     """All parameters of a layered scene within a plausible change: an image, and the right derivatives by those of
     layers."""

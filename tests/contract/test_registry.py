@@ -158,8 +158,8 @@ def build():
     import drjit as dr
     import mitsuba as mi
 
-    class Fisheye(_CAMERA.build()):
-        kind = "fisheye"
+    class WideLens(_CAMERA.build()):
+        kind = "wide_lens"
 
         def ray(self, u, v):
             width, height = self.resolution
@@ -171,10 +171,10 @@ def build():
             direction = self.turned(mi.Vector3f(x * share, y * share, dr.cos(theta)))
             return mi.Point3f(origin) + dr.zeros(mi.Point3f, dr.width(u)), direction
 
-    return Fisheye
+    return WideLens
 
 
-part = Part("fisheye", "sensor", _CAMERA.parameters, build, role="camera")
+part = Part("wide_lens", "sensor", _CAMERA.parameters, build, role="camera")
 '''
 
 
@@ -196,14 +196,14 @@ def test_a_second_camera_is_one_new_file(tmp_path, mitsuba):
     from optics.light.rendering import RenderJob
     from optics.scene import loader
 
-    folder = written(tmp_path / "own", fisheye=CAMERA)
+    folder = written(tmp_path / "own", wide_lens=CAMERA)
     text = loader.find("gelsight").read_text(encoding="utf-8")
     assert 'type="camera"' in text
-    path = tmp_path / "fisheye.xml"
-    path.write_text(text.replace('<sensor type="camera"', '<sensor type="fisheye"'), encoding="utf-8")
+    path = tmp_path / "wide_lens.xml"
+    path.write_text(text.replace('<sensor type="camera"', '<sensor type="wide_lens"'), encoding="utf-8")
     small = {"width": "32", "height": "24"}
     scene, usual = loader.load(path, small, plugins=folder), loader.load("gelsight", small)
-    assert scene.camera.kind == "fisheye" and scene.camera.role == "camera"
+    assert scene.camera.kind == "wide_lens" and scene.camera.role == "camera"
     assert [e.key for e in scene.registry.effects.values() if scene.can_express(e)] == [
         e.key for e in usual.registry.effects.values() if usual.can_express(e)
     ]

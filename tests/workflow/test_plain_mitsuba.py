@@ -18,6 +18,7 @@ CASES = {  # every shipped scene: what replaces its <default>s, at rest and pres
     "gelsight_mini": ({"depth": "0"}, {}),
     "grid_bench": ({}, {"distance": "0.5"}),
     "magictac": ({**GRID, "room": "1"}, {**GRID, "room": "1", "distance": "-0.5"}),
+    "particle_gel": ({"beads": "30"}, {"beads": "30", "depth": "0.8"}),
     "polariscope": ({"analyzer": "30"}, {"analyzer": "60", "polarizer": "30", "regions": "quarters"}),
     "polarization_camera": ({"polarizer": "1"}, {"regions": "halves", "sample_regions": "halves"}),
     "polarizer_bench": ({"analyzer": "30"}, {"analyzer": "30", "polarizer": "30", "pattern": "disc"}),
