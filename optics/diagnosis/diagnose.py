@@ -117,7 +117,7 @@ def diagnose(
     laws = other_laws(
         model, evidence, places, added, variables_of, outcome.scale, case.session if evidence.is_table else None
     )
-    splits, chance = _split(case, outcome, subject)
+    splits, chance = _split(case, outcome, subject, basis)
     wander = 0.0 if case.evidence.is_table else explanations.wander_of(case, outcome, best)
     levels = held.levels(case, best.members, best.fit, wander)
     shifts = held.shifts(case, best.members, best.fit) if subject else []
@@ -180,7 +180,7 @@ def _choose(case: Case, top: int) -> list[Candidate]:
     return chosen + [c for c in live if c.effect.name in others]
 
 
-def _split(case: Case, outcome: Outcome, subject: Candidate | None) -> tuple[list[Split], float]:
+def _split(case: Case, outcome: Outcome, subject: Candidate | None, basis: Basis) -> tuple[list[Split], float]:
     """(splits of the main effect of each survivor, p of the subject's strength by its scatter).
 
     What scatters is written into the refit of an effect that explains the residual by itself."""
@@ -199,7 +199,7 @@ def _split(case: Case, outcome: Outcome, subject: Candidate | None) -> tuple[lis
             continue
         done.add(main.effect.name)
         net = outcome.own_fall(trial, main.effect.name) - main.cone.expectation
-        if not case.evidence.is_table and trial.fall < SHARE * _excess(case):
+        if not case.evidence.is_table and trial.fall < SHARE * _excess(basis):
             continue  # too little for a claim, and a split takes as long as a score
         beside = [v for c in trial.members if c is not main for v in c.variables]
         own, p, clutter = homogeneity.split(
@@ -225,10 +225,9 @@ def _split(case: Case, outcome: Outcome, subject: Candidate | None) -> tuple[lis
     return splits, chance
 
 
-def _excess(case: Case) -> float:
+def _excess(basis: Basis) -> float:
     """The misfit of the base beyond noise, where it is more than noise may make; else 0."""
-    square, dof = case.evidence.normal.square, case.evidence.normal.count - case.evidence.projected.rank
-    return square - dof if square - dof > EXCESS * math.sqrt(2 * max(dof, 1)) else 0.0
+    return basis.chi2 - basis.dof if basis.excess_sd > EXCESS else 0.0
 
 
 def _gaps(evidence: Evidence, chosen: Sequence[Candidate]) -> tuple[list[list[float]], list[list[float]]]:
@@ -256,10 +255,10 @@ def _unexplained(
     basis: Basis,
 ) -> tuple[str, bool]:
     """(sentence, whether a fixed pattern lies in the images) where no effect explains the residual."""
-    excess = basis.chi2 - basis.dof if basis.excess_sd > EXCESS else 0.0
-    share = prints.fixed_pattern(case.model, case.evidence, excess)
+    share = prints.fixed_pattern(case.model, case.evidence, _excess(basis))
     fixed = prints.fixed_text(share, max([f.share for f in fingerprints], default=0.0))
     parts = [fixed, text[0].upper() + text[1:] if fixed else text]
     if word == "UNKNOWN":
-        parts += [prints.unexplained(fingerprints, findings.fall, excess), "" if fixed else prints.goes_with(families)]
+        parts.append(prints.unexplained(fingerprints, findings.fall, _excess(basis)))
+        parts.append("" if fixed else prints.goes_with(families))
     return " ".join(filter(None, parts)), bool(fixed)

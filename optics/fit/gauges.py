@@ -123,7 +123,7 @@ def find(
     for group in _groups(full != 0):
         columns = [k for k in range(len(held)) if full[group, k].any()]
         logs = bool(multiply[group].all())
-        change = full / at[:, None] if logs else full.copy()
+        change = full / np.where(multiply, at, 1.0)[:, None] if logs else full.copy()
         change[:, columns] /= change[[pivots[k] for k in columns], columns]
         for k in columns:
             members = [i for i in group if change[i, k]]

@@ -10,9 +10,30 @@ from dataclasses import dataclass
 from typing import Any
 
 from optics.polarization.mueller import exp, real, where
+from optics.scene.parameter import Parameter
 
 EDGES = (580.0, 500.0)  # nm: where the first band of shares and reflectances ends, and the second
 WHITE = 470.0  # nm over which a white light spreads its power: 360 to 830
+LINE = (  # what a light with a Gaussian spectrum declares
+    Parameter(
+        "wavelength",
+        "nm",
+        0.0,
+        (0.0, 2000.0),
+        "peak wavelength; 0: the same in every band",
+        plausible=3.0,
+        role="light wavelength",
+    ),
+    Parameter(
+        "fwhm",
+        "nm",
+        30.0,
+        (1.0, 1000.0),
+        "full width at half maximum of the spectrum",
+        plausible=5.0,
+        role="light width",
+    ),
+)
 
 
 @dataclass(frozen=True)

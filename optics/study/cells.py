@@ -22,6 +22,7 @@ LARGE = 60_000  # values of the fitted frames, above which they are put into cel
 LARGEST_CELL = 4  # px each way: the dent of a ball that covers fifty pixels still covers a hundred cells
 SMALLEST = 24  # cells along the shorter side of an image
 IN_PIXELS = {"px": 1, "px^2": 2}  # unit -> its power of a length in pixels
+IN_CELLS = {"px": "cell", "px^2": "cell^2"}  # what a diagnosis says of numbers in cells
 
 
 class Cells:
@@ -100,7 +101,7 @@ def cells_for(model: SceneModel, fitted: Sequence[int], variables: Sequence[Vari
     text = model.scene.path.read_text(encoding="utf-8")
     if len(set(re.findall(r'<default name="(width|height)"', text))) < 2 or found.fov not in model.parameters:
         return None
-    by_frame = {k for f in captures.frames for k in (*f.parameters, *f.uncertainty)} | set(captures.uncertainty)
+    by_frame = {key for f in captures.frames for key in (*f.parameters, *f.uncertainty)} | set(captures.uncertainty)
     priors = {key for v in variables if v.prior is not None for key in v.keys}
     if any(found.turns(key) for key in by_frame | priors):
         return None
@@ -117,6 +118,7 @@ def open_in_cells(setup: Setup, cells: Cells) -> tuple[SceneModel, Setup]:
     defines = definitions_of(sized, captures, whole.scene.path, (cells.columns, cells.rows))
     with coarser(cells.k):
         loaded = Scene(whole.scene.path, defines, whole.scene.variant, whole.scene.registry)
+    loaded.parameters = {k: replace(p, unit=IN_CELLS.get(p.unit, p.unit)) for k, p in loaded.parameters.items()}
     model = type(whole)(loaded, captures, captures.noise, flat_field=whole.flat_field)
     model.assumed_errors = dict(whole.assumed_errors)
     return model, replace(setup, values=cells.all_into(setup.values))

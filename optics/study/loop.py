@@ -378,14 +378,17 @@ def examine_in_cells(
 ) -> Diagnosis:
     """`examine` of large images, in cells of k x k pixels; the values of its refits are in pixels again."""
     coarse, own = open_in_cells(setup, cells)
-    # as well as a diagnosis asks of its base
+    variables, values, fitted = kept(record, coarse)
+    start = cells.values_into(values)
+    # a diagnosis calls a base settled that promises less than SETTLED of its excess; four times as well leaves room
+    enough = SETTLED / 4
     found = calibrate.fit(
-        coarse, *in_cells_of(record, coarse, cells), max_iterations=FURTHER, negligible=SETTLED / 4, progress=progress
+        coarse, variables, start, fitted, max_iterations=FURTHER, negligible=enough, progress=progress
     )
     k = cells.k
     remark = (
-        f"images of {cells.width} x {cells.height} px were diagnosed in cells of {k} x {k} px: px of this diagnosis "
-        "are such cells, and what is finer, as a blur or the rim of a shadow, shows less than in the images"
+        f"images of {cells.width} x {cells.height} px were diagnosed in cells of {k} x {k} px, and images and "
+        "pixels of this diagnosis are theirs: what is finer, as a blur or the rim of a shadow, shows less"
     )
     result = examine(record, coarse, own, found, progress, advised, without, ranked, remark)
     result.fits = {name: replace(fit, values=cells.values_back(fit.values)) for name, fit in result.fits.items()}
@@ -396,12 +399,6 @@ def cells_of(record: Record, model: SceneModel) -> Cells | None:
     """The cells in which the last step is diagnosed; None: in pixels."""
     variables, _, fitted = kept(record, model)
     return cells_for(model, fitted, variables)
-
-
-def in_cells_of(record: Record, coarse: SceneModel, cells: Cells) -> tuple[list[Variable], Values, list[int]]:
-    """What a step's folder holds of its fit (`kept`), in cells."""
-    variables, values, fitted = kept(record, coarse)
-    return variables, cells.values_into(values), fitted
 
 
 def _freed_as_in(model: SceneModel, held: Sequence[Variable]) -> Callable[[Any, Effect], list[Variable]]:

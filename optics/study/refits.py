@@ -20,6 +20,7 @@ from optics.fit.result import Fit
 from optics.fit.scene_model import SceneModel
 from optics.scene.declare import Effect
 from optics.scene.parameter import Values, Variable
+from optics.study.places import own_plugins
 from optics.study.setup import Setup, effect_variables
 from optics.study.stages import fit_base, off_neutral
 from optics.version import __version__
@@ -140,9 +141,11 @@ class Refits:
         return self.results.get(names)
 
     def file_of(self, names: Sequence[str]) -> Path:
-        """Where a refit of these variables is kept: it belongs to the base's values and to the program's version."""
+        """Where a refit of these variables is kept: it belongs to the base's values, to the user's own plugins and to
+        the program's version."""
         assert self.folder is not None
-        whole = json.dumps([names, [float(e) for e in self.base.estimate], self.base.frames, __version__])
+        own = own_plugins(self.model.scene.registry)
+        whole = json.dumps([names, [float(e) for e in self.base.estimate], self.base.frames, own, __version__])
         return self.folder / f"{hashlib.sha256(whole.encode()).hexdigest()[:16]}.json"
 
     def keep(self, found: Fit, extra: Sequence[Variable]) -> None:

@@ -30,7 +30,7 @@ import math
 
 from optics.scene.checking import agree, made
 from optics.scene.declare import Part
-from optics.scene.line import changed, relative
+from optics.scene.line import LINE, changed, relative
 from optics.scene.mitsuba_parts import Declared
 from optics.scene.parameter import Parameter
 
@@ -128,24 +128,7 @@ PARAMETERS = (
         how="difference",
         role="light area",
     ),
-    Parameter(
-        "wavelength",
-        "nm",
-        0.0,
-        (0.0, 2000.0),
-        "peak wavelength; 0: the same in every band",
-        plausible=3.0,
-        role="light wavelength",
-    ),
-    Parameter(
-        "fwhm",
-        "nm",
-        30.0,
-        (1.0, 1000.0),
-        "full width at half maximum of the spectrum",
-        plausible=5.0,
-        role="light width",
-    ),
+    *LINE,
 )
 
 

@@ -26,7 +26,7 @@ from optics.scene.checking import agree, ray
 from optics.scene.checking import stokes as sent
 from optics.scene.declare import Part
 from optics.scene.lamp import drifted
-from optics.scene.line import relative
+from optics.scene.line import LINE, relative
 from optics.scene.mitsuba_parts import Declared
 from optics.scene.parameter import Parameter
 
@@ -111,26 +111,7 @@ PARAMETERS = (
         plausible=1.0,
         how="layer",
     ),
-    Parameter(
-        "wavelength",
-        "nm",
-        0.0,
-        (0.0, 2000.0),
-        "peak wavelength; 0: the same in every band",
-        plausible=3.0,
-        how="layer",
-        role="light wavelength",
-    ),
-    Parameter(
-        "fwhm",
-        "nm",
-        30.0,
-        (1.0, 1000.0),
-        "full width at half maximum of the spectrum",
-        plausible=5.0,
-        how="layer",
-        role="light width",
-    ),
+    *(replace(p, how="layer") for p in LINE),
 )
 ROOM = (
     replace(

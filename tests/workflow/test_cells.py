@@ -6,11 +6,17 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from optics import facade
+from optics.captures import capture_set
 from optics.captures.capture_set import Captures, Frame
 from optics.captures.cells import in_cells, noise_of_cells
 from optics.captures.noise import Noise
 from optics.fit.result import Fit
+from optics.proof import demo
+from optics.proof.makers import touch
+from optics.scene import loader
 from optics.scene.parameter import Values, Variable
+from optics.study import cells as cells_of_studies
 from optics.study.cells import Cells
 from optics.study.refits import Refits
 from optics.study.setup import Setup
@@ -41,7 +47,6 @@ def test_a_scene_in_cells_looks_the_same(mitsuba, size):
     are below a grey level. A field of view that ignored the cut column would be 1 % off, and a principal point half a
     pixel."""
     from optics.light.renderer import Renderer
-    from optics.scene import loader
 
     width, height = size
     scene = loader.load("gelsight", {"width": str(width), "height": str(height)})
@@ -67,7 +72,10 @@ def test_a_refit_is_taken_up_again(tmp_path, monkeypatch):
     known, extra = Variable("a", ("m.a",), p), Variable("b", ("m.b",), p)
     base = Fit(Values({"m.a": 0.5}), [known], np.array([0.5]), np.eye(1), 9.0, 8, [0], [9.0], [9], True, "")
     base.normal = object()  # chord steps are possible
-    model = SimpleNamespace(captures=SimpleNamespace(table=None))
+    plugin = tmp_path / "mine.py"
+    plugin.write_text("one law")
+    registry = SimpleNamespace(files=[plugin], name_of=lambda file: file.name)
+    model = SimpleNamespace(captures=SimpleNamespace(table=None), scene=SimpleNamespace(registry=registry))
     first = Refits(model, Setup("captures"), base, [], tmp_path / "refits")
     made = Fit(
         Values({"m.a": 0.25, "m.b": 0.125}, {3: {"m.c": 1.5}}),
@@ -90,6 +98,36 @@ def test_a_refit_is_taken_up_again(tmp_path, monkeypatch):
     np.testing.assert_array_equal(found.covariance, made.covariance)
     other = replace(base, estimate=np.array([0.6]))
     assert Refits(model, Setup("captures"), other, [], tmp_path / "refits").taken_up([extra]) is None
+    plugin.write_text("another law")
+    assert Refits(model, Setup("captures"), base, [], tmp_path / "refits").taken_up([extra]) is None
+    plugin.write_text("one law")
+    assert Refits(model, Setup("captures"), base, [], tmp_path / "refits").taken_up([extra]) is not None
     file = next((tmp_path / "refits").iterdir())
     file.write_text(file.read_text()[:40])
     assert Refits(model, Setup("captures"), base, [], tmp_path / "refits").taken_up([extra]) is None
+
+
+def test_a_verdict_in_cells(mitsuba, tmp_path, monkeypatch):
+    """Images by stock Mitsuba with one effect and a principal point off the middle, whose sides are no multiple of a
+    cell: the effect is claimed in cells, and values are in pixels again."""
+    hidden, strength = "lens vignetting", demo.SECRETS["lens vignetting"]
+    scene = loader.load("gelsight", {"width": "65", "height": "49"})
+    built = {**demo.truth(scene, 4), "camera.exposure": demo.SENSORS["gelsight"][1]}
+    maker = touch.Maker(scene, built, {hidden: strength}, demo.CAMERA, 1004, spp=32, frames=demo.FRAMES)
+    drives = [{led: 1.0} for led in list(scene.leds)[:2]]
+    shot = maker.captures(touch.presses(3, 4), drives, scene_name="gelsight")
+    shot.parameters["camera.exposure"] = built["camera.exposure"]
+    capture_set.write(shot, tmp_path / "captures", bits=16)
+
+    free = ["led_1.power", "led_2.power", "membrane.sigma", "camera.principal_x"]
+    study = facade.calibrate(tmp_path / "captures", tmp_path / "study", free=free, values=built, held_out=["press-02"])
+    monkeypatch.setattr(cells_of_studies, "LARGE", 10_000)
+    diagnosis = study.diagnose(advised=False)
+    assert any("cells of 2 x 2 px" in warning for warning in diagnosis.warnings)
+    assert diagnosis.missing == hidden, diagnosis.text()
+    found = diagnosis.fits[hidden]
+    at = [v.name for v in found.variables].index("camera.vignetting")
+    # a cell is a mean of four pixels: its rims are not those of a pixel in its middle, 2 % at most
+    assert found.estimate[at] == pytest.approx(strength, rel=0.02)
+    shift = next(s for s in diagnosis.shifts if s.variable == "camera.principal_x")
+    assert shift.unit == "cell" and found.values.common["camera.principal_x"] == pytest.approx(0, abs=0.05)
