@@ -27,6 +27,7 @@ XML
     distortion string: k1 k2 k3 k4, in place of the four parameters
     image_circle float, 0.0: radius of the image circle, px, about the principal point; 0: the whole image is lit
     mosaic string: as of the part `camera`
+    filter string: as of the part `camera`
     sensitivity string, identity: as of the part `camera`
 """
 

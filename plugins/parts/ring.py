@@ -16,6 +16,7 @@ XML
     position point: its middle, mm, in place of `x`, `y`, `z`
     target point, (0, 0, 0): what its axis looks at, mm
     count integer, 8: number n of LEDs
+    spectrum string: measured power over the wavelength, as of the part `led`
 """
 
 import math

@@ -27,7 +27,7 @@ MONTE_CARLO = ("clear", "cells", "block", "room")
 EFFECTS = sorted(k for k, e in REGISTRY.effects.items() if e.part not in MONTE_CARLO)
 
 
-def tested(kind):
+def parameters_tested(kind):
     """The parameters that are tested on a kind of part: of one that stands in for another camera or gel, those that the
     other has not been brought as well."""
     part, all_of_it = REGISTRY.parts[kind], REGISTRY.parameters_of(kind)
@@ -36,7 +36,7 @@ def tested(kind):
     return [p for p in all_of_it if p in part.parameters or p not in REGISTRY.parameters_of(part.role)]
 
 
-NUMBERS = [(kind, p.name) for kind in PARTS if kind not in MONTE_CARLO for p in tested(kind) if p.is_number]
+NUMBERS = [(kind, p.name) for kind in PARTS if kind not in MONTE_CARLO for p in parameters_tested(kind) if p.is_number]
 LAYERS = [kind for kind in PARTS if REGISTRY.parts[kind].mueller is not None]
 POWERS = ("power", "band power")  # roles
 MOVED = ("carried", "markers", "target", "beads")  # kinds of shapes that a scene moves besides the gel
@@ -74,6 +74,7 @@ SURROUNDINGS = {  # parameter: what has to stand about it for it to be seen, and
     "fluorescent.time": {"dye.bleaching": 0.05},
     **{f"elastic_skin.{name}": {f"gel.{name}": 8.0} for name in ("width", "length")},  # its rim in view
     **{f"strip.{name}": {"strip_red.phosphor_leak": 0.1} for name in ("die_wavelength", "die_width")},
+    **{f"ring.{name}": {"inner_ring.phosphor_leak": 0.1} for name in ("die_wavelength", "die_width")},
     **{f"{kind}.settling": {f"{kind}.drift": 0.02, f"{kind}.time": 3.0} for kind in ("source", "panel")},
     # the first direction of a carried film is constant in each triangle: a film that bends makes small jumps
     "gel.press_depth": {"film.inserted": 0.0},
@@ -395,7 +396,7 @@ def moves(bench, key):
     """Whether the parameter moves geometry, and with it the rims of shadows."""
     kind, name = bench.renderer.kind(key), key.rsplit(".", 1)[1]
     return (
-        (bench.scene.registry.parts[kind].role in ("gel", "camera", "interface") or kind in MOVED)
+        (kind in MOVED or any(kind in bench.scene.registry.kinds(role) for role in ("gel", "camera", "interface")))
         and bench.scene.parameters[key].how == "difference"
         or (
             kind in bench.scene.registry.kinds("led")
