@@ -9,6 +9,8 @@ with G_sd * D the blur by a Gaussian of that standard deviation (mm); the maximu
 after each blur. Steep walls of h are cut to a slope, and the rim of D0 is rounded, within about a node of the map
 (optics.skin.contact). The gel fills -thickness < z < 0; the camera stands at z < -thickness. The face is a triangle
 mesh on a graded grid that is fine around the contact and moves with it, so that images vary smoothly with the press.
+With `coat` d > 0 the camera sees the coating's inner face, parallel to the one that is touched:
+    h'(x) = d + min over |s| <= d of h(x + s) - sqrt(d^2 - s^2)
 With `skirt` > 0 the skin beside the contact falls off as exp(-distance / skirt) before the smoothing: in place of D0
 stands the max over touched points p of D0(p) exp(-|x - p| / skirt). Indenters: sphere (`indenter_size` = radius),
 cylinder lying on its side (radius), cube face down (edge), balls (radius) `indenter_spacing` apart on a plate without
@@ -34,6 +36,8 @@ from optics.scene.mitsuba_parts import Declared, coarseness
 from optics.scene.parameter import Parameter
 from optics.skin import contact
 
+FINE = 16  # of a ball's radius, the pitch that a coarser mesh keeps: flanks of balls are off by 1 % of the light
+INDENTER_SIZE = 1.5  # mm
 STAGE = 0.05  # mm: how well a stage usually knows where it presses
 PARAMETERS = (
     Parameter("width", "mm", 20.0, (0.1, 1000.0), "size along x", plausible=0.1, how="difference", role="width"),
@@ -99,7 +103,7 @@ PARAMETERS = (
     Parameter(
         "indenter_size",
         "mm",
-        1.5,
+        INDENTER_SIZE,
         (1e-3, 1000.0),
         "radius, radius, edge, radius of the balls, scale of the mesh, or spacing of a map's samples",
         plausible=0.02,
@@ -135,6 +139,16 @@ PARAMETERS = (
         plausible=0.3,
         how="difference",
     ),
+    Parameter(
+        "coat",
+        "mm",
+        0.0,
+        (0.0, 1.0),
+        "thickness of the coating, between the indenter and the face that the camera sees",
+        neutral=0.0,
+        plausible=0.02,
+        how="difference",
+    ),
 )
 
 
@@ -157,6 +171,7 @@ def build():
             "indenter_spacing",
             "smoothing",
             "skirt",
+            "coat",
         )  # what does nothing while press_depth is 0
 
         def __init__(self, props):
@@ -164,7 +179,8 @@ def build():
             self.map_pitch = float(props.get("map_pitch", 0.03))  # mm, of the maps that hold the dent's shape
             self.extent = float(props.get("extent", 3.0))  # mm, half width of the fine part
             self.columns, self.rows = int(props.get("columns", 181)), int(props.get("rows", 161))
-            if (times := coarseness()) > 1:
+            coarsest = float(props.get("indenter_size", INDENTER_SIZE)) / FINE
+            if (times := min(coarseness(), max(int(coarsest / self.pitch), 1))) > 1:
                 self.pitch *= times
                 self.columns, self.rows = -(-self.columns // times), -(-self.rows // times)
             index = np.arange(self.columns * self.rows).reshape(self.rows, self.columns)
@@ -191,6 +207,7 @@ def build():
                 self.extent,
                 self.map_pitch,
                 spacing=n("indenter_spacing"),
+                coat=n("coat"),
             )
             return contact.displacement(profile, n("press_depth"), n("thickness"), n("smoothing"), skirt=n("skirt"))
 

@@ -252,6 +252,31 @@ def test_the_skirts_of_a_tilted_plate_of_balls_are_the_largest_of_all_balls():
         np.testing.assert_allclose(found, expected, atol=2e-7)  # the grid of radii, 1.2e-6 mm, along a slope below 1
 
 
+def test_the_face_behind_a_coat_is_parallel_to_the_indenter():
+    """Of balls the radius grows, of a lying cylinder too, found from its heights; a flat face stays; a sharp edge gets
+    the coat's own radius. Directions are sought 9 deg apart from the normal and 15 deg around it: 1 % of the coat."""
+    coat, pitch = 0.1, 0.02
+    ball, larger = (indenter_profile("sphere", r, (0, 0, 0), 2.0, pitch, coat=c) for r, c in ((1.0, coat), (1.1, 0.0)))
+    np.testing.assert_array_equal(ball.height, larger.height)
+    assert ball.balls.radius == 1.1
+    lying, thick = (indenter_profile("cylinder", r, (0, 0, 30), 2.0, pitch, coat=c) for r, c in ((1, coat), (1.1, 0)))
+    u, v = np.meshgrid(lying.axis, lying.axis)
+    across = np.abs(v * math.cos(math.radians(30)) - u * math.sin(math.radians(30)))
+    near = (across < 0.8) & (np.hypot(u, v) < 1.2)
+    apart = (lying.height - thick.height)[near]
+    assert apart.min() > -1e-4 and apart.max() < 0.01 * coat
+    edge = indenter_profile("cube", 2.0, (45, 0, 0), 2.0, pitch, coat=coat)
+    row = edge.height[:, len(edge.axis) // 2]
+    y = np.abs(edge.axis)
+    round_off = coat / math.sqrt(2)
+    arc = np.where(y < round_off, coat - np.sqrt(np.maximum(coat**2 - y**2, 0)), y - coat * (math.sqrt(2) - 1))
+    off = np.abs(row - arc)
+    # at an edge the directions lie d sin(9 deg) apart: half of that, 8 % of d, on its slope of 1
+    assert off[y < 1].max() < 0.08 * coat and off[(y > 0.2) & (y < 1)].max() < 0.01 * coat
+    with pytest.raises(ValueError, match="coat = -0.1 mm; it must be 0 or more"):
+        indenter_profile("sphere", 1.0, coat=-0.1)
+
+
 @pytest.mark.parametrize("kind", ["tmd", "npy", "png"])
 def test_a_height_map_of_a_sphere_against_the_closed_form(tmp_path, kind):
     """A cap of 1 mm radius, 0.01 mm from sample to sample, more along y than along x; turned, it is the same cap."""
