@@ -510,7 +510,7 @@ def outlook(
                 member.bring(v.frames[0] - first, shared[v.name], side, -rms if side < 0 else rms)
             then[column] = shared[v.name]
         joint.append(member)
-    precision = np.concatenate([evidence.precision, [0.0 if v.prior is None else 1 / v.prior[1] ** 2 for v in fresh]])
+    precision = np.concatenate([evidence.precision, [v.precision for v in fresh]])
     nuisances = [[_unknown(v) for v in fresh if v.holds_in(first + n)] for n in range(len(shots))]
     return Outlook(
         _placed(evidence.normal.gram, now, size),

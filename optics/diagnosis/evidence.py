@@ -438,7 +438,7 @@ def priors(model: Model, values: Values, base: Sequence[Variable]) -> tuple[np.n
     precision, pull = np.zeros(len(base)), np.zeros(len(base))
     for i, v in enumerate(base):
         if v.prior is not None:
-            precision[i] = 1 / v.prior[1] ** 2
+            precision[i] = v.precision
             pull[i] = (v.prior[0] - value_of(model, values, v)) * precision[i]
     return precision, pull
 

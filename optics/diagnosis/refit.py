@@ -76,7 +76,7 @@ class Case:
     def prior_chi2(self, values: Values) -> float:
         """What the base's priors add to chi2."""
         return sum(
-            ((value_of(self.model, values, v) - v.prior[0]) / v.prior[1]) ** 2
+            (value_of(self.model, values, v) - v.prior[0]) ** 2 * v.precision
             for v in self.fit.variables
             if v.prior is not None
         )

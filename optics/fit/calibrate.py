@@ -352,9 +352,7 @@ def _fit_at(descent: Descent, history: list[float], reason: str, start: np.ndarr
     covariance = covariance_of(normal.a)
     # of variables with priors, the degrees of freedom that these and not the data hold: sum of c_ii/sd_i^2
     held = sum(
-        float(np.clip(c / v.prior[1] ** 2, 0.0, 1.0))
-        for v, c in zip(variables, np.diag(covariance))
-        if v.prior is not None
+        float(np.clip(c * v.precision, 0.0, 1.0)) for v, c in zip(variables, np.diag(covariance)) if v.precision > 0
     )
     result = Fit(
         descent.values,

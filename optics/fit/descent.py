@@ -123,10 +123,9 @@ def prior_terms(model: Model, variables: Sequence[Variable], values: Values) -> 
     pull, curvature, total = np.zeros(len(variables)), np.zeros(len(variables)), 0.0
     for i, v in enumerate(variables):
         if v.prior is not None:
-            mean, sd = v.prior
-            gap = mean - value_of(model, values, v)
-            pull[i], curvature[i] = gap / sd**2, 1 / sd**2
-            total += (gap / sd) ** 2
+            gap = v.prior[0] - value_of(model, values, v)
+            pull[i], curvature[i] = gap * v.precision, v.precision
+            total += gap**2 * v.precision
     return pull, curvature, total
 
 

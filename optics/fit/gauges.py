@@ -235,7 +235,7 @@ def _of_variables(data: np.ndarray, variables: Sequence[Variable], values: Seque
 
 def _priors(variables: Sequence[Variable]) -> np.ndarray:
     """(p, p) what priors add to the precision, per plausible size."""
-    return np.diag([0.0 if v.prior is None else (v.parameter.plausible / v.prior[1]) ** 2 for v in variables])
+    return np.diag([v.parameter.plausible**2 * v.precision for v in variables])
 
 
 def _share(fit: Fit, variables: Sequence[Variable]) -> tuple[np.ndarray, np.ndarray]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -12,6 +13,7 @@ from scipy.sparse.csgraph import connected_components
 from optics.fit import showing
 from optics.fit.descent import Normal, scaled_eigen
 from optics.fit.gauges import STILL, Gauges, gauges_of, sparse_basis
+from optics.fit.tempering import weight_of
 from optics.scene.parameter import Values, Variable
 from optics.words import NOT_DETERMINED, some
 
@@ -67,6 +69,16 @@ class Fit:
         return np.sqrt(np.maximum(np.diag(self.covariance), 0))
 
     @property
+    def tempering(self) -> float:
+        """T by which the model's own misfit exceeds noise (optics.fit.tempering); 1: by nothing."""
+        return weight_of(self.variables)
+
+    @property
+    def error(self) -> np.ndarray:
+        """(p,) standard deviation of each estimate where the misfit counts as noise, sqrt(T) sd."""
+        return math.sqrt(self.tempering) * self.sd
+
+    @property
     def correlation(self) -> np.ndarray:
         """(p, p), -1..1."""
         sd = np.where((self.sd > 0) & np.isfinite(self.sd), self.sd, 1)
@@ -111,7 +123,7 @@ class Fit:
             other = f"{self.correlation[i, j]:+.2f} {self.variables[j].name}" if j != i else ""
             start = "" if self.start is None else f"{self.start[i]:11.5g}"
             bound = "  at its bound" if variable.name in self.at_bound else ""
-            number = f"{self.estimate[i]:12.5g}{self.sd[i]:11.2g}"
+            number = f"{self.estimate[i]:12.5g}{self.error[i]:11.2g}"
             if i in blurred:
                 number = f"{self.estimate[i]:12.5g}{'unseen' if i in gauges.silent else 'gauge':>11}"
             elif not variable.parameter.reach.holds(self.estimate[i], self.sd[i]):

@@ -231,6 +231,7 @@ class Variable:
     frames    indices of the frames that it holds in; None: all
     parameter the declaration (unit, bounds, plausible size)
     prior     (mean, standard deviation) or None
+    weight    how many times the prior counts beside chi2 (optics.fit.tempering)
     """
 
     name: str
@@ -238,6 +239,12 @@ class Variable:
     parameter: Parameter
     frames: tuple[int, ...] | None = None
     prior: tuple[float, float] | None = None
+    weight: float = 1.0
+
+    @property
+    def precision(self) -> float:
+        """1/variance of the prior as it counts beside chi2; 0 without a prior."""
+        return 0.0 if self.prior is None else self.weight / self.prior[1] ** 2
 
     def holds_in(self, frame: int) -> bool:
         return self.frames is None or frame in self.frames

@@ -61,6 +61,12 @@ def after_calibration(model: SceneModel, found: Fit, level: Row | None) -> list[
             else f"sends no light, and misses the images by {level.rms:.3g} DN"
         )
         texts.append(f"the model {what}, too far for a missing effect: check {AT_FAULT}")
+    if found.tempering > 1:
+        texts.append(
+            "the model misses the images by more than their noise; errors count this misfit, "
+            f"{found.tempering**0.5:.3g} times those of noise alone, and priors weigh as much more: what is known "
+            "stays near its prior until the missing effect is found"
+        )
     known = [(v, value_of(model, found.values, v), v.prior) for v in found.variables if v.prior is not None]
     moved = [(v, value, prior) for v, value, prior in known if abs(value - prior[0]) > SURPRISING * prior[1]]
     if moved:

@@ -21,6 +21,7 @@ def fit_record(fit: Fit | Mapping, frame_names: Sequence[str] = ()) -> dict:
     """A fit as plain data; a mapping of that form is completed and returned.
 
     variables   name, keys, unit, value, sd, frames (names or None), prior, pull, neutral, plausible, bounds, at_bound
+    tempering   Fit.tempering, which `sd` counts
     pull        (value - prior mean) / prior sd: how far the data moved it from what was known
     """
     blank: dict[str, Any] = {
@@ -33,6 +34,7 @@ def fit_record(fit: Fit | Mapping, frame_names: Sequence[str] = ()) -> dict:
         "converged": True,
         "reason": "",
         "warnings": [],
+        "tempering": 1.0,
     }
     if isinstance(fit, Mapping):
         return {**blank, **fit}
@@ -41,7 +43,7 @@ def fit_record(fit: Fit | Mapping, frame_names: Sequence[str] = ()) -> dict:
         return frame_names[index] if index < len(frame_names) else f"{index:03d}"
 
     variables = []
-    for v, value, sd in zip(fit.variables, np.asarray(fit.estimate, float), np.asarray(fit.sd, float)):
+    for v, value, sd in zip(fit.variables, np.asarray(fit.estimate, float), np.asarray(fit.error, float)):
         p = v.parameter
         variables.append(
             {
@@ -76,6 +78,7 @@ def fit_record(fit: Fit | Mapping, frame_names: Sequence[str] = ()) -> dict:
         "converged": bool(fit.converged),
         "reason": str(fit.reason),
         "warnings": list(getattr(fit, "warnings", ()) or ()),
+        "tempering": fit.tempering,
     }
 
 

@@ -32,6 +32,7 @@ from optics.fit.compare import Comparison
 from optics.fit.model import values_in
 from optics.fit.result import Fit
 from optics.fit.scene_model import SceneModel
+from optics.fit.tempering import tempered, weight_of
 from optics.scene import trust
 from optics.scene.declare import Effect
 from optics.scene.parameter import Values, Variable
@@ -56,6 +57,7 @@ from optics.study.stages import (
     Progress,
     background_of,
     comparison_of,
+    cooled,
     fit_base,
     held_out_values,
     null_models,
@@ -119,7 +121,8 @@ def begin(
     clock = time.perf_counter()
     with record.alone():
         try:
-            found = fit_base(model, variables, fitted, Values(dict(setup.values)), progress, robust=setup.robust)
+            start = Values(dict(setup.values))
+            found = fit_base(model, variables, fitted, start, progress, robust=setup.robust, tempering=True)
             write_step(record, model, "base", None, found, held, time.perf_counter() - clock)
         except BaseException:
             record.discard()
@@ -185,7 +188,7 @@ def kept(record: Record, model: SceneModel, index: int = -1) -> tuple[list[Varia
         if step["effect"]:
             effect = model.scene.registry.find_effect(step["effect"])
             variables += _of_fitted(effect_variables(model, effect, variables), fitted)
-    return variables, values, fitted
+    return tempered(variables, steps[-1].get("tempering", 1.0)), values, fitted
 
 
 def restore(record: Record, model: SceneModel, index: int = -1) -> Fit:
@@ -463,7 +466,7 @@ def _extended(
         raise Underdetermined(
             f"{record.folder}: adding '{effect.name}' would change nothing: {why}; it needs {effect.needs or 'more'}"
         )
-    variables = [*found.variables, *extra]
+    variables = tempered([*found.variables, *extra], weight_of(found.variables))
     if start is None:
         seek(model, found.values, [effect], fitted)
         start = off_neutral(model, found.values, extra)
@@ -471,6 +474,8 @@ def _extended(
     best = calibrate.fit_over_starts(
         model, variables, start, fitted, robust=setup.robust, progress=progress, over=[v.name for v in extra]
     )
+    if model.captures.table is None:
+        best = cooled(model, best, setup.robust, progress)
     best = settled(model, best, setup.robust, progress)
     if effect.file:  # a draft is written after the study began
         own = places.own_plugins(model.scene.registry)

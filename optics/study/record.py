@@ -308,7 +308,7 @@ class Record:
             "fitted": _level(comparison.fitted),
             "held_out": _level(comparison.held_out),
             "total": _level(comparison.total),
-            **{key: record[key] for key in ("converged", "reason", "variables", "correlations")},
+            **{key: record[key] for key in ("converged", "reason", "variables", "correlations", "tempering")},
             "warnings": [*record["warnings"], *warnings],
             "frames": [_frame_entry(i, f) for i, f in enumerate(kept)],
             "fingerprints": [_fingerprint_entry(i, f) for i, f in enumerate(fingerprints)],

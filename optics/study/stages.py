@@ -12,6 +12,7 @@ from optics.fit.compare import Comparison, compare
 from optics.fit.model import value_of
 from optics.fit.result import Fit
 from optics.fit.scene_model import SceneModel
+from optics.fit.tempering import temperature, tempered, weight_of
 from optics.scene.parameter import Values, Variable
 
 Progress = Callable[[str, int, int], None]
@@ -21,6 +22,7 @@ COMMON: dict[str, Any] = {"max_iterations": 12, "tolerance": 20.0}
 POSES: dict[str, Any] = {"max_iterations": 6, "tolerance": 2.0}
 TOGETHER = 0.05  # chi2 per variable: a twentieth of what noise alone makes of each
 SETTLING = 2  # fits after which weights that follow the slopes of readings change little
+COOLINGS, COOLER = 4, 1.5  # fits at most, each with priors that count less than a part of those before
 OFF = 0.1  # plausible sizes off neutral from which an effect is followed
 
 
@@ -33,10 +35,20 @@ def fit_base(
     tolerance: float = TOGETHER,
     robust: bool = False,
     negligible: float | None = None,
+    tempering: bool = False,
 ) -> Fit:
     """Calibrate in three stages: what all frames share, then the poses of one press at a time, then everything
-    together."""
-    variables = list(variables)
+    together.
+
+    tempering   of images: priors count as much more as the model misses them by more than noise, first at the start
+                values, then where each stage ends (optics.fit.tempering)"""
+    tempering = tempering and model.captures.table is None
+
+    def weighed(variables: Sequence[Variable], values: Values) -> list[Variable]:
+        return tempered(variables, temperature(model, values, fitted, dof)) if tempering else list(variables)
+
+    dof = sum(int(model.usable(i).sum()) for i in fitted) - len(variables)
+    variables = weighed(variables, start)
     if model.dialled:
         model.weighed_at = start.copy()
     begun = np.array([value_of(model, start, v) for v in variables])  # where the first stage starts
@@ -48,6 +60,7 @@ def fit_base(
                 model, common, start, fitted, **COMMON, robust=robust, progress=progress
             ).values
         start = values.copy()
+        variables = weighed(variables, start)
         groups: dict[tuple[int, ...], list[Variable]] = {}
         for v in variables:
             if v.frames is not None:
@@ -56,9 +69,12 @@ def fit_base(
             found = calibrate.fit(model, own, values, frames, **POSES, robust=robust, progress=progress)
             for index in frames:
                 start.frame.setdefault(index, {}).update(found.values.frame[index])
+        variables = weighed(variables, start)
     found = calibrate.fit_over_starts(
         model, variables, start, fitted, tolerance=tolerance, negligible=negligible, robust=robust, progress=progress
     )
+    if tempering:
+        found = cooled(model, found, robust, progress)
     found = settled(model, found, robust, progress, tolerance)
     found.start = begun
     return found
@@ -75,6 +91,25 @@ def settled(
         model.weighed_at = found.values.copy()
         found = calibrate.fit(
             model, found.variables, found.values, found.frames, tolerance=tolerance, robust=robust, progress=progress
+        )
+    return found
+
+
+def cooled(model: SceneModel, found: Fit, robust: bool = False, progress: Progress | None = None) -> Fit:
+    """A fit of images calibrated again with priors that count as its own misfit asks, while that is less."""
+    for _ in range(COOLINGS):
+        now = weight_of(found.variables)
+        weight = temperature(model, found.values, found.frames, found.dof)
+        if weight > now / COOLER and not weight == 1 < now:
+            break
+        found = calibrate.fit(
+            model,
+            tempered(found.variables, weight),
+            found.values,
+            found.frames,
+            tolerance=TOGETHER,
+            robust=robust,
+            progress=progress,
         )
     return found
 
