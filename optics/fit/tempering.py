@@ -37,6 +37,8 @@ def temperature(model: Model, values: Values, frames: Sequence[int], dof: int) -
         square, whole = square + float(np.sum(r**2)), whole + int(usable.sum())
         for side in SQUARES:
             height, width = (n // side * side for n in r.shape[:2])
+            if not height * width:
+                continue
             blocks = r[:height, :width].reshape(height // side, side, width // side, side, -1).sum((1, 3))
             sums[side] += float(np.sum(blocks**2))
     dof = min(dof, whole)

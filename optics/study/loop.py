@@ -54,6 +54,7 @@ from optics.study.setup import (
 )
 from optics.study.shown import fingerprints_of, shown_frames
 from optics.study.stages import (
+    TOGETHER,
     Progress,
     background_of,
     comparison_of,
@@ -472,7 +473,14 @@ def _extended(
         start = off_neutral(model, found.values, extra)
     clock = time.perf_counter()
     best = calibrate.fit_over_starts(
-        model, variables, start, fitted, robust=setup.robust, progress=progress, over=[v.name for v in extra]
+        model,
+        variables,
+        start,
+        fitted,
+        tolerance=TOGETHER * weight_of(variables),
+        robust=setup.robust,
+        progress=progress,
+        over=[v.name for v in extra],
     )
     if model.captures.table is None:
         best = cooled(model, best, setup.robust, progress)

@@ -47,6 +47,10 @@ def fit_base(
     def weighed(variables: Sequence[Variable], values: Values) -> list[Variable]:
         return tempered(variables, temperature(model, values, fitted, dof)) if tempering else list(variables)
 
+    def enough(tolerance: float) -> float:
+        """The fall of chi2 per variable that ends a stage; of a wrong model as much as its misfit allows."""
+        return max(tolerance, TOGETHER * weight_of(variables)) if tempering else tolerance
+
     dof = sum(int(model.usable(i).sum()) for i in fitted) - len(variables)
     variables = weighed(variables, start)
     if model.dialled:
@@ -56,8 +60,9 @@ def fit_base(
     if len(common) < len(variables):
         values = start
         if common:
+            stage = {**COMMON, "tolerance": enough(COMMON["tolerance"])}
             values = calibrate.fit_over_starts(
-                model, common, start, fitted, **COMMON, robust=robust, progress=progress
+                model, common, start, fitted, **stage, robust=robust, progress=progress
             ).values
         start = values.copy()
         variables = weighed(variables, start)
@@ -66,12 +71,20 @@ def fit_base(
             if v.frames is not None:
                 groups.setdefault(v.frames, []).append(v)
         for frames, own in groups.items():
-            found = calibrate.fit(model, own, values, frames, **POSES, robust=robust, progress=progress)
+            stage = {**POSES, "tolerance": enough(POSES["tolerance"])}
+            found = calibrate.fit(model, own, values, frames, **stage, robust=robust, progress=progress)
             for index in frames:
                 start.frame.setdefault(index, {}).update(found.values.frame[index])
         variables = weighed(variables, start)
     found = calibrate.fit_over_starts(
-        model, variables, start, fitted, tolerance=tolerance, negligible=negligible, robust=robust, progress=progress
+        model,
+        variables,
+        start,
+        fitted,
+        tolerance=enough(tolerance),
+        negligible=negligible,
+        robust=robust,
+        progress=progress,
     )
     if tempering:
         found = cooled(model, found, robust, progress)
@@ -107,7 +120,7 @@ def cooled(model: SceneModel, found: Fit, robust: bool = False, progress: Progre
             tempered(found.variables, weight),
             found.values,
             found.frames,
-            tolerance=TOGETHER,
+            tolerance=TOGETHER * weight,
             robust=robust,
             progress=progress,
         )

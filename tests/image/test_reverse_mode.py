@@ -145,7 +145,7 @@ def plain(benches):
 
 
 # Most of them compile for half a minute and more where Dr.Jit's cache of kernels is empty: among the slow tests.
-LONG = ("gelsight", "gelsight_mini", "polarizer_bench", "vi2tap", "grid_bench")
+LONG = ("gelsight", "gelsight_mini", "digit", "polarizer_bench", "vi2tap", "grid_bench")
 
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n in LONG else n for n in SCENES])

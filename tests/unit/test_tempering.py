@@ -42,6 +42,15 @@ def test_neighbours_that_miss_alike_count_once():
     assert 0.7 * 16 * 8 < found < 3 * 16 * 8
 
 
+def test_images_smaller_than_a_square():
+    image = 3.0 * np.ones((5, 7, 1))
+    model = model_of(image)
+    model.predict, model.variance = (lambda *_: [np.zeros((5, 7, 1))]), (lambda *_: np.ones((5, 7, 1)))
+    model.usable = lambda frame: np.ones((5, 7, 1), bool)
+    # of squares of 4 x 4 px one fits: 16^2 9 of 35 9
+    assert temperature(model, Values(), [0], 35) == pytest.approx(1 + 16**2 / 35 * 8)
+
+
 def test_a_prior_weighs_more_and_says_the_same():
     p = Parameter("a", "mm", 0.0, (-1.0, 1.0), "a number", plausible=1.0)
     known, free = Variable("a", ("m.a",), p, prior=(0.5, 0.1)), Variable("b", ("m.b",), p)

@@ -195,6 +195,7 @@ def test_a_perfect_bench_lacks_nothing(seed, tmp_path):
     assert abs(value_of(model, fit.values, power) - 2.2) < 4 * fit.sd[0]  # four standard deviations: the diode's gain
 
 
+@pytest.mark.slow
 def test_what_goes_with_a_setting_is_drafted_then_claimed_as_a_formula(tmp_path):
     """A lamp whose supply swings as sin(t/3 min), which no effect has: the curve along its clock, as a table, then as a
     formula."""

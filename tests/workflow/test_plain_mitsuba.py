@@ -74,8 +74,18 @@ def both(mi, name, replaced, **options):
     return mi.load_file(str(path), **options, **defines), loader.load(name, defines)
 
 
-@pytest.mark.parametrize("pressed", [False, True], ids=["rest", "pressed"])
-@pytest.mark.parametrize("name", CASES)
+LONG = ("magictac", "grid_bench")  # Monte Carlo: pressed ones are among the slow tests
+
+
+@pytest.mark.parametrize(
+    "name, pressed",
+    [
+        pytest.param(name, pressed, marks=[pytest.mark.slow] * (pressed and name in LONG))
+        for name in CASES
+        for pressed in (False, True)
+    ],
+    ids=[f"{name}-{state}" for name in CASES for state in ("rest", "pressed")],
+)
 def test_load_file_gives_what_our_loader_gives(name, pressed, mi):
     plain, ours = both(mi, name, CASES[name][pressed])
     if name not in DRAWN:

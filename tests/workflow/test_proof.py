@@ -198,6 +198,7 @@ def test_without_the_projection_it_fails(bench, monkeypatch):
     assert judged(bench, ["camera gamma"], range(3)).rate(name).k == 0
 
 
+@pytest.mark.slow
 def test_a_run_is_taken_up_again_and_becomes_a_page(tmp_path, monkeypatch, capsys):
     """Few cells, in this process; a record that was cut off is made again, one that is whole is not."""
     monkeypatch.setattr(

@@ -78,7 +78,7 @@ def test_a_calibration_finds_the_index_from_brewsters_minimum(tmp_path):
 @pytest.mark.parametrize(
     "effect, hidden, key, strength",
     [
-        ("back-face reflection", {"back": 0.4}, "plate.back_face", 0.4),
+        pytest.param("back-face reflection", {"back": 0.4}, "plate.back_face", 0.4, marks=pytest.mark.slow),
         ("surface scattering", {"scatter": 4e-3}, "plate.scatter", 4e-3),
         ("incidence misalignment", {"offset": -1.0}, "plate.incidence_offset", -1.0),
     ],

@@ -257,9 +257,8 @@ def test_a_prior_is_one_more_measurement(ask, view, monkeypatch, name, off, mean
     question, slope = {"names": [name], "values": {}, "there": {name: there}}, p.per_coordinate(there)
     free = json.loads(ask("/best", **question)[1])
     value, sd = free["values"][name], free["sd"][name] / p.per_coordinate(free["values"][name])  # sd of u
-    monkeypatch.setitem(
-        view.sliders, name, replace(slider, variable=slider.variable.with_prior(there + mean, 0.5 * sd * slope))
-    )
+    known = replace(slider.variable, prior=(there + mean, 0.5 * sd * slope), weight=1.0)
+    monkeypatch.setitem(view.sliders, name, replace(slider, variable=known))
     found = json.loads(ask("/best", **question)[1])
     prior = p.coordinate(there) + mean / slope
     assert p.coordinate(found["values"][name]) == pytest.approx(0.2 * p.coordinate(value) + 0.8 * prior, rel=1e-4)
