@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 from optics.captures import capture_set as capture_files
@@ -12,12 +13,14 @@ from optics.fit.compare import Row
 from optics.fit.model import value_of
 from optics.fit.result import Fit
 from optics.fit.scene_model import SceneModel
+from optics.fit.tempering import weight_of
 from optics.scene.parameter import Values
 from optics.study.setup import GROUPS, Setup
 from optics.words import some, spaced
 
 # of the noise: Monte Carlo error of a prediction below which it adds less than 5 % to the noise (in quadrature)
 CHANCE = 0.3
+COLLIMATED = 4.0  # of the face's width: the distance of a light from which its directions differ by 7 deg at most
 SURPRISING = 3.0  # standard deviations of a prior, beyond which a calibrated value contradicts it
 
 
@@ -61,12 +64,13 @@ def after_calibration(model: SceneModel, found: Fit, level: Row | None) -> list[
             else f"sends no light, and misses the images by {level.rms:.3g} DN"
         )
         texts.append(f"the model {what}, too far for a missing effect: check {AT_FAULT}")
-    if found.tempering > 1:
+    if (misfit := weight_of(found.variables)) > 1:
         texts.append(
             "the model misses the images by more than their noise; errors count this misfit, "
-            f"{found.tempering**0.5:.3g} times those of noise alone, and priors weigh as much more: what is known "
+            f"{misfit**0.5:.3g} times those of noise alone, and priors weigh as much more: what is known "
             "stays near its prior until the missing effect is found"
         )
+    texts += _far_lights(model, found)
     known = [(v, value_of(model, found.values, v), v.prior) for v in found.variables if v.prior is not None]
     moved = [(v, value, prior) for v, value, prior in known if abs(value - prior[0]) > SURPRISING * prior[1]]
     if moved:
@@ -75,6 +79,30 @@ def after_calibration(model: SceneModel, found: Fit, level: Row | None) -> list[
             f"{some([v.name for v, _, _ in moved], 4)}: calibrated to more than {SURPRISING:g} sd from the prior, most "
             f"{v.name}: {value:.4g}{spaced(v.parameter.unit)} for {prior[0]:.4g} +- {prior[1]:g}; check {AT_FAULT}"
         )
+    return texts
+
+
+def _far_lights(model: SceneModel, found: Fit) -> list[str]:
+    """Lights that ran so far from where they were known to be that their distance shows no more."""
+    scene, gel = getattr(model, "scene", None), getattr(getattr(model, "scene", None), "gel", None)
+    if scene is None or gel is None:
+        return []
+    start, now = model.at(Values(), 0), model.at(found.values, 0)
+    across = [float(now[key]) for role in ("width", "length") if (key := scene.key(gel.name, role))]
+    texts = []
+    for led in scene.leds:
+        keys = [scene.key(led, f"light {axis}") for axis in "xyz"]
+        placed = [(v, v.prior) for v in found.variables if v.prior is not None and set(v.keys) & set(keys)]
+        if None in keys or not across:
+            continue
+        before, after = (math.dist([float(at[key]) for key in keys], (0.0, 0.0, 0.0)) for at in (start, now))
+        astray = any(abs(value_of(model, found.values, v) - p[0]) > SURPRISING * p[1] for v, p in placed)
+        if astray and after > max(2 * before, COLLIMATED * max(across)):
+            texts.append(
+                f"{led} ran to {after:.3g} mm from {before:.3g} mm: over the {max(across):.3g} mm of the face it acts "
+                "like collimated light. Light that fills shadows and slopes makes a model do that where it is missing: "
+                "ask for 'light returned by the window', 'ambient light' and 'interreflection'"
+            )
     return texts
 
 

@@ -55,6 +55,32 @@ def test_a_value_far_from_its_prior_is_named():
     )
 
 
+def test_a_light_that_ran_away_is_named_for_what_it_is():
+    """A face of 10 mm: from 12 mm to 45 mm a light acts as a collimated one; to 20 mm, or where nobody said where it
+    stood, it does not, or nobody knows."""
+    z = Parameter("z", "mm", -12.0, (-500.0, 0.0), plausible=1.0)
+
+    def told(place, prior):
+        keys = {
+            "light x": "led.x",
+            "light y": "led.y",
+            "light z": "led.z",
+            "width": "gel.width",
+            "length": "gel.length",
+        }
+        scene = SimpleNamespace(leds=["led"], gel=SimpleNamespace(name="gel"), key=lambda part, role: keys[role])
+        start = {"led.x": 0.0, "led.y": 0.0, "led.z": -12.0, "gel.width": 10.0, "gel.length": 8.0}
+        model = SimpleNamespace(scene=scene, at=lambda values, i: {**start, **values.common}, base=start)
+        fit = SimpleNamespace(
+            variables=[Variable("led.z", ("led.z",), z, None, prior)], values=Values({"led.z": place})
+        )
+        return checks._far_lights(model, fit)
+
+    (text,) = told(-45.0, (-12.0, 2.0))
+    assert text.startswith("led ran to 45 mm from 12 mm: over the 10 mm of the face it acts like collimated light")
+    assert told(-20.0, (-12.0, 2.0)) == told(-45.0, None) == told(-45.0, (-12.0, 20.0)) == []
+
+
 @pytest.mark.parametrize(
     "frames, key",
     [
@@ -108,12 +134,11 @@ def test_an_effect_that_does_not_predict_is_reported_as_no_cause(monkeypatch):
         study.steps.append({"held_out": {"chi2_per_dof": 1.6}})
 
     monkeypatch.setattr(loop, "split", lambda model, setup: ([0], [1]))
-    monkeypatch.setattr(
-        loop, "effect_variables", lambda model, effect, held=(): [SimpleNamespace(frames=None, name="row")]
-    )
+    row = Variable("row", ("camera.row",), Parameter("row", "1", 0.0, (-1.0, 1.0), plausible=0.1))
+    monkeypatch.setattr(loop, "effect_variables", lambda model, effect, held=(): [row])
     monkeypatch.setattr(loop, "write_step", record)
     monkeypatch.setattr(loop.calibrate, "fit_over_starts", lambda *_, **__: SimpleNamespace(warnings=[]))
-    captures = SimpleNamespace(absent=[], exclude={}, folder="captures")
+    captures = SimpleNamespace(absent=[], exclude={}, folder="captures", table=object())
     scene = SimpleNamespace(can_express=lambda effect: True, keys_of=lambda effect: {})
     model = SimpleNamespace(scene=scene, captures=captures, dialled=False, frames=[])
     effect = SimpleNamespace(name="row curve", file="", requires=(), part="camera")
