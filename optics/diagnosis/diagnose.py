@@ -152,7 +152,10 @@ def diagnose(
         shifts=shifts,
         hints=hints,
         not_tested={**scored.not_tested, **(excluded or {})},
-        warnings=remarks.warnings_of(case, word, subject, outcome, shifts, scored.dropped, basis),
+        warnings=[
+            *filter(None, [scored.unsettled]),
+            *remarks.warnings_of(case, word, subject, outcome, shifts, scored.dropped, basis),
+        ],
         claimed=subject.effect.name if subject and word == "CLAIM" else "",
         explanations=told,
         families=families,

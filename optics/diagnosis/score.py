@@ -24,6 +24,7 @@ from optics.words import some
 
 SETTLED = 0.01  # of the excess of chi2 per parameter: what a calibrated base may still absorb. Derivative images of
 # moving edges are finite samples, which no calibration makes orthogonal to a residual with structure
+MOVING = 0.15  # of the excess in all: what a tempered base may still absorb
 KAPPA = 0.1  # noise per pixel of derivative images over their signal, above which strengths are biased
 FAINT = 10  # the power of the test is stated for the plausible strength over this
 
@@ -34,12 +35,14 @@ class Scored:
 
     dropped      names of base variables that stand at a bound, and are taken as known there
     not_tested   effect -> why
+    unsettled    what a base that misses its images may still absorb, in a sentence; empty: nothing to speak of
     """
 
     evidence: Evidence
     table: Table
     dropped: list[str]
     not_tested: dict[str, str]
+    unsettled: str = ""
 
 
 def score(
@@ -61,8 +64,8 @@ def score(
     base, dropped = base_variables(model, fit, fitted)
     candidates, not_tested = candidates_of(model, fit, effects, variables_of, fitted)
     evidence = measure(model, fit.values, base, candidates, fitted, rows_max, seed, progress or silent)
-    _require_convergence(evidence, fit)
-    return Scored(evidence, _rank(evidence, candidates, seed), dropped, not_tested)
+    unsettled = _require_convergence(evidence, fit)
+    return Scored(evidence, _rank(evidence, candidates, seed), dropped, not_tested, unsettled)
 
 
 # -- what must hold before any score ---------------------------------------------------------------------------------
@@ -129,13 +132,21 @@ def _fewest(model: Model, variables: Sequence[Variable]) -> float:
     return min(sum(int(model.usable(f).sum()) for f in v.frames or ()) for v in variables)
 
 
-def _require_convergence(evidence: Evidence, fit: Fit) -> None:
+def _require_convergence(evidence: Evidence, fit: Fit) -> str:
     """Refuse a base that is not calibrated: |Q'r|^2 would be chi2 of a parameter, not of a missing effect.
 
-    Allowed is 1 per parameter or, where the misfit exceeds noise, SETTLED of that excess."""
+    Allowed is 1 per parameter or, where the misfit exceeds noise, SETTLED of that excess. Of a tempered fit of images,
+    whose misfit bends every step, MOVING of it passes with the sentence that is returned: scores are taken beside the
+    base's parameters, at their optimum, so that only what is not linear in them is left to doubt."""
     rank = max(evidence.projected.rank, 1)
     excess = max(evidence.projected.chi2 - (evidence.normal.count - rank), 0.0)
     allowed = max(1.0, SETTLED * excess / rank)
+    if allowed <= evidence.gradient < MOVING * excess / rank and fit.tempering > 1:
+        return (
+            f"the base may still absorb {evidence.projected.absorbed / excess:.1%} of its misfit (chi2 by "
+            f"{evidence.projected.absorbed:.3g}, most of all {some(_off(evidence))}): what explains less than that may "
+            "be the base's own"
+        )
     if evidence.gradient >= allowed:
         how = "" if fit.converged else f" (it stopped: {fit.reason})"
         raise Underdetermined(
@@ -145,6 +156,7 @@ def _require_convergence(evidence: Evidence, fit: Fit) -> None:
             "robust weights, or hold parameters that the captures hardly tell apart: leave them out of --free, or "
             "give them a --prior"
         )
+    return ""
 
 
 def _off(evidence: Evidence) -> list[str]:

@@ -25,6 +25,7 @@ from optics.diagnosis.score import score
 from optics.diagnosis.thresholds import CLUTTERED, TOLD
 from optics.errors import Underdetermined
 from optics.fit.model import value_of
+from optics.fit.tempering import tempered
 from optics.scene.declare import Effect
 from optics.scene.parameter import Parameter, Values, Variable
 
@@ -535,6 +536,22 @@ def test_a_base_that_is_not_calibrated_is_refused():
     fit.values.common["led2.x"] += 0.05
     with pytest.raises(Underdetermined, match=r"not calibrated .*most of all (.*, )?led2\.x"):
         judge(model, fit, library("glare"))
+
+
+def test_a_tempered_base_that_misses_much_may_be_a_little_off():
+    """Its misfit bends every step: a tenth of it that the base could still absorb is said, and refused without
+    tempering, or of a base that is further off."""
+    model, fit = calibrated({"vignetting": 0.3})
+    fit.values.common["led2.x"] += 0.05
+    with pytest.raises(Underdetermined, match="not calibrated"):
+        judge(model, fit, library("vignetting", "glare"))
+    fit.variables = tempered(fit.variables, 50.0)
+    d = judge(model, fit, library("vignetting", "glare"))
+    assert any("may still absorb" in w and "led2.x" in w for w in d.warnings)
+    assert d.rows[0].name == "vignetting"
+    fit.values.common["led2.x"] += 0.2
+    with pytest.raises(Underdetermined, match="not calibrated"):
+        judge(model, fit, library("vignetting", "glare"))
 
 
 @pytest.mark.parametrize("name", ["saturation", "black_level"])
