@@ -198,7 +198,8 @@ def restore(record: Record, model: SceneModel, index: int = -1) -> Fit:
     most = AGAIN if record.steps[index]["converged"] else FURTHER
     if model.dialled:
         model.weighed_at = values.copy()
-    return calibrate.fit(model, variables, values, fitted, max_iterations=most)
+    enough = TOGETHER * weight_of(variables)
+    return calibrate.fit(model, variables, values, fitted, max_iterations=most, tolerance=enough)
 
 
 def _of_fitted(variables: Sequence[Variable], fitted: Sequence[int]) -> list[Variable]:
