@@ -124,12 +124,14 @@ class Balls:
     radius   mm;   slope  beyond which each goes on as a cone (`Profile.envelope`)
     spacing  mm from middle to middle; 0: one ball
     turn     (3, 3) of the plate: balls stay balls, and stand where they are turned to
+    tall     height over width of each: 1 of a ball, less of a flattened one
     """
 
     radius: float
     slope: float
     spacing: float = 0.0
     turn: np.ndarray = field(default_factory=lambda: np.eye(3))
+    tall: float = 1.0
 
     def places(self, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(u, v) as rows and columns of balls (2, ...), and the whole numbers of the nearest ball."""
@@ -151,24 +153,25 @@ class Balls:
 
     def lower(self, r: np.ndarray) -> np.ndarray:
         """Height of a ball's lower side at the distance r from its axis, over its lowest point, mm."""
-        edge = self.radius * self.slope / math.hypot(1.0, self.slope)
+        slope = self.slope / self.tall  # of the ball that is as tall as wide
+        edge = self.radius * slope / math.hypot(1.0, slope)
         inner = np.minimum(r, edge)
-        return self.radius - np.sqrt(self.radius**2 - inner**2) + self.slope * (r - inner)
+        return self.tall * (self.radius - np.sqrt(self.radius**2 - inner**2) + slope * (r - inner))
 
     def contact_line(self, depth: np.ndarray, skirt: float) -> np.ndarray:
         """Radius (mm) at which a skirt leaves a ball, where depth - lower(r) = skirt d lower/dr; 0 where it is not
         touched. On the ball r = R sin t, and
 
-            f(t) = depth - R + R cos t - skirt tan t = 0
+            f(t) = depth/tall - R + R cos t - skirt tan t = 0
 
         falls ever faster, so that Newton's steps from beyond the root end there."""
-        steepest = math.atan(self.slope)
+        steepest = math.atan(self.slope / self.tall)
         t = np.full(np.shape(depth), steepest)
 
         def excess(t):
-            return depth - self.radius * (1 - np.cos(t)) - skirt * np.tan(t)
+            return depth / self.tall - self.radius * (1 - np.cos(t)) - skirt * np.tan(t)
 
-        beyond = np.maximum(excess(t), 0.0) / self.slope  # of deep contacts, on the cone
+        beyond = np.maximum(excess(t), 0.0) / (self.slope / self.tall)  # of deep contacts, on the cone
         for _ in range(NEWTON):
             t = np.clip(t + excess(t) / (self.radius * np.sin(t) + skirt / np.cos(t) ** 2), 0.0, steepest)
         return np.where(depth > 0, self.radius * np.sin(t) + beyond, 0.0)
@@ -252,6 +255,7 @@ def indenter_profile(
     steepest: float = 75.0,
     spacing: float = 1.0,
     coat: float = 0.0,
+    flattening: float = 0.0,
 ) -> Profile:
     """Height of an indenter's lower surface above its lowest point, around the indenter's own axis; cached.
 
@@ -268,6 +272,7 @@ def indenter_profile(
     steepest  deg, see Profile.envelope; a sphere is exact down to depth = R (1 - cos(steepest)), 0.74 R
     spacing   mm between the middles of balls
     coat      mm of skin between the indenter and the face that is meant, see `through_coat`
+    flattening  1 - height/width of a sphere or of balls: below 0 they are taller than wide; others have none
 
     Spheres, cubes and cylinders are closed forms. A mesh is sampled once per power of two of its size, at half the
     pitch, and carried to the size asked for by a C2 spline: smooth in size but for a change by interpolation error
@@ -301,13 +306,16 @@ def indenter_profile(
     if not (math.isfinite(coat) and coat >= 0):
         raise ValueError(f"indenter coat = {coat:g} mm; it must be 0 or more")
     numbers = (float(size), *map(float, rotation), float(extent), float(pitch), float(steepest), spacing)
-    if shape in ("sphere", "balls"):  # of a ball, the parallel face is a ball
-        return _profile(shape, stamp, numbers[0] + coat, *numbers[1:])
-    return _through_coat(_profile(shape, stamp, *numbers), float(coat), math.tan(math.radians(steepest)))
+    if not -1 < flattening < 1:
+        raise ValueError(f"indenter flattening = {flattening:g}; it must lie between -1 and 1")
+    if shape in ("sphere", "balls"):  # of a ball, the parallel face is a ball, of a flattened one nearly one
+        wide, high = size + coat, (1 - flattening) * size + coat
+        return _profile(shape, stamp, float(wide), *numbers[1:], high / wide)
+    return _through_coat(_profile(shape, stamp, *numbers), float(coat))
 
 
 @lru_cache(maxsize=32)
-def _profile(shape, stamp, size, rx, ry, rz, extent, pitch, steepest, spacing) -> Profile:
+def _profile(shape, stamp, size, rx, ry, rz, extent, pitch, steepest, spacing, tall=1.0) -> Profile:
     from optics.skin import patterns
 
     n = 2 * math.ceil(extent / pitch - 1e-9) + 1
@@ -315,25 +323,25 @@ def _profile(shape, stamp, size, rx, ry, rz, extent, pitch, steepest, spacing) -
     u, v = np.meshgrid(axis, axis)
     turn = rotation_matrix(rx, ry, rz)
     if shape == "sphere":
-        height, envelope = sphere(u, v, size, slope)
+        height, envelope = (tall * h for h in sphere(u, v, size, slope / tall))
     elif shape == "cube":
         height, envelope = cube(u, v, size, turn, slope)
     elif shape == "cylinder":
         height, envelope = cylinder(u, v, size, turn, slope)
     elif shape == "balls":
-        height, envelope = patterns.balls(u, v, size, spacing, turn, slope)
+        height, envelope = patterns.balls(u, v, size, spacing, turn, slope, tall)
     elif shape.lower().endswith(MAP_FILES):
         height, envelope = patterns.height_map(axis, size, shape, stamp, turn, slope)
     else:
         height, envelope = mesh(axis, size, shape, stamp, (rx, ry, rz), extent, pitch, slope)
     for a in (height, envelope):
         a.flags.writeable = False
-    found = {"sphere": Balls(size, slope), "balls": Balls(size, slope, spacing, turn)}
+    found = {"sphere": Balls(size, slope, tall=tall), "balls": Balls(size, slope, spacing, turn, tall)}
     return Profile(height, envelope, pitch, found.get(shape))
 
 
 @lru_cache(maxsize=16)
-def _through_coat(profile: Profile, coat: float, slope: float) -> Profile:
+def _through_coat(profile: Profile, coat: float) -> Profile:
     if coat == 0:
         return profile
     height = through_coat(profile.envelope, profile.pitch, coat)

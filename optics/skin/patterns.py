@@ -14,17 +14,23 @@ from optics.skin.contact import cone_envelope, sphere
 
 
 def balls(
-    u: np.ndarray, v: np.ndarray, radius: float, spacing: float, turn: np.ndarray, slope: float
+    u: np.ndarray,
+    v: np.ndarray,
+    radius: float,
+    spacing: float,
+    turn: np.ndarray,
+    slope: float,
+    tall: float = 1.0,
 ) -> tuple[np.ndarray, np.ndarray]:
     """(height, envelope) of balls of a radius, `spacing` mm apart in rows and columns without end, one on the axis;
-    heights over the lowest point of that one.
+    heights over the lowest point of that one. tall: height over width of each.
 
     The plate is turned with its balls (turn: rotation matrix): they stay balls, and stand where they were turned to."""
     plane = turn[:2, :2]
     number = np.rint(np.einsum("ij,j...->i...", np.linalg.inv(plane), np.stack([u, v])) / spacing) * spacing
     x, y = np.einsum("ij,j...->i...", plane, number)
     rise = np.einsum("j,j...->...", turn[2, :2], number)
-    height, envelope = sphere(u - x, v - y, radius, slope)
+    height, envelope = (tall * h for h in sphere(u - x, v - y, radius, slope / tall))
     return height + rise, envelope + rise
 
 

@@ -9,6 +9,7 @@ with G_sd * D the blur by a Gaussian of that standard deviation (mm); the maximu
 after each blur. Steep walls of h are cut to a slope, and the rim of D0 is rounded, within about a node of the map
 (optics.skin.contact). The gel fills -thickness < z < 0; the camera stands at z < -thickness. The face is a triangle
 mesh on a graded grid that is fine around the contact and moves with it, so that images vary smoothly with the press.
+A ball with `flattening` f is (1 - f) times as tall as wide: h is (1 - f) times that of the ball.
 With `coat` d > 0 the camera sees the coating's inner face, parallel to the one that is touched:
     h'(x) = d + min over |s| <= d of h(x + s) - sqrt(d^2 - s^2)
 With `skirt` > 0 the skin beside the contact falls off as exp(-distance / skirt) before the smoothing: in place of D0
@@ -149,6 +150,16 @@ PARAMETERS = (
         plausible=0.02,
         how="difference",
     ),
+    Parameter(
+        "flattening",
+        "1",
+        0.0,
+        (-0.5, 0.5),
+        "1 - height/width of a ball indenter; below 0: taller than wide",
+        neutral=0.0,
+        plausible=0.05,
+        how="difference",
+    ),
 )
 
 
@@ -172,6 +183,7 @@ def build():
             "smoothing",
             "skirt",
             "coat",
+            "flattening",
         )  # what does nothing while press_depth is 0
 
         def __init__(self, props):
@@ -208,6 +220,7 @@ def build():
                 self.map_pitch,
                 spacing=n("indenter_spacing"),
                 coat=n("coat"),
+                flattening=n("flattening"),
             )
             return contact.displacement(profile, n("press_depth"), n("thickness"), n("smoothing"), skirt=n("skirt"))
 
