@@ -35,6 +35,7 @@ MESH_FILES = (".stl", ".obj", ".ply")
 FILES = (*MESH_FILES, *MAP_FILES)
 FLATTEST = 0.05  # slope that softens the contact edge of flat faces: a twentieth of a pitch of height
 STEPS = (10, 24)  # directions from which a parallel face is found: towards the face's normal, and around it
+HALVINGS = 40  # of a quarter turn: 1e-12 rad
 NEWTON = 20  # steps to a contact line: from the steepest place six are enough for skirts of a tenth of the radius
 DETACHING = 0.3  # the weight of contact fades while the smoothed skin goes from 1 to 1.3 times the indenter's depth
 
@@ -175,6 +176,37 @@ class Balls:
         for _ in range(NEWTON):
             t = np.clip(t + excess(t) / (self.radius * np.sin(t) + skirt / np.cos(t) ** 2), 0.0, steepest)
         return np.where(depth > 0, self.radius * np.sin(t) + beyond, 0.0)
+
+    def fillet(self, depth: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
+        """(r where an arc of this radius leaves a ball, r where it meets the untouched face), mm; 0 and 0 of a ball
+        that does not touch. The arc's middle lies a radius above the face, and beside the ball's point at the angle t,
+        from its lowest point, by a radius along the normal n there:
+
+            f(t) = depth - tall R (1 - cos t) - radius (1 - n_z) = 0,   n = (tall sin t, cos t)/norm
+
+        falls all the way, so that halving finds it."""
+        deep = np.asarray(depth, float)
+        low, high = np.zeros(deep.shape), np.full(deep.shape, math.atan(self.slope / self.tall))
+        for _ in range(HALVINGS):
+            t = (low + high) / 2
+            normal = np.cos(t) / np.hypot(self.tall * np.sin(t), np.cos(t))
+            above = deep - self.tall * self.radius * (1 - np.cos(t)) - radius * (1 - normal) > 0
+            low, high = np.where(above, t, low), np.where(above, high, t)
+        across = self.tall * np.sin(low) / np.hypot(self.tall * np.sin(low), np.cos(low))
+        leaves = self.radius * np.sin(low)
+        return np.where(deep > 0, leaves, 0.0), np.where(deep > 0, leaves + radius * across, 0.0)
+
+    def bridged(self, u: np.ndarray, v: np.ndarray, depth: float, radius: float) -> np.ndarray:
+        """Displacement (mm) at (u, v) around the axis with a skin that bends no more sharply than this radius."""
+        at, nearest = self.places(u, v)
+        low = nearest.reshape(2, -1).min(1)
+        every = np.indices(np.ptp(nearest.reshape(2, -1), axis=1) + 1) + low.reshape(2, 1, 1)
+        deep = depth - self.rise(every)
+        leaves, meets = self.fillet(deep, radius)
+        place = tuple(nearest - low.reshape(2, 1, 1))
+        r = self.distance(at, nearest) if self.spacing else np.hypot(u, v)
+        out = np.clip(meets[place] - r, 0.0, radius)
+        return np.where(r < leaves[place], deep[place] - self.lower(r), radius - np.sqrt(radius**2 - out**2))
 
     def dragged(self, u: np.ndarray, v: np.ndarray, depth: float, skirt: float) -> np.ndarray:
         """Displacement with an exponential skirt (mm) at (u, v) around the axis; see `dragged`."""
@@ -356,16 +388,14 @@ def through_coat(height: np.ndarray, pitch: float, coat: float) -> np.ndarray:
 
     Flat parts stay, a sphere's radius grows, smooth parts follow h' - h = coat (1 - sqrt(1 + |grad h|^2)), and sharp
     edges get round. The minimum is sought in `STEPS` directions: 1 % of the coat too high, up to 8 % at sharp edges."""
-    from scipy.ndimage import map_coordinates, spline_filter
+    from scipy.ndimage import shift
 
-    smooth = spline_filter(height)
-    rows, columns = np.indices(height.shape)
     lowest = np.array(height)
     for angle in (np.arange(STEPS[0]) + 1) / STEPS[0] * (math.pi / 2):
         out, up = coat * math.sin(angle) / pitch, coat * (1 - math.cos(angle))
         for turn in 2 * math.pi * np.arange(STEPS[1]) / STEPS[1]:
-            at = (rows + out * math.sin(turn), columns + out * math.cos(turn))
-            moved = map_coordinates(smooth, at, prefilter=False, mode="nearest")
+            there = (-out * math.sin(turn), -out * math.cos(turn))
+            moved = shift(height, there, order=1, mode="nearest")
             np.minimum(lowest, moved + up, out=lowest)
     return lowest
 
@@ -606,7 +636,13 @@ def cone_envelope(height: np.ndarray, rise: float) -> np.ndarray:
 # -- Deformation -----------------------------------------------------------------------------------------------------
 @lru_cache(maxsize=16)
 def displacement(
-    profile: Profile, depth: float, thickness: float, smoothing: float, levels: int = 4, skirt: float = 0.0
+    profile: Profile,
+    depth: float,
+    thickness: float,
+    smoothing: float,
+    levels: int = 4,
+    skirt: float = 0.0,
+    fillet: float = 0.0,
 ) -> tuple[LocalMap, LocalMap]:
     """How far a skin is pushed towards the camera, D(u, v) >= 0 in mm, and where it touches (weight 0..1).
 
@@ -617,6 +653,7 @@ def displacement(
     levels     number of Gaussians, each half as wide as the one before
     skirt      mm over which the skin beside the contact falls to 1/e, see `dragged`; 0: the pyramid alone makes the
                skirt
+    fillet     mm, least radius of the skin where it bridges a corner, see `bridged`; 0: it follows
 
     Pyramid (S1.6): D <- max(D0, G_k * D) for the sd smoothing, smoothing/2, smoothing/4, ... The maximum restores the
     contact after each blur: the skin rests on the indenter where it would otherwise pass through it and leaves it where
@@ -631,12 +668,17 @@ def displacement(
     Both maps fade to zero over the outer eighth of the local grid. Results are cached: do not write into them.
     """
     if not (
-        math.isfinite(depth) and math.isfinite(smoothing) and smoothing >= 0 and thickness > 0 and 0 <= skirt < 1e3
+        math.isfinite(depth)
+        and math.isfinite(smoothing)
+        and smoothing >= 0
+        and thickness > 0
+        and 0 <= skirt < 1e3
+        and 0 <= fillet < 1e3
     ):
         raise ValueError(
             f"press: depth = {depth:g} mm, smoothing = {smoothing:g} mm, thickness = {thickness:g} mm, skirt = "
-            f"{skirt:g} mm; "
-            "need finite depth, smoothing >= 0, thickness > 0 and skirt >= 0"
+            f"{skirt:g} mm, fillet = {fillet:g} mm; "
+            "need finite depth, smoothing >= 0, thickness > 0, skirt >= 0 and fillet >= 0"
         )
     n, pitch = len(profile.height), profile.pitch
     pressed, touch = np.zeros((n, n)), np.zeros((n, n))
@@ -650,8 +692,12 @@ def displacement(
         d0 = d0 - soft_ramp(t - thickness, e)
     weight = smooth_step(np.clip(t / (2 * e) + 0.5, 0.0, 1.0))
     pressed[block] = d0
-    if skirt > 0:
-        pressed = dragged(profile, pressed, depth, thickness, skirt)
+    if skirt > 0 or fillet > 0:
+        bare = pressed
+        if skirt > 0:
+            pressed = dragged(profile, bare, depth, thickness, skirt)
+        if fillet > 0:
+            pressed = np.maximum(pressed, bridged(profile, bare, depth, thickness, fillet))
         weight = weight * (1.0 - smooth_step(np.clip((pressed[block] - d0) / (DETACHING * d0 + 1e-300), 0.0, 1.0)))
         block = (slice(0, n), slice(0, n))  # the skirt belongs to what the blurs below must not take away
         d0, touch[profile.block(2 * depth)] = pressed, weight
@@ -681,6 +727,19 @@ def dragged(profile: Profile, d0: np.ndarray, depth: float, thickness: float, sk
         low = -np.log(np.maximum(d0, 1e-12))
         return np.exp(-cone_envelope(low, profile.pitch / skirt))
     return profile.balls.dragged(*np.meshgrid(profile.axis, profile.axis), depth, skirt)
+
+
+def bridged(profile: Profile, d0: np.ndarray, depth: float, thickness: float, radius: float) -> np.ndarray:
+    """Displacement of a skin that bends no more sharply than a radius where it bridges a corner, mm: its closing by a
+    ball of that radius, which rolls over it on the gel's side and reaches no further.
+
+    Between a ball and the face beside it this is an arc that is tangent to both (a membrane under the tension T that a
+    pressure p holds against them has the radius T/p); of balls a closed form, of other indenters found on the grid, up
+    to 3 % of the radius too deep."""
+    if profile.balls is None or depth >= thickness:
+        grown = -through_coat(-d0, profile.pitch, radius)
+        return np.maximum(through_coat(grown, profile.pitch, radius), d0)
+    return profile.balls.bridged(*np.meshgrid(profile.axis, profile.axis), depth, radius)
 
 
 @lru_cache(maxsize=16)

@@ -12,6 +12,7 @@ mesh on a graded grid that is fine around the contact and moves with it, so that
 A ball with `flattening` f is (1 - f) times as tall as wide: h is (1 - f) times that of the ball.
 With `coat` d > 0 the camera sees the coating's inner face, parallel to the one that is touched:
     h'(x) = d + min over |s| <= d of h(x + s) - sqrt(d^2 - s^2)
+With `fillet` > 0 the skin bridges corners with arcs of that radius: D0 is closed by a ball of it before the smoothing.
 With `skirt` > 0 the skin beside the contact falls off as exp(-distance / skirt) before the smoothing: in place of D0
 stands the max over touched points p of D0(p) exp(-|x - p| / skirt). Indenters: sphere (`indenter_size` = radius),
 cylinder lying on its side (radius), cube face down (edge), balls (radius) `indenter_spacing` apart on a plate without
@@ -160,6 +161,16 @@ PARAMETERS = (
         plausible=0.05,
         how="difference",
     ),
+    Parameter(
+        "fillet",
+        "mm",
+        0.0,
+        (0.0, 5.0),
+        "least radius of the skin where it bridges the corner beside a contact; 0: it follows",
+        neutral=0.0,
+        plausible=0.1,
+        how="difference",
+    ),
 )
 
 
@@ -184,6 +195,7 @@ def build():
             "skirt",
             "coat",
             "flattening",
+            "fillet",
         )  # what does nothing while press_depth is 0
 
         def __init__(self, props):
@@ -222,7 +234,8 @@ def build():
                 coat=n("coat"),
                 flattening=n("flattening"),
             )
-            return contact.displacement(profile, n("press_depth"), n("thickness"), n("smoothing"), skirt=n("skirt"))
+            sizes = (n("press_depth"), n("thickness"), n("smoothing"))
+            return contact.displacement(profile, *sizes, skirt=n("skirt"), fillet=n("fillet"))
 
         def heights(self, x, y):
             """z of the coated face (mm) at x (columns,) and y (rows,), mm, with every `surface` effect: (rows,
