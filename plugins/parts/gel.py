@@ -170,6 +170,7 @@ PARAMETERS = (
         neutral=0.0,
         plausible=0.1,
         how="difference",
+        starts=(0.05, 0.2, 1.0),  # below the skirt's own length it does nothing
     ),
 )
 
