@@ -101,7 +101,7 @@ def build():
 
     class ElasticSkin(known().parts["gel"].build()):
         kind = "elastic_skin"
-        indenter = "sphere"
+        indenter, indenter_radius = "sphere", "tip_radius"
         pressing = (
             "press_x",
             "press_y",

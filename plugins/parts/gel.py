@@ -182,6 +182,7 @@ def build():
 
     class Gel(Declared.on_mesh()):
         kind = "gel"
+        indenter_radius = "indenter_size"  # the parameter that holds the radius of what presses
         pressing = (
             "press_x",
             "press_y",
@@ -204,7 +205,7 @@ def build():
             self.map_pitch = float(props.get("map_pitch", 0.03))  # mm, of the maps that hold the dent's shape
             self.extent = float(props.get("extent", 3.0))  # mm, half width of the fine part
             self.columns, self.rows = int(props.get("columns", 181)), int(props.get("rows", 161))
-            coarsest = float(props.get("indenter_size", INDENTER_SIZE)) / FINE
+            coarsest = float(props.get(self.indenter_radius, INDENTER_SIZE)) / FINE
             if (times := min(coarseness(), max(int(coarsest / self.pitch), 1))) > 1:
                 self.pitch *= times
                 self.columns, self.rows = -(-self.columns // times), -(-self.rows // times)

@@ -183,6 +183,8 @@ def demo(folder: Path, height=72, width=96, presses=4, seed=3, steps=3) -> Recor
             variables=variables,
             estimate=estimate,
             sd=sds,
+            error=sds,
+            tempering=1.0,
             correlation=correlation,
             chi2=found.fitted.chi2,
             dof=found.fitted.dof,
