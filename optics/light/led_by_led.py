@@ -46,8 +46,12 @@ class LedByLed:
         return sum(1 for s in scene.shapes() if is_interface(s) and s.bbox().max.z > nearest)
 
     def spots(self, led):
-        """The points that stand for an LED, each for an equal share of its light."""
-        return [led.point(mi.Point2f(*place)) for place in led.places()] or [led.position()]
+        """The points that stand for an LED, one after another, each for an equal share of its light; opaque, so that
+        what is compiled for one serves all."""
+        for place in led.places():
+            yield led.point(mi.Point2f(*(dr.opaque(mi.Float, c) for c in place)))
+        if not led.places():
+            yield led.position()
 
     def visible(self, scene, si, point, led):
         """Whether the straight line from the surface to a point of an LED meets nothing but windows (detached)."""

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import copy
 from collections import OrderedDict
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from types import SimpleNamespace
 from typing import NamedTuple
 
@@ -456,7 +456,7 @@ class Renderer:
             hits.rims = {key: Finer(counts, self._trace(u, v) if len(index) else None)}  # only the latest is kept
         return hits.rims[key]
 
-    def _spots(self, part, finer: Finer | None = None) -> list:
+    def _spots(self, part, finer: Finer | None = None) -> Iterable:
         """The points that stand for a light, each for an equal share; for finer samples of a crowded scene one point
         for each sample, the points in turn: there are as many samples in a pixel as the light needs points."""
         import mitsuba as mi
@@ -472,22 +472,27 @@ class Renderer:
         import drjit as dr
 
         integrator = self.scene.integrator
-        spots = self._spots(part, finer)
-        share = [integrator.visible(self.scene.mitsuba, si, dr.detach(point), part) for point in spots]
-        dr.eval(share)
+        share = []
+        for point in self._spots(part, finer):
+            share.append(integrator.visible(self.scene.mitsuba, si, dr.detach(point), part))
+            dr.eval(share[-1])
         return share[0] if len(share) == 1 else share
 
-    def _shade(self, sample: Sample, part, visible, finer: Finer | None = None):
-        """Direct radiance per band at hits, an UnpolarizedSpectrum attached to whatever carries gradients."""
-        integrator, scene = self.scene.integrator, self.scene.mitsuba
+    def _shade(self, sample: Sample, part, visible, finer: Finer | None = None, take: Callable = lambda light: light):
+        """Direct radiance per band at hits, an UnpolarizedSpectrum; or the mean of what `take` makes of the light of
+        each point of the source, while it is attached to whatever carries gradients.
+
+        A point is evaluated before the next begins: all share a kernel, which would otherwise grow with their number.
+        """
+        import drjit as dr
+
         self._tune(sample.si)
-        spots = self._spots(part, finer)
-        if len(spots) == 1:
-            return integrator.direct(scene, *sample[:3], part, visible, spots[0])
-        total = 0.0
-        for point, seen in zip(spots, visible):
-            total += integrator.direct(scene, *sample[:3], part, seen, point)
-        return total / len(spots)
+        shares, total = visible if isinstance(visible, list) else [visible], 0.0
+        for point, seen in zip(self._spots(part, finer), shares):
+            total += take(self.scene.integrator.direct(self.scene.mitsuba, *sample[:3], part, seen, point))
+            if len(shares) > 1:
+                dr.eval(total)
+        return total / len(shares)
 
     def _raw(self, image: LedImage, centre: Callable, rim: Callable) -> tuple:
         """Shading at pixel centres (H W, B) and at the finer samples (N, B), None without any."""
@@ -600,14 +605,19 @@ class Renderer:
         self.apply(values, move=moves and len(image.index) > 0)
         value = getattr(part, parameter)
 
+        def forward(attached):
+            def take(light):
+                dr.set_grad(attached, 1.0)
+                return dr.forward_to(light, flags=dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
+
+            return take
+
         def tangent(sample, visible, finer=None):
             attached = mi.Float(dr.detach(value))
             dr.enable_grad(attached)
             setattr(part, parameter, attached)
             try:
-                shaded = self._shade(sample, lamp, visible, finer)
-                dr.set_grad(attached, 1.0)
-                return dr.forward_to(shaded, flags=dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
+                return self._shade(sample, lamp, visible, finer, forward(attached))
             finally:
                 setattr(part, parameter, value)
 
