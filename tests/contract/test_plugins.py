@@ -82,12 +82,13 @@ SURROUNDINGS = {  # parameter: what has to stand about it for it to be seen, and
 }
 
 
-def ways(how):
-    """Parameters whose derivative is made in one way."""
+def ways(how, often=True):
+    """Parameters whose derivative is made in one way; without `often`, all but the first of each part are slow."""
+    own = [(kind, name) for kind, name in NUMBERS if REGISTRY.parameter(kind, name).how == how]
+    first = dict(reversed(own))
     return [
-        pytest.param(kind, name, id=f"{kind}.{name}")
-        for kind, name in NUMBERS
-        if REGISTRY.parameter(kind, name).how == how
+        pytest.param(kind, name, id=f"{kind}.{name}", marks=() if often or first[kind] == name else (pytest.mark.slow,))
+        for kind, name in own
     ]
 
 
@@ -680,7 +681,7 @@ def test_forward_mode_against_differences(kind, name, bench_of):
     assert check_model_derivative(bench, key, 1e-3) > 1e-7, f"{key} does nothing to the bench"
 
 
-@pytest.mark.parametrize("kind, name", ways("difference"))
+@pytest.mark.parametrize("kind, name", ways("difference", often=False))
 def test_differences_do_not_depend_on_their_step(kind, name, bench_of):
     bench = bench_of(kind, name)
     # 3 %: the model's steps are twice as wide, and away from rims images bend by a few percent over a plausible change
@@ -1439,7 +1440,7 @@ def test_drafts_act_along_the_coordinate_that_was_diagnosed(drafts):
     "name, key, tolerance",
     [
         ("incidence", "led_1.x", 2e-3),
-        ("led_distance", "led_1.z", 2e-3),
+        pytest.param("led_distance", "led_1.z", 2e-3, marks=pytest.mark.slow),
         ("half_angle", "led_1.y", 2e-3),
         (
             "led_angle",

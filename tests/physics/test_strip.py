@@ -229,6 +229,7 @@ def test_haze_and_a_second_bounce_are_in_both_renders(more, variant, load):
     assert abs(mean - found) < 4 * error + 5e-4 * found  # and the points' error
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("variant", ["llvm_ad_mono"], indirect=True)
 def test_a_calibration_finds_a_stock_rectangle(variant, load):
     """Place, length and power of a strip from images of three presses by stock Mitsuba, from 1 mm, a third of the

@@ -608,7 +608,7 @@ def stock(folder, roughness, alpha_wall=0.05, alpha_fill=0.1, fill=1.4):
     )
 
 
-@pytest.mark.parametrize("roughness", [0.0, 0.15])
+@pytest.mark.parametrize("roughness", [0.0, pytest.param(0.15, marks=pytest.mark.slow)])
 def test_stock_volpath_sees_the_same(tmp_path, mitsuba, roughness):
     """The same grid by Mitsuba's own dielectrics, media and integrator, pixel by pixel: z has no mean and the spread of
     noise. Of rough faces by the part `rough_interface`, which keeps polarization where stock `roughdielectric` loses

@@ -28,6 +28,7 @@ def captures(mitsuba, tmp_path_factory):
     return folder, built
 
 
+@pytest.mark.slow
 def test_shapes_do_not_make_up_for_light(captures, tmp_path, monkeypatch):
     folder, built = captures
     free = ["led_1.power", "led_2.power", "gel.smoothing"]

@@ -107,6 +107,7 @@ def test_a_refit_is_taken_up_again(tmp_path, monkeypatch):
     assert Refits(model, Setup("captures"), base, [], tmp_path / "refits").taken_up([extra]) is None
 
 
+@pytest.mark.slow
 def test_a_verdict_in_cells(mitsuba, tmp_path, monkeypatch):
     """Images by stock Mitsuba with one effect and a principal point off the middle, whose sides are no multiple of a
     cell: the effect is claimed in cells, and values are in pixels again."""

@@ -87,6 +87,7 @@ def test_far_from_plausible_is_no_tie():
     assert costs[0] == EACH and costs[1] < costs[0] + 2 and costs[2] > costs[1] + CLEAR and costs[3] > costs[2] + 4
 
 
+@pytest.mark.slow
 def test_a_lamp_that_wanders_is_no_effect(tmp_path):
     """Noise shared by some 12 neighbours, twice that of a reading: counted as white it would show effects."""
     claims, stood_out, psi = 0, 0, np.arange(-180.0, 181.0, 4.0)

@@ -59,6 +59,7 @@ def test_imitated_captures_are_the_models_own_with_the_cameras_noise(study, tmp_
     assert again.exit_code != 0 and "exists" in str(again.exception)
 
 
+@pytest.mark.slow
 def test_a_rehearsal_from_the_command_line(study):
     said = CliRunner().invoke(app, ["rehearse", str(study), "--change", "1", "--json"])
     assert said.exit_code == 0, said.output
