@@ -20,24 +20,24 @@
     "gel.press_rz"    = { grid = [0, 30, 60] } # every value; several grids: every combination, the last one fastest
 
 A draw depends on seed, index and key alone: not on the order of work, on shards or workers, nor on what else is
-sampled. The folder gets images/, job.json (what it was made from), manifest.jsonl (a line per sample, appended once its
-files stand) and, when all is done, manifest.csv."""
+sampled. The folder gets images/, job.json (what it was made from) and, when all is done, manifest.jsonl (a line per
+sample) and manifest.csv; until then a sample is recorded, once its files stand, in .parts (optics.study.blocks)."""
 
 from __future__ import annotations
 
 import csv
-import io
-import itertools
+import functools
 import json
 import math
 import os
-import signal
+import time
+import uuid
 import zlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
@@ -45,12 +45,14 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 from optics.captures.noise import Noise
 from optics.errors import OutOfBounds, OutputExists, UnknownKey
 from optics.files import toml_checks as checks
-from optics.files.output import alone, check_folder, file_hash, replacing, write_text
+from optics.files.output import FULL, alone, check_folder, file_hash, replacing, write_text
 from optics.light.rendering import LAYERS, RenderJob
 from optics.scene import loader as scenes
 from optics.scene.mitsuba_parts import DEFAULT_VARIANT
 from optics.scene.trust import Named
+from optics.study.blocks import Block, Blocks, DiskFull, SampleFailed
 from optics.study.calibrated import Calibrated, calibrated
+from optics.study.engines import ENGINES, Status, cores, one_thread, work_through
 
 Progress = Callable[[str, int, int], None]
 
@@ -60,14 +62,11 @@ Pair = Annotated[list[Finite], Field(min_length=2, max_length=2)]
 
 
 SAMPLES_MOST = 10_000_000  # of one job, whose manifest is one file
+RECYCLE = 1000  # samples of one worker: its start, a few seconds, is then a hundredth of its work, or less
 
 
 class BadJob(ValueError):
     """A job file that contradicts its format or its scene."""
-
-
-class SampleFailed(RuntimeError):
-    """A sample that could not be made; those before it are kept."""
 
 
 class Strict(BaseModel):
@@ -429,68 +428,33 @@ def _changes(before, now, name: str = "") -> list[str]:
     return [] if before == now else [name]
 
 
-@contextmanager
-def _alone(folder: Path, shard: tuple[int, int]) -> Iterator[None]:
-    """Lock a shard against a second process; the system frees the lock however the process ends."""
-    lock = folder / f".lock-{shard[0]}-of-{shard[1]}"
-    said = f"{folder}: another process works on shard {shard[0]}/{shard[1]}; wait for it, or take another shard"
-    with alone(lock, said):
-        yield
-
-
-def _manifest(folder: Path, shard: tuple[int, int]) -> Path:
-    return folder / ("manifest.jsonl" if shard == (1, 1) else f"manifest-{shard[0]}-of-{shard[1]}.jsonl")
-
-
-def _lines(file: Path) -> dict[int, dict]:
-    """Records by index; a line that a killed process left incomplete is skipped."""
-    found = {}
-    for line in file.read_text(encoding="utf-8").splitlines() if file.is_file() else ():
-        try:
-            record = json.loads(line)
-            found[record["index"]] = record
-        except (ValueError, TypeError, KeyError):
-            continue
-    return found
-
-
-def _all_lines(folder: Path) -> dict[int, dict]:
-    found = {}
-    for file in sorted(folder.glob("manifest*.jsonl")):
-        found.update(_lines(file))
-    return found
-
-
-def _stands(folder: Path, record: Mapping) -> bool:
-    """Whether every file of a record is there, with its size and hash."""
-    for entry in record["files"].values():
-        file = folder / entry["file"]
-        if not file.is_file() or file.stat().st_size != entry["size"] or file_hash(file) != entry["hash"]:
+def finish(job: Job, blocks: Blocks) -> bool:
+    """Write one ordered manifest and its table once every sample of the job is recorded; whether it is."""
+    if not blocks.finished:
+        if len(blocks.complete()) < blocks.count:
             return False
-    return True
+        try:
+            with alone(blocks.parts / "finish.lock", ""):
+                if not blocks.finished:
+                    _write_table(job, blocks)
+                blocks.finish()
+        except OutputExists:
+            pass  # another worker is at it
+    return blocks.finish()
 
 
-def _text(records: Mapping[int, dict]) -> str:
-    return "".join(json.dumps(records[i], sort_keys=True) + "\n" for i in sorted(records))
-
-
-def _finish(folder: Path, job: Job) -> bool:
-    """Write one ordered manifest and the table once every sample of the job is complete."""
-    records = _all_lines(folder)
-    if len(records) < job.total:
-        return False
-    keys, roles = list(job.parameters) + list(job.sample), list(next(iter(records.values()))["files"])
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(["index", *keys, *roles])
-    for index in sorted(records):
-        values = {**job.parameters, **records[index]["sample"]}
-        writer.writerow([index, *(values[k] for k in keys), *(records[index]["files"][r]["file"] for r in roles)])
-    write_text(folder / "manifest.jsonl", _text(records))
-    write_text(folder / "manifest.csv", out.getvalue())
-    for part in folder.glob("manifest-*-of-*.jsonl"):
-        part.unlink(missing_ok=True)
-    return True
+def _write_table(job: Job, blocks: Blocks) -> None:
+    """manifest.csv: a row per sample, with what is fixed and what is drawn by key, and its files by role."""
+    with replacing(blocks.manifest.with_suffix(".csv")) as file, open(file, "w", encoding="utf-8", newline="") as out:
+        writer = csv.writer(out, lineterminator="\n")
+        keys: list[str] = []
+        roles: list[str] = []
+        for record in blocks.records():
+            values = {**job.parameters, **record["sample"]}
+            if not keys:
+                keys, roles = list(values), list(record["files"])
+                writer.writerow(["index", *keys, *roles])
+            writer.writerow([record["index"], *(values[k] for k in keys), *(record["files"][r]["file"] for r in roles)])
 
 
 # -- the work --------------------------------------------------------------------------------------------------------
@@ -524,15 +488,28 @@ def run(
     *,
     fit: str | Path | None = None,
     frame: str | None = None,
+    on: str = "local",
+    options: Mapping[str, str] | None = None,
+    recycle: int = RECYCLE,
+    watch: Callable[[Status], None] | None = None,
 ) -> Result:
-    """Make the missing samples of a job's shard. It can be stopped at any moment and called again.
+    """Make the missing samples of a job's shard. It can be stopped at any moment and called again, and called from
+    several machines that share the folder.
 
     fit, frame   a calibrated sensor, where the job file names none (optics.study.calibrated)
-    workers   processes of one thread each; None: as many as there are cores. With 1 everything happens in this process.
-    Raises BadJob, UnknownKey, OutOfBounds, OutputExists before any rendering, SampleFailed in its course.
+    workers   processes of one thread each; None: as many as there are cores, on a cluster what its engine takes. With 1
+              on "local", everything happens in this process.
+    on        "local", "slurm" or "ray" (optics.study.engines), with its own `options`
+    recycle   samples that a worker makes before a fresh one takes its place
+    watch     is told the Status, several times a second
+    Raises BadJob, UnknownKey, OutOfBounds, OutputExists before any rendering, SampleFailed and EngineFailed in its
+    course.
     """
-    if workers is not None and workers < 1:
-        raise ValueError(f"workers = {workers}; allowed: whole numbers from 1 on")
+    for name, number in (("workers", workers), ("recycle", recycle)):
+        if number is not None and number < 1:
+            raise ValueError(f"{name} = {number}; allowed: whole numbers from 1 on")
+    if on not in ENGINES:
+        raise UnknownKey(on, ENGINES, "engine", "--on")
     file = Path(os.path.abspath(file))
     job = read(file, fit, frame)
     folder = folder_of(job, file)
@@ -540,147 +517,139 @@ def run(
     maker = Maker(job, file, plugins)
     maker.check()
     _open_folder(folder, maker.identity())
-    own = range(shard[0] - 1, job.total, shard[1])
-    made = 0
-    with _alone(folder, shard):
-        todo = _remaining(folder, shard, own, progress)
-        workers = max(1, min(workers or _cores(), len(todo)))
-        work = _here(maker, todo) if workers == 1 else _crew(job, file, plugins, todo, workers)
-        manifest = _manifest(folder, shard)
+    blocks = Blocks(folder, job.total, shard, uuid.uuid4().hex[:8])
+    blocks.verify(progress)
+    blocks.sweep()
+    before = blocks.counts().recorded
+    if before < blocks.own:
         try:
-            with open(manifest, "a", encoding="utf-8") as lines:
-                for record in work:
-                    lines.write(json.dumps(record, sort_keys=True) + "\n")
-                    lines.flush()
-                    made += 1
-                    if progress:
-                        progress("batch", len(own) - len(todo) + made, len(own))
+            if on == "local" and (workers or cores()) == 1:
+                _here(blocks, maker, watch)
+            else:
+                life = Life(job, file, plugins, shard, blocks.run)
+                with one_thread():
+                    work_through(ENGINES[on](workers, options or {}, folder), life, blocks, recycle, watch)
         finally:
-            work.close()
-            _sweep(folder, shard)
-    return Result(folder, job.total, len(own), made, _finish(folder, job), maker.notes)
+            blocks.sweep()
+    made = blocks.counts().recorded - before
+    complete = finish(job, blocks)
+    failures = {} if complete else blocks.failures()
+    if failures:
+        index, why = next(iter(failures.items()))
+        raise failed(job, index, why, len(failures) - 1)
+    return Result(folder, job.total, blocks.own, made, complete, maker.notes)
 
 
-def _remaining(folder: Path, shard: tuple[int, int], own: Sequence[int], progress: Progress | None) -> list[int]:
-    """Indices of a shard without a record, or whose files differ from it; removes what a killed process left."""
-    known, bad = _all_lines(folder), set()
-    done = [i for i in own if i in known]
-    for k, index in enumerate(done):
-        if not _stands(folder, known[index]):
-            bad.add(index)
-        if progress and k % 50 == 0:
-            progress("checking what is there", k + 1, len(done))
-    _sweep(folder, shard)
-    for manifest in folder.glob("manifest*.jsonl") if bad else [_manifest(folder, shard)]:
-        lines = {i: r for i, r in _lines(manifest).items() if i not in bad}
-        if manifest.is_file() and manifest.read_text(encoding="utf-8") != _text(lines):
-            write_text(manifest, _text(lines))
-    if bad:
-        (folder / "manifest.csv").unlink(missing_ok=True)
-    return [i for i in own if i not in known or i in bad]
+def _here(blocks: Blocks, maker: Maker, watch: Callable[[Status], None] | None) -> None:
+    """All of a shard in this process."""
+    begin, before = time.monotonic(), blocks.counts()
+
+    def made(count: int) -> None:
+        if watch:
+            now, seconds = before.recorded + count, time.monotonic() - begin
+            watch(Status(now, blocks.own, count, 0, 0, 1, seconds))
+
+    with serial():
+        fill(blocks, lambda: maker, made=made)
 
 
-def _sweep(folder: Path, shard: tuple[int, int]) -> None:
-    """Remove unfinished files of this shard."""
-    for file in (folder / "images").glob(".*"):
-        index = file.name[1:7]
-        if index.isdecimal() and int(index) % shard[1] == shard[0] - 1:
-            file.unlink(missing_ok=True)
+@dataclass(frozen=True)
+class Life:
+    """What one worker does, on any engine: make up to `limit` samples, and end. Returns how many it made.
+
+    place   (k, n): this worker begins at the k-th of n places, so that workers rarely want the same block
+    """
+
+    job: Job
+    file: Path
+    plugins: Named
+    shard: tuple[int, int]
+    run: str
+    place: tuple[int, int] = (0, 1)
+    limit: int = RECYCLE
+
+    def __call__(self) -> int:
+        folder = folder_of(self.job, self.file)
+        blocks = Blocks(folder, self.job.total, self.shard, self.run)
+
+        def maker() -> Maker:
+            found = Maker(self.job, self.file, self.plugins)
+            _open_folder(folder, found.identity())  # on this machine, too, it makes the same images
+            return found
+
+        with serial():
+            count = fill(blocks, maker, self.limit, self.place)
+        finish(self.job, blocks)
+        return count
+
+    def checkpoint(self) -> Any:
+        """What submitit submits again when a task runs out of time, or gives way to another."""
+        from submitit.helpers import DelayedSubmission
+
+        return DelayedSubmission(self)
 
 
-def _here(maker: Maker, todo: Sequence[int]) -> Iterator[dict]:
+def fill(
+    blocks: Blocks,
+    maker: Callable[[], Maker],
+    limit: float = math.inf,
+    place: tuple[int, int] = (0, 1),
+    made: Callable[[int], None] | None = None,
+) -> int:
+    """Claim blocks and make their samples, until `limit` of them are made or no block is to be had; how many were.
+
+    A sample that ends in an error is tried again, with others between, up to TRIES times. Raises DiskFull at once.
+    """
+    first = place[0] * len(blocks.numbers) // place[1]
+    order = [*blocks.numbers[first:], *blocks.numbers[:first]]
+    maker, count, trying = functools.cache(maker), 0, True
+    while trying:
+        trying, complete = False, blocks.complete()
+        for number in order:
+            if number in complete:
+                continue
+            with blocks.claim(number) as block:
+                for index in block.wanted if block is not None else ():
+                    if count >= limit:
+                        return count
+                    trying = True
+                    count += _make(block, maker(), index)
+                    if made:
+                        made(count)
+    return count
+
+
+def _make(block: Block, maker: Maker, index: int) -> bool:
+    """Make and record one sample; whether it was made."""
+    try:
+        block.begin(index)
+        block.add(maker.make(index))
+        return True
+    except Exception as error:
+        why = f"{type(error).__name__}: {error}"
+        if isinstance(error, OSError) and error.errno in FULL:
+            raise failed(maker.job, index, why, kind=DiskFull) from error
+        block.fail(index, why)
+        return False
+
+
+@contextmanager
+def serial() -> Iterator[None]:
+    """Sums over faces (normals) and samples (a film) take the order of threads into their last bit: no threads."""
     import drjit as dr
 
     threads = dr.thread_count()
-    dr.set_thread_count(
-        0
-    )  # sums over faces (normals) and samples (a film) take the order of threads into their last bit
+    dr.set_thread_count(0)
     try:
-        for index in todo:
-            try:
-                yield maker.make(index)
-            except Exception as error:
-                raise _failed(maker.job, index, f"{type(error).__name__}: {error}") from error
+        yield
     finally:
         dr.set_thread_count(threads)
 
 
-def _failed(job: Job, index: int, why: str) -> SampleFailed:
+def failed(job: Job, index: int, why: str, more: int = 0, kind: type[SampleFailed] = SampleFailed) -> SampleFailed:
     values = ", ".join(f"{k} = {v:.4g}" if isinstance(v, float) else f"{k} = {v}" for k, v in job.values(index).items())
-    return SampleFailed(
-        f"sample {index} ({values or 'nothing sampled'}): {why}; what was made before is kept, the same command goes on"
+    return kind(
+        f"sample {index} ({values or 'nothing sampled'}): {why}"
+        + (f" (and {more} samples more)" if more else "")
+        + "; what was made is kept, the same command goes on"
     )
-
-
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def _crew(job: Job, file: Path, plugins: Named, todo: Sequence[int], workers: int) -> Iterator[dict]:
-    """Records from worker processes, in the order in which they finish.
-
-    Each holds one end of a pipe and nothing else of this process, so that it ends when this one is killed.
-    """
-    from multiprocessing import get_context
-    from multiprocessing.connection import wait
-
-    context = get_context("spawn")
-    waiting = iter(todo)
-    busy = {}  # connection -> (process, index)
-    processes = []
-    try:
-        for index in itertools.islice(waiting, workers):
-            here, there = context.Pipe()
-            process = context.Process(target=_work, args=(there, job, file, plugins), daemon=True)
-            process.start()
-            there.close()
-            processes.append(process)
-            here.send(index)
-            busy[here] = (process, index)
-        while busy:
-            for connection in wait(list(busy)):
-                process, index = busy.pop(connection)
-                try:
-                    answer = connection.recv()
-                except (EOFError, OSError):
-                    process.join(5)
-                    raise _failed(job, index, f"its process ended (exit code {process.exitcode})") from None
-                if isinstance(answer, str):
-                    raise _failed(job, index, answer)
-                following = next(waiting, None)
-                if following is None:
-                    connection.close()
-                else:
-                    connection.send(following)
-                    busy[connection] = (process, following)
-                yield answer
-    finally:
-        for process in processes:
-            if busy:
-                process.terminate()
-        for process in processes:
-            process.join(10)
-
-
-def _work(connection, job: Job, file: Path, plugins: Named) -> None:
-    """The loop of a worker: it receives an index, and sends a record or the text of an error."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent decides
-    try:
-        index = connection.recv()
-        try:
-            import drjit as dr
-
-            dr.set_thread_count(0)  # see `_here`
-            maker = Maker(job, file, plugins)
-        except Exception as error:
-            connection.send(f"{type(error).__name__}: {error}")
-            return
-        while True:
-            try:
-                answer = maker.make(index)
-            except Exception as error:
-                answer = f"{type(error).__name__}: {error}"
-            connection.send(answer)
-            index = connection.recv()
-    except (EOFError, BrokenPipeError, ConnectionResetError):
-        return  # the parent has no more work, or is gone
