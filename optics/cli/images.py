@@ -189,6 +189,48 @@ def batch(
     )
 
 
+@command
+def export(
+    folder: Annotated[Path, typer.Argument(metavar="BATCH", help="Folder of a finished batch.")],
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for the data set.")],
+    to: Annotated[
+        str, typer.Option("--to", metavar="FORMAT", help="webdataset, hdf5, zarr or lerobot.", show_default=False)
+    ],
+    images: Annotated[
+        str,
+        typer.Option(
+            "--images",
+            metavar="KIND",
+            help="camera: the camera's 8- or 12-bit digital numbers; float: radiance, depth, normals, LEDs.",
+        ),
+    ] = "camera",
+    array: Annotated[
+        list[str] | None,
+        typer.Option("--array", metavar="NAME", help="Take this array. Repeatable.", show_default="all"),
+    ] = None,
+    per_file: Annotated[int, typer.Option("--per-file", metavar="N", help="Samples of a file.")] = 1000,
+    licence: Annotated[str, typer.Option("--licence", help="Of the data, as the card states it.")] = "",
+    as_json: AsJson = False,
+) -> None:
+    """Write a finished batch as a data set for learning, with a data card. May be stopped; the same command goes on."""
+    from optics.study.export import export as write
+
+    with terminal.progress() as progress:
+        card = write(
+            folder,
+            output,
+            to,
+            images=images,
+            arrays=array or (),
+            per_file=per_file,
+            licence=licence,
+            progress=progress,
+        )
+    if as_json:
+        return show(card)
+    print(f"{output}: {card['samples']} samples, {card['files']}; arrays {', '.join(card['arrays'])}; card.md")
+
+
 def _state(status: "Status") -> dict[str, str]:
     """A batch's state, title -> text."""
     return {

@@ -35,7 +35,7 @@ import uuid
 import zlib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -45,7 +45,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 from optics.captures.noise import Noise
 from optics.errors import OutOfBounds, OutputExists, UnknownKey
 from optics.files import toml_checks as checks
-from optics.files.output import FULL, alone, check_folder, file_hash, replacing, write_text
+from optics.files.output import FULL, alone, check_folder, file_hash, replacing, write_json, write_text
 from optics.light.rendering import LAYERS, RenderJob
 from optics.scene import loader as scenes
 from optics.scene.mitsuba_parts import DEFAULT_VARIANT
@@ -343,11 +343,18 @@ class Maker:
         numbers = {k: v for k, v in record["versions"].items() if k not in ("python", "system")}
         return {
             "job": self.job.model_dump(mode="json", exclude={"out", "fit", "frame"}),
-            **({"fit": self.values} if self.job.fit is not None else {}),
+            **({"fit": self.values, "noise": self.noise and asdict(self.noise)} if self.job.fit is not None else {}),
+            # JSON keeps no order of keys, and the order of grids says which sample is which.
+            **({"grids": list(self.job.grids)} if len(self.job.grids) > 1 else {}),
             "scene": record["scene"],
             "plugins": record["plugins"],
             "versions": numbers,
         }
+
+    def described(self) -> dict:
+        """Key -> unit and meaning of what is fixed and drawn, for who reads the folder."""
+        found = {key: self.images.scene.parameters[key] for key in [*self.job.parameters, *self.job.sample]}
+        return {key: {"unit": p.unit, "doc": p.doc} for key, p in found.items()}
 
     def make(self, index: int) -> dict:
         """Write the files of one sample, each whole or not at all, and return its line of the manifest."""
@@ -396,7 +403,7 @@ def folder_of(job: Job, file: Path) -> Path:
 
 def _open_folder(folder: Path, identity: Mapping) -> None:
     """Start a folder, or resume one that was made from the same job."""
-    note = folder / "job.json"
+    note, identity = folder / "job.json", json.loads(json.dumps(identity))
     if note.is_file():
         try:
             before = json.loads(note.read_text(encoding="utf-8"))
@@ -405,7 +412,7 @@ def _open_folder(folder: Path, identity: Mapping) -> None:
                 f"{note}: unreadable ({error}); restore it, or choose another folder for `out`"
             ) from error
         if before != identity:
-            changed = _changes(before, json.loads(json.dumps(identity)))
+            changed = _changes(before, identity)
             raise OutputExists(
                 f"{folder} was made from another job: changed {', '.join(changed[:4])}"
                 f"{' ...' if len(changed) > 4 else ''}; choose another folder for `out`, or undo the change"
@@ -517,6 +524,7 @@ def run(
     maker = Maker(job, file, plugins)
     maker.check()
     _open_folder(folder, maker.identity())
+    write_json(folder / "parameters.json", maker.described())
     blocks = Blocks(folder, job.total, shard, uuid.uuid4().hex[:8])
     blocks.verify(progress)
     blocks.sweep()

@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from importlib import import_module
 from importlib.util import find_spec
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
@@ -105,7 +106,7 @@ class Slurm:
     name, glance = "slurm", 10 * GLANCE
 
     def __init__(self, workers: int | None, options: Mapping[str, str], folder: Path):
-        submitit = _library("submitit", "slurm")
+        submitit = library("submitit", "--on slurm", "slurm")
         self.workers = workers or 16
         try:
             self.executor = submitit.AutoExecutor(folder / ".parts" / "slurm", cluster=options.get("cluster", "slurm"))
@@ -145,7 +146,7 @@ class Ray:
     name, glance = "ray", GLANCE
 
     def __init__(self, workers: int | None, options: Mapping[str, str], folder: Path):
-        self.ray = _library("ray", "ray")
+        self.ray = library("ray", "--on ray", "ray")
         self.started = not self.ray.is_initialized()
         if self.started:
             given = {"include_dashboard": False, "log_to_driver": False, "logging_level": "error", **_typed(options)}
@@ -185,13 +186,12 @@ ENGINES: dict[str, Callable[[int | None, Mapping[str, str], Path], Engine]] = {
 }
 
 
-def _library(module: str, extra: str) -> Any:
-    if find_spec(module) is None:
+def library(module: str, option: str, extra: str) -> Any:
+    """A package that only this option needs. Raises ModuleNotFoundError, which says how to get it."""
+    if find_spec(module.partition(".")[0]) is None:
         raise ModuleNotFoundError(
-            f"--on {extra} needs the package '{module}', which is not installed: pip install 'tactile-optics[{extra}]'"
+            f"{option} needs the package '{module}', which is not installed: pip install 'tactile-optics[{extra}]'"
         )
-    from importlib import import_module
-
     return import_module(module)
 
 
