@@ -19,6 +19,14 @@
     "gel.indenter"    = { choice = ["sphere", "cube"] }
     "gel.press_rz"    = { grid = [0, 30, 60] } # every value; several grids: every combination, the last one fastest
 
+A series of sensors, each with `per_unit` images (optics.study.draws):
+
+    per_unit  = 50
+    posterior = true                           # calibrated values with the fit's covariance; or a list of patterns
+    [unit]                                     # as [sample], once for each sensor
+    "led_1.power"    = { normal = [1, 0.05] }
+    "lens vignetting" = { plausible = 1 }      # an effect, or a parameter: so many plausible sizes, about what it is
+
 A draw depends on seed, index and key alone: not on the order of work, on shards or workers, nor on what else is
 sampled. The folder gets images/, job.json (what it was made from) and, when all is done, manifest.jsonl (a line per
 sample) and manifest.csv; until then a sample is recorded, once its files stand, in .parts (optics.study.blocks)."""
@@ -27,12 +35,12 @@ from __future__ import annotations
 
 import csv
 import functools
+import itertools
 import json
 import math
 import os
 import time
 import uuid
-import zlib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
@@ -40,7 +48,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import Field, ValidationError, field_validator, model_validator
 
 from optics.captures.noise import Noise
 from optics.errors import OutOfBounds, OutputExists, UnknownKey
@@ -52,66 +60,13 @@ from optics.scene.mitsuba_parts import DEFAULT_VARIANT
 from optics.scene.trust import Named
 from optics.study.blocks import Block, Blocks, DiskFull, SampleFailed
 from optics.study.calibrated import Calibrated, calibrated
+from optics.study.draws import BadJob, Distribution, Drawn, Draws, Finite, Strict, Value, stream
 from optics.study.engines import ENGINES, Status, cores, one_thread, work_through
 
 Progress = Callable[[str, int, int], None]
 
-Finite = Annotated[float, Field(allow_inf_nan=False)]
-Value = Finite | str
-Pair = Annotated[list[Finite], Field(min_length=2, max_length=2)]
-
-
 SAMPLES_MOST = 10_000_000  # of one job, whose manifest is one file
 RECYCLE = 1000  # samples of one worker: its start, a few seconds, is then a hundredth of its work, or less
-
-
-class BadJob(ValueError):
-    """A job file that contradicts its format or its scene."""
-
-
-class Strict(BaseModel):
-    model_config = ConfigDict(strict=True, extra="forbid", frozen=True)
-
-
-class Distribution(Strict):
-    """A distribution of values: exactly one of the five is given."""
-
-    uniform: Pair | None = Field(None, description="[low, high], low < high")
-    log_uniform: Pair | None = Field(None, description="[low, high], 0 < low < high")
-    normal: Pair | None = Field(None, description="[mean, standard deviation], the second above 0")
-    choice: Annotated[list[Value], Field(min_length=1)] | None = Field(None, description="a list of numbers or texts")
-    grid: Annotated[list[Value], Field(min_length=1)] | None = Field(None, description="a list of numbers or texts")
-
-    @model_validator(mode="after")
-    def _one(self):
-        given = [name for name in type(self).model_fields if getattr(self, name) is not None]
-        if len(given) != 1:
-            raise ValueError(
-                f"{' and '.join(given) or 'nothing'} given; allowed: exactly one of "
-                f"{', '.join(type(self).model_fields)}"
-            )
-        pair = self.uniform or self.log_uniform
-        if pair and not pair[0] < pair[1]:
-            raise ValueError(f"{given[0]} = {pair}; allowed: [low, high] with low < high")
-        if self.log_uniform and not pair[0] > 0:
-            raise ValueError(f"log_uniform = {pair}; allowed: [low, high] with 0 < low")
-        if self.normal and not self.normal[1] > 0:
-            raise ValueError(f"normal = {self.normal}; allowed: [mean, standard deviation] with the second above 0")
-        return self
-
-    def draw(self, rng: np.random.Generator) -> float | str:
-        if self.uniform:
-            return float(rng.uniform(*self.uniform))
-        if self.log_uniform:
-            return float(np.exp(rng.uniform(*np.log(self.log_uniform))))
-        if self.normal:
-            return float(rng.normal(*self.normal))
-        return self.choice[int(rng.integers(len(self.choice)))]
-
-    @property
-    def extremes(self) -> list[float | str]:
-        """The extreme values of all draws, for a check of bounds; none for a normal, which has no ends."""
-        return self.uniform or self.log_uniform or self.choice or self.grid or []
 
 
 class Camera(Strict):
@@ -149,6 +104,11 @@ class Job(Strict):
     defines: dict[str, Value | int] = Field({}, description="numbers or texts")
     parameters: dict[str, Value] = Field({}, description="numbers or texts")
     sample: dict[str, Distribution] = Field({}, description="key = {uniform = [low, high]}, ...")
+    unit: dict[str, Distribution] = Field({}, description="key = {uniform = [low, high]}, ...")
+    per_unit: Annotated[int, Field(ge=1)] = Field(1, description="a whole number from 1 on: images of a sensor")
+    posterior: bool | Annotated[list[str], Field(min_length=1)] = Field(
+        False, description="true, or a list of patterns of the fit's variables"
+    )
     noise: Camera | None = Field(None, description="a table with " + ", ".join(Camera.model_fields))
 
     @field_validator("outputs", "layers")
@@ -170,9 +130,15 @@ class Job(Strict):
             raise ValueError('outputs names "dn", but [noise] is missing; give ' + ", ".join(Camera.model_fields))
         if self.total > SAMPLES_MOST:
             raise ValueError(f"{self.total:.3g} samples; allowed: up to {SAMPLES_MOST:,} in one job; split it")
-        twice = sorted(set(self.parameters) & set(self.sample))
-        if twice:
-            raise ValueError(f"{twice[0]} stands in [parameters] and in [sample]; allowed: one of them")
+        tables = {"parameters": self.parameters, "sample": self.sample, "unit": self.unit}
+        for one, two in itertools.combinations(tables, 2):
+            if twice := sorted(set(tables[one]) & set(tables[two])):
+                raise ValueError(f"{twice[0]} stands in [{one}] and in [{two}]; allowed: one of them")
+        for key, d in self.unit.items():
+            if d.grid is not None:
+                raise ValueError(f"[unit] {key}: a grid counts images, and not sensors; allowed: choice")
+        if self.posterior and self.fit is None:
+            raise ValueError("posterior, but no fit; give the fit whose covariance it is")
         return self
 
     # -- samples ------------------------------------------------------------------------------------------------------
@@ -185,16 +151,20 @@ class Job(Strict):
         return math.prod(len(values) for values in self.grids.values()) * (self.count or 1)
 
     def values(self, index: int) -> dict[str, float | str]:
-        """What is sampled in the image of this index, by key."""
+        """What is drawn for the image of this index, by key; what takes a scene to draw is in optics.study.draws."""
         point = (
             np.unravel_index(index // (self.count or 1), [len(v) for v in self.grids.values()]) if self.grids else ()
         )
-        chosen = {key: grid[int(i)] for (key, grid), i in zip(self.grids.items(), point)}
-        return {key: chosen[key] if key in chosen else d.draw(self.rng(index, key)) for key, d in self.sample.items()}
+        found = {key: grid[int(i)] for (key, grid), i in zip(self.grids.items(), point)}
+        for table, number, prefix in ((self.sample, index, ""), (self.unit, index // self.per_unit, "unit ")):
+            for key, d in table.items():
+                if key not in found and d.plausible is None:
+                    found[key] = d.draw(self.rng(number, prefix + key))
+        return found
 
     def rng(self, index: int, purpose: str) -> np.random.Generator:
         """The random stream of one index for one purpose."""
-        return np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(index, zlib.crc32(purpose.encode()))))
+        return stream(self.seed, index, purpose)
 
     def camera_noise(self) -> Noise | None:
         return None if self.noise is None else Noise(**self.noise.model_dump())
@@ -216,9 +186,9 @@ def read(file: str | Path, fit: str | Path | None = None, frame: str | None = No
         if own is not None and value != (os.path.abspath(file.parent / str(own)) if name == "fit" else own):
             raise BadJob(f"{file}: {name} = {own!r}, but --{name} {value}; leave out one of them")
         data[name] = value
-    for name in ("parameters", "sample"):
+    for name in ("parameters", "sample", "unit"):
         for key, value in (data.get(name) or {}).items() if isinstance(data.get(name), dict) else ():
-            names = Distribution.model_fields if name == "sample" else ()
+            names = Distribution.model_fields if name != "parameters" else ()
             if (
                 isinstance(value, dict)
                 and not set(value) & set(names)
@@ -245,7 +215,7 @@ def _explained(error: ValidationError, file: Path) -> Exception:
     model, field = Job, None
     for name in place:  # down to the model that holds the key
         if field is not None and field.annotation is not None:
-            inner = {"noise": Camera, "sample": Distribution}.get(place[0])
+            inner = {"noise": Camera, "sample": Distribution, "unit": Distribution}.get(place[0])
             model = inner or model
         field = model.model_fields.get(name, field)
     where = f"{file}: " + (f"[{place[0]}] " if len(place) > 1 else "")
@@ -287,6 +257,13 @@ class Maker:
         if "dn" in job.outputs and self.noise is None:
             raise BadJob(f'{file}: outputs names "dn", but neither [noise] nor the fit tells the noise of the camera')
         self.values = {**sensor.values, **job.parameters}
+        if job.posterior and sensor.posterior is None:
+            raise BadJob(
+                f"{file}: posterior, but the fit holds no covariance; calibrate again, as earlier versions kept none"
+            )
+        self.draws = Draws(
+            job, sensor.scene, self.values, self.file, sensor.posterior if job.posterior else None, sensor.levels
+        )
         self.images = RenderJob(
             sensor.scene, spp=job.spp, layers=job.layers, black=sensor.black, saturation=sensor.saturation
         )
@@ -305,11 +282,9 @@ class Maker:
         scene.check(job.parameters, f"{self.file}: [parameters]")
         if job.parameters:
             scene.check_press(self.values, f"{self.file}: [parameters]")
-        for key, d in job.sample.items():
-            where = f"{self.file}: [sample]"
-            if key not in scene.parameters:
-                raise UnknownKey(key, scene.parameters, "parameter", where, "`optics params SCENE` lists them")
-            parameter = scene.parameters[key]
+        for drawn in self.draws.drawn:
+            key, d, parameter = drawn.name, drawn.distribution, drawn.parameter
+            where = f"{self.file}: [{'unit' if drawn.unit else 'sample'}]"
             if not parameter.is_number and not (d.choice or d.grid):
                 raise BadJob(
                     f"{where}: {key} is a word and no number; allowed: choice or grid of {', '.join(parameter.choices)}"
@@ -318,23 +293,24 @@ class Maker:
                 parameter.check(value, key, where)
                 scene.check_press({**self.values, key: value}, where)
             if d.normal is not None:
-                self._check_normal(key, d)
+                self._check_normal(drawn, where)
 
-    def _check_normal(self, key: str, d: Distribution) -> None:
+    def _check_normal(self, drawn: Drawn, where: str) -> None:
         """A normal has no ends, so its draws themselves are checked."""
-        parameter = self.images.scene.parameters[key]
-        low, high = parameter.bounds
-        if low <= d.normal[0] - 40 * d.normal[1] and d.normal[0] + 40 * d.normal[1] <= high:
+        (mean, sd), (low, high) = drawn.distribution.normal, drawn.parameter.bounds
+        if low <= mean - 40 * sd and mean + 40 * sd <= high:
             return
-        for index in range(self.job.total):
-            value = d.draw(self.job.rng(index, key))
+        step = self.job.per_unit if drawn.unit else 1
+        for index in range(0, self.job.total, step):
+            value = drawn.distribution.draw(self.job.rng(index // step, drawn.purpose))
             if not low <= value <= high:
                 raise OutOfBounds(
-                    key,
+                    drawn.name,
                     value,
-                    parameter.unit,
-                    parameter.bounds,
-                    f"{self.file}: [sample]: normal = {d.normal} draws at index {index}",
+                    drawn.parameter.unit,
+                    drawn.parameter.bounds,
+                    f"{where}: normal = {drawn.distribution.normal} draws at {'unit' if drawn.unit else 'index'} "
+                    f"{index // step}",
                 )
 
     def identity(self) -> dict:
@@ -343,7 +319,11 @@ class Maker:
         numbers = {k: v for k, v in record["versions"].items() if k not in ("python", "system")}
         return {
             "job": self.job.model_dump(mode="json", exclude={"out", "fit", "frame"}),
-            **({"fit": self.values, "noise": self.noise and asdict(self.noise)} if self.job.fit is not None else {}),
+            **(
+                {"fit": self.values, "noise": self.noise and asdict(self.noise), **self._posterior()}
+                if self.job.fit is not None
+                else {}
+            ),
             # JSON keeps no order of keys, and the order of grids says which sample is which.
             **({"grids": list(self.job.grids)} if len(self.job.grids) > 1 else {}),
             "scene": record["scene"],
@@ -351,15 +331,19 @@ class Maker:
             "versions": numbers,
         }
 
+    def _posterior(self) -> dict:
+        return {} if self.draws.posterior is None else {"posterior": self.draws.posterior.table()}
+
     def described(self) -> dict:
         """Key -> unit and meaning of what is fixed and drawn, for who reads the folder."""
-        found = {key: self.images.scene.parameters[key] for key in [*self.job.parameters, *self.job.sample]}
+        found = {key: self.images.scene.parameters[key] for key in [*self.job.parameters, *self.draws.keys]}
         return {key: {"unit": p.unit, "doc": p.doc} for key, p in found.items()}
 
     def make(self, index: int) -> dict:
         """Write the files of one sample, each whole or not at all, and return its line of the manifest."""
         job = self.job
-        values = job.values(index)
+        values = self.draws.at(index)
+        unit = {"unit": self.draws.unit_of(index)} if self.draws.serial else {}
         lights = [None] if job.lights == "together" else list(self.images.scene.lights)
         files = {}
         for led in lights:
@@ -373,7 +357,7 @@ class Maker:
                     "size": path.stat().st_size,
                     "hash": file_hash(path),
                 }
-        return {"index": index, "sample": values, "files": files}
+        return {"index": index, **unit, "sample": values, "files": files}
 
     def _write(self, image, output: str, stem: Path, index: int) -> Path:
         if output == "exr":
