@@ -118,7 +118,8 @@ class Slurm:
                 **_typed({key: value for key, value in options.items() if key != "cluster"}),
             )
         except (RuntimeError, ValueError, NameError, TypeError, AssertionError) as error:
-            raise ValueError(f"--on slurm: {error}; allowed: parameters of submitit.AutoExecutor") from error
+            said = " ".join(str(error).split()).rstrip(".")
+            raise ValueError(f"--on slurm: {said}; allowed: parameters of submitit.AutoExecutor") from error
         self.jobs: list[Any] = []
 
     def start(self, lives: Lives) -> list[Any]:
