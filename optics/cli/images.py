@@ -2,8 +2,9 @@
 
 import sys
 import time
+from datetime import timedelta
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -19,10 +20,14 @@ from optics.cli.shared import (
     Variant,
     command,
     load_sensor,
+    pairs,
     settings,
     show,
     terminal,
 )
+
+if TYPE_CHECKING:
+    from optics.study.engines import Status
 
 
 @command
@@ -113,10 +118,33 @@ def batch(
     job: Annotated[
         Path, typer.Argument(metavar="JOB.toml", help="What to make; optics.study.batch describes the file.")
     ],
+    on: Annotated[
+        str,
+        typer.Option("--on", metavar="ENGINE", help="Where: local, slurm (submitit) or ray. The images are the same."),
+    ] = "local",
+    workers: Annotated[
+        int | None,
+        typer.Option(
+            "--workers",
+            help="Processes of one thread at a time.",
+            show_default="one per core; 16 tasks on Slurm; all CPUs of a Ray cluster",
+        ),
+    ] = None,
+    recycle: Annotated[
+        int, typer.Option("--recycle", metavar="N", help="Samples of a worker before a fresh one takes its place.")
+    ] = 1000,
+    engine: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--engine",
+            metavar="KEY=VALUE",
+            help="Of submitit.AutoExecutor (slurm_partition=cpu, timeout_min=240) or ray.init (address=auto). "
+            "Repeatable.",
+        ),
+    ] = None,
     shard: Annotated[
-        str, typer.Option("--shard", metavar="K/N", help="Make only every N-th sample, from the K-th on.")
+        str, typer.Option("--shard", metavar="K/N", help="Make only every N-th block of samples, from the K-th on.")
     ] = "1/1",
-    workers: Annotated[int | None, typer.Option("--workers", help="Processes.", show_default="one per core")] = None,
     fit: FitFile = None,
     frame: FrameName = None,
     plugins: Plugins = None,
@@ -127,8 +155,20 @@ def batch(
 
     part = work.parse_shard(shard)
     try:
-        with terminal.progress() as progress:
-            result = work.run(job, part, workers, plugins, progress, fit=fit, frame=frame)
+        with terminal.live() as live:
+            result = work.run(
+                job,
+                part,
+                workers,
+                plugins,
+                (lambda what, done, total: live({what: f"{done:,} of {total:,}"})) if live else None,
+                fit=fit,
+                frame=frame,
+                on=on,
+                options=pairs(engine, "--engine"),
+                recycle=recycle,
+                watch=(lambda status: live(_state(status))) if live else None,
+            )
     except KeyboardInterrupt:
         raise KeyboardInterrupt("what was made is kept, the same command goes on") from None
     for text in result.notes:
@@ -145,5 +185,59 @@ def batch(
         )
     print(
         f"{result.folder}: {result.own} of {result.total} samples, {result.made} of them made now"
-        + (", all complete: manifest.csv" if result.complete else ", other shards are still to come")
+        + (", all complete: manifest.csv" if result.complete else ", others are still to come, or being made elsewhere")
     )
+
+
+@command
+def export(
+    folder: Annotated[Path, typer.Argument(metavar="BATCH", help="Folder of a finished batch.")],
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for the data set.")],
+    to: Annotated[
+        str, typer.Option("--to", metavar="FORMAT", help="webdataset, hdf5, zarr or lerobot.", show_default=False)
+    ],
+    images: Annotated[
+        str,
+        typer.Option(
+            "--images",
+            metavar="KIND",
+            help="camera: the camera's 8- or 12-bit digital numbers; float: radiance, depth, normals, LEDs.",
+        ),
+    ] = "camera",
+    array: Annotated[
+        list[str] | None,
+        typer.Option("--array", metavar="NAME", help="Take this array. Repeatable.", show_default="all"),
+    ] = None,
+    per_file: Annotated[int, typer.Option("--per-file", metavar="N", help="Samples of a file.")] = 1000,
+    licence: Annotated[str, typer.Option("--licence", help="Of the data, as the card states it.")] = "",
+    as_json: AsJson = False,
+) -> None:
+    """Write a finished batch as a data set for learning, with a data card. May be stopped; the same command goes on."""
+    from optics.study.export import export as write
+
+    with terminal.progress() as progress:
+        card = write(
+            folder,
+            output,
+            to,
+            images=images,
+            arrays=array or (),
+            per_file=per_file,
+            licence=licence,
+            progress=progress,
+        )
+    if as_json:
+        return show(card)
+    print(f"{output}: {card['samples']} samples, {card['files']}; arrays {', '.join(card['arrays'])}; card.md")
+
+
+def _state(status: "Status") -> dict[str, str]:
+    """A batch's state, title -> text."""
+    return {
+        "made": f"{status.done:,} of {status.total:,}",
+        "per second": f"{status.rate:.3g}",
+        "time left": "?" if status.left is None else str(timedelta(seconds=round(status.left))),
+        "workers": str(status.workers),
+        "died": str(status.died),
+        "samples given up": str(status.given_up),
+    }

@@ -83,6 +83,36 @@ class Terminal:
         with bars:
             yield show
 
+    @contextmanager
+    def live(self) -> Iterator[Callable[[Mapping[str, str]], None] | None]:
+        """A function (title -> text) that keeps a table of one row up to date, or, where stderr is no terminal, writes
+        it as a line now and then; None with --quiet."""
+        if self.quiet:
+            yield None
+            return
+        if not sys.stderr.isatty():
+            last = time.monotonic()
+
+            def line(cells: Mapping[str, str]) -> None:
+                nonlocal last
+                if time.monotonic() - last >= EVERY:
+                    last = time.monotonic()
+                    print(", ".join(f"{title} {text}" for title, text in cells.items()), file=sys.stderr, flush=True)
+
+            yield line
+            return
+        from rich.console import Console
+        from rich.live import Live
+        from rich.table import Table
+
+        def table(cells: Mapping[str, str]) -> Table:
+            rows = Table(*cells, box=None, pad_edge=False)
+            rows.add_row(*cells.values())
+            return rows
+
+        with Live(console=Console(stderr=True), transient=True, refresh_per_second=4) as shown:
+            yield lambda cells: shown.update(table(cells))
+
 
 def _lines() -> Callable[[str, int, int], None]:
     """Progress as lines, one every EVERY seconds: quick work writes none."""

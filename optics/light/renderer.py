@@ -38,7 +38,8 @@ SOFT = 16  # points of a light, above which rims of its shadows take the samples
 CREASE = 25.0  # deg from pixel to pixel: what is no smooth surface
 FLAT_FIELDS = ("multiplicative", "additive", "none")
 MEMORY = 2e9  # bytes of hits, with what images need for their derivatives, that are kept
-IMAGES = 5e8  # bytes of images that are kept without them
+IMAGES = 5e8  # bytes of images that are kept without them, of a renderer that remembers REMEMBER geometries
+REMEMBER = 24
 PER_RAY = 250  # bytes of a camera ray's end and its light, by the memory of processes that held ten million of them
 BOUNCE_SAMPLES = 32  # directions per cell for the second bounce
 BOUNCE_CELL = 2  # px each way of a cell
@@ -49,7 +50,7 @@ class Renderer:
 
     monte_carlo = False  # whether images are Monte Carlo estimates
 
-    def __init__(self, scene: Scene, remember: int = 24):
+    def __init__(self, scene: Scene, remember: int = REMEMBER):
         if scene.camera is None or scene.integrator is None:
             raise BadScene(f"{scene.path}: a prediction needs a part of the type 'camera' and the integrator 'tactile'")
         if not scene.lights:
@@ -286,7 +287,8 @@ class Renderer:
 
     def _keep_plain(self, key: tuple, image: np.ndarray) -> np.ndarray:
         self._plain[key] = image
-        while len(self._plain) > max(2 * len(self.scene.lights), int(IMAGES / max(image.nbytes, 1))):
+        most = int(IMAGES * self.remember / REMEMBER / max(image.nbytes, 1))
+        while len(self._plain) > max(2 * len(self.scene.lights), most):
             self._plain.popitem(last=False)
         return image
 

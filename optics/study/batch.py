@@ -19,100 +19,54 @@
     "gel.indenter"    = { choice = ["sphere", "cube"] }
     "gel.press_rz"    = { grid = [0, 30, 60] } # every value; several grids: every combination, the last one fastest
 
+A series of sensors, each with `per_unit` images (optics.study.draws):
+
+    per_unit  = 50
+    posterior = true                           # calibrated values with the fit's covariance; or a list of patterns
+    [unit]                                     # as [sample], once for each sensor
+    "led_1.power"    = { normal = [1, 0.05] }
+    "lens vignetting" = { plausible = 1 }      # an effect, or a parameter: so many plausible sizes, about what it is
+
 A draw depends on seed, index and key alone: not on the order of work, on shards or workers, nor on what else is
-sampled. The folder gets images/, job.json (what it was made from), manifest.jsonl (a line per sample, appended once its
-files stand) and, when all is done, manifest.csv."""
+sampled. The folder gets images/, job.json (what it was made from) and, when all is done, manifest.jsonl (a line per
+sample) and manifest.csv; until then a sample is recorded, once its files stand, in .parts (optics.study.blocks)."""
 
 from __future__ import annotations
 
 import csv
-import io
+import functools
 import itertools
 import json
 import math
 import os
-import signal
-import zlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import time
+import uuid
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import Field, ValidationError, field_validator, model_validator
 
 from optics.captures.noise import Noise
 from optics.errors import OutOfBounds, OutputExists, UnknownKey
 from optics.files import toml_checks as checks
-from optics.files.output import alone, check_folder, file_hash, replacing, write_text
+from optics.files.output import FULL, alone, check_folder, file_hash, replacing, write_json, write_text
 from optics.light.rendering import LAYERS, RenderJob
 from optics.scene import loader as scenes
 from optics.scene.mitsuba_parts import DEFAULT_VARIANT
 from optics.scene.trust import Named
+from optics.study.blocks import Block, Blocks, DiskFull, SampleFailed
 from optics.study.calibrated import Calibrated, calibrated
+from optics.study.draws import BadJob, Distribution, Drawn, Draws, Finite, Strict, Value, stream
+from optics.study.engines import ENGINES, Status, cores, one_thread, work_through
 
 Progress = Callable[[str, int, int], None]
 
-Finite = Annotated[float, Field(allow_inf_nan=False)]
-Value = Finite | str
-Pair = Annotated[list[Finite], Field(min_length=2, max_length=2)]
-
-
 SAMPLES_MOST = 10_000_000  # of one job, whose manifest is one file
-
-
-class BadJob(ValueError):
-    """A job file that contradicts its format or its scene."""
-
-
-class SampleFailed(RuntimeError):
-    """A sample that could not be made; those before it are kept."""
-
-
-class Strict(BaseModel):
-    model_config = ConfigDict(strict=True, extra="forbid", frozen=True)
-
-
-class Distribution(Strict):
-    """A distribution of values: exactly one of the five is given."""
-
-    uniform: Pair | None = Field(None, description="[low, high], low < high")
-    log_uniform: Pair | None = Field(None, description="[low, high], 0 < low < high")
-    normal: Pair | None = Field(None, description="[mean, standard deviation], the second above 0")
-    choice: Annotated[list[Value], Field(min_length=1)] | None = Field(None, description="a list of numbers or texts")
-    grid: Annotated[list[Value], Field(min_length=1)] | None = Field(None, description="a list of numbers or texts")
-
-    @model_validator(mode="after")
-    def _one(self):
-        given = [name for name in type(self).model_fields if getattr(self, name) is not None]
-        if len(given) != 1:
-            raise ValueError(
-                f"{' and '.join(given) or 'nothing'} given; allowed: exactly one of "
-                f"{', '.join(type(self).model_fields)}"
-            )
-        pair = self.uniform or self.log_uniform
-        if pair and not pair[0] < pair[1]:
-            raise ValueError(f"{given[0]} = {pair}; allowed: [low, high] with low < high")
-        if self.log_uniform and not pair[0] > 0:
-            raise ValueError(f"log_uniform = {pair}; allowed: [low, high] with 0 < low")
-        if self.normal and not self.normal[1] > 0:
-            raise ValueError(f"normal = {self.normal}; allowed: [mean, standard deviation] with the second above 0")
-        return self
-
-    def draw(self, rng: np.random.Generator) -> float | str:
-        if self.uniform:
-            return float(rng.uniform(*self.uniform))
-        if self.log_uniform:
-            return float(np.exp(rng.uniform(*np.log(self.log_uniform))))
-        if self.normal:
-            return float(rng.normal(*self.normal))
-        return self.choice[int(rng.integers(len(self.choice)))]
-
-    @property
-    def extremes(self) -> list[float | str]:
-        """The extreme values of all draws, for a check of bounds; none for a normal, which has no ends."""
-        return self.uniform or self.log_uniform or self.choice or self.grid or []
+RECYCLE = 1000  # samples of one worker: its start, a few seconds, is then a hundredth of its work, or less
 
 
 class Camera(Strict):
@@ -150,6 +104,11 @@ class Job(Strict):
     defines: dict[str, Value | int] = Field({}, description="numbers or texts")
     parameters: dict[str, Value] = Field({}, description="numbers or texts")
     sample: dict[str, Distribution] = Field({}, description="key = {uniform = [low, high]}, ...")
+    unit: dict[str, Distribution] = Field({}, description="key = {uniform = [low, high]}, ...")
+    per_unit: Annotated[int, Field(ge=1)] = Field(1, description="a whole number from 1 on: images of a sensor")
+    posterior: bool | Annotated[list[str], Field(min_length=1)] = Field(
+        False, description="true, or a list of patterns of the fit's variables"
+    )
     noise: Camera | None = Field(None, description="a table with " + ", ".join(Camera.model_fields))
 
     @field_validator("outputs", "layers")
@@ -171,9 +130,15 @@ class Job(Strict):
             raise ValueError('outputs names "dn", but [noise] is missing; give ' + ", ".join(Camera.model_fields))
         if self.total > SAMPLES_MOST:
             raise ValueError(f"{self.total:.3g} samples; allowed: up to {SAMPLES_MOST:,} in one job; split it")
-        twice = sorted(set(self.parameters) & set(self.sample))
-        if twice:
-            raise ValueError(f"{twice[0]} stands in [parameters] and in [sample]; allowed: one of them")
+        tables = {"parameters": self.parameters, "sample": self.sample, "unit": self.unit}
+        for one, two in itertools.combinations(tables, 2):
+            if twice := sorted(set(tables[one]) & set(tables[two])):
+                raise ValueError(f"{twice[0]} stands in [{one}] and in [{two}]; allowed: one of them")
+        for key, d in self.unit.items():
+            if d.grid is not None:
+                raise ValueError(f"[unit] {key}: a grid counts images, and not sensors; allowed: choice")
+        if self.posterior and self.fit is None:
+            raise ValueError("posterior, but no fit; give the fit whose covariance it is")
         return self
 
     # -- samples ------------------------------------------------------------------------------------------------------
@@ -186,16 +151,20 @@ class Job(Strict):
         return math.prod(len(values) for values in self.grids.values()) * (self.count or 1)
 
     def values(self, index: int) -> dict[str, float | str]:
-        """What is sampled in the image of this index, by key."""
+        """What is drawn for the image of this index, by key; what takes a scene to draw is in optics.study.draws."""
         point = (
             np.unravel_index(index // (self.count or 1), [len(v) for v in self.grids.values()]) if self.grids else ()
         )
-        chosen = {key: grid[int(i)] for (key, grid), i in zip(self.grids.items(), point)}
-        return {key: chosen[key] if key in chosen else d.draw(self.rng(index, key)) for key, d in self.sample.items()}
+        found = {key: grid[int(i)] for (key, grid), i in zip(self.grids.items(), point)}
+        for table, number, prefix in ((self.sample, index, ""), (self.unit, index // self.per_unit, "unit ")):
+            for key, d in table.items():
+                if key not in found and d.plausible is None:
+                    found[key] = d.draw(self.rng(number, prefix + key))
+        return found
 
     def rng(self, index: int, purpose: str) -> np.random.Generator:
         """The random stream of one index for one purpose."""
-        return np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(index, zlib.crc32(purpose.encode()))))
+        return stream(self.seed, index, purpose)
 
     def camera_noise(self) -> Noise | None:
         return None if self.noise is None else Noise(**self.noise.model_dump())
@@ -217,9 +186,9 @@ def read(file: str | Path, fit: str | Path | None = None, frame: str | None = No
         if own is not None and value != (os.path.abspath(file.parent / str(own)) if name == "fit" else own):
             raise BadJob(f"{file}: {name} = {own!r}, but --{name} {value}; leave out one of them")
         data[name] = value
-    for name in ("parameters", "sample"):
+    for name in ("parameters", "sample", "unit"):
         for key, value in (data.get(name) or {}).items() if isinstance(data.get(name), dict) else ():
-            names = Distribution.model_fields if name == "sample" else ()
+            names = Distribution.model_fields if name != "parameters" else ()
             if (
                 isinstance(value, dict)
                 and not set(value) & set(names)
@@ -246,7 +215,7 @@ def _explained(error: ValidationError, file: Path) -> Exception:
     model, field = Job, None
     for name in place:  # down to the model that holds the key
         if field is not None and field.annotation is not None:
-            inner = {"noise": Camera, "sample": Distribution}.get(place[0])
+            inner = {"noise": Camera, "sample": Distribution, "unit": Distribution}.get(place[0])
             model = inner or model
         field = model.model_fields.get(name, field)
     where = f"{file}: " + (f"[{place[0]}] " if len(place) > 1 else "")
@@ -288,6 +257,13 @@ class Maker:
         if "dn" in job.outputs and self.noise is None:
             raise BadJob(f'{file}: outputs names "dn", but neither [noise] nor the fit tells the noise of the camera')
         self.values = {**sensor.values, **job.parameters}
+        if job.posterior and sensor.posterior is None:
+            raise BadJob(
+                f"{file}: posterior, but the fit holds no covariance; calibrate again, as earlier versions kept none"
+            )
+        self.draws = Draws(
+            job, sensor.scene, self.values, self.file, sensor.posterior if job.posterior else None, sensor.levels
+        )
         self.images = RenderJob(
             sensor.scene, spp=job.spp, layers=job.layers, black=sensor.black, saturation=sensor.saturation
         )
@@ -306,11 +282,9 @@ class Maker:
         scene.check(job.parameters, f"{self.file}: [parameters]")
         if job.parameters:
             scene.check_press(self.values, f"{self.file}: [parameters]")
-        for key, d in job.sample.items():
-            where = f"{self.file}: [sample]"
-            if key not in scene.parameters:
-                raise UnknownKey(key, scene.parameters, "parameter", where, "`optics params SCENE` lists them")
-            parameter = scene.parameters[key]
+        for drawn in self.draws.drawn:
+            key, d, parameter = drawn.name, drawn.distribution, drawn.parameter
+            where = f"{self.file}: [{'unit' if drawn.unit else 'sample'}]"
             if not parameter.is_number and not (d.choice or d.grid):
                 raise BadJob(
                     f"{where}: {key} is a word and no number; allowed: choice or grid of {', '.join(parameter.choices)}"
@@ -319,23 +293,24 @@ class Maker:
                 parameter.check(value, key, where)
                 scene.check_press({**self.values, key: value}, where)
             if d.normal is not None:
-                self._check_normal(key, d)
+                self._check_normal(drawn, where)
 
-    def _check_normal(self, key: str, d: Distribution) -> None:
+    def _check_normal(self, drawn: Drawn, where: str) -> None:
         """A normal has no ends, so its draws themselves are checked."""
-        parameter = self.images.scene.parameters[key]
-        low, high = parameter.bounds
-        if low <= d.normal[0] - 40 * d.normal[1] and d.normal[0] + 40 * d.normal[1] <= high:
+        (mean, sd), (low, high) = drawn.distribution.normal, drawn.parameter.bounds
+        if low <= mean - 40 * sd and mean + 40 * sd <= high:
             return
-        for index in range(self.job.total):
-            value = d.draw(self.job.rng(index, key))
+        step = self.job.per_unit if drawn.unit else 1
+        for index in range(0, self.job.total, step):
+            value = drawn.distribution.draw(self.job.rng(index // step, drawn.purpose))
             if not low <= value <= high:
                 raise OutOfBounds(
-                    key,
+                    drawn.name,
                     value,
-                    parameter.unit,
-                    parameter.bounds,
-                    f"{self.file}: [sample]: normal = {d.normal} draws at index {index}",
+                    drawn.parameter.unit,
+                    drawn.parameter.bounds,
+                    f"{where}: normal = {drawn.distribution.normal} draws at {'unit' if drawn.unit else 'index'} "
+                    f"{index // step}",
                 )
 
     def identity(self) -> dict:
@@ -344,16 +319,31 @@ class Maker:
         numbers = {k: v for k, v in record["versions"].items() if k not in ("python", "system")}
         return {
             "job": self.job.model_dump(mode="json", exclude={"out", "fit", "frame"}),
-            **({"fit": self.values} if self.job.fit is not None else {}),
+            **(
+                {"fit": self.values, "noise": self.noise and asdict(self.noise), **self._posterior()}
+                if self.job.fit is not None
+                else {}
+            ),
+            # JSON keeps no order of keys, and the order of grids says which sample is which.
+            **({"grids": list(self.job.grids)} if len(self.job.grids) > 1 else {}),
             "scene": record["scene"],
             "plugins": record["plugins"],
             "versions": numbers,
         }
 
+    def _posterior(self) -> dict:
+        return {} if self.draws.posterior is None else {"posterior": self.draws.posterior.table()}
+
+    def described(self) -> dict:
+        """Key -> unit and meaning of what is fixed and drawn, for who reads the folder."""
+        found = {key: self.images.scene.parameters[key] for key in [*self.job.parameters, *self.draws.keys]}
+        return {key: {"unit": p.unit, "doc": p.doc} for key, p in found.items()}
+
     def make(self, index: int) -> dict:
         """Write the files of one sample, each whole or not at all, and return its line of the manifest."""
         job = self.job
-        values = job.values(index)
+        values = self.draws.at(index)
+        unit = {"unit": self.draws.unit_of(index)} if self.draws.serial else {}
         lights = [None] if job.lights == "together" else list(self.images.scene.lights)
         files = {}
         for led in lights:
@@ -367,7 +357,7 @@ class Maker:
                     "size": path.stat().st_size,
                     "hash": file_hash(path),
                 }
-        return {"index": index, "sample": values, "files": files}
+        return {"index": index, **unit, "sample": values, "files": files}
 
     def _write(self, image, output: str, stem: Path, index: int) -> Path:
         if output == "exr":
@@ -397,7 +387,7 @@ def folder_of(job: Job, file: Path) -> Path:
 
 def _open_folder(folder: Path, identity: Mapping) -> None:
     """Start a folder, or resume one that was made from the same job."""
-    note = folder / "job.json"
+    note, identity = folder / "job.json", json.loads(json.dumps(identity))
     if note.is_file():
         try:
             before = json.loads(note.read_text(encoding="utf-8"))
@@ -406,7 +396,7 @@ def _open_folder(folder: Path, identity: Mapping) -> None:
                 f"{note}: unreadable ({error}); restore it, or choose another folder for `out`"
             ) from error
         if before != identity:
-            changed = _changes(before, json.loads(json.dumps(identity)))
+            changed = _changes(before, identity)
             raise OutputExists(
                 f"{folder} was made from another job: changed {', '.join(changed[:4])}"
                 f"{' ...' if len(changed) > 4 else ''}; choose another folder for `out`, or undo the change"
@@ -429,68 +419,33 @@ def _changes(before, now, name: str = "") -> list[str]:
     return [] if before == now else [name]
 
 
-@contextmanager
-def _alone(folder: Path, shard: tuple[int, int]) -> Iterator[None]:
-    """Lock a shard against a second process; the system frees the lock however the process ends."""
-    lock = folder / f".lock-{shard[0]}-of-{shard[1]}"
-    said = f"{folder}: another process works on shard {shard[0]}/{shard[1]}; wait for it, or take another shard"
-    with alone(lock, said):
-        yield
-
-
-def _manifest(folder: Path, shard: tuple[int, int]) -> Path:
-    return folder / ("manifest.jsonl" if shard == (1, 1) else f"manifest-{shard[0]}-of-{shard[1]}.jsonl")
-
-
-def _lines(file: Path) -> dict[int, dict]:
-    """Records by index; a line that a killed process left incomplete is skipped."""
-    found = {}
-    for line in file.read_text(encoding="utf-8").splitlines() if file.is_file() else ():
-        try:
-            record = json.loads(line)
-            found[record["index"]] = record
-        except (ValueError, TypeError, KeyError):
-            continue
-    return found
-
-
-def _all_lines(folder: Path) -> dict[int, dict]:
-    found = {}
-    for file in sorted(folder.glob("manifest*.jsonl")):
-        found.update(_lines(file))
-    return found
-
-
-def _stands(folder: Path, record: Mapping) -> bool:
-    """Whether every file of a record is there, with its size and hash."""
-    for entry in record["files"].values():
-        file = folder / entry["file"]
-        if not file.is_file() or file.stat().st_size != entry["size"] or file_hash(file) != entry["hash"]:
+def finish(job: Job, blocks: Blocks) -> bool:
+    """Write one ordered manifest and its table once every sample of the job is recorded; whether it is."""
+    if not blocks.finished:
+        if len(blocks.complete()) < blocks.count:
             return False
-    return True
+        try:
+            with alone(blocks.parts / "finish.lock", ""):
+                if not blocks.finished:
+                    _write_table(job, blocks)
+                blocks.finish()
+        except OutputExists:
+            pass  # another worker is at it
+    return blocks.finish()
 
 
-def _text(records: Mapping[int, dict]) -> str:
-    return "".join(json.dumps(records[i], sort_keys=True) + "\n" for i in sorted(records))
-
-
-def _finish(folder: Path, job: Job) -> bool:
-    """Write one ordered manifest and the table once every sample of the job is complete."""
-    records = _all_lines(folder)
-    if len(records) < job.total:
-        return False
-    keys, roles = list(job.parameters) + list(job.sample), list(next(iter(records.values()))["files"])
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(["index", *keys, *roles])
-    for index in sorted(records):
-        values = {**job.parameters, **records[index]["sample"]}
-        writer.writerow([index, *(values[k] for k in keys), *(records[index]["files"][r]["file"] for r in roles)])
-    write_text(folder / "manifest.jsonl", _text(records))
-    write_text(folder / "manifest.csv", out.getvalue())
-    for part in folder.glob("manifest-*-of-*.jsonl"):
-        part.unlink(missing_ok=True)
-    return True
+def _write_table(job: Job, blocks: Blocks) -> None:
+    """manifest.csv: a row per sample, with what is fixed and what is drawn by key, and its files by role."""
+    with replacing(blocks.manifest.with_suffix(".csv")) as file, open(file, "w", encoding="utf-8", newline="") as out:
+        writer = csv.writer(out, lineterminator="\n")
+        keys: list[str] = []
+        roles: list[str] = []
+        for record in blocks.records():
+            values = {**job.parameters, **record["sample"]}
+            if not keys:
+                keys, roles = list(values), list(record["files"])
+                writer.writerow(["index", *keys, *roles])
+            writer.writerow([record["index"], *(values[k] for k in keys), *(record["files"][r]["file"] for r in roles)])
 
 
 # -- the work --------------------------------------------------------------------------------------------------------
@@ -524,15 +479,28 @@ def run(
     *,
     fit: str | Path | None = None,
     frame: str | None = None,
+    on: str = "local",
+    options: Mapping[str, str] | None = None,
+    recycle: int = RECYCLE,
+    watch: Callable[[Status], None] | None = None,
 ) -> Result:
-    """Make the missing samples of a job's shard. It can be stopped at any moment and called again.
+    """Make the missing samples of a job's shard. It can be stopped at any moment and called again, and called from
+    several machines that share the folder.
 
     fit, frame   a calibrated sensor, where the job file names none (optics.study.calibrated)
-    workers   processes of one thread each; None: as many as there are cores. With 1 everything happens in this process.
-    Raises BadJob, UnknownKey, OutOfBounds, OutputExists before any rendering, SampleFailed in its course.
+    workers   processes of one thread each; None: as many as there are cores, on a cluster what its engine takes. With 1
+              on "local", everything happens in this process.
+    on        "local", "slurm" or "ray" (optics.study.engines), with its own `options`
+    recycle   samples that a worker makes before a fresh one takes its place
+    watch     is told the Status, several times a second
+    Raises BadJob, UnknownKey, OutOfBounds, OutputExists before any rendering, SampleFailed and EngineFailed in its
+    course.
     """
-    if workers is not None and workers < 1:
-        raise ValueError(f"workers = {workers}; allowed: whole numbers from 1 on")
+    for name, number in (("workers", workers), ("recycle", recycle)):
+        if number is not None and number < 1:
+            raise ValueError(f"{name} = {number}; allowed: whole numbers from 1 on")
+    if on not in ENGINES:
+        raise UnknownKey(on, ENGINES, "engine", "--on")
     file = Path(os.path.abspath(file))
     job = read(file, fit, frame)
     folder = folder_of(job, file)
@@ -540,147 +508,140 @@ def run(
     maker = Maker(job, file, plugins)
     maker.check()
     _open_folder(folder, maker.identity())
-    own = range(shard[0] - 1, job.total, shard[1])
-    made = 0
-    with _alone(folder, shard):
-        todo = _remaining(folder, shard, own, progress)
-        workers = max(1, min(workers or _cores(), len(todo)))
-        work = _here(maker, todo) if workers == 1 else _crew(job, file, plugins, todo, workers)
-        manifest = _manifest(folder, shard)
+    write_json(folder / "parameters.json", maker.described())
+    blocks = Blocks(folder, job.total, shard, uuid.uuid4().hex[:8])
+    blocks.verify(progress)
+    blocks.sweep()
+    before = blocks.counts().recorded
+    if before < blocks.own:
         try:
-            with open(manifest, "a", encoding="utf-8") as lines:
-                for record in work:
-                    lines.write(json.dumps(record, sort_keys=True) + "\n")
-                    lines.flush()
-                    made += 1
-                    if progress:
-                        progress("batch", len(own) - len(todo) + made, len(own))
+            if on == "local" and (workers or cores()) == 1:
+                _here(blocks, maker, watch)
+            else:
+                life = Life(job, file, plugins, shard, blocks.run)
+                with one_thread():
+                    work_through(ENGINES[on](workers, options or {}, folder), life, blocks, recycle, watch)
         finally:
-            work.close()
-            _sweep(folder, shard)
-    return Result(folder, job.total, len(own), made, _finish(folder, job), maker.notes)
+            blocks.sweep()
+    made = blocks.counts().recorded - before
+    complete = finish(job, blocks)
+    failures = {} if complete else blocks.failures()
+    if failures:
+        index, why = next(iter(failures.items()))
+        raise failed(job, index, why, len(failures) - 1)
+    return Result(folder, job.total, blocks.own, made, complete, maker.notes)
 
 
-def _remaining(folder: Path, shard: tuple[int, int], own: Sequence[int], progress: Progress | None) -> list[int]:
-    """Indices of a shard without a record, or whose files differ from it; removes what a killed process left."""
-    known, bad = _all_lines(folder), set()
-    done = [i for i in own if i in known]
-    for k, index in enumerate(done):
-        if not _stands(folder, known[index]):
-            bad.add(index)
-        if progress and k % 50 == 0:
-            progress("checking what is there", k + 1, len(done))
-    _sweep(folder, shard)
-    for manifest in folder.glob("manifest*.jsonl") if bad else [_manifest(folder, shard)]:
-        lines = {i: r for i, r in _lines(manifest).items() if i not in bad}
-        if manifest.is_file() and manifest.read_text(encoding="utf-8") != _text(lines):
-            write_text(manifest, _text(lines))
-    if bad:
-        (folder / "manifest.csv").unlink(missing_ok=True)
-    return [i for i in own if i not in known or i in bad]
+def _here(blocks: Blocks, maker: Maker, watch: Callable[[Status], None] | None) -> None:
+    """All of a shard in this process."""
+    begin, before = time.monotonic(), blocks.counts()
+
+    def made(count: int) -> None:
+        if watch:
+            now, seconds = before.recorded + count, time.monotonic() - begin
+            watch(Status(now, blocks.own, count, 0, 0, 1, seconds))
+
+    with serial():
+        fill(blocks, lambda: maker, made=made)
 
 
-def _sweep(folder: Path, shard: tuple[int, int]) -> None:
-    """Remove unfinished files of this shard."""
-    for file in (folder / "images").glob(".*"):
-        index = file.name[1:7]
-        if index.isdecimal() and int(index) % shard[1] == shard[0] - 1:
-            file.unlink(missing_ok=True)
+@dataclass(frozen=True)
+class Life:
+    """What one worker does, on any engine: make up to `limit` samples, and end. Returns how many it made.
+
+    place   (k, n): this worker begins at the k-th of n places, so that workers rarely want the same block
+    """
+
+    job: Job
+    file: Path
+    plugins: Named
+    shard: tuple[int, int]
+    run: str
+    place: tuple[int, int] = (0, 1)
+    limit: int = RECYCLE
+
+    def __call__(self) -> int:
+        folder = folder_of(self.job, self.file)
+        blocks = Blocks(folder, self.job.total, self.shard, self.run)
+
+        def maker() -> Maker:
+            found = Maker(self.job, self.file, self.plugins)
+            _open_folder(folder, found.identity())  # on this machine, too, it makes the same images
+            return found
+
+        with serial():
+            count = fill(blocks, maker, self.limit, self.place)
+        finish(self.job, blocks)
+        return count
+
+    def checkpoint(self) -> Any:
+        """What submitit submits again when a task runs out of time, or gives way to another."""
+        from submitit.helpers import DelayedSubmission
+
+        return DelayedSubmission(self)
 
 
-def _here(maker: Maker, todo: Sequence[int]) -> Iterator[dict]:
+def fill(
+    blocks: Blocks,
+    maker: Callable[[], Maker],
+    limit: float = math.inf,
+    place: tuple[int, int] = (0, 1),
+    made: Callable[[int], None] | None = None,
+) -> int:
+    """Claim blocks and make their samples, until `limit` of them are made or no block is to be had; how many were.
+
+    A sample that ends in an error is tried again, with others between, up to TRIES times. Raises DiskFull at once.
+    """
+    first = place[0] * len(blocks.numbers) // place[1]
+    order = [*blocks.numbers[first:], *blocks.numbers[:first]]
+    maker, count, trying = functools.cache(maker), 0, True
+    while trying:
+        trying, complete = False, blocks.complete()
+        for number in order:
+            if number in complete:
+                continue
+            with blocks.claim(number) as block:
+                for index in block.wanted if block is not None else ():
+                    if count >= limit:
+                        return count
+                    trying = True
+                    count += _make(block, maker(), index)
+                    if made:
+                        made(count)
+    return count
+
+
+def _make(block: Block, maker: Maker, index: int) -> bool:
+    """Make and record one sample; whether it was made."""
+    try:
+        block.begin(index)
+        block.add(maker.make(index))
+        return True
+    except Exception as error:
+        why = f"{type(error).__name__}: {error}"
+        if isinstance(error, OSError) and error.errno in FULL:
+            raise failed(maker.job, index, why, kind=DiskFull) from error
+        block.fail(index, why)
+        return False
+
+
+@contextmanager
+def serial() -> Iterator[None]:
+    """Sums over faces (normals) and samples (a film) take the order of threads into their last bit: no threads."""
     import drjit as dr
 
     threads = dr.thread_count()
-    dr.set_thread_count(
-        0
-    )  # sums over faces (normals) and samples (a film) take the order of threads into their last bit
+    dr.set_thread_count(0)
     try:
-        for index in todo:
-            try:
-                yield maker.make(index)
-            except Exception as error:
-                raise _failed(maker.job, index, f"{type(error).__name__}: {error}") from error
+        yield
     finally:
         dr.set_thread_count(threads)
 
 
-def _failed(job: Job, index: int, why: str) -> SampleFailed:
+def failed(job: Job, index: int, why: str, more: int = 0, kind: type[SampleFailed] = SampleFailed) -> SampleFailed:
     values = ", ".join(f"{k} = {v:.4g}" if isinstance(v, float) else f"{k} = {v}" for k, v in job.values(index).items())
-    return SampleFailed(
-        f"sample {index} ({values or 'nothing sampled'}): {why}; what was made before is kept, the same command goes on"
+    return kind(
+        f"sample {index} ({values or 'nothing sampled'}): {why}"
+        + (f" (and {more} samples more)" if more else "")
+        + "; what was made is kept, the same command goes on"
     )
-
-
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def _crew(job: Job, file: Path, plugins: Named, todo: Sequence[int], workers: int) -> Iterator[dict]:
-    """Records from worker processes, in the order in which they finish.
-
-    Each holds one end of a pipe and nothing else of this process, so that it ends when this one is killed.
-    """
-    from multiprocessing import get_context
-    from multiprocessing.connection import wait
-
-    context = get_context("spawn")
-    waiting = iter(todo)
-    busy = {}  # connection -> (process, index)
-    processes = []
-    try:
-        for index in itertools.islice(waiting, workers):
-            here, there = context.Pipe()
-            process = context.Process(target=_work, args=(there, job, file, plugins), daemon=True)
-            process.start()
-            there.close()
-            processes.append(process)
-            here.send(index)
-            busy[here] = (process, index)
-        while busy:
-            for connection in wait(list(busy)):
-                process, index = busy.pop(connection)
-                try:
-                    answer = connection.recv()
-                except (EOFError, OSError):
-                    process.join(5)
-                    raise _failed(job, index, f"its process ended (exit code {process.exitcode})") from None
-                if isinstance(answer, str):
-                    raise _failed(job, index, answer)
-                following = next(waiting, None)
-                if following is None:
-                    connection.close()
-                else:
-                    connection.send(following)
-                    busy[connection] = (process, following)
-                yield answer
-    finally:
-        for process in processes:
-            if busy:
-                process.terminate()
-        for process in processes:
-            process.join(10)
-
-
-def _work(connection, job: Job, file: Path, plugins: Named) -> None:
-    """The loop of a worker: it receives an index, and sends a record or the text of an error."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent decides
-    try:
-        index = connection.recv()
-        try:
-            import drjit as dr
-
-            dr.set_thread_count(0)  # see `_here`
-            maker = Maker(job, file, plugins)
-        except Exception as error:
-            connection.send(f"{type(error).__name__}: {error}")
-            return
-        while True:
-            try:
-                answer = maker.make(index)
-            except Exception as error:
-                answer = f"{type(error).__name__}: {error}"
-            connection.send(answer)
-            index = connection.recv()
-    except (EOFError, BrokenPipeError, ConnectionResetError):
-        return  # the parent has no more work, or is gone

@@ -38,7 +38,7 @@ from optics.scene.mitsuba_parts import DEFAULT_VARIANT
 from optics.scene.parameter import Values
 from optics.scene.trust import Named
 from optics.study import places
-from optics.study.fit_files import fit_file, read_fit
+from optics.study.fit_files import Posterior, fit_file, read_fit
 from optics.study.stages import comparison_of
 
 
@@ -117,12 +117,16 @@ class Calibrated:
              and what was fitted in it
     noise    of the camera that took the captures; None: the file does not say
     notes    what an image of it leaves out
+    posterior  what the fit knows of its values; None: the file does not say
+    levels   key -> what a calibrated power is multiplied by in `values`
     """
 
     scene: Scene
     values: dict[str, Any]
     noise: Noise | None = None
     notes: list[str] = field(default_factory=list)
+    posterior: Posterior | None = None
+    levels: dict[str, float] = field(default_factory=dict)
 
     @property
     def black(self) -> float:
@@ -171,7 +175,11 @@ def calibrated(
     noise = noise_of(file, sensor["noise"]) if sensor.get("noise") else None
     if sensor.get("flat_field", "none") != "none":
         notes.append("the study's model holds a measured background, which is no part of the scene: this is without it")
-    return Calibrated(loaded, dict(loaded.check(values, str(file))), noise, notes)
+    posterior = Posterior.from_table(data["posterior"], str(file)) if data["posterior"] else None
+    levels = {
+        key: values[key] / data["parameters"][key] for key in sensor.get("drive", {}) if data["parameters"].get(key)
+    }
+    return Calibrated(loaded, dict(loaded.check(values, str(file))), noise, notes, posterior, levels)
 
 
 def scene_of(file: Path, sensor: Mapping, given: str | Path | None = None) -> tuple[Path, list[str]]:

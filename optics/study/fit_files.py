@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +18,81 @@ from optics.scene.parameter import Values
 CORRELATION_SHOWN = 0.9  # absolute correlation beyond which a pair of variables is listed
 
 
+@dataclass(frozen=True)
+class Posterior:
+    """What a fit knows of the values that all frames share, jointly Gaussian.
+
+    names, keys       of the variables, and the parameters that each sets
+    mean, covariance  (p,) as found, (p, p) of optics.fit.result.Fit.posterior
+    """
+
+    names: tuple[str, ...]
+    keys: tuple[tuple[str, ...], ...]
+    mean: np.ndarray
+    covariance: np.ndarray
+
+    def draw(self, count: int, rng: np.random.Generator) -> np.ndarray:
+        """(count, p) draws."""
+        sd = np.sqrt(np.diag(self.covariance))
+        eigen, vectors = np.linalg.eigh(self.covariance / np.outer(sd, sd))  # of the correlation: units differ
+        root = vectors * np.sqrt(np.maximum(eigen, 0.0))
+        return self.mean + rng.standard_normal((count, len(sd))) @ root.T * sd
+
+    def only(self, places: Sequence[int]) -> Posterior:
+        """Some of the variables, whatever the others are."""
+        names, keys = tuple(self.names[i] for i in places), tuple(self.keys[i] for i in places)
+        return Posterior(names, keys, self.mean[list(places)], self.covariance[np.ix_(places, places)])
+
+    def table(self) -> dict[str, Any]:
+        """As fit.toml has it: the lower triangle of the correlation, whose thin directions need all digits."""
+        sd = np.sqrt(np.diag(self.covariance))
+        correlation = self.covariance / np.outer(sd, sd)
+        return {
+            "variables": list(self.names),
+            "keys": [list(keys) for keys in self.keys],
+            "value": self.mean.tolist(),
+            "sd": sd.tolist(),
+            "correlation": [correlation[i, : i + 1].tolist() for i in range(len(sd))],
+        }
+
+    @classmethod
+    def from_table(cls, table: Mapping[str, Any], where: str) -> Posterior:
+        """Raises ValueError for what is no such table."""
+        try:
+            names, keys = tuple(map(str, table["variables"])), tuple(tuple(map(str, k)) for k in table["keys"])
+            mean, sd = (np.array(table[name], float) for name in ("value", "sd"))
+            lower = np.zeros((len(names), len(names)))
+            for i, row in enumerate(table["correlation"]):
+                lower[i, : i + 1] = row
+            correlation = lower + np.tril(lower, -1).T
+            shapes = {len(names), len(keys), len(mean), len(sd), len(table["correlation"])}
+            whole = len(shapes) == 1 and np.isfinite([*mean, *sd]).all() and (sd > 0).all()
+            if not whole or np.abs(np.diag(correlation) - 1).max(initial=0) > 1e-9 or np.abs(correlation).max() > 1.01:
+                raise ValueError("numbers that do not belong together")
+        except (KeyError, TypeError, ValueError, IndexError) as error:
+            raise ValueError(
+                f"{where}: [posterior]: {error}; allowed: variables, keys, value, sd and the lower triangle of their "
+                "correlation, as `optics calibrate` writes them"
+            ) from error
+        return cls(names, keys, mean, correlation * np.outer(sd, sd))
+
+
+def posterior_of(fit: Fit) -> Posterior | None:
+    """That of a fit; None without a linearisation, or where no value is shared by all frames."""
+    covariance = fit.posterior
+    shared = [i for i, v in enumerate(fit.variables) if v.frames is None]
+    if covariance is None or not shared:
+        return None
+    names, keys = tuple(v.name for v in fit.variables), tuple(v.keys for v in fit.variables)
+    return Posterior(names, keys, np.asarray(fit.estimate, float), covariance).only(shared)
+
+
 def fit_record(fit: Fit | Mapping, frame_names: Sequence[str] = ()) -> dict:
     """A fit as plain data; a mapping of that form is completed and returned.
 
     variables   name, keys, unit, value, sd, frames (names or None), prior, pull, neutral, plausible, bounds, at_bound
     tempering   Fit.tempering, which `sd` counts
+    posterior   Posterior, or None
     pull        (value - prior mean) / prior sd: how far the data moved it from what was known
     """
     blank: dict[str, Any] = {
@@ -35,6 +106,7 @@ def fit_record(fit: Fit | Mapping, frame_names: Sequence[str] = ()) -> dict:
         "reason": "",
         "warnings": [],
         "tempering": 1.0,
+        "posterior": None,
     }
     if isinstance(fit, Mapping):
         return {**blank, **fit}
@@ -79,6 +151,7 @@ def fit_record(fit: Fit | Mapping, frame_names: Sequence[str] = ()) -> dict:
         "reason": str(fit.reason),
         "warnings": list(getattr(fit, "warnings", ()) or ()),
         "tempering": fit.tempering,
+        "posterior": posterior_of(fit),
     }
 
 
@@ -134,6 +207,9 @@ def fit_toml(record: Mapping, name: str = "", origin: Mapping[str, Mapping] | No
         if value is not None:
             fit.add(key, value)
     document.add("fit", fit)
+    if record["posterior"] is not None:
+        document.add("posterior", tomlkit.item(record["posterior"].table()))
+        document["posterior"].comment("joint covariance of values that all frames share: optics.study.fit_files")
     if origin.get("sensor"):
         document.add("sensor", tomlkit.item(dict(origin["sensor"])))
     return f"{tomlkit.dumps(document).rstrip()}\n\n{END}\n"
@@ -141,11 +217,11 @@ def fit_toml(record: Mapping, name: str = "", origin: Mapping[str, Mapping] | No
 
 WHOLE = "Whole only with its last line."  # begins a file that ends with END
 END = "# end"
-TABLES = ("parameters", "uncertainty", "frames", "frames_uncertainty", "fit", "sensor")
+TABLES = ("parameters", "uncertainty", "frames", "frames_uncertainty", "fit", "posterior", "sensor")
 
 
 def read_fit(file: str | Path) -> dict[str, dict]:
-    """fit.toml as plain dictionaries: parameters, uncertainty, frames, frames_uncertainty, fit, sensor.
+    """fit.toml as plain dictionaries: parameters, uncertainty, frames, frames_uncertainty, fit, posterior, sensor.
 
     file   a fit.toml, or the folder of a study, whose last step is taken
 

@@ -1,6 +1,7 @@
 """A batch ends the same, whatever happened on the way: kills, shards, workers, damage."""
 
 import csv
+import dataclasses
 import hashlib
 import json
 import os
@@ -20,6 +21,8 @@ from optics.errors import OutputExists
 from optics.files import exr
 from optics.light.rendering import RenderJob
 from optics.study import batch
+from optics.study.blocks import TRIES, Blocks
+from optics.study.engines import EngineFailed, Local, work_through
 
 JOB = """
 scene = "gelsight"
@@ -193,6 +196,10 @@ def test_shards_are_together_the_whole(whole, job):
     assert last.complete and content(last.folder) == content(whole)
 
 
+def recorded(folder):
+    return Blocks(folder, TOTAL).counts().recorded
+
+
 def command(job, *options):
     return [sys.executable, "-m", "optics.cli", "batch", str(job), *options]
 
@@ -208,9 +215,8 @@ def started(job, *options):
         env={**os.environ, "PYTHONPATH": str(Path(batch.__file__).parents[2])},
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
-    manifest = job.parent / "out" / "manifest.jsonl"
     deadline = time.monotonic() + 60
-    while not manifest.exists() or manifest.read_text().count("\n") < 3:
+    while recorded(job.parent / "out") < 3:
         assert process.poll() is None and time.monotonic() < deadline, process.communicate()
         time.sleep(0.01)
     return process
@@ -240,10 +246,10 @@ def test_killed_in_the_middle_and_resumed(whole, job):
         assert time.monotonic() < deadline, "workers outlive the process that started them"
         time.sleep(0.05)
     out = job.parent / "out"
-    done = (out / "manifest.jsonl").read_text().count("\n")
+    done = recorded(out)
     assert 3 <= done < TOTAL
     (out / "images" / ".000009.0123456789abcdef.exr").write_bytes(b"half an image")  # as a kill in mid-write leaves it
-    with open(out / "manifest.jsonl", "a") as file:
+    with open(out / ".parts" / "00009.part", "a") as file:
         file.write('{"index": 9, "sam')
     result = batch.run(job, workers=1)
     assert result.complete and result.made == TOTAL - done
@@ -305,26 +311,87 @@ def test_a_changed_plugin_is_another_job(whole, tmp_path, monkeypatch):
         batch.run(tmp_path / "job.toml", workers=1)
 
 
-def test_a_sample_that_fails_is_named_and_the_others_are_kept(job, monkeypatch):
-    make = batch.Maker.make
+def failing(monkeypatch, error, often=99):
+    """Sample 2 ends in an error, so many times; returns the indices that were begun."""
+    make, begun = batch.Maker.make, []
 
-    def failing(self, index):
-        if index == 2:
-            raise OSError(28, "No space left on device")
+    def fails(self, index):
+        begun.append(index)
+        if index == 2 and begun.count(2) <= often:
+            raise error
         return make(self, index)
 
-    monkeypatch.setattr(batch.Maker, "make", failing)
-    with pytest.raises(batch.SampleFailed, match=r"sample 2 \(gel.press_x = .*No space left on device; what was made"):
+    monkeypatch.setattr(batch.Maker, "make", fails)
+    return begun
+
+
+def test_a_sample_that_fails_is_named_and_the_others_are_made(whole, job, monkeypatch):
+    begun = failing(monkeypatch, RuntimeError("no such press"))
+    with pytest.raises(
+        batch.SampleFailed, match=r"sample 2 \(gel.press_x = .*\): RuntimeError: no such press; what was made is kept"
+    ):
         batch.run(job, workers=1)
-    assert (job.parent / "out" / "manifest.jsonl").read_text().count("\n") == 2
+    assert begun.count(2) == TRIES and sorted({*begun}) == list(range(TOTAL))
+    out = job.parent / "out"
+    assert recorded(out) == TOTAL - 1 and not (out / "manifest.jsonl").exists()
+    monkeypatch.undo()
+    assert batch.run(job, workers=1).made == 1 and content(out) == content(whole)
 
 
-def test_one_process_per_shard(whole, job):
-    folder = whole
-    with batch._alone(folder, (1, 1)), pytest.raises(OutputExists, match="another process works on shard 1/1"):
-        batch.run(whole.parent / "job.toml", workers=1)
-    with batch._alone(folder, (1, 1)):
-        assert batch.run(whole.parent / "job.toml", (1, 2), workers=1).made == 0
+def test_a_sample_that_fails_once_is_made(whole, job, monkeypatch):
+    begun = failing(monkeypatch, RuntimeError("a file server that hiccups"), often=1)
+    assert batch.run(job, workers=1).complete and begun.count(2) == 2
+    assert content(job.parent / "out") == content(whole)
+
+
+def test_a_full_disk_ends_the_run_at_once(whole, job, monkeypatch):
+    begun = failing(monkeypatch, OSError(28, "No space left on device"))
+    with pytest.raises(batch.SampleFailed, match=r"sample 2 \(.*No space left on device; what was made is kept"):
+        batch.run(job, workers=1)
+    assert begun == [0, 1, 2] and recorded(job.parent / "out") == 2
+    monkeypatch.undo()
+    assert batch.run(job, workers=1).made == TOTAL - 2 and content(job.parent / "out") == content(whole)
+
+
+def test_commands_at_once_share_the_work(whole, job):
+    """A block that another worker is at is left to it, and is made where that one dies."""
+    first = started(job, "--workers", "1")
+    first.send_signal(signal.SIGSTOP)  # it keeps its lock
+    blocks = Blocks(job.parent / "out", TOTAL)
+    for workers in (1, 2):
+        assert not batch.run(job, workers=workers).complete
+        assert recorded(job.parent / "out") == TOTAL - 1, "all but the one that is held"
+    first.kill()
+    first.communicate()
+    result = batch.run(job, workers=1)
+    assert (result.made, result.complete) == (1, True) and not blocks.parts.exists()
+    assert content(job.parent / "out") == content(whole)
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for workers in /proc")
+def test_a_worker_that_is_killed_is_replaced(whole, job):
+    process = started(job, "--workers", "2", "--json")
+    killed = [pid for pid in children(process.pid) if "spawn_main" in Path(f"/proc/{pid}/cmdline").read_text()]
+    os.kill(killed[0], signal.SIGKILL)
+    out, err = process.communicate(timeout=120)
+    assert process.returncode == 0 and json.loads(out)["complete"], err
+    assert content(job.parent / "out") == content(whole)
+
+
+def test_workers_are_recycled(whole, job):
+    states = []
+    result = batch.run(job, workers=2, recycle=3, watch=states.append)
+    assert result.complete and content(result.folder) == content(whole)
+    assert [s.done for s in states] == sorted(s.done for s in states) and states[-1].done == TOTAL
+    assert max(s.workers for s in states) == 2 and {s.died for s in states} == {0}
+
+
+def test_workers_that_cannot_start_are_reported(job, monkeypatch):
+    batch.run(job, (1, 4), workers=1)
+    note = job.parent / "out" / "job.json"
+    broken = dataclasses.replace(batch.Life(batch.read(job), job, None, (1, 1), "run"), plugins=[job.parent / "absent"])
+    with pytest.raises(EngineFailed, match=r"workers died before they began a sample: .*absent"):
+        work_through(Local(1, {}, note.parent), broken, Blocks(note.parent, TOTAL), 100)
 
 
 def test_a_stock_scene_is_the_same_bit_by_bit(tmp_path):

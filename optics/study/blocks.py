@@ -1,0 +1,332 @@
+"""Which samples of a batch are recorded, and who makes the next: blocks of samples that any number of workers share.
+
+The folder of a batch is all that workers have in common, so that every engine (optics.study.engines) and any number of
+commands at once may work on it. Samples are cut into blocks of consecutive indices. A worker claims a block by a lock,
+which the system frees however the worker ends; what it made is appended to the block's own file. In `.parts`:
+
+    00012.lock     held by the worker that is at block 12
+    00012.part     lines of a block in the making: {"try": index, "run": ...} before a sample, its record after it, or
+                   {"failed": why, "index": ..., "run": ...}
+    00012.jsonl    the records of a complete block
+
+Once every block is complete, all records stand in manifest.jsonl in their order, and `.parts` is gone. On a file
+system without locks two workers may make the same sample: both write the same bytes, and one record counts."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TextIO
+
+from optics.errors import OutputExists
+from optics.files.output import alone, file_hash, replacing, write_text
+
+BLOCKS = (
+    256  # blocks that a job has at least, where it has so many samples: twenty workers end within 5 % of each other
+)
+SIZE_MOST = 1000  # samples of a block: a million have a thousand files of records
+TRIES = 3  # of one sample in one run, whatever ended them: an error, or a worker that died
+
+Record = dict[str, Any]
+
+
+class SampleFailed(RuntimeError):
+    """A sample that could not be made; the others are kept."""
+
+
+class DiskFull(SampleFailed):
+    """A sample that found no space; no other one will."""
+
+
+@dataclass
+class Block:
+    """A block that is claimed.
+
+    records   index -> record of what is made
+    tries     index -> how often this run began it
+    failures  index -> why the last try of this run ended in an error
+    """
+
+    samples: range
+    file: Path
+    run: str
+    records: dict[int, Record] = field(default_factory=dict)
+    tries: Counter[int] = field(default_factory=Counter)
+    failures: dict[int, str] = field(default_factory=dict)
+    lines: TextIO | None = None
+
+    @property
+    def wanted(self) -> list[int]:
+        """Samples to be made: without a record, and not begun too often."""
+        return [i for i in self.samples if i not in self.records and self.tries[i] < TRIES]
+
+    @property
+    def given_up(self) -> list[int]:
+        return [i for i in self.samples if i not in self.records and self.tries[i] >= TRIES]
+
+    def begin(self, index: int) -> None:
+        self._write({"try": index, "run": self.run})
+        self.tries[index] += 1
+
+    def add(self, record: Record) -> None:
+        self._write(record)
+        self.records[record["index"]] = record
+
+    def fail(self, index: int, why: str) -> None:
+        self._write({"failed": why, "index": index, "run": self.run})
+        self.failures[index] = why
+
+    def _write(self, line: Mapping) -> None:
+        if self.lines is None:
+            self.lines = open(self.file, "a", encoding="utf-8")  # noqa: SIM115  the claim closes it
+            if self.lines.tell():
+                self.lines.write("\n")  # ends a line that a killed worker left incomplete
+        self.lines.write(json.dumps(line, sort_keys=True) + "\n")
+        self.lines.flush()
+
+
+@dataclass(frozen=True)
+class Counts:
+    """Samples of a shard: recorded, begun too often, and tries of this run."""
+
+    recorded: int
+    given_up: int
+    tries: int
+
+
+class Blocks:
+    """The blocks of a batch's folder.
+
+    total   samples of the job
+    shard   (k, n): every n-th block from the k-th on
+    run     names the run whose tries count
+    """
+
+    def __init__(self, folder: Path, total: int, shard: tuple[int, int] = (1, 1), run: str = ""):
+        self.folder, self.total, self.shard, self.run = folder, total, shard, run
+        self.size = max(1, min(SIZE_MOST, total // BLOCKS))
+        self.count = -(-total // self.size)
+        self.numbers = range(shard[0] - 1, self.count, shard[1])
+        self.parts, self.manifest = folder / ".parts", folder / "manifest.jsonl"
+
+    def samples(self, number: int) -> range:
+        return range(number * self.size, min(self.total, (number + 1) * self.size))
+
+    @property
+    def own(self) -> int:
+        """Samples of the shard."""
+        return sum(len(self.samples(n)) for n in self.numbers)
+
+    @property
+    def finished(self) -> bool:
+        return self.manifest.is_file()
+
+    def file(self, number: int, kind: str) -> Path:
+        return self.parts / f"{number:05d}.{kind}"
+
+    def complete(self) -> set[int]:
+        """Numbers of complete blocks."""
+        if self.finished:
+            return set(range(self.count))
+        return {int(f.stem) for f in self.parts.glob("*.jsonl")}
+
+    # -- work ---------------------------------------------------------------------------------------------------------
+    @contextmanager
+    def claim(self, number: int) -> Iterator[Block | None]:
+        """A block to work on; None where another worker is at it, or where it is complete."""
+        self.parts.mkdir(exist_ok=True)
+        with ExitStack() as held:
+            try:
+                held.enter_context(alone(self.file(number, "lock"), ""))
+            except OutputExists:
+                yield None
+                return
+            block = self.read(number)
+            # In this order: records are gone from `.parts` only after they stand in the manifest.
+            if self.file(number, "jsonl").exists() or self.finished:
+                yield None
+                return
+            try:
+                yield block
+            finally:
+                if block.lines is not None:
+                    block.lines.close()
+                if len(block.records) == len(block.samples):
+                    write_text(self.file(number, "jsonl"), text(block.records))
+                    block.file.unlink(missing_ok=True)
+
+    def read(self, number: int) -> Block:
+        """What is recorded of a block, which others may be writing."""
+        part = self.file(number, "part")
+        block = Block(self.samples(number), part, self.run)
+        for line in _lines(self.file(number, "jsonl")) + _lines(part):
+            if "failed" in line:
+                if line.get("run") == self.run:
+                    block.failures[line["index"]] = line["failed"]
+            elif "try" in line:
+                block.tries[line["try"]] += line.get("run") == self.run
+            elif line["index"] in block.samples:
+                block.records[line["index"]] = line
+        return block
+
+    def counts(self) -> Counts:
+        if self.finished:
+            return Counts(self.own, 0, 0)
+        done = self.complete()
+        recorded = sum(len(self.samples(n)) for n in self.numbers if n in done)
+        open_blocks = [self.read(n) for n in self.opened() if n not in done]
+        return Counts(
+            recorded + sum(len(b.records) for b in open_blocks),
+            sum(len(b.given_up) for b in open_blocks),
+            sum(sum(b.tries.values()) for b in open_blocks),
+        )
+
+    def opened(self) -> list[int]:
+        """Blocks of the shard that somebody has begun and not completed."""
+        return sorted(n for n in (int(f.stem) for f in self.parts.glob("*.part")) if n in self.numbers)
+
+    def failures(self) -> dict[int, str]:
+        """Index -> why, of samples of the shard that were begun too often."""
+        return {
+            i: block.failures.get(i, "its worker died")
+            for n in self.opened()
+            for block in [self.read(n)]
+            for i in block.given_up
+        }
+
+    # -- the folder ---------------------------------------------------------------------------------------------------
+    def verify(self, progress: Any = None) -> None:
+        """Compare every file of the shard's records with its size and hash; what differs counts as not made. Records of
+        blocks that another worker is at are left to it."""
+        if self.finished and not self._verify_manifest(progress):
+            return
+        for file in self.folder.glob("manifest*.jsonl"):  # unfinished ones are those of earlier versions
+            self._reopen(file)
+        checked = 0
+        for number in self.numbers:
+            for kind in ("part", "jsonl"):
+                if not self.file(number, kind).exists():
+                    continue
+                block = self.read(number)
+                bad = {i for i, record in block.records.items() if not stands(self.folder, record)}
+                checked += len(block.records)
+                if progress:
+                    progress("checking what is there", checked, self.own)
+                if bad:
+                    self._drop(number, bad)
+                break
+
+    def _verify_manifest(self, progress: Any) -> bool:
+        """Whether a finished batch must be opened again."""
+        known = 0
+        with open(self.manifest, encoding="utf-8") as lines:
+            for line in lines:
+                record = _record(line)
+                if record is None or record["index"] != known:
+                    return True
+                known += 1
+                if (record["index"] // self.size) in self.numbers and not stands(self.folder, record):
+                    return True
+                if progress:
+                    progress("checking what is there", known, self.total)
+        if known != self.total:
+            return True
+        shutil.rmtree(self.parts, ignore_errors=True)
+        return False
+
+    def _reopen(self, manifest: Path) -> None:
+        """Take the records of a manifest back into blocks."""
+        records: dict[int, dict[int, Record]] = {}
+        for record in _lines(manifest):
+            records.setdefault(record["index"] // self.size, {})[record["index"]] = record
+        self.parts.mkdir(exist_ok=True)
+        for number, own in records.items():
+            if number < self.count and not self.file(number, "jsonl").exists():
+                self._store(number, {**own, **self.read(number).records})
+        manifest.with_suffix(".csv").unlink(missing_ok=True)
+        manifest.unlink()
+
+    def _drop(self, number: int, bad: set[int]) -> None:
+        try:
+            with alone(self.file(number, "lock"), ""):
+                block = self.read(number)
+                self._store(number, {i: r for i, r in block.records.items() if i not in bad})
+        except OutputExists:
+            return
+
+    def _store(self, number: int, records: Mapping[int, Record]) -> None:
+        """Replace all that is recorded of a block."""
+        whole = len(records) == len(self.samples(number))
+        write_text(self.file(number, "jsonl" if whole else "part"), text(records))
+        self.file(number, "part" if whole else "jsonl").unlink(missing_ok=True)
+
+    def sweep(self) -> None:
+        """Remove what workers that died left of the shard's samples, but for blocks that somebody is at."""
+        left: dict[int, list[Path]] = {}
+        for file in (self.folder / "images").glob(".*"):
+            index = file.name[1:].split(".")[0].split("-")[0]
+            if index.isdecimal() and int(index) // self.size in self.numbers:
+                left.setdefault(int(index) // self.size, []).append(file)
+        for number, files in left.items():
+            self.parts.mkdir(exist_ok=True)
+            try:
+                with alone(self.file(number, "lock"), ""):
+                    for file in files:
+                        file.unlink(missing_ok=True)
+            except OutputExists:
+                continue
+
+    def records(self) -> Iterator[Record]:
+        """All records of the job that there are, in their order."""
+        if self.finished:
+            with open(self.manifest, encoding="utf-8") as lines:
+                yield from filter(None, map(_record, lines))
+            return
+        for number in range(self.count):
+            block = self.read(number)
+            yield from (block.records[i] for i in sorted(block.records))
+
+    def finish(self) -> bool:
+        """Write one ordered manifest once every block of the job is complete; whether it is."""
+        if not self.finished:
+            if self.complete() < set(range(self.count)):
+                return False
+            with replacing(self.manifest) as file, open(file, "w", encoding="utf-8") as out:
+                for number in range(self.count):
+                    out.write(self.file(number, "jsonl").read_text(encoding="utf-8"))
+        shutil.rmtree(self.parts, ignore_errors=True)
+        return True
+
+
+def stands(folder: Path, record: Mapping) -> bool:
+    """Whether every file of a record is there, with its size and hash."""
+    for entry in record["files"].values():
+        file = folder / entry["file"]
+        if not file.is_file() or file.stat().st_size != entry["size"] or file_hash(file) != entry["hash"]:
+            return False
+    return True
+
+
+def text(records: Mapping[int, Record]) -> str:
+    return "".join(json.dumps(records[i], sort_keys=True) + "\n" for i in sorted(records))
+
+
+def _record(line: str) -> Record | None:
+    """A line as a record; None for one that a killed worker left incomplete."""
+    try:
+        record = json.loads(line)
+        return record if isinstance(record, dict) and ("index" in record or "try" in record) else None
+    except ValueError:
+        return None
+
+
+def _lines(file: Path) -> list[Record]:
+    try:
+        return [record for line in file.read_text(encoding="utf-8").splitlines() if (record := _record(line))]
+    except FileNotFoundError:
+        return []

@@ -1,0 +1,226 @@
+"""Exports hold what the master files hold, as the libraries that learners use read them."""
+
+import hashlib
+import io
+import json
+import tarfile
+
+import numpy as np
+import OpenEXR
+import pytest
+from PIL import Image
+
+from optics.cli import main
+from optics.errors import OutputExists
+from optics.study import batch, export
+
+h5py = pytest.importorskip("h5py")
+zarr = pytest.importorskip("zarr")
+parquet = pytest.importorskip("pyarrow.parquet")
+
+JOB = """
+scene = "gelsight"
+out = "out"
+seed = 3
+outputs = ["exr", "png", "dn"]
+[defines]
+width = 20
+height = 16
+[parameters]
+"gel.indenter_size" = 2.0
+[sample]
+"gel.press_x" = { uniform = [-4, 4] }
+"gel.indenter" = { choice = ["sphere", "cube"] }
+"led_1.power" = { grid = [0.5, 1.0] }
+"gel.press_depth" = { grid = [0.2, 0.4, 0.6] }
+[noise]
+system_gain = 0.05
+dark_noise = 1.0
+black_level = 8.0
+saturation = 255.0
+prnu = 0.01
+"""
+TOTAL = 6
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("export")
+    (folder / "job.toml").write_text(JOB)
+    assert batch.run(folder / "job.toml", workers=1).complete
+    return folder / "out"
+
+
+def png(made, index, end=""):
+    with Image.open(made / "images" / f"{index:06d}{end}.png") as image:
+        return np.asarray(image)
+
+
+def channel(made, index, name):
+    """Read by OpenEXR alone."""
+    with OpenEXR.File(str(made / "images" / f"{index:06d}.exr"), separate_channels=True) as file:
+        return np.array(file.channels()[name].pixels)
+
+
+def records(made):
+    return [json.loads(line) for line in (made / "manifest.jsonl").read_text().splitlines()]
+
+
+def content(folder):
+    return {
+        p.relative_to(folder).as_posix(): hashlib.sha256(p.read_bytes()).hexdigest()
+        for p in sorted(folder.rglob("*"))
+        if p.is_file()
+    }
+
+
+def test_hdf5(made, tmp_path):
+    card = export.export(made, tmp_path / "x", "hdf5", images="float", per_file=4)
+    seen = []
+    for name in sorted(p.name for p in (tmp_path / "x").glob("*.h5")):
+        with h5py.File(tmp_path / "x" / name) as file:
+            for row, index in enumerate(file["index"][:]):
+                seen.append(index)
+                np.testing.assert_array_equal(file["depth"][row], channel(made, index, "depth.Z"))
+                np.testing.assert_array_equal(file["normal"][row, ..., 1], channel(made, index, "normal.Y"))
+                np.testing.assert_array_equal(file["led_2"][row, ..., 0], channel(made, index, "led_2.R"))
+                for nm in (610, 540, 460):
+                    stored = file["radiance"][row, ..., card["bands_nm"].index(nm)]
+                    np.testing.assert_array_equal(stored, channel(made, index, f"S0.{nm},000000nm"))
+                drawn = records(made)[index]["sample"]
+                assert file["values/gel.press_x"][row] == drawn["gel.press_x"]
+                assert file["values/gel.indenter"].asstr()[row] == drawn["gel.indenter"]
+            assert file["values/gel.press_x"].attrs["unit"] == "mm"
+    assert seen == list(range(TOTAL))
+
+
+def test_zarr(made, tmp_path):
+    export.export(made, tmp_path / "x", "zarr", per_file=4)
+    root = zarr.open_group(str(tmp_path / "x" / "samples.zarr"), mode="r")
+    words = root["values/gel.indenter"].attrs["words"]
+    for index, record in enumerate(records(made)):
+        np.testing.assert_array_equal(root["camera_noisy"][index], png(made, index, "-dn"))
+        np.testing.assert_array_equal(root["camera"][index], png(made, index))
+        assert root["values/gel.press_x"][index] == record["sample"]["gel.press_x"] and root["index"][index] == index
+        assert words[int(root["values/gel.indenter"][index])] == record["sample"]["gel.indenter"]
+
+
+@pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")
+def test_webdataset(made, tmp_path):
+    """The warnings are of webdataset, which leaves its files to the garbage collector."""
+    webdataset = pytest.importorskip("webdataset")
+    card = export.export(made, tmp_path / "x", "webdataset", per_file=4)
+    assert card["files"] == "samples-{000000..000001}.tar"
+    reader = webdataset.WebDataset(str(tmp_path / "x" / card["files"]), shardshuffle=False, empty_check=False)
+    items = list(reader.decode("rgb8"))
+    assert [item["json"]["index"] for item in items] == list(range(TOTAL))
+    for index, (item, record) in enumerate(zip(items, records(made))):
+        np.testing.assert_array_equal(item["camera_noisy.png"], png(made, index, "-dn"))
+        assert item["json"]["gel.press_x"] == record["sample"]["gel.press_x"]
+
+
+def test_arrays_of_a_tar_are_npy(made, tmp_path):
+    export.export(made, tmp_path / "x", "webdataset", images="float", arrays=["depth", "led_1"])
+    with tarfile.open(tmp_path / "x" / "samples-000000.tar") as tar:
+        assert len(tar.getnames()) == 3 * TOTAL
+        stored = np.load(io.BytesIO(tar.extractfile("00000004.depth.npy").read()))
+    np.testing.assert_array_equal(stored, channel(made, 4, "depth.Z"))
+
+
+def test_lerobot(made, tmp_path):
+    """Read by pyarrow; the library itself, which brings torch, reads it too (docs/batches.md says which version)."""
+    export.export(made, tmp_path / "x", "lerobot", per_file=4)
+    info = json.loads((tmp_path / "x/meta/info.json").read_text())
+    episodes = parquet.read_table(tmp_path / "x/meta/episodes").to_pylist()
+    assert info["total_episodes"] == 2 and [e["length"] for e in episodes] == [3, 3]
+    state = info["features"]["observation.state"]["names"]
+    rows = [
+        row
+        for n in range(1 + max(e["data/file_index"] for e in episodes))
+        for row in parquet.read_table(
+            tmp_path / "x" / info["data_path"].format(chunk_index=0, file_index=n)
+        ).to_pylist()
+    ]
+    assert [(r["episode_index"], r["frame_index"]) for r in rows] == [(e, f) for e in range(2) for f in range(3)]
+    for index, (row, record) in enumerate(zip(rows, records(made))):
+        with Image.open(io.BytesIO(row["observation.images.camera"]["bytes"])) as image:
+            np.testing.assert_array_equal(np.asarray(image), png(made, index))
+        found = dict(zip(state, row["observation.state"]))
+        assert found["gel.press_x"] == pytest.approx(record["sample"]["gel.press_x"], rel=1e-6)  # float32
+        assert row["observation.gel.indenter"] == record["sample"]["gel.indenter"]
+        assert found["gel.press_depth"] == pytest.approx((0.2, 0.4, 0.6)[row["frame_index"]])
+    stats = json.loads((tmp_path / "x/meta/stats.json").read_text())["observation.images.camera"]
+    pixels = np.stack([png(made, i) for i in range(TOTAL)]) / 255.0
+    np.testing.assert_allclose(np.ravel(stats["mean"]), pixels.mean((0, 1, 2)), rtol=1e-12)
+    np.testing.assert_allclose(np.ravel(stats["std"]), pixels.std((0, 1, 2)), rtol=1e-9)
+
+
+def test_12_bits_stay_12_bits(tmp_path):
+    """DN beyond 8 bits are kept as they are; the 8-bit preview is not passed for the camera's DN."""
+    (tmp_path / "job.toml").write_text(JOB.replace("saturation = 255.0", "saturation = 4095.0"))
+    folder = batch.run(tmp_path / "job.toml", workers=1).folder
+    card = export.export(folder, tmp_path / "x", "hdf5")
+    assert list(card["arrays"]) == ["camera_noisy"] and card["arrays"]["camera_noisy"]["dtype"] == "uint16"
+    with h5py.File(tmp_path / "x/samples-000000.h5") as file:
+        stored = file["camera_noisy"][:]
+    assert 255 < stored.max() <= 4095
+    with pytest.raises(ValueError, match="camera_noisy has 16 bits, and images of LeRobot have 8; allowed: --images"):
+        export.export(folder, tmp_path / "y", "lerobot")
+
+
+@pytest.mark.parametrize("to", export.FORMATS)
+def test_an_export_that_was_cut_off_goes_on(made, tmp_path, monkeypatch, to):
+    whole = export.export(made, tmp_path / "whole", to, per_file=3)
+    write = export.FORMATS[to].write
+
+    def cut(self, number, items):
+        if number == 1:
+            next(iter(items))
+            raise KeyboardInterrupt
+        write(self, number, items)
+
+    monkeypatch.setattr(export.FORMATS[to], "write", cut)
+    with pytest.raises(KeyboardInterrupt):
+        export.export(made, tmp_path / "cut", to, per_file=3)
+    monkeypatch.undo()
+    assert not (tmp_path / "cut" / "card.json").exists()
+    assert export.export(made, tmp_path / "cut", to, per_file=3) == whole
+    apart = {k for k in content(tmp_path / "whole") if to == "hdf5" and k.endswith(".h5")}  # HDF5 keeps times
+    one, two = content(tmp_path / "whole"), content(tmp_path / "cut")
+    assert one.keys() == two.keys() and all(one[k] == two[k] for k in one.keys() - apart)
+    before = content(tmp_path / "cut")
+    export.export(made, tmp_path / "cut", to, per_file=3)
+    assert content(tmp_path / "cut") == before, "a finished export is left alone"
+    with pytest.raises(OutputExists, match="holds another export: changed per_file"):
+        export.export(made, tmp_path / "cut", to, per_file=6)
+
+
+def test_the_card_says_where_the_data_come_from(made, tmp_path):
+    card = export.export(made, tmp_path / "x", "webdataset", licence="CC-BY-4.0")
+    drawn = [r["sample"]["gel.press_x"] for r in records(made)]
+    value = card["values"]["gel.press_x"]
+    assert value["unit"] == "mm" and value["drawn"] == {"uniform": [-4.0, 4.0]}
+    assert (value["min"], value["max"]) == ([min(drawn)], [max(drawn)])
+    assert card["seed"] == 3 and card["licence"] == "CC-BY-4.0" and card["versions"]["mitsuba"]
+    page = (tmp_path / "x/card.md").read_text()
+    assert "CC-BY-4.0" in page and "| gel.press_x | mm | uniform [-4.0, 4.0] |" in page and "sphere (" in page
+
+
+def test_what_cannot_be_exported_is_said(made, tmp_path, capsys):
+    def said(*words):
+        assert main(["export", *map(str, words)]) != 0
+        return capsys.readouterr().err
+
+    out = tmp_path / "x"
+    assert "unknown format 'hdf6'; did you mean 'hdf5'" in said(made, "-o", out, "--to", "hdf6")
+    assert "unknown kind of images 'floats'; did you mean 'float'" in said(
+        made, "-o", out, "--to", "hdf5", "--images", "floats"
+    )
+    assert "unknown array 'deph'; did you mean 'depth'" in said(
+        made, "-o", out, "--to", "hdf5", "--images", "float", "--array", "deph"
+    )
+    assert "no batch: job.json is missing" in said(tmp_path, "-o", out, "--to", "hdf5")
+    assert not out.exists()
+    out.mkdir()
+    (out / "mine").write_text("")
+    assert "exists and holds no export" in said(made, "-o", out, "--to", "hdf5")
