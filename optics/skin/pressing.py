@@ -4,8 +4,8 @@
     held = drag(touch, (0.1, 0.0), twist, friction)          and the shear under a sideways move, with stick and slip
     ux, uy, uh = held.displacement(depth)                    of the skin at a depth, mm
 
-The skin is a stack of layers (optics.skin.stack) under a rigid, first frictionless indenter. With the influence K of the
-pressure on the face and the overlap o(x, y) by which the indenter would stand in the untouched skin,
+The skin is a stack of layers (optics.skin.stack) under a rigid, first frictionless indenter. With the influence K of
+the pressure on the face and the overlap o(x, y) by which the indenter would stand in the untouched skin,
 
     p >= 0,   u = K p >= o,   p (u - o) = 0        which is   min over p >= 0 of  p K p / 2 - o p
 
@@ -33,9 +33,11 @@ from functools import lru_cache
 
 import numpy as np
 
-from optics.skin.contact import LocalMap, local_axis
+from optics.skin.contact import LocalMap, Profile, local_axis
 from optics.skin.stack import Layer, fields, half_space, response
 
+NODES = 81  # across the grid of an indenter's contact: a ball's force is then true to 1e-3 of itself
+MARGIN = 0.15  # of the depth: beside a press a layer that keeps its volume may rise to meet the indenter
 DECAY = 24.0  # k times the uppermost thickness at the end of the Hankel integrals: exp(-2 k t) of their start is left
 STEPS = 3000  # of the descent, at most; 100 to 700 are usual, more on finer grids
 SETTLED = 1e-5  # change of the load over a step, relative: the force is then true to 1e-4 of itself
@@ -93,6 +95,34 @@ class Contact:
     def displacement(self, depth: float = 0.0) -> tuple[LocalMap, LocalMap, LocalMap]:
         """Displacement of the skin along x, y and inwards (mm) at a depth below the untouched face."""
         return fields(self.pressure, self.shear, self.pitch, self.stack, depth)
+
+
+@lru_cache(maxsize=32)
+def indent(profile: Profile, depth: float, stack: tuple[Layer, ...]) -> Contact:
+    """The contact of an indenter (optics.skin.contact.indenter_profile) whose lowest point is `depth` mm below the
+    untouched face; kept, do not write into it."""
+    from scipy.ndimage import map_coordinates
+
+    axis = profile.axis
+    reached = profile.block(max(depth, 1e-6) * (1 + MARGIN))
+    half = max((float(np.abs(axis[side][[0, -1]]).max()) for side in reached if len(axis[side])), default=0.0)
+    half = min(half + profile.pitch, float(axis[-1]))
+    local = np.linspace(-half, half, NODES)
+    at = (local - axis[0]) / profile.pitch
+    height = map_coordinates(profile.envelope, np.meshgrid(at, at, indexing="ij"), order=1)
+    return press(depth - height, 2 * half / (NODES - 1), stack)
+
+
+@lru_cache(maxsize=32)
+def dragged(touch: Contact, move: tuple[float, float], twist: float, friction: float) -> Contact:
+    """`drag`, kept."""
+    return drag(touch, move, twist, friction)
+
+
+@lru_cache(maxsize=32)
+def sheared(touch: Contact, depth: float) -> tuple[LocalMap, LocalMap, LocalMap]:
+    """What the shear alone does to the skin at a depth, along x, y and inwards, mm; kept."""
+    return fields(np.zeros_like(touch.pressure), touch.shear, touch.pitch, touch.stack, depth)
 
 
 def press(overlap: np.ndarray, pitch: float, stack: Sequence[Layer]) -> Contact:

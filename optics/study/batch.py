@@ -8,6 +8,7 @@
     seed    = 1
     lights  = "together"                       # or "each": one image per LED
     outputs = ["exr", "png", "dn"]             # everything; the camera's DN; the camera's DN with noise (needs [noise])
+    labels  = ["force", "pressure"]            # for learners (optics.light.labels); none without it
     [defines]                                  # of the XML's <default>s
     width = 320
     [parameters]                               # the same in every image
@@ -46,6 +47,8 @@ from optics.captures.noise import Noise
 from optics.errors import OutOfBounds, OutputExists, UnknownKey
 from optics.files import toml_checks as checks
 from optics.files.output import alone, check_folder, file_hash, replacing, write_text
+from optics.light import labels as labelling
+from optics.light.labels import LABELS
 from optics.light.rendering import LAYERS, RenderJob
 from optics.scene import loader as scenes
 from optics.scene.mitsuba_parts import DEFAULT_VARIANT
@@ -145,6 +148,7 @@ class Job(Strict):
     layers: list[Literal[LAYERS]] = Field(
         list(LAYERS), description=f"what an EXR holds beside the preview: {', '.join(LAYERS)}"
     )
+    labels: list[Literal[LABELS]] = Field([], description=f"a list of {', '.join(LABELS)}")
     spp: Annotated[int, Field(ge=1)] | None = Field(None, description="samples per pixel from 1 on: Monte Carlo")
     variant: str = Field(DEFAULT_VARIANT, description="a Mitsuba variant")
     defines: dict[str, Value | int] = Field({}, description="numbers or texts")
@@ -152,7 +156,7 @@ class Job(Strict):
     sample: dict[str, Distribution] = Field({}, description="key = {uniform = [low, high]}, ...")
     noise: Camera | None = Field(None, description="a table with " + ", ".join(Camera.model_fields))
 
-    @field_validator("outputs", "layers")
+    @field_validator("outputs", "layers", "labels")
     @classmethod
     def _once(cls, names):
         if len(set(names)) != len(names):
@@ -289,7 +293,12 @@ class Maker:
             raise BadJob(f'{file}: outputs names "dn", but neither [noise] nor the fit tells the noise of the camera')
         self.values = {**sensor.values, **job.parameters}
         self.images = RenderJob(
-            sensor.scene, spp=job.spp, layers=job.layers, black=sensor.black, saturation=sensor.saturation
+            sensor.scene,
+            spp=job.spp,
+            layers=job.layers,
+            black=sensor.black,
+            saturation=sensor.saturation,
+            labels=job.labels,
         )
         self.folder = folder_of(job, self.file)
 
@@ -343,7 +352,9 @@ class Maker:
         record = self.images.record
         numbers = {k: v for k, v in record["versions"].items() if k not in ("python", "system")}
         return {
-            "job": self.job.model_dump(mode="json", exclude={"out", "fit", "frame"}),
+            "job": self.job.model_dump(
+                mode="json", exclude={"out", "fit", "frame", *(() if self.job.labels else ("labels",))}
+            ),
             **({"fit": self.values} if self.job.fit is not None else {}),
             "scene": record["scene"],
             "plugins": record["plugins"],
@@ -355,19 +366,27 @@ class Maker:
         job = self.job
         values = job.values(index)
         lights = [None] if job.lights == "together" else list(self.images.scene.lights)
-        files = {}
+        files, told = {}, {}
         for led in lights:
             stem = self.folder / "images" / (f"{index:06d}" if led is None else f"{index:06d}-{led}")
             seed = int(job.rng(index, "render").integers(2**31))
             image = self.images.take({**self.values, **values}, seed, None if led is None else [led])
             for output in job.outputs:
-                path = self._write(image, output, stem, index)
-                files[output if led is None else f"{led}.{output}"] = {
-                    "file": path.relative_to(self.folder).as_posix(),
-                    "size": path.stat().st_size,
-                    "hash": file_hash(path),
-                }
-        return {"index": index, "sample": values, "files": files}
+                files[output if led is None else f"{led}.{output}"] = self._entry(
+                    self._write(image, output, stem, index)
+                )
+            told = image.labels.numbers  # of the press, whatever is lit
+        if job.labels and image.labels.arrays:
+            path = self.folder / "images" / f"{index:06d}.npz"
+            files["labels"] = self._entry(labelling.write(path, image.labels.arrays))
+        return {"index": index, "sample": values, "files": files, **({"labels": told} if job.labels else {})}
+
+    def _entry(self, path: Path) -> dict:
+        return {
+            "file": path.relative_to(self.folder).as_posix(),
+            "size": path.stat().st_size,
+            "hash": file_hash(path),
+        }
 
     def _write(self, image, output: str, stem: Path, index: int) -> Path:
         if output == "exr":
@@ -482,10 +501,15 @@ def _finish(folder: Path, job: Job) -> bool:
     keys, roles = list(job.parameters) + list(job.sample), list(next(iter(records.values()))["files"])
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(["index", *keys, *roles])
+    told = list(labelling.flat(records[min(records)].get("labels", {})))
+    writer.writerow(["index", *keys, *told, *roles])
     for index in sorted(records):
         values = {**job.parameters, **records[index]["sample"]}
-        writer.writerow([index, *(values[k] for k in keys), *(records[index]["files"][r]["file"] for r in roles)])
+        labels = labelling.flat(records[index].get("labels", {}))
+        files = records[index]["files"]
+        writer.writerow(
+            [index, *(values[k] for k in keys), *(labels.get(k) for k in told), *(files[r]["file"] for r in roles)]
+        )
     write_text(folder / "manifest.jsonl", _text(records))
     write_text(folder / "manifest.csv", out.getvalue())
     for part in folder.glob("manifest-*-of-*.jsonl"):

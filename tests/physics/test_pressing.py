@@ -1,5 +1,5 @@
-"""Elastic contact on a grid against closed forms (Hertz, flat punch, thin layer, Cattaneo and Mindlin, twist) and a skin
-with a stiff film against finite elements."""
+"""Elastic contact on a grid against closed forms (Hertz, flat punch, thin layer, Cattaneo and Mindlin, twist), and a
+skin with a stiff film against finite elements."""
 
 import math
 
@@ -35,9 +35,11 @@ def test_a_layer_on_a_rigid_base_meets_its_closed_form(poisson):
     # 1e-10: rounding, of a volume that cannot change under a wave 300 thicknesses long
     np.testing.assert_allclose(found.down, (1 - poisson) / (layer.shear * K) * down, rtol=1e-10)
     np.testing.assert_allclose(found.across, np.tanh(kt) / (layer.shear * K), rtol=1e-10)
-    np.testing.assert_allclose(found.side, found.lift, rtol=1e-9)  # Betti
+    np.testing.assert_allclose(found.side, found.lift, rtol=1e-9, atol=1e-30)  # Betti; 0 of short waves at nu = 1/2
     cut = response(K, (Layer(0.5, YOUNG, poisson), Layer(1.5, YOUNG, poisson)), 0.7)
-    np.testing.assert_allclose(cut, response(K, (layer,), 0.7), rtol=1e-9, atol=1e-30)  # a cut through a layer changes nothing
+    np.testing.assert_allclose(
+        cut, response(K, (layer,), 0.7), rtol=1e-9, atol=1e-30
+    )  # a cut through a layer changes nothing
     np.testing.assert_allclose(response(K, deep(poisson)), half_space(K, layer), rtol=1e-9, atol=1e-12)
 
 
@@ -71,7 +73,9 @@ def test_a_skin_with_a_stiff_film_against_finite_elements():
 
     def moduli(x):
         inside = [(x[1] > 2.5) & (x[1] < 2.7), ~((x[1] > 2.5) & (x[1] < 2.7))]
-        lame = [(m.young * m.poisson / ((1 + m.poisson) * (1 - 2 * m.poisson)), m.shear) for m in (layers[1], layers[0])]
+        lame = [
+            (m.young * m.poisson / ((1 + m.poisson) * (1 - 2 * m.poisson)), m.shear) for m in (layers[1], layers[0])
+        ]
         return tuple(sum(np.where(i, v[j], 0.0) for i, v in zip(inside, lame)) for j in (0, 1))
 
     @skfem.BilinearForm
@@ -98,7 +102,7 @@ def test_a_skin_with_a_stiff_film_against_finite_elements():
     for depth in (0.0, 2.5):
         points = np.stack([at, np.full(4, max(depth, 1e-6))])
         by_elements = (basis.probes(points) @ moved).reshape(2, -1)
-            ux, _, uh = fields(pressure, np.zeros((97, 97, 2)), 0.125, layers, depth)
+        ux, _, uh = fields(pressure, np.zeros((97, 97, 2)), 0.125, layers, depth)
         found = np.stack([surface(at, 0 * at, 0.0, 0.0, m) for m in (ux, uh)])
         # 1 %: elements of 0.25 mm under a pressure 1.2 mm wide
         np.testing.assert_allclose(found, by_elements, atol=0.01 * np.abs(by_elements).max())
