@@ -38,8 +38,8 @@ def parameters_tested(kind):
 
 NUMBERS = [(kind, p.name) for kind in PARTS if kind not in MONTE_CARLO for p in parameters_tested(kind) if p.is_number]
 LAYERS = [kind for kind in PARTS if REGISTRY.parts[kind].mueller is not None]
-# of forces, which no image shows, and of a drag's slip; a twist's rims gain on one side what they lose on the other. The
-# physics tests hold them against closed forms
+# of forces, which no image shows, and of a drag's slip; of a twist, one rim gains what another loses. The physics
+# tests hold them against closed forms
 LABELS_ONLY = tuple(("gel", name) for name in ("young", "poisson", "friction", "twist"))
 DRAGGING = ("drag_x", "drag_y")  # of a gel: they move what it carries
 POWERS = ("power", "band power")  # roles
