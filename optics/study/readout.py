@@ -11,7 +11,7 @@ what is not there. The arithmetic is that of optics.readers; this only reads fil
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -138,7 +138,7 @@ def grid(
     together. still: images with nothing near; thresholds: those of `optics.readers.grid.read_sequence` by name."""
     bits: set[int | None] = set()
 
-    def colours(of: Mapping[str, Path]):
+    def colours(of: Mapping[str, Path]) -> Iterator[np.ndarray]:
         for name, file in of.items():
             image, depth = read_image(file, name)
             bits.add(depth)
@@ -154,7 +154,7 @@ def grid(
     references = grid_reader.references(still_frames, groups, saturation=top)
     names = list(files)
 
-    def counted():
+    def counted() -> Iterator[np.ndarray]:
         for i, image in enumerate(colours(files)):
             if progress:
                 progress("grid", i + 1, len(names))
@@ -200,7 +200,7 @@ def likeness(files: Mapping[str, Path], reference: Path, progress: Progress | No
     return rows
 
 
-def _numbers(**values: float) -> Row:
+def _numbers(**values: float | np.ndarray) -> Row:
     """Numbers for JSON: None where there is none."""
     return {name: float(value) if np.isfinite(value) else None for name, value in values.items()}
 
