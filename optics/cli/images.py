@@ -58,6 +58,15 @@ def render(
         ),
     ] = None,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Of everything random.")] = 0,
+    labels: Annotated[
+        str | None,
+        typer.Option(
+            "--labels",
+            metavar="NAMES",
+            help="Labels for learners, by commas: force, pressure, displacement, height, pose, markers; or all that "
+            "the scene has. Channels in the EXR, numbers in FILE.json, arrays in FILE.npz.",
+        ),
+    ] = None,
     plugins: Plugins = None,
     variant: Variant = None,
     force: Force = False,
@@ -68,6 +77,7 @@ def render(
     The channels are radiance (with layers: Stokes vectors) per band, depth, normals, contact, one image per LED,
     variances; optics.light.rendering lists them."""
     from optics.files.output import claim, together, write_json
+    from optics.light import labels as labelling
     from optics.light.rendering import RenderJob
 
     if output.suffix.lower() != ".exr":
@@ -76,15 +86,19 @@ def render(
         )
     record, preview = output.with_suffix(".json"), output.with_suffix(".png")
     maps = (output.with_suffix(".dolp.png"), output.with_suffix(".aolp.png"))
-    files = [output, record, *([preview] if png else []), *(maps if stokes else ())]
+    arrays = output.with_suffix(".npz")
+    files = [output, record, *([preview] if png else []), *(maps if stokes else ()), *([arrays] if labels else [])]
     claim(files, force)
     sensor = load_sensor(scene, fit, frame, define, plugins, variant)
+    named = labelling.named(sensor.scene, labels)
     chosen = sensor.scene.check(sensor.scene.spread(settings(sets), "--set"), "--set")
     values = {**sensor.values, **chosen}
     if chosen:
         sensor.scene.check_press(values, "--set")
     clock = time.perf_counter()
-    images = RenderJob(sensor.scene, spp=spp, stokes=stokes, black=sensor.black, saturation=sensor.saturation)
+    images = RenderJob(
+        sensor.scene, spp=spp, stokes=stokes, black=sensor.black, saturation=sensor.saturation, labels=named
+    )
     with terminal.progress() as progress:
         image = images.take(values, seed, progress=progress)
     seconds = time.perf_counter() - clock
@@ -98,6 +112,8 @@ def render(
             write_maps(maps, list(bands), vectors)
         provenance: Any = image.header["provenance"]
         write_json(record, {**provenance, "command": ["optics", *sys.argv[1:]]})
+        if labels:
+            labelling.write(arrays, image.labels.arrays)
         image.write_exr(output)
     if as_json:
         return show(

@@ -9,6 +9,7 @@ layers as well. Every other Mitsuba scene, and a sensor beside stock lights or b
                                  `stokes`
     depth.Z                      mm from the camera along its axis; infinite where a ray met nothing
     normal.X, .Y, .Z             of the surface, in the scene's frame
+    pressure.Y, traction.X ...   labels that were asked for (optics.light.labels)
     contact.Y                    1 where the indenter touches what is seen
     led_1.R, .G, .B ...          what one LED sends, in the first three bands; with the ambient light they add up to S0
     camera.R, .G, .B             where channels are integrals over the wavelength: each before exposure and gain;
@@ -32,8 +33,10 @@ import numpy as np
 from optics.errors import BadScene
 from optics.files import exr
 from optics.files.output import file_hash, versions
+from optics.light import labels as labelling
 from optics.light import paths
 from optics.light.development import Developer
+from optics.light.labels import Labels
 from optics.light.monte_carlo import renderer_of
 from optics.light.renderer import Hits, Renderer, Sample
 from optics.scene.integral import FEW
@@ -55,11 +58,13 @@ class Rendering:
     header     EXR header
     camera     (H, W, C) DN of the camera, free of noise and not clipped; None for scenes without a camera of this
                program's
+    labels     what a learner is told beside it (optics.light.labels)
     """
 
     channels: dict[str, np.ndarray]
     header: dict[str, object] = field(default_factory=dict)
     camera: np.ndarray | None = None
+    labels: Labels = field(default_factory=Labels)
 
     def stokes(self) -> tuple[np.ndarray, np.ndarray]:
         """Bands in nm (B,) and Stokes vectors (H, W, B, 4); raises ValueError where the image has none."""
@@ -88,6 +93,7 @@ class RenderJob:
 
     black, saturation   DN, of the camera
     spp                 samples per pixel: render by Monte Carlo, even where LED by LED is possible
+    labels              what is known of the press besides (optics.light.labels.LABELS)
     stokes              S1 to S3 in every scene; without it, where there are layers or the integrator has `stokes`
     method              "LED by LED", "from lights and camera" (dielectric bodies), or why the scene goes through
                         `mi.render`
@@ -102,10 +108,12 @@ class RenderJob:
         saturation: float = 255.0,
         layers: Sequence[str] = LAYERS,
         stokes: bool = False,
+        labels: Sequence[str] = (),
     ):
         if spp is not None and not 1 <= spp <= SPP_MOST:
             raise ValueError(f"spp = {spp}; allowed: whole numbers from 1 to {SPP_MOST:,} (samples per pixel)")
-        self.scene, self.spp, self.layers = scene, spp, tuple(layers)
+        self.scene, self.spp, self.layers, self.labels = scene, spp, tuple(layers), tuple(labels)
+        labelling.check(scene, self.labels)
         self.base = scene.values()
         sensors = scene.mitsuba.sensors()
         if len(sensors) != 1:
@@ -186,7 +194,19 @@ class RenderJob:
         if pressed is not None or force is not None:
             newtons = pressed.force if pressed is not None else force()
             image.header["provenance"]["press"] = {"force": [float(f) for f in newtons], "unit": "N"}
+        if self.labels:
+            image.labels = self._labelled(now)
+            image.channels.update(image.labels.channels)
+            image.header["provenance"]["labels"] = image.labels.numbers
         return image
+
+    def _labelled(self, now: Mapping) -> Labels:
+        """The labels of the scene as it was rendered."""
+        position = seen = None
+        if self.scene.gel is not None:
+            hits = self.renderer.hits(now) if self.renderer is not None else self._hits()
+            position, seen = hits.position, labelling.on_skin(self.scene, hits)
+        return labelling.of(self.scene, position, seen, self.labels)
 
     def _exact(self, now: Mapping, seed: int) -> Rendering:
         renderer = self.renderer

@@ -105,6 +105,8 @@ def displaced(gel, x: np.ndarray, y: np.ndarray, depth: float) -> np.ndarray:
     if gel is not None and gel.map.values.any():
         press = gel.numbered("press x"), gel.numbered("press y")
         ux, uy, uz = (surface(x, y, *press, m) for m in _carried(gel.map, depth))
+        if hasattr(gel, "sheared"):  # a drag of the indenter, besides its dent
+            ux, uy, uz = (a + b for a, b in zip((ux, uy, uz), gel.sheared(x, y, depth)))
     return np.stack(np.broadcast_arrays(x + ux, y + uy, -depth - uz), -1)
 
 

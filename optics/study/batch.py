@@ -8,6 +8,7 @@
     seed    = 1
     lights  = "together"                       # or "each": one image per LED
     outputs = ["exr", "png", "dn"]             # everything; the camera's DN; the camera's DN with noise (needs [noise])
+    labels  = ["force", "pressure"]            # for learners (optics.light.labels); none without it
     [defines]                                  # of the XML's <default>s
     width = 320
     [parameters]                               # the same in every image
@@ -54,6 +55,8 @@ from optics.captures.noise import Noise
 from optics.errors import OutOfBounds, OutputExists, UnknownKey
 from optics.files import toml_checks as checks
 from optics.files.output import FULL, alone, check_folder, file_hash, replacing, write_json, write_text
+from optics.light import labels as labelling
+from optics.light.labels import LABELS
 from optics.light.rendering import LAYERS, RenderJob
 from optics.scene import loader as scenes
 from optics.scene.mitsuba_parts import DEFAULT_VARIANT
@@ -99,6 +102,7 @@ class Job(Strict):
     layers: list[Literal[LAYERS]] = Field(
         list(LAYERS), description=f"what an EXR holds beside the preview: {', '.join(LAYERS)}"
     )
+    labels: list[Literal[LABELS]] = Field([], description=f"a list of {', '.join(LABELS)}")
     spp: Annotated[int, Field(ge=1)] | None = Field(None, description="samples per pixel from 1 on: Monte Carlo")
     variant: str = Field(DEFAULT_VARIANT, description="a Mitsuba variant")
     defines: dict[str, Value | int] = Field({}, description="numbers or texts")
@@ -111,7 +115,7 @@ class Job(Strict):
     )
     noise: Camera | None = Field(None, description="a table with " + ", ".join(Camera.model_fields))
 
-    @field_validator("outputs", "layers")
+    @field_validator("outputs", "layers", "labels")
     @classmethod
     def _once(cls, names):
         if len(set(names)) != len(names):
@@ -265,7 +269,12 @@ class Maker:
             job, sensor.scene, self.values, self.file, sensor.posterior if job.posterior else None, sensor.levels
         )
         self.images = RenderJob(
-            sensor.scene, spp=job.spp, layers=job.layers, black=sensor.black, saturation=sensor.saturation
+            sensor.scene,
+            spp=job.spp,
+            layers=job.layers,
+            black=sensor.black,
+            saturation=sensor.saturation,
+            labels=job.labels,
         )
         self.folder = folder_of(job, self.file)
 
@@ -318,7 +327,9 @@ class Maker:
         record = self.images.record
         numbers = {k: v for k, v in record["versions"].items() if k not in ("python", "system")}
         return {
-            "job": self.job.model_dump(mode="json", exclude={"out", "fit", "frame"}),
+            "job": self.job.model_dump(
+                mode="json", exclude={"out", "fit", "frame", *(() if self.job.labels else ("labels",))}
+            ),
             **(
                 {"fit": self.values, "noise": self.noise and asdict(self.noise), **self._posterior()}
                 if self.job.fit is not None
@@ -345,19 +356,28 @@ class Maker:
         values = self.draws.at(index)
         unit = {"unit": self.draws.unit_of(index)} if self.draws.serial else {}
         lights = [None] if job.lights == "together" else list(self.images.scene.lights)
-        files = {}
+        files, told = {}, {}
         for led in lights:
             stem = self.folder / "images" / (f"{index:06d}" if led is None else f"{index:06d}-{led}")
             seed = int(job.rng(index, "render").integers(2**31))
             image = self.images.take({**self.values, **values}, seed, None if led is None else [led])
             for output in job.outputs:
-                path = self._write(image, output, stem, index)
-                files[output if led is None else f"{led}.{output}"] = {
-                    "file": path.relative_to(self.folder).as_posix(),
-                    "size": path.stat().st_size,
-                    "hash": file_hash(path),
-                }
-        return {"index": index, **unit, "sample": values, "files": files}
+                files[output if led is None else f"{led}.{output}"] = self._entry(
+                    self._write(image, output, stem, index)
+                )
+            told = image.labels.numbers  # of the press, whatever is lit
+        if job.labels and image.labels.arrays:
+            path = self.folder / "images" / f"{index:06d}.npz"
+            files["labels"] = self._entry(labelling.write(path, image.labels.arrays))
+        labels = {"labels": told} if job.labels else {}
+        return {"index": index, **unit, "sample": values, "files": files, **labels}
+
+    def _entry(self, path: Path) -> dict:
+        return {
+            "file": path.relative_to(self.folder).as_posix(),
+            "size": path.stat().st_size,
+            "hash": file_hash(path),
+        }
 
     def _write(self, image, output: str, stem: Path, index: int) -> Path:
         if output == "exr":
@@ -435,17 +455,22 @@ def finish(job: Job, blocks: Blocks) -> bool:
 
 
 def _write_table(job: Job, blocks: Blocks) -> None:
-    """manifest.csv: a row per sample, with what is fixed and what is drawn by key, and its files by role."""
+    """manifest.csv: a row per sample, with what is fixed and what is drawn by key, the numbers of labels, and its files
+    by role."""
     with replacing(blocks.manifest.with_suffix(".csv")) as file, open(file, "w", encoding="utf-8", newline="") as out:
         writer = csv.writer(out, lineterminator="\n")
         keys: list[str] = []
+        told: list[str] = []
         roles: list[str] = []
         for record in blocks.records():
             values = {**job.parameters, **record["sample"]}
+            labels = labelling.flat(record.get("labels", {}))
+            files = record["files"]
             if not keys:
-                keys, roles = list(values), list(record["files"])
-                writer.writerow(["index", *keys, *roles])
-            writer.writerow([record["index"], *(values[k] for k in keys), *(record["files"][r]["file"] for r in roles)])
+                keys, told, roles = list(values), list(labels), list(files)
+                writer.writerow(["index", *keys, *told, *roles])
+            row = (*(values[k] for k in keys), *(labels.get(k) for k in told), *(files[r]["file"] for r in roles))
+            writer.writerow([record["index"], *row])
 
 
 # -- the work --------------------------------------------------------------------------------------------------------

@@ -28,6 +28,7 @@ XML
     rows integer, 161: vertices of the mesh along y
 """
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -37,8 +38,9 @@ from optics.scene.checking import agree, made
 from optics.scene.declare import Part
 from optics.scene.parameter import Parameter
 from optics.scene.registry import declared, known
-from optics.skin import contact, forces
+from optics.skin import contact, forces, pressing
 from optics.skin.layer import base_correction
+from optics.skin.stack import Layer
 
 _GEL = declared(Path(__file__).with_name("gel.py"))[0]
 SIZES = {"width": 30.0, "length": 30.0, "thickness": 4.5}  # mm
@@ -128,6 +130,16 @@ def build():
             """(3,) force of the press along x, y and into the skin, N."""
             normal = self.ball().force(self.number("young"), self.number("poisson"))
             return normal * np.array([self.number("drag_x"), self.number("drag_y"), 1.0])
+
+        def touching(self):
+            """Pressure, shear and forces of the press on the outer face (optics.skin.pressing.Contact), around
+            (press_x, press_y); of the half-space, whose force `stiff_base` keeps."""
+            n = self.number
+            profile = contact.indenter_profile("sphere", n("tip_radius"), (0.0, 0.0, 0.0), self.extent, self.map_pitch)
+            deep = (Layer(math.inf, n("young"), n("poisson")),)
+            touch = pressing.indent(profile, self.ball().depth, deep)
+            shear = touch.pressure[..., None] * [n("drag_x"), n("drag_y")]
+            return replace(touch, shear=shear, slip=touch.touched & bool(shear.any()))
 
         def carry(self, x, y, depth):
             """(..., 3) world mm: where the points that rest at (x, y, -depth) are now; arrays are broadcast."""

@@ -14,16 +14,23 @@ With `coat` d > 0 the camera sees the coating's inner face, parallel to the one 
     h'(x) = d + min over |s| <= d of h(x + s) - sqrt(d^2 - s^2)
 With `fillet` > 0 the skin bridges corners with arcs of that radius: D0 is closed by a ball of it before the smoothing.
 With `skirt` > 0 the skin beside the contact falls off as exp(-distance / skirt) before the smoothing: in place of D0
-stands the max over touched points p of D0(p) exp(-|x - p| / skirt). Indenters: sphere (`indenter_size` = radius),
+stands the max over touched points p of D0(p) exp(-|x - p| / skirt).
+The forces of a press are those of an elastic skin under the same indenter at the same depth (optics.skin.pressing): E =
+`young`, `poisson`, on a rigid window at its thickness or, with `backing` deep, without end. They are labels: the dent
+that is seen stays the one above. An indenter that came to where it stands by `drag_x`, `drag_y` and a turn by `twist`
+after it had pressed drags along what sticks to it by `friction` (Coulomb); sheets, markers and beads in the gel are
+carried sideways by that shear. Indenters: sphere (`indenter_size` = radius),
 cylinder lying on its side (radius), cube face down (edge), balls (radius) `indenter_spacing` apart on a plate without
 end, one of them at the press, a mesh file (STL, OBJ, PLY; `indenter_size` = scale) or a measured height map (TMD;
 `indenter_size` = scale; NPY in mm or 16 bit PNG in micrometres: mm from sample to sample).
 Fingerprint
     position and depth of the press move the dent; `smoothing` widens its skirt, `skirt` gives it a long tail.
 Validity
-    quasi-static presses; the skirt is a smoothing, not elasticity. The gel's far side rests on a rigid window.
+    quasi-static presses; the skirt is a smoothing, not elasticity, so that dent and forces are two models of one press.
+    The gel's far side rests on a rigid window. Forces hold for small strains, a few thicknesses from the gel's rim.
 References
-    F-TAC Hand supplementary information, S1.2 and S1.6.
+    F-TAC Hand supplementary information, S1.2 and S1.6. `young`: elastomers of such sensors have 5 to 20 Shore A,
+    which is 0.28 to 0.73 MPa by Gent, Rubber Chem. Technol. 31 (1958) 896; a force that you measured tells yours.
 XML
     pitch float, 0.06: mm, of the fine part of the mesh
     map_pitch float, 0.03: mm, of the maps that hold the dent's shape
@@ -32,14 +39,18 @@ XML
     rows integer, 161: vertices of the mesh along y
 """
 
+import math
+
 from optics.scene.checking import agree, made
 from optics.scene.declare import Part
 from optics.scene.mitsuba_parts import Declared, coarseness
 from optics.scene.parameter import Parameter
-from optics.skin import contact
+from optics.skin import contact, pressing
+from optics.skin.stack import Layer
 
 FINE = 16  # of a ball's radius, the pitch that a coarser mesh keeps: flanks of balls are off by 1 % of the light
 INDENTER_SIZE = 1.5  # mm
+SHEARING = ("poisson", "friction", "drag_x", "drag_y", "twist")
 STAGE = 0.05  # mm: how well a stage usually knows where it presses
 PARAMETERS = (
     Parameter("width", "mm", 20.0, (0.1, 1000.0), "size along x", plausible=0.1, how="difference", role="width"),
@@ -172,6 +183,31 @@ PARAMETERS = (
         how="difference",
         starts=(0.05, 0.2, 1.0),  # below the skirt's own length it does nothing
     ),
+    Parameter("young", "MPa", 0.28, (1e-4, 1e4), "Young's modulus", plausible=0.02, how="difference"),
+    Parameter("poisson", "1", 0.49, (0.0, 0.5), "Poisson's ratio", plausible=0.005, how="difference"),
+    Parameter("backing", "-", "rigid", choices=("rigid", "deep"), doc="what forces find behind: a window, or more gel"),
+    Parameter("friction", "1", 0.8, (0.0, 10.0), "Coulomb's, of indenter and skin", plausible=0.1, how="difference"),
+    *(
+        Parameter(
+            f"drag_{axis}",
+            "mm",
+            0.0,
+            (-50.0, 50.0),
+            f"how far the indenter moved along {axis} after it had pressed, to where it stands",
+            plausible=0.1,
+            how="difference",
+        )
+        for axis in "xy"
+    ),
+    Parameter(
+        "twist",
+        "deg",
+        0.0,
+        (-360.0, 360.0),
+        "how far the indenter turned about z after it had pressed, from x to y",
+        plausible=2.0,
+        how="difference",
+    ),
 )
 
 
@@ -182,6 +218,7 @@ def build():
 
     class Gel(Declared.on_mesh()):
         kind = "gel"
+        carries = False
         indenter_radius = "indenter_size"  # the parameter that holds the radius of what presses
         pressing = (
             "press_x",
@@ -198,6 +235,13 @@ def build():
             "coat",
             "flattening",
             "fillet",
+            "young",
+            "poisson",
+            "backing",
+            "friction",
+            "drag_x",
+            "drag_y",
+            "twist",
         )  # what does nothing while press_depth is 0
 
         def __init__(self, props):
@@ -222,11 +266,16 @@ def build():
             params["faces"] = mi.UInt32(faces.astype(np.uint32).ravel())
             self.rebuild(params)
 
-        def press(self, now=None):
-            """Displacement and contact maps on the indenter's own grid (optics.skin.contact); of the values `now`, or
-            of the gel's own."""
+        def wire(self, scene):
+            self.carries = any(getattr(part, "moved_by", None) == self.role for part in scene.parts)
+
+        def takes(self, name):
+            return self.carries or name not in SHEARING  # what is carried sideways is all that shows of a drag
+
+        def profile(self, now=None):
+            """Lower surface of the indenter (optics.skin.contact.Profile); of the values `now`, or of the gel's own."""
             n = self.number if now is None else now.__getitem__
-            profile = contact.indenter_profile(
+            return contact.indenter_profile(
                 self.indenter if now is None else now["indenter"],
                 n("indenter_size"),
                 (n("press_rx"), n("press_ry"), n("press_rz")),
@@ -236,8 +285,31 @@ def build():
                 coat=n("coat"),
                 flattening=n("flattening"),
             )
+
+        def press(self, now=None):
+            """Displacement and contact maps on the indenter's own grid (optics.skin.contact); of the values `now`, or
+            of the gel's own."""
+            n = self.number if now is None else now.__getitem__
             sizes = (n("press_depth"), n("thickness"), n("smoothing"))
-            return contact.displacement(profile, *sizes, skirt=n("skirt"), fillet=n("fillet"))
+            return contact.displacement(self.profile(now), *sizes, skirt=n("skirt"), fillet=n("fillet"))
+
+        def touching(self):
+            """Pressure, shear and forces of the press (optics.skin.pressing.Contact), around (press_x, press_y)."""
+            n = self.number
+            thick = n("thickness") if self.backing == "rigid" else math.inf
+            layer = Layer(thick, n("young"), n("poisson"))
+            touch = pressing.indent(self.profile(), n("press_depth"), (layer,))
+            move = (n("drag_x"), n("drag_y"))
+            return pressing.dragged(touch, move, math.radians(n("twist")), n("friction"))
+
+        def sheared(self, x, y, depth):
+            """(3, ...) mm along x, y and into the gel: what a drag of the indenter does to points that rest at
+            (x, y, -depth)."""
+            n = self.number
+            if n("press_depth") <= 0 or not (n("drag_x") or n("drag_y") or n("twist")):
+                return 0.0, 0.0, 0.0
+            maps = pressing.sheared(self.touching(), depth)
+            return tuple(contact.surface(x, y, n("press_x"), n("press_y"), m) for m in maps)
 
         def heights(self, x, y):
             """z of the coated face (mm) at x (columns,) and y (rows,), mm, with every `surface` effect: (rows,

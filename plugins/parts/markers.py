@@ -97,6 +97,11 @@ def build():
             """(N, 3) present middles of the caps, mm, in the order of `rest`."""
             return self.caps.copy()
 
+        def centres_at_rest(self):
+            """(N, 3) middles of the caps while nothing presses, mm, in the order of `rest`."""
+            flat = np.full((self.columns * self.rows, 1), -(self.number("depth") + self.number("height")))
+            return np.concatenate([self.rest(), flat], -1)
+
         def rebuild(self, params):
             """Vertices for the present parameters and dent."""
             n = self.number
@@ -131,6 +136,7 @@ def check_rows_and_columns():
     caps = made("markers", **size, bsdf={"type": "fluorescent"}).centres()
     x, y = np.meshgrid([-3.0, 3.0], [-4.0, 0.0, 4.0])
     agree(caps, np.stack([x.ravel(), y.ravel(), np.full(6, -6.0)], -1), 0, 1e-6)
+    agree(caps, made("markers", **size, bsdf={"type": "fluorescent"}).centres_at_rest(), 0, 1e-6)
 
 
 def random(rng):

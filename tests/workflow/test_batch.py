@@ -418,3 +418,29 @@ def test_command_line(whole, capsys):
         "made": 0,
         "complete": True,
     }
+
+
+def test_labels_stand_in_the_manifest_and_beside_the_images(tmp_path):
+    """Forces rise with the depth, the table has a column for each number, and the arrays add up to the force."""
+    file = tmp_path / "job.toml"
+    text = JOB.replace("count = 5", 'labels = ["force", "pose"]').replace('"exr", "png", "dn"', '"png"')
+    file.write_text(text.replace('"gel.press_x" = { uniform = [-4, 4] }\n', ""))
+    folder = batch.run(file, workers=1).folder
+    records = [json.loads(line) for line in (folder / "manifest.jsonl").read_text().splitlines()]
+    force = [r["labels"]["force"][2] for r in records]
+    assert len(force) == 2 and 0 < force[0] < force[1]
+    with np.load(folder / records[1]["files"]["labels"]["file"], allow_pickle=False) as arrays:
+        np.testing.assert_allclose(arrays["force"].sum((0, 1)), records[1]["labels"]["force"], rtol=1e-12)
+    with open(folder / "manifest.csv", newline="") as lines:
+        rows = list(csv.DictReader(lines))
+    assert float(rows[1]["force.2"]) == force[1] and float(rows[1]["pose.press_depth"]) == 0.6
+    before = content(folder)
+    (folder / records[0]["files"]["labels"]["file"]).unlink()
+    assert batch.run(file, workers=1).made == 1 and content(folder) == before  # the same bytes again
+
+
+def test_unknown_labels_are_named(tmp_path):
+    file = tmp_path / "job.toml"
+    file.write_text(JOB.replace("seed = 7", 'seed = 7\nlabels = ["forces"]'))
+    with pytest.raises(batch.BadJob, match="labels.* 'forces'; allowed: a list of force, pressure"):
+        batch.read(file)
