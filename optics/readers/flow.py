@@ -107,9 +107,13 @@ def dense_flow(
 
 def dense_bins(field: np.ndarray, bins: int | tuple[int, int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """`bin_means` of the motion of all pixels, (H, W, 2)."""
-    v, u = np.indices(field.shape[:2])
-    places = np.stack([u.ravel() + 0.5, v.ravel() + 0.5], -1)
-    return bin_means(places, field.reshape(-1, 2), field.shape[:2], bins)
+    return bin_means(pixel_middles(field.shape[:2]), field.reshape(-1, 2), field.shape[:2], bins)
+
+
+def pixel_middles(shape: tuple[int, int]) -> np.ndarray:
+    """(H W, 2) x, y in px of the middles of all pixels, row by row."""
+    v, u = np.indices(shape)
+    return np.stack([u.ravel() + 0.5, v.ravel() + 0.5], -1)
 
 
 def bin_means(
@@ -124,6 +128,32 @@ def bin_means(
 
     A bin without a motion has size, angle and count 0. The circular mean is that of directions: every motion counts
     alike, large or small."""
+    at, motion, rows, columns = _assigned(places, motion, shape, bins)
+    size, angle = np.hypot(*motion.T), np.arctan2(motion[:, 1], motion[:, 0])
+
+    def total(values):
+        return np.bincount(at, values, rows * columns)
+
+    count = np.bincount(at, minlength=rows * columns)
+    mean = total(size) / np.maximum(count, 1)
+    direction = np.arctan2(total(np.sin(angle)), total(np.cos(angle)))
+    return tuple(a.reshape(rows, columns) for a in (mean, np.where(count > 0, direction, 0.0), count))
+
+
+def bin_vectors(
+    places: np.ndarray, motion: np.ndarray, shape: tuple[int, int], bins: int | tuple[int, int]
+) -> np.ndarray:
+    """(rows, columns, 2) px: the mean motion of each bin as a vector, 0 where there is none; arguments as of
+    `bin_means`.
+
+    Motions in opposite directions cancel, as they do not in (11); noise of mean 0 leaves it at 0."""
+    at, motion, rows, columns = _assigned(places, motion, shape, bins)
+    count = np.maximum(np.bincount(at, minlength=rows * columns), 1)
+    return np.stack([np.bincount(at, m, rows * columns) / count for m in motion.T], -1).reshape(rows, columns, 2)
+
+
+def _assigned(places, motion, shape, bins) -> tuple[np.ndarray, np.ndarray, int, int]:
+    """Number of the bin of each motion that counts, those motions, and the rows and columns of bins."""
     places, motion = np.asarray(places, float), np.asarray(motion, float)
     rows, columns = (bins, bins) if np.isscalar(bins) else bins
     if places.shape != motion.shape or places.ndim != 2 or places.shape[1] != 2:
@@ -134,15 +164,7 @@ def bin_means(
     known &= (places >= 0).all(-1) & (places[:, 0] < shape[1]) & (places[:, 1] < shape[0])
     places, motion = places[known], motion[known]
     at = (places[:, 1] * rows / shape[0]).astype(int) * columns + (places[:, 0] * columns / shape[1]).astype(int)
-    size, angle = np.hypot(*motion.T), np.arctan2(motion[:, 1], motion[:, 0])
-
-    def total(values):
-        return np.bincount(at, values, rows * columns)
-
-    count = np.bincount(at, minlength=rows * columns)
-    mean = total(size) / np.maximum(count, 1)
-    direction = np.arctan2(total(np.sin(angle)), total(np.cos(angle)))
-    return tuple(a.reshape(rows, columns) for a in (mean, np.where(count > 0, direction, 0.0), count))
+    return at, motion, rows, columns
 
 
 def feature_vector(size: np.ndarray, angle: np.ndarray) -> np.ndarray:

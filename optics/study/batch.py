@@ -378,16 +378,16 @@ class Maker:
             )
         from optics.files.images import write_image
 
-        pattern = self.noise.fixed_pattern(image.camera.shape, self.job.rng(0, "fixed pattern"))
-        frame = self.noise.expose(image.camera, self.job.rng(index, f"noise {stem.name}"), pattern)
+        frame = self.exposed(image.camera, self.job.rng(index, f"noise {stem.name}"))
         path = stem.with_name(stem.name + "-dn.png")
         with replacing(path) as temporary:
-            write_image(
-                temporary.with_name(temporary.stem),
-                np.clip(np.round(frame), 0, None),
-                8 if self.noise.saturation <= 255 else 16,
-            )
+            write_image(temporary.with_name(temporary.stem), frame, 8 if self.noise.saturation <= 255 else 16)
         return path
+
+    def exposed(self, camera: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """(H, W, C) whole DN of what the camera makes of an image, with noise and its fixed pattern."""
+        pattern = self.noise.fixed_pattern(camera.shape, self.job.rng(0, "fixed pattern"))
+        return np.clip(np.round(self.noise.expose(camera, rng, pattern)), 0, None)
 
 
 # -- the folder ------------------------------------------------------------------------------------------------------
@@ -454,7 +454,8 @@ def _lines(file: Path) -> dict[int, dict]:
     return found
 
 
-def _all_lines(folder: Path) -> dict[int, dict]:
+def manifest_lines(folder: Path) -> dict[int, dict]:
+    """The records of what a batch folder has so far, by index."""
     found = {}
     for file in sorted(folder.glob("manifest*.jsonl")):
         found.update(_lines(file))
@@ -476,7 +477,7 @@ def _text(records: Mapping[int, dict]) -> str:
 
 def _finish(folder: Path, job: Job) -> bool:
     """Write one ordered manifest and the table once every sample of the job is complete."""
-    records = _all_lines(folder)
+    records = manifest_lines(folder)
     if len(records) < job.total:
         return False
     keys, roles = list(job.parameters) + list(job.sample), list(next(iter(records.values()))["files"])
@@ -563,7 +564,7 @@ def run(
 
 def _remaining(folder: Path, shard: tuple[int, int], own: Sequence[int], progress: Progress | None) -> list[int]:
     """Indices of a shard without a record, or whose files differ from it; removes what a killed process left."""
-    known, bad = _all_lines(folder), set()
+    known, bad = manifest_lines(folder), set()
     done = [i for i in own if i in known]
     for k, index in enumerate(done):
         if not _stands(folder, known[index]):
