@@ -22,6 +22,7 @@ _before = signal.signal(signal.SIGINT, _leave) if _first else None
 from optics.cli import scenes  # noqa: E402  # isort: skip
 from optics.cli import images  # noqa: E402  # isort: skip
 from optics.cli import polarized  # noqa: E402  # isort: skip
+from optics.cli import forces  # noqa: E402  # isort: skip
 from optics.cli import captures  # noqa: E402  # isort: skip
 from optics.cli import studies  # noqa: E402  # isort: skip
 from optics.cli import machine  # noqa: E402  # isort: skip
@@ -30,4 +31,4 @@ from optics.cli.shared import app, main, terminal  # noqa: E402
 if _first:
     signal.signal(signal.SIGINT, _before)
 
-__all__ = ["app", "captures", "images", "machine", "main", "polarized", "scenes", "studies", "terminal"]
+__all__ = ["app", "captures", "forces", "images", "machine", "main", "polarized", "scenes", "studies", "terminal"]
