@@ -265,24 +265,17 @@ def measure(
     sensor = Sensor(maker)
     rest: Any = maker.images.take(sensor.base).camera
     rest = maker.exposed(rest, job.rng(0, "noise at rest")) if output == "dn" else np.clip(np.round(rest), 0, None)
-    keypoints = flow.find_beads(rest)
+    readers = {readout: flow.FlowReader(rest, *readout) for readout in readouts}
     collected, order = Collected(readouts), sorted(records)
     for done, index in enumerate(order, 1):
         collected.press(sensor, {**sensor.base, **records[index]["sample"]})
-        image = read_image(maker.folder / records[index]["files"][output]["file"], f"image {index}")[0]
-        for kind in {k for k, _ in readouts}:
+        image, bits = read_image(maker.folder / records[index]["files"][output]["file"], f"image {index}")
+        image = image.astype(np.uint8) if bits == 8 else image  # as a camera gives it
+        for readout, reader in readers.items():
             start = time.perf_counter()
-            if kind == "sparse":
-                places, motion = keypoints, flow.sparse_flow(rest, image, keypoints)
-            else:
-                places, motion = flow.pixel_middles(image.shape[:2]), flow.dense_flow(rest, image).reshape(-1, 2)
-            shared = time.perf_counter() - start
-            for readout in (r for r in readouts if r[0] == kind):
-                start = time.perf_counter()
-                size, angle, _ = flow.bin_means(places, motion, image.shape[:2], readout[1])
-                vectors = flow.bin_vectors(places, motion, image.shape[:2], readout[1])
-                collected.seconds[readout] += shared + time.perf_counter() - start
-                collected.found[readout].append((vectors[None], size[None], angle[None]))
+            found = reader(image)
+            collected.seconds[readout] += time.perf_counter() - start
+            collected.found[readout].append(tuple(a[None] for a in found))
         if progress:
             progress("optical flow", done, len(order))
     return collected.sets(order, sensor.face, _source(maker, "images"))
