@@ -143,6 +143,16 @@ def force_train(
     noise: Annotated[
         float, typer.Option("--noise", min=0, help="px rms added to each bin's motion in training; for scaled.")
     ] = 0.02,
+    width: Annotated[
+        int | None,
+        typer.Option(
+            "--width",
+            min=1,
+            max=10_000,
+            help="Units of each hidden layer.",
+            show_default="1600 of published, 512 of scaled",
+        ),
+    ] = None,
     start: Annotated[
         Path | None,
         typer.Option("--start", metavar="MODEL.npz", help="Train this map further, such as for another sensor."),
@@ -169,7 +179,7 @@ def force_train(
         else:
             from optics.readers.force_training import Plan, train
 
-            plan = Plan(kind, bins, seed, epochs, patience, noise)
+            plan = Plan(kind, bins, seed, epochs, patience, noise, width or 0)
             first = None if start is None else learning.ForceModel.read(start)
             model = train(one, plan, output.with_name(output.name + ".part"), first, progress)
     model.write(output)
@@ -197,6 +207,8 @@ def _told(model: "ForceModel", sets: "dict[str, FeatureSet]", as_json: bool, fil
 
     rows: list[dict[str, Any]] = []
     for name, one in sets.items():
+        if one.flow != model.flow:
+            terminal.note(f"{name} are of {one.flow} flow, the map was trained with {model.flow} flow")
         began = time.perf_counter()
         for k in range(min(len(one), 50)):  # one at a time, as frames come
             model(one.chosen(slice(k, k + 1)))

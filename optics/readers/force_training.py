@@ -114,7 +114,9 @@ def train(
     torch.manual_seed(plan.seed)
     network = _network(torch, plan, x.shape[1], start)
     optimiser = torch.optim.NAdam(network.parameters(), lr=RATE)
-    identity = {**asdict(plan), "presses": len(one), "sum": float(np.abs(x).sum(dtype=float)), "started": bool(start)}
+    first = () if start is None else start.layers
+    data = (x, one.place, one.force, *(w for w, _ in first))
+    identity = {**asdict(plan), "presses": len(one), "data": [float(np.abs(a).sum(dtype=float)) for a in data]}
     state = _resumed(torch, Path(state_file), identity, network, optimiser)
     loss, judged = {"published": (_rms, _armse), "scaled": (_shares, _shares)}[plan.kind]
     clock = time.monotonic()
@@ -204,15 +206,8 @@ def _copied(network: Any) -> dict:
 
 def _save(torch: Any, file: Path, identity: dict, state: dict, network: Any, optimiser: Any) -> None:
     with replacing(file) as temporary:
-        torch.save(
-            {
-                "identity": identity,
-                "state": state,
-                "network": network.state_dict(),
-                "optimiser": optimiser.state_dict(),
-            },
-            temporary,
-        )
+        parts = {"network": network.state_dict(), "optimiser": optimiser.state_dict()}
+        torch.save({"identity": identity, "state": state, **parts}, temporary)
 
 
 def _resumed(torch: Any, file: Path, identity: dict, network: Any, optimiser: Any) -> dict:

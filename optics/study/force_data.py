@@ -4,7 +4,7 @@
     measure("test.toml", [("dense", 40)])      the motion that optical flow finds in the images of `optics batch`
 
 Both take the job file of a batch (optics.study.batch) of a scene with beads in a gel that knows its force. A press is
-told by the gel's position and force; the image at rest is the first one of the job without the press.
+told by the gel's position and force. The image at rest is rendered here, of the job's sensor without a press.
 
 Projected features share with the images what can be seen: the bead that a pixel shows is found by a ray through its
 middle at rest. `dense` counts each pixel with the motion of its bead, a pixel without a bead with that of the nearest
@@ -54,7 +54,9 @@ class Sensor:
         self.x, self.y, depth, width, length = (
             str(self.scene.key(gel.name, role)) for role in ("press x", "press y", "press depth", "width", "length")
         )
-        self.base = {**self.scene.values(), **maker.values, depth: 0.0}
+        values = {**self.scene.values(), **maker.values}
+        unpressed = {key: 0.0 for key in (depth, f"{gel.name}.press_force") if key in values}
+        self.values, self.base = values, {**values, **unpressed}
         self.face = float(self.base[width]), float(self.base[length])
         self.scene.set(self.base)
         self.rest = self.beads.rest()
@@ -66,7 +68,7 @@ class Sensor:
         """Turn the gel's numbers, without building the scene again; (2,) mm place and N force of the press."""
         prefix = f"{self.gel.name}."
         for key, value in values.items():
-            if key.startswith(prefix):
+            if key.startswith(prefix) and not isinstance(value, str):
                 self.gel.hold(key.removeprefix(prefix), float(value))
         return np.array([values[self.x], values[self.y]], float), float(self.gel.force()[2])
 
@@ -195,9 +197,15 @@ def project(
         maker = batch.Maker(job.model_copy(update={"defines": {**job.defines, **define}}), file, plugins)
         maker.check()
         sensor = Sensor(maker)
+        strange = [key for key in job.sample if not key.startswith(f"{sensor.gel.name}.")]
+        if strange:
+            raise batch.BadJob(
+                f"{file}: [sample]: {strange[0]}; presses are projected of one sensor: allowed are parameters of "
+                f"{sensor.gel.name}; give it under [parameters], or render the images with optics batch"
+            )
         shown = sensor.shown()
         sums = {readout: weights(sensor, shown, readout) for readout in readouts}
-        samples = [{**sensor.base, **job.values(int(i))} for i in numbers]
+        samples = [{**sensor.values, **job.values(int(i))} for i in numbers]
         carried = Carried(sensor, samples)
         for start in range(0, len(samples), AT_A_TIME):
             motions = []
@@ -217,7 +225,7 @@ def project(
 
 def _binned(motion: np.ndarray, weight: Any, bins: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Mean vector, mean size and circular mean of the angle, of motions (P, N, 2); as optics.readers.flow.bin_means of
-    every pixel or bead, at a thousandth of its time."""
+    every pixel or bead, for many presses at once."""
     p = len(motion)
     size = np.hypot(motion[..., 0], motion[..., 1])
     still = size == 0
@@ -268,8 +276,9 @@ def measure(
     readers = {readout: flow.FlowReader(rest, *readout) for readout in readouts}
     collected, order = Collected(readouts), sorted(records)
     for done, index in enumerate(order, 1):
-        collected.press(sensor, {**sensor.base, **records[index]["sample"]})
-        image, bits = read_image(maker.folder / records[index]["files"][output]["file"], f"image {index}")
+        collected.press(sensor, {**sensor.values, **records[index]["sample"]})
+        path = maker.folder / records[index]["files"][output]["file"]
+        image, bits = read_image(path, str(path))
         image = image.astype(np.uint8) if bits == 8 else image  # as a camera gives it
         for readout, reader in readers.items():
             start = time.perf_counter()

@@ -105,6 +105,13 @@ def test_the_table_of_a_press_is_true_to_a_ten_thousandth(job, base):
         exact, found = alone(values, place), carried(values, place)
         assert len(carried.tables) == 1
         assert np.abs(found - exact).max() < 1e-4 * np.abs(exact - sensor.rest).max()
+    # a press by force is at rest without it
+    pushed = force_data.Sensor(
+        batch.Maker(read.model_copy(update={"parameters": {"gel.press_force": 0.1}}), file, None)
+    )
+    np.testing.assert_array_equal(pushed.rest, sensor.rest)
+    assert pushed.hold(pushed.values)[1] == pytest.approx(0.1)
+    assert np.abs(pushed.beads.centres() - pushed.rest).max() == 0
     # a drag is not the same all around: each bead is computed
     dragged = {**samples[3], "gel.drag_x": 0.5}
     place, _ = sensor.hold(dragged)
@@ -162,6 +169,10 @@ def test_from_a_job_to_metrics_on_the_command_line(job, optics, tmp_path, monkey
     ):
         code, _, err = optics(*words.split())
         assert code == 2 and re.search(said, err) and err.count("\n") == 1, (words, err)
+    file = job("lit")
+    file.write_text(file.read_text().replace("[noise]", '"camera.exposure" = { uniform = [30, 40] }\n[noise]'))
+    code, _, err = optics("force-features", "lit.toml", "-o", "o", "--project")
+    assert code == 2 and "camera.exposure; presses are projected of one sensor" in err, err
     (tmp_path / "other.toml").write_text('scene = "gelsight"\nout = "o"\ncount = 12\n')
     code, _, err = optics("force-features", "other.toml", "-o", "o", "--project")
     assert code == 2 and "a scene like particle_gel" in err, err
