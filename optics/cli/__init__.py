@@ -23,6 +23,7 @@ from optics.cli import scenes  # noqa: E402  # isort: skip
 from optics.cli import images  # noqa: E402  # isort: skip
 from optics.cli import polarized  # noqa: E402  # isort: skip
 from optics.cli import readers  # noqa: E402  # isort: skip
+from optics.cli import forces  # noqa: E402  # isort: skip
 from optics.cli import captures  # noqa: E402  # isort: skip
 from optics.cli import studies  # noqa: E402  # isort: skip
 from optics.cli import machine  # noqa: E402  # isort: skip
@@ -31,4 +32,16 @@ from optics.cli.shared import app, main, terminal  # noqa: E402
 if _first:
     signal.signal(signal.SIGINT, _before)
 
-__all__ = ["app", "captures", "images", "machine", "main", "polarized", "readers", "scenes", "studies", "terminal"]
+__all__ = [
+    "app",
+    "captures",
+    "forces",
+    "images",
+    "machine",
+    "main",
+    "polarized",
+    "readers",
+    "scenes",
+    "studies",
+    "terminal",
+]

@@ -4,6 +4,7 @@
     motion = sparse_flow(rest, now, keypoints)              (N, 2) px: Lucas and Kanade; NaN where a bead is lost
     field = dense_flow(rest, now)                           (H, W, 2) px: dense inverse search (DIS)
     size, angle, count = bin_means(places, motion, (480, 480), 40)       (11), (12): 40 x 40 bins
+    motion, size, angle = FlowReader(rest, "dense", 40)(now)             all of it at the rate of a camera
 
 Images are (H, W) or (H, W, C), DN from 0 to 255 or one channel of light; of several channels the second, the green one,
 is read. Points are (x, y) in px, the middle of the first pixel at (0.5, 0.5). Detection and flow are OpenCV's, from the
@@ -33,6 +34,8 @@ def green(image: np.ndarray, saturation: float = 255.0) -> np.ndarray:
     image = np.asarray(image)
     if image.ndim == 3:
         image = image[..., min(1, image.shape[2] - 1)]
+    if image.ndim == 2 and image.dtype == np.uint8 and saturation == 255.0:  # as a camera gives it
+        return np.ascontiguousarray(image)
     if image.ndim != 2 or not np.isfinite(image).all():
         raise ValueError(f"image of shape {image.shape}; allowed: (H, W) or (H, W, C) of finite values")
     return np.clip(np.rint(image * (255.0 / saturation)), 0, 255).astype(np.uint8)
@@ -42,10 +45,8 @@ def masked(image: np.ndarray, threshold: float | None = None, saturation: float 
     """(H, W) uint8 green channel, black where no bead is (Figure 10a).
 
     threshold   in 255ths of full scale; None: Otsu's"""
-    cv2, grey = _opencv(), green(image, saturation)
-    if threshold is None:
-        threshold = cv2.threshold(grey, 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)[0]
-    return np.where(grey > threshold, grey, 0).astype(np.uint8)
+    grey = green(image, saturation)
+    return np.where(grey > (_otsu(grey) if threshold is None else threshold), grey, np.uint8(0))
 
 
 def find_beads(image: np.ndarray, threshold: float | None = None, saturation: float = 255.0) -> np.ndarray:
@@ -75,10 +76,18 @@ def sparse_flow(
     """(N, 2) px: how far each keypoint has moved, by Lucas and Kanade's iteration in a pyramid; NaN where it is lost.
 
     A keypoint is followed back as well: one that does not return to within half a pixel is lost."""
-    cv2 = _opencv()
-    first, second = (masked(image, threshold, saturation) for image in (rest, now))
+    return _followed(*_pair(*(masked(image, threshold, saturation) for image in (rest, now))), keypoints)
+
+
+def _pair(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     if first.shape != second.shape:
         raise ValueError(f"images of {first.shape} and {second.shape}; allowed: two of the same size")
+    return first, second
+
+
+def _followed(first: np.ndarray, second: np.ndarray, keypoints: np.ndarray) -> np.ndarray:
+    """`sparse_flow` between two masked images."""
+    cv2 = _opencv()
     at = (np.asarray(keypoints, float) - 0.5).astype(np.float32).reshape(-1, 1, 2)
     if not len(at):
         return np.zeros((0, 2))
@@ -96,20 +105,83 @@ def dense_flow(
     that of its surroundings.
 
     threshold   as in `masked`; both images take that of the one at rest, so that no bead flickers"""
+    threshold = _otsu(green(rest, saturation)) if threshold is None else threshold
+    first, second = _pair(*(masked(image, threshold, saturation) for image in (rest, now)))
+    return _dis().calc(first, second, None)
+
+
+def _dis():
     cv2 = _opencv()
-    if threshold is None:
-        threshold = float(cv2.threshold(green(rest, saturation), 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)[0])
-    first, second = (masked(image, threshold, saturation) for image in (rest, now))
-    if first.shape != second.shape:
-        raise ValueError(f"images of {first.shape} and {second.shape}; allowed: two of the same size")
-    return cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM).calc(first, second, None)
+    return cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+
+
+def _otsu(grey: np.ndarray) -> float:
+    cv2 = _opencv()
+    return float(cv2.threshold(grey, 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)[0])
+
+
+class FlowReader:
+    """Features of image after image of one sensor, from one image at rest: `flow` is "dense" or "sparse".
+
+    What the image at rest takes, its mask and its beads, is done once."""
+
+    def __init__(
+        self,
+        rest: np.ndarray,
+        flow: str = "dense",
+        bins: int | tuple[int, int] = 40,
+        threshold: float | None = None,
+        saturation: float = 255.0,
+    ):
+        if flow not in ("dense", "sparse"):
+            raise ValueError(f"flow = '{flow}'; allowed: 'dense', 'sparse'")
+        self.flow, self.bins, self.saturation = flow, bins, saturation
+        if threshold is None and flow == "dense":
+            threshold = _otsu(green(rest, saturation))
+        self.threshold = threshold
+        self.rest = masked(rest, threshold, saturation)
+        self.dis = _dis() if flow == "dense" else None
+        self.keypoints = find_beads(rest, threshold, saturation) if flow == "sparse" else np.zeros((0, 2))
+
+    def __call__(self, now: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(rows, columns, 2) px mean motion, (rows, columns) px mean size (11) and rad mean angle (12) of the bins."""
+        first, second = _pair(self.rest, masked(now, self.threshold, self.saturation))
+        if self.dis is not None:
+            return dense_features(self.dis.calc(first, second, None), self.bins)
+        motion = _followed(first, second, self.keypoints)
+        size, angle, _ = bin_means(self.keypoints, motion, first.shape, self.bins)
+        return bin_vectors(self.keypoints, motion, first.shape, self.bins), size, angle
+
+
+def dense_features(field: np.ndarray, bins: int | tuple[int, int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Mean motion, mean size and circular mean of the angle of all pixels (H, W, 2), as `bin_vectors` and `bin_means`
+    have them; where bins are whole pixels wide, as the means of blocks, which take a tenth of the time."""
+    height, width = field.shape[:2]
+    rows, columns = (bins, bins) if np.isscalar(bins) else bins
+    if height % rows or width % columns:
+        size, angle, _ = dense_bins(field, bins)
+        return bin_vectors(pixel_middles(field.shape[:2]), field.reshape(-1, 2), field.shape[:2], bins), size, angle
+
+    def means(values: np.ndarray) -> np.ndarray:
+        lines = np.add.reduceat(values, np.arange(0, height, height // rows), 0)
+        return np.add.reduceat(lines, np.arange(0, width, width // columns), 1) / (height // rows * (width // columns))
+
+    x, y = (np.ascontiguousarray(field[..., k]) for k in (0, 1))
+    size = np.sqrt(x * x + y * y)
+    per = 1 / np.where(size > 0, size, 1)
+    angle = np.arctan2(means(y * per), means(np.where(size > 0, x * per, 1)))  # no motion has the angle 0
+    return np.stack([means(x), means(y)], -1), means(size), angle
 
 
 def dense_bins(field: np.ndarray, bins: int | tuple[int, int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """`bin_means` of the motion of all pixels, (H, W, 2)."""
-    v, u = np.indices(field.shape[:2])
-    places = np.stack([u.ravel() + 0.5, v.ravel() + 0.5], -1)
-    return bin_means(places, field.reshape(-1, 2), field.shape[:2], bins)
+    return bin_means(pixel_middles(field.shape[:2]), field.reshape(-1, 2), field.shape[:2], bins)
+
+
+def pixel_middles(shape: tuple[int, int]) -> np.ndarray:
+    """(H W, 2) x, y in px of the middles of all pixels, row by row."""
+    v, u = np.indices(shape)
+    return np.stack([u.ravel() + 0.5, v.ravel() + 0.5], -1)
 
 
 def bin_means(
@@ -124,6 +196,32 @@ def bin_means(
 
     A bin without a motion has size, angle and count 0. The circular mean is that of directions: every motion counts
     alike, large or small."""
+    at, motion, rows, columns = _assigned(places, motion, shape, bins)
+    size, angle = np.hypot(*motion.T), np.arctan2(motion[:, 1], motion[:, 0])
+
+    def total(values):
+        return np.bincount(at, values, rows * columns)
+
+    count = np.bincount(at, minlength=rows * columns)
+    mean = total(size) / np.maximum(count, 1)
+    direction = np.arctan2(total(np.sin(angle)), total(np.cos(angle)))
+    return tuple(a.reshape(rows, columns) for a in (mean, np.where(count > 0, direction, 0.0), count))
+
+
+def bin_vectors(
+    places: np.ndarray, motion: np.ndarray, shape: tuple[int, int], bins: int | tuple[int, int]
+) -> np.ndarray:
+    """(rows, columns, 2) px: the mean motion of each bin as a vector, 0 where there is none; arguments as of
+    `bin_means`.
+
+    Motions in opposite directions cancel, as they do not in (11); noise of mean 0 leaves it at 0."""
+    at, motion, rows, columns = _assigned(places, motion, shape, bins)
+    count = np.maximum(np.bincount(at, minlength=rows * columns), 1)
+    return np.stack([np.bincount(at, m, rows * columns) / count for m in motion.T], -1).reshape(rows, columns, 2)
+
+
+def _assigned(places, motion, shape, bins) -> tuple[np.ndarray, np.ndarray, int, int]:
+    """Number of the bin of each motion that counts, those motions, and the rows and columns of bins."""
     places, motion = np.asarray(places, float), np.asarray(motion, float)
     rows, columns = (bins, bins) if np.isscalar(bins) else bins
     if places.shape != motion.shape or places.ndim != 2 or places.shape[1] != 2:
@@ -134,15 +232,7 @@ def bin_means(
     known &= (places >= 0).all(-1) & (places[:, 0] < shape[1]) & (places[:, 1] < shape[0])
     places, motion = places[known], motion[known]
     at = (places[:, 1] * rows / shape[0]).astype(int) * columns + (places[:, 0] * columns / shape[1]).astype(int)
-    size, angle = np.hypot(*motion.T), np.arctan2(motion[:, 1], motion[:, 0])
-
-    def total(values):
-        return np.bincount(at, values, rows * columns)
-
-    count = np.bincount(at, minlength=rows * columns)
-    mean = total(size) / np.maximum(count, 1)
-    direction = np.arctan2(total(np.sin(angle)), total(np.cos(angle)))
-    return tuple(a.reshape(rows, columns) for a in (mean, np.where(count > 0, direction, 0.0), count))
+    return at, motion, rows, columns
 
 
 def feature_vector(size: np.ndarray, angle: np.ndarray) -> np.ndarray:

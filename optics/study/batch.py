@@ -388,16 +388,16 @@ class Maker:
             )
         from optics.files.images import write_image
 
-        pattern = self.noise.fixed_pattern(image.camera.shape, self.job.rng(0, "fixed pattern"))
-        frame = self.noise.expose(image.camera, self.job.rng(index, f"noise {stem.name}"), pattern)
+        frame = self.exposed(image.camera, self.job.rng(index, f"noise {stem.name}"))
         path = stem.with_name(stem.name + "-dn.png")
         with replacing(path) as temporary:
-            write_image(
-                temporary.with_name(temporary.stem),
-                np.clip(np.round(frame), 0, None),
-                8 if self.noise.saturation <= 255 else 16,
-            )
+            write_image(temporary.with_name(temporary.stem), frame, 8 if self.noise.saturation <= 255 else 16)
         return path
+
+    def exposed(self, camera: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """(H, W, C) whole DN of what the camera makes of an image, with noise and its fixed pattern."""
+        pattern = self.noise.fixed_pattern(camera.shape, self.job.rng(0, "fixed pattern"))
+        return np.clip(np.round(self.noise.expose(camera, rng, pattern)), 0, None)
 
 
 # -- the folder ------------------------------------------------------------------------------------------------------

@@ -83,6 +83,20 @@ outputs = ["png"]
 "gel.press_x" = { uniform = [-1.0, 1.0] }
 "led_1.power" = { choice = [0.5, 1.0] }
 """
+BEADS = """scene = "particle_gel"
+out = "beads"
+count = 12
+outputs = ["png"]
+[defines]
+width = 24
+height = 24
+beads = 60
+detail = 1
+[parameters]
+"gel.press_depth" = 0.8
+[sample]
+"gel.press_x" = { uniform = [-9.0, 9.0] }
+"""
 
 
 @contextlib.contextmanager
@@ -105,6 +119,7 @@ def within(seconds: int = LIMIT):
 def material(tmp_path_factory, mitsuba):
     """Good input of every kind: captures of images and of readings, a scene, a job, a study of readings."""
     import optics as package
+    from optics.readers import force_learning
     from optics.scene import loader
 
     folder = tmp_path_factory.mktemp("torture")
@@ -130,6 +145,13 @@ def material(tmp_path_factory, mitsuba):
     (readings / "readings.csv").write_text("Bench 3\nangle;volts;run\n" + "\n".join(lines) + "\n")
     (readings / "captures.toml").write_text(READINGS)
     (folder / "job.toml").write_text(JOB)
+    (folder / "beads.toml").write_text(BEADS)
+    place, force = rng.uniform(-14, 14, (40, 2)), rng.uniform(0.1, 1.0, 40)
+    motion = rng.normal(size=(40, 4, 4, 2))
+    sizes = np.hypot(*np.moveaxis(motion, -1, 0)), np.arctan2(motion[..., 1], motion[..., 0])
+    pressed = force_learning.FeatureSet(motion, *sizes, place, force, (30.0, 30.0), "dense")
+    pressed.write(folder / "features.npz")
+    force_learning.linear(pressed, 3).write(folder / "map.npz")
     package.calibrate(readings, folder / "study")
     package.Study.open(folder / "study").diagnose(advised=False)
     return folder

@@ -43,6 +43,10 @@ BASE = {
     "rehearse": "study",
     "imitate": "study -o out/set",
     "read": "markers images/a.png",
+    "force-tables": "--draws 1",
+    "force-features": "beads.toml -o out/features --project --flow sparse --bins 4",
+    "force-train": "features.npz -o out/map.npz --kind linear --bins 3",
+    "force-test": "map.npz features.npz",
 }
 TOKENS = ["", "nan", "-1", "1e400", "x" * 3000, "no/such/place", "/dev/null", "\u202e\x07", "*", "=", "a=b", "0"]
 NUMBERS = ["-9223372036854775809", "0", "-1", "1e9", "99999999999999999999", "inf", "0x10", "\uff11", "1.5", ""]

@@ -52,6 +52,26 @@ def test_the_dense_flow_is_that_of_the_beads(pair):
     assert np.abs(still).max() < 1e-3
 
 
+def test_the_reader_of_a_stream_is_the_readers_of_pairs(pair):
+    """Dense and sparse, in bins of whole pixels (140 x 120: 10 x 10) and of parts of pixels (9 x 9)."""
+    rest, now = pair[:2]
+    field, keypoints = flow.dense_flow(rest, now), flow.find_beads(rest)
+    moved = flow.sparse_flow(rest, now, keypoints)
+    pixels = flow.pixel_middles(rest.shape[:2])
+    for bins in (10, 9):
+        for kind, places, motion in (("dense", pixels, field.reshape(-1, 2)), ("sparse", keypoints, moved)):
+            vectors, size, angle = flow.FlowReader(rest, kind, bins)(now)
+            sizes, angles, _ = flow.bin_means(places, motion, rest.shape[:2], bins)
+            # means of 168 px in float32 and in float64
+            np.testing.assert_allclose(size, sizes, atol=1e-5)
+            np.testing.assert_allclose(vectors, flow.bin_vectors(places, motion, rest.shape[:2], bins), atol=1e-5)
+            np.testing.assert_allclose(np.exp(1j * angle), np.exp(1j * angles), atol=1e-4)
+    size, angle = flow.dense_features(np.zeros((12, 12, 2), np.float32), 3)[1:]
+    assert not size.any() and not angle.any()
+    whole = rest.clip(0, 255).round()
+    np.testing.assert_array_equal(flow.green(whole.astype(np.uint8)), flow.green(whole))
+
+
 def test_what_is_no_pair_of_images_is_refused(pair, monkeypatch):
     rest = pair[0]
     with pytest.raises(ValueError, match="same size"):

@@ -1,41 +1,31 @@
 """The force from the motion of beads: exact without noise, its error as forecast, and the published thresholds."""
 
-import importlib.util
-from pathlib import Path
+import json
 
 import numpy as np
 import pytest
 
-from optics.readers.flow import bin_means, feature_vector
+from optics.readers.flow import bin_means, bin_vectors, feature_vector
 from optics.readers.force import condition, image_motion, reconstruct, sensitivity
+from optics.skin import bead_layouts
 from optics.skin.forces import unit_displacements
 
-ROOT = Path(__file__).parents[2]
+
+def beads(count=300):
+    points = bead_layouts.draw("1-6 mm", 3, count)
+    return points, bead_layouts.CONSTANTS.unit(points)
 
 
-@pytest.fixture(scope="module")
-def example():
-    spec = importlib.util.spec_from_file_location("particle_forces", ROOT / "examples/particle_forces.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-def beads(example, count=300):
-    points = example.draw("1-6 mm", 3, count)
-    return points, unit_displacements(points, example.YOUNG, example.POISSON)
-
-
-def test_the_force_is_exact_without_noise(example):
-    points, unit = beads(example)
+def test_the_force_is_exact_without_noise():
+    points, unit = beads()
     for force in ([0.1, -0.2, 0.7], [0.0, 0.0, 1.0], [0.3, 0.0, 0.0]):
         motion = image_motion(points, unit @ force, 286.0, 20.0)
         np.testing.assert_allclose(reconstruct(points, motion, unit, 286.0, 20.0), force, atol=1e-12)
 
 
-def test_the_sensitivity_is_the_derivative(example):
+def test_the_sensitivity_is_the_derivative():
     """Against central differences of the reconstruction by the motion of single beads, at their noise-free motion."""
-    points, unit = beads(example, 40)
+    points, unit = beads(40)
     force = np.array([0.2, 0.1, 0.5])
     motion = image_motion(points, unit @ force, 286.0, 20.0)
     found = sensitivity(points, force, unit, 286.0, 20.0)
@@ -47,21 +37,42 @@ def test_the_sensitivity_is_the_derivative(example):
     assert condition(points, force, unit, 286.0, 20.0) == pytest.approx(np.linalg.norm(found))
 
 
-def test_published_thresholds_and_the_order_of_the_condition_numbers(example):
-    for layout, printed in example.PRINTED.items():
+def test_published_thresholds_and_the_order_of_the_condition_numbers(optics):
+    code, out, _ = optics("force-tables", "--draws", "8", "--json")
+    found = json.loads(out)
+    assert code == 0 and found["agrees"]
+    for layout, printed in bead_layouts.PRINTED.items():
         for kind, value in printed.items():
             # 12 %: the printed numbers have two digits, and the constants behind them are lost
-            assert example.threshold(layout, kind, draws=8) == pytest.approx(value, rel=0.12), (layout, kind)
-    for kind in example.FORCES:
-        kappa = {layout: example.kappa(layout, kind, draws=8) for layout in example.LAYOUTS}
+            assert found["thresholds"][layout][kind] == pytest.approx(value, rel=0.12), (layout, kind)
+    for kind in bead_layouts.FORCES:
+        kappa, error = ({la: found[name][la][kind] for la in bead_layouts.LAYOUTS} for name in ("kappas", "errors"))
         assert kappa["1 mm"] > kappa["2 mm"] > kappa["1-6 mm"] > kappa["6 mm"]
-        # at a noise of 0.1 px the error is what kappa says; 24 draws of 3 components: 8 % of spread, three times
-        assert example.noisy_error("6 mm", kind, 0.1, draws=24) == pytest.approx(0.1 * kappa["6 mm"], rel=0.25)
+        # at a noise of 0.5 px the error is what kappa says; 24 draws of 3 components: 8 % of spread, three times
+        assert error["6 mm"] == pytest.approx(0.5 * kappa["6 mm"], rel=0.25)
+    assert found["exact"] < 1e-12  # (8) without noise, relative
+    # twice the optical centre's distance is another sensor
+    code, out, _ = optics("force-tables", "--draws", "1", "--distance", "40")
+    assert code == 1 and "+" in out
 
 
-def test_only_f_over_e_is_identified(example):
+def test_thresholds_depend_on_f_over_e_alone():
+    """The exact quotient: a threshold falls as 1/(f/E), and is the closed form of one bead below the force."""
+    other = bead_layouts.Constants(f_by_e=5200.0)
+    one, half = (bead_layouts.threshold("6 mm", "shear", c, draws=2) for c in (bead_layouts.CONSTANTS, other))
+    assert half == pytest.approx(one / 2, rel=1e-4)  # half a pixel of motion: the second order is below that
+    # Cerruti at nu = 1/2 and the projection, for the bead of a dense layer that moves most along x
+    h, d = 6.0, 20.0
+    x = np.linspace(0, 15, 3001)
+    r = np.hypot(x, h)
+    per_newton = 3 * 2600 / (4 * np.pi) * ((1 + x**2 / r**2) / r / (d - h) + x * (x * h / r**3) / (d - h) ** 2)
+    # 3000 beads lie 0.5 mm apart, on a peak that is 10 mm wide
+    assert one == pytest.approx(0.5 / per_newton.max(), rel=5e-3)
+
+
+def test_only_f_over_e_is_identified():
     """The same motions from twice the focal length and twice the modulus."""
-    points, _ = beads(example)
+    points, _ = beads()
     motions = [
         image_motion(points, unit_displacements(points, e, 0.5) @ [0.0, 0.1, 0.4], f, 20.0)
         for f, e in ((286, 0.11), (572, 0.22))
@@ -81,10 +92,12 @@ def test_bins():
     _, angle, _ = bin_means([[1.0, 1.0], [1.0, 1.0]], [[-1.0, 0.1], [-1.0, -0.1]], (10, 10), 1)
     assert abs(angle[0, 0]) == pytest.approx(np.pi)
     assert feature_vector(size, np.zeros((2, 2))).shape == (8,)
+    vectors = bin_vectors(places, motion, (10, 10), 2)
+    np.testing.assert_allclose(vectors, [[[0.0, 3.0], [-1.0, 1e-3]], [[1.0, 0.0], [0.0, 0.0]]])
 
 
-def test_bad_input_is_refused(example):
-    points, unit = beads(example, 5)
+def test_bad_input_is_refused():
+    points, unit = beads(5)
     with pytest.raises(ValueError, match="in front of the camera"):
         image_motion(points, unit @ [0, 0, 1.0], 286.0, 5.0)
     with pytest.raises(ValueError, match="allowed: both"):
