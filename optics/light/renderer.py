@@ -162,6 +162,7 @@ class Renderer:
         self.apply(values)
         v, u = np.mgrid[: self.height, : self.width] + 0.5
         hits = Hits(self._trace(u.ravel(), v.ravel()), self.height, self.width)
+        hits.eye = self._eye()
         if self.crowded:
             hits.edges |= _creases(np.where(hits.valid[..., None], hits.normal, 0.0))
         hits.edges |= self._painted(hits)
@@ -170,6 +171,18 @@ class Renderer:
             self._hits.popitem(last=False)
         self._make_room(hits)
         return hits
+
+    def _eye(self) -> np.ndarray:
+        """(3,) where the camera stands, mm."""
+        import mitsuba as mi
+
+        origin, _ = self.scene.camera.ray(*(mi.Float(place) for place in self.scene.camera.middle()))
+        return np.array(origin, float).reshape(3, -1)[:, 0]
+
+    def distances(self, values: Mapping) -> np.ndarray:
+        """(H, W) mm from the camera to what pixels' centres see; infinite where that is nothing."""
+        hits = self.hits(values)
+        return np.where(hits.valid, np.linalg.norm(hits.position - hits.eye, axis=-1), np.inf)
 
     def _make_room(self, latest: Hits) -> None:
         """Forget the oldest geometries while what is kept is larger than MEMORY: large images with many rims."""
@@ -746,6 +759,7 @@ class Hits:
         self.shape = (height, width)
         self.rims: dict = {}
         self.joint: np.ndarray | None = None
+        self.eye = np.zeros(3)  # where the camera stood
         self.valid = np.array(self.si.is_valid()).reshape(height, width)
         self.edges = _edges(self.valid)
         if self.path is not None:  # what is passed, and what is met, changes at an edge

@@ -69,6 +69,8 @@ SURROUNDINGS = {  # parameter: what has to stand about it for it to be seen, and
     "gel.shown_between": {"gel.indenter": "balls", "gel.indenter_size": 0.8, "gel.indenter_spacing": 1.8},
     "gel.thickness": {"gel.absorption": 0.02},
     "elastic_skin.thickness": {"gel.absorption": 0.02},
+    "camera.focus": {"camera.pupil_area": 2.0},
+    "fisheye.focus": {"camera.pupil_area": 2.0},
     "beads.gravity": {"beads.settling": 0.3},
     "fluorescent.bleaching": {"dye.time": 3.0},
     "fluorescent.time": {"dye.bleaching": 0.05},
