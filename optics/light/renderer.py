@@ -318,8 +318,8 @@ class Renderer:
             return image
         part = self.scene.leds[led]
         visible = self._unshaded(hits, part)
-        rim = self._joint_rim(hits) if self.layered or self.crowded else self._rim(hits, visible)
-        share = rim.astype(float) if self.crowded else np.where(rim, 1.0, hits.bent)
+        rim = self._joint_rim(hits) if self.layered else self._rim(hits, visible)
+        share = np.where(self._joint_rim(hits) if self.crowded else rim, 1.0, hits.bent)
         index = np.flatnonzero(share)
         # of a light of many points, an edge in the shadow of one is small
         few = ~(hits.edges if self.crowded or len(part.places()) > SOFT else rim)

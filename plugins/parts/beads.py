@@ -70,6 +70,7 @@ PARAMETERS = (
         "which way was down in the mould, from x (right) to y (down)",
         plausible=20.0,
         how="difference",
+        step=0.4,
     ),
 )
 TRIES = 400  # draws of a bead's place before it counts as not fitting
