@@ -185,7 +185,7 @@ class Renderer:
 
     def distances(self, values: Mapping) -> np.ndarray:
         """(H, W) mm from the camera to what pixels' centres see; infinite where that is nothing."""
-        hits = self.hits(values)
+        hits = self.hits({k: v.real if isinstance(v, complex) else v for k, v in values.items()})
         return np.where(hits.valid, np.linalg.norm(hits.position - hits.eye, axis=-1), np.inf)
 
     def _make_room(self, latest: Hits) -> None:
@@ -494,7 +494,7 @@ class Renderer:
         import mitsuba as mi
 
         here = index[~bent]
-        u, v = self._at(here, self._set(here, CROWDED_RAYS * self.fine**2))
+        u, v = self._at(here, self._set(here, CROWDED_RAYS << (self.fine - 1)))
         o, d = self.scene.camera.ray(mi.Float(u.ravel()), mi.Float(v.ravel()))
         wavelengths = self.scene.integrator.wavelengths(u.size)
         met = self.scene.mitsuba.ray_intersect_preliminary(mi.Ray3f(o, d, mi.Float(0), wavelengths), coherent=True)
@@ -891,13 +891,12 @@ def _shares(bodies: np.ndarray, across: int, down: int) -> tuple[np.ndarray, np.
         for i in range(across):
             low, high = (count * k // across for k in (i, i + 1))
             part = (own & (rank > low[:, None]) & (rank <= high[:, None]))[:, order]
-            size, rank_down = part.sum(1), part.cumsum(1, dtype=np.int16)
-            taken = np.minimum(size, down)
+            size, columns = part.sum(1), order[np.nonzero(part)[1]]
+            taken, starts = np.minimum(size, down), np.cumsum(size) - size
             for j in range(down):
                 some = np.flatnonzero(taken > j)
-                at = ((j + 0.5) * size[some] / taken[some]).astype(int) + 1
-                column = order[(rank_down[some] >= at[:, None]).argmax(1)]
-                found.append((rows[some], column, size[some] / taken[some] / bodies.shape[1]))
+                at = starts[some] + ((j + 0.5) * size[some] / taken[some]).astype(int)
+                found.append((rows[some], columns[at], size[some] / taken[some] / bodies.shape[1]))
         left &= ~own
         more = left.any(1)
         rows, left = rows[more], left[more]

@@ -22,7 +22,7 @@ XML
     count integer, 1000: number of beads
     seed integer, 0: of the draw
     detail integer, 2: subdivisions of an icosahedron, 1 to 4
-    fine integer, 1: finer samples at outlines: 6 fine^2 of each bead in each pixel are lit, 1 to 8
+    fine integer, 1: finer samples at outlines: 6 fine^2 of each bead in each pixel are lit, 1 to 6
 """
 
 from optics.scene.checking import agree, made
@@ -93,10 +93,10 @@ def build():
             self.count, self.seed = int(props.get("count", 1000)), int(props.get("seed", 0))
             self.detail = int(props.get("detail", 2))
             self.fine = int(props.get("fine", 1))
-            if self.count < 1 or not 1 <= self.detail <= 4 or not 1 <= self.fine <= 8:
+            if self.count < 1 or not 1 <= self.detail <= 4 or not 1 <= self.fine <= 6:
                 raise ValueError(
                     f"beads: count = {self.count}, detail = {self.detail}, fine = {self.fine}; allowed: at least 1 "
-                    "bead, a detail of 1 to 4, fine of 1 to 8"
+                    "bead, a detail of 1 to 4, fine of 1 to 6"
                 )
             ball = trimesh.creation.icosphere(subdivisions=self.detail)
             # Cauchy: the mean silhouette of a convex body is a quarter of its surface
