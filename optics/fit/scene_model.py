@@ -107,7 +107,13 @@ class SceneModel:
                 f"{scene.camera.resolution[0]} x {scene.camera.resolution[1]} px; load the scene with "
                 f"-D width={width} -D height={height}"
             )
-        self.developer = Developer(scene.camera, scene.integrator.bands or (0.0,), noise.black_level, noise.saturation)
+        self.developer = Developer(
+            scene.camera,
+            scene.integrator.bands or (0.0,),
+            noise.black_level,
+            noise.saturation,
+            self.renderer.distances,
+        )
         if self.developer.site is not None and self.monte_carlo:
             raise BadScene(
                 f"{captures.folder}: a mosaic of analysers before a scene with dielectric bodies, whose light is "

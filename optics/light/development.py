@@ -15,7 +15,7 @@ complex step: f'(x) v = Im f(x + i h v)/h with h = 1e-30, exact to rounding (Squ
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from types import SimpleNamespace
 from typing import Any
 
@@ -59,11 +59,20 @@ class Developer:
     camera     the scene's camera part
     bands      wavelengths of the image's bands, nm
     black, saturation    DN; (0, 1) for radiance
+    distances  f(values) -> (H, W) mm from the camera to what its pixels see, for effects that ask for `view.astray`
     site       (H, W) rad, the analyser angle of each pixel of a mosaic; None for a camera without one. With a mosaic
                images per band are Stokes vectors, (3, H, W, B)
     """
 
-    def __init__(self, camera, bands: tuple[float, ...], black: float = 0.0, saturation: float = 255.0):
+    def __init__(
+        self,
+        camera,
+        bands: tuple[float, ...],
+        black: float = 0.0,
+        saturation: float = 255.0,
+        distances: Callable[[Mapping], np.ndarray] | None = None,
+    ):
+        self.distances = distances
         self.camera, self.name = camera, camera.name
         self.width, self.height = camera.resolution
         self.bands = tuple(bands)
@@ -84,9 +93,19 @@ class Developer:
         """What an image function sees as `camera`: every parameter of the camera, and the geometry of its pixels.
 
         u, v (H, W) px; x, y (H, W) normalised coordinates; tan (H, W) tangent of the field angle; focal (px); width,
-        height (px); bands (nm); white (B,) radiance per band of white light of radiance 1; settings: all values by key,
-        those of other parts too, (N, 1, 1) where readings were swept."""
+        height (px); astray() (H, W) px by which a ray off the pupil's middle misses the chief ray, per mm off it, at
+        the distance that the pixel sees; bands (nm); white (B,) radiance per band of white light of radiance 1;
+        settings: all values by key, those of other parts too, (N, 1, 1) where readings were swept."""
         own = {n: values[f"{self.name}.{n}"] for n in self.names}
+
+        def astray() -> np.ndarray:
+            if self.distances is None:
+                raise BadScene(
+                    f"'{self.name}' blurs by distance, and here none is known; allowed: {self.name}.pupil_area = 0"
+                )
+            with np.errstate(divide="ignore"):
+                return self.camera.astray(SimpleNamespace(**own), self.u, self.v, self.distances(values))
+
         x, y, focal = self.camera.normalised(SimpleNamespace(**own), self.u, self.v)
         return SimpleNamespace(
             **own,
@@ -98,6 +117,7 @@ class Developer:
             focal=focal,
             width=self.width,
             height=self.height,
+            astray=astray,
             bands=np.array(self.bands),
             white=np.ones(len(self.bands)) if self.integral is None else self.integral.white,
             site=self.site,

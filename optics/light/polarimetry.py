@@ -606,6 +606,8 @@ def sweep(
         scene, developer, base, {k for settings, *_ in groups for k in settings} | {key}
     )
     spot = Spot(scene, column, row, whole)
+    if whole:
+        developer.distances = spot.distances
     total, done = sum(len(x) + len(own) for _, own, _ in groups), 0
     drives = set(scene.powers.values()) if captures is not None else set()
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import copy
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from types import SimpleNamespace
 from typing import NamedTuple
 
@@ -25,9 +25,10 @@ from optics.scene.mitsuba_parts import DEFAULT_VARIANT
 # per pixel at rims; a power of two. Of an image 36 px wide, chi2 misses a path tracer by 10 to 60 with 64, by 5 to 20
 # with 128
 RIM_SAMPLES = 128
-# where a part is `crowded`, with rims in most pixels. Of beads 8 px wide that reach 200 DN, 16 samples miss the mean by
-# 3.8 DN rms, 32 by 1.9 and 64 by 1.0; the noise of a camera is 3
-CROWDED_SAMPLES = 32
+CROWDED_RAYS = 128  # rays through a pixel of a crowded scene, which tell what share of it each body has
+# of these rays, so many each way are lit in each body of each pixel. Of beads 8 px wide that reach 200 DN, pixels miss
+# their mean by 1.6 DN rms; the noise of a camera is 3
+LIT = 2, 3
 LAYERED_RIM_SAMPLES = 32  # in scenes with layers, whose matrices are multiplied for every sample
 PAINTED = 0.05  # of the largest reflectance of a texture: a step from pixel to pixel that needs finer samples
 # difference of a pixel's mean normal from that at its middle, above which finer samples are taken: a fifth of a grey
@@ -36,11 +37,13 @@ BENT = 1e-3
 BENT_SIDE = 4  # finer samples each way where the face bends: the mean of what varies smoothly needs few
 SOFT = 16  # points of a light, above which rims of its shadows take the samples of what bends, BENT_SIDE each way
 CREASE = 25.0  # deg from pixel to pixel: what is no smooth surface
+R2 = 0.7548776662466927, 0.5698402909980532  # of the R2 sequence: shifts from pixel to pixel
 FLAT_FIELDS = ("multiplicative", "additive", "none")
 MEMORY = 2e9  # bytes of hits, with what images need for their derivatives, that are kept
 IMAGES = 5e8  # bytes of images that are kept without them, of a renderer that remembers REMEMBER geometries
 REMEMBER = 24
 PER_RAY = 250  # bytes of a camera ray's end and its light, by the memory of processes that held ten million of them
+FAINT = 0.05  # of the brightest light of a crowded scene: shadows that take less need no finer samples
 BOUNCE_SAMPLES = 32  # directions per cell for the second bounce
 BOUNCE_CELL = 2  # px each way of a cell
 
@@ -70,10 +73,11 @@ class Renderer:
                 f"load the scene with variant='{DEFAULT_VARIANT}' or name one band"
             )
         self.layered = paths.layered(scene)
-        self.crowded = any(getattr(part, "crowded", False) for part in scene.parts.values())
+        bodies = {name: getattr(part, "faces_each", 0) for name, part in scene.parts.items()}
+        self.faces_each = {} if self.layered else {name: faces for name, faces in bodies.items() if faces}
+        self.crowded = bool(self.faces_each)  # by many small bodies, with rims in most pixels
+        self.fine = max((scene.parts[name].fine for name in self.faces_each), default=1)
         self.rim_samples = LAYERED_RIM_SAMPLES if self.layered else RIM_SAMPLES
-        if self.crowded:
-            self.rim_samples = CROWDED_SAMPLES
         self.wavelengths = np.array(scene.integrator.bands or (540.0,))
         self.remember = remember
         self._transmissions: OrderedDict = OrderedDict()
@@ -163,6 +167,7 @@ class Renderer:
         self.apply(values)
         v, u = np.mgrid[: self.height, : self.width] + 0.5
         hits = Hits(self._trace(u.ravel(), v.ravel()), self.height, self.width)
+        hits.eye = self._eye()
         if self.crowded:
             hits.edges |= _creases(np.where(hits.valid[..., None], hits.normal, 0.0))
         hits.edges |= self._painted(hits)
@@ -171,6 +176,18 @@ class Renderer:
             self._hits.popitem(last=False)
         self._make_room(hits)
         return hits
+
+    def _eye(self) -> np.ndarray:
+        """(3,) where the camera stands, mm."""
+        import mitsuba as mi
+
+        origin, _ = self.scene.camera.ray(*(mi.Float(place) for place in self.scene.camera.middle()))
+        return np.array(origin, float).reshape(3, -1)[:, 0]
+
+    def distances(self, values: Mapping) -> np.ndarray:
+        """(H, W) mm from the camera to what pixels' centres see; infinite where that is nothing."""
+        hits = self.hits({k: v.real if isinstance(v, complex) else v for k, v in values.items()})
+        return np.where(hits.valid, np.linalg.norm(hits.position - hits.eye, axis=-1), np.inf)
 
     def _make_room(self, latest: Hits) -> None:
         """Forget the oldest geometries while what is kept is larger than MEMORY: large images with many rims."""
@@ -273,7 +290,7 @@ class Renderer:
         return self._raw(
             image,
             lambda: self._shade(image.hits.sample, part, image.visible),
-            lambda: self._shade(image.finer.sample, part, image.rim_visible, image.finer),
+            lambda: self._shade(image.finer.sample, part, image.rim_visible),
         )
 
     def _keep(self, key: tuple, image: LedImage) -> LedImage:
@@ -302,14 +319,14 @@ class Renderer:
             image.raw = (own, own)
             return image
         part = self.scene.leds[led]
-        visible = self._visible(hits.si, part)
+        visible = self._unshaded(hits, part)
         rim = self._joint_rim(hits) if self.layered else self._rim(hits, visible)
-        share = np.where(rim, 1.0, hits.bent)
+        share = np.where(self._joint_rim(hits) if self.crowded else rim, 1.0, hits.bent)
         index = np.flatnonzero(share)
         # of a light of many points, an edge in the shadow of one is small
-        few = ~(hits.edges if len(part.places()) > SOFT else rim)
+        few = ~(hits.edges if self.crowded or len(part.places()) > SOFT else rim)
         finer = self._finer(hits, index, np.flatnonzero(few.ravel()[index]))
-        rim_visible = self._visible(finer.sample.si, part, finer) if len(index) else None
+        rim_visible = self._visible(finer.sample.si, part) if len(index) else None
         image = LedImage(led, hits, rim, index, finer, visible, rim_visible, self._seen(visible).mean(0) > 0.5)
         image.share = share.reshape(-1, 1)[index]
         image.raw = self._direct(image)
@@ -325,11 +342,30 @@ class Renderer:
         return np.logical_or.reduce([_edges(s & hits.valid) for s in self._seen(visible)]) | hits.edges
 
     def _joint_rim(self, hits: Hits) -> np.ndarray:
-        """Pixels at a rim for any light: in scenes with layers one set of finer samples serves all."""
+        """Pixels at a rim for any light: in scenes with layers, and in crowded ones, one set of finer samples serves
+        all."""
         if hits.joint is None:
-            rims = [self._rim(hits, self._visible(hits.si, part)) for part in self.scene.leds.values()]
-            hits.joint = np.logical_or.reduce([hits.edges, *rims])
+            rim = self._cast if self.crowded else lambda h, part: self._rim(h, self._visible(h.si, part))
+            hits.joint = np.logical_or.reduce([hits.edges, *(rim(hits, part) for part in self.scene.leds.values())])
         return hits.joint
+
+    def _cast(self, hits: Hits, part) -> np.ndarray:
+        """Pixels at a rim of a shadow that a light's points cast, where it takes more than FAINT of the brightest
+        light."""
+        spots, seen = self.scene.integrator.spots(part), self._seen(self._unshaded(hits, part))
+        step, total = np.zeros(hits.shape), np.zeros(hits.shape)
+        for point, own in zip(spots, seen):
+            light = self.scene.integrator.direct(self.scene.mitsuba, *hits.sample[:3], part, hits.si.is_valid(), point)
+            light = hits.image(self._bands(light, min(self.bands, self.scene.integrator.lanes)).max(-1))
+            step, total = step + _edges(own) * light, total + own * light
+        return step > FAINT * np.max(total)
+
+    def _unshaded(self, hits: Hits, part):
+        """`_visible` at pixel centres, kept for as long as the light stands where it does."""
+        key = (part.name, *part.held.values())
+        if hits.lit.get(part.name, ((), None))[0] != key:
+            hits.lit[part.name] = key, self._visible(hits.si, part)
+        return hits.lit[part.name][1]
 
     # -- what layers leave of it --------------------------------------------------------------------------------------
     def image(self, values: Mapping, light: str, component: int = 0) -> np.ndarray:
@@ -438,49 +474,77 @@ class Renderer:
         """Finer samples of the pixels `index`; of `bent` among them, where no edge is, fewer."""
         key = (index.tobytes(), np.asarray(bent).tobytes())
         if key not in hits.rims:
-            # A Hammersley set, shifted from pixel to pixel: an edge in any direction crosses the samples one by one,
-            # and not in rows, so that a shadow that moves changes a pixel in small steps. What only bends is smooth:
-            # the middles of a square grid.
-            counts = np.full(len(index), self.rim_samples)
-            counts[list(bent)] = BENT_SIDE**2
-            k = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
-            here, bends = np.repeat(index, counts), np.repeat(counts < self.rim_samples, counts)
-            levels = self.rim_samples.bit_length() - 1
-            reversed_bits = sum(((k >> b) & 1) / 2 ** (b + 1) for b in range(levels))
-            places = (
-                ((k % BENT_SIDE + 0.5) / BENT_SIDE, k / self.rim_samples, 0.7548776662466927),  # the R2 sequence
-                ((k // BENT_SIDE + 0.5) / BENT_SIDE, reversed_bits, 0.5698402909980532),
-            )
-            u, v = (
-                corner + np.where(bends, middle, (place + here * shift) % 1.0)
-                for corner, (middle, place, shift) in zip((here % self.width, here // self.width), places)
-            )
-            hits.rims = {key: Finer(counts, self._trace(u, v) if len(index) else None)}  # only the latest is kept
+            make = self._in_bodies if self.crowded else self._in_pixels
+            hits.rims = {key: make(index, np.isin(np.arange(len(index)), bent))}  # only the latest is kept
         return hits.rims[key]
 
-    def _spots(self, part, finer: Finer | None = None) -> Iterable:
-        """The points that stand for a light, each for an equal share; for finer samples of a crowded scene one point
-        for each sample, the points in turn: there are as many samples in a pixel as the light needs points."""
+    def _in_pixels(self, index: np.ndarray, bent: np.ndarray) -> Finer:
+        """A Hammersley set in each pixel, shifted from pixel to pixel: an edge in any direction crosses the samples one
+        by one, and not in rows, so that a shadow that moves changes a pixel in small steps. What only bends is smooth:
+        the middles of a square grid."""
+        counts = np.where(bent, BENT_SIDE**2, self.rim_samples)
+        starts = np.cumsum(counts) - counts
+        u, v = np.empty((2, counts.sum()), np.float32)
+        for these, places in ((~bent, self._set(index[~bent], self.rim_samples)), (bent, _grid(BENT_SIDE))):
+            where = starts[these, None] + np.arange(places[0].shape[-1])
+            u[where], v[where] = self._at(index[these], places)
+        return Finer(counts, self._trace(u, v) if len(index) else None)
+
+    def _in_bodies(self, index: np.ndarray, bent: np.ndarray) -> Finer:
+        """A few samples for each body that a pixel sees, which weigh what it has of the pixel; of `bent` the middles of
+        its quarters, as nothing but shadows has an edge there."""
         import mitsuba as mi
 
-        places = part.places()
-        if finer is None or not self.crowded or len(places) < 2:
-            return self.scene.integrator.spots(part)
-        x, y = np.array(places, np.float32)[finer.numbers() % len(places)].T
-        return [part.point(mi.Point2f(np.ascontiguousarray(x), np.ascontiguousarray(y)))]
+        here = index[~bent]
+        u, v = self._at(here, self._set(here, CROWDED_RAYS << (self.fine - 1)))
+        o, d = self.scene.camera.ray(mi.Float(u.ravel()), mi.Float(v.ravel()))
+        wavelengths = self.scene.integrator.wavelengths(u.size)
+        met = self.scene.mitsuba.ray_intersect_preliminary(mi.Ray3f(o, d, mi.Float(0), wavelengths), coherent=True)
+        row, k, weight = _shares(self._bodies(met).reshape(u.shape), *(self.fine * n for n in LIT))
+        quarters = [a.ravel() for a in self._at(index[bent], _grid(2))]
+        pixel = np.append(np.flatnonzero(~bent)[row], np.repeat(np.flatnonzero(bent), 4))
+        u, v = (np.append(a[row, k], quarter) for a, quarter in zip((u, v), quarters))
+        weight = np.append(weight, np.full(len(quarters[0]), 0.25))
+        order = np.argsort(pixel, kind="stable")
+        sample = self._trace(u[order], v[order]) if len(order) else None
+        return Finer(np.bincount(pixel, minlength=len(index)), sample, weight[order])
 
-    def _visible(self, si, part, finer: Finer | None = None):
+    def _bodies(self, met) -> np.ndarray:
+        """(N,) a number for each body that rays met, other than any other's; 0 where they met none."""
+        import drjit as dr
+        import mitsuba as mi
+
+        number, first = mi.UInt32(0), 1
+        for shape in self.scene.mitsuba.shapes():
+            faces = self.faces_each.get(shape.id(), 0)
+            own = met.is_valid() & (met.shape == mi.ShapePtr(shape))
+            number = dr.select(own, first + (met.prim_index // faces if faces else 0), number)
+            first += -(-shape.primitive_count() // faces) if faces else 1
+        return np.array(number)
+
+    def _set(self, index: np.ndarray, count: int) -> tuple[np.ndarray, ...]:
+        """(P, count) places in pixels: a Hammersley set, shifted in each by the R2 sequence."""
+        places = np.arange(count) / count, _reversed(count)
+        return tuple((place + (index * shift)[:, None]) % 1.0 for place, shift in zip(places, R2))
+
+    def _at(self, index: np.ndarray, places: tuple) -> tuple[np.ndarray, np.ndarray]:
+        """(P, n) positions in px of places in pixels."""
+        corners = index % self.width, index // self.width
+        u, v = ((corner[:, None] + place).astype(np.float32) for corner, place in zip(corners, places))
+        return u, v
+
+    def _visible(self, si, part):
         """Share of the LED that each hit sees; a Float (a mask for a point source)."""
         import drjit as dr
 
         integrator = self.scene.integrator
         share = []
-        for point in self._spots(part, finer):
+        for point in integrator.spots(part):
             share.append(integrator.visible(self.scene.mitsuba, si, dr.detach(point), part))
             dr.eval(share[-1])
         return share[0] if len(share) == 1 else share
 
-    def _shade(self, sample: Sample, part, visible, finer: Finer | None = None, take: Callable = lambda light: light):
+    def _shade(self, sample: Sample, part, visible, take: Callable = lambda light: light):
         """Direct radiance per band at hits, an UnpolarizedSpectrum; or the mean of what `take` makes of the light of
         each point of the source, while it is attached to whatever carries gradients.
 
@@ -490,7 +554,7 @@ class Renderer:
 
         self._tune(sample.si)
         shares, total = visible if isinstance(visible, list) else [visible], 0.0
-        for point, seen in zip(self._spots(part, finer), shares):
+        for point, seen in zip(self.scene.integrator.spots(part), shares):
             total += take(self.scene.integrator.direct(self.scene.mitsuba, *sample[:3], part, seen, point))
             if len(shares) > 1:
                 dr.eval(total)
@@ -614,12 +678,12 @@ class Renderer:
 
             return take
 
-        def tangent(sample, visible, finer=None):
+        def tangent(sample, visible):
             attached = mi.Float(dr.detach(value))
             dr.enable_grad(attached)
             setattr(part, parameter, attached)
             try:
-                return self._shade(sample, lamp, visible, finer, forward(attached))
+                return self._shade(sample, lamp, visible, forward(attached))
             finally:
                 setattr(part, parameter, value)
 
@@ -630,8 +694,8 @@ class Renderer:
                 setattr(part, parameter, dr.opaque(mi.Float, float(value[0]) + sign * step))
                 try:
                     finer = image.finer
-                    seen = self._visible(finer.sample.si, lamp, finer)
-                    sides.append(self._shade(finer.sample, lamp, seen, finer))
+                    seen = self._visible(finer.sample.si, lamp)
+                    sides.append(self._shade(finer.sample, lamp, seen))
                 finally:
                     setattr(part, parameter, value)
             return (sides[0] - sides[1]) / (2 * step)
@@ -639,7 +703,7 @@ class Renderer:
         raw = self._raw(
             image,
             lambda: tangent(image.hits.sample, image.visible),
-            moved_rim if moves else lambda: tangent(image.finer.sample, image.rim_visible, image.finer),
+            moved_rim if moves else lambda: tangent(image.finer.sample, image.rim_visible),
         )
         if component and not self.layered:
             return np.zeros((self.height, self.width, self.bands))
@@ -758,6 +822,8 @@ class Hits:
         self.shape = (height, width)
         self.rims: dict = {}
         self.joint: np.ndarray | None = None
+        self.lit: dict[str, tuple] = {}  # what lights see of the pixels' centres, by what it was found for
+        self.eye = np.zeros(3)  # where the camera stood
         self.valid = np.array(self.si.is_valid()).reshape(height, width)
         self.edges = _edges(self.valid)
         if self.path is not None:  # what is passed, and what is met, changes at an edge
@@ -786,19 +852,18 @@ class Finer:
     """Finer samples of some pixels, those of a pixel behind each other.
 
     counts   (n,) of each pixel;   sample   their ends, N in all; None where no pixel has any
+    weights  (N,) share of its pixel that each stands for; None: all of a pixel the same
     """
 
-    def __init__(self, counts: np.ndarray, sample: Sample | None):
-        self.counts, self.sample = counts, sample
+    def __init__(self, counts: np.ndarray, sample: Sample | None, weights: np.ndarray | None = None):
+        self.counts, self.sample, self.weights = counts, sample, weights
         self.size = int(counts.sum())
         self._starts = np.cumsum(counts) - counts
 
-    def numbers(self) -> np.ndarray:
-        """(N,) the number of each sample in its pixel, from 0."""
-        return np.arange(self.size) - np.repeat(self._starts, self.counts)
-
     def mean(self, values: np.ndarray) -> np.ndarray:
         """(n, B) mean in each pixel of values (N, B)."""
+        if self.weights is not None:
+            return np.add.reduceat(values * self.weights[:, None], self._starts)
         return np.add.reduceat(values, self._starts) / self.counts[:, None]
 
     def span(self, values: np.ndarray) -> np.ndarray:
@@ -815,6 +880,45 @@ class LedImage:
         self.share: np.ndarray | float = 1.0  # (n, 1) of the finer samples in each of those pixels
         self.raw: tuple | None = None  # what the light makes before layers: at centres, at finer samples
         self.radiance: np.ndarray | None = None  # the image, in scenes without layers
+
+
+def _grid(side: int) -> tuple[np.ndarray, np.ndarray]:
+    """(n,), (n,) the middles of a square grid in a pixel, row by row."""
+    k = np.arange(side**2)
+    return (k % side + 0.5) / side, (k // side + 0.5) / side
+
+
+def _shares(bodies: np.ndarray, across: int, down: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rows and columns of a table (P, n) of numbers that stand for it, up to across * down for each number in each row;
+    and the share of the row, 1 in all, that each stands for.
+
+    Columns are the places of a Hammersley set. Those of a number are parted by their first coordinate, then by the
+    second, into parts of one size, and the one in the middle of each part is taken."""
+    order = np.argsort(_reversed(bodies.shape[1]))  # columns by their second coordinate
+    rows, left, found = np.arange(len(bodies)), np.ones(bodies.shape, bool), []
+    while len(rows):
+        table = bodies[rows]
+        own = table == table[np.arange(len(rows)), left.argmax(1)][:, None]
+        count, rank = own.sum(1), own.cumsum(1, dtype=np.int16)
+        for i in range(across):
+            low, high = (count * k // across for k in (i, i + 1))
+            part = (own & (rank > low[:, None]) & (rank <= high[:, None]))[:, order]
+            size, columns = part.sum(1), order[np.nonzero(part)[1]]
+            taken, starts = np.minimum(size, down), np.cumsum(size) - size
+            for j in range(down):
+                some = np.flatnonzero(taken > j)
+                at = starts[some] + ((j + 0.5) * size[some] / taken[some]).astype(int)
+                found.append((rows[some], columns[at], size[some] / taken[some] / bodies.shape[1]))
+        left &= ~own
+        more = left.any(1)
+        rows, left = rows[more], left[more]
+    return tuple(np.concatenate(parts) for parts in zip(*found)) if found else (*np.zeros((2, 0), int), np.zeros(0))
+
+
+def _reversed(count: int) -> np.ndarray:
+    """(n,) the second coordinates of a Hammersley set: the bits of a number, behind the point in reverse."""
+    k = np.arange(count)
+    return sum(((k >> b) & 1) / 2 ** (b + 1) for b in range(count.bit_length() - 1))
 
 
 def _creases(normal: np.ndarray) -> np.ndarray:

@@ -160,7 +160,8 @@ class RenderJob:
         if scene.camera is not None and scene.integrator is not None:
             self.integral = scene.integral
             self.auto = self.integral is not None and self.integral.auto
-            self.developer = Developer(scene.camera, self.bands or (0.0,), black, saturation)
+            distances = self.renderer.distances if self.renderer is not None else None
+            self.developer = Developer(scene.camera, self.bands or (0.0,), black, saturation, distances)
         self.record = {
             "scene": scene_record(scene),
             "plugins": plugins_record(scene.registry),
@@ -273,7 +274,9 @@ class RenderJob:
             **(exr.spectral_header(self.stokes, UNITS) if vectors and self.bands else {}),
             "samplesPerPixel": spp,
         }
-        camera = self._developed(vectors, now) if vectors and self.developer is not None else None
+        camera = None
+        if vectors and self.developer is not None:  # whose rays came through all of the pupil
+            camera = self._developed(vectors, {**now, scene.key(scene.camera.name, "pupil"): 0.0})
         return Rendering(channels, header, camera)
 
     def _passes(self, seed: int) -> tuple[dict, dict, int]:

@@ -36,6 +36,13 @@ def radius(law: str, theta_d):
     return 2 * np.tan(theta_d / 2) if law == "stereographic" else theta_d
 
 
+def growth(law: str, theta_d):
+    """d(r/f) / d theta_d, of any shape."""
+    if law == "equisolid":
+        return np.cos(np.minimum(theta_d, math.pi) / 2)
+    return 1 / np.cos(theta_d / 2) ** 2 if law == "stereographic" else np.ones_like(theta_d)
+
+
 def angle(law: str, r):
     """theta_d of r/f, of any shape; infinite where the law has no such radius."""
     if law == "equisolid":

@@ -29,6 +29,7 @@ ROLES = {  # of parameters: what the library turns, sets or solves for, whatever
     "light area": "emitting area of a point light, mm^2; 0: a point",
     "second bounce": "weight of light that the skin reflects twice",
     "exposure": "full scale of the camera per unit of radiance",
+    "pupil": "area of the camera's entrance pupil, mm^2; 0: a pinhole",
     "press x": "where the skin is pressed, right, mm",
     "press y": "where the skin is pressed, down, mm",
     "press depth": "how deep the skin is pressed, mm; 0: untouched",

@@ -22,6 +22,7 @@ XML
     count integer, 1000: number of beads
     seed integer, 0: of the draw
     detail integer, 2: subdivisions of an icosahedron, 1 to 4
+    fine integer, 1: finer samples at outlines: 6 fine^2 of each bead in each pixel are lit, 1 to 6
 """
 
 from optics.scene.checking import agree, made
@@ -69,6 +70,7 @@ PARAMETERS = (
         "which way was down in the mould, from x (right) to y (down)",
         plausible=20.0,
         how="difference",
+        step=0.4,
     ),
 )
 TRIES = 400  # draws of a bead's place before it counts as not fitting
@@ -86,18 +88,20 @@ def build():
         kind = "beads"
         moved_by = "gel"
         carrier = None
-        crowded = True  # rims everywhere: few finer samples in each
 
         def __init__(self, props):
             self.count, self.seed = int(props.get("count", 1000)), int(props.get("seed", 0))
             self.detail = int(props.get("detail", 2))
-            if self.count < 1 or not 1 <= self.detail <= 4:
+            self.fine = int(props.get("fine", 1))
+            if self.count < 1 or not 1 <= self.detail <= 4 or not 1 <= self.fine <= 6:
                 raise ValueError(
-                    f"beads: count = {self.count}, detail = {self.detail}; allowed: at least 1 bead, a detail of 1 to 4"
+                    f"beads: count = {self.count}, detail = {self.detail}, fine = {self.fine}; allowed: at least 1 "
+                    "bead, a detail of 1 to 4, fine of 1 to 6"
                 )
             ball = trimesh.creation.icosphere(subdivisions=self.detail)
             # Cauchy: the mean silhouette of a convex body is a quarter of its surface
             self.ball = ball.vertices * (4 * np.pi / ball.area) ** 0.5
+            self.faces_each = len(ball.faces)  # by which a face's number tells its bead
             n = len(self.ball)
             faces = ball.faces + n * np.arange(self.count)[:, None, None]
             mi.Mesh.__init__(self, "beads", n * self.count, faces.size // 3, props, True, False)

@@ -13,7 +13,9 @@ horizontal field of view, f_y = f_x aspect, the principal point (c_x, c_y) is gi
 image, L_b is the radiance in band b, and M the sensitivities of the channels in the bands (identity, or a measured
 camera of the colour-science library by its name). XML may give `fx`, `fy`, `cx`, `cy` (px) in place of the field of
 view. Frame: x right, y down, z forward (OpenCV); the transform `to_world` gives the nominal pose, `x` ... `roll` what
-departs from it.
+departs from it. Rays of plain Mitsuba start on the entrance pupil, a disc of the area `pupil_area` across the axis, and
+meet where the ray through its middle is `focus` from the camera along the axis; images LED by LED are blurred as the
+effect "defocus" says.
 Fingerprint
     principal point and pose shift the image; distortion grows with the third power of the radius; exposure scales all.
 Validity
@@ -100,6 +102,20 @@ PARAMETERS = (
     Parameter("pan", "deg", 0.0, (-80.0, 80.0), "turn about the y axis", plausible=0.5, how="difference", step=0.2),
     Parameter("tilt", "deg", 0.0, (-80.0, 80.0), "turn about the x axis", plausible=0.5, how="difference", step=0.2),
     Parameter("roll", "deg", 0.0, (-180.0, 180.0), "turn about the z axis", plausible=0.5, how="difference", step=0.8),
+    Parameter(
+        "pupil_area",
+        "mm^2",
+        0.0,
+        (0.0, 1e4),
+        "area of the entrance pupil; 0: a pinhole, all is sharp",
+        neutral=0.0,
+        plausible=0.5,
+        how="image",
+        role="pupil",
+    ),
+    Parameter(
+        "focus", "mm", 20.0, (0.01, 1e6), "distance of what is sharp, along the axis", plausible=1.0, how="image"
+    ),
     Parameter(
         "exposure", "1", 1.0, (0.0, 1e6), "full scale per unit of radiance", plausible=0.1, how="image", role="exposure"
     ),
@@ -205,7 +221,11 @@ def build():
             self.resolution = (width, height)
             matrix = [[float(nominal.matrix[i, j]) for j in range(4)] for i in range(3)]
             self.columns = [dr.opaque(mi.Vector3f, [matrix[i][j] for i in range(3)]) for j in range(4)]
-            self.m_needs_sample_3 = False
+
+        def hold(self, name, value):
+            super().hold(name, value)
+            if name == "pupil_area":
+                self.m_needs_sample_3 = self.number(name) > 0
 
         def wire(self, scene):
             self.bands = len(getattr(scene.integrator, "bands", ())) or 1
@@ -224,6 +244,7 @@ def build():
 
         def parameters_changed(self, keys=()):
             self.reread(keys)
+            self.m_needs_sample_3 = self.number("pupil_area") > 0
 
         def field_of(self, width, fx, props):
             """Horizontal field of view, deg, of an image so wide, px, with a focal length in px."""
@@ -287,6 +308,12 @@ def build():
             y = (v - height / 2 - np.real(own.principal_y)) / (focal * np.real(own.aspect))
             return x, y, focal
 
+        def astray(self, own, u, v, slant):
+            """px in the image by which a ray misses the one through the pupil's middle, per mm between the two on the
+            pupil; of what is `slant` mm from the camera (infinite: nothing)."""
+            x, y, focal = self.normalised(own, u, v)
+            return focal * math.sqrt(np.real(own.aspect)) * (1 / own.focus - np.sqrt(1 + x**2 + y**2) / slant)
+
         def gains(self, own, channels):
             """(channels,) gain of each channel in the frame."""
             return own.gain * np.array([getattr(own, f"gain_{'rgb'[min(c, 2)]}") for c in range(channels)])
@@ -307,8 +334,28 @@ def build():
 
         def sample_ray(self, time, sample1, sample2, sample3, active=True):
             wavelengths, weight = self.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), sample1, active)
-            o, d = self.ray(sample2.x * self.resolution[0], sample2.y * self.resolution[1])
+            o, d = self.through(sample3, *self.ray(sample2.x * self.resolution[0], sample2.y * self.resolution[1]))
             return mi.Ray3f(o, d, time, wavelengths), mi.Spectrum(weight)
+
+        def through(self, sample, o, d):
+            """Origin and direction of a ray through the pupil, of the one through its middle."""
+            if not self.m_needs_sample_3:
+                return o, d
+            axis = self.turned(mi.Vector3f(0, 0, 1))
+            return self.focused(
+                sample,
+                o,
+                d,
+                self.turned(mi.Vector3f(1, 0, 0)),
+                self.turned(mi.Vector3f(0, 1, 0)),
+                self.focus / dr.dot(d, axis),
+            )
+
+        def focused(self, sample, o, d, side, down, distance):
+            """A ray from the pupil, a disc along `side` and `down`, that meets a ray at a distance from its origin."""
+            disc = mi.warp.square_to_uniform_disk_concentric(sample) * dr.sqrt(self.pupil_area / dr.pi)
+            start = o + disc.x * side + disc.y * down
+            return start, dr.normalize(o + distance * d - start)
 
         def sample_ray_differential(self, time, sample1, sample2, sample3, active=True):
             ray, weight = self.sample_ray(time, sample1, sample2, sample3, active)

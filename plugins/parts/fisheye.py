@@ -10,7 +10,9 @@ Definition
 of view of the law alone, at k = 0: half the image's width is the radius of x_fov/2. XML may give `fx`, `fy`, `cx`, `cy`
 (px) and `distortion`, the four numbers of OpenCV's D, in place of these; OpenCV counts from the middle of the first
 pixel, this library from its corner: add 0.5 to its cx and cy. Pose, gains, response and all that happens to the light
-behind the lens are those of the part `camera`. Beyond the image circle, and where a law ends, the image is black.
+behind the lens are those of the part `camera`. Its pupil, as that of a real fisheye nearly, is turned towards whatever
+it sees, and `focus` is the distance from it in every direction. Beyond the image circle, and
+where a law ends, the image is black.
 Fingerprint
     k1 and k2 shift contours with the third and fifth power of the angle; x_fov scales the image.
 Validity
@@ -210,6 +212,12 @@ def build():
             origin = self.columns[3] + self.to_world(mi.Vector3f(self.x, self.y, self.z))
             return mi.Point3f(origin) + dr.zeros(mi.Point3f, dr.width(u)), self.turned(local), seen
 
+        def through(self, sample, o, d):
+            if not self.m_needs_sample_3:
+                return o, d
+            side, down = mi.coordinate_system(d)
+            return self.focused(sample, o, d, side, down, self.focus)
+
         def project(self, points):
             """(N, 2) u, v in px of points (N, 3) in the world, mm; NaN where the lens has them not; numpy."""
             axes = [np.array(self.turned(mi.Vector3f(*axis)), float).ravel() for axis in np.eye(3).tolist()]
@@ -232,9 +240,21 @@ def build():
             )
             return x / r * np.tan(theta), y / r * np.tan(theta), focal
 
+        def astray(self, own, u, v, slant):
+            """px in the image by which a ray misses the one through the pupil's middle, per mm between the two on the
+            pupil, the geometric mean along the radius and across it; of what is `slant` mm away."""
+            x, y, focal = self.normalised(own, u, v)
+            theta = np.arctan(np.hypot(x, y))
+            k = [float(np.real(getattr(own, f"k{i}"))) for i in (1, 2, 3, 4)]
+            bent, slope = fisheye.bent(theta, k), fisheye.slope(theta, k)
+            across = np.divide(fisheye.radius(self.law, bent), np.sin(theta), out=np.ones_like(theta), where=theta > 0)
+            along = fisheye.growth(self.law, bent) * slope
+            return focal * np.sqrt(np.real(own.aspect) * across * along) * (1 / own.focus - 1 / slant)
+
         def sample_ray(self, time, sample1, sample2, sample3, active=True):
             wavelengths, weight = self.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), sample1, active)
             o, d, seen = self.ray_seen(sample2.x * self.resolution[0], sample2.y * self.resolution[1])
+            o, d = self.through(sample3, o, d)
             return mi.Ray3f(o, d, time, wavelengths), mi.Spectrum(dr.select(seen, weight, 0.0))
 
         def to_string(self):

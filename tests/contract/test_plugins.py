@@ -75,6 +75,8 @@ SURROUNDINGS = {  # parameter: what has to stand about it for it to be seen, and
     # off the middle, where stick turns into slip, and without the film, as for the depth of a press
     **{f"gel.{name}": {f"skin.{name}": 0.3, "film.inserted": 0.0} for name in DRAGGING},
     "elastic_skin.thickness": {"gel.absorption": 0.02},
+    "camera.focus": {"camera.pupil_area": 2.0},
+    "fisheye.focus": {"camera.pupil_area": 2.0},
     "beads.gravity": {"beads.settling": 0.3},
     "fluorescent.bleaching": {"dye.time": 3.0},
     "fluorescent.time": {"dye.bleaching": 0.05},

@@ -5,6 +5,7 @@ base     what all of them are: strengths that make a change, the truth of a cell
 touch    digit, gelsight: stock Mitsuba's `path` (optics.proof.makers.touch)
 finger   vi2tap: stock films in the mono variant (optics.proof.makers.finger)
 grid     grid_bench: stock `volpath` (optics.proof.makers.grid)
+particle particle_gel: numpy alone (optics.proof.makers.particle)
 bench    polarizer_bench: coherency matrices (optics.proof.makers.bench)
 laboratory   student, motor, polarimeter, phone, photographs, polarization_camera: benches of other
          laboratories, by plain formulas (optics.proof.makers.laboratory)
@@ -15,6 +16,7 @@ from optics.proof.rigs.bench import Bench
 from optics.proof.rigs.finger import Finger
 from optics.proof.rigs.grid import Grid
 from optics.proof.rigs.laboratory import Motor, Phone, Photographs, Polarimeter, PolarizationCamera, Student
+from optics.proof.rigs.particle import ParticleGel
 from optics.proof.rigs.touch import Digit, Gelsight
 
 RIGS: dict[str, type[Rig]] = {
@@ -24,6 +26,7 @@ RIGS: dict[str, type[Rig]] = {
         Gelsight,
         Finger,
         Grid,
+        ParticleGel,
         Bench,
         Student,
         Motor,

@@ -1,0 +1,325 @@
+"""Captures of a particle gel by numpy alone: balls by their equation, lights by sums, rays through all of the pupil.
+
+It shares nothing with `optics.light` or our parts: rays of a pixel start on the pupil, each is held against every ball
+(closed form) and the cover's face (a height by splines), and what it meets is lit by every LED on its own, with shadows
+by the distance of balls from the way. Spectra are summed over the wavelength. The skin moves by direct sums of point
+forces, of the pressures of flat punches of growing size (Sneddon's contact), incompressible. Shared with the model is
+what its scene file says: the places and diameters of the draw (`optics.skin.cloud`), and where LEDs and lens are.
+Effects are made in the same way: a pupil with an area, an absorbing dye along each way, a shift of the balls, a
+Gaussian over the image. Then come photons, read noise and quantisation. Images are means of SIDE^2 rays per pixel."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from optics.captures import capture_set as capture_files
+from optics.captures.noise import Noise
+from optics.scene.loader import Scene
+from optics.skin.cloud import sizes
+
+# small pixels at high gain: 2.5 DN of noise in the dark, 4 at 150
+CAMERA = Noise(system_gain=0.08, dark_noise=2.5, black_level=8.0, saturation=255.0, prnu=0.0)
+MAKERS = (
+    "lens vignetting",
+    "lens blur",
+    "defocus",
+    "excitation leak",
+    "inner filter",
+    "bleaching",
+    "bead settling",
+    "bead size spread",
+)
+SIDE = 12  # rays of a pixel each way
+RINGS, STEPS, ANGLES = 24, 6, 16  # of a contact: flat punches, radii in each, angles
+
+
+class ParticleMaker:
+    """Makes frames of a particle gel's values with hidden effects {name: strength} or none.
+
+    effects   lens vignetting  power of cos^4;            lens blur         px^2, of a Gaussian along each axis
+              defocus          mm^2, area of the pupil;   excitation leak   share of the last band in the one before
+              inner filter     1/mm, absorption of the dye at its peak;     bleaching   per unit of time
+              bead settling    mm, of the mean bead;      bead size spread  relative
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        values: Mapping[str, float] | None = None,
+        effects: Mapping[str, float] | None = None,
+        noise=CAMERA,
+        seed: int = 0,
+        side: int = SIDE,
+    ):
+        self.values, self.effects = {**scene.values(), **(values or {})}, dict(effects or {})
+        unknown = set(self.effects) - set(MAKERS)
+        if unknown:
+            raise ValueError(f"no independent way to make {', '.join(sorted(unknown))}; known: {', '.join(MAKERS)}")
+        self.noise, self.seed, self.side = noise, seed, side
+        self.size, self.bands = scene.camera.resolution, np.array(scene.integrator.bands)
+        self.camera_z = float(scene.camera.columns[3].z[0])
+        beads = scene.parts["beads"]
+        self.drawn, self.draw_seed, self.rings = (
+            beads.drawn,
+            beads.seed,
+            {n: led.count for n, led in scene.leds.items()},
+        )
+        v = self.values
+        self.spread = self.effects.get("bead size spread", 0.0)
+        self.diameters = sizes(len(self.drawn), v["beads.diameter"], self.spread, self.draw_seed)
+
+    # -- places -------------------------------------------------------------------------------------------------------
+    def rest(self) -> np.ndarray:
+        """(N, 3) middles of the balls at rest, mm."""
+        v = self.values
+        box = np.array([v["beads.width"], v["beads.length"], v["beads.bottom"] - v["beads.top"] + v["beads.diameter"]])
+        at = (self.drawn - [0.5, 0.5, 0.0]) * (box - v["beads.diameter"])
+        way = np.radians(v["beads.gravity"])
+        sunk = self.effects.get("bead settling", 0.0) * (self.diameters / v["beads.diameter"]) ** 2
+        at = np.stack([at[:, 0] + sunk * np.cos(way), at[:, 1] + sunk * np.sin(way), -v["beads.top"] - at[:, 2]], 1)
+        return at
+
+    def loads(self, press: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
+        """(K, 2) places and (K,) forces over E, mm^2, of a ball pressed in by press[2] mm at press[:2]."""
+        x, y, depth = press
+        ball = self.values["gel.tip_radius"]
+        sink = lambda c: c * np.arctanh(c / ball)  # noqa: E731 (depth at which the contact has the radius c)
+        low, high = 0.0, ball * (1 - 1e-12)
+        for _ in range(80):
+            middle = (low + high) / 2
+            low, high = (middle, high) if sink(middle) < depth else (low, middle)
+        edges = np.linspace(0, low, RINGS + 1)
+        c = (edges[1:] + edges[:-1]) / 2
+        force = 2 * c * np.diff(sink(edges)) / (1 - 0.25)  # of a flat punch over E: 2 a delta/(1 - nu^2)
+        q = (np.arange(STEPS) + 0.5) / STEPS  # share of a punch's force within r: 1 - sqrt(1 - r^2/c^2)
+        r = c[:, None] * np.sqrt(1 - (1 - q) ** 2)
+        angle = 2 * np.pi * (np.arange(ANGLES) + 0.5) / ANGLES
+        at = np.stack([x + r[..., None] * np.cos(angle), y + r[..., None] * np.sin(angle)], -1)
+        return at.reshape(-1, 2), np.broadcast_to(force[:, None, None], at.shape[:3]).ravel() / (STEPS * ANGLES)
+
+    def moved(self, points: np.ndarray, press: Sequence[float]) -> np.ndarray:
+        """(N, 3) points (N, 3) of the skin under a press: 3 F/(4 pi E R) (x h/R^2, y h/R^2, 1 + h^2/R^2)."""
+        if press[2] == 0:
+            return points
+        places, forces = self.loads(press)
+        found = points.copy()
+        height = self.values["gel.cover"] - points[:, 2]
+        for start in range(0, len(points), 500):
+            some = slice(start, start + 500)
+            x, y = (points[some, i, None] - places[:, i] for i in (0, 1))
+            h = height[some, None]
+            r = np.sqrt(x**2 + y**2 + h**2)
+            size = 3 * forces / (4 * np.pi * r)
+            found[some] += np.stack([(size * x * h / r**2).sum(1), (size * y * h / r**2).sum(1), 0 * h[:, 0]], 1)
+            found[some, 2] -= (size * (1 + h**2 / r**2)).sum(1)
+        return found
+
+    def face(self, press: Sequence[float]):
+        """Height of the gel's face as a spline of x and y, mm."""
+        from scipy.interpolate import RectBivariateSpline
+
+        axis = np.linspace(-15, 15, 101)
+        grid = np.stack(np.meshgrid(axis, axis, indexing="ij"), -1).reshape(-1, 2)
+        at = self.moved(np.column_stack([grid, np.zeros(len(grid))]), press)
+        return RectBivariateSpline(axis, axis, at[:, 2].reshape(101, 101))
+
+    # -- rays ---------------------------------------------------------------------------------------------------------
+    def rays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Origins, directions (N, 3) and angles from the axis (N,) of all rays, those of a pixel behind each other."""
+        v, (width, height) = self.values, self.size
+        k = (np.arange(self.side) + 0.5) / self.side
+        row, column, down, across = np.meshgrid(np.arange(height), np.arange(width), k, k, indexing="ij")
+        focal = width / 2 / np.radians(v["camera.x_fov"] / 2)
+        x = (column + across - width / 2 - v["camera.principal_x"]).ravel() / focal
+        y = (row + down - height / 2 - v["camera.principal_y"]).ravel() / focal
+        theta = np.hypot(x, y)
+        sine = np.sinc(theta / np.pi)
+        d = np.stack([x * sine, y * sine, np.cos(theta)], 1)
+        o = np.zeros_like(d) + [v["camera.x"], v["camera.y"], self.camera_z + v["camera.z"]]
+        area = self.effects.get("defocus", 0.0)
+        if area:
+            rng = np.random.default_rng([self.seed, 5])
+            n = self.side**2
+            # a pupil's places in each pixel: equal areas in radius and angle, in an order of their own
+            order = rng.permuted(np.tile(np.arange(n), (len(d) // n, 1)), axis=1).ravel()
+            radius = np.sqrt((order // self.side + rng.random(len(d))) / self.side * area / np.pi)
+            angle = 2 * np.pi * (order % self.side + rng.random(len(d))) / self.side
+            side = np.cross(d, [0.0, 1.0, 0.0])
+            side /= np.linalg.norm(side, axis=1, keepdims=True)
+            up = np.cross(d, side)
+            shift = radius[:, None] * (np.cos(angle)[:, None] * side + np.sin(angle)[:, None] * up)
+            d = v["camera.focus"] * d - shift
+            d /= np.linalg.norm(d, axis=1, keepdims=True)
+            o = o + shift
+        return o, d, theta
+
+    def met(self, o, d, centres, face) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Places (N, 3), normals (N, 3) and numbers (N,) of what rays meet: a ball, or -1 for the face."""
+        width, height = self.size
+        far, number = np.full(len(d), np.inf), np.full(len(d), -1)
+        table = d.reshape(height, width, -1, 3)
+        middle = table.mean(2)
+        middle /= np.linalg.norm(middle, axis=-1, keepdims=True)
+        eye = o.mean(0)
+        wide = 1.5 / (width / np.radians(self.values["camera.x_fov"]))  # rad: a pixel and a half
+        wide += np.sqrt(self.effects.get("defocus", 0.0) / np.pi) / 10.0  # the pupil's radius at the nearest balls
+        rows = np.arange(len(d)).reshape(height, width, -1)
+        for k, (centre, size) in enumerate(zip(centres, self.diameters / 2)):
+            to = centre - eye
+            distance = np.linalg.norm(to)
+            near = rows[middle @ to / distance > np.cos(np.arcsin(size / distance) + wide)].ravel()
+            b = ((o[near] - centre) * d[near]).sum(1)
+            root = b**2 - ((o[near] - centre) ** 2).sum(1) + size**2
+            t = np.where(root > 0, -b - np.sqrt(np.maximum(root, 0)), np.inf)
+            closer = t < far[near]
+            far[near[closer]], number[near[closer]] = t[closer], k
+        free = number < 0
+        t = -o[free, 2] / d[free, 2]
+        for _ in range(4):  # the face is all but flat
+            p = o[free] + t[:, None] * d[free]
+            t = t + (face(p[:, 0], p[:, 1], grid=False) - p[:, 2]) / d[free, 2]
+        far[free] = t
+        p = o + far[:, None] * d
+        normal = np.empty_like(p)
+        normal[~free] = (p[~free] - centres[number[~free]]) / (self.diameters[number[~free]] / 2)[:, None]
+        slope = [face(p[free, 0], p[free, 1], dx=i, dy=1 - i, grid=False) for i in (1, 0)]
+        normal[free] = np.stack([slope[0], slope[1], -np.ones(free.sum())], 1)
+        normal[free] /= np.linalg.norm(normal[free], axis=1, keepdims=True)
+        return p, normal, number
+
+    # -- light --------------------------------------------------------------------------------------------------------
+    def lamps(self, ring: str) -> np.ndarray:
+        """(n, 3) places of a ring's LEDs, which look along z, mm."""
+        v, n = self.values, self.rings[ring]
+        angle = 2 * np.pi * np.arange(n) / n + np.radians(v[f"{ring}.roll"])
+        at = np.stack([v[f"{ring}.radius"] * np.cos(angle), v[f"{ring}.radius"] * np.sin(angle), 0 * angle], 1)
+        return at + [v[f"{ring}.{c}"] for c in "xyz"]
+
+    def irradiance(self, ring: str, p, normal, number, centres, view) -> tuple[np.ndarray, np.ndarray]:
+        """(N,) irradiance that one ring at power 1 brings to places, and what of it a dye in the gel leaves on both
+        ways, per band (N, B)."""
+        v, total, left = self.values, np.zeros(len(p)), np.zeros((len(p), len(self.bands)))
+        dye = self.effects.get("inner filter", 0.0)
+        absorbed = dye * np.exp(-4 * np.log(2) * ((self.bands - v["gel.dye_peak"]) / v["gel.dye_fwhm"]) ** 2)
+        own = dye * np.exp(-4 * np.log(2) * ((v[f"{ring}.wavelength"] - v["gel.dye_peak"]) / v["gel.dye_fwhm"]) ** 2)
+        groups = [np.flatnonzero(number == k) for k in range(-1, len(centres))]
+        for lamp in self.lamps(ring):
+            to = lamp - p
+            distance = np.linalg.norm(to, axis=1)
+            to /= distance[:, None]
+            light = np.maximum((normal * to).sum(1), 0) * np.maximum(-to[:, 2], 0) ** v[f"{ring}.mu"] / distance**2
+            for k, group in enumerate(groups, -1):
+                self._shade(light, group, k, p, to, lamp, centres)
+            light /= self.rings[ring]
+            total += light
+            way = gel_length(p, to, distance, v["gel.thickness"])
+            left += light[:, None] * np.exp(-own * way[:, None] - absorbed * view[:, None])
+        return total, left
+
+    def _shade(self, light, group, k: int, p, to, lamp, centres) -> None:
+        """Take the light away from places of one body that other balls shade."""
+        if not len(group):
+            return
+        around = p[group].mean(0) if k >= 0 else None
+        for m, centre in enumerate(centres):
+            if m == k:
+                continue
+            r = self.diameters[m] / 2
+            if around is not None:  # a ball in the way of a lamp to another ball lies near the line between them
+                line = lamp - around
+                s = np.clip((centre - around) @ line / (line @ line), 0, 1)
+                if np.linalg.norm(centre - around - s * line) > r + self.diameters[k] / 2:
+                    continue
+                some = group
+            else:
+                scale = (lamp[2] - 0.0) / (lamp[2] - centre[2])  # where the shadow falls on the face
+                spot = lamp + (centre - lamp) * scale
+                some = group[np.abs(p[group, 0] - spot[0]) < 3 * r]
+                some = some[np.abs(p[some, 1] - spot[1]) < 3 * r]
+            if not len(some):
+                continue
+            away = centre - p[some]
+            along = (away * to[some]).sum(1)
+            light[some[(along > 0) & ((away**2).sum(1) - along**2 < r**2)]] = 0.0
+
+    def radiance(self, press: Sequence[float]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+        """Of each ring at power 1: (H, W, B) radiance by reflection, and by fluorescence."""
+        v, (width, height) = self.values, self.size
+        o, d, theta = self.rays()
+        centres, face = self.moved(self.rest(), press), self.face(press)
+        p, normal, number = self.met(o, d, centres, face)
+        view = gel_length(p, -d, np.full(len(p), np.inf), v["gel.thickness"])
+        fall = np.cos(theta) ** (4 * self.effects.get("lens vignetting", 0.0))
+        ball = number >= 0
+        nm = np.linspace(200, 900, 14001)
+        bell = lambda x, peak, fwhm: np.exp(-4 * np.log(2) * ((x - peak) / fwhm) ** 2)  # noqa: E731
+        made = bell(nm, v["dye.emission_peak"], v["dye.emission_fwhm"])
+        photons = bell(self.bands, v["dye.emission_peak"], v["dye.emission_fwhm"]) / np.trapezoid(made, nm)
+        found = {}
+        for ring in self.rings:
+            _, light = self.irradiance(ring, p, normal, number, centres, view)
+            sent = bell(nm, v[f"{ring}.wavelength"], v[f"{ring}.fwhm"])
+            taken = v["dye.absorptance"] * bell(nm, v["dye.absorption_peak"], v["dye.absorption_fwhm"])
+            absorbed = np.trapezoid(sent * taken * nm, nm)
+            rho = np.where(
+                ball[:, None],
+                [v[f"dye.rho_{c}"] for c in "rgb"],
+                [v[f"cover.rho_{c}"] for c in "rgb"],
+            )
+            mirrored = rho / np.pi * light * bell(self.bands, v[f"{ring}.wavelength"], v[f"{ring}.fwhm"])
+            shone = ball[:, None] * v["dye.yield"] / np.pi * absorbed * light * photons / self.bands
+            found[ring] = tuple(
+                (fall[:, None] * image).reshape(height, width, -1, len(self.bands)).mean(2)
+                for image in (mirrored, shone)
+            )
+        return found
+
+    # -- camera -------------------------------------------------------------------------------------------------------
+    def photograph(self, radiance: np.ndarray, rng) -> np.ndarray:
+        """(H, W, B) noisy, quantised DN."""
+        from scipy.ndimage import gaussian_filter
+
+        n, image = self.noise, radiance
+        if "lens blur" in self.effects:
+            sd = np.sqrt(self.effects["lens blur"])
+            image = np.stack(
+                [gaussian_filter(b, sd, mode="reflect", truncate=6) for b in np.moveaxis(image, -1, 0)], -1
+            )
+        if "excitation leak" in self.effects:
+            image = image.copy()
+            image[..., 1] += self.effects["excitation leak"] * image[..., 2]
+        signal = n.black_level + (n.saturation - n.black_level) * self.values["camera.exposure"] * image
+        return n.expose(signal, rng).astype(np.float32)
+
+    def captures(self, presses: Sequence[Sequence[float]]) -> capture_files.Captures:
+        """Frames of every press (x, y, depth in mm), a group each, lit by one ring after the other; `time` goes on by 1
+        from frame to frame."""
+        rng = np.random.default_rng([self.seed, 3])
+        kept: dict[tuple, dict] = {}
+        frames: list[capture_files.Frame] = []
+        for k, press in enumerate(presses):
+            key = tuple(float(c) for c in press)
+            light = kept.setdefault(key, None) or self.radiance(press)
+            kept[key] = light
+            for ring, (mirrored, shone) in light.items():
+                time = float(len(frames))
+                left = np.exp(-self.effects.get("bleaching", 0.0) * time)
+                settings = {f"gel.press_{n}": c for n, c in zip(("x", "y", "depth"), key)}
+                settings |= {f"{n}.power": float(n == ring) for n in self.rings}
+                settings["dye.time"] = time
+                image = self.photograph(self.values[f"{ring}.power"] * (mirrored + left * shone), rng)
+                name = f"press{k:02d}-{ring}"
+                frames.append(
+                    capture_files.Frame(name, image, None, f"press-{k:02d}", settings, [], f"frames/{name}.png")
+                )
+        known = {"camera.exposure": float(self.values["camera.exposure"]), "cover.sigma": 0.0}
+        return capture_files.Captures(Path("."), "particle_gel", frames, known, self.noise, None, None, "DN", None, [])
+
+
+def gel_length(p: np.ndarray, d: np.ndarray, longest: np.ndarray, thickness: float) -> np.ndarray:
+    """(N,) mm of straight ways from places p along unit vectors d, that leave the gel at z = -thickness."""
+    inside = np.maximum(p[:, 2] + thickness, 0) / np.maximum(-d[:, 2], 1e-9)
+    return np.minimum(inside, longest)

@@ -1,0 +1,62 @@
+"""`particle_gel`: a small field of beads, pressed at three places, by numpy alone (optics.proof.makers.particle)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from optics.captures import capture_set as capture_files
+from optics.proof.cells import Cell
+from optics.proof.makers.particle import CAMERA, ParticleMaker
+from optics.proof.rigs.base import ImageRig, Mean
+from optics.scene import loader as scenes
+
+
+class ParticleGel(ImageRig):
+    """Sixty beads under three presses, first and last the same, lit by one ring after the other; one press is held out.
+    8 bits, 4 DN of noise at 150. Clutter and kinds that the library lacks are not made."""
+
+    name = "particle_gel"
+    effects = (
+        "lens vignetting",
+        "lens blur",
+        "defocus",
+        "excitation leak",
+        "inner filter",
+        "bleaching",
+        "bead settling",
+        "bead size spread",
+    )
+    mistakes = ("gain +20 %", "gain -20 %")
+    cluttered = False
+    free = ("inner_ring.power", "outer_ring.power", "dye.yield", "camera.x_fov", "camera.z")
+    defines = {
+        "width": "40",
+        "height": "40",
+        "x_fov": "40",
+        "beads": "60",
+        "diameter": "1.2",
+        "field": "13",
+        "fine": "4",
+        "detail": "3",
+    }
+    held_out = ("press-02",)
+    presses = ((0.0, 0.0, 0.5), (2.0, -1.5, 0.6), (-1.5, 2.0, 0.5), (0.0, 0.0, 0.5))
+    frames = 3
+
+    def scene(self):
+        return scenes.load(self.name, self.defines)
+
+    def built(self, scene, seed: int) -> dict[str, float]:
+        rng = np.random.default_rng([seed, 1])
+        values = {f"{name}.power": scene.values()[f"{name}.power"] * rng.uniform(0.9, 1.1) for name in scene.leds}
+        values["dye.yield"] = rng.uniform(0.6, 0.75)
+        values["camera.x_fov"] = 40 + rng.uniform(-0.5, 0.5)
+        return {**values, "cover.sigma": 0.0}
+
+    def captures(self, cell: Cell, truth, unknown, *, mean: bool = False) -> capture_files.Captures:
+        scene = self.scene()
+        noise = Mean(CAMERA) if mean else CAMERA
+        maker = ParticleMaker(scene, self.built(scene, cell.seed), truth, noise, 1000 + cell.seed)
+        found = maker.captures(self.presses)
+        found.noise = CAMERA
+        return found
