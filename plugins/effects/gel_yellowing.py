@@ -2,9 +2,9 @@
 
 Definition
     L' = L exp(-y exp(-(lambda - 440)/w) (d_light + d_view))
-with the coefficient y = `yellowing` at 440 nm, the width w = `yellowing_width` of the absorption's tail, and the lengths
-of both paths inside the gel, -thickness < z < 0. Silicones and polyurethanes that age, or are cured too hot, have the
-exponential tail of an absorption in the ultraviolet.
+with the coefficient y = `yellowing` at 440 nm, the width w = `yellowing_width` of the absorption's tail, and the
+lengths of both paths inside the gel, -thickness < z < 0. Silicones and polyurethanes that age, or are cured too hot,
+have the exponential tail of an absorption in the ultraviolet.
 Fingerprint
     blue light darkens with the length of its path: towards the far side of its LED and towards the corners, while red
     light stays. Gel absorption darkens all colours alike; a blue LED that is weaker darkens everywhere.
