@@ -86,11 +86,14 @@ VIEWS = (PRESSED, COLOURED, BENCH, FINGER, MOSAIC, MIRROR, GRID, BEADS)  # the f
 
 # effect -> (view, holders of the effect; None: every part of its kind)
 SHOWN: dict[str, tuple[View, tuple[str, ...] | None]] = {
+    **dict.fromkeys(("lateral-colour", "chromatic-focus", "gel-yellowing"), (COLOURED, None)),
     "colour-crosstalk": (COLOURED, None),  # white light on a grey skin has no colour to mix
     "bleaching": (BEADS, None),  # a setting of time
     "inner-filter": (BEADS, None),  # light that comes back in another colour
     "excitation-leak": (BEADS, None),
-    **dict.fromkeys(("led-centre-shift", "led-width", "sensitivity-tail", "filter-edge-shift"), (SPECTRAL, None)),
+    **dict.fromkeys(
+        ("led-centre-shift", "led-width", "sensitivity-tail", "filter-edge-shift", "metameric-paint"), (SPECTRAL, None)
+    ),
     "phosphor-leak": (WHITE, None),
     "dark-offset": (ONE_SIDE, None),
     "veiling-glare": (ONE_SIDE, None),

@@ -75,8 +75,8 @@ def import_frames(
         raise BadCapture(f"bin = {bin}, bits = {bits}; allowed: bin 1 or more, bits 8 to 16")
     if not source.is_dir():
         raise BadCapture(f"{source}: no such folder of raw frames")
-    rows = _listed(source, Path(settings)) if settings is not None else _named(source)
-    rows = [(file, _keys(own, rename or {}, str(file))) for file, own in rows]
+    rows = listed(source, Path(settings)) if settings is not None else named(source, SUFFIXES)
+    rows = [(file, keyed(own, rename or {}, str(file))) for file, own in rows]
     images, masks = _read(rows, mosaic)
     warnings: list[str] = []
     images, depth = _levelled(images, bits, warnings)
@@ -88,7 +88,7 @@ def import_frames(
     noise = None
     if system_gain is not None and dark_noise is not None:
         noise = Noise(system_gain / count, dark_noise / bin, black_level, float(2**depth - 1), 0.0)
-    frames = _frames(rows, images, masks)
+    frames = framed(rows, images, masks)
     if noise is None and black_level:
         warnings.append(
             f"black_level = {black_level:g} DN belongs to [noise], which repeats stand in for: it is not written down; "
@@ -106,11 +106,11 @@ def import_frames(
 
 
 # -- what was set ----------------------------------------------------------------------------------------------------
-def _named(source: Path) -> list[tuple[Path, dict[str, str]]]:
+def named(source: Path, suffixes: Sequence[str]) -> list[tuple[Path, dict[str, str]]]:
     """Files of a folder, each with the pieces name=value of its name."""
-    files = sorted(file for file in source.iterdir() if file.suffix.lower() in SUFFIXES)
+    files = sorted(file for file in source.iterdir() if file.suffix.lower() in suffixes)
     if not files:
-        raise BadCapture(f"{source}: no raw frames; allowed: {', '.join(SUFFIXES)} files")
+        raise BadCapture(f"{source}: no frames; allowed: {', '.join(suffixes)} files")
     found = []
     for file in files:
         own: dict[str, str] = {}
@@ -125,7 +125,7 @@ def _named(source: Path) -> list[tuple[Path, dict[str, str]]]:
     return found
 
 
-def _listed(source: Path, table: Path) -> list[tuple[Path, dict[str, str]]]:
+def listed(source: Path, table: Path) -> list[tuple[Path, dict[str, str]]]:
     """Files that a CSV lists, each with the cells of its other columns."""
     if not table.is_file():
         raise BadCapture(f"{table}: no such file; give a CSV with the column file and one for each setting")
@@ -154,7 +154,7 @@ def _listed(source: Path, table: Path) -> list[tuple[Path, dict[str, str]]]:
     return found
 
 
-def _keys(own: Mapping[str, str], rename: Mapping[str, str], where: str) -> dict[str, float | str]:
+def keyed(own: Mapping[str, str], rename: Mapping[str, str], where: str) -> dict[str, float | str]:
     """Settings by key, numbers where they are numbers."""
     found: dict[str, float | str] = {}
     for name, text in own.items():
@@ -240,7 +240,7 @@ def _any(mask: np.ndarray, mosaic: Mosaic, bin: int) -> np.ndarray:
     return _joined(_cells(mask, mosaic, bin).any((1, 4)))
 
 
-def _frames(rows: Sequence[tuple[Path, Mapping]], images: Sequence[np.ndarray], masks: Sequence) -> list[Frame]:
+def framed(rows: Sequence[tuple[Path, Mapping]], images: Sequence[np.ndarray], masks: Sequence) -> list[Frame]:
     """A frame for each combination of settings; further files of the same are its repeats."""
     frames: dict[tuple, Frame] = {}
     for (file, own), image, mask in zip(rows, images, masks):

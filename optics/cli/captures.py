@@ -35,15 +35,16 @@ if TYPE_CHECKING:
 
 @app.command(
     "import",
-    help="Read a measured data set of ball presses, a calibration folder of 9DTact, scans under one LED at a time, or "
-    "raw frames of a polarization camera, into a capture folder.",
+    help="Read a measured data set of ball presses, a calibration folder of 9DTact, scans under one LED at a time, raw "
+    "frames of a polarization camera, or hyperspectral images, into a capture folder.",
 )
 def import_(
     source: Annotated[
         Path,
         typer.Argument(
             metavar="SOURCE",
-            help="A calibration pack (.npz or its folder), a folder of images, of scans, or of 9DTact.",
+            help="A calibration pack (.npz or its folder), a folder of images, of scans, or of 9DTact; an ENVI header "
+            "(.hdr), a Spectral EXR, a folder of these, or of images named by their wavelength (skin_550nm.tif).",
         ),
     ],
     output: Annotated[Path, typer.Option("-o", "--output", metavar="CAPTURES", help="Folder of the new capture set.")],
@@ -85,7 +86,8 @@ def import_(
         typer.Option(
             "--settings",
             metavar="CSV",
-            help="Of raw frames: file, and a column per setting; without it file names say them, angle=30__2.tif.",
+            help="Of raw frames and cubes: file, and a column per setting; without it file names say them, "
+            "angle=30__2.tif.",
         ),
     ] = None,
     rename: Annotated[
@@ -95,12 +97,19 @@ def import_(
         ),
     ] = None,
     scene: Annotated[
-        str | None, typer.Option("--scene", help="Scene of raw frames.", show_default="polarization_camera")
+        str | None,
+        typer.Option(
+            "--scene", help="Scene of raw frames, or of cubes.", show_default="polarization_camera, or of cubes digit"
+        ),
     ] = None,
-    bits: Annotated[int | None, typer.Option("--bits", help="Of raw frames; without it, derived.")] = None,
-    black_level: Annotated[float | None, typer.Option("--black-level", help="Of raw frames, DN.")] = None,
-    system_gain: Annotated[float | None, typer.Option("--system-gain", help="Of raw frames, DN per electron.")] = None,
-    dark_noise: Annotated[float | None, typer.Option("--dark-noise", help="Of raw frames, DN, rms.")] = None,
+    bands: Annotated[
+        str | None,
+        typer.Option("--bands", metavar="400:700:10", help="Of cubes: join bands, nm.", show_default="as they are"),
+    ] = None,
+    bits: Annotated[int | None, typer.Option("--bits", help="Of raw frames and cubes; without it, derived.")] = None,
+    black_level: Annotated[float | None, typer.Option("--black-level", help="Of raw frames and cubes, DN.")] = None,
+    system_gain: Annotated[float | None, typer.Option("--system-gain", help="Of these, DN per electron.")] = None,
+    dark_noise: Annotated[float | None, typer.Option("--dark-noise", help="Of these, DN, rms.")] = None,
     force: Force = False,
     quiet: Quiet = False,
     debug: Debug = False,
@@ -108,8 +117,9 @@ def import_(
     """Read presses; write captures.toml, a scene, and a report of contradictions between labels, scale and images.
 
     A folder of scan folders (scan.yaml), of 9DTact (depth_calibration) or of a pack (dataPack.npz) is read as such.
-    With --mosaic, read raw frames of a polarization camera."""
-    from optics.captures import importing, raw_frames, scans, translucent
+    With --mosaic, read raw frames of a polarization camera. Of hyperspectral images each band becomes a channel, and
+    sensitivities.csv says what it sees."""
+    from optics.captures import hyperspectral, importing, raw_frames, scans, translucent
     from optics.polarization.mosaic import read_mosaic
 
     terminal.quiet, terminal.debug = quiet, debug
@@ -124,20 +134,43 @@ def import_(
         "--system-gain": system_gain,
         "--dark-noise": dark_noise,
     }
+    presses = {
+        "--circles": circles,
+        "--ball-radius": ball_radius,
+        "--mm-per-pixel": mm_per_pixel,
+        "--leds": leds,
+        "--every": every,
+        "--untouched": untouched,
+    }
+    of_presses = [name for name, value in presses.items() if value is not None]
+    if mosaic is None and hyperspectral.is_cube_source(source):
+        if of_presses:
+            raise ValueError(f"{', '.join(of_presses)}: not of hyperspectral images; leave these out")
+        read = hyperspectral.import_cubes(
+            source,
+            output,
+            scene=scene or "digit",
+            settings=listed,
+            rename=pairs(rename, "--rename"),
+            bands=bands,
+            bits=bits,
+            bin=bin,
+            black_level=black_level or 0.0,
+            system_gain=system_gain,
+            dark_noise=dark_noise,
+            overwrite=force,
+        )
+        _tell(read.folder, read.warnings)
+        return
+    if bands is not None:
+        raise ValueError(f"--bands: for hyperspectral images only, and {source} holds none; leave it out")
     if mosaic is None and (given := [name for name, value in raw.items() if value is not None]):
         raise ValueError(
             f'{", ".join(given)}: for raw frames of a polarization camera only; give --mosaic "90 45 135 0" as well'
         )
     if mosaic is not None:
-        presses = {
-            "--circles": circles,
-            "--ball-radius": ball_radius,
-            "--mm-per-pixel": mm_per_pixel,
-            "--leds": leds,
-            "--every": every,
-        }
-        if given := [name for name, value in {**presses, "--untouched": untouched}.items() if value is not None]:
-            raise ValueError(f"{', '.join(given)}: for presses only; leave out --mosaic, or these")
+        if of_presses:
+            raise ValueError(f"{', '.join(of_presses)}: for presses only; leave out --mosaic, or these")
         read = raw_frames.import_frames(
             source,
             output,

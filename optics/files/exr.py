@@ -192,19 +192,31 @@ def srgb(linear: np.ndarray) -> np.ndarray:
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055)
 
 
+def in_colours(image: np.ndarray) -> np.ndarray:
+    """(H, W, 1 or 3) of an image (H, W, C) as it is shown: of more channels, which go up in wavelength, the means of
+    the last, the middle and the first third; of two, their mean."""
+    count = image.shape[2]
+    if count in (1, 3):
+        return image
+    if count < 3:
+        return image.mean(2, keepdims=True)
+    return np.stack([part.mean(2) for part in np.array_split(image, 3, axis=2)[::-1]], -1)
+
+
 def write_png(path: str | Path, image: np.ndarray, *, white: float = 1.0, tone: str = "srgb") -> Path:
-    """An 8-bit preview of (H, W), (H, W, 1) or (H, W, 3): `white` becomes 255, what lies beyond is clipped.
+    """An 8-bit preview of (H, W) or (H, W, C): `white` becomes 255, what lies beyond is clipped; see `in_colours`.
 
     tone  'srgb' for linear radiance; 'linear' for values that are shown as they are, such as DN (white=255)
     """
     from PIL import Image
 
     image = np.asarray(image, float)
+    image = in_colours(image) if image.ndim == 3 else image
     image = image[..., 0] if image.ndim == 3 and image.shape[2] == 1 else image
     if tone not in ("srgb", "linear") or not white > 0:
         raise ValueError(f"{path}: tone = {tone!r}, white = {white}; allowed: 'srgb' or 'linear', white > 0")
     if image.ndim != 2 and image.shape[2:] != (3,):
-        raise ValueError(f"{path}: image of shape {image.shape}; allowed: (H, W), (H, W, 1), (H, W, 3)")
+        raise ValueError(f"{path}: image of shape {image.shape}; allowed: (H, W) or (H, W, C)")
     if not np.isfinite(image).all():
         raise ValueError(f"{path}: {np.sum(~np.isfinite(image))} values are not finite; replace them before a preview")
     shown = srgb(image / white) if tone == "srgb" else np.clip(image / white, 0.0, 1.0)

@@ -311,7 +311,8 @@ class RenderJob:
 
     def _band_names(self) -> list[str]:
         if self.integral is not None:
-            return list("RGB") if len(self.integral.quantum) == 3 else ["Y"]
+            count = len(self.integral.quantum)
+            return list("RGB") if count == 3 else ["Y"] if count == 1 else [f"channel{c}" for c in range(count)]
         return list("RGB") if len(self.bands) == 3 else [exr.spectral_name(b)[3:] for b in self.bands] or ["Y"]
 
     def _radiance_channels(self, radiance: np.ndarray, now: Mapping) -> dict[str, np.ndarray]:

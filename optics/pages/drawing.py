@@ -11,6 +11,7 @@ from functools import partial
 import numpy as np
 
 from optics import words
+from optics.files.exr import in_colours
 
 SIDE_MIN = 8  # px; smaller frames are readings, shown as points over the settings
 SIGMA_RANGE = 5.0  # the residual colour bar is symmetric, +- this
@@ -24,8 +25,7 @@ number, percent = partial(words.number, typeset=True), partial(words.percent, ty
 
 
 def eight_bit(image: np.ndarray, white: float) -> np.ndarray:
-    image = image if image.shape[2] in (1, 3) else image.mean(2, keepdims=True)
-    return np.clip(np.nan_to_num(image) / white * 255 + 0.5, 0, 255).astype(np.uint8)
+    return np.clip(np.nan_to_num(in_colours(image)) / white * 255 + 0.5, 0, 255).astype(np.uint8)
 
 
 def colour_planes(z: np.ndarray) -> np.ndarray:

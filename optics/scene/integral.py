@@ -84,7 +84,8 @@ class Integral:
 
     nm       (B,) wavelengths;   auto  whether lights have bands of their own
     colours  (B,) index of the share or reflectance (0, 1, 2) that a band belongs to
-    error    of auto bands, the largest error in a channel over its largest integral (see `Integral`'s module)
+    error    of auto bands, the largest error in a channel over the largest integral of its light, those of the ranges
+             added up
     """
 
     def __init__(self, scene, bands: Sequence[float] = (), count: int = 0):
@@ -186,7 +187,7 @@ class Integral:
         """Groups with their nodes; sets `nm` and `error`."""
         groups: list[Group] = []
         nm: list[float] = []
-        errors = [0.0]
+        worst = 0.0
         colours = colour_index(self.grid)
         for group in contents:
             power = np.real(group.spectrum(self.base))
@@ -195,20 +196,21 @@ class Integral:
             kept = [c for c in range(3) if shares[c] > NEGLIGIBLE * shares.sum()]
             nearest = np.array(kept)[np.abs(np.array(kept)[None] - colours[:, None]).argmin(1)]
             largest = (self.quantum * power * self.step).sum(1).max()
-            polynomials, start = [], len(nm)
+            polynomials, start, total = [], len(nm), 0.0
             for c in kept:
                 inside = nearest == c
                 for n in range(count or 1, (count or MOST) + 1):
                     nodes = gauss_nodes(self.grid[inside], weight[inside], n)
                     rows = np.where(inside, lagrange(nodes, self.grid), 0.0)
                     error = self._error(nodes, rows, inside, power) / largest
-                    if error <= TOLERANCE:
+                    if error <= TOLERANCE / len(kept):
                         break
-                errors.append(float(error))
+                total += float(error)
                 nm.extend(nodes)
                 polynomials.append(rows)
+            worst = max(worst, total)
             groups.append(replace(group, bands=np.arange(start, len(nm)), polynomials=np.concatenate(polynomials)))
-        self.nm, self.error = np.array(nm), max(errors)
+        self.nm, self.error = np.array(nm), worst
         return groups
 
     def _error(self, nodes: np.ndarray, rows: np.ndarray, inside: np.ndarray, power: np.ndarray) -> float:

@@ -327,8 +327,19 @@ class Declared:
 
         if self.integral is None:
             return mi.UnpolarizedSpectrum(*(first, second, third, mi.Float(1.0))[: dr.size_v(mi.UnpolarizedSpectrum)])
-        nm = mi.UnpolarizedSpectrum(wavelengths)
+        return self.in_range(first, second, third, mi.UnpolarizedSpectrum(wavelengths))
+
+    def in_range(self, first, second, third, nm):
+        """A spectrum of three values: from 580 nm on, from 500 nm on, and below."""
+        import drjit as dr
+
         return dr.select(nm >= EDGES[0], first, dr.select(nm >= EDGES[1], second, third))
+
+    def nm(self, wavelengths):
+        """Wavelengths as a spectrum; in a mono variant that of its band, 540 nm where it names none."""
+        import mitsuba as mi
+
+        return mi.UnpolarizedSpectrum(wavelengths if mi.is_spectral else self.band or 540.0)
 
     # -- neighbours ---------------------------------------------------------------------------------------------------
     def wire(self, scene) -> None:

@@ -21,16 +21,12 @@ import numpy as np
 
 from optics.scene.checking import agree
 from optics.scene.declare import Effect
+from optics.scene.images import blurred
 from optics.scene.parameter import Parameter
 
 
 def smear(image, camera):
-    from scipy.fft import dctn, idctn
-
-    rows, columns = image.shape[:2]
-    frequency2 = (np.pi * np.arange(rows) / rows)[:, None] ** 2 + (np.pi * np.arange(columns) / columns) ** 2
-    transfer = np.exp(-camera.blur * frequency2 / 2)[..., None]
-    return idctn(dctn(image, axes=(0, 1)) * transfer, axes=(0, 1))
+    return blurred(image, camera.blur)
 
 
 def check_point_spread():

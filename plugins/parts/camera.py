@@ -31,12 +31,14 @@ XML
     mosaic string: angles of the analysers on the pixels of a polarization camera, deg, row by row as the camera sees
         them: "90 45; 135 0"; none without it; `mosaic` in captures.toml replaces it
     sensitivity string, identity: sensitivities of the channels: a camera of the colour-science library by its name, a
-        file (.csv) with the wavelength and a column for each of 1 or 3 channels, or one channel per band
+        file (.csv) with the wavelength and a column for each channel, or one channel per band. Of a hyperspectral
+        camera, channels after the third have the gain and the response of the third
     filter string: transmittance before the sensor over the wavelength: a file, a name or a law
 """
 
 import math
 
+from optics.files.images import CHANNELS_MOST
 from optics.polarization.mosaic import read_mosaic
 from optics.scene.checking import agree, made
 from optics.scene.declare import Part
@@ -211,10 +213,10 @@ def build():
             self.channels = ()  # curves; none where each channel is a band
             if self.sensitivity != "identity":
                 self.channels = self.read_sensitivities(self.sensitivity, "sensitivity")
-                if len(self.channels) not in (1, 3):
+                if len(self.channels) > CHANNELS_MOST:
                     raise ValueError(
                         f"{self.name}.sensitivity = '{self.sensitivity}' has {len(self.channels)} columns; allowed: 1 "
-                        "or 3"
+                        f"to {CHANNELS_MOST}"
                     )
                 self.curves.update(zip(channel_names(len(self.channels)), self.channels))
             self.read_spectrum(props, "filter", "transmittance")
@@ -374,7 +376,9 @@ def build():
 
 def channel_names(count):
     """Names of the sensitivities of channels among a camera's curves."""
-    return [f"sensitivity {c}" for c in "RGB"] if count == 3 else ["sensitivity"]
+    if count == 3:
+        return [f"sensitivity {c}" for c in "RGB"]
+    return ["sensitivity"] if count == 1 else [f"sensitivity {c}" for c in range(count)]
 
 
 def check_field_of_view():

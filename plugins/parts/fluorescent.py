@@ -91,9 +91,7 @@ def build():
             if self.integral is not None:  # the power of a light is that of all its wavelengths
                 overlap /= math.sqrt(2 * math.pi) * s1
             absorbed = dr.select(led.wavelength > 0, led.kappa(si, to_led, distance) * cos * overlap, 0.0)
-            bands = (
-                mi.UnpolarizedSpectrum(si.wavelengths) if mi.is_spectral else mi.UnpolarizedSpectrum(self.band or 540.0)
-            )
+            bands = self.nm(si.wavelengths)
             s = self.emission_fwhm / WIDTH
             photons = dr.exp(-dr.square((bands - self.emission_peak) / s) / 2) / (math.sqrt(2 * math.pi) * s)
             seen = mi.Frame3f.cos_theta(si.wi) > 0

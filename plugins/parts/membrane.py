@@ -109,9 +109,10 @@ def build():
             s = dr.dot(si.wi, wo) - cos_v * cos_l
             tilt = dr.select(s > 0, s / dr.maximum(dr.maximum(cos_v, cos_l), 1e-6), 0.0)
             albedo = self.albedo(si, active)
-            value = albedo * ((a + b * tilt) * dr.inv_pi)
+            facets = albedo * ((a + b * tilt) * dr.inv_pi)
+            value = mi.UnpolarizedSpectrum(facets)
             for function in self.functions("reflection"):
-                value += function(Geometry(si, wo, cos_v, cos_l, albedo), self)
+                value += function(Geometry(si, wo, cos_v, cos_l, albedo, facets), self)
             return value
 
         def ambient_radiance(self, si):
@@ -125,12 +126,12 @@ def build():
 
 
 class Geometry:
-    """What a `reflection` or `ambient` function sees: surface interaction, local direction to the light, cosines,
-    rho."""
+    """What a `reflection` or `ambient` function sees: surface interaction, local direction to the light, cosines, rho,
+    and what the membrane reflects without effects, 1/sr."""
 
-    def __init__(self, si, wo, cos_view, cos_light, albedo):
+    def __init__(self, si, wo, cos_view, cos_light, albedo, facets=None):
         self.si, self.wi, self.wo = si, si.wi, wo
-        self.cos_view, self.cos_light, self.albedo = cos_view, cos_light, albedo
+        self.cos_view, self.cos_light, self.albedo, self.facets = cos_view, cos_light, albedo, facets
 
 
 def check_lambert():

@@ -129,9 +129,11 @@ def test_png_shows_dn_as_they_are_and_light_as_srgb(tmp_path):
     light = Image.open(exr.write_png(tmp_path / "light.png", np.full((2, 3, 3), 0.5)))
     assert light.size == (3, 2) and np.all(np.array(light) == 188)  # sRGB of 0.5 is 0.7354 = 187.5 / 255
     assert exr.srgb(np.array([-1.0, 0.0, 0.0031308, 1.0, 2.0])) == pytest.approx([0, 0, 0.04045, 1, 1], abs=1e-5)
+    bands = Image.open(exr.write_png(tmp_path / "bands.png", np.arange(6.0)[None, None], white=255, tone="linear"))
+    assert np.array_equal(np.array(bands)[0, 0], [4, 2, 0])  # means 4.5, 2.5, 0.5 of thirds, rounded to even
     for bad, options in (
         (np.full((2, 2), np.nan), {}),
-        (np.zeros((2, 2, 2)), {}),
+        (np.zeros((2, 2, 2, 2)), {}),
         (dn, {"tone": "film"}),
         (dn, {"white": 0}),
     ):
