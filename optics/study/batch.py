@@ -315,6 +315,8 @@ class Maker:
         scene.check(job.parameters, f"{self.file}: [parameters]")
         if job.parameters:
             scene.check_press(self.values, f"{self.file}: [parameters]")
+        if job.fit is None:  # of a fit alone nobody stated a depth
+            scene.check_press({**scene.values(), **self.values}, f"{self.file}: [defines]")
         for key, d in job.sample.items():
             where = f"{self.file}: [sample]"
             if key not in scene.parameters:
