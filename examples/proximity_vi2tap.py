@@ -6,8 +6,11 @@ fails.
 Follows the camera's rays through analyser, skin and film of the shipped finger to cylinders of 20, 30 and 40 mm
 diameter, 60 to 10 mm before the skin, lying across the view and standing on end. The depth map that the rays give
 stands for the paper's monocular depth network, without its errors. The 20 mm cylinder is the reference: its curve turns
-r of the others into a distance. Prints the curves, how far they agree, and what is read at 10 mm; the paper reads 11.51
-(30 mm) and 12.58 mm (40 mm)."""
+r of the others into a distance. Prints the curves, how far they agree, what is read at 10 mm, and where a hand stops
+that stops at the reference's r of 10 mm. The paper's hand stops at 11.51 (30 mm) and 12.58 mm (40 mm). With 320 x 240
+px lying cylinders give 10.3 and 11.0 mm, in the paper's order and 1.2 and 1.5 mm short of it: from 13 to 9 mm the
+outline of the 20 mm cylinder runs behind a row of markers, where its area hardly grows, and nothing here has the
+network's errors."""
 
 import sys
 from pathlib import Path
@@ -79,6 +82,14 @@ def main(image_file: str = "renders/proximity.png") -> None:
             "where the "
             f"cylinders stand at {DISTANCES[-1]:g} mm the reference's curve reads "
             + ", ".join(f"{v:.2f} mm for D{d:g}" for d, v in read.items())
+        )
+        stops = {d: float(proximity.distance(r[DIAMETERS[0]][-1], r[d], DISTANCES)) for d in DIAMETERS[1:]}
+        print(
+            f"a hand that stops at the reference's r of {DISTANCES[-1]:g} mm stops at "
+            + ", ".join(
+                f"{v:.2f} mm from D{d:g}" if np.isfinite(v) else f"less than {DISTANCES[-1]:g} mm from D{d:g}"
+                for d, v in stops.items()
+            )
             + "\n"
         )
         for d, curve in r.items():

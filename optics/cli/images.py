@@ -93,8 +93,8 @@ def render(
     named = labelling.named(sensor.scene, labels)
     chosen = sensor.scene.check(sensor.scene.spread(settings(sets), "--set"), "--set")
     values = {**sensor.values, **chosen}
-    if chosen:
-        sensor.scene.check_press(values, "--set")
+    if chosen or fit is None:  # of a fit alone nobody stated a depth
+        sensor.scene.check_press({**sensor.scene.values(), **values}, "--set" if chosen else str(sensor.scene.path))
     clock = time.perf_counter()
     images = RenderJob(
         sensor.scene, spp=spp, stokes=stokes, black=sensor.black, saturation=sensor.saturation, labels=named

@@ -93,7 +93,7 @@ def of(scene: Scene, position: np.ndarray | None, seen: np.ndarray | None, names
         if "force" in names:
             pressed = scene.block.press()
             force = [0.0, 0.0, 0.0] if pressed is None else [*map(float, pressed.force)]
-            found.numbers["force"] = [force[0], force[1], -force[2]]  # into the skin
+            found.numbers["force"] = [force[0], force[1], 0.0 - force[2]]  # into the skin
         return found
     if set(names) <= {"pose", "markers"}:
         return found
@@ -159,9 +159,12 @@ def _at(values: np.ndarray, pitch: float, press: tuple[float, float], x: np.ndar
 
 
 def _pose(scene: Scene) -> dict[str, float | str]:
-    """The values of the skin's parameters that say where and how it is pressed, by their names."""
-    part = scene.gel if scene.gel is not None else scene.block
-    names = getattr(part, "pressing", tuple(n for n in (*part.numbers, *part.words) if n.startswith("press")))
+    """The values that say where and how the skin is pressed, by their names: a gel's own, or those of a block's
+    target."""
+    part = scene.gel if scene.gel is not None else scene.block.target
+    if part is None:
+        return {}
+    names = getattr(part, "pressing", (*part.numbers, *part.words))
     return {n: part.held[n] if n in part.held else getattr(part, n) for n in names}
 
 

@@ -281,7 +281,7 @@ def _state(vector: np.ndarray | None) -> tuple[float, float]:
 
 
 # -- images ----------------------------------------------------------------------------------------------------------
-DARK = 2e-3  # of the brightest: nothing is said of pixels below
+DARK, BRIGHT = 2e-3, 1e-2  # of the brightest: nothing is said of pixels below the first, all of those above the second
 
 
 def wheel(angle: np.ndarray) -> np.ndarray:
@@ -319,15 +319,16 @@ def map_colours(stokes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """sRGB (H, W, B, 3) of the degree (viridis, 0 to 1) and of the angle (`wheel`) of linear polarization; stokes (H,
     W, B, 4).
 
-    Black where a band is dark; angles fade out below a degree of 5 %, where they mean little.
+    Black where a band is dark, and fading from BRIGHT to DARK, so that dim pixels neither make specks nor holes with a
+    sharp rim; angles fade out below a degree of 5 %, where they mean little.
     """
     from matplotlib import colormaps
 
-    level = stokes[..., 0]
-    seen = level > DARK * np.maximum(level.max((0, 1), keepdims=True), 1e-300)
-    degree = np.where(seen, np.nan_to_num(mueller.degree_of_polarization(stokes)), 0.0)
+    level = stokes[..., 0] / np.maximum(stokes[..., 0].max((0, 1), keepdims=True), 1e-300)
+    seen = np.clip((level - DARK) / (BRIGHT - DARK), 0, 1)[..., None]
+    degree = np.where(seen[..., 0] > 0, np.nan_to_num(mueller.degree_of_polarization(stokes)), 0.0)
     angle = wheel(mueller.angle_of_polarization(stokes))
-    return colormaps["viridis"](degree)[..., :3] * seen[..., None], angle * np.clip(degree / 0.05, 0, 1)[..., None]
+    return colormaps["viridis"](degree)[..., :3] * seen, angle * np.clip(degree / 0.05, 0, 1)[..., None] * seen
 
 
 def write_maps(files: tuple[Path, Path], bands: Sequence[float], stokes: np.ndarray) -> None:

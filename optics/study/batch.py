@@ -291,6 +291,8 @@ class Maker:
         scene.check(job.parameters, f"{self.file}: [parameters]")
         if job.parameters:
             scene.check_press(self.values, f"{self.file}: [parameters]")
+        if job.fit is None:  # of a fit alone nobody stated a depth
+            scene.check_press({**scene.values(), **self.values}, f"{self.file}: [defines]")
         for drawn in self.draws.drawn:
             key, d, parameter = drawn.name, drawn.distribution, drawn.parameter
             where = f"{self.file}: [{'unit' if drawn.unit else 'sample'}]"

@@ -104,3 +104,9 @@ def test_labels_that_a_scene_lacks_are_refused():
     with pytest.raises(UnknownKey, match="did you mean 'force'"):
         labels.named(scene, "forces")
     assert labels.named(scene, "all") == ("force", "pressure", "displacement", "height", "pose")
+
+
+def test_a_block_tells_its_force_and_where_its_target_stands():
+    small = {"width": "8", "height": "6", "columns": "2", "rows": "2", "layers": "2", "distance": "-0.3"}
+    found = labels.of(scenes.load("magictac", small), None, None, ("force", "pose"))
+    assert found.numbers["force"][2] > 0 and found.numbers["pose"]["distance"] == pytest.approx(-0.3)

@@ -305,3 +305,13 @@ def test_plots_and_maps_are_images(bench, tmp_path):
         with Image.open(file) as shown:
             assert min(shown.size) > 300 and np.ptp(np.asarray(shown.convert("L"))) > 100
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.png", "d.png", "e.png"]
+
+
+def test_maps_fade_where_light_does():
+    """Pixels of ever less light, all polarized alike: no step of colour between neighbours of nearly the same light."""
+    level = np.geomspace(1.0, 1e-4, 200)
+    stokes = (level[:, None] * [1.0, 0.6, 0.3, 0.0])[None, :, None, :]
+    for colours in polarimetry.map_colours(stokes):
+        assert np.abs(np.diff(colours[0, :, 0], axis=0)).max() < 0.1  # a hard limit steps by all of the colour
+        np.testing.assert_allclose(colours[0, level > 0.011, 0], np.broadcast_to(colours[0, :1, 0], (98, 3)), atol=1e-6)
+        assert not colours[0, level < 1.9e-3].any()

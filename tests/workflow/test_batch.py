@@ -444,3 +444,17 @@ def test_unknown_labels_are_named(tmp_path):
     file.write_text(JOB.replace("seed = 7", 'seed = 7\nlabels = ["forces"]'))
     with pytest.raises(batch.BadJob, match="labels.* 'forces'; allowed: a list of force, pressure"):
         batch.read(file)
+
+
+def test_a_press_deeper_than_the_gel_is_refused_wherever_it_is_stated(tmp_path, capsys):
+    file = tmp_path / "job.toml"
+    file.write_text(
+        JOB.replace("width = 32", "width = 32\ndepth = 6").replace('"gel.press_depth" =', '"gel.press_rz" =')
+    )
+    assert main(["batch", str(file)]) == 2
+    assert "gel.press_depth" in (said := capsys.readouterr().err) and "the gel is 4 mm thick" in said
+    assert not (tmp_path / "out").exists()
+    for words in (["-D", "depth=6"], ["--set", "gel.press_depth=6"]):
+        assert main(["render", "gelsight", *words, "-o", str(tmp_path / "x.exr")]) == 2
+        assert "the gel is 4 mm thick" in capsys.readouterr().err
+    assert not (tmp_path / "x.exr").exists()
