@@ -426,6 +426,9 @@ def finish(job: Job, blocks: Blocks) -> bool:
             return False
         try:
             with alone(blocks.parts / "finish.lock", ""):
+                for pattern in (".manifest.*", ".job.*", ".parameters.*"):  # of commands that were killed
+                    for file in blocks.folder.glob(pattern):
+                        file.unlink(missing_ok=True)
                 if not blocks.finished:
                     _write_table(job, blocks)
                 blocks.finish()
@@ -508,7 +511,8 @@ def run(
     maker = Maker(job, file, plugins)
     maker.check()
     _open_folder(folder, maker.identity())
-    write_json(folder / "parameters.json", maker.described())
+    if not (folder / "parameters.json").is_file():
+        write_json(folder / "parameters.json", maker.described())
     blocks = Blocks(folder, job.total, shard, uuid.uuid4().hex[:8])
     blocks.verify(progress)
     blocks.sweep()
