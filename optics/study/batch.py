@@ -155,10 +155,13 @@ class Job(Strict):
         point = (
             np.unravel_index(index // (self.count or 1), [len(v) for v in self.grids.values()]) if self.grids else ()
         )
-        found = {key: grid[int(i)] for (key, grid), i in zip(self.grids.items(), point)}
+        chosen = {key: grid[int(i)] for (key, grid), i in zip(self.grids.items(), point)}
+        found = {}
         for table, number, prefix in ((self.sample, index, ""), (self.unit, index // self.per_unit, "unit ")):
             for key, d in table.items():
-                if key not in found and d.plausible is None:
+                if key in chosen:
+                    found[key] = chosen[key]
+                elif d.plausible is None:
                     found[key] = d.draw(self.rng(number, prefix + key))
         return found
 
