@@ -159,10 +159,13 @@ class Job(Strict):
         point = (
             np.unravel_index(index // (self.count or 1), [len(v) for v in self.grids.values()]) if self.grids else ()
         )
-        found = {key: grid[int(i)] for (key, grid), i in zip(self.grids.items(), point)}
+        chosen = {key: grid[int(i)] for (key, grid), i in zip(self.grids.items(), point)}
+        found = {}
         for table, number, prefix in ((self.sample, index, ""), (self.unit, index // self.per_unit, "unit ")):
             for key, d in table.items():
-                if key not in found and d.plausible is None:
+                if key in chosen:
+                    found[key] = chosen[key]
+                elif d.plausible is None:
                     found[key] = d.draw(self.rng(number, prefix + key))
         return found
 
@@ -448,6 +451,9 @@ def finish(job: Job, blocks: Blocks) -> bool:
             return False
         try:
             with alone(blocks.parts / "finish.lock", ""):
+                for pattern in (".manifest.*", ".job.*", ".parameters.*"):  # of commands that were killed
+                    for file in blocks.folder.glob(pattern):
+                        file.unlink(missing_ok=True)
                 if not blocks.finished:
                     _write_table(job, blocks)
                 blocks.finish()
@@ -535,7 +541,8 @@ def run(
     maker = Maker(job, file, plugins)
     maker.check()
     _open_folder(folder, maker.identity())
-    write_json(folder / "parameters.json", maker.described())
+    if not (folder / "parameters.json").is_file():
+        write_json(folder / "parameters.json", maker.described())
     blocks = Blocks(folder, job.total, shard, uuid.uuid4().hex[:8])
     blocks.verify(progress)
     blocks.sweep()

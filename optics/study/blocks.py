@@ -133,7 +133,7 @@ class Blocks:
         """Numbers of complete blocks."""
         if self.finished:
             return set(range(self.count))
-        return {int(f.stem) for f in self.parts.glob("*.jsonl")}
+        return {int(f.stem) for f in self.parts.glob("[0-9]*.jsonl")}
 
     # -- work ---------------------------------------------------------------------------------------------------------
     @contextmanager
@@ -188,7 +188,7 @@ class Blocks:
 
     def opened(self) -> list[int]:
         """Blocks of the shard that somebody has begun and not completed."""
-        return sorted(n for n in (int(f.stem) for f in self.parts.glob("*.part")) if n in self.numbers)
+        return sorted(n for n in (int(f.stem) for f in self.parts.glob("[0-9]*.part")) if n in self.numbers)
 
     def failures(self) -> dict[int, str]:
         """Index -> why, of samples of the shard that were begun too often."""

@@ -38,7 +38,6 @@ XML
 
 import math
 
-from optics.files.images import CHANNELS_MOST
 from optics.polarization.mosaic import read_mosaic
 from optics.scene.checking import agree, made
 from optics.scene.declare import Part
@@ -212,6 +211,8 @@ def build():
             self.declare(props)
             self.channels = ()  # curves; none where each channel is a band
             if self.sensitivity != "identity":
+                from optics.files.images import CHANNELS_MOST
+
                 self.channels = self.read_sensitivities(self.sensitivity, "sensitivity")
                 if len(self.channels) > CHANNELS_MOST:
                     raise ValueError(
