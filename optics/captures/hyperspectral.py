@@ -111,16 +111,17 @@ def import_cubes(
         raise BadCapture(f"bin = {bin}; allowed: 1 or more pixels")
     _check_output(Path(folder), overwrite)
     found = _found(source, None if settings is None else Path(settings))
-    rows, cubes, warnings = [], [], []
-    counts = 1
+    rows: list = []
+    cubes: list[Cube] = []
+    warnings: list[str] = []
+    first, counts = found[0][2](), 1
     for file, own, read in found:
-        cube = read()
-        if cubes and (cube.values.shape[:2] != shape or not np.array_equal(cube.nm, nm)):
+        cube = read() if cubes else first
+        if cube.values.shape != first.values.shape or not np.array_equal(cube.nm, first.nm):
             raise BadCapture(
-                f"{file}: {cube.values.shape[:2]} pixels in {len(cube.nm)} bands; allowed: {shape} in the {len(nm)} "
-                f"bands of {found[0][0].name}; one camera, one size"
+                f"{file}: (H, W, bands) = {cube.values.shape}; allowed: {first.values.shape} with the wavelengths of "
+                f"{found[0][0].name}; one camera, one size"
             )
-        shape, nm = cube.values.shape[:2], cube.nm
         if bands is not None:
             cube, counts = _joined(cube, bands, str(source))
         cubes.append(_binned(cube, bin, str(file)))
@@ -321,8 +322,8 @@ def _joined(cube: Cube, bands: str, where: str) -> tuple[Cube, int]:
     inside = [np.abs(cube.nm - n) <= step / 2 + 1e-9 for n in nm]
     if empty := [n for n, own in zip(nm, inside) if not own.any()]:
         raise BadCapture(
-            f"{where}: bands = {bands!r}: none of the source's bands ({cube.nm[0]:g} to {cube.nm[-1]:g} nm) lies within "
-            f"{step / 2:g} nm of {empty[0]:g} nm; allowed: a range that they cover"
+            f"{where}: bands = {bands!r}: none of the source's bands ({cube.nm[0]:g} to {cube.nm[-1]:g} nm) lies "
+            f"within {step / 2:g} nm of {empty[0]:g} nm; allowed: a range that they cover"
         )
     values = np.stack([cube.values[..., own].mean(-1) for own in inside], -1)
     middle = np.array([cube.nm[own].mean() for own in inside])
