@@ -38,6 +38,7 @@ BENT_SIDE = 4  # finer samples each way where the face bends: the mean of what v
 SOFT = 16  # points of a light, above which rims of its shadows take the samples of what bends, BENT_SIDE each way
 CREASE = 25.0  # deg from pixel to pixel: what is no smooth surface
 R2 = 0.7548776662466927, 0.5698402909980532  # of the R2 sequence: shifts from pixel to pixel
+CORNERS = np.array([[0.5, 0.5], [0.02, 0.02], [0.98, 0.02], [0.02, 0.98], [0.98, 0.98]]).T  # of a pixel
 FLAT_FIELDS = ("multiplicative", "additive", "none")
 MEMORY = 2e9  # bytes of hits, with what images need for their derivatives, that are kept
 IMAGES = 5e8  # bytes of images that are kept without them, of a renderer that remembers REMEMBER geometries
@@ -169,7 +170,7 @@ class Renderer:
         hits = Hits(self._trace(u.ravel(), v.ravel()), self.height, self.width)
         hits.eye = self._eye()
         if self.crowded:
-            hits.edges |= _creases(np.where(hits.valid[..., None], hits.normal, 0.0))
+            hits.edges |= _creases(np.where(hits.valid[..., None], hits.normal, 0.0)) | self._parted()
         hits.edges |= self._painted(hits)
         self._hits[key] = hits
         while len(self._hits) > self.remember:
@@ -493,14 +494,9 @@ class Renderer:
     def _in_bodies(self, index: np.ndarray, bent: np.ndarray) -> Finer:
         """A few samples for each body that a pixel sees, which weigh what it has of the pixel; of `bent` the middles of
         its quarters, as nothing but shadows has an edge there."""
-        import mitsuba as mi
-
         here = index[~bent]
         u, v = self._at(here, self._set(here, CROWDED_RAYS << (self.fine - 1)))
-        o, d = self.scene.camera.ray(mi.Float(u.ravel()), mi.Float(v.ravel()))
-        wavelengths = self.scene.integrator.wavelengths(u.size)
-        met = self.scene.mitsuba.ray_intersect_preliminary(mi.Ray3f(o, d, mi.Float(0), wavelengths), coherent=True)
-        row, k, weight = _shares(self._bodies(met).reshape(u.shape), *(self.fine * n for n in LIT))
+        row, k, weight = _shares(self._bodies(u, v), *(self.fine * n for n in LIT))
         quarters = [a.ravel() for a in self._at(index[bent], _grid(2))]
         pixel = np.append(np.flatnonzero(~bent)[row], np.repeat(np.flatnonzero(bent), 4))
         u, v = (np.append(a[row, k], quarter) for a, quarter in zip((u, v), quarters))
@@ -509,18 +505,28 @@ class Renderer:
         sample = self._trace(u[order], v[order]) if len(order) else None
         return Finer(np.bincount(pixel, minlength=len(index)), sample, weight[order])
 
-    def _bodies(self, met) -> np.ndarray:
-        """(N,) a number for each body that rays met, other than any other's; 0 where they met none."""
+    def _parted(self) -> np.ndarray:
+        """Pixels in whose corners and middle not one body is seen: also those of bodies that no middle sees."""
+        index = np.arange(self.height * self.width)
+        bodies = self._bodies(*self._at(index, CORNERS))
+        return (bodies != bodies[:, :1]).any(1).reshape(self.height, self.width)
+
+    def _bodies(self, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """A number for each body that rays through places in px of any shape meet, other than any other's; 0 where they
+        meet none."""
         import drjit as dr
         import mitsuba as mi
 
+        o, d = self.scene.camera.ray(mi.Float(u.ravel()), mi.Float(v.ravel()))
+        wavelengths = self.scene.integrator.wavelengths(u.size)
+        met = self.scene.mitsuba.ray_intersect_preliminary(mi.Ray3f(o, d, mi.Float(0), wavelengths), coherent=True)
         number, first = mi.UInt32(0), 1
         for shape in self.scene.mitsuba.shapes():
             faces = self.faces_each.get(shape.id(), 0)
             own = met.is_valid() & (met.shape == mi.ShapePtr(shape))
             number = dr.select(own, first + (met.prim_index // faces if faces else 0), number)
             first += -(-shape.primitive_count() // faces) if faces else 1
-        return np.array(number)
+        return np.array(number).reshape(u.shape)
 
     def _set(self, index: np.ndarray, count: int) -> tuple[np.ndarray, ...]:
         """(P, count) places in pixels: a Hammersley set, shifted in each by the R2 sequence."""

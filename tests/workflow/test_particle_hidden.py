@@ -16,7 +16,6 @@ from optics.skin.forces import ball, displacements
 EFFECTS = {
     "lens vignetting": (1.0, {"camera.vignetting": 1.0}),
     "lens blur": (0.3, {"camera.blur": 0.3}),
-    "defocus": (40.0, {"camera.pupil_area": 40.0}),
     "excitation leak": (0.2, {"camera.excitation_leak": 0.2}),
     "inner filter": (0.05, {"gel.dye": 0.05}),
     "bleaching": (0.2, {"dye.bleaching": 0.2}),
@@ -54,9 +53,9 @@ def test_the_makers_skin_moves_as_the_models(rig, mitsuba):
     np.testing.assert_allclose(moved, expected, atol=1e-3 * np.abs(expected).max())
 
 
-@pytest.mark.parametrize("effect", [None, *EFFECTS])
+@pytest.mark.parametrize("effect", [None, *(pytest.param(e, marks=pytest.mark.slow) for e in EFFECTS)])
 def test_maker_and_model_agree(rig, made, effect):
-    """The image of the first ring, with and without each effect; the change by it is the model's to a fifth."""
+    """The second frame of a press, with and without each effect; the change by it is the model's to a fifth."""
     strength, values = EFFECTS.get(effect, (0.0, {}))
     captures = made({effect: strength} if effect else {})
     scene = rig.scene()
@@ -65,17 +64,32 @@ def test_maker_and_model_agree(rig, made, effect):
     plain = model.predict(Values(built), [1])[0]
     seen = captures.frames[1].image
     if effect is None:
-        # 0.4 DN rms of up to 130, at rims: samples of both; the noise of a frame is 2.5 to 4
-        assert np.std(seen - plain) < 0.5 and seen[..., 1].max() > 80
+        # samples of both at rims, 0.3 DN in green, of up to 96; the noise of a frame is 2.5 to 4
+        assert np.std((seen - plain)[..., 1]) < 0.4 and seen[..., 1].max() > 80
         return
     changed = model.predict(Values({**built, **values}), [1])[0]
-    assert np.std(changed - plain) > 0.5
+    assert np.std(changed - plain) > 0.3
     # a fifth of the change, of blur what rims hide, besides the error without any
-    assert np.std(seen - changed) < 0.5 + 0.2 * np.std(changed - plain)
+    assert np.std(seen - changed) < 0.3 + 0.2 * np.std(changed - plain)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("effect, change", [(None, 0.0), ("excitation leak", 0.02), ("defocus", 0.02)])
+def test_rays_through_the_pupil_are_those_of_a_path_tracer(rig, made):
+    """Where the blur is as wide as a bead, and a Gaussian for each pixel is poor: the maker against mi.render."""
+    from optics.light.rendering import RenderJob
+
+    sharp, soft = (made(e).frames[1].image[..., 1] - 8.0 for e in ({}, {"defocus": 20.0}))
+    press = dict(zip(("gel.press_x", "gel.press_y", "gel.press_depth"), rig.presses[1]))
+    scene = rig.scene()
+    now = {**rig.built(scene, 0), **press, "inner_ring.power": 0.0, "camera.pupil_area": 20.0}
+    traced = 247 * RenderJob(scene, spp=512, layers=(), saturation=1.0).take(now).camera[..., 1]
+    blocks = [a.reshape(20, 2, 20, 2).mean((1, 3)) for a in (soft - traced, soft - sharp)]
+    # noise of 512 paths, up to 2 DN in a pixel; measured 0.5 of 3.0 in pixels with 4096 of them
+    assert np.std(blocks[0]) < 0.5 * np.std(blocks[1]), [np.std(b) for b in blocks]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("effect, change", [(None, 0.0), ("bead settling", 0.02)])
 def test_what_is_hidden_is_named_and_nothing_else(rig, effect, change):
     kind = "library" if effect else "none"
     record = blind.run(rig, Cell(rig.name, kind, (effect,) if effect else (), change, 0.0, "same", "", 1))

@@ -58,7 +58,8 @@ class ParticleMaker:
         unknown = set(self.effects) - set(MAKERS)
         if unknown:
             raise ValueError(f"no independent way to make {', '.join(sorted(unknown))}; known: {', '.join(MAKERS)}")
-        self.noise, self.seed, self.side = noise, seed, side
+        self.noise, self.seed = noise, seed
+        self.side = 2 * side if "defocus" in self.effects else side  # rays that cross a pupil scatter
         self.size, self.bands = scene.camera.resolution, np.array(scene.integrator.bands)
         self.camera_z = float(scene.camera.columns[3].z[0])
         beads = scene.parts["beads"]
@@ -142,11 +143,12 @@ class ParticleMaker:
         area = self.effects.get("defocus", 0.0)
         if area:
             rng = np.random.default_rng([self.seed, 5])
+            # equal areas in radius and angle, by the R2 sequence from ray to ray, shifted from pixel to pixel
             n = self.side**2
-            # a pupil's places in each pixel: equal areas in radius and angle, in an order of their own
-            order = rng.permuted(np.tile(np.arange(n), (len(d) // n, 1)), axis=1).ravel()
-            radius = np.sqrt((order // self.side + rng.random(len(d))) / self.side * area / np.pi)
-            angle = 2 * np.pi * (order % self.side + rng.random(len(d))) / self.side
+            k = np.arange(len(d))
+            shift = rng.random((2, len(d) // n)).repeat(n, axis=1)
+            radius = np.sqrt((k * 0.7548776662466927 + shift[0]) % 1.0 * area / np.pi)
+            angle = 2 * np.pi * (k * 0.5698402909980532 + shift[1])
             side = np.cross(d, [0.0, 1.0, 0.0])
             side /= np.linalg.norm(side, axis=1, keepdims=True)
             up = np.cross(d, side)
