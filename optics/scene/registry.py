@@ -93,13 +93,14 @@ class Registry:
         return file.relative_to(home).as_posix()
 
     def kinds(self, part: str) -> tuple[str, ...]:
-        """The kinds that a name stands for: the part of that kind, and all that play that role."""
+        """The kinds that a name stands for: the part of that kind first, and all that play that role."""
         return self._kinds.get(part, ())
 
     @cached_property
     def _kinds(self) -> dict[str, tuple[str, ...]]:
         names = {name for part in self.parts.values() for name in (part.kind, part.role)}
-        return {n: tuple(k for k, part in self.parts.items() if n in (k, part.role)) for n in names}
+        stands = {n: [k for k, part in self.parts.items() if n in (k, part.role)] for n in names}
+        return {n: tuple(sorted(kinds, key=lambda k: k != n)) for n, kinds in stands.items()}
 
     def parameters_of(self, kind: str) -> tuple[Parameter, ...]:
         """A part's own parameters and those that effects bring to it."""

@@ -45,6 +45,7 @@ from optics.study.setup import recorded
 BENT = 0.5  # the largest relative change that a strength of 1 is called plausible for
 CELLS = ("place", "channel")  # coordinates of cells, each with a value of its own: none lies between two of them
 VIEW = (
+    "astray",
     "u",
     "v",
     "px",

@@ -17,7 +17,7 @@ With `skirt` > 0 the skin beside the contact falls off as exp(-distance / skirt)
 stands the max over touched points p of D0(p) exp(-|x - p| / skirt).
 The forces of a press are those of an elastic skin under the same indenter at the same depth (optics.skin.pressing): E =
 `young`, `poisson`, on a rigid window at its thickness or, with `backing` deep, without end. They are labels: the dent
-that is seen stays the one above. An indenter that came to where it stands by `drag_x`, `drag_y` and a turn by `twist`
+that is seen stays the one above. An indenter that came to where it stands by `shift_x`, `shift_y` and a turn by `twist`
 after it had pressed drags along what sticks to it by `friction` (Coulomb); sheets, markers and beads in the gel are
 carried sideways by that shear. Indenters: sphere (`indenter_size` = radius),
 cylinder lying on its side (radius), cube face down (edge), balls (radius) `indenter_spacing` apart on a plate without
@@ -50,7 +50,7 @@ from optics.skin.stack import Layer
 
 FINE = 16  # of a ball's radius, the pitch that a coarser mesh keeps: flanks of balls are off by 1 % of the light
 INDENTER_SIZE = 1.5  # mm
-SHEARING = ("poisson", "friction", "drag_x", "drag_y", "twist")
+SHEARING = ("poisson", "friction", "shift_x", "shift_y", "twist")
 STAGE = 0.05  # mm: how well a stage usually knows where it presses
 PARAMETERS = (
     Parameter("width", "mm", 20.0, (0.1, 1000.0), "size along x", plausible=0.1, how="difference", role="width"),
@@ -189,7 +189,7 @@ PARAMETERS = (
     Parameter("friction", "1", 0.8, (0.0, 10.0), "Coulomb's, of indenter and skin", plausible=0.1, how="difference"),
     *(
         Parameter(
-            f"drag_{axis}",
+            f"shift_{axis}",
             "mm",
             0.0,
             (-50.0, 50.0),
@@ -239,8 +239,8 @@ def build():
             "poisson",
             "backing",
             "friction",
-            "drag_x",
-            "drag_y",
+            "shift_x",
+            "shift_y",
             "twist",
         )  # what does nothing while press_depth is 0
 
@@ -299,14 +299,14 @@ def build():
             thick = n("thickness") if self.backing == "rigid" else math.inf
             layer = Layer(thick, n("young"), n("poisson"))
             touch = pressing.indent(self.profile(), n("press_depth"), (layer,))
-            move = (n("drag_x"), n("drag_y"))
+            move = (n("shift_x"), n("shift_y"))
             return pressing.dragged(touch, move, math.radians(n("twist")), n("friction"))
 
         def sheared(self, x, y, depth):
             """(3, ...) mm along x, y and into the gel: what a drag of the indenter does to points that rest at
             (x, y, -depth)."""
             n = self.number
-            if n("press_depth") <= 0 or not (n("drag_x") or n("drag_y") or n("twist")):
+            if n("press_depth") <= 0 or not (n("shift_x") or n("shift_y") or n("twist")):
                 return 0.0, 0.0, 0.0
             maps = pressing.sheared(self.touching(), depth)
             return tuple(contact.surface(x, y, n("press_x"), n("press_y"), m) for m in maps)

@@ -41,7 +41,7 @@ LAYERS = [kind for kind in PARTS if REGISTRY.parts[kind].mueller is not None]
 # of forces, which no image shows, and of a drag's slip; of a twist, one rim gains what another loses. The physics
 # tests hold them against closed forms
 LABELS_ONLY = tuple(("gel", name) for name in ("young", "poisson", "friction", "twist"))
-DRAGGING = ("drag_x", "drag_y")  # of a gel: they move what it carries
+DRAGGING = ("shift_x", "shift_y")  # of a gel: they move what it carries
 POWERS = ("power", "band power")  # roles
 MOVED = ("carried", "markers", "target", "beads")  # kinds of shapes that a scene moves besides the gel
 OF_IMAGES = tuple(s for s in IMAGE_STAGES if s != "sensitivity")  # stages whose functions are given an image
@@ -465,8 +465,10 @@ def check_continuity(bench, effect):
             little = np.abs(moved(bench, effect, p, sign * 1e-4 * p.plausible) - rest).mean()
             assert whole > 1e-7, f"{effect.name}: a plausible {p.name} does nothing to the bench"
             # 20 times: an onset like a square root, which ranking by a finite step can still use, would give 100. The
-            # floor: a single sample of the 16 of a rim that flips is worth up to 1e-6 of the mean.
-            assert little <= 20e-4 * whole + 1e-6, f"{effect.name}: {p.name} jumps by {little:.2g} at neutral"
+            # floor: a single sample of the 16 of a rim that flips is worth up to 1e-6 of the mean; in a crowded scene
+            # it is one of six, and which of a bead's rays are lit changes with it.
+            floor = 5e-6 if bench.renderer.crowded else 1e-6
+            assert little <= 20e-4 * whole + floor, f"{effect.name}: {p.name} jumps by {little:.2g} at neutral"
 
 
 def check_onset(bench, effect):
@@ -974,6 +976,8 @@ def test_all_layers_drawn_at_once_give_derivatives(kind, seed, bench_of):
         **draw(rng, bench),
         bench.renderer.bounce_key: 0.0,
     }  # of a second bounce only powers have derivatives
+    # light that is taken away everywhere leaves pixels that are darker than black
+    values.update({k: abs(v) for k, v in values.items() if k.endswith(".stray")})
     if kind != "source":  # reflections between films take their time
         values.update({k: 0.0 for k in values if k.endswith(".face")})
     image = bench.image(values)

@@ -43,7 +43,7 @@ def test_pixels_add_up_to_the_force_and_the_drag():
         "gelsight",
         {"width": "160", "height": "120", "depth": "0.6"},
         ("force", "pressure", "displacement", "height"),
-        {"gel.drag_x": 3.0, "gel.friction": 0.5},
+        {"gel.shift_x": 3.0, "gel.friction": 0.5},
     )
     told, c = image.labels.numbers, image.channels
     position = job.renderer.hits(job.base | {"gel.press_depth": 0.6}).position
@@ -64,7 +64,7 @@ def test_markers_are_where_a_robot_finds_them():
     scene = scenes.load("vi2tap", FINGER)
     job = RenderJob(scene, labels=names, layers=())
     rest = job.take({"skin.press_depth": 0.0})
-    pressed = job.take({"skin.press_depth": 1.2, "skin.drag_x": 1.0})
+    pressed = job.take({"skin.press_depth": 1.2, "skin.shift_x": 1.0})
     told = {k: np.array(v, float) for k, v in pressed.labels.numbers.items() if k.startswith("marker")}
     seen = np.isfinite(told["markers_at_rest"]).all(1)
     found = [reader.find(image.camera[..., 1]).centres for image in (rest, pressed)]

@@ -117,10 +117,12 @@ def within(seconds: int = LIMIT):
 
 @pytest.fixture(scope="session")
 def material(tmp_path_factory, mitsuba):
-    """Good input of every kind: captures of images and of readings, a scene, a job, a study of readings."""
+    """Good input of every kind: captures of images and of readings, a scene, a job, a finished batch, a study of
+    readings."""
     import optics as package
     from optics.readers import force_learning
     from optics.scene import loader
+    from optics.study import batch
 
     folder = tmp_path_factory.mktemp("torture")
     rng = np.random.default_rng(0)
@@ -146,6 +148,8 @@ def material(tmp_path_factory, mitsuba):
     (readings / "captures.toml").write_text(READINGS)
     (folder / "job.toml").write_text(JOB)
     (folder / "beads.toml").write_text(BEADS)
+    (folder / "made.toml").write_text(JOB.replace('out = "out"', 'out = "made"'))
+    batch.run(folder / "made.toml", workers=1)
     place, force = rng.uniform(-14, 14, (40, 2)), rng.uniform(0.1, 1.0, 40)
     motion = rng.normal(size=(40, 4, 4, 2))
     sizes = np.hypot(*np.moveaxis(motion, -1, 0)), np.arctan2(motion[..., 1], motion[..., 0])

@@ -43,6 +43,7 @@ BASE = {
     "rehearse": "study",
     "imitate": "study -o out/set",
     "read": "markers images/a.png",
+    "export": "made -o out/data --to webdataset",
     "force-tables": "--draws 1",
     "force-features": "beads.toml -o out/features --project --flow sparse --bins 4",
     "force-train": "features.npz -o out/map.npz --kind linear --bins 3",

@@ -186,6 +186,7 @@ def demo(folder: Path, height=72, width=96, presses=4, seed=3, steps=3) -> Recor
             error=sds,
             tempering=1.0,
             correlation=correlation,
+            posterior=None,
             chi2=found.fitted.chi2,
             dof=found.fitted.dof,
             converged=True,
