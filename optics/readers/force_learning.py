@@ -288,6 +288,11 @@ def linear(one: FeatureSet, bins: int, seed: int = 0, say: Callable[[str, int, i
     train, held, _ = split(len(one), seed)
     x, y = one.vectors("linear").astype(float), labels(one.place, one.force, bins, one.face).astype(float)
     values, vectors = np.linalg.eigh(x[train].T @ x[train])
+    if not values[-1] > 0:
+        raise BadFeatures(
+            f"none of the {len(train)} presses to train with moves anything; allowed: presses with motion; make the "
+            "features again with optics force-features"
+        )
     right = vectors.T @ (x[train].T @ y[train])
     best: tuple[float, float, np.ndarray] = (np.inf, 0.0, right)
     for k, penalty in enumerate(PENALTIES):

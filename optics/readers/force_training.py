@@ -75,7 +75,7 @@ def _torch() -> Any:
         import torch
     except ModuleNotFoundError as error:
         raise ModuleNotFoundError(
-            "training a network needs PyTorch, which is not installed; next step: pip install torch"
+            "training a network needs PyTorch, which is not installed; next step: pip install tactile-optics[learn]"
         ) from error
     return torch
 

@@ -102,7 +102,7 @@ def test_without_torch_the_next_step_is_said(monkeypatch, tmp_path):
     from optics.readers.force_training import Plan, train
 
     monkeypatch.setitem(sys.modules, "torch", None)
-    with pytest.raises(ModuleNotFoundError, match="pip install torch"):
+    with pytest.raises(ModuleNotFoundError, match="pip install tactile-optics\\[learn\\]"):
         train(some(), Plan("scaled"), tmp_path / "state")
     with pytest.raises(ValueError, match="allowed: published, scaled"):
         Plan("deep")
@@ -189,3 +189,12 @@ def test_the_scaled_network_learns_a_law_that_it_has_not_seen_and_starts_from_an
     np.testing.assert_allclose(further(test).sum(1).mean() / model(test).sum(1).mean(), 2.0, rtol=0.05)
     with pytest.raises(BadFeatures, match="to start from"):
         training.train(other, training.Plan("published", 3), tmp_path / "c", model)
+
+
+def test_a_linear_map_refuses_presses_without_motion():
+    from optics.readers.force_learning import BadFeatures, FeatureSet, linear
+
+    n, still = 30, np.zeros((30, 2, 2))
+    one = FeatureSet(np.zeros((n, 2, 2, 2)), still, still, np.zeros((n, 2)), np.ones(n), (20.0, 20.0), "dense")
+    with pytest.raises(BadFeatures, match="none of the 22 presses .* moves anything"):
+        linear(one, 2)
