@@ -44,7 +44,7 @@ MEMORY = 2e9  # bytes of hits, with what images need for their derivatives, that
 IMAGES = 5e8  # bytes of images that are kept without them, of a renderer that remembers REMEMBER geometries
 REMEMBER = 24
 PER_RAY = 250  # bytes of a camera ray's end and its light, by the memory of processes that held ten million of them
-FAINT = 0.05  # of the brightest light of a crowded scene: shadows that take less need no finer samples
+FAINT = 0.05  # of the largest irradiance in a crowded scene: shadows that take less need no finer samples
 BOUNCE_SAMPLES = 32  # directions per cell for the second bounce
 BOUNCE_CELL = 2  # px each way of a cell
 
@@ -351,13 +351,16 @@ class Renderer:
         return hits.joint
 
     def _cast(self, hits: Hits, part) -> np.ndarray:
-        """Pixels at a rim of a shadow that a light's points cast, where it takes more than FAINT of the brightest
-        light."""
-        spots, seen = self.scene.integrator.spots(part), self._seen(self._unshaded(hits, part))
+        """Pixels at a rim of a shadow that a light's points cast, where it takes more than FAINT of the largest
+        irradiance, cos/d^2 of each point. What the surfaces and the light are made of does not enter: the same pixels
+        are sampled finely whatever image of a geometry is made first."""
+        import drjit as dr
+
+        si = hits.si
         step, total = np.zeros(hits.shape), np.zeros(hits.shape)
-        for point, own in zip(spots, seen):
-            light = self.scene.integrator.direct(self.scene.mitsuba, *hits.sample[:3], part, hits.si.is_valid(), point)
-            light = hits.image(self._bands(light, min(self.bands, self.scene.integrator.lanes)).max(-1))
+        for point, own in zip(self.scene.integrator.spots(part), self._seen(self._unshaded(hits, part))):
+            to = dr.detach(point) - si.p
+            light = hits.image(dr.maximum(dr.dot(si.sh_frame.n, to), 0) / dr.norm(to) ** 3) * hits.valid
             step, total = step + _edges(own) * light, total + own * light
         return step > FAINT * np.max(total)
 

@@ -127,3 +127,15 @@ def test_beads_that_do_not_fit_are_refused_in_one_sentence(optics):
     with pytest.raises(ValueError, match="larger than a bead"):
         draw(3, (1.0, -0.1, 1.0), np.full(3, 0.5))
     assert sizes(4000, 0.5, 0.1, 3).std() == pytest.approx(0.05, rel=0.05)  # 4000 draws: 1 %, five times
+
+
+def test_an_image_does_not_depend_on_those_before_it(load):
+    """Which pixels are sampled finely is kept with a geometry: it may not hang on the dye of the first image."""
+    from optics.light.renderer import Renderer
+
+    scene = load(beads=300, detail=1, width=40, height=40)
+    bleached = {**scene.values(), "dye.time": 3.0, "dye.bleaching": 0.3}
+    alone = Renderer(scene).radiance(bleached)
+    after = Renderer(scene)
+    after.radiance({**bleached, "dye.bleaching": 0.0, "gel.dye": 2.0})
+    np.testing.assert_array_equal(after.radiance(bleached), alone)
