@@ -87,7 +87,7 @@ class Batch:
 
     def item(self, record: Mapping, images: str, only: Sequence[str]) -> Item:
         """A sample's values and arrays; only: names of arrays, none for all. Raises ValueError for a damaged file."""
-        item = Item(record["index"], self._values(record), {})
+        item = Item(record["index"], self.values(record), {})
         for role, entry in record["files"].items():
             file = self.folder / entry["file"]
             light, _, kind = role.rpartition(".")
@@ -110,7 +110,8 @@ class Batch:
             )
         return item
 
-    def _values(self, record: Mapping) -> dict[str, float | str]:
+    def values(self, record: Mapping) -> dict[str, float | str]:
+        """Numbers and words of a sample, by key; NaN for a number that there is none of: a marker outside the image."""
         found: dict[str, float | str] = {}
 
         def add(name: str, value: Any) -> None:
@@ -120,10 +121,10 @@ class Batch:
             elif isinstance(value, list):
                 for number, inner in enumerate(value):
                     add(f"{name}.{number}", inner)
-            elif isinstance(value, (int, float)):
-                found[name] = float(value)
-            elif value is not None:
-                found[name] = str(value)
+            elif value is None:
+                found[name] = math.nan
+            else:
+                found[name] = value if isinstance(value, str) else float(value)
 
         add("", {**self.job["parameters"], **record["sample"]})
         for key in record.keys() - {"index", "sample", "files"}:
@@ -221,7 +222,10 @@ class Moments:
         own = self.of[name]
         if "words" in own:
             return own
-        count = max(own["count"], 1)
+        count = own["count"]
+        if not count:
+            none = [None] * len(own["sum"])
+            return {"min": none, "max": none, "mean": none, "std": none, "count": 0}
         mean = np.divide(own["sum"], count)
         variance = np.maximum(np.divide(own["squares"], count) - mean**2, 0.0)
         return {
@@ -270,14 +274,15 @@ class WebDataset:
         with replacing(self.folder / self.plan.name(number, ".tar")) as file, tarfile.open(file, "w") as tar:
             for item in items:
                 key = f"{item.index:08d}"
-                self._add(tar, f"{key}.json", json.dumps({"index": item.index, **item.values}).encode())
-                for name, values in item.arrays.items():
+                values = {k: None if v != v else v for k, v in item.values.items()}  # JSON has no NaN
+                self._add(tar, f"{key}.json", json.dumps({"index": item.index, **values}).encode())
+                for name, array in item.arrays.items():
                     stem = name.replace(".", "_")  # what follows the first dot is the name of the entry
                     if name in item.files:
                         self._add(tar, f"{key}.{stem}.png", item.files[name].read_bytes())
                     else:
                         memory = io.BytesIO()
-                        np.save(memory, values)
+                        np.save(memory, array)
                         self._add(tar, f"{key}.{stem}.npy", memory.getvalue())
 
     @staticmethod
@@ -342,7 +347,7 @@ class Zarr:
     def _words(self) -> dict[str, list[str]]:
         words = {key: {str(v)} for key, v in self.plan.first.values.items() if isinstance(v, str)}
         for record in self.plan.batch.records() if words else ():
-            for key, value in record["sample"].items():
+            for key, value in self.plan.batch.values(record).items():
                 if key in words:
                     words[key].add(str(value))
         return {key: sorted(found) for key, found in words.items()}
@@ -525,7 +530,7 @@ class LeRobot:
                 found[f"observation.images.{name}"] = {**shares, "count": [self.plan.total]}
         if self.numbers:
             rows = [moments.summary(f"values/{key}") for key in self.numbers]
-            state = {k: [row[k][0] for row in rows] for k in kinds}
+            state = {k: np.array([row[k][0] for row in rows], float).tolist() for k in kinds}  # None: NaN
             found["observation.state"] = {**state, "count": [self.plan.total]}
         return found
 
@@ -641,6 +646,12 @@ def _counted(
                     "first sample; allowed: arrays of one shape; leave it out by naming the others with --array"
                 )
             moments.add(f"arrays/{name}", values)
+        kinds, usual = ({k: type(v) for k, v in values.items()} for values in (item.values, plan.first.values))
+        if unlike := sorted(k for k in kinds.keys() | usual.keys() if kinds.get(k) is not usual.get(k)):
+            raise ValueError(
+                f"{plan.batch.folder}: sample {item.index}: the value {unlike[0]} is missing, new, or of another kind "
+                "than in the first sample; allowed: the same numbers and words in each; make two batches of them"
+            )
         for key, value in item.values.items():
             moments.add(f"values/{key}", value)
         yield item
@@ -692,6 +703,8 @@ def _page(card: Mapping) -> str:
     def span(own: Mapping) -> str:
         if "words" in own:
             return ", ".join(f"{word} ({count})" for word, count in sorted(own["words"].items()))
+        if not own["count"]:
+            return "no number"
         low, high = min(own["min"]), max(own["max"])
         return f"{low:.6g} to {high:.6g}, mean {float(np.mean(own['mean'])):.6g}"
 

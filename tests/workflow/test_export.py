@@ -3,6 +3,8 @@
 import hashlib
 import io
 import json
+import math
+import shutil
 import tarfile
 
 import numpy as np
@@ -166,6 +168,60 @@ def test_12_bits_stay_12_bits(tmp_path):
     assert 255 < stored.max() <= 4095
     with pytest.raises(ValueError, match="camera_noisy has 16 bits, and images of LeRobot have 8; allowed: --images"):
         export.export(folder, tmp_path / "y", "lerobot")
+
+
+def labelled(made, folder, **labels):
+    """A copy of the batch whose records have labels: name -> one a sample."""
+    shutil.copytree(made, folder)
+    lines = [
+        {**record, "labels": {name: values[record["index"]] for name, values in labels.items()}}
+        for record in records(made)
+    ]
+    (folder / "manifest.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    return folder
+
+
+@pytest.mark.parametrize("to", export.FORMATS)
+def test_labels_without_a_number_and_words_keep_their_place(made, tmp_path, to):
+    """A marker leaves the image in samples 0 and 3: NaN there, and every other sample has its own number and word."""
+    u, words = [None, 1.0, 2.0, None, 4.0, 5.0], ["cube", "sphere", "cone", "cube", "sphere", "ring"]
+    batch = labelled(made, tmp_path / "batch", markers=[[[v, None]] for v in u], pose=[{"indenter": w} for w in words])
+    card = export.export(batch, tmp_path / "x", to, per_file=2)
+    keys, found = ("labels.markers.0.0", "labels.markers.0.1", "labels.pose.indenter"), []
+    if to == "webdataset":
+        for file in sorted((tmp_path / "x").glob("*.tar")):
+            with tarfile.open(file) as tar:
+                texts = [tar.extractfile(n).read().decode() for n in tar.getnames() if n.endswith(".json")]
+            assert not any("NaN" in text for text in texts), "no JSON"
+            found += [[json.loads(text)[key] for key in keys] for text in texts]
+    elif to == "hdf5":
+        for name in sorted((tmp_path / "x").glob("*.h5")):
+            with h5py.File(name) as file:
+                words_of = file[f"values/{keys[2]}"].asstr()[:]
+                found += zip(*(file[f"values/{key}"][:] for key in keys[:2]), words_of)
+    elif to == "zarr":
+        root = zarr.open_group(str(tmp_path / "x" / "samples.zarr"), mode="r")
+        columns = [root[f"values/{key}"][:] for key in keys]
+        known = root[f"values/{keys[2]}"].attrs["words"]
+        found = [(a, b, known[int(w)]) for a, b, w in zip(*columns)]
+    else:
+        names = json.loads((tmp_path / "x/meta/info.json").read_text())["features"]["observation.state"]["names"]
+        for file in sorted((tmp_path / "x/data").rglob("*.parquet")):
+            for row in parquet.read_table(file).to_pylist():
+                state = dict(zip(names, row["observation.state"]))
+                found.append((state[keys[0]], state[keys[1]], row[f"observation.{keys[2]}"]))
+    nan = [math.nan if v is None else v for v in u]
+    np.testing.assert_array_equal([math.nan if a is None else a for a, _, _ in found], nan)
+    assert all(b is None or math.isnan(b) for _, b, _ in found) and [w for _, _, w in found] == words
+    value = card["values"][keys[0]]
+    assert (value["count"], value["min"], value["max"], value["mean"]) == (4, [1.0], [5.0], [3.0])
+    assert card["values"][keys[1]]["mean"] == [None] and "no number" in (tmp_path / "x/card.md").read_text()
+
+
+def test_samples_with_other_values_are_refused(made, tmp_path):
+    batch = labelled(made, tmp_path / "batch", torque=[1.0, 2.0, "strong", 4.0, 5.0, 6.0])
+    with pytest.raises(ValueError, match="sample 2: the value labels.torque is missing, new, or of another kind"):
+        export.export(batch, tmp_path / "x", "zarr")
 
 
 @pytest.mark.parametrize("to", export.FORMATS)
