@@ -20,6 +20,7 @@ import math
 import tarfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -66,10 +67,10 @@ class Batch:
         self.saturation = 255.0 if noise is None else noise["saturation"]
         units = self.folder / "parameters.json"
         self.parameters = json.loads(units.read_text(encoding="utf-8")) if units.is_file() else {}
-        with open(self.manifest, encoding="utf-8") as lines:
-            first = json.loads(next(lines))
-            self.total = 1 + sum(1 for _ in lines)
-        self.roles = list(first["files"])
+        with open(self.manifest, "rb") as lines:
+            self.starts = np.cumsum([0, *map(len, lines)])[:-1]  # bytes before each record
+        self.total = len(self.starts)
+        self.roles = list(next(self.records())["files"])
 
     def bands(self) -> list[float]:
         """nm, of the last axis of `radiance`, or the last but one of `stokes`."""
@@ -80,10 +81,9 @@ class Batch:
         return [float(band) for band in exr.spectral_image(spectral)[0]]
 
     def records(self, first: int = 0) -> Iterator[dict]:
-        with open(self.manifest, encoding="utf-8") as lines:
-            for number, line in enumerate(lines):
-                if number >= first:
-                    yield json.loads(line)
+        with open(self.manifest, "rb") as lines:
+            lines.seek(self.starts[first])
+            yield from map(json.loads, lines)
 
     def item(self, record: Mapping, images: str, only: Sequence[str]) -> Item:
         """A sample's values and arrays; only: names of arrays, none for all. Raises ValueError for a damaged file."""
@@ -253,7 +253,9 @@ class Plan:
 
 
 class Format(Protocol):
-    """writes   number of a file -> its samples; finish: what the whole needs; pattern: names the files to a reader."""
+    """write: number of a file -> its samples; finish: what the whole needs; pattern: names the files to a reader.
+
+    Making one refuses what the format cannot hold, and writes nothing."""
 
     pattern: str
 
@@ -331,18 +333,21 @@ class Zarr:
     def __init__(self, folder: Path, plan: Plan):
         self.zarr = library("zarr", "--to zarr", "data")
         self.plan, self.pattern, self.root = plan, "samples.zarr", folder / "samples.zarr"
-        group = self.zarr.open_group(str(self.root), mode="a")
         self.words = self._words()
-        self.arrays = {}
-        for name, values in plan.first.arrays.items():
-            self.arrays[name] = self._open(name, values.shape, values.dtype)
-        self.values = {key: self._open(f"values/{key}", (), "f8") for key in plan.first.values}
-        self.index = self._open("index", (), "i8")
-        for key, array in self.values.items():
-            array.attrs["unit"] = unit_of(plan.batch, key)
+
+    @cached_property
+    def targets(self) -> dict[str, Any]:
+        """Name -> zarr array of all that is stored."""
+        first = self.plan.first
+        group = self.zarr.open_group(str(self.root), mode="a")
+        group.attrs["samples"] = self.plan.total
+        arrays = {name: self._open(name, values.shape, values.dtype) for name, values in first.arrays.items()}
+        numbers = {key: self._open(f"values/{key}", (), "f8") for key in first.values}
+        for key, array in numbers.items():
+            array.attrs["unit"] = unit_of(self.plan.batch, key)
             if key in self.words:
                 array.attrs["words"] = self.words[key]
-        group.attrs["samples"] = plan.total
+        return {**arrays, **numbers, "index": self._open("index", (), "i8")}
 
     def _words(self) -> dict[str, list[str]]:
         words = {key: {str(v)} for key, v in self.plan.first.values.items() if isinstance(v, str)}
@@ -369,8 +374,8 @@ class Zarr:
 
     def write(self, number: int, items: Sequence[Item] | Iterator[Item]) -> None:
         first = number * self.plan.per_file
-        waiting: dict[str, list] = {name: [] for name in (*self.arrays, *self.values, "index")}
-        targets = {**self.arrays, **self.values, "index": self.index}
+        targets = self.targets
+        waiting: dict[str, list] = {name: [] for name in targets}
         stored = dict.fromkeys(waiting, first)
 
         def store(name: str) -> None:
@@ -590,8 +595,14 @@ def export(
     card = folder / "card.json"
     state = folder / ".export"
     if _already(folder, state, card, identity):
-        return json.loads(card.read_text(encoding="utf-8"))
+        made = json.loads(card.read_text(encoding="utf-8"))
+        if licence and licence != made["licence"]:
+            made["licence"] = licence
+            write_text(folder / "card.md", _page(made))
+            write_json(card, made)
+        return made
     writer = FORMATS[to](folder, plan)
+    write_json(state / "export.json", identity)
     moments = Moments()
     count = -(-source.total // per_file)
     for number in range(count):
@@ -612,7 +623,7 @@ def export(
 
 
 def _already(folder: Path, state: Path, card: Path, identity: Mapping) -> bool:
-    """Whether the same export stands complete; makes the folder of a new one. Raises OutputExists for another one."""
+    """Whether the same export stands complete. Raises OutputExists for another one."""
     note = state / "export.json"
     if card.is_file() or note.is_file():
         before = json.loads((card if card.is_file() else note).read_text(encoding="utf-8"))
@@ -624,8 +635,6 @@ def _already(folder: Path, state: Path, card: Path, identity: Mapping) -> bool:
     check_folder(folder)
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise OutputExists(f"{folder} exists and holds no export; choose another folder")
-    state.mkdir(parents=True)
-    write_json(note, identity)
     return False
 
 

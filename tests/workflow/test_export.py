@@ -168,6 +168,7 @@ def test_12_bits_stay_12_bits(tmp_path):
     assert 255 < stored.max() <= 4095
     with pytest.raises(ValueError, match="camera_noisy has 16 bits, and images of LeRobot have 8; allowed: --images"):
         export.export(folder, tmp_path / "y", "lerobot")
+    assert export.export(folder, tmp_path / "y", "hdf5")["samples"] == TOTAL, "what was refused left nothing"
 
 
 def labelled(made, folder, **labels):
@@ -259,6 +260,9 @@ def test_the_card_says_where_the_data_come_from(made, tmp_path):
     assert (value["min"], value["max"]) == ([min(drawn)], [max(drawn)])
     assert card["seed"] == 3 and card["licence"] == "CC-BY-4.0" and card["versions"]["mitsuba"]
     page = (tmp_path / "x/card.md").read_text()
+    again = export.export(made, tmp_path / "x", "webdataset", licence="CC0-1.0")
+    assert again["licence"] == "CC0-1.0" and "- licence: CC0-1.0" in (tmp_path / "x/card.md").read_text()
+    assert export.export(made, tmp_path / "x", "webdataset") == again, "a licence that was stated stays"
     assert "CC-BY-4.0" in page and "| gel.press_x | mm | uniform [-4.0, 4.0] |" in page and "sphere (" in page
 
 
