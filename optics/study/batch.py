@@ -430,8 +430,8 @@ def _open_folder(folder: Path, identity: Mapping) -> None:
     check_folder(folder)
     if folder.exists() and (not folder.is_dir() or any(not p.name.startswith(".") for p in folder.iterdir())):
         raise OutputExists(f"{folder} exists and holds no batch; choose another folder for `out`")
-    (folder / "images").mkdir(parents=True, exist_ok=True)
-    write_text(note, json.dumps(identity, indent=1, sort_keys=True) + "\n")
+    write_text(note, json.dumps(identity, indent=1, sort_keys=True) + "\n")  # first: it makes the folder a batch's
+    (folder / "images").mkdir(exist_ok=True)
 
 
 def _changes(before, now, name: str = "") -> list[str]:
@@ -459,6 +459,9 @@ def finish(job: Job, blocks: Blocks) -> bool:
                 blocks.finish()
         except OutputExists:
             pass  # another worker is at it
+        except FileNotFoundError:
+            if not blocks.finished:  # another worker has been at it, and `.parts` is gone
+                raise
     return blocks.finish()
 
 
