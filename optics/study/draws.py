@@ -243,4 +243,6 @@ def _selected(posterior: Posterior, asked: bool | list[str], own: set[str], wher
         for i, (name, keys) in enumerate(zip(posterior.names, posterior.keys))
         if any(fnmatchcase(name, pattern) for pattern in patterns) and not own & set(keys)
     ]
+    if not kept:
+        raise BadJob(f"{where}: the job sets or draws every value itself; leave posterior out, or these values")
     return posterior.only(kept)

@@ -185,6 +185,9 @@ def test_a_posterior_is_drawn_jointly_and_within_bounds(scene):
     assert set(some.at(0)) == {"led_1.power", "led_2.power"} and some.posterior.names == ("led_1.power",)
     with pytest.raises(UnknownKey, match="unknown variable 'lamp"):
         Draws(made.model_copy(update={"posterior": ["lamp*"]}), scene, {}, FILE, posterior)
+    every = job(fit="s", scene=None, posterior=["led_2*"], unit={"led_2.power": {"normal": [1.0, 0.1]}})
+    with pytest.raises(BadJob, match="sets or draws every value itself; leave posterior out"):
+        Draws(every, scene, {}, FILE, posterior)
     outside = replace(posterior, mean=np.array([1.0, 2.0, -1.0]))
     with pytest.raises(BadJob, match="most often outside is membrane.sigma; leave it out"):
         Draws(made, scene, {}, FILE, outside).at(0)
