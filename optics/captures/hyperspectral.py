@@ -27,7 +27,7 @@ import numpy as np
 from optics.captures import capture_set as capture_sets
 from optics.captures.capture_set import Captures
 from optics.captures.noise import Noise
-from optics.captures.raw_frames import Read, framed, keyed, listed, named
+from optics.captures.raw_frames import BLACK_LEVEL_LOST, Read, framed, keyed, listed, named
 from optics.errors import BadCapture, BadScene, OutputExists
 from optics.files import exr
 from optics.files.images import CHANNELS_MOST, PIXELS_MOST, read_image
@@ -98,8 +98,10 @@ def import_cubes(
 
     settings  a CSV with the column file; None: the names of the files say what was set
     rename    name in the CSV or in file names -> parameter key
-    bands     a range "400:700:10", nm: channels are means of the source's bands within half a step; None: as they are
-    bits      of a value, which saturates at 2^bits - 1; None: those of its type, of real numbers the largest value
+    bands     a range "400:700:10", nm: channels are means of the source's bands within half a step; a band on the
+              border of two counts in the upper one, so that channels share no noise. None: as they are
+    bits      of a value, which saturates at 2^bits - 1, and with it every mean that it is part of; None: those of its
+              type, of real numbers the largest value
     bin       pixels each way that are averaged
     black_level, system_gain, dark_noise    DN, DN per electron, DN rms of single values; gain and noise both or neither
     Raises BadCapture, OutputExists.
@@ -115,6 +117,7 @@ def import_cubes(
     cubes: list[Cube] = []
     warnings: list[str] = []
     first, counts = found[0][2](), 1
+    full = float(np.float32(2**bits - 1 if bits is not None else first.whole or np.inf))  # as values are
     for file, own, read in found:
         cube = read() if cubes else first
         if cube.values.shape != first.values.shape or not np.array_equal(cube.nm, first.nm):
@@ -122,9 +125,11 @@ def import_cubes(
                 f"{file}: (H, W, bands) = {cube.values.shape}; allowed: {first.values.shape} with the wavelengths of "
                 f"{found[0][0].name}; one camera, one size"
             )
+        if (most := cube.values.max()) > full:
+            raise BadCapture(f"{file}: values up to {most:g} DN do not fit {bits} bit; allowed: up to {full:g} DN")
         if bands is not None:
-            cube, counts = _joined(cube, bands, str(source))
-        cubes.append(_binned(cube, bin, str(file)))
+            cube, counts = _joined(cube, bands, str(source), full)
+        cubes.append(_binned(cube, bin, str(file), full))
         rows.append((file, keyed(own, rename or {}, str(file))))
     if len(cubes[0].nm) > CHANNELS_MOST:
         raise BadCapture(
@@ -132,13 +137,12 @@ def import_cubes(
             f'bands = "{cubes[0].nm[0]:.0f}:{cubes[0].nm[-1]:.0f}:10"'
         )
     averaged = bin * bin * counts
-    noise, most = None, float(max(c.values.max() for c in cubes))
-    top = 2**bits - 1 if bits is not None else cubes[0].whole or most
-    if most > top:
-        raise BadCapture(f"{source}: values up to {most:g} DN do not fit {bits} bit; allowed: up to {top:g} DN")
+    noise, top = None, full if np.isfinite(full) else float(max(c.values.max() for c in cubes))
     if system_gain is not None and dark_noise is not None:
-        noise = Noise(system_gain / averaged, dark_noise / np.sqrt(averaged), black_level, float(top), 0.0)
+        noise = Noise(system_gain / averaged, dark_noise / np.sqrt(averaged), black_level, top, 0.0)
     frames = framed(rows, [c.values for c in cubes], [c.mask for c in cubes])
+    if noise is None and black_level:
+        warnings.append(BLACK_LEVEL_LOST.format(black_level))
     if noise is None and not any(f.repeats for f in frames):
         warnings.append(
             "neither repeats nor system_gain and dark_noise: nothing says how large a residual may be; record two "
@@ -268,8 +272,8 @@ def read_envi(file: Path) -> Cube:
 def _envi_fields(file: Path) -> dict[str, str]:
     """Fields of a header by their names in lower case; lists in braces, which may go over lines, without these."""
     try:
-        text = file.read_text(encoding="utf-8", errors="strict")
-    except (OSError, UnicodeDecodeError) as error:
+        text = file.read_text(encoding="utf-8-sig", errors="replace")  # descriptions are written in any encoding
+    except OSError as error:
         raise BadCapture(f"{file}: no ENVI header ({error})") from error
     if not text.lstrip().startswith("ENVI"):
         raise BadCapture(f"{file}: its first line is not ENVI; allowed: a header of the ENVI format")
@@ -309,7 +313,7 @@ def _ordered(nm, values, width, whole: int | None, where: str, mask: np.ndarray 
     return Cube(nm, values, np.gradient(nm) if width is None else np.asarray(width, float)[order], whole, mask)
 
 
-def _joined(cube: Cube, bands: str, where: str) -> tuple[Cube, int]:
+def _joined(cube: Cube, bands: str, where: str, full: float = np.inf) -> tuple[Cube, int]:
     """Means of bands within half a step of each of a range, and the least number of bands in a mean."""
     try:
         centres, nodes = parse(bands, where)
@@ -319,20 +323,25 @@ def _joined(cube: Cube, bands: str, where: str) -> tuple[Cube, int]:
         raise BadCapture(f"{where}: bands = {bands!r}; allowed: a range such as 400:700:10")
     nm = np.sort(np.array(centres))
     step = float(np.diff(nm).min())
-    inside = [np.abs(cube.nm - n) <= step / 2 + 1e-9 for n in nm]
+    inside = [(cube.nm - n >= -step / 2 - 1e-9) & (cube.nm - n < step / 2 - 1e-9) for n in nm]
     if empty := [n for n, own in zip(nm, inside) if not own.any()]:
         raise BadCapture(
             f"{where}: bands = {bands!r}: none of the source's bands ({cube.nm[0]:g} to {cube.nm[-1]:g} nm) lies "
             f"within {step / 2:g} nm of {empty[0]:g} nm; allowed: a range that they cover"
         )
-    values = np.stack([cube.values[..., own].mean(-1) for own in inside], -1)
+    values = np.stack([_mean(cube.values[..., own], -1, full) for own in inside], -1)
     middle = np.array([cube.nm[own].mean() for own in inside])
     # variance of what several bands see together: their own and that of their centres, as full widths
     spread = [np.sqrt((cube.width[own] ** 2).mean() + 8 * np.log(2) * cube.nm[own].var()) for own in inside]
     return replace(cube, nm=middle, values=values, width=np.array(spread)), min(int(own.sum()) for own in inside)
 
 
-def _binned(cube: Cube, bin: int, where: str) -> Cube:
+def _mean(values: np.ndarray, axes: int | tuple[int, ...], full: float) -> np.ndarray:
+    """Means; saturated where one of the values is, since what that one would have been is not known."""
+    return np.where((values >= full).any(axes), full, values.mean(axes)).astype(np.float32)
+
+
+def _binned(cube: Cube, bin: int, where: str, full: float) -> Cube:
     height, width = (n // bin for n in cube.values.shape[:2])
     if not height or not width:
         raise BadCapture(f"{where}: bin = {bin} of {cube.values.shape[:2]} pixels; allowed: a block or more")
@@ -343,7 +352,7 @@ def _binned(cube: Cube, bin: int, where: str) -> Cube:
         for a in (cube.values, np.ones(cube.values.shape[:2]) if cube.mask is None else cube.mask)
     ]
     mask = None if cube.mask is None else blocks[1].all((1, 3))[..., 0]
-    return replace(cube, values=blocks[0].mean((1, 3)), mask=mask)
+    return replace(cube, values=_mean(blocks[0], (1, 3), full), mask=mask)
 
 
 def _sensitivities(cube: Cube, source: str) -> str:

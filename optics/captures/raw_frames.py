@@ -33,6 +33,10 @@ from optics.polarization.mosaic import Mosaic, checked
 DEPTHS = (10, 12, 14, 16)
 OWN = ("file", "group", "mask")
 PIECES = re.compile(r",|__")
+BLACK_LEVEL_LOST = (
+    "black_level = {:g} DN belongs to [noise], which repeats stand in for: it is not written down; give system_gain "
+    "and dark_noise as well"
+)
 
 
 @dataclass
@@ -90,10 +94,7 @@ def import_frames(
         noise = Noise(system_gain / count, dark_noise / bin, black_level, float(2**depth - 1), 0.0)
     frames = framed(rows, images, masks)
     if noise is None and black_level:
-        warnings.append(
-            f"black_level = {black_level:g} DN belongs to [noise], which repeats stand in for: it is not written down; "
-            "give system_gain and dark_noise as well"
-        )
+        warnings.append(BLACK_LEVEL_LOST.format(black_level))
     if noise is None and not any(f.repeats for f in frames):
         warnings.append(
             "neither repeats nor system_gain and dark_noise: nothing says how large a residual may be; record two "

@@ -37,7 +37,8 @@ def envi(file, values, order="bil", kind=">u2", **changed):
         **changed,
     }
     text = "".join(f"{name} = {value}\n" for name, value in fields.items() if value is not None)
-    file.write_text(f"ENVI\ndescription = {{a cube, of\n two lines}}\n{text}", encoding="utf-8")
+    # a description in the encoding of the instrument's maker
+    file.write_bytes(f"ENVI\ndescription = {{a cube at 20 °C, of\n two lines}}\n{text}".encode("latin-1"))
     stored = values.transpose({"bsq": (2, 0, 1), "bil": (0, 2, 1), "bip": (0, 1, 2)}[order]).astype(kind)
     file.with_suffix(".raw").write_bytes(b"\0\0\0\0" + stored.tobytes())
     return file
@@ -79,15 +80,19 @@ def test_bands_are_joined_and_pixels_averaged(cube, tmp_path):
     of 10 nm see is theirs and that of their centres, 200/3 nm^2."""
     cube = cube.copy()
     cube[0, 0, 0] = 7
+    cube[4, 3, 1] = 4095  # saturated at 12 bits: so is the mean that it is part of
     file = envi(tmp_path / "a.hdr", cube, **{"data ignore value": 7})
-    hyperspectral.import_cubes(file, tmp_path / "set", bands="460:640:30", bin=2, **NUMBERS)
+    hyperspectral.import_cubes(file, tmp_path / "set", bands="460:640:30", bin=2, bits=12, **NUMBERS)
     captures = capture_set.load(tmp_path / "set")
     expected = cube.astype(float).reshape(3, 2, 4, 2, 7, 3).mean((1, 3, 5))
+    expected[2, 1, 0] = 4095
     assert captures.frames[0].image[1:] == pytest.approx(expected[1:], rel=1e-6)
     assert captures.frames[0].mask.sum() == 11 and not captures.frames[0].mask[0, 0]
     assert captures.noise.dark_noise == pytest.approx(1 / np.sqrt(12))
     joined, _ = hyperspectral._joined(hyperspectral.read_envi(file), "460:640:30", "")
     assert joined.width == pytest.approx(np.sqrt(12.5**2 + 8 * np.log(2) * 200 / 3))
+    pairs, count = hyperspectral._joined(hyperspectral.read_envi(file), "460:640:20", "")
+    assert count == 2 and pairs.nm == pytest.approx(np.arange(455.0, 636.0, 20.0)), "a band on a border is used once"
 
 
 @pytest.mark.parametrize(
@@ -115,6 +120,8 @@ def test_what_is_no_cube_is_refused(cube, tmp_path):
         hyperspectral.import_cubes(file, tmp_path / "set", bands="400:700:10", **NUMBERS)
     with pytest.raises(BadCapture, match="both, or neither"):
         hyperspectral.import_cubes(file, tmp_path / "set", dark_noise=1.0)
+    read = hyperspectral.import_cubes(file, tmp_path / "plain", black_level=8.0)
+    assert "black_level = 8 DN belongs to [noise]" in read.warnings[0]
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "notes.txt").write_text("kept")
     with pytest.raises(OutputExists):
