@@ -143,6 +143,15 @@ def import_(
         "--untouched": untouched,
     }
     of_presses = [name for name, value in presses.items() if value is not None]
+    shared: dict[str, Any] = {
+        "settings": listed,
+        "bits": bits,
+        "bin": bin,
+        "black_level": black_level or 0.0,
+        "system_gain": system_gain,
+        "dark_noise": dark_noise,
+        "overwrite": force,
+    }
     if mosaic is None and hyperspectral.is_cube_source(source):
         if of_presses:
             raise ValueError(f"{', '.join(of_presses)}: not of hyperspectral images; leave these out")
@@ -150,15 +159,9 @@ def import_(
             source,
             output,
             scene=scene or "digit",
-            settings=listed,
             rename=pairs(rename, "--rename"),
             bands=bands,
-            bits=bits,
-            bin=bin,
-            black_level=black_level or 0.0,
-            system_gain=system_gain,
-            dark_noise=dark_noise,
-            overwrite=force,
+            **shared,
         )
         _tell(read.folder, read.warnings)
         return
@@ -175,15 +178,9 @@ def import_(
             source,
             output,
             mosaic=read_mosaic(mosaic),
-            settings=listed,
             rename=pairs(rename, "--rename"),
             scene=scene or "polarization_camera",
-            bits=bits,
-            bin=bin,
-            black_level=black_level or 0.0,
-            system_gain=system_gain,
-            dark_noise=dark_noise,
-            overwrite=force,
+            **shared,
         )
         _tell(read.folder, read.warnings)
         return

@@ -30,6 +30,7 @@ from optics.errors import OutputExists, UnknownKey
 from optics.files import exr
 from optics.files.images import read_array
 from optics.files.output import check_folder, file_hash, replacing, write_json, write_text
+from optics.light import labels as labelling
 from optics.study.engines import library
 
 PER_FILE = 1000
@@ -112,24 +113,12 @@ class Batch:
 
     def values(self, record: Mapping) -> dict[str, float | str]:
         """Numbers and words of a sample, by key; NaN for a number that there is none of: a marker outside the image."""
-        found: dict[str, float | str] = {}
-
-        def add(name: str, value: Any) -> None:
-            if isinstance(value, Mapping):
-                for key, inner in value.items():
-                    add(f"{name}.{key}" if name else key, inner)
-            elif isinstance(value, list):
-                for number, inner in enumerate(value):
-                    add(f"{name}.{number}", inner)
-            elif value is None:
-                found[name] = math.nan
-            else:
-                found[name] = value if isinstance(value, str) else float(value)
-
-        add("", {**self.job["parameters"], **record["sample"]})
-        for key in record.keys() - {"index", "sample", "files"}:
-            add(key, record[key])
-        return found
+        own = {key: record[key] for key in sorted(record.keys() - {"index", "sample", "files"})}
+        told = labelling.flat({**self.job["parameters"], **record["sample"], **own})
+        return {
+            name: math.nan if value is None else value if isinstance(value, str) else float(value)  # type: ignore[arg-type]
+            for name, value in told.items()
+        }
 
 
 def _arrays(file: Path, kind: str, images: str) -> dict[str, np.ndarray]:

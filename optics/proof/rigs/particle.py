@@ -6,7 +6,7 @@ import numpy as np
 
 from optics.captures import capture_set as capture_files
 from optics.proof.cells import Cell
-from optics.proof.makers.particle import CAMERA, ParticleMaker
+from optics.proof.makers.particle import CAMERA, MAKERS, ParticleMaker
 from optics.proof.rigs.base import ImageRig, Mean
 from optics.scene import loader as scenes
 
@@ -16,16 +16,7 @@ class ParticleGel(ImageRig):
     8 bits, 4 DN of noise at 150. Clutter and kinds that the library lacks are not made."""
 
     name = "particle_gel"
-    effects = (
-        "lens vignetting",
-        "lens blur",
-        "defocus",
-        "excitation leak",
-        "inner filter",
-        "bleaching",
-        "bead settling",
-        "bead size spread",
-    )
+    effects = MAKERS
     mistakes = ("gain +20 %", "gain -20 %")
     cluttered = False
     free = ("inner_ring.power", "outer_ring.power", "dye.yield", "camera.x_fov", "camera.z")
