@@ -5,8 +5,8 @@
 A point of the skin that a press shows at x lies at X in the flat field; J is the area that a piece of skin takes when
 pressed over the area that it takes at rest. Squares of image between the contacts are looked for in the flat field by
 normalized cross-correlation; u is the cubic in x and y that their places follow, by least squares with a Cauchy loss,
-as squares without grain, and dust on the window, which does not move, are found anywhere. The sum of the LEDs' images is
-used, in logarithms and without what is wider than grain.
+as squares without grain are found anywhere, and dust on the window does not move. The mean of the LEDs' logarithms is
+used, without what is wider than grain.
 
 A gel between a window and a plate cannot be compressed, so it gives way to the side: squeezed by a share e of its
 thickness it spreads over 1/(1 - e) of its area (K. L. Johnson, Contact Mechanics, 5.8)."""

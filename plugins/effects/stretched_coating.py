@@ -10,10 +10,10 @@ grain, which moves from the flat field to the press), and one number k for all p
              to the light: k = (3 z^2/D^2 - 1) h/z for a lamp at the height z and the distance D
 Fingerprint
     a gain of the pressed image over the flat field, the same under every LED, smooth, and least where the skin spreads
-    least. Lens vignetting and uneven lamps divide out with a multiplicative flat field; a lamp that drifts is one factor
-    for a frame; the object behind a thin coating shows in the contacts only.
+    least. Lens vignetting and uneven lamps divide out with a multiplicative flat field; a lamp that drifts is one
+    factor for a frame; the object behind a thin coating shows in the contacts only.
 Validity
-    small J - 1; a stretch of more than the image shows, as a cubic motion has it. Frames that state no stretch have none.
+    small J - 1; a stretch that varies slowly over the image. Frames that state no stretch have none.
 References
     Kubelka, J. Opt. Soc. Am. 38, 448 (1948); K. L. Johnson, Contact Mechanics, 5.8 (a layer that cannot be compressed);
     the neglect of S1.4: a coating that is the same everywhere and stays so.

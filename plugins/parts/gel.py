@@ -19,9 +19,10 @@ The forces of a press are those of an elastic skin under the same indenter at th
 `young`, `poisson`, on a rigid window at its thickness or, with `backing` deep, without end. They are labels: the dent
 that is seen stays the one above. An indenter that came to where it stands by `shift_x`, `shift_y` and a turn by `twist`
 after it had pressed drags along what sticks to it by `friction` (Coulomb); sheets, markers and beads in the gel are
-carried sideways by that shear. A wide press squeezes the gel to its rim; by how much that stretches the face is not
-computed: `stretch`, `stretch_x` ... `stretch_yy` state it, J - 1 = s + sx x + sy y + sxx x^2 + sxy x y + syy y^2 with the
-area J of a piece of pressed skin over that at rest, for the effects that use it. Indenters: sphere (`indenter_size` = radius),
+carried sideways by that shear.
+By how much a wide press stretches the face is not computed: `stretch`, `stretch_x` ... `stretch_yy` state it, J - 1 = s
++ sx x + sy y + sxx x^2 + sxy x y + syy y^2, J the area of a piece of pressed skin over that at rest, for effects of it.
+Indenters: sphere (`indenter_size` = radius),
 cylinder lying on its side (radius), cube face down (edge), balls (radius) `indenter_spacing` apart on a plate without
 end, one of them at the press, a mesh file (STL, OBJ, PLY; `indenter_size` = scale) or a measured height map (TMD;
 `indenter_size` = scale; NPY in mm or 16 bit PNG in micrometres: mm from sample to sample).
@@ -210,6 +211,7 @@ PARAMETERS = (
             (-bound, bound),
             f"areal stretch of the pressed face, J - 1: its {word}",
             plausible=size,
+            how="difference",
         )
         for name, unit, bound, size, word in (
             ("stretch", "1", 2.0, 0.05, "value at x = y = 0"),
@@ -386,8 +388,8 @@ def build():
             n = self.number if self.recalled is None else self.recalled.__getitem__
             if n("press_depth") <= 0:
                 return dr.zeros(mi.Float, 1)
-            linear = self.stretch + self.stretch_x * p.x + self.stretch_y * p.y
-            return linear + self.stretch_xx * p.x * p.x + self.stretch_xy * p.x * p.y + self.stretch_yy * p.y * p.y
+            s, x, y, xx, xy, yy = map(n, STRETCH)
+            return s + (x + xx * p.x + xy * p.y) * p.x + (y + yy * p.y) * p.y
 
         def recall(self, values):
             """Let `touched` answer for a geometry that the mesh has left: the gel's values by name; None: its own."""
