@@ -118,6 +118,10 @@ SHOWN: dict[str, tuple[View, tuple[str, ...] | None]] = {
     "twisted-plate": (View("polarizer_bench", {"analyzer": "90"}, {"sample.retard_0": 180.0}, "sample.angle"), None),
     "sample-absorption": (View("polariscope", {"width": "180", "height": "135", "analyzer": "45"}), ("sample",)),
     "plate-behind-the-coating": (View("gelsight_bench"), None),  # a plate of balls
+    "stretched-coating": (
+        View("gelsight_bench", {}, {"gel.stretch": 0.04, "gel.stretch_xx": 0.003, "gel.stretch_yy": 0.002}),
+        None,
+    ),
     "soft-saturation": (View("polarizer_bench", {}, {"source.power": 2.8}, "analyzer.angle"), None),
     "stress-birefringence": (
         View("polarizer_bench", {"width": "180", "height": "180", "x_fov": "8", "pattern": "disc", "analyzer": "90"}),

@@ -16,6 +16,8 @@ Derived, not measured, and said so:
                ball is near
     lights     the direction of the least-squares fit I/F = l.n + c on the balls, at DISTANCE
     black      values that are cut off below (`corrections.black_levels`): masked, of blocks the whole block
+    stretch    how far each press spreads the skin (optics.captures.skin_motion): `gel.stretch` and its slopes, of no
+               effect until `stretched coating` is asked for
     masks      blemishes: values that miss the median around them, or on balls a linear shading, by BLEMISH standard
                deviations"""
 
@@ -40,6 +42,7 @@ from optics.captures.corrections import (
 )
 from optics.captures.importing import Imported, comment, filled, noise_of_levels, write_set
 from optics.captures.noise import Noise
+from optics.captures.skin_motion import STRETCH, SkinMotion, skin_motion
 from optics.errors import BadCapture
 from optics.files.images import read_image, varied
 from optics.files.output import shipped
@@ -319,7 +322,7 @@ def import_scans(
     tick("import", 0, steps)
     black = black_levels([i for s in (*scans, flat) for i in s.images])
     flats = np.stack([filled(i, bin, saturation, black)[..., 0] for i in flat.images])
-    plates, cut, settings = [], [], []
+    plates, cut, settings, motions = [], [], [], {}
     for done, scan in enumerate(scans, 1):
         plate = plate_of(scan)
         warnings += _contradictions(scan, plate, first)
@@ -327,6 +330,12 @@ def import_scans(
         cut.append(np.stack([filled(i, bin, saturation, black)[..., 0] for i in scan.images]))
         pose = dict(zip(POSE, (plate.x, plate.y, 0.0, 0.0, 0.0, plate.turn)))
         settings.append({key: round(float(value), 6) for key, value in pose.items()})
+        motion = skin_motion(
+            flat.images[..., 0], scan.images[..., 0], plate.balls, plate.spacing, scan.radius, scan.mm_per_pixel
+        )
+        if motion:
+            motions[scan.name] = motion
+            settings[-1] |= {f"gel.{key}": float(f"{value:.4g}") for key, value in motion.settings().items()}
         tick("import", done, steps)
     shape = flats.shape[1:]
     offsets, distances = zip(*(nearest(shape, p.balls, scale) for p in plates))
@@ -369,7 +378,10 @@ def import_scans(
     remark = drift_text(np.array(drift)[:, None], [f.name for f in frames])
     if remark:
         warnings.append(f"{remark}; left as it is: light that the balls throw on the level face looks the same")
-    facts = _facts(source, scans, flat, plates, bin, scale, shape, noise, lights, warnings)
+    if motions and len(motions) < len(scans):
+        for pose in settings:  # a column of all frames or of none
+            pose |= {f"gel.{key}": pose.get(f"gel.{key}", 0.0) for key in STRETCH}
+    facts = _facts(source, scans, flat, plates, motions, bin, scale, shape, noise, lights, warnings)
     facts["corrections"] = corrections
     path = write_set(
         Path(folder),
@@ -437,7 +449,9 @@ def _depth(scan: Scan, ratios: np.ndarray, offset: np.ndarray, lights: Mapping[s
     return min(float(np.median(known)), scan.radius)
 
 
-def _facts(source, scans, flat, plates, bin, scale, shape, noise, lights, warnings) -> dict:
+def _facts(
+    source, scans, flat, plates, motions: Mapping[str, SkinMotion], bin, scale, shape, noise, lights, warnings
+) -> dict:
     azimuths = {label: math.degrees(math.atan2(y, x)) for label, (x, y, _) in lights.items()}
     return {
         "source": str(source),
@@ -449,6 +463,7 @@ def _facts(source, scans, flat, plates, bin, scale, shape, noise, lights, warnin
                 "turn_deg": p.turn,
                 "spacing_mm": p.spacing,
                 "circles_off_rms_mm": p.rms,
+                "skin_motion": _motion(motions.get(s.name)),
             }
             for s, p in zip(scans, plates)
         },
@@ -477,6 +492,18 @@ def _facts(source, scans, flat, plates, bin, scale, shape, noise, lights, warnin
             },
         },
         "warnings": warnings,
+    }
+
+
+def _motion(motion: SkinMotion | None) -> dict[str, Any] | None:
+    if motion is None:
+        return None
+    return {
+        "areal_stretch": list(motion.corners()),
+        "places_agree": list(motion.places),
+        "places_off_rms_mm": motion.rms,
+        "coefficients": motion.coefficients.tolist(),
+        "half_width_mm": motion.half_width,
     }
 
 
@@ -547,6 +574,7 @@ def readme(facts: Mapping) -> str:
             "",
             "Derived",
             *places,
+            *_stretched(facts["scans"]),
             f"- images of {width} x {height} px, means of blocks of {facts['bin']} px",
             f"- noise: {facts['noise']['system_gain']:.3g} DN/DN and {facts['noise']['dark_noise']:.3g} DN, by "
             "neighbours of the level face; the coating's grain counts as noise",
@@ -555,3 +583,19 @@ def readme(facts: Mapping) -> str:
             "",
         ]
     )
+
+
+def _stretched(scans: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """What the grain of the coating says of each scan, a sentence each."""
+    found = []
+    for name, facts in scans.items():
+        if (motion := facts["skin_motion"]) is None:
+            found.append(f"- {name}: the coating's grain is not found again in the flat field; no stretch is stated")
+            continue
+        low, high = (100 * share for share in motion["areal_stretch"])
+        agree, tried = motion["places_agree"]
+        found.append(
+            f"- {name}: the skin is stretched by {low:.2g} to {high:.2g} % of its area against the flat field "
+            f"({agree} of {tried} places of its grain agree, within {1000 * motion['places_off_rms_mm']:.2g} um rms)"
+        )
+    return found

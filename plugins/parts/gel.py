@@ -19,7 +19,10 @@ The forces of a press are those of an elastic skin under the same indenter at th
 `young`, `poisson`, on a rigid window at its thickness or, with `backing` deep, without end. They are labels: the dent
 that is seen stays the one above. An indenter that came to where it stands by `shift_x`, `shift_y` and a turn by `twist`
 after it had pressed drags along what sticks to it by `friction` (Coulomb); sheets, markers and beads in the gel are
-carried sideways by that shear. Indenters: sphere (`indenter_size` = radius),
+carried sideways by that shear.
+By how much a wide press stretches the face is not computed: `stretch`, `stretch_x` ... `stretch_yy` state it, J - 1 = s
++ sx x + sy y + sxx x^2 + sxy x y + syy y^2, J the area of a piece of pressed skin over that at rest, for effects of it.
+Indenters: sphere (`indenter_size` = radius),
 cylinder lying on its side (radius), cube face down (edge), balls (radius) `indenter_spacing` apart on a plate without
 end, one of them at the press, a mesh file (STL, OBJ, PLY; `indenter_size` = scale) or a measured height map (TMD;
 `indenter_size` = scale; NPY in mm or 16 bit PNG in micrometres: mm from sample to sample).
@@ -51,6 +54,7 @@ from optics.skin.stack import Layer
 FINE = 16  # of a ball's radius, the pitch that a coarser mesh keeps: flanks of balls are off by 1 % of the light
 INDENTER_SIZE = 1.5  # mm
 SHEARING = ("poisson", "friction", "shift_x", "shift_y", "twist")
+STRETCH = ("stretch", "stretch_x", "stretch_y", "stretch_xx", "stretch_xy", "stretch_yy")
 STAGE = 0.05  # mm: how well a stage usually knows where it presses
 PARAMETERS = (
     Parameter("width", "mm", 20.0, (0.1, 1000.0), "size along x", plausible=0.1, how="difference", role="width"),
@@ -199,6 +203,25 @@ PARAMETERS = (
         )
         for axis in "xy"
     ),
+    *(
+        Parameter(
+            name,
+            unit,
+            0.0,
+            (-bound, bound),
+            f"areal stretch of the pressed face, J - 1: its {word}",
+            plausible=size,
+            how="difference",
+        )
+        for name, unit, bound, size, word in (
+            ("stretch", "1", 2.0, 0.05, "value at x = y = 0"),
+            ("stretch_x", "1/mm", 1.0, 0.01, "slope along x"),
+            ("stretch_y", "1/mm", 1.0, 0.01, "slope along y"),
+            ("stretch_xx", "1/mm^2", 1.0, 2e-3, "share of x^2"),
+            ("stretch_xy", "1/mm^2", 1.0, 2e-3, "share of x y"),
+            ("stretch_yy", "1/mm^2", 1.0, 2e-3, "share of y^2"),
+        )
+    ),
     Parameter(
         "twist",
         "deg",
@@ -242,6 +265,7 @@ def build():
             "shift_x",
             "shift_y",
             "twist",
+            *STRETCH,
         )  # what does nothing while press_depth is 0
 
         def __init__(self, props):
@@ -357,6 +381,15 @@ def build():
             n = self.number if self.recalled is None else self.recalled.__getitem__
             shape = self.indenter if self.recalled is None else self.recalled["indenter"]
             return 1 - self.touched(p) if shape == "balls" and n("press_depth") > 0 else dr.zeros(mi.Float, 1)
+
+        def stretched(self, p):
+            """J - 1 of the face at the point p, as the gel's `stretch` parameters state it; 0 where nothing is pressed;
+            Dr.Jit."""
+            n = self.number if self.recalled is None else self.recalled.__getitem__
+            if n("press_depth") <= 0:
+                return dr.zeros(mi.Float, 1)
+            s, x, y, xx, xy, yy = map(n, STRETCH)
+            return s + (x + xx * p.x + xy * p.y) * p.x + (y + yy * p.y) * p.y
 
         def recall(self, values):
             """Let `touched` answer for a geometry that the mesh has left: the gel's values by name; None: its own."""
