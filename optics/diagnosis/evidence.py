@@ -385,7 +385,9 @@ def measure(
     evidence.signal = signal / count - float(model.noise.black_level)
     evidence.noise = math.sqrt(variance / count) / evidence.signal
     evidence.masked = 1 - (count / total)
-    evidence.projected = evidence.project(evidence.normal, evidence.base, evidence.rest, settled=bool(noisy))
+    evidence.projected = evidence.project(
+        evidence.normal, evidence.base, evidence.rest, settled=not noisy.isdisjoint(evidence.base)
+    )
     return evidence
 
 
