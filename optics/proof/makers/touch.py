@@ -20,9 +20,10 @@ import numpy as np
 from optics.captures import capture_set as capture_files
 from optics.captures.noise import Noise
 from optics.light.development import sensitivities
+from optics.proof.makers import in_variant
 from optics.scene.loader import Scene
-from optics.scene.mitsuba_parts import DEFAULT_VARIANT, use_variant
 
+VARIANT = "llvm_ad_mono"
 CAMERA = Noise(system_gain=0.04, dark_noise=0.8, black_level=8.0, saturation=255.0, prnu=0.0)
 MAKERS = (
     "lens vignetting",
@@ -238,8 +239,7 @@ class Maker:
 
     def light(self, press: Sequence[float]) -> dict[str, np.ndarray]:
         """{LED: (H, W, 3) radiance at power 1}, and under 'ambient' what no LED made."""
-        use_variant("llvm_ad_mono")
-        try:
+        with in_variant(VARIANT):
             v = self.values
             mesh = self.mesh(press)
             rho = [v[f"{self.membrane}.rho_{c}"] for c in "rgb"]
@@ -267,8 +267,6 @@ class Maker:
                 }
                 images["ambient"] = self.traced(self.scene(mesh, sky, 2), 1.0)[..., None] * np.array(rho)
             return images
-        finally:
-            use_variant(DEFAULT_VARIANT)
 
     def through_gel(self, image: np.ndarray, led: str, press) -> np.ndarray:
         """Beer-Lambert and single scattering in numpy, on the analytic view of the dented plane (pixel centres)."""
@@ -377,8 +375,14 @@ class Maker:
         rng = np.random.default_rng([self.seed, 3])
         drives = drives or [{led: 1.0} for led in self.leds]
         frames = []
-        for k, press in enumerate(np.asarray(at, float)):
-            light = self.light(press)
+        at = np.asarray(at, float)
+        with in_variant(VARIANT):
+            lights = []
+            for press in at:
+                lights.append(self.light(press))
+                if progress:
+                    progress("captures", len(lights), len(at))
+        for k, (press, light) in enumerate(zip(at, lights)):
             noted = press + known_to * rng.standard_normal(3) * (1, 1, 0.5)
             for drive in drives:
                 radiance = sum(p * self.values[f"{led}.power"] * light[led] for led, p in drive.items() if p)
@@ -408,8 +412,6 @@ class Maker:
                         file=f"frames/press{k:02d}-{on}.png",
                     )
                 )
-            if progress:
-                progress("captures", k + 1, len(at))
         return capture_files.Captures(
             folder=Path("."),
             scene=scene_name,

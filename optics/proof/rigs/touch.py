@@ -20,6 +20,7 @@ from optics.captures import capture_set as capture_files
 from optics.captures.noise import Noise
 from optics.proof import demo
 from optics.proof.cells import Cell, pairs_of
+from optics.proof.makers import in_variant
 from optics.proof.makers import touch as synthetic
 from optics.proof.rigs.base import PATTERNS, ImageRig, Mean, Workshop, smooth
 from optics.scene import loader as scenes
@@ -306,8 +307,9 @@ class Wild(Workshop, synthetic.Maker):
         """A capture set of these shots."""
         rng = np.random.default_rng([self.seed, 3])
         frames = []
-        for number, shot in enumerate(shots):
-            light = self.light(shot.press)
+        with in_variant(synthetic.VARIANT):
+            lights = [self.light(shot.press) for shot in shots]
+        for number, (shot, light) in enumerate(zip(shots, lights)):
             radiance = sum(p * self.values[f"{led}.power"] * light[led] for led, p in shot.drive.items() if p)
             radiance = radiance + light.get("ambient", 0.0) + np.zeros((*self.size[::-1], 3))
             settings = {f"{led}.power": float(shot.drive.get(led, 0.0)) for led in self.leds}
