@@ -12,9 +12,8 @@ from typing import Annotated
 import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from optics.proof import blind
+from optics.proof import blind, kept
 from optics.proof import cells as plan
-from optics.proof import kept
 
 QUICK = {"polarizer_bench": 1}
 
@@ -75,7 +74,9 @@ def main(
     records = [both[c.name] for _, batch in tasks for c in batch if c.name in both]
     planned = sum(len(batch) for _, batch in tasks)
     if not records:
-        raise typer.BadParameter(f"{folder} holds no record of this plan, nor does {cells}; run without --count", param_hint="--count")
+        raise typer.BadParameter(
+            f"{folder} holds no record of this plan, nor does {cells}; run without --count", param_hint="--count"
+        )
     found = count.count(records, planned)
     print(found.text())
     print(f"page: {page.write(found, records, output / 'proof.html')}")

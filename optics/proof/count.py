@@ -137,8 +137,8 @@ class Count:
         for name, one in self.rigs.items():
             lines += [
                 "",
-                f"{name}: {one.done} cells, {one.each:.0f} s of a processor each; {one.unreachable} skipped because the "
-                f"effect cannot be made so strong, {len(one.failed)} failed",
+                f"{name}: {one.done} cells, {one.each:.0f} s of a processor each; {one.unreachable} skipped, as "
+                f"the effect cannot be made so strong, {len(one.failed)} failed",
                 *one.lines(),
             ]
         lines += ["", *self.elsewhere.lines()] if self.elsewhere else []
@@ -294,9 +294,7 @@ def _measures(good: Sequence[dict]) -> list[Measure]:
         _mean("localisation F1, kinds that act in a part", [f1(r["parts"], last(r)["flagged"]) for r in local])
     )
     several = [r for r in _some(good, "pair") if named(r)]
-    found.append(
-        _mean("false discovery rate, two hidden", [false_share(list(named(r)), _hidden(r)) for r in several])
-    )
+    found.append(_mean("false discovery rate, two hidden", [false_share(list(named(r)), _hidden(r)) for r in several]))
     every = [r for r in good if r["cell"]["kind"] in ("library", "pair", "none", "unknown") and named(r)]
     true = [_hidden(r) if r["cell"]["kind"] in ("library", "pair") else [] for r in every]
     found.append(

@@ -1,7 +1,7 @@
-"""Effects hidden in a small DIGIT by stock Mitsuba's path tracer, found blind: of the proof's cells, two that are cheap.
+"""Effects hidden in a small DIGIT by stock Mitsuba's path tracer, found blind: two of the proof's cells, made cheap.
 
-Three presses of 24 x 32 px and a dark frame; one press is held out. Candidates are the hidden effect and those that come
-nearest to it, so that a minute of the loop becomes seconds."""
+Three presses of 24 x 32 px and a dark frame; one press is held out. Candidates are the hidden effect and those that
+come nearest to it, so that a minute of the loop becomes seconds."""
 
 import pytest
 
