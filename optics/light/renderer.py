@@ -46,8 +46,8 @@ REMEMBER = 24
 PER_RAY = 250  # bytes of a camera ray's end and its light, by the memory of processes that held ten million of them
 FAINT = 0.05  # of the largest irradiance in a crowded scene: shadows that take less need no finer samples
 BOUNCE_SAMPLES = 32  # directions per cell for the second bounce, at least
-# of these, an image has at least so many: of a shallow dent few meet a lit flank, and in an image of 36 x 48 px the error
-# of 32 per cell is as large as the light itself (with these a quarter)
+# of these, an image has at least so many: of a shallow dent few meet a lit flank, and in an image of 36 x 48 px the
+# error of 32 per cell is as large as the light itself (with these a quarter)
 BOUNCE_RAYS = 2**17
 BOUNCE_CELL = 2  # px each way of a cell
 
