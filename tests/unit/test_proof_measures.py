@@ -143,3 +143,27 @@ def test_parts_in_which_a_kind_acts_and_parts_that_are_found():
     false = [bool(measures.flagged(told(rng.standard_normal(16), np.ones(16)))) for _ in range(400)]
     assert np.mean(false) < 0.05 + 3 * np.sqrt(0.05 * 0.95 / 400)
     assert measures.flagged(SimpleNamespace(fingerprints=[])) is None
+
+
+@pytest.mark.parametrize("variance", [0.02, 0.1, 0.5])
+def test_makers_blur_has_the_variance_that_is_hidden(variance):
+    """The second moment of what a smooth spot becomes, of either law; a Gaussian sampled once a pixel made 0.013
+    of 0.1."""
+    from scipy.ndimage import gaussian_filter
+
+    from optics.proof.makers import touch as maker
+    from optics.proof.rigs.touch import _disc
+
+    y, x = np.mgrid[:41, :41] - 20.0
+    spot = np.exp(-(x**2 + y**2) / 8)[..., None]
+    disc = _disc(maker.FINE * np.sqrt(4 * variance))
+    gauss = maker.smeared(spot, lambda p: gaussian_filter(p, maker.FINE * np.sqrt(variance), truncate=6))
+
+    def moment(image):
+        return float((image[..., 0] * x**2).sum() / image.sum())
+
+    assert gauss.sum() == pytest.approx(spot.sum(), rel=1e-6)
+    assert moment(gauss) - moment(spot) == pytest.approx(variance, rel=0.005)
+    cells = np.mgrid[: len(disc), : len(disc)][1] - len(disc) // 2
+    # a disc of cells is a ninth of a pixel wider, in variance 1/12 of its square
+    assert float((disc * cells**2).sum()) / maker.FINE**2 == pytest.approx(variance, abs=0.002)

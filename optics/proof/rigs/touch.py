@@ -240,7 +240,8 @@ class Wild(Workshop, synthetic.Maker):
             self.values = values
 
     def lens(self, image):
-        from scipy.ndimage import convolve, gaussian_filter, map_coordinates
+        from scipy.ndimage import gaussian_filter, map_coordinates
+        from scipy.signal import fftconvolve
 
         e = self.effects
         x, y = self._tangents()
@@ -258,8 +259,13 @@ class Wild(Workshop, synthetic.Maker):
         if "lens vignetting" in e:
             image = image * (1 - 2 * e["lens vignetting"] * t2 * (1 + 0.6 * t2 / t2.max()))[..., None]
         if "lens blur" in e:
-            disc = _disc(np.sqrt(4 * e["lens blur"]))  # the variance of a disc of radius R is R^2/4 along a line
-            image = np.stack([convolve(image[..., c], disc, mode="reflect") for c in range(3)], -1)
+            # the variance of a disc of radius R is R^2/4 along a line
+            disc = _disc(synthetic.FINE * np.sqrt(4 * e["lens blur"]))
+
+            def mirrored(plane):
+                return fftconvolve(np.pad(plane, disc.shape[0] // 2, "symmetric"), disc, mode="valid")
+
+            image = synthetic.smeared(image, mirrored)
         if "veiling glare" in e:
             wide = np.stack([gaussian_filter(image[..., c], width / 5, mode="reflect") for c in range(3)], -1)
             image = image + e["veiling glare"] * (wide - image)
