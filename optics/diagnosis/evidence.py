@@ -195,6 +195,12 @@ class Evidence:
     candidates: list[Candidate] = field(default_factory=list)
 
     @property
+    def apart(self) -> float:
+        """Values whose noise in derivative images is independent: neighbours within 2 x 2 pixels and channels share
+        directions of the second bounce, and all frames do."""
+        return max(self.normal.count / max(len(self.frames), 1) / (4 * self.channels), 1.0)
+
+    @property
     def channels(self) -> int:
         return self.use[0].shape[2]
 
@@ -385,7 +391,9 @@ def measure(
     evidence.signal = signal / count - float(model.noise.black_level)
     evidence.noise = math.sqrt(variance / count) / evidence.signal
     evidence.masked = 1 - (count / total)
-    evidence.projected = evidence.project(evidence.normal, evidence.base, evidence.rest, settled=bool(noisy))
+    evidence.projected = evidence.project(
+        evidence.normal, evidence.base, evidence.rest, settled=not noisy.isdisjoint(evidence.base)
+    )
     return evidence
 
 

@@ -26,6 +26,7 @@ SETTLED = 0.01  # of the excess of chi2 per parameter: what a calibrated base ma
 # moving edges are finite samples, which no calibration makes orthogonal to a residual with structure
 MOVING = 0.15  # of the excess in all: what a tempered base may still absorb
 KAPPA = 0.1  # noise per pixel of derivative images over their signal, above which strengths are biased
+OWN_NOISE = 5.0  # standard deviations of the product of two independent noises, over the number of those that are apart
 FAINT = 10  # the power of the test is stated for the plausible strength over this
 
 
@@ -215,11 +216,10 @@ def solve(
     Returns V of all columns of candidates (k, k), zero where nothing is visible, and (columns, cone) of every form.
     """
     projected, first = evidence.projected, len(evidence.base)
-    # Where the noise of a derivative image exceeds what survives of it, products of two such images are random, and may
-    # be next to nothing.
-    visible = (projected.survival > st.VISIBLE) & (
-        np.diag(projected.information) > evidence.normal.noise[evidence.rest]
-    )
+    # What the noise of a derivative image makes of the products of two such images: where no more than that survives,
+    # these are random, and may be next to nothing.
+    random = evidence.normal.noise[evidence.rest] * min(OWN_NOISE / math.sqrt(evidence.apart), 1.0)
+    visible = (projected.survival > st.VISIBLE) & (np.diag(projected.information) > random)
     for c in candidates:
         if c.broken:
             visible[[i - first for columns in c.forms.values() for i in columns]] = False

@@ -20,6 +20,8 @@ from optics.diagnosis.thresholds import CLEAR, close
 from optics.files.output import write_text
 from optics.fit.compare import plain
 from optics.fit.model import value_of
+from optics.fit.result import Fit
+from optics.proof import kept, measures
 from optics.proof.cells import Cell
 from optics.study import loop
 
@@ -37,6 +39,8 @@ def run(rig, cell: Cell) -> dict:
         "failed": "",
         "unreachable": False,
         "coordinates": list(rig.unknown.get(cell.hidden[0], ())) if cell.kind == "unknown" else [],
+        "parts": rig.parts(cell),
+        "made": kept.made(),
     }
     if rig.outside:
         record["facts"] = rig.facts(cell)
@@ -45,7 +49,7 @@ def run(rig, cell: Cell) -> dict:
         record["truth"] = rig.make(captures, cell)
         if cell.hidden and not record["truth"]:
             return {**record, "unreachable": True}
-        record["made"] = time.perf_counter() - clock
+        record["making"] = time.perf_counter() - clock
         several = rig.outside or cell.kind == "pair"
         # Readings of a stranger may break the program anywhere: whatever is raised on them is a crash to be counted.
         errors = Exception if rig.outside else (ValueError, KeyError, ArithmeticError, np.linalg.LinAlgError)
@@ -54,7 +58,7 @@ def run(rig, cell: Cell) -> dict:
             study, model, fit = loop.begin(setup, study_folder)
             for _ in range(STEPS if several else 1):
                 diagnosis = loop.examine(study, model, setup, fit, advised=False)
-                record["steps"].append(_step(rig, model, cell, diagnosis))
+                record["steps"].append(_step(rig, model, cell, fit, diagnosis))
                 if not several or diagnosis.word != "CLAIM":
                     break
                 name = diagnosis.missing
@@ -69,7 +73,7 @@ def run(rig, cell: Cell) -> dict:
     return plain(record)
 
 
-def _step(rig, model, cell: Cell, d: Diagnosis) -> dict:
+def _step(rig, model, cell: Cell, base: Fit, d: Diagnosis) -> dict:
     refitted = sorted((r for r in d.rows if r.refit is not None), key=lambda r: -r.net_refit)
     best = refitted[0].net_refit if refitted else 0.0
     # what frees less and does as well goes first, as in a diagnosis
@@ -91,13 +95,13 @@ def _step(rig, model, cell: Cell, d: Diagnosis) -> dict:
         "excess_sd": d.basis.excess_sd,
         "phi": d.basis.phi,
         "conditions": {c.name: [c.value, c.holds] for c in d.conditions},
+        "failing": [c.name for c in d.conditions if not c.holds],
         "held_out": [level.chi2_held_out for level in d.levels],
-        "misfit": [level.held_out for level in d.levels],
-        "complete": {r.name: r.refit.complete for r in refitted[:1]},
         "coordinates": [f.coordinate for f in d.fingerprints[:4]],
-        "explanations": [e.effects for e in d.survivors],
         "correct": _correct(d, cell, rig.says_the_same(cell)),
         "strength": _strengths(rig, model, cell, d),
+        "bias": measures.bias(rig.known(model.scene, cell.seed), base, measures.first_fit(d, cell)),
+        "flagged": measures.flagged(d) if cell.kind == "unknown" else None,
     }
 
 

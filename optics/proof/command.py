@@ -12,7 +12,7 @@ from typing import Annotated
 import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from optics.proof import blind
+from optics.proof import blind, kept
 from optics.proof import cells as plan
 
 QUICK = {"polarizer_bench": 1}
@@ -34,6 +34,12 @@ def main(
     minutes: Annotated[float, typer.Option(help="Start no cell after this many minutes; 0: no limit.")] = 0.0,
     quick: Annotated[bool, typer.Option("--quick", help="One round of the fastest bench, in a minute.")] = False,
     count_only: Annotated[bool, typer.Option("--count", help="Run nothing; count the records that exist.")] = False,
+    cells: Annotated[
+        Path,
+        typer.Option(metavar="DIR", help="Finished cells, a file per sensor: they are counted, and not run again."),
+    ] = kept.FOLDER,
+    keep: Annotated[bool, typer.Option("--keep", help="Put the cells of this run into these files.")] = False,
+    afresh: Annotated[bool, typer.Option("--afresh", help="Count none of these files' cells, and run them.")] = False,
 ) -> None:
     """Hide effects in captures that an independent renderer makes, run the loop blind on each, and count its
     verdicts."""
@@ -53,17 +59,24 @@ def main(
         wanted.append([[c for c in batch if not kind or c.kind in kind] for batch in batches])
     # round by round over all rigs, so that what is done when time is up is balanced
     tasks = [(name, batch) for turn in zip(*wanted) for name, batch in zip(names, turn)]
-    todo = [
-        (name, left)
-        for name, batch in tasks
-        if (left := [c for c in batch if blind.take_up(folder / f"{c.name}.json") is None])
-    ]
+    known = {} if afresh else kept.read(cells)
+
+    def left(batch):
+        return [c for c in batch if c.name not in known and blind.take_up(folder / f"{c.name}.json") is None]
+
+    todo = [(name, rest) for name, batch in tasks if (rest := left(batch))]
     if not count_only:
         _run(todo, folder, jobs or os.cpu_count() or 1, minutes)
-    records = [r for _, batch in tasks for c in batch if (r := blind.take_up(folder / f"{c.name}.json"))]
+    made = {c.name: r for _, batch in tasks for c in batch if (r := blind.take_up(folder / f"{c.name}.json"))}
+    if keep:
+        kept.add(cells, made)
+    both = {**known, **made}
+    records = [both[c.name] for _, batch in tasks for c in batch if c.name in both]
     planned = sum(len(batch) for _, batch in tasks)
     if not records:
-        raise typer.BadParameter(f"{folder} holds no record of this plan; run without --count", param_hint="--count")
+        raise typer.BadParameter(
+            f"{folder} holds no record of this plan, nor does {cells}; run without --count", param_hint="--count"
+        )
     found = count.count(records, planned)
     print(found.text())
     print(f"page: {page.write(found, records, output / 'proof.html')}")

@@ -1,4 +1,5 @@
-"""The proof as one HTML page: targets, confusion matrix, power, predictions against what came, pulls, null sets."""
+"""The proof as one HTML page, sensor by sensor: targets, what others measure, confusion matrix, predictions against
+what came, pulls, null sets. No rate pools sensors."""
 
 from __future__ import annotations
 
@@ -10,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from optics.files.output import write_text
-from optics.proof.count import Count
+from optics.proof.count import Count, Counted
 from optics.proof.rates import Rate, last, named
 
 INK, GOOD, BAD, SOFT = "#26323c", "#1d5fa6", "#b22f33", "#d9b36c"
@@ -47,20 +48,20 @@ def write(found: Count, records: Sequence[dict], file: Path) -> Path:
         ),
         key=lambda c: (c["rig"], c["kind"], c["hidden"], c["change"], c["clutter"], c["seed"]),
     )
-    figures = {}
-    if found.done:
-        figures = {
-            "confusion": confusion(found),
-            "power": power(found),
-            "falls": falls(records),
-            "pulls": pulls(found),
-            "nulls": nulls(found),
+    figures = {
+        name: {
+            "confusion": confusion(one),
+            "falls": falls([r for r in records if r["cell"]["rig"] == name]),
+            "pulls": pulls(one),
+            "nulls": nulls(one),
         }
+        for name, one in found.rigs.items()
+    }
     html = environment.get_template("page.html.j2").render(
         found=found,
         figures=figures,
+        power=power(found) if found.rigs else "",
         cells=cells,
-        tables=[("all", found), *(found.rigs.items() if len(found.rigs) > 1 else [])] if found.done else [],
     )
     for path, text in ((file, html), (file.with_name("proof.json"), json.dumps(found.json(), indent=1))):
         write_text(path, text)
@@ -99,7 +100,7 @@ def _svg(draw, width: float = 5.2, height: float = 3.4) -> str:
     return text[text.index("<svg") :]
 
 
-def confusion(found: Count) -> str:
+def confusion(found: Counted) -> str:
     """Rows: what was hidden; columns: what was claimed, or the verdict where nothing was."""
     rows = sorted(
         found.confusion,
@@ -144,8 +145,11 @@ def power(found: Count) -> str:
     """Share of right claims against the raw change, without clutter."""
 
     def draw(ax):
-        for k, (rig, levels) in enumerate(sorted(found.power.items())):
+        for k, (rig, one) in enumerate(found.rigs.items()):
+            levels = one.power
             x = sorted(levels, key=float)
+            if not x:
+                continue
             rates = [Rate("", *levels[v], 0, 0) for v in x]
             y = [r.value for r in rates]
             error = np.array([[r.value - r.interval[0], r.interval[1] - r.value] for r in rates]).T
@@ -198,7 +202,7 @@ def falls(records: Sequence[dict]) -> str:
     return _svg(draw)
 
 
-def pulls(found: Count) -> str:
+def pulls(found: Counted) -> str:
     """(found - true)/sd of claimed strengths, without clutter, beside the normal density."""
     values = np.clip(found.pulls["no clutter"], -6, 6)
 
@@ -213,7 +217,7 @@ def pulls(found: Count) -> str:
     return _svg(draw)
 
 
-def nulls(found: Count) -> str:
+def nulls(found: Counted) -> str:
     """Family-wise p of sets with nothing hidden: on the diagonal where it means what it says."""
     p = np.sort(found.null_p)
 

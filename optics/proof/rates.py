@@ -30,8 +30,13 @@ class Rate:
         ci = binomtest(self.k, self.n).proportion_ci(0.95, method="exact")
         return float(ci.low), float(ci.high)
 
+    @property
+    def bound(self) -> float:
+        """The near end of the interval: what targets are held against."""
+        return self.interval[1] if self.low else self.interval[0]
+
     def reached(self, target: float) -> bool:
-        return self.interval[1] <= target if self.low else self.interval[0] >= target
+        return self.bound <= target if self.low else self.bound >= target
 
     @property
     def verdict(self) -> str:

@@ -43,6 +43,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from dataclasses import field as dataclass_field
+from functools import cached_property
 
 from optics.scene.parameter import Parameter
 from optics.words import key_of
@@ -186,6 +187,6 @@ class Effect:
         """The name as one word, for the command line: 'lens vignetting' -> 'lens-vignetting'."""
         return key_of(self.name)
 
-    @property
+    @cached_property
     def parameter_names(self) -> tuple[str, ...]:
         return tuple(p if isinstance(p, str) else p.name for p in self.parameters)

@@ -376,6 +376,12 @@ class Declared:
 
     def beyond(self, name: str) -> str:
         """Why Dr.Jit finds no derivative by a parameter through `mi.render`, or a wrong one; empty where it does."""
+        known = self.__dict__.setdefault("_beyond", {})  # asked for at every change of a scene
+        if name not in known:
+            known[name] = self._why_beyond(name)
+        return known[name]
+
+    def _why_beyond(self, name: str) -> str:
         if self.numbers[name].how == "image":
             return "it acts on the finished image"
         if name in self.registry.shaping(self.kind):

@@ -657,6 +657,35 @@ def test_noisy_derivatives_are_rendered_twice_with_seeds_of_their_own():
     assert len(seeds - {0}) == 2
 
 
+def test_a_noisy_image_of_one_effect_leaves_the_scores_of_others_as_they_are():
+    """The base's images are exact, so that what is left of its gradient is known and is projected off: taken as zero,
+    it gave an effect that the base can undo a score of thousands."""
+    model, fit = calibrated()
+    name = fit.variables[0].name
+    off = fit.values.copy()
+    off.common[name] += 0.05 * math.sqrt(fit.covariance[0, 0])  # as far from its optimum as a calibration stops
+    fit = replace(fit, values=off)
+    effects, plain = library("vignetting", "glare", "gamma"), model.derivatives
+
+    def derivatives(values, variables, frames=None, secant=None, seed=0):
+        for image, images in plain(values, variables, frames, secant, seed):
+            for v, own in images.items():
+                if v == "sensor.glare":
+                    images[v] = own * (1 + 0.05 * np.random.default_rng(seed).standard_normal(own.shape))
+            yield image, images
+
+    def rows():
+        table = score(model, fit, effects, model.variables_of, FITTED).table
+        return {c.effect.name: c.row for c in table.order}
+
+    before = rows()
+    model.derivatives = derivatives
+    after = rows()
+    assert after["glare"].kappa == pytest.approx(0.05, rel=0.2) and before["glare"].kappa == 0
+    for effect in ("vignetting", "gamma"):
+        assert after[effect].fall == pytest.approx(before[effect].fall, rel=1e-9)
+
+
 class Estimated(MockModel):
     """The mock with images that are estimates: the same error in an image and in what follows it (a lamp's power), by
     the seed."""

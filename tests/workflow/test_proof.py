@@ -129,7 +129,7 @@ def test_the_set_and_its_size_are_counted_whether_or_not_something_stands_out():
         }
 
     found = count.count([weak(1e-4, "a"), weak(1e-4, "b", "a", "c"), weak(0.3, "c", "b")], 3)
-    assert found.set_size == 2 and "2.00 (target: at most 2)" in found.text()
+    assert found.only.set_size == 2 and "2.00 (target: at most 2)" in found.text()
     rates = [found.rate(f"in the set, 0.2 %, no clutter{where}") for where in ("", ", where one stands out")]
     assert [(r.k, r.n) for r in rates] == [(2, 3), (2, 2)]
 
@@ -141,7 +141,7 @@ def test_the_bench_finds_what_is_hidden_and_predicts_what_comes(bench):
     found = judged(bench, effects)
     assert found.rate("top-1 after refit, 0.5 %, no clutter").k == len(effects) and found.holds
     assert found.rate("fall of chi2 within 20 % of its prediction, to 0.5 %").k == len(effects)
-    assert all(abs(p) < 5 for p in found.pulls["no clutter"])
+    assert all(abs(p) < 5 for p in found.only.pulls["no clutter"])
 
 
 def test_where_nothing_stands_out_the_set_is_that_of_the_scores(bench):
@@ -213,6 +213,9 @@ def test_a_run_is_taken_up_again_and_becomes_a_page(tmp_path, monkeypatch, capsy
         "minutes": 0.0,
         "quick": False,
         "count_only": False,
+        "cells": tmp_path / "kept",
+        "keep": False,
+        "afresh": False,
     }
     command.main(**arguments)
     files = sorted((tmp_path / "records").glob("*.json"))
@@ -231,5 +234,5 @@ def test_a_run_is_taken_up_again_and_becomes_a_page(tmp_path, monkeypatch, capsy
     unknown = next(r for r in records if r["cell"]["kind"] == "unknown")
     assert unknown["steps"][-1]["word"] == "UNKNOWN" and "analyzer.angle" in unknown["steps"][-1]["coordinates"][:2]
     assert not count.named(next(r for r in records if r["cell"]["kind"] == "none"))
-    assert page.confusion(count.count(records, 2)).startswith("<svg")
+    assert page.confusion(count.count(records, 2).only).startswith("<svg")
     assert math.isfinite(records[0]["seconds"])

@@ -17,8 +17,8 @@ import numpy as np
 
 from optics.captures import capture_set as capture_files
 from optics.captures.noise import Noise
+from optics.proof.makers import in_variant
 from optics.scene.loader import Scene
-from optics.scene.mitsuba_parts import DEFAULT_VARIANT, use_variant
 
 VARIANT = "llvm_ad_mono_polarized"
 # small pixels at high gain: 800 electrons are white
@@ -218,8 +218,7 @@ class GridMaker:
         """(H, W) radiance at power 1, and its standard error from independent passes."""
         import mitsuba as mi
 
-        use_variant(VARIANT)
-        try:
+        with in_variant(VARIANT):
             scene = self.scene(distance, panel)
             passes = []
             for _ in range(PASSES):
@@ -229,8 +228,6 @@ class GridMaker:
                 )
                 passes.append(np.array(image, float).reshape(*self.size[::-1]))
             return np.mean(passes, 0), np.std(passes, 0, ddof=1) / np.sqrt(PASSES)
-        finally:
-            use_variant(DEFAULT_VARIANT)
 
     # -- camera -------------------------------------------------------------------------------------------------------
     def photograph(self, radiance: np.ndarray, error: np.ndarray, rng) -> np.ndarray:
@@ -247,9 +244,16 @@ class GridMaker:
         """Frames of the rod at every distance (mm), a group each, lit by one panel after the other."""
         rng = np.random.default_rng([self.seed, 3])
         frames = []
+        with in_variant(VARIANT):
+            light = {}
+            for k, distance in enumerate(distances):
+                for panel in self.panels:
+                    light[distance, panel] = self.radiance(distance, panel)
+                if progress:
+                    progress("captures", k + 1, len(distances))
         for k, distance in enumerate(distances):
             for panel in self.panels:
-                radiance, error = self.radiance(distance, panel)
+                radiance, error = light[distance, panel]
                 power = self.values[f"{panel}.power"]
                 settings = {
                     "object.distance": float(distance),
@@ -267,7 +271,5 @@ class GridMaker:
                         f"frames/{name}.png",
                     )
                 )
-            if progress:
-                progress("captures", k + 1, len(distances))
         known = {"camera.exposure": float(self.values["camera.exposure"])}
         return capture_files.Captures(Path("."), "grid_bench", frames, known, self.noise, None, None, "DN", None, [])

@@ -66,6 +66,15 @@ class Rig:
         """Effects of the library that mean what is hidden, besides its own name."""
         return ()
 
+    def known(self, scene, seed: int) -> dict[str, float]:
+        """Values of the sensor as it was built, by key; empty where it has no such values."""
+        return {}
+
+    def parts(self, cell: Cell) -> list[int]:
+        """Parts of the image (`optics.proof.measures`) in which an unknown kind acts; empty where it acts
+        everywhere."""
+        return []
+
     # -- what follows -------------------------------------------------------------------------------------------------
     def strength(self, effect: str, change: float) -> float:
         """That changes the image by so much (rms over mean, before any calibration); inf where none does."""
@@ -138,6 +147,17 @@ class ImageRig(Rig):
     def built(self, scene, seed: int) -> dict[str, float]:
         """Values of the sensor as it was built."""
         raise NotImplementedError
+
+    def known(self, scene, seed: int) -> dict[str, float]:
+        return self.built(self.scene(), seed)
+
+    def parts(self, cell: Cell) -> list[int]:
+        from optics.proof.measures import parts_of
+
+        if cell.kind != "unknown" or cell.hidden[0] not in LOCAL:
+            return []
+        width, height = self.scene().camera.resolution
+        return parts_of(SCREENS[cell.hidden[0]](*screen(width, height)))
 
     def keys(self, scene, effect: str) -> tuple[str, ...]:
         return self.several.get(effect) or (next(iter(scene.keys_of(scene.registry.find_effect(effect)).values()))[0],)
@@ -249,6 +269,14 @@ SCREENS: dict[str, Callable] = {
     "tap": lambda u, v, r: np.where(u < 0.5, 1.0, 0.0),
     "ring": lambda u, v, r: np.exp(-(((r - 0.55) / 0.1) ** 2)),
 }
+LOCAL = ("stain", "tap", "ring")  # of these, kinds that act in a part of the image and nowhere else
+
+
+def screen(width: int, height: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(H, W) u across the image, v down it, r from its middle to its corners, all to 1, at the middles of pixels."""
+    y, x = np.mgrid[:height, :width] + 0.5
+    r = np.hypot(x - width / 2, y - height / 2)
+    return x / width, y / height, r / r.max()
 
 
 class Workshop:
@@ -284,10 +312,7 @@ class Workshop:
         """(H, W, 1 or 3) gain by a kind that the library lacks."""
         if kind == "red drift":
             return 1 + size * np.random.default_rng([self.seed, frame, 7]).standard_normal() * np.array([[[1.0, 0, 0]]])
-        width, height = self.size
-        y, x = np.mgrid[:height, :width] + 0.5
-        r = np.hypot(x - width / 2, y - height / 2)
-        return 1 + size * SCREENS[kind](x / width, y / height, r / r.max())[..., None]
+        return 1 + size * SCREENS[kind](*screen(*self.size))[..., None]
 
     def photograph(self, radiance, rng, frame: int, press=None):
         image = radiance

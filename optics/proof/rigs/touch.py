@@ -20,6 +20,7 @@ from optics.captures import capture_set as capture_files
 from optics.captures.noise import Noise
 from optics.proof import demo
 from optics.proof.cells import Cell, pairs_of
+from optics.proof.makers import in_variant
 from optics.proof.makers import touch as synthetic
 from optics.proof.rigs.base import PATTERNS, ImageRig, Mean, Workshop, smooth
 from optics.scene import loader as scenes
@@ -239,7 +240,8 @@ class Wild(Workshop, synthetic.Maker):
             self.values = values
 
     def lens(self, image):
-        from scipy.ndimage import convolve, gaussian_filter, map_coordinates
+        from scipy.ndimage import gaussian_filter, map_coordinates
+        from scipy.signal import fftconvolve
 
         e = self.effects
         x, y = self._tangents()
@@ -257,8 +259,13 @@ class Wild(Workshop, synthetic.Maker):
         if "lens vignetting" in e:
             image = image * (1 - 2 * e["lens vignetting"] * t2 * (1 + 0.6 * t2 / t2.max()))[..., None]
         if "lens blur" in e:
-            disc = _disc(np.sqrt(4 * e["lens blur"]))  # the variance of a disc of radius R is R^2/4 along a line
-            image = np.stack([convolve(image[..., c], disc, mode="reflect") for c in range(3)], -1)
+            # the variance of a disc of radius R is R^2/4 along a line
+            disc = _disc(synthetic.FINE * np.sqrt(4 * e["lens blur"]))
+
+            def mirrored(plane):
+                return fftconvolve(np.pad(plane, disc.shape[0] // 2, "symmetric"), disc, mode="valid")
+
+            image = synthetic.smeared(image, mirrored)
         if "veiling glare" in e:
             wide = np.stack([gaussian_filter(image[..., c], width / 5, mode="reflect") for c in range(3)], -1)
             image = image + e["veiling glare"] * (wide - image)
@@ -306,8 +313,9 @@ class Wild(Workshop, synthetic.Maker):
         """A capture set of these shots."""
         rng = np.random.default_rng([self.seed, 3])
         frames = []
-        for number, shot in enumerate(shots):
-            light = self.light(shot.press)
+        with in_variant(synthetic.VARIANT):
+            lights = [self.light(shot.press) for shot in shots]
+        for number, (shot, light) in enumerate(zip(shots, lights)):
             radiance = sum(p * self.values[f"{led}.power"] * light[led] for led, p in shot.drive.items() if p)
             radiance = radiance + light.get("ambient", 0.0) + np.zeros((*self.size[::-1], 3))
             settings = {f"{led}.power": float(shot.drive.get(led, 0.0)) for led in self.leds}

@@ -1,0 +1,50 @@
+"""Effects hidden in a small DIGIT by stock Mitsuba's path tracer, found blind: two of the proof's cells, made cheap.
+
+Three presses of 24 x 32 px and a dark frame; one press is held out. Candidates are the hidden effect and those that
+come nearest to it, so that a minute of the loop becomes seconds."""
+
+import pytest
+
+from optics.proof.cells import Cell
+from optics.proof.rigs.touch import Digit
+from optics.study import loop
+
+# hidden effect: (strength, its look-alikes; relative error allowed: four standard errors, and what the maker's own
+# law differs by)
+HIDDEN = {
+    "colour crosstalk": (0.012, ("sensitivity tail", "camera gamma", "veiling glare"), 0.06),
+    "lens vignetting": (0.3, ("camera gamma", "height fall-off", "gel absorption"), 0.06),
+}
+OFTEN = ("dark offset", "gain drift")
+
+
+class Small(Digit):
+    width, height = 24, 32
+    held_out = ("press-02",)
+
+    def shots(self, scene, seed):
+        everything = super().shots(scene, seed)
+        return [*everything[:3], everything[-1]]
+
+
+@pytest.fixture(scope="module")
+def rig(mitsuba):
+    return Small()  # makers share the light of its presses
+
+
+@pytest.mark.parametrize("effect", HIDDEN)
+def test_an_effect_hidden_in_a_sensor_is_named(rig, effect, tmp_path):
+    strength, alike, near = HIDDEN[effect]
+    rig._strengths[effect, 0.02] = strength
+    rig.make(tmp_path / "captures", Cell(rig.name, "library", (effect,), 0.02, 0.0, "same", "", 1))
+    setup = rig.setup(tmp_path / "captures", 1)
+    study, model, fit = loop.begin(setup, tmp_path / "study")
+    tested = (effect, *alike, *OFTEN)
+    without = [e.name for e in loop.candidates(model, study) if e.name not in tested]
+    diagnosis = loop.examine(study, model, setup, fit, advised=False, without=without)
+    assert len(diagnosis.rows) == len(tested)
+    assert diagnosis.word == "CLAIM" and diagnosis.missing == effect, diagnosis.sentence
+    found = diagnosis.row(effect).refit
+    assert found.strength[0] == pytest.approx(strength, rel=near), diagnosis.sentence
+    before, after = (level.chi2_held_out for level in diagnosis.levels)
+    assert after < 1.1 < before  # 2304 values: chi2 per value scatters by 3 %
