@@ -104,6 +104,8 @@ def diagnose(
         say,
         foresee=foresee,
     )
+    if isinstance(evidence.spectrum, st.Sweeps) and evidence.thinning == 1:
+        evidence.spectrum.apart = case.session.apart
     basis = basis_of(model, evidence, evidence.structure(evidence.whitened, evidence.base))
     case.places = places = prints.places(model, fit.values, evidence)
     chosen = _choose(case, top)

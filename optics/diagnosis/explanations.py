@@ -57,6 +57,7 @@ BLOCKS = 8  # pieces of a session, each left out once
 LEAST = 2  # values per number that is fitted, below which no set of effects is refitted
 CONTENDERS = 40  # explanations of a table whose shared noise is sought; others are behind without it
 WIDTHS = np.geomspace(0.003, 3.0, 13)  # plausible sizes: of the prior of strengths of each frame
+ALONE = 0.01  # of what all readings know of a direction: what the others know where a block alone determines it
 LOOSE = 10.0  # plausible sizes: what keeps a strength that a left-out block alone determines near neutral
 
 
@@ -536,6 +537,17 @@ def wander_of(case: Case, outcome: Outcome, trial: Trial) -> float:
     return math.sqrt(readings.noise(outcome.scale).power * outcome.scale / max(readings.bright, 1e-12))
 
 
+def beside_noise(case: Case, outcome: Outcome) -> tuple[Correlation, float]:
+    """(noise that neighbouring readings share about the base, p of structure that it leaves); p is NaN where there is
+    no such noise, or it leaves misfit."""
+    noise = _readings(case, outcome.base).correlation()
+    if not noise.power or noise.scale > MISSTATED:
+        return noise, math.nan
+    evidence = case.evidence
+    left = evidence.structure(evidence.whitened, evidence.base, lambda c: case.session.independent(c, noise))
+    return noise, left.p
+
+
 def noise_of(case: Case, outcome: Outcome, trial: Trial) -> Correlation:
     """What neighbouring readings share about an explanation of a table."""
     return _readings(case, trial).noise(outcome.scale)
@@ -549,6 +561,9 @@ def _with_survivors(case: Case, outcome: Outcome) -> Outcome:
     # what readings or frames share is a rival where it, and not chance, is what stands against an effect
     able = (case.evidence.is_table or case.lamp is not None) and needed < fall
     outcome.shared = able and lead <= needed
+    if able and lead < -TOLD:  # noise explains it better than any effect does, at the odds of any other rival
+        outcome.best, outcome.survivors = base, [base]
+        return outcome
     while True:
         # what the leader rules out stays so beside a simpler one
         judges = [best] if best is outcome.leader else [best, outcome.leader]
@@ -570,10 +585,27 @@ def _with_survivors(case: Case, outcome: Outcome) -> Outcome:
     for name in outcome.core:
         rival, lead, needed = _without(case, outcome, next(c for c in best.members if c.effect.name == name))
         if lead <= needed and rival.members and rival not in outcome.survivors:
-            outcome.survivors.append(rival)
+            if rival.keys < best.keys:  # nobody needs it: what it was beside is asked for alone
+                outcome.survivors = _all_without(case, outcome, name)
+                outcome.best = outcome.survivors[0]
+            else:
+                outcome.survivors.append(rival)
             break
         outcome.shared |= able and lead <= needed and not rival.members
     return outcome
+
+
+def _all_without(case: Case, outcome: Outcome, name: str) -> list[Trial]:
+    """The survivors, each without an effect that it is not surely better with; the best first."""
+    found: list[Trial] = []
+    for t in outcome.survivors:
+        inner = next((o for o in outcome.trials if o.members and o.names == t.names - {name}), None)
+        if inner is not None:
+            lead, needed = _lead(case, outcome, t, inner)
+            t = inner if lead <= max(needed, SURE) else t
+        found += [t] if t not in found else []
+    found = [t for t in found if not any(o is not t and o.keys < t.keys for o in found)]
+    return sorted(found, key=lambda t: t.deviance + t.cost)
 
 
 def _told(case: Case, outcome: Outcome, best: Trial, other: Trial) -> bool:
@@ -739,18 +771,23 @@ def left_out(case: Case, trial: Trial) -> float:
     """chi2 of the readings, each block of the session predicted by a fit of all others.
 
     With images X and residuals r of block b at the optimum, (G - G_b + P) step = -X_b'r_b moves the optimum to that of
-    the others; P holds priors, and strengths that only the block determines (LOOSE)."""
+    the others; P holds priors, and strengths of each frame that only the block determines (LOOSE). Other directions
+    that only the block determines (ALONE), as a backlash where it is the only run downwards, stay: the others cannot
+    tell what they would predict."""
     columns, r = _measured(case, trial), np.concatenate(_kept(case, trial.images))
     order = case.evidence.order(case.model)
     prior = np.zeros(columns.shape[1])
     prior[: len(case.evidence.precision)] = case.evidence.precision
     known = len(case.evidence.base)
     prior[known:] = [1 / (LOOSE * t) ** 2 for c in trial.members for t in c.plausible]
-    gram, total = columns.T @ columns + np.diag(prior), 0.0
+    turn, total = st.root(columns.T @ columns + np.diag(prior)).T, 0.0
+    least = 0.0 if trial.by_frame else ALONE
     for block in blocks(case, order):
-        own = columns[block]
-        inverse, _ = st.inverse(gram - own.T @ own)
-        total += float(np.sum((r[block] + own @ (inverse @ (own.T @ r[block]))) ** 2))
+        own = columns[block] @ turn  # in axes in which all readings together know each direction by 1
+        known, axes = np.linalg.eigh(np.eye(turn.shape[1]) - own.T @ own)
+        axes, known = axes[:, known > max(least, st.VISIBLE)], known[known > max(least, st.VISIBLE)]
+        step = axes @ ((own @ axes).T @ r[block] / known)
+        total += float(np.sum((r[block] + own @ step) ** 2))
     return total
 
 

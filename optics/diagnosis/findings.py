@@ -14,7 +14,7 @@ from optics.diagnosis import statistics as st
 from optics.diagnosis.correlation import WANDER
 from optics.diagnosis.decide import Findings, Opponent, ordered, rivals
 from optics.diagnosis.evidence import Candidate, Evidence
-from optics.diagnosis.explanations import Outcome, fall_over_noise, lead_without
+from optics.diagnosis.explanations import Outcome, beside_noise, fall_over_noise, lead_without
 from optics.diagnosis.refit import Case, clear
 from optics.diagnosis.result import Basis, Fingerprint, Law, Level, Split
 from optics.diagnosis.thresholds import AS_GOOD, LEVEL, MISSTATED, TOLD, UNEVEN
@@ -85,6 +85,9 @@ def findings_of(
     if subject is None:
         fall = max([t.fall - t.expectation for t in outcome.trials] + [0.0])
         own = Findings(table.p_best, basis.structure_p, fall=fall, excess_sd=basis.excess_sd)
+        if case.evidence.is_table and outcome.wander <= NOTICED:
+            noise, p = beside_noise(case, outcome)
+            own = replace(own, wander=outcome.wander, wander_p=p, memory=noise.length)
     else:
         own = _of_subject(case, outcome, subject, splits, chance, levels, basis)
     own = replace(own, measured=measured, misstated=misstated)
@@ -99,7 +102,7 @@ def findings_of(
     whole = {f.coordinate: f.net for f in fingerprints}
     followed = _followed(case, subject, best.fit, best.fall - best.expectation, fingerprints)
     # a curve is no better than effects while any set of them does as well: the leader, not the simplest beside it
-    leader = outcome.leader
+    leader = outcome.leader if subject else outcome.base
     complete = bool(leader.members) and leader.complete
     fall = leader.fall - leader.expectation if subject else own.fall
     session = case.session if case.evidence.is_table else case.lamp

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from optics.diagnosis.decide import CURVE, Findings
+from optics.diagnosis.decide import CURVE, Findings, wander_text
 from optics.diagnosis.result import (
     NAMED,
     PLANS,
@@ -21,7 +21,7 @@ from optics.diagnosis.result import (
     Row,
     Shift,
 )
-from optics.diagnosis.thresholds import CLEAR, CLUTTERED, LEVEL, MARGIN, TOLD
+from optics.diagnosis.thresholds import CLEAR, CLUTTERED, LEVEL, MARGIN, TOLD, is_structured
 from optics.words import (
     ANYWHERE,
     NO_LIMIT,
@@ -158,7 +158,9 @@ def _nothing(f: Findings, tested: int) -> str:
     else:
         how = f"after refit, the best, {f.winner}, has a strength of {f.clear:.2g} sd"
     tail = (
-        f"no excess misfit is left ({f.excess_sd:.2g} sd)"
+        f"{wander_text(f)}, as of a lamp that wanders, explains the rest (structure beside it: p {p_text(f.wander_p)})"
+        if is_structured(f.structure_p, f.excess_sd) or f.weighed
+        else f"no excess misfit is left ({f.excess_sd:.2g} sd)"
         if math.isnan(f.structure_p)
         else f"no low-frequency structure is left (p {p_text(f.structure_p)})"
     )
