@@ -58,6 +58,7 @@ LEAST = 2  # values per number that is fitted, below which no set of effects is 
 CONTENDERS = 40  # explanations of a table whose shared noise is sought; others are behind without it
 WIDTHS = np.geomspace(0.003, 3.0, 13)  # plausible sizes: of the prior of strengths of each frame
 ALONE = 0.01  # of what all readings know of a direction: what the others know where a block alone determines it
+ALIKE = 1.0  # chi2 between the predictions of two explanations, of all values, below which they are the same
 LOOSE = 10.0  # plausible sizes: what keeps a strength that a left-out block alone determines near neutral
 
 
@@ -161,7 +162,8 @@ class Outcome:
 
     def told(self) -> list[Explanation]:
         """All trials as records, best first."""
-        found = []
+        found: list[Explanation] = []
+        same = self._same_as()
         for t in self.trials:
             sd = {v.name: float(s) for v, s in zip(t.fit.variables, t.fit.sd)}
             variables = [v for c in t.members for v in c.variables]
@@ -183,8 +185,22 @@ class Outcome:
                     units=[v.parameter.unit for v in variables],
                     survives=bool(t.members) and t in self.survivors,
                     told={c.effect.name: known_of(t.fit, c) for c in t.members if t in self.survivors},
+                    same_as=same.get(t.names, ""),
                 )
             )
+        return found
+
+    def _same_as(self) -> dict[frozenset[str], str]:
+        """The survivors that predict the same values as a better one, by its name."""
+        found: dict[frozenset[str], str] = {}
+        first: list[Trial] = []
+        for t in sorted((t for t in self.survivors if t.members), key=self.trials.index):
+            for o in first:
+                if sum(float(np.sum((a - b).astype(float) ** 2)) for a, b in zip(t.images, o.images)) < ALIKE:
+                    found[t.names] = " with ".join(c.effect.name for c in o.members)
+                    break
+            else:
+                first.append(t)
         return found
 
 

@@ -102,6 +102,8 @@ class Explanation:
     variables, strength, sd, units   of all its strengths
     survives     whether it is not told apart from the best
     told         effect -> what is known of its strengths where a gauge leaves only combinations, in words
+    same_as      name of a better one that survives and predicts the same values, under another name: no value of these
+                 captures can tell the two apart, however often it is taken again; '' for none
     """
 
     effects: list[str]
@@ -118,6 +120,7 @@ class Explanation:
     units: list[str]
     survives: bool
     told: dict[str, str] = field(default_factory=dict)
+    same_as: str = ""
 
     @property
     def complete(self) -> bool:
@@ -127,6 +130,14 @@ class Explanation:
     @property
     def name(self) -> str:
         return " with ".join(self.effects)
+
+
+def kinds_of(explanations: Sequence[Explanation]) -> list[list[Explanation]]:
+    """Explanations, those together that predict the same values (`Explanation.same_as`)."""
+    found: dict[str, list[Explanation]] = {}
+    for e in explanations:
+        found.setdefault(e.same_as or e.name, []).append(e)
+    return list(found.values())
 
 
 @dataclass
@@ -475,6 +486,11 @@ class Diagnosis:
     def survivors(self) -> list[Explanation]:
         """The explanations that are not told apart, best first."""
         return [e for e in self.explanations if e.survives]
+
+    @property
+    def kinds(self) -> list[list[Explanation]]:
+        """The survivors, those together that predict the same values under other names."""
+        return kinds_of(self.survivors)
 
     @property
     def missing(self) -> str:

@@ -20,6 +20,7 @@ from optics.diagnosis.result import (
     Level,
     Row,
     Shift,
+    kinds_of,
 )
 from optics.diagnosis.thresholds import CLEAR, CLUTTERED, LEVEL, MARGIN, TOLD, is_structured
 from optics.words import (
@@ -37,6 +38,7 @@ from optics.words import (
     with_sd,
 )
 
+LEAST = 0.1  # D with the best shots, below which these leave two effects as alike as they are
 # what to check where no effect brings the model near its images
 AT_FAULT = (
     "units, LEDs that were off, black_level, and that images are linear (not encoded for viewing) and whole, with row "
@@ -103,6 +105,9 @@ def advice_lines(advice: Sequence[Advice]) -> list[str]:
     plans = {a.family: a for a in advice if a.family in PLANS}
     singles = [a for a in advice if a.family not in PLANS]
     lines = [f"next: {advice_text(plans['together'])}"] if "together" in plans else []
+    if lines and (p := plans["together"].hardest).after < LEAST:
+        # a shot that changes nothing is no advice
+        return [f"next: no shot that was tried tells {p.effect} from {p.rival}: what does is another setting or part"]
     if "more of the same" in plans:
         lines.append(f"      (more of the same instead: {advice_text(plans['more of the same'])})")
     known = {a.shot for a in plans.values()}
@@ -216,24 +221,36 @@ def _strength_in(e: Explanation, row: Row) -> str:
 
 
 def _ambiguous(f: Findings, explanations: Sequence[Explanation]) -> str:
-    alive = [e for e in explanations if e.survives]
-    names = ", or ".join(f"{e.name} ({e.fall:.4g})" for e in alive)
+    kinds = kinds_of([e for e in explanations if e.survives])
+    names = ", or ".join(_kind(kind) for kind in kinds)
+    count = len(kinds)
     if f.shared:
         return (
             "noise that neighbours in the session share, such as a lamp that wanders, is not told apart from "
-            f"{'this explanation' if len(alive) == 1 else f'these {len(alive)} explanations'} (fall of chi2): {names}."
+            f"{'this explanation' if count == 1 else f'these {count} explanations'} (fall of chi2): {names}."
         )
     if f.law_lead < TOLD:
-        one = len(alive) == 1
         return (
-            f"{'this explanation is' if one else f'{len(alive)} explanations are'} not told apart (fall of chi2) from "
-            f"another law of {f.law}, which is in the model: {names}."
+            f"{'this explanation is' if count == 1 else f'{count} explanations are'} not told apart (fall of chi2) "
+            f"from another law of {f.law}, which is in the model: {names}."
         )
+    if count > 1:
+        return (
+            f"{count} explanations are not told apart (fall of chi2): {names}. All others are behind by more than noise "
+            "and misfit allow."
+        )
+    if len(kinds[0]) > 1:
+        return f"one law explains the residual, under {len(kinds[0])} names (fall of chi2): {names}."
+    return f"these explain the residual: {names}; the data do not tell what else would."
+
+
+def _kind(kind: Sequence[Explanation]) -> str:
+    """Explanations that predict the same values, with their fall."""
+    if len(kind) == 1:
+        return f"{kind[0].name} ({kind[0].fall:.4g})"
+    names = ", ".join(e.name for e in kind[:-1]) + f" or {kind[-1].name}"
     return (
-        f"{len(alive)} explanations are not told apart (fall of chi2): {names}. All others are behind by more than "
-        "noise and misfit allow."
-        if len(alive) > 1
-        else f"these explain the residual: {names}; the data do not tell what else would."
+        f"{names} ({kind[0].fall:.4g}; the same values under {len(kind)} names, which only other settings tell apart)"
     )
 
 
