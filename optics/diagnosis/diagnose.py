@@ -30,7 +30,7 @@ from optics.diagnosis.explanations import Outcome
 from optics.diagnosis.findings import basis_of, findings_of, subject_of
 from optics.diagnosis.laws import other_laws
 from optics.diagnosis.refit import Case, refit_each
-from optics.diagnosis.result import Basis, Diagnosis, Family, Fingerprint, Row, Split
+from optics.diagnosis.result import Basis, Diagnosis, Family, Fingerprint, Row, Split, kinds_of
 from optics.diagnosis.score import score
 from optics.diagnosis.text import sentence
 from optics.diagnosis.thresholds import EXCESS, LEVEL, MAX_SPLIT, SHARE, close
@@ -158,6 +158,7 @@ def diagnose(
             *filter(None, [scored.unsettled]),
             *remarks.warnings_of(case, word, subject, outcome, shifts, scored.dropped, basis),
         ],
+        kinds=[[e.name for e in kind] for kind in kinds_of(told)] if word == "AMBIGUOUS" else [],
         claimed=subject.effect.name if subject and word == "CLAIM" else "",
         explanations=told,
         families=families,

@@ -35,7 +35,7 @@ import numpy as np
 
 from optics.diagnosis import homogeneity, pairs
 from optics.diagnosis import statistics as st
-from optics.diagnosis.correlation import Correlation, Readings
+from optics.diagnosis.correlation import NOTICED, SHORTEST, Correlation, Readings
 from optics.diagnosis.evidence import Candidate, at_bound, measure, priors, silent
 from optics.diagnosis.refit import FAILURES, START, Case, excess_of, known_of, weighed, with_effects
 from optics.diagnosis.result import Explanation, leaves_nothing
@@ -512,6 +512,11 @@ def compete(case: Case, trials: list[Trial]) -> Outcome:
     for t in order:
         t.deviance = t.after / scale
     if case.evidence.is_table:
+        # where effects leave nothing, a lamp that swings as nobody would let it is no rival of theirs
+        case.session.most = NOTICED if any(t.members and t.complete for t in order) else math.inf
+        for t in order:
+            if t.readings is not None:
+                t.readings.most = case.session.most
         best = next((t for t in order if t.members), order[0])
         scale = max(_readings(case, best).correlation().scale, 1.0)
         correlation = _readings(case, best).noise(scale)
@@ -554,14 +559,18 @@ def wander_of(case: Case, outcome: Outcome, trial: Trial) -> float:
 
 
 def beside_noise(case: Case, outcome: Outcome) -> tuple[Correlation, float]:
-    """(noise that neighbouring readings share about the base, p of structure that it leaves); p is NaN where there is
-    no such noise, or it leaves misfit."""
-    noise = _readings(case, outcome.base).correlation()
-    if not noise.power or noise.scale > MISSTATED:
+    """(noise that neighbouring readings share about the base, p of structure and of jumps that it leaves); p is NaN where
+    there is no such noise, or it leaves misfit. A lamp that wanders does not jump, as one that is changed does, and takes
+    longer than neighbours: noise of the SHORTEST memory may stand for flicker."""
+    readings = _readings(case, outcome.base)
+    noise = readings.correlation()
+    if not noise.power or noise.scale > MISSTATED or noise.length <= SHORTEST:
         return noise, math.nan
     evidence = case.evidence
     left = evidence.structure(evidence.whitened, evidence.base, lambda c: case.session.independent(c, noise))
-    return noise, left.p
+    new = case.session.independent(np.concatenate([b.r for b in evidence.blocks])[:, None], noise)[:, 0]
+    jump = len(new) * math.erfc(float(np.abs(new).max()) / math.sqrt(2))
+    return noise, min(left.p, jump)
 
 
 def noise_of(case: Case, outcome: Outcome, trial: Trial) -> Correlation:

@@ -11,7 +11,7 @@ import numpy as np
 
 from optics.diagnosis import fingerprints as prints
 from optics.diagnosis import statistics as st
-from optics.diagnosis.correlation import WANDER
+from optics.diagnosis.correlation import NOTICED, WANDER
 from optics.diagnosis.decide import Findings, Opponent, ordered, rivals
 from optics.diagnosis.evidence import Candidate, Evidence
 from optics.diagnosis.explanations import Outcome, beside_noise, fall_over_noise, lead_without
@@ -22,7 +22,6 @@ from optics.fit.compare import led_label
 from optics.fit.model import Model, value_of
 from optics.fit.result import Fit
 
-NOTICED = 2 * WANDER  # of the signal, rms: a wander that nobody takes for noise
 
 
 def basis_of(model: Model, evidence: Evidence, structure: st.Structure) -> Basis:
@@ -85,7 +84,7 @@ def findings_of(
     if subject is None:
         fall = max([t.fall - t.expectation for t in outcome.trials] + [0.0])
         own = Findings(table.p_best, basis.structure_p, fall=fall, excess_sd=basis.excess_sd)
-        if case.evidence.is_table and outcome.wander <= NOTICED:
+        if case.evidence.is_table and outcome.wander <= WANDER:
             noise, p = beside_noise(case, outcome)
             own = replace(own, wander=outcome.wander, wander_p=p, memory=noise.length)
     else:
@@ -111,8 +110,9 @@ def findings_of(
         fingerprints = prints.beside_shared_noise(
             case.model, case.evidence, case.places or [], fingerprints, session, scale
         )
-        gain = outcome.base.deviance - leader.deviance - leader.expectation
-        fall = max(gain, 0.0) if subject else fall / scale
+        # of those that effects bring beside such noise too
+        ahead = [leader] if subject else outcome.trials
+        fall = max(0.0, *(outcome.base.deviance - t.deviance - t.expectation for t in ahead))
     fingerprints = [replace(f, ratio=f.net / max(fall, 1.0)) for f in fingerprints]
     if not fingerprints:
         return own

@@ -133,9 +133,9 @@ class Explanation:
 
 
 def kinds_of(explanations: Sequence[Explanation]) -> list[list[Explanation]]:
-    """Explanations, those together that predict the same values (`Explanation.same_as`)."""
+    """The explanations that survive, those together that predict the same values (`Explanation.same_as`)."""
     found: dict[str, list[Explanation]] = {}
-    for e in explanations:
+    for e in [e for e in explanations if e.survives]:
         found.setdefault(e.same_as or e.name, []).append(e)
     return list(found.values())
 
@@ -443,6 +443,7 @@ class Diagnosis:
     rows        one per tested effect, best first; not_tested: effect -> why
     ambiguous   effects of the explanations that the data cannot tell apart, under AMBIGUOUS, the simplest explanation
                 first; claimed: the cause, under CLAIM
+    kinds       under AMBIGUOUS, names of those explanations, those together that predict the same values
     compared    effects that were refitted, in the order of gaps (D between them) and correct (P(correct))
     levels      misfit of the base, then of the base with the best effect, on fitted and held-out frames
     explanations   sets of effects that were refitted, best first; families: what the residual depends on, best first
@@ -473,6 +474,7 @@ class Diagnosis:
     advice: list[Advice] = field(default_factory=list)
     families: list[Family] = field(default_factory=list)
     laws: list[Law] = field(default_factory=list)
+    kinds: list[list[str]] = field(default_factory=list)
     fits: dict[str, Any] = field(default_factory=dict, repr=False, compare=False)
     evidence: Any = field(default=None, repr=False, compare=False)
 
@@ -486,11 +488,6 @@ class Diagnosis:
     def survivors(self) -> list[Explanation]:
         """The explanations that are not told apart, best first."""
         return [e for e in self.explanations if e.survives]
-
-    @property
-    def kinds(self) -> list[list[Explanation]]:
-        """The survivors, those together that predict the same values under other names."""
-        return kinds_of(self.survivors)
 
     @property
     def missing(self) -> str:

@@ -16,6 +16,7 @@ from optics.diagnosis.evidence import Candidate, Evidence, Progress, at_bound, m
 from optics.diagnosis.result import Row
 from optics.diagnosis.thresholds import CLEAR, EXCESS, JUDGED, LEVEL
 from optics.errors import Underdetermined
+from optics.fit import gauges
 from optics.fit.model import Model, value_of
 from optics.fit.result import Fit
 from optics.scene.declare import Effect
@@ -220,9 +221,12 @@ def solve(
     visible = (projected.survival > st.VISIBLE) & (
         np.diag(projected.information) > evidence.normal.noise[evidence.rest]
     )
+    size = np.diag(evidence.normal.gram)
     for c in candidates:
-        if c.broken:
-            visible[[i - first for columns in c.forms.values() for i in columns]] = False
+        for columns in c.forms.values():
+            own = np.array(columns) - first
+            # an image of rounding alone survives any projection
+            visible[own] &= (size[columns] * c.plausible**2 > gauges.STILL) & (not c.broken)
     information = projected.information * np.outer(visible, visible)
     score = projected.score * visible
     shared: list[tuple[np.ndarray, st.Cone]] = []

@@ -221,7 +221,7 @@ def _strength_in(e: Explanation, row: Row) -> str:
 
 
 def _ambiguous(f: Findings, explanations: Sequence[Explanation]) -> str:
-    kinds = kinds_of([e for e in explanations if e.survives])
+    kinds = kinds_of(explanations)
     names = ", or ".join(_kind(kind) for kind in kinds)
     count = len(kinds)
     if f.shared:

@@ -140,9 +140,9 @@ def test_a_zero_is_found_by_the_short_way(tmp_path):
 def test_names_of_one_law_are_told_as_one(tmp_path):
     """One exposure of one lamp: light past the films and an offset of the meter are the same readings."""
     found = judged(tmp_path, noisy(malus(TURN, stray=0.03)), {"analyzer.angle": TURN}, 'absent = ["sample"]')
-    kinds = [{e.name for e in kind} for kind in found.kinds]
-    assert any({"stray light", "dark offset"} <= kind for kind in kinds), found.sentence
-    assert "the same values under" in found.sentence and len(kinds) < len(found.survivors)
+    assert any({"stray light", "dark offset"} <= {*kind} for kind in found.kinds), found.sentence
+    assert "the same values under" in found.sentence and len(found.kinds) < len(found.survivors)
+    assert {name for kind in found.kinds for name in kind} == {e.name for e in found.survivors}
 
 
 def test_other_series_of_a_table_are_passed_over(tmp_path):
