@@ -23,7 +23,6 @@ from optics.fit.model import Model, value_of
 from optics.fit.result import Fit
 
 
-
 def basis_of(model: Model, evidence: Evidence, structure: st.Structure) -> Basis:
     """What the verdict rests on: data, noise and misfit of the base."""
     n, rank = evidence.normal.count, evidence.projected.rank
