@@ -166,7 +166,8 @@ def _columns(file: Path, header: Sequence[str], table: Table, where: str) -> tup
     roles = [*values, *([group] if group else []), *spread.values(), *ignore]
     if len(set(roles)) < len(roles):
         raise BadCapture(
-            f"{where}: the column '{max(roles, key=roles.count)}' is named twice, of values, group, uncertainty and ignore; "
+            f"{where}: the column '{max(roles, key=roles.count)}' is named twice, of values, group, uncertainty and "
+            "ignore; "
             "allowed: one of these"
         )
     settings = [column for column in columns if column not in roles]

@@ -559,9 +559,9 @@ def wander_of(case: Case, outcome: Outcome, trial: Trial) -> float:
 
 
 def beside_noise(case: Case, outcome: Outcome) -> tuple[Correlation, float]:
-    """(noise that neighbouring readings share about the base, p of structure and of jumps that it leaves); p is NaN where
-    there is no such noise, or it leaves misfit. A lamp that wanders does not jump, as one that is changed does, and takes
-    longer than neighbours: noise of the SHORTEST memory may stand for flicker."""
+    """(noise that neighbouring readings share about the base, p of structure and of jumps that it leaves); p is NaN
+    where there is no such noise, or it leaves misfit. A lamp that wanders does not jump, as one that is changed does,
+    and takes longer than neighbours: noise of the SHORTEST memory may stand for flicker."""
     readings = _readings(case, outcome.base)
     noise = readings.correlation()
     if not noise.power or noise.scale > MISSTATED or noise.length <= SHORTEST:

@@ -236,8 +236,8 @@ def _ambiguous(f: Findings, explanations: Sequence[Explanation]) -> str:
         )
     if count > 1:
         return (
-            f"{count} explanations are not told apart (fall of chi2): {names}. All others are behind by more than noise "
-            "and misfit allow."
+            f"{count} explanations are not told apart (fall of chi2): {names}. All others are behind by more than "
+            "noise and misfit allow."
         )
     if len(kinds[0]) > 1:
         return f"one law explains the residual, under {len(kinds[0])} names (fall of chi2): {names}."
@@ -250,7 +250,7 @@ def _kind(kind: Sequence[Explanation]) -> str:
         return f"{kind[0].name} ({kind[0].fall:.4g})"
     names = ", ".join(e.name for e in kind[:-1]) + f" or {kind[-1].name}"
     return (
-        f"{names} ({kind[0].fall:.4g}; the same values under {len(kind)} names, which only other settings tell apart)"
+        f"{names} ({kind[0].fall:.4g}; the same values under {len(kind)} names, which other settings alone tell apart)"
     )
 
 

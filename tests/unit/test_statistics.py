@@ -415,9 +415,7 @@ def test_a_bound_strength_that_a_free_one_imitates_adds_nothing(ratio):
     cone = st.Cone(information, [1, 0])
     scores = np.random.default_rng(4).standard_normal((2000, 60)) @ columns.T
     falls = cone.fall(scores)
-    assert falls == pytest.approx(
-        (scores[:, 0] ** 2) / information[0, 0], rel=1e-6
-    )  # of one strength that may have any sign
+    assert falls == pytest.approx((scores[:, 0] ** 2) / information[0, 0], rel=1e-6)  # any sign
     assert np.mean(cone.p(falls) < 0.05) == pytest.approx(0.05, abs=0.015)  # three sd of 2000
     fall, _ = cone.solve(scores[0])
     assert fall == pytest.approx(falls[0], rel=1e-6)

@@ -1,5 +1,5 @@
-"""Tables of strangers' benches, by formulas of this file: what made verdicts fail on them that the library's own idea of a
-bench did not show."""
+"""Tables of strangers' benches, by formulas of this file: what made verdicts fail on them that the library's own idea
+of a bench did not show."""
 
 import sys
 from pathlib import Path
@@ -19,8 +19,8 @@ COLOURS = np.array([610.0, 540.0, 465.0])  # nm
 TURN = np.arange(0.0, 181.0, 10.0)  # deg
 
 
-# exposure and the means of red, green and blue at TURN: a phone behind two films, one 4 deg off, with a plate of 36 deg at
-# 75 deg between them, a dial that is set to 0.74 deg, by Mueller matrices that are not the library's
+# exposure and the means of red, green and blue at TURN: a phone behind two films, one 4 deg off, with a plate of 36 deg
+# at 75 deg between them, a dial that is set to 0.74 deg, by Mueller matrices that are not the library's
 PHONE = (
     (1, 180.9, 180.7, 180.4),
     (1, 187, 186.8, 184.8),
@@ -113,7 +113,7 @@ def put(folder, columns, values, group, noise):
 
 
 def test_a_run_that_alone_knows_a_direction_is_not_predicted_along_it(tmp_path):
-    """One run in four is held out, one of the three left is the only one downwards: the others cannot predict its lag."""
+    """One run in four is held out, one of the three left is the only one downwards: others do not know its lag."""
     put(tmp_path / "captures", *runs(np.random.default_rng(2), lag=4.0, scale=0.99, wander=0.008), 0.002)
     free = ["source.power", "analyzer.offset"]
     found = diagnosed(tmp_path / "captures", tmp_path / "study", free=free)
@@ -129,8 +129,8 @@ def test_a_lamp_that_wanders_and_nothing_else_is_nothing(seed, tmp_path):
 
 
 def test_a_zero_is_found_by_the_short_way(tmp_path):
-    """A film that stands crossed or parallel only shows a misalignment by its square: no slope says how far. Half a turn
-    more is the same film, and no reason to call 6 degrees implausible."""
+    """A film that stands crossed or parallel only shows a misalignment by its square: no slope tells how far. Half
+    a turn more is the same film, and no reason to call 6 degrees implausible."""
     dial = np.tile(np.repeat([90.0, 0.0], 9), 2)
     found = judged(tmp_path, noisy(malus(dial, offset=6.0)), {"analyzer.angle": dial}, 'absent = ["sample", "middle"]')
     own = next(e for e in found.explanations if e.effects == ["polarizer misalignment"])

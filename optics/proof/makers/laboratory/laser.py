@@ -1,5 +1,5 @@
-"""A polarimeter with a laser, or a lamp behind a narrow filter: one wavelength, which is none of those at which films and
-plates are catalogued.
+"""A polarimeter with a laser, or a lamp behind a narrow filter: one wavelength, which is none of those at which films
+and plates are catalogued.
 
 The plans and plates are those of `polarimeter`; retardances stand in captures as the catalogue has them, at 540 nm."""
 

@@ -1,8 +1,8 @@
 """Runs up and down: a film is turned from 0 to 360 deg and back, over and over, each way a run that has a name.
 
 Two to six runs, at one power of the lamp or two, by hand or by a motor, with the time of each reading and the side from
-which its dial was approached. The gain of the meter is fixed, and stated; the lamp wanders over ten readings or more; where runs are held out, what one of them
-alone shows must not be asked of the others."""
+which its dial was approached. The gain of the meter is fixed, and stated; the lamp wanders over ten readings or more.
+Where runs are held out, what one of them alone shows must not be asked of the others."""
 
 from __future__ import annotations
 
