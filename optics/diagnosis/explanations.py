@@ -806,12 +806,12 @@ def left_out(case: Case, trial: Trial) -> float:
     known = len(case.evidence.base)
     prior[known:] = [1 / (LOOSE * t) ** 2 for c in trial.members for t in c.plausible]
     turn, total = st.root(columns.T @ columns + np.diag(prior)).T, 0.0
-    least = 0.0 if trial.by_frame else ALONE
+    least = max(0.0 if trial.by_frame else ALONE, st.VISIBLE)
     for block in blocks(case, order):
         own = columns[block] @ turn  # in axes in which all readings together know each direction by 1
-        known, axes = np.linalg.eigh(np.eye(turn.shape[1]) - own.T @ own)
-        axes, known = axes[:, known > max(least, st.VISIBLE)], known[known > max(least, st.VISIBLE)]
-        step = axes @ ((own @ axes).T @ r[block] / known)
+        shares, axes = np.linalg.eigh(np.eye(turn.shape[1]) - own.T @ own)  # of that, what the others know
+        axes = axes[:, shares > least]
+        step = axes @ ((own @ axes).T @ r[block] / shares[shares > least])
         total += float(np.sum((r[block] + own @ step) ** 2))
     return total
 

@@ -407,7 +407,7 @@ def test_what_follows_a_setting_and_what_does_not():
 
 @pytest.mark.parametrize("ratio", [0.95, 0.3, 1.7, 2.3])
 def test_a_bound_strength_that_a_free_one_imitates_adds_nothing(ratio):
-    """A leak, 0 or more, and its slope at one wavelength: two names of one image. What the projection leaves of the leak
+    """A leak, 0 or more, and its slope at one wavelength: two names of one image. What is left of the leak
     is rounding, and a score divided by it made half of all falls infinite."""
     image = np.random.default_rng(3).standard_normal(60)
     columns = np.stack([image, ratio * image])
