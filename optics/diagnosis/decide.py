@@ -189,8 +189,8 @@ def _word_of_winner(f: Findings, failed: set[str]) -> str:
         bars.add("no better curve")
     alone = not failed & bars
     alone = alone and not f.another_law
-    rivals = f.survivors > 1 or f.shared or LAW in failed
-    if failed & {"lead", LAW} and alone and f.some_even and rivals:
+    rivals = f.survivors > 1 or f.shared or LAW in failed or bool(f.fragile)
+    if failed & {"lead", LAW, "robust"} and alone and f.some_even and rivals:
         return "AMBIGUOUS"
     return "PARTIAL" if failed - {"spread"} and failed <= {"share", "even", "spread"} else ""
 

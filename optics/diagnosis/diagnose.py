@@ -133,6 +133,10 @@ def diagnose(
     rows, names = [c.row for c in table.order], [c.effect.name for c in chosen]
     gaps, correct = _gaps(evidence, chosen)
     ambiguous = list(dict.fromkeys(name for e in told if e.survives for name in e.effects))
+    kinds = [[e.name for e in kind] for kind in kinds_of(told)]
+    if findings.fragile and findings.fragile not in ambiguous:  # by other weights or masks it is the best
+        ambiguous.append(findings.fragile)
+        kinds.append([findings.fragile])
     hints = remarks.hints_of(word, conditions, outcome, findings, gaps, names)
     text = sentence(word, conditions, findings, rows, told, fingerprints, levels, shifts, basis)
     if word in ("UNKNOWN", "CANNOT_TELL"):
@@ -158,7 +162,7 @@ def diagnose(
             *filter(None, [scored.unsettled]),
             *remarks.warnings_of(case, word, subject, outcome, shifts, scored.dropped, basis),
         ],
-        kinds=[[e.name for e in kind] for kind in kinds_of(told)] if word == "AMBIGUOUS" else [],
+        kinds=kinds if word == "AMBIGUOUS" else [],
         claimed=subject.effect.name if subject and word == "CLAIM" else "",
         explanations=told,
         families=families,

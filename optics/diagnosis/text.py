@@ -224,24 +224,25 @@ def _ambiguous(f: Findings, explanations: Sequence[Explanation]) -> str:
     kinds = kinds_of(explanations)
     names = ", or ".join(_kind(kind) for kind in kinds)
     count = len(kinds)
+    other = f" By other weights or masks {f.fragile} does better." if f.fragile else ""
     if f.shared:
         return (
             "noise that neighbours in the session share, such as a lamp that wanders, is not told apart from "
-            f"{'this explanation' if count == 1 else f'these {count} explanations'} (fall of chi2): {names}."
+            f"{'this explanation' if count == 1 else f'these {count} explanations'} (fall of chi2): {names}.{other}"
         )
     if f.law_lead < TOLD:
         return (
             f"{'this explanation is' if count == 1 else f'{count} explanations are'} not told apart (fall of chi2) "
-            f"from another law of {f.law}, which is in the model: {names}."
+            f"from another law of {f.law}, which is in the model: {names}.{other}"
         )
     if count > 1:
         return (
             f"{count} explanations are not told apart (fall of chi2): {names}. All others are behind by more than "
-            "noise and misfit allow."
+            f"noise and misfit allow.{other}"
         )
     if len(kinds[0]) > 1:
-        return f"one law explains the residual, under {len(kinds[0])} names (fall of chi2): {names}."
-    return f"these explain the residual: {names}; the data do not tell what else would."
+        return f"one law explains the residual, under {len(kinds[0])} names (fall of chi2): {names}.{other}"
+    return f"these explain the residual: {names}.{other or ' The data do not tell what else would.'}"
 
 
 def _kind(kind: Sequence[Explanation]) -> str:
