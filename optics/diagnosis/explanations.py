@@ -144,6 +144,11 @@ class Outcome:
         return [c.effect.name for c in self.best.members if c.effect.name in common]
 
     @property
+    def named(self) -> set[str]:
+        """The effects of all survivors."""
+        return {name for t in self.survivors for name in t.names}
+
+    @property
     def base(self) -> Trial:
         """The explanation without effects."""
         return next(t for t in self.trials if not t.members)

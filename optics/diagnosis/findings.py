@@ -193,7 +193,7 @@ def _of_subject(
         chance=chance,
         carried=carried,
         carried_by=carried_by,
-        fragile=table.fragile(name, best.names),
+        fragile=table.fragile(name, outcome.named),
     )
 
 

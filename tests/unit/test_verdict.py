@@ -17,11 +17,13 @@ from optics.captures.noise import Noise
 from optics.diagnosis import decide as decide_rules
 from optics.diagnosis import fingerprints, homogeneity, pairs
 from optics.diagnosis import statistics as st
+from optics.diagnosis.correlation import Correlation
 from optics.diagnosis.decide import Findings, decide
 from optics.diagnosis.diagnose import diagnose
 from optics.diagnosis.evidence import Candidate, measure
+from optics.diagnosis.explanations import Outcome
 from optics.diagnosis.result import WORDS, Diagnosis, Fingerprint
-from optics.diagnosis.score import score
+from optics.diagnosis.score import Table, score
 from optics.diagnosis.thresholds import CLUTTERED, TOLD
 from optics.errors import Underdetermined
 from optics.fit.model import value_of
@@ -328,6 +330,21 @@ def test_every_condition_is_needed_for_a_claim():
         {"winner": ""},
     ):
         assert decide(replace(GOOD, **broken))[0] != "CLAIM"
+
+
+def test_what_survives_overturns_nothing():
+    """Other weights prefer b to a, by itself; but a is missing beside b or beside c, and each of these explains it."""
+
+    def candidate(name):
+        return SimpleNamespace(
+            effect=SimpleNamespace(name=name), row=SimpleNamespace(net=100.0), contains=lambda other: False
+        )
+
+    table = Table([candidate(name) for name in "abc"], np.zeros((0, 0)), None, 0.0, {"a": 50.0, "b": 500.0}, {})
+    trials = [SimpleNamespace(names=frozenset(names)) for names in ("ac", "ab")]
+    outcome = Outcome(trials[0], trials[0], trials, trials, 1.0, Correlation())
+    assert table.fragile("a", outcome.best.names) == "b"
+    assert outcome.named == {"a", "b", "c"} and table.fragile("a", outcome.named) == ""
 
 
 class Slope(Exact):
