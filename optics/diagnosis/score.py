@@ -23,6 +23,7 @@ from optics.scene.declare import Effect
 from optics.scene.parameter import Variable
 from optics.words import some
 
+REALISED = 0.5  # of the fall that a score promises: what its refit must have brought to count against another
 SETTLED = 0.01  # of the excess of chi2 per parameter: what a calibrated base may still absorb. Derivative images of
 # moving edges are finite samples, which no calibration makes orthogonal to a residual with structure
 MOVING = 0.15  # of the excess in all: what a tempered base may still absorb
@@ -202,6 +203,9 @@ class Table:
             for name in sorted(net, key=lambda n: -net[n]):
                 if name == effect or name in beside or own[name].contains(own[effect]) or effect not in net:
                     continue
+                tried = own[name].row.refit
+                if tried is not None and tried.fall < REALISED * own[name].row.fall:
+                    continue  # a finite step that promises what no refit brings
                 if net[name] - net[effect] > CLEAR and own[name].row.net - own[effect].row.net < CLEAR:
                     return name
                 break

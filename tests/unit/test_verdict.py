@@ -337,7 +337,9 @@ def test_what_survives_overturns_nothing():
 
     def candidate(name):
         return SimpleNamespace(
-            effect=SimpleNamespace(name=name), row=SimpleNamespace(net=100.0), contains=lambda other: False
+            effect=SimpleNamespace(name=name),
+            row=SimpleNamespace(net=100.0, fall=100.0, refit=None),
+            contains=lambda other: False,
         )
 
     table = Table([candidate(name) for name in "abc"], np.zeros((0, 0)), None, 0.0, {"a": 50.0, "b": 500.0}, {})
@@ -345,6 +347,8 @@ def test_what_survives_overturns_nothing():
     outcome = Outcome(trials[0], trials[0], trials, trials, 1.0, Correlation())
     assert table.fragile("a", outcome.best.names) == "b"
     assert outcome.named == {"a", "b", "c"} and table.fragile("a", outcome.named) == ""
+    table.order[1].row.refit = SimpleNamespace(fall=10.0)  # a tenth of what its score had promised
+    assert table.fragile("a") == ""
 
 
 class Slope(Exact):
