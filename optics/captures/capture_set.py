@@ -58,6 +58,7 @@ TABLE_KEYS = (
     "scale",
     "offset",
     "uncertainty",
+    "ignore",
 )
 NOISE_KEYS = tuple(name for name in UNITS if name != "quantisation")  # the step is read off the images
 UNMOVED = 8  # readings in a row at one setting, on average, from which its error is solved for and not weighed
@@ -507,6 +508,7 @@ def _read_table(find: Find, data: object, where: str) -> tuple[Table, list[Frame
         checks.text(data, "group", where) or "",
         numbers["offset"],
         words["uncertainty"],
+        checks.texts(data, "ignore", where),
     )
     rows, step = readings.read(find(name, f"{where}: file"), table, where)
     frames = [
@@ -546,7 +548,8 @@ def check(captures: Captures, parameters: Mapping[str, Parameter]) -> None:
                     where,
                     "`optics params SCENE` lists them"
                     + (
-                        f'; rename = {{ "{key}" = "KEY" }} under [table] of {FILE} gives a column its key'
+                        f'; rename = {{ "{key}" = "KEY" }} under [table] of {FILE} gives a column its key, '
+                        f'ignore = ["{key}"] passes over it'
                         if captures.table is not None and settings is not captures.parameters
                         else ""
                     ),

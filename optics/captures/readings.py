@@ -32,6 +32,7 @@ class Table:
     scale, offset   column -> number; a cell becomes scale * cell + offset. Settings: to the parameter's unit. Readings:
                  the scale that the noise is stated in
     uncertainty  parameter key -> column with the standard deviation of that setting, in the key's unit
+    ignore       columns that are passed over, such as another series of readings
     """
 
     file: str
@@ -44,6 +45,7 @@ class Table:
     group: str = ""
     offset: dict[str, float] = field(default_factory=dict)
     uncertainty: dict[str, str] = field(default_factory=dict)
+    ignore: list[str] = field(default_factory=list)
 
 
 @dataclass
@@ -79,6 +81,8 @@ def read(file: Path, table: Table, where: str) -> tuple[list[Row], float]:
         row = Row({}, [])
         values: dict[str, float] = {}
         for column, text in zip(columns, cells):
+            if column in table.ignore:
+                continue
             if column == table.group:
                 if not text:
                     raise BadCapture(f"{here}: {column} = ''; allowed: the name of a group in every row")
@@ -158,17 +162,19 @@ def _columns(file: Path, header: Sequence[str], table: Table, where: str) -> tup
     spread = {key: named(column, "uncertainty", columns) for key, column in table.uncertainty.items()}
     if len(set(columns)) < len(columns) or len(set(values)) < len(values) or "" in columns:
         raise BadCapture(f"{file}: columns {columns}, values {values}; allowed: each name once, none empty; rename one")
-    roles = [*values, *([group] if group else []), *spread.values()]
+    ignore = [named(column, "ignore", columns) for column in table.ignore]
+    roles = [*values, *([group] if group else []), *spread.values(), *ignore]
     if len(set(roles)) < len(roles):
         raise BadCapture(
-            f"{where}: the column '{max(roles, key=roles.count)}' is named twice, of values, group and uncertainty; "
+            f"{where}: the column '{max(roles, key=roles.count)}' is named twice, of values, group, uncertainty and "
+            "ignore; "
             "allowed: one of these"
         )
     settings = [column for column in columns if column not in roles]
     for key in spread:
         if key not in settings:
             raise UnknownKey(key, settings, "setting", f"{where}: uncertainty", f"the columns of {file}, after rename")
-    numbers = [column for column in columns if column != group]
+    numbers = [column for column in columns if column != group and column not in ignore]
     scale = {named(column, "scale", numbers): factor for column, factor in table.scale.items()}
     offset = {
         named(column, "offset", [c for c in numbers if c not in spread.values()]): shift
@@ -185,6 +191,7 @@ def _columns(file: Path, header: Sequence[str], table: Table, where: str) -> tup
         group,
         offset,
         spread,
+        ignore,
     )
 
 

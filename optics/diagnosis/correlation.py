@@ -24,6 +24,7 @@ Source: Patterson & Thompson, Recovery of inter-block information when block siz
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -38,6 +39,7 @@ SHORTEST = 3.0  # readings: shared over fewer, it is hardly more than noise of a
 # What shared noise must gain in twice the log likelihood: few white sessions exceed it, and these lose little.
 NOTED = 4.0
 WANDER = 0.015  # of the signal, rms: what a lamp or an amplifier may wander in a session
+NOTICED = 2 * WANDER  # of the signal, rms: a wander that nobody takes for noise
 KINDS = ("amplifier", "lamp")
 
 
@@ -67,6 +69,7 @@ class Readings:
     beside    (k + 1, k + 1) products of images and residual among further values, which share nothing; None: there are
               none
     more      their number;   shortest   length, in readings
+    most      of the signal, rms: what noise that neighbours share may be
     """
 
     def __init__(
@@ -78,7 +81,9 @@ class Readings:
         beside: np.ndarray | None = None,
         more: int = 0,
         shortest: float = SHORTEST,
+        most: float = math.inf,
     ):
+        self.most = most
         places = np.argsort(order, kind="stable")
         columns = np.column_stack([fitted, residual])[places]
         beside = np.zeros((columns.shape[1],) * 2) if beside is None else beside
@@ -113,6 +118,7 @@ class Readings:
         if not self.shared:
             return best
         x2 = self.power * scale / max(self.bright, 1e-12) / WANDER**2
+        x2 = np.where(x2 > (self.most / WANDER) ** 2, math.inf, x2)
         for kind, left, logs, _ in self.shared:
             gains = self.white / scale - (left / scale + logs + x2)
             i = int(np.argmax(gains))

@@ -49,6 +49,8 @@ class Findings:
                  not told apart from several effects; curve_lead: of its score over that of the best explanation,
                  0 where that leaves nothing
     shared       whether noise that neighbouring readings share explains it as well as the best explanation
+    wander       rms of such noise over the signal where it alone leaves no misfit, over `memory` readings; wander_p: of
+                 structure that it leaves; NaN where it does not do
     share        of the excess that the best explanation explains, where excess_sd > EXCESS; curve_share: the best curve
     left         misfit over mean signal with the best explanation
     uneven       largest h of the winner's splits, by the split uneven_by (in words), uneven_limit allowed; even:
@@ -74,6 +76,9 @@ class Findings:
     fall: float = 0.0
     common: bool = True
     shared: bool = False
+    wander: float = math.nan
+    wander_p: float = math.nan
+    memory: float = math.nan
     survivors: int = 1
     lead: float = math.inf
     needed: float = TOLD
@@ -158,7 +163,16 @@ def decide(f: Findings) -> tuple[str, list[Condition]]:
                 "rest is spread homogeneously, as from a wrong noise model",
             )
         )
+    if f.wander_p >= LEVEL and not (significant and f.winner):
+        text = f"{wander_text(f)} leaves none (p {p_text(f.wander_p)})"
+        conditions.append(Condition("structure beside shared noise", f.wander_p, LEVEL, False, text))
+        return "NOTHING", conditions
     return "CANNOT_TELL", conditions
+
+
+def wander_text(f: Findings) -> str:
+    """The noise that neighbouring readings share, in words."""
+    return f"noise of {percent(f.wander)} of the signal that some {f.memory:.2g} neighbouring readings share"
 
 
 def _word_of_winner(f: Findings, failed: set[str]) -> str:
@@ -175,8 +189,8 @@ def _word_of_winner(f: Findings, failed: set[str]) -> str:
         bars.add("no better curve")
     alone = not failed & bars
     alone = alone and not f.another_law
-    rivals = f.survivors > 1 or f.shared or LAW in failed
-    if failed & {"lead", LAW} and alone and f.some_even and rivals:
+    rivals = f.survivors > 1 or f.shared or LAW in failed or bool(f.fragile)
+    if failed & {"lead", LAW, "robust"} and alone and f.some_even and rivals:
         return "AMBIGUOUS"
     return "PARTIAL" if failed - {"spread"} and failed <= {"share", "even", "spread"} else ""
 

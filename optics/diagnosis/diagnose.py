@@ -30,7 +30,7 @@ from optics.diagnosis.explanations import Outcome
 from optics.diagnosis.findings import basis_of, findings_of, subject_of
 from optics.diagnosis.laws import other_laws
 from optics.diagnosis.refit import Case, refit_each
-from optics.diagnosis.result import Basis, Diagnosis, Family, Fingerprint, Row, Split
+from optics.diagnosis.result import Basis, Diagnosis, Family, Fingerprint, Row, Split, kinds_of
 from optics.diagnosis.score import score
 from optics.diagnosis.text import sentence
 from optics.diagnosis.thresholds import EXCESS, LEVEL, MAX_SPLIT, SHARE, close
@@ -104,6 +104,8 @@ def diagnose(
         say,
         foresee=foresee,
     )
+    if isinstance(evidence.spectrum, st.Sweeps) and evidence.thinning == 1:
+        evidence.spectrum.apart = case.session.apart
     basis = basis_of(model, evidence, evidence.structure(evidence.whitened, evidence.base))
     case.places = places = prints.places(model, fit.values, evidence)
     chosen = _choose(case, top)
@@ -131,6 +133,10 @@ def diagnose(
     rows, names = [c.row for c in table.order], [c.effect.name for c in chosen]
     gaps, correct = _gaps(evidence, chosen)
     ambiguous = list(dict.fromkeys(name for e in told if e.survives for name in e.effects))
+    kinds = [[e.name for e in kind] for kind in kinds_of(told)]
+    if findings.fragile and findings.fragile not in ambiguous:  # by other weights or masks it is the best
+        ambiguous.append(findings.fragile)
+        kinds.append([findings.fragile])
     hints = remarks.hints_of(word, conditions, outcome, findings, gaps, names)
     text = sentence(word, conditions, findings, rows, told, fingerprints, levels, shifts, basis)
     if word in ("UNKNOWN", "CANNOT_TELL"):
@@ -156,6 +162,7 @@ def diagnose(
             *filter(None, [scored.unsettled]),
             *remarks.warnings_of(case, word, subject, outcome, shifts, scored.dropped, basis),
         ],
+        kinds=kinds if word == "AMBIGUOUS" else [],
         claimed=subject.effect.name if subject and word == "CLAIM" else "",
         explanations=told,
         families=families,

@@ -237,8 +237,17 @@ class Evidence:
         gram = self.normal.gram[np.ix_(base, base)] + np.diag(_padded(self.precision, base))
         return st.inverse(gram, self.normal.truncation(base))[0]
 
-    def structure(self, whitened: Sequence[np.ndarray], base: Sequence[int]) -> st.Structure:
-        """Test of low-frequency structure in residual images, after a calibration of the columns `base`."""
+    def structure(
+        self,
+        whitened: Sequence[np.ndarray],
+        base: Sequence[int],
+        apart: Callable[[np.ndarray], np.ndarray] | None = None,
+    ) -> st.Structure:
+        """Test of low-frequency structure in residual images, after a calibration of the columns `base`.
+
+        apart   of readings, what whitens columns (n, k) by the noise that they share; None: by that of settings"""
+        if apart is not None and isinstance(self.spectrum, st.Sweeps):
+            return self.spectrum.test(whitened, base, self.inverse(base), apart)
         return self.spectrum.test(whitened, base, self.inverse(base))
 
     def variance(self, model: Model, frame: int, prediction: np.ndarray, values: Values | None = None) -> np.ndarray:

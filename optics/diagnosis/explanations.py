@@ -35,7 +35,7 @@ import numpy as np
 
 from optics.diagnosis import homogeneity, pairs
 from optics.diagnosis import statistics as st
-from optics.diagnosis.correlation import Correlation, Readings
+from optics.diagnosis.correlation import NOTICED, SHORTEST, Correlation, Readings
 from optics.diagnosis.evidence import Candidate, at_bound, measure, priors, silent
 from optics.diagnosis.refit import FAILURES, START, Case, excess_of, known_of, weighed, with_effects
 from optics.diagnosis.result import Explanation, leaves_nothing
@@ -57,6 +57,8 @@ BLOCKS = 8  # pieces of a session, each left out once
 LEAST = 2  # values per number that is fitted, below which no set of effects is refitted
 CONTENDERS = 40  # explanations of a table whose shared noise is sought; others are behind without it
 WIDTHS = np.geomspace(0.003, 3.0, 13)  # plausible sizes: of the prior of strengths of each frame
+ALONE = 0.01  # of what all readings know of a direction: what the others know where a block alone determines it
+ALIKE = 1.0  # chi2 between the predictions of two explanations, of all values, below which they are the same
 LOOSE = 10.0  # plausible sizes: what keeps a strength that a left-out block alone determines near neutral
 
 
@@ -142,6 +144,11 @@ class Outcome:
         return [c.effect.name for c in self.best.members if c.effect.name in common]
 
     @property
+    def named(self) -> set[str]:
+        """The effects of all survivors."""
+        return {name for t in self.survivors for name in t.names}
+
+    @property
     def base(self) -> Trial:
         """The explanation without effects."""
         return next(t for t in self.trials if not t.members)
@@ -160,7 +167,8 @@ class Outcome:
 
     def told(self) -> list[Explanation]:
         """All trials as records, best first."""
-        found = []
+        found: list[Explanation] = []
+        same = self._same_as()
         for t in self.trials:
             sd = {v.name: float(s) for v, s in zip(t.fit.variables, t.fit.sd)}
             variables = [v for c in t.members for v in c.variables]
@@ -182,8 +190,22 @@ class Outcome:
                     units=[v.parameter.unit for v in variables],
                     survives=bool(t.members) and t in self.survivors,
                     told={c.effect.name: known_of(t.fit, c) for c in t.members if t in self.survivors},
+                    same_as=same.get(t.names, ""),
                 )
             )
+        return found
+
+    def _same_as(self) -> dict[frozenset[str], str]:
+        """The survivors that predict the same values as a better one, by its name."""
+        found: dict[frozenset[str], str] = {}
+        first: list[Trial] = []
+        for t in sorted((t for t in self.survivors if t.members), key=self.trials.index):
+            for o in first:
+                if sum(float(np.sum((a - b).astype(float) ** 2)) for a, b in zip(t.images, o.images)) < ALIKE:
+                    found[t.names] = " with ".join(c.effect.name for c in o.members)
+                    break
+            else:
+                first.append(t)
         return found
 
 
@@ -495,6 +517,11 @@ def compete(case: Case, trials: list[Trial]) -> Outcome:
     for t in order:
         t.deviance = t.after / scale
     if case.evidence.is_table:
+        # where effects leave nothing, a lamp that swings as nobody would let it is no rival of theirs
+        case.session.most = NOTICED if any(t.members and t.complete for t in order) else math.inf
+        for t in order:
+            if t.readings is not None:
+                t.readings.most = case.session.most
         best = next((t for t in order if t.members), order[0])
         scale = max(_readings(case, best).correlation().scale, 1.0)
         correlation = _readings(case, best).noise(scale)
@@ -536,6 +563,21 @@ def wander_of(case: Case, outcome: Outcome, trial: Trial) -> float:
     return math.sqrt(readings.noise(outcome.scale).power * outcome.scale / max(readings.bright, 1e-12))
 
 
+def beside_noise(case: Case, outcome: Outcome) -> tuple[Correlation, float]:
+    """(noise that neighbouring readings share about the base, p of structure and of jumps that it leaves); p is NaN
+    where there is no such noise, or it leaves misfit. A lamp that wanders does not jump, as one that is changed does,
+    and takes longer than neighbours: noise of the SHORTEST memory may stand for flicker."""
+    readings = _readings(case, outcome.base)
+    noise = readings.correlation()
+    if not noise.power or noise.scale > MISSTATED or noise.length <= SHORTEST:
+        return noise, math.nan
+    evidence = case.evidence
+    left = evidence.structure(evidence.whitened, evidence.base, lambda c: case.session.independent(c, noise))
+    new = case.session.independent(np.concatenate([b.r for b in evidence.blocks])[:, None], noise)[:, 0]
+    jump = len(new) * math.erfc(float(np.abs(new).max()) / math.sqrt(2))
+    return noise, min(left.p, jump)
+
+
 def noise_of(case: Case, outcome: Outcome, trial: Trial) -> Correlation:
     """What neighbouring readings share about an explanation of a table."""
     return _readings(case, trial).noise(outcome.scale)
@@ -549,6 +591,9 @@ def _with_survivors(case: Case, outcome: Outcome) -> Outcome:
     # what readings or frames share is a rival where it, and not chance, is what stands against an effect
     able = (case.evidence.is_table or case.lamp is not None) and needed < fall
     outcome.shared = able and lead <= needed
+    if able and lead < -TOLD:  # noise explains it better than any effect does, at the odds of any other rival
+        outcome.best, outcome.survivors = base, [base]
+        return outcome
     while True:
         # what the leader rules out stays so beside a simpler one
         judges = [best] if best is outcome.leader else [best, outcome.leader]
@@ -570,10 +615,27 @@ def _with_survivors(case: Case, outcome: Outcome) -> Outcome:
     for name in outcome.core:
         rival, lead, needed = _without(case, outcome, next(c for c in best.members if c.effect.name == name))
         if lead <= needed and rival.members and rival not in outcome.survivors:
-            outcome.survivors.append(rival)
+            if rival.keys < best.keys:  # nobody needs it: what it was beside is asked for alone
+                outcome.survivors = _all_without(case, outcome, name)
+                outcome.best = outcome.survivors[0]
+            else:
+                outcome.survivors.append(rival)
             break
         outcome.shared |= able and lead <= needed and not rival.members
     return outcome
+
+
+def _all_without(case: Case, outcome: Outcome, name: str) -> list[Trial]:
+    """The survivors, each without an effect that it is not surely better with; the best first."""
+    found: list[Trial] = []
+    for t in outcome.survivors:
+        inner = next((o for o in outcome.trials if o.members and o.names == t.names - {name}), None)
+        if inner is not None:
+            lead, needed = _lead(case, outcome, t, inner)
+            t = inner if lead <= max(needed, SURE) else t
+        found += [t] if t not in found else []
+    found = [t for t in found if not any(o is not t and o.keys < t.keys for o in found)]
+    return sorted(found, key=lambda t: t.deviance + t.cost)
 
 
 def _told(case: Case, outcome: Outcome, best: Trial, other: Trial) -> bool:
@@ -739,18 +801,23 @@ def left_out(case: Case, trial: Trial) -> float:
     """chi2 of the readings, each block of the session predicted by a fit of all others.
 
     With images X and residuals r of block b at the optimum, (G - G_b + P) step = -X_b'r_b moves the optimum to that of
-    the others; P holds priors, and strengths that only the block determines (LOOSE)."""
+    the others; P holds priors, and strengths of each frame that only the block determines (LOOSE). Other directions
+    that only the block determines (ALONE), as a backlash where it is the only run downwards, stay: the others cannot
+    tell what they would predict."""
     columns, r = _measured(case, trial), np.concatenate(_kept(case, trial.images))
     order = case.evidence.order(case.model)
     prior = np.zeros(columns.shape[1])
     prior[: len(case.evidence.precision)] = case.evidence.precision
     known = len(case.evidence.base)
     prior[known:] = [1 / (LOOSE * t) ** 2 for c in trial.members for t in c.plausible]
-    gram, total = columns.T @ columns + np.diag(prior), 0.0
+    turn, total = st.root(columns.T @ columns + np.diag(prior)).T, 0.0
+    least = max(0.0 if trial.by_frame else ALONE, st.VISIBLE)
     for block in blocks(case, order):
-        own = columns[block]
-        inverse, _ = st.inverse(gram - own.T @ own)
-        total += float(np.sum((r[block] + own @ (inverse @ (own.T @ r[block]))) ** 2))
+        own = columns[block] @ turn  # in axes in which all readings together know each direction by 1
+        shares, axes = np.linalg.eigh(np.eye(turn.shape[1]) - own.T @ own)  # of that, what the others know
+        axes = axes[:, shares > least]
+        step = axes @ ((own @ axes).T @ r[block] / shares[shares > least])
+        total += float(np.sum((r[block] + own @ step) ** 2))
     return total
 
 

@@ -11,18 +11,16 @@ import numpy as np
 
 from optics.diagnosis import fingerprints as prints
 from optics.diagnosis import statistics as st
-from optics.diagnosis.correlation import WANDER
+from optics.diagnosis.correlation import NOTICED, WANDER
 from optics.diagnosis.decide import Findings, Opponent, ordered, rivals
 from optics.diagnosis.evidence import Candidate, Evidence
-from optics.diagnosis.explanations import Outcome, fall_over_noise, lead_without
+from optics.diagnosis.explanations import Outcome, beside_noise, fall_over_noise, lead_without
 from optics.diagnosis.refit import Case, clear
 from optics.diagnosis.result import Basis, Fingerprint, Law, Level, Split
 from optics.diagnosis.thresholds import AS_GOOD, LEVEL, MISSTATED, TOLD, UNEVEN
 from optics.fit.compare import led_label
 from optics.fit.model import Model, value_of
 from optics.fit.result import Fit
-
-NOTICED = 2 * WANDER  # of the signal, rms: a wander that nobody takes for noise
 
 
 def basis_of(model: Model, evidence: Evidence, structure: st.Structure) -> Basis:
@@ -85,6 +83,9 @@ def findings_of(
     if subject is None:
         fall = max([t.fall - t.expectation for t in outcome.trials] + [0.0])
         own = Findings(table.p_best, basis.structure_p, fall=fall, excess_sd=basis.excess_sd)
+        if case.evidence.is_table and outcome.wander <= WANDER:
+            noise, p = beside_noise(case, outcome)
+            own = replace(own, wander=outcome.wander, wander_p=p, memory=noise.length)
     else:
         own = _of_subject(case, outcome, subject, splits, chance, levels, basis)
     own = replace(own, measured=measured, misstated=misstated)
@@ -99,7 +100,7 @@ def findings_of(
     whole = {f.coordinate: f.net for f in fingerprints}
     followed = _followed(case, subject, best.fit, best.fall - best.expectation, fingerprints)
     # a curve is no better than effects while any set of them does as well: the leader, not the simplest beside it
-    leader = outcome.leader
+    leader = outcome.leader if subject else outcome.base
     complete = bool(leader.members) and leader.complete
     fall = leader.fall - leader.expectation if subject else own.fall
     session = case.session if case.evidence.is_table else case.lamp
@@ -108,8 +109,9 @@ def findings_of(
         fingerprints = prints.beside_shared_noise(
             case.model, case.evidence, case.places or [], fingerprints, session, scale
         )
-        gain = outcome.base.deviance - leader.deviance - leader.expectation
-        fall = max(gain, 0.0) if subject else fall / scale
+        # of those that effects bring beside such noise too
+        ahead = [leader] if subject else outcome.trials
+        fall = max(0.0, *(outcome.base.deviance - t.deviance - t.expectation for t in ahead))
     fingerprints = [replace(f, ratio=f.net / max(fall, 1.0)) for f in fingerprints]
     if not fingerprints:
         return own
@@ -191,7 +193,7 @@ def _of_subject(
         chance=chance,
         carried=carried,
         carried_by=carried_by,
-        fragile=table.fragile(name, best.names),
+        fragile=table.fragile(name, outcome.named),
     )
 
 

@@ -134,7 +134,7 @@ def write_verdicts(
             c.row.verdict = "possible"
         elif word == "PARTIAL" and c is winner:
             c.row.verdict = "partial"
-        if c is winner and table.p_best < LEVEL and table.fragile(c.effect.name, outcome.best.names):
+        if c is winner and table.p_best < LEVEL and table.fragile(c.effect.name, outcome.named):
             c.row.flags.append("fragile")
 
 
@@ -180,7 +180,7 @@ def warnings_of(
     if winner is not None and table.p_best < LEVEL:
         name = winner.effect.name
         for what, other in table.preferred.items():
-            if other and other == table.fragile(name, outcome.best.names):
+            if other and other == table.fragile(name, outcome.named):
                 texts.append(f"fragile: {what} the best effect is {other}, not {name}")
     if outcome.correlation.share > 0:
         texts.append(

@@ -102,6 +102,8 @@ class Explanation:
     variables, strength, sd, units   of all its strengths
     survives     whether it is not told apart from the best
     told         effect -> what is known of its strengths where a gauge leaves only combinations, in words
+    same_as      name of a better one that survives and predicts the same values, under another name: no value of these
+                 captures can tell the two apart, however often it is taken again; '' for none
     """
 
     effects: list[str]
@@ -118,6 +120,7 @@ class Explanation:
     units: list[str]
     survives: bool
     told: dict[str, str] = field(default_factory=dict)
+    same_as: str = ""
 
     @property
     def complete(self) -> bool:
@@ -127,6 +130,14 @@ class Explanation:
     @property
     def name(self) -> str:
         return " with ".join(self.effects)
+
+
+def kinds_of(explanations: Sequence[Explanation]) -> list[list[Explanation]]:
+    """The explanations that survive, those together that predict the same values (`Explanation.same_as`)."""
+    found: dict[str, list[Explanation]] = {}
+    for e in [e for e in explanations if e.survives]:
+        found.setdefault(e.same_as or e.name, []).append(e)
+    return list(found.values())
 
 
 @dataclass
@@ -432,6 +443,7 @@ class Diagnosis:
     rows        one per tested effect, best first; not_tested: effect -> why
     ambiguous   effects of the explanations that the data cannot tell apart, under AMBIGUOUS, the simplest explanation
                 first; claimed: the cause, under CLAIM
+    kinds       under AMBIGUOUS, names of those explanations, those together that predict the same values
     compared    effects that were refitted, in the order of gaps (D between them) and correct (P(correct))
     levels      misfit of the base, then of the base with the best effect, on fitted and held-out frames
     explanations   sets of effects that were refitted, best first; families: what the residual depends on, best first
@@ -462,6 +474,7 @@ class Diagnosis:
     advice: list[Advice] = field(default_factory=list)
     families: list[Family] = field(default_factory=list)
     laws: list[Law] = field(default_factory=list)
+    kinds: list[list[str]] = field(default_factory=list)
     fits: dict[str, Any] = field(default_factory=dict, repr=False, compare=False)
     evidence: Any = field(default=None, repr=False, compare=False)
 

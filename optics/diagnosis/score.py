@@ -16,12 +16,14 @@ from optics.diagnosis.evidence import Candidate, Evidence, Progress, at_bound, m
 from optics.diagnosis.result import Row
 from optics.diagnosis.thresholds import CLEAR, EXCESS, JUDGED, LEVEL
 from optics.errors import Underdetermined
+from optics.fit import gauges
 from optics.fit.model import Model, value_of
 from optics.fit.result import Fit
 from optics.scene.declare import Effect
 from optics.scene.parameter import Variable
 from optics.words import some
 
+REALISED = 0.5  # of the fall that a score promises: what its refit must have brought to count against another
 SETTLED = 0.01  # of the excess of chi2 per parameter: what a calibrated base may still absorb. Derivative images of
 # moving edges are finite samples, which no calibration makes orthogonal to a residual with structure
 MOVING = 0.15  # of the excess in all: what a tempered base may still absorb
@@ -202,6 +204,9 @@ class Table:
             for name in sorted(net, key=lambda n: -net[n]):
                 if name == effect or name in beside or own[name].contains(own[effect]) or effect not in net:
                     continue
+                tried = own[name].row.refit
+                if tried is not None and tried.fall < REALISED * own[name].row.fall:
+                    continue  # a finite step that promises what no refit brings
                 if net[name] - net[effect] > CLEAR and own[name].row.net - own[effect].row.net < CLEAR:
                     return name
                 break
@@ -220,9 +225,12 @@ def solve(
     # these are random, and may be next to nothing.
     random = evidence.normal.noise[evidence.rest] * min(OWN_NOISE / math.sqrt(evidence.apart), 1.0)
     visible = (projected.survival > st.VISIBLE) & (np.diag(projected.information) > random)
+    size = np.diag(evidence.normal.gram)
     for c in candidates:
-        if c.broken:
-            visible[[i - first for columns in c.forms.values() for i in columns]] = False
+        for columns in c.forms.values():
+            own = np.array(columns) - first
+            # an image of rounding alone survives any projection
+            visible[own] &= (size[columns] * c.plausible**2 > gauges.STILL) & (not c.broken)
     information = projected.information * np.outer(visible, visible)
     score = projected.score * visible
     shared: list[tuple[np.ndarray, st.Cone]] = []

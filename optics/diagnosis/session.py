@@ -12,6 +12,7 @@ Residuals and images are whitened by it before neighbours are asked what they sh
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 import numpy as np
@@ -28,7 +29,11 @@ MOST = 64  # values that share an error, beyond which they are left as they are
 
 
 class Session:
-    """Of the kept readings of a table, in the order of the evidence's blocks."""
+    """Of the kept readings of a table, in the order of the evidence's blocks.
+
+    most   of the signal, rms: what noise that neighbours share may be"""
+
+    most = math.inf
 
     def __init__(self, model: Model, evidence: Evidence):
         self.order = evidence.order(model).astype(float)
@@ -58,7 +63,8 @@ class Session:
         whole = self.apart(np.column_stack([fitted, residual]))
         precision, pull = known or self.known
         beside = known_products(precision, pull, fitted.shape[1])
-        return Readings(whole[:, -1], whole[:, :-1], self.order, self.loads, beside, int(np.count_nonzero(precision)))
+        more = int(np.count_nonzero(precision))
+        return Readings(whole[:, -1], whole[:, :-1], self.order, self.loads, beside, more, most=self.most)
 
     def independent(self, columns: np.ndarray, noise: Correlation) -> np.ndarray:
         """(n, k) images as of readings that are independent, in units of their noise: what is new in each of them."""

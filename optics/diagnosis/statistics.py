@@ -21,7 +21,7 @@ Inference (2005); errors in variables: Fuller, Measurement Error Models (1987).
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 
@@ -182,6 +182,10 @@ class Cone:
         self.sign, self.free, self.bound = sign, np.flatnonzero(side[self.live] == 0), np.flatnonzero(side[self.live])
         across = v[np.ix_(self.bound, self.free)]
         self.free_inverse, self.free_rank = inverse(v[np.ix_(self.free, self.free)], VISIBLE)
+        # a bound strength that free ones imitate, as a leak and its slope do at one wavelength, adds but rounding
+        own = np.diag(v)[self.bound]
+        seen = own - np.einsum("bi,ij,bj->b", across, self.free_inverse, across) > VISIBLE * own
+        self.bound, across = self.bound[seen], across[seen]
         self.across = across @ self.free_inverse  # (bound, free)
         self.cone = v[np.ix_(self.bound, self.bound)] - self.across @ across.T
         self.inverse, self.rank = inverse(self.information, VISIBLE)
@@ -556,10 +560,14 @@ class Sweeps:
     against the rest.
 
     Along each coordinate in turn, by the ranks of its values. What a calibration absorbs is projected off, so that F is
-    exactly F-distributed in white noise of any size. p is that of the best coordinate times their number."""
+    exactly F-distributed in white noise of any size. p is that of the best coordinate times their number.
+
+    apart   whitens columns (n, k) of all readings by the errors that some of them share: the channels of one setting of
+            a dial move together, which is no structure"""
 
     def __init__(self) -> None:
         self.parts: list[tuple] = []
+        self.apart: Callable[[np.ndarray], np.ndarray] = np.asarray
 
     def add(self, use: np.ndarray, where: Index, columns: np.ndarray, along: Mapping[str, np.ndarray]) -> None:
         """Add a sweep: as in `Spectrum`, and along: {coordinate: value of each reading, (N, 1, 1)}."""
@@ -572,15 +580,25 @@ class Sweeps:
             )
         )
 
-    def test(self, residuals: Sequence[np.ndarray], base: Index, inverse_gram: np.ndarray) -> Structure:
-        """As `Spectrum.test`; `high` is NaN, as neighbouring readings share no interpolation, unlike pixels."""
+    def test(
+        self,
+        residuals: Sequence[np.ndarray],
+        base: Index,
+        inverse_gram: np.ndarray,
+        apart: Callable[[np.ndarray], np.ndarray] | None = None,
+    ) -> Structure:
+        """As `Spectrum.test`; `high` is NaN, as neighbouring readings share no interpolation, unlike pixels.
+
+        apart   in place of the attribute, where noise is shared otherwise"""
+        apart = apart or self.apart
         r = np.concatenate([residual[use] for residual, (use, *_) in zip(residuals, self.parts)]).astype(float)
         calibrated = np.zeros((len(r), len(base)))
         for (use, where, columns, _), end in zip(self.parts, np.cumsum([use.sum() for use, *_ in self.parts])):
             here = [(i, int(np.flatnonzero(where == c)[0])) for i, c in enumerate(base) if c in where]
             calibrated[end - use.sum() : end, [i for i, _ in here]] = columns[:, [j for _, j in here]]
-        taken = orthonormal(calibrated)
-        r -= taken @ (taken.T @ r)
+        taken = orthonormal(apart(calibrated))
+        r = apart(r[:, None])[:, 0]
+        r = r - taken @ (taken.T @ r)
         names = sorted(set.intersection(*[set(along) for *_, along in self.parts]))
         tests = [_slow(np.concatenate([along[name] for *_, along in self.parts]), r, taken) for name in names]
         found = [test for test in tests if test]

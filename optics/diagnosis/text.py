@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from optics.diagnosis.decide import CURVE, Findings
+from optics.diagnosis.decide import CURVE, Findings, wander_text
 from optics.diagnosis.result import (
     NAMED,
     PLANS,
@@ -20,8 +20,9 @@ from optics.diagnosis.result import (
     Level,
     Row,
     Shift,
+    kinds_of,
 )
-from optics.diagnosis.thresholds import CLEAR, CLUTTERED, LEVEL, MARGIN, TOLD
+from optics.diagnosis.thresholds import CLEAR, CLUTTERED, LEVEL, MARGIN, TOLD, is_structured
 from optics.words import (
     ANYWHERE,
     NO_LIMIT,
@@ -37,6 +38,7 @@ from optics.words import (
     with_sd,
 )
 
+LEAST = 0.1  # D with the best shots, below which these leave two effects as alike as they are
 # what to check where no effect brings the model near its images
 AT_FAULT = (
     "units, LEDs that were off, black_level, and that images are linear (not encoded for viewing) and whole, with row "
@@ -103,6 +105,9 @@ def advice_lines(advice: Sequence[Advice]) -> list[str]:
     plans = {a.family: a for a in advice if a.family in PLANS}
     singles = [a for a in advice if a.family not in PLANS]
     lines = [f"next: {advice_text(plans['together'])}"] if "together" in plans else []
+    if lines and (p := plans["together"].hardest).after < LEAST:
+        # a shot that changes nothing is no advice
+        return [f"next: no shot that was tried tells {p.effect} from {p.rival}: what does is another setting or part"]
     if "more of the same" in plans:
         lines.append(f"      (more of the same instead: {advice_text(plans['more of the same'])})")
     known = {a.shot for a in plans.values()}
@@ -158,7 +163,9 @@ def _nothing(f: Findings, tested: int) -> str:
     else:
         how = f"after refit, the best, {f.winner}, has a strength of {f.clear:.2g} sd"
     tail = (
-        f"no excess misfit is left ({f.excess_sd:.2g} sd)"
+        f"{wander_text(f)}, as of a lamp that wanders, explains the rest (structure beside it: p {p_text(f.wander_p)})"
+        if is_structured(f.structure_p, f.excess_sd) or f.weighed
+        else f"no excess misfit is left ({f.excess_sd:.2g} sd)"
         if math.isnan(f.structure_p)
         else f"no low-frequency structure is left (p {p_text(f.structure_p)})"
     )
@@ -214,24 +221,37 @@ def _strength_in(e: Explanation, row: Row) -> str:
 
 
 def _ambiguous(f: Findings, explanations: Sequence[Explanation]) -> str:
-    alive = [e for e in explanations if e.survives]
-    names = ", or ".join(f"{e.name} ({e.fall:.4g})" for e in alive)
+    kinds = kinds_of(explanations)
+    names = ", or ".join(_kind(kind) for kind in kinds)
+    count = len(kinds)
+    other = f" By other weights or masks {f.fragile} does better." if f.fragile else ""
     if f.shared:
         return (
             "noise that neighbours in the session share, such as a lamp that wanders, is not told apart from "
-            f"{'this explanation' if len(alive) == 1 else f'these {len(alive)} explanations'} (fall of chi2): {names}."
+            f"{'this explanation' if count == 1 else f'these {count} explanations'} (fall of chi2): {names}.{other}"
         )
     if f.law_lead < TOLD:
-        one = len(alive) == 1
         return (
-            f"{'this explanation is' if one else f'{len(alive)} explanations are'} not told apart (fall of chi2) from "
-            f"another law of {f.law}, which is in the model: {names}."
+            f"{'this explanation is' if count == 1 else f'{count} explanations are'} not told apart (fall of chi2) "
+            f"from another law of {f.law}, which is in the model: {names}.{other}"
         )
+    if count > 1:
+        return (
+            f"{count} explanations are not told apart (fall of chi2): {names}. All others are behind by more than "
+            f"noise and misfit allow.{other}"
+        )
+    if len(kinds[0]) > 1:
+        return f"one law explains the residual, under {len(kinds[0])} names (fall of chi2): {names}.{other}"
+    return f"these explain the residual: {names}.{other or ' The data do not tell what else would.'}"
+
+
+def _kind(kind: Sequence[Explanation]) -> str:
+    """Explanations that predict the same values, with their fall."""
+    if len(kind) == 1:
+        return f"{kind[0].name} ({kind[0].fall:.4g})"
+    names = ", ".join(e.name for e in kind[:-1]) + f" or {kind[-1].name}"
     return (
-        f"{len(alive)} explanations are not told apart (fall of chi2): {names}. All others are behind by more than "
-        "noise and misfit allow."
-        if len(alive) > 1
-        else f"these explain the residual: {names}; the data do not tell what else would."
+        f"{names} ({kind[0].fall:.4g}; the same values under {len(kind)} names, which other settings alone tell apart)"
     )
 
 

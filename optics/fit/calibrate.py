@@ -348,7 +348,7 @@ def _require_data(descent: Descent, normal: Normal) -> None:
 
 def _fit_at(descent: Descent, history: list[float], reason: str, start: np.ndarray) -> Fit:
     """The fit that a descent has come to, linearised there."""
-    variables, normal, theta = descent.variables, descent.here, descent.theta
+    variables, normal, theta = descent.variables, descent.here, _turned_back(descent)
     covariance = covariance_of(normal.a)
     # of variables with priors, the degrees of freedom that these and not the data hold: sum of c_ii/sd_i^2
     held = sum(
@@ -377,6 +377,19 @@ def _fit_at(descent: Descent, history: list[float], reason: str, start: np.ndarr
     )
     result.warnings = warnings_of(result, normal.a)
     return result
+
+
+def _turned_back(descent: Descent) -> np.ndarray:
+    """The values that a descent has come to; periodic ones within half a period of their prior, or of neutral."""
+    theta = np.array(descent.theta, float)
+    for i, v in enumerate(descent.variables):
+        middle = v.prior[0] if v.prior is not None else v.parameter.neutral
+        if math.isfinite(v.parameter.period) and middle is not None:
+            turns = round((theta[i] - middle) / v.parameter.period)
+            if turns:
+                theta[i] -= turns * v.parameter.period
+                descent.values.put(v, theta[i])
+    return theta
 
 
 def extended(

@@ -85,6 +85,7 @@ def _step(rig, model, cell: Cell, base: Fit, d: Diagnosis) -> dict:
         "word": d.word,
         "claimed": d.claimed,
         "ambiguous": d.ambiguous,
+        "kinds": d.kinds,
         "sentence": d.sentence,
         "p_best": min((r.p_family for r in d.rows), default=1.0),
         "score": [r.name for r in d.rows[:5]],

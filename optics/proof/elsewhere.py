@@ -98,7 +98,9 @@ def elsewhere(records: Sequence[dict], parts: bool = True) -> Elsewhere | None:
     for what, of, size in (
         ("one hidden", single, lambda r: len(ties(r))),
         ("one hidden, what no reading tells from it counted with it", single, _classes),
+        ("one hidden, names of one law on these readings counted once", single, kinds),
         ("two hidden", pairs, lambda r: len(ties(r))),
+        ("two hidden, names of one law on these readings counted once", pairs, kinds),
     ):
         counts = [size(r) for r in of if ties(r)]
         if counts:
@@ -130,6 +132,11 @@ def snr(r: dict) -> float:
 def ties(r: dict) -> list[str]:
     """Members of the set that the last diagnosis could not tell apart; none where it gives no set."""
     return list(last(r)["ambiguous"])
+
+
+def kinds(r: dict) -> int:
+    """Explanations of that set, those that predict the same values counted once."""
+    return len(last(r).get("kinds") or ties(r))
 
 
 def _classes(r: dict) -> int:

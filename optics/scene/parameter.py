@@ -73,6 +73,7 @@ class Parameter:
                 linear: a fit that stepped it to 0 would see nothing of anything else
     starts      values at which a search begins besides the present one, of what a fit cannot reach step by step from
                 there: other orders of a retardance, other quadrants of an unknown zero
+    period      change that makes no difference: half a turn of a film's zero; a fit ends within half of it from neutral
     pair        name of the part's parameter that is the other component of the same vector; `starts` are then its
                 lengths, each taken in eight directions
     through     name of the part's setting through whose changes alone it shows: where that has one value in all frames,
@@ -100,6 +101,7 @@ class Parameter:
     linear: bool = False
     multiplies: bool = False
     starts: tuple[float, ...] = ()
+    period: float = math.inf
     pair: str = ""
     through: str = ""
     squared: bool = False

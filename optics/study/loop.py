@@ -199,7 +199,10 @@ def restore(record: Record, model: SceneModel, index: int = -1) -> Fit:
     if model.dialled:
         model.weighed_at = values.copy()
     enough = TOGETHER * weight_of(variables)
-    return calibrate.fit(model, variables, values, fitted, max_iterations=most, tolerance=enough)
+    found = calibrate.fit(model, variables, values, fitted, max_iterations=most, tolerance=enough)
+    if record.steps[index]["converged"] and not found.converged:  # on another machine, the last digits differ
+        found = calibrate.fit(model, variables, found.values, fitted, max_iterations=FURTHER, tolerance=enough)
+    return found
 
 
 def _of_fitted(variables: Sequence[Variable], fitted: Sequence[int]) -> list[Variable]:

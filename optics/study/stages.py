@@ -22,6 +22,7 @@ COMMON: dict[str, Any] = {"max_iterations": 12, "tolerance": 20.0}
 POSES: dict[str, Any] = {"max_iterations": 6, "tolerance": 2.0}
 TOGETHER = 0.05  # chi2 per variable: a twentieth of what noise alone makes of each
 SETTLING = 2  # fits after which weights that follow the slopes of readings change little
+UNSETTLED, STILL = 12, 0.3  # such fits at most; standard deviations by which the last one may move off its weights
 COOLINGS, COOLER = 4, 1.5  # fits at most, each with priors that count less than a part of those before
 OFF = 0.1  # plausible sizes off neutral from which an effect is followed
 
@@ -100,11 +101,19 @@ def settled(
     such an error."""
     if not model.dialled:
         return found
-    for _ in range(SETTLING):
-        model.weighed_at = found.values.copy()
+    for turn in range(UNSETTLED):
+        # one that a bad model throws from one side of an extinction to the other is taken halfway
+        at = found.values.copy()
+        if turn >= SETTLING and model.weighed_at is not None:
+            for v in found.variables:
+                at.put(v, (value_of(model, at, v) + value_of(model, model.weighed_at, v)) / 2)
+        model.weighed_at = at
         found = calibrate.fit(
             model, found.variables, found.values, found.frames, tolerance=tolerance, robust=robust, progress=progress
         )
+        moved = [abs(e - value_of(model, at, v)) for v, e in zip(found.variables, found.estimate)]
+        if turn + 1 >= SETTLING and not any(m > STILL * sd for m, sd in zip(moved, found.sd)):
+            break
     return found
 
 

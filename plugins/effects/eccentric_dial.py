@@ -54,6 +54,7 @@ effect = Effect(
     per="part",
     acts=("analyzer.angle",),
     needs="a whole turn of the analyser",
+    onset="both",  # of films that stand only where the light turns, the slope is 0
     checks=(check_circle, check_opposite_marks),
     random=random,
 )

@@ -32,5 +32,6 @@ effect = Effect(
     per="part",
     acts=("analyzer.angle",),
     needs="the analyser on both flanks of Malus' curve",
+    onset="both",  # of films that stand only where the light turns, the slope is 0
     checks=(check_shifted_malus,),
 )

@@ -30,5 +30,6 @@ effect = Effect(
     per="part",
     acts=("analyzer.angle",),
     needs="angles over half a turn or more",
+    onset="both",  # of films that stand only where the light turns, the slope is 0
     checks=(check_ratio,),
 )

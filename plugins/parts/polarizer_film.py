@@ -102,6 +102,7 @@ PARAMETERS = (
         neutral=0.0,
         plausible=1.0,
         starts=(-45.0, 45.0, 90.0),
+        period=180.0,
         how="layer",
     ),
     Parameter(

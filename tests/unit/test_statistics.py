@@ -403,3 +403,19 @@ def test_what_follows_a_setting_and_what_does_not():
     assert abs(np.mean(p < 0.05) - 0.05) < 4 * np.sqrt(0.05 * 0.95 / 2000)  # exact in white noise
     assert st.follows(x, np.cos(x / 3) + 0.05 * rng.standard_normal(13)) < 1e-4
     assert np.isnan(st.follows(x[:3], x[:3])) and np.isnan(st.follows(0 * x, x)) and np.isnan(st.follows(x, 0 * x))
+
+
+@pytest.mark.parametrize("ratio", [0.95, 0.3, 1.7, 2.3])
+def test_a_bound_strength_that_a_free_one_imitates_adds_nothing(ratio):
+    """A leak, 0 or more, and its slope at one wavelength: two names of one image. What is left of the leak
+    is rounding, and a score divided by it made half of all falls infinite."""
+    image = np.random.default_rng(3).standard_normal(60)
+    columns = np.stack([image, ratio * image])
+    information = columns @ columns.T
+    cone = st.Cone(information, [1, 0])
+    scores = np.random.default_rng(4).standard_normal((2000, 60)) @ columns.T
+    falls = cone.fall(scores)
+    assert falls == pytest.approx((scores[:, 0] ** 2) / information[0, 0], rel=1e-6)  # any sign
+    assert np.mean(cone.p(falls) < 0.05) == pytest.approx(0.05, abs=0.015)  # three sd of 2000
+    fall, _ = cone.solve(scores[0])
+    assert fall == pytest.approx(falls[0], rel=1e-6)

@@ -17,11 +17,13 @@ from optics.captures.noise import Noise
 from optics.diagnosis import decide as decide_rules
 from optics.diagnosis import fingerprints, homogeneity, pairs
 from optics.diagnosis import statistics as st
+from optics.diagnosis.correlation import Correlation
 from optics.diagnosis.decide import Findings, decide
 from optics.diagnosis.diagnose import diagnose
 from optics.diagnosis.evidence import Candidate, measure
+from optics.diagnosis.explanations import Outcome
 from optics.diagnosis.result import WORDS, Diagnosis, Fingerprint
-from optics.diagnosis.score import score
+from optics.diagnosis.score import Table, score
 from optics.diagnosis.thresholds import CLUTTERED, TOLD
 from optics.errors import Underdetermined
 from optics.fit.model import value_of
@@ -259,7 +261,11 @@ GOOD = Findings(
         ({"lead": TOLD + 0.1}, "CLAIM"),
         ({"lead": 100.0, "needed": 101.0}, "CANNOT_TELL"),
         ({"survivors": 3}, "CLAIM"),
-        ({"fragile": "b"}, "CANNOT_TELL"),
+        ({"fragile": "b"}, "AMBIGUOUS"),
+        ({"fragile": "b", "share": 0.02}, "CANNOT_TELL"),
+        ({"p_family": 0.02, "wander": 0.005, "wander_p": 0.3, "memory": 20.0}, "NOTHING"),
+        ({"p_family": 0.02, "wander": 0.005, "wander_p": 0.001, "memory": 20.0}, "CANNOT_TELL"),
+        ({"p_family": 0.02, "wander": 0.005, "wander_p": 0.3, "memory": 20.0, "rival": True, "ratio": 3.0}, "UNKNOWN"),
         ({"ahead": -1.0}, "CANNOT_TELL"),
         ({"carried": 0.95, "carried_by": "LED led_6"}, "CANNOT_TELL"),
         ({"carried": 0.5, "carried_by": "LED led_6"}, "CLAIM"),
@@ -324,6 +330,25 @@ def test_every_condition_is_needed_for_a_claim():
         {"winner": ""},
     ):
         assert decide(replace(GOOD, **broken))[0] != "CLAIM"
+
+
+def test_what_survives_overturns_nothing():
+    """Other weights prefer b to a, by itself; but a is missing beside b or beside c, and each of these explains it."""
+
+    def candidate(name):
+        return SimpleNamespace(
+            effect=SimpleNamespace(name=name),
+            row=SimpleNamespace(net=100.0, fall=100.0, refit=None),
+            contains=lambda other: False,
+        )
+
+    table = Table([candidate(name) for name in "abc"], np.zeros((0, 0)), None, 0.0, {"a": 50.0, "b": 500.0}, {})
+    trials = [SimpleNamespace(names=frozenset(names)) for names in ("ac", "ab")]
+    outcome = Outcome(trials[0], trials[0], trials, trials, 1.0, Correlation())
+    assert table.fragile("a", outcome.best.names) == "b"
+    assert outcome.named == {"a", "b", "c"} and table.fragile("a", outcome.named) == ""
+    table.order[1].row.refit = SimpleNamespace(fall=10.0)  # a tenth of what its score had promised
+    assert table.fragile("a") == ""
 
 
 class Slope(Exact):

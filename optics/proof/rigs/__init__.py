@@ -7,15 +7,24 @@ finger   vi2tap: stock films in the mono variant (optics.proof.makers.finger)
 grid     grid_bench: stock `volpath` (optics.proof.makers.grid)
 particle particle_gel: numpy alone (optics.proof.makers.particle)
 bench    polarizer_bench: coherency matrices (optics.proof.makers.bench)
-laboratory   student, motor, polarimeter, phone, photographs, polarization_camera: benches of other
-         laboratories, by plain formulas (optics.proof.makers.laboratory)
+laboratory   student, runs, motor, polarimeter, laser, phone, photographs, polarization_camera: benches of
+         other laboratories, by plain formulas (optics.proof.makers.laboratory)
 """
 
 from optics.proof.rigs.base import Rig
 from optics.proof.rigs.bench import Bench
 from optics.proof.rigs.finger import Finger
 from optics.proof.rigs.grid import Grid
-from optics.proof.rigs.laboratory import Motor, Phone, Photographs, Polarimeter, PolarizationCamera, Student
+from optics.proof.rigs.laboratory import (
+    Laser,
+    Motor,
+    Phone,
+    Photographs,
+    Polarimeter,
+    PolarizationCamera,
+    Runs,
+    Student,
+)
 from optics.proof.rigs.particle import ParticleGel
 from optics.proof.rigs.touch import Digit, Gelsight
 
@@ -29,8 +38,10 @@ RIGS: dict[str, type[Rig]] = {
         ParticleGel,
         Bench,
         Student,
+        Runs,
         Motor,
         Polarimeter,
+        Laser,
         Phone,
         Photographs,
         PolarizationCamera,

@@ -23,11 +23,13 @@ from optics.proof.makers.laboratory import (
     causes,
     design,
     folder,
+    laser,
     mosaic,
     motor,
     phone,
     photographs,
     polarimeter,
+    runs,
     student,
 )
 from optics.proof.makers.laboratory.session import Session
@@ -310,6 +312,20 @@ class Polarimeter(Laboratory):
     )
     others = _known(effects)
     unknown = _odd("dichroic sample", "range step", "lamp step")
+
+
+class Laser(Polarimeter):
+    """A polarimeter by light of one wavelength."""
+
+    name = "laser"
+    draw = staticmethod(laser.session)
+
+
+class Runs(Student):
+    """A film turned up and down, in runs that have names, before a lamp that wanders."""
+
+    name = "runs"
+    draw = staticmethod(runs.session)
 
 
 class Phone(Laboratory):

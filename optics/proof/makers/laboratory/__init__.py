@@ -10,6 +10,8 @@ down.
     student       films on hand-turned mounts with scales, a photodiode or a lux meter
     motor         a motor and an encoder: hundreds of readings
     polarimeter   a plate that is turned between polarizers, in one band or three
+    laser         the same by light of one wavelength, which is no catalogue's
+    runs          a film turned up and down, each way a run that has a name
     phone         a phone's camera through polarizers: the mean of a region, red, green and blue
     mosaic        a polarization camera: an analyser on every pixel, a panel of four unknown polarizations
     photographs   the same as images, a sheet beside bare light

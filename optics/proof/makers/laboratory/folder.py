@@ -23,14 +23,16 @@ def write(folder: Path, session: Session, readings: np.ndarray) -> Path:
     turns = {key: f"{key.partition('.')[0]} (rad)" for key in session.settings if session.radians and key in DIALS}
     mark, comma = ("\t", True) if session.continental else (",", False)
     lines = [f"{session.note}"] if session.headed else []
-    lines += [mark.join([*(turns.get(key, key) for key in session.settings), *values])]
+    named = [] if session.runs is None else ["run"]
+    lines += [mark.join([*(turns.get(key, key) for key in session.settings), *values, *named])]
     for i, row in enumerate(readings):
         cells = [
             f"{math.radians(column[i]):.6f}" if key in turns else f"{column[i]:.6g}"
             for key, column in session.settings.items()
         ]
         cells += [f"{value / meter.per:.{meter.decimals}f}" for value in row]
-        lines.append(mark.join(cell.replace(".", ",") if comma else cell for cell in cells))
+        cells = [cell.replace(".", ",") if comma else cell for cell in cells]
+        lines.append(mark.join([*cells, *([] if session.runs is None else [str(session.runs[i])])]))
     (folder / "readings.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
     text = ['scene = "polarizer_bench"', *known(session), *(_noise(session) if session.noise_said else [])]
     stated = {k: v for k, v in session.fixed.items() if k.partition(".")[0] not in session.absent}
@@ -38,6 +40,7 @@ def write(folder: Path, session: Session, readings: np.ndarray) -> Path:
     text += uncertainties(session) + exclusions(session)
     text += ["[table]", 'file = "readings.txt"', f"values = [{', '.join(map(_quoted, values))}]"]
     text += ["skip = 1"] if session.headed else []
+    text += ['group = "run"'] if named else []
     text += ['delimiter = "\\t"', 'decimal = ","'] if comma else []
     scale = dict.fromkeys(turns, 180 / math.pi)
     if meter.per != 1:

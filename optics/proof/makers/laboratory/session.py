@@ -64,6 +64,7 @@ class Session:
     misread    index of a row whose dial was read 10 deg off; None
     noise_said, dials_said, absent, exclude    what he writes: share of the true noise (0: nothing of it), whether dial
                errors are stated
+    runs       (n,) names of the runs that readings belong to, which are held out together; None: none has a name
     radians, continental, headed    how: angles in rad, commas for points, a line before the names of the columns
     power      of the lamp;   plate_in   False: what is turned is a sample holder, empty unless something is hidden in
                it
@@ -87,6 +88,7 @@ class Session:
     dials_said: bool = False
     absent: tuple[str, ...] = ()
     exclude: Mapping[str, str] = field(default_factory=dict)
+    runs: np.ndarray | None = None
     radians: bool = False
     continental: bool = False
     headed: bool = False
