@@ -30,7 +30,6 @@ import numpy as np
 from optics.errors import BadScene, UnknownKey
 from optics.files.output import replacing
 from optics.scene.loader import Scene
-from optics.skin.contact import surface
 
 LABELS = ("force", "pressure", "displacement", "height", "pose", "markers")
 NODES = 81  # a side, of the arrays over the whole skin
@@ -119,17 +118,17 @@ def of(scene: Scene, position: np.ndarray | None, seen: np.ndarray | None, names
             np.float32
         )
     if "displacement" in names:
-        maps, signs = _moved(gel, touch, press), (1.0, 1.0, -1.0)
-        grid = [s * m(x[None, :], y[:, None]) for m, s in zip(maps, signs)]
-        found.arrays |= {"displacement": np.stack(grid, -1), "skin_x": x, "skin_y": y}
+        signs = np.array([1.0, 1.0, -1.0])[:, None, None]
+        grid = signs * _moved(gel, touch, press, x[None, :], y[:, None])
+        found.arrays |= {"displacement": np.moveaxis(grid, 0, -1), "skin_x": x, "skin_y": y}
         rendered = gel.heights(x, y)
         near = np.hypot(x[None, :] - press[0], y[:, None] - press[1]) < gel.numbered("thickness") + touch.axis[-1]
         found.numbers["dent_difference"] = (
             float(np.sqrt(np.mean((grid[2] - rendered)[near] ** 2))) if near.any() else 0.0
         )
         if position is not None:
-            for name, m, s in zip("XYZ", maps, signs):
-                found.channels[f"displacement.{name}"] = np.where(shown, s * m(*at), 0.0)
+            for name, moved in zip("XYZ", signs * _moved(gel, touch, press, *at)):
+                found.channels[f"displacement.{name}"] = np.where(shown, moved, 0.0)
     if "height" in names:
         found.arrays |= {"height": gel.heights(x, y), "skin_x": x, "skin_y": y}
         if position is not None:
@@ -137,16 +136,13 @@ def of(scene: Scene, position: np.ndarray | None, seen: np.ndarray | None, names
     return found
 
 
-def _moved(gel, touch, press):
-    """Functions (x, y) -> mm along x, y and into the skin: the elastic displacement of the face that is seen."""
-    if hasattr(gel, "carry"):
-        rest = lambda x, y: gel.carry(*np.broadcast_arrays(x, y), np.zeros(1))  # noqa: E731
-
-        def component(axis, sign):
-            return lambda x, y: sign * (rest(x, y)[..., axis] - (np.broadcast_arrays(x, y)[axis] if axis < 2 else 0.0))
-
-        return component(0, 1.0), component(1, 1.0), component(2, -1.0)
-    return tuple((lambda x, y, m=m: surface(x, y, *press, m)) for m in touch.displacement())
+def _moved(gel, touch, press, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """(3, ...) mm along x, y and into the skin: the elastic displacement of the face that is seen, at places on it."""
+    if not hasattr(gel, "carry"):
+        return touch.moved(x, y, press)
+    x, y = np.broadcast_arrays(x, y)
+    moved = gel.carry(x, y, np.zeros(1)) - np.stack([x, y, np.zeros(x.shape)], -1)
+    return np.moveaxis(moved, -1, 0) * np.array([1.0, 1.0, -1.0])[:, None, None]
 
 
 def _at(values: np.ndarray, pitch: float, press: tuple[float, float], x: np.ndarray, y: np.ndarray) -> np.ndarray:

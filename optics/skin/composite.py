@@ -164,11 +164,16 @@ class Skin:
 
 @lru_cache(maxsize=8)
 def _factor(skin: Skin, c: float, form: str):
-    """Solver of the held skin with its springs: loads (3 N, m) -> displacements (3 N, m)."""
+    return solver(skin, c, form, skin.held)
+
+
+def solver(skin: Skin, c: float, form: str, held: np.ndarray):
+    """Solver of a skin with its springs whose nodes `held` (N,) bool do not move: loads (3 N, m) -> displacements
+    (3 N, m), N and mm."""
     from scipy.sparse import diags
     from scipy.sparse.linalg import splu
 
-    free = np.flatnonzero(np.repeat(~skin.held, 3))
+    free = np.flatnonzero(np.repeat(~held, 3))
     extra = np.zeros(3 * len(skin.nodes))
     for axis in range(3):
         extra[3 * skin.layer(skin.film) + axis] = skin.springs(c, form)

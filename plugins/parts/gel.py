@@ -16,8 +16,10 @@ With `fillet` > 0 the skin bridges corners with arcs of that radius: D0 is close
 With `skirt` > 0 the skin beside the contact falls off as exp(-distance / skirt) before the smoothing: in place of D0
 stands the max over touched points p of D0(p) exp(-|x - p| / skirt).
 The forces of a press are those of an elastic skin under the same indenter at the same depth (optics.skin.pressing): E =
-`young`, `poisson`, on a rigid window at its thickness or, with `backing` deep, without end. They are labels: the dent
-that is seen stays the one above. An indenter that came to where it stands by `shift_x`, `shift_y` and a turn by `twist`
+`young`, `poisson`, on a rigid window at its thickness; with `backing` deep, without end; with `backing` held, held at its
+rim, free behind, and stiffened by `springs` in its middle plane (optics.skin.held). They are labels: the dent that is
+seen stays the one above, unless `dent` is elastic: then the face, and what it carries, move as that skin does, and
+`smoothing`, `skirt` and `fillet` do nothing. An indenter that came to where it stands by `shift_x`, `shift_y` and a turn by `twist`
 after it had pressed drags along what sticks to it by `friction` (Coulomb); sheets, markers and beads in the gel are
 carried sideways by that shear. Indenters: sphere (`indenter_size` = radius),
 cylinder lying on its side (radius), cube face down (edge), balls (radius) `indenter_spacing` apart on a plate without
@@ -45,12 +47,14 @@ from optics.scene.checking import agree, made
 from optics.scene.declare import Part
 from optics.scene.mitsuba_parts import Declared, coarseness
 from optics.scene.parameter import Parameter
-from optics.skin import contact, pressing
+from optics.skin import contact, held, pressing
 from optics.skin.stack import Layer
 
 FINE = 16  # of a ball's radius, the pitch that a coarser mesh keeps: flanks of balls are off by 1 % of the light
 INDENTER_SIZE = 1.5  # mm
-SHEARING = ("poisson", "friction", "shift_x", "shift_y", "twist")
+DRAG = ("friction", "shift_x", "shift_y", "twist")
+SHEARING = ("poisson", *DRAG)
+ROUNDING = ("smoothing", "skirt", "fillet")  # of the geometric dent
 STAGE = 0.05  # mm: how well a stage usually knows where it presses
 PARAMETERS = (
     Parameter("width", "mm", 20.0, (0.1, 1000.0), "size along x", plausible=0.1, how="difference", role="width"),
@@ -185,7 +189,30 @@ PARAMETERS = (
     ),
     Parameter("young", "MPa", 0.28, (1e-4, 1e4), "Young's modulus", plausible=0.02, how="difference"),
     Parameter("poisson", "1", 0.49, (0.0, 0.5), "Poisson's ratio", plausible=0.005, how="difference"),
-    Parameter("backing", "-", "rigid", choices=("rigid", "deep"), doc="what forces find behind: a window, or more gel"),
+    Parameter(
+        "backing",
+        "-",
+        "rigid",
+        choices=("rigid", "deep", "held"),
+        doc="what forces find behind: a window, more gel, or nothing, the rim being held",
+    ),
+    Parameter(
+        "springs",
+        "N/mm^3",
+        0.0,
+        (0.0, 1e3),
+        "of a held skin: c of the spheroid of springs that stand for a film in its middle plane",
+        neutral=0.0,
+        plausible=0.001,
+        how="difference",
+    ),
+    Parameter(
+        "dent",
+        "-",
+        "geometric",
+        choices=("geometric", "elastic"),
+        doc="what is seen: the indenter's shape with a smoothing, or the face of the elastic skin",
+    ),
     Parameter("friction", "1", 0.8, (0.0, 10.0), "Coulomb's, of indenter and skin", plausible=0.1, how="difference"),
     *(
         Parameter(
@@ -238,6 +265,8 @@ def build():
             "young",
             "poisson",
             "backing",
+            "springs",
+            "dent",
             "friction",
             "shift_x",
             "shift_y",
@@ -270,7 +299,14 @@ def build():
             self.carries = any(getattr(part, "moved_by", None) == self.role for part in scene.parts)
 
         def takes(self, name):
+            if self.elastic:
+                return name not in ROUNDING and (self.carries or name not in DRAG)
             return self.carries or name not in SHEARING  # what is carried sideways is all that shows of a drag
+
+        @property
+        def elastic(self):
+            """Whether the face that is seen is that of the elastic skin."""
+            return getattr(self, "dent", "") == "elastic"
 
         def profile(self, now=None):
             """Lower surface of the indenter (optics.skin.contact.Profile); of the values `now`, or of the gel's own."""
@@ -290,17 +326,30 @@ def build():
             """Displacement and contact maps on the indenter's own grid (optics.skin.contact); of the values `now`, or
             of the gel's own."""
             n = self.number if now is None else now.__getitem__
+            if self.elastic if now is None else now.get("dent") == "elastic":
+                touch = self.touching(now)
+                return touch.displacement()[2], touch.touch
             sizes = (n("press_depth"), n("thickness"), n("smoothing"))
             return contact.displacement(self.profile(now), *sizes, skirt=n("skirt"), fillet=n("fillet"))
 
-        def touching(self):
-            """Pressure, shear and forces of the press (optics.skin.pressing.Contact), around (press_x, press_y)."""
-            n = self.number
-            thick = n("thickness") if self.backing == "rigid" else math.inf
-            layer = Layer(thick, n("young"), n("poisson"))
-            touch = pressing.indent(self.profile(), n("press_depth"), (layer,))
+        def touching(self, now=None):
+            """Pressure, shear and forces of the press (optics.skin.pressing.Contact), around (press_x, press_y); of the
+            values `now`, or of the gel's own."""
+            n = self.number if now is None else now.__getitem__
+            backing = self.backing if now is None else now["backing"]
+            if backing == "held":
+                sizes = (n("width"), n("length"), n("thickness"), n("young"), n("poisson"), n("springs"))
+                place = (n("press_x"), n("press_y"))
+                touch = held.indent(self.profile(now), n("press_depth"), place, held.held_skin(*sizes))
+            else:
+                layer = Layer(n("thickness") if backing == "rigid" else math.inf, n("young"), n("poisson"))
+                touch = pressing.indent(self.profile(now), n("press_depth"), (layer,))
             move = (n("shift_x"), n("shift_y"))
             return pressing.dragged(touch, move, math.radians(n("twist")), n("friction"))
+
+        def moved(self, x, y, depth):
+            """(3, ...) mm along x, y and into the gel: how the elastic skin moves points that rest at (x, y, -depth)."""
+            return self.touching().moved(x, y, (self.number("press_x"), self.number("press_y")), depth)
 
         def sheared(self, x, y, depth):
             """(3, ...) mm along x, y and into the gel: what a drag of the indenter does to points that rest at
@@ -308,8 +357,7 @@ def build():
             n = self.number
             if n("press_depth") <= 0 or not (n("shift_x") or n("shift_y") or n("twist")):
                 return 0.0, 0.0, 0.0
-            maps = pressing.sheared(self.touching(), depth)
-            return tuple(contact.surface(x, y, n("press_x"), n("press_y"), m) for m in maps)
+            return pressing.shear_alone(self.touching()).moved(x, y, (n("press_x"), n("press_y")), depth)
 
         def heights(self, x, y):
             """z of the coated face (mm) at x (columns,) and y (rows,), mm, with every `surface` effect: (rows,
@@ -317,7 +365,10 @@ def build():
             n = self.number
             self.map, self.touch = self.press()
             x, y = np.asarray(x, float)[None, :], np.asarray(y, float)[:, None]
-            z = -contact.surface(x, y, n("press_x"), n("press_y"), self.map)
+            if self.elastic:
+                z = -self.moved(x, y, 0.0)[2]
+            else:
+                z = -contact.surface(x, y, n("press_x"), n("press_y"), self.map)
             for function in self.functions("surface"):
                 z = z + function(x, y, self)
             return z
