@@ -346,7 +346,7 @@ class Renderer:
         """Pixels at a rim for any light: in scenes with layers, and in crowded ones, one set of finer samples serves
         all."""
         if hits.joint is None:
-            rim = self._cast if self.crowded else lambda h, part: self._rim(h, self._visible(h.si, part))
+            rim = self._cast if self.crowded else lambda h, part: self._rim(h, self._unshaded(h, part))
             hits.joint = np.logical_or.reduce([hits.edges, *(rim(hits, part) for part in self.scene.leds.values())])
         return hits.joint
 
@@ -790,8 +790,11 @@ class Renderer:
         return self._mix(image, image.raw, self.weights(values, image, component))
 
     def glow(self, values: Mapping) -> LedImage:
-        """The image of light that no LED made, in a scene with layers, before these."""
+        """The image of light that no LED made, in a scene with layers, before these; the latest is kept."""
         hits = self.hits(values)
+        key = tuple(values[k] for k in (*self.ambient_keys, *self.shading_keys))
+        if hits.glow is not None and hits.glow[0] == key:
+            return hits.glow[1]
         rim = self._joint_rim(hits)
         index = np.flatnonzero(rim)
         image = LedImage("", hits, rim, index, self._finer(hits, index), None, None, hits.valid)
@@ -799,6 +802,7 @@ class Renderer:
             self._shone(values, hits.sample),
             self._shone(values, image.finer.sample) if len(index) else None,
         )
+        hits.glow = key, image
         return image
 
     def _shone(self, values: Mapping, sample: Sample) -> np.ndarray:
@@ -832,6 +836,7 @@ class Hits:
         self.rims: dict = {}
         self.joint: np.ndarray | None = None
         self.lit: dict[str, tuple] = {}  # what lights see of the pixels' centres, by what it was found for
+        self.glow: tuple | None = None  # the image of light that no LED made, behind what it was found for
         self.eye = np.zeros(3)  # where the camera stood
         self.valid = np.array(self.si.is_valid()).reshape(height, width)
         self.edges = _edges(self.valid)
