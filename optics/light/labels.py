@@ -32,6 +32,33 @@ from optics.files.output import replacing
 from optics.scene.loader import Scene
 
 LABELS = ("force", "pressure", "displacement", "height", "pose", "markers")
+NUMBERS = {  # name -> unit and meaning of what goes to the manifest; of a pose those of the scene's parameters
+    "force": ("N", "of the indenter on the skin, along x, y and into the skin"),
+    "torque": ("N mm", "of the indenter on the skin about the press axis, from x to y"),
+    "contact_area": ("mm^2", "touched area"),
+    "dent_difference": ("mm", "rms distance of the rendered face from the elastic one about the press"),
+    "markers": ("px", "u, v of each marker's cap in the image"),
+    "markers_at_rest": ("px", "u, v while nothing presses"),
+    "marker_motion": ("px", "u, v now less those at rest"),
+    "markers_3d": ("mm", "x, y, z of each marker's cap"),
+}
+ARRAYS = {  # of what is per node
+    "force": ("N", "on each node along x, y and into the skin"),
+    "x": ("mm", "of the columns of nodes of force"),
+    "y": ("mm", "of the rows of nodes of force"),
+    "slip": ("", "whether a node slides"),
+    "displacement": ("mm", "of the elastic skin's face, along the world's axes"),
+    "height": ("mm", "z of the rendered face"),
+    "skin_x": ("mm", "of the columns of nodes of displacement and height"),
+    "skin_y": ("mm", "of the rows of nodes of displacement and height"),
+}
+CHANNELS = {  # of what is per pixel
+    "pressure": ("N/mm^2", "of the indenter on what a pixel sees"),
+    "traction": ("N/mm^2", "shear of the indenter on what a pixel sees, along x and y"),
+    "slip": ("", "1 where the skin slides"),
+    "displacement": ("mm", "of the elastic skin at what a pixel sees, along the world's axes"),
+    "height": ("mm", "z of the rendered face"),
+}
 NODES = 81  # a side, of the arrays over the whole skin
 NEWTON = 12  # steps to a marker's pixel
 STEP = 0.5  # px, of differences of the camera's rays
@@ -75,6 +102,19 @@ def named(scene: Scene, text: str | None) -> tuple[str, ...]:
         if name not in LABELS:
             raise UnknownKey(name, [*LABELS, "all"], "label", "--labels")
     return names
+
+
+def described(scene: Scene, names: Sequence[str]) -> dict[str, dict[str, str]]:
+    """Name of a number or of a pose's part -> unit and meaning, of these labels of a scene."""
+    if not names:
+        return {}
+    told = of(scene, None, None, names).numbers
+    found = {name: dict(zip(("unit", "doc"), NUMBERS[name])) for name in told if name != "pose"}
+    part = scene.gel if scene.gel is not None else getattr(scene.block, "target", None)
+    for name in told.get("pose", {}):
+        own = scene.parameters.get(f"{part.name}.{name}")
+        found[f"pose.{name}"] = {"unit": own.unit, "doc": own.doc} if own is not None else {"unit": "", "doc": ""}
+    return found
 
 
 def of(scene: Scene, position: np.ndarray | None, seen: np.ndarray | None, names: Sequence[str]) -> Labels:

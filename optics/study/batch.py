@@ -351,9 +351,14 @@ class Maker:
         return {} if self.draws.posterior is None else {"posterior": self.draws.posterior.table()}
 
     def described(self) -> dict:
-        """Key -> unit and meaning of what is fixed and drawn, for who reads the folder."""
-        found = {key: self.images.scene.parameters[key] for key in [*self.job.parameters, *self.draws.keys]}
-        return {key: {"unit": p.unit, "doc": p.doc} for key, p in found.items()}
+        """Key -> unit and meaning of what is fixed and drawn, and of labels, for who reads the folder."""
+        scene = self.images.scene
+        found = {key: scene.parameters[key] for key in [*self.job.parameters, *self.draws.keys]}
+        labels = labelling.described(scene, self.job.labels)
+        return {
+            **{key: {"unit": p.unit, "doc": p.doc} for key, p in found.items()},
+            **{f"labels.{name}": told for name, told in labels.items()},
+        }
 
     def make(self, index: int) -> dict:
         """Write the files of one sample, each whole or not at all, and return its line of the manifest."""
