@@ -23,6 +23,7 @@ from optics.scene.layer import active_effects
 from optics.scene.mitsuba_parts import is_part
 
 STEPS = 24  # surfaces that a ray may pass
+BLOCK = 8192  # rays at a time in numpy: what they take stays near the processor
 GRAZE = 1e-4  # mm per mm of the coordinates: how far beyond a surface a ray goes on
 
 
@@ -58,7 +59,8 @@ class Path:
     groups: list = field(default_factory=list)
 
     def sequences(self) -> list[tuple[tuple[int, ...], np.ndarray]]:
-        """Rays by the parts that they pass: (indices of the parts, from the camera on; which rays)."""
+        """Rays by the parts that they pass: (indices of the parts, from the camera on; which rays), up to BLOCK of them
+        each."""
         if not self.steps:
             return [((), np.arange(len(self.lost)))]
         if not self.groups:
@@ -66,9 +68,10 @@ class Path:
             for column in table.T:  # one number for each sequence met so far
                 code = np.unique(code * (len(self.names) + 1) + column + 1, return_inverse=True)[1]
             firsts = np.unique(code, return_index=True)[1]
-            self.groups = [
-                (tuple(int(i) for i in table[first]), np.flatnonzero(code == code[first])) for first in firsts
-            ]
+            for first in firsts:
+                rays = np.flatnonzero(code == code[first])
+                parts = tuple(int(i) for i in table[first])
+                self.groups += [(parts, rays[start : start + BLOCK]) for start in range(0, len(rays), BLOCK)]
         return self.groups
 
     def kept(self, group: int, place: int, name: str, scene, values: Mapping, make) -> Mueller:
@@ -206,17 +209,26 @@ def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 def _step(part: np.ndarray, si, k: np.ndarray, x: np.ndarray, extents: Mapping) -> tuple[Step, np.ndarray]:
     """A surface in its own axes, and its normal: z the normal, x the first direction of its coordinates; `extents` of
     parts that stretch."""
-    normal, du, dv, uv = (np.array(a, float).T for a in (si.sh_frame.n, si.dp_du, si.dp_dv, si.uv))
-    size_u, size_v = _length(du), _length(dv)
-    none = size_u == 0
-    du[none], normal[none] = (1.0, 0.0, 0.0), (0.0, 0.0, -1.0)
-    e1 = across(du, normal)
-    e2 = _cross(normal, e1)
-    local = [np.stack([_dot(axis, a) for axis in (e1, e2, normal)], -1) for a in (k, x)]
-    for index, (width, length) in extents.items():
-        size_u, size_v = np.where(part == index, width, size_u), np.where(part == index, length, size_v)
-    v = (uv[:, 1] - 0.5) * size_v * np.where(_dot(dv, e2) < 0, -1, 1)
-    return Step(part, *local, (uv[:, 0] - 0.5) * size_u, v), normal
+    met = [np.array(a).T for a in (si.sh_frame.n, si.dp_du, si.dp_dv, si.uv)]
+    normals, own_k, own_x = (np.empty((len(part), 3)) for _ in range(3))
+    place = np.empty((2, len(part)))
+    for start in range(0, len(part), BLOCK):
+        rays = slice(start, start + BLOCK)
+        normal, du, dv, uv = (a[rays].astype(float) for a in met)
+        size_u, size_v = _length(du), _length(dv)
+        none = size_u == 0
+        du[none], normal[none] = (1.0, 0.0, 0.0), (0.0, 0.0, -1.0)
+        e1 = across(du, normal)
+        e2 = _cross(normal, e1)
+        for i, axis in enumerate((e1, e2, normal)):
+            own_k[rays, i], own_x[rays, i] = _dot(axis, k[rays]), _dot(axis, x[rays])
+        for index, (width, length) in extents.items():
+            on = part[rays] == index
+            size_u, size_v = np.where(on, width, size_u), np.where(on, length, size_v)
+        place[0, rays] = (uv[:, 0] - 0.5) * size_u
+        place[1, rays] = (uv[:, 1] - 0.5) * size_v * np.where(_dot(dv, e2) < 0, -1, 1)
+        normals[rays] = normal
+    return Step(part, own_k, own_x, *place), normals
 
 
 def _refract(here: np.ndarray, direction: np.ndarray, x: np.ndarray, normal: np.ndarray, index: float) -> tuple:
@@ -225,7 +237,14 @@ def _refract(here: np.ndarray, direction: np.ndarray, x: np.ndarray, normal: np.
     lost = np.zeros(len(here), bool)
     if index == 1 or not here.any():
         return direction, x, lost
-    d, axis, normal = direction[here], x[here], normal[here]
+    direction, x, which = direction.copy(), x.copy(), np.flatnonzero(here)
+    for start in range(0, len(which), BLOCK):
+        rays = which[start : start + BLOCK]
+        direction[rays], x[rays], lost[rays] = _bent(direction[rays], x[rays], normal[rays], index)
+    return direction, x, lost
+
+
+def _bent(d: np.ndarray, axis: np.ndarray, normal: np.ndarray, index: float) -> tuple:
     cos1 = -_dot(d, normal)
     front = cos1 >= 0
     n = np.where(front, index, 1 / index)
@@ -240,10 +259,7 @@ def _refract(here: np.ndarray, direction: np.ndarray, x: np.ndarray, normal: np.
     s = np.where(length > 1e-9, s / np.maximum(length, 1e-12), axis)
     turned = _dot(axis, s)[:, None] * s + _dot(axis, _cross(d, s))[:, None] * _cross(bent, s)
     on = ~total[:, None]
-    direction, x = direction.copy(), x.copy()
-    direction[here], x[here] = np.where(on, bent, d), np.where(on, turned, axis)
-    lost[here] = total
-    return direction, x, lost
+    return np.where(on, bent, d), np.where(on, turned, axis), total
 
 
 # -- what light loses ------------------------------------------------------------------------------------------------

@@ -84,6 +84,7 @@ class Renderer:
         self._transmissions: OrderedDict = OrderedDict()
         self._recent: list[paths.Path] = []
         self._hits: OrderedDict = OrderedDict()
+        self._glow: tuple[tuple, LedImage] | None = None  # the image of light that no LED made, and of which values
         self._images: OrderedDict[tuple, LedImage] = OrderedDict()
         self._plain: OrderedDict[tuple, np.ndarray] = OrderedDict()  # of differences, which need nothing else
         image_keys = {k for k, p in scene.parameters.items() if p.how == "image"}
@@ -214,6 +215,7 @@ class Renderer:
     def forget_hits(self) -> None:
         """Release the kept hits: a search over many geometries returns to none of them."""
         self._hits.clear()
+        self._glow = None
 
     def contact_weight(self, values: Mapping, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """1 where the gel is touched at points (x, y) in mm of any shape, 0 elsewhere; between at the rim."""
@@ -436,9 +438,9 @@ class Renderer:
         if key not in self._transmissions:
             if all(
                 path is not other for other in self._recent
-            ):  # matrices are large: those of the last two paths are kept
+            ):  # matrices are large: those of the last geometries, at centres and at finer samples, are kept
                 self._recent.append(path)
-                if len(self._recent) > 4:
+                if len(self._recent) > 2 * min(self.remember, 2):
                     self._recent.pop(0).matrices.clear()
             self._transmissions[key] = paths.transmission(self.scene, path, values, self.wavelengths, component)
             while len(self._transmissions) > 2 * self.remember:
@@ -793,8 +795,8 @@ class Renderer:
         """The image of light that no LED made, in a scene with layers, before these; the latest is kept."""
         hits = self.hits(values)
         key = tuple(values[k] for k in (*self.ambient_keys, *self.shading_keys))
-        if hits.glow is not None and hits.glow[0] == key:
-            return hits.glow[1]
+        if self._glow is not None and self._glow[1].hits is hits and self._glow[0] == key:
+            return self._glow[1]
         rim = self._joint_rim(hits)
         index = np.flatnonzero(rim)
         image = LedImage("", hits, rim, index, self._finer(hits, index), None, None, hits.valid)
@@ -802,7 +804,7 @@ class Renderer:
             self._shone(values, hits.sample),
             self._shone(values, image.finer.sample) if len(index) else None,
         )
-        hits.glow = key, image
+        self._glow = key, image
         return image
 
     def _shone(self, values: Mapping, sample: Sample) -> np.ndarray:
@@ -836,7 +838,6 @@ class Hits:
         self.rims: dict = {}
         self.joint: np.ndarray | None = None
         self.lit: dict[str, tuple] = {}  # what lights see of the pixels' centres, by what it was found for
-        self.glow: tuple | None = None  # the image of light that no LED made, behind what it was found for
         self.eye = np.zeros(3)  # where the camera stood
         self.valid = np.array(self.si.is_valid()).reshape(height, width)
         self.edges = _edges(self.valid)

@@ -38,6 +38,7 @@ NODES = 41  # across the grid of a contact: a ball's force is then true to 3e-3 
 COARSE = 21  # of the first solution, which says where the fine one looks
 ELEMENTS = 4  # through the thickness, the film's plane in the middle
 EDGE = 0.4  # of the thickness, of an element along the face
+AT_A_TIME = 64  # loads
 MOST = 40  # elements along a side
 COMPRESSIBLE = 0.4995  # the largest ratio of these elements: forces of a held skin are then true to 1e-3
 PITCH = 0.25  # mm, of maps that cover the whole skin
@@ -74,9 +75,13 @@ class HeldSkin:
         sign = np.array([1.0, 1.0, -1.0])  # inwards is -z
 
         def moved(nodes: np.ndarray, solve) -> np.ndarray:
-            loads = np.zeros((3 * len(skin.nodes), len(nodes)))
-            loads[3 * nodes + axis, np.arange(len(nodes))] = sign[axis]
-            return solve(loads).T.reshape(len(nodes), nx, ny, nz, 3) * sign
+            found = np.empty((len(nodes), nx, ny, nz, 3))
+            for start in range(0, len(nodes), AT_A_TIME):
+                some = nodes[start : start + AT_A_TIME]
+                loads = np.zeros((3 * len(skin.nodes), len(some)))
+                loads[3 * some + axis, np.arange(len(some))] = sign[axis]
+                found[start : start + AT_A_TIME] = solve(loads).T.reshape(len(some), nx, ny, nz, 3) * sign
+            return found
 
         bonded = moved(face[[(nx // 2) * ny + ny // 2]], solver(skin, 0.0, FORMS[0], base | skin.held))[0]
         found = moved(face, solver(skin, self.springs, FORMS[0], skin.held)).reshape(nx, ny, nx, ny, nz, 3)
@@ -205,7 +210,7 @@ class HeldContact(Contact):
         return (whole + whole.T) / 2
 
 
-@lru_cache(maxsize=32)
+@lru_cache(maxsize=4)
 def indent(profile: Profile, depth: float, place: tuple[float, float], skin: HeldSkin) -> HeldContact:
     """The contact of an indenter whose lowest point is `depth` mm below the untouched face; kept, do not write into
     it."""

@@ -141,13 +141,13 @@ def lowest(profile: Profile, local: np.ndarray) -> np.ndarray:
     return map_coordinates(profile.envelope, np.meshgrid(at, at, indexing="ij"), order=1)
 
 
-@lru_cache(maxsize=32)
+@lru_cache(maxsize=4)
 def dragged(touch: Contact, move: tuple[float, float], twist: float, friction: float) -> Contact:
     """`drag`, kept."""
     return drag(touch, move, twist, friction)
 
 
-@lru_cache(maxsize=32)
+@lru_cache(maxsize=4)
 def shear_alone(touch: Contact) -> Contact:
     """What the shear of a contact does to the skin without its pressure; kept."""
     return replace(touch, pressure=np.zeros_like(touch.pressure))
