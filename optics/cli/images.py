@@ -161,12 +161,23 @@ def batch(
     shard: Annotated[
         str, typer.Option("--shard", metavar="K/N", help="Make only every N-th block of samples, from the K-th on.")
     ] = "1/1",
+    check_files: Annotated[
+        bool,
+        typer.Option(
+            "--check-files",
+            help="Read every image that is there and compare its hash, also those that nobody wrote to since.",
+        ),
+    ] = False,
     fit: FitFile = None,
     frame: FrameName = None,
     plugins: Plugins = None,
     as_json: AsJson = False,
 ) -> None:
-    """Make many images from a job file. May be stopped at any moment; the same command goes on."""
+    """Make many images from a job file. May be stopped at any moment; the same command goes on.
+
+    Ctrl-C ends workers of this machine and of Ray, and cancels running and queued tasks of Slurm. A killed command takes
+    its own processes along; Slurm's tasks go on without it, and the next command counts what they made.
+    """
     from optics.study import batch as work
 
     part = work.parse_shard(shard)
@@ -184,6 +195,7 @@ def batch(
                 options=pairs(engine, "--engine"),
                 recycle=recycle,
                 watch=(lambda status: live(_state(status))) if live else None,
+                check_files=check_files,
             )
     except KeyboardInterrupt:
         raise KeyboardInterrupt("what was made is kept, the same command goes on") from None

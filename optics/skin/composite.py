@@ -188,13 +188,17 @@ def solver(skin: Skin, c: float, form: str, held: np.ndarray):
     return solve
 
 
-def complementary(compliance: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """f >= 0 with A f >= wanted and f (A f - wanted) = 0, for a positive definite A: an active set (Signorini)."""
-    active = wanted > 0
+def complementary(compliance: np.ndarray, wanted: np.ndarray, start: np.ndarray | None = None) -> np.ndarray:
+    """f >= 0 with A f >= wanted and f (A f - wanted) = 0, for a positive definite A: an active set (Signorini).
+
+    start   (N,) bool: the set to begin with; None: where something is wanted"""
+    from scipy.linalg import solve
+
+    active = wanted > 0 if start is None else start
     for _ in range(STEPS):
         force = np.zeros(len(wanted))
         if active.any():
-            force[active] = np.linalg.solve(compliance[np.ix_(active, active)], wanted[active])
+            force[active] = solve(compliance[np.ix_(active, active)], wanted[active], assume_a="pos", check_finite=False)
         short = wanted - compliance @ force
         changed = np.where(active, force > 0, short > 1e-9 * np.abs(wanted).max())
         if (changed == active).all():

@@ -117,7 +117,7 @@ def carried_points(gel, points: np.ndarray) -> np.ndarray:
 
     Of a dent alone the displacement is found at LEVELS depths, and is linear in between."""
     x, y, depth = points[:, 0], points[:, 1], -points[:, 2]
-    if gel is None or not (hasattr(gel, "carry") or gel.map.values.any()):
+    if gel is None or not (hasattr(gel, "carry") or getattr(gel, "elastic", False) or gel.map.values.any()):
         return points.copy()
     if hasattr(gel, "carry"):
         return gel.carry(x, y, depth)
@@ -192,12 +192,14 @@ class SkinStress:
 
     def __init__(self, gel, h1: float, h2: float):
         self.press = gel.numbered("press x"), gel.numbered("press y")
-        self.dent, self.depths = gel.map, (h1, h2)
+        self.touch = gel.touching() if getattr(gel, "elastic", False) else None
+        self.dent, self.depths = gel.map if self.touch is None else None, (h1, h2)
 
     @cached_property
     def maps(self) -> tuple[LocalMap, LocalMap] | None:
         """Made when first asked for: a sheet without stress asks never."""
-        return _stress(self.dent, *self.depths) if self.dent.values.any() else None
+        dent = self.dent if self.touch is None else self.touch.displacement()[2]
+        return _stress(dent, *self.depths) if dent.values.any() else None
 
     @cached_property
     def texture(self):

@@ -34,8 +34,8 @@ from optics.skin.contact import LocalMap, Profile, local_axis, surface
 from optics.skin.pressing import MARGIN, Contact
 from optics.skin.stack import Layer, fields
 
-NODES = 41  # across the grid of a contact: a ball's force is then true to 3e-3 of itself
-COARSE = 21  # of the first solution, which says where the fine one looks
+NODES = 31  # across the grid of a contact: a ball's force is then true to 3e-3 of itself
+COARSE = 17  # of the first solution, which says where the fine one looks
 ELEMENTS = 4  # through the thickness, the film's plane in the middle
 EDGE = 0.4  # of the thickness, of an element along the face
 AT_A_TIME = 64  # loads
@@ -240,12 +240,12 @@ def _solve(
         return pressure
     able = overlap > -MARGIN * depth
     axis = local_axis(n, pitch)
-    look = able.copy()
+    look, start = able.copy(), overlap > 0
     if before is not None and before[0].any():
         touched, coarse = before
         at = (axis - coarse[0]) / (coarse[1] - coarse[0])
-        near = map_coordinates(touched.astype(float), np.meshgrid(at, at, indexing="ij"), order=1) > 0
-        look = able & binary_dilation(near, iterations=2)
+        share = map_coordinates(touched.astype(float), np.meshgrid(at, at, indexing="ij"), order=1)
+        look, start = able & binary_dilation(share > 0, iterations=2), share > 0.5
     wrapped = pressing.Influence(n, pitch, (skin.layer,)).cells
     m = len(wrapped)
     on_skin = np.logical_and.outer(*(np.abs(p + axis) <= a[-1] for p, a in zip(place[::-1], skin.axes[::-1])))
@@ -260,7 +260,7 @@ def _solve(
         between = skin.compliance(2)[np.ix_(used, used)] * pitch**2
         matrix = wrapped[(v[:, None] - v) % m, (u[:, None] - u) % m] + weights @ between @ weights.T
         pressure[:] = 0.0
-        pressure[v, u] = complementary(matrix, overlap[v, u])
+        pressure[v, u] = complementary(matrix, overlap[v, u], start[v, u])
         rest = able & ~look
         if not rest.any():
             return pressure
@@ -270,5 +270,5 @@ def _solve(
         short = overlap[b, a] - far - wrapped[(b[:, None] - v) % m, (a[:, None] - u) % m] @ own
         if not (short > 1e-6 * depth).any():
             return pressure
-        look = able
+        look, start = able, pressure > 0
 

@@ -251,7 +251,8 @@ class Influence:
         place = np.fft.fftfreq(m, 1 / m) * pitch  # a load's cell at 0, all others around it
         normal, xx, yy, xy = _cells(place, pitch, stack[0])
         if len(stack) > 1 or math.isfinite(stack[0].thickness):
-            down, mean, half = _less(float(np.hypot(place.min(), place.min())), stack)
+            reach = float(np.hypot(place.min(), place.min()))
+            down, mean, half = _less(2.0 ** math.ceil(math.log2(reach)), stack)  # few of them, which are kept
             r, turn = np.hypot(place, place[:, None]), 2 * np.arctan2(place[:, None], place)
             normal = normal + down(r) * pitch**2
             xx, yy = (a + (mean(r) - s * np.cos(turn) * half(r)) * pitch**2 for a, s in ((xx, 1), (yy, -1)))
@@ -295,7 +296,7 @@ def _less(reach: float, stack: tuple[Layer, ...]) -> tuple[Callable, ...]:
     x, w = np.polynomial.legendre.leggauss(nodes)
     k, w = (x + 1) / 2 * DECAY / thin, w / 2 * DECAY / thin
     found, half = response(k, stack), half_space(k, stack[0])
-    r = np.linspace(0.0, 1.01 * reach, max(100, int(8 * reach / thin)))
+    r = np.linspace(0.0, 1.01 * reach, max(200, int(16 * reach / thin)))
     waves = k * r[:, None]
     weight = w * k / (2 * math.pi)
     down = (j0(waves) * (weight * (found.down - half.down))).sum(-1)

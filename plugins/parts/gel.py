@@ -287,6 +287,7 @@ def build():
             faces = np.stack([a, d, c, a, c, b], -1).reshape(-1, 3)  # normals towards the camera (-z)
             mi.Mesh.__init__(self, "gel", index.size, len(faces), props, True, False)
             self.declare(props)
+            self._map = None
             self.seen_touch = None  # of which a texture was made
             self.recalled = None  # another geometry than the mesh is in, as `recall` has it
             if self.indenter.lower().endswith(contact.FILES):
@@ -302,6 +303,17 @@ def build():
             if self.elastic:
                 return name not in ROUNDING and (self.carries or name not in DRAG)
             return self.carries or name not in SHEARING  # what is carried sideways is all that shows of a drag
+
+        @property
+        def map(self):
+            """The face's displacement around the press axis (optics.skin.contact.LocalMap)."""
+            if self._map is None:  # of an elastic dent, few ask for it
+                self._map = self.touching().displacement()[2]
+            return self._map
+
+        @map.setter
+        def map(self, found):
+            self._map = found
 
         @property
         def elastic(self):
@@ -363,11 +375,12 @@ def build():
             """z of the coated face (mm) at x (columns,) and y (rows,), mm, with every `surface` effect: (rows,
             columns)."""
             n = self.number
-            self.map, self.touch = self.press()
             x, y = np.asarray(x, float)[None, :], np.asarray(y, float)[:, None]
             if self.elastic:
+                self._map, self.touch = None, self.touching().touch
                 z = -self.moved(x, y, 0.0)[2]
             else:
+                self.map, self.touch = self.press()
                 z = -contact.surface(x, y, n("press_x"), n("press_y"), self.map)
             for function in self.functions("surface"):
                 z = z + function(x, y, self)
