@@ -34,6 +34,7 @@ BLOCKS = (
     256  # blocks that a job has at least, where it has so many samples: twenty workers end within 5 % of each other
 )
 SIZE_MOST = 1000  # samples of a block: a million have a thousand files of records
+TICK = 2_000_000_000  # ns: the coarsest clock of a file system; what was written so shortly before is read
 TRIES = 3  # of one sample in one run, whatever ended them: an error, or a worker that died
 
 Record = dict[str, Any]
@@ -328,9 +329,9 @@ def stands(folder: Path, record: Mapping, since: int = -1) -> bool:
 
 
 def _since(records: Path, all_of_them: bool) -> int:
-    """When records were written last, ns: their files stood by then; -1 where every file is to be read."""
+    """When records were written last, ns, less TICK: their files stood by then; -1 where every file is to be read."""
     try:
-        return -1 if all_of_them else records.stat().st_mtime_ns
+        return -1 if all_of_them else records.stat().st_mtime_ns - TICK
     except FileNotFoundError:
         return -1
 
