@@ -79,6 +79,7 @@ def render(
     from optics.files.output import claim, together, write_json
     from optics.light import labels as labelling
     from optics.light.rendering import RenderJob
+    from optics.scene.loader import told
 
     if output.suffix.lower() != ".exr":
         raise ValueError(
@@ -127,6 +128,9 @@ def render(
     for file in files:
         print(file)
     terminal.note(f"{images.method}, {seconds:.1f} s")
+    look = "" if define or chosen or fit is not None else told(scene)[1]
+    if look and look.split("-o")[0].split() != ["optics", "render", str(scene)]:
+        terminal.note(f"nothing was set; worth a look: {look}")
 
 
 @command
@@ -175,8 +179,8 @@ def batch(
 ) -> None:
     """Make many images from a job file. May be stopped at any moment; the same command goes on.
 
-    Ctrl-C ends workers of this machine and of Ray, and cancels running and queued tasks of Slurm. A killed command takes
-    its own processes along; Slurm's tasks go on without it, and the next command counts what they made.
+    Ctrl-C ends workers of this machine and of Ray, and cancels running and queued tasks of Slurm. A killed command
+    takes its own processes along; Slurm's tasks go on without it, and the next command counts what they made.
     """
     from optics.study import batch as work
 

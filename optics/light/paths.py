@@ -177,8 +177,8 @@ def _which(met, pointers: list):
 
 
 def _placed(part, si, k, x, extents: Mapping) -> tuple[tuple, object]:
-    """(k, x, u, v) of rays at a surface in its own axes, and its normal (Dr.Jit): z the normal, x the first direction of
-    its coordinates; `extents` of parts that stretch."""
+    """(k, x, u, v) of rays at a surface in its own axes, and its normal (Dr.Jit): z the normal, x the first direction
+    of its coordinates; `extents` of parts that stretch."""
     import drjit as dr
     import mitsuba as mi
 

@@ -198,7 +198,8 @@ def complementary(compliance: np.ndarray, wanted: np.ndarray, start: np.ndarray 
     for _ in range(STEPS):
         force = np.zeros(len(wanted))
         if active.any():
-            force[active] = solve(compliance[np.ix_(active, active)], wanted[active], assume_a="pos", check_finite=False)
+            own = compliance[np.ix_(active, active)]
+            force[active] = solve(own, wanted[active], assume_a="pos", check_finite=False)
         short = wanted - compliance @ force
         changed = np.where(active, force > 0, short > 1e-9 * np.abs(wanted).max())
         if (changed == active).all():

@@ -47,8 +47,9 @@ PITCH = 0.25  # mm, of maps that cover the whole skin
 class HeldSkin:
     """Finite elements of a skin, as what they add to an endless layer on a window.
 
-    differences   (axis, load node, z, y, x, 3) mm/N along x, y and inwards: of a unit load along x, y or inwards at each
-                  node of the outer face, of this skin less of the layer; planes z from the inner face to the outer one
+    differences   (load node, z, y, x, 3) mm/N along x, y and inwards: of a unit load along one axis (0, 1: x, y; 2:
+                  inwards) at each node of the outer face, of this skin less of the layer; planes z from the inner face
+                  to the outer one
     """
 
     def __init__(self, width: float, length: float, thickness: float, young: float, poisson: float, springs: float):
@@ -152,7 +153,8 @@ class HeldContact(Contact):
         near = [surface(x, y, *self.place, m) for m in maps]
         plane = self._far(depth)
         if np.ndim(x) == 2 and np.shape(x)[0] == 1 and np.shape(y)[1:] == (1,):
-            far = np.einsum("vj,jic,ui->cvu", self.skin._along(y[:, 0], 1), plane, self.skin._along(x[0], 0), optimize=True)
+            two, one = self.skin._along(y[:, 0], 1), self.skin._along(x[0], 0)
+            far = np.einsum("vj,jic,ui->cvu", two, plane, one, optimize=True)
         else:
             at = [np.ravel(a) for a in np.broadcast_arrays(x, y)]
             one, two = self.skin._along(at[0], 0), self.skin._along(at[1], 1)
@@ -222,9 +224,7 @@ def indent(profile: Profile, depth: float, place: tuple[float, float], skin: Hel
         pressure = _solve(overlap, pitch, place, skin, depth, inside)
         inside = pressure > 0, local_axis(n, pitch)
     none = np.zeros((n, n, 2))
-    return HeldContact(
-        overlap, pressure, none, np.zeros((n, n), bool), pitch, (skin.layer,), skin=skin, place=place
-    )
+    return HeldContact(overlap, pressure, none, np.zeros((n, n), bool), pitch, (skin.layer,), skin=skin, place=place)
 
 
 def _solve(
@@ -271,4 +271,3 @@ def _solve(
         if not (short > 1e-6 * depth).any():
             return pressure
         look, start = able, pressure > 0
-

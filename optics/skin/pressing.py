@@ -240,8 +240,8 @@ def descend(influence: Operator, aim: np.ndarray, project: Callable, what: str) 
 
 # -- Influence -------------------------------------------------------------------------------------------------------
 class Influence:
-    """The face's displacement under uniform cells, on a grid of twice the nodes: `cells` (m, m) mm^3/N by the pressure of
-    the cell at [0, 0], others around it; transforms `normal` of it (1, 1, m, m/2 + 1) and `sideways` of the shear
+    """The face's displacement under uniform cells, on a grid of twice the nodes: `cells` (m, m) mm^3/N by the pressure
+    of the cell at [0, 0], others around it; transforms `normal` of it (1, 1, m, m/2 + 1) and `sideways` of the shear
     (2, 2, m, m/2 + 1)."""
 
     def __init__(self, n: int, pitch: float, stack: tuple[Layer, ...]):
