@@ -128,7 +128,7 @@ def render(
     for file in files:
         print(file)
     terminal.note(f"{images.method}, {seconds:.1f} s")
-    look = "" if define or chosen or fit is not None else told(scene)[1]
+    look = "" if define or chosen or fit is not None or scene is None else told(scene)[1]
     if look and look.split("-o")[0].split() != ["optics", "render", str(scene)]:
         terminal.note(f"nothing was set; worth a look: {look}")
 

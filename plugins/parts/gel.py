@@ -16,12 +16,12 @@ With `fillet` > 0 the skin bridges corners with arcs of that radius: D0 is close
 With `skirt` > 0 the skin beside the contact falls off as exp(-distance / skirt) before the smoothing: in place of D0
 stands the max over touched points p of D0(p) exp(-|x - p| / skirt).
 The forces of a press are those of an elastic skin under the same indenter at the same depth (optics.skin.pressing): E =
-`young`, `poisson`, on a rigid window at its thickness; with `backing` deep, without end; with `backing` held, held at its
-rim, free behind, and stiffened by `springs` in its middle plane (optics.skin.held). They are labels: the dent that is
-seen stays the one above, unless `dent` is elastic: then the face, and what it carries, move as that skin does, and
-`smoothing`, `skirt` and `fillet` do nothing. An indenter that came to where it stands by `shift_x`, `shift_y` and a turn by `twist`
-after it had pressed drags along what sticks to it by `friction` (Coulomb); sheets, markers and beads in the gel are
-carried sideways by that shear. Indenters: sphere (`indenter_size` = radius),
+`young`, `poisson`, on a rigid window at its thickness; with `backing` deep, without end; with `backing` held, held at
+its rim, free behind, and stiffened by `springs` in its middle plane (optics.skin.held). They are labels: the dent that
+is seen stays the one above, unless `dent` is elastic: then the face, and what it carries, move as that skin does, and
+`smoothing`, `skirt` and `fillet` do nothing. An indenter that came to where it stands by `shift_x`, `shift_y` and a
+turn by `twist` after it had pressed drags along what sticks to it by `friction` (Coulomb); sheets, markers and beads in
+the gel are carried sideways by that shear. Indenters: sphere (`indenter_size` = radius),
 cylinder lying on its side (radius), cube face down (edge), balls (radius) `indenter_spacing` apart on a plate without
 end, one of them at the press, a mesh file (STL, OBJ, PLY; `indenter_size` = scale) or a measured height map (TMD;
 `indenter_size` = scale; NPY in mm or 16 bit PNG in micrometres: mm from sample to sample).
@@ -360,7 +360,7 @@ def build():
             return pressing.dragged(touch, move, math.radians(n("twist")), n("friction"))
 
         def moved(self, x, y, depth):
-            """(3, ...) mm along x, y and into the gel: how the elastic skin moves points that rest at (x, y, -depth)."""
+            """(3, ...) mm along x, y and into the gel: how the elastic skin moves what rests at (x, y, -depth)."""
             return self.touching().moved(x, y, (self.number("press_x"), self.number("press_y")), depth)
 
         def sheared(self, x, y, depth):
