@@ -18,8 +18,8 @@ stands the max over touched points p of D0(p) exp(-|x - p| / skirt).
 The forces of a press are those of an elastic skin under the same indenter at the same depth (optics.skin.pressing): E =
 `young`, `poisson`, on a rigid window at its thickness; with `backing` deep, without end; with `backing` held, held at
 its rim, free behind, and stiffened by `springs` in its middle plane (optics.skin.held). They are labels: the dent that
-is seen stays the one above, unless `dent` is elastic: then the face, and what it carries, move as that skin does, and
-`smoothing`, `skirt` and `fillet` do nothing. An indenter that came to where it stands by `shift_x`, `shift_y` and a
+is seen stays the one above, unless `dent_model` is elastic: then the face, and what it carries, move as that skin does,
+and `smoothing`, `skirt` and `fillet` do nothing. An indenter that came to where it stands by `shift_x`, `shift_y` and a
 turn by `twist` after it had pressed drags along what sticks to it by `friction` (Coulomb); sheets, markers and beads in
 the gel are carried sideways by that shear. Indenters: sphere (`indenter_size` = radius),
 cylinder lying on its side (radius), cube face down (edge), balls (radius) `indenter_spacing` apart on a plate without
@@ -202,12 +202,11 @@ PARAMETERS = (
         0.0,
         (0.0, 1e3),
         "of a held skin: c of the spheroid of springs that stand for a film in its middle plane",
-        neutral=0.0,
         plausible=0.001,
         how="difference",
     ),
     Parameter(
-        "dent",
+        "dent_model",
         "-",
         "geometric",
         choices=("geometric", "elastic"),
@@ -266,7 +265,7 @@ def build():
             "poisson",
             "backing",
             "springs",
-            "dent",
+            "dent_model",
             "friction",
             "shift_x",
             "shift_y",
@@ -318,7 +317,7 @@ def build():
         @property
         def elastic(self):
             """Whether the face that is seen is that of the elastic skin."""
-            return getattr(self, "dent", "") == "elastic"
+            return getattr(self, "dent_model", "") == "elastic"
 
         def profile(self, now=None):
             """Lower surface of the indenter (optics.skin.contact.Profile); of the values `now`, or of the gel's own."""
@@ -338,7 +337,7 @@ def build():
             """Displacement and contact maps on the indenter's own grid (optics.skin.contact); of the values `now`, or
             of the gel's own."""
             n = self.number if now is None else now.__getitem__
-            if self.elastic if now is None else now.get("dent") == "elastic":
+            if self.elastic if now is None else now.get("dent_model") == "elastic":
                 touch = self.touching(now)
                 return touch.displacement()[2], touch.touch
             sizes = (n("press_depth"), n("thickness"), n("smoothing"))
@@ -360,8 +359,10 @@ def build():
             return pressing.dragged(touch, move, math.radians(n("twist")), n("friction"))
 
         def moved(self, x, y, depth):
-            """(3, ...) mm along x, y and into the gel: how the elastic skin moves what rests at (x, y, -depth)."""
-            return self.touching().moved(x, y, (self.number("press_x"), self.number("press_y")), depth)
+            """(3, ...) mm along x, y and into the gel: how the elastic skin moves what rests at (x, y, -depth); what
+            lies deeper than the gel, as its inner face."""
+            n = self.number
+            return self.touching().moved(x, y, (n("press_x"), n("press_y")), min(depth, n("thickness")))
 
         def sheared(self, x, y, depth):
             """(3, ...) mm along x, y and into the gel: what a drag of the indenter does to points that rest at
@@ -369,7 +370,8 @@ def build():
             n = self.number
             if n("press_depth") <= 0 or not (n("shift_x") or n("shift_y") or n("twist")):
                 return 0.0, 0.0, 0.0
-            return pressing.shear_alone(self.touching()).moved(x, y, (n("press_x"), n("press_y")), depth)
+            alone = pressing.shear_alone(self.touching())
+            return alone.moved(x, y, (n("press_x"), n("press_y")), min(depth, n("thickness")))
 
         def heights(self, x, y):
             """z of the coated face (mm) at x (columns,) and y (rows,), mm, with every `surface` effect: (rows,
