@@ -6,26 +6,41 @@ import html
 import math
 import re
 import textwrap
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
 from typing import Any
 
-NARROWEST = 12  # characters of a column that is broken over lines
+NARROWEST = 7  # characters of a column that is broken over lines
 
 
-def table(rows: Sequence[Sequence[str]], left: Collection[int] | None = None, width: int | None = None) -> str:
+_room: ContextVar[int | None] = ContextVar("room", default=None)  # characters of a line of the terminal
+
+
+@contextmanager
+def fitting(width: int | None) -> Iterator[None]:
+    """Within, tables are at most so wide, where their columns allow it; None: as wide as they are."""
+    token = _room.set(width)
+    try:
+        yield
+    finally:
+        _room.reset(token)
+
+
+def table(rows: Sequence[Sequence[str]], left: Collection[int] | None = None) -> str:
     """Aligned columns, two spaces apart; `left`: columns that begin at the left (None: all), the others end at the
     right.
 
-    width   of the terminal: cells of the widest columns go over several lines, so that a row fits; None: never"""
-    widths = [max(len(cell) for cell in column) for column in zip(*rows)]
+    Where there is a terminal (`fitting`), cells of the widest columns go over several lines, so that a row fits."""
+    widths, width = [max(len(cell) for cell in column) for column in zip(*rows)], _room.get()
     if width is not None and sum(widths) + 2 * (len(widths) - 1) > width:
         room = width - 2 * (len(widths) - 1)
-        cap = max((c for c in range(NARROWEST, max(widths) + 1) if sum(min(w, c) for w in widths) <= room), default=0)
+        cap = max((c for c in range(1, max(widths) + 1) if sum(min(w, c) for w in widths) <= room), default=0)
         cap = max(cap, NARROWEST)
         lines = [[textwrap.wrap(cell, cap) or [""] for cell in row] for row in rows]
         rows = [[cell[i] if i < len(cell) else "" for cell in row] for row in lines for i in range(max(map(len, row)))]
-        widths = [min(w, cap) for w in widths]
+        widths = [max(len(cell) for cell in column) for column in zip(*rows)]
     return "\n".join(
         "  ".join(
             cell.ljust(w) if left is None or i in left else cell.rjust(w)

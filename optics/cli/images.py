@@ -79,6 +79,7 @@ def render(
     from optics.files.output import claim, together, write_json
     from optics.light import labels as labelling
     from optics.light.rendering import RenderJob
+    from optics.scene.loader import told
 
     if output.suffix.lower() != ".exr":
         raise ValueError(
@@ -127,6 +128,9 @@ def render(
     for file in files:
         print(file)
     terminal.note(f"{images.method}, {seconds:.1f} s")
+    look = "" if define or chosen or fit is not None or scene is None else told(scene)[1]
+    if look and look.split("-o")[0].split() != ["optics", "render", str(scene)]:
+        terminal.note(f"nothing was set; worth a look: {look}")
 
 
 @command
@@ -161,12 +165,23 @@ def batch(
     shard: Annotated[
         str, typer.Option("--shard", metavar="K/N", help="Make only every N-th block of samples, from the K-th on.")
     ] = "1/1",
+    check_files: Annotated[
+        bool,
+        typer.Option(
+            "--check-files",
+            help="Read every image that is there and compare its hash, also those that nobody wrote to since.",
+        ),
+    ] = False,
     fit: FitFile = None,
     frame: FrameName = None,
     plugins: Plugins = None,
     as_json: AsJson = False,
 ) -> None:
-    """Make many images from a job file. May be stopped at any moment; the same command goes on."""
+    """Make many images from a job file. May be stopped at any moment; the same command goes on.
+
+    Ctrl-C ends workers of this machine and of Ray, and cancels running and queued tasks of Slurm. A killed command
+    takes its own processes along; Slurm's tasks go on without it, and the next command counts what they made.
+    """
     from optics.study import batch as work
 
     part = work.parse_shard(shard)
@@ -184,6 +199,7 @@ def batch(
                 options=pairs(engine, "--engine"),
                 recycle=recycle,
                 watch=(lambda status: live(_state(status))) if live else None,
+                check_files=check_files,
             )
     except KeyboardInterrupt:
         raise KeyboardInterrupt("what was made is kept, the same command goes on") from None

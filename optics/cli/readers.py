@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from optics.cli.shared import AsJson, Force, columns, command, show, terminal
+from optics.cli.shared import AsJson, Force, command, show, terminal
 from optics.words import number, table
 
 
@@ -125,7 +125,7 @@ def read(
         terminal.note("nothing found")
         return
     head = list(rows[0])
-    print(table([head, *([_cell(row[name]) for name in head] for row in rows)], width=columns()))
+    print(table([head, *([_cell(row[name]) for name in head] for row in rows)]))
 
 
 def _fit_together(what: str, given: dict[str, Any]) -> None:

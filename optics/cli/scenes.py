@@ -1,7 +1,6 @@
 """Commands that show what there is: scenes, their parameters, effects and parts; and the one that drafts an effect."""
 
 import math
-import re
 from collections.abc import Mapping, Sequence
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -16,7 +15,6 @@ from optics.cli.shared import (
     Plugins,
     SceneName,
     Variant,
-    columns,
     command,
     load_scene,
     scan,
@@ -33,16 +31,17 @@ if TYPE_CHECKING:
 
 @command
 def scenes(as_json: AsJson = False) -> None:
-    """List the scenes that ship with the program."""
+    """List the scenes that ship with the program, and a command worth a first look for each."""
     from optics.scene import loader as scene
 
-    rows = []
+    rows: list[dict[str, str]] = []
     for name in scene.shipped_scenes():
-        path = scene.find(name)
-        comment = re.search(r"<!--(.*?)-->", path.read_text(encoding="utf-8"), re.DOTALL)
-        title = next((line.strip() for line in (comment[1] if comment else "").splitlines() if line.strip()), "")
-        rows.append({"name": name, "title": title, "file": str(path)})
-    show(rows) if as_json else print(table([(r["name"], r["title"]) for r in rows], width=columns()))
+        title, look = scene.told(name)
+        rows.append({"name": name, "title": title, "look": look, "file": str(scene.find(name))})
+    if as_json:
+        return show(rows)
+    print(table([(r["name"], r["title"]) for r in rows]))
+    print("\nworth a first look:\n" + "\n".join(f"  {r['look']}" for r in rows if r["look"]))
 
 
 @command
@@ -70,7 +69,7 @@ def params(
     if as_json:
         return show(rows)
     head = ("key", "value", "unit", "bounds", "neutral", "derivative", "meaning")
-    print(table([head, *map(_parameter_line, rows)], width=columns()))
+    print(table([head, *map(_parameter_line, rows)]))
     if not patterns and (loaded.curves or loaded.integral is not None):
         print(
             "\n" + table([("spectrum", "kind", "nm", "mean", "source"), *map(_spectrum_line, spectra.records(loaded))])
@@ -259,7 +258,7 @@ def effects(
         (r["key"], r["part"], ", ".join(p["name"] for p in r["parameters"]), r["onset"], r["needs"] or "-")
         for r in records
     ]
-    print(f"{table([head, *lines], width=columns())}\n\nparts, each with a page too: {', '.join(sorted(found.parts))}")
+    print(f"{table([head, *lines])}\n\nparts, each with a page too: {', '.join(sorted(found.parts))}")
 
 
 def _effect_record(found: "Registry", e: "Effect") -> dict[str, Any]:
@@ -307,8 +306,8 @@ def _effect_page(found: "Registry", e: "Effect", as_json: bool) -> None:
         for p in r["parameters"]
     ]
     print(f"{r['page'].strip()}\n\n{r['name']}: `{r['key']}`, {r['file']}")
-    print(table(facts, width=columns()))
-    print("\n" + table([("parameter", "unit", "neutral", "bounds", "meaning"), *lines], width=columns()))
+    print(table(facts))
+    print("\n" + table([("parameter", "unit", "neutral", "bounds", "meaning"), *lines]))
 
 
 def _part_page(found: "Registry", kind: str, as_json: bool) -> None:
@@ -358,6 +357,5 @@ def _part_page(found: "Registry", kind: str, as_json: bool) -> None:
                     for r in rows
                 ),
             ],
-            width=columns(),
         )
     )

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from optics.version import __version__
+from optics.words import fitting
 
 if TYPE_CHECKING:
     from optics.scene.loader import Scene
@@ -292,7 +293,8 @@ def _run(arguments: Sequence[str]) -> int:
     with warnings.catch_warnings():
         warnings.showwarning = lambda text, *_: terminal.note(f"warning: {one_line(text)}")
         try:
-            code = int(app(args=arguments, prog_name="optics", standalone_mode=False) or 0)
+            with fitting(columns()):
+                code = int(app(args=arguments, prog_name="optics", standalone_mode=False) or 0)
             return _interrupted() if code == INTERRUPTED else code  # typer says nothing of one outside a command
         except Exception as error:
             return _report(error)

@@ -30,9 +30,35 @@ import numpy as np
 from optics.errors import BadScene, UnknownKey
 from optics.files.output import replacing
 from optics.scene.loader import Scene
-from optics.skin.contact import surface
 
 LABELS = ("force", "pressure", "displacement", "height", "pose", "markers")
+NUMBERS = {  # name -> unit and meaning of what goes to the manifest; of a pose those of the scene's parameters
+    "force": ("N", "of the indenter on the skin, along x, y and into the skin"),
+    "torque": ("N mm", "of the indenter on the skin about the press axis, from x to y"),
+    "contact_area": ("mm^2", "touched area"),
+    "dent_difference": ("mm", "rms distance of the rendered face from the elastic one about the press"),
+    "markers": ("px", "u, v of each marker's cap in the image"),
+    "markers_at_rest": ("px", "u, v while nothing presses"),
+    "marker_motion": ("px", "u, v now less those at rest"),
+    "markers_3d": ("mm", "x, y, z of each marker's cap"),
+}
+ARRAYS = {  # of what is per node
+    "force": ("N", "on each node along x, y and into the skin"),
+    "x": ("mm", "of the columns of nodes of force"),
+    "y": ("mm", "of the rows of nodes of force"),
+    "slip": ("", "whether a node slides"),
+    "displacement": ("mm", "of the elastic skin's face, along the world's axes"),
+    "height": ("mm", "z of the rendered face"),
+    "skin_x": ("mm", "of the columns of nodes of displacement and height"),
+    "skin_y": ("mm", "of the rows of nodes of displacement and height"),
+}
+CHANNELS = {  # of what is per pixel
+    "pressure": ("N/mm^2", "of the indenter on what a pixel sees"),
+    "traction": ("N/mm^2", "shear of the indenter on what a pixel sees, along x and y"),
+    "slip": ("", "1 where the skin slides"),
+    "displacement": ("mm", "of the elastic skin at what a pixel sees, along the world's axes"),
+    "height": ("mm", "z of the rendered face"),
+}
 NODES = 81  # a side, of the arrays over the whole skin
 NEWTON = 12  # steps to a marker's pixel
 STEP = 0.5  # px, of differences of the camera's rays
@@ -78,6 +104,19 @@ def named(scene: Scene, text: str | None) -> tuple[str, ...]:
     return names
 
 
+def described(scene: Scene, names: Sequence[str]) -> dict[str, dict[str, str]]:
+    """Name of a number or of a pose's part -> unit and meaning, of these labels of a scene."""
+    if not names:
+        return {}
+    told = of(scene, None, None, names).numbers
+    found = {name: dict(zip(("unit", "doc"), NUMBERS[name])) for name in told if name != "pose"}
+    part = scene.gel if scene.gel is not None else getattr(scene.block, "target", None)
+    for name in told.get("pose", {}):
+        own = scene.parameters.get(f"{part.name}.{name}")
+        found[f"pose.{name}"] = {"unit": own.unit, "doc": own.doc} if own is not None else {"unit": "", "doc": ""}
+    return found
+
+
 def of(scene: Scene, position: np.ndarray | None, seen: np.ndarray | None, names: Sequence[str]) -> Labels:
     """The labels of the scene as it is set now.
 
@@ -119,17 +158,17 @@ def of(scene: Scene, position: np.ndarray | None, seen: np.ndarray | None, names
             np.float32
         )
     if "displacement" in names:
-        maps, signs = _moved(gel, touch, press), (1.0, 1.0, -1.0)
-        grid = [s * m(x[None, :], y[:, None]) for m, s in zip(maps, signs)]
-        found.arrays |= {"displacement": np.stack(grid, -1), "skin_x": x, "skin_y": y}
+        signs = np.array([1.0, 1.0, -1.0])[:, None, None]
+        grid = signs * _moved(gel, touch, press, x[None, :], y[:, None])
+        found.arrays |= {"displacement": np.moveaxis(grid, 0, -1), "skin_x": x, "skin_y": y}
         rendered = gel.heights(x, y)
         near = np.hypot(x[None, :] - press[0], y[:, None] - press[1]) < gel.numbered("thickness") + touch.axis[-1]
         found.numbers["dent_difference"] = (
             float(np.sqrt(np.mean((grid[2] - rendered)[near] ** 2))) if near.any() else 0.0
         )
         if position is not None:
-            for name, m, s in zip("XYZ", maps, signs):
-                found.channels[f"displacement.{name}"] = np.where(shown, s * m(*at), 0.0)
+            for name, moved in zip("XYZ", signs * _moved(gel, touch, press, *at)):
+                found.channels[f"displacement.{name}"] = np.where(shown, moved, 0.0)
     if "height" in names:
         found.arrays |= {"height": gel.heights(x, y), "skin_x": x, "skin_y": y}
         if position is not None:
@@ -137,16 +176,13 @@ def of(scene: Scene, position: np.ndarray | None, seen: np.ndarray | None, names
     return found
 
 
-def _moved(gel, touch, press):
-    """Functions (x, y) -> mm along x, y and into the skin: the elastic displacement of the face that is seen."""
-    if hasattr(gel, "carry"):
-        rest = lambda x, y: gel.carry(*np.broadcast_arrays(x, y), np.zeros(1))  # noqa: E731
-
-        def component(axis, sign):
-            return lambda x, y: sign * (rest(x, y)[..., axis] - (np.broadcast_arrays(x, y)[axis] if axis < 2 else 0.0))
-
-        return component(0, 1.0), component(1, 1.0), component(2, -1.0)
-    return tuple((lambda x, y, m=m: surface(x, y, *press, m)) for m in touch.displacement())
+def _moved(gel, touch, press, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """(3, ...) mm along x, y and into the skin: the elastic displacement of the face that is seen, at places on it."""
+    if not hasattr(gel, "carry"):
+        return touch.moved(x, y, press)
+    x, y = np.broadcast_arrays(x, y)
+    moved = gel.carry(x, y, np.zeros(1)) - np.stack([x, y, np.zeros(x.shape)], -1)
+    return np.moveaxis(moved, -1, 0) * np.array([1.0, 1.0, -1.0])[:, None, None]
 
 
 def _at(values: np.ndarray, pitch: float, press: tuple[float, float], x: np.ndarray, y: np.ndarray) -> np.ndarray:

@@ -23,6 +23,7 @@ from optics.scene.layer import active_effects
 from optics.scene.mitsuba_parts import is_part
 
 STEPS = 24  # surfaces that a ray may pass
+BLOCK = 8192  # rays at a time in numpy: what they take stays near the processor
 GRAZE = 1e-4  # mm per mm of the coordinates: how far beyond a surface a ray goes on
 
 
@@ -58,7 +59,8 @@ class Path:
     groups: list = field(default_factory=list)
 
     def sequences(self) -> list[tuple[tuple[int, ...], np.ndarray]]:
-        """Rays by the parts that they pass: (indices of the parts, from the camera on; which rays)."""
+        """Rays by the parts that they pass: (indices of the parts, from the camera on; which rays), up to BLOCK of them
+        each."""
         if not self.steps:
             return [((), np.arange(len(self.lost)))]
         if not self.groups:
@@ -66,9 +68,10 @@ class Path:
             for column in table.T:  # one number for each sequence met so far
                 code = np.unique(code * (len(self.names) + 1) + column + 1, return_inverse=True)[1]
             firsts = np.unique(code, return_index=True)[1]
-            self.groups = [
-                (tuple(int(i) for i in table[first]), np.flatnonzero(code == code[first])) for first in firsts
-            ]
+            for first in firsts:
+                rays = np.flatnonzero(code == code[first])
+                parts = tuple(int(i) for i in table[first])
+                self.groups += [(parts, rays[start : start + BLOCK]) for start in range(0, len(rays), BLOCK)]
         return self.groups
 
     def kept(self, group: int, place: int, name: str, scene, values: Mapping, make) -> Mueller:
@@ -102,48 +105,44 @@ def trace(scene, u: np.ndarray, v: np.ndarray) -> Path:
     camera, names = scene.camera, passable(scene)
     n = len(u)
     o, d = camera.ray(mi.Float(u.astype(np.float32)), mi.Float(v.astype(np.float32)))
-    down = camera.turned(mi.Vector3f(0, 1, 0))
-    direction = np.array(d, float).T + np.zeros((n, 3))
-    x = np.cross(np.array(down, float).T, direction)  # across the image's vertical, as Mitsuba's `stokes` has it
-    x /= np.linalg.norm(x, axis=-1, keepdims=True)
-    origin = np.array(o, float).T + np.zeros((n, 3))
+    zero = mi.Vector3d(dr.zeros(mi.Float64, n))
+    direction, origin = mi.Vector3d(d) + zero, mi.Point3d(o) + zero
+    # across the image's vertical, as Mitsuba's `stokes` has it
+    x = dr.normalize(dr.cross(mi.Vector3d(camera.turned(mi.Vector3f(0, 1, 0))), direction))
     wavelengths = scene.integrator.wavelengths(n)
-    steps, lost = [], np.zeros(n, bool)
+    steps, lost = [], dr.zeros(mi.Bool, n)
     extents = {i: e for i, name in enumerate(names) if (e := getattr(scene.parts[name], "extent", lambda: None)())}
+    indices = {i: scene.parts[name].number("index") for i, name in enumerate(names) if scene.declaration(name).refracts}
     layers = [mi.BSDFPtr(scene.parts[name]) for name in names]
     shapes = [mi.ShapePtr(shape) for shape in scene.mitsuba.shapes()]
     for _ in range(STEPS + 1):
-        ray = mi.Ray3f(
-            mi.Point3f(*origin.T.astype(np.float32)),
-            mi.Vector3f(*direction.T.astype(np.float32)),
-            mi.Float(0),
-            wavelengths,
-        )
-        si = scene.mitsuba.ray_intersect(ray)
+        si = scene.mitsuba.ray_intersect(mi.Ray3f(mi.Point3f(origin), mi.Vector3f(direction), mi.Float(0), wavelengths))
         part, shape = (_which(met, pointers) for met, pointers in ((si.bsdf(), layers), (si.shape, shapes)))
-        dr.eval(si, part, shape)  # at once: piece by piece, every array would trace the rays anew
-        part, shape = np.where(lost, -1, np.array(part)), np.array(shape)
-        step, frame = _step(part, si, -direction, x, extents)
-        if not (part >= 0).any():
+        part = dr.select(lost, -1, part)
+        place, normal = _placed(part, si, -direction, x, extents)
+        for i, index in indices.items():
+            if index != 1:
+                direction, x, total = _refract(part == i, direction, x, normal, index)
+                lost |= total
+        p = mi.Point3d(si.p)
+        far = 1 + dr.maximum(dr.maximum(dr.abs(p.x), dr.abs(p.y)), dr.abs(p.z))
+        origin = dr.select(part >= 0, p + direction * (GRAZE * far), origin)
+        # at once: piece by piece, every array would trace the rays anew
+        dr.eval(si, part, shape, place, direction, x, origin, lost)
+        met = np.array(part)
+        step = Step(met, *(np.array(a).T for a in place[:2]), *(np.array(a) for a in place[2:]))
+        if not (met >= 0).any():
             break
         steps.append(step)
-        on = part >= 0
-        p = np.array(si.p, float).T
-        for index, name in enumerate(names):
-            if scene.declaration(name).refracts:
-                here = on & (part == index)
-                direction, x, total = _refract(here, direction, x, frame[2], scene.parts[name].number("index"))
-                lost |= total
-        ahead = p + direction * (GRAZE * (1 + np.abs(p).max(-1, keepdims=True)))
-        origin = np.where(on[:, None], ahead, origin)
     else:
         lost |= part >= 0
+    shape, lost = np.array(shape), np.array(lost)
     # the ray that reaches the end is straight; light that it brings to `origin` leaves the surface towards it
     return Path(
         names,
         steps,
         si,
-        mi.Point3f(*origin.T.astype(np.float32)),
+        mi.Point3f(origin),
         step,
         shape,
         lost,
@@ -177,51 +176,44 @@ def _which(met, pointers: list):
     return found
 
 
-def across(axis: np.ndarray, k: np.ndarray) -> np.ndarray:
-    """The unit vector across k (N, 3) that is nearest to an axis (1 or N, 3)."""
-    x = axis - (axis * k).sum(-1, keepdims=True) * k
-    return x / np.linalg.norm(x, axis=-1, keepdims=True)
+def _placed(part, si, k, x, extents: Mapping) -> tuple[tuple, object]:
+    """(k, x, u, v) of rays at a surface in its own axes, and its normal (Dr.Jit): z the normal, x the first direction
+    of its coordinates; `extents` of parts that stretch."""
+    import drjit as dr
+    import mitsuba as mi
 
-
-def _step(part: np.ndarray, si, k: np.ndarray, x: np.ndarray, extents: Mapping) -> tuple[Step, tuple]:
-    """A surface in its own axes: z the normal, x the first direction of its coordinates; `extents` of parts that
-    stretch."""
-    normal, du, dv, uv = (np.array(a, float).T for a in (si.sh_frame.n, si.dp_du, si.dp_dv, si.uv))
-    ok = np.linalg.norm(du, axis=-1) > 0
-    du = np.where(ok[:, None], du, (1.0, 0.0, 0.0))
-    normal = np.where(ok[:, None], normal, (0.0, 0.0, -1.0))
-    e1 = across(du, normal)
-    e2 = np.cross(normal, e1)
-    axes = np.stack([e1, e2, normal], -2)
-    local = [np.einsum("nij,nj->ni", axes, a) for a in (k, x)]
-    size_u, size_v = np.linalg.norm(du, axis=-1), np.linalg.norm(dv, axis=-1)
+    normal, du, dv = (mi.Vector3d(a) for a in (si.sh_frame.n, si.dp_du, si.dp_dv))
+    size_u, size_v = dr.norm(du), dr.norm(dv)
+    flat = size_u == 0
+    du, normal = dr.select(flat, mi.Vector3d(1, 0, 0), du), dr.select(flat, mi.Vector3d(0, 0, -1), normal)
+    e1 = dr.normalize(du - dr.dot(du, normal) * normal)
+    e2 = dr.cross(normal, e1)
+    own = [mi.Vector3d(*(dr.dot(axis, a) for axis in (e1, e2, normal))) for a in (k, x)]
     for index, (width, length) in extents.items():
-        size_u, size_v = np.where(part == index, width, size_u), np.where(part == index, length, size_v)
-    v = (uv[:, 1] - 0.5) * size_v * np.where((dv * e2).sum(-1) < 0, -1, 1)
-    return Step(part, *local, (uv[:, 0] - 0.5) * size_u, v), (e1, e2, normal)
+        size_u, size_v = dr.select(part == index, width, size_u), dr.select(part == index, length, size_v)
+    u, v = (mi.Float64(a) - 0.5 for a in (si.uv.x, si.uv.y))
+    return (*own, u * size_u, v * size_v * dr.select(dr.dot(dv, e2) < 0, -1.0, 1.0)), normal
 
 
-def _refract(here: np.ndarray, direction: np.ndarray, x: np.ndarray, normal: np.ndarray, index: float) -> tuple:
-    """Directions beyond a boundary, the axes x carried along (s stays s, p stays p), and where nothing passes."""
-    if index == 1 or not here.any():
-        return direction, x, np.zeros(len(here), bool)
-    cos1 = (-direction * normal).sum(-1)
-    front = cos1 >= 0
-    n = np.where(front, index, 1 / index)
-    facing = np.where(front[:, None], normal, -normal)
-    cos1 = np.abs(cos1)
-    square = 1 - (1 - cos1**2) / n**2
+def _refract(here, direction, x, normal, index: float) -> tuple:
+    """Directions beyond a boundary of the rays `here`, the axes x carried along (s stays s, p stays p), and where
+    nothing passes (Dr.Jit)."""
+    import drjit as dr
+
+    cos1 = -dr.dot(direction, normal)
+    n = dr.select(cos1 >= 0, index, 1 / index)
+    facing = dr.select(cos1 >= 0, normal, -normal)
+    cos1 = dr.abs(cos1)
+    square = 1 - (1 - dr.square(cos1)) / dr.square(n)
     total = here & (square <= 0)
-    cos2 = np.sqrt(np.maximum(square, 0))
-    bent = direction / n[:, None] + (cos1 / n - cos2)[:, None] * facing
-    bent /= np.linalg.norm(bent, axis=-1, keepdims=True)
-    s = np.cross(direction, facing)
-    length = np.linalg.norm(s, axis=-1, keepdims=True)
-    s = np.where(length > 1e-9, s / np.maximum(length, 1e-12), x)
-    p, bent_p = np.cross(direction, s), np.cross(bent, s)
-    turned = (x * s).sum(-1, keepdims=True) * s + (x * p).sum(-1, keepdims=True) * bent_p
-    on = (here & ~total)[:, None]
-    return np.where(on, bent, direction), np.where(on, turned, x), total
+    cos2 = dr.sqrt(dr.maximum(square, 0))
+    bent = dr.normalize(direction / n + (cos1 / n - cos2) * facing)
+    s = dr.cross(direction, facing)
+    length = dr.norm(s)
+    s = dr.select(length > 1e-9, s / dr.maximum(length, 1e-12), x)
+    turned = dr.dot(x, s) * s + dr.dot(x, dr.cross(direction, s)) * dr.cross(bent, s)
+    on = here & ~total
+    return dr.select(on, bent, direction), dr.select(on, turned, x), total
 
 
 # -- what light loses ------------------------------------------------------------------------------------------------

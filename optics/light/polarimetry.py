@@ -281,6 +281,7 @@ def _state(vector: np.ndarray | None) -> tuple[float, float]:
 
 
 # -- images ----------------------------------------------------------------------------------------------------------
+GREY = 0.55  # of maps where nothing is said
 DARK, BRIGHT = 2e-3, 1e-2  # of the brightest: nothing is said of pixels below the first, all of those above the second
 
 
@@ -319,8 +320,8 @@ def map_colours(stokes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """sRGB (H, W, B, 3) of the degree (viridis, 0 to 1) and of the angle (`wheel`) of linear polarization; stokes (H,
     W, B, 4).
 
-    Black where a band is dark, and fading from BRIGHT to DARK, so that dim pixels neither make specks nor holes with a
-    sharp rim; angles fade out below a degree of 5 %, where they mean little.
+    GREY where a band is dark, and fading into it from BRIGHT to DARK; angles also below a degree of 5 %, where they
+    mean little. What is polarized and what is not then lies on one ground: black would look like holes in it.
     """
     from matplotlib import colormaps
 
@@ -328,7 +329,9 @@ def map_colours(stokes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     seen = np.clip((level - DARK) / (BRIGHT - DARK), 0, 1)[..., None]
     degree = np.where(seen[..., 0] > 0, np.nan_to_num(mueller.degree_of_polarization(stokes)), 0.0)
     angle = wheel(mueller.angle_of_polarization(stokes))
-    return colormaps["viridis"](degree)[..., :3] * seen, angle * np.clip(degree / 0.05, 0, 1)[..., None] * seen
+    certain = np.clip(degree / 0.05, 0, 1)[..., None] * seen
+    degrees = colormaps["viridis"](degree)[..., :3]
+    return GREY + (degrees - GREY) * seen, GREY + (angle - GREY) * certain
 
 
 def write_maps(files: tuple[Path, Path], bands: Sequence[float], stokes: np.ndarray) -> None:
@@ -343,9 +346,9 @@ def write_maps(files: tuple[Path, Path], bands: Sequence[float], stokes: np.ndar
     rows = -(-count // columns)
     circle = ListedColormap(wheel(np.linspace(0, 180, 256)))
     legends = (
-        ("degree of linear polarization (black: dark)", "viridis", 1, np.linspace(0, 1, 6)),
+        ("degree of linear polarization (grey: dark)", "viridis", 1, np.linspace(0, 1, 6)),
         (
-            "angle of linear polarization, deg: 0 right, 90 up\n(black: dark or unpolarized)",
+            "angle of linear polarization, deg: 0 right, 90 up\n(grey: dark or unpolarized)",
             circle,
             180,
             np.arange(0, 181, 45),

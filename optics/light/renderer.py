@@ -87,6 +87,7 @@ class Renderer:
         self._transmissions: OrderedDict = OrderedDict()
         self._recent: list[paths.Path] = []
         self._hits: OrderedDict = OrderedDict()
+        self._glow: tuple[tuple, LedImage] | None = None  # the image of light that no LED made, and of which values
         self._images: OrderedDict[tuple, LedImage] = OrderedDict()
         self._plain: OrderedDict[tuple, np.ndarray] = OrderedDict()  # of differences, which need nothing else
         image_keys = {k for k, p in scene.parameters.items() if p.how == "image"}
@@ -217,6 +218,7 @@ class Renderer:
     def forget_hits(self) -> None:
         """Release the kept hits: a search over many geometries returns to none of them."""
         self._hits.clear()
+        self._glow = None
 
     def contact_weight(self, values: Mapping, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """1 where the gel is touched at points (x, y) in mm of any shape, 0 elsewhere; between at the rim."""
@@ -349,7 +351,7 @@ class Renderer:
         """Pixels at a rim for any light: in scenes with layers, and in crowded ones, one set of finer samples serves
         all."""
         if hits.joint is None:
-            rim = self._cast if self.crowded else lambda h, part: self._rim(h, self._visible(h.si, part))
+            rim = self._cast if self.crowded else lambda h, part: self._rim(h, self._unshaded(h, part))
             hits.joint = np.logical_or.reduce([hits.edges, *(rim(hits, part) for part in self.scene.leds.values())])
         return hits.joint
 
@@ -439,9 +441,9 @@ class Renderer:
         if key not in self._transmissions:
             if all(
                 path is not other for other in self._recent
-            ):  # matrices are large: those of the last two paths are kept
+            ):  # matrices are large: those of the last geometries, at centres and at finer samples, are kept
                 self._recent.append(path)
-                if len(self._recent) > 4:
+                if len(self._recent) > 2 * min(self.remember, 2):
                     self._recent.pop(0).matrices.clear()
             self._transmissions[key] = paths.transmission(self.scene, path, values, self.wavelengths, component)
             while len(self._transmissions) > 2 * self.remember:
@@ -794,8 +796,11 @@ class Renderer:
         return self._mix(image, image.raw, self.weights(values, image, component))
 
     def glow(self, values: Mapping) -> LedImage:
-        """The image of light that no LED made, in a scene with layers, before these."""
+        """The image of light that no LED made, in a scene with layers, before these; the latest is kept."""
         hits = self.hits(values)
+        key = tuple(values[k] for k in (*self.ambient_keys, *self.shading_keys))
+        if self._glow is not None and self._glow[1].hits is hits and self._glow[0] == key:
+            return self._glow[1]
         rim = self._joint_rim(hits)
         index = np.flatnonzero(rim)
         image = LedImage("", hits, rim, index, self._finer(hits, index), None, None, hits.valid)
@@ -803,6 +808,7 @@ class Renderer:
             self._shone(values, hits.sample),
             self._shone(values, image.finer.sample) if len(index) else None,
         )
+        self._glow = key, image
         return image
 
     def _shone(self, values: Mapping, sample: Sample) -> np.ndarray:

@@ -143,7 +143,7 @@ class RenderJob:
                 "dielectric bodies; allowed: "
                 "without --spp and --stokes, or luminous areas (emitters of the type 'source') in place of LEDs"
             )
-        self.renderer = None if reason else renderer_of(scene, remember=2)
+        self.renderer = None if reason else renderer_of(scene, remember=1)
         if self.renderer is not None and self.renderer.layered:
             reason = veiled(self.renderer, self.base)
             self.renderer = None if reason else self.renderer

@@ -47,6 +47,7 @@ from optics.pages.drawing import (
     webp,
     wrapped,
 )
+from optics.pages.glossary import GLOSSARY, explained
 from optics.study.record import Record
 from optics.study.shown import Fingerprint, Shown
 from optics.words import ANYWHERE, NO_LIMIT, Reach, as_float, below, figures, fixed, share_text, some, spaced
@@ -128,7 +129,8 @@ def render(study: Record) -> str:
     viewer = viewer_images(study, shown) if points is None else NO_IMAGES
     nouns = FRAMES if points is None else SWEEPS
     verdicts = [verdict(told(study.diagnosis(i), points)) for i in range(len(study.steps))]
-    return environment.get_template("report.html.j2").render(
+    page = environment.get_template("report.html.j2").render(
+        glossary=GLOSSARY,
         study=study.ladder,
         steps=study.steps,
         headline=headline(study, verdicts, nouns),
@@ -155,6 +157,7 @@ def render(study: Record) -> str:
         parameters=parameter_tables(study.steps),
         comparisons=comparisons,
     )
+    return explained(page)
 
 
 # -- words -----------------------------------------------------------------------------------------------------------

@@ -151,6 +151,8 @@ def train(
     )
     record = {**asdict(plan), "best_epoch": state["best_epoch"], "validation_loss": state["best"]}
     record |= {"presses": len(parts[0]), "trained_on": dict(one.source)}
+    if start is not None:
+        record["started_from"] = dict(start.record)
     Path(state_file).unlink(missing_ok=True)
     return ForceModel(plan.kind, layers, mean, scale, plan.bins, one.bins, one.face, one.flow, record)
 

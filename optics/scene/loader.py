@@ -58,6 +58,15 @@ def shipped_scenes() -> list[str]:
     return sorted(p.stem for p in shipped("scenes").glob("*.xml"))
 
 
+def told(name: str | Path) -> tuple[str, str]:
+    """What a scene is, and a command worth a first look: the first line of its file's comment, and its line `Look:`;
+    empty where it has none."""
+    comment = re.search(r"<!--(.*?)-->", find(name).read_text(encoding="utf-8"), re.DOTALL)
+    lines = [line.strip() for line in (comment[1] if comment else "").splitlines() if line.strip()]
+    look = next((line.removeprefix("Look:").strip() for line in lines if line.startswith("Look:")), "")
+    return (lines[0] if lines else ""), look
+
+
 def load(
     name: str | Path,
     defines: Mapping[str, str] | None = None,

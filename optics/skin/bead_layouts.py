@@ -22,6 +22,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -43,6 +44,12 @@ PRINTED = {  # N: Table 2
     "6 mm": {"shear": 0.056, "normal": 0.084},
     "1-6 mm": {"shear": 0.018, "normal": 0.048},
 }
+LIMITS = {  # of the constants: name, unit, lowest, highest
+    "distance": ("distance", "mm", max(deep for _, deep in LAYOUTS.values()) + 1, 1e4),
+    "f_by_e": ("f/E", "px mm^2/N", 1.0, 1e6),
+    "poisson": ("Poisson's ratio", "", 0.0, 0.5),
+    "beads": ("beads", "", 10, 100_000),
+}
 ORDER = ("1 mm", "2 mm", "1-6 mm", "6 mm")  # Figures 5 and 6 in words: the worst first
 Progress = Callable[[str, int, int], None]
 
@@ -57,13 +64,8 @@ class Constants:
     beads: int = 3000
 
     def __post_init__(self) -> None:
-        deepest = max(deep for _, deep in LAYOUTS.values())
-        for name, value, unit, low, high in (
-            ("distance", self.distance, "mm", deepest + 1, 1e4),
-            ("f/E", self.f_by_e, "px mm^2/N", 1.0, 1e6),
-            ("Poisson's ratio", self.poisson, "", 0.0, 0.5),
-            ("beads", self.beads, "", 10, 100_000),
-        ):
+        for own, (name, unit, low, high) in LIMITS.items():
+            value = getattr(self, own)
             if not low <= value <= high:
                 raise ValueError(
                     f"{name} = {value:g} {unit}".rstrip() + f"; allowed: {low:g} to {high:g} {unit}".rstrip()
@@ -200,12 +202,8 @@ class Tables:
 
 def tables(constants: Constants = CONSTANTS, draws: int = 20, progress: Progress | None = None) -> Tables:
     """Both tables and the numbers of both figures."""
-    changes = {
-        "f/E + 10 %": {"f_by_e": 1.1 * constants.f_by_e},
-        "d + 10 %": {"distance": 1.1 * constants.distance},
-        "Poisson's ratio - 10 %": {"poisson": 0.9 * constants.poisson},
-        "beads + 10 %": {"beads": min(round(1.1 * constants.beads), 100_000)},
-    }
+    wanted = (("f/E", "f_by_e", 1), ("d", "distance", 1), ("Poisson's ratio", "poisson", -1), ("beads", "beads", 1))
+    changes = dict(_tenth(constants, *each) for each in wanted)
     done, total = 0, (4 + len(changes)) * len(LAYOUTS) * len(FORCES)
     few = min(draws, 5)
 
@@ -238,6 +236,14 @@ def tables(constants: Constants = CONSTANTS, draws: int = 20, progress: Progress
         max(exact(layout, kind) for layout in LAYOUTS for kind in FORCES),
         identified,
     )
+
+
+def _tenth(constants: Constants, title: str, name: str, sign: int) -> tuple[str, dict[str, Any]]:
+    """A constant changed by a tenth: upwards (sign 1), or the other way where that leaves its limits."""
+    now, (_, _, low, high) = getattr(constants, name), LIMITS[name]
+    sign = sign if low <= (1 + sign / 10) * now <= high else -sign
+    after = (1 + sign / 10) * now
+    return f"{title} {'+' if sign > 0 else '-'} 10 %", {name: round(after) if isinstance(now, int) else after}
 
 
 def plot(file: Path, constants: Constants = CONSTANTS, draws: int = 20, progress: Progress | None = None) -> None:

@@ -164,11 +164,16 @@ class Skin:
 
 @lru_cache(maxsize=8)
 def _factor(skin: Skin, c: float, form: str):
-    """Solver of the held skin with its springs: loads (3 N, m) -> displacements (3 N, m)."""
+    return solver(skin, c, form, skin.held)
+
+
+def solver(skin: Skin, c: float, form: str, held: np.ndarray):
+    """Solver of a skin with its springs whose nodes `held` (N,) bool do not move: loads (3 N, m) -> displacements
+    (3 N, m), N and mm."""
     from scipy.sparse import diags
     from scipy.sparse.linalg import splu
 
-    free = np.flatnonzero(np.repeat(~skin.held, 3))
+    free = np.flatnonzero(np.repeat(~held, 3))
     extra = np.zeros(3 * len(skin.nodes))
     for axis in range(3):
         extra[3 * skin.layer(skin.film) + axis] = skin.springs(c, form)
@@ -183,13 +188,18 @@ def _factor(skin: Skin, c: float, form: str):
     return solve
 
 
-def complementary(compliance: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """f >= 0 with A f >= wanted and f (A f - wanted) = 0, for a positive definite A: an active set (Signorini)."""
-    active = wanted > 0
+def complementary(compliance: np.ndarray, wanted: np.ndarray, start: np.ndarray | None = None) -> np.ndarray:
+    """f >= 0 with A f >= wanted and f (A f - wanted) = 0, for a positive definite A: an active set (Signorini).
+
+    start   (N,) bool: the set to begin with; None: where something is wanted"""
+    from scipy.linalg import solve
+
+    active = wanted > 0 if start is None else start
     for _ in range(STEPS):
         force = np.zeros(len(wanted))
         if active.any():
-            force[active] = np.linalg.solve(compliance[np.ix_(active, active)], wanted[active])
+            own = compliance[np.ix_(active, active)]
+            force[active] = solve(own, wanted[active], assume_a="pos", check_finite=False)
         short = wanted - compliance @ force
         changed = np.where(active, force > 0, short > 1e-9 * np.abs(wanted).max())
         if (changed == active).all():

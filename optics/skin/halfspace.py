@@ -34,7 +34,7 @@ log(R + h) -> -2 pi exp(-kh)/k^2; the tests hold it against the point load and a
 from __future__ import annotations
 
 import math
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 
@@ -102,7 +102,9 @@ def displaced(gel, x: np.ndarray, y: np.ndarray, depth: float) -> np.ndarray:
     if hasattr(gel, "carry"):  # a skin that knows better than its dent
         return gel.carry(x, y, depth)
     ux = uy = uz = 0.0
-    if gel is not None and gel.map.values.any():
+    if getattr(gel, "elastic", False):
+        ux, uy, uz = gel.moved(x, y, depth)
+    elif gel is not None and gel.map.values.any():
         press = gel.numbered("press x"), gel.numbered("press y")
         ux, uy, uz = (surface(x, y, *press, m) for m in _carried(gel.map, depth))
         if hasattr(gel, "sheared"):  # a drag of the indenter, besides its dent
@@ -115,7 +117,7 @@ def carried_points(gel, points: np.ndarray) -> np.ndarray:
 
     Of a dent alone the displacement is found at LEVELS depths, and is linear in between."""
     x, y, depth = points[:, 0], points[:, 1], -points[:, 2]
-    if gel is None or not (hasattr(gel, "carry") or gel.map.values.any()):
+    if gel is None or not (hasattr(gel, "carry") or getattr(gel, "elastic", False) or gel.map.values.any()):
         return points.copy()
     if hasattr(gel, "carry"):
         return gel.carry(x, y, depth)
@@ -183,15 +185,25 @@ def _check(pitch: float, poisson: float, *depths: float) -> None:
 class SkinStress:
     """The stress pattern of a pressed skin for a sheet in it (plugins/effects/stress_birefringence.py): f(x, y, size)
     -> (P_q, P_u)
-    in mm.
+    in mm; of an elastic dent, by the face alone.
 
     x, y are the sheet's own axes as the camera sees it (x right, y up): y of the world and 2 s_xy change their signs.
     The integral runs from h1 to h2. Taken over by whoever traces rays, as the scene moves on to other presses."""
 
     def __init__(self, gel, h1: float, h2: float):
         self.press = gel.numbered("press x"), gel.numbered("press y")
-        self.maps = _stress(gel.map, h1, h2) if gel.map.values.any() else None
-        self.texture = None if self.maps is None else Texture(np.stack([m.values for m in self.maps], -1))
+        self.touch = gel.touching() if getattr(gel, "elastic", False) else None
+        self.dent, self.depths = gel.map if self.touch is None else None, (h1, h2)
+
+    @cached_property
+    def maps(self) -> tuple[LocalMap, LocalMap] | None:
+        """Made when first asked for: a sheet without stress asks never."""
+        dent = self.dent if self.touch is None else self.touch.displacement()[2]
+        return _stress(dent, *self.depths) if dent.values.any() else None
+
+    @cached_property
+    def texture(self):
+        return None if self.maps is None else Texture(np.stack([m.values for m in self.maps], -1))
 
     def __call__(self, x, y, size):
         if self.maps is None:

@@ -29,11 +29,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
+from typing import NamedTuple
 
 import numpy as np
 
-from optics.skin.contact import LocalMap, Profile, local_axis
+from optics.skin.contact import LocalMap, Profile, local_axis, surface
 from optics.skin.stack import Layer, fields, half_space, response
 
 NODES = 81  # across the grid of an indenter's contact: a ball's force is then true to 1e-3 of itself
@@ -72,6 +73,11 @@ class Contact:
         return self.pressure > 0
 
     @property
+    def touch(self) -> LocalMap:
+        """1 where the indenter touches, 0 elsewhere."""
+        return LocalMap(self.touched.astype(float), self.pitch)
+
+    @property
     def area(self) -> float:
         """Touched area, mm^2."""
         return float(self.touched.sum() * self.pitch**2)
@@ -93,36 +99,58 @@ class Contact:
         return float((u * self.forces[..., 1] - v * self.forces[..., 0]).sum())
 
     def displacement(self, depth: float = 0.0) -> tuple[LocalMap, LocalMap, LocalMap]:
-        """Displacement of the skin along x, y and inwards (mm) at a depth below the untouched face."""
-        return fields(self.pressure, self.shear, self.pitch, self.stack, depth)
+        """Displacement of the skin along x, y and inwards (mm) at a depth below the untouched face; kept."""
+        if depth not in self._maps:
+            self._maps[depth] = fields(self.pressure, self.shear, self.pitch, self.stack, depth)
+        return self._maps[depth]
+
+    def moved(self, x: np.ndarray, y: np.ndarray, press: tuple[float, float], depth: float = 0.0) -> np.ndarray:
+        """(3, ...) mm along x, y and inwards of the points that rest at (x, y, -depth), mm, of a press at `press`."""
+        return np.stack(np.broadcast_arrays(*(surface(x, y, *press, m) for m in self.displacement(depth))))
+
+    @cached_property
+    def _maps(self) -> dict[float, tuple[LocalMap, LocalMap, LocalMap]]:
+        return {}
+
+    def sideways(self) -> Operator:
+        """The influence of shear on the face's own grid."""
+        return _by_waves(Influence(len(self.axis), self.pitch, self.stack).sideways, len(self.axis))
 
 
 @lru_cache(maxsize=32)
 def indent(profile: Profile, depth: float, stack: tuple[Layer, ...]) -> Contact:
     """The contact of an indenter (optics.skin.contact.indenter_profile) whose lowest point is `depth` mm below the
     untouched face; kept, do not write into it."""
-    from scipy.ndimage import map_coordinates
+    pitch = 2 * reach(profile, depth) / (NODES - 1)
+    return press(depth - lowest(profile, local_axis(NODES, pitch)), pitch, stack)
 
+
+def reach(profile: Profile, depth: float) -> float:
+    """Half width of a grid around the press axis that holds the contact of an indenter, mm."""
     axis = profile.axis
     reached = profile.block(max(depth, 1e-6) * (1 + MARGIN))
     half = max((float(np.abs(axis[side][[0, -1]]).max()) for side in reached if len(axis[side])), default=0.0)
-    half = min(half + profile.pitch, float(axis[-1]))
-    local = np.linspace(-half, half, NODES)
-    at = (local - axis[0]) / profile.pitch
-    height = map_coordinates(profile.envelope, np.meshgrid(at, at, indexing="ij"), order=1)
-    return press(depth - height, 2 * half / (NODES - 1), stack)
+    return min(half + profile.pitch, float(axis[-1]))
 
 
-@lru_cache(maxsize=32)
+def lowest(profile: Profile, local: np.ndarray) -> np.ndarray:
+    """(n, n) mm: height of an indenter over its lowest point, at the nodes of a grid around the press axis."""
+    from scipy.ndimage import map_coordinates
+
+    at = (local - profile.axis[0]) / profile.pitch
+    return map_coordinates(profile.envelope, np.meshgrid(at, at, indexing="ij"), order=1)
+
+
+@lru_cache(maxsize=4)
 def dragged(touch: Contact, move: tuple[float, float], twist: float, friction: float) -> Contact:
     """`drag`, kept."""
     return drag(touch, move, twist, friction)
 
 
-@lru_cache(maxsize=32)
-def sheared(touch: Contact, depth: float) -> tuple[LocalMap, LocalMap, LocalMap]:
-    """What the shear alone does to the skin at a depth, along x, y and inwards, mm; kept."""
-    return fields(np.zeros_like(touch.pressure), touch.shear, touch.pitch, touch.stack, depth)
+@lru_cache(maxsize=4)
+def shear_alone(touch: Contact) -> Contact:
+    """What the shear of a contact does to the skin without its pressure; kept."""
+    return replace(touch, pressure=np.zeros_like(touch.pressure))
 
 
 def press(overlap: np.ndarray, pitch: float, stack: Sequence[Layer]) -> Contact:
@@ -140,7 +168,7 @@ def press(overlap: np.ndarray, pitch: float, stack: Sequence[Layer]) -> Contact:
     none = np.zeros((n, n, 2))
     if overlap.max() <= 0:
         return Contact(overlap, np.zeros((n, n)), none, np.zeros((n, n), bool), pitch, stack)
-    influence = Influence(n, pitch, stack).normal
+    influence = _by_waves(Influence(n, pitch, stack).normal, n)
     pressure = descend(influence, overlap[None], lambda p: np.maximum(p, 0.0), "pressure")[0]
     return Contact(overlap, pressure, none, np.zeros((n, n), bool), pitch, stack)
 
@@ -164,25 +192,36 @@ def drag(touch: Contact, move: tuple[float, float], twist: float, friction: floa
         size = np.hypot(*q)
         return q * np.where(size > limit, limit / np.maximum(size, 1e-300), 1.0)
 
-    influence = Influence(len(axis), touch.pitch, touch.stack)
-    shear = descend(influence.sideways, aim, within, "shear")
+    shear = descend(touch.sideways(), aim, within, "shear")
     slip = touch.touched & (np.hypot(*shear) > limit * (1 - 1e-6))
     return replace(touch, shear=np.moveaxis(shear, 0, -1), slip=slip)
 
 
-def descend(influence: np.ndarray, aim: np.ndarray, project: Callable, what: str) -> np.ndarray:
-    """argmin over allowed x of x K x / 2 - aim x, by projected gradients with momentum.
+class Operator(NamedTuple):
+    """An influence K on a grid: `moved` (c, n, n) of loads (c, n, n), and no less than its largest eigenvalue."""
 
-    influence   (c, c, m, m/2 + 1) transform of K on the doubled grid;   aim  (c, n, n);   project  onto what is allowed
-    """
+    moved: Callable[[np.ndarray], np.ndarray]
+    steepest: float
+
+
+def _by_waves(influence: np.ndarray, n: int) -> Operator:
+    """Of a transform (c, c, m, m/2 + 1) of K on the doubled grid."""
     from scipy.fft import irfft2, rfft2
 
-    n, m = aim.shape[-1], influence.shape[-2]
-    steepest = float(np.linalg.eigvalsh(np.moveaxis(influence, (0, 1), (-2, -1))).max())
+    m = influence.shape[-2]
 
     def moved(x):
         return irfft2(np.einsum("ab...,b...->a...", influence, rfft2(x, (m, m))), (m, m))[:, :n, :n]
 
+    return Operator(moved, float(np.linalg.eigvalsh(np.moveaxis(influence, (0, 1), (-2, -1))).max()))
+
+
+def descend(influence: Operator, aim: np.ndarray, project: Callable, what: str) -> np.ndarray:
+    """argmin over allowed x of x K x / 2 - aim x, by projected gradients with momentum.
+
+    influence   K;   aim  (c, n, n);   project  onto what is allowed
+    """
+    moved, steepest = influence
     x = before = np.zeros_like(aim)
     speed = 1.0
     change = math.inf
@@ -201,8 +240,9 @@ def descend(influence: np.ndarray, aim: np.ndarray, project: Callable, what: str
 
 # -- Influence -------------------------------------------------------------------------------------------------------
 class Influence:
-    """Transforms of the face's displacement under uniform cells, on a grid of twice the nodes: `normal` of the pressure
-    (1, 1, m, m/2 + 1) and `sideways` of the shear (2, 2, m, m/2 + 1)."""
+    """The face's displacement under uniform cells, on a grid of twice the nodes: `cells` (m, m) mm^3/N by the pressure
+    of the cell at [0, 0], others around it; transforms `normal` of it (1, 1, m, m/2 + 1) and `sideways` of the shear
+    (2, 2, m, m/2 + 1)."""
 
     def __init__(self, n: int, pitch: float, stack: tuple[Layer, ...]):
         from scipy.fft import next_fast_len, rfft2
@@ -211,11 +251,13 @@ class Influence:
         place = np.fft.fftfreq(m, 1 / m) * pitch  # a load's cell at 0, all others around it
         normal, xx, yy, xy = _cells(place, pitch, stack[0])
         if len(stack) > 1 or math.isfinite(stack[0].thickness):
-            down, mean, half = _less(float(np.hypot(place.min(), place.min())), stack)
+            reach = float(np.hypot(place.min(), place.min()))
+            down, mean, half = _less(2.0 ** math.ceil(math.log2(reach)), stack)  # few of them, which are kept
             r, turn = np.hypot(place, place[:, None]), 2 * np.arctan2(place[:, None], place)
             normal = normal + down(r) * pitch**2
             xx, yy = (a + (mean(r) - s * np.cos(turn) * half(r)) * pitch**2 for a, s in ((xx, 1), (yy, -1)))
             xy = xy - np.sin(turn) * half(r) * pitch**2
+        self.cells = normal
         self.normal = rfft2(normal)[None, None].real  # even in x and y
         self.sideways = np.array([[rfft2(xx), rfft2(xy)], [rfft2(xy), rfft2(yy)]]).real
 
@@ -254,7 +296,7 @@ def _less(reach: float, stack: tuple[Layer, ...]) -> tuple[Callable, ...]:
     x, w = np.polynomial.legendre.leggauss(nodes)
     k, w = (x + 1) / 2 * DECAY / thin, w / 2 * DECAY / thin
     found, half = response(k, stack), half_space(k, stack[0])
-    r = np.linspace(0.0, 1.01 * reach, max(100, int(8 * reach / thin)))
+    r = np.linspace(0.0, 1.01 * reach, max(200, int(16 * reach / thin)))
     waves = k * r[:, None]
     weight = w * k / (2 * math.pi)
     down = (j0(waves) * (weight * (found.down - half.down))).sum(-1)

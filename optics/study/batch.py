@@ -69,6 +69,7 @@ from optics.study.engines import ENGINES, Status, cores, one_thread, work_throug
 Progress = Callable[[str, int, int], None]
 
 SAMPLES_MOST = 10_000_000  # of one job, whose manifest is one file
+CHECKED = 10_000  # samples of a job whose draws are looked at before any is rendered, evenly over all: a second or two
 RECYCLE = 1000  # samples of one worker: its start, a few seconds, is then a hundredth of its work, or less
 
 
@@ -308,6 +309,24 @@ class Maker:
                 scene.check_press({**self.values, key: value}, where)
             if d.normal is not None:
                 self._check_normal(drawn, where)
+        self._check_draws()
+
+    def _check_draws(self) -> None:
+        """What is drawn together, of up to CHECKED samples: values that a draw of another makes bad."""
+        scene, total = self.images.scene, self.job.total
+        if not self.draws.keys:
+            return
+        gel = scene.gel
+        press = () if gel is None else [scene.key(gel.name, role) for role in ("press depth", "thickness")]
+        rest = {**scene.values(), **self.values}
+        for index in sorted({k * total // min(CHECKED, total) for k in range(min(CHECKED, total))}):
+            where = f"{self.file}: sample {index}"
+            values = self.draws.at(index)
+            scene.check(values, where)
+            if set(values) & set(press) and None not in press:
+                depth, thickness = (values.get(key, rest[key]) for key in press)
+                if depth > thickness:
+                    scene.check_press({**rest, **values}, where)
 
     def _check_normal(self, drawn: Drawn, where: str) -> None:
         """A normal has no ends, so its draws themselves are checked."""
@@ -351,9 +370,14 @@ class Maker:
         return {} if self.draws.posterior is None else {"posterior": self.draws.posterior.table()}
 
     def described(self) -> dict:
-        """Key -> unit and meaning of what is fixed and drawn, for who reads the folder."""
-        found = {key: self.images.scene.parameters[key] for key in [*self.job.parameters, *self.draws.keys]}
-        return {key: {"unit": p.unit, "doc": p.doc} for key, p in found.items()}
+        """Key -> unit and meaning of what is fixed and drawn, and of labels, for who reads the folder."""
+        scene = self.images.scene
+        found = {key: scene.parameters[key] for key in [*self.job.parameters, *self.draws.keys]}
+        labels = labelling.described(scene, self.job.labels)
+        return {
+            **{key: {"unit": p.unit, "doc": p.doc} for key, p in found.items()},
+            **{f"labels.{name}": told for name, told in labels.items()},
+        }
 
     def make(self, index: int) -> dict:
         """Write the files of one sample, each whole or not at all, and return its line of the manifest."""
@@ -519,6 +543,7 @@ def run(
     options: Mapping[str, str] | None = None,
     recycle: int = RECYCLE,
     watch: Callable[[Status], None] | None = None,
+    check_files: bool = False,
 ) -> Result:
     """Make the missing samples of a job's shard. It can be stopped at any moment and called again, and called from
     several machines that share the folder.
@@ -529,6 +554,7 @@ def run(
     on        "local", "slurm" or "ray" (optics.study.engines), with its own `options`
     recycle   samples that a worker makes before a fresh one takes its place
     watch     is told the Status, several times a second
+    check_files   read every file that is there and compare its hash; else only those that were written to since
     Raises BadJob, UnknownKey, OutOfBounds, OutputExists before any rendering, SampleFailed and EngineFailed in its
     course.
     """
@@ -547,7 +573,7 @@ def run(
     if not (folder / "parameters.json").is_file():
         write_json(folder / "parameters.json", maker.described())
     blocks = Blocks(folder, job.total, shard, uuid.uuid4().hex[:8])
-    blocks.verify(progress)
+    blocks.verify(progress, check_files)
     blocks.sweep()
     before = blocks.counts().recorded
     if before < blocks.own:

@@ -14,11 +14,15 @@ system without locks two workers may make the same sample: both write the same b
 
 from __future__ import annotations
 
+import itertools
 import json
+import os
 import shutil
+import stat
+import time
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TextIO
@@ -30,6 +34,7 @@ BLOCKS = (
     256  # blocks that a job has at least, where it has so many samples: twenty workers end within 5 % of each other
 )
 SIZE_MOST = 1000  # samples of a block: a million have a thousand files of records
+TICK = 2_000_000_000  # ns: the coarsest clock of a file system; what was written so shortly before is read
 TRIES = 3  # of one sample in one run, whatever ended them: an error, or a worker that died
 
 Record = dict[str, Any]
@@ -200,10 +205,13 @@ class Blocks:
         }
 
     # -- the folder ---------------------------------------------------------------------------------------------------
-    def verify(self, progress: Any = None) -> None:
-        """Compare every file of the shard's records with its size and hash; what differs counts as not made. Records of
-        blocks that another worker is at are left to it."""
-        if self.finished and not self._verify_manifest(progress):
+    def verify(self, progress: Any = None, all_of_them: bool = False) -> None:
+        """Compare the files of the shard's records with size and hash; what differs counts as not made. Records of
+        blocks that another worker is at are left to it.
+
+        A file of the recorded size that nobody wrote to since its record was written is taken as it is, without reading
+        it; all_of_them: every file is read."""
+        if self.finished and not self._verify_manifest(progress, all_of_them):
             return
         for file in self.folder.glob("manifest*.jsonl"):  # unfinished ones are those of earlier versions
             self._reopen(file)
@@ -212,8 +220,8 @@ class Blocks:
             for kind in ("part", "jsonl"):
                 if not self.file(number, kind).exists():
                     continue
-                block = self.read(number)
-                bad = {i for i, record in block.records.items() if not stands(self.folder, record)}
+                block, since = self.read(number), _since(self.file(number, kind), all_of_them)
+                bad = {i for i, record in block.records.items() if not stands(self.folder, record, since)}
                 checked += len(block.records)
                 if progress:
                     progress("checking what is there", checked, self.own)
@@ -221,33 +229,35 @@ class Blocks:
                     self._drop(number, bad)
                 break
 
-    def _verify_manifest(self, progress: Any) -> bool:
+    def _verify_manifest(self, progress: Any, all_of_them: bool) -> bool:
         """Whether a finished batch must be opened again."""
-        known = 0
+        known, since, began = 0, _since(self.manifest, all_of_them), time.time_ns()
         with open(self.manifest, encoding="utf-8") as lines:
             for line in lines:
                 record = _record(line)
                 if record is None or record["index"] != known:
                     return True
                 known += 1
-                if (record["index"] // self.size) in self.numbers and not stands(self.folder, record):
+                if (record["index"] // self.size) in self.numbers and not stands(self.folder, record, since):
                     return True
                 if progress:
                     progress("checking what is there", known, self.total)
         if known != self.total:
             return True
         shutil.rmtree(self.parts, ignore_errors=True)
+        if len(self.numbers) == self.count:
+            with suppress(OSError):  # of a folder that may only be read
+                os.utime(self.manifest, ns=(began, began))  # what was read now need not be read again
         return False
 
     def _reopen(self, manifest: Path) -> None:
-        """Take the records of a manifest back into blocks."""
-        records: dict[int, dict[int, Record]] = {}
-        for record in _lines(manifest):
-            records.setdefault(record["index"] // self.size, {})[record["index"]] = record
+        """Take the records of a manifest back into blocks, block by block where it is in order."""
         self.parts.mkdir(exist_ok=True)
-        for number, own in records.items():
-            if number < self.count and not self.file(number, "jsonl").exists():
-                self._store(number, {**own, **self.read(number).records})
+        with open(manifest, encoding="utf-8") as lines:
+            records = filter(None, map(_record, lines))
+            for number, own in itertools.groupby(records, lambda record: record["index"] // self.size):
+                if number < self.count and not self.file(number, "jsonl").exists():
+                    self._store(number, {**{r["index"]: r for r in own}, **self.read(number).records})
         manifest.with_suffix(".csv").unlink(missing_ok=True)
         manifest.unlink()
 
@@ -303,13 +313,27 @@ class Blocks:
         return True
 
 
-def stands(folder: Path, record: Mapping) -> bool:
-    """Whether every file of a record is there, with its size and hash."""
+def stands(folder: Path, record: Mapping, since: int = -1) -> bool:
+    """Whether every file of a record is there, with its size and, of those written to after `since` (ns), its hash."""
     for entry in record["files"].values():
         file = folder / entry["file"]
-        if not file.is_file() or file.stat().st_size != entry["size"] or file_hash(file) != entry["hash"]:
+        try:
+            status = file.stat()
+        except OSError:
+            return False
+        if not stat.S_ISREG(status.st_mode) or status.st_size != entry["size"]:
+            return False
+        if status.st_mtime_ns > since and file_hash(file) != entry["hash"]:
             return False
     return True
+
+
+def _since(records: Path, all_of_them: bool) -> int:
+    """When records were written last, ns, less TICK: their files stood by then; -1 where every file is to be read."""
+    try:
+        return -1 if all_of_them else records.stat().st_mtime_ns - TICK
+    except FileNotFoundError:
+        return -1
 
 
 def text(records: Mapping[int, Record]) -> str:

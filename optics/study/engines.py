@@ -100,7 +100,9 @@ def _tied(reader: Connection) -> None:
 class Slurm:
     """Array tasks of a Slurm cluster, through submitit. The folder must lie on a file system that all nodes share.
 
-    Slurm restarts a task whose node fails or is taken away; submitit submits a task again that ran out of time.
+    Slurm restarts a task whose node fails or is taken away; submitit submits a task again that ran out of time. A
+    command that ends, by Ctrl-C as well, cancels its tasks, running or queued. One that is killed cannot: its tasks go
+    on, record what they make, and share the rest with the next command.
     """
 
     name, glance = "slurm", 10 * GLANCE

@@ -7,7 +7,7 @@ The EXR files of the batch stay the master; an export is made from them and can 
                `camera_noisy`, uint8 for a camera of 8 bits and uint16 (of 12 bits: 0 to 4095) beyond
                images "float": what the EXR holds, float32: radiance (H, W, bands), or stokes (H, W, bands, 4), preview,
                depth, normal, contact, led_1 ..., by the names of optics.light.rendering
-               files .npy and .npz of the record, by their own names, with either
+               files .npy of the record by their own names, and .npz as `nodes.` and the names in them, with either
 
 It is written in files of `per_file` samples, each whole or not at all; an interrupted export goes on with the first
 that is missing."""
@@ -33,6 +33,17 @@ from optics.files.output import check_folder, file_hash, replacing, write_json, 
 from optics.light import labels as labelling
 from optics.study.engines import library
 
+NODES = "nodes."  # before the names of what is per node: pixels have such names as well
+PLANES = {  # of what every EXR or camera file holds
+    "camera": ("DN", "the camera's numbers without noise"),
+    "camera_noisy": ("DN", "the camera's numbers"),
+    "preview": ("full scale", "R, G, B of the camera without noise, linear"),
+    "radiance": ("W mm^-2 sr^-1", "per band, for LED powers in W/sr"),
+    "stokes": ("W mm^-2 sr^-1", "S0 to S3 per band"),
+    "depth": ("mm", "from the camera along its axis; infinite where a ray meets nothing"),
+    "normal": ("", "of the surface in the scene's frame"),
+    "contact": ("", "1 where the indenter touches what is seen"),
+}
 PER_FILE = 1000
 CHUNK = 4_000_000  # bytes of a zarr chunk: few files, and one sample is still read fast
 IMAGES = ("camera", "float")
@@ -125,7 +136,7 @@ def _arrays(file: Path, kind: str, images: str) -> dict[str, np.ndarray]:
     """What one file of a sample gives, name -> array."""
     if file.suffix == ".npz":
         with np.load(file, allow_pickle=False) as arrays:
-            return {name: arrays[name] for name in arrays.files}
+            return {NODES + name: arrays[name] for name in arrays.files}
     if file.suffix == ".npy":
         return {kind: np.load(file, allow_pickle=False)}
     if file.suffix == ".png":
@@ -537,7 +548,21 @@ FORMATS: dict[str, type[Format]] = {"webdataset": WebDataset, "hdf5": Hdf5, "zar
 
 
 def unit_of(batch: Batch, key: str) -> str:
-    return batch.parameters.get(key, {}).get("unit", "")
+    return described(batch, key).get("unit", "")
+
+
+def described(batch: Batch, key: str) -> dict[str, str]:
+    """Unit and meaning of a value; of a number in a list (labels.force.0), those of the list."""
+    while key not in batch.parameters and "." in key:
+        key = key.rpartition(".")[0]
+    return dict(batch.parameters.get(key, {}))
+
+
+def array_described(name: str) -> tuple[str, str]:
+    """Unit and meaning of an array; of one LED's image, those of the image."""
+    if name.startswith(NODES):
+        return labelling.ARRAYS.get(name.removeprefix(NODES), ("", ""))
+    return {**PLANES, **labelling.CHANNELS}.get(name.rpartition(".")[2], ("", ""))
 
 
 # -- the export ------------------------------------------------------------------------------------------------------
@@ -671,7 +696,7 @@ def _card(plan: Plan, identity: Mapping, moments: Moments, pattern: str, licence
     for key in plan.first.values:
         drawn = job["sample"].get(key) or job.get("unit", {}).get(key)
         values[key] = {
-            **plan.batch.parameters.get(key, {}),
+            **described(plan.batch, key),
             "drawn": {k: v for k, v in drawn.items() if v is not None} if drawn else None,
             **moments.summary(f"values/{key}"),
         }
@@ -687,7 +712,12 @@ def _card(plan: Plan, identity: Mapping, moments: Moments, pattern: str, licence
         "versions": made["versions"],
         "job": job,
         "arrays": {
-            name: {"shape": list(a.shape), "dtype": str(a.dtype), **moments.summary(f"arrays/{name}")}
+            name: {
+                "shape": list(a.shape),
+                "dtype": str(a.dtype),
+                **dict(zip(("unit", "doc"), array_described(name))),
+                **moments.summary(f"arrays/{name}"),
+            }
             for name, a in plan.first.arrays.items()
         },
         **({"bands_nm": plan.batch.bands()} if plan.first.arrays.keys() & {"radiance", "stokes"} else {}),
@@ -726,9 +756,12 @@ def _page(card: Mapping) -> str:
         "",
         "## Arrays",
         "",
-        "| name | shape | type | range |",
-        "|---|---|---|---|",
-        *(f"| {n} | {a['shape']} | {a['dtype']} | {span(a)} |" for n, a in card["arrays"].items()),
+        "| name | unit | shape | type | range | meaning |",
+        "|---|---|---|---|---|---|",
+        *(
+            f"| {n} | {a.get('unit', '')} | {a['shape']} | {a['dtype']} | {span(a)} | {a.get('doc', '')} |"
+            for n, a in card["arrays"].items()
+        ),
         *(["", f"Bands: {', '.join(f'{b:g}' for b in card['bands_nm'])} nm."] if "bands_nm" in card else []),
         "",
         "## Values",

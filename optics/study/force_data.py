@@ -268,17 +268,19 @@ def measure(
         )
     maker = batch.Maker(job, file, plugins)
     maker.check()
-    records = {r["index"]: r for r in Blocks(maker.folder, job.total).records()}
-    if not records:
+    blocks = Blocks(maker.folder, job.total)
+    total = blocks.counts().recorded
+    if not total:
         raise OutputExists(f"{maker.folder}: no images of {file} are there; make them with optics batch {file}")
     sensor = Sensor(maker)
     rest: Any = maker.images.take(sensor.base).camera
     rest = maker.exposed(rest, job.rng(0, "noise at rest")) if output == "dn" else np.clip(np.round(rest), 0, None)
     readers = {readout: flow.FlowReader(rest, *readout) for readout in readouts}
-    collected, order = Collected(readouts), sorted(records)
-    for done, index in enumerate(order, 1):
-        collected.press(sensor, {**sensor.values, **records[index]["sample"]})
-        path = maker.folder / records[index]["files"][output]["file"]
+    collected, order = Collected(readouts), []  # type: ignore[var-annotated]
+    for record in blocks.records():  # one at a time, in the order of their indices
+        order.append(record["index"])
+        collected.press(sensor, {**sensor.values, **record["sample"]})
+        path = maker.folder / record["files"][output]["file"]
         image, bits = read_image(path, str(path))
         image = image.astype(np.uint8) if bits == 8 else image  # as a camera gives it
         for readout, reader in readers.items():
@@ -287,5 +289,5 @@ def measure(
             collected.seconds[readout] += time.perf_counter() - start
             collected.found[readout].append(tuple(a[None] for a in found))
         if progress:
-            progress("optical flow", done, len(order))
+            progress("optical flow", len(order), total)
     return collected.sets(order, sensor.face, _source(maker, "images"))

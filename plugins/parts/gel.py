@@ -16,10 +16,12 @@ With `fillet` > 0 the skin bridges corners with arcs of that radius: D0 is close
 With `skirt` > 0 the skin beside the contact falls off as exp(-distance / skirt) before the smoothing: in place of D0
 stands the max over touched points p of D0(p) exp(-|x - p| / skirt).
 The forces of a press are those of an elastic skin under the same indenter at the same depth (optics.skin.pressing): E =
-`young`, `poisson`, on a rigid window at its thickness or, with `backing` deep, without end. They are labels: the dent
-that is seen stays the one above. An indenter that came to where it stands by `shift_x`, `shift_y` and a turn by `twist`
-after it had pressed drags along what sticks to it by `friction` (Coulomb); sheets, markers and beads in the gel are
-carried sideways by that shear.
+`young`, `poisson`, on a rigid window at its thickness; with `backing` deep, without end; with `backing` held, held at
+its rim, free behind, and stiffened by `springs` in its middle plane (optics.skin.held). They are labels: the dent that
+is seen stays the one above, unless `dent_model` is elastic: then the face, and what it carries, move as that skin does,
+and `smoothing`, `skirt` and `fillet` do nothing. An indenter that came to where it stands by `shift_x`, `shift_y` and a
+turn by `twist` after it had pressed drags along what sticks to it by `friction` (Coulomb); sheets, markers and beads in
+the gel are carried sideways by that shear.
 By how much a wide press stretches the face is not computed: `stretch`, `stretch_x` ... `stretch_yy` state it, J - 1 = s
 + sx x + sy y + sxx x^2 + sxy x y + syy y^2, J the area of a piece of pressed skin over that at rest, for effects of it.
 Indenters: sphere (`indenter_size` = radius),
@@ -48,12 +50,14 @@ from optics.scene.checking import agree, made
 from optics.scene.declare import Part
 from optics.scene.mitsuba_parts import Declared, coarseness
 from optics.scene.parameter import Parameter
-from optics.skin import contact, pressing
+from optics.skin import contact, held, pressing
 from optics.skin.stack import Layer
 
 FINE = 16  # of a ball's radius, the pitch that a coarser mesh keeps: flanks of balls are off by 1 % of the light
 INDENTER_SIZE = 1.5  # mm
-SHEARING = ("poisson", "friction", "shift_x", "shift_y", "twist")
+DRAG = ("friction", "shift_x", "shift_y", "twist")
+SHEARING = ("poisson", *DRAG)
+ROUNDING = ("smoothing", "skirt", "fillet")  # of the geometric dent
 STRETCH = ("stretch", "stretch_x", "stretch_y", "stretch_xx", "stretch_xy", "stretch_yy")
 STAGE = 0.05  # mm: how well a stage usually knows where it presses
 PARAMETERS = (
@@ -189,7 +193,29 @@ PARAMETERS = (
     ),
     Parameter("young", "MPa", 0.28, (1e-4, 1e4), "Young's modulus", plausible=0.02, how="difference"),
     Parameter("poisson", "1", 0.49, (0.0, 0.5), "Poisson's ratio", plausible=0.005, how="difference"),
-    Parameter("backing", "-", "rigid", choices=("rigid", "deep"), doc="what forces find behind: a window, or more gel"),
+    Parameter(
+        "backing",
+        "-",
+        "rigid",
+        choices=("rigid", "deep", "held"),
+        doc="what forces find behind: a window, more gel, or nothing, the rim being held",
+    ),
+    Parameter(
+        "springs",
+        "N/mm^3",
+        0.0,
+        (0.0, 1e3),
+        "of a held skin: c of the spheroid of springs that stand for a film in its middle plane",
+        plausible=0.001,
+        how="difference",
+    ),
+    Parameter(
+        "dent_model",
+        "-",
+        "geometric",
+        choices=("geometric", "elastic"),
+        doc="what is seen: the indenter's shape with a smoothing, or the face of the elastic skin",
+    ),
     Parameter("friction", "1", 0.8, (0.0, 10.0), "Coulomb's, of indenter and skin", plausible=0.1, how="difference"),
     *(
         Parameter(
@@ -261,6 +287,8 @@ def build():
             "young",
             "poisson",
             "backing",
+            "springs",
+            "dent_model",
             "friction",
             "shift_x",
             "shift_y",
@@ -282,6 +310,7 @@ def build():
             faces = np.stack([a, d, c, a, c, b], -1).reshape(-1, 3)  # normals towards the camera (-z)
             mi.Mesh.__init__(self, "gel", index.size, len(faces), props, True, False)
             self.declare(props)
+            self._map = None
             self.seen_touch = None  # of which a texture was made
             self.recalled = None  # another geometry than the mesh is in, as `recall` has it
             if self.indenter.lower().endswith(contact.FILES):
@@ -294,7 +323,25 @@ def build():
             self.carries = any(getattr(part, "moved_by", None) == self.role for part in scene.parts)
 
         def takes(self, name):
+            if self.elastic:
+                return name not in ROUNDING and (self.carries or name not in DRAG)
             return self.carries or name not in SHEARING  # what is carried sideways is all that shows of a drag
+
+        @property
+        def map(self):
+            """The face's displacement around the press axis (optics.skin.contact.LocalMap)."""
+            if self._map is None:  # of an elastic dent, few ask for it
+                self._map = self.touching().displacement()[2]
+            return self._map
+
+        @map.setter
+        def map(self, found):
+            self._map = found
+
+        @property
+        def elastic(self):
+            """Whether the face that is seen is that of the elastic skin."""
+            return getattr(self, "dent_model", "") == "elastic"
 
         def profile(self, now=None):
             """Lower surface of the indenter (optics.skin.contact.Profile); of the values `now`, or of the gel's own."""
@@ -314,17 +361,32 @@ def build():
             """Displacement and contact maps on the indenter's own grid (optics.skin.contact); of the values `now`, or
             of the gel's own."""
             n = self.number if now is None else now.__getitem__
+            if self.elastic if now is None else now.get("dent_model") == "elastic":
+                touch = self.touching(now)
+                return touch.displacement()[2], touch.touch
             sizes = (n("press_depth"), n("thickness"), n("smoothing"))
             return contact.displacement(self.profile(now), *sizes, skirt=n("skirt"), fillet=n("fillet"))
 
-        def touching(self):
-            """Pressure, shear and forces of the press (optics.skin.pressing.Contact), around (press_x, press_y)."""
-            n = self.number
-            thick = n("thickness") if self.backing == "rigid" else math.inf
-            layer = Layer(thick, n("young"), n("poisson"))
-            touch = pressing.indent(self.profile(), n("press_depth"), (layer,))
+        def touching(self, now=None):
+            """Pressure, shear and forces of the press (optics.skin.pressing.Contact), around (press_x, press_y); of the
+            values `now`, or of the gel's own."""
+            n = self.number if now is None else now.__getitem__
+            backing = self.backing if now is None else now["backing"]
+            if backing == "held":
+                sizes = (n("width"), n("length"), n("thickness"), n("young"), n("poisson"), n("springs"))
+                place = (n("press_x"), n("press_y"))
+                touch = held.indent(self.profile(now), n("press_depth"), place, held.held_skin(*sizes))
+            else:
+                layer = Layer(n("thickness") if backing == "rigid" else math.inf, n("young"), n("poisson"))
+                touch = pressing.indent(self.profile(now), n("press_depth"), (layer,))
             move = (n("shift_x"), n("shift_y"))
             return pressing.dragged(touch, move, math.radians(n("twist")), n("friction"))
+
+        def moved(self, x, y, depth):
+            """(3, ...) mm along x, y and into the gel: how the elastic skin moves what rests at (x, y, -depth); what
+            lies deeper than the gel, as its inner face."""
+            n = self.number
+            return self.touching().moved(x, y, (n("press_x"), n("press_y")), min(depth, n("thickness")))
 
         def sheared(self, x, y, depth):
             """(3, ...) mm along x, y and into the gel: what a drag of the indenter does to points that rest at
@@ -332,16 +394,20 @@ def build():
             n = self.number
             if n("press_depth") <= 0 or not (n("shift_x") or n("shift_y") or n("twist")):
                 return 0.0, 0.0, 0.0
-            maps = pressing.sheared(self.touching(), depth)
-            return tuple(contact.surface(x, y, n("press_x"), n("press_y"), m) for m in maps)
+            alone = pressing.shear_alone(self.touching())
+            return alone.moved(x, y, (n("press_x"), n("press_y")), min(depth, n("thickness")))
 
         def heights(self, x, y):
             """z of the coated face (mm) at x (columns,) and y (rows,), mm, with every `surface` effect: (rows,
             columns)."""
             n = self.number
-            self.map, self.touch = self.press()
             x, y = np.asarray(x, float)[None, :], np.asarray(y, float)[:, None]
-            z = -contact.surface(x, y, n("press_x"), n("press_y"), self.map)
+            if self.elastic:
+                self._map, self.touch = None, self.touching().touch
+                z = -self.moved(x, y, 0.0)[2]
+            else:
+                self.map, self.touch = self.press()
+                z = -contact.surface(x, y, n("press_x"), n("press_y"), self.map)
             for function in self.functions("surface"):
                 z = z + function(x, y, self)
             return z

@@ -47,7 +47,24 @@ MOVED = ("carried", "markers", "target", "beads")  # kinds of shapes that a scen
 OF_IMAGES = tuple(s for s in IMAGE_STAGES if s != "sensitivity")  # stages whose functions are given an image
 LAYERED = ("layer", "detector", "glow")  # stages whose functions are differentiated by complex step
 SECTIONS = ("Definition", "Fingerprint", "Validity", "References")
-UNITS = {"1", "N", "mm", "mm^2", "deg", "rad", "nm", "px", "px^2", "DN", "1/mm", "1/mm^2", "MPa", "1e-12/Pa", "-"}
+UNITS = {
+    "1",
+    "N",
+    "mm",
+    "mm^2",
+    "deg",
+    "rad",
+    "nm",
+    "px",
+    "px^2",
+    "DN",
+    "1/mm",
+    "1/mm^2",
+    "MPa",
+    "1e-12/Pa",
+    "N/mm^3",
+    "-",
+}
 
 IDENTITY = 1e-6  # of full scale: ten roundings of float32
 FLOAT = 3e-7  # relative rounding of an image in float32: what a difference of two images cannot resolve

@@ -83,6 +83,30 @@ def test_markers_are_where_a_robot_finds_them():
     assert pressed.labels.numbers["force"][0] > 0
 
 
+def test_an_elastic_dent_is_the_skin_that_forces_are_of():
+    """What is rendered, what is carried and what labels say are one skin; a geometric dent says how far it is off."""
+    names = ("force", "displacement", "markers")
+    small = {**FINGER, "width": "64", "height": "48", "depth": "2"}
+    told = {}
+    for dent in ("geometric", "elastic"):
+        job, image = taken("vi2tap", {**small, "dent": dent}, names)
+        told[dent] = image.labels.numbers
+    assert told["elastic"]["force"] == told["geometric"]["force"] and told["elastic"]["force"][2] > 0.05
+    assert told["geometric"]["dent_difference"] > 0.3  # mm: a skin that is held at its rim bends as a whole
+    assert told["elastic"]["dent_difference"] < 1e-9
+    skin, film = job.scene.gel, job.scene.parts["film_sheet"]
+    x, y, press = np.array([1.0, 6.0]), np.array([0.5, -4.0]), (1.0, 0.5)
+    import mitsuba as mi
+
+    sheet = np.array(mi.traverse(job.scene.parts["film_sheet"])["vertex_positions"]).reshape(film.rows, film.columns, 3)
+    grid = np.stack(np.meshgrid(*(np.linspace(-h, h, n) for h, n in ((24, film.columns), (21.5, film.rows)))), -1)
+    near = [np.hypot(*(grid - place).transpose(2, 0, 1)).argmin() for place in zip(x, y)]
+    at = grid.reshape(-1, 2)[near]
+    moved = skin.touching().moved(*at.T, press, 2.5)
+    np.testing.assert_allclose(sheet.reshape(-1, 3)[near], np.c_[at + moved[:2].T, -2.5 - moved[2]], atol=1e-5)
+    assert moved[2].max() > 0.8
+
+
 def test_a_fisheye_is_turned_around_as_its_law_says():
     camera = scenes.load("particle_gel", {"width": "96", "height": "96", "beads": "10"}).camera
     rng = np.random.default_rng(0)

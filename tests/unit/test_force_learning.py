@@ -187,6 +187,7 @@ def test_the_scaled_network_learns_a_law_that_it_has_not_seen_and_starts_from_an
     other = FeatureSet(one.motion, one.size, one.angle, one.place, 2 * one.force, FACE, "dense")
     further = training.train(other, training.Plan("scaled", 3, epochs=10, width=64), tmp_path / "b", model)
     np.testing.assert_allclose(further(test).sum(1).mean() / model(test).sum(1).mean(), 2.0, rtol=0.05)
+    assert further.record["started_from"] == model.record and "started_from" not in model.record
     with pytest.raises(BadFeatures, match="to start from"):
         training.train(other, training.Plan("published", 3), tmp_path / "c", model)
 

@@ -52,6 +52,8 @@ def test_published_thresholds_and_the_order_of_the_condition_numbers(optics):
         assert error["6 mm"] == pytest.approx(0.5 * kappa["6 mm"], rel=0.25)
     assert found["exact"] < 1e-12  # (8) without noise, relative
     # twice the optical centre's distance is another sensor
+    code, out, said = optics("force-tables", "--draws", "1", "--distance", "9900", "--beads", "10")
+    assert code == 1 and "d - 10 %" in out and "error" not in said  # which would name what nobody gave
     code, out, _ = optics("force-tables", "--draws", "1", "--distance", "40")
     assert code == 1 and "+" in out
 

@@ -226,7 +226,7 @@ def test_the_colours_of_angles_close_and_keep_their_lightness():
     assert np.ptp(linear @ [0.2126, 0.7152, 0.0722]) < 0.12  # OKLab's lightness is not CIE's luminance, but near it
 
 
-def test_maps_are_black_where_nothing_can_be_said():
+def test_maps_are_grey_where_nothing_can_be_said():
     stokes = np.zeros((2, 2, 1, 4))
     stokes[0, 0, 0] = 1, 0, 1, 0  # polarized along 45 deg
     stokes[0, 1, 0] = 1, 0, 0, 0  # unpolarized
@@ -234,8 +234,8 @@ def test_maps_are_black_where_nothing_can_be_said():
     degree, angle = polarimetry.map_colours(stokes)
     np.testing.assert_allclose(angle[0, 0, 0], polarimetry.wheel(45.0))
     assert degree[0, 0, 0] == pytest.approx([0.99, 0.91, 0.14], abs=0.01)  # the bright end of viridis
-    assert not angle[0, 1].any() and degree[0, 1].any()
-    assert not degree[1].any() and not angle[1].any()
+    assert (angle[0, 1] == polarimetry.GREY).all() and (degree[0, 1] != polarimetry.GREY).any()
+    assert (degree[1] == polarimetry.GREY).all() and (angle[1] == polarimetry.GREY).all()
 
 
 # -- readings against a parameter ------------------------------------------------------------------------------------
@@ -314,4 +314,4 @@ def test_maps_fade_where_light_does():
     for colours in polarimetry.map_colours(stokes):
         assert np.abs(np.diff(colours[0, :, 0], axis=0)).max() < 0.1  # a hard limit steps by all of the colour
         np.testing.assert_allclose(colours[0, level > 0.011, 0], np.broadcast_to(colours[0, :1, 0], (98, 3)), atol=1e-6)
-        assert not colours[0, level < 1.9e-3].any()
+        assert (colours[0, level < 1.9e-3] == polarimetry.GREY).all()

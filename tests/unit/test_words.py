@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from optics import words
 from optics.diagnosis.result import Row
 from optics.diagnosis.text import limit_text, strength_text
 from optics.errors import UnknownKey
@@ -128,6 +129,19 @@ def test_a_fit_says_what_the_captures_do_not_determine():
     assert third.split()[1:3] == ["5", "?"] and "nan" not in third
     page = found._repr_html_()
     assert "12.0 ± 2.0" in page and "not determined" in page and "error unknown" in page
+
+
+def test_tables_fit_the_terminal():
+    rows = [("parameter of a part", "value", "unit", "bounds of it", "neutral", "a derivative's way", "what it means")]
+    rows.append(("led_1.power_of_one", "1.23456", "W/sr", "0 .. 1000", "-", "central differences", "words " * 20))
+    wide = words.table(rows)
+    assert len(wide) > 200
+    for width in (80, 100):
+        with words.fitting(width):
+            narrow = words.table(rows)
+        assert max(map(len, narrow.split("\n"))) <= width
+        assert "".join(narrow.split()).count("words") == 20
+    assert words.table(rows) == wide  # to a file or a program
 
 
 def test_a_pages_table_says_what_a_step_does_not_determine():

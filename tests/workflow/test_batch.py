@@ -17,10 +17,10 @@ import pytest
 from PIL import Image
 
 from optics.cli import main
-from optics.errors import OutputExists
+from optics.errors import OutOfBounds, OutputExists
 from optics.files import exr
 from optics.light.rendering import RenderJob
-from optics.study import batch
+from optics.study import batch, blocks
 from optics.study.blocks import TRIES, Blocks
 from optics.study.engines import EngineFailed, Local, work_through
 
@@ -458,3 +458,36 @@ def test_a_press_deeper_than_the_gel_is_refused_wherever_it_is_stated(tmp_path, 
         assert main(["render", "gelsight", *words, "-o", str(tmp_path / "x.exr")]) == 2
         assert "the gel is 4 mm thick" in capsys.readouterr().err
     assert not (tmp_path / "x.exr").exists()
+
+
+def test_what_nobody_wrote_to_is_not_read_again(tmp_path, monkeypatch):
+    """A finished batch is checked by sizes and times; a changed file is found, and with check_files one whose time was
+    set back."""
+    file = tmp_path / "job.toml"
+    file.write_text(JOB)
+    folder = batch.run(file, workers=1).folder
+    read, plain = [], blocks.file_hash
+    monkeypatch.setattr(blocks, "file_hash", lambda name: read.append(name) or plain(name))
+    long_ago = time.time_ns() - 10 * blocks.TICK
+    for image in (folder / "images").iterdir():
+        os.utime(image, ns=(long_ago, long_ago))
+    assert batch.run(file, workers=1).made == 0 and read == []
+    victim = folder / "images" / "000002.png"
+    whole = victim.read_bytes()
+    victim.write_bytes(whole[:-1] + bytes([whole[-1] ^ 1]))
+    os.utime(victim, ns=(long_ago, long_ago))
+    assert batch.run(file, workers=1).made == 0
+    assert batch.run(file, workers=1, check_files=True).made == 1 and victim.read_bytes() == whole
+    victim.write_bytes(whole[:-1] + bytes([whole[-1] ^ 1]))
+    assert batch.run(file, workers=1).made == 1 and victim.read_bytes() == whole
+
+
+def test_draws_that_are_bad_together_are_named_before_rendering(tmp_path, monkeypatch):
+    """Each value lies within its bounds, and so does each alone in the scene; sample 2 presses deeper than its gel."""
+    file = tmp_path / "job.toml"
+    table = '[sample]\n"gel.thickness" = { grid = [4.0, 1.0] }\n"gel.press_depth" = { grid = [0.5, 1.5] }\n'
+    file.write_text(JOB.split("[sample]")[0].replace("count = 5", "") + table + "[noise]" + JOB.split("[noise]")[1])
+    monkeypatch.setattr(batch, "fill", lambda *a, **k: pytest.fail("it renders"))
+    with pytest.raises(OutOfBounds, match=r"sample 3.*gel.press_depth = 1.5"):
+        batch.run(file, workers=1)
+    assert not (tmp_path / "out").exists()

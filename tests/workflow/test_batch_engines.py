@@ -2,6 +2,7 @@
 
 Ray runs in process and Slurm on this machine (`sinfo` must answer); each test is skipped where its engine is absent."""
 
+import contextlib
 import hashlib
 import os
 import random
@@ -11,6 +12,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -183,6 +185,49 @@ def test_engines_that_are_not_there_are_named(tmp_path, monkeypatch, capsys):
     assert main(["batch", str(job), "--engine", "partition=cpu", "--workers", "2"]) != 0
     assert "unknown option of the engine 'local' 'partition'" in capsys.readouterr().err
     assert not list((tmp_path / "out" / "images").iterdir())
+
+
+def test_ctrl_c_cancels_tasks_of_slurm_that_wait_or_run(tmp_path, monkeypatch):
+    """By a cluster that is none: of four tasks one ended, one runs, two wait. What was recorded stands."""
+
+    class Task:
+        cancelled = False
+
+        def __init__(self, ended):
+            self.done = lambda: ended
+            self.exception = lambda: None
+
+        def cancel(self, check=True):
+            self.cancelled = True
+
+    tasks = []
+
+    class Cluster:
+        def __init__(self, folder, cluster):
+            assert cluster == "slurm"
+
+        def update_parameters(self, **given):
+            assert given["slurm_array_parallelism"] == 2
+
+        def batch(self):
+            return contextlib.nullcontext()
+
+        def submit(self, life):
+            if not tasks:
+                life()  # the first one makes its samples and ends
+            tasks.append(Task(ended=not tasks))
+            return tasks[-1]
+
+    def looked(status):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(engines, "library", lambda *names: SimpleNamespace(AutoExecutor=Cluster))
+    job = job_in(tmp_path, 6)
+    with pytest.raises(KeyboardInterrupt):
+        batch.run(job, on="slurm", workers=2, recycle=2, watch=looked)
+    assert [task.cancelled for task in tasks] == [False] + [True] * (len(tasks) - 1) and len(tasks) >= 3
+    assert Blocks(tmp_path / "out", 6).counts().recorded == 2
+    assert batch.run(job, workers=1).made == 4
 
 
 def test_parameters_that_submitit_lacks_are_named(tmp_path):
