@@ -74,10 +74,8 @@ class Renderer:
                 f"load the scene with variant='{DEFAULT_VARIANT}' or name one band"
             )
         self.layered = paths.layered(scene)
-        bodies = {name: getattr(part, "faces_each", 0) for name, part in scene.parts.items()}
-        self.faces_each = {} if self.layered else {name: faces for name, faces in bodies.items() if faces}
-        self.crowded = bool(self.faces_each)  # by many small bodies, with rims in most pixels
-        self.fine = max((scene.parts[name].fine for name in self.faces_each), default=1)
+        self.crowded = scene.traced is not None and not self.layered  # by many balls, with rims in most pixels
+        self.fine = max((getattr(part, "fine", 1) for part in scene.parts.values()), default=1)
         self.rim_samples = LAYERED_RIM_SAMPLES if self.layered else RIM_SAMPLES
         self.wavelengths = np.array(scene.integrator.bands or (540.0,))
         self.remember = remember
@@ -140,10 +138,14 @@ class Renderer:
             and (move or k not in self._fixed)
         }
         now.update(dict.fromkeys(self.power_keys, 1.0))
-        self.scene.set(now)
+        self.scene.set(now, meshes=not self.crowded)
         gel = self.scene.gel
         if hasattr(gel, "recall"):
             gel.recall(None if move else {n: values[f"{gel.name}.{n}"] for n in (*gel.numbers, *gel.words)})
+
+    def _world(self):
+        """The Mitsuba scene that rays meet."""
+        return self.scene.traced.scene if self.crowded else self.scene.mitsuba
 
     def _trace(self, u: np.ndarray, v: np.ndarray) -> tuple:
         import drjit as dr
@@ -154,8 +156,10 @@ class Renderer:
                 path = paths.trace(self.scene, u, v)
                 return Sample(path.si, mi.UnpolarizedSpectrum(1.0), path.origin, path)
             si, weight, origin = self.scene.integrator.hits(
-                self.scene.mitsuba, self.scene.camera, mi.Float(u.astype(np.float32)), mi.Float(v.astype(np.float32))
+                self._world(), self.scene.camera, mi.Float(u.astype(np.float32)), mi.Float(v.astype(np.float32))
             )
+            if self.crowded:
+                si = self.scene.traced.sharpen(si, origin)
             dr.eval(si, weight, origin)
         return Sample(si, weight, origin)
 
@@ -498,11 +502,12 @@ class Renderer:
         """A few samples for each body that a pixel sees, which weigh what it has of the pixel; of `bent` the middles of
         its quarters, as nothing but shadows has an edge there."""
         here = index[~bent]
-        u, v = self._at(here, self._set(here, CROWDED_RAYS << (self.fine - 1)))
-        row, k, weight = _shares(self._bodies(u, v), *(self.fine * n for n in LIT))
+        places, shifts = self._places(here, CROWDED_RAYS << (self.fine - 1))
+        row, k, weight = _shares(self._bodies(here, places, shifts), *(self.fine * n for n in LIT))
+        taken = self._at(here[row], [((place[k] + shift[row]) % 1)[:, None] for place, shift in zip(places, shifts)])
         quarters = [a.ravel() for a in self._at(index[bent], _grid(2))]
         pixel = np.append(np.flatnonzero(~bent)[row], np.repeat(np.flatnonzero(bent), 4))
-        u, v = (np.append(a[row, k], quarter) for a, quarter in zip((u, v), quarters))
+        u, v = (np.append(a, quarter) for a, quarter in zip(taken, quarters))
         weight = np.append(weight, np.full(len(quarters[0]), 0.25))
         order = np.argsort(pixel, kind="stable")
         sample = self._trace(u[order], v[order]) if len(order) else None
@@ -511,30 +516,38 @@ class Renderer:
     def _parted(self) -> np.ndarray:
         """Pixels in whose corners and middle not one body is seen: also those of bodies that no middle sees."""
         index = np.arange(self.height * self.width)
-        bodies = self._bodies(*self._at(index, CORNERS))
+        bodies = self._bodies(index, CORNERS.astype(np.float32), np.zeros((2, index.size), np.float32))
         return (bodies != bodies[:, :1]).any(1).reshape(self.height, self.width)
 
-    def _bodies(self, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """A number for each body that rays through places in px of any shape meet, other than any other's; 0 where they
-        meet none."""
+    def _bodies(self, index: np.ndarray, places: np.ndarray, shifts: np.ndarray) -> np.ndarray:
+        """(P, n) a number for each body that rays meet, other than any other's; 0 where they meet none.
+
+        index    (P,) of pixels;   places, shifts   (2, n) and (2, P): a ray passes its pixel at the sum, modulo 1"""
         import drjit as dr
         import mitsuba as mi
 
-        o, d = self.scene.camera.ray(mi.Float(u.ravel()), mi.Float(v.ravel()))
-        wavelengths = self.scene.integrator.wavelengths(u.size)
-        met = self.scene.mitsuba.ray_intersect_preliminary(mi.Ray3f(o, d, mi.Float(0), wavelengths), coherent=True)
-        number, first = mi.UInt32(0), 1
-        for shape in self.scene.mitsuba.shapes():
-            faces = self.faces_each.get(shape.id(), 0)
-            own = met.is_valid() & (met.shape == mi.ShapePtr(shape))
-            number = dr.select(own, first + (met.prim_index // faces if faces else 0), number)
-            first += -(-shape.primitive_count() // faces) if faces else 1
-        return np.array(number).reshape(u.shape)
+        count = places.shape[1]
+        ray = dr.arange(mi.UInt32, index.size * count)
+        own, k = ray // count, ray % count
+        corners = (dr.gather(mi.Float, mi.Float(c.astype(np.float32)), own) for c in (index % self.width, index // self.width))
+        within = (
+            dr.gather(mi.Float, mi.Float(place), k) + dr.gather(mi.Float, mi.Float(shift), own)
+            for place, shift in zip(places, shifts)
+        )
+        o, d = self.scene.camera.ray(*(c + at - dr.floor(at) for c, at in zip(corners, within)))
+        wavelengths = self.scene.integrator.wavelengths(dr.width(ray))
+        met = self._world().ray_intersect_preliminary(mi.Ray3f(o, d, mi.Float(0), wavelengths), coherent=True)
+        return np.array(self.scene.traced.number(met)).reshape(index.size, count)
+
+    def _places(self, index: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+        """(2, count) places in a pixel, a Hammersley set, and (2, P) how far it is shifted in each, by the R2
+        sequence."""
+        shifts = np.stack([index * shift % 1.0 for shift in R2])
+        return np.stack([np.arange(count) / count, _reversed(count)]).astype(np.float32), shifts.astype(np.float32)
 
     def _set(self, index: np.ndarray, count: int) -> tuple[np.ndarray, ...]:
         """(P, count) places in pixels: a Hammersley set, shifted in each by the R2 sequence."""
-        places = np.arange(count) / count, _reversed(count)
-        return tuple((place + (index * shift)[:, None]) % 1.0 for place, shift in zip(places, R2))
+        return tuple((place + shift[:, None]) % 1.0 for place, shift in zip(*self._places(index, count)))
 
     def _at(self, index: np.ndarray, places: tuple) -> tuple[np.ndarray, np.ndarray]:
         """(P, n) positions in px of places in pixels."""
@@ -549,7 +562,7 @@ class Renderer:
         integrator = self.scene.integrator
         share = []
         for point in integrator.spots(part):
-            share.append(integrator.visible(self.scene.mitsuba, si, dr.detach(point), part))
+            share.append(integrator.visible(self._world(), si, dr.detach(point), part))
             dr.eval(share[-1])
         return share[0] if len(share) == 1 else share
 
@@ -564,7 +577,7 @@ class Renderer:
         self._tune(sample.si)
         shares, total = visible if isinstance(visible, list) else [visible], 0.0
         for point, seen in zip(self.scene.integrator.spots(part), shares):
-            total += take(self.scene.integrator.direct(self.scene.mitsuba, *sample[:3], part, seen, point))
+            total += take(self.scene.integrator.direct(self._world(), *sample[:3], part, seen, point))
             if len(shares) > 1:
                 dr.eval(total)
         return total / len(shares)
@@ -744,7 +757,7 @@ class Renderer:
                 sampler = mi.load_dict({"type": "independent"})
                 sampler.seed(directions, count)
                 self._tune(sample.si)
-                return self.scene.integrator.bounced(self.scene.mitsuba, *sample[:3], lamp, 1, sampler)
+                return self.scene.integrator.bounced(self._world(), *sample[:3], lamp, 1, sampler)
 
             rows, columns = -(-self.height // BOUNCE_CELL), -(-self.width // BOUNCE_CELL)
             coarse = self._each_band(shade, other).reshape(rows, columns, BOUNCE_SAMPLES, self.bands).mean(2)
@@ -807,7 +820,7 @@ class Renderer:
 
         def shade(membrane):
             self._tune(sample.si)
-            return self.scene.integrator.ambient(self.scene.mitsuba, *sample[:3], membrane) + 0 * sample.si.t
+            return self.scene.integrator.ambient(self._world(), *sample[:3], membrane) + 0 * sample.si.t
 
         found = sum(self._each_band(lambda m=m: shade(m)) for m in self.scene.membranes.values())
         return found if self.integral is None else found * self.integral.white
@@ -904,7 +917,19 @@ def _shares(bodies: np.ndarray, across: int, down: int) -> tuple[np.ndarray, np.
     Columns are the places of a Hammersley set. Those of a number are parted by their first coordinate, then by the
     second, into parts of one size, and the one in the middle of each part is taken."""
     order = np.argsort(_reversed(bodies.shape[1]))  # columns by their second coordinate
-    rows, left, found = np.arange(len(bodies)), np.ones(bodies.shape, bool), []
+    found = [_parts(bodies, rows, order, across, down) for rows in _blocks(len(bodies))]
+    joined = [part for block in found for part in block]
+    return tuple(np.concatenate(parts) for parts in zip(*joined)) if joined else (*np.zeros((2, 0), int), np.zeros(0))
+
+
+def _blocks(count: int, size: int = 4096) -> Iterator[np.ndarray]:
+    """Numbers from 0 to count in blocks whose tables stay in a processor's cache."""
+    return (np.arange(start, min(start + size, count)) for start in range(0, count, size))
+
+
+def _parts(bodies: np.ndarray, rows: np.ndarray, order: np.ndarray, across: int, down: int) -> list[tuple]:
+    """`_shares` of some rows, body by body and part by part."""
+    left, found = np.ones((len(rows), bodies.shape[1]), bool), []
     while len(rows):
         table = bodies[rows]
         own = table == table[np.arange(len(rows)), left.argmax(1)][:, None]
@@ -921,7 +946,7 @@ def _shares(bodies: np.ndarray, across: int, down: int) -> tuple[np.ndarray, np.
         left &= ~own
         more = left.any(1)
         rows, left = rows[more], left[more]
-    return tuple(np.concatenate(parts) for parts in zip(*found)) if found else (*np.zeros((2, 0), int), np.zeros(0))
+    return found
 
 
 def _reversed(count: int) -> np.ndarray:

@@ -88,6 +88,8 @@ def build():
         kind = "beads"
         moved_by = "gel"
         carrier = None
+        aside = False  # whether the mesh waits
+        times = 0  # how often the beads were placed
 
         def __init__(self, props):
             self.count, self.seed = int(props.get("count", 1000)), int(props.get("seed", 0))
@@ -101,7 +103,6 @@ def build():
             ball = trimesh.creation.icosphere(subdivisions=self.detail)
             # Cauchy: the mean silhouette of a convex body is a quarter of its surface
             self.ball = ball.vertices * (4 * np.pi / ball.area) ** 0.5
-            self.faces_each = len(ball.faces)  # by which a face's number tells its bead
             n = len(self.ball)
             faces = ball.faces + n * np.arange(self.count)[:, None, None]
             mi.Mesh.__init__(self, "beads", n * self.count, faces.size // 3, props, True, False)
@@ -142,9 +143,16 @@ def build():
             """(N, 3) present middles in the world, mm, in the order of `rest`."""
             return self.middles.copy()
 
+        def balls(self):
+            """(N, 3) present middles and (N,) radii, mm: what is traced as balls (optics.scene.crowd)."""
+            return self.middles, self.diameters() / 2
+
         def rebuild(self, params):
             """Vertices for the present parameters and dent."""
             self.middles = carried_points(self.carrier, self.rest())
+            self.times += 1
+            if self.aside:
+                return
             radii = self.diameters()[:, None, None] / 2
             vertices = self.middles[:, None].astype(np.float32) + (radii * self.ball).astype(np.float32)
             params["vertex_positions"] = mi.Float(vertices.ravel())
