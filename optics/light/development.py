@@ -94,8 +94,9 @@ class Developer:
 
         u, v (H, W) px; x, y (H, W) normalised coordinates; tan (H, W) tangent of the field angle; focal (px); width,
         height (px); astray() (H, W) px by which a ray off the pupil's middle misses the chief ray, per mm off it, at
-        the distance that the pixel sees; bands (nm); white (B,) radiance per band of white light of radiance 1;
-        settings: all values by key, those of other parts too, (N, 1, 1) where readings were swept."""
+        the distance that the pixel sees; sampled, whether rays started all over the pupil; bands (nm);
+        white (B,) radiance per band of white light of radiance 1; settings: all values by key, those of
+        other parts too, (N, 1, 1) where readings were swept."""
         own = {n: values[f"{self.name}.{n}"] for n in self.names}
 
         def astray() -> np.ndarray:
@@ -118,6 +119,7 @@ class Developer:
             width=self.width,
             height=self.height,
             astray=astray,
+            sampled=getattr(self.camera, "sampled", False),
             bands=np.array(self.bands),
             white=np.ones(len(self.bands)) if self.integral is None else self.integral.white,
             site=self.site,

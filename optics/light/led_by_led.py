@@ -25,8 +25,11 @@ class LedByLed:
 
     def hits(self, scene, camera, u, v):
         """Where the camera's rays through the pixel positions (u, v) meet the membrane: (si, weight, origin)."""
-        o, d = camera.ray(u, v)
-        ray = mi.Ray3f(o, d, mi.Float(0), self.wavelengths(dr.width(u)))
+        return self.reached(scene, *camera.ray(u, v))
+
+    def reached(self, scene, o, d):
+        """Where rays meet the membrane, whatever flat interfaces they pass: (si, weight, origin)."""
+        ray = mi.Ray3f(o, d, mi.Float(0), self.wavelengths(dr.width(o)))
         si = scene.ray_intersect(ray)
         weight = mi.UnpolarizedSpectrum(1.0)
         for _ in range(sum(1 for s in scene.shapes() if is_interface(s))):

@@ -12,6 +12,7 @@ from __future__ import annotations
 import copy
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import NamedTuple
 
@@ -76,6 +77,11 @@ class Renderer:
         self.layered = paths.layered(scene)
         self.crowded = scene.traced is not None and not self.layered  # by many balls, with rims in most pixels
         self.fine = max((getattr(part, "fine", 1) for part in scene.parts.values()), default=1)
+        if self.crowded:  # rays start all over the pupil: it is no longer a blur of the image
+            scene.camera.sampled = True
+            for name in (scene.camera.named("pupil"), scene.camera.named("focus")):
+                key = f"{scene.camera.name}.{name}"
+                scene.parameters[key] = replace(scene.parameters[key], how="difference", step=1.0)
         self.rim_samples = LAYERED_RIM_SAMPLES if self.layered else RIM_SAMPLES
         self.wavelengths = np.array(scene.integrator.bands or (540.0,))
         self.remember = remember
@@ -147,7 +153,19 @@ class Renderer:
         """The Mitsuba scene that rays meet."""
         return self.scene.traced.scene if self.crowded else self.scene.mitsuba
 
-    def _trace(self, u: np.ndarray, v: np.ndarray) -> tuple:
+    def _rays(self, u, v, lens=None):
+        """Origins, directions and weights of the camera's rays in a crowded scene, behind its flat interfaces.
+
+        lens   places in the unit square that stand for the pupil (Dr.Jit); None: its middle"""
+        import drjit as dr
+        import mitsuba as mi
+
+        o, d = self.scene.camera.ray(mi.Float(u), mi.Float(v))
+        if lens is not None:
+            o, d = self.scene.camera.through(mi.Point2f(*lens), o, d)
+        return self.scene.traced.enter(o, d, self.scene.integrator.wavelengths(dr.width(o)))
+
+    def _trace(self, u: np.ndarray, v: np.ndarray, lens: tuple | None = None) -> tuple:
         import drjit as dr
         import mitsuba as mi
 
@@ -155,11 +173,13 @@ class Renderer:
             if self.layered:
                 path = paths.trace(self.scene, u, v)
                 return Sample(path.si, mi.UnpolarizedSpectrum(1.0), path.origin, path)
-            si, weight, origin = self.scene.integrator.hits(
-                self._world(), self.scene.camera, mi.Float(u.astype(np.float32)), mi.Float(v.astype(np.float32))
-            )
+            u, v = (mi.Float(a.astype(np.float32)) for a in (u, v))
             if self.crowded:
+                o, d, weight = self._rays(u, v, lens and tuple(mi.Float(a) for a in lens))
+                si, _, origin = self.scene.integrator.reached(self._world(), o, d)
                 si = self.scene.traced.sharpen(si, origin)
+            else:
+                si, weight, origin = self.scene.integrator.hits(self._world(), self.scene.camera, u, v)
             dr.eval(si, weight, origin)
         return Sample(si, weight, origin)
 
@@ -174,7 +194,7 @@ class Renderer:
         hits = Hits(self._trace(u.ravel(), v.ravel()), self.height, self.width)
         hits.eye = self._eye()
         if self.crowded:
-            hits.edges |= _creases(np.where(hits.valid[..., None], hits.normal, 0.0)) | self._parted()
+            hits.edges |= _creases(np.where(hits.valid[..., None], hits.normal, 0.0)) | self._parted(values)
         hits.edges |= self._painted(hits)
         self._hits[key] = hits
         while len(self._hits) > self.remember:
@@ -501,42 +521,71 @@ class Renderer:
     def _in_bodies(self, index: np.ndarray, bent: np.ndarray) -> Finer:
         """A few samples for each body that a pixel sees, which weigh what it has of the pixel; of `bent` the middles of
         its quarters, as nothing but shadows has an edge there."""
-        here = index[~bent]
-        places, shifts = self._places(here, CROWDED_RAYS << (self.fine - 1))
-        row, k, weight = _shares(self._bodies(here, places, shifts), *(self.fine * n for n in LIT))
+        here, blurred = index[~bent], self.scene.camera.number(self.scene.camera.named("pupil")) > 0
+        count = CROWDED_RAYS << (self.fine - 1)
+        places, shifts = self._places(here, count)
+        lens = _places_on_lens(count, here) if blurred else None
+        row, k, weight = _shares(self._bodies(here, places, shifts, lens), *(self.fine * n for n in LIT))
         taken = self._at(here[row], [((place[k] + shift[row]) % 1)[:, None] for place, shift in zip(places, shifts)])
         quarters = [a.ravel() for a in self._at(index[bent], _grid(2))]
         pixel = np.append(np.flatnonzero(~bent)[row], np.repeat(np.flatnonzero(bent), 4))
         u, v = (np.append(a, quarter) for a, quarter in zip(taken, quarters))
         weight = np.append(weight, np.full(len(quarters[0]), 0.25))
         order = np.argsort(pixel, kind="stable")
-        sample = self._trace(u[order], v[order]) if len(order) else None
+        through = None
+        if lens is not None:
+            own = ((place[k] + shift[row]) % 1 for place, shift in zip(*lens))
+            through = tuple(np.append(a, np.full(len(quarters[0]), 0.5, np.float32))[order] for a in own)
+        sample = self._trace(u[order], v[order], through) if len(order) else None
         return Finer(np.bincount(pixel, minlength=len(index)), sample, weight[order])
 
-    def _parted(self) -> np.ndarray:
-        """Pixels in whose corners and middle not one body is seen: also those of bodies that no middle sees."""
+    def _parted(self, values: Mapping) -> np.ndarray:
+        """Pixels in whose corners and middle not one body is seen: also those of bodies that no middle sees. Behind a
+        pupil, all that are as near to one of these as its circles of confusion are wide."""
+        from scipy.ndimage import maximum_filter
+
         index = np.arange(self.height * self.width)
         bodies = self._bodies(index, CORNERS.astype(np.float32), np.zeros((2, index.size), np.float32))
-        return (bodies != bodies[:, :1]).any(1).reshape(self.height, self.width)
+        parted = (bodies != bodies[:, :1]).any(1).reshape(self.height, self.width)
+        camera = self.scene.camera
+        area = values[f"{camera.name}.{camera.named('pupil')}"]
+        if area == 0:
+            return parted
+        own = SimpleNamespace(**{n: values[f"{camera.name}.{n}"] for n in camera.numbers})
+        v, u = np.mgrid[: self.height, : self.width] + 0.5
+        nearest, farthest = (float(f(p)) for f, p in ((np.min, self._reach()), (np.max, self._reach())))
+        wide = max(np.abs(camera.astray(own, u, v, far)).max() for far in (nearest, farthest))
+        return maximum_filter(parted, 2 * int(np.ceil(wide * np.sqrt(area / np.pi))) + 1)
 
-    def _bodies(self, index: np.ndarray, places: np.ndarray, shifts: np.ndarray) -> np.ndarray:
+    def _reach(self) -> np.ndarray:
+        """Distances of the balls from the camera, mm."""
+        eye = self._eye()
+        return np.concatenate([np.linalg.norm(c.middles - eye, axis=1) for c in self.scene.traced.crowds])
+
+    def _bodies(self, index: np.ndarray, places: np.ndarray, shifts: np.ndarray, lens=None) -> np.ndarray:
         """(P, n) a number for each body that rays meet, other than any other's; 0 where they meet none.
 
-        index    (P,) of pixels;   places, shifts   (2, n) and (2, P): a ray passes its pixel at the sum, modulo 1"""
+        index    (P,) of pixels;   places, shifts   (2, n) and (2, P): a ray passes its pixel at the sum, modulo 1
+        lens     the same of the pupil; None: its middle"""
         import drjit as dr
         import mitsuba as mi
 
         count = places.shape[1]
         ray = dr.arange(mi.UInt32, index.size * count)
         own, k = ray // count, ray % count
-        corners = (dr.gather(mi.Float, mi.Float(c.astype(np.float32)), own) for c in (index % self.width, index // self.width))
-        within = (
-            dr.gather(mi.Float, mi.Float(place), k) + dr.gather(mi.Float, mi.Float(shift), own)
-            for place, shift in zip(places, shifts)
-        )
-        o, d = self.scene.camera.ray(*(c + at - dr.floor(at) for c, at in zip(corners, within)))
+
+        def sums(places, shifts):
+            for place, shift in zip(places, shifts):
+                at = dr.gather(mi.Float, mi.Float(place), k) + dr.gather(mi.Float, mi.Float(shift), own)
+                yield at - dr.floor(at)
+
+        corners = (mi.Float(c.astype(np.float32)) for c in (index % self.width, index // self.width))
+        u, v = (dr.gather(mi.Float, c, own) + at for c, at in zip(corners, sums(places, shifts)))
+        o, d, _ = self._rays(u, v, None if lens is None else tuple(sums(*lens)))
         wavelengths = self.scene.integrator.wavelengths(dr.width(ray))
-        met = self._world().ray_intersect_preliminary(mi.Ray3f(o, d, mi.Float(0), wavelengths), coherent=True)
+        met = self._world().ray_intersect_preliminary(
+            mi.Ray3f(o, d, mi.Float(0), wavelengths), coherent=lens is None
+        )
         return np.array(self.scene.traced.number(met)).reshape(index.size, count)
 
     def _places(self, index: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -902,6 +951,15 @@ class LedImage:
         self.share: np.ndarray | float = 1.0  # (n, 1) of the finer samples in each of those pixels
         self.raw: tuple | None = None  # what the light makes before layers: at centres, at finer samples
         self.radiance: np.ndarray | None = None  # the image, in scenes without layers
+
+
+def _places_on_lens(count: int, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(2, count) places on the unit square that stand for the pupil, to go with those of a pixel, and (2, P) how far
+    they are shifted in each pixel: further coordinates of the R4 sequence, which are in step with no other."""
+    k, step = np.arange(count), 1 / 1.1673039782614187 ** np.arange(1, 5)  # the root of x^5 = x + 1
+    return tuple(
+        np.stack([n * s % 1.0 for s in step[2:]]).astype(np.float32) for n in (k, np.asarray(index) * 1.0)
+    )
 
 
 def _grid(side: int) -> tuple[np.ndarray, np.ndarray]:

@@ -10,6 +10,15 @@ from __future__ import annotations
 import numpy as np
 
 
+BEYOND = 1e-4  # share of the coordinates' size by which a ray starts beyond an interface (optics.light.led_by_led)
+
+
+def _scene(shapes):
+    import mitsuba as mi
+
+    return mi.load_dict({"type": "scene", **{f"shape{k}": shape for k, shape in enumerate(shapes)}}, optimize=False)
+
+
 class Crowd:
     """Balls of one part in a scene of their own, and what a ray meets of them.
 
@@ -71,27 +80,48 @@ class Crowd:
 
 
 class Traced:
-    """The scene that images LED by LED trace: Mitsuba's own, or one with balls in place of crowds' meshes.
+    """The scene that images LED by LED trace: one with balls in place of crowds' meshes.
 
-    scene   Mitsuba's, of other shapes than crowds, and their balls
+    scene    Mitsuba's, of other shapes than crowds, and their balls; without flat interfaces, which light from LEDs
+             passes straight
+    windows  these interfaces, which lie between the camera and all else
     """
 
     def __init__(self, whole, parts):
-        import mitsuba as mi
-
         found = [part for part in parts if hasattr(part, "balls")]
         firsts = np.cumsum([1, *(len(part.balls()[1]) for part in found)])
         self.crowds = [Crowd(part, int(first)) for part, first in zip(found, firsts)]
         self.bodies = int(firsts[-1])  # the first number that no ball has
         others = [shape for shape in whole.shapes() if not any(shape is part for part in found)]
-        members = {f"shape{k}": shape for k, shape in enumerate((*others, *(c.shape for c in self.crowds)))}
-        self.scene = mi.load_dict({"type": "scene", **members}, optimize=False)
+        flat = [shape for shape in others if getattr(shape.bsdf(), "role", "") == "interface"]
+        others = [shape for shape in others if not any(shape is window for window in flat)]
+        self.scene = _scene((*others, *(c.shape for c in self.crowds)))
+        self.windows = [shape.bsdf() for shape in flat]
+        self._front = _scene(flat)
 
     def place(self) -> None:
         """Take up where all shapes are now."""
         for crowd in self.crowds:
             crowd.place()
         self.scene.parameters_changed([])
+        self._front.parameters_changed([])
+
+    def enter(self, o, d, wavelengths):
+        """Rays behind the flat interfaces between the camera and all else, and what these leave of their light."""
+        import drjit as dr
+        import mitsuba as mi
+
+        weight = mi.UnpolarizedSpectrum(1.0)
+        if all(window.number("index") == 1 for window in self.windows):
+            return o, d, weight
+        for _ in self.windows:
+            si = self._front.ray_intersect(mi.Ray3f(o, d, mi.Float(0), wavelengths))
+            flat = si.is_valid()
+            bs, passed = si.bsdf().sample(mi.BSDFContext(), si, mi.Float(0.5), mi.Point2f(0.5), flat)
+            d = dr.select(flat, si.to_world(bs.wo), d)
+            o = dr.select(flat, si.p + d * (BEYOND * (1 + dr.max(dr.abs(si.p)))), o)
+            weight = dr.select(flat, weight * mi.unpolarized_spectrum(passed), weight)
+        return o, d, weight
 
     def sharpen(self, si, origin):
         for crowd in self.crowds:

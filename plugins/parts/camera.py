@@ -115,7 +115,14 @@ PARAMETERS = (
         role="pupil",
     ),
     Parameter(
-        "focus", "mm", 20.0, (0.01, 1e6), "distance of what is sharp, along the axis", plausible=1.0, how="image"
+        "focus",
+        "mm",
+        20.0,
+        (0.01, 1e6),
+        "distance of what is sharp, along the axis",
+        plausible=1.0,
+        how="image",
+        role="focus",
     ),
     Parameter(
         "exposure", "1", 1.0, (0.0, 1e6), "full scale per unit of radiance", plausible=0.1, how="image", role="exposure"
