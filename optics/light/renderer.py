@@ -26,10 +26,7 @@ from optics.scene.mitsuba_parts import DEFAULT_VARIANT
 # per pixel at rims; a power of two. Of an image 36 px wide, chi2 misses a path tracer by 10 to 60 with 64, by 5 to 20
 # with 128
 RIM_SAMPLES = 128
-CROWDED_RAYS = 128  # rays through a pixel of a crowded scene, which tell what share of it each body has
-# of these rays, so many each way are lit in each body of each pixel. Of beads 8 px wide that reach 200 DN, pixels miss
-# their mean by 1.6 DN rms; the noise of a camera is 3
-LIT = 2, 3
+CROWDED_SAMPLES = 16  # of a crowded scene, whose pixels nearly all have rims
 LAYERED_RIM_SAMPLES = 32  # in scenes with layers, whose matrices are multiplied for every sample
 PAINTED = 0.05  # of the largest reflectance of a texture: a step from pixel to pixel that needs finer samples
 # difference of a pixel's mean normal from that at its middle, above which finer samples are taken: a fifth of a grey
@@ -83,6 +80,9 @@ class Renderer:
                 key = f"{scene.camera.name}.{name}"
                 scene.parameters[key] = replace(scene.parameters[key], how="difference", step=1.0)
         self.rim_samples = LAYERED_RIM_SAMPLES if self.layered else RIM_SAMPLES
+        self.bent_side = BENT_SIDE
+        if self.crowded:
+            self.rim_samples, self.bent_side = CROWDED_SAMPLES << (self.fine - 1), 2
         self.wavelengths = np.array(scene.integrator.bands or (540.0,))
         self.remember = remember
         self._transmissions: OrderedDict = OrderedDict()
@@ -175,7 +175,7 @@ class Renderer:
                 return Sample(path.si, mi.UnpolarizedSpectrum(1.0), path.origin, path)
             u, v = (mi.Float(a.astype(np.float32)) for a in (u, v))
             if self.crowded:
-                o, d, weight = self._rays(u, v, lens and tuple(mi.Float(a) for a in lens))
+                o, d, weight = self._rays(u, v, None if lens is None else [mi.Float(a.astype(np.float32)) for a in lens])
                 si, _, origin = self.scene.integrator.reached(self._world(), o, d)
                 si = self.scene.traced.sharpen(si, origin)
             else:
@@ -502,42 +502,25 @@ class Renderer:
         """Finer samples of the pixels `index`; of `bent` among them, where no edge is, fewer."""
         key = (index.tobytes(), np.asarray(bent).tobytes())
         if key not in hits.rims:
-            make = self._in_bodies if self.crowded else self._in_pixels
-            hits.rims = {key: make(index, np.isin(np.arange(len(index)), bent))}  # only the latest is kept
+            hits.rims = {key: self._in_pixels(index, np.isin(np.arange(len(index)), bent))}  # only the latest is kept
         return hits.rims[key]
 
     def _in_pixels(self, index: np.ndarray, bent: np.ndarray) -> Finer:
         """A Hammersley set in each pixel, shifted from pixel to pixel: an edge in any direction crosses the samples one
         by one, and not in rows, so that a shadow that moves changes a pixel in small steps. What only bends is smooth:
-        the middles of a square grid."""
-        counts = np.where(bent, BENT_SIDE**2, self.rim_samples)
+        the middles of a square grid. Behind a pupil each sample has a place on it as well."""
+        counts = np.where(bent, self.bent_side**2, self.rim_samples)
         starts = np.cumsum(counts) - counts
         u, v = np.empty((2, counts.sum()), np.float32)
-        for these, places in ((~bent, self._set(index[~bent], self.rim_samples)), (bent, _grid(BENT_SIDE))):
-            where = starts[these, None] + np.arange(places[0].shape[-1])
-            u[where], v[where] = self._at(index[these], places)
-        return Finer(counts, self._trace(u, v) if len(index) else None)
-
-    def _in_bodies(self, index: np.ndarray, bent: np.ndarray) -> Finer:
-        """A few samples for each body that a pixel sees, which weigh what it has of the pixel; of `bent` the middles of
-        its quarters, as nothing but shadows has an edge there."""
-        here, blurred = index[~bent], self.scene.camera.number(self.scene.camera.named("pupil")) > 0
-        count = CROWDED_RAYS << (self.fine - 1)
-        places, shifts = self._places(here, count)
-        lens = _places_on_lens(count, here) if blurred else None
-        row, k, weight = _shares(self._bodies(here, places, shifts, lens), *(self.fine * n for n in LIT))
-        taken = self._at(here[row], [((place[k] + shift[row]) % 1)[:, None] for place, shift in zip(places, shifts)])
-        quarters = [a.ravel() for a in self._at(index[bent], _grid(2))]
-        pixel = np.append(np.flatnonzero(~bent)[row], np.repeat(np.flatnonzero(bent), 4))
-        u, v = (np.append(a, quarter) for a, quarter in zip(taken, quarters))
-        weight = np.append(weight, np.full(len(quarters[0]), 0.25))
-        order = np.argsort(pixel, kind="stable")
-        through = None
-        if lens is not None:
-            own = ((place[k] + shift[row]) % 1 for place, shift in zip(*lens))
-            through = tuple(np.append(a, np.full(len(quarters[0]), 0.5, np.float32))[order] for a in own)
-        sample = self._trace(u[order], v[order], through) if len(order) else None
-        return Finer(np.bincount(pixel, minlength=len(index)), sample, weight[order])
+        rim = starts[~bent, None] + np.arange(self.rim_samples)
+        middle = starts[bent, None] + np.arange(self.bent_side**2)
+        u[rim], v[rim] = self._at(index[~bent], self._set(index[~bent], self.rim_samples))
+        u[middle], v[middle] = self._at(index[bent], _grid(self.bent_side))
+        lens = None
+        if self.crowded and self.scene.camera.number(self.scene.camera.named("pupil")) > 0:
+            lens = np.full((2, counts.sum()), 0.5, np.float32)
+            lens[:, rim] = _places_on_lens(self.rim_samples, index[~bent])
+        return Finer(counts, self._trace(u, v, lens) if len(index) else None)
 
     def _parted(self, values: Mapping) -> np.ndarray:
         """Pixels in whose corners and middle not one body is seen: also those of bodies that no middle sees. Behind a
@@ -545,7 +528,7 @@ class Renderer:
         from scipy.ndimage import maximum_filter
 
         index = np.arange(self.height * self.width)
-        bodies = self._bodies(index, CORNERS.astype(np.float32), np.zeros((2, index.size), np.float32))
+        bodies = self._bodies(*self._at(index, CORNERS))
         parted = (bodies != bodies[:, :1]).any(1).reshape(self.height, self.width)
         camera = self.scene.camera
         area = values[f"{camera.name}.{camera.named('pupil')}"]
@@ -562,41 +545,23 @@ class Renderer:
         eye = self._eye()
         return np.concatenate([np.linalg.norm(c.middles - eye, axis=1) for c in self.scene.traced.crowds])
 
-    def _bodies(self, index: np.ndarray, places: np.ndarray, shifts: np.ndarray, lens=None) -> np.ndarray:
-        """(P, n) a number for each body that rays meet, other than any other's; 0 where they meet none.
-
-        index    (P,) of pixels;   places, shifts   (2, n) and (2, P): a ray passes its pixel at the sum, modulo 1
-        lens     the same of the pupil; None: its middle"""
+    def _bodies(self, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """A number for each body that rays through places in px of any shape meet, other than any other's; 0 where they
+        meet none."""
         import drjit as dr
         import mitsuba as mi
 
-        count = places.shape[1]
-        ray = dr.arange(mi.UInt32, index.size * count)
-        own, k = ray // count, ray % count
-
-        def sums(places, shifts):
-            for place, shift in zip(places, shifts):
-                at = dr.gather(mi.Float, mi.Float(place), k) + dr.gather(mi.Float, mi.Float(shift), own)
-                yield at - dr.floor(at)
-
-        corners = (mi.Float(c.astype(np.float32)) for c in (index % self.width, index // self.width))
-        u, v = (dr.gather(mi.Float, c, own) + at for c, at in zip(corners, sums(places, shifts)))
-        o, d, _ = self._rays(u, v, None if lens is None else tuple(sums(*lens)))
-        wavelengths = self.scene.integrator.wavelengths(dr.width(ray))
-        met = self._world().ray_intersect_preliminary(
-            mi.Ray3f(o, d, mi.Float(0), wavelengths), coherent=lens is None
+        o, d, _ = self._rays(u.ravel(), v.ravel())
+        ray = mi.Ray3f(o, d, mi.Float(0), self.scene.integrator.wavelengths(dr.width(o)))
+        return np.array(self.scene.traced.number(self._world().ray_intersect_preliminary(ray, coherent=True))).reshape(
+            u.shape
         )
-        return np.array(self.scene.traced.number(met)).reshape(index.size, count)
-
-    def _places(self, index: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-        """(2, count) places in a pixel, a Hammersley set, and (2, P) how far it is shifted in each, by the R2
-        sequence."""
-        shifts = np.stack([index * shift % 1.0 for shift in R2])
-        return np.stack([np.arange(count) / count, _reversed(count)]).astype(np.float32), shifts.astype(np.float32)
 
     def _set(self, index: np.ndarray, count: int) -> tuple[np.ndarray, ...]:
         """(P, count) places in pixels: a Hammersley set, shifted in each by the R2 sequence."""
-        return tuple((place + shift[:, None]) % 1.0 for place, shift in zip(*self._places(index, count)))
+        places = np.arange(count, dtype=np.float32) / count, _reversed(count).astype(np.float32)
+        shifts = ((index * shift % 1.0).astype(np.float32) for shift in R2)
+        return tuple((place + shift[:, None]) % 1.0 for place, shift in zip(places, shifts))
 
     def _at(self, index: np.ndarray, places: tuple) -> tuple[np.ndarray, np.ndarray]:
         """(P, n) positions in px of places in pixels."""
@@ -923,18 +888,15 @@ class Finer:
     """Finer samples of some pixels, those of a pixel behind each other.
 
     counts   (n,) of each pixel;   sample   their ends, N in all; None where no pixel has any
-    weights  (N,) share of its pixel that each stands for; None: all of a pixel the same
     """
 
-    def __init__(self, counts: np.ndarray, sample: Sample | None, weights: np.ndarray | None = None):
-        self.counts, self.sample, self.weights = counts, sample, weights
+    def __init__(self, counts: np.ndarray, sample: Sample | None):
+        self.counts, self.sample = counts, sample
         self.size = int(counts.sum())
         self._starts = np.cumsum(counts) - counts
 
     def mean(self, values: np.ndarray) -> np.ndarray:
         """(n, B) mean in each pixel of values (N, B)."""
-        if self.weights is not None:
-            return np.add.reduceat(values * self.weights[:, None], self._starts)
         return np.add.reduceat(values, self._starts) / self.counts[:, None]
 
     def span(self, values: np.ndarray) -> np.ndarray:
@@ -953,58 +915,17 @@ class LedImage:
         self.radiance: np.ndarray | None = None  # the image, in scenes without layers
 
 
-def _places_on_lens(count: int, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(2, count) places on the unit square that stand for the pupil, to go with those of a pixel, and (2, P) how far
-    they are shifted in each pixel: further coordinates of the R4 sequence, which are in step with no other."""
-    k, step = np.arange(count), 1 / 1.1673039782614187 ** np.arange(1, 5)  # the root of x^5 = x + 1
-    return tuple(
-        np.stack([n * s % 1.0 for s in step[2:]]).astype(np.float32) for n in (k, np.asarray(index) * 1.0)
-    )
+def _places_on_lens(count: int, index: np.ndarray) -> np.ndarray:
+    """(2, P, count) places on the unit square that stand for the pupil, to go with those in pixels: further coordinates
+    of the R4 sequence, which are in step with no other, shifted from pixel to pixel."""
+    step = 1 / 1.1673039782614187 ** np.arange(3, 5)  # powers of the root of x^5 = x + 1
+    return np.stack([(np.arange(count) * s + (np.asarray(index)[:, None] * s * 0.5) % 1.0) % 1.0 for s in step])
 
 
 def _grid(side: int) -> tuple[np.ndarray, np.ndarray]:
     """(n,), (n,) the middles of a square grid in a pixel, row by row."""
     k = np.arange(side**2)
     return (k % side + 0.5) / side, (k // side + 0.5) / side
-
-
-def _shares(bodies: np.ndarray, across: int, down: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rows and columns of a table (P, n) of numbers that stand for it, up to across * down for each number in each row;
-    and the share of the row, 1 in all, that each stands for.
-
-    Columns are the places of a Hammersley set. Those of a number are parted by their first coordinate, then by the
-    second, into parts of one size, and the one in the middle of each part is taken."""
-    order = np.argsort(_reversed(bodies.shape[1]))  # columns by their second coordinate
-    found = [_parts(bodies, rows, order, across, down) for rows in _blocks(len(bodies))]
-    joined = [part for block in found for part in block]
-    return tuple(np.concatenate(parts) for parts in zip(*joined)) if joined else (*np.zeros((2, 0), int), np.zeros(0))
-
-
-def _blocks(count: int, size: int = 4096) -> Iterator[np.ndarray]:
-    """Numbers from 0 to count in blocks whose tables stay in a processor's cache."""
-    return (np.arange(start, min(start + size, count)) for start in range(0, count, size))
-
-
-def _parts(bodies: np.ndarray, rows: np.ndarray, order: np.ndarray, across: int, down: int) -> list[tuple]:
-    """`_shares` of some rows, body by body and part by part."""
-    left, found = np.ones((len(rows), bodies.shape[1]), bool), []
-    while len(rows):
-        table = bodies[rows]
-        own = table == table[np.arange(len(rows)), left.argmax(1)][:, None]
-        count, rank = own.sum(1), own.cumsum(1, dtype=np.int16)
-        for i in range(across):
-            low, high = (count * k // across for k in (i, i + 1))
-            part = (own & (rank > low[:, None]) & (rank <= high[:, None]))[:, order]
-            size, columns = part.sum(1), order[np.nonzero(part)[1]]
-            taken, starts = np.minimum(size, down), np.cumsum(size) - size
-            for j in range(down):
-                some = np.flatnonzero(taken > j)
-                at = starts[some] + ((j + 0.5) * size[some] / taken[some]).astype(int)
-                found.append((rows[some], columns[at], size[some] / taken[some] / bodies.shape[1]))
-        left &= ~own
-        more = left.any(1)
-        rows, left = rows[more], left[more]
-    return found
 
 
 def _reversed(count: int) -> np.ndarray:
