@@ -44,7 +44,7 @@ REMEMBER = 24
 PER_RAY = 250  # bytes of a camera ray's end and its light, by the memory of processes that held ten million of them
 FAINT = 0.05  # of the largest irradiance in a crowded scene: shadows that take less need no finer samples
 BOUNCE_SAMPLES = 32  # directions per cell for the second bounce
-BOUNCE_CELL = 2  # px each way of a cell
+BOUNCE_CELL = 2  # px each way of a cell; 1 in a crowded scene, whose pixels differ
 
 
 class Renderer:
@@ -80,9 +80,10 @@ class Renderer:
                 key = f"{scene.camera.name}.{name}"
                 scene.parameters[key] = replace(scene.parameters[key], how="difference", step=1.0)
         self.rim_samples = LAYERED_RIM_SAMPLES if self.layered else RIM_SAMPLES
-        self.bent_side = BENT_SIDE
+        self.bent_side, self.bounce = BENT_SIDE, (BOUNCE_CELL, BOUNCE_SAMPLES)
         if self.crowded:
             self.rim_samples, self.bent_side = CROWDED_SAMPLES << (self.fine - 1), 2
+            self.bounce = 1, CROWDED_SAMPLES << (self.fine - 1)
         self.wavelengths = np.array(scene.integrator.bands or (540.0,))
         self.remember = remember
         self._transmissions: OrderedDict = OrderedDict()
@@ -773,22 +774,24 @@ class Renderer:
                 self._tune(sample.si)
                 return self.scene.integrator.bounced(self._world(), *sample[:3], lamp, 1, sampler)
 
-            rows, columns = -(-self.height // BOUNCE_CELL), -(-self.width // BOUNCE_CELL)
-            coarse = self._each_band(shade, other).reshape(rows, columns, BOUNCE_SAMPLES, self.bands).mean(2)
-            image = zoom(coarse, (BOUNCE_CELL, BOUNCE_CELL, 1), order=1, mode="nearest", grid_mode=True)
+            cell, samples = self.bounce
+            rows, columns = -(-self.height // cell), -(-self.width // cell)
+            coarse = self._each_band(shade, other).reshape(rows, columns, samples, self.bands).mean(2)
+            image = zoom(coarse, (cell, cell, 1), order=1, mode="nearest", grid_mode=True)
             self._keep_plain(own, image[: self.height, : self.width].astype(float))
         return self._bounced(values, led, self._plain[key], component)
 
     def _spread_rays(self, seed: int) -> tuple[Sample, int, int]:
         """(ends of the camera rays that gather light from all around, seed of their second directions, their number):
         the same for every geometry and LED."""
-        rows, columns = -(-self.height // BOUNCE_CELL), -(-self.width // BOUNCE_CELL)
+        cell, samples = self.bounce
+        rows, columns = -(-self.height // cell), -(-self.width // cell)
         v, u = np.mgrid[:rows, :columns]
         rng = np.random.default_rng([seed, 77])
-        count = u.size * BOUNCE_SAMPLES
-        at = [np.repeat(a.ravel(), BOUNCE_SAMPLES) + rng.random(count) for a in (u, v)]
+        count = u.size * samples
+        at = [np.repeat(a.ravel(), samples) + rng.random(count) for a in (u, v)]
         sample = self._trace(
-            *(np.minimum(a * BOUNCE_CELL, size - 1e-3) for a, size in zip(at, (self.width, self.height)))
+            *(np.minimum(a * cell, size - 1e-3) for a, size in zip(at, (self.width, self.height)))
         )
         return sample, int(rng.integers(2**31)), count
 

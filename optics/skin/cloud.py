@@ -15,12 +15,16 @@ import numpy as np
 JAMMED = 0.384  # of the volume: where random sequential addition of equal balls ends (Widom's problem)
 
 
+def lots(count: int, seed: int) -> np.ndarray:
+    """(N,) one normal number for each bead, which says whether it is large or small."""
+    return np.random.default_rng([seed, 1]).standard_normal(count)
+
+
 def sizes(count: int, diameter: float, spread: float, seed: int) -> np.ndarray:
     """(N,) diameters in mm: log-normal about a mean, with the relative standard deviation `spread`."""
     if spread == 0:
         return np.full(count, float(diameter))
-    normal = np.random.default_rng([seed, 1]).standard_normal(count)
-    return diameter * np.exp(spread * normal - spread**2 / 2)
+    return diameter * np.exp(spread * lots(count, seed) - spread**2 / 2)
 
 
 def draw(

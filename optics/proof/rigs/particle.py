@@ -12,8 +12,8 @@ from optics.scene import loader as scenes
 
 
 class ParticleGel(ImageRig):
-    """Sixty beads under three presses, first and last the same, lit by one ring after the other; one press is held out.
-    8 bits, 4 DN of noise at 150. Clutter and kinds that the library lacks are not made."""
+    """Forty beads under three presses, first and last the same, lit by one ring after the other; one press is held out.
+    0.7 DN of noise in the dark, 1 at 150. Clutter and kinds that the library lacks are not made."""
 
     name = "particle_gel"
     effects = MAKERS
@@ -27,6 +27,8 @@ class ParticleGel(ImageRig):
         "beads": "40",
         "diameter": "1.2",
         "field": "11",
+        "top": "0.65",
+        "bottom": "3.85",
         "fine": "5",
         "detail": "1",
     }
