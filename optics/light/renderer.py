@@ -129,7 +129,8 @@ class Renderer:
 
     # -- geometry -----------------------------------------------------------------------------------------------------
     def geometry(self, values: Mapping) -> tuple:
-        return tuple(values[k] for k in self.geometry_keys)
+        own = tuple(values[k] for k in self.geometry_keys)
+        return (*own, *(c.part.version for c in self.scene.traced.crowds)) if self.crowded else own
 
     def apply(self, values: Mapping, move: bool = True) -> None:
         """Set everything but the LEDs' powers, which stay at 1: images are kept per unit of power.

@@ -345,6 +345,18 @@ class Scene:
             for part in self._crowds:
                 part.aside = False
 
+    def put(self, name: str, points, diameters=None) -> None:
+        """Give the bodies of a crowd (N, 3) places at rest, mm, and (N,) diameters; meshes follow when they are asked
+        for."""
+        part = self.parts[name]
+        part.put(points, diameters)
+        part.aside = True
+        try:
+            move([part])
+        finally:
+            part.aside = False
+        self._behind = True
+
     def check_press(self, values: Mapping[str, float | str], where: str) -> None:
         """Raises OutOfBounds for a press that is deeper than its gel is thick, of values that someone states.
 
