@@ -68,7 +68,7 @@ class ParticleMaker:
         if unknown:
             raise ValueError(f"no independent way to make {', '.join(sorted(unknown))}; known: {', '.join(MAKERS)}")
         self.noise, self.seed = noise, seed
-        self.side = 2 * side if "defocus" in self.effects else side  # rays that cross a pupil scatter
+        self.side = round(1.5 * side) if "defocus" in self.effects else side  # rays that cross a pupil scatter
         self.size, self.bands = scene.camera.resolution, np.array(scene.integrator.bands)
         self.camera_z = float(scene.camera.columns[3].z[0])
         beads = scene.parts["beads"]
@@ -176,11 +176,17 @@ class ParticleMaker:
     def rays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Origins, directions (N, 3) and angles from the axis (N,) of all rays, those of a pixel behind each other."""
         v, (width, height) = self.values, self.size
-        k = (np.arange(self.side) + 0.5) / self.side
-        row, column, down, across = np.meshgrid(np.arange(height), np.arange(width), k, k, indexing="ij")
+        n = self.side**2
+        # the R2 sequence, shifted at random from pixel to pixel: no two rays of a pixel share a row or a column, so that
+        # a rim that moves by a thousandth of a pixel changes it by as much
+        shift = np.random.default_rng([self.seed, 9]).random((2, width * height)).repeat(n, axis=1)
+        k = np.tile(np.arange(n), width * height)
+        pixel = np.arange(width * height).repeat(n)
+        across, down = ((k * step + own) % 1.0 for step, own in zip((0.7548776662466927, 0.5698402909980532), shift))
+        row, column = pixel // width, pixel % width
         focal = width / 2 / np.radians(v["camera.x_fov"] / 2)
-        x = (column + across - width / 2 - v["camera.principal_x"]).ravel() / focal
-        y = (row + down - height / 2 - v["camera.principal_y"]).ravel() / focal
+        x = (column + across - width / 2 - v["camera.principal_x"]) / focal
+        y = (row + down - height / 2 - v["camera.principal_y"]) / focal
         theta = np.hypot(x, y)
         sine = np.sinc(theta / np.pi)
         d = np.stack([x * sine, y * sine, np.cos(theta)], 1)
@@ -188,12 +194,10 @@ class ParticleMaker:
         area = self.effects.get("defocus", 0.0)
         if area:
             rng = np.random.default_rng([self.seed, 5])
-            # equal areas in radius and angle, by the R2 sequence from ray to ray, shifted from pixel to pixel
-            n = self.side**2
-            k = np.arange(len(d))
-            shift = rng.random((2, len(d) // n)).repeat(n, axis=1)
-            radius = np.sqrt((k * 0.7548776662466927 + shift[0]) % 1.0 * area / np.pi)
-            angle = 2 * np.pi * (k * 0.5698402909980532 + shift[1])
+            # equal areas in radius and angle, by further irrational steps, shifted from pixel to pixel
+            shift = rng.random((2, width * height)).repeat(n, axis=1)
+            radius = np.sqrt((k * 0.6180339887498949 + shift[0]) % 1.0 * area / np.pi)
+            angle = 2 * np.pi * (k * 0.4142135623730951 + shift[1])
             side = np.cross(d, [0.0, 1.0, 0.0])
             side /= np.linalg.norm(side, axis=1, keepdims=True)
             up = np.cross(d, side)
