@@ -7,10 +7,29 @@ of a million triangles takes a second, and a ray costs a third."""
 
 from __future__ import annotations
 
+import contextlib
+import os
+import sys
+from collections.abc import Iterator
+
 import numpy as np
 
 
 BEYOND = 1e-4  # share of the coordinates' size by which a ray starts beyond an interface (optics.light.led_by_led)
+
+
+@contextlib.contextmanager
+def _remarks_away() -> Iterator[None]:
+    """Without what nanobind writes to stderr of the types that a tensor is not, when Mitsuba takes one as a property."""
+    sys.stderr.flush()
+    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nowhere, 2)
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(nowhere)
 
 
 def _scene(shapes):
@@ -30,7 +49,8 @@ class Crowd:
 
         self.part, self.first = part, first
         self.count = len(part.balls()[1])
-        self.shape = mi.load_dict({"type": "ellipsoids", **self._tensors(), "extent": 1.0, "bsdf": part.bsdf()})
+        with _remarks_away():
+            self.shape = mi.load_dict({"type": "ellipsoids", **self._tensors(), "extent": 1.0, "bsdf": part.bsdf()})
         self.place()
 
     def _tensors(self):
