@@ -1,21 +1,22 @@
 """Places of many small bodies, refined together with the scene's parameters: a sparse problem.
 
 A thousand beads in a gel have three unknown coordinates each, and each touches a few pixels only. Derivative images of
-many beads are made at once: beads whose outlines stay apart in all frames share a colour (Curtis, Powell & Reid, J. Inst.
-Math. Appl. 13 (1974) 117), and all of a colour are moved together. With the derivatives J of the places, sparse, and K
+many beads are made at once: beads whose outlines stay apart in all frames share a colour (Curtis, Powell & Reid, J.
+Inst. Math. Appl. 13 (1974) 117), and all of a colour are moved together. With the derivatives J of the places, sparse, and K
 of the scene's parameters, dense, the normal equations
 
     [A  B] [x]   [a]        A = J'WJ + priors, sparse: beads that share a pixel        a = J'W(y - f)
     [B' C] [z] = [b]        B = J'WK,  C = K'WK + priors                               b = K'W(y - f)
 
-are solved by eliminating the beads: (C - B'A^-1 B) z = b - B'A^-1 a (Schur's complement), then A x = a - B z. Derivatives
-leave out what a bead's shadow does beyond its own outline: that slows the steps, and moves nothing where they end, as
+are solved by eliminating the beads: (C - B'A^-1 B) z = b - B'A^-1 a (Schur's complement), then A x = a - B z.
+Derivatives leave out what a bead's shadow does beyond its own outline: that slows the steps, and moves nothing where they end, as
 the residual there is noise."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -31,7 +32,12 @@ ALONG = 0.02  # of the distance, along the line of sight: a fiftieth of the outl
 MARGIN = 2.0  # px beyond an outline that a bead still changes
 WORTH = 0.02  # fall of what is minimised per variable that is not worth another step
 DAMPING = 1e-3
+CHORDS, MOST_POOR = 10, 4  # steps on the same derivatives, and those without a gain that are tried
+PART = 0.05  # of what the steps on these derivatives gained: a step that gains less is better followed by new ones
 LARGEST = 4.0  # half widths of the differences, by which one step moves a bead at most
+
+
+State = tuple[list[np.ndarray], list[np.ndarray]]  # predictions and residuals of frames
 
 
 @dataclass
@@ -71,7 +77,7 @@ def refine(
     depth_prior   mean and standard deviation of -z, mm, that hold for every bead before it is seen
 
     Leaves the scene with the places that were found. Raises BadScene where the part has no places to fit."""
-    part = model.scene.parts.get(name)
+    part: Any = model.scene.parts.get(name)
     if part is None or not hasattr(part, "put"):
         raise BadScene(f"'{name}' is no part with places to fit; allowed: a part of the kind 'beads'")
     problem = _Problem(model, part, list(variables), list(range(len(model.frames)) if frames is None else frames))
@@ -85,17 +91,23 @@ def refine(
             progress("places", iteration, max_iterations)
         equations = problem.linearise(points, values, state)
         history.append(equations.total)
-        gained = promised = 0.0
-        for _ in range(6):
-            x, z, promised = equations.step(damping)
+        gained, poor = 0.0, 0
+        for _ in range(CHORDS):  # on the same derivatives, which cost as much as some twenty steps
+            x, z = equations.step(damping)
             moved = problem.moved(points, x), problem.put(values, z)
             trial = problem.residual(*moved)
-            gained = equations.total - problem.total(*moved, trial)
-            if gained > 0:
+            gain = equations.total - problem.total(*moved, trial)
+            if gain > 0:
                 (points, values), state = moved, trial
+                gained += gain
+                equations.renew(points, values, state)
                 damping = max(damping / 5, 1e-8)
-                break
-            damping = max(damping * 8, DAMPING)
+                if gain < PART * gained:
+                    break
+            else:
+                damping, poor = max(damping * 8, DAMPING), poor + 1
+                if gained or poor > MOST_POOR:
+                    break
         if gained < WORTH * (points.size + len(problem.variables)):
             break
     equations = problem.linearise(points, values, state)
@@ -111,18 +123,18 @@ class _Problem:
 
     prior: tuple[float, float] | None = None
 
-    def __init__(self, model: SceneModel, part, variables: list[Variable], frames: list[int]):
+    def __init__(self, model: SceneModel, part: Any, variables: list[Variable], frames: list[int]):
         self.model, self.part, self.variables, self.frames = model, part, variables, frames
         self.pixels = [(f, model.usable(f)) for f in frames]
 
     def place(self, points: np.ndarray) -> None:
         self.model.scene.put(self.part.name, points, self.part.measured)
 
-    def predict(self, points, values) -> list[np.ndarray]:
+    def predict(self, points: np.ndarray, values: Values) -> list[np.ndarray]:
         self.place(points)
         return self.model.predict(values, self.frames)
 
-    def residual(self, points, values) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    def residual(self, points: np.ndarray, values: Values) -> State:
         """Predictions, and the residuals of all frames."""
         found = self.predict(points, values)
         return found, [self.model.frames[f].image - p for f, p in zip(self.frames, found)]
@@ -139,11 +151,11 @@ class _Problem:
         step = np.clip(x.reshape(-1, 3), -LARGEST, LARGEST)
         return points + np.einsum("nkc,nk->nc", self.axes, step)
 
-    def total(self, points, values, state) -> float:
+    def total(self, points: np.ndarray, values: Values, state: State) -> float:
         chi2 = sum(float((r**2 * s**2).sum()) for r, s in zip(state[1], self.scales))
         return chi2 + self.of_priors(points) + prior_terms(self.model, self.variables, values)[2]
 
-    def of_priors(self, points) -> float:
+    def of_priors(self, points: np.ndarray) -> float:
         return 0.0 if self.prior is None else float((((-points[:, 2] - self.prior[0]) / self.prior[1]) ** 2).sum())
 
     def look(self, points: np.ndarray, values: Values) -> None:
@@ -202,7 +214,7 @@ class _Problem:
             colour[k] = next(c for c in range(count + 1) if c not in taken)
         return [np.flatnonzero(colour == c) for c in range(colour.max() + 1)]
 
-    def linearise(self, points: np.ndarray, values: Values, state) -> _Equations:
+    def linearise(self, points: np.ndarray, values: Values, state: State) -> _Equations:
         from scipy.sparse import coo_matrix
 
         model, channels = self.model, self.model.shape[2]
@@ -239,24 +251,33 @@ class _Problem:
 class _Equations:
     """Normal equations of a problem at one point."""
 
-    def __init__(self, problem: _Problem, j, k: np.ndarray, r: np.ndarray, points: np.ndarray, values: Values):
+    def __init__(self, problem: _Problem, j: Any, k: np.ndarray, r: np.ndarray, points: np.ndarray, values: Values):
         from scipy.sparse import block_diag, csc_matrix
 
-        self.problem = problem
+        self.problem, self.j, self.k = problem, j, k
         self.a, self.b, self.c = csc_matrix(j.T @ j), j.T @ k, k.T @ k
-        self.ra, self.rb = j.T @ r, k.T @ r
         if problem.prior is not None:
-            mean, sd = problem.prior
-            slope = -problem.axes[:, :, 2] / sd  # of the depth, in standard deviations
-            self.a = self.a + csc_matrix(block_diag([np.outer(s, s) for s in slope]))
-            self.ra = self.ra - (slope * ((-points[:, 2] - mean) / sd)[:, None]).ravel()
-        pull, curvature, _ = prior_terms(problem.model, problem.variables, values)
-        self.c, self.rb = self.c + np.diag(curvature), self.rb + pull
-        self.chi2 = float(r @ r)
-        self.total = self.chi2 + problem.of_priors(points) + prior_terms(problem.model, problem.variables, values)[2]
+            self.slope = -problem.axes[:, :, 2] / problem.prior[1]  # of the depth, in standard deviations
+            self.a = self.a + csc_matrix(block_diag([np.outer(s, s) for s in self.slope]))
+        self.c = self.c + np.diag(prior_terms(problem.model, problem.variables, values)[1])
+        self.toward(r, points, values)
         self.dof = int(sum(u.sum() for _, u in problem.pixels)) - points.size - len(problem.variables)
 
-    def _eliminated(self, damping: float):
+    def renew(self, points: np.ndarray, values: Values, state: State) -> None:
+        """Take up other residuals with the same derivatives and weights."""
+        self.toward(np.concatenate([(r * s).ravel() for r, s in zip(state[1], self.problem.scales)]), points, values)
+
+    def toward(self, r: np.ndarray, points: np.ndarray, values: Values) -> None:
+        """The right side, and what is minimised, of weighed residuals."""
+        problem = self.problem
+        pull, _, prior = prior_terms(problem.model, problem.variables, values)
+        self.ra, self.rb, self.chi2 = self.j.T @ r, self.k.T @ r + pull, float(r @ r)
+        self.total = self.chi2 + problem.of_priors(points) + prior
+        if problem.prior is not None:
+            mean, sd = problem.prior
+            self.ra = self.ra - (self.slope * ((-points[:, 2] - mean) / sd)[:, None]).ravel()
+
+    def _eliminated(self, damping: float) -> tuple[Any, np.ndarray, np.ndarray]:
         """A factorised, A^-1 B, and the Schur complement C - B'A^-1 B."""
         from scipy.sparse import diags
         from scipy.sparse.linalg import splu
@@ -267,11 +288,12 @@ class _Equations:
         inner = factor.solve(self.b) if self.b.shape[1] else self.b
         return factor, inner, self.c + damping * np.diag(np.diag(self.c)) - self.b.T @ inner
 
-    def step(self, damping: float) -> tuple[np.ndarray, np.ndarray, float]:
+    def step(self, damping: float) -> tuple[np.ndarray, np.ndarray]:
+        """(3 N,) in half widths of the differences along each line of sight, and (p,) of the parameters."""
         factor, inner, schur = self._eliminated(damping)
         z = np.linalg.lstsq(schur, self.rb - inner.T @ self.ra, rcond=1e-12)[0] if len(schur) else np.zeros(0)
         x = factor.solve(self.ra - self.b @ z)
-        return x, z, float(x @ self.ra + z @ self.rb)
+        return x, z
 
     def errors(self) -> tuple[np.ndarray, np.ndarray]:
         """(N, 3, 3) mm^2 covariances of the places, and (p,) standard deviations of the parameters."""

@@ -177,7 +177,9 @@ class Renderer:
                 return Sample(path.si, mi.UnpolarizedSpectrum(1.0), path.origin, path)
             u, v = (mi.Float(a.astype(np.float32)) for a in (u, v))
             if self.crowded:
-                o, d, weight = self._rays(u, v, None if lens is None else [mi.Float(a.astype(np.float32)) for a in lens])
+                o, d, weight = self._rays(
+                    u, v, None if lens is None else [mi.Float(a.astype(np.float32)) for a in lens]
+                )
                 si, _, origin = self.scene.integrator.reached(self._world(), o, d)
                 si = self.scene.traced.sharpen(si, origin)
             else:
@@ -791,9 +793,7 @@ class Renderer:
         rng = np.random.default_rng([seed, 77])
         count = u.size * samples
         at = [np.repeat(a.ravel(), samples) + rng.random(count) for a in (u, v)]
-        sample = self._trace(
-            *(np.minimum(a * cell, size - 1e-3) for a, size in zip(at, (self.width, self.height)))
-        )
+        sample = self._trace(*(np.minimum(a * cell, size - 1e-3) for a, size in zip(at, (self.width, self.height))))
         return sample, int(rng.integers(2**31)), count
 
     def _bounced(self, values: Mapping, led: str, image: np.ndarray, component: int) -> np.ndarray:

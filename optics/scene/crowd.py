@@ -11,16 +11,17 @@ import contextlib
 import os
 import sys
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
-
 
 BEYOND = 1e-4  # share of the coordinates' size by which a ray starts beyond an interface (optics.light.led_by_led)
 
 
 @contextlib.contextmanager
 def _remarks_away() -> Iterator[None]:
-    """Without what nanobind writes to stderr of the types that a tensor is not, when Mitsuba takes one as a property."""
+    """Without what nanobind writes to stderr of the types that a tensor is not, while Mitsuba takes one as a
+    property."""
     sys.stderr.flush()
     kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
     try:
@@ -75,7 +76,7 @@ class Crowd:
         self._rows = mi.Float(np.column_stack([self.middles, self.radii]).astype(np.float32).ravel())
         dr.eval(self._rows)
 
-    def sharpen(self, si, origin):
+    def sharpen(self, si: Any, origin: Any) -> Any:
         """The same hits, to the last digits of float32: Mitsuba's are off by up to a hundredth of a radius at rims.
 
         With b = (s - o).d and l the distance of the middle s from the ray, t = b - sqrt(r^2 - l^2)."""
@@ -90,7 +91,7 @@ class Crowd:
         b = dr.dot(s - origin, d)
         off = origin + b * d - s
         t = b - dr.sqrt(dr.maximum(dr.square(r) - dr.squared_norm(off), 0.0))
-        n = mi.Normal3f(dr.normalize(origin + t * d - s))
+        n: Any = mi.Normal3f(dr.normalize(origin + t * d - s))
         si.t = dr.select(own, t, si.t)
         si.p = dr.select(own, s + r * n, si.p)
         si.n = dr.select(own, n, si.n)
@@ -126,16 +127,16 @@ class Traced:
         self.scene.parameters_changed([])
         self._front.parameters_changed([])
 
-    def enter(self, o, d, wavelengths):
+    def enter(self, o: Any, d: Any, wavelengths: Any) -> tuple:
         """Rays behind the flat interfaces between the camera and all else, and what these leave of their light."""
         import drjit as dr
         import mitsuba as mi
 
-        weight = mi.UnpolarizedSpectrum(1.0)
+        weight: Any = mi.UnpolarizedSpectrum(1.0)
         if all(window.number("index") == 1 for window in self.windows):
             return o, d, weight
         for _ in self.windows:
-            si = self._front.ray_intersect(mi.Ray3f(o, d, mi.Float(0), wavelengths))
+            si: Any = self._front.ray_intersect(mi.Ray3f(o, d, mi.Float(0), wavelengths))
             flat = si.is_valid()
             bs, passed = si.bsdf().sample(mi.BSDFContext(), si, mi.Float(0.5), mi.Point2f(0.5), flat)
             d = dr.select(flat, si.to_world(bs.wo), d)

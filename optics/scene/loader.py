@@ -18,9 +18,9 @@ from pathlib import Path
 from optics.errors import BadScene, OutOfBounds, UnknownKey
 from optics.files.output import shipped
 from optics.scene import showing, trust
+from optics.scene.crowd import Traced
 from optics.scene.declare import LED_BY_LED, Effect, Part
 from optics.scene.integral import FEW, Integral, refuse_unseen
-from optics.scene.crowd import Traced
 from optics.scene.mitsuba_parts import DEFAULT_VARIANT, Declared, is_part, loading, move, use_variant
 from optics.scene.parameter import Parameter, Variable, keys_with
 from optics.scene.registry import Registry, known

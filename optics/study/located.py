@@ -3,8 +3,8 @@
     found = locate(Setup(captures="session"), "beads.csv")
     optics calibrate session -D places=beads.csv ...
 
-In the image at rest each bead is found as a bright disc (`optics.readers.flow.find_beads`), on the line of sight through
-its middle and in the middle of the layer that has beads. `optics.fit.bodies` fits all places in all frames: a bead's
+In the image at rest each bead is found as a bright disc (`optics.readers.flow.find_beads`), on the line of sight
+through its middle and in the middle of the layer that has beads. `optics.fit.bodies` fits all places in all frames: a bead's
 size, its brightness and its motion under presses tell its depth. Where the residual shows a bead that was not found,
 hidden behind another or merged with it, it is added, and all are fitted once more. A scene takes part whose beads have
 `<string name="places" value="$places"/>`."""
@@ -16,6 +16,7 @@ import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -110,8 +111,9 @@ def locate(
 
 
 def _crowd(model: SceneModel) -> str:
-    found = [n for n, part in model.scene.parts.items() if hasattr(part, "put")]
-    if len(found) != 1 or len(model.scene.parts[found[0]].balls()[1]) != 1:
+    parts: dict[str, Any] = {n: part for n, part in model.scene.parts.items() if hasattr(part, "put")}
+    found = list(parts)
+    if len(found) != 1 or len(parts[found[0]].balls()[1]) != 1:
         raise BadScene(
             f"{model.scene.path}: {len(found)} parts have beads to locate, and the definition 'places' reaches "
             f"{'none of them' if found else 'none'}; allowed: one part of the kind 'beads' that has "
@@ -136,13 +138,13 @@ def at_rest(model: SceneModel) -> list[int]:
 
 def start_places(model: SceneModel, name: str) -> np.ndarray:
     """(N, 3) mm: beads of the image at rest, in the middle of the layer that has them."""
-    image = sum(model.frames[i].image.astype(float) - model.noise.black_level for i in at_rest(model))
+    image = np.sum([model.frames[i].image.astype(float) - model.noise.black_level for i in at_rest(model)], 0)
     light = image[..., int(np.argmax(image.mean((0, 1))))]
     places = find_beads(np.clip(light, 0, None), saturation=max(float(light.max()), 1.0))
     if not len(places):
         raise ValueError(
-            f"{model.captures.folder}: no bead is seen in the frames at rest; allowed: a frame without a press, in which "
-            "beads are 4 px wide or more and brighter than what is around them"
+            f"{model.captures.folder}: no bead is seen in the frames at rest; allowed: a frame without a press, in "
+            "which beads are 4 px wide or more and brighter than what is around them"
         )
     return _at_depth(model, places, depth_prior(model, name)[0])
 
@@ -162,7 +164,8 @@ def missed(model: SceneModel, name: str, fit: Bodies) -> np.ndarray:
 
     frames = at_rest(model)
     predicted = model.predict(fit.values, frames)
-    camera, part = model.scene.camera, model.scene.parts[name]
+    camera: Any = model.scene.camera
+    part: Any = model.scene.parts[name]
     middles, radii = part.balls()
     wide = float(np.median(np.linalg.norm(camera.project(middles + [1e-2, 0, 0]) - camera.project(middles), axis=1)))
     sd = max(0.5 * wide * 100 * float(np.median(radii)), 0.7)  # px

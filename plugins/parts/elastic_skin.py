@@ -127,8 +127,8 @@ def build():
             found = forces.ball_by_force(found.force(*elastic) + n("press_force"), n("tip_radius"), *elastic)
             if found.depth > n("thickness"):
                 raise ValueError(
-                    f"'{self.name}': press_force = {n('press_force'):g} N presses the ball {found.depth:.3g} mm deep, and "
-                    f"the gel is {n('thickness'):g} mm thick; allowed: less force, or a larger modulus `young` (now "
+                    f"'{self.name}': press_force = {n('press_force'):g} N presses the ball {found.depth:.3g} mm deep, "
+                    f"and the gel is {n('thickness'):g} mm thick; allowed: less force, or a larger modulus `young` (now "
                     f"{elastic[0]:g} MPa)"
                 )
             return found

@@ -3,8 +3,6 @@
 import numpy as np
 import pytest
 
-from optics.scene.checking import made
-
 
 @pytest.fixture(scope="module")
 def load(mitsuba):

@@ -25,6 +25,7 @@ def test_outlines_are_those_of_balls(load):
     for centre, at in zip(centres, camera.project(centres)):
         u, v = (at + rng.uniform(-6, 6, (40_000, 2))).astype("f").T
         o, d = camera.ray(mi.Float(u), mi.Float(v))
+        o = o + d * ((-4.45 - o.z) / d.z)  # behind the face of the base
         si = scene.mitsuba.ray_intersect(mi.Ray3f(o, d, mi.Float(0), scene.integrator.wavelengths(len(u))))
         hit = np.array(si.shape == mi.ShapePtr(next(s for s in scene.mitsuba.shapes() if s.id() == "beads")))
         away = centre - np.array([0, 0, -18.75])

@@ -43,10 +43,9 @@ def equations():
 
 def test_eliminating_the_bodies_solves_the_whole(equations):
     found, whole, right, _ = equations
-    x, z, promised = found.step(0.0)
+    x, z = found.step(0.0)
     step = np.linalg.lstsq(whole, right, rcond=None)[0]
     np.testing.assert_allclose(np.concatenate([x, z]), step, rtol=1e-8, atol=1e-10)
-    assert promised == pytest.approx(right @ right - np.sum((right - whole @ step) ** 2))
 
 
 def test_errors_are_those_of_the_whole(equations):

@@ -177,8 +177,8 @@ class ParticleMaker:
         """Origins, directions (N, 3) and angles from the axis (N,) of all rays, those of a pixel behind each other."""
         v, (width, height) = self.values, self.size
         n = self.side**2
-        # the R2 sequence, shifted at random from pixel to pixel: no two rays of a pixel share a row or a column, so that
-        # a rim that moves by a thousandth of a pixel changes it by as much
+        # the R2 sequence, shifted at random from pixel to pixel: no two rays of a pixel share a row or a column, so
+        # that a rim that moves by a thousandth of a pixel changes it by as much
         shift = np.random.default_rng([self.seed, 9]).random((2, width * height)).repeat(n, axis=1)
         k = np.tile(np.arange(n), width * height)
         pixel = np.arange(width * height).repeat(n)
