@@ -1,16 +1,16 @@
 """Places of many small bodies, refined together with the scene's parameters: a sparse problem.
 
-A thousand beads in a gel have three unknown coordinates each, and each touches a few pixels only. Derivative images of
-many beads are made at once: beads whose outlines stay apart in all frames share a colour (Curtis, Powell & Reid, J.
-Inst. Math. Appl. 13 (1974) 117), and all of a colour are moved together. With the derivatives J of the places, sparse, and K
-of the scene's parameters, dense, the normal equations
+A thousand beads in a gel have three unknown coordinates each, and each touches a few pixels only. Derivative images
+of many beads are made at once: beads whose outlines stay apart in all frames share a colour (Curtis, Powell & Reid,
+J. Inst. Math. Appl. 13 (1974) 117), and all of a colour are moved together. With the derivatives J of the places,
+sparse, and K of the scene's parameters, dense, the normal equations
 
     [A  B] [x]   [a]        A = J'WJ + priors, sparse: beads that share a pixel        a = J'W(y - f)
     [B' C] [z] = [b]        B = J'WK,  C = K'WK + priors                               b = K'W(y - f)
 
 are solved by eliminating the beads: (C - B'A^-1 B) z = b - B'A^-1 a (Schur's complement), then A x = a - B z.
-Derivatives leave out what a bead's shadow does beyond its own outline: that slows the steps, and moves nothing where they end, as
-the residual there is noise."""
+Derivatives leave out what a bead's shadow does beyond its own outline: that slows the steps, and moves nothing
+where they end, as the residual there is noise."""
 
 from __future__ import annotations
 

@@ -136,7 +136,9 @@ class Traced:
         if all(window.number("index") == 1 for window in self.windows):
             return o, d, weight
         for _ in self.windows:
-            si: Any = self._front.ray_intersect(mi.Ray3f(o, d, mi.Float(0), wavelengths))
+            ray: Any = mi.Ray3f(mi.Point3f(o), mi.Vector3f(d))
+            ray.wavelengths = wavelengths
+            si: Any = self._front.ray_intersect(ray)
             flat = si.is_valid()
             bs, passed = si.bsdf().sample(mi.BSDFContext(), si, mi.Float(0.5), mi.Point2f(0.5), flat)
             d = dr.select(flat, si.to_world(bs.wo), d)

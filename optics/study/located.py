@@ -4,10 +4,10 @@
     optics calibrate session -D places=beads.csv ...
 
 In the image at rest each bead is found as a bright disc (`optics.readers.flow.find_beads`), on the line of sight
-through its middle and in the middle of the layer that has beads. `optics.fit.bodies` fits all places in all frames: a bead's
-size, its brightness and its motion under presses tell its depth. Where the residual shows a bead that was not found,
-hidden behind another or merged with it, it is added, and all are fitted once more. A scene takes part whose beads have
-`<string name="places" value="$places"/>`."""
+through its middle and in the middle of the layer that has beads. `optics.fit.bodies` fits all places in all frames:
+a bead's size, its brightness and its motion under presses tell its depth. Where the residual shows a bead that was
+not found, hidden behind another or merged with it, it is added, and all are fitted once more. A scene takes part
+whose beads have `<string name="places" value="$places"/>`."""
 
 from __future__ import annotations
 

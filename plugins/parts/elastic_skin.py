@@ -126,10 +126,10 @@ def build():
                 return found
             found = forces.ball_by_force(found.force(*elastic) + n("press_force"), n("tip_radius"), *elastic)
             if found.depth > n("thickness"):
+                deep, thick, force = found.depth, n("thickness"), n("press_force")
                 raise ValueError(
-                    f"'{self.name}': press_force = {n('press_force'):g} N presses the ball {found.depth:.3g} mm deep, "
-                    f"and the gel is {n('thickness'):g} mm thick; allowed: less force, or a larger modulus `young` (now "
-                    f"{elastic[0]:g} MPa)"
+                    f"'{self.name}': press_force = {force:g} N presses the ball {deep:.3g} mm deep, the gel is "
+                    f"{thick:g} mm thick; allowed: less force, or a larger `young` (now {elastic[0]:g} MPa)"
                 )
             return found
 
