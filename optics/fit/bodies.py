@@ -33,6 +33,7 @@ MARGIN = 2.0  # px beyond an outline that a bead still changes
 WORTH = 0.02  # fall of what is minimised per variable that is not worth another step
 DAMPING = 1e-3
 CHORDS, MOST_POOR = 10, 4  # steps on the same derivatives, and those without a gain that are tried
+GOOD = 0.7  # of the fall that was promised: with less, derivatives no longer hold, and other steps may lead astray
 PART = 0.05  # of what the steps on these derivatives gained: a step that gains less is better followed by new ones
 LARGEST = 4.0  # half widths of the differences, by which one step moves a bead at most
 
@@ -93,7 +94,7 @@ def refine(
         history.append(equations.total)
         gained, poor = 0.0, 0
         for _ in range(CHORDS):  # on the same derivatives, which cost as much as some twenty steps
-            x, z = equations.step(damping)
+            x, z, promised = equations.step(damping)
             moved = problem.moved(points, x), problem.put(values, z)
             trial = problem.residual(*moved)
             gain = equations.total - problem.total(*moved, trial)
@@ -102,7 +103,7 @@ def refine(
                 gained += gain
                 equations.renew(points, values, state)
                 damping = max(damping / 5, 1e-8)
-                if gain < PART * gained:
+                if gain < GOOD * promised or gain < PART * gained:
                     break
             else:
                 damping, poor = max(damping * 8, DAMPING), poor + 1
@@ -288,12 +289,14 @@ class _Equations:
         inner = factor.solve(self.b) if self.b.shape[1] else self.b
         return factor, inner, self.c + damping * np.diag(np.diag(self.c)) - self.b.T @ inner
 
-    def step(self, damping: float) -> tuple[np.ndarray, np.ndarray]:
-        """(3 N,) in half widths of the differences along each line of sight, and (p,) of the parameters."""
+    def step(self, damping: float) -> tuple[np.ndarray, np.ndarray, float]:
+        """(3 N,) in half widths of the differences along each line of sight, (p,) of the parameters, and the fall that
+        they promise."""
         factor, inner, schur = self._eliminated(damping)
         z = np.linalg.lstsq(schur, self.rb - inner.T @ self.ra, rcond=1e-12)[0] if len(schur) else np.zeros(0)
         x = factor.solve(self.ra - self.b @ z)
-        return x, z
+        fall = 2 * (x @ self.ra + z @ self.rb) - x @ (self.a @ x) - 2 * x @ (self.b @ z) - z @ self.c @ z
+        return x, z, float(fall)
 
     def errors(self) -> tuple[np.ndarray, np.ndarray]:
         """(N, 3, 3) mm^2 covariances of the places, and (p,) standard deviations of the parameters."""

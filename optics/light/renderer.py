@@ -26,6 +26,7 @@ from optics.scene.mitsuba_parts import DEFAULT_VARIANT
 # per pixel at rims; a power of two. Of an image 36 px wide, chi2 misses a path tracer by 10 to 60 with 64, by 5 to 20
 # with 128
 RIM_SAMPLES = 128
+PINHOLE = 1e-9  # mm^2: a pupil smaller than a wavelength across is a point
 CROWDED_SAMPLES = 16  # of a crowded scene, whose pixels nearly all have rims
 LAYERED_RIM_SAMPLES = 32  # in scenes with layers, whose matrices are multiplied for every sample
 PAINTED = 0.05  # of the largest reflectance of a texture: a step from pixel to pixel that needs finer samples
@@ -521,28 +522,28 @@ class Renderer:
         u[rim], v[rim] = self._at(index[~bent], self._set(index[~bent], self.rim_samples))
         u[middle], v[middle] = self._at(index[bent], _grid(self.bent_side))
         lens = None
-        if self.crowded and self.scene.camera.number(self.scene.camera.named("pupil")) > 0:
+        if self.crowded and self.scene.camera.number(self.scene.camera.named("pupil")) > PINHOLE:
             lens = np.full((2, counts.sum()), 0.5, np.float32)
             lens[:, rim] = _places_on_lens(self.rim_samples, index[~bent])
         return Finer(counts, self._trace(u, v, lens) if len(index) else None)
 
     def _parted(self, values: Mapping) -> np.ndarray:
-        """Pixels in whose corners and middle not one body is seen: also those of bodies that no middle sees. Behind a
-        pupil, all that are as near to one of these as its circles of confusion are wide."""
+        """Pixels in whose corners and middle not one body is seen: also those of bodies that no middle sees. And
+        all that are as near to one of these as circles of confusion are wide."""
         from scipy.ndimage import maximum_filter
 
         index = np.arange(self.height * self.width)
         bodies = self._bodies(*self._at(index, CORNERS))
         parted = (bodies != bodies[:, :1]).any(1).reshape(self.height, self.width)
         camera = self.scene.camera
-        area = values[f"{camera.name}.{camera.named('pupil')}"]
-        if area == 0:
-            return parted
+        area, wide = values[f"{camera.name}.{camera.named('pupil')}"], 0.0
         own = SimpleNamespace(**{n: values[f"{camera.name}.{n}"] for n in camera.numbers})
         v, u = np.mgrid[: self.height, : self.width] + 0.5
-        nearest, farthest = (float(f(p)) for f, p in ((np.min, self._reach()), (np.max, self._reach())))
-        wide = max(np.abs(camera.astray(own, u, v, far)).max() for far in (nearest, farthest))
-        return maximum_filter(parted, 2 * int(np.ceil(wide * np.sqrt(area / np.pi))) + 1)
+        if area > PINHOLE:
+            reach = self._reach()
+            wide = max(np.abs(camera.astray(own, u, v, far)).max() for far in (reach.min(), reach.max()))
+        # by a pixel at least, so that a small pupil changes no pixel's way of being sampled
+        return maximum_filter(parted, 2 * max(int(np.ceil(wide * np.sqrt(area / np.pi))), 1) + 1)
 
     def _reach(self) -> np.ndarray:
         """Distances of the balls from the camera, mm."""

@@ -30,6 +30,7 @@ from optics.scene.parameter import Values
 from optics.skin.cloud import write_places
 from optics.study.setup import Setup, open_model
 
+AMISS = 1.5  # chi2 over its degrees of freedom, above which places are not to be believed
 ROUNDS = 3  # fits, between which beads are added
 SEEN = 6.0  # standard deviations by which a disc as large as a bead must stand out of the residual
 BRIGHT = 0.3  # of the median bead's light, which it must have
@@ -68,6 +69,11 @@ class Located:
             f"{len(fit.points)} beads: {self.found} in the image at rest, {self.added} in what was left",
             f"chi2/dof {fit.chi2 / fit.dof:.3f}; errors in the median {across:.3g} mm across, {deep:.3g} mm in depth",
         ]
+        if fit.chi2 > AMISS * fit.dof:
+            lines.append(
+                "warning: the images are not explained; some places are wrong, or the scene is: give more presses, or "
+                "parameters by --free, and compare the images"
+            )
         lines += [
             f"{v.name:30s} {fit.values.common[v.name]:.5g} +- {sd:.2g} {v.parameter.unit}"
             for v, sd in zip(fit.variables, fit.sd)

@@ -36,8 +36,6 @@ NARROW = 1e-6  # px^2/mm^2: a range of variances below which nodes would fall to
 def defocused(image, camera):
     from scipy.fft import dctn, idctn
 
-    if camera.sampled:
-        return image
     spread = camera.astray() ** 2 / (4 * math.pi)  # px^2 per mm^2
     rows, columns = image.shape[:2]
     omega2 = (math.pi * np.arange(rows) / rows)[:, None] ** 2 + (math.pi * np.arange(columns) / columns) ** 2
@@ -71,7 +69,7 @@ def check_each_distance_by_itself():
     z[:, :60], z[:, 120:] = 10.0, 30.0
     image = np.zeros((60, 180, 1))
     image[30, [30, 90, 150]] = 1.0
-    camera = SimpleNamespace(pupil_area=math.pi / 4, sampled=False, astray=lambda: 300 * (1 / 16 - 1 / z))
+    camera = SimpleNamespace(pupil_area=math.pi / 4, astray=lambda: 300 * (1 / 16 - 1 / z))
     found = defocused(image, camera)[..., 0]
     agree(found.sum(), 3.0)
     v, u = np.mgrid[:60, :60]

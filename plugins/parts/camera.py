@@ -201,6 +201,7 @@ def build():
 
     class Camera(Declared.on(mi.Sensor)):
         kind = "camera"
+        sampled = False  # whether images LED by LED are made of rays that start all over the pupil
         bands = 3  # of the scene
 
         def __init__(self, props):

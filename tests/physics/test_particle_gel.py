@@ -83,7 +83,7 @@ def test_a_path_tracer_sees_the_same_light(load):
     """Light by light with few samples in each pixel, and mi.render with many, through an absorbing gel."""
     from optics.light.rendering import RenderJob
 
-    scene = load(width=60, height=60, beads=60, diameter=2.4, depth=0.5)
+    scene = load(width=60, height=60, beads=60, diameter=2.4, depth=0.5, top=1.3, bottom=3.2)
     absorbing = {"gel.absorption": 0.05}
     exact, traced = (RenderJob(scene, spp=spp, layers=(), saturation=1.0).take(absorbing) for spp in (None, 256))
     one, other = (image.camera.reshape(6, 10, 6, 10, 3).mean((1, 3)) for image in (exact, traced))
