@@ -94,6 +94,17 @@ def locate(
 
     Raises BadScene for a scene that takes no table of places, ValueError where no bead is found."""
     file = Path(file)
+    file.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        return _located(setup, file, free, progress)
+    except BaseException:
+        file.unlink(missing_ok=True)
+        raise
+
+
+def _located(
+    setup: Setup, file: Path, free: Sequence[str], progress: Callable[[str, int, int], None] | None
+) -> Located:
     setup = replace(setup, defines={**setup.defines, "places": os.path.abspath(file)})
     write_places(file, np.array([[0.0, 0.0, -1.0]]))  # until the image at rest is read
     model = open_model(setup)
