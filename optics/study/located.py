@@ -170,6 +170,8 @@ def _at_depth(model: SceneModel, places: np.ndarray, depth: float) -> np.ndarray
     """(N, 3) where the lines of sight through (N, 2) px are so deep below the face."""
     import mitsuba as mi
 
+    if not len(places):
+        return np.zeros((0, 3))
     o, d = (np.array(a, float).T for a in model.scene.camera.ray(*(mi.Float(a.astype("f")) for a in places.T)))
     return o + d * ((-depth - o[:, 2]) / d[:, 2])[:, None]
 
