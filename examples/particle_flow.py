@@ -28,7 +28,7 @@ def seen(scene, centres: np.ndarray) -> np.ndarray:
 
     at = scene.camera.project(centres)
     o, d = scene.camera.ray(*(mi.Float(a.astype("f")) for a in at.T))
-    si = scene.mitsuba.ray_intersect(mi.Ray3f(o, d, mi.Float(0), scene.integrator.wavelengths(len(at))))
+    si = scene.traced.scene.ray_intersect(mi.Ray3f(o, d, mi.Float(0), scene.integrator.wavelengths(len(at))))
     width, height = scene.camera.resolution
     hit = np.linalg.norm(np.array(si.p, float).T - centres, axis=-1) < 0.51 * scene.parts["beads"].diameters()
     return hit & (at > 4).all(-1) & (at[:, 0] < width - 4) & (at[:, 1] < height - 4)

@@ -42,6 +42,48 @@ StartFit = Annotated[
 
 
 @command
+def locate(
+    captures: CaptureSet,
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="FILE.csv", help="Table of places, mm.")],
+    free: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--free",
+            metavar="PATTERN",
+            help="Parameters to solve for with the places. Repeatable. Without it: the powers of the lights.",
+        ),
+    ] = None,
+    define: Defines = None,
+    sets: Settings = None,
+    plugins: Plugins = None,
+    outside: Outside = False,
+    force: Force = False,
+    as_json: AsJson = False,
+) -> None:
+    """Find beads whose places nobody knows, and fit all places in all frames, with a few parameters of the scene.
+
+    Depths come from the size and light of each bead, and from its motion under presses: give frames at rest and under
+    several. The table goes into a calibration by `-D places=FILE.csv`; FILE.json beside it has the errors."""
+    from optics.files.output import claim
+    from optics.study.located import locate as find
+    from optics.study.setup import Setup
+
+    if output.suffix.lower() != ".csv":
+        raise ValueError(f"-o {output}: a table of places; allowed: a name ending in .csv")
+    claim([output, output.with_suffix(".json")], force)
+    setup = Setup(
+        captures=str(captures),
+        defines=dict(pairs(define, "-D")),
+        values=dict(settings(sets)),
+        plugins=None if plugins is None else [str(path) for path in plugins],
+        outside=outside,
+    )
+    with terminal.progress() as progress:
+        found = find(setup, output, free or (), progress=progress)
+    show(found.record()) if as_json else print(f"{found.text()}\n{output}")
+
+
+@command
 def calibrate(
     captures: CaptureSet,
     output: Annotated[Path, typer.Option("-o", "--output", metavar="STUDY", help="Folder of the new study.")],

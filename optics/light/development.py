@@ -94,8 +94,9 @@ class Developer:
 
         u, v (H, W) px; x, y (H, W) normalised coordinates; tan (H, W) tangent of the field angle; focal (px); width,
         height (px); astray() (H, W) px by which a ray off the pupil's middle misses the chief ray, per mm off it, at
-        the distance that the pixel sees; bands (nm); white (B,) radiance per band of white light of radiance 1;
-        settings: all values by key, those of other parts too, (N, 1, 1) where readings were swept."""
+        the distance that the pixel sees; bands (nm);
+        white (B,) radiance per band of white light of radiance 1; settings: all values by key, those of
+        other parts too, (N, 1, 1) where readings were swept."""
         own = {n: values[f"{self.name}.{n}"] for n in self.names}
 
         def astray() -> np.ndarray:
@@ -128,6 +129,12 @@ class Developer:
         for effect in self.effects[stage]:
             if all(getattr(view, n) == self.neutral[n] for n in effect.parameter_names):
                 continue  # at neutral an effect is the identity; the contract tests hold every effect to that
+            if (
+                stage == "lens"
+                and getattr(self.camera, "sampled", False)
+                and self.camera.named("pupil") in effect.parameter_names
+            ):
+                continue  # rays started all over the pupil
             image = effect.stages[stage](image, view)
         return image
 

@@ -25,8 +25,11 @@ class LedByLed:
 
     def hits(self, scene, camera, u, v):
         """Where the camera's rays through the pixel positions (u, v) meet the membrane: (si, weight, origin)."""
-        o, d = camera.ray(u, v)
-        ray = mi.Ray3f(o, d, mi.Float(0), self.wavelengths(dr.width(u)))
+        return self.reached(scene, *camera.ray(u, v))
+
+    def reached(self, scene, o, d):
+        """Where rays meet the membrane, whatever flat interfaces they pass: (si, weight, origin)."""
+        ray = mi.Ray3f(o, d, mi.Float(0), self.wavelengths(dr.width(o)))
         si = scene.ray_intersect(ray)
         weight = mi.UnpolarizedSpectrum(1.0)
         for _ in range(sum(1 for s in scene.shapes() if is_interface(s))):
@@ -72,6 +75,23 @@ class LedByLed:
             total += dr.select(own, pigment.fluorescence(si, led, to_led, distance), 0.0)
         return total
 
+    def excited_again(self, scene, si, second, led, point, visibility):
+        """Radiance per band of the fluorescence at `si` that light of an LED excites which a second pigment reflects,
+        for a direction that was drawn by its cosine: pi times the radiance is the irradiance."""
+        total = mi.UnpolarizedSpectrum(0.0)
+        to_led = point - second.p
+        distance = dr.norm(to_led)
+        to_led /= distance
+        cos = dr.maximum(dr.dot(second.sh_frame.n, to_led), 0.0)
+        sent = led.kappa(second, to_led, distance) * cos & visibility
+        for pigment in self.glowing(scene):
+            own = si.is_valid() & (si.bsdf() == mi.BSDFPtr(pigment))
+            for other in self.glowing(scene):
+                here = own & second.is_valid() & (second.bsdf() == mi.BSDFPtr(other))
+                again = pigment.excited(si, led, other.returned(led.wavelength) * sent)
+                total += dr.select(here, again, 0.0)
+        return total
+
     def direct(self, scene, si, weight, origin, led, visibility, point=None):
         """Radiance per band that one LED sends to the camera by one reflection (S3, S5), and by the gel itself; as a
         point at its position, or at another."""
@@ -113,6 +133,7 @@ class LedByLed:
             point = led.point(sampler.next_2d()) if led.reach() > 0 else led.position()
             seen = self.visible(scene, second, point, led)
             light = self.direct(scene, second, 1.0, si.p, led, seen, point)
-            total += dr.select(second.is_valid(), mi.unpolarized_spectrum(factor) * light, 0.0)
+            light = mi.unpolarized_spectrum(factor) * light + self.excited_again(scene, si, second, led, point, seen)
+            total += dr.select(second.is_valid(), light, 0.0)
         # `direct` followed the light up to the first surface only
         return total * weight * self.kept_to(scene, si, origin, led) / count

@@ -12,6 +12,7 @@ from __future__ import annotations
 import copy
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import NamedTuple
 
@@ -25,10 +26,8 @@ from optics.scene.mitsuba_parts import DEFAULT_VARIANT
 # per pixel at rims; a power of two. Of an image 36 px wide, chi2 misses a path tracer by 10 to 60 with 64, by 5 to 20
 # with 128
 RIM_SAMPLES = 128
-CROWDED_RAYS = 128  # rays through a pixel of a crowded scene, which tell what share of it each body has
-# of these rays, so many each way are lit in each body of each pixel. Of beads 8 px wide that reach 200 DN, pixels miss
-# their mean by 1.6 DN rms; the noise of a camera is 3
-LIT = 2, 3
+PINHOLE = 1e-9  # mm^2: a pupil smaller than a wavelength across is a point
+CROWDED_SAMPLES = 16  # of a crowded scene, whose pixels nearly all have rims
 LAYERED_RIM_SAMPLES = 32  # in scenes with layers, whose matrices are multiplied for every sample
 PAINTED = 0.05  # of the largest reflectance of a texture: a step from pixel to pixel that needs finer samples
 # difference of a pixel's mean normal from that at its middle, above which finer samples are taken: a fifth of a grey
@@ -49,7 +48,7 @@ BOUNCE_SAMPLES = 32  # directions per cell for the second bounce, at least
 # of these, an image has at least so many: of a shallow dent few meet a lit flank, and in an image of 36 x 48 px the
 # error of 32 per cell is as large as the light itself (with these a quarter)
 BOUNCE_RAYS = 2**17
-BOUNCE_CELL = 2  # px each way of a cell
+BOUNCE_CELL = 2  # px each way of a cell; 1 in a crowded scene, whose pixels differ
 
 
 class Renderer:
@@ -77,11 +76,19 @@ class Renderer:
                 f"load the scene with variant='{DEFAULT_VARIANT}' or name one band"
             )
         self.layered = paths.layered(scene)
-        bodies = {name: getattr(part, "faces_each", 0) for name, part in scene.parts.items()}
-        self.faces_each = {} if self.layered else {name: faces for name, faces in bodies.items() if faces}
-        self.crowded = bool(self.faces_each)  # by many small bodies, with rims in most pixels
-        self.fine = max((scene.parts[name].fine for name in self.faces_each), default=1)
+        self.crowded = scene.traced is not None and not self.layered  # by many balls, with rims in most pixels
+        self.fine = max((getattr(part, "fine", 1) for part in scene.parts.values()), default=1)
+        if self.crowded:  # rays start all over the pupil: it is no longer a blur of the image
+            scene.camera.sampled = True
+            for name in (scene.camera.named("pupil"), scene.camera.named("focus")):
+                key = f"{scene.camera.name}.{name}"
+                scene.parameters[key] = replace(scene.parameters[key], how="difference", step=1.0)
         self.rim_samples = LAYERED_RIM_SAMPLES if self.layered else RIM_SAMPLES
+        cells = -(-self.height // BOUNCE_CELL) * -(-self.width // BOUNCE_CELL)
+        self.bent_side, self.bounce = BENT_SIDE, (BOUNCE_CELL, max(BOUNCE_SAMPLES, -(-BOUNCE_RAYS // cells)))
+        if self.crowded:
+            self.rim_samples, self.bent_side = CROWDED_SAMPLES << (self.fine - 1), 2
+            self.bounce = 1, CROWDED_SAMPLES << (self.fine - 1)
         self.wavelengths = np.array(scene.integrator.bands or (540.0,))
         self.remember = remember
         self._transmissions: OrderedDict = OrderedDict()
@@ -128,7 +135,8 @@ class Renderer:
 
     # -- geometry -----------------------------------------------------------------------------------------------------
     def geometry(self, values: Mapping) -> tuple:
-        return tuple(values[k] for k in self.geometry_keys)
+        own = tuple(values[k] for k in self.geometry_keys)
+        return (*own, *(c.part.version for c in self.scene.traced.crowds)) if self.crowded else own
 
     def apply(self, values: Mapping, move: bool = True) -> None:
         """Set everything but the LEDs' powers, which stay at 1: images are kept per unit of power.
@@ -144,12 +152,28 @@ class Renderer:
             and (move or k not in self._fixed)
         }
         now.update(dict.fromkeys(self.power_keys, 1.0))
-        self.scene.set(now)
+        self.scene.set(now, meshes=not self.crowded)
         gel = self.scene.gel
         if hasattr(gel, "recall"):
             gel.recall(None if move else {n: values[f"{gel.name}.{n}"] for n in (*gel.numbers, *gel.words)})
 
-    def _trace(self, u: np.ndarray, v: np.ndarray) -> tuple:
+    def _world(self):
+        """The Mitsuba scene that rays meet."""
+        return self.scene.traced.scene if self.crowded else self.scene.mitsuba
+
+    def _rays(self, u, v, lens=None):
+        """Origins, directions and weights of the camera's rays in a crowded scene, behind its flat interfaces.
+
+        lens   places in the unit square that stand for the pupil (Dr.Jit); None: its middle"""
+        import drjit as dr
+        import mitsuba as mi
+
+        o, d = self.scene.camera.ray(mi.Float(u), mi.Float(v))
+        if lens is not None:
+            o, d = self.scene.camera.through(mi.Point2f(*lens), o, d)
+        return self.scene.traced.enter(o, d, self.scene.integrator.wavelengths(dr.width(o)))
+
+    def _trace(self, u: np.ndarray, v: np.ndarray, lens: tuple | None = None) -> tuple:
         import drjit as dr
         import mitsuba as mi
 
@@ -157,9 +181,15 @@ class Renderer:
             if self.layered:
                 path = paths.trace(self.scene, u, v)
                 return Sample(path.si, mi.UnpolarizedSpectrum(1.0), path.origin, path)
-            si, weight, origin = self.scene.integrator.hits(
-                self.scene.mitsuba, self.scene.camera, mi.Float(u.astype(np.float32)), mi.Float(v.astype(np.float32))
-            )
+            u, v = (mi.Float(a.astype(np.float32)) for a in (u, v))
+            if self.crowded:
+                o, d, weight = self._rays(
+                    u, v, None if lens is None else [mi.Float(a.astype(np.float32)) for a in lens]
+                )
+                si, _, origin = self.scene.integrator.reached(self._world(), o, d)
+                si = self.scene.traced.sharpen(si, origin)
+            else:
+                si, weight, origin = self.scene.integrator.hits(self._world(), self.scene.camera, u, v)
             dr.eval(si, weight, origin)
         return Sample(si, weight, origin)
 
@@ -174,7 +204,7 @@ class Renderer:
         hits = Hits(self._trace(u.ravel(), v.ravel()), self.height, self.width)
         hits.eye = self._eye()
         if self.crowded:
-            hits.edges |= _creases(np.where(hits.valid[..., None], hits.normal, 0.0)) | self._parted()
+            hits.edges |= _creases(np.where(hits.valid[..., None], hits.normal, 0.0)) | self._parted(values)
         hits.edges |= self._painted(hits)
         self._hits[key] = hits
         while len(self._hits) > self.remember:
@@ -483,41 +513,48 @@ class Renderer:
         """Finer samples of the pixels `index`; of `bent` among them, where no edge is, fewer."""
         key = (index.tobytes(), np.asarray(bent).tobytes())
         if key not in hits.rims:
-            make = self._in_bodies if self.crowded else self._in_pixels
-            hits.rims = {key: make(index, np.isin(np.arange(len(index)), bent))}  # only the latest is kept
+            hits.rims = {key: self._in_pixels(index, np.isin(np.arange(len(index)), bent))}  # only the latest is kept
         return hits.rims[key]
 
     def _in_pixels(self, index: np.ndarray, bent: np.ndarray) -> Finer:
         """A Hammersley set in each pixel, shifted from pixel to pixel: an edge in any direction crosses the samples one
         by one, and not in rows, so that a shadow that moves changes a pixel in small steps. What only bends is smooth:
-        the middles of a square grid."""
-        counts = np.where(bent, BENT_SIDE**2, self.rim_samples)
+        the middles of a square grid. Behind a pupil each sample has a place on it as well."""
+        counts = np.where(bent, self.bent_side**2, self.rim_samples)
         starts = np.cumsum(counts) - counts
         u, v = np.empty((2, counts.sum()), np.float32)
-        for these, places in ((~bent, self._set(index[~bent], self.rim_samples)), (bent, _grid(BENT_SIDE))):
-            where = starts[these, None] + np.arange(places[0].shape[-1])
-            u[where], v[where] = self._at(index[these], places)
-        return Finer(counts, self._trace(u, v) if len(index) else None)
+        rim = starts[~bent, None] + np.arange(self.rim_samples)
+        middle = starts[bent, None] + np.arange(self.bent_side**2)
+        u[rim], v[rim] = self._at(index[~bent], self._set(index[~bent], self.rim_samples))
+        u[middle], v[middle] = self._at(index[bent], _grid(self.bent_side))
+        lens = None
+        if self.crowded and self.scene.camera.number(self.scene.camera.named("pupil")) > PINHOLE:
+            lens = np.full((2, counts.sum()), 0.5, np.float32)
+            lens[:, rim] = _places_on_lens(self.rim_samples, index[~bent])
+        return Finer(counts, self._trace(u, v, lens) if len(index) else None)
 
-    def _in_bodies(self, index: np.ndarray, bent: np.ndarray) -> Finer:
-        """A few samples for each body that a pixel sees, which weigh what it has of the pixel; of `bent` the middles of
-        its quarters, as nothing but shadows has an edge there."""
-        here = index[~bent]
-        u, v = self._at(here, self._set(here, CROWDED_RAYS << (self.fine - 1)))
-        row, k, weight = _shares(self._bodies(u, v), *(self.fine * n for n in LIT))
-        quarters = [a.ravel() for a in self._at(index[bent], _grid(2))]
-        pixel = np.append(np.flatnonzero(~bent)[row], np.repeat(np.flatnonzero(bent), 4))
-        u, v = (np.append(a[row, k], quarter) for a, quarter in zip((u, v), quarters))
-        weight = np.append(weight, np.full(len(quarters[0]), 0.25))
-        order = np.argsort(pixel, kind="stable")
-        sample = self._trace(u[order], v[order]) if len(order) else None
-        return Finer(np.bincount(pixel, minlength=len(index)), sample, weight[order])
+    def _parted(self, values: Mapping) -> np.ndarray:
+        """Pixels in whose corners and middle not one body is seen: also those of bodies that no middle sees. And
+        all that are as near to one of these as circles of confusion are wide."""
+        from scipy.ndimage import maximum_filter
 
-    def _parted(self) -> np.ndarray:
-        """Pixels in whose corners and middle not one body is seen: also those of bodies that no middle sees."""
         index = np.arange(self.height * self.width)
         bodies = self._bodies(*self._at(index, CORNERS))
-        return (bodies != bodies[:, :1]).any(1).reshape(self.height, self.width)
+        parted = (bodies != bodies[:, :1]).any(1).reshape(self.height, self.width)
+        camera = self.scene.camera
+        area, wide = values[f"{camera.name}.{camera.named('pupil')}"], 0.0
+        own = SimpleNamespace(**{n: values[f"{camera.name}.{n}"] for n in camera.numbers})
+        v, u = np.mgrid[: self.height, : self.width] + 0.5
+        if area > PINHOLE:
+            reach = self._reach()
+            wide = max(np.abs(camera.astray(own, u, v, far)).max() for far in (reach.min(), reach.max()))
+        # by a pixel at least, so that a small pupil changes no pixel's way of being sampled
+        return maximum_filter(parted, 2 * max(int(np.ceil(wide * np.sqrt(area / np.pi))), 1) + 1)
+
+    def _reach(self) -> np.ndarray:
+        """Distances of the balls from the camera, mm."""
+        eye = self._eye()
+        return np.concatenate([np.linalg.norm(c.middles - eye, axis=1) for c in self.scene.traced.crowds])
 
     def _bodies(self, u: np.ndarray, v: np.ndarray) -> np.ndarray:
         """A number for each body that rays through places in px of any shape meet, other than any other's; 0 where they
@@ -525,21 +562,17 @@ class Renderer:
         import drjit as dr
         import mitsuba as mi
 
-        o, d = self.scene.camera.ray(mi.Float(u.ravel()), mi.Float(v.ravel()))
-        wavelengths = self.scene.integrator.wavelengths(u.size)
-        met = self.scene.mitsuba.ray_intersect_preliminary(mi.Ray3f(o, d, mi.Float(0), wavelengths), coherent=True)
-        number, first = mi.UInt32(0), 1
-        for shape in self.scene.mitsuba.shapes():
-            faces = self.faces_each.get(shape.id(), 0)
-            own = met.is_valid() & (met.shape == mi.ShapePtr(shape))
-            number = dr.select(own, first + (met.prim_index // faces if faces else 0), number)
-            first += -(-shape.primitive_count() // faces) if faces else 1
-        return np.array(number).reshape(u.shape)
+        o, d, _ = self._rays(u.ravel(), v.ravel())
+        ray = mi.Ray3f(o, d, mi.Float(0), self.scene.integrator.wavelengths(dr.width(o)))
+        return np.array(self.scene.traced.number(self._world().ray_intersect_preliminary(ray, coherent=True))).reshape(
+            u.shape
+        )
 
     def _set(self, index: np.ndarray, count: int) -> tuple[np.ndarray, ...]:
         """(P, count) places in pixels: a Hammersley set, shifted in each by the R2 sequence."""
-        places = np.arange(count) / count, _reversed(count)
-        return tuple((place + (index * shift)[:, None]) % 1.0 for place, shift in zip(places, R2))
+        places = np.arange(count, dtype=np.float32) / count, _reversed(count).astype(np.float32)
+        shifts = ((index * shift % 1.0).astype(np.float32) for shift in R2)
+        return tuple((place + shift[:, None]) % 1.0 for place, shift in zip(places, shifts))
 
     def _at(self, index: np.ndarray, places: tuple) -> tuple[np.ndarray, np.ndarray]:
         """(P, n) positions in px of places in pixels."""
@@ -554,7 +587,7 @@ class Renderer:
         integrator = self.scene.integrator
         share = []
         for point in integrator.spots(part):
-            share.append(integrator.visible(self.scene.mitsuba, si, dr.detach(point), part))
+            share.append(integrator.visible(self._world(), si, dr.detach(point), part))
             dr.eval(share[-1])
         return share[0] if len(share) == 1 else share
 
@@ -569,7 +602,7 @@ class Renderer:
         self._tune(sample.si)
         shares, total = visible if isinstance(visible, list) else [visible], 0.0
         for point, seen in zip(self.scene.integrator.spots(part), shares):
-            total += take(self.scene.integrator.direct(self.scene.mitsuba, *sample[:3], part, seen, point))
+            total += take(self.scene.integrator.direct(self._world(), *sample[:3], part, seen, point))
             if len(shares) > 1:
                 dr.eval(total)
         return total / len(shares)
@@ -749,26 +782,25 @@ class Renderer:
                 sampler = mi.load_dict({"type": "independent"})
                 sampler.seed(directions, count)
                 self._tune(sample.si)
-                return self.scene.integrator.bounced(self.scene.mitsuba, *sample[:3], lamp, 1, sampler)
+                return self.scene.integrator.bounced(self._world(), *sample[:3], lamp, 1, sampler)
 
-            rows, columns = -(-self.height // BOUNCE_CELL), -(-self.width // BOUNCE_CELL)
-            coarse = self._each_band(shade, other).reshape(rows, columns, -1, self.bands).mean(2)
-            image = zoom(coarse, (BOUNCE_CELL, BOUNCE_CELL, 1), order=1, mode="nearest", grid_mode=True)
+            cell, samples = self.bounce
+            rows, columns = -(-self.height // cell), -(-self.width // cell)
+            coarse = self._each_band(shade, other).reshape(rows, columns, samples, self.bands).mean(2)
+            image = zoom(coarse, (cell, cell, 1), order=1, mode="nearest", grid_mode=True)
             self._keep_plain(own, image[: self.height, : self.width].astype(float))
         return self._bounced(values, led, self._plain[key], component)
 
     def _spread_rays(self, seed: int) -> tuple[Sample, int, int]:
         """(ends of the camera rays that gather light from all around, seed of their second directions, their number):
         the same for every geometry and LED."""
-        rows, columns = -(-self.height // BOUNCE_CELL), -(-self.width // BOUNCE_CELL)
+        cell, samples = self.bounce
+        rows, columns = -(-self.height // cell), -(-self.width // cell)
         v, u = np.mgrid[:rows, :columns]
         rng = np.random.default_rng([seed, 77])
-        each = max(BOUNCE_SAMPLES, -(-BOUNCE_RAYS // u.size))
-        count = u.size * each
-        at = [np.repeat(a.ravel(), each) + rng.random(count) for a in (u, v)]
-        sample = self._trace(
-            *(np.minimum(a * BOUNCE_CELL, size - 1e-3) for a, size in zip(at, (self.width, self.height)))
-        )
+        count = u.size * samples
+        at = [np.repeat(a.ravel(), samples) + rng.random(count) for a in (u, v)]
+        sample = self._trace(*(np.minimum(a * cell, size - 1e-3) for a, size in zip(at, (self.width, self.height))))
         return sample, int(rng.integers(2**31)), count
 
     def _bounced(self, values: Mapping, led: str, image: np.ndarray, component: int) -> np.ndarray:
@@ -817,7 +849,7 @@ class Renderer:
 
         def shade(membrane):
             self._tune(sample.si)
-            return self.scene.integrator.ambient(self.scene.mitsuba, *sample[:3], membrane) + 0 * sample.si.t
+            return self.scene.integrator.ambient(self._world(), *sample[:3], membrane) + 0 * sample.si.t
 
         found = sum(self._each_band(lambda m=m: shade(m)) for m in self.scene.membranes.values())
         return found if self.integral is None else found * self.integral.white
@@ -871,18 +903,15 @@ class Finer:
     """Finer samples of some pixels, those of a pixel behind each other.
 
     counts   (n,) of each pixel;   sample   their ends, N in all; None where no pixel has any
-    weights  (N,) share of its pixel that each stands for; None: all of a pixel the same
     """
 
-    def __init__(self, counts: np.ndarray, sample: Sample | None, weights: np.ndarray | None = None):
-        self.counts, self.sample, self.weights = counts, sample, weights
+    def __init__(self, counts: np.ndarray, sample: Sample | None):
+        self.counts, self.sample = counts, sample
         self.size = int(counts.sum())
         self._starts = np.cumsum(counts) - counts
 
     def mean(self, values: np.ndarray) -> np.ndarray:
         """(n, B) mean in each pixel of values (N, B)."""
-        if self.weights is not None:
-            return np.add.reduceat(values * self.weights[:, None], self._starts)
         return np.add.reduceat(values, self._starts) / self.counts[:, None]
 
     def span(self, values: np.ndarray) -> np.ndarray:
@@ -901,37 +930,17 @@ class LedImage:
         self.radiance: np.ndarray | None = None  # the image, in scenes without layers
 
 
+def _places_on_lens(count: int, index: np.ndarray) -> np.ndarray:
+    """(2, P, count) places on the unit square that stand for the pupil, to go with those in pixels: further coordinates
+    of the R4 sequence, which are in step with no other, shifted from pixel to pixel."""
+    step = 1 / 1.1673039782614187 ** np.arange(3, 5)  # powers of the root of x^5 = x + 1
+    return np.stack([(np.arange(count) * s + (np.asarray(index)[:, None] * s * 0.5) % 1.0) % 1.0 for s in step])
+
+
 def _grid(side: int) -> tuple[np.ndarray, np.ndarray]:
     """(n,), (n,) the middles of a square grid in a pixel, row by row."""
     k = np.arange(side**2)
     return (k % side + 0.5) / side, (k // side + 0.5) / side
-
-
-def _shares(bodies: np.ndarray, across: int, down: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rows and columns of a table (P, n) of numbers that stand for it, up to across * down for each number in each row;
-    and the share of the row, 1 in all, that each stands for.
-
-    Columns are the places of a Hammersley set. Those of a number are parted by their first coordinate, then by the
-    second, into parts of one size, and the one in the middle of each part is taken."""
-    order = np.argsort(_reversed(bodies.shape[1]))  # columns by their second coordinate
-    rows, left, found = np.arange(len(bodies)), np.ones(bodies.shape, bool), []
-    while len(rows):
-        table = bodies[rows]
-        own = table == table[np.arange(len(rows)), left.argmax(1)][:, None]
-        count, rank = own.sum(1), own.cumsum(1, dtype=np.int16)
-        for i in range(across):
-            low, high = (count * k // across for k in (i, i + 1))
-            part = (own & (rank > low[:, None]) & (rank <= high[:, None]))[:, order]
-            size, columns = part.sum(1), order[np.nonzero(part)[1]]
-            taken, starts = np.minimum(size, down), np.cumsum(size) - size
-            for j in range(down):
-                some = np.flatnonzero(taken > j)
-                at = starts[some] + ((j + 0.5) * size[some] / taken[some]).astype(int)
-                found.append((rows[some], columns[at], size[some] / taken[some] / bodies.shape[1]))
-        left &= ~own
-        more = left.any(1)
-        rows, left = rows[more], left[more]
-    return tuple(np.concatenate(parts) for parts in zip(*found)) if found else (*np.zeros((2, 0), int), np.zeros(0))
 
 
 def _reversed(count: int) -> np.ndarray:

@@ -228,7 +228,7 @@ class Walk:
         for led, point in zip(self.lamps, spots) if self.glowing(scene) else ():
             to_led = point - si.p
             distance = dr.norm(to_led)
-            clear = ~scene.ray_test(si.spawn_ray_to(point), si.is_valid())
+            clear = self.visible(scene, si, point, led)
             shone = self.excited(scene, si, led, to_led / distance, distance)
             for function in self.fading:
                 shone *= function(self.inside.path(si.p, origin, point, led, si), self.inside)

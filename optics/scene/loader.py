@@ -18,6 +18,7 @@ from pathlib import Path
 from optics.errors import BadScene, OutOfBounds, UnknownKey
 from optics.files.output import shipped
 from optics.scene import showing, trust
+from optics.scene.crowd import Traced
 from optics.scene.declare import LED_BY_LED, Effect, Part
 from optics.scene.integral import FEW, Integral, refuse_unseen
 from optics.scene.mitsuba_parts import DEFAULT_VARIANT, Declared, is_part, loading, move, use_variant
@@ -114,13 +115,13 @@ class Scene:
         with loading(self.registry):
             try:
                 # one by one: in parallel the parts are made, and then listed, in an order that changes from run to run
-                self.mitsuba = mi.load_file(
+                self._whole = mi.load_file(
                     str(self.path), parallel=False, optimize=False, **{k: str(v) for k, v in self.defines.items()}
                 )
             except (RuntimeError, ValueError, TypeError, KeyError) as error:
                 raise BadScene(f"{self.path}: {_reason(error, self.path, self.registry)}") from error
         with self._named():
-            self.neighbours = wire(self.mitsuba)
+            self.neighbours = wire(self._whole)
         self.parts: dict[str, Declared] = {}
         for part in self.neighbours.parts:
             if part.name in self.parts:
@@ -130,6 +131,8 @@ class Scene:
             self.camera, self.gel, self.block = (self.neighbours.one(role) for role in ("camera", "gel", "block"))
         integrator = self.neighbours.integrator
         self.integrator = integrator if is_part(integrator) else None
+        self._crowds = [part for part in self.parts.values() if hasattr(part, "balls")]
+        self._behind, self._placed, self._traced_crowds = False, [0], None
         declared = {n: self.registry.parts[p.kind] for n, p in self.parts.items()}
         lights = {n: p for n, p in self.parts.items() if declared[n].category == "emitter"}
         self.leds = {n: p for n, p in lights.items() if declared[n].stokes is None}
@@ -157,6 +160,29 @@ class Scene:
         self.integral: Integral | None = None
         if getattr(self.integrator, "integrates", False):
             self._integrate()
+
+    @property
+    def mitsuba(self):
+        """The Mitsuba scene, whose meshes are brought up to date first where `set` left them."""
+        if self._behind:
+            self._behind = False
+            with self._named():
+                for part in self._crowds:
+                    part.place()
+                self._whole.parameters_changed([])
+        return self._whole
+
+    @property
+    def traced(self):
+        """What images LED by LED trace (optics.scene.crowd.Traced); None where that is the Mitsuba scene itself."""
+        if not self._crowds:
+            return None
+        if self._traced_crowds is None:
+            self._traced_crowds = Traced(self._whole, self._crowds)
+        elif self._placed != [part.times for part in self._crowds]:
+            self._traced_crowds.place()
+        self._placed = [part.times for part in self._crowds]
+        return self._traced_crowds
 
     def _integrate(self) -> None:
         """Have channels be integrals over the wavelength (optics.scene.integral)."""
@@ -290,8 +316,10 @@ class Scene:
             found.update(dict.fromkeys(matching, value))
         return {**found, **{key: value for key, value in values.items() if not set(key) & set("*?[")}}
 
-    def set(self, values: Mapping[str, float | str], where: str = "") -> None:
-        """Set parameters by key; geometry is rebuilt once, and only if it changed."""
+    def set(self, values: Mapping[str, float | str], where: str = "", meshes: bool = True) -> None:
+        """Set parameters by key; geometry is rebuilt once, and only if it changed.
+
+        meshes = False leaves the meshes of crowds for when `mitsuba` is asked for: enough for `traced`."""
         import mitsuba as mi
 
         now = self.values()
@@ -312,9 +340,31 @@ class Scene:
                 moved.add(name)
         if stock:
             self._traversed.update()
-        with self._named():
-            if move([self.parts[n] for n in moved]):
-                self.mitsuba.parameters_changed([])
+        for part in self._crowds:
+            part.aside = not meshes
+        try:
+            with self._named():
+                if move([self.parts[n] for n in moved]):
+                    if meshes or not self._crowds:
+                        self._behind = False
+                        self._whole.parameters_changed([])
+                    else:
+                        self._behind = True
+        finally:
+            for part in self._crowds:
+                part.aside = False
+
+    def put(self, name: str, points, diameters=None) -> None:
+        """Give the bodies of a crowd (N, 3) places at rest, mm, and (N,) diameters; meshes follow when they are asked
+        for."""
+        part = self.parts[name]
+        part.put(points, diameters)
+        part.aside = True
+        try:
+            move([part])
+        finally:
+            part.aside = False
+        self._behind = True
 
     def check_press(self, values: Mapping[str, float | str], where: str) -> None:
         """Raises OutOfBounds for a press that is deeper than its gel is thick, of values that someone states.

@@ -30,6 +30,7 @@ ROLES = {  # of parameters: what the library turns, sets or solves for, whatever
     "second bounce": "weight of light that the skin reflects twice",
     "exposure": "full scale of the camera per unit of radiance",
     "pupil": "area of the camera's entrance pupil, mm^2; 0: a pinhole",
+    "focus": "distance from the camera at which its lens is sharp, mm",
     "press x": "where the skin is pressed, right, mm",
     "press y": "where the skin is pressed, down, mm",
     "press depth": "how deep the skin is pressed, mm; 0: untouched",

@@ -9,18 +9,60 @@ out, as its text says."""
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import numpy as np
 
 JAMMED = 0.384  # of the volume: where random sequential addition of equal balls ends (Widom's problem)
 
 
+def lots(count: int, seed: int) -> np.ndarray:
+    """(N,) one normal number for each bead, which says whether it is large or small."""
+    return np.random.default_rng([seed, 1]).standard_normal(count)
+
+
 def sizes(count: int, diameter: float, spread: float, seed: int) -> np.ndarray:
     """(N,) diameters in mm: log-normal about a mean, with the relative standard deviation `spread`."""
     if spread == 0:
         return np.full(count, float(diameter))
-    normal = np.random.default_rng([seed, 1]).standard_normal(count)
-    return diameter * np.exp(spread * normal - spread**2 / 2)
+    return diameter * np.exp(spread * lots(count, seed) - spread**2 / 2)
+
+
+def write_places(path: Path, points: np.ndarray, diameters: np.ndarray | None = None) -> None:
+    """Write (N, 3) middles in the world, mm, and (N,) diameters as a table `x,y,depth[,diameter]`."""
+    table = np.column_stack([points[:, :2], -points[:, 2], *([] if diameters is None else [diameters])])
+    names = "x,y,depth" + ("" if diameters is None else ",diameter")
+    np.savetxt(path, table, fmt="%.6f", delimiter=",", header=names, comments="")
+
+
+def read_places(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
+    """(N, 3) middles in the world, mm, and (N,) diameters or None, of a table with the columns `x`, `y`, `depth` below
+    the face, and perhaps `diameter`, mm. Raises ValueError with the file, the line and what is allowed."""
+    allowed = "allowed: a table of numbers, mm, whose first line is x,y,depth or x,y,depth,diameter"
+    try:
+        lines = [line.strip() for line in Path(path).read_text(encoding="utf-8").splitlines()]
+    except (OSError, UnicodeDecodeError) as error:
+        raise ValueError(f"places of beads: {path}: unreadable: {error}; {allowed}") from error
+    names = lines[0].replace(" ", "").split(",") if lines else []
+    if names not in (["x", "y", "depth"], ["x", "y", "depth", "diameter"]):
+        raise ValueError(f"places of beads: {path}: the first line is '{lines[0] if lines else ''}'; {allowed}")
+    rows = []
+    for number, line in enumerate(lines[1:], 2):
+        if not line:
+            continue
+        try:
+            row = [float(word) for word in line.split(",")]
+        except ValueError:
+            row = []
+        if len(row) != len(names) or not np.isfinite(row).all():
+            raise ValueError(f"places of beads: {path}, line {number}: '{line[:60]}'; {allowed}")
+        if len(row) == 4 and not row[3] > 0:
+            raise ValueError(f"places of beads: {path}, line {number}: diameter = {row[3]:g} mm; allowed: above 0")
+        rows.append(row)
+    if not rows:
+        raise ValueError(f"places of beads: {path} has no bead; {allowed}")
+    table = np.array(rows)
+    return table[:, :3] * [1, 1, -1], table[:, 3] if len(names) == 4 else None
 
 
 def draw(

@@ -80,9 +80,9 @@ class Sensor:
 
         places = flow.pixel_middles(self.shape).astype(np.float32)
         ray: Any = self.scene.camera.ray(mi.Float(places[:, 0]), mi.Float(places[:, 1]))
-        met = np.array(self.scene.mitsuba.ray_intersect(mi.Ray3f(*ray)).p, float).T
+        met = np.array(self.scene.traced.scene.ray_intersect(mi.Ray3f(*ray)).p, float).T
         away, nearest = cKDTree(self.rest).query(met)
-        on = away < 0.51 * self.beads.diameters()[nearest]  # the outline of a bead is a polyhedron's
+        on = away < 0.51 * self.beads.diameters()[nearest]  # float32 at outlines
         return np.where(on, nearest, -1).reshape(self.shape)
 
 

@@ -8,14 +8,16 @@ with the distance z of what p sees and the image's scale m, px per rad: of the p
 axis and m its focal length; of a `fisheye`, z is the way from the lens and m the local scale, the geometric mean along
 the radius and across it. A thin lens gives the same V (Potmesil & Chakravarty). The strength is the pupil's area, in
 which the variance is linear. The spread is exact for each V; between distances it is interpolated by polynomials in V
-(Chebyshev nodes), to 1e-3 of the finest detail.
+(Chebyshev nodes), to 1e-3 of the finest detail. In scenes full of beads no image is blurred: the rays of each pixel
+start all over the pupil, an even disc of that area, and meet at the focus, so that what hides what is as seen from each
+point of it.
 Fingerprint
     rims of beads are soft near the lens and at the base, and sharp between; lens blur is the same at every depth. Where
     all that is seen has one distance, the two are the same.
 Validity
-    blur that is small against the beads: what a bead hides of another is not seen past its rim, and a Gaussian has
-    tails that a disc has not. A pixel spreads as far as the distance at its middle says: of discs as wide as the beads'
-    radius of 3 px, rays through the pupil leave most of the change unexplained.
+    lenses without other aberrations. Where images are blurred, blur that is small against what is seen: what a body
+    hides of another is not seen past its rim, a Gaussian has tails that a disc has not, and a pixel spreads as far as
+    the distance at its middle says.
 References
     Potmesil & Chakravarty, ACM TOG 1 (1982) 85; Born & Wolf, Principles of Optics, 8.8 (beyond geometry).
 """

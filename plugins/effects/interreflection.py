@@ -3,10 +3,11 @@
 Definition
     L' = L + s L_2,   L_2 the light after two reflections
 by Monte Carlo over the second direction. s = 1 is physics; a fit that needs s far from 1 means that interreflection is
-not the cause.
+not the cause. Among fluorescent beads it is the light that they scatter into one another: what one sends, its own light
+and what it reflects, is reflected by the next, and the excitation that it reflects excites the next again.
 Fingerprint
     the inner flanks of a dent and its shadows brighten, with the square of the reflectance: colours become more
-    saturated. A specular lobe brightens where a mirror would.
+    saturated. A specular lobe brightens where a mirror would. Beads are lit from the sides that neighbours are on.
 Validity
     two reflections; a bright cover outside the gel takes part only if it is in the scene.
 References

@@ -22,13 +22,17 @@ XML
     count integer, 1000: number of beads
     seed integer, 0: of the draw
     detail integer, 2: subdivisions of an icosahedron, 1 to 4
-    fine integer, 1: finer samples at outlines: 6 fine^2 of each bead in each pixel are lit, 1 to 6
+    fine integer, 1: samples of a pixel that has an outline, 16 times 2^(fine - 1); 1 to 6
+    places string, drawn: a table of measured places in place of the draw, .csv with the columns x, y, depth and perhaps
+        diameter, mm, at rest; `count`, `width`, `length`, `top` and `bottom` then say nothing, nor do `diameter` and
+        `spread` beside measured diameters
 """
 
 from optics.scene.checking import agree, made
 from optics.scene.declare import Part
 from optics.scene.mitsuba_parts import Declared
 from optics.scene.parameter import Parameter
+from optics.scene.regions import found_file
 
 PARAMETERS = (
     Parameter(
@@ -81,16 +85,24 @@ def build():
     import numpy as np
     import trimesh
 
-    from optics.skin.cloud import draw, sizes
+    from optics.skin.cloud import draw, read_places, sizes
     from optics.skin.halfspace import carried_points
 
     class Beads(Declared.on_mesh()):
         kind = "beads"
         moved_by = "gel"
         carrier = None
+        aside = False  # whether the mesh waits
+        times = 0  # how often the beads were placed
+        version = 0  # how often `put` was called
 
         def __init__(self, props):
             self.count, self.seed = int(props.get("count", 1000)), int(props.get("seed", 0))
+            table = str(props.get("places", "drawn"))
+            self.given, self.measured = None, None  # places and diameters that are known
+            if table != "drawn":
+                self.given, self.measured = read_places(found_file([str(f) for f in mi.file_resolver()], table))
+                self.count = len(self.given)
             self.detail = int(props.get("detail", 2))
             self.fine = int(props.get("fine", 1))
             if self.count < 1 or not 1 <= self.detail <= 4 or not 1 <= self.fine <= 6:
@@ -101,7 +113,6 @@ def build():
             ball = trimesh.creation.icosphere(subdivisions=self.detail)
             # Cauchy: the mean silhouette of a convex body is a quarter of its surface
             self.ball = ball.vertices * (4 * np.pi / ball.area) ** 0.5
-            self.faces_each = len(ball.faces)  # by which a face's number tells its bead
             n = len(self.ball)
             faces = ball.faces + n * np.arange(self.count)[:, None, None]
             mi.Mesh.__init__(self, "beads", n * self.count, faces.size // 3, props, True, False)
@@ -112,7 +123,8 @@ def build():
                     f"beads '{self.name}': top = {own('top'):g} mm, bottom = {own('bottom'):g} mm; allowed: a "
                     "top above the bottom"
                 )
-            self.drawn = draw(self.count, self.box(), self.diameters(), self.seed, self.name, TRIES)
+            if self.given is None:
+                self.drawn = draw(self.count, self.box(), self.diameters(), self.seed, self.name, TRIES)
             params = mi.traverse(self)
             params["faces"] = mi.UInt32(faces.astype(np.uint32).ravel())
             self.rebuild(params)
@@ -126,25 +138,54 @@ def build():
             n = self.number
             return n("width") - n("diameter"), n("length") - n("diameter"), n("bottom") - n("top")
 
+        def takes(self, name):
+            if name in ("spread", "diameter") and self.measured is not None:
+                return False
+            return self.given is None or name not in ("width", "length", "top", "bottom")
+
+        def put(self, points, diameters=None):
+            """Take (N, 3) places at rest in the world, mm, and (N,) diameters as known; they show when the part is
+            placed next."""
+            if len(points) != self.count:
+                raise ValueError(f"beads '{self.name}': {len(points)} places for {self.count} beads")
+            self.given = np.array(points, float)
+            self.measured = None if diameters is None else np.array(diameters, float)
+            self.version += 1
+
         def diameters(self):
             """(N,) mm."""
+            if self.measured is not None:
+                return self.measured
             return sizes(self.count, self.number("diameter"), self.number("spread"), self.seed)
+
+        def sunk(self):
+            """(N, 3) mm that the beads have sunk."""
+            down = np.radians(self.number("gravity"))
+            way = self.number("settling") * (self.diameters() / self.number("diameter")) ** 2
+            return way[:, None] * [np.cos(down), np.sin(down), 0.0]
 
         def rest(self):
             """(N, 3) middles in the world while nothing presses, mm."""
-            points = (self.drawn - [0.5, 0.5, 0.0]) * self.box()
-            points = points * [1, 1, -1] - [0, 0, self.number("top")]
-            down = np.radians(self.number("gravity"))
-            sunk = self.number("settling") * (self.diameters() / self.number("diameter")) ** 2
-            return points + sunk[:, None] * [np.cos(down), np.sin(down), 0.0]
+            points = self.given
+            if points is None:
+                points = (self.drawn - [0.5, 0.5, 0.0]) * self.box()
+                points = points * [1, 1, -1] - [0, 0, self.number("top")]
+            return points + self.sunk()
 
         def centres(self):
             """(N, 3) present middles in the world, mm, in the order of `rest`."""
             return self.middles.copy()
 
+        def balls(self):
+            """(N, 3) present middles and (N,) radii, mm: what is traced as balls (optics.scene.crowd)."""
+            return self.middles, self.diameters() / 2
+
         def rebuild(self, params):
             """Vertices for the present parameters and dent."""
             self.middles = carried_points(self.carrier, self.rest())
+            self.times += 1
+            if self.aside:
+                return
             radii = self.diameters()[:, None, None] / 2
             vertices = self.middles[:, None].astype(np.float32) + (radii * self.ball).astype(np.float32)
             params["vertex_positions"] = mi.Float(vertices.ravel())

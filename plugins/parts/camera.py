@@ -14,8 +14,8 @@ image, L_b is the radiance in band b, and M the sensitivities of the channels in
 camera of the colour-science library by its name). XML may give `fx`, `fy`, `cx`, `cy` (px) in place of the field of
 view. Frame: x right, y down, z forward (OpenCV); the transform `to_world` gives the nominal pose, `x` ... `roll` what
 departs from it. Rays of plain Mitsuba start on the entrance pupil, a disc of the area `pupil_area` across the axis, and
-meet where the ray through its middle is `focus` from the camera along the axis; images LED by LED are blurred as the
-effect "defocus" says.
+meet where the ray through its middle is `focus` from the camera along the axis; so do those of images LED by LED in
+scenes full of beads, and other images are blurred as the effect "defocus" says.
 Fingerprint
     principal point and pose shift the image; distortion grows with the third power of the radius; exposure scales all.
 Validity
@@ -115,7 +115,14 @@ PARAMETERS = (
         role="pupil",
     ),
     Parameter(
-        "focus", "mm", 20.0, (0.01, 1e6), "distance of what is sharp, along the axis", plausible=1.0, how="image"
+        "focus",
+        "mm",
+        20.0,
+        (0.01, 1e6),
+        "distance of what is sharp, along the axis",
+        plausible=1.0,
+        how="image",
+        role="focus",
     ),
     Parameter(
         "exposure", "1", 1.0, (0.0, 1e6), "full scale per unit of radiance", plausible=0.1, how="image", role="exposure"
@@ -194,6 +201,7 @@ def build():
 
     class Camera(Declared.on(mi.Sensor)):
         kind = "camera"
+        sampled = False  # whether images LED by LED are made of rays that start all over the pupil
         bands = 3  # of the scene
 
         def __init__(self, props):

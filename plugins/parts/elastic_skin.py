@@ -124,7 +124,14 @@ def build():
             found = forces.ball(n("press_depth"), n("tip_radius"))
             if n("press_force") == 0:
                 return found
-            return forces.ball_by_force(found.force(*elastic) + n("press_force"), n("tip_radius"), *elastic)
+            found = forces.ball_by_force(found.force(*elastic) + n("press_force"), n("tip_radius"), *elastic)
+            if found.depth > n("thickness"):
+                deep, thick, force = found.depth, n("thickness"), n("press_force")
+                raise ValueError(
+                    f"'{self.name}': press_force = {force:g} N presses the ball {deep:.3g} mm deep, the gel is "
+                    f"{thick:g} mm thick; allowed: less force, or a larger `young` (now {elastic[0]:g} MPa)"
+                )
+            return found
 
         def force(self):
             """(3,) force of the press along x, y and into the skin, N."""

@@ -75,6 +75,12 @@ def build():
 
         def fluorescence(self, si, led, to_led, distance):
             """Radiance per nm that light of an LED excites, for a unit vector to it and its distance."""
+            cos = dr.maximum(dr.dot(si.sh_frame.n, to_led), 0.0)
+            return self.excited(si, led, led.kappa(si, to_led, distance) * cos)
+
+        def excited(self, si, led, irradiance):
+            """Radiance per nm that light of an LED's spectrum excites, by the irradiance in the middle of the
+            spectrum."""
             s1, s2 = led.fwhm / WIDTH, self.absorption_fwhm / WIDTH
             square = dr.square(s1) + dr.square(s2)
             middle = (led.wavelength * dr.square(s2) + self.absorption_peak * dr.square(s1)) / square
@@ -87,10 +93,9 @@ def build():
                 * dr.exp(-dr.square(led.wavelength - self.absorption_peak) / (2 * square))
                 * middle
             )
-            cos = dr.maximum(dr.dot(si.sh_frame.n, to_led), 0.0)
             if self.integral is not None:  # the power of a light is that of all its wavelengths
                 overlap /= math.sqrt(2 * math.pi) * s1
-            absorbed = dr.select(led.wavelength > 0, led.kappa(si, to_led, distance) * cos * overlap, 0.0)
+            absorbed = dr.select(led.wavelength > 0, irradiance * overlap, 0.0)
             bands = self.nm(si.wavelengths)
             s = self.emission_fwhm / WIDTH
             photons = dr.exp(-dr.square((bands - self.emission_peak) / s) / 2) / (math.sqrt(2 * math.pi) * s)
@@ -104,6 +109,10 @@ def build():
             """Power per nm that is emitted, per photon, at wavelengths; numpy."""
             s = own.emission_fwhm / WIDTH
             return np.exp(-(((nm - own.emission_peak) / s) ** 2) / 2) / (math.sqrt(2 * math.pi) * s * nm)
+
+        def returned(self, nm):
+            """Reflectance at wavelengths (Dr.Jit)."""
+            return self.in_range(self.rho_r, self.rho_g, self.rho_b, nm)
 
         def brdf(self, si, wo, active=True):
             return self.rho(si) * dr.inv_pi

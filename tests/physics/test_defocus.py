@@ -47,7 +47,9 @@ def test_the_blur_is_that_of_rays_through_the_pupil(mitsuba):
     from optics.light.rendering import RenderJob
     from optics.scene import loader
 
-    scene = loader.load("particle_gel", {"width": "96", "height": "96", "beads": "120", "diameter": "1.6"})
+    scene = loader.load(
+        "particle_gel", {"width": "96", "height": "96", "beads": "120", "diameter": "1.6", "bottom": "3.6"}
+    )
     wide = {"camera.pupil_area": 12.0, "camera.focus": 16.0}
     sharp, blurred, traced = (
         RenderJob(scene, spp=spp, layers=(), saturation=1.0)

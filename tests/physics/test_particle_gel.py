@@ -25,6 +25,7 @@ def test_outlines_are_those_of_balls(load):
     for centre, at in zip(centres, camera.project(centres)):
         u, v = (at + rng.uniform(-6, 6, (40_000, 2))).astype("f").T
         o, d = camera.ray(mi.Float(u), mi.Float(v))
+        o = o + d * ((-4.45 - o.z) / d.z)  # behind the face of the base
         si = scene.mitsuba.ray_intersect(mi.Ray3f(o, d, mi.Float(0), scene.integrator.wavelengths(len(u))))
         hit = np.array(si.shape == mi.ShapePtr(next(s for s in scene.mitsuba.shapes() if s.id() == "beads")))
         away = centre - np.array([0, 0, -18.75])
@@ -82,7 +83,7 @@ def test_a_path_tracer_sees_the_same_light(load):
     """Light by light with few samples in each pixel, and mi.render with many, through an absorbing gel."""
     from optics.light.rendering import RenderJob
 
-    scene = load(width=60, height=60, beads=60, diameter=2.4, depth=0.5)
+    scene = load(width=60, height=60, beads=60, diameter=2.4, depth=0.5, top=1.3, bottom=3.2)
     absorbing = {"gel.absorption": 0.05}
     exact, traced = (RenderJob(scene, spp=spp, layers=(), saturation=1.0).take(absorbing) for spp in (None, 256))
     one, other = (image.camera.reshape(6, 10, 6, 10, 3).mean((1, 3)) for image in (exact, traced))

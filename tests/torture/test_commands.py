@@ -34,6 +34,7 @@ BASE = {
     "design": "small.xml -n 2 --effects lens-vignetting",
     "compare": "readings",
     "calibrate": "readings -o out/study",
+    "locate": "images -o out/beads.csv",
     "diagnose": "study",
     "add": "study vignetting",
     "report": "study -o out/page.html",

@@ -21,6 +21,10 @@ EFFECTS = {
     "bleaching": (0.2, {"dye.bleaching": 0.2}),
     "bead settling": (0.1, {"beads.settling": 0.1}),
     "bead size spread": (0.1, {"beads.spread": 0.1}),
+    "defocus": (4.0, {"camera.pupil_area": 4.0}),
+    "refraction at the window": (0.03, {"base.index": 1.03}),
+    "finite layer": (1.0, {"gel.stiff_base": 1.0}),
+    "interreflection": (1.0, {"integrator.interreflection": 1.0}),
 }
 
 
@@ -55,7 +59,7 @@ def test_the_makers_skin_moves_as_the_models(rig, mitsuba):
 
 @pytest.mark.parametrize("effect", [None, *(pytest.param(e, marks=pytest.mark.slow) for e in EFFECTS)])
 def test_maker_and_model_agree(rig, made, effect):
-    """The second frame of a press, with and without each effect; the change by it is the model's to a fifth."""
+    """The second frame of a press, with and without each effect; the change by it is the model's to 0.3."""
     strength, values = EFFECTS.get(effect, (0.0, {}))
     captures = made({effect: strength} if effect else {})
     scene = rig.scene()
@@ -64,13 +68,13 @@ def test_maker_and_model_agree(rig, made, effect):
     plain = model.predict(Values(built), [1])[0]
     seen = captures.frames[1].image
     if effect is None:
-        # samples of both at rims, 0.3 DN in green, of up to 96; the noise of a frame is 2.5 to 4
-        assert np.std((seen - plain)[..., 1]) < 0.4 and seen[..., 1].max() > 80
+        # samples of both at rims, 0.09 DN in green, of up to 130; the noise of a frame is 0.7 to 1
+        assert np.std((seen - plain)[..., 1]) < 0.15 and seen[..., 1].max() > 80
         return
     changed = model.predict(Values({**built, **values}), [1])[0]
-    assert np.std(changed - plain) > 0.3
-    # a fifth of the change, of blur what rims hide, besides the error without any
-    assert np.std(seen - changed) < 0.3 + 0.2 * np.std(changed - plain)
+    assert np.std(changed - plain) > 0.2
+    # 0.3 of the change, besides the error without any: measured 0.02 to 0.25, most where samples are drawn at random
+    assert np.std(seen - changed) < 0.15 + 0.3 * np.std(changed - plain)
 
 
 @pytest.mark.slow
@@ -83,7 +87,7 @@ def test_rays_through_the_pupil_are_those_of_a_path_tracer(rig, made):
     scene = rig.scene()
     now = {**rig.built(scene, 0), **press, "inner_ring.power": 0.0, "camera.pupil_area": 20.0}
     traced = 247 * RenderJob(scene, spp=512, layers=(), saturation=1.0).take(now).camera[..., 1]
-    blocks = [a.reshape(20, 2, 20, 2).mean((1, 3)) for a in (soft - traced, soft - sharp)]
+    blocks = [a.reshape(16, 2, 16, 2).mean((1, 3)) for a in (soft - traced, soft - sharp)]
     # noise of 512 paths, up to 2 DN in a pixel; measured 0.5 of 3.0 in pixels with 4096 of them
     assert np.std(blocks[0]) < 0.5 * np.std(blocks[1]), [np.std(b) for b in blocks]
 

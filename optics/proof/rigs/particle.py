@@ -12,8 +12,8 @@ from optics.scene import loader as scenes
 
 
 class ParticleGel(ImageRig):
-    """Sixty beads under three presses, first and last the same, lit by one ring after the other; one press is held out.
-    8 bits, 4 DN of noise at 150. Clutter and kinds that the library lacks are not made."""
+    """Forty beads under three presses, first and last the same, lit by one ring after the other; one press is held out.
+    0.7 DN of noise in the dark, 1 at 150. Clutter and kinds that the library lacks are not made."""
 
     name = "particle_gel"
     effects = MAKERS
@@ -21,14 +21,16 @@ class ParticleGel(ImageRig):
     cluttered = False
     free = ("inner_ring.power", "outer_ring.power", "dye.yield", "camera.x_fov", "camera.z")
     defines = {
-        "width": "40",
-        "height": "40",
-        "x_fov": "40",
-        "beads": "60",
+        "width": "32",
+        "height": "32",
+        "x_fov": "34",
+        "beads": "40",
         "diameter": "1.2",
-        "field": "13",
-        "fine": "4",
-        "detail": "3",
+        "field": "11",
+        "top": "0.65",
+        "bottom": "3.85",
+        "fine": "5",
+        "detail": "1",
     }
     held_out = ("press-02",)
     presses = ((0.0, 0.0, 0.5), (2.0, -1.5, 0.6), (-1.5, 2.0, 0.5), (0.0, 0.0, 0.5))
@@ -41,7 +43,7 @@ class ParticleGel(ImageRig):
         rng = np.random.default_rng([seed, 1])
         values = {f"{name}.power": scene.values()[f"{name}.power"] * rng.uniform(0.9, 1.1) for name in scene.leds}
         values["dye.yield"] = rng.uniform(0.6, 0.75)
-        values["camera.x_fov"] = 40 + rng.uniform(-0.5, 0.5)
+        values["camera.x_fov"] = 34 + rng.uniform(-0.5, 0.5)
         return {**values, "cover.sigma": 0.0}
 
     def captures(self, cell: Cell, truth, unknown, *, mean: bool = False) -> capture_files.Captures:
