@@ -28,7 +28,7 @@ from optics.scene import loader as scenes
 from optics.study import loop
 
 SENSOR = "Nikon 5100 (NPL)"
-BANDS = {"bands": "auto 3"}  # lens and plate change within the line of an LED
+NODES = {"plate": {"bands": "auto 3"}, "lens": {"bands": "auto 2"}}  # both change within the line of an LED
 IN_LAMPS = ("LED centre shift", "LED width", "phosphor leak")
 
 
@@ -42,7 +42,7 @@ class ColourBench(Rig):
                "dispersive retardance")  # fmt: skip
     others = effects
     mistakes = ("gain +20 %", "gain -20 %", "black level 0.5 DN")
-    defines = BANDS
+    defines = NODES["plate"]
     lamps: Mapping[str, colour.Lamp] = {
         "led_blue": (Line(470, 25),),
         "led_cyan": (Line(505, 30),),
@@ -206,7 +206,7 @@ class WildColour(Wild):
 
 
 class DigitColour(Digit):
-    """Five presses, each lit by red, green and blue alone and by all of them, one at 0.4 of the exposure as well, and
+    """Four presses, each lit by red, green and blue alone and by all of them, one at 0.4 of the exposure as well, and
     a dark frame; one of the presses is held out. The paint was measured, to 1 %."""
 
     name = "digit_colour"
@@ -219,7 +219,7 @@ class DigitColour(Digit):
     random = ()
     pairs = ()
     mistakes = ("gain +20 %", "gain -20 %", "pattern 0.3 %")
-    defines = BANDS
+    defines = NODES["lens"]
     several = {
         "LED centre shift": tuple(f"led_{c}.centre_shift" for c in ("red", "green", "blue")),
         "LED width": tuple(f"led_{c}.line_growth" for c in ("red", "green", "blue")),
@@ -231,10 +231,11 @@ class DigitColour(Digit):
         "lateral colour": ("camera.lateral_colour",),
         "filter edge shift": ("camera.edge_tilt",),
     }
+    width, height = 24, 32
     frames = 4
 
     def scene(self):
-        return scenes.load("digit", {"width": str(self.width), "height": str(self.height), **BANDS})
+        return scenes.load("digit", {"width": str(self.width), "height": str(self.height), **self.defines})
 
     def built(self, scene, seed: int) -> dict[str, float]:
         return {**demo.truth(scene, seed), f"{scene.camera.name}.exposure": self.exposure}
@@ -243,7 +244,7 @@ class DigitColour(Digit):
         from optics.proof.makers import touch
         from optics.proof.rigs.touch import Shot
 
-        at = [tuple(float(v) for v in p) for p in touch.presses(5, seed)]
+        at = [tuple(float(v) for v in p) for p in touch.presses(4, seed)]
         leds = list(scene.leds)
         drives = {"all": dict.fromkeys(leds, 1.0), **{led: {led: 1.0} for led in leds}}
         shots = [
