@@ -366,7 +366,7 @@ def pigments_of(scene) -> list:
 
 def exciting_lights(scene, pigment) -> tuple[str, ...]:
     """The LEDs that make a pigment shine: those of a known wavelength, and those whose curve it absorbs."""
-    own = numbers_of(scene, pigment.name, scene.values())
+    own = SimpleNamespace(**{n: pigment.number(n) for n in pigment.numbers})
     found = []
     for name in scene.leds:
         part = scene.parts[name]
@@ -382,7 +382,7 @@ def refuse_unseen(scene) -> None:
     for name, part in scene.lights.items() if channels else ():
         curve: Curve | None = part.curves.get("spectrum")
         if curve is not None and not any(name in exciting_lights(scene, p) for p in pigments_of(scene)):
-            overlap(curve, channels, f"{scene.path}: {name}.spectrum", f"'{scene.camera.name}'")
+            overlap(curve, channels, f"{name}.spectrum", f"'{scene.camera.name}'")
 
 
 __all__ = ["FEW", "VISIBLE", "Integral", "colour_index", "parse", "refuse_unseen"]
