@@ -50,7 +50,9 @@ def compared(name: str) -> tuple[np.ndarray, np.ndarray, list[str]]:
     for c, channel in enumerate("RGB"):
         change = new[..., c].mean() / old[..., c].mean() - 1
         rms = np.sqrt((left[..., c] ** 2).mean() / (old[..., c] ** 2).mean())
-        lines.append(f"{name:8} {channel}   mean {100 * change:+6.1f} %   left by powers {100 * rms:5.2f} % of the image's rms")
+        lines.append(
+            f"{name:8} {channel}   mean {100 * change:+6.1f} %   left by powers {100 * rms:5.2f} % of the image's rms"
+        )
     lines.append(f"{name:8} powers that fit best: {', '.join(f'{n} {p:.3f}' for n, p in zip(lights, powers))}")
     return old, new, lines
 

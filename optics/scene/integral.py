@@ -10,9 +10,10 @@ the largest of all int S_k Q_c: light of one wavelength gives what a band at tha
 fixed bands  L_b is radiance per nm; M_cb = Q_c(nm_b) w_b/N with the weights w_b of the trapezium rule.
 auto         Lights have bands of their own: the nodes of Gauss rules for S_k sum_c Q_c, in each range in which
              shares and reflectances hold (EDGES); L_b = P_k(nm_b) and M_cb = int S_k Q_c l_b/N with the
-             Lagrange polynomial l_b of the node; a range that only an effect's light reaches has nodes too. What S_k and Q_c are, parameters among them, is in M alone: it is
-             exact whatever they are, and so are its derivatives. The number of nodes is the smallest with which what is
-             known of the paths (reflectances, the probes of `_probes`) has an error below TOLERANCE."""
+             Lagrange polynomial l_b of the node; a range that only an effect's light reaches has nodes too. What S_k
+             and Q_c are, parameters among them, is in M alone: it is exact whatever they are, and so are its
+             derivatives. The number of nodes is the smallest with which what is known of the paths (reflectances, the
+             probes of `_probes`) has an error below TOLERANCE."""
 
 from __future__ import annotations
 
@@ -204,13 +205,14 @@ class Integral:
             largest = (self.quantum * power * self.step).sum(1).max()
             polynomials, start, total = [], len(nm), 0.0
             for c in kept:
-                inside = nearest == c
+                share = self._share(nearest, c)
+                inside = share > 0
                 own = power if shares[c] > least else wide
-                weight = own * self.quantum.sum(0) * self.step
+                weight = own * self.quantum.sum(0) * self.step * share
                 for n in range(count or 1, (count or MOST) + 1):
                     nodes = gauss_nodes(self.grid[inside], weight[inside], n)
-                    rows = np.where(inside, lagrange(nodes, self.grid), 0.0)
-                    error = self._error(nodes, rows, inside, own) / largest
+                    rows = share * lagrange(nodes, self.grid)
+                    error = self._error(nodes, rows, share, own) / largest
                     if error <= TOLERANCE / len(kept):
                         break
                 total += float(error)
@@ -231,9 +233,18 @@ class Integral:
                 found = np.maximum(found, np.real(group.spectrum({**self.base, key: p.neutral + p.plausible})))
         return found
 
-    def _error(self, nodes: np.ndarray, rows: np.ndarray, inside: np.ndarray, power: np.ndarray) -> float:
+    def _share(self, ranges: np.ndarray, number: int) -> np.ndarray:
+        """(N,) what each place of the grid counts in a range: the place on a border of two counts half in each, as what
+        jumps there needs for an error of second order in the step."""
+        found = (ranges == number).astype(float)
+        for k in np.flatnonzero(np.isin(self.grid, EDGES)):
+            if k:
+                found[k] = ((ranges[k] == number) + (ranges[k - 1] == number)) / 2
+        return found
+
+    def _error(self, nodes: np.ndarray, rows: np.ndarray, share: np.ndarray, power: np.ndarray) -> float:
         """The largest error of the integrals of the probes over one range, of all channels."""
-        density = self.quantum * power * self.step * inside
+        density = self.quantum * power * self.step * share
         worst = 0.0
         for probe in self._probes():
             exact = density @ probe(self.grid)

@@ -1,7 +1,7 @@
 """A curve over the wavelength, for numbers, complex numbers and Dr.Jit.
 
-What a curve is of decides what its values may be, and what lies beyond its ends: light, sensitivity and the absorptance of a
-pigment are 0 there, a transmittance, a reflectance, an absorption and an index stay as they are at the end."""
+What a curve is of decides what its values may be, and what lies beyond its ends: light, sensitivity and the absorptance
+of a pigment are 0 there, a transmittance, a reflectance, an absorption and an index stay as they are at the end."""
 
 from __future__ import annotations
 

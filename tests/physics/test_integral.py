@@ -175,13 +175,15 @@ def test_light_that_only_an_effect_brings_has_nodes(mitsuba, tmp_path):
     paint = np.interp(scene.integral.nm, [400, 480, 560, 700], [0.1, 0.1, 0.9, 0.9])
     matrix = scene.integral.matrix({**scene.values(), key: 0.1}) - scene.integral.matrix(scene.values())
     found = matrix[:, group.bands] @ paint[group.bands]
-    own = gaussian(nm, 450.0, 20.0) / gaussian(nm, 450.0, 20.0).sum() - gaussian(nm, 592.0, 17.0) / gaussian(
-        nm, 592.0, 17.0
-    ).sum()
+    own = (
+        gaussian(nm, 450.0, 20.0) / gaussian(nm, 450.0, 20.0).sum()
+        - gaussian(nm, 592.0, 17.0) / gaussian(nm, 592.0, 17.0).sum()
+    )
     exact = 0.1 * scene.integral.quantum @ (own * np.interp(nm, [400, 480, 560, 700], [0.1, 0.1, 0.9, 0.9]))
     assert found == pytest.approx(exact / scene.integral.unit, abs=2e-4)  # of channels that are 1 at most
 
 
+@pytest.mark.slow
 def test_pigments_and_ultraviolet_leds_are_given_by_curves(mitsuba, tmp_path):
     """Vi2TaP with its Gaussians written as curves is the same image, in auto bands and in three; a curve of the LED
     that neither camera nor pigment takes up is refused."""

@@ -556,9 +556,9 @@ def test_bands_of_different_index_are_followed_apart(tmp_path, mitsuba):
     plate = box("plate", clear("glass", 1.5, more='<float name="dispersion" value="0.1"/>'), (40, 40, thick / 2),
                 turn='<rotate y="1" angle="50"/>')  # fmt: skip
     halves = [
-        f'<shape type="rectangle" id="{name}_plane"><transform name="to_world"><rotate x="1" angle="180"/><scale x="40" '
-        f'y="40"/><translate x="{middle + edge + 0.013}" z="15"/></transform>{BLACK}<emitter type="source" id="{name}"/>'
-        "</shape>"
+        f'<shape type="rectangle" id="{name}_plane"><transform name="to_world"><rotate x="1" angle="180"/><scale '
+        f'x="40" y="40"/><translate x="{middle + edge + 0.013}" z="15"/></transform>{BLACK}<emitter type="source" '
+        f'id="{name}"/></shape>'
         for name, middle in (("right", 40), ("left", -40))
     ]
     t = load(tmp_path, [plate, *halves], fov=14.0, size=64)

@@ -24,7 +24,7 @@ DIE, DIE_WIDTH = 450.0, 20.0  # nm: of what a phosphor lets through
 
 # effect -> how the other law differs from that of the library
 OTHER = {
-    "LED centre shift": "1.5 of it for arsenide and phosphide LEDs (beyond 560 nm), a half for nitride ones, as by heat",
+    "LED centre shift": "1.5 of it for LEDs of phosphides (beyond 560 nm), a half for those of nitrides, as by heat",
     "LED width": "towards the red alone, twice as much: the high-energy side keeps its slope",
     "phosphor leak": "the die stands at 445 nm and is 25 nm wide",
     "sensitivity tail": "half of it at the blue end, one and a half at the red end, as silicon responds",
@@ -94,12 +94,14 @@ def sensitivities(camera: str, hidden: Mapping[str, float] | None = None, other:
 
 
 def reflectance(rho: Sequence[float], hidden: Mapping[str, float], other: bool = False) -> np.ndarray:
-    """(N,) of a paint with the reflectances rho in the ranges of red, green and blue."""
+    """(N,) of a paint with the reflectances rho in the ranges of red, green and blue; on a border their mean, which is
+    what a sum over a step needs."""
     found = np.zeros(len(NM))
     for (low, high), middle, own in zip(RANGES, MIDDLES, rho):
         x = (NM - middle) / 100
         bent = x * (1 + 0.5 * x / 0.2) if other else x
-        found = np.where((low <= NM) & (high > NM), own * np.exp(hidden.get("metameric paint", 0.0) * bent), found)
+        share = ((low <= NM) & (high > NM)) / 2 + ((low < NM) & (high >= NM)) / 2
+        found += share * own * np.exp(hidden.get("metameric paint", 0.0) * bent)
     return found
 
 

@@ -9,6 +9,7 @@ law        "other": effects with the same cause and size as the library's, but a
 
 from __future__ import annotations
 
+import re
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
@@ -19,11 +20,11 @@ from optics.captures import capture_set as capture_files
 from optics.captures.noise import Noise
 from optics.proof import demo
 from optics.proof.cells import Cell
-from optics.proof.makers import colour
-from optics.proof.makers.colour import NM, Line
-from optics.proof.rigs.base import Rig, change_of, smooth, strength_at
+from optics.proof.makers import colour, touch
+from optics.proof.makers.colour import Line
+from optics.proof.rigs.base import PATTERNS, Mean, Rig, change_of, smooth, strength_at
 from optics.proof.rigs.bench import JITTER, PHOTODIODE, WANDER
-from optics.proof.rigs.touch import CAMERA, Digit, Wild
+from optics.proof.rigs.touch import CAMERA, Digit, Shot, Wild
 from optics.scene import loader as scenes
 from optics.study import loop
 
@@ -33,9 +34,9 @@ IN_LAMPS = ("LED centre shift", "LED width", "phosphor leak")
 
 
 class ColourBench(Rig):
-    """144 readings of three channels: each of six LEDs, the analyser round in twelve steps, the plate at two angles. The
-    powers of the LEDs are known to 1 %, as by a radiometer; the paint, the plate's retardance and the analyser's zero
-    are not."""
+    """144 readings of three channels: each of six LEDs, the analyser round in twelve steps, the plate at two angles.
+    The powers of the LEDs are known to 1 %, as by a radiometer; the paint, the plate's retardance and the analyser's
+    zero are not."""
 
     name = "colour_bench"
     effects = ("LED centre shift", "LED width", "phosphor leak", "sensitivity tail", "metameric paint",
@@ -44,11 +45,11 @@ class ColourBench(Rig):
     mistakes = ("gain +20 %", "gain -20 %", "black level 0.5 DN")
     defines = NODES["plate"]
     lamps: Mapping[str, colour.Lamp] = {
-        "led_blue": (Line(470, 35),),
+        "led_blue": (Line(470, 25),),
         "led_cyan": (Line(505, 30),),
-        "led_green": (Line(530, 47),),
+        "led_green": (Line(530, 35),),
         "led_amber": (Line(592, 17),),
-        "led_red": (Line(625, 17),),
+        "led_red": (Line(625, 20),),
         "led_white": (Line(450, 20, 1.0), Line(560, 120, 4.0)),
     }
     powers = {"led_red": 1.2, "led_white": 1.6}  # of the others 1
@@ -143,8 +144,6 @@ class ColourBench(Rig):
 
 def _places(scene: str, leds: tuple[str, ...]) -> dict[str, np.ndarray]:
     """Where LEDs stand, mm, by the scene's text."""
-    import re
-
     text, found = scenes.find(scene).read_text(encoding="utf-8"), {}
     for led in leds:
         place = re.search(rf'id="{led}">\s*<point name="position" x="([^"]+)" y="([^"]+)" z="([^"]+)"', text)
@@ -244,9 +243,6 @@ class DigitColour(Digit):
         return {**found, f"{scene.camera.name}.exposure": self.exposure}
 
     def shots(self, scene, seed: int):
-        from optics.proof.makers import touch
-        from optics.proof.rigs.touch import Shot
-
         at = [tuple(float(v) for v in p) for p in touch.presses(4, seed)]
         leds = list(scene.leds)
         drives = {"all": dict.fromkeys(leds, 1.0), **{led: {led: 1.0} for led in leds}}
@@ -262,8 +258,6 @@ class DigitColour(Digit):
         ]
 
     def captures(self, cell: Cell, truth, unknown, *, mean: bool = False) -> capture_files.Captures:
-        from optics.proof.rigs.base import PATTERNS, Mean
-
         scene = self.scene()
         noise: Noise | Mean = Mean(CAMERA) if mean else CAMERA
         maker = WildColour(
@@ -287,6 +281,3 @@ class DigitColour(Digit):
         paint = {f"membrane.rho_{c}": rho for c, rho in zip("rgb", (0.66, 0.52, 0.40))}
         found.priors = {key: (rho, 0.01 * rho) for key, rho in paint.items()}
         return found
-
-
-__all__ = ["NM", "ColourBench", "DigitColour", "WildColour"]
