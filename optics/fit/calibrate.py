@@ -303,7 +303,7 @@ def _descend(
         history.append(normal.total)
         promise, excess = descent.promised, max(normal.chi2 - sum(normal.frame_n) + count, 0.0)
         if promise < max(accuracy, negligible * excess):
-            return history, f"converged after {iteration} linearisations"
+            return history, _converged(len(history))
         if normal.total - promise > asked:
             return history, f"not followed: the linear model promised a fall of {promise:.3g}, and more was asked for"
         near = promise < NEAR * count
@@ -325,8 +325,15 @@ def _descend(
         return history, f"stopped after {max_iterations} linearisations without converging; allow more or start nearer"
     descent.theta, descent.values = best[1:]
     if best[0] < count:
-        return history, f"converged after {iteration + 1} linearisations"
+        return history, _converged(len(history))
     return history, f"the linear model still promised a fall of {best[0]:.3g}, which no step brought"
+
+
+def _converged(linearisations: int) -> str:
+    """A fit that starts at its optimum, as one that is taken up again does, needs one to know it."""
+    if linearisations == 1:
+        return "converged: the start is the optimum, by one linearisation"
+    return f"converged after {linearisations} linearisations"
 
 
 def _require_data(descent: Descent, normal: Normal) -> None:

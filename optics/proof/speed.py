@@ -6,6 +6,7 @@ taxim        a new press by the package of that name, where it is installed with
 derivatives  all derivative images of 30 parameters, in units of the primal
 render       the same scene by `tactile` and by stock `path`: time x variance, which is time at equal noise
 prediction   the images of six LEDs against `path` with as many samples as its noise needs to fall to their error
+spectra      a new press in auto bands over the same in the scene's fixed ones, in turns; processor time
 ranking      every effect scored on 16 frames of 160 x 120, presses solved for as well
 """
 
@@ -248,6 +249,43 @@ def against_stock(renderer, now: dict, ours: float) -> None:
     )
 
 
+NIKON = "Nikon 5100 (NPL)"
+SPECTRAL = {  # scene: what the image is taken of, the parameter that changes from lap to lap, and the target
+    "gelsight": ({"width": "320", "height": "240"}, "gel.press_depth", 1.5),
+    "digit": ({}, "gel.press_depth", 1.5),
+    "vi2tap": ({"analyzer": "90"}, "skin.press_depth", 2.5),
+}
+
+
+def spectral_cost(name: str, laps: int = 7) -> tuple[float, float, int]:
+    """Processor seconds of an image in fixed bands and in auto bands, medians of laps in turns, each at another depth
+    of the press; and the number of auto bands. The camera is the same."""
+    from optics.light.rendering import RenderJob
+    from optics.scene import loader as scenes
+
+    defines, key, _ = SPECTRAL[name]
+    loaded = [scenes.load(name, {**defines, "sensitivity": NIKON, **more}) for more in ({}, {"bands": "auto"})]
+    jobs = [RenderJob(scene) for scene in loaded]
+    spent: tuple[list[float], list[float]] = ([], [])
+    for lap in range(laps + 2):
+        for job, own in zip(jobs, spent):
+            start = time.process_time()
+            job.take({key: 0.4 + 0.03 * lap})
+            if lap >= 2:  # the first two compile kernels, and fill what is kept
+                own.append(time.process_time() - start)
+    return median(spent[0]), median(spent[1]), len(loaded[1].integral.nm)
+
+
+def spectra() -> None:
+    for name, (_, _, target) in SPECTRAL.items():
+        fixed, auto, bands = spectral_cost(name)
+        row(
+            f"{name}: auto bands / fixed bands",
+            f"{auto / fixed:.2f} x",
+            f"{1e3 * auto:.0f} ms with {bands} bands, {1e3 * fixed:.0f} ms fixed; target below {target} x",
+        )
+
+
 def ranking() -> None:
     """The time in which a diagnosis ranks all effects that gelsight can express."""
     from optics.captures import capture_set as files
@@ -303,6 +341,8 @@ def main() -> int:
     against_stock(renderer, now, ours)
     use_variant("llvm_ad_spectral_polarized")
     printed_grid()
+    use_variant("llvm_ad_spectral_polarized")
+    spectra()
     ranking()
     return 0
 

@@ -10,9 +10,10 @@ the largest of all int S_k Q_c: light of one wavelength gives what a band at tha
 fixed bands  L_b is radiance per nm; M_cb = Q_c(nm_b) w_b/N with the weights w_b of the trapezium rule.
 auto         Lights have bands of their own: the nodes of Gauss rules for S_k sum_c Q_c, in each range in which
              shares and reflectances hold (EDGES); L_b = P_k(nm_b) and M_cb = int S_k Q_c l_b/N with the
-             Lagrange polynomial l_b of the node. What S_k and Q_c are, parameters among them, is in M alone: it is
-             exact whatever they are, and so are its derivatives. The number of nodes is the smallest with which what is
-             known of the paths (reflectances, the probes of `_probes`) has an error below TOLERANCE."""
+             Lagrange polynomial l_b of the node; a range that only an effect's light reaches has nodes too. What S_k
+             and Q_c are, parameters among them, is in M alone: it is exact whatever they are, and so are its
+             derivatives. The number of nodes is the smallest with which what is known of the paths (reflectances, the
+             probes of `_probes`) has an error below TOLERANCE."""
 
 from __future__ import annotations
 
@@ -162,8 +163,10 @@ class Integral:
         ]
         most = max(self._signal(group) for group in found)
         found = [replace(group, seen=self._signal(group) / most if most > 0 else 0.0) for group in found]
-        exciting = tuple(n for n in scene.leds if scene.parts[n].held.get("wavelength", 0.0) > 0)
-        for pigment in [p for p in scene.parts.values() if hasattr(p, "fluorescence")] if exciting else ():
+        for pigment in pigments_of(scene):
+            exciting = exciting_lights(scene, pigment)
+            if not exciting:
+                continue
             seen_too = [n for g in found for n in g.lights if n in exciting and g.seen > NEGLIGIBLE]
             if seen_too and self.auto:
                 raise BadScene(
@@ -191,18 +194,25 @@ class Integral:
         colours = colour_index(self.grid)
         for group in contents:
             power = np.real(group.spectrum(self.base))
-            weight = power * self.quantum.sum(0) * self.step
-            shares = np.array([weight[colours == c].sum() for c in range(3)])
-            kept = [c for c in range(3) if shares[c] > NEGLIGIBLE * shares.sum()]
+            wide = self._widest(group)
+            shares, others = (
+                np.array([(p * self.quantum.sum(0) * self.step)[colours == c].sum() for c in range(3)])
+                for p in (power, wide)
+            )
+            least = NEGLIGIBLE * shares.sum()
+            kept = [c for c in range(3) if max(shares[c], others[c]) > least]
             nearest = np.array(kept)[np.abs(np.array(kept)[None] - colours[:, None]).argmin(1)]
             largest = (self.quantum * power * self.step).sum(1).max()
             polynomials, start, total = [], len(nm), 0.0
             for c in kept:
-                inside = nearest == c
+                share = self._share(nearest, c)
+                inside = share > 0
+                own = power if shares[c] > least else wide
+                weight = own * self.quantum.sum(0) * self.step * share
                 for n in range(count or 1, (count or MOST) + 1):
                     nodes = gauss_nodes(self.grid[inside], weight[inside], n)
-                    rows = np.where(inside, lagrange(nodes, self.grid), 0.0)
-                    error = self._error(nodes, rows, inside, power) / largest
+                    rows = share * lagrange(nodes, self.grid)
+                    error = self._error(nodes, rows, share, own) / largest
                     if error <= TOLERANCE / len(kept):
                         break
                 total += float(error)
@@ -213,9 +223,28 @@ class Integral:
         self.nm, self.error = np.array(nm), worst
         return groups
 
-    def _error(self, nodes: np.ndarray, rows: np.ndarray, inside: np.ndarray, power: np.ndarray) -> float:
+    def _widest(self, group: Group) -> np.ndarray:
+        """(N,) the largest power per nm that an effect of a plausible size gives a group: where a phosphor's die may
+        leak there have to be nodes, as those of another range say nothing of what becomes of its light."""
+        found = np.real(group.spectrum(self.base))
+        for key in group.keys:
+            p = self.scene.parameters[key]
+            if p.neutral is not None:
+                found = np.maximum(found, np.real(group.spectrum({**self.base, key: p.neutral + p.plausible})))
+        return found
+
+    def _share(self, ranges: np.ndarray, number: int) -> np.ndarray:
+        """(N,) what each place of the grid counts in a range: the place on a border of two counts half in each, as what
+        jumps there needs for an error of second order in the step."""
+        found = (ranges == number).astype(float)
+        for k in np.flatnonzero(np.isin(self.grid, EDGES)):
+            if k:
+                found[k] = ((ranges[k] == number) + (ranges[k - 1] == number)) / 2
+        return found
+
+    def _error(self, nodes: np.ndarray, rows: np.ndarray, share: np.ndarray, power: np.ndarray) -> float:
         """The largest error of the integrals of the probes over one range, of all channels."""
-        density = self.quantum * power * self.step * inside
+        density = self.quantum * power * self.step * share
         worst = 0.0
         for probe in self._probes():
             exact = density @ probe(self.grid)
@@ -341,13 +370,30 @@ def texture_over(texture, nm: np.ndarray) -> Curve | None:
     return Curve(nm, values.copy(), "absorption") if np.ptp(values) > 1e-6 * np.abs(values).max() else None
 
 
+def pigments_of(scene) -> list:
+    """The parts of a scene that shine where ultraviolet light meets them."""
+    return [p for p in scene.parts.values() if hasattr(p, "fluorescence")]
+
+
+def exciting_lights(scene, pigment) -> tuple[str, ...]:
+    """The LEDs that make a pigment shine: those of a known wavelength, and those whose curve it absorbs."""
+    own = SimpleNamespace(**{n: pigment.number(n) for n in pigment.numbers})
+    found = []
+    for name in scene.leds:
+        part = scene.parts[name]
+        curve = part.curves.get("spectrum")
+        if part.held.get("wavelength", 0.0) > 0 if curve is None else pigment.excited_by(own, curve):
+            found.append(name)
+    return tuple(found)
+
+
 def refuse_unseen(scene) -> None:
-    """Refuse a light with a curve of its own that the camera's sensitivities do not see."""
+    """Refuse a light with a curve of its own that the camera's sensitivities do not see, nor any pigment."""
     channels = scene.camera.channels if scene.camera is not None else ()
     for name, part in scene.lights.items() if channels else ():
         curve: Curve | None = part.curves.get("spectrum")
-        if curve is not None:
-            overlap(curve, channels, f"{scene.path}: {name}.spectrum", f"'{scene.camera.name}'")
+        if curve is not None and not any(name in exciting_lights(scene, p) for p in pigments_of(scene)):
+            overlap(curve, channels, f"{name}.spectrum", f"'{scene.camera.name}'")
 
 
 __all__ = ["FEW", "VISIBLE", "Integral", "colour_index", "parse", "refuse_unseen"]

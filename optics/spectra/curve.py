@@ -1,7 +1,7 @@
 """A curve over the wavelength, for numbers, complex numbers and Dr.Jit.
 
-What a curve is of decides what its values may be, and what lies beyond its ends: light and sensitivity are 0 there, a
-transmittance, a reflectance, an absorption and an index stay as they are at the end."""
+What a curve is of decides what its values may be, and what lies beyond its ends: light, sensitivity and the absorptance
+of a pigment are 0 there, a transmittance, a reflectance, an absorption and an index stay as they are at the end."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ KINDS = {  # of a curve: its unit, the values it may have, and whether it is 0 b
     "sensitivity": ("relative", (0.0, np.inf), True),
     "transmittance": ("1", (0.0, 1.0), False),
     "reflectance": ("1", (0.0, 1.0), False),
+    "absorptance": ("1", (0.0, 1.0), True),
     "absorption": ("1/mm", (0.0, np.inf), False),
     "index": ("1", (0.1, 10.0), False),
 }

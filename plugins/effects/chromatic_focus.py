@@ -73,6 +73,6 @@ effect = Effect(
         ),
     ),
     acts=("curvature", "rim", "channel"),
-    needs="sharp edges in two colours",
+    needs="sharp edges in two colours as far apart as 470 and 625 nm",
     checks=(check_variances,),
 )

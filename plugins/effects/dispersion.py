@@ -58,7 +58,7 @@ effect = Effect(
         ),
     ),
     acts=("channel", "radius"),
-    needs="images in two colours",
+    needs="images in two colours as far apart as 460 and 620 nm",
     checks=(check_abbe_number,),
     random=random,
 )

@@ -30,6 +30,6 @@ effect = Effect(
     per="part",
     parameters=("retard_dispersion",),
     acts=("channel", "analyzer.angle"),
-    needs="a retardance, in two colours or more",
+    needs="a retardance, in two colours as far apart as 460 and 620 nm",
     checks=(check_ratio_of_colours,),
 )

@@ -66,6 +66,7 @@ effect = Effect(
         Parameter("edge_softness", "nm", 10.0, (1.0, 100.0), "softness w of the edge", plausible=2.0, how="image"),
     ),
     acts=("radius", "channel"),
-    needs="a wide field of view and light near the filter's edge",
+    needs="a wide field of view and light near the filter's edge: an LED within 20 nm of it, beside one 60 nm below, "
+    "which it leaves alone",
     checks=(check_shifted_edge,),
 )

@@ -52,6 +52,6 @@ effect = Effect(
         ),
     ),
     acts=("gel_path", "led_distance", "height", "channel"),
-    needs="LEDs of two colours, presses of different depth and place",
+    needs="an LED of 470 nm or less beside a red one, presses of different depth and place",
     checks=(check_tail,),
 )  # fmt: skip

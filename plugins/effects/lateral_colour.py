@@ -68,6 +68,6 @@ effect = Effect(
         ),
     ),
     acts=("radius", "gradient", "channel"),
-    needs="contours far from the middle in two colours",
+    needs="contours far from the middle in two colours as far apart as 470 and 625 nm",
     checks=(check_parabola,),
 )

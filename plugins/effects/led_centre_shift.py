@@ -46,6 +46,7 @@ effect = Effect(
         Parameter("centre_shift", "nm", 0.0, (-50.0, 50.0), "shift d of the spectrum", neutral=0.0, plausible=1.0),
     ),
     acts=("channel", "led"),
-    needs="coloured LEDs, or a measured spectrum, and several channels",
+    needs="coloured LEDs, or a measured spectrum, and several channels; to tell it from a paint or a width, a "
+    "second LED within 30 nm of the first, or a 10 nm band-pass filter on one flank of its line",
     checks=(check_shifted_line,),
 )

@@ -43,6 +43,7 @@ effect = Effect(
     stages={"spectrum": widen},
     parameters=(Parameter("line_growth", "1", 0.0, (-0.8, 5.0), "growth g of the width", neutral=0.0, plausible=0.1),),
     acts=("channel", "led"),
-    needs="coloured LEDs, or a measured spectrum, and several channels",
+    needs="coloured LEDs, or a measured spectrum, and several channels; to tell it from a shift or a response, 10 nm "
+    "band-pass filters on both flanks of a line",
     checks=(check_power_is_kept,),
 )

@@ -63,6 +63,7 @@ effect = Effect(
         Parameter("die_width", "nm", 20.0, (5.0, 60.0), "full width at half maximum of the die's line", plausible=3.0),
     ),
     acts=("channel", "led"),
-    needs="white LEDs and several channels",
+    needs="white LEDs and several channels; to tell it from a tail or from stray light, a long-pass filter of "
+    "500 nm before the LED, which takes the die's line away",
     checks=(check_power_is_kept,),
 )

@@ -52,6 +52,7 @@ effect = Effect(
         ),
     ),
     acts=("channel",),
-    needs="LEDs of different colours",
+    needs="LEDs of different colours; to tell it from crosstalk, an LED between two channels, such as 500 nm, or a "
+    "band-pass filter before an LED",
     checks=(check_pedestal,),
 )

@@ -10,6 +10,7 @@ with kappa and the spectrum w of the LED (S2), the absorptance a (a Gaussian of 
 `emission_peak`). Both w and a are Gaussians, whose product has a closed form: with their widths s1, s2, S^2 = s1^2 +
 s2^2 and the peaks l1, l2
     int w a l dl = absorptance sqrt(2 pi) s1 s2/S exp(-(l1 - l2)^2/(2 S^2)) (l1 s2^2 + l2 s1^2)/S^2
+Measured curves, of the LED or of the pigment, are integrated by a Gauss rule of eight nodes.
 Fingerprint
     markers shine in the colour of the emission, as bright as the ultraviolet at their place, at every angle of an
     analyser.
@@ -18,6 +19,11 @@ Validity
 References
     Vi2TaP (RA-L 2025), II.B: Silc Pig pigment under UVC LEDs; Lakowicz, Principles of Fluorescence Spectroscopy, 3rd
     ed., ch. 1.
+XML
+    emission_spectrum string: measured power of the fluorescence over the wavelength, in place of the Gaussian of
+        `emission_peak`: a file, a name or a law (see "Spectra" in the guide); relative
+    excitation_spectrum string: measured absorptance over the wavelength, 0 to 1 and 0 beyond its ends, which
+        `absorptance` scales, in place of the Gaussian of `absorption_peak`
 """
 
 import math
@@ -63,6 +69,8 @@ PARAMETERS = (
     ),
 )
 WIDTH = 2 * math.sqrt(2 * math.log(2))  # fwhm over standard deviation
+DARK = 1e-6  # share of a lamp's light whose absorption counts as none
+NODES = 8  # of integrals over a lamp's spectrum
 
 
 def build():
@@ -73,6 +81,11 @@ def build():
     class Fluorescent(matt()):
         kind = "fluorescent"
 
+        def __init__(self, props):
+            super().__init__(props)
+            self.read_spectrum(props, "emission_spectrum", "power")
+            self.read_spectrum(props, "excitation_spectrum", "absorptance")
+
         def fluorescence(self, si, led, to_led, distance):
             """Radiance per nm that light of an LED excites, for a unit vector to it and its distance."""
             cos = dr.maximum(dr.dot(si.sh_frame.n, to_led), 0.0)
@@ -81,32 +94,60 @@ def build():
         def excited(self, si, led, irradiance):
             """Radiance per nm that light of an LED's spectrum excites, by the irradiance in the middle of the
             spectrum."""
-            s1, s2 = led.fwhm / WIDTH, self.absorption_fwhm / WIDTH
-            square = dr.square(s1) + dr.square(s2)
-            middle = (led.wavelength * dr.square(s2) + self.absorption_peak * dr.square(s1)) / square
-            overlap = (
-                self.absorptance
-                * math.sqrt(2 * math.pi)
-                * s1
-                * s2
-                / dr.sqrt(square)
-                * dr.exp(-dr.square(led.wavelength - self.absorption_peak) / (2 * square))
-                * middle
-            )
+            absorbed, area = self.overlap(led)
             if self.integral is not None:  # the power of a light is that of all its wavelengths
-                overlap /= math.sqrt(2 * math.pi) * s1
-            absorbed = dr.select(led.wavelength > 0, irradiance * overlap, 0.0)
-            bands = self.nm(si.wavelengths)
-            s = self.emission_fwhm / WIDTH
-            photons = dr.exp(-dr.square((bands - self.emission_peak) / s) / 2) / (math.sqrt(2 * math.pi) * s)
-            seen = mi.Frame3f.cos_theta(si.wi) > 0
+                absorbed /= area
+            absorbed = irradiance * absorbed
+            if "spectrum" not in led.curves:
+                absorbed = dr.select(led.wavelength > 0, absorbed, 0.0)
             left = getattr(self, "yield") * dr.exp(-self.bleaching * self.time)
+            seen = mi.Frame3f.cos_theta(si.wi) > 0
             if self.lane is not None:
                 return dr.select(seen, left * absorbed * self.lane / math.pi, 0.0)
+            bands = self.nm(si.wavelengths)
+            measured = self.curves.get("emission_spectrum")
+            if measured is not None:
+                return dr.select(seen, left * absorbed * measured(bands) / (photons_of(measured) * math.pi), 0.0)
+            s = self.emission_fwhm / WIDTH
+            photons = dr.exp(-dr.square((bands - self.emission_peak) / s) / 2) / (math.sqrt(2 * math.pi) * s)
             return dr.select(seen, left * absorbed * photons / (bands * math.pi), 0.0)
+
+        def overlap(self, led):
+            """int w a l dl of an LED with the peak 1, and the area of its spectrum, nm."""
+            lamp, measured = led.curves.get("spectrum"), self.curves.get("excitation_spectrum")
+            s1, s2 = led.fwhm / WIDTH, self.absorption_fwhm / WIDTH
+            area = math.sqrt(2 * math.pi) * s1
+            if lamp is None and measured is None:
+                square = dr.square(s1) + dr.square(s2)
+                middle = (led.wavelength * dr.square(s2) + self.absorption_peak * dr.square(s1)) / square
+                apart = dr.exp(-dr.square(led.wavelength - self.absorption_peak) / (2 * square))
+                return self.absorptance * area * s2 / dr.sqrt(square) * apart * middle, area
+            if lamp is None:
+                x, w = np.polynomial.hermite.hermgauss(NODES)
+                rule = [(led.wavelength + math.sqrt(2) * s1 * x, math.sqrt(2) * s1 * w) for x, w in zip(x, w)]
+            else:
+                rule, area = gauss_rule(lamp), lamp.area / float(lamp.values.max())
+            total = mi.Float(0.0)
+            for nm, weight in rule:
+                if measured is not None:
+                    share = measured(mi.UnpolarizedSpectrum(nm))[0]
+                else:
+                    share = dr.exp(-dr.square((nm - self.absorption_peak) / s2) / 2)
+                total += weight * share * nm
+            return self.absorptance * total, area
+
+        def excited_by(self, own, lamp):
+            """Whether light of a measured spectrum excites it, at the numbers `own`; numpy."""
+            nm = np.arange(lamp.span[0], lamp.span[1] + 0.5)
+            measured, s = self.curves.get("excitation_spectrum"), own.absorption_fwhm / WIDTH
+            share = np.exp(-(((nm - own.absorption_peak) / s) ** 2) / 2) if measured is None else measured(nm)
+            return float((lamp(nm) * share).sum()) > DARK * float(lamp(nm).sum())
 
         def emission(self, own, nm):
             """Power per nm that is emitted, per photon, at wavelengths; numpy."""
+            measured = self.curves.get("emission_spectrum")
+            if measured is not None:
+                return measured(nm) / photons_of(measured)
             s = own.emission_fwhm / WIDTH
             return np.exp(-(((nm - own.emission_peak) / s) ** 2) / 2) / (math.sqrt(2 * math.pi) * s * nm)
 
@@ -118,6 +159,26 @@ def build():
             return self.rho(si) * dr.inv_pi
 
     return Fluorescent
+
+
+def photons_of(curve):
+    """int P(l) l dl of a measured power: photons, up to a constant."""
+    import numpy as np
+
+    nm = np.arange(curve.span[0], curve.span[1] + 0.25, 0.25)
+    return float(np.trapezoid(curve(nm) * nm, nm))
+
+
+def gauss_rule(lamp):
+    """[(nm, weight)] of integrals over a measured spectrum of peak 1."""
+    import numpy as np
+
+    from optics.spectra.quadrature import gauss_nodes, lagrange
+
+    nm = np.arange(lamp.span[0], lamp.span[1] + 0.25, 0.25)
+    power = lamp(nm) / float(lamp.values.max()) * 0.25
+    nodes = gauss_nodes(nm, power, NODES)
+    return [(float(n), float(w)) for n, w in zip(nodes, lagrange(nodes, nm) @ power)]
 
 
 def check_photons():
@@ -138,6 +199,35 @@ def check_photons():
     agree((found * nm).sum() * 0.2, 0.4 / math.pi * absorbed, 1e-4)  # power/d^2 = 1
 
 
+def check_measured_curves():
+    """Gaussians that are given as curves, of LED and pigment, shine as those that are given by their numbers."""
+    import drjit as dr
+    import mitsuba as mi
+    import numpy as np
+
+    place = {"position": [0.0, 0.0, 10.0], "power": 100.0}
+    line = {"wavelength": 365.0, "fwhm": 20.0}
+    numbers = {"absorption_peak": 330.0, "absorption_fwhm": 90.0, "emission_peak": 520.0, "emission_fwhm": 60.0}
+    nm = np.arange(150.0, 800.0, 2.0)
+    taken, sent = (np.exp(-4 * math.log(2) * ((nm - p) / w) ** 2) for p, w in ((330.0, 90.0), (520.0, 60.0)))
+    taken_text, sent_text = (
+        ", ".join(f"{n:g}:{v:.9f}" for n, v in zip(nm, values)) for values in (taken, sent / nm * 520)
+    )
+    paints = [made("fluorescent", **numbers)]
+    paints += [made("fluorescent", excitation_spectrum=taken_text, emission_spectrum=sent_text)]
+    lamps = [made("led", **place, **line), made("led", **place, spectrum="gaussian(365, 20)")]
+    si = dr.zeros(mi.SurfaceInteraction3f)
+    si.sh_frame, si.wi = mi.Frame3f(mi.Normal3f(0, 0, 1)), mi.Vector3f(0, 0, 1)
+    si.wavelengths = type(si.wavelengths)(500.0, 520.0, 560.0, 600.0)
+    found = [
+        [float(lane[0]) for lane in paint.fluorescence(si, lamp, mi.Vector3f(0, 0, 1), mi.Float(10.0))]
+        for paint in paints
+        for lamp in lamps
+    ]
+    for other in found[1:]:
+        agree(other, found[0], 1e-3)  # straight lines between points 2 nm apart
+
+
 def random(rng):
     """A pigment that ultraviolet light excites."""
     return {
@@ -147,4 +237,4 @@ def random(rng):
     }
 
 
-part = Part("fluorescent", "bsdf", PARAMETERS, build, checks=(check_photons,), random=random)
+part = Part("fluorescent", "bsdf", PARAMETERS, build, checks=(check_photons, check_measured_curves), random=random)

@@ -476,8 +476,9 @@ def test_the_critical_angle(tmp_path, mitsuba):
         assert (float(bs.wo.z[0]) > 0) == passes
 
 
-def through_prism(folder, apex, n, incidence, copies=8):
-    """Deviation (deg) of rays that pass both faces of a prism; angles in deg, `incidence` (N,)."""
+def through_prism(folder, apex, n, incidence, copies=8, more="", band=None):
+    """Deviation (deg) of rays that pass both faces of a prism; angles in deg, `incidence` (N,). band: number of the one
+    that they belong to; None: all, which then go one way."""
     half = np.radians(apex) / 2
     height = float(1 / np.tan(half))
     corners = [(x, y, z) for y in (-5, 5) for x, z in ((-1, 0), (1, 0), (0, height))]
@@ -488,12 +489,13 @@ def through_prism(folder, apex, n, incidence, copies=8):
     shape = (
         f'<shape type="obj" id="prism"><string name="filename" value="{folder / "prism.obj"}"/><boolean '
         'name="face_normals" value="true"/>'
-        f"{clear('glass', n)}</shape>"
+        f"{clear('glass', n, more=more)}</shape>"
     )
     t = load(folder, [shape, screen(30)])
+    group = (0, 1, 2) if band is None else (band,)
     angle = np.repeat(np.radians(incidence) - half, copies)  # of the ray above the base
     d = np.stack([np.cos(angle), 0 * angle, np.sin(angle)], -1)
-    log = followed(t, np.array([-0.4, 0.0, 0.6 * height]) - 3 * d, d, 3)
+    log = followed(t, np.array([-0.4, 0.0, 0.6 * height]) - 3 * d, d, 3, group=group)
     out = np.degrees(angle - np.arctan2(log[2, :, 5], log[2, :, 3])).reshape(len(incidence), copies)
     passed = ((log[1, :, 14] == 1) & (log[2, :, 14] == 0)).reshape(out.shape)  # neither face reflected
     assert passed.any(1).all() and (log[2, :, 3] > 0)[passed.ravel()].all()
@@ -510,6 +512,63 @@ def test_a_prism_deviates(tmp_path, mitsuba, apex, n):
     expected = np.degrees(theta - a + np.arcsin(n * np.sin(a - np.arcsin(np.sin(theta) / n))))
     np.testing.assert_allclose(found, expected, rtol=0, atol=3e-5)
     assert abs(found[0] - (2 * symmetric - apex)) < 3e-5 and found.min() > found[0] - 3e-5
+
+
+SELLMEIER = '<string name="index_spectrum" value="pmma.csv"/>'
+CAUCHY = '<float name="dispersion" value="0.008"/>'
+
+
+@pytest.mark.parametrize("law, more", [("sellmeier", SELLMEIER), ("cauchy", CAUCHY)])
+def test_a_prism_disperses(tmp_path, mitsuba, law, more):
+    """Each band goes the way of its own index: deviations at 620, 540 and 460 nm of an equilateral prism of 1.4932 at
+    540 nm, by n^2 = 1 + 1.1819 w^2/(w^2 - 0.011313), w in um, of the source of its table (whose rows have five digits:
+    5e-6 in n are 6e-4 deg), or by n + 0.008 ((540/nm)^2 - 1); and the spread from 460 to 620 nm."""
+    nm, apex = np.array([620.0, 540.0, 460.0]), np.radians(60.0)
+    um2 = (nm / 1e3) ** 2
+    n = np.sqrt(1 + 1.1819 * um2 / (um2 - 0.011313)) if law == "sellmeier" else 0.008 * ((540 / nm) ** 2 - 1)
+    n = 1.4932 + n - n[1]
+    incidence = np.array([40.0, 48.3, 60.0])
+    theta = np.radians(incidence)
+    found = np.array([through_prism(tmp_path, 60.0, 1.4932, incidence, more=more, band=b) for b in range(3)])
+    bent = np.arcsin(np.sin(theta) / n[:, None])
+    expected = np.degrees(theta - apex + np.arcsin(n[:, None] * np.sin(apex - bent)))
+    np.testing.assert_allclose(found, expected, rtol=0, atol=2e-3 if law == "sellmeier" else 5e-5)
+    spread = found[2] - found[0]
+    assert (spread > 0.3).all() and spread == pytest.approx(expected[2] - expected[0], abs=2e-3)
+
+
+def test_bands_of_different_index_are_followed_apart(tmp_path, mitsuba):
+    """A plate shifts a ray by d sin(a) (1 - cos(a)/sqrt(n^2 - sin(a)^2)) (Snell), each band by its own n: 1.5 + 0.1
+    ((540/nm)^2 - 1), more than any glass, so that blue and red see the edge of a screen 1.45 px apart behind a plate
+    that is turned by 50 deg, and green in the middle of the image."""
+    from scipy.optimize import brentq
+
+    thick, distance = 8.0, 35.0
+
+    def met(angle, n):
+        """Where a ray from the camera at an angle to the axis meets the screen, mm."""
+        a = np.radians(50.0) - angle
+        shift = thick * np.sin(a) * (1 - np.cos(a) / np.sqrt(n**2 - np.sin(a) ** 2))
+        return distance * np.tan(angle) + shift / np.cos(angle)
+
+    indices = 1.5 + 0.1 * ((540 / np.array([620.0, 540.0, 460.0])) ** 2 - 1)
+    edge = met(0.0, 1.5)
+    plate = box("plate", clear("glass", 1.5, more='<float name="dispersion" value="0.1"/>'), (40, 40, thick / 2),
+                turn='<rotate y="1" angle="50"/>')  # fmt: skip
+    halves = [
+        f'<shape type="rectangle" id="{name}_plane"><transform name="to_world"><rotate x="1" angle="180"/><scale '
+        f'x="40" y="40"/><translate x="{middle + edge + 0.013}" z="15"/></transform>{BLACK}<emitter type="source" '
+        f'id="{name}"/></shape>'
+        for name, middle in (("right", 40), ("left", -40))
+    ]
+    t = load(tmp_path, [plate, *halves], fov=14.0, size=64)
+    rows = t.take(rays=256, packets=1000, seed=1).radiance[:, 28:36].mean(1)  # (light, W, B), in the plane of incidence
+    share = rows[t.lights.index("right")] / rows.sum(0)
+    low, high = share[25:29].mean(0), share[36:40].mean(0)  # what the plate reflects twice makes a faint ghost
+    place = 36 - ((share - low) / (high - low))[28:36].sum(0)  # px from the left rim to the edge
+    pixel = 2 * np.tan(np.radians(7.0)) / 64
+    expected = [32 + np.tan(brentq(lambda angle, n=n: met(angle, n) - edge, -0.1, 0.1)) / pixel for n in indices]
+    assert place == pytest.approx(expected, abs=0.05)  # 256 rays in each of eight pixels at the edge
 
 
 def test_the_aperture_of_a_light_guide(tmp_path, mitsuba):

@@ -56,6 +56,21 @@ def test_spectral_names_and_back(tmp_path, rng, components):
     assert ("polarisationHandedness" in header) == (components == 4)
 
 
+def test_a_reader_of_the_convention_opens_it(tmp_path, rng):
+    """colour-science's reader of Spectral EXR finds every band and Stokes component."""
+    pytest.importorskip("OpenImageIO")
+    import colour
+
+    bands = [400.0, 452.5, 700.0]
+    stokes = rng.normal(size=(6, 8, 3, 4)).astype(np.float32)
+    exr.write(tmp_path / "s.exr", exr.spectral_channels(bands, stokes), exr.spectral_header(True))
+    found = colour.read_spectral_image_Fichet2021(str(tmp_path / "s.exr"))
+    for k in range(4):
+        nm, values = found[f"S{k}"]
+        np.testing.assert_allclose(nm, bands)
+        np.testing.assert_array_equal(values, stokes[..., k])
+
+
 def test_preview_has_the_colour_of_the_light():
     one = np.eye(3)[None]  # three pixels, each lit in one band
     rgb = np.stack(list(exr.preview_channels([460.0, 530.0, 640.0], one).values()), -1)[0]

@@ -12,6 +12,7 @@ SMALL = {"width": "24", "height": "18"}
 GRID = {"columns": "4", "rows": "4", "layers": "2", "block_width": "3.6", "block_length": "3.6"}
 CASES = {  # every shipped scene: what replaces its <default>s, at rest and pressed
     "9dtact": ({"depth": "0"}, {}),
+    "colour_bench": ({}, {"bands": "592, 530, 470"}),
     "digit": ({}, {"depth": "0.8"}),
     "gelsight": ({}, {"depth": "0.8"}),
     "gelsight_bench": ({"depth": "0"}, {}),

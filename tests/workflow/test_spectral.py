@@ -35,3 +35,14 @@ def test_a_hidden_shift_of_wavelengths_is_claimed(mitsuba, tmp_path):
     assert found.word == "CLAIM" and found.claimed == "LED centre shift"
     (row,) = [r for r in found.rows if r.name == "LED centre shift"]
     assert row.refit.strength[0] == pytest.approx(SHIFT, abs=4 * row.refit.sd[0])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["gelsight", "digit", "vi2tap"])
+def test_auto_bands_cost_little_more_than_fixed_ones(mitsuba, name):
+    """Processor time of an image at another press; the targets are those of `make bench`. A tenth more is allowed for
+    other work on the machine."""
+    from optics.proof.speed import SPECTRAL, spectral_cost
+
+    fixed, auto, _ = spectral_cost(name)
+    assert auto / fixed < 1.1 * SPECTRAL[name][2], (auto, fixed)

@@ -7,12 +7,14 @@ finger   vi2tap: stock films in the mono variant (optics.proof.makers.finger)
 grid     grid_bench: stock `volpath` (optics.proof.makers.grid)
 particle particle_gel: numpy alone (optics.proof.makers.particle)
 bench    polarizer_bench: coherency matrices (optics.proof.makers.bench)
+colour   colour_bench, and digit with channels as integrals: sums in steps of 1 nm (optics.proof.makers.colour)
 laboratory   student, runs, motor, polarimeter, laser, phone, photographs, polarization_camera: benches of
          other laboratories, by plain formulas (optics.proof.makers.laboratory)
 """
 
 from optics.proof.rigs.base import Rig
 from optics.proof.rigs.bench import Bench
+from optics.proof.rigs.colour import ColourBench, DigitColour
 from optics.proof.rigs.finger import Finger
 from optics.proof.rigs.grid import Grid
 from optics.proof.rigs.laboratory import (
@@ -37,6 +39,8 @@ RIGS: dict[str, type[Rig]] = {
         Grid,
         ParticleGel,
         Bench,
+        ColourBench,
+        DigitColour,
         Student,
         Runs,
         Motor,
