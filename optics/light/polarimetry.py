@@ -387,8 +387,8 @@ class Spot(Renderer):
                 min(place + 2, size) - start for place, size, start in zip((column, row), full, self.corner)
             )
 
-    def _trace(self, u: np.ndarray, v: np.ndarray):
-        return super()._trace(u + self.corner[0], v + self.corner[1])
+    def _trace(self, u: np.ndarray, v: np.ndarray, lens: np.ndarray | None = None):
+        return super()._trace(u + self.corner[0], v + self.corner[1], lens)
 
 
 @dataclass

@@ -130,7 +130,7 @@ def render(study: Record) -> str:
     nouns = FRAMES if points is None else SWEEPS
     verdicts = [verdict(told(study.diagnosis(i), points)) for i in range(len(study.steps))]
     page = environment.get_template("report.html.j2").render(
-        glossary=GLOSSARY,
+        glossary={k: v for k, v in GLOSSARY.items() if not points or "image" not in k + v},
         study=study.ladder,
         steps=study.steps,
         headline=headline(study, verdicts, nouns),

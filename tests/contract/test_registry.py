@@ -381,6 +381,7 @@ def test_the_shipped_parts_have_what_their_roles_ask_for(mitsuba, load_bench):
 
 NAMED = {  # files that read a parameter by its name, and why they may
     "optics/light/paths.py": {"index"},  # the declared meaning of `refracts`
+    "optics/scene/crowd.py": {"index"},  # of flat interfaces: the same
     "optics/light/transport.py": {"dop_q", "dop_u"},  # of sources among dielectric bodies, which must not polarize
 }
 
