@@ -304,8 +304,8 @@ class Material:
         return differences(lambda v: self.image({**now, key: v}), now[key], p.step * p.plausible, p.bounds)[0]
 
 
-# at rest dark, or without what makes an interface visible: for what no other scene has
-LAST = ("colour_bench", "particle_gel")
+# scenes that are dark at rest, and those whose interface is not there: for what no other scene has
+LAST = {"colour_bench": None, "particle_gel": "interface"}
 
 
 @pytest.fixture
@@ -324,7 +324,12 @@ def bench_of(benches, mitsuba):
                 kinds += effect.requires
         order = sorted(
             scene.shipped_scenes(),
-            key=lambda n: (n != "gelsight", n.startswith("polari") and n != "polarizer_bench", n in LAST, n),
+            key=lambda n: (
+                n != "gelsight",
+                n.startswith("polari") and n != "polarizer_bench",
+                LAST.get(n, "") in (None, kinds[0]),
+                n,
+            ),
         )
         # scenes with these kinds, then those where others play their roles
         for meant in (lambda kind: (kind,), REGISTRY.kinds):
