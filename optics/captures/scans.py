@@ -42,10 +42,11 @@ from optics.captures.corrections import (
 )
 from optics.captures.importing import Imported, comment, filled, noise_of_levels, write_set
 from optics.captures.noise import Noise
-from optics.captures.skin_motion import STRETCH, SkinMotion, skin_motion
+from optics.captures.skin_motion import SkinMotion, skin_motion
 from optics.errors import BadCapture
 from optics.files.images import read_image, varied
 from optics.files.output import shipped
+from optics.skin.contact import STRETCH
 
 FILE = "scan.yaml"
 DISTANCE = 30.0  # mm from the middle of the face to a light, where no better is known
@@ -499,7 +500,7 @@ def _motion(motion: SkinMotion | None) -> dict[str, Any] | None:
     if motion is None:
         return None
     return {
-        "areal_stretch": list(motion.corners()),
+        "areal_stretch": list(motion.extremes()),
         "places_agree": list(motion.places),
         "places_off_rms_mm": motion.rms,
         "coefficients": motion.coefficients.tolist(),

@@ -18,6 +18,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from optics.skin.contact import STRETCH
+
 ACROSS = 1200  # px: images are averaged down to about this; grain is wider than the pixels that are lost
 GRAIN = (0.75, 6.0)  # px after averaging: standard deviations of the two blurs whose difference is grain
 HALF, REACH = 1 / 7, 1 / 6  # of the spacing of contacts: half a square's side, and how far it is looked for
@@ -25,7 +27,6 @@ CLEAR = 1.4  # of a contact's radius: what its shadow and skirt change
 AGREES = 1.0  # px after averaging: the Cauchy loss's scale, and how well a place agrees with the cubic
 LEAST = 30  # places that agree, for the 20 numbers of two cubics
 SHARE = 0.2  # of all places: chance alone makes one of 300 agree
-STRETCH = ("stretch", "stretch_x", "stretch_y", "stretch_xx", "stretch_xy", "stretch_yy")
 
 
 @dataclass(frozen=True)
@@ -61,17 +62,20 @@ class SkinMotion:
     def settings(self) -> dict[str, float]:
         """The `stretch` parameters of a gel: J - 1 = s + sx x + sy y + sxx x^2 + sxy x y + syy y^2, by least squares
         over the image; 1, 1/mm and 1/mm^2."""
-        x, y = np.meshgrid(*(np.linspace(-half, half, 25) for half in (self.half_width, self.half_height)))
-        x, y = x.ravel(), y.ravel()
+        x, y = self._grid()
         terms = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], -1)
         found = np.linalg.lstsq(terms, self.areal_stretch(x, y), rcond=None)[0]
         return dict(zip(STRETCH, map(float, found)))
 
-    def corners(self) -> tuple[float, float]:
+    def extremes(self) -> tuple[float, float]:
         """Smallest and largest J - 1 on a grid over the image."""
-        x, y = np.meshgrid(*(np.linspace(-half, half, 25) for half in (self.half_width, self.half_height)))
-        found = self.areal_stretch(x, y)
+        found = self.areal_stretch(*self._grid())
         return float(found.min()), float(found.max())
+
+    def _grid(self) -> np.ndarray:
+        """(2, 625) x and y of a grid over the image, mm from its middle."""
+        axes = (np.linspace(-half, half, 25) for half in (self.half_width, self.half_height))
+        return np.reshape(np.meshgrid(*axes), (2, -1))
 
 
 def cubic(x: np.ndarray, y: np.ndarray) -> np.ndarray:

@@ -30,6 +30,8 @@ import numpy as np
 from optics.errors import UnknownKey
 from optics.files.heights import SUFFIXES as MAP_FILES
 
+# the numbers of a skin that state J - 1 = s + sx x + sy y + sxx x^2 + sxy x y + syy y^2, in this order
+STRETCH = ("stretch", "stretch_x", "stretch_y", "stretch_xx", "stretch_xy", "stretch_yy")
 SHAPES = ("sphere", "cylinder", "cube", "balls")
 MESH_FILES = (".stl", ".obj", ".ply")
 FILES = (*MESH_FILES, *MAP_FILES)

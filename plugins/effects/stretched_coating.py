@@ -4,8 +4,8 @@ Definition
     L' = L (1 + k (J - 1)),    J - 1 = s + sx x + sy y + sxx x^2 + sxy x y + syy y^2
 with the areal stretch J of the pressed face, that the gel's `stretch` parameters state (measured by the coating's own
 grain, which moves from the flat field to the press), and one number k for all places, LEDs and presses.
-    k < 0    a coating that is thinned scatters less: -S d/(1 + S d) where it absorbs nothing and air lies behind, with
-             its coefficient S of scattering and its thickness d (Kubelka-Munk, R = S d/(1 + S d), d -> d/J)
+    k < 0    a coating that is thinned scatters less: k = -1/(1 + S d) where it absorbs nothing and air lies behind,
+             with its coefficient S of scattering and its thickness d (Kubelka-Munk, R = S d/(1 + S d), d -> d/J)
     k > 0    what lies behind is brighter; or the gel, whose volume stays, is thinner by h (1 - 1/J) and its face nearer
              to the light: k = (3 z^2/D^2 - 1) h/z for a lamp at the height z and the distance D
 Fingerprint

@@ -58,7 +58,6 @@ INDENTER_SIZE = 1.5  # mm
 DRAG = ("friction", "shift_x", "shift_y", "twist")
 SHEARING = ("poisson", *DRAG)
 ROUNDING = ("smoothing", "skirt", "fillet")  # of the geometric dent
-STRETCH = ("stretch", "stretch_x", "stretch_y", "stretch_xx", "stretch_xy", "stretch_yy")
 STAGE = 0.05  # mm: how well a stage usually knows where it presses
 PARAMETERS = (
     Parameter("width", "mm", 20.0, (0.1, 1000.0), "size along x", plausible=0.1, how="difference", role="width"),
@@ -293,7 +292,7 @@ def build():
             "shift_x",
             "shift_y",
             "twist",
-            *STRETCH,
+            *contact.STRETCH,
         )  # what does nothing while press_depth is 0
 
         def __init__(self, props):
@@ -454,7 +453,7 @@ def build():
             n = self.number if self.recalled is None else self.recalled.__getitem__
             if n("press_depth") <= 0:
                 return dr.zeros(mi.Float, 1)
-            s, x, y, xx, xy, yy = map(n, STRETCH)
+            s, x, y, xx, xy, yy = map(n, contact.STRETCH)
             return s + (x + xx * p.x + xy * p.y) * p.x + (y + yy * p.y) * p.y
 
         def recall(self, values):
