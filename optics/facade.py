@@ -102,6 +102,7 @@ def calibrate(
     defines: Mapping[str, object] | None = None,
     plugins: Named = None,
     flat_field: str | None = None,
+    region: str = "",
     outside: bool = False,
     robust: bool = False,
     seed: int = 0,
@@ -124,6 +125,8 @@ def calibrate(
     held_out    groups of frames to test on and not to fit. None: every fourth, where there are four or more; []: none
     values      start values, by key, above those of the fit;   defines, plugins: as in `load`
     flat_field  how a background image enters: "multiplicative", "additive" or "none"; None: as the captures ask
+    region      what is fitted and judged: "all" of each image, or the "contact", where the gel has the shape of what
+                presses it; "": as the captures ask, else all
     outside     images and tables that captures.toml names may lie outside its folder
     robust      residuals beyond three sigmas count less (Huber)
     resume      continue the study in `folder`, if its inputs are the same
@@ -149,6 +152,7 @@ def calibrate(
         defines=defines,
         plugins=plugins,
         flat_field=flat_field,
+        region=region,
         outside=outside,
         robust=robust,
         seed=seed,
@@ -166,15 +170,17 @@ def compare(
     defines: Mapping[str, object] | None = None,
     plugins: Named = None,
     flat_field: str | None = None,
+    region: str = "",
     outside: bool = False,
 ) -> Compared:
     """Captures measured against a scene's predictions, without fitting anything.
 
-    fit        a study's folder (its last step) or a fit.toml: its values, definitions, plugins and flat field. On the
-               captures of the study the numbers are the study's own: values of held-out frames are those that it found
+    fit        a study's folder (its last step) or a fit.toml: its values, definitions, plugins, flat field and region.
+               On the captures of the study the numbers are the study's own: values of held-out frames are those that it
+               found
     values     by key, above those of the fit
     held_out   groups that the fit has not seen; None: those that it held out
-    defines, plugins, flat_field   replace those of the fit
+    defines, plugins, flat_field, region   replace those of the fit
     outside    images and tables that captures.toml names may lie outside its folder
 
     Raises BadScene where the fit belongs to another scene than the captures.
@@ -190,6 +196,7 @@ def compare(
         defines=defines,
         plugins=plugins,
         flat_field=flat_field or origin.get("flat_field"),
+        region=region or origin.get("region", ""),
         outside=outside,
         uncertainty=dict(origin.get("uncertainty", {})),
     )

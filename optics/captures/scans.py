@@ -480,16 +480,17 @@ def _facts(
         "noise": {"system_gain": noise.system_gain, "dark_noise": noise.dark_noise},
         "light_azimuths_deg": azimuths,
         "setup": {
-            "free": ["led_*.[xyz]", "gel.skirt", "gel.smoothing"],
-            # the circles give place and turn of a plate to a micrometre; its depth and tilt show in the shading only
-            "per_group": ["gel.press_depth", "gel.press_r[xy]"],
+            # where balls touch, the shape is known, and depth, tilt and the skin between them do not matter
+            "region": "contact",
+            "free": ["board.[xyz]", "board.scale", "led_*.turn"],
+            "per_group": ["gel.press_[xy]"],
             "flat_field": "multiplicative",
             "priors": {
-                "led_*.[xyz]": [None, 15.0],
-                "gel.press_depth": [None, 0.3 * scans[0].radius],
-                "gel.press_r[xy]": [None, 1.0],
-                "gel.skirt": [None, 0.1],
-                "gel.smoothing": [None, 0.03],
+                "board.[xy]": [None, 0.7 * DISTANCE],
+                "board.z": [None, 0.7 * DISTANCE],
+                "board.scale": [None, 0.7],
+                "led_*.turn": [None, 30.0],
+                "gel.press_[xy]": [None, 0.01],  # what the circles leave open, with a camera that is not square to it
             },
         },
         "warnings": warnings,
@@ -533,17 +534,26 @@ def _scene(facts: Mapping, scans: Sequence[Scan], lights: Mapping[str, np.ndarra
         rows=2 * math.ceil(0.58 * height * scale / (ball / MESH)) + 1,
         smoothing=f"{0.1 * ball:.3g}",
         skirt=f"{0.1 * ball:.3g}",
-        leds="\n".join(_led(label, *direction) for label, direction in lights.items()),
+        **_ring(lights),
     )
 
 
-def _led(label: str, x: float, y: float, z: float) -> str:
-    azimuth, elevation = math.atan2(y, x), min(max(math.atan2(z, math.hypot(x, y)), 0.3), 1.2)
-    across = DISTANCE * math.cos(elevation)
-    place = f'x="{across * math.cos(azimuth):.4g}" y="{across * math.sin(azimuth):.4g}"'
+def _ring(lights: Mapping[str, np.ndarray]) -> dict[str, str]:
+    """The board's height and its LEDs as XML: on one circle, each in the direction that the balls' shading shows, at
+    the mean elevation."""
+    elevations = [math.atan2(z, math.hypot(x, y)) for x, y, z in lights.values()]
+    elevation = min(max(float(np.mean(elevations)), 0.3), 1.2)
+    radius, height = DISTANCE * math.cos(elevation), DISTANCE * math.sin(elevation)
+    leds = [_led(label, math.atan2(y, x), radius, height) for label, (x, y, _) in lights.items()]
+    return {"board_z": f"{-height:.4g}", "leds": "\n".join(leds)}
+
+
+def _led(label: str, azimuth: float, radius: float, height: float) -> str:
+    place = f'x="{radius * math.cos(azimuth):.5g}" y="{radius * math.sin(azimuth):.5g}"'
     return f"""    <emitter type="led" id="led_{label}">
-        <point name="position" {place} z="{-DISTANCE * math.sin(elevation):.4g}"/>
-        <point name="target" x="0" y="0" z="0"/>
+        <string name="board" value="board"/>
+        <point name="position" {place} z="0"/>
+        <point name="target" x="0" y="0" z="{height:.4g}"/>
         <float name="mu" value="0"/>
         <float name="power" value="0"/>
     </emitter>"""
@@ -579,8 +589,13 @@ def readme(facts: Mapping) -> str:
             f"- images of {width} x {height} px, means of blocks of {facts['bin']} px",
             f"- noise: {facts['noise']['system_gain']:.3g} DN/DN and {facts['noise']['dark_noise']:.3g} DN, by "
             "neighbours of the level face; the coating's grain counts as noise",
-            f"- lights in scene.xml: azimuths {azimuths} deg by the balls' shading; elevation a guess, distance "
-            "assumed; calibrate them",
+            f"- lights in scene.xml: azimuths {azimuths} deg by the balls' shading, seen from the middle of the view; "
+            "assumed: one circle, parallel to the face, its distance, lights without a lobe; calibrate them",
+            "",
+            "Advised for a calibration (import.json)",
+            "- region contact: where balls touch, the shape is known, and only the optics can be wrong; '--region all' "
+            "fits the skin between them as well, with gel.skirt and gel.smoothing free",
+            "- free: the circle's middle, height and size, and where on it each LED stands (turn)",
             "",
         ]
     )

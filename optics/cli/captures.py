@@ -18,6 +18,7 @@ from optics.cli.shared import (
     Outside,
     Plugins,
     Quiet,
+    Region,
     Settings,
     app,
     check_finite,
@@ -311,6 +312,7 @@ def compare(
     define: Defines = None,
     sets: Settings = None,
     flat_field: FlatField = None,
+    region: Region = "",
     plugins: Plugins = None,
     outside: Outside = False,
     as_json: AsJson = False,
@@ -330,6 +332,7 @@ def compare(
         defines=pairs(define, "-D"),
         plugins=plugins,
         flat_field=flat_field,
+        region=region,
         outside=outside,
     )
     comparison = found.comparison

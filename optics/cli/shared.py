@@ -209,6 +209,16 @@ FlatField = Annotated[
         "--flat-field", metavar="MODE", help="How a background image enters: multiplicative, additive or none."
     ),
 ]
+Region = Annotated[
+    str,
+    typer.Option(
+        "--region",
+        metavar="all|contact",
+        help="What is fitted and judged: all of each image, or the contact, where the gel has the shape of what "
+        "presses it.",
+        show_default="all, or what an import advises",
+    ),
+]
 
 
 def command(function: Callable[..., None]) -> Callable[..., None]:

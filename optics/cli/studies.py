@@ -15,6 +15,7 @@ from optics.cli.shared import (
     Force,
     Outside,
     Plugins,
+    Region,
     Settings,
     StudyFolder,
     command,
@@ -121,6 +122,7 @@ def calibrate(
     define: Defines = None,
     sets: Settings = None,
     flat_field: FlatField = None,
+    region: Region = "",
     plugins: Plugins = None,
     outside: Outside = False,
     robust: Annotated[
@@ -147,6 +149,7 @@ def calibrate(
             defines=pairs(define, "-D"),
             plugins=plugins,
             flat_field=flat_field,
+            region=region,
             outside=outside,
             robust=robust,
             seed=seed,

@@ -30,6 +30,7 @@ MOVING = 0.15  # of the excess in all: what a tempered base may still absorb
 KAPPA = 0.1  # noise per pixel of derivative images over their signal, above which strengths are biased
 OWN_NOISE = 5.0  # standard deviations of the product of two independent noises, over the number of those that are apart
 FAINT = 10  # the power of the test is stated for the plausible strength over this
+INNER = 0.5  # of the values must be left where masks are one pixel wider, for these to be another choice of mask
 
 
 @dataclass
@@ -257,7 +258,10 @@ def _rank(evidence: Evidence, candidates: list[Candidate], seed: int) -> Table:
     order = sorted(candidates, key=lambda c: (not len(c.cone.live), -c.row.net, c.effect.name))
     p_best = min((c.row.p_family for c in candidates), default=1.0)
     uniform = _net_by(evidence, uniform_gram, candidates)
-    dilated = _net_by(evidence, evidence.thinned(lambda block: block.inner.astype(float)), candidates)
+    inner = np.concatenate([block.inner for block in evidence.blocks])
+    dilated = {}
+    if inner.mean() > INNER:  # of small islands little is left: other data, not another mask
+        dilated = _net_by(evidence, evidence.thinned(lambda block: block.inner.astype(float)), candidates)
     return Table(order, information, family, p_best, uniform, dilated)
 
 

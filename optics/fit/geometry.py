@@ -63,13 +63,14 @@ def _light(model: SceneModel, now: Mapping, hits: Hits) -> tuple[np.ndarray, np.
     """(H, W) each: incidence of the LED that is brightest in a pixel, distance to it, shadow of any, rims."""
     shadow, rim = np.zeros(hits.shape, bool), hits.edges.copy()
     incidence, distance, best = np.full(hits.shape, np.nan), np.full(hits.shape, np.nan), np.zeros(hits.shape)
+    places = model.scene.places_of(now)
     for led, power in model.lit(now).items():
         if led in model.scene.sources:
             continue
         image = model.renderer.led(now, led)
         shadow |= ~image.lit & hits.valid
         rim |= image.rim
-        to = _place(model, now, led) - hits.position
+        to = places[led] - hits.position
         strength = (power * model.renderer.image(now, led)).sum(-1)
         brightest = strength > best
         best = np.where(brightest, strength, best)
@@ -118,7 +119,7 @@ def lit_geometry(model: SceneModel, values: Values, frame: int) -> dict[str, np.
     to_camera = _unit(eye)
     found = {"depth": np.where(hits.valid, np.linalg.norm(eye, axis=-1), np.nan)} if scene.gel is None else {}
     best, toward, axis = np.full(hits.shape, -1.0), np.zeros(p.shape), np.zeros(p.shape)
-    at = {led: _place(model, now, led) for led in scene.leds}
+    at = scene.places_of(now)
     on = model.lit(now)
     for led, power in on.items():
         if led not in at:
@@ -145,11 +146,6 @@ def lit_geometry(model: SceneModel, values: Values, frame: int) -> dict[str, np.
             }
         )
     return found
-
-
-def _place(model: SceneModel, now: Mapping, led: str) -> np.ndarray:
-    """(3,) mm, where an LED stands."""
-    return np.array([float(now[model.scene.key(led, f"light {axis}")]) for axis in "xyz"])
 
 
 def _axis(led, pan: float, tilt: float) -> np.ndarray:

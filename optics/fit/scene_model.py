@@ -17,6 +17,7 @@ from optics.captures.capture_set import Captures, Frame, cfa_channel, sweeps, wi
 from optics.captures.noise import Noise
 from optics.errors import BadScene, UnknownKey
 from optics.fit import geometry
+from optics.fit.contact import ALL, CONTACT, REGIONS, known_shape
 from optics.fit.model import value_of
 from optics.light.development import STEP, Developer
 from optics.scene.loader import Scene
@@ -39,10 +40,16 @@ class SceneModel:
                  scene does not explain of it is a gain; "additive": it is light that a press does not change; None: it
                  is not used
     flat         (H, W, C) DN, the background of all frames above black; None where it is not used
+    region       what is fitted and judged: "all", or "contact", where the shape is known (optics.fit.contact)
     """
 
     def __init__(
-        self, scene: Scene, captures: Captures, noise: Noise | None = None, flat_field: bool | str | None = True
+        self,
+        scene: Scene,
+        captures: Captures,
+        noise: Noise | None = None,
+        flat_field: bool | str | None = True,
+        region: str = ALL,
     ):
         from optics.light.monte_carlo import renderer_of
 
@@ -142,6 +149,13 @@ class SceneModel:
                 f"{captures.folder}: the set has a background, and the scene no gel that could be at rest in it; "
                 "allowed: --flat-field none"
             )
+        if region not in REGIONS:
+            raise UnknownKey(region, REGIONS, "region")
+        if region == CONTACT and (scene.gel is None or captures.table is not None):
+            raise BadScene(
+                f"{captures.folder}: region = contact, but the scene has no gel that something presses; allowed: all"
+            )
+        self.region, self._known_shapes = region, {}
         self._backgrounds: dict[int, tuple[np.ndarray, np.ndarray]] = {}
         self.flat = self._above_black(captures.flat_field)  # a declared nuisance; see `predict`
 
@@ -537,9 +551,9 @@ class SceneModel:
         return (second - first) / (high - low)
 
     # -- what a fit and a diagnosis need of the data ------------------------------------------------------------------
-    def usable(self, index: int) -> np.ndarray:
+    def usable(self, index: int, region: str = "") -> np.ndarray:
         """(H, W, C) bool, the values to use: not saturated, not clipped at black, not masked by the user, in a mosaic
-        the pixel's own channel."""
+        the pixel's own channel; in the model's region or in another (optics.fit.contact)."""
         frame = self.frames[index]
         beside = 1 if self.captures.table is None else 0  # readings of a sweep are no neighbours
         mask = self.noise.usable(frame.image, beside)
@@ -552,7 +566,14 @@ class SceneModel:
             mask &= frame.image != 0
         if self.renderer.layered and self.captures.table is None:
             mask &= self._resolved(index)
+        if (region or self.region) == CONTACT:
+            mask &= self._known_shape(index)[..., None]
         return mask
+
+    def _known_shape(self, index: int) -> np.ndarray:
+        if index not in self._known_shapes:
+            self._known_shapes[index] = known_shape(self, index)
+        return self._known_shapes[index]
 
     def _resolved(self, index: int) -> np.ndarray:
         """(H, W, C) False at sharp edges that the finer samples do not resolve to the noise: where the step across a

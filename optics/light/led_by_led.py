@@ -45,7 +45,7 @@ class LedByLed:
 
     def windows(self, scene, led):
         """How many flat interfaces stand between an LED and the skin."""
-        nearest = led.numbered("light z") - led.reach()
+        nearest = led.stands()[2] - led.reach()
         return sum(1 for s in scene.shapes() if is_interface(s) and s.bbox().max.z > nearest)
 
     def spots(self, led):

@@ -37,6 +37,7 @@ BENT_SIDE = 4  # finer samples each way where the face bends: the mean of what v
 SOFT = 16  # points of a light, above which rims of its shadows take the samples of what bends, BENT_SIDE each way
 CREASE = 25.0  # deg from pixel to pixel: what is no smooth surface
 R2 = 0.7548776662466927, 0.5698402909980532  # of the R2 sequence: shifts from pixel to pixel
+MOVES = ("light x", "light y", "light z", "light turn")  # roles of a light's parameters that move it
 CORNERS = np.array([[0.5, 0.5], [0.02, 0.02], [0.98, 0.02], [0.02, 0.98], [0.98, 0.98]]).T  # of a pixel
 FLAT_FIELDS = ("multiplicative", "additive", "none")
 MEMORY = 2e9  # bytes of hits, with what images need for their derivatives, that are kept
@@ -103,7 +104,8 @@ class Renderer:
             f"{n}.{w}" for n, p in scene.parts.items() if scene.declaration(n).mueller is not None for w in p.words
         }
         self.layer_order = sorted(self.layer_keys | words)  # what the layers' matrices depend on
-        led_keys = {k for k in scene.parameters if k.rsplit(".", 1)[0] in scene.lights} - self.layer_keys
+        lights = {*scene.lights, *scene.boards}
+        led_keys = {k for k in scene.parameters if k.rsplit(".", 1)[0] in lights} - self.layer_keys
         led_keys -= {k for k in led_keys if scene.parameters[k].role == "regions"}  # which are geometry
         self.power_keys = scene.power_keys(*scene.lights)  # images are kept per unit of each
         own = [k for k in scene.parameters if k not in image_keys and k not in led_keys and k not in self.layer_keys]
@@ -120,7 +122,8 @@ class Renderer:
             k for k in own if k not in self.geometry_keys and k != self.bounce_key and k not in self.ambient_keys
         ]
         self.led_keys = {
-            n: [k for k in led_keys if k.rsplit(".", 1)[0] == n and k not in self.power_keys] for n in scene.lights
+            n: [k for k in led_keys if k.rsplit(".", 1)[0] in (n, _board(light)) and k not in self.power_keys]
+            for n, light in scene.lights.items()
         }
         self._fixed = {
             k for k in self.geometry_keys if self.kind(k)
@@ -714,7 +717,7 @@ class Renderer:
         image = self.led(values, led)
         name, parameter = key.rsplit(".", 1)
         part, lamp = self.scene.parts[name], self.scene.leds[led]
-        moves = part is lamp and part.numbers[parameter].role in ("light x", "light y", "light z")
+        moves = name == _board(lamp) or (part is lamp and part.numbers[parameter].role in MOVES)
         self.apply(values, move=moves and len(image.index) > 0)
         value = getattr(part, parameter)
 
@@ -928,6 +931,12 @@ class LedImage:
         self.share: np.ndarray | float = 1.0  # (n, 1) of the finer samples in each of those pixels
         self.raw: tuple | None = None  # what the light makes before layers: at centres, at finer samples
         self.radiance: np.ndarray | None = None  # the image, in scenes without layers
+
+
+def _board(light) -> str:
+    """Name of the board that a light stands on; '' for none."""
+    board = getattr(light, "board", None)
+    return board.name if board is not None else ""
 
 
 def _places_on_lens(count: int, index: np.ndarray) -> np.ndarray:

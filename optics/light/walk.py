@@ -81,7 +81,8 @@ class Walk:
         self.fading, self.veils = (gel.functions(s) if gel is not None else () for s in ("segment", "volume"))
         emitters = scene.emitters()
         points = [i for i, e in enumerate(emitters) if mi.has_flag(e.flags(), mi.EmitterFlags.DeltaPosition)]
-        self.points, self.others = len(points), len(points) < len(emitters)
+        boards = sum(getattr(e, "role", "") == "board" for e in emitters)
+        self.points, self.others = len(points), len(points) + boards < len(emitters)
         self.point_lights = dr.gather(mi.EmitterPtr, scene.emitters_dr(), mi.UInt32(points)) if points else None
         self.point_list = [emitters[i] for i in points]
         self.lamps = (

@@ -484,6 +484,7 @@ class View:
             *(w for k, v in s.defines.items() for w in ("-D", f"{k}={v}")),
             *(w for g in groups for w in ("--hold-out", g)),
             *(["--flat-field", s.flat_field] if s.flat_field else []),
+            *(["--region", s.region] if s.region else []),
             *(w for p in s.plugins or () for w in ("--plugins", p)),
         ]
         return {"file": str(file), "text": text, "command": shlex.join(words)}

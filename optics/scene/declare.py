@@ -76,6 +76,7 @@ ROLES = {  # of parts: all that the library knows of them; a kind plays the role
     "integrator": "renders, and names the bands",
     "gel": "the skin that a press dents: the parameters of a press, its map of displacements, paths of light in it",
     "led": "a light at a point or of a small area with its own image; among dielectric bodies its lobe is that of `mu`",
+    "board": "a rigid carrier of LEDs, which sends no light itself",
     "membrane": "a matt coat of the skin",
     "interface": "a flat boundary that is passed without reflections",
     "clear": "the material of a dielectric body (`index`, `absorption`), where light is followed by Monte Carlo",

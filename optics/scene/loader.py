@@ -15,9 +15,12 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from optics.errors import BadScene, OutOfBounds, UnknownKey
 from optics.files.output import shipped
 from optics.scene import showing, trust
+from optics.scene.boards import on_board
 from optics.scene.crowd import Traced
 from optics.scene.declare import LED_BY_LED, Effect, Part
 from optics.scene.integral import FEW, Integral, refuse_unseen
@@ -96,6 +99,7 @@ class Scene:
     parts        id -> Mitsuba plugin object of ours
     parameters   key -> Parameter, in the order of the file
     camera, integrator, gel, block, leds, membranes    the parts by role (None or empty where the scene has none)
+    boards       carriers of LEDs, by id
     powers, band_powers    the key of each light's power, and of its powers in single bands
     """
 
@@ -134,7 +138,8 @@ class Scene:
         self._crowds = [part for part in self.parts.values() if hasattr(part, "balls")]
         self._behind, self._placed, self._traced_crowds = False, [0], None
         declared = {n: self.registry.parts[p.kind] for n, p in self.parts.items()}
-        lights = {n: p for n, p in self.parts.items() if declared[n].category == "emitter"}
+        self.boards = {n: p for n, p in self.parts.items() if declared[n].role == "board"}
+        lights = {n: p for n, p in self.parts.items() if declared[n].category == "emitter" and n not in self.boards}
         self.leds = {n: p for n, p in lights.items() if declared[n].stokes is None}
         self.sources = {n: p for n, p in lights.items() if n not in self.leds}
         self.lights = {**self.leds, **self.sources}
@@ -231,6 +236,18 @@ class Scene:
         """The key of a part's parameter that has a role; None where it has none."""
         name = self.parts[part].named(role)
         return None if name is None else f"{part}.{name}"
+
+    def places_of(self, values: Mapping, leds: Sequence[str] | None = None) -> dict[str, np.ndarray]:
+        """Where LEDs (None: all) stand at these values, (3,) mm each; a light without a place is left out."""
+        keys = {n: [self.key(n, f"light {axis}") for axis in "xyz"] for n in (self.leds if leds is None else leds)}
+        keys = {n: own for n, own in keys.items() if None not in own}
+        found = {n: np.array([float(values[key]) for key in own]) for n, own in keys.items()}
+        for n, own in found.items():
+            board = getattr(self.leds[n], "board", None)
+            if board is not None:
+                pose = {p: float(values[f"{board.name}.{p}"]) for p in board.numbers}
+                found[n] = on_board(own, float(values[self.key(n, "light turn")]), pose)
+        return found
 
     def declaration(self, name: str) -> Part:
         """What the plugin file says of a part of the scene."""

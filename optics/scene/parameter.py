@@ -24,6 +24,7 @@ ROLES = {  # of parameters: what the library turns, sets or solves for, whatever
     "light z": "where a point light stands, from the camera towards the skin, mm",
     "light pan": "turn of a point light's axis about its up axis, deg",
     "light tilt": "turn of a point light's axis about its side axis, deg",
+    "light turn": "turn of a point light about the axis of the board that it stands on, deg",
     "light wavelength": "peak of a light's spectrum, nm; 0: white",
     "light width": "full width at half maximum of a light's spectrum, nm",
     "light area": "emitting area of a point light, mm^2; 0: a point",

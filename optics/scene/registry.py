@@ -195,7 +195,7 @@ def _add(parts: dict[str, Part], effects: dict[str, Effect], item: Part | Effect
             raise BadPlugin(f"{file}: category {item.category!r} is none of {', '.join(CATEGORIES)}")
         if item.kind in parts:
             raise BadPlugin(f"{file}: a part of the kind '{item.kind}' exists already; choose another kind")
-        if item.category == "emitter" and not any(p.role == "power" for p in item.parameters):
+        if item.category == "emitter" and item.role != "board" and not any(p.role == "power" for p in item.parameters):
             raise BadPlugin(
                 f"{file}: the light '{item.kind}' has no parameter with role='power'; declare the one that scales its "
                 "light and switches it off at 0"

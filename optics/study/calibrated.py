@@ -3,7 +3,7 @@
 fit.toml carries all that it takes. Besides the values it has
 
     [fit]     captures, held_out, parameters, held_out_parameters     what the misfit was counted with
-    [sensor]  scene, scene_hash, plugins, flat_field, defines, noise  what the values belong to
+    [sensor]  scene, scene_hash, plugins, flat_field, region, defines, noise  what the values belong to
               plugin_files                                            plugins that do not ship: name -> hash
               settings, frames.NAME                                   what the captures set, in all frames and in each
               drive                                                   the level that frames drove each light with; the
@@ -61,6 +61,7 @@ def origin_of(
         }
     flat = any(model.flat_of(index) is not None for index in range(len(model.frames)))
     scene["flat_field"] = str(model.flat_field) if flat else "none"
+    scene["region"] = model.region
     scene["defines"] = {name: str(value) for name, value in model.scene.defines.items()}
     scene["settings"] = dict(captures.parameters)
     scene["drive"] = _drives(model)

@@ -18,7 +18,7 @@ from optics.scene.mitsuba_parts import coarser
 from optics.scene.parameter import Values, Variable
 from optics.study.setup import Setup, definitions_of
 
-LARGE = 60_000  # values of the fitted frames, above which they are put into cells: some minutes of a diagnosis
+LARGE = 60_000  # usable values of the fitted frames, above which they are put into cells: some minutes of a diagnosis
 LARGEST_CELL = 4  # px each way: the dent of a ball that covers fifty pixels still covers a hundred cells
 SMALLEST = 24  # cells along the shorter side of an image
 IN_PIXELS = {"px": 1, "px^2": 2}  # unit -> its power of a length in pixels
@@ -91,7 +91,7 @@ def cells_for(model: SceneModel, fitted: Sequence[int], variables: Sequence[Vari
     cells: readings, raw mosaics, scenes of Monte Carlo estimates, and scenes whose size in pixels is fixed, or whose
     frames or priors state something in pixels."""
     captures, camera = model.captures, model.scene.camera
-    values = sum(int(model.frames[i].image.size) for i in fitted)
+    values = sum(int(model.usable(i).sum()) for i in fitted)
     if values <= LARGE or captures.table is not None or captures.cfa or captures.mosaic or model.monte_carlo:
         return None
     k = min(math.ceil(math.sqrt(values / LARGE)), LARGEST_CELL, min(camera.resolution) // SMALLEST)
@@ -119,6 +119,6 @@ def open_in_cells(setup: Setup, cells: Cells) -> tuple[SceneModel, Setup]:
     with coarser(cells.k):
         loaded = Scene(whole.scene.path, defines, whole.scene.variant, whole.scene.registry)
     loaded.parameters = {k: replace(p, unit=IN_CELLS.get(p.unit, p.unit)) for k, p in loaded.parameters.items()}
-    model = type(whole)(loaded, captures, captures.noise, flat_field=whole.flat_field)
+    model = type(whole)(loaded, captures, captures.noise, whole.flat_field, whole.region)
     model.assumed_errors = dict(whole.assumed_errors)
     return model, replace(setup, values=cells.all_into(setup.values))

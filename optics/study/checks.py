@@ -83,27 +83,30 @@ def after_calibration(model: SceneModel, found: Fit, level: Row | None) -> list[
 
 
 def _far_lights(model: SceneModel, found: Fit) -> list[str]:
-    """Lights that ran so far from where they were known to be that their distance shows no more."""
+    """Lights that ran so far from where they were known to be that their distance shows no more; those of a board as
+    one."""
     scene, gel = getattr(model, "scene", None), getattr(getattr(model, "scene", None), "gel", None)
     if scene is None or gel is None:
         return []
     start, now = model.at(Values(), 0), model.at(found.values, 0)
     across = [float(now[key]) for role in ("width", "length") if (key := scene.key(gel.name, role))]
-    texts = []
-    for led in scene.leds:
-        keys = [scene.key(led, f"light {axis}") for axis in "xyz"]
-        placed = [(v, v.prior) for v in found.variables if v.prior is not None and set(v.keys) & set(keys)]
-        if None in keys or not across:
-            continue
-        before, after = (math.dist([float(at[key]) for key in keys], (0.0, 0.0, 0.0)) for at in (start, now))
+    here, there = scene.places_of(start), scene.places_of(now)
+    texts: dict[str, str] = {}
+    for led in there if across else ():
+        board = getattr(scene.leds[led], "board", None)
+        keys = {scene.key(led, f"light {axis}") for axis in "xyz"}
+        keys |= {f"{board.name}.{p}" for p in board.numbers} if board is not None else set()
+        placed = [(v, v.prior) for v in found.variables if v.prior is not None and set(v.keys) & keys]
+        before, after = math.hypot(*here[led]), math.hypot(*there[led])
         astray = any(abs(value_of(model, found.values, v) - p[0]) > SURPRISING * p[1] for v, p in placed)
         if astray and after > max(2 * before, COLLIMATED * max(across)):
-            texts.append(
-                f"{led} ran to {after:.3g} mm from {before:.3g} mm: over the {max(across):.3g} mm of the face it acts "
+            name = led if board is None else board.name
+            texts[name] = (
+                f"{name} ran to {after:.3g} mm from {before:.3g} mm: over the {max(across):.3g} mm of the face it acts "
                 "like collimated light. Light that fills shadows and slopes makes a model do that where it is missing: "
                 "ask for 'light returned by the window', 'ambient light' and 'interreflection'"
             )
-    return texts
+    return list(texts.values())
 
 
 def of_dials(keys: Sequence[str], width: Width | None) -> list[str]:

@@ -264,6 +264,7 @@ KINDS = {  # of entries that the program reads
     "sensor.plugins": "a list of texts",
     "sensor.plugin_files": "a table of texts",
     "sensor.flat_field": "text",
+    "sensor.region": "text",
     "sensor.defines": "a table of texts",
     "sensor.noise": "a table of numbers",
     "sensor.settings": "a table of numbers or texts",

@@ -15,8 +15,8 @@ to all usable pixels, to be scored on the whole image. It is tried as a factor a
 on each geometry at hand: the poses that the captures state, on a plate of balls the balls' own normals there, and the
 poses of each study. What gives it the smaller held-out error counts, and is said.
 
-The contact is what the captures state, so that it is the same for all: INNER radii around the middle of each whole ball
-of a plate, else where the indenter touches the face. Errors:
+The contact is what the captures state (optics.fit.contact), so that it is the same for all, wherever a study was
+fitted. Errors:
 
     rms, L1      of measured minus predicted, DN and in units of full scale;   predictions clipped to the camera's range
     ratio        rms of (measured - predicted)/(flat field times gain), where there is a flat field
@@ -41,6 +41,7 @@ from optics.captures import capture_set as capture_files
 from optics.errors import BadCapture, Underdetermined
 from optics.fit import calibrate
 from optics.fit.compare import Comparison, compare, led_label
+from optics.fit.contact import ALL, contact, is_plate, on_balls, words
 from optics.fit.null_models import Lambert, Shape, Table, place_of, tables, tilt_of
 from optics.fit.scene_model import SceneModel
 from optics.scene import trust
@@ -55,8 +56,6 @@ from optics.study.stages import held_out_values
 
 Progress = Callable[[str, int, int], None]
 
-INNER = 0.65  # of a ball's radius: well inside the contact
-MOST_BALLS = 40  # on either side of the plate's first ball
 PHOTOGRAPH, BACKGROUND = "another photograph", "background"
 SUBSETS = 4  # choices of presses of which the error against their number is the mean
 NUMBERS_OF_PRESSES = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
@@ -198,7 +197,7 @@ class _Bench:
         self.leds = {i: led_label(model.frames[i].parameters) for i in self.frames}
         self.black, self.saturation = model.noise.black_level, model.noise.saturation
         self.full_scale = self.saturation - self.black
-        self.usable = {i: model.usable(i) for i in self.frames}
+        self.usable = {i: model.usable(i, ALL) for i in self.frames}  # wherever a study was fitted
         self.flats = self._flats()
         self.tilts: dict[str, dict[int, np.ndarray]] = {}
         self.region, self.inner = self._contact()
@@ -257,38 +256,23 @@ class _Bench:
         return found
 
     # -- geometry ----------------------------------------------------------------------------------------------------
-    def _face(self, now: Mapping) -> np.ndarray:
-        """(H, W, 2) mm: where each pixel meets the untouched face."""
-        return self.model.renderer.hits(self.model.untouched(dict(now))).position[..., :2]
-
     def _contact(self) -> tuple[str, dict[int, np.ndarray]]:
         """(words, (H, W) bool of each frame): the contact as the captures state it."""
-        model, gel = self.model, self.model.scene.gel
-        found: dict[int, np.ndarray] = {}
-        kept: dict[tuple, np.ndarray] = {}
+        model = self.model
+        plate = {i: is_plate(model, i) for i in self.frames}
         self.balls: dict[int, tuple[np.ndarray, np.ndarray]] = {}  # offset over radius (H, W, 2), length
-        is_plate = [model.at(Values(), i).get(f"{gel.name}.indenter") == "balls" for i in self.frames]
         for i in self.frames:
-            now = model.at(Values(), i)
-            key = model.renderer.geometry(now)
-            if is_plate[i]:
-                offset, whole = _on_balls(self._face(now), now, gel.name)
+            if plate[i]:
+                offset = on_balls(model, i)[0]
                 self.balls[i] = (offset, np.linalg.norm(offset, axis=-1))
-                found[i] = whole & (self.balls[i][1] < INNER)
-                continue
-            if key not in kept:
-                hits = model.renderer.hits(now)
-                x, y = (np.where(hits.valid, hits.position[..., k], 0) for k in (0, 1))
-                weight = model.renderer.contact_weight(now, x.ravel(), y.ravel()).reshape(hits.shape)
-                kept[key] = (weight > 0.5) & hits.valid
-            found[i] = kept[key]
+        found = {i: contact(model, i) for i in self.frames}
         empty = [i for i in (*self.held, *self.fitted) if not (found[i][..., None] & self.usable[i]).any()]
         if empty:
             raise BadCapture(
                 f"{self.folder}: frame {model.frames[empty[0]].name}: no usable pixel in the contact that its "
                 "settings state; check its press, its mask and the scene's scale"
             )
-        return (f"{INNER:g} radii of each whole ball" if all(is_plate) else "where the indenter touches"), found
+        return words(all(plate.values())), found
 
     def _geometries(self) -> None:
         """Normals of each frame by name: as stated, of the balls themselves, by each study."""
@@ -605,22 +589,6 @@ def _split(model: SceneModel, setup: Setup) -> tuple[list[int], list[int]]:
     return [i for own in groups[:-1] for i in own], list(groups[-1])
 
 
-def _on_balls(face: np.ndarray, now: Mapping, gel: str) -> tuple[np.ndarray, np.ndarray]:
-    """((H, W, 2) offset from the nearest ball's middle over the radius, (H, W) bool: that ball is whole in view).
-
-    face   (H, W, 2) mm"""
-    radius, spacing = float(now[f"{gel}.indenter_size"]), float(now[f"{gel}.indenter_spacing"])
-    turn = math.radians(float(now[f"{gel}.press_rz"]))
-    press = np.array([float(now[f"{gel}.press_{axis}"]) for axis in "xy"])
-    rotation = np.array([[math.cos(turn), math.sin(turn)], [-math.sin(turn), math.cos(turn)]])  # of rows
-    place = np.rint((face - press) @ np.linalg.inv(rotation) / spacing)
-    place = np.clip(place, -MOST_BALLS, MOST_BALLS)
-    middle = press + place @ rotation * spacing
-    low, high = face.min((0, 1)), face.max((0, 1))
-    whole = ((middle - radius >= low) & (middle + radius <= high)).all(-1)
-    return (face - middle) / radius, whole
-
-
 def _ball_tilt(offset: np.ndarray, length: np.ndarray) -> np.ndarray:
     """(H, W, 3): n - n0 of balls, level beside them."""
     ball = length < 0.95  # steeper flanks are not touched
@@ -654,14 +622,10 @@ def ring_of(ladder: Ladder) -> Ring | None:
     """The circle through a study's calibrated LEDs; None for fewer than three, or LEDs on one line."""
     scene, values = ladder.model.scene, ladder.values[-1]
     now = {**ladder.model.base, **values.common}
-    places: dict[str, list[float]] = {}
-    for led in scene.leds:
-        keys = [key for axis in "xy" if (key := scene.key(led, f"light {axis}"))]
-        if len(keys) == 2:
-            places[led] = [float(now[key]) for key in keys]
+    places = scene.places_of(now)
     if len(places) < 3:
         return None
-    at = np.array(list(places.values()))
+    at = np.array(list(places.values()))[:, :2]
     fitted = circle(at)
     if fitted is None:
         return None

@@ -47,6 +47,8 @@ class Setup:
     held_out    names of groups that the calibration does not see; None: every fourth of four or more
     values      start values, by key
     flat_field  how a background image enters, see `optics.fit.model.Model`
+    region      what is fitted and judged: "all" of each image, or the "contact", where the shape is known
+                (optics.fit.contact); "": all
     uncertainty standard deviation of settings by key, where the captures state none; None: that of dials is found from
                 the readings when a study begins (optics.diagnosis.dials)
     robust      residuals beyond three sigmas count less (Huber), for dirt and glints; a diagnosis weighs all alike
@@ -63,6 +65,7 @@ class Setup:
     held_out: list[str] | None = None
     values: dict[str, float | str] = field(default_factory=dict)
     flat_field: str | None = None
+    region: str = ""
     uncertainty: dict[str, float] | None = None
     robust: bool = False
     seed: int = 0
@@ -78,11 +81,22 @@ def setup_for(captures: str | Path, **given: object) -> Setup:
     kept = ("per_group", "held_out", "plugins")  # of which an empty list says something
     own = {name: value for name, value in given.items() if value or (value == [] and name in kept)}
     if {"free", "per_group"} & set(own):
-        advised = {name: value for name, value in advised.items() if name == "flat_field"}
+        advised = {name: value for name, value in advised.items() if name in ("flat_field", "region")}
     return recorded({**advised, **own, "captures": str(captures)})
 
 
-ADVICE = ("free", "per_group", "priors", "held_out", "values", "flat_field", "uncertainty", "robust", "defines")
+ADVICE = (
+    "free",
+    "per_group",
+    "priors",
+    "held_out",
+    "values",
+    "flat_field",
+    "region",
+    "uncertainty",
+    "robust",
+    "defines",
+)
 
 
 def _advised(file: Path) -> dict[str, Any]:
@@ -170,6 +184,8 @@ def open_model(
     if noise is None:
         noise = estimate(found, clocks=keys_with(loaded.parameters, "clock"))
     options = {} if setup.flat_field is None else {"flat_field": setup.flat_field}
+    if setup.region:
+        options["region"] = setup.region
     model = model_class(loaded, found, noise.in_scale_of(fitted), **options)
     model.assumed_errors = dict(setup.uncertainty or {})
     return model

@@ -22,17 +22,21 @@ References
 XML
     position point: where it stands, mm, in place of `x`, `y`, `z`
     target point, (0, 0, 0): what the axis looks at, mm: its nominal direction is from the position to here
+    board string: id of the part `board` that it stands on; position, target and axis are then in the board's frame
+    placed string: FILE:DESIGNATOR of a pick-and-place file, for x and y on the board, mm
     spectrum string: measured power over the wavelength, in place of the Gaussian: a file, a name or a law (see
         "Spectra" in the guide); relative to its peak, of channels as integrals to its area
 """
 
 import math
 
+from optics.errors import BadScene
 from optics.scene.checking import agree, made
 from optics.scene.declare import Part
 from optics.scene.line import LINE, changed, relative
 from optics.scene.mitsuba_parts import Declared
 from optics.scene.parameter import Parameter
+from optics.scene.pick_and_place import placed
 
 PARAMETERS = (
     Parameter(
@@ -87,6 +91,16 @@ PARAMETERS = (
         plausible=5.0,
         role="light tilt",
         free="all",
+    ),
+    Parameter(
+        "turn",
+        "deg",
+        0.0,
+        (-360.0, 360.0),
+        "turn t about the axis of the board that it stands on; of no effect without one",
+        plausible=2.0,
+        step=0.2,
+        role="light turn",
     ),
     Parameter("mu", "1", 1.2, (0.0, 200.0), "lobe exponent mu of (S2)", plausible=0.3, free="all"),
     Parameter(
@@ -146,6 +160,13 @@ def build():
             if position is not None:
                 for name, value in zip("xyz", position):
                     props[name] = float(value)
+            self.board, self.board_name = None, str(props.get("board", ""))
+            named = str(props.get("placed", ""))
+            if named:
+                if not self.board_name:
+                    raise ValueError(f"led '{props.id()}': placed = {named!r} is a place on a board; name its board")
+                for name, value in zip("xy", placed(named, tuple(str(f) for f in mi.file_resolver()))):
+                    props[name] = value
             self.declare(props)
             self.read_spectrum(props, "spectrum", "power")
             nominal = [float(t) - self.number(n) for t, n in zip(target, "xyz")]
@@ -153,12 +174,38 @@ def build():
                 raise ValueError(
                     f"led '{self.name}': position and target are the same point; the axis has no direction"
                 )
-            self.frame = [dr.opaque(mi.Vector3f, v) for v in frame_along(nominal)]
+            self.own_frame = [dr.opaque(mi.Vector3f, v) for v in frame_along(nominal)]
             self.m_flags = +mi.EmitterFlags.DeltaPosition
             self.m_needs_sample_3 = False
 
+        def wire(self, scene):
+            self.board = scene.named(self.board_name) if self.board_name else None
+            if self.board_name and getattr(self.board, "role", "") != "board":
+                raise BadScene(
+                    f"led '{self.name}': its board '{self.board_name}' is no part of the type 'board' of this scene"
+                )
+
+        @property
+        def frame(self):
+            """Side, up and forward of the axis; they turn with the board."""
+            if self.board is None:
+                return self.own_frame
+            return [self.board.turned(self.board.about_axis(v, self.turn)) for v in self.own_frame]
+
         def position(self):
-            return mi.Point3f(self.x, self.y, self.z)
+            own = mi.Point3f(self.x, self.y, self.z)
+            if self.board is None and self.board_name:
+                raise BadScene(
+                    f"led '{self.name}' stands on the board '{self.board_name}', and this scene's parts have not been "
+                    "told of one another; call optics.wire(scene) before you render with another integrator"
+                )
+            return own if self.board is None else self.board.place(own, self.turn)
+
+        def stands(self):
+            """The position as three floats, mm."""
+            if self.board is None:
+                return tuple(self.number(n) for n in "xyz")
+            return tuple(float(c[0]) for c in self.position())
 
         def axis(self):
             side, up, forward = self.frame
@@ -256,7 +303,8 @@ def build():
             return mi.Spectrum(0.0)
 
         def bbox(self):
-            return mi.ScalarBoundingBox3f(mi.ScalarPoint3f(*[self.number(n) for n in "xyz"]))
+            waits = self.board is None and self.board_name
+            return mi.ScalarBoundingBox3f(mi.ScalarPoint3f(*([0.0] * 3 if waits else self.stands())))
 
         def sample_wavelengths(self, si, sample, active=True):
             wavelengths, weight = (

@@ -62,7 +62,7 @@ def build():
             along, count = props.get("along", None), int(props.get("points", 0))
             super().__init__(props)
             if along is not None:
-                self.frame = [dr.opaque(mi.Vector3f, v) for v in self.turned([float(c) for c in along])]
+                self.own_frame = [dr.opaque(mi.Vector3f, v) for v in self.turned([float(c) for c in along])]
             size = self.number("length") + self.number("width")
             count = count or max(4 * math.ceil(size / 2), FEWEST)
             if count < 4 or count % 4:
@@ -71,7 +71,7 @@ def build():
 
         def turned(self, along):
             """The frame (side, up, forward) whose side is `along` as far as that lies across the axis."""
-            axis = [float(c[0]) for c in self.frame[2]]
+            axis = [float(c[0]) for c in self.own_frame[2]]
             side = np.array(along) - np.dot(along, axis) * np.array(axis)
             if np.linalg.norm(side) < 1e-3 * max(np.linalg.norm(along), 1e-30):
                 raise ValueError(f"strip '{self.name}': along = {along} is the direction of its axis; choose another")

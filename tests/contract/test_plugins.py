@@ -71,6 +71,12 @@ FLOAT = 3e-7  # relative rounding of an image in float32: what a difference of t
 
 FILMS = ("analyzer", "middle", "polarizer")
 SURROUNDINGS = {  # parameter: what has to stand about it for it to be seen, and for its onset to be smooth
+    # one ball in place of fifty, of whose many shadows some edge always passes a sample; and no kink of (S3), which a
+    # far light's turn sends across many pixels
+    **{
+        key: {"membrane.sigma": 0.0, "gel.indenter": "sphere", "gel.indenter_size": 1.5}
+        for key in ("led.turn", *(f"board.{name}" for name in ("x", "y", "z", "rx", "ry", "rz", "scale")))
+    },
     # the part's Validity: of polarized light, and behind two films, a film without a leak leaks as sqrt(T2) at first
     "polarizer_film.leak": {"middle.inserted": 0.0, "source.dop_q": 0.0, "source.dop_u": 0.0},
     # below 0 a leak is cut off
@@ -322,6 +328,8 @@ def bench_of(benches, mitsuba):
             brought = [p.name for p in (*effect.parameters, *effect.shape) if not isinstance(p, str)]
             if effect.part == part.kind and name in brought:
                 kinds += effect.requires
+        if any(p.name == name and p.role == "light turn" for p in part.parameters):
+            kinds += ("board",)
         order = sorted(
             scene.shipped_scenes(),
             key=lambda n: (
@@ -439,8 +447,9 @@ def moves(bench, key):
         and bench.scene.parameters[key].how == "difference"
         or (
             kind in bench.scene.registry.kinds("led")
-            and name in ("x", "y", "z", "area", "length", "width", "roll", "radius")
+            and name in ("x", "y", "z", "turn", "area", "length", "width", "roll", "radius")
         )
+        or kind == "board"
     )
 
 

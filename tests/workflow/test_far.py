@@ -68,7 +68,12 @@ def test_a_light_that_ran_away_is_named_for_what_it_is():
             "width": "gel.width",
             "length": "gel.length",
         }
-        scene = SimpleNamespace(leds=["led"], gel=SimpleNamespace(name="gel"), key=lambda part, role: keys[role])
+        scene = SimpleNamespace(
+            leds={"led": None},
+            gel=SimpleNamespace(name="gel"),
+            key=lambda part, role: keys[role],
+            places_of=lambda now: {"led": [now[f"led.{axis}"] for axis in "xyz"]},
+        )
         start = {"led.x": 0.0, "led.y": 0.0, "led.z": -12.0, "gel.width": 10.0, "gel.length": 8.0}
         model = SimpleNamespace(scene=scene, at=lambda values, i: {**start, **values.common}, base=start)
         fit = SimpleNamespace(
