@@ -13,7 +13,8 @@ Every model of a board is tested on the same frames, pixels and regions:
 Rivals get the benefit of the doubt. A table is fitted once to the pixels of the contact, to be scored there, and once
 to all usable pixels, to be scored on the whole image. It is tried as a factor and as an addition to the flat field, and
 on each geometry at hand: the poses that the captures state, on a plate of balls the balls' own normals there, and the
-poses of each study. What gives it the smaller held-out error counts, and is said.
+poses of each study. What gives it the smaller held-out error counts, and is said. Where a study finds a gain of its own
+in each held-out frame, a table gets the one that suits it best.
 
 The contact is what the captures state (optics.fit.contact), so that it is the same for all, wherever a study was
 fitted. Errors:
@@ -200,11 +201,22 @@ class _Bench:
         self.usable = {i: model.usable(i, ALL) for i in self.frames}  # wherever a study was fitted
         self.flats = self._flats()
         self.tilts: dict[str, dict[int, np.ndarray]] = {}
+        self.gained = any(self._finds_gains(ladder) for ladder in ladders)
+        if self.gained:
+            self.notes.append(
+                "a study finds a gain of its own in each held-out frame (gain drift): tables get one there as well"
+            )
         self.region, self.inner = self._contact()
         self.x, self.y = place_of(model.shape)
         self._geometries()
 
     # -- frames ------------------------------------------------------------------------------------------------------
+    def _finds_gains(self, ladder: Ladder) -> bool:
+        """Whether a step of a study has gains of single held-out frames, which its fit found in these themselves."""
+        camera, stated = self.model.scene.camera.name, [f.parameters for f in self.model.frames]
+        found = {(i, key) for values in ladder.values for i, own in values.frame.items() for key in own}
+        return any(i in self.held and key.startswith(f"{camera}.gain") and key not in stated[i] for i, key in found)
+
     def _lights(self, index: int) -> tuple:
         """What frames of one table share: settings of lights and of what is in the way, but neither press nor
         camera."""
@@ -422,6 +434,13 @@ class _Bench:
                 best = _Score(error, kind, variant, added, geometry, guess, numbers)
         assert best is not None  # there is always a geometry
         return best
+
+    def with_gain(self, index: int, prediction: np.ndarray, inner: bool) -> np.ndarray:
+        """A prediction with the gain of each channel that suits the held-out frame itself best, by least squares."""
+        mask, light = self.mask(index, inner), prediction - self.black
+        measured = self.model.frames[index].image - self.black
+        gain = (mask * light * measured).sum((0, 1)) / np.maximum((mask * light**2).sum((0, 1)), 1e-12)
+        return self.black + gain * light
 
     def photographs(self, inner: bool) -> tuple[list[np.ndarray], list[str]] | None:
         """For each held-out frame the most similar photograph of another press under the same lights, and its name."""

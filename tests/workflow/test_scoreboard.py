@@ -5,6 +5,7 @@ import importlib.util
 import json
 import math
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from optics.captures import capture_set, importing, scans
 from optics.captures.noise import Noise
 from optics.errors import BadCapture
 from optics.study import board as boards
-from optics.study.scoreboard import BACKGROUND, PHOTOGRAPH, circle, scoreboard
+from optics.study.scoreboard import BACKGROUND, PHOTOGRAPH, _Bench, circle, scoreboard
 
 ROOT = Path(__file__).resolve().parents[2]
 DATA = ROOT.parent / "shared" / "data"
@@ -223,3 +224,16 @@ def test_a_real_set_of_single_presses_is_scored(mitsuba, tmp_path):
     assert errors["linear in the normal"] < errors[PHOTOGRAPH] < errors[BACKGROUND]
     rows = board.by_presses["quadratic in the normal, with position"]
     assert rows[-1]["presses"] == 10 and rows[-1]["ratio"] < rows[0]["ratio"]
+
+
+def test_a_table_gets_a_gain_where_a_study_finds_one():
+    """Least squares above black, of usable values alone."""
+    bench = object.__new__(_Bench)
+    rng = np.random.default_rng(0)
+    light = rng.uniform(20, 200, (6, 7, 2))
+    image = 5.0 + light * np.array([1.1, 0.8])
+    mask = np.ones(light.shape, bool)
+    mask[0, 0], image[0, 0] = False, 255.0
+    bench.black, bench.model = 5.0, SimpleNamespace(frames=[SimpleNamespace(image=image)])
+    bench.mask = lambda index, inner: mask
+    assert bench.with_gain(0, 5.0 + light, True)[mask] == pytest.approx(image[mask])
