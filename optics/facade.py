@@ -125,8 +125,8 @@ def calibrate(
     held_out    groups of frames to test on and not to fit. None: every fourth, where there are four or more; []: none
     values      start values, by key, above those of the fit;   defines, plugins: as in `load`
     flat_field  how a background image enters: "multiplicative", "additive" or "none"; None: as the captures ask
-    region      what is fitted and judged: "all" of each image, or the "contact", where the gel has the shape of what
-                presses it; "": as the captures ask, else all
+    region      what is fitted and judged: "all" of each image, or "known": the contact and the level face far from it,
+                whose shapes are known; "": as the captures ask, else all
     outside     images and tables that captures.toml names may lie outside its folder
     robust      residuals beyond three sigmas count less (Huber)
     resume      continue the study in `folder`, if its inputs are the same

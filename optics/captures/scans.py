@@ -480,8 +480,8 @@ def _facts(
         "noise": {"system_gain": noise.system_gain, "dark_noise": noise.dark_noise},
         "light_azimuths_deg": azimuths,
         "setup": {
-            # where balls touch, the shape is known, and depth, tilt and the skin between them do not matter
-            "region": "contact",
+            # depth, tilt and the skin between the balls do not matter there
+            "region": "known",
             "free": ["board.[xyz]", "board.scale", "led_*.turn"],
             "per_group": ["gel.press_[xy]"],
             "flat_field": "multiplicative",
@@ -593,8 +593,8 @@ def readme(facts: Mapping) -> str:
             "assumed: one circle, parallel to the face, its distance, lights without a lobe; calibrate them",
             "",
             "Advised for a calibration (import.json)",
-            "- region contact: where balls touch, the shape is known, and only the optics can be wrong; '--region all' "
-            "fits the skin between them as well, with gel.skirt and gel.smoothing free",
+            "- region known: where balls touch, and half-way between them, the shape is known, and only the optics can "
+            "be wrong; '--region all' fits the skin between them as well, with gel.skirt and gel.smoothing free",
             "- free: the circle's middle, height and size, and where on it each LED stands (turn)",
             "",
         ]

@@ -213,9 +213,9 @@ Region = Annotated[
     str,
     typer.Option(
         "--region",
-        metavar="all|contact",
-        help="What is fitted and judged: all of each image, or the contact, where the gel has the shape of what "
-        "presses it.",
+        metavar="all|known",
+        help="What is fitted and judged: all of each image, or where the shape is known: the contact, and the level "
+        "face far from it.",
         show_default="all, or what an import advises",
     ),
 ]

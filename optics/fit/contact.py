@@ -1,13 +1,16 @@
-"""Where the shape of what is seen is known: in the contact, and where nothing is pressed.
+"""Where the shape of what is seen is known: in the contact, on the level face far from it, and of a gel at rest.
 
-A gel that a body of known shape presses has that body's shape where they touch; beside the contact its skin hangs
-free, and its shape is a model as well. `region = "contact"` fits and judges a model where only the optics can fail:
+A gel that a body of known shape presses has that body's shape where they touch, and far away it is level as it was;
+between the two its skin hangs free, and its shape is a model as well. `region = "known"` fits and judges a model where
+only the optics can fail:
 
-    plate of balls     INNER radii around the middle of each ball that is whole in view
-    other indenters    where the indenter touches the face, as the captures state its pose
+    plate of balls     INNER radii around the middle of each ball that is whole in view; and where four balls are as far
+                       as can be, where the skin is level by symmetry: APART of their spacing from each, and two radii
+    other indenters    where the indenter touches the face; and FAR contact radii away from there
     at rest            all of the image
 
-The contact is that of the poses that the captures state: no fit changes it."""
+A contact alone does not tell a lamp's gain from light that only the contact returns; the level face does. All is
+as the poses say that the captures state: no fit changes it."""
 
 from __future__ import annotations
 
@@ -22,9 +25,11 @@ from optics.scene.parameter import Values
 if TYPE_CHECKING:
     from optics.fit.scene_model import SceneModel
 
-ALL, CONTACT = "all", "contact"
-REGIONS = (ALL, CONTACT)
+ALL, KNOWN = "all", "known"
+REGIONS = (ALL, KNOWN)
 INNER = 0.65  # of a ball's radius: well inside the contact
+APART = 0.58  # of the spacing of balls, from the middle of each: near the middle of four, which is .71 away
+FAR = 2.0  # contact radii from a contact's edge
 MOST_BALLS = 40  # on either side of the plate's first ball
 
 
@@ -35,12 +40,20 @@ def is_plate(model: SceneModel, index: int) -> bool:
 
 
 def known_shape(model: SceneModel, index: int) -> np.ndarray:
-    """(H, W) bool: the contact; of a frame in which nothing is pressed, all."""
-    now = model.at(Values(), index)
-    depth = model.scene.key(model.scene.gel.name, "press depth")
+    """(H, W) bool: the contact and the level face; of a frame in which nothing is pressed, all."""
+    from scipy.ndimage import distance_transform_edt
+
+    now, gel = model.at(Values(), index), model.scene.gel.name
+    depth = model.scene.key(gel, "press depth")
     if depth and not float(now[depth]) > 0:
         return np.ones(model.shape[:2], bool)
-    return contact(model, index)
+    touched = contact(model, index)
+    if is_plate(model, index):
+        radius, spacing = float(now[f"{gel}.indenter_size"]), float(now[f"{gel}.indenter_spacing"])
+        return touched | (np.linalg.norm(on_balls(model, index)[0], axis=-1) > max(APART * spacing / radius, 2.0))
+    if not touched.any():
+        return touched
+    return touched | (distance_transform_edt(~touched) > FAR * math.sqrt(touched.sum() / math.pi))
 
 
 def contact(model: SceneModel, index: int) -> np.ndarray:

@@ -17,7 +17,7 @@ from optics.captures.capture_set import Captures, Frame, cfa_channel, sweeps, wi
 from optics.captures.noise import Noise
 from optics.errors import BadScene, UnknownKey
 from optics.fit import geometry
-from optics.fit.contact import ALL, CONTACT, REGIONS, known_shape
+from optics.fit.contact import ALL, KNOWN, REGIONS, known_shape
 from optics.fit.model import value_of
 from optics.light.development import STEP, Developer
 from optics.scene.loader import Scene
@@ -40,7 +40,7 @@ class SceneModel:
                  scene does not explain of it is a gain; "additive": it is light that a press does not change; None: it
                  is not used
     flat         (H, W, C) DN, the background of all frames above black; None where it is not used
-    region       what is fitted and judged: "all", or "contact", where the shape is known (optics.fit.contact)
+    region       what is fitted and judged: "all", or "known", where the shape is known (optics.fit.contact)
     """
 
     def __init__(
@@ -151,9 +151,9 @@ class SceneModel:
             )
         if region not in REGIONS:
             raise UnknownKey(region, REGIONS, "region")
-        if region == CONTACT and (scene.gel is None or captures.table is not None):
+        if region == KNOWN and (scene.gel is None or captures.table is not None):
             raise BadScene(
-                f"{captures.folder}: region = contact, but the scene has no gel that something presses; allowed: all"
+                f"{captures.folder}: region = known, but the scene has no gel that something presses; allowed: all"
             )
         self.region, self._known_shapes = region, {}
         self._backgrounds: dict[int, tuple[np.ndarray, np.ndarray]] = {}
@@ -566,7 +566,7 @@ class SceneModel:
             mask &= frame.image != 0
         if self.renderer.layered and self.captures.table is None:
             mask &= self._resolved(index)
-        if (region or self.region) == CONTACT:
+        if (region or self.region) == KNOWN:
             mask &= self._known_shape(index)[..., None]
         return mask
 

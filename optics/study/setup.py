@@ -47,7 +47,7 @@ class Setup:
     held_out    names of groups that the calibration does not see; None: every fourth of four or more
     values      start values, by key
     flat_field  how a background image enters, see `optics.fit.model.Model`
-    region      what is fitted and judged: "all" of each image, or the "contact", where the shape is known
+    region      what is fitted and judged: "all" of each image, or "known": where the skin's shape is known
                 (optics.fit.contact); "": all
     uncertainty standard deviation of settings by key, where the captures state none; None: that of dials is found from
                 the readings when a study begins (optics.diagnosis.dials)
