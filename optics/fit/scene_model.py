@@ -528,11 +528,26 @@ class SceneModel:
                 if self.parameters[key].how == "difference"
                 else tangent(now, name, key, component)
             )
-            return factor * lit[name] * image
+            return factor * (lit[name] * image + self._difference_bounced(now, {name: lit[name]}, key, seed, component))
         total: Any = sum((power * tangent(now, led, key, component) for led, power in lit.items()), 0.0)
+        total = total + self._difference_bounced(now, lit, key, seed, component)
         if glows:
             total = total + self._difference_ambient(now, key, component)
         return factor * total
+
+    def _difference_bounced(
+        self, now: Mapping, lit: Mapping[str, np.ndarray], key: str, seed: int, component: int
+    ) -> np.ndarray | float:
+        """d / d key of what lights send by way of two reflections: a difference with the same second directions."""
+        weight = now[self.renderer.bounce_key] if self.renderer.bounce_key else 0.0
+        if not weight:
+            return 0.0
+        low, high = self.parameters[key].sides(now[key])
+        ends = [
+            sum(power * self.renderer.bounced({**now, key: value}, led, seed, component) for led, power in lit.items())
+            for value in (low, high)
+        ]
+        return weight * (ends[1] - ends[0]) / (high - low)
 
     def _difference(self, now: Mapping, key: str, seed: int, component: int) -> np.ndarray:
         """Central difference of the linear image, one-sided at a bound; common samples."""
