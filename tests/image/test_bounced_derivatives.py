@@ -1,4 +1,4 @@
-"""Derivatives while light is reflected twice: what arrives by the second reflection changes with lights and coat too."""
+"""Derivatives while light is reflected twice: what the second reflection brings changes with lights and coat too."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,8 @@ def test_derivatives_with_a_second_reflection(key, bench):
     """Against central differences of the prediction, of another step, with the same second directions; without the
     second reflection's part the derivative is off by several times the tolerance."""
     p = bench.scene.parameters[key]
-    base = {**bench.values, "gel.press_depth": 1.2, "integrator.interreflection": 3.0, "membrane.sigma": 0.1, "gel.absorption": 0.05}
+    base = {**bench.values, "gel.press_depth": 1.2, "integrator.interreflection": 3.0}
+    base |= {"membrane.sigma": 0.1, "gel.absorption": 0.05}
     step = 0.5 * p.step * p.plausible
     above, below = (bench.image({**base, key: base[key] + s * step}) for s in (1, -1))
     wanted = (above - below) / (2 * step)
