@@ -79,10 +79,12 @@ def test_every_command_is_tried():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("part", range(40))
-def test_hostile_options(place, met, monkeypatch, part):
+def test_hostile_options(place, met, monkeypatch, record_property, part):
     """Forty parts of all cases."""
     monkeypatch.chdir(place)
-    for name, words, option, value in itertools.islice(ALL, part, None, 40):
+    mine = list(itertools.islice(ALL, part, None, 40))
+    record_property("cases", len(mine))
+    for name, words, option, value in mine:
         shutil.rmtree(place / "out", ignore_errors=True)
         met(name, *words.split(), f"{option}={value}", seconds=120)
 
