@@ -64,7 +64,7 @@ from optics.scene.trust import Named
 from optics.study.blocks import Block, Blocks, DiskFull, SampleFailed
 from optics.study.calibrated import Calibrated, calibrated
 from optics.study.draws import BadJob, Distribution, Drawn, Draws, Finite, Strict, Value, stream
-from optics.study.engines import ENGINES, Status, cores, one_thread, work_through
+from optics.study.engines import ENGINES, Status, cores, for_workers, work_through
 
 Progress = Callable[[str, int, int], None]
 
@@ -582,7 +582,7 @@ def run(
                 _here(blocks, maker, watch)
             else:
                 life = Life(job, file, plugins, shard, blocks.run)
-                with one_thread():
+                with for_workers():
                     work_through(ENGINES[on](workers, options or {}, folder), life, blocks, recycle, watch)
         finally:
             blocks.sweep()
