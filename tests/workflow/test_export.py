@@ -5,6 +5,8 @@ import io
 import json
 import math
 import shutil
+import subprocess
+import sys
 import tarfile
 
 import numpy as np
@@ -250,6 +252,24 @@ def test_an_export_that_was_cut_off_goes_on(made, tmp_path, monkeypatch, to):
     assert content(tmp_path / "cut") == before, "a finished export is left alone"
     with pytest.raises(OutputExists, match="holds another export: changed per_file"):
         export.export(made, tmp_path / "cut", to, per_file=6)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="limits of file sizes end processes elsewhere")
+@pytest.mark.parametrize("to", ["hdf5", "zarr"])
+def test_a_full_disk_is_said_and_the_export_goes_on(made, tmp_path, to):
+    """A limit on the size of files stands for the disk. The HDF5 library ends the process where writing fails."""
+    limited = (
+        "import resource, sys\nfrom optics.cli import main\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (1024, 1024))\nsys.exit(main(sys.argv[1:]))\n"
+    )
+    words = ["export", str(made), "-o", str(tmp_path / "x"), "--to", to, "--images", "float"]
+    done = subprocess.run([sys.executable, "-c", limited, *words], capture_output=True, text=True)
+    assert done.returncode == 2 and len(done.stderr.splitlines()) == 1, done.stderr
+    assert str(tmp_path / "x") in done.stderr and "File too large" in done.stderr
+    assert not list((tmp_path / "x").rglob("*.h5"))
+    assert main(words) == 0
+    whole = export.export(made, tmp_path / "whole", to, images="float")
+    assert whole["samples"] == TOTAL and content(tmp_path / "x") == content(tmp_path / "whole")
 
 
 def test_the_card_says_where_the_data_come_from(made, tmp_path):
