@@ -484,9 +484,9 @@ class LeRobot:
                 if values.dtype == np.uint8:
                     columns[f"observation.images.{name}"].append({"bytes": _png(item, name), "path": f"{place}.png"})
                 else:
-                    columns[f"observation.{name}"].append(values.tolist())
+                    columns[f"observation.{name}"].append(self._cell(values.tolist()))
             if self.numbers:
-                columns["observation.state"].append([item.values[k] for k in self.numbers])
+                columns["observation.state"].append(self._cell([item.values[k] for k in self.numbers]))
             for key in self.words:
                 columns[f"observation.{key}"].append(item.values[key])
             columns["timestamp"].append(place % length / self.FPS)
@@ -494,19 +494,24 @@ class LeRobot:
             columns["episode_index"].append(place // length)
             columns["index"].append(place)
             columns["task_index"].append(0)
-        types = {name: self._type(name, feature) for name, feature in self.features().items()}
+        types = {name: self._type(feature) for name, feature in self.features().items()}
         table = pa.table({name: pa.array(columns[name], types[name]) for name in columns})
         path = self.folder / f"data/chunk-{number // 1000:03d}/file-{number % 1000:03d}.parquet"
         with replacing(path) as file:
             self.pq.write_table(table, file, compression="zstd")
 
-    def _type(self, name: str, feature: Mapping) -> Any:
+    @staticmethod
+    def _cell(values: list) -> Any:
+        """What stands in a table: LeRobot reads a feature of the shape (1,) as a number and not as a list."""
+        return values[0] if len(values) == 1 and not isinstance(values[0], list) else values
+
+    def _type(self, feature: Mapping) -> Any:
         pa = self.pa
         if feature["dtype"] == "image":
             return pa.struct([("bytes", pa.binary()), ("path", pa.string())])
         kind = pa.type_for_alias(feature["dtype"])
         shape = feature["shape"]
-        if shape == [1] and name != "observation.state":
+        if shape == [1]:
             return kind
         if len(shape) == 1:
             return pa.list_(kind, shape[0])

@@ -159,6 +159,19 @@ def test_lerobot(made, tmp_path):
     np.testing.assert_allclose(np.ravel(stats["std"]), pixels.std((0, 1, 2)), rtol=1e-9)
 
 
+def test_a_single_number_of_lerobot_is_no_list(tmp_path):
+    """Of a feature of the shape (1,) LeRobot's library reads numbers, and refuses a file with lists."""
+    (tmp_path / "job.toml").write_text(
+        'scene = "gelsight"\nout = "out"\noutputs = ["png"]\n[defines]\nwidth = 20\nheight = 16\n[sample]\n'
+        '"gel.press_depth" = { grid = [0.2, 0.4] }\n'
+    )
+    export.export(batch.run(tmp_path / "job.toml", workers=1).folder, tmp_path / "x", "lerobot")
+    info = json.loads((tmp_path / "x/meta/info.json").read_text())
+    table = parquet.read_table(tmp_path / "x" / info["data_path"].format(chunk_index=0, file_index=0))
+    assert info["features"]["observation.state"]["shape"] == [1]
+    assert table.column("observation.state").to_pylist() == [pytest.approx(0.2), pytest.approx(0.4)]
+
+
 def test_12_bits_stay_12_bits(tmp_path):
     """DN beyond 8 bits are kept as they are; the 8-bit preview is not passed for the camera's DN."""
     (tmp_path / "job.toml").write_text(JOB.replace("saturation = 255.0", "saturation = 4095.0"))
