@@ -468,6 +468,9 @@ def _changes(before, now, name: str = "") -> list[str]:
     return [] if before == now else [name]
 
 
+PATIENCE = 10.0  # s for another command to write its manifest, also where a file server tells of it seconds later
+
+
 def finish(job: Job, blocks: Blocks) -> bool:
     """Write one ordered manifest and its table once every sample of the job is recorded; whether it is."""
     if not blocks.finished:
@@ -483,9 +486,12 @@ def finish(job: Job, blocks: Blocks) -> bool:
                 blocks.finish()
         except OutputExists:
             pass  # another worker is at it
-        except FileNotFoundError:
-            if not blocks.finished:  # another worker has been at it, and `.parts` is gone
-                raise
+        except FileNotFoundError:  # `.parts` is gone, or, where a file system has no locks, what was being written
+            until = time.monotonic() + PATIENCE
+            while not blocks.finished:  # another command has been at it, or is
+                if time.monotonic() > until:
+                    raise
+                time.sleep(PATIENCE / 50)
     return blocks.finish()
 
 
