@@ -151,7 +151,7 @@ def test_words_and_numbers_of_a_table_stay_whole():
         lines = words.table([head, row], left=(0,)).splitlines()
     assert len(lines) == 2 and max(map(len, lines)) <= 80 and "chi2/dof" in lines[0] and "100.0 %" in lines[1]
     with words.fitting(20):  # no room for them
-        assert words.table([head, row]).count("\n") > 3
+        assert words.table([head, row]).count("\n") > 1
 
 
 def test_a_pages_table_says_what_a_step_does_not_determine():
