@@ -604,6 +604,7 @@ def _variant_rows(llvm_works: bool) -> list[Row]:
             capture_output=True,
             text=True,
             errors="replace",
+            cwd=os.sep,  # `-c` looks for modules in the current folder, where captures may lie
             timeout=PROBE_SECONDS,
         )
     except (OSError, subprocess.TimeoutExpired) as error:

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import Any
 
 NARROWEST = 7  # characters of a column that is broken over lines
+UNBROKEN = 14  # characters of a word or number that stays whole, where the line has room for all of these
 
 
 _room: ContextVar[int | None] = ContextVar("room", default=None)  # characters of a line of the terminal
@@ -32,22 +33,44 @@ def table(rows: Sequence[Sequence[str]], left: Collection[int] | None = None) ->
     """Aligned columns, two spaces apart; `left`: columns that begin at the left (None: all), the others end at the
     right.
 
-    Where there is a terminal (`fitting`), cells of the widest columns go over several lines, so that a row fits."""
+    Where there is a terminal (`fitting`), cells of the widest columns go over several lines, so that a row fits; where
+    one space between columns leaves more words whole, it is one."""
     widths, width = [max(len(cell) for cell in column) for column in zip(*rows)], _room.get()
-    if width is not None and sum(widths) + 2 * (len(widths) - 1) > width:
-        room = width - 2 * (len(widths) - 1)
-        cap = max((c for c in range(1, max(widths) + 1) if sum(min(w, c) for w in widths) <= room), default=0)
-        cap = max(cap, NARROWEST)
-        lines = [[textwrap.wrap(cell, cap) or [""] for cell in row] for row in rows]
+    between = 2
+    if width is not None and sum(widths) + between * (len(widths) - 1) > width:
+        limits, between = _limits(rows, widths, width)
+        lines = [[textwrap.wrap(cell, most) or [""] for cell, most in zip(row, limits)] for row in rows]
         rows = [[cell[i] if i < len(cell) else "" for cell in row] for row in lines for i in range(max(map(len, row)))]
         widths = [max(len(cell) for cell in column) for column in zip(*rows)]
     return "\n".join(
-        "  ".join(
+        (" " * between)
+        .join(
             cell.ljust(w) if left is None or i in left else cell.rjust(w)
             for i, (cell, w) in enumerate(zip(row, widths))
-        ).rstrip()
+        )
+        .rstrip()
         for row in rows
     )
+
+
+def _limits(rows: Sequence[Sequence[str]], widths: Sequence[int], width: int) -> tuple[list[int], int]:
+    """How wide each column may be, and the spaces between two: the widest columns give way first, and words and numbers
+    stay whole where that is enough."""
+
+    def whole(cell: str) -> int:
+        parts = [cell] if _NUMBER.fullmatch(cell) else cell.split()
+        return min(max(map(len, parts), default=0), UNBROKEN)
+
+    floors, narrowest = [max(map(whole, column)) for column in zip(*rows)], [NARROWEST] * len(widths)
+    for least, between in ((floors, 2), (floors, 1), (narrowest, 2)):
+        for cap in range(max(widths), 0, -1):
+            limits = [max(cap, floor) for floor in least]
+            if sum(map(min, widths, limits)) + between * (len(widths) - 1) <= width:
+                return limits, between
+    return narrowest, 2
+
+
+_NUMBER = re.compile(r"[-+]?[\d.]\S*( \S{1,3})?")  # with its unit
 
 
 def some(names: Sequence[str], most: int = 5, between: str = ", ") -> str:

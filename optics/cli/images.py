@@ -1,10 +1,13 @@
 """Commands that make images: one, or many from a job file."""
 
+import shlex
 import sys
 import time
+from collections.abc import Sequence
 from datetime import timedelta
+from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
@@ -58,6 +61,15 @@ def render(
         ),
     ] = None,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Of everything random.")] = 0,
+    look: Annotated[
+        bool | None,
+        typer.Option(
+            "--look/--no-look",
+            help="What you set stands above the scene's first look (`optics scenes`: a press, lights by colour), or "
+            "above its file alone.",
+            show_default="--look where a shipped scene is named and nothing is set",
+        ),
+    ] = None,
     labels: Annotated[
         str | None,
         typer.Option(
@@ -79,7 +91,6 @@ def render(
     from optics.files.output import claim, together, write_json
     from optics.light import labels as labelling
     from optics.light.rendering import RenderJob
-    from optics.scene.loader import told
 
     if output.suffix.lower() != ".exr":
         raise ValueError(
@@ -90,9 +101,11 @@ def render(
     arrays = output.with_suffix(".npz")
     files = [output, record, *([preview] if png else []), *(maps if stokes else ()), *([arrays] if labels else [])]
     claim(files, force)
-    sensor = load_sensor(scene, fit, frame, define, plugins, variant)
+    first = _first_look(scene, fit, look, unset=not (define or sets or fit))
+    sensor = load_sensor(scene, fit, frame, [*first.defines, *(define or ())], plugins, variant)
     named = labelling.named(sensor.scene, labels)
-    chosen = sensor.scene.check(sensor.scene.spread(settings(sets), "--set"), "--set")
+    spread = [sensor.scene.spread(settings(given), "--set") for given in (first.sets, sets)]
+    chosen = sensor.scene.check({**spread[0], **spread[1]}, "--set")
     values = {**sensor.values, **chosen}
     if chosen or fit is None:  # of a fit alone nobody stated a depth
         sensor.scene.check_press({**sensor.scene.values(), **values}, "--set" if chosen else str(sensor.scene.path))
@@ -128,9 +141,8 @@ def render(
     for file in files:
         print(file)
     terminal.note(f"{images.method}, {seconds:.1f} s")
-    look = "" if define or chosen or fit is not None or scene is None else told(scene)[1]
-    if look and look.split("-o")[0].split() != ["optics", "render", str(scene)]:
-        terminal.note(f"nothing was set; worth a look: {look}")
+    if first.note:
+        terminal.note(first.note)
 
 
 @command
@@ -261,6 +273,42 @@ def export(
     if as_json:
         return show(card)
     print(f"{output}: {card['samples']} samples, {card['files']}; arrays {', '.join(card['arrays'])}; card.md")
+
+
+class FirstLook(NamedTuple):
+    """The options -D and --set of a scene's first look, and what to say of it."""
+
+    defines: Sequence[str] = ()
+    sets: Sequence[str] = ()
+    note: str = ""
+
+
+def _first_look(scene: str | None, fit: Path | None, look: bool | None, unset: bool) -> FirstLook:
+    """What an image begins with: `look` as asked for; None: the first look where a shipped scene is named and nothing
+    is set. A file of your own is rendered as it stands."""
+    from optics.scene.loader import shipped_scenes, told
+
+    if look and fit is not None:
+        raise ValueError(f"--look: {fit} is a calibrated sensor, which has no first look; leave one of the two out")
+    if scene is None or not (unset and scene in shipped_scenes() if look is None else look):
+        return FirstLook()
+    text = told(scene)[1]
+    try:
+        words = shlex.split(text)
+    except ValueError as error:
+        raise ValueError(f"{scene}: its line `Look: {text}`: {error}") from None
+    if words[:2] != ["optics", "render"]:
+        if look:
+            has = f"it has: {text}" if text else "its file has no line `Look: optics render ...`"
+            raise ValueError(f"--look: {scene} has no first look that is an image; {has}")
+        return FirstLook(note=f"worth a look: {text}" if text else "")
+    taken = [(option, word) for option, word in pairwise(words) if option in ("-D", "--set")]
+    shown = " ".join(f"{option} {shlex.quote(word)}" for option, word in taken)
+    return FirstLook(
+        [word for option, word in taken if option == "-D"],
+        [word for option, word in taken if option == "--set"],
+        "" if look or not taken else f"nothing was set: this is its first look, {shown}; as its file has it: --no-look",
+    )
 
 
 def _state(status: "Status") -> dict[str, str]:

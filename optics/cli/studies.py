@@ -1,8 +1,9 @@
 """Commands about studies: calibrate, diagnose, add an effect, rehearse, and look at the result."""
 
+import math
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -270,14 +271,18 @@ def values(
     from optics.errors import UnknownKey
     from optics.facade import Study
     from optics.study.record import readable
-    from optics.words import table
+    from optics.words import as_float, table
+
+    def spread(sd: Any) -> str:
+        """Records write an infinite standard deviation as a word."""
+        return "undetermined" if as_float(sd) == math.inf else f"+- {as_float(sd):.2g}" if sd else ""
 
     with readable(study):
         found = Study.open(study).record.steps[-1]["variables"]
         chosen = [v for v in found if not patterns or any(fnmatch(v["name"], p) for p in patterns)]
         if patterns and not chosen:
             raise UnknownKey(patterns[0], [v["name"] for v in found], "parameter of this study")
-        lines = [(v["name"], f"{v['value']:.6g}", f"+- {v['sd']:.2g}" if v["sd"] else "", v["unit"]) for v in chosen]
+        lines = [(v["name"], f"{v['value']:.6g}", spread(v["sd"]), v["unit"]) for v in chosen]
     show(chosen) if as_json else print(table([("parameter", "value", "1 sd", "unit"), *lines], left=(0, 3)))
 
 

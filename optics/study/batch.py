@@ -64,7 +64,7 @@ from optics.scene.trust import Named
 from optics.study.blocks import Block, Blocks, DiskFull, SampleFailed
 from optics.study.calibrated import Calibrated, calibrated
 from optics.study.draws import BadJob, Distribution, Drawn, Draws, Finite, Strict, Value, stream
-from optics.study.engines import ENGINES, Status, cores, one_thread, work_through
+from optics.study.engines import ENGINES, Status, cores, for_workers, work_through
 
 Progress = Callable[[str, int, int], None]
 
@@ -468,6 +468,9 @@ def _changes(before, now, name: str = "") -> list[str]:
     return [] if before == now else [name]
 
 
+PATIENCE = 10.0  # s for another command to write its manifest, also where a file server tells of it seconds later
+
+
 def finish(job: Job, blocks: Blocks) -> bool:
     """Write one ordered manifest and its table once every sample of the job is recorded; whether it is."""
     if not blocks.finished:
@@ -483,9 +486,12 @@ def finish(job: Job, blocks: Blocks) -> bool:
                 blocks.finish()
         except OutputExists:
             pass  # another worker is at it
-        except FileNotFoundError:
-            if not blocks.finished:  # another worker has been at it, and `.parts` is gone
-                raise
+        except FileNotFoundError:  # `.parts` is gone, or, where a file system has no locks, what was being written
+            until = time.monotonic() + PATIENCE
+            while not blocks.finished:  # another command has been at it, or is
+                if time.monotonic() > until:
+                    raise
+                time.sleep(PATIENCE / 50)
     return blocks.finish()
 
 
@@ -582,7 +588,7 @@ def run(
                 _here(blocks, maker, watch)
             else:
                 life = Life(job, file, plugins, shard, blocks.run)
-                with one_thread():
+                with for_workers():
                     work_through(ENGINES[on](workers, options or {}, folder), life, blocks, recycle, watch)
         finally:
             blocks.sweep()

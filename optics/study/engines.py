@@ -24,7 +24,12 @@ from typing import Any, Protocol
 from optics.errors import UnknownKey
 from optics.study.blocks import TRIES, Blocks, DiskFull
 
-ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+# Libraries of arrays use one thread, and no module is taken from the folder in which the command was given, where
+# captures may lie (from Python 3.11 on; 3.10 has no such switch, and its local workers look there first).
+ENVIRONMENT = {
+    **dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"),
+    "PYTHONSAFEPATH": "1",
+}
 GLANCE = 0.2  # seconds between two looks at the folder; ten times that on a cluster, whose file server others use too
 Lives = Sequence[Callable[[], int]]
 
@@ -116,7 +121,7 @@ class Slurm:
                 name=folder.name,
                 cpus_per_task=1,
                 slurm_array_parallelism=self.workers,
-                slurm_setup=[f"export {name}={value}" for name, value in ONE_THREAD.items()],
+                slurm_setup=[*(f"export {name}={value}" for name, value in ENVIRONMENT.items()), f"cd {os.sep}"],
                 **_typed({key: value for key, value in options.items() if key != "cluster"}),
             )
         except (RuntimeError, ValueError, NameError, TypeError, AssertionError) as error:
@@ -156,7 +161,8 @@ class Ray:
             if "address" not in given and "RAY_ADDRESS" not in os.environ:
                 given.setdefault("num_cpus", workers or cores())
             try:
-                self.ray.init(runtime_env={"env_vars": ONE_THREAD}, **given)
+                with _at_the_root():  # Ray's workers look for modules in the folder from which it was begun
+                    self.ray.init(runtime_env={"env_vars": ENVIRONMENT}, **given)
             except (RuntimeError, ValueError, TypeError, ConnectionError) as error:
                 raise ValueError(f"--on ray: {error}; allowed: parameters of ray.init") from error
         elif options:
@@ -180,6 +186,17 @@ class Ray:
 
 def _call(life: Callable[[], int]) -> int:
     return life()
+
+
+@contextmanager
+def _at_the_root() -> Iterator[None]:
+    """The root is the current folder within; nobody who sends data writes there."""
+    here = os.getcwd()
+    os.chdir(os.sep)
+    try:
+        yield
+    finally:
+        os.chdir(here)
 
 
 ENGINES: dict[str, Callable[[int | None, Mapping[str, str], Path], Engine]] = {
@@ -302,9 +319,9 @@ def _error(worker: Work) -> BaseException | None:
 
 
 @contextmanager
-def one_thread() -> Iterator[None]:
-    """Libraries of arrays use one thread in processes that are started within; what the user set stays."""
-    added = {name: value for name, value in ONE_THREAD.items() if name not in os.environ}
+def for_workers() -> Iterator[None]:
+    """Processes that are started within have ENVIRONMENT; what the user set stays."""
+    added = {name: value for name, value in ENVIRONMENT.items() if name not in os.environ}
     os.environ.update(added)
     try:
         yield

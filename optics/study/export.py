@@ -297,6 +297,37 @@ class WebDataset:
         pass
 
 
+class Sink(io.FileIO):
+    """A file for the HDF5 library, which ends the process where the system takes no more, as on a full disk: the first
+    error is kept, what comes later is dropped, and the error is raised once the library is done."""
+
+    def __init__(self, path: Path):
+        super().__init__(path, "w+")
+        self.failed: OSError | None = None
+
+    def write(self, data: Any) -> int:
+        left = memoryview(data).cast("B")
+        while left and self.failed is None:
+            try:
+                left = left[super().write(left) :]
+            except OSError as error:
+                self.failed = error
+        return memoryview(data).nbytes
+
+    def truncate(self, size: int | None = None) -> int:
+        if self.failed is None:
+            try:
+                return super().truncate(size)
+            except OSError as error:
+                self.failed = error
+        return size or 0
+
+    def __exit__(self, *raised: Any) -> None:
+        super().__exit__(*raised)
+        if self.failed is not None:
+            raise self.failed
+
+
 class Hdf5:
     """Files with a dataset per array, (N, ...), compressed, a chunk per sample, and `values/KEY`, (N,)."""
 
@@ -306,7 +337,11 @@ class Hdf5:
 
     def write(self, number: int, items: Sequence[Item] | Iterator[Item]) -> None:
         count = min(self.plan.per_file, self.plan.total - number * self.plan.per_file)
-        with replacing(self.folder / self.plan.name(number, ".h5")) as path, self.h5py.File(path, "w") as file:
+        with (
+            replacing(self.folder / self.plan.name(number, ".h5")) as path,
+            Sink(path) as sink,
+            self.h5py.File(sink, "w") as file,
+        ):
             index = file.create_dataset("index", (count,), "i8")
             for name, values in self.plan.first.arrays.items():
                 file.create_dataset(
@@ -316,6 +351,8 @@ class Hdf5:
                 kind = self.h5py.string_dtype() if isinstance(value, str) else "f8"
                 file.create_dataset(f"values/{key}", (count,), kind).attrs["unit"] = unit_of(self.plan.batch, key)
             for row, item in enumerate(items):
+                if sink.failed:
+                    break
                 index[row] = item.index
                 for name, values in item.arrays.items():
                     file[name][row] = values
@@ -447,9 +484,9 @@ class LeRobot:
                 if values.dtype == np.uint8:
                     columns[f"observation.images.{name}"].append({"bytes": _png(item, name), "path": f"{place}.png"})
                 else:
-                    columns[f"observation.{name}"].append(values.tolist())
+                    columns[f"observation.{name}"].append(self._cell(values.tolist()))
             if self.numbers:
-                columns["observation.state"].append([item.values[k] for k in self.numbers])
+                columns["observation.state"].append(self._cell([item.values[k] for k in self.numbers]))
             for key in self.words:
                 columns[f"observation.{key}"].append(item.values[key])
             columns["timestamp"].append(place % length / self.FPS)
@@ -457,19 +494,24 @@ class LeRobot:
             columns["episode_index"].append(place // length)
             columns["index"].append(place)
             columns["task_index"].append(0)
-        types = {name: self._type(name, feature) for name, feature in self.features().items()}
+        types = {name: self._type(feature) for name, feature in self.features().items()}
         table = pa.table({name: pa.array(columns[name], types[name]) for name in columns})
         path = self.folder / f"data/chunk-{number // 1000:03d}/file-{number % 1000:03d}.parquet"
         with replacing(path) as file:
             self.pq.write_table(table, file, compression="zstd")
 
-    def _type(self, name: str, feature: Mapping) -> Any:
+    @staticmethod
+    def _cell(values: list) -> Any:
+        """What stands in a table: LeRobot reads a feature of the shape (1,) as a number and not as a list."""
+        return values[0] if len(values) == 1 and not isinstance(values[0], list) else values
+
+    def _type(self, feature: Mapping) -> Any:
         pa = self.pa
         if feature["dtype"] == "image":
             return pa.struct([("bytes", pa.binary()), ("path", pa.string())])
         kind = pa.type_for_alias(feature["dtype"])
         shape = feature["shape"]
-        if shape == [1] and name != "observation.state":
+        if shape == [1]:
             return kind
         if len(shape) == 1:
             return pa.list_(kind, shape[0])
@@ -623,7 +665,14 @@ def export(
         note = state / f"{number:06d}.json"
         if not note.is_file():
             own = Moments()
-            writer.write(number, _counted(plan, number, images, arrays, own, progress))
+            try:
+                writer.write(number, _counted(plan, number, images, arrays, own, progress))
+            except OSError as error:
+                if error.filename is None and error.errno is not None:  # the libraries' own do not say where
+                    raise OSError(
+                        error.errno, f"{error.strerror}; what is whole is kept, the same command goes on", str(folder)
+                    ) from error
+                raise
             write_json(note, own.of)
         moments.merge(json.loads(note.read_text(encoding="utf-8")))
     writer.finish(moments)

@@ -1,10 +1,12 @@
 """Hostile input by the hundred: `make torture` tries all of it, the usual run a small part.
 
-What may happen is the same everywhere (`met`): the command works, or it ends with one line that says what is wrong."""
+What may happen is the same everywhere (`met`): the command works, or it ends with one line that says what is wrong.
+A case is one hostile input: an example of hypothesis, a value of an option, or else a test. The summary counts them."""
 
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
 import shutil
 import signal
@@ -98,6 +100,39 @@ detail = 1
 [sample]
 "gel.press_x" = { uniform = [-9.0, 9.0] }
 """
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call(item):
+    """Count the examples that hypothesis hands to a test."""
+    handle = getattr(item.obj, "hypothesis", None)
+    if handle is None:
+        return (yield)
+    inner, tried = handle.inner_test, 0
+
+    @functools.wraps(inner)
+    def counted(*arguments, **named):
+        nonlocal tried
+        tried += 1
+        return inner(*arguments, **named)
+
+    handle.inner_test = counted
+    try:
+        return (yield)
+    finally:
+        handle.inner_test = inner
+        item.user_properties.append(("cases", tried))
+
+
+def pytest_terminal_summary(terminalreporter):
+    """Say how many cases were tried; one test is one case where it does not say otherwise."""
+    kinds = {kind: terminalreporter.getreports(kind) for kind in ("passed", "failed")}
+    tried = {
+        kind: sum(dict(report.user_properties).get("cases", 1) for report in reports if report.when == "call")
+        for kind, reports in kinds.items()
+    }
+    failed = len(kinds["failed"])
+    terminalreporter.write_line(f"{sum(tried.values())} hostile cases tried, {failed} tests failed")
 
 
 @contextlib.contextmanager

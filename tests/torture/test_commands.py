@@ -6,7 +6,10 @@ import os
 import re
 import shutil
 import struct
+import subprocess
+import sys
 import zlib
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -79,10 +82,12 @@ def test_every_command_is_tried():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("part", range(40))
-def test_hostile_options(place, met, monkeypatch, part):
+def test_hostile_options(place, met, monkeypatch, record_property, part):
     """Forty parts of all cases."""
     monkeypatch.chdir(place)
-    for name, words, option, value in itertools.islice(ALL, part, None, 40):
+    mine = list(itertools.islice(ALL, part, None, 40))
+    record_property("cases", len(mine))
+    for name, words, option, value in mine:
         shutil.rmtree(place / "out", ignore_errors=True)
         met(name, *words.split(), f"{option}={value}", seconds=120)
 
@@ -150,6 +155,21 @@ def test_a_plugin_that_ends_the_program_is_named(place, met, monkeypatch):
     (place / "odd.py").write_text("import sys\nsys.exit(0)\n")
     code, said = met("render", "small.xml", "-o", "x.exr", "--plugins", "odd.py")
     assert code == 2 and "odd.py: SystemExit" in said
+
+
+@pytest.mark.slow  # each starts programs of its own
+@pytest.mark.skipif(sys.version_info < (3, 11), reason="Python 3.10 looks in the current folder for a spawned worker")
+@pytest.mark.parametrize("words", ["batch job.toml --workers 2", "batch job.toml --on ray --workers 1", "doctor"])
+def test_modules_in_the_current_folder_do_not_run(place, words):
+    """Captures may lie where a command is given: what starts further processes takes no module from there."""
+    if "ray" in words:
+        pytest.importorskip("ray")
+    for name in ("signal", "json", "pickle", "socket", "numpy", "mitsuba", "submitit", "optics"):
+        (place / f"{name}.py").write_text(f"open({str(place / 'ran')!r}, 'a').write({name!r})\n")
+    program = Path(sys.executable).with_name("optics")
+    done = subprocess.run([program, *words.split()], cwd=place, capture_output=True, text=True, timeout=300)
+    assert not (place / "ran").exists(), (place / "ran").read_text()
+    assert done.returncode in ((0, 1) if words == "doctor" else (0,)), done.stderr
 
 
 REFUSED = {
@@ -247,9 +267,6 @@ WRITING = [
 @pytest.mark.parametrize("words", WRITING)
 def test_a_read_only_folder(place, words):
     """As somebody who may not write: one line, which names the place."""
-    import subprocess
-    import sys
-
     user = ["setpriv", "--reuid=65534", "--regid=65534", "--clear-groups"] if os.geteuid() == 0 else []
     for folder, _, files in os.walk(place):
         os.chmod(folder, 0o555)

@@ -1,6 +1,7 @@
 """The command line shows what the library knows, writes what it says, and keeps stdout for results."""
 
 import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -292,6 +293,31 @@ def test_a_image_of_a_sensor(optics, tmp_path):
     with Image.open(file.with_suffix(".png")) as opened:
         shown = np.asarray(opened, float)
     assert np.abs(shown - np.clip(np.round(image.camera), 0, 255)).max() <= 1  # a DN on the edge of two
+
+
+def test_the_first_image_of_a_scene_is_its_first_look(optics, tmp_path):
+    """With nothing set a newcomer sees a press in colour, and how; what is set, and a file of your own, mean what they
+    say."""
+    made = {}
+    for name, words in (
+        ("bare", ["gelsight"]),
+        ("look", ["gelsight", "--look", "-D", "width=64", "--set", "camera.exposure=100"]),
+        ("plain", ["gelsight", "--no-look"]),
+        ("set", ["gelsight", *SIZE]),
+        ("own", [shutil.copy(scene.find("gelsight"), tmp_path / "own.xml")]),
+    ):
+        code, _, err = optics("render", *words, "-o", tmp_path / f"{name}.exr")
+        assert code == 0 and ("nothing was set: this is its first look, -D depth=" in err) == (name == "bare"), err
+        made[name] = exr.read(tmp_path / f"{name}.exr")[0], json.loads((tmp_path / f"{name}.json").read_text())
+    touched = {name: bool(channels["contact.Y"].max() > 0) for name, (channels, _) in made.items()}
+    assert touched == {"bare": True, "look": True, "plain": False, "set": False, "own": False}
+    colours = np.stack([made["bare"][0][c] for c in "RGB"], -1)
+    assert np.ptp(colours, -1).mean() > 0.3 * colours.mean()
+    assert made["look"][1]["parameters"]["camera.exposure"] == 100 and made["look"][0]["R"].shape == (240, 64)
+    code, _, err = optics("render", "polarizer_bench", "--look", "-o", tmp_path / "x.exr")
+    assert code == 2 and "has no first look that is an image; it has: optics sweep" in err
+    code, _, err = optics("render", "--fit", tmp_path, "--look", "-o", tmp_path / "x.exr")
+    assert code == 2 and "has no first look" in err and not (tmp_path / "x.exr").exists()
 
 
 def test_existing_images_are_kept_unless_forced(optics, tmp_path):

@@ -144,6 +144,16 @@ def test_tables_fit_the_terminal():
     assert words.table(rows) == wide  # to a file or a program
 
 
+def test_words_and_numbers_of_a_table_stay_whole():
+    head = ("by frame", "values", "used", "chi2/dof", "bias DN", "rms DN", "noise DN", "L1", "PSNR dB", "SSIM")
+    row = ("reading 3", "1152", "100.0 %", "42.612", "-10.260", "14.093", "2.104", "0.0487", "24.87", "0.5209")
+    with words.fitting(80):
+        lines = words.table([head, row], left=(0,)).splitlines()
+    assert len(lines) == 2 and max(map(len, lines)) <= 80 and "chi2/dof" in lines[0] and "100.0 %" in lines[1]
+    with words.fitting(20):  # no room for them
+        assert words.table([head, row]).count("\n") > 1
+
+
 def test_a_pages_table_says_what_a_step_does_not_determine():
     known = {"value": 12.0, "sd": 2.0, "plausible": 10.0, "bounds": [-720.0, 720.0]}
     assert estimated(known) == "12.0 ± 2.0"

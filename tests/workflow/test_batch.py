@@ -8,6 +8,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections import Counter
 from pathlib import Path
@@ -366,6 +367,25 @@ def test_commands_at_once_share_the_work(whole, job):
     result = batch.run(job, workers=1)
     assert (result.made, result.complete) == (1, True) and not blocks.parts.exists()
     assert content(job.parent / "out") == content(whole)
+
+
+@pytest.mark.parametrize("other", [True, False], ids=["goes on", "has died"])
+def test_two_commands_that_finish_at_once_without_locks(job, monkeypatch, other):
+    """The other one's sweep takes away what this one is writing: this one waits for the other's manifest."""
+    write = batch._write_table
+
+    def swept(own, blocks):
+        if other:
+            threading.Timer(0.3, lambda: (write(own, blocks), blocks.finish())).start()
+        raise FileNotFoundError(2, "No such file or directory", ".manifest.x.csv")
+
+    monkeypatch.setattr(batch, "_write_table", swept)
+    monkeypatch.setattr(batch, "PATIENCE", 5.0 if other else 0.1)
+    if other:
+        assert batch.run(job, workers=1).complete and (job.parent / "out" / "manifest.csv").is_file()
+    else:
+        with pytest.raises(FileNotFoundError):
+            batch.run(job, workers=1)
 
 
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for workers in /proc")

@@ -5,6 +5,8 @@ import io
 import json
 import math
 import shutil
+import subprocess
+import sys
 import tarfile
 
 import numpy as np
@@ -157,6 +159,19 @@ def test_lerobot(made, tmp_path):
     np.testing.assert_allclose(np.ravel(stats["std"]), pixels.std((0, 1, 2)), rtol=1e-9)
 
 
+def test_a_single_number_of_lerobot_is_no_list(tmp_path):
+    """Of a feature of the shape (1,) LeRobot's library reads numbers, and refuses a file with lists."""
+    (tmp_path / "job.toml").write_text(
+        'scene = "gelsight"\nout = "out"\noutputs = ["png"]\n[defines]\nwidth = 20\nheight = 16\n[sample]\n'
+        '"gel.press_depth" = { grid = [0.2, 0.4] }\n'
+    )
+    export.export(batch.run(tmp_path / "job.toml", workers=1).folder, tmp_path / "x", "lerobot")
+    info = json.loads((tmp_path / "x/meta/info.json").read_text())
+    table = parquet.read_table(tmp_path / "x" / info["data_path"].format(chunk_index=0, file_index=0))
+    assert info["features"]["observation.state"]["shape"] == [1]
+    assert table.column("observation.state").to_pylist() == [pytest.approx(0.2), pytest.approx(0.4)]
+
+
 def test_12_bits_stay_12_bits(tmp_path):
     """DN beyond 8 bits are kept as they are; the 8-bit preview is not passed for the camera's DN."""
     (tmp_path / "job.toml").write_text(JOB.replace("saturation = 255.0", "saturation = 4095.0"))
@@ -250,6 +265,24 @@ def test_an_export_that_was_cut_off_goes_on(made, tmp_path, monkeypatch, to):
     assert content(tmp_path / "cut") == before, "a finished export is left alone"
     with pytest.raises(OutputExists, match="holds another export: changed per_file"):
         export.export(made, tmp_path / "cut", to, per_file=6)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="limits of file sizes end processes elsewhere")
+@pytest.mark.parametrize("to", ["hdf5", "zarr"])
+def test_a_full_disk_is_said_and_the_export_goes_on(made, tmp_path, to):
+    """A limit on the size of files stands for the disk. The HDF5 library ends the process where writing fails."""
+    limited = (
+        "import resource, sys\nfrom optics.cli import main\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (1024, 1024))\nsys.exit(main(sys.argv[1:]))\n"
+    )
+    words = ["export", str(made), "-o", str(tmp_path / "x"), "--to", to, "--images", "float"]
+    done = subprocess.run([sys.executable, "-c", limited, *words], capture_output=True, text=True)
+    assert done.returncode == 2 and len(done.stderr.splitlines()) == 1, done.stderr
+    assert str(tmp_path / "x") in done.stderr and "File too large" in done.stderr
+    assert not list((tmp_path / "x").rglob("*.h5"))
+    assert main(words) == 0
+    whole = export.export(made, tmp_path / "whole", to, images="float")
+    assert whole["samples"] == TOTAL and content(tmp_path / "x") == content(tmp_path / "whole")
 
 
 def test_the_card_says_where_the_data_come_from(made, tmp_path):

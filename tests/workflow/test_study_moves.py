@@ -83,6 +83,17 @@ def test_a_study_without_its_captures_says_where_it_looked(moved, tmp_path, opti
     assert code == 2 and "changed since the study began: captures/readings.csv" in said
 
 
+def test_what_is_not_determined_is_told_so(project, tmp_path, optics):
+    """Records write an infinite standard deviation as a word."""
+    study = shutil.copytree(project / "study", tmp_path / "study")
+    file = study / "steps" / "00-base" / "step.json"
+    step = json.loads(file.read_text())
+    step["variables"][0]["sd"] = "inf"
+    file.write_text(json.dumps(step))
+    code, said, error = optics("values", study)
+    assert code == 0 and "undetermined" in said, error
+
+
 def test_what_is_no_input_may_change(moved, optics):
     (moved / "captures" / "notes.txt").write_text("a remark")
     assert optics("add", moved / "study", "extinction leak")[0] == 0
