@@ -72,6 +72,15 @@ def test_a_plate_turned_between_films_and_its_colours():
     assert np.abs(higher[:, 0] - expected[:, 0]).max() > 0.05
 
 
+def test_a_folder_states_any_wavelength_but_that_at_which_benches_are_described(tmp_path):
+    """A laser's owner writes its wavelength: without it, a plate of his catalogue would be another at 650 nm."""
+    plain = two_films()
+    for band in (bench.GREEN, 650.0):
+        made = replace(plain, bands=(band,))
+        folder.write(tmp_path / f"{band:g}", made, made.mean({}))
+        assert capture_set.load(tmp_path / f"{band:g}").bands == ([band] if band != bench.GREEN else [])
+
+
 def test_limits_of_haze_of_a_twist_and_of_a_dichroic_sheet():
     c2 = np.cos(np.radians(DIAL)) ** 2
     assert seen({"haze": 1.0}) == pytest.approx(np.full(12, T1**2 / 4), rel=1e-12)
