@@ -755,8 +755,10 @@ def _readings(case: Case, trial: Trial) -> Readings:
 
 def _of_frames(case: Case, lamp: Frames, trial: Trial) -> Readings:
     """The frames about an explanation of images, with the derivative images of the base."""
-    columns = case.evidence.dense([*case.evidence.base, *(i for c in trial.members for i in c.columns)])
-    return lamp.about(np.concatenate(_kept(case, trial.images)), columns)
+    evidence = case.evidence
+    columns = evidence.dense([*evidence.base, *(i for c in trial.members for i in c.columns)])
+    known = priors(case.model, trial.fit.values, [evidence.columns[i] for i in evidence.base])
+    return lamp.about(np.concatenate(_kept(case, trial.images)), columns, known)
 
 
 def _measured(case: Case, trial: Trial) -> np.ndarray:

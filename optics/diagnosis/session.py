@@ -63,8 +63,10 @@ class Session:
         whole = self.apart(np.column_stack([fitted, residual]))
         precision, pull = known or self.known
         beside = known_products(precision, pull, fitted.shape[1])
-        more = int(np.count_nonzero(precision))
-        return Readings(whole[:, -1], whole[:, :-1], self.order, self.loads, beside, more, most=self.most)
+        own = np.flatnonzero(precision)
+        return Readings(
+            whole[:, -1], whole[:, :-1], self.order, self.loads, beside, len(own), most=self.most, known=own
+        )
 
     def independent(self, columns: np.ndarray, noise: Correlation) -> np.ndarray:
         """(n, k) images as of readings that are independent, in units of their noise: what is new in each of them."""
@@ -89,16 +91,22 @@ class Frames:
         signal = np.split(evidence.lit(model), np.cumsum([len(block.r) for block in evidence.blocks])[:-1])
         self.signal = [g / max(float(np.linalg.norm(g)), 1e-12) for g in signal]
         self.thinning = evidence.thinning
+        self.known = evidence.precision, evidence.pull
         self.loads = {"lamp": np.array([np.linalg.norm(g) for g in signal]) * np.sqrt(evidence.thinning)}
 
-    def about(self, residual: np.ndarray, fitted: np.ndarray) -> Readings:
-        """As of `Session`, whatever is known beforehand."""
+    def about(
+        self, residual: np.ndarray, fitted: np.ndarray, known: tuple[np.ndarray, np.ndarray] | None = None
+    ) -> Readings:
+        """As of `Session`: the dial of a frame that is known to a degree does not take up what a lamp did there."""
         whole = np.column_stack([fitted, residual])
         parts = np.split(whole, np.cumsum([len(g) for g in self.signal])[:-1])
         along = np.array([g @ part for g, part in zip(self.signal, parts)]) * np.sqrt(self.thinning)
         across = self.thinning * whole.T @ whole - along.T @ along
         order, more = np.arange(len(along)), self.thinning * len(whole) - len(along)
-        return Readings(along[:, -1], along[:, :-1], order, self.loads, across, more, APART)
+        precision, pull = known or self.known
+        across += known_products(precision, pull, fitted.shape[1])
+        own = np.flatnonzero(precision)
+        return Readings(along[:, -1], along[:, :-1], order, self.loads, across, more + len(own), APART, known=own)
 
 
 def _shared_errors(model: Model, evidence: Evidence) -> list[tuple[np.ndarray, np.ndarray]]:
