@@ -16,11 +16,11 @@ where that is more; of readings, each explanation may have noise that neighbours
 Whether an explanation needs an effect that a simpler one lacks is a question of significance: family-wise; of images,
 with the design effect of what tells the two apart (`optics.diagnosis.homogeneity.variances`). Of two that are not
 nested, one is told apart from the best when its score is TOLD lower (CLEAR, where plausibility alone decides; an effect
-is claimed when the best explanation without it is SURE lower); when, of
-images or of readings with MISSTATED noise, the difference of falls exceeds the smaller of HALF of what the best one
-leaves and MARGIN of its fall, as misfit that is left may lie along any direction; and, of readings, when it predicts
-blocks of the session worse that were left out. All others survive. An effect that is part of every explanation that
-survives is missing, whichever of them is right.
+is claimed when the best explanation without it is SURE lower); of readings, what it predicts better of blocks of the
+session that were left out counts against that lead; and when, of images or of readings with MISSTATED noise, the
+difference of falls exceeds the smaller of HALF of what the best one leaves and MARGIN of its fall, as misfit that is
+left may lie along any direction. All others survive. An effect that is part of every explanation that survives is
+missing, whichever of them is right.
 
 Sources: MacKay, Bayesian interpolation, Neural Computation 4, 415 (1992), Occam factor; Vuong, Econometrica 57, 307
 (1989), the variance of a difference of log likelihoods."""
@@ -485,20 +485,24 @@ def _beside_at(case: Case, trial: Trial, others: Sequence[Candidate]) -> list[tu
 
 
 def _joined(case: Case, trials: dict[frozenset[str], Trial]) -> None:
-    """Pairs of images' effects, whose refits are dear: by the linear fall of both, those that may win."""
+    """Pairs of images' effects, whose refits are dear: those that may win by the linear fall of both, beside what a lamp
+    may have done to whole frames."""
     evidence, scale = case.evidence, _scale(case, trials.values())
-    best = _leader(case, trials)
-    top = _score(best, scale)
+    _bound_wander(case, trials.values())
+    scores = {names: _score(t, scale) + _gain(case, t, scale) for names, t in trials.items()}
+    best = trials[max(scores, key=lambda names: scores[names])]
+    top = scores[best.names]
     live = [c for c in case.table.order if c.row.p_family < LEVEL and len(c.cone.live) and not c.broken]
     wanted = []
     for net, a, b, linear in pairs.ranked(evidence, live[: pairs.CONSIDERED]):
         both = [a, b]
-        both_cost = sum(map(expected_cost, both))
         nested = best.names <= frozenset(c.effect.name for c in both)
         needed = max(CLEAR, pairs.LEAD * best.fall) if nested else -CLEAR
-        if (nested and (not best.members or best.complete)) or net / scale - both_cost - top < needed:
+        if nested and (not best.members or best.complete):
             continue
-        wanted.append((net / scale - both_cost, both, linear))
+        expected = net / scale + _expected_gain(case, both, scale) - sum(map(expected_cost, both))
+        if expected - top >= needed:
+            wanted.append((expected, both, linear))
     for _, (a, b), linear in sorted(wanted, key=lambda t: -t[0])[: pairs.REFITTED]:
         try:
             found = with_effects(case, [(a, linear[: len(a.columns)]), (b, linear[len(a.columns) :])], START)
@@ -509,6 +513,29 @@ def _joined(case: Case, trials: dict[frozenset[str], Trial]) -> None:
             trials[made.names] = made
 
 
+def _bound_wander(case: Case, trials: Iterable[Trial]) -> None:
+    """Where effects leave nothing, a lamp that swings as nobody would let it is no rival of theirs."""
+    most = NOTICED if any(t.members and t.complete for t in trials) else math.inf
+    if case.evidence.is_table:
+        case.session.most = most
+    elif case.lamp is not None:
+        case.lamp.most = most
+
+
+def _gain(case: Case, trial: Trial, scale: float) -> float:
+    """By how much shared noise lowers the deviance of an explanation of images: 0 where it has a gain of each frame."""
+    return 0.0 if case.lamp is None or trial.by_frame else _of_frames(case, case.lamp, trial).noise(scale).gain
+
+
+def _expected_gain(case: Case, members: Sequence[Candidate], scale: float) -> float:
+    """The same of a set of effects, before it is refitted."""
+    if case.lamp is None or any(c.effect.scope == "frame" for c in members):
+        return 0.0
+    evidence = case.evidence
+    columns = evidence.dense([*evidence.base, *(i for c in members for i in c.columns)])
+    return case.lamp.about(np.concatenate([b.r for b in evidence.blocks]), columns).noise(scale).gain
+
+
 # -- the competition -------------------------------------------------------------------------------------------------
 def compete(case: Case, trials: list[Trial]) -> Outcome:
     """The explanations that are not told apart from the best."""
@@ -516,9 +543,8 @@ def compete(case: Case, trials: list[Trial]) -> Outcome:
     order = sorted(trials, key=lambda t: -_score(t, scale))
     for t in order:
         t.deviance = t.after / scale
+    _bound_wander(case, order)
     if case.evidence.is_table:
-        # where effects leave nothing, a lamp that swings as nobody would let it is no rival of theirs
-        case.session.most = NOTICED if any(t.members and t.complete for t in order) else math.inf
         for t in order:
             if t.readings is not None:
                 t.readings.most = case.session.most
@@ -538,7 +564,7 @@ def compete(case: Case, trials: list[Trial]) -> Outcome:
         order.sort(key=lambda t: t.deviance + t.cost)
     elif case.lamp is not None:
         for t in order:
-            t.gain = 0.0 if t.by_frame else _of_frames(case, case.lamp, t).noise(scale).gain
+            t.gain = _gain(case, t, scale)
             t.deviance -= t.gain
         order.sort(key=lambda t: t.deviance + t.cost)
     # whether there is anything is a question of its own, which costs do not answer
@@ -644,7 +670,8 @@ def _told(case: Case, outcome: Outcome, best: Trial, other: Trial) -> bool:
         return True
     lead, needed = outcome.leads[other.names] if best is outcome.leader else _lead(case, outcome, best, other)
     # whether anything predicts better than nothing is a condition of a claim, not of what is told apart
-    return lead > needed and not (other.members and best.ahead > other.ahead)
+    ahead = best.ahead - other.ahead if other.members and best.ahead > other.ahead else 0.0
+    return lead - ahead > needed
 
 
 def _inherited(case: Case, outcome: Outcome, alive: Sequence[Trial]) -> list[Trial]:
@@ -681,9 +708,11 @@ def _lead(case: Case, outcome: Outcome, best: Trial, other: Trial) -> tuple[floa
             lead, needed, cost = data, data - significant, 0.0
     if best.complete or (is_table and outcome.scale < MISSTATED):
         return lead, needed
-    fall = best.fall - other.fall
+    # of images, less what a lamp did to whole frames: that lies in no direction of an effect
+    shared = 0.0 if is_table else outcome.scale
+    fall = best.fall - other.fall + shared * (best.gain - other.gain)
     dof = max(case.evidence.normal.count - case.evidence.projected.rank, 1)
-    misfit = min(HALF * best.left(dof), MARGIN * best.fall)
+    misfit = min(HALF * max(best.left(dof) - shared * best.gain, 0.0), MARGIN * best.fall)
     if misfit and fall + cost * outcome.scale < misfit:
         return lead, max(needed, lead + misfit - fall)
     return lead, needed
@@ -706,6 +735,10 @@ def _design_effect(case: Case, outcome: Outcome, one: Trial, other: Trial) -> fl
     """By how much the variance of the difference of two chi2 of images exceeds what independent noise makes."""
     direction = _kept(case, [a - b for a, b in zip(one.images, other.images)])
     left = _kept(case, outcome.leader.images)
+    if case.lamp is not None and not outcome.leader.by_frame:
+        # what a lamp did to whole frames has been counted: it is no scatter between them
+        noise = _of_frames(case, case.lamp, outcome.leader).noise(outcome.scale)
+        direction, left = case.lamp.independent(direction, noise), case.lamp.independent(left, noise)
     total = sum(float(d @ d) for d in direction)
     if not total > 0 or case.places is None:
         return 1.0

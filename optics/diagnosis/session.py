@@ -13,7 +13,7 @@ Residuals and images are whitened by it before neighbours are asked what they sh
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from scipy import linalg
@@ -85,7 +85,11 @@ class Frames:
     """Images as a session: what the lamp, or an exposure, does to a whole frame is shared by its pixels.
 
     The part of a residual along the signal of its frame is one reading, with the load |g| of its whitened signal g;
-    what is across shares nothing."""
+    what is across shares nothing.
+
+    most   as of `Session`"""
+
+    most = math.inf
 
     def __init__(self, model: Model, evidence: Evidence):
         signal = np.split(evidence.lit(model), np.cumsum([len(block.r) for block in evidence.blocks])[:-1])
@@ -106,7 +110,15 @@ class Frames:
         precision, pull = known or self.known
         across += known_products(precision, pull, fitted.shape[1])
         own = np.flatnonzero(precision)
-        return Readings(along[:, -1], along[:, :-1], order, self.loads, across, more + len(own), APART, known=own)
+        more += len(own)
+        return Readings(along[:, -1], along[:, :-1], order, self.loads, across, more, APART, self.most, own)
+
+    def independent(self, columns: Sequence[np.ndarray], noise: Correlation) -> list[np.ndarray]:
+        """Of each frame, (n,) values in units of the noise, with what its lamp may have done weighed down: as of frames
+        that share nothing with each other."""
+        bright = float(np.mean(np.square(self.loads["lamp"]))) if len(self.signal) else 1.0
+        shared = noise.power * np.square(self.loads["lamp"]) / max(bright, 1e-300)
+        return [c - (1 - 1 / math.sqrt(1 + p)) * (g @ c) * g for c, g, p in zip(columns, self.signal, shared)]
 
 
 def _shared_errors(model: Model, evidence: Evidence) -> list[tuple[np.ndarray, np.ndarray]]:
