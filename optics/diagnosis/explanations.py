@@ -69,7 +69,7 @@ class Trial:
     members    effects, none for the base;   fit, fall, after, expected, images   as of `optics.diagnosis.refit.Attempt`
     cost       see the module
     deviance   see the module; NaN before the competition;   gain: what shared noise lowers it by
-    readings   of a table, about it; None before
+    readings   of a table, or frames of images, about it; None before
     ahead      chi2 of the blocks that were left out in turn, less that of the base; NaN where it was not computed
     """
 
@@ -787,11 +787,16 @@ def _readings(case: Case, trial: Trial) -> Readings:
 
 
 def _of_frames(case: Case, lamp: Frames, trial: Trial) -> Readings:
-    """The frames about an explanation of images, with the derivative images of the base."""
+    """The frames about an explanation of images, with the derivative images of the base; once, as it competes more
+    than once."""
+    if trial.readings is not None:
+        trial.readings.most = lamp.most
+        return trial.readings
     evidence = case.evidence
     columns = evidence.dense([*evidence.base, *(i for c in trial.members for i in c.columns)])
     known = priors(case.model, trial.fit.values, [evidence.columns[i] for i in evidence.base])
-    return lamp.about(np.concatenate(_kept(case, trial.images)), columns, known)
+    trial.readings = lamp.about(np.concatenate(_kept(case, trial.images)), columns, known)
+    return trial.readings
 
 
 def _measured(case: Case, trial: Trial) -> np.ndarray:
