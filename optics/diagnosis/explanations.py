@@ -699,7 +699,8 @@ def _lead(case: Case, outcome: Outcome, best: Trial, other: Trial) -> tuple[floa
     if best.by_frame and not is_table:  # a lamp that wanders is no rival of a gain of each frame, but the same
         data, shared = data + other.gain, 0.0
     if not is_table:
-        data = outcome.scale * data / _design_effect(case, outcome, best, other)
+        known = (case.prior_chi2(other.fit.values) - case.prior_chi2(best.fit.values)) / outcome.scale
+        data = outcome.scale * (data - known) / _design_effect(case, outcome, best, other) + known
     lead, needed = data + cost, TOLD if data > TOLD else CLEAR  # what is plausible decides alone only where it is clear
     if other.keys < best.keys:
         significant = data - _significant(case, best, other)
@@ -768,7 +769,10 @@ def fall_over_noise(case: Case, outcome: Outcome, name: str) -> float:
     without = outcome.without(outcome.best, name)
     if case.evidence.is_table:
         return without.deviance - outcome.best.deviance
-    return outcome.own_fall(outcome.best, name) / _design_effect(case, outcome, outcome.best, without)
+    # what is known beforehand, as where a dial stood, is no image, and does not scatter between parts of it
+    known = case.prior_chi2(without.fit.values) - case.prior_chi2(outcome.best.fit.values)
+    own = outcome.own_fall(outcome.best, name) - known
+    return own / _design_effect(case, outcome, outcome.best, without) + known
 
 
 def _kept(case: Case, images: Sequence[np.ndarray]) -> list[np.ndarray]:
