@@ -32,6 +32,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy.special import chdtri
 
 from optics.diagnosis import homogeneity, pairs
 from optics.diagnosis import statistics as st
@@ -627,9 +628,10 @@ def _with_survivors(case: Case, outcome: Outcome) -> Outcome:
         alive = [best] + [t for t in outcome.trials if t is not best and id(t) not in told]
         alive += [t for t in _inherited(case, outcome, alive) if t not in alive]
         outcome.shared |= able and base in alive
-        # noise is a rival that is no explanation by effects; what is clearly not worth its cost beside it adds nothing
+        # noise is a rival that is no explanation by effects; what is clearly not worth its cost beside it, or explains
+        # no more than chance does, is that noise under another name
         if outcome.shared:
-            alive = [t for t in alive if t is best or (t.members and t.deviance + t.cost < base.deviance + CLEAR)]
+            alive = [t for t in alive if t is best or (t.members and _adds_to_noise(t, base))]
         # an explanation within another that is not told apart says the same with less
         kept = [t for t in alive if not any(o is not t and o.keys < t.keys for o in alive)]
         kept.sort(key=lambda t: t.deviance + t.cost)
@@ -649,6 +651,14 @@ def _with_survivors(case: Case, outcome: Outcome) -> Outcome:
             break
         outcome.shared |= able and lead <= needed and not rival.members
     return outcome
+
+
+def _adds_to_noise(trial: Trial, base: Trial) -> bool:
+    """Whether effects explain more than chance does of what noise that neighbours share leaves by itself, and are worth
+    their cost."""
+    gain = base.deviance - trial.deviance
+    chance = float(chdtri(max(sum(len(c.cone.live) for c in trial.members), 1), LEVEL))
+    return gain > max(trial.cost - CLEAR, chance)
 
 
 def _all_without(case: Case, outcome: Outcome, name: str) -> list[Trial]:
@@ -725,8 +735,6 @@ def _significant(case: Case, best: Trial, inner: Trial) -> float:
     more = [c for c in best.members if c.effect.name not in inner.names]
     if len(more) == 1:
         return more[0].cone.critical(single)
-    from scipy.special import chdtri
-
     # of one that contains another, the strengths that it has besides
     free = sum(len(c.cone.live) for c in best.members) - sum(len(c.cone.live) for c in inner.members)
     return float(chdtri(max(free, 1), single))
