@@ -486,8 +486,8 @@ def _beside_at(case: Case, trial: Trial, others: Sequence[Candidate]) -> list[tu
 
 
 def _joined(case: Case, trials: dict[frozenset[str], Trial]) -> None:
-    """Pairs of images' effects, whose refits are dear: those that may win by the linear fall of both, beside what a lamp
-    may have done to whole frames."""
+    """Pairs of images' effects, whose refits are dear: those that may win by the linear fall of both, beside what a
+    lamp may have done to whole frames."""
     evidence, scale = case.evidence, _scale(case, trials.values())
     _bound_wander(case, trials.values())
     scores = {names: _score(t, scale) + _gain(case, t, scale) for names, t in trials.items()}

@@ -47,7 +47,9 @@ def test_a_prediction_counts_against_a_lead_and_is_no_veto(ahead, told):
     assert explanations._told(None, outcome, best, other) is told
 
 
-@pytest.mark.parametrize("gain, cost, adds", [(0.0, 4.4, False), (6.0, 9.0, False), (7.0, 9.0, True), (9.0, 30.0, False)])
+@pytest.mark.parametrize(
+    "gain, cost, adds", [(0.0, 4.4, False), (6.0, 9.0, False), (7.0, 9.0, True), (9.0, 30.0, False)]
+)
 def test_what_adds_no_more_than_chance_to_shared_noise_is_that_noise(gain, cost, adds):
     """One strength: chance brings 6.6 once in a hundred times. A misalignment of 0 explains a lamp that wanders."""
     members = [SimpleNamespace(cone=SimpleNamespace(live=[0]))]
