@@ -16,11 +16,11 @@ where that is more; of readings, each explanation may have noise that neighbours
 Whether an explanation needs an effect that a simpler one lacks is a question of significance: family-wise; of images,
 with the design effect of what tells the two apart (`optics.diagnosis.homogeneity.variances`). Of two that are not
 nested, one is told apart from the best when its score is TOLD lower (CLEAR, where plausibility alone decides; an effect
-is claimed when the best explanation without it is SURE lower); of readings, what it predicts better of blocks of the
-session that were left out counts against that lead; and when, of images or of readings with MISSTATED noise, the
-difference of falls exceeds the smaller of HALF of what the best one leaves and MARGIN of its fall, as misfit that is
-left may lie along any direction. All others survive. An effect that is part of every explanation that survives is
-missing, whichever of them is right.
+is claimed when every explanation without it is SURE lower, and NO_TIE where plausibility alone decides); of readings,
+what it predicts better of blocks of the session that were left out counts against that lead; and when, of images or of
+readings with MISSTATED noise, the difference of falls exceeds the smaller of HALF of what the best one leaves and
+MARGIN of its fall, as misfit that is left may lie along any direction. All others survive. An effect that is part of
+every explanation that survives is missing, whichever of them is right.
 
 Sources: MacKay, Bayesian interpolation, Neural Computation 4, 415 (1992), Occam factor; Vuong, Econometrica 57, 307
 (1989), the variance of a difference of log likelihoods."""
@@ -42,7 +42,7 @@ from optics.diagnosis.refit import FAILURES, START, Case, excess_of, known_of, w
 from optics.diagnosis.result import Explanation, leaves_nothing
 from optics.diagnosis.score import solve
 from optics.diagnosis.session import Frames
-from optics.diagnosis.thresholds import CLEAR, EACH, HALF, LEVEL, MARGIN, MISSTATED, SURE, TOLD
+from optics.diagnosis.thresholds import CLEAR, EACH, HALF, LEVEL, MARGIN, MISSTATED, NO_TIE, SURE, TOLD
 from optics.fit import calibrate
 from optics.fit.model import value_of
 from optics.fit.result import Fit
@@ -766,10 +766,17 @@ def _without(case: Case, outcome: Outcome, subject: Candidate) -> tuple[Trial, f
     """(the best explanation without an effect, and without any that contains it; lead over it; lead that a claim
     needs)."""
     own = {(key, v.frames) for v in subject.variables for key in v.keys}
-    rival, best = min((t for t in outcome.trials if not own <= t.keys), key=lambda t: t.deviance + t.cost), outcome.best
-    lead, needed = _lead(case, outcome, best, rival)
-    tested = rival.keys < best.keys and rival.gain - best.gain < TOLD  # by significance, in white noise
-    return rival, lead, needed if tested else max(needed, SURE)
+    best = outcome.best
+    rivals = sorted((t for t in outcome.trials if not own <= t.keys), key=lambda t: t.deviance + t.cost)
+    near = [t for t in rivals[1:] if t.members and t.deviance + t.cost < best.deviance + best.cost + NO_TIE]
+    found = []
+    for rival in [*rivals[:1], *near]:
+        lead, needed = _lead(case, outcome, best, rival)
+        if not (rival.keys < best.keys and rival.gain - best.gain < TOLD):  # by significance, in white noise
+            by_data = lead - (rival.cost - best.cost) > TOLD or not rival.members
+            needed = max(needed, SURE if by_data else NO_TIE)
+        found.append((rival, lead, needed))
+    return min(found, key=lambda t: t[1] - t[2])
 
 
 def fall_over_noise(case: Case, outcome: Outcome, name: str) -> float:

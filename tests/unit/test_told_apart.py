@@ -55,3 +55,23 @@ def test_what_adds_no_more_than_chance_to_shared_noise_is_that_noise(gain, cost,
     members = [SimpleNamespace(cone=SimpleNamespace(live=[0]))]
     trial = SimpleNamespace(deviance=100.0 - gain, cost=cost, members=members)
     assert explanations._adds_to_noise(trial, SimpleNamespace(deviance=100.0)) is adds
+
+
+@pytest.mark.parametrize(
+    "fit, cost, needed",
+    [
+        (0.0, 13.7, explanations.NO_TIE),  # the same readings, by a less plausible pair: no claim
+        (0.0, 25.0, explanations.NO_TIE),  # 180 degrees against 1: a claim
+        (12.0, 1.0, explanations.SURE),  # the data tell
+    ],
+)
+def test_plausibility_alone_must_lead_by_more(monkeypatch, fit, cost, needed):
+    """An eccentric dial, and a misalignment with a wrong scale, that read the same at the two places of a dial."""
+    variable = SimpleNamespace(keys=("eccentric",), frames=None)
+    subject = SimpleNamespace(variables=[variable])
+    best = SimpleNamespace(keys={("eccentric", None)}, deviance=100.0, cost=20.0, gain=0.0, members=["eccentric"])
+    pair = SimpleNamespace(keys={("a", None)}, deviance=100.0 + fit, cost=20.0 + cost, gain=0.0, members=["a", "b"])
+    lead = pair.deviance + pair.cost - best.deviance - best.cost
+    monkeypatch.setattr(explanations, "_lead", lambda *a: (lead, explanations.TOLD))
+    outcome = SimpleNamespace(best=best, trials=[best, pair])
+    assert explanations._without(None, outcome, subject) == (pair, lead, needed)
