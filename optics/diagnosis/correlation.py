@@ -10,9 +10,12 @@ a reading, as of an amplifier, or with the signal over it, as of a lamp (`kind`)
 imitates whatever changes slowly during a session. So each explanation of the readings is judged by its deviance with
 the shared noise that suits it best,
 
-    deviance = min over power >= 0, length, kind of (r' V^-1 r / scale + ln det V + x^2)
+    deviance = min over power >= 0, length, kind of (r' V^-1 r / scale + ln det V + ln det(P + K' V^-1 K) + x^2)
 
-with the residual r after everything that was fitted is fitted again by these weights. x is the rms of the shared noise
+with the residual r after everything that was fitted is fitted again by these weights. K are the images of what is known
+beforehand to a precision P, such as the dial of each photograph: its error is one more noise, with the covariance
+K P^-1 K', and what that allows, shared noise need not bring; the determinant is counted from its value without shared
+noise. x is the rms of the shared noise
 over that of the signal, in units of WANDER. Its prior is a Gaussian's, not Student's as of an effect: whoever takes
 readings sees a lamp that wanders by 5 % and mends it, while an effect may be of any size.
 
@@ -33,7 +36,8 @@ import numpy as np
 from optics.diagnosis import statistics as st
 
 FEWEST = 12  # degrees of freedom from which a correlation is estimated
-POWERS = np.geomspace(0.01, 100.0, 11)
+LEAST, MOST = 0.01, 100.0  # powers tried, at least: in units of the noise of a reading
+PER_DECADE = 2.5  # powers
 LENGTHS = 7  # tried, from SHORTEST to half of the session
 SHORTEST = 3.0  # readings: shared over fewer, it is hardly more than noise of a wrong size
 # What shared noise must gain in twice the log likelihood: few white sessions exceed it, and these lose little.
@@ -69,6 +73,7 @@ class Readings:
     beside    (k + 1, k + 1) products of images and residual among further values, which share nothing; None: there are
               none
     more      their number;   shortest   length, in readings
+    known     (m,) the columns of `fitted` that are known beforehand, with their precision in `beside`
     most      of the signal, rms: what noise that neighbours share may be
     """
 
@@ -82,6 +87,7 @@ class Readings:
         more: int = 0,
         shortest: float = SHORTEST,
         most: float = math.inf,
+        known: np.ndarray | None = None,
     ):
         self.most = most
         places = np.argsort(order, kind="stable")
@@ -89,6 +95,8 @@ class Readings:
         beside = np.zeros((columns.shape[1],) * 2) if beside is None else beside
         whole = columns.T @ columns + beside
         self.reached = float(whole[-1, -1])  # as the fit left it, which may have stopped short of what images promise
+        own = np.arange(0) if known is None else known
+        dials = columns[:, own], beside[np.ix_(own, own)]
         root = st.root(whole[:-1, :-1]).T  # of an orthonormal basis of what was fitted
         turn = np.zeros((len(whole), root.shape[1] + 1))
         turn[:-1, :-1], turn[-1, -1] = root, 1.0
@@ -97,16 +105,18 @@ class Readings:
         self.white = float((turn.T @ whole @ turn)[-1, -1])
         self.bright = float(np.mean(np.square(loads["lamp"]))) if len(residual) else 0.0
         self.free = len(residual) + more - root.shape[1]
-        self.shared: list[tuple[str, np.ndarray, np.ndarray, np.ndarray]] = []  # kind, and what `_left` returns
+        # kind, r' V^-1 r, determinants of V and of what is known beforehand, that of all else which was fitted
+        self.shared: list[tuple[str, np.ndarray, np.ndarray, np.ndarray]] = []
         if self.free < FEWEST or not self.white > 0:
             return
         t = order[places].astype(float)
         lengths = np.geomspace(shortest, max(float(np.ptp(t)) / 2, 2 * shortest), LENGTHS)
-        self.power, self.length = (grid.ravel() for grid in np.meshgrid(POWERS, lengths))
-        self.shared = [
-            (kind, *_left(columns, t, of_rms_1(load)[places], self.power, self.length, beside))
-            for kind, load in loads.items()
-        ]
+        self.power, self.length = (grid.ravel() for grid in np.meshgrid(powers(self.bright), lengths))
+        for kind, load in loads.items():
+            lit = of_rms_1(load)[places]
+            left, logs, determinant = _left(columns, t, lit, self.power, self.length, beside)
+            beforehand = _known(*dials, t, lit, self.power, self.length)
+            self.shared.append((kind, left, logs + beforehand, determinant - beforehand))
 
     def deviance(self, scale: float) -> float:
         """See the module."""
@@ -139,6 +149,13 @@ class Readings:
         return best
 
 
+def powers(bright: float) -> np.ndarray:
+    """Powers that are tried, up to a wander that nobody takes for noise: of the mean of a whole image, whose noise is
+    small, that is more than 100. bright: mean square of the signal over the noise."""
+    decades = math.log10(max(MOST, NOTICED**2 * bright) / LEAST)
+    return LEAST * 10 ** (np.arange(math.ceil(PER_DECADE * decades - 1e-9) + 1) / PER_DECADE)
+
+
 def of_rms_1(load: np.ndarray) -> np.ndarray:
     """h (n,); 0 where nothing is lit."""
     rms = float(np.sqrt(np.mean(np.square(load)))) if len(load) else 0.0
@@ -166,6 +183,17 @@ def _left(
     solved = np.linalg.solve(fitted, across[..., None])[..., 0]
     left = np.maximum(own - np.einsum("gk,gk->g", across, solved), 1e-300)
     return left, logs, np.linalg.slogdet(fitted)[1]
+
+
+def _known(
+    columns: np.ndarray, beside: np.ndarray, t: np.ndarray, load: np.ndarray, power: np.ndarray, length: np.ndarray
+) -> np.ndarray:
+    """ln det(P + K' V^-1 K), less its value without shared noise, (g,); columns (n, m): of K, in the order of t."""
+    if not columns.shape[1]:
+        return np.zeros(len(power))
+    white, _ = whitened(columns, t, load, power, length)
+    products = np.einsum("igj,igk->gjk", white, white, optimize=True) + beside
+    return np.linalg.slogdet(products)[1] - np.linalg.slogdet(columns.T @ columns + beside)[1]
 
 
 def whitened(

@@ -315,8 +315,8 @@ def _of_the_strength(f: Findings) -> list[Condition]:
             "held out",
             f.held_out,
             0.0,
-            f.held_out > 0,
-            "no frames were held out"
+            f.held_out > 0 or (math.isnan(f.held_out) and f.ahead > 0),
+            ("no frames were held out" if math.isnan(f.ahead) else "no frames were held out, but blocks of readings")
             if math.isnan(f.held_out)
             else f"chi2 of held-out frames falls by {f.held_out:.3g}",
         ),

@@ -116,9 +116,8 @@ def diagnose(
     reference = best.fall - best.expectation if subject else max([c.row.net for c in table.order], default=0.0)
     fingerprints = prints.fingerprints(model, evidence, places, max(reference, 1.0), say)
     families = prints.families(fingerprints)
-    laws = other_laws(
-        model, evidence, places, added, variables_of, outcome.scale, case.session if evidence.is_table else None
-    )
+    beside = case.session if evidence.is_table else None if best.by_frame else case.lamp
+    laws = other_laws(model, evidence, places, added, variables_of, outcome.scale, beside)
     splits, chance = _split(case, outcome, subject, basis)
     wander = 0.0 if case.evidence.is_table else explanations.wander_of(case, outcome, best)
     levels = held.levels(case, best.members, best.fit, wander)

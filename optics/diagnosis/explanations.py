@@ -16,11 +16,11 @@ where that is more; of readings, each explanation may have noise that neighbours
 Whether an explanation needs an effect that a simpler one lacks is a question of significance: family-wise; of images,
 with the design effect of what tells the two apart (`optics.diagnosis.homogeneity.variances`). Of two that are not
 nested, one is told apart from the best when its score is TOLD lower (CLEAR, where plausibility alone decides; an effect
-is claimed when the best explanation without it is SURE lower); when, of
-images or of readings with MISSTATED noise, the difference of falls exceeds the smaller of HALF of what the best one
-leaves and MARGIN of its fall, as misfit that is left may lie along any direction; and, of readings, when it predicts
-blocks of the session worse that were left out. All others survive. An effect that is part of every explanation that
-survives is missing, whichever of them is right.
+is claimed when every explanation without it is SURE lower, and NO_TIE where plausibility alone decides); of readings,
+what it predicts better of blocks of the session that were left out counts against that lead; and when, of images or of
+readings with MISSTATED noise, the difference of falls exceeds the smaller of HALF of what the best one leaves and
+MARGIN of its fall, as misfit that is left may lie along any direction. All others survive. An effect that is part of
+every explanation that survives is missing, whichever of them is right.
 
 Sources: MacKay, Bayesian interpolation, Neural Computation 4, 415 (1992), Occam factor; Vuong, Econometrica 57, 307
 (1989), the variance of a difference of log likelihoods."""
@@ -32,6 +32,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy.special import chdtri
 
 from optics.diagnosis import homogeneity, pairs
 from optics.diagnosis import statistics as st
@@ -41,7 +42,7 @@ from optics.diagnosis.refit import FAILURES, START, Case, excess_of, known_of, w
 from optics.diagnosis.result import Explanation, leaves_nothing
 from optics.diagnosis.score import solve
 from optics.diagnosis.session import Frames
-from optics.diagnosis.thresholds import CLEAR, EACH, HALF, LEVEL, MARGIN, MISSTATED, SURE, TOLD
+from optics.diagnosis.thresholds import CLEAR, EACH, HALF, LEVEL, MARGIN, MISSTATED, NO_TIE, SURE, TOLD
 from optics.fit import calibrate
 from optics.fit.model import value_of
 from optics.fit.result import Fit
@@ -69,7 +70,7 @@ class Trial:
     members    effects, none for the base;   fit, fall, after, expected, images   as of `optics.diagnosis.refit.Attempt`
     cost       see the module
     deviance   see the module; NaN before the competition;   gain: what shared noise lowers it by
-    readings   of a table, about it; None before
+    readings   of a table, or frames of images, about it; None before
     ahead      chi2 of the blocks that were left out in turn, less that of the base; NaN where it was not computed
     """
 
@@ -485,20 +486,24 @@ def _beside_at(case: Case, trial: Trial, others: Sequence[Candidate]) -> list[tu
 
 
 def _joined(case: Case, trials: dict[frozenset[str], Trial]) -> None:
-    """Pairs of images' effects, whose refits are dear: by the linear fall of both, those that may win."""
+    """Pairs of images' effects, whose refits are dear: those that may win by the linear fall of both, beside what a
+    lamp may have done to whole frames."""
     evidence, scale = case.evidence, _scale(case, trials.values())
-    best = _leader(case, trials)
-    top = _score(best, scale)
+    _bound_wander(case, trials.values())
+    scores = {names: _score(t, scale) + _gain(case, t, scale) for names, t in trials.items()}
+    best = trials[max(scores, key=lambda names: scores[names])]
+    top = scores[best.names]
     live = [c for c in case.table.order if c.row.p_family < LEVEL and len(c.cone.live) and not c.broken]
     wanted = []
     for net, a, b, linear in pairs.ranked(evidence, live[: pairs.CONSIDERED]):
         both = [a, b]
-        both_cost = sum(map(expected_cost, both))
         nested = best.names <= frozenset(c.effect.name for c in both)
         needed = max(CLEAR, pairs.LEAD * best.fall) if nested else -CLEAR
-        if (nested and (not best.members or best.complete)) or net / scale - both_cost - top < needed:
+        if nested and (not best.members or best.complete):
             continue
-        wanted.append((net / scale - both_cost, both, linear))
+        expected = net / scale + _expected_gain(case, both, scale) - sum(map(expected_cost, both))
+        if expected - top >= needed:
+            wanted.append((expected, both, linear))
     for _, (a, b), linear in sorted(wanted, key=lambda t: -t[0])[: pairs.REFITTED]:
         try:
             found = with_effects(case, [(a, linear[: len(a.columns)]), (b, linear[len(a.columns) :])], START)
@@ -509,6 +514,29 @@ def _joined(case: Case, trials: dict[frozenset[str], Trial]) -> None:
             trials[made.names] = made
 
 
+def _bound_wander(case: Case, trials: Iterable[Trial]) -> None:
+    """Where effects leave nothing, a lamp that swings as nobody would let it is no rival of theirs."""
+    most = NOTICED if any(t.members and t.complete for t in trials) else math.inf
+    if case.evidence.is_table:
+        case.session.most = most
+    elif case.lamp is not None:
+        case.lamp.most = most
+
+
+def _gain(case: Case, trial: Trial, scale: float) -> float:
+    """By how much shared noise lowers the deviance of an explanation of images: 0 where it has a gain of each frame."""
+    return 0.0 if case.lamp is None or trial.by_frame else _of_frames(case, case.lamp, trial).noise(scale).gain
+
+
+def _expected_gain(case: Case, members: Sequence[Candidate], scale: float) -> float:
+    """The same of a set of effects, before it is refitted."""
+    if case.lamp is None or any(c.effect.scope == "frame" for c in members):
+        return 0.0
+    evidence = case.evidence
+    columns = evidence.dense([*evidence.base, *(i for c in members for i in c.columns)])
+    return case.lamp.about(np.concatenate([b.r for b in evidence.blocks]), columns).noise(scale).gain
+
+
 # -- the competition -------------------------------------------------------------------------------------------------
 def compete(case: Case, trials: list[Trial]) -> Outcome:
     """The explanations that are not told apart from the best."""
@@ -516,9 +544,8 @@ def compete(case: Case, trials: list[Trial]) -> Outcome:
     order = sorted(trials, key=lambda t: -_score(t, scale))
     for t in order:
         t.deviance = t.after / scale
+    _bound_wander(case, order)
     if case.evidence.is_table:
-        # where effects leave nothing, a lamp that swings as nobody would let it is no rival of theirs
-        case.session.most = NOTICED if any(t.members and t.complete for t in order) else math.inf
         for t in order:
             if t.readings is not None:
                 t.readings.most = case.session.most
@@ -538,7 +565,7 @@ def compete(case: Case, trials: list[Trial]) -> Outcome:
         order.sort(key=lambda t: t.deviance + t.cost)
     elif case.lamp is not None:
         for t in order:
-            t.gain = 0.0 if t.by_frame else _of_frames(case, case.lamp, t).noise(scale).gain
+            t.gain = _gain(case, t, scale)
             t.deviance -= t.gain
         order.sort(key=lambda t: t.deviance + t.cost)
     # whether there is anything is a question of its own, which costs do not answer
@@ -601,9 +628,10 @@ def _with_survivors(case: Case, outcome: Outcome) -> Outcome:
         alive = [best] + [t for t in outcome.trials if t is not best and id(t) not in told]
         alive += [t for t in _inherited(case, outcome, alive) if t not in alive]
         outcome.shared |= able and base in alive
-        # noise is a rival that is no explanation by effects; what is clearly not worth its cost beside it adds nothing
+        # noise is a rival that is no explanation by effects; what is clearly not worth its cost beside it, or explains
+        # no more than chance does, is that noise under another name
         if outcome.shared:
-            alive = [t for t in alive if t is best or (t.members and t.deviance + t.cost < base.deviance + CLEAR)]
+            alive = [t for t in alive if t is best or (t.members and _adds_to_noise(t, base))]
         # an explanation within another that is not told apart says the same with less
         kept = [t for t in alive if not any(o is not t and o.keys < t.keys for o in alive)]
         kept.sort(key=lambda t: t.deviance + t.cost)
@@ -625,6 +653,14 @@ def _with_survivors(case: Case, outcome: Outcome) -> Outcome:
     return outcome
 
 
+def _adds_to_noise(trial: Trial, base: Trial) -> bool:
+    """Whether effects explain more than chance does of what noise that neighbours share leaves by itself, and are worth
+    their cost."""
+    gain = base.deviance - trial.deviance
+    chance = float(chdtri(max(sum(len(c.cone.live) for c in trial.members), 1), LEVEL))
+    return gain > max(trial.cost - CLEAR, chance)
+
+
 def _all_without(case: Case, outcome: Outcome, name: str) -> list[Trial]:
     """The survivors, each without an effect that it is not surely better with; the best first."""
     found: list[Trial] = []
@@ -644,7 +680,8 @@ def _told(case: Case, outcome: Outcome, best: Trial, other: Trial) -> bool:
         return True
     lead, needed = outcome.leads[other.names] if best is outcome.leader else _lead(case, outcome, best, other)
     # whether anything predicts better than nothing is a condition of a claim, not of what is told apart
-    return lead > needed and not (other.members and best.ahead > other.ahead)
+    ahead = best.ahead - other.ahead if other.members and best.ahead > other.ahead else 0.0
+    return lead - ahead > needed
 
 
 def _inherited(case: Case, outcome: Outcome, alive: Sequence[Trial]) -> list[Trial]:
@@ -672,7 +709,8 @@ def _lead(case: Case, outcome: Outcome, best: Trial, other: Trial) -> tuple[floa
     if best.by_frame and not is_table:  # a lamp that wanders is no rival of a gain of each frame, but the same
         data, shared = data + other.gain, 0.0
     if not is_table:
-        data = outcome.scale * data / _design_effect(case, outcome, best, other)
+        known = (case.prior_chi2(other.fit.values) - case.prior_chi2(best.fit.values)) / outcome.scale
+        data = outcome.scale * (data - known) / _design_effect(case, outcome, best, other) + known
     lead, needed = data + cost, TOLD if data > TOLD else CLEAR  # what is plausible decides alone only where it is clear
     if other.keys < best.keys:
         significant = data - _significant(case, best, other)
@@ -681,9 +719,11 @@ def _lead(case: Case, outcome: Outcome, best: Trial, other: Trial) -> tuple[floa
             lead, needed, cost = data, data - significant, 0.0
     if best.complete or (is_table and outcome.scale < MISSTATED):
         return lead, needed
-    fall = best.fall - other.fall
+    # of images, less what a lamp did to whole frames: that lies in no direction of an effect
+    shared = 0.0 if is_table else outcome.scale
+    fall = best.fall - other.fall + shared * (best.gain - other.gain)
     dof = max(case.evidence.normal.count - case.evidence.projected.rank, 1)
-    misfit = min(HALF * best.left(dof), MARGIN * best.fall)
+    misfit = min(HALF * max(best.left(dof) - shared * best.gain, 0.0), MARGIN * best.fall)
     if misfit and fall + cost * outcome.scale < misfit:
         return lead, max(needed, lead + misfit - fall)
     return lead, needed
@@ -695,8 +735,6 @@ def _significant(case: Case, best: Trial, inner: Trial) -> float:
     more = [c for c in best.members if c.effect.name not in inner.names]
     if len(more) == 1:
         return more[0].cone.critical(single)
-    from scipy.special import chdtri
-
     # of one that contains another, the strengths that it has besides
     free = sum(len(c.cone.live) for c in best.members) - sum(len(c.cone.live) for c in inner.members)
     return float(chdtri(max(free, 1), single))
@@ -706,6 +744,10 @@ def _design_effect(case: Case, outcome: Outcome, one: Trial, other: Trial) -> fl
     """By how much the variance of the difference of two chi2 of images exceeds what independent noise makes."""
     direction = _kept(case, [a - b for a, b in zip(one.images, other.images)])
     left = _kept(case, outcome.leader.images)
+    if case.lamp is not None and not outcome.leader.by_frame:
+        # what a lamp did to whole frames has been counted: it is no scatter between them
+        noise = _of_frames(case, case.lamp, outcome.leader).noise(outcome.scale)
+        direction, left = case.lamp.independent(direction, noise), case.lamp.independent(left, noise)
     total = sum(float(d @ d) for d in direction)
     if not total > 0 or case.places is None:
         return 1.0
@@ -724,10 +766,17 @@ def _without(case: Case, outcome: Outcome, subject: Candidate) -> tuple[Trial, f
     """(the best explanation without an effect, and without any that contains it; lead over it; lead that a claim
     needs)."""
     own = {(key, v.frames) for v in subject.variables for key in v.keys}
-    rival, best = min((t for t in outcome.trials if not own <= t.keys), key=lambda t: t.deviance + t.cost), outcome.best
-    lead, needed = _lead(case, outcome, best, rival)
-    tested = rival.keys < best.keys and rival.gain - best.gain < TOLD  # by significance, in white noise
-    return rival, lead, needed if tested else max(needed, SURE)
+    best = outcome.best
+    rivals = sorted((t for t in outcome.trials if not own <= t.keys), key=lambda t: t.deviance + t.cost)
+    near = [t for t in rivals[1:] if t.members and t.deviance + t.cost < best.deviance + best.cost + NO_TIE]
+    found = []
+    for rival in [*rivals[:1], *near]:
+        lead, needed = _lead(case, outcome, best, rival)
+        if not (rival.keys < best.keys and rival.gain - best.gain < TOLD):  # by significance, in white noise
+            by_data = lead - (rival.cost - best.cost) > TOLD or not rival.members
+            needed = max(needed, SURE if by_data else NO_TIE)
+        found.append((rival, lead, needed))
+    return min(found, key=lambda t: t[1] - t[2])
 
 
 def fall_over_noise(case: Case, outcome: Outcome, name: str) -> float:
@@ -735,7 +784,10 @@ def fall_over_noise(case: Case, outcome: Outcome, name: str) -> float:
     without = outcome.without(outcome.best, name)
     if case.evidence.is_table:
         return without.deviance - outcome.best.deviance
-    return outcome.own_fall(outcome.best, name) / _design_effect(case, outcome, outcome.best, without)
+    # what is known beforehand, as where a dial stood, is no image, and does not scatter between parts of it
+    known = case.prior_chi2(without.fit.values) - case.prior_chi2(outcome.best.fit.values)
+    own = outcome.own_fall(outcome.best, name) - known
+    return own / _design_effect(case, outcome, outcome.best, without) + known
 
 
 def _kept(case: Case, images: Sequence[np.ndarray]) -> list[np.ndarray]:
@@ -754,9 +806,16 @@ def _readings(case: Case, trial: Trial) -> Readings:
 
 
 def _of_frames(case: Case, lamp: Frames, trial: Trial) -> Readings:
-    """The frames about an explanation of images, with the derivative images of the base."""
-    columns = case.evidence.dense([*case.evidence.base, *(i for c in trial.members for i in c.columns)])
-    return lamp.about(np.concatenate(_kept(case, trial.images)), columns)
+    """The frames about an explanation of images, with the derivative images of the base; once, as it competes more
+    than once."""
+    if trial.readings is not None:
+        trial.readings.most = lamp.most
+        return trial.readings
+    evidence = case.evidence
+    columns = evidence.dense([*evidence.base, *(i for c in trial.members for i in c.columns)])
+    known = priors(case.model, trial.fit.values, [evidence.columns[i] for i in evidence.base])
+    trial.readings = lamp.about(np.concatenate(_kept(case, trial.images)), columns, known)
+    return trial.readings
 
 
 def _measured(case: Case, trial: Trial) -> np.ndarray:

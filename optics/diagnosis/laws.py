@@ -18,7 +18,7 @@ from optics.diagnosis import fingerprints as prints
 from optics.diagnosis import statistics as st
 from optics.diagnosis.evidence import Evidence
 from optics.diagnosis.result import Law
-from optics.diagnosis.session import Session
+from optics.diagnosis.session import Frames, Session
 from optics.diagnosis.thresholds import MIMICS
 from optics.fit.model import Model
 from optics.scene.declare import Effect
@@ -36,13 +36,13 @@ def other_laws(
     added: Sequence[Effect],
     variables_of: Callable[[Effect], Sequence[Variable]],
     scale: float,
-    session: Session | None,
+    session: Session | Frames | None,
 ) -> list[Law]:
     """A freer law of each added effect along each coordinate, best score first.
 
     places   what `optics.diagnosis.fingerprints.places` returns
-    scale    variance over the stated one, in which falls of readings are judged beside noise that neighbours share
-    session  of a table; None: of images
+    scale    variance over the stated one, in which falls are judged beside noise that neighbours share
+    session  whose readings, or frames, share noise; None: none is known to
     """
     if not added:
         return []
@@ -99,9 +99,9 @@ def _fall_of_images(evidence: Evidence) -> Callable[[Sequence[np.ndarray]], tupl
 
 
 def _fall_of_readings(
-    evidence: Evidence, session: Session, scale: float
+    evidence: Evidence, session: Session | Frames, scale: float
 ) -> Callable[[Sequence[np.ndarray]], tuple[float, int]]:
-    """The same for readings, beside noise that neighbours share, in units of the scale."""
+    """The same beside noise that neighbours share, in units of the scale."""
     base, r = evidence.dense(evidence.base), np.concatenate([block.r for block in evidence.blocks])
     rank, before = st.orthonormal(base).shape[1], session.about(r, base).deviance(scale)
 

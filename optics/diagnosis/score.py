@@ -242,10 +242,27 @@ def solve(
             cone = st.Cone(information[np.ix_(own, own)], c.sides, seed)
             shared.append((own, cone))
             forms.append((form, own, cone, *cone.solve(score[own])))
-        c.form, own, c.cone, fall, c.linear = max(forms, key=lambda t: t[3] - t[2].expectation)
+        c.form, own, c.cone, fall, c.linear = _best_form(c, forms)
         c.columns = [int(i) + first for i in own]
         c.row = _row(evidence, c, own, fall)
     return information, shared
+
+
+def _best_form(c: Candidate, forms: Sequence[tuple]) -> tuple:
+    """The form (name, places, cone, fall, coefficients) that explains most.
+
+    A finite step that sees more directions than the slope must explain more by CLEAR: the steps of two offsets bend
+    apart, which makes a common rotation look like something that readings show."""
+
+    def net(form: tuple) -> float:
+        return form[3] - form[2].expectation
+
+    def rank(form: tuple) -> int:
+        return st.inverse(form[2].information * np.outer(c.plausible, c.plausible), st.VISIBLE)[1]
+
+    best = max(forms, key=net)
+    slope = next((form for form in forms if form[0] == "tangent"), best)
+    return slope if net(best) - net(slope) < CLEAR and 0 < rank(slope) < rank(best) else best
 
 
 def _rank(evidence: Evidence, candidates: list[Candidate], seed: int) -> Table:

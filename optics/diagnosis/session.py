@@ -13,7 +13,7 @@ Residuals and images are whitened by it before neighbours are asked what they sh
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from scipy import linalg
@@ -63,8 +63,10 @@ class Session:
         whole = self.apart(np.column_stack([fitted, residual]))
         precision, pull = known or self.known
         beside = known_products(precision, pull, fitted.shape[1])
-        more = int(np.count_nonzero(precision))
-        return Readings(whole[:, -1], whole[:, :-1], self.order, self.loads, beside, more, most=self.most)
+        own = np.flatnonzero(precision)
+        return Readings(
+            whole[:, -1], whole[:, :-1], self.order, self.loads, beside, len(own), most=self.most, known=own
+        )
 
     def independent(self, columns: np.ndarray, noise: Correlation) -> np.ndarray:
         """(n, k) images as of readings that are independent, in units of their noise: what is new in each of them."""
@@ -83,22 +85,40 @@ class Frames:
     """Images as a session: what the lamp, or an exposure, does to a whole frame is shared by its pixels.
 
     The part of a residual along the signal of its frame is one reading, with the load |g| of its whitened signal g;
-    what is across shares nothing."""
+    what is across shares nothing.
+
+    most   as of `Session`"""
+
+    most = math.inf
 
     def __init__(self, model: Model, evidence: Evidence):
         signal = np.split(evidence.lit(model), np.cumsum([len(block.r) for block in evidence.blocks])[:-1])
         self.signal = [g / max(float(np.linalg.norm(g)), 1e-12) for g in signal]
         self.thinning = evidence.thinning
+        self.known = evidence.precision, evidence.pull
         self.loads = {"lamp": np.array([np.linalg.norm(g) for g in signal]) * np.sqrt(evidence.thinning)}
 
-    def about(self, residual: np.ndarray, fitted: np.ndarray) -> Readings:
-        """As of `Session`, whatever is known beforehand."""
+    def about(
+        self, residual: np.ndarray, fitted: np.ndarray, known: tuple[np.ndarray, np.ndarray] | None = None
+    ) -> Readings:
+        """As of `Session`: the dial of a frame that is known to a degree does not take up what a lamp did there."""
         whole = np.column_stack([fitted, residual])
         parts = np.split(whole, np.cumsum([len(g) for g in self.signal])[:-1])
         along = np.array([g @ part for g, part in zip(self.signal, parts)]) * np.sqrt(self.thinning)
         across = self.thinning * whole.T @ whole - along.T @ along
         order, more = np.arange(len(along)), self.thinning * len(whole) - len(along)
-        return Readings(along[:, -1], along[:, :-1], order, self.loads, across, more, APART)
+        precision, pull = known or self.known
+        across += known_products(precision, pull, fitted.shape[1])
+        own = np.flatnonzero(precision)
+        more += len(own)
+        return Readings(along[:, -1], along[:, :-1], order, self.loads, across, more, APART, self.most, own)
+
+    def independent(self, columns: Sequence[np.ndarray], noise: Correlation) -> list[np.ndarray]:
+        """Of each frame, (n,) values in units of the noise, with what its lamp may have done weighed down: as of frames
+        that share nothing with each other."""
+        bright = float(np.mean(np.square(self.loads["lamp"]))) if len(self.signal) else 1.0
+        shared = noise.power * np.square(self.loads["lamp"]) / max(bright, 1e-300)
+        return [c - (1 - 1 / math.sqrt(1 + p)) * (g @ c) * g for c, g, p in zip(columns, self.signal, shared)]
 
 
 def _shared_errors(model: Model, evidence: Evidence) -> list[tuple[np.ndarray, np.ndarray]]:

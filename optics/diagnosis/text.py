@@ -186,10 +186,13 @@ def _claim(
     text = f"{row.name} is missing, strength {_strength_in(best, row)}."
     if len(best.effects) > 1 or len(alive) > 1:
         text += " It is part of every explanation that is not ruled out: " + ", or ".join(e.name for e in alive) + "."
+    if math.isnan(levels[0].held_out):  # of readings that are too few to hold any out
+        lowered = f"chi2 of blocks of readings that were left out in turn by {f.ahead:.4g}"
+    else:
+        lowered = f"held-out misfit from {percent(levels[0].held_out)} to {percent(levels[-1].held_out)}"
     text += (
-        f" Adding {'it' if len(best.effects) == 1 else 'all of the first'} lowers held-out misfit from "
-        f"{percent(levels[0].held_out)} to {percent(levels[-1].held_out)} (noise: {percent(basis.noise)}). Its "
-        "strength is the same in every part of the data."
+        f" Adding {'it' if len(best.effects) == 1 else 'all of the first'} lowers {lowered} "
+        f"(noise: {percent(basis.noise)}). Its strength is the same in every part of the data."
     )
     others = [r for r in rows if r is not row and limits(r)]
     if others:

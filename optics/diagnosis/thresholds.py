@@ -15,6 +15,9 @@ TOLD = 2 * math.log(
 # The same at which an effect is claimed: odds of 99 to 1. Noise is never quite what the model says, and of 74 claims on
 # strangers' benches 3 of the 6 with a lead between the two were wrong, none of those above.
 SURE = 2 * math.log(99)
+# The same where the data do not tell, and plausibility alone decides: what a strength of 36 plausible sizes costs. Of
+# three claims on strangers' benches by less than that, two were wrong.
+NO_TIE = 3 * math.log1p(36**2 / 2)
 EACH = 2 * math.log(9)  # cost of an effect: prior odds of one in ten that a given one of the library acts
 USUAL = 0.05  # of the signal: what an unknown cause changes, as effects of plausible size do
 HALF = 0.5  # of what the best explanation leaves: misfit that is left may lie along the direction that tells two apart

@@ -134,6 +134,8 @@ class SceneModel:
                 + (
                     "a column of `values` for each"
                     if captures.table is not None
+                    else "or one band, such as `bands = [540]`: a study of a polarization camera is of one colour"
+                    if captures.mosaic is not None
                     else 'or one with cfa = "RGGB" (or its like) if it is a raw mosaic; or take a scene whose '
                     "integrator names one band"
                     if channels == 1

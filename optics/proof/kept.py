@@ -24,6 +24,7 @@ READ = {  # of a step
     "word",
     "claimed",
     "ambiguous",
+    "kinds",
     "sentence",
     "added",
     "p_best",

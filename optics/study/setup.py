@@ -44,7 +44,7 @@ class Setup:
                 power of every LED, reflectance and roughness of every membrane, power of every source
     per_group   key patterns of parameters with a value per group of frames; None: the press, where groups are given
     priors      pattern -> (mean, standard deviation); a mean of None is the present value
-    held_out    names of groups that the calibration does not see; None: every fourth of four or more
+    held_out    names of groups that the calibration does not see; None: one in four, of four or more
     values      start values, by key
     flat_field  how a background image enters, see `optics.fit.model.Model`
     region      what is fitted and judged: "all" of each image, or "known": where the skin's shape is known
@@ -214,7 +214,7 @@ def split(model: SceneModel, setup: Setup) -> tuple[list[int], list[int]]:
     names = list(groups)
     held = setup.held_out
     if held is None:
-        held = names[1::GROUPS] if len(names) >= GROUPS else []
+        held = _every_fourth(model, groups) if len(names) >= GROUPS else []
     for name in held:
         if name not in groups:
             raise UnknownKey(name, names, "group of frames", setup.captures)
@@ -223,6 +223,25 @@ def split(model: SceneModel, setup: Setup) -> tuple[list[int], list[int]]:
     if not fitted:
         raise Underdetermined(f"{setup.captures}: every group is held out; leave some to calibrate on")
     return fitted, out
+
+
+def _every_fourth(model: SceneModel, groups: Mapping[str, Sequence[int]]) -> list[str]:
+    """One group of four: the second, or the next that is not the only one at a level of some setting. Held out, the one
+    photograph of a shorter exposure would leave nothing that tells a dark offset from light.
+
+    Levels are those of settings with fewer values than half of the groups: of more, as of a dial that is turned, each
+    value is like its neighbours."""
+    names = list(groups)
+    needed: set[str] = set()
+    for key in {key for f in model.frames for key in f.parameters}:
+        seen: dict[float | str | None, set[str]] = {}
+        for name in names:
+            for i in groups[name]:
+                seen.setdefault(model.frames[i].parameters.get(key), set()).add(name)
+        if 2 * len(seen) < len(names):
+            needed |= {next(iter(own)) for own in seen.values() if len(own) == 1}
+    slots = [names[first : first + GROUPS] for first in range(1, len(names), GROUPS)]
+    return [next((name for name in slot if name not in needed), slot[0]) for slot in slots]
 
 
 # -- what is free ----------------------------------------------------------------------------------------------------

@@ -4,7 +4,7 @@ curves owe it most of their significance."""
 import numpy as np
 import pytest
 
-from optics.diagnosis.correlation import FEWEST, KINDS, LENGTHS, NOTED, Readings
+from optics.diagnosis.correlation import FEWEST, KINDS, LENGTHS, MOST, NOTED, NOTICED, Readings, powers
 
 COUNT = 160
 TURN = np.linspace(0, 2 * np.pi, COUNT)
@@ -123,3 +123,32 @@ def test_what_shares_nothing_counts_beside():
     fit = np.linalg.solve(whole.T @ inverse @ whole, whole.T @ inverse @ rest)
     assert left[i] == pytest.approx((rest - whole @ fit) @ inverse @ (rest - whole @ fit), rel=1e-8)
     assert logs[i] == pytest.approx(np.linalg.slogdet(v)[1], rel=1e-9)
+
+
+def test_what_is_known_beforehand_is_one_more_noise():
+    """Of dials with the images K, known to P: the likelihood is that of V + K P^-1 K', to a constant."""
+    rng = np.random.default_rng(7)
+    dials, precision = np.zeros((COUNT, 4)), np.array([1.0, 4.0, 0.25, 9.0])
+    dials[np.arange(COUNT), np.arange(COUNT) % 4] = rng.uniform(5, 20, COUNT)
+    residual = drawn(rng, 2.0, 8.0, "lamp")
+    beside = np.zeros((5, 5))
+    beside[range(4), range(4)] = precision
+    found = Readings(residual, dials, np.arange(COUNT), LOADS, beside, 4, known=np.arange(4))
+
+    def deviance(v):
+        v = v + (dials / precision) @ dials.T
+        return residual @ np.linalg.solve(v, residual) + np.linalg.slogdet(v)[1]
+
+    without = deviance(np.eye(COUNT)) - found.white
+    for kind, left, logs, _ in found.shared:
+        for i in (3, len(left) // 2, len(left) - 5):
+            expected = deviance(covariance(found.power[i], found.length[i], kind))
+            assert left[i] + logs[i] == pytest.approx(expected - without, abs=1e-6)
+
+
+def test_a_usual_wander_is_tried_whatever_the_noise_of_a_reading():
+    """The mean of a photograph has 1e3 times less noise than a reading: 3 % of its signal are 1e3 times more of it."""
+    for bright in (1.0, 1e4, 5e6):
+        tried = powers(bright)
+        assert tried[-1] >= max(MOST, NOTICED**2 * bright) * (1 - 1e-9)
+        assert np.diff(np.log10(tried)) == pytest.approx(0.4, abs=1e-9)

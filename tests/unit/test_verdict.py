@@ -280,6 +280,8 @@ GOOD = Findings(
         ({"rival": True, "ratio": 2.0, "structure_p": 0.5}, "CANNOT_TELL"),
         ({"held_out": -3.0}, "CANNOT_TELL"),
         ({"held_out": math.nan}, "CANNOT_TELL"),
+        ({"held_out": math.nan, "ahead": 200.0}, "CLAIM"),  # of readings, blocks were left out in turn
+        ({"held_out": math.nan, "ahead": -1.0}, "CANNOT_TELL"),
         ({"p_winner": 0.5}, "CANNOT_TELL"),
         ({"p_winner": 0.5, "structure_p": 0.5, "excess_sd": 1.0}, "NOTHING"),
         ({"clear": 0.3, "structure_p": 0.5, "excess_sd": 1.0}, "NOTHING"),

@@ -72,6 +72,23 @@ def test_a_plate_turned_between_films_and_its_colours():
     assert np.abs(higher[:, 0] - expected[:, 0]).max() > 0.05
 
 
+def test_a_camera_shows_the_mean_of_a_signal_below_black_as_well():
+    """As of a dark offset of -4 DN in crossed films: noise of 1 DN over 4000 pixels, 0.016 DN, four times."""
+    camera = photographs.Camera(247.0, 1.0, 0.0, gain=0.1)
+    for level in (-4.0, 0.0, 30.0):
+        shown = camera.shown(np.full(4000, level), np.random.default_rng(5)) - camera.black
+        assert shown.mean() == pytest.approx(level, abs=4 * camera.sd(np.array(level)) / math.sqrt(4000))
+
+
+def test_a_folder_states_any_wavelength_but_that_at_which_benches_are_described(tmp_path):
+    """A laser's owner writes its wavelength: without it, a plate of his catalogue would be another at 650 nm."""
+    plain = two_films()
+    for band in (bench.GREEN, 650.0):
+        made = replace(plain, bands=(band,))
+        folder.write(tmp_path / f"{band:g}", made, made.mean({}))
+        assert capture_set.load(tmp_path / f"{band:g}").bands == ([band] if band != bench.GREEN else [])
+
+
 def test_limits_of_haze_of_a_twist_and_of_a_dichroic_sheet():
     c2 = np.cos(np.radians(DIAL)) ** 2
     assert seen({"haze": 1.0}) == pytest.approx(np.full(12, T1**2 / 4), rel=1e-12)

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from optics.proof.makers.laboratory.bench import GREEN
 from optics.proof.makers.laboratory.session import DIALS, Meter, Session
 
 CHANNELS = {1: ("reading",), 3: ("red", "green", "blue")}
@@ -76,7 +77,7 @@ def exclusions(session: Session) -> list[str]:
 def known(session: Session) -> list[str]:
     """Bands, and parts that are absent."""
     found = []
-    if len(session.bands) > 1:
+    if session.bands != (GREEN,):  # which is what a bench is described at
         found += [f"bands = [{', '.join(f'{b:g}' for b in session.bands)}]"]
     if session.absent:
         found += [f"absent = [{', '.join(map(_quoted, session.absent))}]"]

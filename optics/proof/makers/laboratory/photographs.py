@@ -36,7 +36,8 @@ class Camera(Meter):
         return np.sqrt(self.gain * np.maximum(signal, 0) + self.floor**2 + 1 / 12)
 
     def shown(self, signal: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        counted = self.gain * rng.poisson(np.maximum(signal, 0) / self.gain)
+        # an offset below black is the amplifier's: it is there where no light is
+        counted = self.gain * rng.poisson(np.maximum(signal, 0) / self.gain) + np.minimum(signal, 0)
         return np.clip(np.round(self.black + counted + self.floor * rng.standard_normal(signal.shape)), 0, self.top)
 
 
