@@ -568,9 +568,13 @@ class SceneModel:
         return (second - first) / (high - low)
 
     # -- what a fit and a diagnosis need of the data ------------------------------------------------------------------
-    def usable(self, index: int, region: str = "") -> np.ndarray:
+    def usable(self, index: int) -> np.ndarray:
         """(H, W, C) bool, the values to use: not saturated, not clipped at black, not masked by the user, in a mosaic
-        the pixel's own channel; in the model's region or in another (optics.fit.contact)."""
+        the pixel's own channel; in the model's region."""
+        return self.usable_in(index, self.region)
+
+    def usable_in(self, index: int, region: str) -> np.ndarray:
+        """`usable` of another region (optics.fit.contact)."""
         frame = self.frames[index]
         beside = 1 if self.captures.table is None else 0  # readings of a sweep are no neighbours
         mask = self.noise.usable(frame.image, beside)
@@ -583,7 +587,7 @@ class SceneModel:
             mask &= frame.image != 0
         if self.renderer.layered and self.captures.table is None:
             mask &= self._resolved(index)
-        if (region or self.region) == KNOWN:
+        if region == KNOWN:
             mask &= self._known_shape(index)[..., None]
         return mask
 

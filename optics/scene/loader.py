@@ -246,7 +246,7 @@ class Scene:
             board = getattr(self.leds[n], "board", None)
             if board is not None:
                 pose = {p: float(values[f"{board.name}.{p}"]) for p in board.numbers}
-                found[n] = on_board(own, float(values[self.key(n, "light turn")]), pose)
+                found[n] = on_board(own, float(values[turn]) if (turn := self.key(n, "light turn")) else 0.0, pose)
         return found
 
     def declaration(self, name: str) -> Part:

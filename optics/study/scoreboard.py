@@ -198,7 +198,7 @@ class _Bench:
         self.leds = {i: led_label(model.frames[i].parameters) for i in self.frames}
         self.black, self.saturation = model.noise.black_level, model.noise.saturation
         self.full_scale = self.saturation - self.black
-        self.usable = {i: model.usable(i, ALL) for i in self.frames}  # wherever a study was fitted
+        self.usable = {i: model.usable_in(i, ALL) for i in self.frames}  # wherever a study was fitted
         self.flats = self._flats()
         self.tilts: dict[str, dict[int, np.ndarray]] = {}
         self.gained = any(self._finds_gains(ladder) for ladder in ladders)

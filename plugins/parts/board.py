@@ -5,6 +5,8 @@ Definition
 places an LED that names the board: its x, y, z (mm) and its `turn` t are in the board's plane and along its axis, s is
 `scale` and o = (x, y, z) the board's origin. R turns about the x axis by rx, then about y by ry, then about z by rz, by
 the right hand. The LED's `target` is a point of the board's frame as well, so that its axis turns with the board.
+    An LED names its board, <string name="board" value="ring"/>, and may take its x and y from the pick-and-place file
+that the board was populated by, <string name="placed" value="board.csv:D7"/>.
     One pose stands for the places of all LEDs: a board that is 1 mm off moves them alike, one of unknown size scales
 them, and LEDs of a circle stay on a circle, wherever on it each is soldered (`turn`).
 Fingerprint
@@ -14,9 +16,6 @@ Validity
     the board itself is not seen: it casts no shadow and returns no light ('light from the surrounding face').
 References
     three rotations one after the other: Goldstein, Classical Mechanics, 4.4.
-XML
-    <emitter type="board" id="ring"/>, and in each of its LEDs <string name="board" value="ring"/>; an LED may take its
-    x and y from a pick-and-place file, <string name="placed" value="board.csv:D7"/>.
 """
 
 from optics.scene.checking import agree, made

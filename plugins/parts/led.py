@@ -190,7 +190,7 @@ def build():
             """Side, up and forward of the axis; they turn with the board."""
             if self.board is None:
                 return self.own_frame
-            return [self.board.turned(self.board.about_axis(v, self.turn)) for v in self.own_frame]
+            return [self.board.turned(self.board.about_axis(v, self.turned_by())) for v in self.own_frame]
 
         def position(self):
             own = mi.Point3f(self.x, self.y, self.z)
@@ -199,7 +199,11 @@ def build():
                     f"led '{self.name}' stands on the board '{self.board_name}', and this scene's parts have not been "
                     "told of one another; call optics.wire(scene) before you render with another integrator"
                 )
-            return own if self.board is None else self.board.place(own, self.turn)
+            return own if self.board is None else self.board.place(own, self.turned_by())
+
+        def turned_by(self):
+            """Its turn about the board's axis, deg; of lights that have none, 0."""
+            return self.turn if "turn" in self.numbers else 0.0
 
         def stands(self):
             """The position as three floats, mm."""

@@ -17,6 +17,8 @@ XML
     target point, (0, 0, 0): what its axis looks at, mm
     count integer, 8: number n of LEDs
     spectrum string: measured power over the wavelength, as of the part `led`
+    board string: id of the part `board` that it stands on, as of the part `led`
+    placed string: FILE:DESIGNATOR of a pick-and-place file, as of the part `led`
 """
 
 import math
@@ -28,7 +30,11 @@ from optics.scene.parameter import Parameter
 from optics.scene.registry import declared, known
 
 PARAMETERS = (
-    *(p for p in declared(Path(__file__).with_name("led.py"))[0].parameters if p.role != "light area"),
+    *(
+        p
+        for p in declared(Path(__file__).with_name("led.py"))[0].parameters
+        if p.role not in ("light area", "light turn")
+    ),
     Parameter("radius", "mm", 8.0, (0.01, 500.0), "of the circle", plausible=0.3, how="difference"),
     Parameter("roll", "deg", 0.0, (-360.0, 360.0), "turn about the axis", plausible=3.0, how="difference"),
 )

@@ -27,6 +27,8 @@ XML
     target point, (0, 0, 0): what it faces, mm: the axis is from the position to here
     along vector: the direction of its long side, as far as that lies across the axis
     spectrum string: measured power over the wavelength, as of the part `led`
+    board string: id of the part `board` that it stands on, as of the part `led`
+    placed string: FILE:DESIGNATOR of a pick-and-place file, as of the part `led`
     points integer, 0: number n of points, a multiple of 4; 0: by its size
 """
 
@@ -42,7 +44,11 @@ from optics.scene.registry import declared, known
 
 FEWEST = 16
 PARAMETERS = (
-    *(p for p in declared(Path(__file__).with_name("led.py"))[0].parameters if p.role != "light area"),
+    *(
+        p
+        for p in declared(Path(__file__).with_name("led.py"))[0].parameters
+        if p.role not in ("light area", "light turn")
+    ),
     Parameter("length", "mm", 10.0, (0.01, 100.0), "size along its long side", plausible=0.5, how="difference"),
     Parameter("width", "mm", 1.0, (0.01, 100.0), "size across its long side", plausible=0.2, how="difference"),
     Parameter(

@@ -242,6 +242,9 @@ def lit_point(powers):
             gel=None,
             leds={led: SimpleNamespace(frame=axes) for led in ("near", "above")},
             key=lambda part, role: f"{part}.{role.split()[-1]}",
+            places_of=lambda now: {
+                led: np.array([now[f"{led}.{axis}"] for axis in "xyz"]) for led in ("near", "above")
+            },
         ),
     )
 

@@ -29,7 +29,7 @@ def test_what_is_known_of_a_plate_of_balls(bench_scene):
     """INNER radii around each whole ball, and the middles of four balls, APART from each."""
     shifted = {"gel.press_x": 0.3, "gel.press_y": -0.2}
     model = model_of(bench_scene, [shifted], "known")
-    own, all_of_it = model.usable(0)[..., 0], model.usable(0, "all")
+    own, all_of_it = model.usable(0)[..., 0], model.usable_in(0, "all")
     assert all_of_it.all() and not own.all()
     x, y = np.moveaxis(model.renderer.hits(model.untouched(model.at(Values(), 0))).position[..., :2], -1, 0)
     nearest = np.hypot((x - 0.3) - np.round(x - 0.3), (y + 0.2) - np.round(y + 0.2))
@@ -58,7 +58,7 @@ def test_what_is_known_of_one_indenter(mitsuba):
     own, known = model.usable(0)[..., 0], model.coordinates(Values(), 0)
     radius = np.sqrt(known["contact"].sum() / np.pi)
     wanted = known["contact"] | (known["contact_distance"] > FAR * radius)
-    assert (own == wanted)[model.usable(0, "all")[..., 0]].all()
+    assert (own == wanted)[model.usable_in(0, "all")[..., 0]].all()
     assert own[known["contact"]].any() and own[~known["contact"]].any() and not own.all()
 
 
