@@ -81,6 +81,8 @@ SURROUNDINGS = {  # parameter: what has to stand about it for it to be seen, and
     "polarizer_film.leak": {"middle.inserted": 0.0, "source.dop_q": 0.0, "source.dop_u": 0.0},
     # below 0 a leak is cut off
     "polarizer_film.leak_tilt": {f"{film}.leak": 0.01 for film in FILMS},
+    # they stiffen a held skin, whose dent they shape where it is the elastic one
+    "gel.springs": {"gel.backing": "held", "gel.dent_model": "elastic"},
     # what a ball does not show
     **{
         f"gel.press_r{axis}": {
