@@ -490,7 +490,7 @@ def _facts(
                 "board.z": [None, 0.7 * DISTANCE],
                 "board.scale": [None, 0.7],
                 "led_*.turn": [None, 30.0],
-                "gel.press_[xy]": [None, 0.01],  # what the circles leave open, with a camera that is not square to it
+                "gel.press_[xy]": [None, 0.01],  # circles and shading agree to 0.003 mm; a lens or camera may shift one
             },
         },
         "warnings": warnings,

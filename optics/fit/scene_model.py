@@ -17,7 +17,7 @@ from optics.captures.capture_set import Captures, Frame, cfa_channel, sweeps, wi
 from optics.captures.noise import Noise
 from optics.errors import BadScene, UnknownKey
 from optics.fit import geometry
-from optics.fit.contact import ALL, KNOWN, REGIONS, known_shape
+from optics.fit.known_shape import ALL, KNOWN, REGIONS, known_shape
 from optics.fit.model import value_of
 from optics.light.development import STEP, Developer
 from optics.scene.loader import Scene
@@ -40,7 +40,7 @@ class SceneModel:
                  scene does not explain of it is a gain; "additive": it is light that a press does not change; None: it
                  is not used
     flat         (H, W, C) DN, the background of all frames above black; None where it is not used
-    region       what is fitted and judged: "all", or "known", where the shape is known (optics.fit.contact)
+    region       what is fitted and judged: "all", or "known", where the shape is known (optics.fit.known_shape)
     """
 
     def __init__(
@@ -574,7 +574,7 @@ class SceneModel:
         return self.usable_in(index, self.region)
 
     def usable_in(self, index: int, region: str) -> np.ndarray:
-        """`usable` of another region (optics.fit.contact)."""
+        """`usable` of another region (optics.fit.known_shape)."""
         frame = self.frames[index]
         beside = 1 if self.captures.table is None else 0  # readings of a sweep are no neighbours
         mask = self.noise.usable(frame.image, beside)

@@ -766,7 +766,7 @@ class Renderer:
 
         Light from all around varies slowly: it is gathered for every second pixel each way, over the area of the four,
         and interpolated linearly in between. The directions are the same in every cell and for every geometry and LED
-        of a seed: what the mean misses then varies as slowly as the face, and is no noise between cells.
+        of a seed: what the mean misses is no noise between cells, but shifts all that are shaped alike by the same.
         """
         from scipy.ndimage import zoom
 

@@ -16,7 +16,7 @@ on each geometry at hand: the poses that the captures state, on a plate of balls
 poses of each study. What gives it the smaller held-out error counts, and is said. Where a study finds a gain of its own
 in each held-out frame, a table gets the one that suits it best.
 
-The contact is what the captures state (optics.fit.contact), so that it is the same for all, wherever a study was
+The contact is what the captures state (optics.fit.known_shape), so that it is the same for all, wherever a study was
 fitted. Errors:
 
     rms, L1      of measured minus predicted, DN and in units of full scale;   predictions clipped to the camera's range
@@ -42,7 +42,7 @@ from optics.captures import capture_set as capture_files
 from optics.errors import BadCapture, Underdetermined
 from optics.fit import calibrate
 from optics.fit.compare import Comparison, compare, led_label
-from optics.fit.contact import ALL, contact, is_plate, on_balls, words
+from optics.fit.known_shape import ALL, contact, contact_in_words, is_plate, on_balls
 from optics.fit.null_models import Lambert, Shape, Table, place_of, tables, tilt_of
 from optics.fit.scene_model import SceneModel
 from optics.scene import trust
@@ -277,14 +277,20 @@ class _Bench:
             if plate[i]:
                 offset = on_balls(model, i)[0]
                 self.balls[i] = (offset, np.linalg.norm(offset, axis=-1))
-        found = {i: contact(model, i) for i in self.frames}
+        kept: dict[tuple, np.ndarray] = {}  # frames of one press share theirs
+        found: dict[int, np.ndarray] = {}
+        for i in self.frames:
+            key = model.renderer.geometry(model.at(Values(), i))
+            if key not in kept:
+                kept[key] = contact(model, i)
+            found[i] = kept[key]
         empty = [i for i in (*self.held, *self.fitted) if not (found[i][..., None] & self.usable[i]).any()]
         if empty:
             raise BadCapture(
                 f"{self.folder}: frame {model.frames[empty[0]].name}: no usable pixel in the contact that its "
                 "settings state; check its press, its mask and the scene's scale"
             )
-        return words(all(plate.values())), found
+        return contact_in_words(all(plate.values())), found
 
     def _geometries(self) -> None:
         """Normals of each frame by name: as stated, of the balls themselves, by each study."""

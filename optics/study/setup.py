@@ -48,7 +48,7 @@ class Setup:
     values      start values, by key
     flat_field  how a background image enters, see `optics.fit.model.Model`
     region      what is fitted and judged: "all" of each image, or "known": where the skin's shape is known
-                (optics.fit.contact); "": all
+                (optics.fit.known_shape); "": all
     uncertainty standard deviation of settings by key, where the captures state none; None: that of dials is found from
                 the readings when a study begins (optics.diagnosis.dials)
     robust      residuals beyond three sigmas count less (Huber), for dirt and glints; a diagnosis weighs all alike

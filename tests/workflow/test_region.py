@@ -6,7 +6,7 @@ import pytest
 from optics.captures.capture_set import Captures, Frame
 from optics.captures.noise import Noise
 from optics.errors import BadScene, UnknownKey
-from optics.fit.contact import APART, FAR, INNER
+from optics.fit.known_shape import APART, FAR, INNER
 from optics.fit.scene_model import SceneModel
 from optics.scene import loader
 from optics.scene.parameter import Values

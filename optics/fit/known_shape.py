@@ -89,6 +89,6 @@ def _nearest_ball(face: np.ndarray, now: Mapping, gel: str) -> tuple[np.ndarray,
     return (face - middle) / radius, whole
 
 
-def words(plate: bool) -> str:
+def contact_in_words(plate: bool) -> str:
     """The contact in words."""
     return f"{INNER:g} radii of each whole ball" if plate else "where the indenter touches"
