@@ -545,8 +545,9 @@ class SceneModel:
         if not weight:
             return 0.0
         low, high = self.parameters[key].sides(now[key])
+        bounced = self.renderer.bounced
         ends = [
-            sum(power * self.renderer.bounced({**now, key: value}, led, seed, component) for led, power in lit.items())
+            sum(power * bounced({**now, key: value}, led, seed, component, roughly=True) for led, power in lit.items())
             for value in (low, high)
         ]
         return weight * (ends[1] - ends[0]) / (high - low)

@@ -10,6 +10,8 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from optics.light.grazing import density, drawn
+
 # share of the coordinates' size (mm) that a ray is moved along its direction beyond a flat interface, so that it does
 # not meet it again; float32 resolves 1e-7
 BEYOND = 1e-4
@@ -123,17 +125,31 @@ class LedByLed:
             share *= function(gel.path(si.p, origin, si.p, led, si), gel)
         return share
 
-    def bounced(self, scene, si, weight, origin, led, count, sampler):
+    def second_direction(self, si, sampler, grazing):
+        """(direction, BRDF times cosine over the density that it was drawn by, cosine over pi and this density); drawn
+        by the surface's law, or with `grazing` most of them where a level skin meets itself."""
+        context, bsdf, n = mi.BSDFContext(), si.bsdf(), si.sh_frame.n
+        bs, factor = bsdf.sample(context, si, sampler.next_1d(), sampler.next_2d(), si.is_valid())
+        if not grazing:
+            return si.to_world(bs.wo), mi.unpolarized_spectrum(factor), 1.0
+        w, counts = drawn(n, sampler.next_1d(), sampler.next_2d(), si.to_world(bs.wo))
+        own = si.to_local(w)
+        value, law = bsdf.eval_pdf(context, si, own, si.is_valid() & counts)
+        p = density(n, w, law)
+        weight = dr.select(counts & (p > 0), 1 / p, 0.0)
+        cos = dr.maximum(mi.Frame3f.cos_theta(own), 0.0)
+        return w, mi.unpolarized_spectrum(value) * weight, cos / dr.pi * weight
+
+    def bounced(self, scene, si, weight, origin, led, count, sampler, grazing=False):
         """Radiance per band that one LED sends to the camera by two reflections, mean of `count` directions."""
         total = mi.UnpolarizedSpectrum(0.0)
-        context = mi.BSDFContext()
         for _ in range(count):
-            bs, factor = si.bsdf().sample(context, si, sampler.next_1d(), sampler.next_2d(), si.is_valid())
-            second = scene.ray_intersect(si.spawn_ray(si.to_world(bs.wo)), si.is_valid())
+            w, factor, cosine = self.second_direction(si, sampler, grazing)
+            second = scene.ray_intersect(si.spawn_ray(w), si.is_valid())
             point = led.point(sampler.next_2d()) if led.reach() > 0 else led.position()
             seen = self.visible(scene, second, point, led)
-            light = self.direct(scene, second, 1.0, si.p, led, seen, point)
-            light = mi.unpolarized_spectrum(factor) * light + self.excited_again(scene, si, second, led, point, seen)
+            light = factor * self.direct(scene, second, 1.0, si.p, led, seen, point)
+            light += cosine * self.excited_again(scene, si, second, led, point, seen)
             total += dr.select(second.is_valid(), light, 0.0)
         # `direct` followed the light up to the first surface only
         return total * weight * self.kept_to(scene, si, origin, led) / count

@@ -83,7 +83,9 @@ class MonteCarloRenderer(Renderer):
         hits = self.hits(values)
         return LedImage(led, hits, np.zeros(hits.shape, bool), np.zeros(0, int), None, None, None, hits.valid)
 
-    def bounced(self, values: Mapping, led: str, seed: int = 0, component: int = 0) -> np.ndarray:
+    def bounced(
+        self, values: Mapping, led: str, seed: int = 0, component: int = 0, roughly: bool = False
+    ) -> np.ndarray:
         return np.zeros((self.height, self.width, self.bands))
 
     def tangent(self, values: Mapping, key: str, seed: int = 0) -> np.ndarray:

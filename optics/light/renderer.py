@@ -48,8 +48,12 @@ PER_RAY = 250  # bytes of a camera ray's end and its light, by the memory of pro
 FAINT = 0.05  # of the largest irradiance in a crowded scene: shadows that take less need no finer samples
 BOUNCE_SAMPLES = 32  # directions per cell for the second bounce, at least
 # of these, an image has at least so many: few of a face meet a lit flank. On a plate of balls, whose second reflections
-# are 6 % of the direct light, 128 per cell of an image of 153 x 128 px leave .9 % of it, rms
+# are 6 % of the direct light, 128 per cell of an image of 153 x 128 px leave .5 % of it, rms
 BOUNCE_RAYS = 2**19
+BOUNCE_NUMBERS = (
+    10  # that a direction is drawn by: a place in the cell, a technique, two directions, a point of the light
+)
+ROUGHLY = 4  # times fewer directions suffice for how second reflections change: with the same ones on both sides
 BOUNCE_CELL = 2  # px each way of a cell; 1 in a crowded scene, whose pixels differ
 
 
@@ -88,6 +92,7 @@ class Renderer:
         self.rim_samples = LAYERED_RIM_SAMPLES if self.layered else RIM_SAMPLES
         cells = -(-self.height // BOUNCE_CELL) * -(-self.width // BOUNCE_CELL)
         self.bent_side, self.bounce = BENT_SIDE, (BOUNCE_CELL, _power_of_two(max(BOUNCE_SAMPLES, BOUNCE_RAYS / cells)))
+        self.grazing = not self.crowded  # whether second directions are drawn where a level skin meets itself
         if self.crowded:
             self.rim_samples, self.bent_side = CROWDED_SAMPLES << (self.fine - 1), 2
             self.bounce = 1, CROWDED_SAMPLES << (self.fine - 1)
@@ -760,51 +765,62 @@ class Renderer:
             return np.zeros((self.height, self.width, self.bands))
         return self._mix(image, raw, self.weights(values, image, component) if self.layered else (1.0, 1.0))
 
-    def bounced(self, values: Mapping, led: str, seed: int = 0, component: int = 0) -> np.ndarray:
+    def bounced(
+        self, values: Mapping, led: str, seed: int = 0, component: int = 0, roughly: bool = False
+    ) -> np.ndarray:
         """(H, W, B): light of one LED at power 1 after two reflections, unpolarized before any layers, as a component
-        of the Stokes vector; the mean over second directions of a Sobol sequence.
+        of the Stokes vector; the mean over second directions.
 
         Light from all around varies slowly: it is gathered for every second pixel each way, over the area of the four,
-        and interpolated linearly in between. The directions are the same in every cell and for every geometry and LED
-        of a seed: what the mean misses is no noise between cells, but shifts all that are shaped alike by the same.
+        and interpolated linearly in between. A cell's directions are those of one Sobol sequence, shifted from cell to
+        cell by another, so that what a mean misses is noise of single cells. They are the same for every geometry and
+        LED of a seed, for differences.
+
+        roughly   with ROUGHLY times fewer directions
         """
         from scipy.ndimage import zoom
 
         if led in self.scene.sources:  # it lights nothing
             return np.zeros((1, 1, self.bands))
-        key = ("bounced", seed, *self._led_key(values, led))
+        cell, samples = self.bounce
+        samples = max(samples // ROUGHLY, 1) if roughly else samples
+        key = ("bounced", seed, samples, *self._led_key(values, led))
         if key in self._plain:
             return self._bounced(values, led, self._plain[key], component)
         self.apply(values)
-        sample, directions = self._spread_rays(seed)
+        sample, numbers = self._spread_rays(seed, samples)
         for other in (led, *sorted(self.together - {led})):  # as for direct light: these will be asked for next
-            own = ("bounced", seed, *self._led_key(values, other))
+            own = ("bounced", seed, samples, *self._led_key(values, other))
             if other in self.scene.sources or own in self._plain:
                 continue
 
             def shade(lamp=self.scene.leds[other]):
                 self._tune(sample.si)
-                return self.scene.integrator.bounced(self._world(), *sample[:3], lamp, 1, Directions(directions))
+                world, given = self._world(), Directions(numbers)
+                return self.scene.integrator.bounced(world, *sample[:3], lamp, 1, given, self.grazing)
 
-            cell, samples = self.bounce
             rows, columns = -(-self.height // cell), -(-self.width // cell)
             coarse = self._each_band(shade, other).reshape(rows, columns, samples, self.bands).mean(2)
             image = zoom(coarse, (cell, cell, 1), order=1, mode="nearest", grid_mode=True)
             self._keep_plain(own, image[: self.height, : self.width].astype(float))
         return self._bounced(values, led, self._plain[key], component)
 
-    def _spread_rays(self, seed: int) -> tuple[Sample, np.ndarray]:
-        """(ends of the camera rays that gather light from all around, the numbers (rays, 5) that their second
+    def _spread_rays(self, seed: int, samples: int) -> tuple[Sample, np.ndarray]:
+        """(ends of the camera rays that gather light from all around, the numbers (rays, n) that their second
         directions are drawn by): the same for every geometry and LED."""
         from scipy.stats import qmc
 
-        cell, samples = self.bounce
+        cell = self.bounce[0]
         rows, columns = -(-self.height // cell), -(-self.width // cell)
-        drawn = qmc.Sobol(7, seed=np.random.default_rng([seed, 77])).random(samples)
-        v, u = (a.ravel()[:, None] for a in np.mgrid[:rows, :columns])
-        at = [(a + drawn[:, k]).ravel() for k, a in enumerate((u, v))]
+        rng = np.random.default_rng([seed, 77])
+        drawn, shifts = (
+            qmc.Sobol(BOUNCE_NUMBERS, rng=rng).random(_power_of_two(n))[:n] for n in (samples, rows * columns)
+        )
+        numbers = ((drawn + shifts[:, None]) % 1).reshape(-1, BOUNCE_NUMBERS)
+        v, u = (np.repeat(a.ravel(), samples) for a in np.mgrid[:rows, :columns])
+        at = [a + numbers[:, k] for k, a in enumerate((u, v))]
         sample = self._trace(*(np.minimum(a * cell, size - 1e-3) for a, size in zip(at, (self.width, self.height))))
-        return sample, np.tile(drawn[:, 2:], (rows * columns, 1))
+        return sample, numbers[:, 2:]
 
     def _bounced(self, values: Mapping, led: str, image: np.ndarray, component: int) -> np.ndarray:
         """A bounced image behind the layers."""
