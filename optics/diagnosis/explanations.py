@@ -19,7 +19,8 @@ nested, one is told apart from the best when its score is TOLD lower (CLEAR, whe
 is claimed when every explanation without it is SURE lower, and NO_TIE where plausibility alone decides); of readings,
 what it predicts better of blocks of the session that were left out counts against that lead; and when, of images or of
 readings with MISSTATED noise, the difference of falls exceeds the smaller of HALF of what the best one leaves and
-MARGIN of its fall, as misfit that is left may lie along any direction. All others survive. An effect that is part of
+MARGIN of its fall, as misfit that is left may lie along any direction; and of images, where misfit is left, noise that
+frames share rules out nothing that leaves less by itself at no more cost. All others survive. An effect that is part of
 every explanation that survives is missing, whichever of them is right.
 
 Sources: MacKay, Bayesian interpolation, Neural Computation 4, 415 (1992), Occam factor; Vuong, Econometrica 57, 307
@@ -501,7 +502,8 @@ def _joined(case: Case, trials: dict[frozenset[str], Trial]) -> None:
         needed = max(CLEAR, pairs.LEAD * best.fall) if nested else -CLEAR
         if nested and (not best.members or best.complete):
             continue
-        expected = net / scale + _expected_gain(case, both, scale) - sum(map(expected_cost, both))
+        fall = net - pairs.shortfall(both)
+        expected = fall / scale + _expected_gain(case, both, scale) - sum(map(expected_cost, both))
         if expected - top >= needed:
             wanted.append((expected, both, linear))
     for _, (a, b), linear in sorted(wanted, key=lambda t: -t[0])[: pairs.REFITTED]:
@@ -717,6 +719,9 @@ def _lead(case: Case, outcome: Outcome, best: Trial, other: Trial) -> tuple[floa
         # noise that the simpler one shares, and the other does not need, is no part of that: a rival with a cost
         if significant < lead - needed or shared < TOLD:
             lead, needed, cost = data, data - significant, 0.0
+    # where misfit is left, lamps make up for much of what is wrong: no reason against what needs them less
+    if not is_table and outcome.scale > MISSTATED and other.fall > best.fall and other.cost < best.cost + TOLD:
+        return lead, max(needed, lead)
     if best.complete or (is_table and outcome.scale < MISSTATED):
         return lead, needed
     # of images, less what a lamp did to whole frames: that lies in no direction of an effect

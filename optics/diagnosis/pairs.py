@@ -1,5 +1,5 @@
-"""Pairs of effects, ranked by the linear fall of chi2 that both make together: T = u' V^-1 u over the columns of
-both."""
+"""Pairs of effects, ranked by the linear fall of chi2 that both make together, T = u' V^-1 u over the columns of both,
+less what the refits of each alone fell short of their own T."""
 
 from __future__ import annotations
 
@@ -38,3 +38,9 @@ def ranked(evidence: Evidence, candidates: Sequence[Candidate]) -> list[tuple[fl
         if all(signs):  # no strength beyond a bound
             found.append((float(projected.score[own] @ linear) - rank, a, b, linear))
     return sorted(found, key=lambda t: -t[0])
+
+
+def shortfall(members: Sequence[Candidate]) -> float:
+    """How much less than their scores promised the refits of effects by themselves brought, 0 without refits: of an
+    image that is far from proportional to its strength, a pair does not keep the promise either."""
+    return sum(max(c.row.fall - c.row.refit.fall, 0.0) for c in members if c.row.refit is not None)

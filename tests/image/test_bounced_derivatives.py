@@ -3,11 +3,15 @@
 import numpy as np
 import pytest
 
+from optics.light import renderer
 
-@pytest.mark.parametrize("key", ["led_1.x", "membrane.rho_r", "membrane.sigma", "gel.absorption"])
-def test_derivatives_with_a_second_reflection(key, bench):
-    """Against central differences of the prediction, of another step, with the same second directions; without the
-    second reflection's part the derivative is off by several times the tolerance."""
+KEYS = ["led_1.x", "membrane.rho_r", "membrane.sigma", "gel.absorption"]
+
+
+def compared(bench, key):
+    """(rms of the derivative image without the second reflection, of the derivative image itself) less a central
+    difference of the prediction, of another step; over the rms of that difference. A light that moves crosses rims:
+    without the 2 % of the pixels that differ most."""
     p = bench.scene.parameters[key]
     base = {**bench.values, "gel.press_depth": 1.2, "integrator.interreflection": 3.0}
     base |= {"membrane.sigma": 0.1, "gel.absorption": 0.05}
@@ -15,9 +19,24 @@ def test_derivatives_with_a_second_reflection(key, bench):
     above, below = (bench.image({**base, key: base[key] + s * step}) for s in (1, -1))
     wanted = (above - below) / (2 * step)
     found = bench.derivative(key, base)
-    smooth = np.abs(wanted - found) < np.quantile(np.abs(wanted - found), 0.98)  # a light that moves crosses rims
+    smooth = np.abs(wanted - found) < np.quantile(np.abs(wanted - found), 0.98)
     scale = np.sqrt(np.mean(wanted[smooth] ** 2))
-    off = np.sqrt(np.mean((found - wanted)[smooth] ** 2)) / scale
     alone = bench.derivative(key, {**base, "integrator.interreflection": 0.0})
+    return [np.sqrt(np.mean((x - wanted)[smooth] ** 2)) / scale for x in (alone, found)]
+
+
+@pytest.mark.parametrize("key", KEYS)
+def test_derivatives_with_a_second_reflection(key, bench, monkeypatch):
+    """With the directions of the prediction: without the second reflection's part the derivative is off by several
+    times the tolerance, which is what another step changes."""
+    monkeypatch.setattr(renderer, "ROUGHLY", 1)
+    alone, off = compared(bench, key)
     assert off < 0.01
-    assert np.sqrt(np.mean((alone - wanted)[smooth] ** 2)) / scale > 0.03
+    assert alone > 0.03
+
+
+def test_fewer_directions_leave_little_error(bench):
+    """Of derivatives, with a second reflection three times as strong as physics allows: below half of what leaving it
+    out would bring."""
+    alone, off = compared(bench, "membrane.sigma")
+    assert off < 0.5 * alone

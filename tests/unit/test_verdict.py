@@ -868,6 +868,17 @@ def test_pairs_expect_nothing_of_what_the_projection_left_as_rounding():
     assert both == [a, b] and np.isclose(fall, 16 + 9 - 2) and np.allclose(linear, [2, 1, 0])
 
 
+def test_pairs_keep_no_more_of_a_promise_than_their_members_did():
+    """A refit that brings less than its score promised lowers what a pair is expected to bring; one that brings more
+    raises nothing, and an effect that was not refitted has promised nothing yet."""
+    short, more, unknown = (
+        SimpleNamespace(row=SimpleNamespace(fall=100.0, refit=refit))
+        for refit in (SimpleNamespace(fall=60.0), SimpleNamespace(fall=130.0), None)
+    )
+    assert pairs.shortfall([short, more]) == 40.0
+    assert pairs.shortfall([more, unknown]) == 0.0
+
+
 def curve(coordinate, net, dof=16):
     return Fingerprint(coordinate, net + dof, dof, 1e-9, net, 1.0, "gain", [], [], [], [])
 
