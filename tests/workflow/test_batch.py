@@ -207,8 +207,8 @@ def command(job, *options):
 
 
 def started(job, *options, most=3):
-    """A process at work, once its folder is there and `most` samples are made; it heeds interrupts even where these tests
-    run in the background."""
+    """A process at work, once its folder is there and `most` samples are made; it heeds interrupts even where these
+    tests run in the background."""
     process = subprocess.Popen(
         command(job, *options),
         stdout=subprocess.PIPE,
@@ -239,8 +239,8 @@ def children(pid):
 
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for orphans in /proc")
 def test_killed_in_the_middle_and_resumed(whole, job):
-    """The test holds the lock of the last sample until the kill, so that the command cannot end before, however fast the
-    machine is, or however late this test is called."""
+    """The test holds the lock of the last sample until the kill, so that the command cannot end before, however fast
+    the machine is, or however late this test is called."""
     out = job.parent / "out"
     process = started(job, "--workers", "2", most=0)  # makes its folder; workers take seconds to start
     (out / ".parts").mkdir(exist_ok=True)
