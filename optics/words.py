@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import Any
 
 NARROWEST = 7  # characters of a column that is broken over lines
+PROSE = 30  # characters of a line of prose in a table: what is narrower is hard to read
 UNBROKEN = 14  # characters of a word or number that stays whole, where the line has room for all of these
 
 
@@ -68,6 +69,20 @@ def _limits(rows: Sequence[Sequence[str]], widths: Sequence[int], width: int) ->
             if sum(map(min, widths, limits)) + between * (len(widths) - 1) <= width:
                 return limits, between
     return narrowest, 2
+
+
+def annotated(rows: Sequence[Sequence[str]], short: Sequence[Sequence[str]], notes: Sequence[str]) -> str:
+    """A table whose last column is prose, beside the others; or, where the line leaves less than PROSE characters for
+    it, the `short` rows, each with its note under it."""
+    width = _room.get()
+    others = [max(len(cell) for cell in column) for column in list(zip(*rows))[:-1]]
+    if width is None or sum(others) + 2 * len(others) + PROSE <= width:
+        return table(rows)
+    with fitting(None):  # a row is a line, whose note can follow it
+        lines = table(short).splitlines()
+    indent = " " * 4
+    below = [textwrap.wrap(note, max(width, PROSE), initial_indent=indent, subsequent_indent=indent) for note in notes]
+    return "\n".join(text for line, note in zip(lines, below) for text in (line, *note))
 
 
 _NUMBER = re.compile(r"[-+]?[\d.]\S*( \S{1,3})?")  # with its unit

@@ -5,6 +5,7 @@ folder of plugins, which then has to meet the same contract as those that ship."
 
 from __future__ import annotations
 
+import gc
 import os
 import re
 import tempfile
@@ -61,6 +62,18 @@ def pytest_collection_modifyitems(items):
         items.sort(key=lambda item: place.get(item.path.stem, len(LONGEST)))  # stable: the others keep their order
 
 
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_teardown(item, nextitem):
+    """Let the scenes of a file of tests go with it; a scene and its parts hold each other, so that nothing else does.
+
+    Dr.Jit records the code of every part that is alive for each call of a part, whichever scene a kernel traces:
+    thirteen benches alive cost test_touch_hidden.py 52 s of processor time in place of 16."""
+    result = yield
+    if nextitem is None or nextitem.path != item.path:
+        gc.collect()
+    return result
+
+
 @pytest.fixture(scope="session")
 def mitsuba():
     """Mitsuba in the default variant, on an LLVM that works."""
@@ -76,6 +89,8 @@ def mitsuba():
         import drjit
 
         drjit.set_thread_count(1)  # there is a worker for each core
+    gc.collect()
+    gc.freeze()  # modules stay: what collects later need not look at them
     return mitsuba
 
 
@@ -348,9 +363,9 @@ def load_bench(mitsuba, tmp_path_factory):
     return load
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def benches(load_bench):
-    """`load_bench`, each bench loaded once."""
+    """`load_bench`, each bench loaded once for a file of tests."""
     return lru_cache(None)(load_bench)
 
 

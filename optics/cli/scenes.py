@@ -21,7 +21,7 @@ from optics.cli.shared import (
     show,
     terminal,
 )
-from optics.words import key_of, number, table
+from optics.words import annotated, key_of, number, table
 
 if TYPE_CHECKING:
     from optics.scene.declare import Effect
@@ -69,7 +69,9 @@ def params(
     if as_json:
         return show(rows)
     head = ("key", "value", "unit", "bounds", "neutral", "derivative", "meaning")
-    print(table([head, *map(_parameter_line, rows)]))
+    lines = [_parameter_line(r) for r in rows]
+    short, notes = zip(*map(_parameter_short, rows)) if rows else ((), ())
+    print(annotated([head, *lines], [head[:5], *short], ["", *notes]))
     if not patterns and (loaded.curves or loaded.integral is not None):
         print(
             "\n" + table([("spectrum", "kind", "nm", "mean", "source"), *map(_spectrum_line, spectra.records(loaded))])
@@ -163,6 +165,16 @@ def _parameter_line(r: Mapping[str, Any]) -> tuple[str, ...]:
         "-" if r["neutral"] is None else f"{r['neutral']:g}",
         DERIVATIVES[r["derivative"]] + (", linear" if r["linear"] else ", of its square" if r["squared"] else ""),
         r["meaning"] + (f" [effect: {r['effect']}]" if r["effect"] else ""),
+    )
+
+
+def _parameter_short(r: Mapping[str, Any]) -> tuple[tuple[str, ...], str]:
+    """For a narrow terminal: what fits one line, and what stands under it."""
+    key, value, unit, span, neutral, derivative, meaning = _parameter_line(r)
+    named = f"; {', '.join(r['choices'])}" if r["choices"] else ""
+    return (
+        (key, value, unit, "a word" if r["choices"] else span, neutral),
+        meaning + named + (f"; derivative: {derivative}" if r["derivative"] else ""),
     )
 
 

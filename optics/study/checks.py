@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+import numpy as np
+
 from optics.captures import capture_set as capture_files
 from optics.diagnosis.dials import Width
 from optics.diagnosis.text import AT_FAULT
@@ -35,6 +37,7 @@ def of_captures(model: SceneModel) -> list[str]:
     from optics.light.rendering import veiled
 
     texts = [*model.captures.warnings, *warnings_of(model.noise, model.captures), *_unnamed(model), *_astray(model)]
+    texts += without_shading(model)
     if model.cut_off:
         count = sum(int((f.image == 0).sum()) for f in model.frames)
         texts.append(
@@ -128,6 +131,24 @@ def _unverified(model: SceneModel, setup: Setup, held: Sequence[int]) -> list[st
     return [
         f"{groups} groups of frames: none is held out, so nothing verifies what is found; take {GROUPS} or more, or "
         "name one to hold out (--hold-out)"
+    ]
+
+
+def without_shading(model: SceneModel) -> list[str]:
+    """Images under light that hold one value: nothing in them tells a model from another."""
+    found = {}
+    for f in model.frames:
+        values = f.image[np.isfinite(f.image)]
+        lit = any(f.parameters.get(key, model.base[key]) != 0 for key in model.scene.powers.values())
+        if f.readings or values.size < 2 or values.min() < values.max() or not lit:
+            continue
+        found[f.name] = float(values.flat[0])
+    if not found:
+        return []
+    name, value = next(iter(found.items()))
+    return [
+        f"{len(found)} of {len(model.frames)} images hold one value everywhere, such as '{name}', where every value is "
+        f"{value:g} DN: nothing in them tells one model from another. Look at the files, or leave these frames out"
     ]
 
 

@@ -16,7 +16,7 @@ import pytest
 import typer.main
 from PIL import Image
 
-from optics.cli import app
+from optics.cli import app, main
 
 PLUGIN = """from optics import Effect, Parameter
 def f(image, camera):
@@ -220,6 +220,22 @@ def test_what_cannot_hold_is_refused(place, met, monkeypatch, words):
     code, said = met(*words.split())
     assert code == 2 and re.search(REFUSED[words], said), said
     assert not (place / "s").exists() and not (place / "x.exr").exists()
+
+
+@pytest.mark.parametrize(
+    ("level", "code", "said"),
+    [
+        (0, 2, "far below what it has without light"),
+        (255, 2, "frame 1 ('b.png'): all saturated"),
+        (128, 0, "1 of 2 images hold one value everywhere, such as 'b', where every value is 128 DN"),
+    ],
+)
+def test_images_without_shading_are_named(place, capsys, monkeypatch, level, code, said):
+    monkeypatch.chdir(place)
+    for name in "bc":  # c repeats b
+        Image.fromarray(np.full((12, 16, 3), level, np.uint8)).save(place / "images" / f"{name}.png")
+    assert main(["compare", "images"]) == code
+    assert said in capsys.readouterr().err
 
 
 @pytest.mark.slow

@@ -144,6 +144,18 @@ def test_tables_fit_the_terminal():
     assert words.table(rows) == wide  # to a file or a program
 
 
+def test_prose_stands_under_its_row_where_the_line_is_narrow():
+    rows = [("key", "value", "unit", "bounds", "meaning"), ("camera.principal_x", "12", "px", "0 .. 1", "word " * 20)]
+    short, notes = [row[:2] for row in rows], ["", rows[1][-1]]
+    assert words.annotated(rows, short, notes) == words.table(rows)
+    with words.fitting(60):
+        head, row, *below = words.annotated(rows, short, notes).splitlines()
+    assert head.split() == ["key", "value"] and row.split() == ["camera.principal_x", "12"]
+    assert below and all(len(line) <= 60 and line.startswith("    word") for line in below)
+    with words.fitting(200):
+        assert words.annotated(rows, short, notes) == words.table(rows)
+
+
 def test_words_and_numbers_of_a_table_stay_whole():
     head = ("by frame", "values", "used", "chi2/dof", "bias DN", "rms DN", "noise DN", "L1", "PSNR dB", "SSIM")
     row = ("reading 3", "1152", "100.0 %", "42.612", "-10.260", "14.093", "2.104", "0.0487", "24.87", "0.5209")

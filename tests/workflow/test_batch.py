@@ -20,6 +20,7 @@ from PIL import Image
 from optics.cli import main
 from optics.errors import OutOfBounds, OutputExists
 from optics.files import exr
+from optics.files.output import alone
 from optics.light.rendering import RenderJob
 from optics.study import batch, blocks
 from optics.study.blocks import TRIES, Blocks
@@ -205,9 +206,9 @@ def command(job, *options):
     return [sys.executable, "-m", "optics.cli", "batch", str(job), *options]
 
 
-def started(job, *options):
-    """A process at work, once it has made three samples; it heeds interrupts even where these tests run in the
-    background."""
+def started(job, *options, most=3):
+    """A process at work, once its folder is there and `most` samples are made; it heeds interrupts even where these
+    tests run in the background."""
     process = subprocess.Popen(
         command(job, *options),
         stdout=subprocess.PIPE,
@@ -217,7 +218,8 @@ def started(job, *options):
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
     deadline = time.monotonic() + 60
-    while recorded(job.parent / "out") < 3:
+    out = job.parent / "out"
+    while not (out / "job.json").exists() or recorded(out) < most:
         assert process.poll() is None and time.monotonic() < deadline, process.communicate()
         time.sleep(0.01)
     return process
@@ -237,18 +239,26 @@ def children(pid):
 
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for orphans in /proc")
 def test_killed_in_the_middle_and_resumed(whole, job):
-    process = started(job, "--workers", "2")
-    workers = children(process.pid)
-    assert len(workers) >= 2
-    process.kill()
-    process.communicate()
-    deadline = time.monotonic() + 30
-    while any(Path(f"/proc/{pid}").exists() for pid in workers):
-        assert time.monotonic() < deadline, "workers outlive the process that started them"
-        time.sleep(0.05)
+    """The test holds the lock of the last sample until the kill, so that the command cannot end before, however fast
+    the machine is, or however late this test is called."""
     out = job.parent / "out"
+    process = started(job, "--workers", "2", most=0)  # makes its folder; workers take seconds to start
+    (out / ".parts").mkdir(exist_ok=True)
+    workers: set[int] = set()
+    deadline = time.monotonic() + 120
+    with alone(out / ".parts" / "00009.lock", "the last sample was begun already"):
+        while recorded(out) < 3:
+            workers |= set(children(process.pid))
+            assert process.poll() is None and time.monotonic() < deadline, process.communicate()
+            time.sleep(0.01)
+        process.kill()
+        process.communicate()
+        deadline = time.monotonic() + 30
+        while any(Path(f"/proc/{pid}").exists() for pid in workers):
+            assert time.monotonic() < deadline, "workers outlive the process that started them"
+            time.sleep(0.05)
     done = recorded(out)
-    assert 3 <= done < TOTAL
+    assert len(workers) >= 2 and 3 <= done < TOTAL
     (out / "images" / ".000009.0123456789abcdef.exr").write_bytes(b"half an image")  # as a kill in mid-write leaves it
     with open(out / ".parts" / "00009.part", "a") as file:
         file.write('{"index": 9, "sam')
