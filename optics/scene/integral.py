@@ -244,11 +244,11 @@ class Integral:
 
     def _error(self, nodes: np.ndarray, rows: np.ndarray, share: np.ndarray, power: np.ndarray) -> float:
         """The largest error of the integrals of the probes over one range, of all channels."""
-        density = self.quantum * power * self.step * share
+        density = self.quantum * power * self.step
         worst = 0.0
         for probe in self._probes():
-            exact = density @ probe(self.grid)
-            found = (density @ rows.T) @ probe(nodes)
+            exact = density @ (share * probe(self.grid))
+            found = (density @ rows.T) @ probe(nodes)  # the rows have the share in them
             worst = max(worst, float(np.abs(found - exact).max()))
         return worst
 

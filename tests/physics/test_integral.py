@@ -89,6 +89,14 @@ def test_reflectance_and_filter_are_integrated(mitsuba, tmp_path, paint):
     assert np.abs(found - expected).max() < 5e-4 * expected.max()  # 3e-4 of the trapezium rule, see above
 
 
+def test_a_straight_line_needs_two_nodes(mitsuba, tmp_path):
+    """What two nodes integrate exactly is told as exact, also where a range ends within the light of an LED; and where
+    nobody says how many nodes, there are two for each range."""
+    line = {"membrane": '<string name="reflectance" value="300:0.05, 900:0.95"/>'}
+    two, free = (digit(mitsuba, tmp_path, bands, **line).integral for bands in ("auto 2", "auto"))
+    assert two.error < 1e-10 and len(free.nm) <= len(two.nm)  # 1e-10: rounding of sums over 1600 places
+
+
 @pytest.mark.parametrize("key", ["led_green.wavelength", "led_red.fwhm"])
 def test_derivatives_by_peak_and_width(auto, mitsuba, tmp_path, key):
     """Auto bands: complex step through the matrix, against central differences, whose error is the third order: 1e-6
