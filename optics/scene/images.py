@@ -12,14 +12,19 @@ import numpy as np
 def blurred(image: np.ndarray, variance) -> np.ndarray:
     """An image (H, W, B) smeared by Gaussians of a variance along each axis, px^2, one for all bands or (B,).
 
-    By the cosine transform, as a factor exp(-V (pi k/N)^2/2): the image is mirrored at its borders, and the result is
-    exact for any V, also far below a pixel."""
+    By the cosine transform, as a factor exp(-V (pi k/N)^2/2), which is exact for any V, also far below a pixel. Beyond
+    its borders the image goes on with the slope that it has there, turned about the border's pixel: what lies there
+    sends light in as well."""
     from scipy.fft import dctn, idctn
 
+    widest = float(np.max(np.real(variance), initial=0.0))
+    reach = 8 * 2 ** max(int(np.ceil(np.log2(max(6 * np.sqrt(widest), 1e-9) / 8))), 0)  # 6 sd, in few steps
+    image = np.pad(image, ((reach, reach), (reach, reach), (0, 0)), "reflect", reflect_type="odd")
     rows, columns = image.shape[:2]
     frequency2 = (np.pi * np.arange(rows) / rows)[:, None] ** 2 + (np.pi * np.arange(columns) / columns) ** 2
     transfer = np.exp(-np.asarray(variance) * frequency2[..., None] / 2)
-    return idctn(dctn(image, axes=(0, 1)) * transfer, axes=(0, 1))
+    found = idctn(dctn(image, axes=(0, 1)) * transfer, axes=(0, 1))
+    return found[reach:-reach, reach:-reach]
 
 
 BEYOND = 14  # places that a row goes on at each end: what ends there is felt by 0.268 of it one place further in
