@@ -2,10 +2,10 @@
 
 Definition
     I' = I * G,  G a Gaussian of variance V (px^2) along each axis
-The convolution is computed in the cosine transform as a factor exp(-V (pi k/N)^2 / 2), which is exact for any V, also far
-below a pixel. Beyond its borders the image goes on with the slope that it has there, as what lies outside sends light in
-too. The strength is the variance rather than the width, so that the onset is linear. On sharp edges it is linear only up to 1/16 px^2; the ranking therefore tries a finite step
-as well.
+The convolution is computed in the cosine transform as a factor exp(-V (pi k/N)^2 / 2), which is exact for any V, also
+far below a pixel. Beyond its borders the image goes on with the slope that it has there, as what lies outside sends
+light in too. The strength is the variance rather than the width, so that the onset is linear. On sharp edges it is
+linear only up to 1/16 px^2; the ranking therefore tries a finite step as well.
 Fingerprint
     acts where the image is curved: at shadow rims and at the rim of the contact. LED size blurs shadow rims only,
     smoothing of the gel only the dent.

@@ -34,7 +34,7 @@ def test_a_small_growth_moves_details_as_it_should():
 
 
 def test_what_leaves_at_a_border_has_come_from_beyond_it():
-    """A slope stays a slope to the last pixel under blur and under growth: nothing mirrors it, nothing makes it level."""
+    """A slope stays a slope to the last pixel under blur and growth: nothing mirrors it, nothing makes it level."""
     v, u = np.mgrid[:HEIGHT, :WIDTH] + 0.5
     slope = (100 + 3 * u - 2 * v)[..., None]
     for variance in (0.6, 30.0):  # 1e-5 of the image: what rings of the kink where what was turned ends, 6 sd outside
