@@ -4,42 +4,66 @@ Both are linear in the image and analytic in their strength, for derivatives by 
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 
 
 def blurred(image: np.ndarray, variance) -> np.ndarray:
     """An image (H, W, B) smeared by Gaussians of a variance along each axis, px^2, one for all bands or (B,).
 
-    By the cosine transform, as a factor exp(-V (pi k/N)^2/2): the image is mirrored at its borders, and the result is
-    exact for any V, also far below a pixel."""
+    By the cosine transform, as a factor exp(-V (pi k/N)^2/2), which is exact for any V, also far below a pixel. Beyond
+    its borders the image goes on with the slope that it has there, turned about the border's pixel: what lies there
+    sends light in as well."""
     from scipy.fft import dctn, idctn
 
+    widest = float(np.max(np.real(variance), initial=0.0))
+    reach = 8 * 2 ** max(int(np.ceil(np.log2(max(6 * np.sqrt(widest), 1e-9) / 8))), 0)  # 6 sd, in few steps
+    image = np.pad(image, ((reach, reach), (reach, reach), (0, 0)), "reflect", reflect_type="odd")
     rows, columns = image.shape[:2]
     frequency2 = (np.pi * np.arange(rows) / rows)[:, None] ** 2 + (np.pi * np.arange(columns) / columns) ** 2
     transfer = np.exp(-np.asarray(variance) * frequency2[..., None] / 2)
-    return idctn(dctn(image, axes=(0, 1)) * transfer, axes=(0, 1))
+    found = idctn(dctn(image, axes=(0, 1)) * transfer, axes=(0, 1))
+    return found[reach:-reach, reach:-reach]
+
+
+BEYOND = 14  # places that a row goes on at each end: what ends there is felt by 0.268 of it one place further in
+
+
+@cache
+def _through(count: int) -> np.ndarray:
+    """(N + 2 BEYOND, N) weights of the cubic B-splines whose sum goes through N values, and goes on at both ends with
+    the slope that it has there: as it came from, turned about the end."""
+    whole = count + 2 * BEYOND
+    matrix = (4 * np.eye(whole) + np.eye(whole, k=1) + np.eye(whole, k=-1)) / 6
+    matrix[0, 0] = matrix[-1, -1] = 5 / 6  # mirrored
+    at = np.arange(whole) - BEYOND
+    end = np.clip(at, 0, count - 1)
+    values = np.eye(count)
+    going_on = values[end] + np.where(at == end, 0.0, 1.0)[:, None] * (
+        values[end] - values[np.clip(2 * end - at, 0, count - 1)]
+    )
+    return np.linalg.solve(matrix, going_on)
 
 
 def resampling(places) -> np.ndarray:
     """(M, N) matrix that reads N equidistant values at places (M,), 0 at the first and N - 1 at the last of as many
-    places; complex ones give derivatives. Beyond its ends a row of values goes on as it ends.
+    places; complex ones give derivatives. Beyond its ends a row of values goes on with the slope that it has there,
+    as far as BEYOND - 3 places.
 
-    Cubic convolution, of the third order (Keys, IEEE Trans. ASSP 29, 1153, 1981)."""
+    By the cubic spline through the values (Unser, IEEE Signal Processing Magazine 16 (6), 22, 1999): a wave of 6 px
+    moves by 0.6 % less than it should, one of 4 px by 4.5 %. Cubic convolution has 17 % and 36 %."""
     places = np.asarray(places)
     count = len(places)
+    inside = np.clip(places.real, 2 - BEYOND, count + BEYOND - 3)
+    places = np.where(inside == places.real, places, inside)
     first = np.floor(places.real).astype(int)
     t = places - first
-    weights = (
-        ((-0.5 * t + 1) * t - 0.5) * t,
-        (1.5 * t - 2.5) * t * t + 1,
-        ((-1.5 * t + 2) * t + 0.5) * t,
-        (0.5 * t - 0.5) * t * t,
-    )
-    matrix = np.zeros((count, count), places.dtype)
-    rows = np.arange(count)
+    weights = ((1 - t) ** 3 / 6, (3 * t**3 - 6 * t**2 + 4) / 6, (-3 * t**3 + 3 * t**2 + 3 * t + 1) / 6, t**3 / 6)
+    matrix = np.zeros((count, count + 2 * BEYOND), places.dtype)
     for k, weight in enumerate(weights):
-        np.add.at(matrix, (rows, np.clip(first + k - 1, 0, count - 1)), weight)
-    return matrix
+        matrix[np.arange(count), first + k - 1 + BEYOND] = weight
+    return matrix @ _through(count)
 
 
 def magnified(image: np.ndarray, growth, middle: tuple[float, float]) -> np.ndarray:

@@ -9,11 +9,11 @@ Fingerprint
     the middle there are none. Radial distortion moves all colours alike; dispersion of a body acts at the body's edges.
 Validity
     a line over the wavelength: an achromat, whose two ends of the visible meet, needs a parabola. The image is
-    resampled by cubic convolution, which softens details below 2 px; in a single band without a wavelength nothing
-    happens.
+    resampled by cubic splines, which move details below 4 px by 5 % less than they should; in a single band without a
+    wavelength nothing happens.
 References
-    Born & Wolf, Principles of Optics, 4.7 (chromatic aberration of magnification); Keys, IEEE Trans. ASSP 29, 1153
-    (1981).
+    Born & Wolf, Principles of Optics, 4.7 (chromatic aberration of magnification); Unser, IEEE Signal Processing
+    Magazine 16 (6), 22 (1999).
 """
 
 from types import SimpleNamespace
@@ -35,18 +35,19 @@ def resize(image, camera):
 
 
 def check_parabola():
-    """A parabola about the axis, which cubic convolution reads exactly: its value at the distance r is that at
-    r/(1 + g), g = 0.02 at 640 nm, -0.02 at 440 nm, 0 at 540 nm; away from borders, where rows go on as they end."""
-    u, v = np.meshgrid(np.arange(60) + 0.5 - 33.0, np.arange(40) + 0.5 - 18.0)
+    """A parabola about the axis, which cubic splines read exactly: its value at the distance r is that at r/(1 + g),
+    g = 0.02 at 640 nm, -0.02 at 440 nm, 0 at 540 nm; 20 px from the borders, where rows go on as they end: what that
+    does to a spline falls by 0.268 from px to px, to 4e-12."""
+    u, v = np.meshgrid(np.arange(60) + 0.5 - 33.0, np.arange(50) + 0.5 - 23.0)
     camera = SimpleNamespace(
-        lateral_colour=0.02, bands=np.array([640.0, 540.0, 440.0]), width=60, height=40, principal_x=3.0,
+        lateral_colour=0.02, bands=np.array([640.0, 540.0, 440.0]), width=60, height=50, principal_x=3.0,
         principal_y=-2.0,
     )  # fmt: skip
     parabola = 2.0 + 0.1 * u - 0.03 * u * v + 0.05 * v**2
-    found = resize(np.repeat(parabola[..., None], 3, 2), camera)[4:-4, 4:-4]
+    found = resize(np.repeat(parabola[..., None], 3, 2), camera)[20:-20, 20:-20]
     for band, g in enumerate((0.02, 0.0, -0.02)):
         x, y = u / (1 + g), v / (1 + g)
-        expected = (2.0 + 0.1 * x - 0.03 * x * y + 0.05 * y**2)[4:-4, 4:-4]
+        expected = (2.0 + 0.1 * x - 0.03 * x * y + 0.05 * y**2)[20:-20, 20:-20]
         agree(found[..., band], expected, 1e-9, 1e-9)
 
 

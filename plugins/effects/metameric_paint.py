@@ -9,8 +9,8 @@ match.
 Fingerprint
     a channel changes by the place of the light's spectrum in its band: lights of one colour, but not of one wavelength,
     change against each other, and white ones against coloured ones. In bands that stand at 620, 540 and 460 nm nothing
-    changes. With one light in each band it is a gain of that light, which its power and rho take up; two lights in one
-    band, whose powers are known, tell it apart.
+    changes. With one light in each band it is nearly a gain of that light, which its power and rho take up but for the
+    flanks of its line; two lights in one band, 30 nm apart and of known powers, tell it apart.
 Validity
     one slope in all bands; light of lamps, not what `ambient` adds. Without bands as integrals (`bands` auto) it is
     read at the bands' wavelengths. A measured paint is given by the membrane's `reflectance`.

@@ -55,9 +55,10 @@ def auto(mitsuba, tmp_path_factory):
 
 
 def test_few_nodes_give_what_many_bands_give(mitsuba, auto, tmp_path):
-    """Six bands in place of 161, whose trapezium rule of 2.5 nm errs by 3e-4 at the kinks of the sensitivities, which
+    """Ten bands in place of 161, whose trapezium rule of 2.5 nm errs by 3e-4 at the kinks of the sensitivities, which
     are straight lines over 5 nm."""
-    assert len(auto.integral.nm) <= 7 and auto.integral.error < 1e-12  # nothing on the way depends on the wavelength
+    # two nodes in the range of a line, one in those that its flanks reach, or a phosphor's leak would
+    assert len(auto.integral.nm) == 10 and auto.integral.error < 1e-12  # nothing on the way depends on the wavelength
     fine = digit(mitsuba, tmp_path, "380:780:2.5")
     found, expected = (RenderJob(s).take() for s in (auto, fine))
     assert found.camera == pytest.approx(expected.camera, abs=4e-4 * expected.camera.max())
@@ -87,6 +88,14 @@ def test_reflectance_and_filter_are_integrated(mitsuba, tmp_path, paint):
     assert 6 < len(few.integral.nm) < 60 and few.integral.error < 3e-4
     found, expected = (RenderJob(s).take().camera for s in (few, many))
     assert np.abs(found - expected).max() < 5e-4 * expected.max()  # 3e-4 of the trapezium rule, see above
+
+
+def test_a_straight_line_needs_two_nodes(mitsuba, tmp_path):
+    """What two nodes integrate exactly is told as exact, also where a range ends within the light of an LED; and where
+    nobody says how many nodes, there are two for each range."""
+    line = {"membrane": '<string name="reflectance" value="300:0.05, 900:0.95"/>'}
+    two, free = (digit(mitsuba, tmp_path, bands, **line).integral for bands in ("auto 2", "auto"))
+    assert two.error < 1e-10 and len(free.nm) <= len(two.nm)  # 1e-10: rounding of sums over 1600 places
 
 
 @pytest.mark.parametrize("key", ["led_green.wavelength", "led_red.fwhm"])
@@ -240,10 +249,10 @@ def test_a_light_that_no_channel_sees_is_dark(mitsuba, tmp_path):
 
 
 def test_lights_that_share_bands_keep_one_spectrum(mitsuba, tmp_path):
-    """Two lamps of one curve have one set of nodes."""
+    """Three lamps of one curve have one set of nodes, two in each range."""
     xml = dict.fromkeys(("led_red", "led_green", "led_blue"), '<string name="spectrum" value="CIE LED-B3"/>')
     scene = digit(mitsuba, tmp_path, "auto", **xml)
-    assert len(scene.integral.groups) == 1 and len(scene.integral.nm) == 3
+    assert len(scene.integral.groups) == 1 and len(scene.integral.nm) == 6
     white = scene.integral.matrix() @ scene.integral.white  # what no lamp sends, in the bands of the lamps
     exact = (scene.integral.quantum * scene.integral.step).sum(1) / WHITE / scene.integral.unit
     assert white == pytest.approx(exact, rel=1e-9)

@@ -112,21 +112,27 @@ def unit(lamps: Sequence[Lamp], camera: str) -> float:
 
 
 # -- a touch sensor ---------------------------------------------------------------------------------------------------
+BENT_BY_LENS = ("lateral colour", "chromatic focus")  # what moves light from pixel to pixel
+FINE = 4  # samples of a pixel each way, on which these act: what a pixel has is the mean of what falls on it
+AROUND = 3  # pixels around the image, from which these bring light into it
+
+
 def through_lens(
-    grey: np.ndarray, weights: np.ndarray, field: np.ndarray, hidden: Mapping[str, float], other: bool, centre
+    grey: np.ndarray, weights: np.ndarray, field: np.ndarray, hidden: Mapping[str, float], other: bool
 ) -> np.ndarray:
-    """(H, W, C) image of what looks alike at all wavelengths, grey (H, W), through a lens that does not.
+    """(H, W, C) image of what looks alike at all wavelengths, grey (H, W), through a lens that does not; of what moves
+    light (BENT_BY_LENS) grey is (FINE (H + 2 AROUND), FINE (W + 2 AROUND)). The axis meets the middle of the image.
 
     weights  (C, N) what each wavelength counts in each channel;   field  (H, W) tangent of the field angle
-    centre   (x, y) px, where the axis meets the image
 
     Wavelengths go through the lens in slabs of 4 nm.
     """
     from scipy.ndimage import gaussian_filter, map_coordinates
 
+    moved = bool(set(BENT_BY_LENS) & set(hidden))
     height, width = grey.shape
     y, x = np.mgrid[:height, :width] + 0.5
-    found = np.zeros((height, width, len(weights)))
+    found = np.zeros((*field.shape, len(weights)))
     for start in range(0, len(NM), 4):
         own = slice(start, start + 4)
         counts, nm = weights[:, own].sum(1), float(NM[own].mean())
@@ -136,11 +142,14 @@ def through_lens(
         if "lateral colour" in hidden:
             away = (nm - 540) / 100
             growth = 1 + hidden["lateral colour"] * away * ((1 - 0.3 * away) if other else 1)
-            at = [(y - centre[1]) / growth + centre[1] - 0.5, (x - centre[0]) / growth + centre[0] - 0.5]
+            at = [(y - height / 2) / growth + height / 2 - 0.5, (x - width / 2) / growth + width / 2 - 0.5]
             image = map_coordinates(image, at, order=3, mode="nearest")
         if "chromatic focus" in hidden:
-            sd = np.sqrt(hidden["chromatic focus"]) * abs(nm - (525.0 if other else 540.0)) / 100
+            sd = FINE * np.sqrt(hidden["chromatic focus"]) * abs(nm - (525.0 if other else 540.0)) / 100
             image = gaussian_filter(image, sd, mode="reflect", truncate=6) if sd > 0.05 else image
+        if moved:
+            image = image.reshape(height // FINE, FINE, width // FINE, FINE).mean((1, 3))
+            image = image[AROUND:-AROUND, AROUND:-AROUND]
         if "filter edge shift" in hidden:
             soft = 14.0 if other else 10.0
             seen = NM[own] / np.sqrt(1 - hidden["filter edge shift"] * (field**2 / (1 + field**2))[..., None])

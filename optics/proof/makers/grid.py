@@ -23,7 +23,16 @@ from optics.scene.loader import Scene
 VARIANT = "llvm_ad_mono_polarized"
 # small pixels at high gain: 800 electrons are white
 CAMERA = Noise(system_gain=0.3, dark_noise=2.0, black_level=8.0, saturation=255.0, prnu=0.0)
-MAKERS = ("volume scattering", "rough walls", "index mismatch", "body absorption", "unfilled cell", "wall thickness")
+MAKERS = (
+    "volume scattering",
+    "rough walls",
+    "index mismatch",
+    "body absorption",
+    "unfilled cell",
+    "wall thickness",
+    "dispersion",
+    "coloured absorption",
+)
 PASSES = 8  # independent renders of an image
 BOX = np.array(
     [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
@@ -38,6 +47,8 @@ class GridMaker:
                                   index
               unfilled cell       (column, row, layer), full of air;  wall thickness    what is added to that of walls,
                                   mm
+              dispersion          of the filling: what its index has at 540/sqrt(2) nm more than at 540 nm
+              coloured absorption of the filling: change of ln(alpha) per 100 nm
     spp       samples per pixel of an image, over all passes
     shares    of every frame made so far: rms of the image's own error over the camera's noise
     """
@@ -73,6 +84,7 @@ class GridMaker:
         }
         self.noise, self.seed, self.spp, self.count = noise, seed, spp, 0
         self.shares: list[float] = []
+        self.bands = tuple(float(nm) for nm in scene.integrator.bands)
 
     # -- bodies -------------------------------------------------------------------------------------------------------
     def mesh(self, name: str, points, faces, **has):
@@ -136,12 +148,14 @@ class GridMaker:
         centres = [[v["object.x"], v["object.y"], z] for z in (distance, distance + v["object.length"])]
         return self.mesh("rod", np.concatenate([*ends, centres]), faces, bsdf=bsdf)
 
-    def scene(self, distance: float, panel: str):
-        """The stock scene with the rod at a distance (mm) and one panel of radiance 1."""
+    def scene(self, distance: float, panel: str, nm: float = 540.0):
+        """The stock scene with the rod at a distance (mm) and one panel of radiance 1, as it is at a wavelength."""
         import mitsuba as mi
 
         v, e, t = self.values, self.effects, mi.ScalarTransform4f
         walls, filling = v["walls.index"], v["filling.index"] + e.get("index mismatch", 0.0)
+        filling += e.get("dispersion", 0.0) * ((540 / nm) ** 2 - 1)
+        fades = np.exp(e.get("coloured absorption", 0.0) * (nm - 540) / 100)
         rough = e.get("rough walls", 0.0)
 
         def medium(absorption, scattering=0.0):
@@ -170,7 +184,8 @@ class GridMaker:
 
         resin = medium(v["walls.absorption"])
         support = medium(
-            e.get("body absorption", v["filling.absorption"]), e.get("volume scattering", v["filling.scattering"])
+            fades * e.get("body absorption", v["filling.absorption"]),
+            e.get("volume scattering", v["filling.scattering"]),
         )
         low, high = self.cells()
         filled = np.ones(self.counts, bool)
@@ -214,12 +229,12 @@ class GridMaker:
                 content[name]["emitter"] = {"type": "area", "radiance": {"type": "uniform", "value": 1.0}}
         return mi.load_dict(content, optimize=False)
 
-    def radiance(self, distance: float, panel: str) -> tuple[np.ndarray, np.ndarray]:
-        """(H, W) radiance at power 1, and its standard error from independent passes."""
+    def radiance(self, distance: float, panel: str, nm: float = 540.0) -> tuple[np.ndarray, np.ndarray]:
+        """(H, W) radiance at power 1 and a wavelength, and its standard error from independent passes."""
         import mitsuba as mi
 
         with in_variant(VARIANT):
-            scene = self.scene(distance, panel)
+            scene = self.scene(distance, panel, nm)
             passes = []
             for _ in range(PASSES):
                 self.count += 1
@@ -231,12 +246,14 @@ class GridMaker:
 
     # -- camera -------------------------------------------------------------------------------------------------------
     def photograph(self, radiance: np.ndarray, error: np.ndarray, rng) -> np.ndarray:
-        """(H, W, 1) noisy, quantised DN; what the image's own error is of that noise goes to `shares`."""
+        """(H, W, B) noisy, quantised DN of a radiance (H, W) or (H, W, B); the share that the image's own error has
+        in that noise goes to `shares`."""
         n = self.noise
         full = (n.saturation - n.black_level) * self.values["camera.exposure"]
         signal = n.black_level + full * radiance
         self.shares.append(float(np.sqrt(np.mean((full * error / n.sd(signal)) ** 2))))
-        return n.expose(signal, rng)[..., None].astype(np.float32)
+        found = n.expose(signal, rng).astype(np.float32)
+        return found if found.ndim == 3 else found[..., None]
 
     def captures(
         self, distances: Sequence[float], progress: Callable[[str, int, int], None] | None = None
@@ -248,7 +265,8 @@ class GridMaker:
             light = {}
             for k, distance in enumerate(distances):
                 for panel in self.panels:
-                    light[distance, panel] = self.radiance(distance, panel)
+                    each = [self.radiance(distance, panel, nm) for nm in self.bands]
+                    light[distance, panel] = tuple(np.stack(images, -1) for images in zip(*each))
                 if progress:
                     progress("captures", k + 1, len(distances))
         for k, distance in enumerate(distances):

@@ -25,6 +25,7 @@ from optics.scene.loader import Scene
 
 VARIANT = "llvm_ad_mono"
 FINE = 9  # samples of a pixel each way, on which blur acts; odd, so that one of them is its middle
+AROUND = 12  # pixels beyond the borders that blur brings light from
 CAMERA = Noise(system_gain=0.04, dark_noise=0.8, black_level=8.0, saturation=255.0, prnu=0.0)
 MAKERS = (
     "lens vignetting",
@@ -59,11 +60,14 @@ def presses(count: int, seed: int, width: float = 7.0, length: float = 5.0, dept
 
 def smeared(image: np.ndarray, spread: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
     """An image (H, W, C) after a blur that acts on FINE samples of a pixel each way of the cubic spline through it: a
-    kernel sampled once a pixel has the variance asked for only if that is wide (0.013 px^2 in place of 0.1)."""
+    kernel sampled once a pixel has the variance asked for only if that is wide (0.013 px^2 in place of 0.1). Light
+    comes in from AROUND pixels beyond the borders, where the image goes on with its slope."""
     from scipy.ndimage import zoom
 
-    planes = (zoom(image[..., c], FINE, order=3, mode="reflect", grid_mode=True) for c in range(image.shape[2]))
-    return np.stack([spread(plane)[FINE // 2 :: FINE, FINE // 2 :: FINE] for plane in planes], -1)
+    wide = np.pad(image, ((AROUND, AROUND), (AROUND, AROUND), (0, 0)), "reflect", reflect_type="odd")
+    planes = (zoom(wide[..., c], FINE, order=3, mode="reflect", grid_mode=True) for c in range(image.shape[2]))
+    inside = slice(FINE * AROUND + FINE // 2, -FINE * AROUND, FINE)
+    return np.stack([spread(plane)[inside, inside] for plane in planes], -1)
 
 
 class Maker:

@@ -4,7 +4,7 @@ study begins.
 base     what all of them are: strengths that make a change, the truth of a cell, captures with what is noted wrongly
 touch    digit, gelsight: stock Mitsuba's `path` (optics.proof.makers.touch)
 finger   vi2tap: stock films in the mono variant (optics.proof.makers.finger)
-grid     grid_bench: stock `volpath` (optics.proof.makers.grid)
+grid     grid_bench, in one and in three colours: stock `volpath` (optics.proof.makers.grid)
 particle particle_gel: numpy alone (optics.proof.makers.particle)
 bench    polarizer_bench: coherency matrices (optics.proof.makers.bench)
 colour   colour_bench, and digit with channels as integrals: sums in steps of 1 nm (optics.proof.makers.colour)
@@ -16,7 +16,7 @@ from optics.proof.rigs.base import Rig
 from optics.proof.rigs.bench import Bench
 from optics.proof.rigs.colour import ColourBench, DigitColour
 from optics.proof.rigs.finger import Finger
-from optics.proof.rigs.grid import Grid
+from optics.proof.rigs.grid import Grid, GridColour
 from optics.proof.rigs.laboratory import (
     Laser,
     Motor,
@@ -37,6 +37,7 @@ RIGS: dict[str, type[Rig]] = {
         Gelsight,
         Finger,
         Grid,
+        GridColour,
         ParticleGel,
         Bench,
         ColourBench,

@@ -173,16 +173,21 @@ class WildColour(Wild):
     def light(self, press) -> dict[str, np.ndarray]:
         v, hidden, other = self.values, self.hidden, self.bent
         whole = {f"{self.membrane}.rho_{c}": 1.0 for c in "rgb"}
+        size, spp, fov = self.size, self.spp, f"{self.camera}.x_fov"
         self.values = {**v, **whole}
+        if set(colour.BENT_BY_LENS) & set(hidden):
+            wide = [n + 2 * colour.AROUND for n in size]
+            half = np.tan(np.radians(v[fov]) / 2) * wide[0] / size[0]
+            self.values[fov] = 2 * float(np.degrees(np.arctan(half)))
+            self.size, self.spp = (colour.FINE * wide[0], colour.FINE * wide[1]), spp // colour.FINE**2
         try:
             grey = {led: image[..., 0] for led, image in super().light(press).items()}
             ways = {led: self._way(led, press) for led in grey} if "gel yellowing" in hidden else {}
         finally:
-            self.values = v
+            self.values, self.size, self.spp = v, size, spp
         quantum = colour.sensitivities(SENSOR, hidden, other)
         quantum = quantum * colour.reflectance([v[f"{self.membrane}.rho_{c}"] for c in "rgb"], hidden, other)
         x, y = self._tangents()
-        width, height = self.size
         found = {}
         for led, image in grey.items():
             weights = quantum * colour.spectrum(self.lamps[led], hidden, other)
@@ -192,7 +197,7 @@ class WildColour(Wild):
                 found[led] = image[..., None] * (kept @ weights.T)
             else:
                 field = np.hypot(x, y)
-                found[led] = colour.through_lens(image, weights, field, hidden, other, (width / 2, height / 2))
+                found[led] = colour.through_lens(image, weights, field, hidden, other)
         return found
 
     def _way(self, led: str, press) -> np.ndarray:

@@ -1,5 +1,5 @@
 """`grid_bench`: a small printed grid, a rod at three distances, by stock Mitsuba's `volpath`
-(optics.proof.makers.grid)."""
+(optics.proof.makers.grid); in one colour, and in three for what changes with the wavelength."""
 
 from __future__ import annotations
 
@@ -38,14 +38,14 @@ class Grid(ImageRig):
     width, height, spp = 32, 24, 8192
 
     def scene(self):
-        return scenes.load(self.name, {**self.defines, "width": str(self.width), "height": str(self.height)})
+        return scenes.load("grid_bench", {**self.defines, "width": str(self.width), "height": str(self.height)})
 
     def built(self, scene, seed: int) -> dict[str, float]:
         rng = np.random.default_rng([seed, 1])
         return {f"{name}.power": rng.uniform(0.9, 1.1) for name in scene.sources}
 
     def captures(self, cell: Cell, truth, unknown, *, mean: bool = False) -> capture_files.Captures:
-        scene = scenes.load(self.name, {"width": str(self.width), "height": str(self.height)})
+        scene = self.scene()
         hidden = {
             e: s + (self.start(scene, self.keys(scene, e)[0]) if e != "wall thickness" else 0.0)
             for e, s in truth.items()
@@ -64,3 +64,19 @@ class Grid(ImageRig):
 
     def parameters(self, effect: str):
         return None if effect in self.uncounted else super().parameters(effect)
+
+
+class GridColour(Grid):
+    """The same in red, green and blue, at two distances and with coarser pixels: each wavelength goes its own way
+    through the filling, or loses its own share there."""
+
+    name = "grid_colour"
+    effects = ("dispersion", "coloured absorption")
+    mistakes = ()
+    defines = {**Grid.defines, "bands": "610, 540, 460"}
+    held_out = ("distance-01",)
+    several = {"dispersion": ("filling.dispersion",), "coloured absorption": ("filling.absorption_slope",)}
+    most = {"dispersion": 0.05, "coloured absorption": 3.0}
+    uncounted = ()
+    distances = (2.5, 4.5)
+    width, height, spp = 20, 15, 4096

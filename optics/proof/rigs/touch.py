@@ -166,6 +166,7 @@ class Wild(Workshop, synthetic.Maker):
     def light(self, press: Sequence[float]) -> dict[str, np.ndarray]:
         key = (
             self.seed,
+            self.size,
             self.clutter,
             self.other,
             tuple(np.round(press, 9)),
