@@ -104,6 +104,7 @@ class Explanation:
     told         effect -> what is known of its strengths where a gauge leaves only combinations, in words
     same_as      name of a better one that survives and predicts the same values, under another name: no value of these
                  captures can tell the two apart, however often it is taken again; '' for none
+    larger       whether it contains one that survives, and has a better score: likelier, but not shown to be needed
     """
 
     effects: list[str]
@@ -121,6 +122,12 @@ class Explanation:
     survives: bool
     told: dict[str, str] = field(default_factory=dict)
     same_as: str = ""
+    larger: bool = False
+
+    @property
+    def possible(self) -> bool:
+        """Whether it may be the truth, by what the captures tell."""
+        return self.survives or self.larger
 
     @property
     def complete(self) -> bool:
@@ -133,9 +140,9 @@ class Explanation:
 
 
 def kinds_of(explanations: Sequence[Explanation]) -> list[list[Explanation]]:
-    """The explanations that survive, those together that predict the same values (`Explanation.same_as`)."""
+    """The explanations that may be the truth, those together that predict the same values (`Explanation.same_as`)."""
     found: dict[str, list[Explanation]] = {}
-    for e in [e for e in explanations if e.survives]:
+    for e in [e for e in explanations if e.possible]:
         found.setdefault(e.same_as or e.name, []).append(e)
     return list(found.values())
 
