@@ -131,7 +131,7 @@ def diagnose(
     remarks.write_verdicts(table, word, subject, outcome, splits)
     rows, names = [c.row for c in table.order], [c.effect.name for c in chosen]
     gaps, correct = _gaps(evidence, chosen)
-    ambiguous = list(dict.fromkeys(name for e in told if e.survives for name in e.effects))
+    ambiguous = list(dict.fromkeys(name for e in told if e.possible for name in e.effects))
     kinds = [[e.name for e in kind] for kind in kinds_of(told)]
     if findings.fragile and findings.fragile not in ambiguous:  # by other weights or masks it is the best
         ambiguous.append(findings.fragile)
@@ -196,7 +196,8 @@ def _split(case: Case, outcome: Outcome, subject: Candidate | None, basis: Basis
     splits: list[Split] = []
     chance = math.nan
     done: set[str] = set()
-    for told, trial in zip([e for e in outcome.told() if e.survives], outcome.survivors):
+    left = {frozenset(e.effects): e for e in outcome.told()}
+    for trial in outcome.survivors:
         if not trial.members or len(done) >= MAX_SPLIT:
             continue
         main = (
@@ -220,7 +221,7 @@ def _split(case: Case, outcome: Outcome, subject: Candidate | None, basis: Basis
             case.say,
             main,
             trial.fit,
-            told,
+            left[trial.names],
             net,
             beside,
             explanations.noise_of(case, outcome, trial) if case.evidence.is_table else None,

@@ -167,10 +167,15 @@ class Products:
         score = self.score[fitted:] - across @ self.score[:fitted]
         chi2 = self.square - float(self.score[:fitted] @ inverse @ self.score[:fitted])
         free, first = self.count - rank, beside - fitted
+        # what a fit takes up but for rounding, as a leak does a lamp behind crossed films, is not seen
+        seen = np.diag(information) > st.VISIBLE * np.diag(self.gram)[fitted:]
+        information, score = information * np.outer(seen, seen), score * seen
         if free < FEWEST or not np.diag(information)[first:].any():
             return None
-        mixed = np.linalg.solve(np.eye(first) + information[:first, :first], information[:first, first:])
-        chi2 -= float(score[:first] @ np.linalg.solve(np.eye(first) + information[:first, :first], score[:first]))
+        # of alike images that are 1e9 times larger than noise, rounding leaves no difference, nor its sign
+        inverse, _ = st.inverse(np.eye(first) + information[:first, :first])
+        mixed = inverse @ information[:first, first:]
+        chi2 -= float(score[:first] @ inverse @ score[:first])
         shares, turn = np.linalg.eigh(information[first:, first:] - information[first:, :first] @ mixed)
         square = (turn.T @ (score[first:] - mixed.T @ score[:first])) ** 2
         widths = np.concatenate([[0.0], WIDTHS])[:, None] ** 2

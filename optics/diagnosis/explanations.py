@@ -123,6 +123,8 @@ class Outcome:
 
     leader       the explanation with the best score; best: the simplest that is not told apart from it
     survivors    all that are not told apart from the best, the best first
+    larger       explanations that contain survivors and have a better score than any that they contain: that more is
+                 needed is not shown, but likelier than not
     core         effects that every survivor has
     leads        explanation -> (lead of the best in score, lead needed)
     scale        chi2 per degree of freedom that the best leaves, at least 1; correlation: of the readings about it
@@ -139,6 +141,7 @@ class Outcome:
     leads: dict[frozenset[str], tuple[float, float]] = field(default_factory=dict)
     shared: bool = False
     wander: float = 0.0
+    larger: list[Trial] = field(default_factory=list)
 
     @property
     def core(self) -> list[str]:
@@ -193,6 +196,7 @@ class Outcome:
                     survives=bool(t.members) and t in self.survivors,
                     told={c.effect.name: known_of(t.fit, c) for c in t.members if t in self.survivors},
                     same_as=same.get(t.names, ""),
+                    larger=t in self.larger,
                 )
             )
         return found
@@ -201,7 +205,7 @@ class Outcome:
         """The survivors that predict the same values as a better one, by its name."""
         found: dict[frozenset[str], str] = {}
         first: list[Trial] = []
-        for t in sorted((t for t in self.survivors if t.members), key=self.trials.index):
+        for t in sorted((t for t in [*self.survivors, *self.larger] if t.members), key=self.trials.index):
             for o in first:
                 if sum(float(np.sum((a - b).astype(float) ** 2)) for a, b in zip(t.images, o.images)) < ALIKE:
                     found[t.names] = " with ".join(c.effect.name for c in o.members)
@@ -282,7 +286,7 @@ def search(case: Case, chosen: Sequence[Candidate], fits: dict[str, Fit]) -> Out
     for name in sorted(race.leader.names):
         race.widen(without=name)
     outcome = compete(case, list(trials.values()))
-    if race.exchange(outcome.survivors):
+    if race.exchange([*outcome.survivors, *outcome.larger]):
         outcome = compete(case, list(trials.values()))
     return _weighed_by_blocks(case, outcome)
 
@@ -555,8 +559,9 @@ def compete(case: Case, trials: list[Trial]) -> Outcome:
         scale = max(_readings(case, best).correlation().scale, 1.0)
         correlation = _readings(case, best).noise(scale)
         for i, t in enumerate(order):
+            t.deviance = t.after / scale
             # from what its refit reached: where that stopped short, images promise what no refit brings
-            if i < CONTENDERS or len(t.members) < 2:
+            if i < CONTENDERS or len(t.members) < 2 or t.readings is not None:
                 t.gain = _readings(case, t).noise(scale).gain
                 t.deviance = _readings(case, t).reached / scale - t.gain
         # whitened by what readings of one setting share, residuals are larger: of the others by as much as the base's
@@ -613,6 +618,26 @@ def noise_of(case: Case, outcome: Outcome, trial: Trial) -> Correlation:
 
 
 def _with_survivors(case: Case, outcome: Outcome) -> Outcome:
+    outcome = _survived(case, outcome)
+    outcome.larger = _larger(case, outcome) if outcome.best.members else []
+    return outcome
+
+
+def _larger(case: Case, outcome: Outcome) -> list[Trial]:
+    """See `Outcome`."""
+    found: list[Trial] = []
+    for t in sorted(outcome.trials, key=lambda t: len(t.members)):
+        inner = [o for o in (*outcome.survivors, *found) if o.members and o.keys < t.keys]
+        if not inner or t in outcome.survivors or any(outcome.score(o) >= outcome.score(t) for o in inner):
+            continue
+        if outcome.shared and not _adds_to_noise(t, outcome.base):
+            continue
+        if t is outcome.leader or not _told(case, outcome, outcome.leader, t):
+            found.append(t)
+    return found
+
+
+def _survived(case: Case, outcome: Outcome) -> Outcome:
     best = outcome.leader
     base = outcome.base
     lead, needed = _lead(case, outcome, best, base) if best.members else (0.0, 0.0)

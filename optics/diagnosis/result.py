@@ -104,6 +104,7 @@ class Explanation:
     told         effect -> what is known of its strengths where a gauge leaves only combinations, in words
     same_as      name of a better one that survives and predicts the same values, under another name: no value of these
                  captures can tell the two apart, however often it is taken again; '' for none
+    larger       whether it contains one that survives, and has a better score: likelier, but not shown to be needed
     """
 
     effects: list[str]
@@ -121,6 +122,12 @@ class Explanation:
     survives: bool
     told: dict[str, str] = field(default_factory=dict)
     same_as: str = ""
+    larger: bool = False
+
+    @property
+    def possible(self) -> bool:
+        """Whether it may be the truth, by what the captures tell."""
+        return self.survives or self.larger
 
     @property
     def complete(self) -> bool:
@@ -133,9 +140,9 @@ class Explanation:
 
 
 def kinds_of(explanations: Sequence[Explanation]) -> list[list[Explanation]]:
-    """The explanations that survive, those together that predict the same values (`Explanation.same_as`)."""
+    """The explanations that may be the truth, those together that predict the same values (`Explanation.same_as`)."""
     found: dict[str, list[Explanation]] = {}
-    for e in [e for e in explanations if e.survives]:
+    for e in [e for e in explanations if e.possible]:
         found.setdefault(e.same_as or e.name, []).append(e)
     return list(found.values())
 
@@ -232,6 +239,11 @@ class Split:
     holds: bool
 
 
+def _occam(dof: int, fall: float) -> float:
+    """dof ln(1 + fall/dof): what numbers could have fitted with a prior as wide as they were found."""
+    return dof * math.log1p(max(fall, 0.0) / dof)
+
+
 @dataclass(frozen=True)
 class Fingerprint:
     """The residual as a curve along one coordinate, after projecting off what a calibration absorbs.
@@ -243,6 +255,8 @@ class Fingerprint:
     family      what the coordinate belongs to (`optics.diagnosis.fingerprints`)
     share       of the excess misfit, NaN within noise
     size        rms change that it makes, over the rms signal
+    seen        fall of chi2 by its bins alone, in the noise that is left with them; NaN: `fall`. Beside noise that
+                neighbours share, `fall` is what is gained over that noise, which bins take the place of
     """
 
     coordinate: str
@@ -260,13 +274,14 @@ class Fingerprint:
     share: float = math.nan
     unit: str = ""
     size: float = 0.0
+    seen: float = math.nan
 
     @property
     def cost(self) -> float:
-        """dof ln(1 + fall/dof) + 3 ln(1 + (size/USUAL)^2/2) + EACH: what so many bins could have fitted, whatever the
+        """dof ln(1 + seen/dof) + 3 ln(1 + (size/USUAL)^2/2) + EACH: what so many bins could have fitted, whatever the
         data are, with a prior as wide as the curve that was found; how far that width is from usual; and the odds that
         an unknown cause acts. The same three costs as of an effect (`optics.diagnosis.explanations`)."""
-        bins = self.dof * math.log1p(max(self.fall, 0.0) / self.dof)
+        bins = _occam(self.dof, self.fall if math.isnan(self.seen) else self.seen)
         return bins + 3 * math.log1p((self.size / USUAL) ** 2 / 2) + EACH
 
 
@@ -275,7 +290,7 @@ class Law:
     """A freer law of an effect that the model has: its strength changes slowly along a coordinate.
 
     fall, dof   with so many further strengths, of chi2 or, of readings, of deviance (optics.diagnosis.correlation)
-    p           of that fall in noise
+    p           of that fall in noise;   seen: as of `Fingerprint`
     """
 
     effect: str
@@ -283,11 +298,12 @@ class Law:
     fall: float
     dof: int
     p: float
+    seen: float = math.nan
 
     @property
     def cost(self) -> float:
         """As of `Fingerprint`."""
-        return self.dof * math.log1p(max(self.fall, 0.0) / self.dof)
+        return _occam(self.dof, self.fall if math.isnan(self.seen) else self.seen)
 
     @property
     def score(self) -> float:

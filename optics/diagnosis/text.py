@@ -382,17 +382,18 @@ def _cells(r: Row, d: Diagnosis) -> tuple[str, ...]:
 
 
 def _explanation_lines(d: Diagnosis) -> list[str]:
-    """The explanations that survive, and the best of those that do not."""
+    """The explanations that may be the truth, and the best of the others."""
     if len([e for e in d.explanations if e.effects]) < 2:
         return []
-    alive = d.survivors
-    others = [e for e in d.explanations if e.effects and not e.survives]
+    alive = [e for e in d.explanations if e.possible]
+    others = [e for e in d.explanations if e.effects and not e.possible]
     head = ("explanation", "fall", "cost", "excess left", "behind", "needed", "blocks left out", "")
     lines = []
     for e in [*alive[:6], *others[:5]]:
         blocks = "-" if math.isnan(e.ahead) else f"{e.ahead:+.4g}"
         behind, needed = ("-", "-") if e in alive[:1] else (f"{e.lead:.3g}", f"{e.needed:.3g}")
-        mark = "survives" if e.survives else "" if e.lead > e.needed else "the same with more"
+        more = "the same with more, and likelier" if e.larger else "the same with more"
+        mark = "survives" if e.survives else more if e.larger or not e.lead > e.needed else ""
         lines.append((e.name, f"{e.fall:.4g}", f"{e.cost:.3g}", f"{e.excess_sd:.2g} sd", behind, needed, blocks, mark))
     return [
         "",

@@ -1196,7 +1196,11 @@ def _explanations(d: Mapping) -> list[dict]:
     sets = [e for e in d.get("explanations") or () if e.get("effects")]
     if len(sets) < 2:
         return []
-    alive, others = ([e for e in sets if bool(e.get("survives")) == wanted] for wanted in (True, False))
+
+    def possible(e: Mapping) -> bool:
+        return bool(e.get("survives") or e.get("larger"))
+
+    alive, others = ([e for e in sets if possible(e) == wanted] for wanted in (True, False))
     return [
         {
             "name": " + ".join(e["effects"]),
@@ -1205,7 +1209,7 @@ def _explanations(d: Mapping) -> list[dict]:
             "excess": _text(as_float(e.get("excess_sd")), "{:.2g}") + " sd",
             "lead": "–" if e in alive[:1] else _text(as_float(e.get("lead")), "{:.3g}"),
             "needed": "–" if e in alive[:1] else _text(as_float(e.get("needed")), "{:.3g}"),
-            "survives": bool(e.get("survives")),
+            "survives": possible(e),
             "why": "" if as_float(e.get("lead")) > as_float(e.get("needed")) else "the same with more",
         }
         for e in [*alive[:8], *others[:4]]

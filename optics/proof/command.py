@@ -6,6 +6,7 @@ import multiprocessing
 import os
 import sys
 import time
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -70,9 +71,11 @@ def main(
     made = {c.name: r for _, batch in tasks for c in batch if (r := blind.take_up(folder / f"{c.name}.json"))}
     if keep:
         kept.add(cells, made)
-    both = {**known, **made}
-    records = [both[c.name] for _, batch in tasks for c in batch if c.name in both]
-    planned = sum(len(batch) for _, batch in tasks)
+    of_plan = [c.name for _, batch in tasks for c in batch]
+    if quick:
+        known = {name: known[name] for name in of_plan if name in known}
+    records = counted(of_plan, {**known, **made}, names, kind)
+    planned = max(len(of_plan), len(records))
     if not records:
         raise typer.BadParameter(
             f"{folder} holds no record of this plan, nor does {cells}; run without --count", param_hint="--count"
@@ -80,6 +83,15 @@ def main(
     found = count.count(records, planned)
     print(found.text())
     print(f"page: {page.write(found, records, output / 'proof.html')}")
+
+
+def counted(
+    planned: Sequence[str], records: Mapping[str, dict], rigs: Sequence[str], kinds: Sequence[str] | None
+) -> list[dict]:
+    """The records {name of a cell: record} of a plan, then those of these rigs and kinds beyond its rounds."""
+    cells = {name: record["cell"] for name, record in records.items()}
+    beyond = sorted(name for name, c in cells.items() if c["rig"] in rigs and (not kinds or c["kind"] in kinds))
+    return [records[name] for name in dict.fromkeys([*planned, *beyond]) if name in records]
 
 
 def _run(todo, folder: Path, jobs: int, minutes: float) -> None:

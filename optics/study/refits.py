@@ -31,7 +31,7 @@ ROUGH = 0.5  # chi2 per variable at which a refit of a diagnosis, which compares
 # left, falls that differ by less than a fifth decide nothing (`optics.diagnosis.thresholds.MARGIN`).
 COARSE = 0.01
 AS_PROMISED = 0.7  # of the promised fall: a calibration that falls by more has not ended in another minimum
-FEW = 4  # iterations of a refit that continues one
+FEW = 12  # iterations of a refit that continues one: chord steps have brought it near
 
 
 class Refits:
@@ -96,12 +96,12 @@ class Refits:
         return self.chords[names]
 
     def calibrated(self, variables: Sequence[Variable], extra: Sequence[Variable], frames: Sequence[int]) -> Fit:
-        """The fit by chord steps, and where these come near the best without an end, a calibration that continues them;
-        where that falls short of what was promised, one from the study's start values: a strong effect may have bent
-        the base's values far from the truth."""
+        """The fit by chord steps, and where these have no end but come near the best, or were promised to, a
+        calibration that continues them; where that falls short of what was promised, one from the study's start values:
+        a strong effect may have bent the base's values far from the truth."""
         quick = self.chord(extra)
         leader = max(map(self.fall, (*self.chords.values(), *self.results.values())))
-        if quick.converged or not self.fall(quick) > PROMISING * leader:
+        if quick.converged or not max(self.fall(quick), quick.promised) > PROMISING * leader:
             return quick
         asked = self.minimised(self.base) - PROMISING * leader
         further = calibrate.fit(

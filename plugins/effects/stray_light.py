@@ -4,7 +4,7 @@ Definition
     I' = I + s                                                   s in units of radiance, the same in all bands
 Fingerprint
     an offset that depends neither on the angle of a polarizer nor on the power of the source. It scales with the
-    exposure, which a dark offset does not; a leak scales with the source.
+    exposure, which a dark offset does not; a leak scales with the source. Light adds: what is missing is no stray light.
 Validity
     constant over a session and over the image.
 References
@@ -40,7 +40,7 @@ effect = Effect(
     stages={"lens": add},
     parameters=(
         Parameter(
-            "stray", "1", 0.0, (-1e3, 1e3), "radiance s added to every pixel", neutral=0.0, plausible=0.01, how="image"
+            "stray", "1", 0.0, (0.0, 1e3), "radiance s added to every pixel", neutral=0.0, plausible=0.01, how="image"
         ),
     ),
     requires=("polarizer_film",),

@@ -53,6 +53,20 @@ def test_noise_that_is_stated_too_small_is_no_dial_error():
     assert sum(w is not None and w.gain > 6 for w in widths) <= 2
 
 
+def test_images_that_dwarf_the_noise_change_no_width():
+    """Three leaks that are alike and 1e9 times as large as noise, as behind crossed films whose model is dark: rounding
+    leaves of their differences what has no sign. The width is that of a bench with one of them."""
+    rng = np.random.default_rng(5)
+    residual = drawn(rng, 0.5)
+    leak = (LIGHT**2)[:, None]
+    one = np.column_stack([FITTED, leak, BESIDE, np.diag(SLOPE)])
+    plain = Products.of(one, residual).most_likely(2, 5)
+    for size in 10.0 ** np.arange(3, 11):
+        alike = size * leak * (1 + 1e-9 * rng.standard_normal((COUNT, 3)))
+        found = Products.of(np.column_stack([FITTED, alike, BESIDE, np.diag(SLOPE)]), residual).most_likely(2, 7)
+        assert found is not None and found.sd == pytest.approx(plain.sd, rel=0.1), size
+
+
 def test_the_likelihood_is_that_of_the_covariance():
     """-2 ln L = r' P r + ln det V, restricted to what no fit touches, at the scale 1."""
     rng = np.random.default_rng(4)

@@ -167,3 +167,16 @@ def test_makers_blur_has_the_variance_that_is_hidden(variance):
     cells = np.mgrid[: len(disc), : len(disc)][1] - len(disc) // 2
     # a disc of cells is a ninth of a pixel wider, in variance 1/12 of its square
     assert float((disc * cells**2).sum()) / maker.FINE**2 == pytest.approx(variance, abs=0.002)
+
+
+def test_finished_cells_beyond_the_plan_are_counted():
+    """Cells of a later round that are kept belong to the count; those of other sensors and kinds do not."""
+    from optics.proof.command import counted
+
+    def record(name, rig="student", kind="none"):
+        return {"name": name, "cell": {"rig": rig, "kind": kind}}
+
+    records = {name: record(name) for name in "dba"}
+    records |= {"p": record("p", kind="pair"), "g": record("g", rig="gelsight")}
+    assert [r["name"] for r in counted(["b", "c"], records, ["student"], ["none"])] == ["b", "a", "d"]
+    assert [r["name"] for r in counted(["b"], records, ["student"], None)] == ["b", "a", "d", "p"]

@@ -75,3 +75,64 @@ def test_plausibility_alone_must_lead_by_more(monkeypatch, fit, cost, needed):
     monkeypatch.setattr(explanations, "_lead", lambda *a: (lead, explanations.TOLD))
     outcome = SimpleNamespace(best=best, trials=[best, pair])
     assert explanations._without(None, outcome, subject) == (pair, lead, needed)
+
+
+@pytest.mark.parametrize(
+    "deviance, lead, larger",
+    [
+        (88.0, 0.0, ["a", "b"]),  # 12 for 9.1: below what is significant among many effects, and yet likelier
+        (92.0, 0.0, []),  # 8 for 9.1
+        (88.0, 8.0, []),  # ruled out by another
+    ],
+)
+def test_a_set_names_what_is_likelier_than_its_simplest_member(deviance, lead, larger):
+    """An effect, and the same with a second one whose fall is not significant: both may be the truth."""
+
+    def trial(names, deviance, cost):
+        keys = {(name, None) for name in names}
+        own = {"names": frozenset(names), "keys": keys, "members": list(names), "ahead": 0.0}
+        return SimpleNamespace(deviance=deviance, cost=cost, after=150.0, **own)
+
+    base, one, both, other = (
+        trial("", 150.0, 0.0),
+        trial("a", 100.0, 9.9),
+        trial("ab", deviance, 19.0),
+        trial("c", 99, 9),
+    )
+    leads = {one.names: (0.0, 5.9), both.names: (lead, 5.9)}
+    outcome = explanations.Outcome(other, one, [one, other], [other, both, one, base], 1.0, None, leads)
+    assert [c for t in explanations._larger(None, outcome) for c in t.members] == larger
+
+
+def test_all_sets_are_weighed_by_one_noise(monkeypatch):
+    """Where noise that neighbours share explains what seemed to be noise of twice the size, sets too many to be asked
+    for shared noise of their own are weighed by that size too: they came out ahead, at half of their chi2."""
+
+    def trial(n):
+        names, after = frozenset(f"{n}ab" if n else ""), 100.0 + n
+        return SimpleNamespace(
+            names=names,
+            members=[*names],
+            keys={(name, None) for name in names},
+            fall=200.0 - after,
+            after=after,
+            cost=1.0,
+            gain=0.0,
+            readings=None,
+        )
+
+    trials = [trial(n) for n in range(explanations.CONTENDERS + 20)]
+    readings = {
+        "correlation": lambda: SimpleNamespace(scale=1.0),
+        "noise": lambda scale: SimpleNamespace(gain=20.0),
+    }
+    monkeypatch.setattr(explanations, "_scale", lambda *_: 2.0)
+    monkeypatch.setattr(explanations, "_bound_wander", lambda *_: None)
+    monkeypatch.setattr(explanations, "_readings", lambda _, t: SimpleNamespace(reached=t.after, **readings))
+    monkeypatch.setattr(explanations, "wander_of", lambda *_: 0.0)
+    monkeypatch.setattr(explanations, "_lead", lambda *_: (0.0, 0.0))
+    monkeypatch.setattr(explanations, "_with_survivors", lambda _, outcome: outcome)
+    case = SimpleNamespace(evidence=SimpleNamespace(is_table=True), session=SimpleNamespace(most=np.inf))
+    outcome = explanations.compete(case, trials)
+    assert outcome.leader.after == 101.0
+    assert {t.deviance - t.after for t in outcome.trials} == {0.0, -20.0}

@@ -78,6 +78,13 @@ def test_what_every_explanation_holds_is_claimed(tmp_path):
     assert "analyzer.offset - polarizer.offset = 2.0" in told or "analyzer.offset - polarizer.offset = 1.9" in told
 
 
+def test_less_than_dark_is_no_stray_light(tmp_path):
+    """A meter whose zero is too low: light past the films can only add."""
+    d = judged(tmp_path, noisy(malus(MALUS, stray=-0.02)))
+    assert d.survivors and all("stray light" not in e.effects for e in d.survivors), d.sentence
+    assert any("dark offset" in e.effects for e in d.survivors)
+
+
 def test_far_from_plausible_is_no_tie():
     """Half a wave, 18 plausible sizes, or 36 of them, against 1: the odds are beyond 19 to 1."""
     angle = Parameter("angle", "deg", 0.0, neutral=0.0, plausible=10.0)
