@@ -4,7 +4,7 @@ Definition
     I' = I + s                                                   s in units of radiance, the same in all bands
 Fingerprint
     an offset that depends neither on the angle of a polarizer nor on the power of the source. It scales with the
-    exposure, which a dark offset does not; a leak scales with the source. Light adds: what is missing is no stray light.
+    exposure, which a dark offset does not; a leak scales with the source. Light only adds.
 Validity
     constant over a session and over the image.
 References
