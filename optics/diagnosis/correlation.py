@@ -136,14 +136,6 @@ class Readings:
                 best = Correlation(scale, float(self.power[i]), float(self.length[i]), kind, float(gains[i]))
         return best
 
-    def left(self, noise: Correlation) -> float:
-        """r' V^-1 r / scale beside a noise that was found, of readings in the same order and with the same loads."""
-        for kind, left, *_ in self.shared:
-            if noise.power and kind == noise.kind:
-                place = np.abs(np.log(self.power / noise.power)) + np.abs(np.log(self.length / noise.length))
-                return float(left[np.argmin(place)]) / noise.scale
-        return self.white / noise.scale
-
     def correlation(self) -> Correlation:
         """By restricted maximum likelihood; one that noise alone makes (NOTED) is none."""
         best = Correlation(self.white / max(self.free, 1))
@@ -155,15 +147,6 @@ class Readings:
                 scale = float(left[i] / self.free)
                 best = Correlation(scale, float(self.power[i]), float(self.length[i]), kind, float(gains[i]))
         return best
-
-
-def gained(before: Readings, after: Readings, scale: float) -> tuple[float, float]:
-    """(fall of deviance by what is fitted besides, fall of chi2 by it in the noise that is left with it).
-
-    What takes the place of shared noise gains little over that noise, but could have fitted as much as in its
-    absence."""
-    noise = after.noise(scale)
-    return before.deviance(scale) - after.deviance(scale), before.left(noise) - after.left(noise)
 
 
 def powers(bright: float) -> np.ndarray:

@@ -15,7 +15,6 @@ from dataclasses import replace
 import numpy as np
 
 from optics.diagnosis import statistics as st
-from optics.diagnosis.correlation import gained
 from optics.diagnosis.decide import ordered
 from optics.diagnosis.evidence import Evidence, Progress
 from optics.diagnosis.result import Family, Fingerprint
@@ -204,8 +203,7 @@ def beside_shared_noise(
     scale: float,
 ) -> list[Fingerprint]:
     """The significant curves, with their falls of deviance (`optics.diagnosis.correlation`): beside noise that
-    neighbours share, a curve along what was turned slowly counts for less, as a lamp that wanders brings it too. One
-    that takes the place of that noise pays for its bins as it would without it (`Fingerprint.seen`).
+    neighbours share, a curve along what was turned slowly counts for less, as a lamp that wanders brings it too.
 
     scale   variance over the stated one
     """
@@ -222,9 +220,10 @@ def beside_shared_noise(
         dof = before.free - after.free
         if not 0 < dof < before.free:
             continue
-        fall, seen = gained(before, after, scale)
-        p = _chance(evidence, fall, dof, before.free, reached)
-        judged.append(replace(f, fall=fall, dof=dof, p=p, net=fall - dof, seen=seen))
+        fall = reached - after.deviance(scale)
+        judged.append(
+            replace(f, fall=fall, dof=dof, p=_chance(evidence, fall, dof, before.free, reached), net=fall - dof)
+        )
     return judged
 
 

@@ -16,7 +16,6 @@ from scipy.stats import rankdata
 
 from optics.diagnosis import fingerprints as prints
 from optics.diagnosis import statistics as st
-from optics.diagnosis.correlation import gained
 from optics.diagnosis.evidence import Evidence
 from optics.diagnosis.result import Law
 from optics.diagnosis.session import Frames, Session
@@ -59,9 +58,9 @@ def other_laws(
             x = np.concatenate([p[coordinate] for p in places])
             laws = []
             for images in _strengths(evidence, own, x):
-                fall, dof, seen = judge(images)
+                fall, dof = judge(images)
                 if dof:
-                    laws.append(Law(effect.name, coordinate, fall, dof, float(chdtrc(dof, max(fall, 0.0))), seen))
+                    laws.append(Law(effect.name, coordinate, fall, dof, float(chdtrc(dof, max(fall, 0.0)))))
             found += [max(laws, key=lambda law: law.score)] if laws else []
     return sorted(found, key=lambda law: -law.score)
 
@@ -83,13 +82,10 @@ def _strengths(evidence: Evidence, own: Sequence[int], x: np.ndarray) -> Iterato
         ]
 
 
-Judge = Callable[[Sequence[np.ndarray]], tuple[float, int, float]]  # images -> fall, dof, seen: as of `Law`
+def _fall_of_images(evidence: Evidence) -> Callable[[Sequence[np.ndarray]], tuple[float, int]]:
+    """(fall of chi2, dof) of further images of each block."""
 
-
-def _fall_of_images(evidence: Evidence) -> Judge:
-    """(fall of chi2, dof, the fall again) of further images of each block."""
-
-    def fall_of(images: Sequence[np.ndarray]) -> tuple[float, int, float]:
+    def fall_of(images: Sequence[np.ndarray]) -> tuple[float, int]:
         count, first = images[0].shape[1], len(evidence.columns)
         normal = evidence.thinned(extra=count)
         for block, own in zip(evidence.blocks, images):
@@ -97,22 +93,21 @@ def _fall_of_images(evidence: Evidence) -> Judge:
         rest = list(range(first, first + count))
         projected = evidence.project(normal, evidence.base, rest, evidence.thinning)
         fall, dof, *_ = st.joint(projected, np.diag(normal.gram)[rest])
-        return fall * evidence.thinning, dof, fall * evidence.thinning
+        return fall * evidence.thinning, dof
 
     return fall_of
 
 
-def _fall_of_readings(evidence: Evidence, session: Session | Frames, scale: float) -> Judge:
+def _fall_of_readings(
+    evidence: Evidence, session: Session | Frames, scale: float
+) -> Callable[[Sequence[np.ndarray]], tuple[float, int]]:
     """The same beside noise that neighbours share, in units of the scale."""
     base, r = evidence.dense(evidence.base), np.concatenate([block.r for block in evidence.blocks])
-    rank, before = st.orthonormal(base).shape[1], session.about(r, base)
+    rank, before = st.orthonormal(base).shape[1], session.about(r, base).deviance(scale)
 
-    def fall_of(images: Sequence[np.ndarray]) -> tuple[float, int, float]:
+    def fall_of(images: Sequence[np.ndarray]) -> tuple[float, int]:
         whole = np.hstack([base, np.concatenate(images)])
         dof = st.orthonormal(whole).shape[1] - rank
-        if not dof:
-            return 0.0, 0, 0.0
-        fall, seen = gained(before, session.about(r, whole), scale)
-        return fall, dof, seen
+        return before - session.about(r, whole).deviance(scale) if dof else 0.0, dof
 
     return fall_of

@@ -239,11 +239,6 @@ class Split:
     holds: bool
 
 
-def _occam(dof: int, fall: float) -> float:
-    """dof ln(1 + fall/dof): what numbers could have fitted with a prior as wide as they were found."""
-    return dof * math.log1p(max(fall, 0.0) / dof)
-
-
 @dataclass(frozen=True)
 class Fingerprint:
     """The residual as a curve along one coordinate, after projecting off what a calibration absorbs.
@@ -255,8 +250,6 @@ class Fingerprint:
     family      what the coordinate belongs to (`optics.diagnosis.fingerprints`)
     share       of the excess misfit, NaN within noise
     size        rms change that it makes, over the rms signal
-    seen        fall of chi2 by its bins alone, in the noise that is left with them; NaN: `fall`. Beside noise that
-                neighbours share, `fall` is what is gained over that noise, which bins take the place of
     """
 
     coordinate: str
@@ -274,14 +267,13 @@ class Fingerprint:
     share: float = math.nan
     unit: str = ""
     size: float = 0.0
-    seen: float = math.nan
 
     @property
     def cost(self) -> float:
-        """dof ln(1 + seen/dof) + 3 ln(1 + (size/USUAL)^2/2) + EACH: what so many bins could have fitted, whatever the
+        """dof ln(1 + fall/dof) + 3 ln(1 + (size/USUAL)^2/2) + EACH: what so many bins could have fitted, whatever the
         data are, with a prior as wide as the curve that was found; how far that width is from usual; and the odds that
         an unknown cause acts. The same three costs as of an effect (`optics.diagnosis.explanations`)."""
-        bins = _occam(self.dof, self.fall if math.isnan(self.seen) else self.seen)
+        bins = self.dof * math.log1p(max(self.fall, 0.0) / self.dof)
         return bins + 3 * math.log1p((self.size / USUAL) ** 2 / 2) + EACH
 
 
@@ -290,7 +282,7 @@ class Law:
     """A freer law of an effect that the model has: its strength changes slowly along a coordinate.
 
     fall, dof   with so many further strengths, of chi2 or, of readings, of deviance (optics.diagnosis.correlation)
-    p           of that fall in noise;   seen: as of `Fingerprint`
+    p           of that fall in noise
     """
 
     effect: str
@@ -298,12 +290,11 @@ class Law:
     fall: float
     dof: int
     p: float
-    seen: float = math.nan
 
     @property
     def cost(self) -> float:
         """As of `Fingerprint`."""
-        return _occam(self.dof, self.fall if math.isnan(self.seen) else self.seen)
+        return self.dof * math.log1p(max(self.fall, 0.0) / self.dof)
 
     @property
     def score(self) -> float:

@@ -1,14 +1,10 @@
 """Noise that neighbouring readings share: its likelihood is that of the covariance, its numbers are found, and slow
 curves owe it most of their significance."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
-from optics.diagnosis.correlation import FEWEST, KINDS, LENGTHS, MOST, NOTED, NOTICED, Readings, gained, powers
-from optics.diagnosis.result import Fingerprint
-from optics.diagnosis.thresholds import TOLD
+from optics.diagnosis.correlation import FEWEST, KINDS, LENGTHS, MOST, NOTED, NOTICED, Readings, powers
 
 COUNT = 160
 TURN = np.linspace(0, 2 * np.pi, COUNT)
@@ -95,31 +91,6 @@ def test_a_sharp_curve_keeps_its_significance_beside_a_lamp_that_wanders():
     noise = drawn(rng, 3.0, 20.0, "lamp") + sharp
     fall = about(noise).deviance(1.0) - about(noise, np.column_stack([FITTED, sharp])).deviance(1.0)
     assert fall == pytest.approx(COUNT, rel=0.25)
-
-
-@pytest.mark.parametrize("steps, best, least", [(0.0, "offset", 0.9), (0.03, "curve", 0.9)])
-def test_bins_that_take_the_place_of_a_wander_pay_for_it(steps, best, least):
-    """An offset, and a lamp that wanders: a gain and an offset in eight parts of the session contain both. Over the
-    noise they gain a tenth of what they explain without it, and by that alone they would beat the truth in one case of
-    two (of 40). Where the gain does jump from part to part, they win."""
-    bins = np.arange(COUNT) * 8 // COUNT
-    held = (bins[:, None] == np.arange(8)).astype(float)
-    base, curve = SIGNAL[:, None], np.hstack([held * SIGNAL[:, None], held])
-    won = {"offset": 0, "curve": 0, "by what is gained alone": 0}
-    for seed in range(12):
-        rng = np.random.default_rng(seed)
-        jumps = steps * rng.choice([-1.0, 1.0], 8)[bins] * SIGNAL
-        r = drawn(rng, 2.0, 50.0, "lamp") + (jumps if steps else 3.0)
-        before, after = about(r, base), about(r, curve)
-        offset = gained(before, about(r, FITTED), 1.0)[0] - 1 - 15  # an effect's cost, its bins' counterpart
-        (fall, seen), dof = gained(before, after, 1.0), before.free - after.free
-        found = Fingerprint("reading", fall, dof, 0.0, fall - dof, 1.0, "gain", [], [], [], [], seen=seen)
-        lead = found.net - found.cost - offset
-        won["offset"] += lead < TOLD
-        won["curve"] += lead > TOLD
-        won["by what is gained alone"] += lead + found.cost - replace(found, seen=np.nan).cost > TOLD
-    assert won[best] >= least * 12, won
-    assert won["by what is gained alone"] >= (4 if not steps else 11), won
 
 
 def test_of_few_readings_no_correlation_is_asked():
