@@ -136,3 +136,37 @@ def test_all_sets_are_weighed_by_one_noise(monkeypatch):
     outcome = explanations.compete(case, trials)
     assert outcome.leader.after == 101.0
     assert {t.deviance - t.after for t in outcome.trials} == {0.0, -20.0}
+
+
+@pytest.mark.parametrize(
+    "scale, fall, cost, ruled_out",
+    [
+        (10.0, 3.05e6, 37.0, False),  # leaves less by itself, at less cost
+        (10.0, 3.05e6, 97.0, True),  # the same at a higher cost
+        (10.0, 2.90e6, 37.0, True),  # leaves more
+        (1.0, 3.05e6, 37.0, True),  # where noise alone is left, what a lamp did is known
+    ],
+)
+def test_a_lamp_rules_out_nothing_that_leaves_less_where_misfit_is_left(monkeypatch, scale, fall, cost, ruled_out):
+    """Beside the best, whose misfit a wander of the lamp takes up, another is behind by 1000 in deviance."""
+
+    def trial(name, deviance, gain, fall, cost):
+        fit = SimpleNamespace(values=0.0)
+        return SimpleNamespace(
+            keys={name},
+            deviance=deviance,
+            gain=gain,
+            fall=fall,
+            cost=cost,
+            fit=fit,
+            by_frame=False,
+            complete=False,
+            left=lambda dof: 0.0,
+        )
+
+    best, other = trial("a", 1e4, 9e3, 2.97e6, 47.0), trial("b", 1.1e4, 2e3, fall, cost)
+    evidence = SimpleNamespace(is_table=False, normal=SimpleNamespace(count=20000), projected=SimpleNamespace(rank=20))
+    case = SimpleNamespace(evidence=evidence, prior_chi2=lambda values: 0.0)
+    monkeypatch.setattr(explanations, "_design_effect", lambda *a: 1.0)
+    lead, needed = explanations._lead(case, SimpleNamespace(scale=scale), best, other)
+    assert (lead > needed) is ruled_out
