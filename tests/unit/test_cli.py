@@ -132,7 +132,7 @@ def test_spectra_are_listed_and_drawn(optics, tmp_path):
     code, text, _ = optics("params", *auto)
     assert code == 0 and "gaussian(625, 17)" in text and "Nikon 5100" in text and "estimated error" in text
     code, text, err = optics("plot-spectra", *auto, "-o", str(tmp_path / "spectra.png"))
-    assert (code, text.strip()) == (0, str(tmp_path / "spectra.png")) and "led_red: 616.6, 631.0" in err  # a 17 nm LED takes two nodes
+    assert (code, text.strip()) == (0, str(tmp_path / "spectra.png")) and "led_red: 616.6, 631.0" in err
     assert np.std(Image.open(tmp_path / "spectra.png").convert("L")) > 10
     drawn = json.loads(optics("plot-spectra", "gelsight", "-o", str(tmp_path / "plain.svg"), "--json")[1])
     assert [s["source"] for s in drawn["spectra"]] == ["white"] * 6 and drawn["bands"] is None
