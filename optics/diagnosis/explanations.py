@@ -744,7 +744,7 @@ def _lead(case: Case, outcome: Outcome, best: Trial, other: Trial) -> tuple[floa
         # noise that the simpler one shares, and the other does not need, is no part of that: a rival with a cost
         if significant < lead - needed or shared < TOLD:
             lead, needed, cost = data, data - significant, 0.0
-    # where misfit is left, lamps make up for much of what is wrong: no reason against what needs them less
+    # where misfit is left, a lamp's wander makes up for much of it: it rules out nothing that leaves less without it
     if not is_table and outcome.scale > MISSTATED and other.fall > best.fall and other.cost < best.cost + TOLD:
         return lead, max(needed, lead)
     if best.complete or (is_table and outcome.scale < MISSTATED):

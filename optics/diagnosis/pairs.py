@@ -1,5 +1,5 @@
-"""Pairs of effects, ranked by the linear fall of chi2 that both make together, T = u' V^-1 u over the columns of both,
-less what the refits of each alone fell short of their own T."""
+"""Pairs of effects, ranked by the linear fall of chi2 that both make together, T = u' V^-1 u over the columns of both.
+`shortfall` says what the refits of each alone fell short of their own T: so much less is expected of a pair."""
 
 from __future__ import annotations
 

@@ -8,10 +8,9 @@ meets its neighbours' flanks a little above the level. Directions drawn by the c
     low     uniform in azimuth and elevation e, from the surface's horizon or the level to ABOVE
             density  1/(2 pi (ABOVE - e_low) cos(e))
 
-per steradian, with n the normal of the surface, m that of the level, along z, and cos(theta) = n.m. Light of one
-radiance on all of the level then has no variance. The rest is drawn by the surface's own law, and each direction is
-weighed by the three densities together: the mean is right for every shape (balance heuristic: Veach & Guibas, SIGGRAPH
-1995, 419)."""
+per steradian, with n the normal of the surface, m that of the level, along z, and cos(theta) = n.m. All directions that
+meet the level then weigh alike. The rest is drawn by the surface's own law, and each direction is weighed by the three
+densities together: the mean is right for every shape (balance heuristic: Veach & Guibas, SIGGRAPH 1995, 419)."""
 
 from __future__ import annotations
 
@@ -60,7 +59,7 @@ def _in_lune(n, m, cos, u):
     return x * across + y * down + dr.safe_sqrt(1 - x * x - y * y) * n
 
 
-def _lowest(n, m, cos, h):
+def _lowest(n, cos, h):
     """Elevation from which low directions are drawn, at the azimuth of the level vector h."""
     return dr.maximum(dr.atan2(-dr.dot(h, n), cos), 0.0)
 
@@ -68,7 +67,7 @@ def _lowest(n, m, cos, h):
 def _low(n, m, cos, u):
     sin_phi, cos_phi = dr.sincos(2 * dr.pi * u.x)
     h = mi.Vector3f(cos_phi, sin_phi, 0)
-    least = _lowest(n, m, cos, h)
+    least = _lowest(n, cos, h)
     sin, cos_e = dr.sincos(dr.lerp(least, dr.maximum(mi.Float(ABOVE), least), u.y))
     return cos_e * h + sin * m
 
@@ -91,7 +90,7 @@ def density(n, w, law):
     up = dr.dot(w, m)
     beside = dr.safe_sqrt(1 - up * up)
     h = (w - up * m) / dr.maximum(beside, 1e-9)
-    least, e = _lowest(n, m, cos, h), dr.atan2(up, beside)
+    least, e = _lowest(n, cos, h), dr.atan2(up, beside)
     in_lune = dr.dot(w, n) / dr.pi / dr.maximum((1 - cos) / 2, 1e-9)
     in_low = 1 / (2 * dr.pi * dr.maximum((ABOVE - least) * beside, 1e-9))
     found = dr.select((up < 0) & (dr.dot(w, n) > 0), lune * in_lune, 0.0)

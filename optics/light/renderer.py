@@ -50,9 +50,7 @@ BOUNCE_SAMPLES = 32  # directions per cell for the second bounce, at least
 # of these, an image has at least so many: few of a face meet a lit flank. On a plate of balls, whose second reflections
 # are 6 % of the direct light, 128 per cell of an image of 153 x 128 px leave .5 % of it, rms
 BOUNCE_RAYS = 2**19
-BOUNCE_NUMBERS = (
-    10  # that a direction is drawn by: a place in the cell, a technique, two directions, a point of the light
-)
+BOUNCE_NUMBERS = 10  # of a direction: a place in the cell, a technique, two directions, a point of the light
 ROUGHLY = 4  # times fewer directions suffice for how second reflections change: with the same ones on both sides
 BOUNCE_CELL = 2  # px each way of a cell; 1 in a crowded scene, whose pixels differ
 

@@ -27,16 +27,16 @@ def compared(bench, key):
 
 @pytest.mark.parametrize("key", KEYS)
 def test_derivatives_with_a_second_reflection(key, bench, monkeypatch):
-    """With the directions of the prediction: without the second reflection's part the derivative is off by several
-    times the tolerance, which is what another step changes."""
+    """With the directions of the prediction. What is left is the curvature over half a step: at most 1.6e-4 of the
+    derivative (LED place, roughness). Without the second reflection's part the derivative is off by .03 to .07."""
     monkeypatch.setattr(renderer, "ROUGHLY", 1)
     alone, off = compared(bench, key)
-    assert off < 0.01
+    assert off < 5e-4
     assert alone > 0.03
 
 
 def test_fewer_directions_leave_little_error(bench):
-    """Of derivatives, with a second reflection three times as strong as physics allows: below half of what leaving it
-    out would bring."""
+    """Of derivatives, with a second reflection three times as strong as physics allows: the noise of a quarter of the
+    directions, 0.055 of what leaving the second reflection out would bring; twice that is allowed."""
     alone, off = compared(bench, "membrane.sigma")
-    assert off < 0.5 * alone
+    assert off < 0.11 * alone

@@ -28,26 +28,40 @@ def directions(mi, tilt, up, seed=0):
     return np.array(n).T[0], np.array(w).T, weight
 
 
+def form_factor(tilt):
+    return (1 - np.cos(np.radians(tilt))) / 2
+
+
+def grazing_law():
+    from optics.light import grazing
+
+    return grazing
+
+
 @pytest.mark.parametrize("up", (1, -1))
 @pytest.mark.parametrize("tilt", TILTS)
 def test_means_are_those_of_the_hemisphere(mitsuba, tilt, up):
-    """Integrals over the hemisphere of 1, and of what a level face fills of it: form factor (1 - cos(theta))/2. Errors
-    of 2^14 points of a Sobol sequence at jumps of the density are 1e-3."""
+    """Integrals over the hemisphere of 1, of the cosine, and of what a level face fills of it, its form factor
+    (1 - cos(theta))/2. Allowed are three times the rms over 48 draws, the largest of all tilts: 1.4e-3, 1.1e-3, and
+    4.5e-4 of the form factor; without a lune (0.5 deg) that is met by 1 direction in 50000, rms 1.3e-4."""
     n, w, weight = directions(mitsuba, tilt, up)
     cosine = np.maximum(w @ n, 0.0) / np.pi
     assert np.allclose(np.linalg.norm(w, axis=1), 1.0, atol=1e-5)
     assert np.mean(cosine * weight) == pytest.approx(1.0, abs=4e-3)
-    level = (1 - np.cos(np.radians(tilt))) / 2
-    assert np.mean(cosine * weight * (w[:, 2] * up < 0)) == pytest.approx(level, abs=2e-3 * level + 1e-4)
-    first = np.mean(cosine * (w @ n) * weight)  # of the cosine: 2/3
-    assert first == pytest.approx(2 / 3, abs=3e-3)
+    share = form_factor(tilt)
+    assert np.mean(cosine * weight * (w[:, 2] * up < 0)) == pytest.approx(
+        share, abs=1.4e-3 * share if share > grazing_law().LEAST / 2 else 4e-4
+    )
+    assert np.mean(cosine * (w @ n) * weight) == pytest.approx(2 / 3, abs=3e-3)
 
 
 @pytest.mark.parametrize("tilt", TILTS[2:])
-def test_level_face_is_seen_with_little_noise(mitsuba, tilt):
-    """What a flank sees of a level face of one radiance varies less than with directions by the cosine, of which
-    (1 - cos(theta))/2 meet it: the share that is drawn in the lune is known, and only that varies."""
+def test_level_face_of_one_radiance_varies_by_the_share_alone(mitsuba, tilt):
+    """A direction meets the level face with q = LUNE + (1 - LUNE - LOW) (1 - cos(theta))/2, and all that do weigh
+    alike: relative deviation sqrt((1 - q)/q). By the cosine alone q were the form factor, 10 times the deviation at
+    12 deg."""
+    law = grazing_law()
     n, w, weight = directions(mitsuba, tilt, -1, seed=1)
     value = np.maximum(w @ n, 0.0) / np.pi * weight * (w[:, 2] > 0)
-    share = (1 - np.cos(np.radians(tilt))) / 2
-    assert value.std() / value.mean() < 0.75 * np.sqrt((1 - share) / share)
+    q = law.LUNE + (1 - law.LUNE - law.LOW) * form_factor(tilt)
+    assert value.std() / value.mean() == pytest.approx(np.sqrt((1 - q) / q), rel=2e-3)
