@@ -21,7 +21,7 @@ Source of the deformation: the GelSight-type supplement, S1.2 (depth kept within
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
 
@@ -120,6 +120,35 @@ def gaussian_blur(a: np.ndarray, sd: float) -> np.ndarray:
 
 
 # -- Indenters -------------------------------------------------------------------------------------------------------
+@dataclass(frozen=True)
+class RestFace:
+    """A face that is not level, z = level + share (z0 - level), z0 = (xx x^2 + 2 xy x y + yy y^2)/2, away from the
+    camera.
+
+    xx, xy, yy        1/mm
+    press_x, press_y  mm, where the axis of an indenter meets it
+    level             mm, z of the plane that the depth of the press is counted from
+    share             of z0 that is left while the indenter presses
+    """
+
+    xx: float
+    xy: float
+    yy: float
+    press_x: float = 0.0
+    press_y: float = 0.0
+    level: float = 0.0
+    share: float = 1.0
+
+    def height(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """z in mm at x and y of the sensor, mm."""
+        z0 = (self.xx * x * x + 2 * self.xy * x * y + self.yy * y * y) / 2
+        return self.level + self.share * (z0 - self.level)
+
+    def around(self, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """mm by which it stands out over its level, at u and v from the indenter's axis, mm."""
+        return self.height(u + self.press_x, v + self.press_y) - self.level
+
+
 @dataclass(frozen=True, eq=False)
 class Balls:
     """One ball on the axis, or a square grid of them on a turned plate.
@@ -128,6 +157,7 @@ class Balls:
     spacing  mm from middle to middle; 0: one ball
     turn     (3, 3) of the plate: balls stay balls, and stand where they are turned to
     tall     height over width of each: 1 of a ball, less of a flattened one
+    face     of the skin at rest; None: level
     """
 
     radius: float
@@ -135,6 +165,7 @@ class Balls:
     spacing: float = 0.0
     turn: np.ndarray = field(default_factory=lambda: np.eye(3))
     tall: float = 1.0
+    face: RestFace | None = None
 
     def places(self, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(u, v) as rows and columns of balls (2, ...), and the whole numbers of the nearest ball."""
@@ -151,8 +182,14 @@ class Balls:
         return np.hypot(a * across + b * along, c * across + d * along)
 
     def rise(self, number: np.ndarray) -> np.ndarray:
-        """mm by which the lowest points of balls (2, ...) stand above that of the ball on the axis."""
-        return np.einsum("j,j...->...", self.turn[2, :2] * self.spacing, number)
+        """mm by which the lowest points of balls (2, ...) stand above that of the ball on the axis; over a curved face,
+        less what the face stands out to each."""
+        rise = np.einsum("j,j...->...", self.turn[2, :2] * self.spacing, number)
+        return rise if self.face is None else rise - self.face.around(*self.middle(number))
+
+    def middle(self, number: np.ndarray) -> np.ndarray:
+        """(2, ...) u and v of the middles of balls, mm."""
+        return np.einsum("ij,j...->i...", self.turn[:2, :2] * self.spacing, number)
 
     def lower(self, r: np.ndarray) -> np.ndarray:
         """Height of a ball's lower side at the distance r from its axis, over its lowest point, mm."""
@@ -219,14 +256,21 @@ class Balls:
         line = self.contact_line(deep, skirt)
         edge = np.where(deep > 0, deep - self.lower(line), 0.0)
 
-        def drag(r, number):
+        def drag(r, number, u, v):
             place = tuple(number - low.reshape(2, *[1] * r.ndim))
-            beyond = edge[place] * np.exp(-np.maximum(r - line[place], 0.0) / skirt)
-            return np.where(r < line[place], deep[place] - self.lower(r), beyond)
+            out = np.maximum(r - line[place], 0.0)
+            inside, rim = deep[place] - self.lower(r), edge[place]
+            if self.face is not None:  # by which the face stands out to a point of the contact more than to its middle
+                middle = self.middle(number)
+                shrunk = np.minimum(line[place] / np.maximum(r, 1e-12), 1.0)
+                foot = middle + shrunk * (np.stack([u, v]) - middle)
+                more = self.face.around(*foot) - self.face.around(*middle)
+                inside, rim = inside + more, np.maximum(rim + np.where(rim > 0, more, 0.0), 0.0)
+            return np.where(r < line[place], inside, rim * np.exp(-out / skirt))
 
         if not self.spacing:
-            return drag(np.hypot(u, v), nearest)
-        found = drag(self.distance(at, nearest), nearest)
+            return drag(np.hypot(u, v), nearest, u, v)
+        found = drag(self.distance(at, nearest), nearest, u, v)
         # Of a tilted plate another of the four balls around may drag more, where it is hardly further: with a margin m
         # r2 - r1 < m asks for S^2 - 2 S f < m (r1 + r2), f the way to the nearest row or column, r1 + r2 < 2.3 S.
         margin = math.inf
@@ -236,7 +280,8 @@ class Balls:
         own, around = at[:, between], np.floor(at[:, between]).astype(int)
         for corner in ((0, 0), (1, 0), (0, 1), (1, 1)):
             number = around + np.reshape(corner, (2, 1))
-            found[between] = np.maximum(found[between], drag(self.distance(own, number), number))
+            others = drag(self.distance(own, number), number, u[between], v[between])
+            found[between] = np.maximum(found[between], others)
         return found
 
 
@@ -270,6 +315,11 @@ class Profile:
     def lowest(self) -> tuple[np.ndarray, np.ndarray]:
         """Lowest envelope of every row and of every column, to find the block that a depth can reach."""
         return self.envelope.min(axis=1), self.envelope.min(axis=0)
+
+    def over(self, face: RestFace) -> Profile:
+        """The indenter as a face that is not level meets it: its height over each point of that face, less that over a
+        level face."""
+        return _over(self, face)
 
     def block(self, height: float) -> tuple[slice, slice]:
         """Rows and columns that hold all nodes whose envelope is below `height`."""
@@ -372,6 +422,13 @@ def _profile(shape, stamp, size, rx, ry, rz, extent, pitch, steepest, spacing, t
         a.flags.writeable = False
     found = {"sphere": Balls(size, slope, tall=tall), "balls": Balls(size, slope, spacing, turn, tall)}
     return Profile(height, envelope, pitch, found.get(shape))
+
+
+@lru_cache(maxsize=32)
+def _over(profile: Profile, face: RestFace) -> Profile:
+    z0 = face.around(profile.axis[None, :], profile.axis[:, None])
+    balls = None if profile.balls is None else replace(profile.balls, face=face)
+    return Profile(profile.height - z0, profile.envelope - z0, profile.pitch, balls)
 
 
 @lru_cache(maxsize=16)
@@ -736,9 +793,9 @@ def bridged(profile: Profile, d0: np.ndarray, depth: float, thickness: float, ra
     ball of that radius, which rolls over it on the gel's side and reaches no further.
 
     Between a ball and the face beside it this is an arc that is tangent to both (a membrane under the tension T that a
-    pressure p holds against them has the radius T/p); of balls a closed form, of other indenters found on the grid, up
-    to 3 % of the radius too deep."""
-    if profile.balls is None or depth >= thickness:
+    pressure p holds against them has the radius T/p); of balls a closed form, of other indenters and over a curved face
+    found on the grid, up to 3 % of the radius too deep."""
+    if profile.balls is None or profile.balls.face is not None or depth >= thickness:
         grown = -through_coat(-d0, profile.pitch, radius)
         return np.maximum(through_coat(grown, profile.pitch, radius), d0)
     return profile.balls.bridged(*np.meshgrid(profile.axis, profile.axis), depth, radius)

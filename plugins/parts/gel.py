@@ -1,8 +1,9 @@
 """Gel: the soft layer of the sensor and its coated face, pressed by an indenter.
 
 Definition
-    z(x, y) = -D(x - press_x, y - press_y) + sum of `surface` effects          the coated face; flat at z = 0
-    D0 = clip(press_depth - h, 0, thickness)                   h(x, y): height of the indenter over its lowest point
+    z(x, y) = z0 - D(x - press_x, y - press_y) + sum of `surface` effects      the coated face
+    z0 = (curve_xx x^2 + 2 curve_xy x y + curve_yy y^2)/2                     the face at rest; level without a curve
+    D0 = clip(press_depth + z0 - m - h, 0, thickness)          h(x, y): height of the indenter over its lowest point
     D <- max(D0, G_sd * D), from D = D0, sd = smoothing, smoothing/2, smoothing/4, smoothing/8                  (S1.6)
     D <- G_sd * D once more, sd^2 = (smoothing/16)^2 + map_pitch^2                        without restoring the contact
 with G_sd * D the blur by a Gaussian of that standard deviation (mm); the maximum puts the skin back onto the indenter
@@ -10,6 +11,8 @@ after each blur. Steep walls of h are cut to a slope, and the rim of D0 is round
 (optics.skin.contact). The gel fills -thickness < z < 0; the camera stands at z < -thickness. The face is a triangle
 mesh on a graded grid that is fine around the contact and moves with it, so that images vary smoothly with the press.
 A ball with `flattening` f is (1 - f) times as tall as wide: h is (1 - f) times that of the ball.
+The depth is counted from the face where the indenter's axis meets it, m = z0(press_x, press_y), that of a plate of balls
+from the mean of z0 over the gel; and the plate takes the share `evened` of z0 - m out of the face beside the balls.
 With `coat` d > 0 the camera sees the coating's inner face, parallel to the one that is touched:
     h'(x) = d + min over |s| <= d of h(x + s) - sqrt(d^2 - s^2)
 With `fillet` > 0 the skin bridges corners with arcs of that radius: D0 is closed by a ball of it before the smoothing.
@@ -58,6 +61,7 @@ INDENTER_SIZE = 1.5  # mm
 DRAG = ("friction", "shift_x", "shift_y", "twist")
 SHEARING = ("poisson", *DRAG)
 ROUNDING = ("smoothing", "skirt", "fillet")  # of the geometric dent
+CURVE = ("curve_xx", "curve_xy", "curve_yy")
 STAGE = 0.05  # mm: how well a stage usually knows where it presses
 PARAMETERS = (
     Parameter("width", "mm", 20.0, (0.1, 1000.0), "size along x", plausible=0.1, how="difference", role="width"),
@@ -108,6 +112,28 @@ PARAMETERS = (
         role="press depth",
         free="press",
         prior_sd=STAGE,
+    ),
+    *(
+        Parameter(
+            name,
+            "1/mm",
+            0.0,
+            (-0.5, 0.5),
+            f"curve of the face at rest, {term}; below 0: it stands out in the middle",
+            neutral=0.0,
+            plausible=2e-3,
+            how="difference",
+        )
+        for name, term in zip(CURVE, ("along x", "xy: a saddle", "along y"))
+    ),
+    Parameter(
+        "evened",
+        "1",
+        0.5,
+        (0.0, 1.0),
+        "share of the curve that a plate of balls takes out of the skin between the balls",
+        plausible=0.3,
+        how="difference",
     ),
     Parameter("press_rx", "deg", 0.0, (-180.0, 180.0), "turn of the indenter about x", plausible=1.0, how="difference"),
     Parameter("press_ry", "deg", 0.0, (-180.0, 180.0), "turn of the indenter about y", plausible=1.0, how="difference"),
@@ -272,6 +298,7 @@ def build():
             "press_x",
             "press_y",
             "press_depth",
+            "evened",
             "press_rx",
             "press_ry",
             "press_rz",
@@ -342,8 +369,25 @@ def build():
             """Whether the face that is seen is that of the elastic skin."""
             return getattr(self, "dent_model", "") == "elastic"
 
+        def rest_face(self, now=None):
+            """The face that the indenter finds (optics.skin.contact.RestFace); None: level."""
+            n = self.number if now is None else now.__getitem__
+            xx, xy, yy = map(n, CURVE)
+            if not (xx or xy or yy):
+                return None
+            x, y, shape = n("press_x"), n("press_y"), self.indenter if now is None else now["indenter"]
+            if shape == "balls" and n("press_depth") > 0:
+                mean = (xx * n("width") ** 2 + yy * n("length") ** 2) / 24
+                return contact.RestFace(xx, xy, yy, x, y, mean, 1 - n("evened"))
+            return contact.RestFace(xx, xy, yy, x, y, (xx * x * x + 2 * xy * x * y + yy * y * y) / 2)
+
         def profile(self, now=None):
-            """Lower surface of the indenter (optics.skin.contact.Profile); of the values `now`, or of the gel's own."""
+            """Lower surface of the indenter (optics.skin.contact.Profile), over the face that it finds; of the values
+            `now`, or of the gel's own."""
+            face, level = self.rest_face(now), self.level_profile(now)
+            return level if face is None else level.over(face)
+
+        def level_profile(self, now=None):
             n = self.number if now is None else now.__getitem__
             return contact.indenter_profile(
                 self.indenter if now is None else now["indenter"],
@@ -407,6 +451,8 @@ def build():
             else:
                 self.map, self.touch = self.press()
                 z = -contact.surface(x, y, n("press_x"), n("press_y"), self.map)
+            if (face := self.rest_face()) is not None:
+                z = z + face.height(x, y)
             for function in self.functions("surface"):
                 z = z + function(x, y, self)
             return z

@@ -95,6 +95,13 @@ SURROUNDINGS = {  # parameter: what has to stand about it for it to be seen, and
         for axis in "xyz"
     },
     "gel.indenter_spacing": {"gel.indenter": "balls", "gel.indenter_size": 0.8, "gel.indenter_spacing": 1.8},
+    "gel.evened": {
+        "gel.indenter": "balls",
+        "gel.indenter_size": 0.8,
+        "gel.indenter_spacing": 1.8,
+        "gel.curve_xx": -0.01,
+        "gel.curve_yy": -0.01,
+    },
     "gel.stretch_gain": {"gel.stretch": 0.05, "gel.stretch_xx": 0.002, "gel.stretch_yy": 0.003},
     **dict.fromkeys(
         (f"gel.stretch{axes}" for axes in ("", "_x", "_y", "_xx", "_xy", "_yy")), {"gel.stretch_gain": 0.3}
