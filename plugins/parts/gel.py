@@ -11,8 +11,8 @@ after each blur. Steep walls of h are cut to a slope, and the rim of D0 is round
 (optics.skin.contact). The gel fills -thickness < z < 0; the camera stands at z < -thickness. The face is a triangle
 mesh on a graded grid that is fine around the contact and moves with it, so that images vary smoothly with the press.
 A ball with `flattening` f is (1 - f) times as tall as wide: h is (1 - f) times that of the ball.
-The depth is counted from the face where the indenter's axis meets it, m = z0(press_x, press_y), that of a plate of balls
-from the mean of z0 over the gel; and the plate takes the share `evened` of z0 - m out of the face beside the balls.
+The depth is counted from the face where the indenter's axis meets it, m = z0(press_x, press_y), that of a plate of
+balls from the mean of z0 over the gel; and the plate takes the share `evened` of z0 - m out of the face beside them.
 With `coat` d > 0 the camera sees the coating's inner face, parallel to the one that is touched:
     h'(x) = d + min over |s| <= d of h(x + s) - sqrt(d^2 - s^2)
 With `fillet` > 0 the skin bridges corners with arcs of that radius: D0 is closed by a ball of it before the smoothing.
