@@ -424,7 +424,7 @@ def _profile(shape, stamp, size, rx, ry, rz, extent, pitch, steepest, spacing, t
     return Profile(height, envelope, pitch, found.get(shape))
 
 
-@lru_cache(maxsize=32)
+@lru_cache(maxsize=4)  # of maps of up to 40 MB
 def _over(profile: Profile, face: RestFace) -> Profile:
     z0 = face.around(profile.axis[None, :], profile.axis[:, None])
     balls = None if profile.balls is None else replace(profile.balls, face=face)
