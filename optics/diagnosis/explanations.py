@@ -564,7 +564,7 @@ def _wanted(
         expected = expected_of(net - pairs.shortfall(both), both)
         if expected - top >= needed:
             found.append((expected, a, b, linear))
-    return [pair for _, *pair in sorted(found, key=lambda t: -t[0])]
+    return [(a, b, linear) for _, a, b, linear in sorted(found, key=lambda t: -t[0])]
 
 
 def _bound_wander(case: Case, trials: Iterable[Trial]) -> None:
