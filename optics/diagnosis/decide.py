@@ -29,6 +29,7 @@ from optics.diagnosis.thresholds import (
 from optics.words import p_text, percent
 
 MANY = 3  # effects of one explanation
+DIALS = "dials known"  # of an effect with a strength per frame
 LAW = "no other law"  # of an effect that the model has already
 CURVE = "a curve explains it"  # name of the condition that a curve must meet for UNKNOWN
 
@@ -63,6 +64,7 @@ class Findings:
     far          of it, in plausible sizes; at_end: at which end of its range it stands, in words; '' for none
     complete     whether the best explanation leaves nothing
     ran          what of the base ran to the end of its range, and comes back with the best explanation, in words
+    unset        dials of images whose errors nobody states, where the winner has a strength for each frame; '' for none
     chance       family-wise p of that strength by its scatter between parts of the sensor or session, NaN where there
                  are too few parts
     carried      share of the winner's fall in the one part that carries most of it, by the part carried_by (in words);
@@ -108,6 +110,7 @@ class Findings:
     at_end: str = ""
     complete: bool = True
     ran: str = ""
+    unset: str = ""
     chance: float = math.nan
     carried: float = 0.0
     carried_by: str = ""
@@ -198,8 +201,8 @@ def _word_of_winner(f: Findings, failed: set[str]) -> str:
         bars.add("no better curve")
     alone = not failed & bars
     alone = alone and not f.another_law
-    rivals = f.survivors > 1 or f.shared or LAW in failed or bool(f.fragile)
-    if failed & {"lead", LAW, "robust"} and alone and f.some_even and rivals:
+    rivals = f.survivors > 1 or f.shared or LAW in failed or bool(f.fragile) or bool(f.unset)
+    if failed & {"lead", LAW, "robust", DIALS} and alone and f.some_even and rivals:
         return "AMBIGUOUS"
     return "PARTIAL" if failed - {"spread"} and failed <= {"share", "even", "spread"} else ""
 
@@ -271,6 +274,15 @@ def _against_causes_outside(f: Findings) -> list[Condition]:
             f"{f.law_lead:.3g} ahead of another law of {f.law}, {SURE:.3g} needed"
             if f.law
             else "no effect that the model has explains it by another law",
+        ),
+        Condition(
+            DIALS,
+            float(bool(f.unset)),
+            0.0,
+            not f.unset,
+            f"errors of {f.unset}, which captures do not state, act on every frame too: give them under [uncertainty]"
+            if f.unset
+            else "no error of a dial that nobody states acts as it does",
         ),
         Condition(
             "share",

@@ -13,6 +13,7 @@ from optics.diagnosis import fingerprints as prints
 from optics.diagnosis import statistics as st
 from optics.diagnosis.correlation import NOTICED, WANDER
 from optics.diagnosis.decide import Findings, Opponent, ordered, rivals
+from optics.diagnosis.dials import unstated
 from optics.diagnosis.evidence import Candidate, Evidence, at_bound
 from optics.diagnosis.explanations import Outcome, beside_noise, fall_over_noise, lead_without
 from optics.diagnosis.refit import Case, clear
@@ -21,6 +22,7 @@ from optics.diagnosis.thresholds import AS_GOOD, LEVEL, MISSTATED, TOLD, UNEVEN
 from optics.fit.compare import led_label
 from optics.fit.model import Model, value_of
 from optics.fit.result import Fit
+from optics.fit.scene_model import SceneModel
 from optics.scene.parameter import Variable
 
 
@@ -195,6 +197,7 @@ def _of_subject(
         at_end=_at_end(subject, strength),
         complete=best.complete,
         ran=_ran(case, best.fit),
+        unset=_unset(case, subject),
         chance=chance,
         carried=carried,
         carried_by=carried_by,
@@ -217,6 +220,14 @@ def _at_end(subject: Candidate, strength: Sequence[float]) -> str:
         if at_bound(v, x) and abs(x - start) > 0
     ]
     return ", ".join(ends)
+
+
+def _unset(case: Case, subject: Candidate) -> str:
+    """The dials that images turn and nobody states, beside an effect with a strength per frame."""
+    model = case.model
+    if subject.effect.scope != "frame" or case.evidence.is_table or not isinstance(model, SceneModel):
+        return ""
+    return " and ".join(unstated(model))
 
 
 def _ran(case: Case, fit: Fit) -> str:

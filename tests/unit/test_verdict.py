@@ -298,6 +298,7 @@ GOOD = Findings(
         ({"p_family": 0.02, "rival": True, "ratio": 3.0, "curve_share": 0.01}, "CANNOT_TELL"),
         ({"law": "b along frame", "law_lead": SURE + 0.1}, "CLAIM"),
         ({"law": "b along frame", "law_lead": SURE - 0.1}, "AMBIGUOUS"),  # as over any other rival
+        ({"unset": "analyzer.angle"}, "AMBIGUOUS"),  # a gain of each frame, or a dial that was off in each
         ({"far": 80.0}, "CLAIM"),  # whatever its size, it explains all
         ({"far": 80.0, "complete": False}, "CLAIM"),
         # an axis 80 deg off that leaves structure, where a lamp had been turned up without end
