@@ -122,6 +122,11 @@ class Readings:
         """See the module."""
         return self.white / scale - self.noise(scale).gain
 
+    def standing(self, scale: float) -> float:
+        """The deviance where the fit stands: what it left by the weights that it had, or where it stopped short, is not
+        fitted again."""
+        return self.reached / scale - self.noise(scale).gain
+
     def noise(self, scale: float) -> Correlation:
         """The shared noise of least deviance; `gain` is what it lowers the deviance by."""
         best = Correlation(scale)

@@ -15,10 +15,12 @@ from optics.diagnosis.thresholds import (
     CARRIED,
     EXCESS,
     FAR,
+    IMPOSSIBLE,
     LEVEL,
     MIMICS,
     SHARE,
     STRENGTH,
+    SURE,
     TOLD,
     UNEVEN,
     allowed,
@@ -27,6 +29,7 @@ from optics.diagnosis.thresholds import (
 from optics.words import p_text, percent
 
 MANY = 3  # effects of one explanation
+DIALS = "dials known"  # of an effect with a strength per frame
 LAW = "no other law"  # of an effect that the model has already
 CURVE = "a curve explains it"  # name of the condition that a curve must meet for UNKNOWN
 
@@ -58,6 +61,10 @@ class Findings:
     held_out     fall on held-out frames, NaN where there are none
     ahead        fall of chi2 on blocks of readings that were left out in turn; NaN for images
     clear        of the winner's strength from none, in standard deviations; NaN where they are unknown
+    far          of it, in plausible sizes; at_end: at which end of its range it stands, in words; '' for none
+    complete     whether the best explanation leaves nothing
+    ran          what of the base ran to the end of its range, and comes back with the best explanation, in words
+    unset        dials of images whose errors nobody states, where the winner has a strength for each frame; '' for none
     chance       family-wise p of that strength by its scatter between parts of the sensor or session, NaN where there
                  are too few parts
     carried      share of the winner's fall in the one part that carries most of it, by the part carried_by (in words);
@@ -99,6 +106,11 @@ class Findings:
     held_out: float = math.nan
     ahead: float = math.nan
     clear: float = math.nan
+    far: float = 0.0
+    at_end: str = ""
+    complete: bool = True
+    ran: str = ""
+    unset: str = ""
     chance: float = math.nan
     carried: float = 0.0
     carried_by: str = ""
@@ -189,8 +201,8 @@ def _word_of_winner(f: Findings, failed: set[str]) -> str:
         bars.add("no better curve")
     alone = not failed & bars
     alone = alone and not f.another_law
-    rivals = f.survivors > 1 or f.shared or LAW in failed or bool(f.fragile)
-    if failed & {"lead", LAW, "robust"} and alone and f.some_even and rivals:
+    rivals = f.survivors > 1 or f.shared or LAW in failed or bool(f.fragile) or bool(f.unset)
+    if failed & {"lead", LAW, "robust", DIALS} and alone and f.some_even and rivals:
         return "AMBIGUOUS"
     return "PARTIAL" if failed - {"spread"} and failed <= {"share", "even", "spread"} else ""
 
@@ -257,11 +269,20 @@ def _against_causes_outside(f: Findings) -> list[Condition]:
         Condition(
             LAW,
             f.law_lead,
-            TOLD,
-            f.law_lead > TOLD,
-            f"{f.law_lead:.3g} ahead of another law of {f.law}, {TOLD:.3g} needed"
+            SURE,
+            f.law_lead > SURE,
+            f"{f.law_lead:.3g} ahead of another law of {f.law}, {SURE:.3g} needed"
             if f.law
             else "no effect that the model has explains it by another law",
+        ),
+        Condition(
+            DIALS,
+            float(bool(f.unset)),
+            0.0,
+            not f.unset,
+            f"errors of {f.unset}, which captures do not state, act on every frame too: give them under [uncertainty]"
+            if f.unset
+            else "no error of a dial that nobody states acts as it does",
         ),
         Condition(
             "share",
@@ -292,6 +313,16 @@ def _of_the_strength(f: Findings) -> list[Condition]:
             STRENGTH,
             not f.clear < STRENGTH,
             "its error is unknown" if math.isnan(f.clear) else f"{f.clear:.2g} sd from none, {STRENGTH:g} needed",
+        ),
+        Condition(
+            "range",
+            f.far,
+            IMPOSSIBLE,
+            not f.far > IMPOSSIBLE or (not f.at_end and (f.complete or not f.ran)),
+            f"{f.far:.2g} times the plausible strength"
+            + (f", at the end of its range ({f.at_end})" if f.at_end else "")
+            + (f"; without it {f.ran} ran to the end of its range" if f.ran else "")
+            + (f"; {IMPOSSIBLE:g} allowed" if f.at_end or (f.ran and not f.complete) else ""),
         ),
         Condition(
             "beyond clutter",

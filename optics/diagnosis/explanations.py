@@ -29,8 +29,9 @@ Sources: MacKay, Bayesian interpolation, Neural Computation 4, 415 (1992), Occam
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import zip_longest
 
 import numpy as np
 from scipy.special import chdtri
@@ -43,7 +44,7 @@ from optics.diagnosis.refit import FAILURES, START, Case, excess_of, known_of, w
 from optics.diagnosis.result import Explanation, leaves_nothing
 from optics.diagnosis.score import solve
 from optics.diagnosis.session import Frames
-from optics.diagnosis.thresholds import CLEAR, EACH, HALF, LEVEL, MARGIN, MISSTATED, NO_TIE, SURE, TOLD
+from optics.diagnosis.thresholds import CLEAR, EACH, EXCESS, HALF, LEVEL, MARGIN, MISSTATED, NO_TIE, SURE, TOLD
 from optics.fit import calibrate
 from optics.fit.model import value_of
 from optics.fit.result import Fit
@@ -72,6 +73,8 @@ class Trial:
     cost       see the module
     deviance   see the module; NaN before the competition;   gain: what shared noise lowers it by
     readings   of a table, or frames of images, about it; None before
+    bare       whether it leaves no more of images than noise that is stated too small (MISSTATED), without structure,
+               and a lamp that wanders unnoticed
     ahead      chi2 of the blocks that were left out in turn, less that of the base; NaN where it was not computed
     """
 
@@ -87,6 +90,7 @@ class Trial:
     deviance: float = math.nan
     gain: float = 0.0
     readings: Readings | None = None
+    bare: bool = False
     ahead: float = math.nan
 
     @property
@@ -110,7 +114,7 @@ class Trial:
     @property
     def complete(self) -> bool:
         """Whether it leaves nothing to explain."""
-        return leaves_nothing(self.structure_p, self.excess_sd)
+        return self.bare or leaves_nothing(self.structure_p, self.excess_sd)
 
     def left(self, dof: int) -> float:
         """chi2 beyond its expectation, 0 or more."""
@@ -321,7 +325,25 @@ def _trial(case: Case, members: list[Candidate], found: Fit) -> Trial:
         cost_of(case, members, found),
         excess_of(case.evidence, made.after, made.expected, members),
         case.evidence.structure(made.images, columns).p,
+        bare=not case.evidence.is_table and _is_bare(case, made.images, made.after, made.expected, columns),
     )
+
+
+def _is_bare(case: Case, images: Sequence[np.ndarray], after: float, expected: float, columns: Sequence[int]) -> bool:
+    """See `Trial`. A lamp adds a share of its signal to each frame: a w, with the whitened signal w of the frame as it
+    was measured, and a = w'r / w'w."""
+    evidence, black = case.evidence, float(case.model.noise.black_level)
+    rest, swung, lit = [], 0.0, 0.0
+    for frame, r, sigma, use in zip(evidence.frames, images, evidence.sigma, evidence.use):
+        w = np.where(use, (np.asarray(case.model.frames[frame].image, float) - black) / sigma, 0.0)
+        bright = max(float(np.sum(w**2)), 1e-300)
+        a = float(np.sum(w * r)) / bright
+        rest.append(r - a * w)
+        swung, lit = swung + a**2 * bright, lit + bright
+    most = 1 + EXCESS * math.sqrt(2 / max(evidence.normal.count, 1)) if case.measured else MISSTATED
+    if swung > NOTICED**2 * lit or after - swung > most * expected:
+        return False
+    return evidence.structure(rest, columns).p >= LEVEL
 
 
 def _score(trial: Trial, scale: float) -> float:
@@ -491,26 +513,29 @@ def _beside_at(case: Case, trial: Trial, others: Sequence[Candidate]) -> list[tu
 
 
 def _joined(case: Case, trials: dict[frozenset[str], Trial]) -> None:
-    """Pairs of images' effects, whose refits are dear: those that may win by the linear fall of both, beside what a
-    lamp may have done to whole frames."""
-    evidence, scale = case.evidence, _scale(case, trials.values())
+    """Pairs of images' effects, whose refits are dear: those that may win by the linear fall of both.
+
+    They are ranked beside what a lamp may have done to whole frames, and without it, by falls as they are. Of two
+    causes each alone leaves much, for which a lamp that swings makes up, and what no explanation has reached yet counts
+    as noise. By the first ranking no pair may be worth a refit then, while the refit of the right one would show that
+    the lamp stands still."""
     _bound_wander(case, trials.values())
-    scores = {names: _score(t, scale) + _gain(case, t, scale) for names, t in trials.items()}
-    best = trials[max(scores, key=lambda names: scores[names])]
-    top = scores[best.names]
     live = [c for c in case.table.order if c.row.p_family < LEVEL and len(c.cone.live) and not c.broken]
-    wanted = []
-    for net, a, b, linear in pairs.ranked(evidence, live[: pairs.CONSIDERED]):
-        both = [a, b]
-        nested = best.names <= frozenset(c.effect.name for c in both)
-        needed = max(CLEAR, pairs.LEAD * best.fall) if nested else -CLEAR
-        if nested and (not best.members or best.complete):
-            continue
-        fall = net - pairs.shortfall(both)
-        expected = fall / scale + _expected_gain(case, both, scale) - sum(map(expected_cost, both))
-        if expected - top >= needed:
-            wanted.append((expected, both, linear))
-    for _, (a, b), linear in sorted(wanted, key=lambda t: -t[0])[: pairs.REFITTED]:
+    ranked = pairs.ranked(case.evidence, live[: pairs.CONSIDERED])
+    scale = _scale(case, trials.values())
+    beside = _wanted(
+        trials.values(),
+        ranked,
+        lambda t: _score(t, scale) + _gain(case, t, scale),
+        lambda net, both: net / scale + _expected_gain(case, both, scale) - sum(map(expected_cost, both)),
+    )
+    without = _wanted(
+        trials.values(), ranked, lambda t: _score(t, 1.0), lambda net, both: net - sum(map(expected_cost, both))
+    )
+    wanted = {
+        frozenset(c.effect.name for c in pair[:2]): pair for two in zip_longest(beside, without) for pair in two if pair
+    }
+    for a, b, linear in list(wanted.values())[: pairs.REFITTED]:
         try:
             found = with_effects(case, [(a, linear[: len(a.columns)]), (b, linear[len(a.columns) :])], START)
         except FAILURES:
@@ -518,6 +543,28 @@ def _joined(case: Case, trials: dict[frozenset[str], Trial]) -> None:
         made = _trial(case, [a, b], found)
         if math.isfinite(made.after):
             trials[made.names] = made
+
+
+def _wanted(
+    trials: Iterable[Trial],
+    ranked: Sequence[tuple[float, Candidate, Candidate, np.ndarray]],
+    score_of: Callable[[Trial], float],
+    expected_of: Callable[[float, list[Candidate]], float],
+) -> list[tuple[Candidate, Candidate, np.ndarray]]:
+    """The pairs that are expected to do better than the best trial, best first: the two effects, and coefficients."""
+    scores = [(score_of(t), t) for t in trials]
+    top, best = max(scores, key=lambda s: s[0])
+    found = []
+    for net, a, b, linear in ranked:
+        both = [a, b]
+        nested = best.names <= frozenset(c.effect.name for c in both)
+        needed = max(CLEAR, pairs.LEAD * best.fall) if nested else -CLEAR
+        if nested and (not best.members or best.complete):
+            continue
+        expected = expected_of(net - pairs.shortfall(both), both)
+        if expected - top >= needed:
+            found.append((expected, a, b, linear))
+    return [(a, b, linear) for _, a, b, linear in sorted(found, key=lambda t: -t[0])]
 
 
 def _bound_wander(case: Case, trials: Iterable[Trial]) -> None:
@@ -563,7 +610,7 @@ def compete(case: Case, trials: list[Trial]) -> Outcome:
             # from what its refit reached: where that stopped short, images promise what no refit brings
             if i < CONTENDERS or len(t.members) < 2 or t.readings is not None:
                 t.gain = _readings(case, t).noise(scale).gain
-                t.deviance = _readings(case, t).reached / scale - t.gain
+                t.deviance = _readings(case, t).standing(scale)
         # whitened by what readings of one setting share, residuals are larger: of the others by as much as the base's
         base = next(t for t in order if not t.members)
         for t in order:

@@ -13,7 +13,8 @@ from optics.diagnosis import fingerprints as prints
 from optics.diagnosis import statistics as st
 from optics.diagnosis.correlation import NOTICED, WANDER
 from optics.diagnosis.decide import Findings, Opponent, ordered, rivals
-from optics.diagnosis.evidence import Candidate, Evidence
+from optics.diagnosis.dials import unstated
+from optics.diagnosis.evidence import Candidate, Evidence, at_bound
 from optics.diagnosis.explanations import Outcome, beside_noise, fall_over_noise, lead_without
 from optics.diagnosis.refit import Case, clear
 from optics.diagnosis.result import Basis, Fingerprint, Law, Level, Split
@@ -21,6 +22,8 @@ from optics.diagnosis.thresholds import AS_GOOD, LEVEL, MISSTATED, TOLD, UNEVEN
 from optics.fit.compare import led_label
 from optics.fit.model import Model, value_of
 from optics.fit.result import Fit
+from optics.fit.scene_model import SceneModel
+from optics.scene.parameter import Variable
 
 
 def basis_of(model: Model, evidence: Evidence, structure: st.Structure) -> Basis:
@@ -78,7 +81,7 @@ def findings_of(
     splits   of the survivors' main effects; chance: p of the subject's strength by scatter
     """
     table, subject, best = case.table, subject_of(outcome), outcome.best
-    measured = case.model.captures is not None and case.model.captures.noise is None
+    measured = case.measured
     misstated = basis.structure_p >= LEVEL and basis.phi < MISSTATED and not (measured or case.evidence.is_table)
     if subject is None:
         fall = max([t.fall - t.expectation for t in outcome.trials] + [0.0])
@@ -190,11 +193,50 @@ def _of_subject(
         held_out=levels[-1].fall if len(levels) > 1 else math.nan,
         ahead=-best.ahead,
         clear=clear(best.fit, subject, strength),
+        far=_far(subject, strength),
+        at_end=_at_end(subject, strength),
+        complete=best.complete,
+        ran=_ran(case, best.fit),
+        unset=_unset(case, subject),
         chance=chance,
         carried=carried,
         carried_by=carried_by,
         fragile=table.fragile(name, outcome.named),
     )
+
+
+def _far(subject: Candidate, strength: Sequence[float]) -> float:
+    """The change of an effect's strengths in plausible sizes: of several, the root of the sum of squares; of strengths
+    of each frame, the rms."""
+    square = np.square((np.array(strength) - subject.start) / subject.plausible)
+    return math.sqrt(float(np.mean(square) if subject.effect.scope == "frame" else np.sum(square)))
+
+
+def _at_end(subject: Candidate, strength: Sequence[float]) -> str:
+    """'camera.glare 1' where a strength that moved stands at an end of its range; '' where none does."""
+    ends = [
+        f"{v.name} {x:.3g}"
+        for v, x, start in zip(subject.variables, strength, subject.start)
+        if at_bound(v, x) and abs(x - start) > 0
+    ]
+    return ", ".join(ends)
+
+
+def _unset(case: Case, subject: Candidate) -> str:
+    """The dials that images turn and nobody states, beside an effect with a strength per frame."""
+    model = case.model
+    if subject.effect.scope != "frame" or case.evidence.is_table or not isinstance(model, SceneModel):
+        return ""
+    return " and ".join(unstated(model))
+
+
+def _ran(case: Case, fit: Fit) -> str:
+    """The values of the base that stand at a bound, and that a fit brings back by more than a plausible size."""
+
+    def moved(v: Variable) -> float:
+        return abs(value_of(case.model, fit.values, v) - value_of(case.model, case.fit.values, v))
+
+    return ", ".join(v.name for v in case.base if v.name in case.fit.at_bound and moved(v) > v.parameter.plausible)
 
 
 def _carried(case: Case, outcome: Outcome, subject: Candidate) -> tuple[float, str]:

@@ -101,9 +101,10 @@ def _fall_of_images(evidence: Evidence) -> Callable[[Sequence[np.ndarray]], tupl
 def _fall_of_readings(
     evidence: Evidence, session: Session | Frames, scale: float
 ) -> Callable[[Sequence[np.ndarray]], tuple[float, int]]:
-    """The same beside noise that neighbours share, in units of the scale."""
+    """The same beside noise that neighbours share, in units of the scale; from where the base stands, as effects fall:
+    both are judged by other weights than those that it was fitted by."""
     base, r = evidence.dense(evidence.base), np.concatenate([block.r for block in evidence.blocks])
-    rank, before = st.orthonormal(base).shape[1], session.about(r, base).deviance(scale)
+    rank, before = st.orthonormal(base).shape[1], session.about(r, base).standing(scale)
 
     def fall_of(images: Sequence[np.ndarray]) -> tuple[float, int]:
         whole = np.hstack([base, np.concatenate(images)])

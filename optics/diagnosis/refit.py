@@ -64,6 +64,11 @@ class Case:
         return Frames(self.model, self.evidence) if enough else None
 
     @property
+    def measured(self) -> bool:
+        """Whether repeats fix the size of the noise."""
+        return self.model.captures is not None and self.model.captures.noise is None
+
+    @property
     def base(self) -> list[Variable]:
         """The variables of the fit that act in the fitted frames."""
         return [v for v in self.fit.variables if v.frames is None or set(v.frames) & set(self.fitted)]

@@ -22,7 +22,7 @@ from optics.diagnosis.result import (
     Shift,
     kinds_of,
 )
-from optics.diagnosis.thresholds import CLEAR, CLUTTERED, LEVEL, MARGIN, TOLD, is_structured
+from optics.diagnosis.thresholds import CLEAR, CLUTTERED, LEVEL, MARGIN, SURE, is_structured
 from optics.words import (
     ANYWHERE,
     NO_LIMIT,
@@ -233,7 +233,12 @@ def _ambiguous(f: Findings, explanations: Sequence[Explanation]) -> str:
             "noise that neighbours in the session share, such as a lamp that wanders, is not told apart from "
             f"{'this explanation' if count == 1 else f'these {count} explanations'} (fall of chi2): {names}.{other}"
         )
-    if f.law_lead < TOLD:
+    if f.unset:
+        return (
+            f"errors of {f.unset}, which nobody states, act on every frame as a strength of each does; not told apart "
+            f"from them: {names}.{other}"
+        )
+    if f.law_lead <= SURE:
         return (
             f"{'this explanation is' if count == 1 else f'{count} explanations are'} not told apart (fall of chi2) "
             f"from another law of {f.law}, which is in the model: {names}.{other}"

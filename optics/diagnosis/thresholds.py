@@ -31,6 +31,10 @@ EXCESS = 5.0  # ... where the excess is more than this many standard deviations
 UNEVEN = 0.1  # of the fall: what splitting the strength by channel, frame, ... may still gain
 MISSTATED = 2.0  # variance over the stated one above which what the best explanation leaves is misfit, not noise
 STRENGTH = 2.0  # standard deviations of a claimed strength from none: a fall without it has another cause
+# Plausible sizes (what NO_TIE costs) beyond which a strength is no claim if it stands at the end of its range, or if it
+# leaves structure where the base had run to the end of its own: falls are counted from a base that failed then, and all
+# that brings it back seems to be missing.
+IMPOSSIBLE = 36.0
 FAR = 0.3  # misfit over the mean signal: more than the effects of a sensor leave
 # Misfit over the mean signal of the fixed pattern alone in a good sensor (optics.proof, clutter 1), whose coating adds
 # 1 % of mottle.

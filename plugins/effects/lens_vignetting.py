@@ -44,7 +44,7 @@ effect = Effect(
             "vignetting",
             "1",
             0.0,
-            (0.0, 20.0),
+            (0.0, 200.0),
             "strength v; 1 is the natural cos^4 fall-off",
             neutral=0.0,
             plausible=0.5,

@@ -5,8 +5,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from optics.diagnosis import explanations, score
+from optics.diagnosis import explanations, laws, score
 from optics.diagnosis import statistics as st
+from optics.diagnosis.correlation import Readings
+from optics.scene import registry
 
 
 def form(name, information, fall):
@@ -128,7 +130,11 @@ def test_all_sets_are_weighed_by_one_noise(monkeypatch):
     }
     monkeypatch.setattr(explanations, "_scale", lambda *_: 2.0)
     monkeypatch.setattr(explanations, "_bound_wander", lambda *_: None)
-    monkeypatch.setattr(explanations, "_readings", lambda _, t: SimpleNamespace(reached=t.after, **readings))
+
+    def readings_of(_, t):
+        return SimpleNamespace(reached=t.after, standing=lambda scale: t.after / scale - 20.0, **readings)
+
+    monkeypatch.setattr(explanations, "_readings", readings_of)
     monkeypatch.setattr(explanations, "wander_of", lambda *_: 0.0)
     monkeypatch.setattr(explanations, "_lead", lambda *_: (0.0, 0.0))
     monkeypatch.setattr(explanations, "_with_survivors", lambda _, outcome: outcome)
@@ -170,3 +176,97 @@ def test_a_lamp_rules_out_nothing_that_leaves_less_where_misfit_is_left(monkeypa
     monkeypatch.setattr(explanations, "_design_effect", lambda *a: 1.0)
     lead, needed = explanations._lead(case, SimpleNamespace(scale=scale), best, other)
     assert (lead > needed) is ruled_out
+
+
+def test_a_law_falls_from_where_effects_fall():
+    """By what readings share they have other weights than the fit had, so that a base stands off its optimum. An effect
+    falls from there, and another law of the same image falls as far."""
+    rng, count = np.random.default_rng(1), 60
+    base, image = np.ones((count, 1)), np.cos(np.linspace(0, 6, count))[:, None]
+    r = (base + 5 * image)[:, 0] + rng.standard_normal(count)  # off its optimum by 1 along the base
+
+    def about(residual, fitted):
+        return Readings(residual, fitted, np.arange(count), {"lamp": np.full(count, 100.0)})
+
+    blocks = [SimpleNamespace(r=r)]
+    evidence = SimpleNamespace(dense=lambda columns: base, base=[0], blocks=blocks)
+    fall, dof = laws._fall_of_readings(evidence, SimpleNamespace(about=about), 1.0)([image])
+    whole = np.hstack([base, image])
+    left = r - whole @ np.linalg.lstsq(whole, r, rcond=None)[0]
+    effect = about(r, base).standing(1.0) - about(left, whole).standing(1.0)
+    assert about(r, base).standing(1.0) - about(r, base).deviance(1.0) == pytest.approx(count, rel=0.5)
+    assert (fall, dof) == (pytest.approx(effect, rel=1e-9), 1)
+
+
+@pytest.mark.parametrize("lamp, refitted", [(0.0, [{"a", "b"}]), (9000.0, [{"a", "b"}])])
+def test_a_lamp_that_swings_keeps_no_pair_from_a_refit(monkeypatch, lamp, refitted):
+    """Of two causes that make 10,000 of chi2, one alone leaves 4000, and a lamp that swings makes up for those."""
+
+    def candidate(name):
+        row = SimpleNamespace(p_family=0.0, refit=None)
+        cone = SimpleNamespace(live=[0])
+        return SimpleNamespace(effect=SimpleNamespace(name=name), row=row, cone=cone, broken=False, columns=[0])
+
+    def trial(members, fall, excess):
+        names = frozenset(c.effect.name for c in members)
+        return SimpleNamespace(members=members, names=names, fall=fall, cost=10.0, excess_sd=excess, keys=names)
+
+    a, b = candidate("a"), candidate("b")
+    trials = {t.names: t for t in (trial([], 0.0, 70.0), trial([a], 6000.0, 30.0), trial([b], 5000.0, 35.0))}
+    for t in trials.values():
+        t.complete = False
+    case = SimpleNamespace(
+        evidence=SimpleNamespace(
+            is_table=False, normal=SimpleNamespace(count=10000), projected=SimpleNamespace(rank=9)
+        ),
+        lamp=SimpleNamespace(most=0.0),
+        table=SimpleNamespace(order=[a, b]),
+    )
+    monkeypatch.setattr(explanations.pairs, "ranked", lambda *_: [(9900.0, a, b, np.zeros(2))])
+    monkeypatch.setattr(explanations, "_gain", lambda case, t, scale: lamp if len(t.members) == 1 else 0.0)
+    monkeypatch.setattr(explanations, "_expected_gain", lambda *_: 0.0)
+    monkeypatch.setattr(explanations, "expected_cost", lambda c: 10.0)
+    monkeypatch.setattr(explanations, "with_effects", lambda *_: None)
+    made = SimpleNamespace(after=100.0, names=frozenset("ab"))
+    monkeypatch.setattr(explanations, "_trial", lambda *_: made)
+    explanations._joined(case, trials)
+    assert [set(names) for names in trials if len(names) == 2] == refitted
+
+
+@pytest.mark.parametrize(
+    "swing, pattern, noise, measured, bare",
+    [
+        (0.01, 0.0, 1.0, False, True),  # a lamp that wanders by 1 %
+        (0.05, 0.0, 1.0, False, False),  # no lamp does that unnoticed
+        (0.01, 0.5, 1.0, False, False),  # a slope over the image
+        (0.0, 0.0, 1.2, False, True),  # noise that is stated too small
+        (0.0, 0.0, 1.2, True, False),  # of noise that repeats have measured, an excess is misfit
+    ],
+)
+def test_what_leaves_a_lamp_that_wanders_leaves_nothing(swing, pattern, noise, measured, bare):
+    """Eight frames of 24 x 32 px, 50 DN with noise of 1 DN: 1 % of one frame is 14 sd of its mean."""
+    rng, shape = np.random.default_rng(3), (24, 32, 3)
+    lamp = swing * np.array([1, -1, 0.5, 1, -1, -0.5, 1, -1])
+    slope = pattern * np.linspace(-1, 1, 32)[None, :, None]
+    left = [noise * rng.standard_normal(shape) + 50 * g + slope for g in lamp]
+    spectrum = st.Spectrum(1)
+    for _ in left:
+        spectrum.add(np.ones(shape, bool), [0], np.zeros((*shape, 1)))
+    evidence = SimpleNamespace(
+        frames=range(8),
+        sigma=[np.ones(shape)] * 8,
+        use=[np.ones(shape, bool)] * 8,
+        normal=SimpleNamespace(count=8 * 2304),
+        structure=lambda images, columns: spectrum.test(images, [0], np.zeros((1, 1))),
+    )
+    frames = [SimpleNamespace(image=60.0 + image) for image in left]
+    model = SimpleNamespace(noise=SimpleNamespace(black_level=10.0), frames=frames)
+    case = SimpleNamespace(evidence=evidence, model=model, measured=measured)
+    after = sum(float(np.sum(image**2)) for image in left)
+    assert explanations._is_bare(case, left, after, 8 * 2304.0, []) is bare
+
+
+def test_a_narrow_field_may_fall_off_by_a_tenth():
+    """cos^(4 v) at 2.5 degrees off the axis."""
+    (vignetting,) = registry.default().find_effect("lens vignetting").parameters
+    assert np.cos(np.radians(2.5)) ** (4 * vignetting.bounds[1]) < 0.9

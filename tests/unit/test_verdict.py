@@ -24,7 +24,7 @@ from optics.diagnosis.evidence import Candidate, measure
 from optics.diagnosis.explanations import Outcome
 from optics.diagnosis.result import WORDS, Diagnosis, Fingerprint
 from optics.diagnosis.score import Table, score
-from optics.diagnosis.thresholds import CLUTTERED, TOLD
+from optics.diagnosis.thresholds import CLUTTERED, SURE, TOLD
 from optics.errors import Underdetermined
 from optics.fit.model import value_of
 from optics.fit.tempering import tempered
@@ -296,7 +296,15 @@ GOOD = Findings(
         ({"rival": True, "ratio": 2.0, "curve_share": 0.06}, "UNKNOWN"),
         ({"rival": True, "ratio": 2.0, "curve_share": 0.04}, "CANNOT_TELL"),
         ({"p_family": 0.02, "rival": True, "ratio": 3.0, "curve_share": 0.01}, "CANNOT_TELL"),
-        ({"law": "b along frame", "law_lead": TOLD + 0.1}, "CLAIM"),
+        ({"law": "b along frame", "law_lead": SURE + 0.1}, "CLAIM"),
+        ({"law": "b along frame", "law_lead": SURE - 0.1}, "AMBIGUOUS"),  # as over any other rival
+        ({"unset": "analyzer.angle"}, "AMBIGUOUS"),  # a gain of each frame, or a dial that was off in each
+        ({"far": 80.0}, "CLAIM"),  # whatever its size, it explains all
+        ({"far": 80.0, "complete": False}, "CLAIM"),
+        # an axis 80 deg off that leaves structure, where a lamp had been turned up without end
+        ({"far": 80.0, "complete": False, "ran": "source.power"}, "CANNOT_TELL"),
+        ({"far": 80.0, "at_end": "camera.glare 1"}, "CANNOT_TELL"),
+        ({"far": 2.0, "at_end": "gel.share 1", "complete": False}, "CLAIM"),  # a structural effect that is there: 1
         ({"law": "b along frame", "law_lead": 1.0}, "AMBIGUOUS"),
         ({"law": "b along frame", "law_lead": -TOLD - 0.1}, "UNKNOWN"),
         ({"law": "b along frame", "law_lead": -TOLD - 0.1, "structure_p": 0.5}, "CANNOT_TELL"),
