@@ -76,7 +76,8 @@ class Normal:
     def kappa(self) -> np.ndarray:
         """Noise over signal per pixel of one render of each column."""
         signal = np.maximum(np.diag(self.gram), 1e-300)
-        return np.sqrt(self.noise / signal)
+        with np.errstate(over="ignore"):  # infinite, where the products of two images come out below 0
+            return np.sqrt(self.noise / signal)
 
     def truncation(self, columns: Index) -> float:
         """Eigenvalues of these columns that their noise can make: kappa^2/sqrt(n), times 5, and never below TRUNCATION.
