@@ -243,6 +243,18 @@ def test_light_that_only_an_effect_brings_has_nodes(mitsuba, tmp_path):
     assert found == pytest.approx(exact / scene.integral.unit, abs=2e-4)  # of channels that are 1 at most
 
 
+def test_what_a_pigment_sends_is_drawn_times_the_sensitivities(mitsuba):
+    """On Vi2TaP the red channel's small maximum at 530 nm counts more beside the pigment's light than by itself."""
+    from optics.light.spectra import draw
+
+    defines = {"width": "16", "height": "12", "bands": "auto", "sensitivity": NIKON}
+    figure = draw(loader.load(shipped("scenes") / "vi2tap.xml", defines))
+    red = [line.get_xydata() for line in figure.axes[0].lines if line.get_color() == "#c03030"]
+    alone, seen = (np.interp(530.0, *line.T) / line[:, 1].max() for line in red)
+    assert alone == pytest.approx(0.12, abs=0.02)  # of the table
+    assert seen > 2 * alone  # white light by itself leaves it as it is
+
+
 @pytest.mark.slow
 def test_pigments_and_ultraviolet_leds_are_given_by_curves(mitsuba, tmp_path):
     """Vi2TaP with its Gaussians written as curves is the same image, in auto bands and in three; a curve of the LED
