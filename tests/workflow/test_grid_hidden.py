@@ -54,6 +54,16 @@ def small(effects=None, seed=1, spp=64):
     return GridMaker(scenes.load("grid_bench", {"width": "12", "height": "9"}), BUILT, effects, seed=seed, spp=spp)
 
 
+def test_differences_by_an_index_are_as_wide_as_a_plausible_change(mitsuba):
+    """Rays that meet another wall than before make the noise of a difference, which falls with its width."""
+    scene = scenes.load("grid_bench", {"width": "12", "height": "9"})
+    for part in ("walls", "filling"):
+        for name in ("index", "index_offset", "dispersion"):
+            parameter = scene.parameters[f"{part}.{name}"]
+            assert parameter.how == "difference" and parameter.step >= 1, name
+
+
+@pytest.mark.slow
 def test_differences_by_the_dispersion_are_seen_beside_their_own_noise(mitsuba):
     """Noise over signal of a derivative image, of one pixel, as two seeds tell it: with steps of a tenth of a plausible
     change it was 4, and a dispersion that shows was left out as noise."""
