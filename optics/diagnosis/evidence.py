@@ -269,7 +269,7 @@ class Evidence:
         return normal
 
     def project(
-        self, normal: st.Normal, base: Sequence[int], rest: Sequence[int], thinning: int = 1, settled: bool = False
+        self, normal: st.Normal, base: Sequence[int], rest: Sequence[int], thinning: int = 1, noisy: bool = False
     ) -> st.Projected:
         """Project with the priors of the first base columns; thinned data meet thinned priors."""
         return st.project(
@@ -278,7 +278,7 @@ class Evidence:
             rest,
             _padded(self.precision, base) / thinning,
             _padded(self.pull, base) / thinning,
-            settled=settled,
+            noisy=noisy,
         )
 
 
@@ -401,7 +401,7 @@ def measure(
     evidence.noise = math.sqrt(variance / count) / evidence.signal
     evidence.masked = 1 - (count / total)
     evidence.projected = evidence.project(
-        evidence.normal, evidence.base, evidence.rest, settled=not noisy.isdisjoint(evidence.base)
+        evidence.normal, evidence.base, evidence.rest, noisy=not noisy.isdisjoint(evidence.base)
     )
     return evidence
 

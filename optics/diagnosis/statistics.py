@@ -76,7 +76,8 @@ class Normal:
     def kappa(self) -> np.ndarray:
         """Noise over signal per pixel of one render of each column."""
         signal = np.maximum(np.diag(self.gram), 1e-300)
-        return np.sqrt(self.noise / signal)
+        with np.errstate(over="ignore"):  # infinite, where the products of two images come out below 0
+            return np.sqrt(self.noise / signal)
 
     def truncation(self, columns: Index) -> float:
         """Eigenvalues of these columns that their noise can make: kappa^2/sqrt(n), times 5, and never below TRUNCATION.
@@ -132,13 +133,14 @@ def project(
     precision: np.ndarray | None = None,
     pull: np.ndarray | None = None,
     truncation: float | None = None,
-    settled: bool = False,
+    noisy: bool = False,
 ) -> Projected:
     """Project the columns `base` off the columns `rest` and the residual.
 
     precision, pull   (p,) 1/tau^2 and (mean - value)/tau^2 of priors on the base: rows that a calibration sees as well
-    settled           the base is known to be at its optimum, where J'r = 0: noise of the images in J'r is left out of
-                      the scores, and its expectation out of `absorbed`
+    noisy             images of the base are Monte Carlo estimates: the expectation of their noise is left out of
+                      `absorbed`. J'r itself counts in the scores: at the optimum that a fit found with images J + N it
+                      is not 0 but -N'r, and what nearly is an image of the base would show all of that
     """
     base, rest = np.asarray(base, int), np.asarray(rest, int)
     precision = np.zeros(len(base)) if precision is None else precision
@@ -151,11 +153,10 @@ def project(
     x = inv @ across
     v = normal.gram[np.ix_(rest, rest)] - across.T @ x
     absorbed = float(b @ inv @ b)
-    if settled:
+    if noisy:
         absorbed = max(
             absorbed - float(np.diag(inv) @ normal.noise[base]) * normal.square / max(normal.count, 1) / 2, 0.0
         )
-        b = np.zeros_like(b)
     prior = float(np.sum(pull**2 / np.where(precision > 0, precision, 1.0)))
     survival = np.clip(np.divide(np.diag(v), raw, out=np.zeros(len(rest)), where=raw > 0), 0.0, 1.0)
     return Projected(

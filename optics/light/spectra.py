@@ -65,9 +65,11 @@ def draw(scene: Scene) -> Any:
         colour = _colour(nm, shapes[key])
         axis.fill_between(nm, shapes[key], color=colour, alpha=0.35, lw=0, label=f"{label}: light")
         axis.plot(nm, shapes[key], color=colour, lw=0.8)
+    sent = [spectrum_of(scene, n, scene.values(), nm) for n in scene.lights]
     for name, part in scene.parts.items():
         if hasattr(part, "fluorescence"):
             glow = part.emission(numbers_of(scene, name, scene.values()), nm)
+            sent.append(glow / (glow.sum() * STEP))  # of power 1, as lights
             colour = _colour(nm, glow)
             axis.fill_between(nm, glow / glow.max(), color=colour, alpha=0.35, lw=0, label=f"{name}: emission")
     channels = scene.camera.seen(nm) if scene.camera is not None and scene.camera.channels else np.zeros((0, len(nm)))
@@ -77,10 +79,7 @@ def draw(scene: Scene) -> Any:
         axis.plot(nm, row / channels.max(), color=colour, lw=1.6, label=title)
     if scene.integral is not None and scene.integral.auto:
         for q, colour in zip(scene.integral.quantum, colours):
-            total = sum(
-                np.interp(nm, scene.integral.grid, q, 0, 0) * spectrum_of(scene, n, scene.values(), nm)
-                for n in scene.lights
-            )
+            total = np.interp(nm, scene.integral.grid, q, 0, 0) * sum(sent)
             title = "light times sensitivity" if colour == colours[0] else None
             axis.plot(nm, total / max(total.max(), 1e-30), color=colour, lw=0.8, ls=":", label=title)
     styles = iter(("--", "-.", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 1))))

@@ -1,4 +1,5 @@
-"""Speed, measured beside stock Mitsuba in one run: `make bench`. Prints ratios; judges nothing.
+"""Speed, measured beside stock Mitsuba in one run: `make bench`, or a part of it: `make bench
+ARGS=spectra`. Prints ratios; judges nothing.
 
 new press    geometry, hits, shadows and images of six LEDs, 320 x 240
 taxim        a new press by the package of that name, where it is installed with jax (a table of a sensor's shades and a
@@ -6,7 +7,9 @@ taxim        a new press by the package of that name, where it is installed with
 derivatives  all derivative images of 30 parameters, in units of the primal
 render       the same scene by `tactile` and by stock `path`: time x variance, which is time at equal noise
 prediction   the images of six LEDs against `path` with as many samples as its noise needs to fall to their error
-spectra      a new press in auto bands over the same in the scene's fixed ones, in turns; processor time
+spectra      a new press in auto bands over the same in the scene's fixed ones, in turns; processor time. A floor and
+             a wall under a white LED by auto bands and by stock `path` with wavelengths by Monte Carlo: time at equal
+             noise
 ranking      every effect scored on 16 frames of 160 x 120, presses solved for as well
 """
 
@@ -15,6 +18,7 @@ from __future__ import annotations
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from statistics import median
 
@@ -276,7 +280,40 @@ def spectral_cost(name: str, laps: int = 7) -> tuple[float, float, int]:
     return median(spent[0]), median(spent[1]), len(loaded[1].integral.nm)
 
 
+def spectral_noise(max_depth: int, passes: int = 32, spp: int = 256) -> tuple[float, float, float, float]:
+    """Of channels as integrals (optics.proof.makers.white): s of our image, loading and tracing included; s of stock
+    `path`, in the variant `llvm_ad_spectral_polarized`, to the same error; that error, rms; the images' mean.
+
+    The error is that against the mean of the passes, less the noise of that mean, plus three of its standard
+    deviations: what ours is at most, so that the time of `path` is what it takes at least."""
+    from optics.proof.makers import white
+
+    with tempfile.TemporaryDirectory() as folder:
+        scene, warm = white.by_nodes(Path(folder), max_depth, "auto")
+        stock = white.by_wavelengths(scene.integral.unit, max_depth)
+        warm(), stock(spp, 0)  # kernels are compiled
+        start = time.perf_counter()
+        image = white.by_nodes(Path(folder), max_depth, "auto")[1]()
+        ours = time.perf_counter() - start
+    start = time.perf_counter()
+    images = np.array([stock(spp, 1 + k) for k in range(passes)])
+    spent = (time.perf_counter() - start) / passes
+    variance = images.var(0, ddof=1)
+    own = variance / passes
+    excess = float(((image - images.mean(0)) ** 2 - own).mean())
+    sd = float(np.sqrt((2 * own**2 * (1 + 1 / (passes - 1))).sum()) / own.size)  # of noise alone
+    error = max(excess, 0.0) + 3 * sd
+    return ours, spent * float(variance.mean()) / error, error**0.5, float(images.mean())
+
+
 def spectra() -> None:
+    for max_depth in (2, 3):
+        ours, stock, error, level = spectral_noise(max_depth)
+        row(
+            f"white LED, {'direct light' if max_depth == 2 else 'two bounces'}: ours / stock path",
+            f"{ours / stock:.2g} x",
+            f"{ours:.2f} s; path at least {stock:.3g} s to our error, at most {error / level:.1e}; target below 1",
+        )
     for name, (_, _, target) in SPECTRAL.items():
         fixed, auto, bands = spectral_cost(name)
         row(
@@ -319,7 +356,7 @@ def ranking() -> None:
         )
 
 
-def main() -> int:
+def presses() -> None:
     from optics.scene.mitsuba_parts import use_variant
 
     renderer, values, press = new_press(320, 240)
@@ -340,12 +377,20 @@ def main() -> int:
 
     against_stock(renderer, now, ours)
     use_variant("llvm_ad_spectral_polarized")
-    printed_grid()
-    use_variant("llvm_ad_spectral_polarized")
-    spectra()
-    ranking()
+
+
+PARTS = {"presses": presses, "grid": printed_grid, "spectra": spectra, "ranking": ranking}
+
+
+def main(names: Sequence[str]) -> int:
+    """Measure the named parts; none named: all."""
+    if unknown := set(names) - set(PARTS):
+        print(f"no part {', '.join(sorted(unknown))}; there are {', '.join(PARTS)}", file=sys.stderr)
+        return 2
+    for name in names or PARTS:
+        PARTS[name]()
     return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(main(sys.argv[1:]))

@@ -109,9 +109,13 @@ def read_table(
     delimiter = next((d for d in (";", "\t", ",") if d in lines[0]), None)
     rows = [[cell.strip().strip('"') for cell in line.split(delimiter)] for line in lines]
     head = [] if _is_number(rows[0][0]) else rows.pop(0)
-    if not rows or any(len(row) != len(rows[0]) for row in rows) or len(rows[0]) < 2:
+    if not rows:
+        raise BadScene(f"{say}: {file.name} holds a header and no rows; allowed: a wavelength and a value in each row")
+    short = next((row for row in rows if len(row) != len(rows[0]) or len(row) < 2), None)
+    if short is not None:
         raise BadScene(
-            f"{say}: rows of {file.name} differ in length, or have no value; allowed: a wavelength and values"
+            f"{say}: rows of {file.name} differ in length, or have no value, such as '{' '.join(short)}'; allowed: a "
+            "wavelength and values, as many in every row and parted alike"
         )
     try:
         data = np.array([[float(cell) for cell in row] for row in rows])
@@ -148,7 +152,11 @@ def checked(nm: np.ndarray, values: np.ndarray, kind: str, source: str, say: str
     """A curve whose numbers are what its kind may have; raises BadScene, which starts with `say`."""
     unit, (low, high), _ = KINDS[kind]
     if not (np.isfinite(nm).all() and np.isfinite(values).all()):
-        raise BadScene(f"{say}: numbers that are not finite; allowed: a wavelength and a finite value in each row")
+        k = int(np.argmin(np.isfinite(nm) & np.isfinite(values)))
+        raise BadScene(
+            f"{say}: {values[k]:g} at {nm[k]:g} nm is not finite; allowed: a wavelength and a finite value in each "
+            "row; leave out what was not measured"
+        )
     if len(nm) < 2:
         raise BadScene(f"{say}: {len(nm)} row; allowed: two and more")
     steps = np.diff(nm)

@@ -55,6 +55,7 @@ effect = Effect(
             neutral=0.0,
             plausible=0.005,
             how="difference",
+            step=1.0,
         ),
     ),
     acts=("channel", "radius"),

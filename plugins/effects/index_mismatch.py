@@ -50,6 +50,7 @@ effect = Effect(
             neutral=0.0,
             plausible=0.01,
             how="difference",
+            step=1.0,
         ),
     ),
     acts=("rim", "radius"),

@@ -29,7 +29,9 @@ from optics.scene.parameter import Parameter
 from optics.scene.surfaces import passing
 
 PARAMETERS = (
-    Parameter("index", "1", 1.5, (1.0, 2.5), "refractive index n at 540 nm", plausible=0.01, how="difference"),
+    Parameter(
+        "index", "1", 1.5, (1.0, 2.5), "refractive index n at 540 nm", plausible=0.01, how="difference", step=1.0
+    ),
     Parameter(
         "absorption",
         "1/mm",

@@ -70,6 +70,56 @@ def test_few_nodes_give_what_many_bands_give(mitsuba, auto, tmp_path):
     assert not any(name.startswith("S0.") for name in found.channels)
 
 
+NOT_AUTO = {  # scenes that take no auto bands, and why; lines as theirs: tests/unit/test_spectra.py
+    "grid_bench": "followed in up to 4 bands; allowed",
+    "magictac": "followed in up to 4 bands; allowed",
+    "particle_gel": "the camera sees the light of inner_ring, outer_ring itself.*allowed: fixed bands",
+}
+WAYS = {
+    "tilt": lambda nm: np.exp(0.3 * (nm - 540) / 100),
+    "fade": lambda nm: np.exp(-0.5 * np.exp(-(nm - 540) / 100)),  # a resin that turns yellow
+    "quarter wave": lambda nm: np.sin(np.pi / 4 * 540 / nm) ** 2,  # between crossed polarizers
+}
+
+
+@pytest.mark.parametrize("name", sorted(p.stem for p in shipped("scenes").glob("*.xml")))
+def test_nodes_of_every_shipped_scene_meet_sums_in_steps_of_1_nm(mitsuba, tmp_path, name):
+    """Each light of each scene, as it is and over ways that change with the wavelength, to 1e-4 of its largest
+    channel."""
+    text = (shipped("scenes") / f"{name}.xml").read_text(encoding="utf-8")
+    text = re.sub(r'<default name="(bands|sensitivity)"[^>]*>', "", text)
+    text = re.sub(r'<string name="sensitivity"[^>]*>', "", text)
+    text = re.sub(r'(<string name="bands" value=")[^"]*', r"\1auto 5", text)
+    text, cameras = re.subn(
+        r'(<sensor type="(?:camera|fisheye)"[^>]*>)', rf'\1 <string name="sensitivity" value="{NIKON}"/>', text
+    )
+    assert cameras == 1
+    (tmp_path / "scene.xml").write_text(text, encoding="utf-8")
+    if name in NOT_AUTO:
+        with pytest.raises(BadScene, match=NOT_AUTO[name]):
+            loader.load(tmp_path / "scene.xml")
+        return
+    scene = loader.load(tmp_path / "scene.xml")
+    integral, values = scene.integral, scene.values()
+    every = slice(None, None, 4)  # of the grid of 0.25 nm
+    nm = integral.grid[every]
+    assert np.diff(nm) == pytest.approx(1.0)
+    ends = np.where((nm == nm[0]) | (nm == nm[-1]), 0.5, 1.0)
+    quantum = np.stack([np.interp(nm, q.nm, q.values, left=0, right=0) for q in read_channels(NIKON)])
+    matrix = integral.matrix(values)
+    assert integral.groups
+    for group in integral.groups:
+        weights = quantum * group.spectrum(values)[every] * ends / integral.unit
+        for way in (np.ones_like, *WAYS.values()):
+            found = matrix[:, group.bands] @ way(integral.nm[group.bands])
+            # the amber line of 17 nm stands on a corner of the red sensitivity, which is straight over 5 nm: there sums
+            # in steps of 1 nm are off by 2.4e-4, which is found with steps of 0.25 nm
+            tolerance = 3e-4 if group.lights == ("led_amber",) else 1e-4
+            assert found == pytest.approx(weights @ way(nm), abs=tolerance * weights.sum(1).max()), group.lights
+            fine = (integral.quantum * integral.step * group.spectrum(values)) @ way(integral.grid) / integral.unit
+            assert found == pytest.approx(fine, abs=2e-5 * weights.sum(1).max()), group.lights
+
+
 @pytest.mark.parametrize(
     "paint",
     [
@@ -191,6 +241,18 @@ def test_light_that_only_an_effect_brings_has_nodes(mitsuba, tmp_path):
     )
     exact = 0.1 * scene.integral.quantum @ (own * np.interp(nm, [400, 480, 560, 700], [0.1, 0.1, 0.9, 0.9]))
     assert found == pytest.approx(exact / scene.integral.unit, abs=2e-4)  # of channels that are 1 at most
+
+
+def test_what_a_pigment_sends_is_drawn_times_the_sensitivities(mitsuba):
+    """On Vi2TaP the red channel's small maximum at 530 nm counts more beside the pigment's light than by itself."""
+    from optics.light.spectra import draw
+
+    defines = {"width": "16", "height": "12", "bands": "auto", "sensitivity": NIKON}
+    figure = draw(loader.load(shipped("scenes") / "vi2tap.xml", defines))
+    red = [line.get_xydata() for line in figure.axes[0].lines if line.get_color() == "#c03030"]
+    alone, seen = (np.interp(530.0, *line.T) / line[:, 1].max() for line in red)
+    assert alone == pytest.approx(0.12, abs=0.02)  # of the table
+    assert seen > 2 * alone  # white light by itself leaves it as it is
 
 
 @pytest.mark.slow

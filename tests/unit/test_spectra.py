@@ -24,9 +24,11 @@ BAD = {  # a file's text: what the error says
     "400,10\n500,50\n": "looks like per cent",
     "0.4,0.1\n0.7,0.2\n": "header that names another unit",
     "wavelength (inch),T\n400,0.1\n500,0.2\n": "unit 'inch'",
-    "400,0.1\n500\n": "differ in length",
+    "400,0.1\n500\n": "differ in length, or have no value, such as '500'",
+    "nm,T\n400;0.1\n500;0.2\n": "no value, such as '400;0.1'",
     "400,0.1\n500,abc\n": "'abc'",
-    "400,nan\n500,0.1\n": "not finite",
+    "400,nan\n500,0.1\n": "nan at 400 nm is not finite",
+    "wavelength (nm),T\n": "a header and no rows",
     "400,0.1\n": "1 row",
     "": "no rows",
 }
@@ -46,6 +48,15 @@ def test_a_bad_table_gets_one_error(text, tmp_path):
     with pytest.raises(BadScene, match="filter = 'bad.csv'.*" + BAD[text].split()[0].replace("(", r"\(")) as error:
         read_curve("bad.csv", "transmittance", [tmp_path], "camera.filter")
     assert BAD[text] in str(error.value) and "\n" not in str(error.value)
+
+
+def test_bands_that_are_no_light_ask_for_the_unit():
+    from optics.spectra.bands import parse
+
+    for text, wrong in (("0.61, 0.54, 0.46", "0.61 nm"), ("0.4:0.7:0.1", "0.4 nm"), ("6100, 54000", "54000 nm")):
+        with pytest.raises(BadScene, match=rf"camera: bands = .*: {wrong}; allowed: .*is the unit nm"):
+            parse(text, "camera")
+    assert parse("610, 540, 460", "camera") == ((610.0, 540.0, 460.0), None)
 
 
 @pytest.mark.parametrize(

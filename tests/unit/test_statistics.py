@@ -54,6 +54,28 @@ def test_priors_are_rows_of_the_base():
     assert left.chi2 == pytest.approx(dense.chi2, rel=1e-10)
 
 
+def test_noise_of_the_images_of_a_base_makes_no_candidate_that_is_nearly_one_of_them():
+    """A fit whose image of a power has noise of 4 % ends where the residual is orthogonal to that noisy image: by fresh
+    images the power should fall. A candidate that is that power but for 3 % must not be taken for the cause."""
+    rng, n, signal, noise, apart = np.random.default_rng(7), 2000, 10.0, 0.4, 0.3
+    falls = []
+    for _ in range(200):
+        power = signal * (1 + 0.3 * rng.standard_normal(n))
+        other = -power + apart * rng.standard_normal(n)
+        of_fit, *fresh = (power + noise * rng.standard_normal(n) for _ in range(3))
+        r = rng.standard_normal(n) - (of_fit - power)
+        r -= of_fit * (of_fit @ r) / (of_fit @ of_fit)
+        normal = st.Normal(2)
+        a, b = (np.stack([image, other], 1) for image in fresh)
+        normal.add(range(2), a, r, b)
+        left = st.project(normal, [0], [1], noisy=True)
+        falls.append(float(left.score[0] ** 2 / left.information[0, 0]))
+    # what is apart and the mean noise of two fresh images, times a residual of variance 1 + noise^2, over what is apart
+    expected = (apart**2 + noise**2 / 2) * (1 + noise**2) / apart**2
+    # the mean of 200 squares of Gaussian numbers is known to 10 %; without J'r it was 600
+    assert np.mean(falls) == pytest.approx(expected, rel=0.4)
+
+
 def test_frames_may_be_streamed_and_lack_columns():
     j, g, r = data()
     a = np.hstack([j, g])

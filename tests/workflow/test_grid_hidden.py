@@ -4,13 +4,17 @@ hidden in turn.
 A matt rod at three distances, lit by one panel after the other, 8 bits. Free are the powers of the panels; held out is
 one distance."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from optics.captures import capture_set as capture_files
 from optics.fit.model import value_of
-from optics.proof.makers.grid import GridMaker
+from optics.fit.scene_model import SceneModel
+from optics.proof.makers.grid import CAMERA, GridMaker
 from optics.scene import loader as scenes
+from optics.scene.parameter import Values, Variable
 from optics.scene.registry import known
 from optics.study import loop
 
@@ -48,6 +52,29 @@ def study_of(folder, effects, seed=5):
 
 def small(effects=None, seed=1, spp=64):
     return GridMaker(scenes.load("grid_bench", {"width": "12", "height": "9"}), BUILT, effects, seed=seed, spp=spp)
+
+
+def test_differences_by_an_index_are_as_wide_as_a_plausible_change(mitsuba):
+    """Rays that meet another wall than before make the noise of a difference, which falls with its width."""
+    scene = scenes.load("grid_bench", {"width": "12", "height": "9"})
+    for part in ("walls", "filling"):
+        for name in ("index", "index_offset", "dispersion"):
+            parameter = scene.parameters[f"{part}.{name}"]
+            assert parameter.how == "difference" and parameter.step >= 1, name
+
+
+@pytest.mark.slow
+def test_differences_by_the_dispersion_are_seen_beside_their_own_noise(mitsuba):
+    """Noise over signal of a derivative image, of one pixel, as two seeds tell it: with steps of a tenth of a plausible
+    change it was 4, and a dispersion that shows was left out as noise."""
+    scene = scenes.load("grid_bench", {**CHANCE, "width": "12", "height": "9", "bands": "610, 540, 460"})
+    frames = [capture_files.Frame("flat", np.full((9, 12, 3), 50, np.float32))]
+    model = SceneModel(scene, capture_files.Captures(Path("."), "grid_bench", frames, noise=CAMERA), CAMERA)
+    key = "filling.dispersion"
+    variable = Variable(key, (key,), scene.parameters[key])
+    one, other = (next(iter(model.derivatives(Values(), [variable], [0], seed=s)))[1][key] for s in (1, 2))
+    noise, signal = np.mean((one - other) ** 2) / 2, np.mean(one * other)
+    assert noise < 1.5**2 * signal
 
 
 def test_frames_are_lit_by_one_panel_each_and_as_noisy_as_they_say():

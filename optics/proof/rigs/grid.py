@@ -80,3 +80,9 @@ class GridColour(Grid):
     uncounted = ()
     distances = (2.5, 4.5)
     width, height, spp = 20, 15, 4096
+
+    def parameters(self, effect: str):
+        """Of the dispersion of both materials: what walls bend is the difference."""
+        if effect == "dispersion":
+            return {"filling.dispersion": 1.0, "walls.dispersion": -1.0}, 0.0
+        return super().parameters(effect)
