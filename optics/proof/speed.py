@@ -1,5 +1,5 @@
-"""Speed, measured beside stock Mitsuba in one run: `make bench`, or a part of it: `make bench
-ARGS=spectra`. Prints ratios; judges nothing.
+"""Speed, measured beside stock Mitsuba in one run: `make bench`, or a part of it: `make bench ARGS=spectra`. Prints
+ratios; judges nothing.
 
 new press    geometry, hits, shadows and images of six LEDs, 320 x 240
 taxim        a new press by the package of that name, where it is installed with jax (a table of a sensor's shades and a
@@ -150,9 +150,6 @@ def printed_grid() -> None:
             f"noise {np.median(error / np.maximum(image, 1e-12)):.1%} in the median pixel, "
             f"{(error**2).mean() ** 0.5 / image.mean():.0%} rms; target 5 % below 60 s",
         )
-    from optics.scene.mitsuba_parts import use_variant
-
-    use_variant("llvm_ad_spectral_polarized")
 
 
 def new_press(width: int, height: int):
@@ -357,8 +354,6 @@ def ranking() -> None:
 
 
 def presses() -> None:
-    from optics.scene.mitsuba_parts import use_variant
-
     renderer, values, press = new_press(320, 240)
     scene = renderer.scene
     ours = timed(press, 9)
@@ -376,7 +371,6 @@ def presses() -> None:
     row("30 derivative images", f"{derivatives / lit:.1f} x primal", "target below 30 x")
 
     against_stock(renderer, now, ours)
-    use_variant("llvm_ad_spectral_polarized")
 
 
 PARTS = {"presses": presses, "grid": printed_grid, "spectra": spectra, "ranking": ranking}
@@ -387,7 +381,10 @@ def main(names: Sequence[str]) -> int:
     if unknown := set(names) - set(PARTS):
         print(f"no part {', '.join(sorted(unknown))}; there are {', '.join(PARTS)}", file=sys.stderr)
         return 2
+    from optics.scene.mitsuba_parts import use_variant
+
     for name in names or PARTS:
+        use_variant()  # a part may leave another
         PARTS[name]()
     return 0
 

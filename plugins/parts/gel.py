@@ -48,6 +48,7 @@ XML
 """
 
 import math
+from dataclasses import replace
 
 from optics.scene.checking import agree, made
 from optics.scene.declare import Part
@@ -375,11 +376,12 @@ def build():
             xx, xy, yy = map(n, CURVE)
             if not (xx or xy or yy):
                 return None
-            x, y, shape = n("press_x"), n("press_y"), self.indenter if now is None else now["indenter"]
+            shape = self.indenter if now is None else now["indenter"]
+            face = contact.RestFace(xx, xy, yy, n("press_x"), n("press_y"))
             if shape == "balls" and n("press_depth") > 0:
                 mean = (xx * n("width") ** 2 + yy * n("length") ** 2) / 24
-                return contact.RestFace(xx, xy, yy, x, y, mean, 1 - n("evened"))
-            return contact.RestFace(xx, xy, yy, x, y, (xx * x * x + 2 * xy * x * y + yy * y * y) / 2)
+                return replace(face, level=mean, share=1 - n("evened"))
+            return replace(face, level=face.around(0.0, 0.0))
 
         def profile(self, now=None):
             """Lower surface of the indenter (optics.skin.contact.Profile), over the face that it finds; of the values

@@ -43,11 +43,13 @@ def test_a_flat_field_shows_the_slope_and_a_contact_does_not(bench, one_led):
 
 
 def test_an_elastic_skin_takes_the_indenters_shape_over_a_curved_face(mitsuba):
-    """The middle of the contact is the ball, as deep below the face as it is pressed, curved or not."""
+    """The middle of the contact is the ball, as deep below the face as it is pressed, to 7e-5 mm, curved or not. The
+    allowed 2e-4 mm are 3 % of what the slope of the face makes at 0.3 mm beside the middle: (c/2) (3.3^2 - 3^2) =
+    -7.6e-3 mm, were the ball to lean with it."""
     from optics.scene.checking import made
 
     r = np.array([-0.3, 0.0, 0.3])
     for curve in (0.0, -8e-3):
         gel = made("gel", press_x=3.0, press_depth=0.5, dent_model="elastic", curve_xx=curve, bsdf={"type": "membrane"})
         ball = curve * 9 / 2 - (0.5 - 1.5 + np.sqrt(1.5**2 - r**2))
-        np.testing.assert_allclose(gel.heights(3.0 + r, [0.0])[0], ball, atol=2e-3)  # of pitches of 0.03 mm
+        np.testing.assert_allclose(gel.heights(3.0 + r, [0.0])[0], ball, atol=2e-4)

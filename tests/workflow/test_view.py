@@ -281,7 +281,11 @@ def test_best_of_a_bounded_effect_stays_within(ask):
             {"frame": 0, "values": {"camera.vignettin": 1}},
             "unknown parameter of this page 'camera.vignettin'; did you mean 'camera.vignetting'?",
         ),
-        ("/predict", {"frame": 0, "values": {VIGNETTING: -1}}, "vignetting = -1 is outside its bounds [0, 200]"),
+        (
+            "/predict",
+            {"frame": 0, "values": {VIGNETTING: -1}},
+            "camera.vignetting = -1 is outside its bounds [0, 200]",
+        ),
         ("/predict", {"frame": 0, "values": {VIGNETTING: "much"}}, "is not a number"),
         ("/predict", {"frame": 0, "values": [1]}, "values: not a table"),
         ("/predict", {"frame": 6}, "no frame 6; allowed: 0 to 5"),
