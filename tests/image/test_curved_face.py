@@ -39,7 +39,7 @@ def test_a_flat_field_shows_the_slope_and_a_contact_does_not(bench, one_led):
     level, curved = bench.image(pressed)[..., 0], bench.image({**pressed, **CURVE})[..., 0]
     inside = np.hypot(flat[..., 0], flat[..., 1]) < 0.7  # of a contact of 1 mm
     assert inside.sum() > 20
-    np.testing.assert_allclose(curved[inside], level[inside], rtol=1e-3)
+    np.testing.assert_allclose(curved[inside], level[inside], rtol=2e-5)  # float32; 4e-6 was found
 
 
 def test_an_elastic_skin_takes_the_indenters_shape_over_a_curved_face(mitsuba):
