@@ -10,6 +10,7 @@ from optics.errors import BadScene
 from optics.polarization.layers import Crossing, Texture, evaluate
 from optics.polarization.mueller import real, where
 from optics.scene.declare import Part
+from optics.scene.mitsuba_parts import Neighbour
 from optics.scene.registry import Registry
 from optics.scene.surfaces import passing, to_local_mueller
 
@@ -145,8 +146,8 @@ def bsdf(kind: str, own: Callable, beside: tuple[str, ...] = ()) -> type:
 
     class Layer(passing(mi.BSDFFlags.Null)):
         unrendered = {"face": "mi.render leaves out what layers reflect to one another"}
-        carrier = None  # the stretching shape that it lies on, if it does
-        skin = None  # the gel of the scene
+        carrier = Neighbour()  # the stretching shape that it lies on, if it does
+        skin = Neighbour()  # the gel of the scene
         field = None  # what an effect makes of both (optics.scene.declare.Effect.field)
 
         def wire(self, scene):

@@ -215,6 +215,21 @@ def _is_weight(thing) -> bool:
     return isinstance(thing, mi.Spectrum)
 
 
+class Neighbour:
+    """An attribute: another part of the same scene, or None. It is held weakly: the scene holds all parts, and a ring of
+    references that runs through Mitsuba is never let go by Python."""
+
+    def __set_name__(self, owner, name):
+        self.name = f"_{name}"
+
+    def __get__(self, part, owner=None):
+        known = part.__dict__.get(self.name) if part is not None else None
+        return None if known is None else known()
+
+    def __set__(self, part, neighbour):
+        part.__dict__[self.name] = None if neighbour is None else weakref.ref(neighbour)
+
+
 class Declared:
     """What every part can do: read its declared parameters from XML, expose them, know its effects and its neighbours.
 
@@ -228,7 +243,7 @@ class Declared:
     band: float | None = None  # nm: what a mono variant renders, where the scene's integrator names one band
     unrendered: Mapping[str, str] = {}  # parameters without a derivative through mi.render, and why
     curves: Mapping[str, Curve] = {}  # spectra that it was given, by the name of the attribute in XML
-    integral = None  # of scenes whose channels are integrals: optics.scene.integral.Integral
+    _integral = None  # reference to that of the scene; a part must not hold its scene, which Mitsuba has hold the part
     lane = None  # of lights and pigments whose spectrum is in the integral's matrix: 1 in the lanes that are theirs
     region_size = 0.0  # mm across a map of regions; 0: as wide as the camera sees
     _wired = False
@@ -325,7 +340,7 @@ class Declared:
         import drjit as dr
         import mitsuba as mi
 
-        if self.integral is None:
+        if self._integral is None:
             return mi.UnpolarizedSpectrum(*(first, second, third, mi.Float(1.0))[: dr.size_v(mi.UnpolarizedSpectrum)])
         return self.in_range(first, second, third, mi.UnpolarizedSpectrum(wavelengths))
 
@@ -341,6 +356,17 @@ class Declared:
 
         return mi.UnpolarizedSpectrum(wavelengths if mi.is_spectral else self.band or 540.0)
 
+    @property
+    def integral(self):
+        """Of scenes whose channels are integrals, the `optics.scene.integral.Integral`; None of others."""
+        if self._integral is not None and self._integral() is None:
+            raise ReferenceError(f"the scene of '{self.name}' is gone; keep it as long as its parts")
+        return None if self._integral is None else self._integral()
+
+    @integral.setter
+    def integral(self, integral) -> None:
+        self._integral = weakref.ref(integral)
+
     # -- neighbours ---------------------------------------------------------------------------------------------------
     def wire(self, scene) -> None:
         """Find the neighbours that the part depends on (optics.scene.wiring.Neighbours); called once a scene."""
@@ -350,8 +376,8 @@ class Declared:
 
     def follow(self, *leaders) -> None:
         """Be placed anew whenever one of these parts changes (None and Mitsuba's own objects never do)."""
-        self._leaders = tuple(leader for leader in leaders if is_part(leader))
-        for leader in self._leaders:
+        self._leaders = tuple(weakref.ref(leader) for leader in leaders if is_part(leader))
+        for leader in filter(None, (known() for known in self._leaders)):
             if all(known() is not self for known in leader._followers):
                 leader._followers = (*leader._followers, weakref.ref(self))
 
@@ -519,7 +545,7 @@ def move(parts) -> bool:
     wanted.sort(key=lambda part: part._order)
     placed: list = []
     while wanted:
-        ready = [p for p in wanted if not any(leader in wanted for leader in p._leaders)]
+        ready = [p for p in wanted if not any(known() in wanted for known in p._leaders)]
         for part in ready:
             part.place()
         placed += ready
