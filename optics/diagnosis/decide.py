@@ -30,6 +30,7 @@ from optics.words import p_text, percent
 
 MANY = 3  # effects of one explanation
 DIALS = "dials known"  # of an effect with a strength per frame
+RIVALS = "rivals calibrated"  # of pairs of effects of images, which are dear
 LAW = "no other law"  # of an effect that the model has already
 CURVE = "a curve explains it"  # name of the condition that a curve must meet for UNKNOWN
 
@@ -72,6 +73,7 @@ class Findings:
     law          an effect that the model has, and the coordinate along which another law of it explains most; ''  for
                  none that is significant; law_lead: of the best explanation's score over that law's
     fragile      an effect that other weights or masks prefer clearly, '' for none
+    untried      explanations without the winner that may do better by their scores, and were not refitted, in words
     measured     whether repeats fix the size of the noise
     misstated    whether the excess is that of images whose noise is stated a little too small: without structure
     """
@@ -117,6 +119,7 @@ class Findings:
     law: str = ""
     law_lead: float = math.inf
     fragile: str = ""
+    untried: Sequence[str] = ()
     measured: bool = False
     misstated: bool = False
 
@@ -201,8 +204,8 @@ def _word_of_winner(f: Findings, failed: set[str]) -> str:
         bars.add("no better curve")
     alone = not failed & bars
     alone = alone and not f.another_law
-    rivals = f.survivors > 1 or f.shared or LAW in failed or bool(f.fragile) or bool(f.unset)
-    if failed & {"lead", LAW, "robust", DIALS} and alone and f.some_even and rivals:
+    rivals = f.survivors > 1 or f.shared or LAW in failed or bool(f.fragile) or bool(f.unset) or bool(f.untried)
+    if failed & {"lead", LAW, "robust", DIALS, RIVALS} and alone and f.some_even and rivals:
         return "AMBIGUOUS"
     return "PARTIAL" if failed - {"spread"} and failed <= {"share", "even", "spread"} else ""
 
@@ -251,7 +254,23 @@ def _against_effects(f: Findings) -> list[Condition]:
             not f.fragile,
             f"other weights or masks prefer {f.fragile}" if f.fragile else "other weights and masks agree",
         ),
+        Condition(
+            RIVALS,
+            float(len(f.untried)),
+            0.0,
+            not f.untried,
+            f"by scores {_first_of(f.untried)} may explain more, and {'was' if len(f.untried) == 1 else 'were'} not "
+            "calibrated"
+            if f.untried
+            else "every pair that may explain more by its score was calibrated",
+        ),
     ]
+
+
+def _first_of(names: Sequence[str]) -> str:
+    """'a with b, and 3 more pairs'."""
+    more = len(names) - 1
+    return names[0] + (f", and {more} more pair{'s' * (more > 1)}," if more else "")
 
 
 def _against_causes_outside(f: Findings) -> list[Condition]:

@@ -134,6 +134,7 @@ class Outcome:
     scale        chi2 per degree of freedom that the best leaves, at least 1; correlation: of the readings about it
     shared       whether noise that neighbouring readings share explains it as well as the best does
     wander       rms of such noise over that of the signal, where nothing else explains it
+    untried      pairs of effects of images that may do better than the best by their scores, and were not refitted
     """
 
     leader: Trial
@@ -146,6 +147,7 @@ class Outcome:
     shared: bool = False
     wander: float = 0.0
     larger: list[Trial] = field(default_factory=list)
+    untried: list[frozenset[str]] = field(default_factory=list)
 
     @property
     def core(self) -> list[str]:
@@ -283,8 +285,8 @@ def search(case: Case, chosen: Sequence[Candidate], fits: dict[str, Fit]) -> Out
     """
     trials = _singly(case, chosen, fits)
     if not case.evidence.is_table:
-        _joined(case, trials)
-        return compete(case, list(trials.values()))
+        untried = _joined(case, trials)
+        return replace(compete(case, list(trials.values())), untried=untried)
     race = Race(case, trials)
     race.widen()
     for name in sorted(race.leader.names):
@@ -512,59 +514,80 @@ def _beside_at(case: Case, trial: Trial, others: Sequence[Candidate]) -> list[tu
     return [(c, c.row.net, c.change_of(c.linear)) for c in there if len(c.cone.live) and not c.broken]
 
 
-def _joined(case: Case, trials: dict[frozenset[str], Trial]) -> None:
-    """Pairs of images' effects, whose refits are dear: those that may win by the linear fall of both.
+def _joined(case: Case, trials: dict[frozenset[str], Trial]) -> list[frozenset[str]]:
+    """Pairs of images' effects, whose refits are dear: those that may win by the linear fall of both. Returns those
+    that still may when so many as can be waited for were refitted.
 
     They are ranked beside what a lamp may have done to whole frames, and without it, by falls as they are. Of two
     causes each alone leaves much, for which a lamp that swings makes up, and what no explanation has reached yet counts
     as noise. By the first ranking no pair may be worth a refit then, while the refit of the right one would show that
-    the lamp stands still."""
+    the lamp stands still. What refits reach is asked of the pairs that come after them."""
     _bound_wander(case, trials.values())
     live = [c for c in case.table.order if c.row.p_family < LEVEL and len(c.cone.live) and not c.broken]
     ranked = pairs.ranked(case.evidence, live[: pairs.CONSIDERED])
     scale = _scale(case, trials.values())
-    beside = _wanted(
-        trials.values(),
-        ranked,
-        lambda t: _score(t, scale) + _gain(case, t, scale),
-        lambda net, both: net / scale + _expected_gain(case, both, scale) - sum(map(expected_cost, both)),
-    )
-    without = _wanted(
-        trials.values(), ranked, lambda t: _score(t, 1.0), lambda net, both: net - sum(map(expected_cost, both))
-    )
-    wanted = {
-        frozenset(c.effect.name for c in pair[:2]): pair for two in zip_longest(beside, without) for pair in two if pair
-    }
-    for a, b, linear in list(wanted.values())[: pairs.REFITTED]:
+    rankings = [
+        _Ranking(
+            lambda t: _score(t, scale) + _gain(case, t, scale),
+            ranked,
+            lambda net, both: net / scale + _expected_gain(case, both, scale) - sum(map(expected_cost, both)),
+        ),
+        _Ranking(lambda t: _score(t, 1.0), ranked, lambda net, both: net - sum(map(expected_cost, both))),
+    ]
+    tried = set(trials)
+    for n in range(pairs.REFITTED):
+        wanted = _next(rankings, trials.values(), tried)
+        if not wanted:
+            break
+        case.say("refit of pairs", n, pairs.REFITTED)
+        a, b, linear = wanted[0]
+        tried.add(names := frozenset([a.effect.name, b.effect.name]))
         try:
             found = with_effects(case, [(a, linear[: len(a.columns)]), (b, linear[len(a.columns) :])], START)
         except FAILURES:
             continue
         made = _trial(case, [a, b], found)
         if math.isfinite(made.after):
-            trials[made.names] = made
+            trials[names] = made
+    case.say("refit of pairs", pairs.REFITTED, pairs.REFITTED)
+    return [frozenset(c.effect.name for c in pair[:2]) for pair in _next(rankings, trials.values(), tried)]
 
 
-def _wanted(
-    trials: Iterable[Trial],
-    ranked: Sequence[tuple[float, Candidate, Candidate, np.ndarray]],
-    score_of: Callable[[Trial], float],
-    expected_of: Callable[[float, list[Candidate]], float],
-) -> list[tuple[Candidate, Candidate, np.ndarray]]:
-    """The pairs that are expected to do better than the best trial, best first: the two effects, and coefficients."""
-    scores = [(score_of(t), t) for t in trials]
-    top, best = max(scores, key=lambda s: s[0])
-    found = []
-    for net, a, b, linear in ranked:
-        both = [a, b]
-        nested = best.names <= frozenset(c.effect.name for c in both)
-        needed = max(CLEAR, pairs.LEAD * best.fall) if nested else -CLEAR
-        if nested and (not best.members or best.complete):
-            continue
-        expected = expected_of(net - pairs.shortfall(both), both)
-        if expected - top >= needed:
-            found.append((expected, a, b, linear))
-    return [(a, b, linear) for _, a, b, linear in sorted(found, key=lambda t: -t[0])]
+Pair = tuple[Candidate, Candidate, np.ndarray]  # two effects, and coefficients of both
+
+
+class _Ranking:
+    """Pairs by what is expected of them, and the trials that they are held against by `score_of`."""
+
+    def __init__(
+        self,
+        score_of: Callable[[Trial], float],
+        ranked: Sequence[tuple[float, Candidate, Candidate, np.ndarray]],
+        expected_of: Callable[[float, list[Candidate]], float],
+    ):
+        self.score_of = score_of
+        expected = [(expected_of(net - pairs.shortfall([a, b]), [a, b]), (a, b, x)) for net, a, b, x in ranked]
+        self.expected = sorted(expected, key=lambda e: -e[0])
+
+    def wanted(self, trials: Iterable[Trial]) -> list[Pair]:
+        """The pairs that are expected to do better than the best trial, best first."""
+        top, best = max(((self.score_of(t), t) for t in trials), key=lambda s: s[0])
+        found = []
+        for expected, pair in self.expected:
+            nested = best.names <= frozenset(c.effect.name for c in pair[:2])
+            if nested and (not best.members or best.complete):
+                continue
+            needed = max(CLEAR, pairs.LEAD * best.fall) if nested else -CLEAR
+            if expected - top >= needed:
+                found.append(pair)
+        return found
+
+
+def _next(rankings: Sequence[_Ranking], trials: Iterable[Trial], tried: set[frozenset[str]]) -> list[Pair]:
+    """The pairs that any ranking wants and that were not tried, the best of each ranking in turn."""
+    turns = zip_longest(*(r.wanted(trials) for r in rankings))
+    found = {frozenset(c.effect.name for c in pair[:2]): pair for turn in turns for pair in turn if pair}
+    return [pair for names, pair in found.items() if names not in tried]
 
 
 def _bound_wander(case: Case, trials: Iterable[Trial]) -> None:
@@ -783,8 +806,7 @@ def _lead(case: Case, outcome: Outcome, best: Trial, other: Trial) -> tuple[floa
     if best.by_frame and not is_table:  # a lamp that wanders is no rival of a gain of each frame, but the same
         data, shared = data + other.gain, 0.0
     if not is_table:
-        known = (case.prior_chi2(other.fit.values) - case.prior_chi2(best.fit.values)) / outcome.scale
-        data = outcome.scale * (data - known) / _design_effect(case, outcome, best, other) + known
+        data = _less_alike(case, outcome, outcome.scale * data, best, other)
     lead, needed = data + cost, TOLD if data > TOLD else CLEAR  # what is plausible decides alone only where it is clear
     if other.keys < best.keys:
         significant = data - _significant(case, best, other)
@@ -861,10 +883,17 @@ def fall_over_noise(case: Case, outcome: Outcome, name: str) -> float:
     without = outcome.without(outcome.best, name)
     if case.evidence.is_table:
         return without.deviance - outcome.best.deviance
-    # what is known beforehand, as where a dial stood, is no image, and does not scatter between parts of it
-    known = case.prior_chi2(without.fit.values) - case.prior_chi2(outcome.best.fit.values)
-    own = outcome.own_fall(outcome.best, name) - known
-    return own / _design_effect(case, outcome, outcome.best, without) + known
+    return _less_alike(case, outcome, outcome.own_fall(outcome.best, name), outcome.best, without)
+
+
+def _less_alike(case: Case, outcome: Outcome, fall: float, best: Trial, other: Trial) -> float:
+    """What is left of a fall of chi2 of images, with priors, when neighbours that miss alike do not count apart.
+
+    What is known beforehand, as where a dial stood, is no image: it does not scatter between parts of one, and counts
+    once, however often it counted in the fit."""
+    weighed = case.prior_chi2(other.fit.values) - case.prior_chi2(best.fit.values)
+    known = case.known_chi2(other.fit.values) - case.known_chi2(best.fit.values)
+    return (fall - weighed) / _design_effect(case, outcome, best, other) + known
 
 
 def _kept(case: Case, images: Sequence[np.ndarray]) -> list[np.ndarray]:

@@ -202,6 +202,7 @@ def _of_subject(
         carried=carried,
         carried_by=carried_by,
         fragile=table.fragile(name, outcome.named),
+        untried=[" with ".join(sorted(names)) for names in outcome.untried if name not in names],
     )
 
 

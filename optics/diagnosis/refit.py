@@ -79,12 +79,19 @@ class Case:
         return self.evidence.normal.square + self.prior_chi2(self.fit.values)
 
     def prior_chi2(self, values: Values) -> float:
-        """What the base's priors add to chi2."""
-        return sum(
-            (value_of(self.model, values, v) - v.prior[0]) ** 2 * v.precision
+        """What the base's priors add to chi2, as often as they count beside it (`Variable.weight`)."""
+        return sum(v.weight * square for v, square in self._from_priors(values))
+
+    def known_chi2(self, values: Values) -> float:
+        """The same, once: what was known before contradicts the values by so much, whatever images say."""
+        return sum(square for _, square in self._from_priors(values))
+
+    def _from_priors(self, values: Values) -> list[tuple[Variable, float]]:
+        return [
+            (v, ((value_of(self.model, values, v) - v.prior[0]) / v.prior[1]) ** 2)
             for v in self.fit.variables
             if v.prior is not None
-        )
+        ]
 
 
 @dataclass

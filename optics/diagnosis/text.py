@@ -228,6 +228,8 @@ def _ambiguous(f: Findings, explanations: Sequence[Explanation]) -> str:
     names = ", or ".join(_kind(kind) for kind in kinds)
     count = len(kinds)
     other = f" By other weights or masks {f.fragile} does better." if f.fragile else ""
+    if f.untried:
+        other += f" By its score {f.untried[0]} may explain more, and was not calibrated."
     if f.shared:
         return (
             "noise that neighbours in the session share, such as a lamp that wanders, is not told apart from "

@@ -216,8 +216,10 @@ def _is_weight(thing) -> bool:
 
 
 class Neighbour:
-    """An attribute: another part of the same scene, or None. It is held weakly: the scene holds all parts, and a ring of
-    references that runs through Mitsuba is never let go by Python."""
+    """An attribute: another part of the same scene, or None.
+
+    It is held weakly: the scene holds all its parts, and Python never lets go of a ring of references that runs through
+    Mitsuba."""
 
     def __set_name__(self, owner, name):
         self.name = f"_{name}"

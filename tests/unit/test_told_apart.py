@@ -31,12 +31,16 @@ def test_where_slopes_show_nothing_a_finite_step_decides():
     assert score._best_form(SimpleNamespace(plausible=np.ones(2)), both)[0] == "secant"
 
 
-def test_what_is_known_of_dials_counts_whole_in_a_fall(monkeypatch):
-    """22 of chi2, 20 of them by which dials need not be off: noise that images share divides the other 2 alone."""
+@pytest.mark.parametrize("weight", [1.0, 50.0])
+def test_what_is_known_of_dials_counts_whole_in_a_fall_and_once(monkeypatch, weight):
+    """22 of chi2, 20 of them by which dials need not be off: noise that images share divides the other 2 alone. Where a
+    fit that misses images had what is known count many times, it counts once all the same."""
     monkeypatch.setattr(explanations, "_design_effect", lambda *a: 10.0)
     best, without = (SimpleNamespace(fit=SimpleNamespace(values=v)) for v in (1.0, 21.0))
-    outcome = SimpleNamespace(best=best, without=lambda *a: without, own_fall=lambda *a: 22.0)
-    case = SimpleNamespace(evidence=SimpleNamespace(is_table=False), prior_chi2=lambda values: values)
+    outcome = SimpleNamespace(best=best, without=lambda *a: without, own_fall=lambda *a: 2.0 + 20.0 * weight)
+    case = SimpleNamespace(
+        evidence=SimpleNamespace(is_table=False), prior_chi2=lambda v: weight * v, known_chi2=lambda v: v
+    )
     assert explanations.fall_over_noise(case, outcome, "a") == pytest.approx(20.2)
 
 
@@ -172,7 +176,7 @@ def test_a_lamp_rules_out_nothing_that_leaves_less_where_misfit_is_left(monkeypa
 
     best, other = trial("a", 1e4, 9e3, 2.97e6, 47.0), trial("b", 1.1e4, 2e3, fall, cost)
     evidence = SimpleNamespace(is_table=False, normal=SimpleNamespace(count=20000), projected=SimpleNamespace(rank=20))
-    case = SimpleNamespace(evidence=evidence, prior_chi2=lambda values: 0.0)
+    case = SimpleNamespace(evidence=evidence, prior_chi2=lambda values: 0.0, known_chi2=lambda values: 0.0)
     monkeypatch.setattr(explanations, "_design_effect", lambda *a: 1.0)
     lead, needed = explanations._lead(case, SimpleNamespace(scale=scale), best, other)
     assert (lead > needed) is ruled_out
@@ -198,39 +202,80 @@ def test_a_law_falls_from_where_effects_fall():
     assert (fall, dof) == (pytest.approx(effect, rel=1e-9), 1)
 
 
-@pytest.mark.parametrize("lamp, refitted", [(0.0, [{"a", "b"}]), (9000.0, [{"a", "b"}])])
-def test_a_lamp_that_swings_keeps_no_pair_from_a_refit(monkeypatch, lamp, refitted):
-    """Of two causes that make 10,000 of chi2, one alone leaves 4000, and a lamp that swings makes up for those."""
+def candidate(name):
+    row = SimpleNamespace(p_family=0.0, refit=None)
+    cone = SimpleNamespace(live=[0])
+    return SimpleNamespace(effect=SimpleNamespace(name=name), row=row, cone=cone, broken=False, columns=[0])
 
-    def candidate(name):
-        row = SimpleNamespace(p_family=0.0, refit=None)
-        cone = SimpleNamespace(live=[0])
-        return SimpleNamespace(effect=SimpleNamespace(name=name), row=row, cone=cone, broken=False, columns=[0])
 
-    def trial(members, fall, excess):
-        names = frozenset(c.effect.name for c in members)
-        return SimpleNamespace(members=members, names=names, fall=fall, cost=10.0, excess_sd=excess, keys=names)
-
-    a, b = candidate("a"), candidate("b")
-    trials = {t.names: t for t in (trial([], 0.0, 70.0), trial([a], 6000.0, 30.0), trial([b], 5000.0, 35.0))}
-    for t in trials.values():
-        t.complete = False
-    case = SimpleNamespace(
-        evidence=SimpleNamespace(
-            is_table=False, normal=SimpleNamespace(count=10000), projected=SimpleNamespace(rank=9)
-        ),
-        lamp=SimpleNamespace(most=0.0),
-        table=SimpleNamespace(order=[a, b]),
+def trial(members, fall, excess):
+    names = frozenset(c.effect.name for c in members)
+    return SimpleNamespace(
+        members=members,
+        names=names,
+        fall=fall,
+        cost=10.0,
+        after=1e4 - fall,
+        excess_sd=excess,
+        keys=names,
+        complete=False,
     )
-    monkeypatch.setattr(explanations.pairs, "ranked", lambda *_: [(9900.0, a, b, np.zeros(2))])
-    monkeypatch.setattr(explanations, "_gain", lambda case, t, scale: lamp if len(t.members) == 1 else 0.0)
-    monkeypatch.setattr(explanations, "_expected_gain", lambda *_: 0.0)
-    monkeypatch.setattr(explanations, "expected_cost", lambda c: 10.0)
-    monkeypatch.setattr(explanations, "with_effects", lambda *_: None)
-    made = SimpleNamespace(after=100.0, names=frozenset("ab"))
-    monkeypatch.setattr(explanations, "_trial", lambda *_: made)
-    explanations._joined(case, trials)
-    assert [set(names) for names in trials if len(names) == 2] == refitted
+
+
+@pytest.fixture
+def search_of_pairs(monkeypatch):
+    """Refits pairs of effects that are ranked so, and reach so much; returns (names that were tried, those untried)."""
+
+    def search(trials, ranked, reached, lamp=0.0):
+        case = SimpleNamespace(
+            evidence=SimpleNamespace(
+                is_table=False, normal=SimpleNamespace(count=10000), projected=SimpleNamespace(rank=9)
+            ),
+            lamp=SimpleNamespace(most=0.0),
+            table=SimpleNamespace(order=[]),
+            say=lambda *_: None,
+        )
+        tried = []
+
+        def made(case, members, found):
+            tried.append(names := {c.effect.name for c in members})
+            return trial(members, reached(names), 10.0)
+
+        monkeypatch.setattr(explanations.pairs, "ranked", lambda *_: ranked)
+        monkeypatch.setattr(explanations, "_gain", lambda case, t, scale: lamp if len(t.members) == 1 else 0.0)
+        monkeypatch.setattr(explanations, "_expected_gain", lambda *_: 0.0)
+        monkeypatch.setattr(explanations, "expected_cost", lambda c: 10.0)
+        monkeypatch.setattr(explanations, "with_effects", lambda *_: None)
+        monkeypatch.setattr(explanations, "_trial", made)
+        untried = explanations._joined(case, {t.names: t for t in trials})
+        return tried, [set(names) for names in untried]
+
+    return search
+
+
+@pytest.mark.parametrize("lamp", [0.0, 9000.0])
+def test_a_lamp_that_swings_keeps_no_pair_from_a_refit(search_of_pairs, lamp):
+    """Of two causes that make 10,000 of chi2, one alone leaves 4000, and a lamp that swings makes up for those."""
+    a, b = candidate("a"), candidate("b")
+    trials = [trial([], 0.0, 70.0), trial([a], 6000.0, 30.0), trial([b], 5000.0, 35.0)]
+    assert search_of_pairs(trials, [(9900.0, a, b, np.zeros(2))], lambda names: 9900.0, lamp) == ([{"a", "b"}], [])
+
+
+def test_pairs_are_refitted_until_none_may_win_or_nobody_can_wait(search_of_pairs, monkeypatch):
+    """What a refit reaches is asked of the next pairs: one that keeps its promise ends the search, and where none does,
+    those that are left are told."""
+    names = "abcdef"
+    effects = [candidate(n) for n in names]
+    trials = [trial([], 0.0, 70.0), *(trial([c], 5000.0, 35.0) for c in effects)]
+    ranked = [(9900.0 - 10 * i, effects[0], c, np.zeros(2)) for i, c in enumerate(effects[1:])]
+    ranked.append((7000.0, effects[1], effects[2], np.zeros(2)))
+    monkeypatch.setattr(explanations.pairs, "REFITTED", 3)
+    # within CLEAR of what was reached, the second may still be better
+    tried, untried = search_of_pairs(trials, ranked, lambda names: 9889.0 + explanations.CLEAR)
+    assert tried == [{"a", "b"}] and not untried
+    tried, untried = search_of_pairs(trials, ranked, lambda names: 6000.0)
+    assert tried == [{"a", "b"}, {"a", "c"}, {"a", "d"}]
+    assert untried == [{"a", "e"}, {"a", "f"}, {"b", "c"}]
 
 
 @pytest.mark.parametrize(
