@@ -126,14 +126,19 @@ SURROUNDINGS = {  # parameter: what has to stand about it for it to be seen, and
 }
 
 
+def is_dear(kind, name):
+    """Whether a number of a light of many points is one of an LED too, whose formula it takes: its kernels take seconds
+    to compile."""
+    alike = ("led", name) in NUMBERS and name not in ("x", "pan", "fwhm")  # of each kind of number one is tried
+    return kind in ("strip", "ring") and alike
+
+
 def ways(how, often=True):
     """Parameters whose derivative is made in one way; without `often`, all but the first of each part are slow."""
     own = [n for n in NUMBERS if REGISTRY.parameter(*n).how == how and n not in LABELS_ONLY]
     first = dict(reversed(own))
-    return [
-        pytest.param(kind, name, id=f"{kind}.{name}", marks=() if often or first[kind] == name else (pytest.mark.slow,))
-        for kind, name in own
-    ]
+    slow = [is_dear(*n) or not (often or first[n[0]] == n[1]) for n in own]
+    return [pytest.param(*n, id=".".join(n), marks=[pytest.mark.slow] * s) for n, s in zip(own, slow)]
 
 
 def settling():
@@ -144,7 +149,11 @@ def settling():
         for kind, name in NUMBERS
         if REGISTRY.parameter(kind, name).neutral is not None and (kind, name) not in freed
     ]
-    return [pytest.param(e, id=e.key) for e in (*(REGISTRY.effects[k] for k in EFFECTS), *alone)]
+    found = (*(REGISTRY.effects[k] for k in EFFECTS), *alone)
+    return [
+        pytest.param(e, id=e.key, marks=[pytest.mark.slow] * all(is_dear(e.part, name) for name in e.parameter_names))
+        for e in found
+    ]
 
 
 # -- what a plugin says about itself ---------------------------------------------------------------------------------

@@ -415,7 +415,7 @@ def test_bands_bring_no_spectral_noise(mitsuba, tmp_path):
 
 
 # -- channels as integrals over the wavelength -----------------------------------------------------------------------
-@pytest.mark.parametrize("max_depth", [2, 3])
+@pytest.mark.parametrize("max_depth", [2, pytest.param(3, marks=pytest.mark.slow)])
 def test_integrals_over_the_wavelength(mitsuba, tmp_path, max_depth):
     """A white LED, two paints, a camera's three curves: 24 Gauss nodes, whose error is told as 2.8e-5, against
     wavelengths by Monte Carlo."""
