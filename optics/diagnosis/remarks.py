@@ -16,7 +16,7 @@ from optics.diagnosis.explanations import Outcome, Trial
 from optics.diagnosis.refit import Case
 from optics.diagnosis.result import NAMED, Basis, Condition, Shift, Split
 from optics.diagnosis.score import KAPPA, Table
-from optics.diagnosis.text import AT_FAULT, moved_by
+from optics.diagnosis.text import AT_FAULT, leaves_misfit, left_of, moved_by
 from optics.diagnosis.thresholds import CLEAR, EXCESS, LEVEL
 from optics.fit.model import value_of
 from optics.words import some
@@ -30,8 +30,11 @@ USUALLY = "the same press at 0.4 of the exposure, and one deeper press, often te
 
 
 def write_limits(case: Case, claimed: Trial | None, basis: Basis) -> None:
-    """Upper limits of every effect; after a claim, at the values of the best explanation, so as not to be misled."""
+    """Upper limits of every effect; after a claim, at the values of the best explanation, so as not to be misled. Where
+    that leaves much, more is missing there too, and they are those of the base."""
     evidence, others, widen = case.evidence, case.table.order, math.sqrt(max(basis.phi, 1.0))
+    if claimed is not None and leaves_misfit(claimed.excess_sd, basis):
+        claimed = None
     if claimed is not None:
         others = [c for c in others if c not in claimed.members]
         near = _beside(case, claimed)
@@ -39,7 +42,7 @@ def write_limits(case: Case, claimed: Trial | None, basis: Basis) -> None:
             evidence, others = _again(case, claimed, others)
         else:
             evidence = near
-        widen = math.sqrt(max(1 + claimed.excess_sd * math.sqrt(2 / basis.dof), 1.0))
+        widen = math.sqrt(max(left_of(claimed.excess_sd, basis), 1.0))
     for c in others:
         _write_limit(evidence, c, list(c.forms) if claimed is not None else [c.form], widen)
 

@@ -22,7 +22,7 @@ from optics.diagnosis.result import (
     Shift,
     kinds_of,
 )
-from optics.diagnosis.thresholds import CLEAR, CLUTTERED, LEVEL, MARGIN, SURE, is_structured
+from optics.diagnosis.thresholds import CLEAR, CLUTTERED, LEVEL, MARGIN, MISSTATED, SURE, is_structured
 from optics.words import (
     ANYWHERE,
     NO_LIMIT,
@@ -62,6 +62,16 @@ def strength_text(
         return f"{len(values)} values, {NOT_DETERMINED}"
     biggest = max(known, key=lambda i: abs(values[i]))
     return f"{len(values)} values up to {with_sd(values[biggest], sds[biggest], unit=unit)}"
+
+
+def left_of(excess_sd: float, basis: Basis) -> float:
+    """chi2 per degree of freedom that an explanation leaves."""
+    return 1 + excess_sd * math.sqrt(2 / max(basis.dof, 1))
+
+
+def leaves_misfit(excess_sd: float, basis: Basis) -> bool:
+    """Whether an explanation leaves more than a wrong size of the noise would: what else is missing has no limits."""
+    return left_of(excess_sd, basis) > MISSTATED
 
 
 def limits(row: Row) -> list[float]:
@@ -194,7 +204,7 @@ def _claim(
         f" Adding {'it' if len(best.effects) == 1 else 'all of the first'} lowers {lowered} "
         f"(noise: {percent(basis.noise)}). Its strength is the same in every part of the data."
     )
-    others = [r for r in rows if r is not row and limits(r)]
+    others = [] if leaves_misfit(best.excess_sd, basis) else [r for r in rows if r is not row and limits(r)]
     if others:
         text += " Not " + ", not ".join(limit_text(r) for r in others[:3]) + "."
     moved = [s for s in shifts if s.warn][:2]

@@ -9,7 +9,7 @@ import pytest
 
 from optics import words
 from optics.diagnosis.result import Row
-from optics.diagnosis.text import limit_text, strength_text
+from optics.diagnosis.text import _claim, limit_text, strength_text
 from optics.errors import UnknownKey
 from optics.fit.compare import Row as Scored
 from optics.fit.compare import compare
@@ -219,3 +219,28 @@ def test_a_comparison_without_freedom_or_scatter_has_dashes():
 )
 def test_a_hint_is_set_off(key, hint, text):
     assert str(UnknownKey(key, [f"led_{i}.x" for i in range(1, 20)], hint=hint)).endswith(text)
+
+
+@pytest.mark.parametrize("left, told", [(1.0, True), (1.9, True), (2.2, False)])
+def test_a_claim_beside_much_misfit_rules_nothing_out(left, told):
+    """Limits of effects are those of a model from which one of them may be missing still."""
+
+    basis = SimpleNamespace(dof=1000, noise=0.01)
+    claimed, other = row(name="retardance"), row(name="leak")
+    best = SimpleNamespace(
+        effects=["retardance"],
+        survives=True,
+        complete=False,
+        excess_sd=(left - 1) * math.sqrt(1000 / 2),
+        structure_p=1e-9,
+        name="retardance",
+        told={},
+        variables=[],
+        strength=[],
+        sd=[],
+        units=[],
+    )
+    levels = [SimpleNamespace(held_out=0.05), SimpleNamespace(held_out=0.02)]
+    f = SimpleNamespace(lead=100.0, against="leak")
+    text = _claim(f, claimed, [claimed, other], [best], levels, [], basis)
+    assert ("Not leak" in text) is told
