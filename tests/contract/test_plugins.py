@@ -1039,7 +1039,9 @@ def test_everything_drawn_at_once_gives_images(seed, bench):
         assert np.isfinite(bench.derivative(key, values)).all(), key
 
 
-@pytest.mark.parametrize("kind, seed", [("source", 0), ("source", 1), ("markers", 0)])
+@pytest.mark.parametrize(
+    "kind, seed", [("source", 0), ("source", 1), pytest.param("markers", 0, marks=pytest.mark.slow)]
+)
 def test_all_layers_drawn_at_once_give_derivatives(kind, seed, bench_of):
     """All parameters of a layered scene within a plausible change: an image, and the right derivatives by those of
     layers."""

@@ -153,7 +153,14 @@ def at_the_noise(chi2_per_dof: float, count: int) -> bool:
 # Whose readings have three bands, or whose refits are dear: among the slow tests.
 DEAR = (
     *("leak", "stray light", "film reflections", "dispersive retardance", "gamma", "coloured leak", "scale", "stress"),
-    *("drift", "depolarization", "depolarization and drift", "dark offset", "retardance along a polarizer"),
+    *(
+        "drift",
+        "misalignment",
+        "depolarization",
+        "depolarization and drift",
+        "dark offset",
+        "retardance along a polarizer",
+    ),
 )
 
 
