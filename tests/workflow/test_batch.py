@@ -11,6 +11,7 @@ import sys
 import threading
 import time
 from collections import Counter
+from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
@@ -206,22 +207,66 @@ def command(job, *options):
     return [sys.executable, "-m", "optics.cli", "batch", str(job), *options]
 
 
-def started(job, *options, most=3):
-    """A process at work, once its folder is there and `most` samples are made; it heeds interrupts even where these
-    tests run in the background."""
-    process = subprocess.Popen(
-        command(job, *options),
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env={**os.environ, "PYTHONPATH": str(Path(batch.__file__).parents[2])},
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
-    )
-    deadline = time.monotonic() + 60
-    out = job.parent / "out"
-    while not (out / "job.json").exists() or recorded(out) < most:
-        assert process.poll() is None and time.monotonic() < deadline, process.communicate()
+# The command line, in a process that stops itself once it has begun a sample (with one worker it makes them itself).
+STOPS = """
+import os, signal, sys
+from optics.cli import main
+from optics.study.batch import Maker
+make = Maker.make
+def stops(self, index):
+    if index == {index}:
+        os.kill(os.getpid(), signal.SIGSTOP)
+    return make(self, index)
+Maker.make = stops
+sys.exit(main(sys.argv[1:]))
+"""
+LONG = 300  # s for what takes seconds where other processes have the cores
+
+
+@pytest.fixture
+def start():
+    """Starts commands that heed interrupts even where these tests run in the background; none outlives its test."""
+    with ExitStack() as all_of_them:
+
+        def start(words):
+            process = subprocess.Popen(
+                words,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                text=True,
+                env={**os.environ, "PYTHONPATH": str(Path(batch.__file__).parents[2])},
+                preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+            )
+            all_of_them.enter_context(process)  # waits, and closes its pipes
+            all_of_them.callback(process.kill)
+            return process
+
+        yield start
+
+
+def wait(process, until, seconds=LONG):
+    """Wait for something while a process runs; what it said where it ends before, or where that takes too long."""
+    deadline = time.monotonic() + seconds
+    while not until():
+        late = time.monotonic() > deadline
+        if late:
+            process.kill()
+        assert process.poll() is None and not late, (f"{seconds} s" if late else "it ended", process.communicate())
         time.sleep(0.01)
+
+
+def state(pid):
+    """One letter, as in ps: T is stopped; None where there is no such process."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0]
+    except OSError:
+        return None
+
+
+def stopped_at(start, job, index):
+    """A command that has stopped in the midst of a sample; it holds the lock of that sample."""
+    process = start([sys.executable, "-c", STOPS.format(index=index), "batch", str(job), "--workers", "1"])
+    wait(process, lambda: state(process.pid) == "T")
     return process
 
 
@@ -237,23 +282,23 @@ def children(pid):
     return found
 
 
-@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for orphans in /proc")
-def test_killed_in_the_middle_and_resumed(whole, job):
+in_proc = pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks at processes in /proc")
+
+
+@in_proc
+def test_killed_in_the_middle_and_resumed(whole, job, start):
     """The test holds the lock of the last sample until the kill, so that the command cannot end before, however fast
     the machine is, or however late this test is called."""
     out = job.parent / "out"
-    process = started(job, "--workers", "2", most=0)  # makes its folder; workers take seconds to start
+    process = start(command(job, "--workers", "2"))
+    wait(process, (out / "job.json").exists)
     (out / ".parts").mkdir(exist_ok=True)
     workers: set[int] = set()
-    deadline = time.monotonic() + 120
-    with alone(out / ".parts" / "00009.lock", "the last sample was begun already"):
-        while recorded(out) < 3:
-            workers |= set(children(process.pid))
-            assert process.poll() is None and time.monotonic() < deadline, process.communicate()
-            time.sleep(0.01)
+    with alone(out / ".parts" / "00009.lock", "the last sample was begun already"):  # workers take seconds to start
+        wait(process, lambda: workers.update(children(process.pid)) or recorded(out) >= 3)
         process.kill()
         process.communicate()
-        deadline = time.monotonic() + 30
+        deadline = time.monotonic() + LONG
         while any(Path(f"/proc/{pid}").exists() for pid in workers):
             assert time.monotonic() < deadline, "workers outlive the process that started them"
             time.sleep(0.05)
@@ -267,15 +312,18 @@ def test_killed_in_the_middle_and_resumed(whole, job):
     assert content(out) == content(whole)
 
 
-def test_interrupted_says_how_to_go_on(whole, job):
-    process = started(job, "--workers", "1")
+@in_proc
+def test_interrupted_says_how_to_go_on(whole, job, start):
+    process = stopped_at(start, job, 4)
     process.send_signal(signal.SIGINT)
-    out, err = process.communicate(timeout=60)
+    process.send_signal(signal.SIGCONT)
+    out, err = process.communicate(timeout=LONG)
     assert (
         process.returncode == 130
         and err.splitlines()[-1] == "interrupted: what was made is kept, the same command goes on"
     )
     assert "Traceback" not in err and out == ""
+    assert recorded(job.parent / "out") == 4
     assert not [p for p in (job.parent / "out" / "images").iterdir() if p.name.startswith(".")]
     assert batch.run(job, workers=1).complete and content(job.parent / "out") == content(whole)
 
@@ -364,19 +412,21 @@ def test_a_full_disk_ends_the_run_at_once(whole, job, monkeypatch):
     assert batch.run(job, workers=1).made == TOTAL - 2 and content(job.parent / "out") == content(whole)
 
 
-def test_commands_at_once_share_the_work(whole, job):
+@in_proc
+def test_commands_at_once_share_the_work(whole, job, start):
     """A block that another worker is at is left to it, and is made where that one dies."""
-    first = started(job, "--workers", "1")
-    first.send_signal(signal.SIGSTOP)  # it keeps its lock
-    blocks = Blocks(job.parent / "out", TOTAL)
+    first = stopped_at(start, job, 4)
+    out = job.parent / "out"
+    blocks = Blocks(out, TOTAL)
+    assert recorded(out) == 4
     for workers in (1, 2):
         assert not batch.run(job, workers=workers).complete
-        assert recorded(job.parent / "out") == TOTAL - 1, "all but the one that is held"
+        assert recorded(out) == TOTAL - 1, "all but the one that is held"
     first.kill()
     first.communicate()
     result = batch.run(job, workers=1)
     assert (result.made, result.complete) == (1, True) and not blocks.parts.exists()
-    assert content(job.parent / "out") == content(whole)
+    assert content(out) == content(whole)
 
 
 @pytest.mark.parametrize("other", [True, False], ids=["goes on", "has died"])
@@ -398,14 +448,23 @@ def test_two_commands_that_finish_at_once_without_locks(job, monkeypatch, other)
             batch.run(job, workers=1)
 
 
-@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for workers in /proc")
-def test_a_worker_that_is_killed_is_replaced(whole, job):
-    process = started(job, "--workers", "2", "--json")
-    killed = [pid for pid in children(process.pid) if "spawn_main" in Path(f"/proc/{pid}/cmdline").read_text()]
-    os.kill(killed[0], signal.SIGKILL)
-    out, err = process.communicate(timeout=120)
-    assert process.returncode == 0 and json.loads(out)["complete"], err
-    assert content(job.parent / "out") == content(whole)
+@in_proc
+def test_a_worker_that_is_killed_is_replaced(whole, job, start):
+    """While the test holds the lock of the last sample the command cannot end, and while the command is stopped it
+    cannot let its workers go."""
+    out = job.parent / "out"
+    process = start(command(job, "--workers", "2", "--json"))
+    wait(process, (out / "job.json").exists)
+    (out / ".parts").mkdir(exist_ok=True)
+    with alone(out / ".parts" / "00009.lock", "the last sample was begun already"):
+        wait(process, lambda: recorded(out) >= 3)
+        process.send_signal(signal.SIGSTOP)
+        workers = [pid for pid in children(process.pid) if "spawn_main" in Path(f"/proc/{pid}/cmdline").read_text()]
+        os.kill(workers[0], signal.SIGKILL)
+    process.send_signal(signal.SIGCONT)
+    said, err = process.communicate(timeout=LONG)
+    assert process.returncode == 0 and json.loads(said)["complete"], err
+    assert content(out) == content(whole)
 
 
 def test_workers_are_recycled(whole, job):
