@@ -11,7 +11,7 @@ import sys
 import threading
 import time
 from collections import Counter
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -282,6 +282,14 @@ def children(pid):
     return found
 
 
+@contextmanager
+def held(out, index):
+    """The lock of a sample, as a worker holds it that is at it."""
+    (out / ".parts").mkdir(parents=True)
+    with alone(out / ".parts" / f"{index:05d}.lock", "it is another's"):
+        yield
+
+
 in_proc = pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks at processes in /proc")
 
 
@@ -290,11 +298,9 @@ def test_killed_in_the_middle_and_resumed(whole, job, start):
     """The test holds the lock of the last sample until the kill, so that the command cannot end before, however fast
     the machine is, or however late this test is called."""
     out = job.parent / "out"
-    process = start(command(job, "--workers", "2"))
-    wait(process, (out / "job.json").exists)
-    (out / ".parts").mkdir(exist_ok=True)
     workers: set[int] = set()
-    with alone(out / ".parts" / "00009.lock", "the last sample was begun already"):  # workers take seconds to start
+    with held(out, TOTAL - 1):
+        process = start(command(job, "--workers", "2"))
         wait(process, lambda: workers.update(children(process.pid)) or recorded(out) >= 3)
         process.kill()
         process.communicate()
@@ -453,10 +459,8 @@ def test_a_worker_that_is_killed_is_replaced(whole, job, start):
     """While the test holds the lock of the last sample the command cannot end, and while the command is stopped it
     cannot let its workers go."""
     out = job.parent / "out"
-    process = start(command(job, "--workers", "2", "--json"))
-    wait(process, (out / "job.json").exists)
-    (out / ".parts").mkdir(exist_ok=True)
-    with alone(out / ".parts" / "00009.lock", "the last sample was begun already"):
+    with held(out, TOTAL - 1):
+        process = start(command(job, "--workers", "2", "--json"))
         wait(process, lambda: recorded(out) >= 3)
         process.send_signal(signal.SIGSTOP)
         workers = [pid for pid in children(process.pid) if "spawn_main" in Path(f"/proc/{pid}/cmdline").read_text()]
