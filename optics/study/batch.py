@@ -218,8 +218,12 @@ def read(file: str | Path, fit: str | Path | None = None, frame: str | None = No
 
 def _explained(error: ValidationError, file: Path) -> Exception:
     """The first validation error as a sentence: what, where, allowed."""
-    first, more = error.errors()[0], error.error_count() - 1
-    place = [str(p) for p in first["loc"] if not str(p).startswith(("list[", "constrained-", "float", "str", "int"))]
+    kinds = ("float", "str", "int", "bool")  # pydantic names what it tried
+    places = [
+        [str(p) for p in e["loc"] if p not in kinds and not str(p).startswith(("list[", "constrained-"))]
+        for e in error.errors()
+    ]
+    first, place, more = error.errors()[0], places[0], len(set(map(tuple, places))) - 1
     model, field = Job, None
     for name in place:  # down to the model that holds the key
         if field is not None and field.annotation is not None:
@@ -237,7 +241,7 @@ def _explained(error: ValidationError, file: Path) -> Exception:
         text = f"{first['input']!r}; allowed: {field.description if field else text}"
     return BadJob(
         f"{where}{f'{name} = ' if first['type'] != 'value_error' else f'{name}: ' if name else ''}{text}"
-        + (f" (and {more} more)" if more and first["type"] not in ("union",) else "")
+        + (f" (and {more} more)" if more else "")
     )
 
 
