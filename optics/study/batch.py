@@ -444,7 +444,9 @@ def _open_folder(folder: Path, identity: Mapping) -> None:
     if note.is_file():
         try:
             before = json.loads(note.read_text(encoding="utf-8"))
-        except ValueError as error:
+            if not isinstance(before, dict):
+                raise ValueError("no table")
+        except (ValueError, RecursionError) as error:
             raise OutputExists(
                 f"{note}: unreadable ({error}); restore it, or choose another folder for `out`"
             ) from error
@@ -460,6 +462,14 @@ def _open_folder(folder: Path, identity: Mapping) -> None:
         raise OutputExists(f"{folder} exists and holds no batch; choose another folder for `out`")
     write_text(note, json.dumps(identity, indent=1, sort_keys=True) + "\n")  # first: it makes the folder a batch's
     (folder / "images").mkdir(exist_ok=True)
+
+
+def _is_table(file: Path) -> bool:
+    """Whether a file is there and holds a JSON table."""
+    try:
+        return isinstance(json.loads(file.read_text(encoding="utf-8")), dict)
+    except (OSError, ValueError, RecursionError):
+        return False
 
 
 def _changes(before, now, name: str = "") -> list[str]:
@@ -580,7 +590,7 @@ def run(
     maker = Maker(job, file, plugins)
     maker.check()
     _open_folder(folder, maker.identity())
-    if not (folder / "parameters.json").is_file():
+    if not _is_table(folder / "parameters.json"):
         write_json(folder / "parameters.json", maker.described())
     blocks = Blocks(folder, job.total, shard, uuid.uuid4().hex[:8])
     blocks.verify(progress, check_files)

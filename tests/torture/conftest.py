@@ -200,7 +200,7 @@ def material(tmp_path_factory, mitsuba):
     _scans(folder / "scans", rng)
     (folder / "job.toml").write_text(JOB)
     (folder / "beads.toml").write_text(BEADS)
-    (folder / "made.toml").write_text(JOB.replace('out = "out"', 'out = "made"'))
+    (folder / "made.toml").write_text(JOB.replace('out = "out"\ncount = 1', 'out = "made"\ncount = 3'))
     batch.run(folder / "made.toml", workers=1)
     place, force = rng.uniform(-14, 14, (40, 2)), rng.uniform(0.1, 1.0, 40)
     motion = rng.normal(size=(40, 4, 4, 2))

@@ -143,6 +143,52 @@ def test_a_study(material, met, tmp_path_factory, name, data):
     met("values", study)
 
 
+@given(data=st.data())
+@pytest.mark.parametrize("name", ["manifest.jsonl", "job.json", "parameters.json", ".parts"])
+def test_a_batch(material, met, tmp_path_factory, name, data):
+    """Records of a batch, damaged: the next run ends with the images of the first or with an error, and an export gives
+    what the batch's own folder holds, or an error."""
+    folder = tmp_path_factory.mktemp("batch")
+    for file in ("small.xml", "made.toml"):
+        shutil.copy(material / file, folder)
+    made = shutil.copytree(material / "made", folder / "made")
+    images = {f.name: f.read_bytes() for f in (made / "images").iterdir()}
+    file = made / name
+    if name == ".parts":  # as a run leaves them that was killed
+        file.mkdir()
+        for index, line in enumerate((made / "manifest.jsonl").read_text().splitlines()):
+            (file / f"{index:05d}.{data.draw(st.sampled_from(['part', 'jsonl']))}").write_text(line + "\n")
+        (made / "manifest.jsonl").unlink()
+        file = file / data.draw(st.sampled_from(sorted(f.name for f in file.iterdir())))
+    lines = file.read_text().splitlines() if name in ("manifest.jsonl", ".parts") else [file.read_text()]
+    records = [json.loads(line) for line in lines]
+    value = st.sampled_from(
+        [None, True, -1, 1.5, 10**30, "x", "\0", "/etc/passwd", "../../../../etc/passwd", [], {}, [1], {"a": 1}, [[]]]
+    )
+    for _ in range(data.draw(st.integers(1, 2))):
+        at = records
+        while isinstance(at, (dict, list)) and at:
+            key = data.draw(st.sampled_from(sorted(at) if isinstance(at, dict) else range(len(at))))
+            if not isinstance(at[key], (dict, list)) or not at[key] or data.draw(st.booleans()):
+                if data.draw(st.booleans()):
+                    del at[key]
+                else:
+                    at[key] = copy.deepcopy(data.draw(value))
+                break
+            at = at[key]
+    text = "\n".join(json.dumps(record) for record in records) + "\n"
+    more = data.draw(st.sampled_from(["", "", "", "null\n", "[" * 9000, '{"try": [], "run": 1}\n', "\xff\x00"]))
+    raw = (text + more).encode("latin-1")
+    file.write_bytes(raw[: data.draw(st.sampled_from([len(raw), len(raw), len(raw), len(raw) // 2, 0]))])
+    if data.draw(st.booleans()):
+        code, _ = met("export", made, "-o", folder / "data", "--to", data.draw(st.sampled_from(["webdataset", "hdf5"])))
+        assert code == 0 or not (folder / "data" / "card.json").exists()
+        assert not any(b"root:" in f.read_bytes() for f in folder.rglob("*.tar"))
+    if met("batch", folder / "made.toml", "--workers", "1")[0] == 0:
+        assert {f.name: f.read_bytes() for f in (made / "images").iterdir()} == images
+        assert len((made / "manifest.jsonl").read_text().splitlines()) == 3
+
+
 # -- boards, scans, posteriors ---------------------------------------------------------------------------------------
 CELLS = [
     "", "nan", "inf", "1e300", "1e30", "-1", "9" * 400, "1,5", "1.234,5", "1.5mm", "1 in", "3 ft", "D1", "Ref", "PosX",

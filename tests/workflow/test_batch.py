@@ -350,6 +350,64 @@ def test_damage_is_found_and_mended(whole, tmp_path):
 
 
 @pytest.mark.parametrize(
+    "changed",
+    [
+        {"index": "x"},
+        {"index": None},
+        {"files": [1]},
+        {"files": {"png": "x"}},
+        {"files": {"png": {"file": "/etc/passwd", "size": 1, "hash": "x"}}},
+        {"files": {"png": {"file": "../job.toml", "size": 1, "hash": "x"}}},
+        {"sample": 3},
+        {"labels": []},
+    ],
+    ids=str,
+)
+def test_a_record_that_is_none_counts_as_not_made(whole, tmp_path, changed, capsys):
+    """Whoever edited it: the sample is made again, and an export reads nothing outside the batch's folder."""
+    import shutil
+
+    shutil.copytree(whole, tmp_path / "out")
+    (tmp_path / "job.toml").write_text(JOB)
+    manifest = tmp_path / "out" / "manifest.jsonl"
+    records = [json.loads(line) for line in manifest.read_text().splitlines()]
+    records[3].update(changed)
+    manifest.write_text("".join(json.dumps(record) + "\n" for record in records))
+    assert main(["export", str(tmp_path / "out"), "-o", str(tmp_path / "data"), "--to", "webdataset"]) == 2
+    assert "manifest.jsonl: line 4: no record of sample 3; run `optics batch` again" in capsys.readouterr().err
+    result = batch.run(tmp_path / "job.toml", workers=1)
+    assert result.made == 1 and content(tmp_path / "out") == content(whole)
+
+
+def test_files_of_others_among_the_records_are_left_alone(whole, tmp_path):
+    import shutil
+
+    shutil.copytree(whole, tmp_path / "out")
+    (tmp_path / "job.toml").write_text(JOB)
+    parts, manifest = tmp_path / "out" / ".parts", tmp_path / "out" / "manifest.jsonl"
+    parts.mkdir()
+    for index, line in enumerate(manifest.read_text().splitlines()[:-1]):
+        (parts / f"{index:05d}.jsonl").write_text(line + "\n")
+    manifest.unlink()
+    for name in ("0abc.jsonl", "99999.jsonl", "0x.part"):
+        (parts / name).write_text("{}\n")
+    (parts / "00009.part").write_text('{"try": "x"}\n{"failed": 1, "index": []}\n[1]\nnull\n' + "[" * 99_999 + "\n\xff")
+    result = batch.run(tmp_path / "job.toml", workers=1)
+    assert result.made == 1 and content(tmp_path / "out") == content(whole)
+
+
+def test_an_export_of_a_manifest_cut_short_is_refused(whole, tmp_path, capsys):
+    import shutil
+
+    shutil.copytree(whole, tmp_path / "out")
+    manifest = tmp_path / "out" / "manifest.jsonl"
+    manifest.write_text("".join(manifest.read_text().splitlines(keepends=True)[:4]))
+    assert main(["export", str(tmp_path / "out"), "-o", str(tmp_path / "data"), "--to", "webdataset"]) == 2
+    assert "manifest.jsonl: 4 records of 10 samples; run `optics batch` again" in capsys.readouterr().err
+    assert not (tmp_path / "data").exists()
+
+
+@pytest.mark.parametrize(
     ("old", "new", "changed"),
     [
         ("seed = 7", "seed = 8", "job.seed"),
