@@ -117,6 +117,12 @@ class Scene:
         for key in self.defines:
             if key not in named:
                 raise UnknownKey(key, named, "definition", str(self.path), "-D sets what the XML names in <default>")
+        try:
+            str(self.path).encode()
+        except UnicodeEncodeError as error:
+            raise BadScene(
+                f"{self.path}: Mitsuba reads no path that is not UTF-8; rename the file or folder"
+            ) from error
         use_variant(variant, self.registry)
         import mitsuba as mi
 
