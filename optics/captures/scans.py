@@ -24,6 +24,8 @@ Derived, not measured, and said so:
 from __future__ import annotations
 
 import math
+import re
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -44,11 +46,15 @@ from optics.captures.importing import Imported, comment, filled, noise_of_levels
 from optics.captures.noise import Noise
 from optics.captures.skin_motion import SkinMotion, skin_motion
 from optics.errors import BadCapture
+from optics.files import yaml_checks
 from optics.files.images import read_image, varied
 from optics.files.output import shipped
+from optics.files.yaml_checks import short
 from optics.skin.contact import STRETCH
 
 FILE = "scan.yaml"
+LEDS = 64  # images of one scan
+SMALLEST, ACROSS = 5.0, 200  # px of a ball's radius at least, and how many of them are across an image at most
 DISTANCE = 30.0  # mm from the middle of the face to a light, where no better is known
 CAMERA = 200.0  # mm: nearly telecentric, as lenses for inspection are
 CONTACT = 0.85  # of the ball's radius: touched, where nothing tells
@@ -103,53 +109,80 @@ def is_scan_source(source: Path) -> bool:
 # -- reading ---------------------------------------------------------------------------------------------------------
 def read_scan(folder: Path) -> Scan:
     """A scan folder; raises BadCapture with the file, the key and what is allowed."""
-    import yaml
-
     file = folder / FILE
     if not file.is_file():
         raise BadCapture(f"{file}: no such file; give a scan folder, or a folder of them")
-    try:
-        data = yaml.safe_load(file.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise BadCapture(f"{file}: no YAML ({error})") from error
+    data = yaml_checks.parse(file)
     names = data.get("images") if isinstance(data, dict) else None
-    if not isinstance(names, list) or not names or not all(isinstance(n, str) for n in names):
-        raise BadCapture(f"{file}: images = {names!r}; allowed: a list of file names, one for each LED")
+    if not isinstance(names, list) or not 0 < len(names) <= LEDS or not all(isinstance(n, str) for n in names):
+        raise BadCapture(
+            f"{file}: images = {short(names)}; allowed: a list of file names, one for each LED, at most {LEDS}"
+        )
+    labels = [Path(n).stem.removeprefix("image") for n in names]
+    for name, label in zip(names, labels):
+        if names.count(name) > 1 or labels.count(label) > 1:
+            raise BadCapture(f"{file}: images: {short(name)} stands twice; allowed: one image for each LED")
+        if not re.fullmatch(r"[\w-]+", label, re.ASCII):
+            raise BadCapture(
+                f"{file}: images: {short(name)}: names of files name the LEDs; allowed: letters, digits, - and _, such "
+                "as image07.png"
+            )
     images: list[np.ndarray] = []
     for name in names:
-        if not (folder / name).is_file() or Path(name).name != name:
-            raise BadCapture(f"{file}: images: no file '{name}' in {folder}; allowed: names of images that lie there")
+        if Path(name).name != name or len(name) > 200 or not (folder / name).is_file():
+            raise BadCapture(
+                f"{file}: images: no file {short(name)} in {folder}; allowed: names of images that lie there"
+            )
         image, _ = read_image(folder / name, f"{folder / name}")
         varied(image, f"{folder / name}")
         if image.shape[2] != 1 or (images and image.shape != images[0].shape):
+            of = f", as {names[0]} with {images[0].shape}" if images else ""
             raise BadCapture(
-                f"{folder / name}: (H, W, C) = {image.shape}; allowed: one channel, all images of one size"
+                f"{folder / name}: (H, W, C) = {image.shape}{of}; allowed: one channel, all images of one size"
             )
         images.append(image.astype(np.float64))
-    circles = [_circle(a, file) for a in data.get("annotations") or () if _of(a, "type") == "GridCircle"]
-    numbers = [_number(data, key, file) for key in ("calibradius", "calibspacing", "mmperpixel")]
-    if circles and min(numbers) <= 0:
+    height, width = images[0].shape[:2]
+    marks = data.get("annotations") or []
+    if not isinstance(marks, list):
+        raise BadCapture(f"{file}: annotations = {short(marks)}; allowed: a list of tables, of the type GridCircle")
+    circles = [
+        _circle(a, f"{file}: annotations[{k}]", (width, height))
+        for k, a in enumerate(marks)
+        if _of(a, "type") == "GridCircle"
+    ]
+    at = [(gx, gy) for *_, gx, gy in circles]
+    if len(set(at)) < len(at):
+        twice = next(place for place, count in Counter(at).items() if count > 1)
         raise BadCapture(
-            f"{file}: calibradius, calibspacing, mmperpixel = {', '.join(f'{n:g}' for n in numbers)}; allowed: above 0 "
-            "where circles are annotated"
+            f"{file}: annotations: two circles at gx, gy = {twice[0]:g}, {twice[1]:g}; allowed: one a ball"
         )
-    labels = [Path(n).stem.removeprefix("image") for n in names]
-    return Scan(folder.name, labels, np.stack(images), np.array(circles, float).reshape(-1, 4), *numbers)
+    if not circles:
+        return Scan(folder.name, labels, np.stack(images), np.zeros((0, 4)), 0.0, 0.0, 0.0)
+    radius, spacing, scale = (
+        yaml_checks.number(data, key, file, 1e-6, 1e3) for key in ("calibradius", "calibspacing", "mmperpixel")
+    )
+    least, most = max(SMALLEST, max(height, width) / ACROSS), min(height, width) / 2
+    if not least <= radius / scale <= most:
+        raise BadCapture(
+            f"{file}: calibradius = {radius:g} mm at mmperpixel = {scale:g} mm are {radius / scale:.3g} px; allowed: "
+            f"balls of {least:.3g} to {most:.3g} px radius in images of {width} x {height} px"
+        )
+    if spacing < radius:
+        raise BadCapture(
+            f"{file}: calibspacing = {spacing:g} mm between balls of calibradius = {radius:g} mm; allowed: more than "
+            "their radius"
+        )
+    return Scan(folder.name, labels, np.stack(images), np.array(circles, float), radius, spacing, scale)
 
 
 def _of(table: Any, key: str) -> Any:
     return table.get(key) if isinstance(table, dict) else None
 
 
-def _number(table: Any, key: str, file: Path, default: float | None = 0.0) -> float:
-    value = table.get(key, default)
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-        raise BadCapture(f"{file}: {key} = {value!r}; allowed: a number")
-    return float(value)
-
-
-def _circle(table: Any, file: Path) -> list[float]:
-    return [_number(table, key, file, None) for key in ("x", "y", "gx", "gy")]
+def _circle(table: Any, where: str, size: tuple[int, int]) -> list[float]:
+    """x, y in px, of which a ball at the edge may stand beyond the image; gx, gy."""
+    place = [yaml_checks.number(table, key, where, -n, 2.0 * n) for key, n in zip("xy", size)]
+    return [*place, *(yaml_checks.number(table, key, where, -1e4, 1e4) for key in ("gx", "gy"))]
 
 
 def scans_in(source: Path) -> tuple[list[Scan], Scan, list[str]]:
@@ -410,7 +443,14 @@ def _corrections(bin: int, masked: Sequence[float]) -> list[dict[str, str]]:
 
 
 def _contradictions(scan: Scan, plate: Plate, first: Scan) -> list[str]:
+    """In sentences; raises BadCapture where circles are of no such plate."""
     found = []
+    if not 0.5 < plate.spacing / scan.spacing < 2 or plate.rms > scan.radius:
+        raise BadCapture(
+            f"{scan.name}: circles are {plate.spacing:.4g} mm apart and miss a square grid by {plate.rms:.2g} mm rms; "
+            f"allowed: about calibspacing = {scan.spacing:g} mm apart, and less than a ball's radius of "
+            f"{scan.radius:g} mm off; annotate them again, or correct mmperpixel"
+        )
     if abs(plate.spacing / scan.spacing - 1) > ALIKE:
         found.append(
             f"{scan.name}: balls are {plate.spacing:.4g} mm apart by their circles and mmperpixel, {scan.spacing:.4g} "

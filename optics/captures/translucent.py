@@ -49,6 +49,7 @@ from optics.captures.importing import (
 )
 from optics.captures.noise import SATURATED, Noise
 from optics.errors import BadCapture
+from optics.files import yaml_checks
 from optics.files.images import read_image, varied
 from optics.files.output import shipped
 
@@ -180,27 +181,18 @@ def _near(folder: Path, name: str) -> Path | None:
 
 
 def _config(folder: Path) -> tuple[Mapping, Path]:
-    import yaml
-
     file = _near(folder, CONFIG)
     if file is None:
         return {}, folder / CONFIG
-    try:
-        data = yaml.safe_load(file.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise BadCapture(f"{file}: no YAML ({error})") from error
+    data = yaml_checks.parse(file)
     if not isinstance(data, dict):
         raise BadCapture(f"{file}: {type(data).__name__}; allowed: keys and values")
     return data, file
 
 
 def _number(table: Any, key: str, file: Path) -> float | None:
-    value = table.get(key) if isinstance(table, dict) else None
-    if value is None:
-        return None
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-        raise BadCapture(f"{file}: {key} = {value!r}; allowed: a number")
-    return float(value)
+    known = isinstance(table, dict) and table.get(key) is not None
+    return yaml_checks.number(table, key, file) if known else None
 
 
 def _array(file: Path) -> np.ndarray:
@@ -226,7 +218,8 @@ def _maps(
         values = _array(position)
         if values.shape != (3,) or not np.isfinite(values).all() or values[2] <= 0:
             raise BadCapture(f"{position}: {values.tolist()}; allowed: row, column (px), mm per pixel above 0")
-        size = (config.get("camera_calibration") or {}).get("crop_size", [345, 460])
+        camera = config.get("camera_calibration")
+        size = camera.get("crop_size", [345, 460]) if isinstance(camera, dict) else [345, 460]
         if not isinstance(size, list) or len(size) != 2 or not all(isinstance(n, int) and n > 0 for n in size):
             raise BadCapture(
                 f"{config_file}: crop_size = {size!r}; allowed: two whole numbers above 0, rows and columns"

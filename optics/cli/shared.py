@@ -273,6 +273,9 @@ def _let_ask() -> None:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command line and return its exit code; without arguments, that of this program."""
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:  # closed by who started the program
+            setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115  for as long as the program runs
     if arguments is None:
         try:
             code = _run(sys.argv[1:])
@@ -342,7 +345,14 @@ def _usage(error: Any) -> str:
 
 def _text(error: Exception) -> str:
     if isinstance(error, OSError) and error.strerror:
-        return f"{error.filename}: {error.strerror}" if error.filename else error.strerror
+        from optics.files.output import FULL
+
+        if error.filename:
+            return f"{error.filename}: {error.strerror}"
+        if isinstance(error, FileNotFoundError) and not _is_somewhere():
+            return "the current folder is gone; change to another one"
+        # writers of files say theirs (optics.files.output.naming): what is left is a table, or text for a program
+        return f"standard output: {error.strerror}" if error.errno in FULL else error.strerror
     if isinstance(error, MemoryError):
         return (
             f"not enough memory: {error or 'the system gave none'}; take fewer pixels (-D width=..., --bin) or frames"
@@ -350,6 +360,13 @@ def _text(error: Exception) -> str:
     if type(error) is KeyError:
         return f"no entry {error}"
     return str(error) or type(error).__name__
+
+
+def _is_somewhere() -> bool:
+    try:
+        return bool(os.getcwd())
+    except FileNotFoundError:
+        return False
 
 
 def columns() -> int | None:

@@ -285,8 +285,8 @@ def compare(
     data = [_frame(i, *arrays) for i, arrays in enumerate(zip(measured, predicted, sd, usable))]
     if not any(use.any() for *_, use in data):
         raise Underdetermined(
-            "no usable value in any frame: everything is masked, saturated or not finite; "
-            "check the masks and the noise model's saturation"
+            "no usable value in any frame: everything is masked, saturated, not finite, or where the shape is not "
+            "known; check the masks and the noise model's saturation; allowed: --region all"
         )
     shape = data[0][0].shape
     channels = list(channels or {1: ["L"], 3: ["R", "G", "B"]}.get(shape[2], [f"c{k}" for k in range(shape[2])]))

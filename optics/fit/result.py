@@ -89,8 +89,12 @@ class Fit:
         if self.normal is None:
             return None
         sizes = np.array([v.parameter.plausible for v in self.variables])
-        scaled = self.normal.a * np.outer(sizes, sizes) / self.tempering
-        return np.linalg.inv(scaled + np.eye(len(sizes))) * np.outer(sizes, sizes)
+        scaled = self.normal.a * np.outer(sizes, sizes) / self.tempering + np.eye(len(sizes))
+        unit = np.sqrt(np.diag(scaled))
+        eigen, vectors = np.linalg.eigh(scaled / np.outer(unit, unit))
+        # a product of a matrix with its transpose has no eigenvalue below 0, however ill-conditioned the fit
+        root = vectors / np.sqrt(np.maximum(eigen, len(sizes) * np.finfo(float).eps)) * (sizes / unit)[:, None]
+        return root @ root.T
 
     @property
     def correlation(self) -> np.ndarray:

@@ -48,6 +48,7 @@ from optics.pages.drawing import (
     wrapped,
 )
 from optics.pages.glossary import GLOSSARY, explained
+from optics.pages.mosaics import Eye
 from optics.study.record import Record
 from optics.study.shown import Fingerprint, Shown
 from optics.words import ANYWHERE, NO_LIMIT, Reach, as_float, below, figures, fixed, share_text, some, spaced
@@ -107,6 +108,7 @@ def render(study: Record) -> str:
 
     from optics.pages import residual_maps
 
+    eye = Eye(study.ladder["facts"])
     environment = Environment(
         loader=FileSystemLoader(Path(__file__).parent),
         autoescape=True,
@@ -124,9 +126,11 @@ def render(study: Record) -> str:
     )
     environment.globals.update(measure=measure, scatter=scatter, estimated=estimated)
     comparisons = [study.comparison(i) for i in range(len(study.steps))]
-    shown = [study.frames(i) for i in range(len(study.steps))]
+    shown = [[eye.frame(f) for f in study.frames(i)] for i in range(len(study.steps))]
     points = Readings.of(shown)
     viewer = viewer_images(study, shown) if points is None else NO_IMAGES
+    seen = [eye.maps(c) for c in comparisons]
+    prints = [[eye.fingerprint(f) for f in study.fingerprints(i)] for i in range(len(study.steps))]
     nouns = FRAMES if points is None else SWEEPS
     verdicts = [verdict(told(study.diagnosis(i), points)) for i in range(len(study.steps))]
     page = environment.get_template("report.html.j2").render(
@@ -139,16 +143,17 @@ def render(study: Record) -> str:
         viewer=viewer,
         payload=_script(viewer),
         colour_bar=colour_bar(),
+        woven=eye.note,
         nouns=nouns,
         points=points,
         plots=reading_plots(points, study.steps, comparisons[0].channels) if points else {},
         ladder_wide=ladder_chart(study, 920, 330, nouns),
         ladder_narrow=ladder_chart(study, 360, 300, nouns),
-        fingerprints=[[] if points else fingerprint_images(study.fingerprints(i)) for i in range(len(study.steps))],
+        fingerprints=[[] if points else fingerprint_images(own) for own in prints],
         readings=[] if viewer["frames"] or points else reading_charts(comparisons),
         curves=residual_curves(comparisons, points),
-        maps=map_images(comparisons, study.steps) if points is None else [],
-        pages=residual_maps.pages(comparisons, shown, study.steps) if points is None else [],
+        maps=map_images(seen, study.steps) if points is None else [],
+        pages=residual_maps.pages(seen, shown, study.steps) if points is None else [],
         coordinates=[residual_maps.coordinates(told(study.diagnosis(i), points)) for i in range(len(study.steps))],
         facts=facts(study.ladder["facts"], points),
         numbers=number_tables(comparisons, nouns),
@@ -213,6 +218,8 @@ def facts(record: Mapping, points: Readings | None = None) -> dict[str, list[tup
     def text(key: str, value) -> str:
         if isinstance(value, float):
             return percent(value) if key == "masked" else number(value, 4)
+        if key == "mosaic":
+            return " / ".join(" ".join(f"{angle:g}°" for angle in row) for row in value)
         if isinstance(value, (list, tuple)):
             return (" × " if all(isinstance(v, int) for v in value) else ", ").join(map(str, value))
         return json.dumps(value) if isinstance(value, Mapping) else str(value)

@@ -25,6 +25,7 @@ from optics.pages.drawing import (
     webp,
     wrapped,
 )
+from optics.pages.mosaics import Eye
 from optics.study.board import PUBLISHED, STEP, Board, Entry, Level
 from optics.words import figures, fixed, some
 
@@ -251,11 +252,15 @@ def images(board: Board) -> dict[str, Any]:
     found = board.images
     if found is None or min(found.measured.shape[:2]) < SIDE_MIN:
         return {}
-    bins = max(1, math.ceil(max(found.measured.shape[:2]) / SIDE_MAX))
-    usable = np.where(found.usable, 1.0, np.nan)
-    measured = _blocks(found.measured, bins)
+    eye = Eye(found.mosaic)
+    raw = eye.whole(found.measured)
+    bins = max(1, math.ceil(max(raw.shape[:2]) / SIDE_MAX))
+    usable = np.where(found.usable if found.usable.ndim == 3 else found.usable[..., None], 1.0, np.nan)
+    measured = _blocks(raw, bins)
     white = rounded_up(float(np.nanpercentile(found.measured, 99.5)))
-    residuals = {name: _mean(_blocks((found.measured - p) * usable, bins), 2) for name, p in found.predicted.items()}
+    residuals = {
+        name: _mean(_blocks(eye.whole((found.measured - p) * usable), bins), 2) for name, p in found.predicted.items()
+    }
     own = board.best(STEP) or board.best("rival")
     first = residuals[own.name] if own and own.name in residuals else next(iter(residuals.values()))
     limit = rounded_up(max(float(np.nanpercentile(np.abs(first), QUANTILE)), 1e-3 * board.full_scale))
@@ -264,10 +269,11 @@ def images(board: Board) -> dict[str, Any]:
         "measured": webp(eight_bit(measured, white)),
         "size": measured.shape[:2][::-1],
         "limit": words.number(limit),
+        "note": eye.note,
         "models": [
             {
                 "name": name,
-                "predicted": webp(eight_bit(_blocks(p, bins), white)),
+                "predicted": webp(eight_bit(_blocks(eye.whole(p), bins), white)),
                 "residual": coloured(residuals[name], -limit, limit, DIVERGING),
             }
             for name, p in found.predicted.items()

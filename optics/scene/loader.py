@@ -31,6 +31,7 @@ from optics.scene.trust import Named
 from optics.scene.wiring import wire
 from optics.spectra.curve import Curve
 
+NAME = r"[^/\\\x00-\x1f\x7f]{1,100}"  # of a part
 PIXELS_MOST = 50_000_000  # of a camera: a render keeps some hundred bytes for each
 KEEPS = "use 'interface', 'rough_interface' or 'sheet', which keep it"
 DEPOLARIZERS = {  # stock materials without a Mueller matrix, by the name that Mitsuba prints
@@ -108,11 +109,20 @@ class Scene:
     ):
         self.path, self.defines, self.variant = Path(path), dict(defines), variant
         self.registry = registry or known()
-        text = self.path.read_text(encoding="utf-8")
+        try:
+            text = self.path.read_text(encoding="utf-8-sig")
+        except UnicodeDecodeError as error:
+            raise BadScene(f"{self.path}: no text in UTF-8 ({error}); save it as UTF-8") from error
         named = re.findall(r'<default\s+name="([^"]+)"', text)
         for key in self.defines:
             if key not in named:
                 raise UnknownKey(key, named, "definition", str(self.path), "-D sets what the XML names in <default>")
+        try:
+            str(self.path).encode()
+        except UnicodeEncodeError as error:
+            raise BadScene(
+                f"{self.path}: Mitsuba reads no path that is not UTF-8; rename the file or folder"
+            ) from error
         use_variant(variant, self.registry)
         import mitsuba as mi
 
@@ -130,6 +140,11 @@ class Scene:
         for part in self.neighbours.parts:
             if part.name in self.parts:
                 raise BadScene(f"{self.path}: two parts have the id '{part.name}'; give every part its own id=\"...\"")
+            if not re.fullmatch(NAME, part.name):
+                raise BadScene(
+                    f"{self.path}: id = {part.name[:60]!r}; allowed: 1 to 100 characters without /, \\ and line ends, "
+                    "as files are named by it"
+                )
             self.parts[part.name] = part
         with self._named():
             self.camera, self.gel, self.block = (self.neighbours.one(role) for role in ("camera", "gel", "block"))
@@ -146,10 +161,10 @@ class Scene:
         self.membranes = {n: p for n, p in self.parts.items() if hasattr(p, "ambient_radiance")}
         for sensor in self.mitsuba.sensors():
             width, height = (int(n) for n in sensor.film().size())
-            if width * height > PIXELS_MOST:
+            if not 0 < width * height <= PIXELS_MOST:
                 raise BadScene(
-                    f"{self.path}: a camera of {width} x {height} pixels; allowed: up to {PIXELS_MOST:,}; make width "
-                    "and height smaller"
+                    f"{self.path}: a camera of {width} x {height} pixels; allowed: 1 to {PIXELS_MOST:,}; change width "
+                    "and height"
                 )
         self.monte_carlo = any(p.role == "clear" for p in self.parts.values())
         self.parameters: dict[str, Parameter] = {}

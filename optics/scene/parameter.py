@@ -15,6 +15,7 @@ from optics.words import Reach, spaced
 
 HOW = ("ad", "difference", "image", "layer", "path")
 FREE = ("", "all", "press")
+LARGEST = 1e18  # of any number: squares of larger ones overflow in single precision, in which images are computed
 FALL = 10.0  # a linearisation lowers a factor to no less than this part of it: at 0 it would hide everything else
 ROLES = {  # of parameters: what the library turns, sets or solves for, whatever a part calls it
     "power": "scales all light of a light; 0 switches it off",
@@ -210,6 +211,11 @@ class Parameter:
             ) from None
         if not math.isfinite(number):
             raise ValueError(f"{where + ': ' if where else ''}{key} = {number}{spaced(self.unit)} is not finite")
+        if abs(number) > LARGEST:
+            raise ValueError(
+                f"{where + ': ' if where else ''}{key} = {number:g}{spaced(self.unit)} is beyond what can be computed "
+                f"with; allowed: {-LARGEST:g} to {LARGEST:g}{spaced(self.unit)}"
+            )
         if not self.bounds[0] <= number <= self.bounds[1]:
             raise OutOfBounds(key, number, self.unit, self.bounds, where)
         return number

@@ -218,8 +218,12 @@ def read(file: str | Path, fit: str | Path | None = None, frame: str | None = No
 
 def _explained(error: ValidationError, file: Path) -> Exception:
     """The first validation error as a sentence: what, where, allowed."""
-    first, more = error.errors()[0], error.error_count() - 1
-    place = [str(p) for p in first["loc"] if not str(p).startswith(("list[", "constrained-", "float", "str", "int"))]
+    kinds = ("float", "str", "int", "bool")  # pydantic names what it tried
+    places = [
+        [str(p) for p in e["loc"] if p not in kinds and not str(p).startswith(("list[", "constrained-"))]
+        for e in error.errors()
+    ]
+    first, place, more = error.errors()[0], places[0], len(set(map(tuple, places))) - 1
     model, field = Job, None
     for name in place:  # down to the model that holds the key
         if field is not None and field.annotation is not None:
@@ -237,7 +241,7 @@ def _explained(error: ValidationError, file: Path) -> Exception:
         text = f"{first['input']!r}; allowed: {field.description if field else text}"
     return BadJob(
         f"{where}{f'{name} = ' if first['type'] != 'value_error' else f'{name}: ' if name else ''}{text}"
-        + (f" (and {more} more)" if more and first["type"] not in ("union",) else "")
+        + (f" (and {more} more)" if more else "")
     )
 
 
@@ -440,7 +444,9 @@ def _open_folder(folder: Path, identity: Mapping) -> None:
     if note.is_file():
         try:
             before = json.loads(note.read_text(encoding="utf-8"))
-        except ValueError as error:
+            if not isinstance(before, dict):
+                raise ValueError("no table")
+        except (ValueError, RecursionError) as error:
             raise OutputExists(
                 f"{note}: unreadable ({error}); restore it, or choose another folder for `out`"
             ) from error
@@ -456,6 +462,14 @@ def _open_folder(folder: Path, identity: Mapping) -> None:
         raise OutputExists(f"{folder} exists and holds no batch; choose another folder for `out`")
     write_text(note, json.dumps(identity, indent=1, sort_keys=True) + "\n")  # first: it makes the folder a batch's
     (folder / "images").mkdir(exist_ok=True)
+
+
+def _is_table(file: Path) -> bool:
+    """Whether a file is there and holds a JSON table."""
+    try:
+        return isinstance(json.loads(file.read_text(encoding="utf-8")), dict)
+    except (OSError, ValueError, RecursionError):
+        return False
 
 
 def _changes(before, now, name: str = "") -> list[str]:
@@ -576,7 +590,7 @@ def run(
     maker = Maker(job, file, plugins)
     maker.check()
     _open_folder(folder, maker.identity())
-    if not (folder / "parameters.json").is_file():
+    if not _is_table(folder / "parameters.json"):
         write_json(folder / "parameters.json", maker.described())
     blocks = Blocks(folder, job.total, shard, uuid.uuid4().hex[:8])
     blocks.verify(progress, check_files)

@@ -138,7 +138,8 @@ class Blocks:
         """Numbers of complete blocks."""
         if self.finished:
             return set(range(self.count))
-        return {int(f.stem) for f in self.parts.glob("[0-9]*.jsonl")}
+        there = _names(self.parts)
+        return {n for n in range(self.count) if there and self.file(n, "jsonl").name in there}
 
     # -- work ---------------------------------------------------------------------------------------------------------
     @contextmanager
@@ -193,7 +194,8 @@ class Blocks:
 
     def opened(self) -> list[int]:
         """Blocks of the shard that somebody has begun and not completed."""
-        return sorted(n for n in (int(f.stem) for f in self.parts.glob("[0-9]*.part")) if n in self.numbers)
+        there = _names(self.parts)
+        return [n for n in self.numbers if self.file(n, "part").name in there]
 
     def failures(self) -> dict[int, str]:
         """Index -> why, of samples of the shard that were begun too often."""
@@ -225,17 +227,17 @@ class Blocks:
                 checked += len(block.records)
                 if progress:
                     progress("checking what is there", checked, self.own)
-                if bad:
+                if bad or (kind == "jsonl" and len(block.records) < len(block.samples)):
                     self._drop(number, bad)
                 break
 
     def _verify_manifest(self, progress: Any, all_of_them: bool) -> bool:
         """Whether a finished batch must be opened again."""
         known, since, began = 0, _since(self.manifest, all_of_them), time.time_ns()
-        with open(self.manifest, encoding="utf-8") as lines:
+        with open(self.manifest, "rb") as lines:
             for line in lines:
                 record = _record(line)
-                if record is None or record["index"] != known:
+                if record is None or record.get("index") != known or "files" not in record:
                     return True
                 known += 1
                 if (record["index"] // self.size) in self.numbers and not stands(self.folder, record, since):
@@ -253,8 +255,8 @@ class Blocks:
     def _reopen(self, manifest: Path) -> None:
         """Take the records of a manifest back into blocks, block by block where it is in order."""
         self.parts.mkdir(exist_ok=True)
-        with open(manifest, encoding="utf-8") as lines:
-            records = filter(None, map(_record, lines))
+        with open(manifest, "rb") as lines:
+            records = (r for r in filter(None, map(_record, lines)) if "files" in r)
             for number, own in itertools.groupby(records, lambda record: record["index"] // self.size):
                 if number < self.count and not self.file(number, "jsonl").exists():
                     self._store(number, {**{r["index"]: r for r in own}, **self.read(number).records})
@@ -294,7 +296,7 @@ class Blocks:
     def records(self) -> Iterator[Record]:
         """All records of the job that there are, in their order."""
         if self.finished:
-            with open(self.manifest, encoding="utf-8") as lines:
+            with open(self.manifest, "rb") as lines:
                 yield from filter(None, map(_record, lines))
             return
         for number in range(self.count):
@@ -340,17 +342,55 @@ def text(records: Mapping[int, Record]) -> str:
     return "".join(json.dumps(records[i], sort_keys=True) + "\n" for i in sorted(records))
 
 
-def _record(line: str) -> Record | None:
-    """A line as a record; None for one that a killed worker left incomplete."""
+def _record(line: str | bytes) -> Record | None:
+    """A line as a record; None for one that a killed worker left incomplete, or that is none: its sample is made
+    again."""
     try:
         record = json.loads(line)
-        return record if isinstance(record, dict) and ("index" in record or "try" in record) else None
-    except ValueError:
+    except (ValueError, RecursionError):
         return None
+    if not isinstance(record, dict):
+        return None
+    if "failed" in record:
+        return record if isinstance(record["failed"], str) and _is_whole(record.get("index")) else None
+    if "try" in record:
+        return record if _is_whole(record["try"]) else None
+    return sample_record(record)
+
+
+def sample_record(record: Any) -> Record | None:
+    """The record of a sample as it is; None where it is none, such as one with files outside the batch's folder."""
+    if not isinstance(record, dict) or not _is_whole(record.get("index")) or not _is_whole(record.get("unit", 0)):
+        return None
+    files, sample, labels = (record.get(name) for name in ("files", "sample", "labels"))
+    if not isinstance(files, dict) or not files or not isinstance(sample, dict):
+        return None
+    values = all(isinstance(v, (int, float, str)) and not isinstance(v, bool) for v in sample.values())
+    whole = values and all(_is_entry(entry) for entry in files.values())
+    return record if whole and ("labels" not in record or isinstance(labels, dict)) else None
+
+
+def _is_whole(value: object) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 1 << 62
+
+
+def _is_entry(entry: object) -> bool:
+    if not isinstance(entry, dict) or not isinstance(entry.get("hash"), str) or not _is_whole(entry.get("size")):
+        return False
+    file = entry.get("file")
+    return isinstance(file, str) and "\0" not in file and not os.path.isabs(file) and ".." not in Path(file).parts
+
+
+def _names(folder: Path) -> set[str]:
+    try:
+        return set(os.listdir(folder))
+    except FileNotFoundError:
+        return set()
 
 
 def _lines(file: Path) -> list[Record]:
     try:
-        return [record for line in file.read_text(encoding="utf-8").splitlines() if (record := _record(line))]
+        text = file.read_text(encoding="utf-8", errors="replace")
+        return [record for line in text.splitlines() if (record := _record(line))]
     except FileNotFoundError:
         return []

@@ -88,13 +88,15 @@ class Ring:
 
 @dataclass
 class Images:
-    """A held-out frame as models predict it: (H, W, C) DN; the contact (H, W) bool."""
+    """A held-out frame as models predict it: (H, W, C) DN; the contact (H, W) bool; the mosaic of its pixels, as
+    optics.study.shown.mosaic_of says it."""
 
     frame: str
     measured: np.ndarray
     predicted: dict[str, np.ndarray]
     usable: np.ndarray
     contact: np.ndarray
+    mosaic: dict[str, Any] = field(default_factory=dict)
 
 
 @dataclass

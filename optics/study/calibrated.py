@@ -177,6 +177,11 @@ def calibrated(
     if sensor.get("flat_field", "none") != "none":
         notes.append("the study's model holds a measured background, which is no part of the scene: this is without it")
     posterior = Posterior.from_table(data["posterior"], str(file)) if data["posterior"] else None
+    for key in () if posterior is None else [key for keys in posterior.keys for key in keys]:
+        if key not in loaded.parameters:
+            raise UnknownKey(key, loaded.parameters, "parameter", f"{file}: [posterior] keys")
+        if not loaded.parameters[key].is_number:
+            raise ValueError(f"{file}: [posterior] keys: {key} is a word and no number; calibrate again")
     levels = {
         key: values[key] / data["parameters"][key] for key in sensor.get("drive", {}) if data["parameters"].get(key)
     }

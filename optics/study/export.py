@@ -25,12 +25,14 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
+from pydantic import BaseModel, Field, RootModel, ValidationError, model_validator
 
 from optics.errors import OutputExists, UnknownKey
 from optics.files import exr
 from optics.files.images import read_array
 from optics.files.output import check_folder, file_hash, replacing, write_json, write_text
 from optics.light import labels as labelling
+from optics.study.blocks import sample_record
 from optics.study.engines import library
 
 NODES = "nodes."  # before the names of what is per node: pixels have such names as well
@@ -73,15 +75,19 @@ class Batch:
             )
         if not self.manifest.is_file():
             raise FileNotFoundError(f"{folder}: the batch is not finished; run `optics batch` again, then export it")
-        self.made = json.loads((self.folder / "job.json").read_text(encoding="utf-8"))
+        self.made = _table(self.folder / "job.json", _Made)
+        units = self.folder / "parameters.json"
+        self.parameters = _table(units, _Described) if units.is_file() else {}
         self.job: dict[str, Any] = self.made["job"]
         noise = self.made.get("noise") or self.job["noise"]
         self.saturation = 255.0 if noise is None else noise["saturation"]
-        units = self.folder / "parameters.json"
-        self.parameters = json.loads(units.read_text(encoding="utf-8")) if units.is_file() else {}
+        grids = [len(d["grid"]) for d in self.job["sample"].values() if d.get("grid")]
+        asked = math.prod(grids) * (self.job["count"] or 1)
         with open(self.manifest, "rb") as lines:
             self.starts = np.cumsum([0, *map(len, lines)])[:-1]  # bytes before each record
         self.total = len(self.starts)
+        if self.total != asked:
+            raise ValueError(f"{self.manifest}: {self.total} records of {asked} samples; {AGAIN}")
         self.roles = list(next(self.records())["files"])
 
     def bands(self) -> list[float]:
@@ -95,7 +101,11 @@ class Batch:
     def records(self, first: int = 0) -> Iterator[dict]:
         with open(self.manifest, "rb") as lines:
             lines.seek(self.starts[first])
-            yield from map(json.loads, lines)
+            for index, line in enumerate(lines, first):
+                record = sample_record(_loaded(line))
+                if record is None or record["index"] != index:
+                    raise ValueError(f"{self.manifest}: line {index + 1}: no record of sample {index}; {AGAIN}")
+                yield record
 
     def item(self, record: Mapping, images: str, only: Sequence[str]) -> Item:
         """A sample's values and arrays; only: names of arrays, none for all. Raises ValueError for a damaged file."""
@@ -130,6 +140,71 @@ class Batch:
             name: math.nan if value is None else value if isinstance(value, str) else float(value)  # type: ignore[arg-type]
             for name, value in told.items()
         }
+
+
+AGAIN = "run `optics batch` again, which makes what is missing or damaged, then export it"
+
+
+def _loaded(text: str | bytes) -> Any:
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError):
+        return None
+
+
+class _Noise(BaseModel):
+    saturation: float = Field(gt=0)
+
+
+class _Drawn(BaseModel):
+    grid: list[float | str] | None = None
+
+
+class _Job(BaseModel):
+    seed: int
+    count: int | None = Field(ge=1)
+    parameters: dict[str, float | str]
+    sample: dict[str, _Drawn]
+    unit: dict[str, _Drawn] = {}
+    noise: _Noise | None
+
+
+class _Scene(BaseModel):
+    name: str
+    hash: str
+    defines: dict[str, Any]
+
+
+class _Made(BaseModel):
+    """What the card says of job.json."""
+
+    job: _Job
+    scene: _Scene
+    plugins: dict[str, Any]
+    versions: dict[str, str]
+    noise: _Noise | None = None
+    grids: list[str] = []
+
+    @model_validator(mode="after")
+    def _known(self) -> _Made:
+        if "optics" not in self.versions or any(not (d := self.job.sample.get(k)) or not d.grid for k in self.grids):
+            raise ValueError("versions or grids are not those of a batch")
+        return self
+
+
+class _Described(RootModel[dict[str, dict[str, str]]]):
+    """parameters.json: key -> unit, doc."""
+
+
+def _table(file: Path, form: type[BaseModel]) -> dict[str, Any]:
+    found = _loaded(file.read_bytes())
+    try:
+        form.model_validate(found, strict=True)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(map(str, first["loc"])) or "all of it"
+        raise ValueError(f"{file}: {where}: {first['msg']}; restore it, or {AGAIN}") from error
+    return found
 
 
 def _arrays(file: Path, kind: str, images: str) -> dict[str, np.ndarray]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +12,10 @@ import numpy as np
 
 from optics.errors import UnknownKey
 from optics.files.toml_checks import tomllib
+from optics.fit.known_shape import ALL, REGIONS
 from optics.fit.result import Fit
 from optics.fit.scene_model import SceneModel
-from optics.scene.parameter import Values
+from optics.scene.parameter import LARGEST, Values
 
 CORRELATION_SHOWN = 0.9  # absolute correlation beyond which a pair of variables is listed
 
@@ -57,24 +59,72 @@ class Posterior:
 
     @classmethod
     def from_table(cls, table: Mapping[str, Any], where: str) -> Posterior:
-        """Raises ValueError for what is no such table."""
+        """Raises ValueError for what is no such table, UnknownKey for an entry that it does not have."""
+        from pydantic import ValidationError
+
+        where = f"{where}: [posterior]"
         try:
-            names, keys = tuple(map(str, table["variables"])), tuple(tuple(map(str, k)) for k in table["keys"])
-            mean, sd = (np.array(table[name], float) for name in ("value", "sd"))
-            lower = np.zeros((len(names), len(names)))
-            for i, row in enumerate(table["correlation"]):
-                lower[i, : i + 1] = row
-            correlation = lower + np.tril(lower, -1).T
-            shapes = {len(names), len(keys), len(mean), len(sd), len(table["correlation"])}
-            whole = len(shapes) == 1 and np.isfinite([*mean, *sd]).all() and (sd > 0).all()
-            if not whole or np.abs(np.diag(correlation) - 1).max(initial=0) > 1e-9 or np.abs(correlation).max() > 1.01:
-                raise ValueError("numbers that do not belong together")
-        except (KeyError, TypeError, ValueError, IndexError) as error:
+            read = _posterior_table().model_validate(table)
+        except ValidationError as error:
+            errors = error.errors()
+            first = next((e for e in errors if e["type"] == "extra_forbidden"), errors[0])
+            name = "".join(f"[{p}]" if isinstance(p, int) else str(p) for p in first["loc"])
+            if first["type"] == "extra_forbidden":
+                raise UnknownKey(name, PARTS, "entry", where) from error
+            if first["type"] == "missing":
+                raise ValueError(f"{where}: {name} is missing; {AGAIN}") from error
+            allowed = first["msg"].replace("Input should be", "allowed:")
+            raise ValueError(f"{where}: {name} = {first['input']!r}; {allowed}; {AGAIN}") from error
+        count = len(read.variables)
+        for name in PARTS:
+            if len(getattr(read, name)) != count:
+                raise ValueError(f"{where}: {count} variables, but {len(getattr(read, name))} of {name}; {AGAIN}")
+        for what, names in (("variables", read.variables), ("keys", [key for keys in read.keys for key in keys])):
+            if len(set(names)) < len(names):
+                twice = next(name for name in names if names.count(name) > 1)
+                raise ValueError(f"{where}: {what}: '{twice}' stands twice; allowed: each once; {AGAIN}")
+        lower = np.zeros((count, count))
+        for i, row in enumerate(read.correlation):
+            if len(row) != i + 1:
+                raise ValueError(
+                    f"{where}: correlation[{i}]: {len(row)} numbers; allowed: {i + 1}, the last 1; {AGAIN}"
+                )
+            lower[i, : i + 1] = row
+        correlation = lower + np.tril(lower, -1).T
+        least = float(np.linalg.eigvalsh(correlation)[0])
+        if np.abs(np.diag(correlation) - 1).max() > ROUNDING or least < -ROUNDING:
             raise ValueError(
-                f"{where}: [posterior]: {error}; allowed: variables, keys, value, sd and the lower triangle of their "
-                "correlation, as `optics calibrate` writes them"
-            ) from error
-        return cls(names, keys, mean, correlation * np.outer(sd, sd))
+                f"{where}: correlation: no correlation of numbers, with {np.diag(correlation).min():g} on its diagonal "
+                f"and a least eigenvalue of {least:.3g}; allowed: 1, and 0 or more; {AGAIN}"
+            )
+        sd = np.array(read.sd)
+        keys = tuple(map(tuple, read.keys))
+        return cls(tuple(read.variables), keys, np.array(read.value), correlation * np.outer(sd, sd))
+
+
+PARTS = ("variables", "keys", "value", "sd", "correlation")
+AGAIN = "restore the file, or calibrate again"
+ROUNDING = 1e-6  # of a correlation's diagonal and eigenvalues: files of earlier versions are no better
+
+
+@cache
+def _posterior_table() -> Any:
+    """The model of [posterior] (pydantic takes its time to be imported)."""
+    from typing import Annotated
+
+    from pydantic import ConfigDict, Field, create_model
+
+    number = Annotated[float, Field(ge=-LARGEST, le=LARGEST, allow_inf_nan=False)]
+    spread = Annotated[float, Field(ge=1 / LARGEST, le=LARGEST, allow_inf_nan=False)]
+    kinds = {
+        "variables": Annotated[list[str], Field(min_length=1)],
+        "keys": list[Annotated[list[str], Field(min_length=1)]],
+        "value": list[number],
+        "sd": list[spread],
+        "correlation": list[list[number]],
+    }
+    config = ConfigDict(strict=True, extra="forbid")
+    return create_model("Table", __config__=config, **{name: (kind, ...) for name, kind in kinds.items()})  # type: ignore[call-overload]
 
 
 def posterior_of(fit: Fit) -> Posterior | None:
@@ -232,7 +282,7 @@ def read_fit(file: str | Path) -> dict[str, dict]:
         text = file.read_text(encoding="utf-8-sig")
         data = tomllib.loads(text)
     except (ValueError, RecursionError) as error:
-        raise ValueError(f"{file}: not valid TOML: {error}") from error
+        raise ValueError(f"{file}: not valid TOML: {error}; restore the file, or take another step's") from error
     head = text.lstrip().splitlines()[:3]
     cut = f"# {WHOLE}" in head and text.rstrip().splitlines()[-1] != END
     if cut or not text.strip() or (any(line.startswith("# Calibrated values") for line in head) and "fit" not in data):
@@ -248,6 +298,9 @@ def read_fit(file: str | Path) -> dict[str, dict]:
         value = data.get(table, {}).get(name)
         if value is not None and not _is(value, kind):
             raise ValueError(f"{file}: [{table}] {name} = {value!r}; allowed: {kind}")
+    region = data.get("sensor", {}).get("region") or ALL
+    if region not in REGIONS:
+        raise UnknownKey(region, REGIONS, "region", f"{file}: [sensor]")
     for table in ("frames", "frames_uncertainty"):
         if not _is(data.get(table, {}), "a table of tables"):
             raise ValueError(f"{file}: [{table}]: allowed: a table for each frame")

@@ -52,7 +52,7 @@ from optics.study.setup import (
     split,
     variables_of_base,
 )
-from optics.study.shown import fingerprints_of, shown_frames
+from optics.study.shown import fingerprints_of, mosaic_of, shown_frames
 from optics.study.stages import (
     TOGETHER,
     Progress,
@@ -111,6 +111,7 @@ def begin(
             "fitted": len(fitted),
             "held_out": len(held),
             "image": list(model.shape),
+            **mosaic_of(model),
             "masked": 1 - float(sum(u.sum() for u in usable)) / values_in(model, range(len(usable))),
             "setup": asdict(setup),
         },

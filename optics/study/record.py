@@ -333,7 +333,12 @@ class Record:
                 np.savez_compressed(new / "images/maps.npz", rms=comparison.rms_map, mean=comparison.mean_map)
             (new / "step.json").write_text(_dumps(entry), encoding="utf-8")
         self.steps.append(entry)
-        self._save()
+        try:
+            self._save()
+        except BaseException:  # a full disk, or Ctrl-C: the study is as it was
+            self.steps.pop()
+            shutil.rmtree(path, ignore_errors=True)
+            raise
         return path
 
     def put_diagnosis(

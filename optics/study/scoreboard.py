@@ -53,6 +53,7 @@ from optics.study.board import RIVAL, STEP, Board, Entry, Images, Level, Ring
 from optics.study.fit_files import read_fit
 from optics.study.record import Record
 from optics.study.setup import Setup, open_model, setup_for, split
+from optics.study.shown import mosaic_of
 from optics.study.stages import held_out_values
 
 Progress = Callable[[str, int, int], None]
@@ -536,6 +537,7 @@ class _Bench:
             {name: self.clip(shown[name][0]) for name in dict.fromkeys(names)},
             self.usable[first],
             self.inner[first],
+            mosaic_of(self.model),
         )
 
     def azimuths(self, chosen: Mapping[int, tuple[_Score, _Score]]) -> dict[str, float]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatch
 from pathlib import Path
@@ -18,8 +18,9 @@ from optics.captures.noise import Noise, estimate
 from optics.errors import BadCapture, OutOfBounds, Underdetermined, UnknownKey
 from optics.fit import calibrate
 from optics.fit.gauges import acting
+from optics.fit.known_shape import ALL, REGIONS
 from optics.fit.model import value_of
-from optics.fit.scene_model import SceneModel
+from optics.fit.scene_model import FLAT_FIELDS, SceneModel
 from optics.scene import loader as scenes
 from optics.scene import trust
 from optics.scene.declare import Effect
@@ -82,6 +83,8 @@ def setup_for(captures: str | Path, **given: object) -> Setup:
     own = {name: value for name, value in given.items() if value or (value == [] and name in kept)}
     if {"free", "per_group"} & set(own):
         advised = {name: value for name, value in advised.items() if name in ("flat_field", "region")}
+    if own.get("region", ALL) not in REGIONS:
+        raise UnknownKey(str(own["region"]), REGIONS, "region", "--region")
     return recorded({**advised, **own, "captures": str(captures)})
 
 
@@ -121,18 +124,44 @@ def _advised(file: Path) -> dict[str, Any]:
     priors = advised.get("priors", {})
     if not isinstance(priors, dict) or not all(_is_prior(prior) for prior in priors.values()):
         raise BadCapture(f"{file}: setup: priors = {priors!r}; allowed: pattern -> [mean or null, standard deviation]")
-    for name, kind in (("free", list), ("per_group", list), ("held_out", list), ("values", dict), ("defines", dict)):
-        if not isinstance(advised.get(name, kind()), kind):
-            raise BadCapture(f"{file}: setup: {name} = {advised[name]!r}; allowed: a {kind.__name__}")
-    return advised
+    for name, value in advised.items():
+        if name != "priors" and value is not None and not _ADVISED[name][0](value):
+            raise BadCapture(f"{file}: setup: {name} = {value!r}; allowed: {_ADVISED[name][1]}; import the set again")
+    return {name: value for name, value in advised.items() if value is not None}
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _are_texts(value: object) -> bool:
+    return isinstance(value, list) and all(isinstance(v, str) for v in value)
+
+
+def _maps_to(value: object, *kinds: Callable[[object], bool]) -> bool:
+    return isinstance(value, dict) and all(any(kind(v) for kind in kinds) for v in value.values())
+
+
+def _is_text(value: object) -> bool:
+    return isinstance(value, str)
+
+
+_ADVISED: dict[str, tuple[Callable[[object], bool], str]] = {  # what an entry may be, and the same in words
+    "free": (_are_texts, "a list of patterns"),
+    "per_group": (_are_texts, "a list of patterns"),
+    "held_out": (_are_texts, "a list of groups"),
+    "values": (lambda v: _maps_to(v, _is_number, _is_text), "key -> number or text"),
+    "defines": (lambda v: _maps_to(v, _is_number, _is_text), "name -> number or text"),
+    "uncertainty": (lambda v: _maps_to(v, lambda n: _is_number(n) and n >= 0), "key -> number from 0 on"),  # type: ignore[operator]
+    "flat_field": (lambda v: v in FLAT_FIELDS, f"{', '.join(FLAT_FIELDS)}"),
+    "region": (lambda v: v in REGIONS, f"{' or '.join(REGIONS)}"),
+    "robust": (lambda v: isinstance(v, bool), "true or false"),
+}
 
 
 def _is_prior(prior: object) -> bool:
-    def number(value: object) -> bool:
-        return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
-
     pair = isinstance(prior, list) and len(prior) == 2
-    return pair and (prior[0] is None or number(prior[0])) and number(prior[1]) and prior[1] > 0  # type: ignore[index]
+    return pair and (prior[0] is None or _is_number(prior[0])) and _is_number(prior[1]) and prior[1] > 0  # type: ignore[index]
 
 
 def recorded(facts: Mapping[str, Any]) -> Setup:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -57,6 +58,14 @@ class Fingerprint:
     image: np.ndarray
     residual: np.ndarray
     strength: float = math.nan
+
+
+def mosaic_of(model: SceneModel) -> dict[str, Any]:
+    """Of raw frames: `mosaic`, the cell of analysers (deg, row by row), or `cfa`, the pattern of colour filters."""
+    cell = getattr(model.scene.camera, "mosaic", ())
+    if cell:
+        return {"mosaic": [list(row) for row in cell]}
+    return {} if model.captures.cfa is None else {"cfa": model.captures.cfa}
 
 
 def shown_frames(

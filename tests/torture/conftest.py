@@ -102,6 +102,15 @@ detail = 1
 """
 
 
+BOARDS = {
+    "kicad": 'Ref,Val,Package,PosX,PosY,Rot,Side\n"D1","LED","0603",12.5000,-3.2500,90.0000,top\n',
+    "ascii": "## Unit = mm, Angle = deg.\n# Ref     Val   PosX       PosY\nD1        LED   12.5       -3.25\n## End\n",
+    "altium": "Units used: mil\n\nDesignator\tLayer\tMid X\tMid Y\nD1\tTop\t12.5mm\t-3.25mm\nD2\tTop\t100\t2\n",
+    "easyeda": "Designator;Mid X(mil);Mid Y(mil)\nD1;492.126;-127,953\n",
+}
+BALLS = {(i, j): (40.0 + 24 * i, 36.0 + 24 * j) for i in range(3) for j in range(2)}  # px in images of 128 x 96 px
+
+
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_call(item):
     """Count the examples that hypothesis hands to a test."""
@@ -187,9 +196,11 @@ def material(tmp_path_factory, mitsuba):
     lines = [f"{row};r{i % 5}" for i, row in enumerate(rows)]
     (readings / "readings.csv").write_text("Bench 3\nangle;volts;run\n" + "\n".join(lines) + "\n")
     (readings / "captures.toml").write_text(READINGS)
+    _boards(folder)
+    _scans(folder / "scans", rng)
     (folder / "job.toml").write_text(JOB)
     (folder / "beads.toml").write_text(BEADS)
-    (folder / "made.toml").write_text(JOB.replace('out = "out"', 'out = "made"'))
+    (folder / "made.toml").write_text(JOB.replace('out = "out"\ncount = 1', 'out = "made"\ncount = 3'))
     batch.run(folder / "made.toml", workers=1)
     place, force = rng.uniform(-14, 14, (40, 2)), rng.uniform(0.1, 1.0, 40)
     motion = rng.normal(size=(40, 4, 4, 2))
@@ -200,6 +211,39 @@ def material(tmp_path_factory, mitsuba):
     package.calibrate(readings, folder / "study")
     package.Study.open(folder / "study").diagnose(advised=False)
     return folder
+
+
+def _boards(folder):
+    """A small bench whose first LED stands where FILE says, and files of four programs."""
+    from optics.scene import loader
+
+    text = loader.find("gelsight_bench").read_text(encoding="utf-8").replace('value="320"', 'value="16"')
+    text = text.replace('value="240"', 'value="12"')
+    start, end = text.index('<emitter type="led" id="led_1">'), text.index('<emitter type="led" id="led_2">')
+    led = '<string name="board" value="ring"/><string name="placed" value="FILE:D1"/>'
+    led = f'<emitter type="led" id="led_1">{led}</emitter>'
+    (folder / "board.xml").write_text(f"{text[:start]}{led}{text[end:]}", encoding="utf-8")
+    for kind, table in BOARDS.items():
+        (folder / f"{kind}.csv").write_text(table)
+
+
+def _scans(folder, rng):
+    """A plate of balls under three LEDs, and the flat field."""
+    import yaml
+
+    y, x = np.mgrid[:96, :128]
+    for name, balls in (("one", BALLS), ("flat", {})):
+        (folder / name).mkdir(parents=True)
+        for label, turn in (("07", 0.0), ("08", 2.1), ("09", 4.2)):
+            shade = 100.0 + rng.normal(0, 1.5, x.shape)
+            for u, v in balls.values():
+                near = np.hypot(x - u, y - v) < 7
+                shade[near] += 6 * ((x - u) * np.cos(turn) + (y - v) * np.sin(turn))[near]
+            Image.fromarray(np.round(shade).astype(np.uint8)).save(folder / name / f"image{label}.png")
+        circles = [{"type": "GridCircle", "gx": i, "gy": j, "x": u, "y": v} for (i, j), (u, v) in balls.items()]
+        table = {"images": [f"image{label}.png" for label in ("07", "08", "09")], "annotations": circles}
+        sizes = {"calibradius": 0.4, "calibspacing": 1.2, "mmperpixel": 0.05}
+        (folder / name / "scan.yaml").write_text(yaml.safe_dump(table | (sizes if balls else {})))
 
 
 @pytest.fixture

@@ -29,19 +29,70 @@ def test_a_number_with_a_unit_of_its_own(tmp_path):
     assert placed("board.csv:D2", [tmp_path]) == pytest.approx((2.54, 2.0))
 
 
+ASCII = """### Module positions - created on a Tuesday ###
+## Unit = inches, Angle = deg.
+# Ref     Val       Package                PosX       PosY       Rot  Side
+D1        LED       0603                   0.5        -0.25      90.0000  top
+## End
+"""
+
+
+@pytest.mark.parametrize(
+    "text, expected",
+    [
+        (ASCII, (12.7, -6.35)),
+        ("Ref,Mid X (inch),Mid Y (inch)\nD1,0.5,1in\n", (12.7, 25.4)),
+        ("Ref,Mid X [um],Mid Y [cm]\nD1,1000,3\n", (1.0, 30.0)),
+        ("Units used: mil\n\nDesignator,Mid X,Mid Y\nD1,100,2mm\n", (2.54, 2.0)),
+        ("Ref;PosX;PosY\nD1;1,5;-2\n", (1.5, -2.0)),
+        ("Reference list\nRef,PosX,PosY\n\n#\nD1,1,2\nD1,1,2\n", (1.0, 2.0)),
+    ],
+    ids=["kicad ascii", "inches", "units in brackets", "unit above", "decimal comma", "twice at one place"],
+)
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
+def test_units_and_notations_of_pick_and_place_files(text, expected, encoding, tmp_path):
+    (tmp_path / "board.csv").write_text(text, encoding=encoding, newline="\r\n")
+    assert placed("board.csv:D1", [tmp_path]) == pytest.approx(expected)
+
+
+HEAD = "Ref,PosX,PosY\n"
+
+
 @pytest.mark.parametrize(
     "text, named, message",
     [
         (KICAD, "board.csv", "FILE:DESIGNATOR"),
         (KICAD, "board.csv:D9", "no part 'D9'; it has D1, D2"),
         ("a,b\n1,2\n", "board.csv:D1", "no pick-and-place table"),
-        ("Ref,PosX\nD1,2\n", "board.csv:D1", "no column for y"),
-        ("Ref,PosX,PosY\nD1,two,3\n", "board.csv:D1", "x = 'two'"),
+        ("Ref,PosX\nD1,2\n", "board.csv:D1", "no column for y; its head is Ref, PosX"),
+        (HEAD + "D1,two,3\n", "board.csv:D1", "line 2: x = 'two'; allowed: a number, in mm or with a unit: mm, mil"),
+        (HEAD + "D1,nan,3\n", "board.csv:D1", "line 2: x = 'nan'"),
+        (HEAD + "D1,2,1e300\n", "board.csv:D1", r"line 2: y = 1e\+300 mm; allowed: -10000 to 10000 mm; check its unit"),
+        (HEAD + "D1,2,3ft\n", "board.csv:D1", "line 2: y = '3ft'"),
+        ("Ref,PosX(ft),PosY(ft)\nD1,2,3\n", "board.csv:D1", r"unit 'ft' of the column 'PosX\(ft\)'; allowed: mm"),
+        (HEAD + "D2,1,1\nD1,1,2\nD1,3,4\n", "board.csv:D1", "'D1' stands at several places, in lines 3, 4"),
+        (HEAD + "D1,2\n", "board.csv:D1", "line 2: 2 columns of 3; needed: D1's x and y"),
+        (HEAD + '"D1,2,3\nD2,1,2\n', "board.csv:D1", "no part 'D1'; it has D1,2,3, D2"),
+        (HEAD + 20_000 * "D,1,2\n", "board.csv:D1", "over 10000 rows"),
+        (HEAD + "D1," + 200_000 * "1" + ",3\n", "board.csv:D1", "no part 'D1'"),
+        ("Ref," + 50_000 * "x," + "\n", "board.csv:D1", "no column for y"),
+        ("", "board.csv:D1", "no pick-and-place table"),
+        (KICAD, "/etc/passwd:root", "/etc/passwd: lies outside .*; allowed: a file beside the scene's XML"),
+        (KICAD, "../../../../../../../../../../etc/passwd:root", "lies outside"),
+        (KICAD, "link.csv:D1", "link.csv: lies outside .*, at /etc/passwd"),
     ],
 )
 def test_bad_pick_and_place_files(text, named, message, tmp_path):
     (tmp_path / "board.csv").write_text(text)
-    with pytest.raises(ValueError, match=message):
+    (tmp_path / "link.csv").symlink_to("/etc/passwd")
+    with pytest.raises(ValueError, match=message) as raised:
+        placed(named, [tmp_path])
+    assert len(str(raised.value)) < 800
+
+
+@pytest.mark.parametrize("named", ["absent.csv:D1", "/dev/zero:D1", 5000 * "x" + ":D1", ".:D1", "a\0b.csv:D1"])
+def test_files_that_are_none(named, tmp_path):
+    with pytest.raises(FileNotFoundError, match="no such file in .*; allowed: a pick-and-place file beside"):
         placed(named, [tmp_path])
 
 

@@ -1,6 +1,7 @@
 """The command line shows what the library knows, writes what it says, and keeps stdout for results."""
 
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -499,3 +500,26 @@ def test_a_calibration_folder_of_9dtact_is_known_by_its_layout(tmp_path, capsys)
     assert "give --ball-radius" in capsys.readouterr().err
     assert cli.main(["import", str(tmp_path), "-o", str(tmp_path / "out"), "--circles", "a.csv"]) == 2
     assert "--circles: the folder's images say so; leave these out" in capsys.readouterr().err
+
+
+ENDS = {  # words of a shell -> (exit code, what stderr says)
+    "{optics} scenes >&-": (0, ""),
+    "{optics} scenes 2>&- >/dev/null": (0, ""),
+    "{optics} scenes --json >/dev/full": (2, "error: standard output: No space left on device"),
+    "mkdir gone && cd gone && rmdir ../gone && {optics} params gelsight": (
+        2,
+        "error: the current folder is gone; change",
+    ),
+    "cp {scene} $'bad\\xff.xml' && {optics} params $'bad\\xff.xml'": (2, "Mitsuba reads no path that is not UTF-8"),
+}
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs bash and /dev/full")
+@pytest.mark.parametrize("words", ENDS)
+def test_odd_ends_of_a_pipe_and_odd_folders(tmp_path, words):
+    command = f"{sys.executable} -m optics.cli"
+    script = words.replace("{optics}", command).replace("{scene}", str(scene.find("gelsight")))
+    home = {**os.environ, "PYTHONPATH": str(Path(cli.__file__).parents[2])}
+    done = subprocess.run(["bash", "-c", script], cwd=tmp_path, capture_output=True, text=True, env=home)
+    code, said = ENDS[words]
+    assert done.returncode == code and said in done.stderr and "Traceback" not in done.stderr, done.stderr

@@ -155,8 +155,68 @@ def test_values_of_single_frames_are_integrated_out(tmp_path):
     (tmp_path / "fit.toml").write_text(fit_toml(fit_record(fit, ["a"])))
     read = Posterior.from_table(read_fit(tmp_path / "fit.toml")["posterior"], "fit.toml")
     np.testing.assert_allclose(read.covariance, posterior.covariance, rtol=1e-14)
-    with pytest.raises(ValueError, match="do not belong together"):
-        Posterior.from_table({**posterior.table(), "sd": [1.0]}, "fit.toml")
+
+
+TABLE = {
+    "variables": ["led_1.power", "led_3.power"],
+    "keys": [["led_1.power"], ["led_3.power"]],
+    "value": [1.0, 2.0],
+    "sd": [0.1, 0.2],
+    "correlation": [[1.0], [0.5, 1.0]],
+}
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"sd": [1.0]}, "2 variables, but 1 of sd"),
+        ({"sd": [0.1, 0.0]}, r"sd\[1\] = 0.0; allowed: greater"),
+        ({"sd": [0.1, float("nan")]}, r"sd\[1\] = nan; allowed: a finite number"),
+        ({"sd": [0.1, 1e300]}, r"sd\[1\] = 1e\+300; allowed: less"),
+        ({"value": [True, 1.0]}, r"value\[0\] = True; allowed: a valid number"),
+        ({"value": "12"}, "value = '12'; allowed: a valid list"),
+        ({"keys": ["ab", "cd"]}, r"keys\[0\] = 'ab'"),
+        ({"keys": [["led_1.power"], []]}, r"keys\[1\] = \[\]"),
+        ({"keys": [["led_1.power"], ["led_1.power"]]}, "keys: 'led_1.power' stands twice"),
+        ({"variables": ["a", "a"]}, "variables: 'a' stands twice"),
+        ({"correlation": [[1.0], [float("nan"), 1.0]]}, r"correlation\[1\]\[0\] = nan"),
+        ({"correlation": [[1.0], [1.0]]}, r"correlation\[1\]: 1 numbers; allowed: 2"),
+        ({"correlation": [[1.0, 0.5], [0.5, 1.0]]}, r"correlation\[0\]: 2 numbers; allowed: 1"),
+        ({"correlation": [[1.0], [1.2, 1.0]]}, "a least eigenvalue of -0.2; allowed: 1, and 0 or more"),
+        ({"correlation": [[1.0], [0.5, 0.9]]}, "with 0.9 on its diagonal"),
+        ({"corelation": [[1.0]]}, "unknown entry 'corelation'; did you mean 'correlation'"),
+        (dict.fromkeys(TABLE, []), r"variables = \[\]"),
+    ],
+)
+def test_a_table_that_is_no_posterior(changed, message):
+    with pytest.raises((ValueError, UnknownKey), match=rf"fit.toml: \[posterior\].*{message}"):
+        Posterior.from_table({**TABLE, **changed}, "fit.toml")
+
+
+def test_three_numbers_that_cannot_be_correlated_so():
+    """Each pair could be: an eigenvalue of 1 + 2 (-.9) cos(0) = -.8 says that the three cannot."""
+    rows = [[1.0], [0.9, 1.0], [0.9, -0.9, 1.0]]
+    table = {
+        "variables": ["a", "b", "c"],
+        "keys": [["a"], ["b"], ["c"]],
+        "value": [0.0] * 3,
+        "sd": [1.0] * 3,
+        "correlation": rows,
+    }
+    with pytest.raises(ValueError, match="a least eigenvalue of -0.8"):
+        Posterior.from_table(table, "fit.toml")
+
+
+def test_a_posterior_of_an_ill_conditioned_fit_can_be_drawn_from():
+    """Columns that agree to 1e-7, beside one that is 1e6 times as strong: no eigenvalue below 0 by rounding."""
+    j = np.random.default_rng(0).standard_normal((50, 4))
+    j[:, 1] = j[:, 0] * (1 + 1e-7)
+    j[:, 2] *= 1e6
+    fit = fitted(1e6 * j.T @ j, [0.5, 0.2, 0.1, 0.3])
+    table = posterior_of(fit).table()
+    read = Posterior.from_table(table, "fit.toml")
+    np.testing.assert_array_equal(read.covariance, read.covariance.T)
+    assert np.linalg.eigvalsh(read.covariance / np.outer(table["sd"], table["sd"]))[0] > -1e-14
 
 
 def test_a_posterior_is_drawn_jointly_and_within_bounds(scene):

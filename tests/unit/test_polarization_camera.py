@@ -14,6 +14,7 @@ from optics.fit.scene_model import SceneModel
 from optics.polarization.mosaic import read_mosaic
 from optics.scene import loader
 from optics.scene.parameter import Values, Variable
+from optics.study.shown import mosaic_of
 
 MOSAIC = ((90.0, 45.0), (135.0, 0.0))
 NOISE = Noise(0.1, 1.5, 64.0, 4095.0, 0.0)
@@ -64,6 +65,10 @@ TOLERANCE = 3.0  # DN of 4095: rays are up to 4.4 deg aslant, where S1 and S2 tu
 @pytest.fixture(scope="module")
 def model(mitsuba):
     return model_of([frame("bare"), frame("film", angle=30.0, **FILM)])
+
+
+def test_a_study_notes_the_mosaic_for_its_pages(model):
+    assert mosaic_of(model) == {"mosaic": [list(row) for row in MOSAIC]}
 
 
 def test_a_prediction_is_what_its_analysers_let_through(model):

@@ -127,9 +127,25 @@ def test_the_scene_shows_the_balls_where_they_are(imported):
     [
         ({"images": "image07.png"}, "images = 'image07.png'; allowed: a list of file names"),
         ({"images": ["image07.png", "../two/image08.png"]}, "no file '../two/image08.png'"),
+        ({"images": ["image07.png", "image07.png"]}, "'image07.png' stands twice"),
+        ({"images": ["image0.7.png"]}, "names of files name the LEDs; allowed: letters, digits"),
         ({"calibradius": "a"}, "calibradius = 'a'; allowed: a number"),
-        ({"mmperpixel": 0}, "allowed: above 0 where circles are annotated"),
-        ({"annotations": [{"type": "GridCircle", "x": 1, "y": 2, "gx": 0}]}, "gy = None; allowed: a number"),
+        ({"calibradius": 0.001}, "are 0.0833 px; allowed: balls of 5 to 192 px radius in images of 512 x 384 px"),
+        ({"calibspacing": 0.1}, "calibspacing = 0.1 mm between balls of calibradius = 0.25 mm"),
+        ({"mmperpixel": 0}, "mmperpixel = 0; allowed: a number from 1e-06 to 1000"),
+        ({"annotations": 3}, "annotations = 3; allowed: a list"),
+        (
+            {"annotations": [{"type": "GridCircle", "x": 1, "y": 2, "gx": 0}]},
+            "annotations[0]: gy = None; allowed: a number",
+        ),
+        (
+            {"annotations": [{"type": "GridCircle", "x": 1e300, "y": 2, "gx": 0, "gy": 0}]},
+            "annotations[0]: x = 1e+300; allowed: a number from -512 to 1024",
+        ),
+        (
+            {"annotations": 2 * [{"type": "GridCircle", "x": 1, "y": 2, "gx": 0, "gy": 0}]},
+            "two circles at gx, gy = 0, 0; allowed: one a ball",
+        ),
     ],
 )
 def test_a_bad_scan_is_refused(tmp_path, spoil, message):
@@ -137,6 +153,42 @@ def test_a_bad_scan_is_refused(tmp_path, spoil, message):
     with pytest.raises(BadCapture) as error:
         scans.import_scans(tmp_path, tmp_path / "out")
     assert message in str(error.value) and "scan.yaml" in str(error.value)
+
+
+BOMB = "a0: &a0 [x, x, x, x, x, x, x, x, x]\n" + "".join(
+    f"a{i + 1}: &a{i + 1} [{', '.join(9 * [f'*a{i}'])}]\n" for i in range(9)
+)
+
+
+@pytest.mark.parametrize(
+    "text, message",
+    [
+        ("images: [a, b", "no YAML (while parsing a flow sequence"),
+        ("", "images = None; allowed"),
+        (
+            "images: [a.png]\ncalibradius: 1\ncalibradius: 2\n",
+            "no YAML (line 3: calibradius stands twice in one table)",
+        ),
+        ("images: " + 5000 * "[", "nested too deep"),
+        ("images: !!python/object/apply:os.getcwd []", "no YAML (could not determine a constructor"),
+        (BOMB + "images: *a9\n", "images = [[[...], [...], "),
+        ("x: " + 5000 * "9", "no YAML"),
+    ],
+)
+def test_yaml_that_is_none_or_too_much(tmp_path, text, message):
+    (tmp_path / "one").mkdir()
+    (tmp_path / "one" / "scan.yaml").write_text(text)
+    with pytest.raises(BadCapture) as error:
+        scans.import_scans(tmp_path, tmp_path / "out")
+    assert message in str(error.value) and "scan.yaml" in str(error.value) and len(str(error.value)) < 500
+
+
+def test_circles_of_another_plate_are_refused(tmp_path):
+    rng = np.random.default_rng(3)
+    write_scan(tmp_path / "one", middles(0, 0, 0), rng, calibspacing=3.0)
+    write_scan(tmp_path / "flat", {}, rng, annotated=False)
+    with pytest.raises(BadCapture, match="one: circles are 1 mm apart .* about calibspacing = 3 mm"):
+        scans.import_scans(tmp_path, tmp_path / "out")
 
 
 def test_scans_without_a_flat_field_or_of_another_scale(tmp_path, source):

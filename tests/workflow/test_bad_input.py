@@ -44,6 +44,9 @@ def broken_scenes(good):
         "bounds": good.replace(sigma, sigma.replace("0.2", "9")),
         "nan": good.replace(sigma, sigma.replace("0.2", "nan")),
         "twins": good.replace('id="led_2"', 'id="led_1"'),
+        "escape": good.replace('id="led_2"', 'id="../../led_2"'),
+        "line": good.replace('id="led_2"', 'id="led&#10;_2"'),
+        "long": good.replace('id="led_2"', f'id="{200 * "x"}"'),
         "cameras": good.replace("</scene>", sensor_of(good).replace('id="camera"', 'id="second"') + "</scene>"),
         "blind": good.replace(sensor_of(good), ""),
         "dark": re.sub(r"<emitter.*?</emitter>", "", good, flags=re.DOTALL),
@@ -184,6 +187,7 @@ def place(tmp_path_factory):
     (folder / "small.xml").write_text(good, encoding="utf-8")
     for name, text in broken_scenes(good).items():
         (folder / f"{name}.xml").write_text(text, encoding="utf-8")
+    (folder / "wide.xml").write_text(good, encoding="utf-16")
     (folder / "folder.xml").mkdir()
     for name, (file, text) in PLUGINS.items():
         (folder / "plugins_" / name).mkdir(parents=True)
@@ -243,6 +247,10 @@ CASES = [
     ("params bounds.xml", r"bounds\.xml: line \d+.*membrane\.sigma = 9 rad is outside its bounds \[0, 1\.5\] rad"),
     ("params nan.xml", r"nan\.xml: line \d+.*membrane\.sigma = nan rad is not finite"),
     ("params twins.xml", r'twins\.xml: line \d+.*duplicate ID: "led_1"'),
+    ("params escape.xml", r"escape\.xml: id = '\.\./\.\./led_2'; allowed: 1 to 100 characters without /"),
+    ("params line.xml", r"line\.xml: id = 'led\\n_2'; allowed: 1 to 100 characters"),
+    ("params long.xml", r"long\.xml: id = 'x{60}'; allowed: 1 to 100 characters"),
+    ("params wide.xml", r"wide\.xml: no text in UTF-8 .*; save it as UTF-8"),
     ("params cameras.xml", r"cameras\.xml: 2 parts of the kind 'camera'; one is allowed"),
     ("params reference.xml", r"reference\.xml: line \d+.*\"membran\""),
     ("params texture.xml", r"texture\.xml: line \d+.*absent\.png"),
@@ -259,6 +267,10 @@ CASES = [
     # what is said of a scene on the command line
     ("params small.xml ledd_1.x", r"small\.xml: unknown parameter 'ledd_1\.x'; did you mean 'led_1\.x'"),
     ("params small.xml -D widht=20", r"small\.xml: unknown definition 'widht'; did you mean 'width'"),
+    ("params small.xml -D width=0", r"small\.xml: a camera of 0 x 36 pixels; allowed: 1 to 50,000,000"),
+    (RENDER + " -D height=0", r"small\.xml: a camera of 48 x 0 pixels; allowed: 1 to 50,000,000"),
+    (RENDER + " --set led_1.x=1e300", r"--set: led_1\.x = 1e\+300 mm is beyond .*; allowed: -1e\+18 to 1e\+18 mm"),
+    ("compare captures/good --region conact", r"--region: unknown region 'conact'"),
     ("params small.xml -D width", r"-D width: no '='; allowed: -D NAME=VALUE"),
     ("params small.xml -D width=wide", r'small\.xml: line \d+.*"wide"'),
     ("params small.xml -D width=-20", r"small\.xml: line \d+.*-20 is out of bounds"),

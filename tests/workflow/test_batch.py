@@ -11,7 +11,7 @@ import sys
 import threading
 import time
 from collections import Counter
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -282,6 +282,14 @@ def children(pid):
     return found
 
 
+@contextmanager
+def held(out, index):
+    """The lock of a sample, as a worker holds it that is at it."""
+    (out / ".parts").mkdir(parents=True)
+    with alone(out / ".parts" / f"{index:05d}.lock", "it is another's"):
+        yield
+
+
 in_proc = pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks at processes in /proc")
 
 
@@ -290,11 +298,9 @@ def test_killed_in_the_middle_and_resumed(whole, job, start):
     """The test holds the lock of the last sample until the kill, so that the command cannot end before, however fast
     the machine is, or however late this test is called."""
     out = job.parent / "out"
-    process = start(command(job, "--workers", "2"))
-    wait(process, (out / "job.json").exists)
-    (out / ".parts").mkdir(exist_ok=True)
     workers: set[int] = set()
-    with alone(out / ".parts" / "00009.lock", "the last sample was begun already"):  # workers take seconds to start
+    with held(out, TOTAL - 1):
+        process = start(command(job, "--workers", "2"))
         wait(process, lambda: workers.update(children(process.pid)) or recorded(out) >= 3)
         process.kill()
         process.communicate()
@@ -341,6 +347,64 @@ def test_damage_is_found_and_mended(whole, tmp_path):
     (images / "000008.png").unlink()
     result = batch.run(tmp_path / "job.toml", workers=1)
     assert result.made == 3 and content(tmp_path / "out") == content(whole)
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"index": "x"},
+        {"index": None},
+        {"files": [1]},
+        {"files": {"png": "x"}},
+        {"files": {"png": {"file": "/etc/passwd", "size": 1, "hash": "x"}}},
+        {"files": {"png": {"file": "../job.toml", "size": 1, "hash": "x"}}},
+        {"sample": 3},
+        {"labels": []},
+    ],
+    ids=str,
+)
+def test_a_record_that_is_none_counts_as_not_made(whole, tmp_path, changed, capsys):
+    """Whoever edited it: the sample is made again, and an export reads nothing outside the batch's folder."""
+    import shutil
+
+    shutil.copytree(whole, tmp_path / "out")
+    (tmp_path / "job.toml").write_text(JOB)
+    manifest = tmp_path / "out" / "manifest.jsonl"
+    records = [json.loads(line) for line in manifest.read_text().splitlines()]
+    records[3].update(changed)
+    manifest.write_text("".join(json.dumps(record) + "\n" for record in records))
+    assert main(["export", str(tmp_path / "out"), "-o", str(tmp_path / "data"), "--to", "webdataset"]) == 2
+    assert "manifest.jsonl: line 4: no record of sample 3; run `optics batch` again" in capsys.readouterr().err
+    result = batch.run(tmp_path / "job.toml", workers=1)
+    assert result.made == 1 and content(tmp_path / "out") == content(whole)
+
+
+def test_files_of_others_among_the_records_are_left_alone(whole, tmp_path):
+    import shutil
+
+    shutil.copytree(whole, tmp_path / "out")
+    (tmp_path / "job.toml").write_text(JOB)
+    parts, manifest = tmp_path / "out" / ".parts", tmp_path / "out" / "manifest.jsonl"
+    parts.mkdir()
+    for index, line in enumerate(manifest.read_text().splitlines()[:-1]):
+        (parts / f"{index:05d}.jsonl").write_text(line + "\n")
+    manifest.unlink()
+    for name in ("0abc.jsonl", "99999.jsonl", "0x.part"):
+        (parts / name).write_text("{}\n")
+    (parts / "00009.part").write_text('{"try": "x"}\n{"failed": 1, "index": []}\n[1]\nnull\n' + "[" * 99_999 + "\n\xff")
+    result = batch.run(tmp_path / "job.toml", workers=1)
+    assert result.made == 1 and content(tmp_path / "out") == content(whole)
+
+
+def test_an_export_of_a_manifest_cut_short_is_refused(whole, tmp_path, capsys):
+    import shutil
+
+    shutil.copytree(whole, tmp_path / "out")
+    manifest = tmp_path / "out" / "manifest.jsonl"
+    manifest.write_text("".join(manifest.read_text().splitlines(keepends=True)[:4]))
+    assert main(["export", str(tmp_path / "out"), "-o", str(tmp_path / "data"), "--to", "webdataset"]) == 2
+    assert "manifest.jsonl: 4 records of 10 samples; run `optics batch` again" in capsys.readouterr().err
+    assert not (tmp_path / "data").exists()
 
 
 @pytest.mark.parametrize(
@@ -453,10 +517,8 @@ def test_a_worker_that_is_killed_is_replaced(whole, job, start):
     """While the test holds the lock of the last sample the command cannot end, and while the command is stopped it
     cannot let its workers go."""
     out = job.parent / "out"
-    process = start(command(job, "--workers", "2", "--json"))
-    wait(process, (out / "job.json").exists)
-    (out / ".parts").mkdir(exist_ok=True)
-    with alone(out / ".parts" / "00009.lock", "the last sample was begun already"):
+    with held(out, TOTAL - 1):
+        process = start(command(job, "--workers", "2", "--json"))
         wait(process, lambda: recorded(out) >= 3)
         process.send_signal(signal.SIGSTOP)
         workers = [pid for pid in children(process.pid) if "spawn_main" in Path(f"/proc/{pid}/cmdline").read_text()]

@@ -265,6 +265,30 @@ def test_a_full_disk_leaves_nothing_and_names_the_file(project, tmp_path, words)
     assert {str(f) for f in (tmp_path / "p").rglob("*")} - before <= {str(tmp_path / "p" / "study" / ".lock")}
 
 
+@pytest.mark.parametrize("words", ["calibrate captures -o new", "add study extinction-leak"])
+def test_a_disk_that_is_full_at_the_last_file_of_a_step_leaves_nothing(project, tmp_path, optics, monkeypatch, words):
+    """Its folder stands by then, and only the record of the study does not."""
+    shutil.copytree(project, tmp_path / "p")
+    monkeypatch.chdir(tmp_path / "p")
+    before = {f.relative_to(tmp_path): f.read_bytes() for f in tmp_path.rglob("*") if f.is_file()}
+    save = Record._save
+
+    def full(record):
+        if record.steps:
+            raise OSError(28, "No space left on device", str(record.folder / "ladder.json"))
+        save(record)
+
+    monkeypatch.setattr(Record, "_save", full)
+    code, _, said = optics(*words.split())
+    assert code == 2 and "ladder.json: No space left on device" in said
+    after = {f.relative_to(tmp_path): f.read_bytes() for f in tmp_path.rglob("*") if f.is_file() and f.name != ".lock"}
+    assert after == {name: data for name, data in before.items() if name.name != ".lock"}
+    assert not (tmp_path / "p" / "new").exists()
+    monkeypatch.undo()
+    monkeypatch.chdir(tmp_path / "p")
+    assert optics(*words.split())[0] == 0
+
+
 def test_a_full_disk_is_said_with_the_file(tmp_path):
     with (
         pytest.raises(OSError, match=r"No space left on device: it is not written.*'.*a\.txt'"),
