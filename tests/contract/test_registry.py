@@ -371,7 +371,9 @@ def test_a_stand_in_carries_an_effect_only_with_what_it_reads(tmp_path):
     assert set(registry.carriers(registry.find_effect("gel yellowing"))) == {"gel", "elastic_skin"}
     assert "stretch_gain" not in {p.name for p in registry.parameters_of("elastic_skin")}
     file = Path(registry.find_effect("stretched coating").file)
-    lacking = file.read_text(encoding="utf-8").replace("reads=STRETCH", 'reads=("strain",)').replace("stretch", "strtch")
+    lacking = (
+        file.read_text(encoding="utf-8").replace("reads=STRETCH", 'reads=("strain",)').replace("stretch", "strtch")
+    )
     with pytest.raises(BadPlugin, match="no part 'gel' has all that the effect reads: strain"):
         known(written(tmp_path / "own", lacking=lacking))
 
