@@ -12,8 +12,9 @@ from optics.scene import loader as scenes
 
 
 class ParticleGel(ImageRig):
-    """Forty beads at rest and under three presses, first and last the same, lit by one ring after the other; one press is
-    held out. 0.7 DN of noise in the dark, 1 at 150. Clutter and kinds that the library lacks are not made."""
+    """Forty beads at rest and under three presses, the first made again as the last, lit by one ring after the other;
+    one press is held out. 0.7 DN of noise in the dark, 1 at 150. Clutter and kinds that the library lacks are not
+    made."""
 
     name = "particle_gel"
     effects = MAKERS
