@@ -219,7 +219,7 @@ def effect_page(effect, reg, record: dict) -> str:
     rows = [(p, "freed by the effect") for p in reg.effect_parameters(effect)]
     rows += [(p, "stays as it is") for p in brought if p.name not in effect.parameter_names]
     facts = [
-        ["part", " or ".join(f"[{kind}](../parts/{kind}.md)" for kind in reg.kinds(effect.part))],
+        ["part", " or ".join(f"[{kind}](../parts/{kind}.md)" for kind in reg.carriers(effect))],
         ["enters at", ", ".join(f"`{s}`" for s in effect.stages) or "the part itself"],
         [
             "one value for",
@@ -256,17 +256,17 @@ def part_page(part, reg) -> str:
     source = {
         p.name: f"[{e.name}](../effects/{e.key}.md)"
         for e in reg.effects.values()
-        if part.kind in reg.kinds(e.part)
+        if part.kind in reg.carriers(e)
         for p in (*e.parameters, *e.shape)
         if not isinstance(p, str)
     }
-    freed = {n: f"[{e.name}](../effects/{e.key}.md)" for e in reg.effects.values() if part.kind in reg.kinds(e.part)
+    freed = {n: f"[{e.name}](../effects/{e.key}.md)" for e in reg.effects.values() if part.kind in reg.carriers(e)
              for n in e.parameter_names}  # fmt: skip
     rows = [
         (p, f"effect {source[p.name]}" if p.name not in own else f"effect {freed[p.name]}" if p.name in freed else "")
         for p in reg.parameters_of(part.kind)
     ]
-    acting = sorted((e for e in reg.effects.values() if part.kind in reg.kinds(e.part)), key=lambda e: e.key)
+    acting = sorted((e for e in reg.effects.values() if part.kind in reg.carriers(e)), key=lambda e: e.key)
     known = attributes(part.doc)
     text = (
         f"# {escaped(title)}\n\n{escaped(sentence)}\n\n"

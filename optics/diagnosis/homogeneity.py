@@ -39,7 +39,8 @@ class Added:
     own         columns of the base, of what was added beside, and of the effect
     calibrated  those but the effect's; effect: the effect's
     change      (k,) of its strengths from where they started
-    images      per block, the whitened difference (n,) that the effect makes
+    images      per block, the whitened difference (n,) that the effect makes; again: the same of other samples, where
+                these are Monte Carlo estimates, for products in which their noise does not add up
     net         fall of chi2 with it
     scale       of the noise over the stated one, where what is left is noise
     apart       (n, k) of all kept values -> the same as of independent values, in which `own` is then given
@@ -51,6 +52,7 @@ class Added:
     effect: list[int]
     change: np.ndarray
     images: list[np.ndarray]
+    again: list[np.ndarray]
     net: float
     scale: float = 1.0
     apart: Callable[[np.ndarray], np.ndarray] = np.asarray
@@ -139,12 +141,17 @@ def _added(
     without = found.values.copy()
     for v, start in zip(c.variables, c.start):
         without.put(v, float(start))
-    changes = zip(*(model.predict(values, own.frames, own.seed) for values in (found.values, without)))
-    images = [
-        (np.asarray(new, float) - old).reshape(-1)[block.index] / block.sigma
-        for block, (new, old) in zip(own.blocks, changes)
-    ]
-    return Added(c.effect.name, own, calibrated, effect, change, images, net)
+
+    def images(seed: int) -> list[np.ndarray]:
+        changes = zip(*(model.predict(values, own.frames, seed) for values in (found.values, without)))
+        return [
+            (np.asarray(new, float) - old).reshape(-1)[block.index] / block.sigma
+            for block, (new, old) in zip(own.blocks, changes)
+        ]
+
+    first = images(own.seed)
+    twice = any(block.b is not None for block in own.blocks)
+    return Added(c.effect.name, own, calibrated, effect, change, first, images(own.seed + 1) if twice else first, net)
 
 
 def _of_independent_readings(model: Model, added: Added, noise: Correlation) -> Added:
@@ -181,23 +188,37 @@ def _cut(
 
     own, calibrated, effect = added.own, added.calibrated, added.effect
     count, first, k = len(labels), len(own.columns), own.thinning
-    cut = [image[:, None] * (index[:, None] == np.arange(count)) for image, index in zip(added.images, bins)]
-    cut = _dealt(added.apart(np.concatenate(cut)), own.blocks)
+
+    def parts_of(images: Sequence[np.ndarray]) -> list[np.ndarray]:
+        cut = [image[:, None] * (index[:, None] == np.arange(count)) for image, index in zip(images, bins)]
+        return _dealt(added.apart(np.concatenate(cut)), own.blocks)
+
+    cut = parts_of(added.images)
+    again = cut if added.again is added.images else parts_of(added.again)
     normal, rest = plain.copy(), np.arange(first, first + count)
-    for block, part in zip(own.blocks, cut):
-        across = part.T @ block.middle
+    for block, one, other in zip(own.blocks, cut, again):
+        # samples of the same seed meet in none of the products
+        across = one.T @ block.middle if block.b is None else (one.T @ block.b + other.T @ block.a) / 2
         normal.gram[np.ix_(rest, block.where)] += across
         normal.gram[np.ix_(block.where, rest)] += across.T
-        normal.gram[np.ix_(rest, rest)] += part.T @ part
-        normal.score[rest] += part.T @ block.r
+        normal.gram[np.ix_(rest, rest)] += (one.T @ other + other.T @ one) / 2
+        normal.score[rest] += (one + other).T @ block.r / 2
     lengths = np.diag(normal.gram)[rest]
     projected = own.project(normal, calibrated + effect, [*rest], k)
     fall, dof, *_ = st.joint(projected, lengths)
-    if dof == 0:
+    # What the parts gain together is no difference between them: the image that the effect makes is not quite its
+    # derivative times its strength.
+    whole, apart = _together(projected, lengths)
+    fall, dof = max(fall - whole, 0.0), dof - (apart is not None)
+    if dof <= 0:
         return None
     _, _, delta, sd = st.joint(own.project(normal, calibrated, [*rest], k), lengths)
-    cut = _off_base(own, cut, projected, calibrated + effect)
+    cut = _off_base(own, [(one + other) / 2 for one, other in zip(cut, again)], projected, calibrated + effect)
     found = variances(cut, [block.r for block in own.blocks], places)
+    score, information = projected.score, projected.information
+    if apart is not None:
+        score, information = apart @ score, apart @ information @ apart.T
+        found = [(apart @ b @ apart.T, parts) for b, parts in found]
     return Split(
         effect=added.name,
         by=by,
@@ -208,10 +229,19 @@ def _cut(
         dof=dof,
         p=float(chdtrc(dof, fall / added.scale)),
         h=max(fall - dof, 0.0) * k / max(added.net, 1e-9),
-        chance=by_clutter(projected.score, projected.information, found),
+        chance=by_clutter(score, information, found),
         limit=UNEVEN,
         holds=True,
     )
+
+
+def _together(projected: st.Projected, lengths: np.ndarray) -> tuple[float, np.ndarray | None]:
+    """(fall with one strength for all parts of an image, what takes that off the parts' scores: u - V 1 (1'u)/(1'V 1));
+    (0, None) where the base absorbs the whole image."""
+    v = projected.information.sum(1)
+    if v.sum() <= st.VISIBLE * float(lengths.sum()):
+        return 0.0, None
+    return float(projected.score.sum()) ** 2 / float(v.sum()), np.eye(len(v)) - np.outer(v, np.ones(len(v))) / v.sum()
 
 
 def scattered(refit: Refit, chance: float, clutter: np.ndarray) -> Refit:

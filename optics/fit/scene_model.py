@@ -526,12 +526,12 @@ class SceneModel:
             return factor * self._difference(now, key, seed, component)
         if own:
             image = (
-                self._difference_led(now, name, key, component)
+                self._difference_led(now, name, key, component, seed)
                 if self.parameters[key].how == "difference"
-                else tangent(now, name, key, component)
+                else tangent(now, name, key, component, seed)
             )
             return factor * (lit[name] * image + self._difference_bounced(now, {name: lit[name]}, key, seed, component))
-        total: Any = sum((power * tangent(now, led, key, component) for led, power in lit.items()), 0.0)
+        total: Any = sum((power * tangent(now, led, key, component, seed) for led, power in lit.items()), 0.0)
         total = total + self._difference_bounced(now, lit, key, seed, component)
         if glows:
             total = total + self._difference_ambient(now, key, component)
@@ -558,9 +558,9 @@ class SceneModel:
         first, second = (self.renderer.radiance({**now, key: value}, seed, component) for value in (low, high))
         return (second - first) / (high - low)
 
-    def _difference_led(self, now: Mapping, led: str, key: str, component: int) -> np.ndarray:
+    def _difference_led(self, now: Mapping, led: str, key: str, component: int, seed: int = 0) -> np.ndarray:
         low, high = self.parameters[key].sides(now[key])
-        first, second = (self.renderer.image({**now, key: value}, led, component) for value in (low, high))
+        first, second = (self.renderer.image({**now, key: value}, led, component, seed) for value in (low, high))
         return (second - first) / (high - low)
 
     def _difference_ambient(self, now: Mapping, key: str, component: int) -> np.ndarray:

@@ -59,8 +59,8 @@ class MonteCarloRenderer(Renderer):
         self._estimates.move_to_end(key)
         return known
 
-    def image(self, values: Mapping, light: str, component: int = 0) -> np.ndarray:
-        return self.light({**values, **dict.fromkeys(self.scene.power_keys(light), 1.0)}, light, 0, component)
+    def image(self, values: Mapping, light: str, component: int = 0, seed: int = 0) -> np.ndarray:
+        return self.light({**values, **dict.fromkeys(self.scene.power_keys(light), 1.0)}, light, seed, component)
 
     def light(self, values: Mapping, light: str, seed: int = 0, component: int = 0) -> np.ndarray:
         found = self.estimate(values, seed)
@@ -78,7 +78,7 @@ class MonteCarloRenderer(Renderer):
         """(H, W, B) of the lights that are on; black where none is."""
         return sum(images, np.zeros((self.height, self.width, self.bands)))
 
-    def led(self, values: Mapping, led: str) -> LedImage:
+    def led(self, values: Mapping, led: str, seed: int = 0) -> LedImage:
         """No shadow has a rim here."""
         hits = self.hits(values)
         return LedImage(led, hits, np.zeros(hits.shape, bool), np.zeros(0, int), None, None, None, hits.valid)

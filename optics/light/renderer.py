@@ -29,6 +29,10 @@ from optics.scene.mitsuba_parts import DEFAULT_VARIANT
 RIM_SAMPLES = 128
 PINHOLE = 1e-9  # mm^2: a pupil smaller than a wavelength across is a point
 CROWDED_SAMPLES = 16  # of a crowded scene, whose pixels nearly all have rims
+# times as many behind a pupil: a mean over pixel and pupil then errs as one over the pixel does without. Of discs 4 px
+# wide, blurred over 0.1 to 0.6 px, 1024 samples leave 0.003 to 0.005 of the step at their rim, where 256 of a sharp one
+# leave 0.004
+BEHIND_PUPIL = 4
 LAYERED_RIM_SAMPLES = 32  # in scenes with layers, whose matrices are multiplied for every sample
 PAINTED = 0.05  # of the largest reflectance of a texture: a step from pixel to pixel that needs finer samples
 # difference of a pixel's mean normal from that at its middle, above which finer samples are taken: a fifth of a grey
@@ -50,6 +54,9 @@ BOUNCE_SAMPLES = 32  # directions per cell for the second bounce, at least
 # of these, an image has at least so many: few of a face meet a lit flank. On a plate of balls, whose second reflections
 # are 6 % of the direct light, 128 per cell of an image of 153 x 128 px leave .5 % of it, rms
 BOUNCE_RAYS = 2**19
+# The same of a crowded scene, where each pixel is a cell: what its directions miss is noise that no neighbour shares,
+# and lets a fit find the second reflections too weak (by a fifth with 256 per pixel, where powers absorb half of them)
+CROWDED_BOUNCE_RAYS = 2**20
 BOUNCE_NUMBERS = 10  # of a direction: a place in the cell, a technique, two directions, a point of the light
 ROUGHLY = 4  # times fewer directions suffice for how second reflections change: with the same ones on both sides
 BOUNCE_CELL = 2  # px each way of a cell; 1 in a crowded scene, whose pixels differ
@@ -93,7 +100,8 @@ class Renderer:
         self.grazing = not self.crowded  # whether second directions are drawn where a level skin meets itself
         if self.crowded:
             self.rim_samples, self.bent_side = CROWDED_SAMPLES << (self.fine - 1), 2
-            self.bounce = 1, CROWDED_SAMPLES << (self.fine - 1)
+            rays = CROWDED_BOUNCE_RAYS / (self.height * self.width)
+            self.bounce = 1, _power_of_two(max(CROWDED_SAMPLES << (self.fine - 1), rays))
         self.wavelengths = np.array(scene.integrator.bands or (540.0,))
         self.remember = remember
         self._transmissions: OrderedDict = OrderedDict()
@@ -283,17 +291,21 @@ class Renderer:
         return edges
 
     # -- one LED ------------------------------------------------------------------------------------------------------
-    def _led_key(self, values: Mapping, led: str) -> tuple:
+    def _led_key(self, values: Mapping, led: str, seed: int = 0) -> tuple:
         return (
             led,
             self.geometry(values),
             tuple(values[k] for k in self.shading_keys),
             tuple(values[k] for k in self.led_keys[led]),
+            seed if self.crowded else 0,
         )
 
-    def led(self, values: Mapping, led: str) -> LedImage:
-        """The image that one LED makes at power 1 by direct light, kept with what its derivatives need."""
-        key = self._led_key(values, led)
+    def led(self, values: Mapping, led: str, seed: int = 0) -> LedImage:
+        """The image that one LED makes at power 1 by direct light, kept with what its derivatives need.
+
+        seed   of the finer samples of a crowded scene, whose errors in most pixels add up to more than a fit ignores:
+               derivatives by other samples than the prediction's do not follow them"""
+        key = self._led_key(values, led, seed)
         if key in self._images:
             self._images.move_to_end(key)
             return self._images[key]
@@ -302,22 +314,22 @@ class Renderer:
             self.apply(values, move=False)
             return self._keep(key, self._shaded_again(alike))
         self.apply(values)
-        image = self._keep(key, self._render_led(hits, led))
+        image = self._keep(key, self._render_led(hits, led, seed))
         for other in self.together - {
             led
         }:  # moving the geometry costs more than an image: make what will be asked for next
-            key = self._led_key(values, other)
+            key = self._led_key(values, other, seed)
             if key not in self._images and key not in self._plain:
-                self._keep(key, self._render_led(hits, other))
+                self._keep(key, self._render_led(hits, other, seed))
         return image
 
     def _placed_alike(self, key: tuple) -> LedImage | None:
         """A kept image of the same LED in the same place over the same geometry, which differs in shading alone: with
         its shadows nothing needs to be traced. None where there is none, or shading is that of layers."""
-        led, geometry, _, own = key
+        led, geometry, _, *own = key
         if self.layered or led in self.scene.sources:
             return None
-        alike = (i for k, i in reversed(self._images.items()) if (k[0], k[1], k[3]) == (led, geometry, own))
+        alike = (i for k, i in reversed(self._images.items()) if (k[0], k[1], *k[3:]) == (led, geometry, *own))
         return next(alike, None)
 
     def _shaded_again(self, alike: LedImage) -> LedImage:
@@ -352,7 +364,7 @@ class Renderer:
             self._plain.popitem(last=False)
         return image
 
-    def _render_led(self, hits: Hits, led: str) -> LedImage:
+    def _render_led(self, hits: Hits, led: str, seed: int = 0) -> LedImage:
         if led in self.scene.sources:  # what it sends lies in the weights
             rim = self._joint_rim(hits)
             index = np.flatnonzero(rim)
@@ -368,7 +380,7 @@ class Renderer:
         index = np.flatnonzero(share)
         # of a light of many points, an edge in the shadow of one is small
         few = ~(hits.edges if self.crowded or len(part.places()) > SOFT else rim)
-        finer = self._finer(hits, index, np.flatnonzero(few.ravel()[index]))
+        finer = self._finer(hits, index, np.flatnonzero(few.ravel()[index]), seed if self.crowded else 0)
         rim_visible = self._visible(finer.sample.si, part) if len(index) else None
         image = LedImage(led, hits, rim, index, finer, visible, rim_visible, self._seen(visible).mean(0) > 0.5)
         image.share = share.reshape(-1, 1)[index]
@@ -414,15 +426,15 @@ class Renderer:
         return hits.lit[part.name][1]
 
     # -- what layers leave of it --------------------------------------------------------------------------------------
-    def image(self, values: Mapping, light: str, component: int = 0) -> np.ndarray:
+    def image(self, values: Mapping, light: str, component: int = 0, seed: int = 0) -> np.ndarray:
         """(H, W, B) what one light makes at power 1, layers and all; (N, 1, B) where `values` hold arrays of readings.
 
         component  of the Stokes vector in the camera's axes; 0: what the camera records, S0 unless its detector
                    prefers a polarization (stage `detector`)
         """
         if not self.layered:
-            plain = self._plain.get(self._led_key(values, light))
-            plain = self.led(values, light).radiance if plain is None else plain
+            plain = self._plain.get(self._led_key(values, light, seed))
+            plain = self.led(values, light, seed).radiance if plain is None else plain
             return plain if component == 0 else np.zeros_like(plain)
         image = self.led(values, light)
         seen = [
@@ -500,7 +512,7 @@ class Renderer:
 
     def light(self, values: Mapping, light: str, seed: int = 0, component: int = 0) -> np.ndarray:
         """(H, W, B) what one light makes at its power, by one reflection and by two."""
-        image = self.image(values, light, component)
+        image = self.image(values, light, component, seed)
         if self.bounce_key and values[self.bounce_key]:
             image = image + values[self.bounce_key] * self.bounced(values, light, seed, component)
         return self.powers(values, light) * image
@@ -516,28 +528,31 @@ class Renderer:
         plain = {**values, **paths.undetected(self.scene)}
         return np.stack([self.radiance(plain, seed, component) for component in range(4)])
 
-    def _finer(self, hits: Hits, index: np.ndarray, bent: np.ndarray | tuple = ()) -> Finer:
+    def _finer(self, hits: Hits, index: np.ndarray, bent: np.ndarray | tuple = (), seed: int = 0) -> Finer:
         """Finer samples of the pixels `index`; of `bent` among them, where no edge is, fewer."""
-        key = (index.tobytes(), np.asarray(bent).tobytes())
-        if key not in hits.rims:
-            hits.rims = {key: self._in_pixels(index, np.isin(np.arange(len(index)), bent))}  # only the latest is kept
+        key = (index.tobytes(), np.asarray(bent).tobytes(), seed)
+        if key not in hits.rims:  # only the latest is kept
+            hits.rims = {key: self._in_pixels(index, np.isin(np.arange(len(index)), bent), seed)}
         return hits.rims[key]
 
-    def _in_pixels(self, index: np.ndarray, bent: np.ndarray) -> Finer:
+    def _in_pixels(self, index: np.ndarray, bent: np.ndarray, seed: int = 0) -> Finer:
         """A Hammersley set in each pixel, shifted from pixel to pixel: an edge in any direction crosses the samples one
         by one, and not in rows, so that a shadow that moves changes a pixel in small steps. What only bends is smooth:
-        the middles of a square grid. Behind a pupil each sample has a place on it as well."""
-        counts = np.where(bent, self.bent_side**2, self.rim_samples)
+        the middles of a square grid. Behind a pupil each sample has a place on it as well. Another seed shifts the
+        sets by another amount."""
+        pupil = self.crowded and self.scene.camera.number(self.scene.camera.named("pupil")) > PINHOLE
+        samples = self.rim_samples * BEHIND_PUPIL if pupil else self.rim_samples
+        counts = np.where(bent, self.bent_side**2, samples)
         starts = np.cumsum(counts) - counts
         u, v = np.empty((2, counts.sum()), np.float32)
-        rim = starts[~bent, None] + np.arange(self.rim_samples)
+        rim = starts[~bent, None] + np.arange(samples)
         middle = starts[bent, None] + np.arange(self.bent_side**2)
-        u[rim], v[rim] = self._at(index[~bent], self._set(index[~bent], self.rim_samples))
+        u[rim], v[rim] = self._at(index[~bent], self._set(index[~bent], samples, seed))
         u[middle], v[middle] = self._at(index[bent], _grid(self.bent_side))
         lens = None
-        if self.crowded and self.scene.camera.number(self.scene.camera.named("pupil")) > PINHOLE:
+        if pupil:
             lens = np.full((2, counts.sum()), 0.5, np.float32)
-            lens[:, rim] = _places_on_lens(self.rim_samples, index[~bent])
+            lens[:, rim] = _places_on_lens(samples, index[~bent], _shift(seed)[2:])
         return Finer(counts, self._trace(u, v, lens) if len(index) else None)
 
     def _parted(self, values: Mapping) -> np.ndarray:
@@ -575,10 +590,10 @@ class Renderer:
             u.shape
         )
 
-    def _set(self, index: np.ndarray, count: int) -> tuple[np.ndarray, ...]:
-        """(P, count) places in pixels: a Hammersley set, shifted in each by the R2 sequence."""
+    def _set(self, index: np.ndarray, count: int, seed: int = 0) -> tuple[np.ndarray, ...]:
+        """(P, count) places in pixels: a Hammersley set, shifted in each by the R2 sequence and in all by the seed."""
         places = np.arange(count, dtype=np.float32) / count, _reversed(count).astype(np.float32)
-        shifts = ((index * shift % 1.0).astype(np.float32) for shift in R2)
+        shifts = (((index * shift + own) % 1.0).astype(np.float32) for shift, own in zip(R2, _shift(seed)))
         return tuple((place + shift[:, None]) % 1.0 for place, shift in zip(places, shifts))
 
     def _at(self, index: np.ndarray, places: tuple) -> tuple[np.ndarray, np.ndarray]:
@@ -703,22 +718,22 @@ class Renderer:
         shares = own + [1.0] * self.bands
         return values[self.scene.powers[led]] * np.array(shares[: self.bands])
 
-    def led_tangent_at_rest(self, values: Mapping, led: str, key: str, component: int = 0) -> np.ndarray:
+    def led_tangent_at_rest(self, values: Mapping, led: str, key: str, component: int = 0, seed: int = 0) -> np.ndarray:
         """`led_tangent`, kept: all frames share the gel at rest."""
-        known = (key, component, *self._led_key(values, led), *(values[k] for k in self.layer_order))
+        known = (key, component, *self._led_key(values, led, seed), *(values[k] for k in self.layer_order))
         if known not in self._tangents:
-            self._tangents[known] = self.led_tangent(values, led, key, component).astype(np.float32)
+            self._tangents[known] = self.led_tangent(values, led, key, component, seed).astype(np.float32)
             while len(self._tangents) > 8 * len(self.scene.lights):
                 self._tangents.popitem(last=False)
         return self._tangents[known]
 
-    def led_tangent(self, values: Mapping, led: str, key: str, component: int = 0) -> np.ndarray:
+    def led_tangent(self, values: Mapping, led: str, key: str, component: int = 0, seed: int = 0) -> np.ndarray:
         """d / d parameter of one LED's image (of a component of the Stokes vectors), forward mode; rims by central
         differences where the LED moves."""
         import drjit as dr
         import mitsuba as mi
 
-        image = self.led(values, led)
+        image = self.led(values, led, seed)
         name, parameter = key.rsplit(".", 1)
         part, lamp = self.scene.parts[name], self.scene.leds[led]
         moves = name == _board(lamp) or (part is lamp and part.numbers[parameter].role in MOVES)
@@ -975,11 +990,17 @@ def _board(light) -> str:
     return board.name if board is not None else ""
 
 
-def _places_on_lens(count: int, index: np.ndarray) -> np.ndarray:
+def _shift(seed: int) -> np.ndarray:
+    """(4,) shifts of finer samples, in a pixel and on a pupil; none of the seed 0."""
+    return np.random.default_rng([seed, 41]).random(4) if seed else np.zeros(4)
+
+
+def _places_on_lens(count: int, index: np.ndarray, shift: np.ndarray | tuple = (0.0, 0.0)) -> np.ndarray:
     """(2, P, count) places on the unit square that stand for the pupil, to go with those in pixels: further coordinates
-    of the R4 sequence, which are in step with no other, shifted from pixel to pixel."""
+    of the R4 sequence, which are in step with no other, shifted from pixel to pixel and by `shift`."""
     step = 1 / 1.1673039782614187 ** np.arange(3, 5)  # powers of the root of x^5 = x + 1
-    return np.stack([(np.arange(count) * s + (np.asarray(index)[:, None] * s * 0.5) % 1.0) % 1.0 for s in step])
+    own = [(np.asarray(index)[:, None] * s * 0.5 + move) % 1.0 for s, move in zip(step, shift)]
+    return np.stack([(np.arange(count) * s + move) % 1.0 for s, move in zip(step, own)])
 
 
 def _grid(side: int) -> tuple[np.ndarray, np.ndarray]:

@@ -145,6 +145,8 @@ class Effect:
     scope       'common' (one value in all frames) or 'frame' (a value per frame)
     per         'kind' (one value shared by all parts of the kind, such as all LEDs) or 'part' (each its own)
     requires    kinds of further parts that a scene must have for the effect to make sense in it
+    reads       names of the part's own parameters that the functions read besides: of the kinds that play the part's
+                role, those that lack one do not carry the effect
     mixes_pixels  True where it mixes the pixels of an image: point readings cannot have it
     acts        coordinates that it acts through: radius, height, slope, led, channel, frame, intensity ...
     needs       what a capture set must vary for it to be seen, in words
@@ -166,6 +168,7 @@ class Effect:
     scope: str = "common"
     per: str = "kind"
     requires: tuple[str, ...] = ()
+    reads: tuple[str, ...] = ()
     mixes_pixels: bool = False
     acts: tuple[str, ...] = ()
     needs: str = ""

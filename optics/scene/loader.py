@@ -425,7 +425,7 @@ class Scene:
     def keys_of(self, effect: Effect) -> dict[str, list[str]]:
         """The effect's parameter names, each with the keys it has in this scene (empty where the scene lacks the
         part)."""
-        kinds = self.registry.kinds(effect.part)
+        kinds = self.registry.carriers(effect)
         holders = {n: p for n, p in self.parts.items() if p.kind in kinds}
         return {
             name: [f"{n}.{name}" for n, p in holders.items() if f"{n}.{name}" in self.parameters and p.takes(name)]

@@ -156,7 +156,7 @@ def _built(registry: Registry, part: Part) -> type:
             files = [
                 e.file
                 for e in registry.effects.values()
-                if part.kind in registry.kinds(e.part) and p in (*e.parameters, *e.shape)
+                if part.kind in registry.carriers(e) and p in (*e.parameters, *e.shape)
             ]
             raise BadPlugin(
                 f"{files[0] if files else part.file}: parameter '{p.name}' has the name of something else that the "
@@ -417,7 +417,7 @@ class Declared:
         stages = {
             s
             for e in self.registry.effects.values()
-            if name in e.parameter_names and self.kind in self.registry.kinds(e.part)
+            if name in e.parameter_names and self.kind in self.registry.carriers(e)
             for s in e.stages
         }
         if stages and stages <= {*IMAGE_STAGES, "detector", "glow"}:

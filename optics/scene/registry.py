@@ -108,7 +108,7 @@ class Registry:
             brought = [
                 p
                 for e in self.effects.values()
-                if kind in self.kinds(e.part)
+                if kind in self.carriers(e)
                 for p in (*e.parameters, *e.shape)
                 if not isinstance(p, str)
             ]
@@ -140,7 +140,7 @@ class Registry:
             self._stages[kind, stage] = tuple(
                 self.effects[k]
                 for k in sorted(self.effects)
-                if kind in self.kinds(self.effects[k].part) and stage in self.effects[k].stages
+                if kind in self.carriers(self.effects[k]) and stage in self.effects[k].stages
             )
         return self._stages[kind, stage]
 
@@ -156,6 +156,13 @@ class Registry:
         brought = (n for e in self.at_stage(kind, "surface") for n in (*e.parameter_names, *(p.name for p in e.shape)))
         return frozenset((*(p.name for p in self.parts[kind].parameters), *brought))
 
+    def carriers(self, effect: Effect) -> tuple[str, ...]:
+        """The kinds that carry an effect: of those that its part's name stands for, the ones that have what it
+        reads."""
+        return tuple(
+            k for k in self.kinds(effect.part) if {p.name for p in self.parts[k].parameters}.issuperset(effect.reads)
+        )
+
     def find_effect(self, name: str) -> Effect:
         key = key_of(name)
         if key not in self.effects:
@@ -168,6 +175,10 @@ class Registry:
             for name in (effect.part, *effect.requires):
                 if not self.kinds(name):
                     raise BadPlugin(f"{effect.file}: part '{name}' is none of {', '.join(sorted(self.parts))}")
+            if not self.carriers(effect):
+                raise BadPlugin(
+                    f"{effect.file}: no part '{effect.part}' has all that the effect reads: {', '.join(effect.reads)}"
+                )
             for stage in effect.stages:
                 if not set(self.kinds(effect.part)) <= set(self.kinds(STAGES[stage]) or self.parts):
                     raise BadPlugin(

@@ -44,6 +44,7 @@ def check_between():
 effect = Effect(
     name="plate behind the coating",
     part="gel",
+    reads=("indenter_spacing",),
     stages={"segment": show},
     parameters=(
         Parameter(

@@ -26,6 +26,7 @@ import numpy as np
 from optics.scene.checking import agree, made
 from optics.scene.declare import Effect
 from optics.scene.parameter import Parameter
+from optics.skin.contact import STRETCH
 
 
 def brighten(path, gel):
@@ -47,6 +48,7 @@ def check_gain():
 effect = Effect(
     name="stretched coating",
     part="gel",
+    reads=STRETCH,
     stages={"segment": brighten},
     parameters=(
         Parameter(

@@ -98,9 +98,6 @@ PARAMETERS = (
 
 
 def build():
-    import drjit as dr
-    import mitsuba as mi
-
     class ElasticSkin(known().parts["gel"].build()):
         kind = "elastic_skin"
         indenter, indenter_radius = "sphere", "tip_radius"
@@ -176,9 +173,6 @@ def build():
             dent = np.interp(r, radius, found.face(radius)) * fade * fade[:, None]
             touch = np.clip((found.a - r) / self.map_pitch + 0.5, 0, 1) if found.a else np.zeros_like(r)
             return contact.LocalMap(dent, self.map_pitch), contact.LocalMap(touch, self.map_pitch)
-
-        def beside(self, p):
-            return dr.zeros(mi.Float, 1)  # no plate of balls presses it
 
         def heights(self, x, y):
             self.map, self.touch = self.press()

@@ -18,6 +18,7 @@ from optics.errors import BadPlugin
 from optics.files.output import shipped
 from optics.scene import checking
 from optics.scene.declare import IMAGE_STAGES, Effect
+from optics.scene.loader import find, shipped_scenes
 from optics.scene.registry import Registry, known
 
 REGISTRY = known()
@@ -328,6 +329,8 @@ class Material:
         return differences(lambda v: self.image({**now, key: v}), now[key], p.step * p.plausible, p.bounds)[0]
 
 
+# scenes whose images are made LED by LED
+SHIPPED = [n for n in shipped_scenes() if 'type="clear"' not in find(n).read_text(encoding="utf-8")]
 # scenes that are dark at rest, and those whose interface is not there: for what no other scene has
 LAST = {"colour_bench": None, "particle_gel": "interface"}
 
@@ -1002,7 +1005,7 @@ def draw(rng, bench, chosen=None):
     values, registry = {}, bench.scene.registry
     for name, part in bench.scene.parts.items():
         around = {p: bench.values[f"{name}.{p}"] for p in part.numbers}
-        effects = [e for e in registry.effects.values() if part.kind in registry.kinds(e.part)]
+        effects = [e for e in registry.effects.values() if part.kind in registry.carriers(e)]
         # what draws several parameters comes last: its values belong together
         for item in (registry.parts[part.kind], *sorted(effects, key=lambda e: len(e.parameter_names))):
             drawn = checking.draw(item, own_parameters(item, registry), rng, around)
@@ -1037,6 +1040,17 @@ def test_everything_drawn_at_once_gives_images(seed, bench):
     assert np.isfinite(image).all() and image.std() > 0
     for key in ("led_1.x", "membrane.sigma", "gel.haze", "camera.blur"):
         assert np.isfinite(bench.derivative(key, values)).all(), key
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_every_scene_gives_images_with_all_its_effects(name, benches):
+    """Each effect that a scene can express is drawn at once: parts that stand in for another carry what they can
+    compute."""
+    bench = benches(name)
+    effects = [e for e in bench.scene.registry.effects.values() if bench.scene.can_express(e)]
+    own = {k for e in effects for held in bench.scene.keys_of(e).values() for k in held}
+    image = bench.image(draw(np.random.default_rng(3), bench, own))
+    assert effects and np.isfinite(image).all() and image.std() > 0
 
 
 @pytest.mark.parametrize(

@@ -365,6 +365,19 @@ def test_a_light_without_a_power_is_refused(tmp_path):
         known(written(tmp_path / "own", spot=source))
 
 
+def test_a_stand_in_carries_an_effect_only_with_what_it_reads(tmp_path):
+    registry = known()
+    assert registry.carriers(registry.find_effect("stretched coating")) == ("gel",)
+    assert set(registry.carriers(registry.find_effect("gel yellowing"))) == {"gel", "elastic_skin"}
+    assert "stretch_gain" not in {p.name for p in registry.parameters_of("elastic_skin")}
+    file = Path(registry.find_effect("stretched coating").file)
+    lacking = (
+        file.read_text(encoding="utf-8").replace("reads=STRETCH", 'reads=("strain",)').replace("stretch", "strtch")
+    )
+    with pytest.raises(BadPlugin, match="no part 'gel' has all that the effect reads: strain"):
+        known(written(tmp_path / "own", lacking=lacking))
+
+
 def test_the_shipped_parts_have_what_their_roles_ask_for(mitsuba, load_bench):
     """The table of the page on parts, on parts of a scene: some are set when a part is made."""
     import re

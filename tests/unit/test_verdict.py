@@ -904,3 +904,25 @@ def curve(coordinate, net, dof=16):
 def test_bins_of_a_curve_cost_what_they_could_have_fitted(found, effects, rival):
     best = decide_rules.Opponent(1000.0, 12.0, effects, 3, complete=True, decides=True)
     assert bool(decide_rules.rivals([found], best)) == rival
+
+
+def test_what_a_whole_image_gains_is_no_difference_between_its_parts():
+    """Parts that gain one strength together gain nothing by being apart; what a part gains alone stays."""
+    from optics.diagnosis.homogeneity import _together
+    from optics.diagnosis.statistics import Projected, joint
+
+    rng = np.random.default_rng(4)
+    a = rng.standard_normal((50, 3))
+    information, lengths = a.T @ a, np.diag(a.T @ a)
+
+    def gained(strengths):
+        projected = Projected(information, information @ strengths, np.ones(3), np.zeros((0, 3)), 0, 0.0, 0.0)
+        whole, apart = _together(projected, lengths)
+        left = apart @ projected.score
+        assert left.sum() == pytest.approx(0, abs=1e-9)
+        return joint(projected, lengths)[0] - whole
+
+    assert gained(np.full(3, 0.3)) == pytest.approx(0, abs=1e-9)
+    assert gained(np.array([0.3, 0.3, 0.6])) > 0.5
+    absorbed = Projected(information * 1e-9, information[0] * 0, np.ones(3), np.zeros((0, 3)), 0, 0.0, 0.0)
+    assert _together(absorbed, lengths) == (0.0, None)
