@@ -30,7 +30,7 @@ class ParticleGel(ImageRig):
         "field": "11",
         "top": "0.65",
         "bottom": "3.85",
-        "fine": "6",
+        "fine": "5",
         "detail": "1",
     }
     held_out = ("press-02",)
