@@ -13,7 +13,7 @@ from optics.diagnosis.evidence import Candidate, Evidence
 from optics.diagnosis.thresholds import MARGIN
 
 CONSIDERED = 10  # effects, the best by themselves: 45 pairs
-REFITTED = 8  # pairs at most: each costs a calibration, and of few sets more than two are wanted
+REFITTED = 8  # pairs at most: each costs a calibration
 # Of the fall: by how much two effects must do better than one to be refitted
 LEAD = MARGIN / 4
 

@@ -361,9 +361,11 @@ class Declared:
     @property
     def integral(self):
         """Of scenes whose channels are integrals, the `optics.scene.integral.Integral`; None of others."""
-        if self._integral is not None and self._integral() is None:
+        if self._integral is None:
+            return None
+        if (found := self._integral()) is None:
             raise ReferenceError(f"the scene of '{self.name}' is gone; keep it as long as its parts")
-        return None if self._integral is None else self._integral()
+        return found
 
     @integral.setter
     def integral(self, integral) -> None:

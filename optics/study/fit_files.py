@@ -18,6 +18,9 @@ from optics.fit.scene_model import SceneModel
 from optics.scene.parameter import LARGEST, Values
 
 CORRELATION_SHOWN = 0.9  # absolute correlation beyond which a pair of variables is listed
+PARTS = ("variables", "keys", "value", "sd", "correlation")
+AGAIN = "restore the file, or calibrate again"
+ROUNDING = 1e-6  # of a correlation's diagonal and eigenvalues: files of earlier versions are no better
 
 
 @dataclass(frozen=True)
@@ -100,11 +103,6 @@ class Posterior:
         sd = np.array(read.sd)
         keys = tuple(map(tuple, read.keys))
         return cls(tuple(read.variables), keys, np.array(read.value), correlation * np.outer(sd, sd))
-
-
-PARTS = ("variables", "keys", "value", "sd", "correlation")
-AGAIN = "restore the file, or calibrate again"
-ROUNDING = 1e-6  # of a correlation's diagonal and eigenvalues: files of earlier versions are no better
 
 
 @cache
