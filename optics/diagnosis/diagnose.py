@@ -15,7 +15,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -29,11 +29,12 @@ from optics.diagnosis.evidence import Candidate, Evidence, Progress, silent
 from optics.diagnosis.explanations import Outcome
 from optics.diagnosis.findings import basis_of, findings_of, subject_of
 from optics.diagnosis.laws import other_laws
-from optics.diagnosis.refit import Case, refit_each
+from optics.diagnosis.refit import Case, Cooled, refit_each
 from optics.diagnosis.result import Basis, Diagnosis, Family, Fingerprint, Row, Split, kinds_of
 from optics.diagnosis.score import score
 from optics.diagnosis.text import sentence
 from optics.diagnosis.thresholds import EXCESS, LEVEL, MAX_SPLIT, SHARE, close
+from optics.errors import Underdetermined
 from optics.fit import calibrate
 from optics.fit.model import Model
 from optics.fit.result import Fit
@@ -54,6 +55,7 @@ def diagnose(
     fitted: Sequence[int],
     refit: Callable[..., Fit] | None = None,
     foresee: Callable[[Sequence[Sequence[Variable]], Progress], None] | None = None,
+    cooler: Callable[[Sequence[Fit]], Cooled | None] | None = None,
     rows_max: int = 400_000,
     seed: int = 0,
     top: int = 5,
@@ -61,6 +63,7 @@ def diagnose(
     ranked: Callable[[list[Row]], None] | None = None,
     excluded: Mapping[str, str] | None = None,
     added: Sequence[Effect] = (),
+    asked: Collection[str] = (),
 ) -> Diagnosis:
     """Score, refit and judge: which effect a calibrated model lacks.
 
@@ -70,6 +73,8 @@ def diagnose(
     held_out      frames that were not fitted; only what each frame has for itself is fitted there
     refit         `optics.fit.calibrate.fit` unless given; called as refit(model, variables, start, frames=[...])
     foresee       called before the refits, with the variables of each effect that is refitted
+    cooler        called with the refits, the best first; what to begin again from, where priors of the base counted
+                  more than that one asks, and it matters
     rows_max      values (pixel x channel) that curves, splits and alternative weights may use
     seed          of the simulations and of derivative images; the same seed gives the same table
     top           how many of the best effects are refitted, besides those that cannot be told from the best
@@ -77,6 +82,7 @@ def diagnose(
     excluded      effect -> why it is not among `effects`, for the record
 
     added         effects that the model has already, whose laws may differ from the library's (optics.diagnosis.laws)
+    asked         names of effects that are refitted, whatever their score
 
     Raises Underdetermined when the base is not calibrated to convergence, or black level or saturation are unknown;
     ValueError when frames are fitted and held out at once, or none is fitted.
@@ -108,8 +114,33 @@ def diagnose(
         evidence.spectrum.apart = case.session.apart
     basis = basis_of(model, evidence, evidence.structure(evidence.whitened, evidence.base))
     case.places = places = prints.places(model, fit.values, evidence)
-    chosen = _choose(case, top)
+    chosen = _choose(case, top, asked)
     fits = refit_each(case, chosen)
+    if cooler is not None and (cooled := cooler(_best_first(case, fits))):
+        try:
+            again = diagnose(
+                model,
+                cooled.base,
+                effects,
+                variables_of,
+                held_out,
+                fitted=fitted,
+                refit=cooled.refit,
+                foresee=cooled.foresee,
+                rows_max=rows_max,
+                seed=seed,
+                top=top,
+                progress=progress,
+                ranked=ranked,
+                excluded=excluded,
+                added=added,
+                asked=fits,
+            )
+        except Underdetermined:  # with priors that count less the base has no end
+            pass
+        else:
+            again.warnings.append(cooled.remark)
+            return again
     outcome = explanations.search(case, chosen, fits)
     subject, best = subject_of(outcome), outcome.best
 
@@ -171,7 +202,13 @@ def diagnose(
     )
 
 
-def _choose(case: Case, top: int) -> list[Candidate]:
+def _best_first(case: Case, fits: Mapping[str, Fit]) -> list[Fit]:
+    """The refits, that of the largest fall first."""
+    falls = {c.effect.name: c.row.refit.fall for c in case.table.order if c.row.refit is not None}
+    return [fits[name] for name in sorted(fits, key=lambda name: -falls[name])]
+
+
+def _choose(case: Case, top: int, asked: Collection[str] = ()) -> list[Candidate]:
     """The effects to refit: those that cannot be told from the best by score; of a table all that stand out besides, as
     its refits are cheap; of images the best of them, and winners of other weights.
 
@@ -185,7 +222,7 @@ def _choose(case: Case, top: int) -> list[Candidate]:
         return [c for c in seen if c in live or c in near]
     chosen = live[:top] + [c for c in near if c not in live[:top]]
     chosen = chosen[:MAX_REFITS]
-    others = {*case.table.preferred.values()} - {c.effect.name for c in chosen}
+    others = {*case.table.preferred.values(), *asked} - {c.effect.name for c in chosen}
     return chosen + [c for c in live if c.effect.name in others]
 
 

@@ -34,6 +34,21 @@ SEEN_AT = 0.25  # relative change of the strength below which its image needs no
 FAILURES = (ValueError, ArithmeticError, np.linalg.LinAlgError)  # by which a refit says that it has no result
 
 
+@dataclass(frozen=True)
+class Cooled:
+    """What a diagnosis begins again from, where an explanation leaves so little that what is known counts less than it
+    did in the base (`optics.fit.tempering`): every explanation, and the base, is then held to it alike.
+
+    base    calibrated with priors that count as that explanation asks;   refit, foresee   as of
+            `optics.diagnosis.diagnose.diagnose`, from there;   remark: a warning that the diagnosis gets
+    """
+
+    base: Fit
+    refit: Callable[..., Fit]
+    foresee: Callable[[Sequence[Sequence[Variable]], Progress], None]
+    remark: str
+
+
 @dataclass
 class Case:
     """A calibrated model under diagnosis; the arguments are those of `optics.diagnosis.diagnose.diagnose`."""

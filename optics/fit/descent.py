@@ -10,7 +10,7 @@ they bring little of what these promise."""
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import lsq_linear
@@ -127,6 +127,19 @@ def prior_terms(model: Model, variables: Sequence[Variable], values: Values) -> 
             pull[i], curvature[i] = gap * v.precision, v.precision
             total += gap**2 * v.precision
     return pull, curvature, total
+
+
+def with_priors(
+    normal: Normal, model: Model, values: Values, old: Sequence[Variable], new: Sequence[Variable]
+) -> Normal:
+    """Normal equations at these values with the priors of other variables of the same names."""
+    pulls, curvatures, priors = zip(*(prior_terms(model, variables, values) for variables in (old, new)))
+    return replace(
+        normal,
+        a=normal.a + np.diag(curvatures[1] - curvatures[0]),
+        b=normal.b + pulls[1] - pulls[0],
+        prior=priors[1],
+    )
 
 
 def again(model: Model, variables: Sequence[Variable], values: Values, frames: Sequence[int], normal: Normal) -> Normal:

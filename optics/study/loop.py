@@ -360,6 +360,7 @@ def _examined(
         fitted=fitted,
         refit=refits.of,
         foresee=refits.foresee,
+        cooler=refits.cooler,
         seed=setup.seed,
         progress=progress,
         ranked=keep,

@@ -13,16 +13,19 @@ from pathlib import Path
 
 import numpy as np
 
+from optics.diagnosis.refit import Cooled
+from optics.diagnosis.thresholds import CLEAR, MISSTATED
 from optics.files.output import write_text
 from optics.fit import calibrate
-from optics.fit.descent import prior_terms
+from optics.fit.descent import prior_terms, with_priors
 from optics.fit.result import Fit
 from optics.fit.scene_model import SceneModel
+from optics.fit.tempering import tempered
 from optics.scene.declare import Effect
 from optics.scene.parameter import Values, Variable
 from optics.study.places import own_plugins
 from optics.study.setup import Setup, effect_variables
-from optics.study.stages import fit_base, off_neutral
+from optics.study.stages import COOLER, cooled, fit_base, off_neutral
 from optics.version import __version__
 
 PROMISING = 0.7  # of the best fall of chi2: an unconverged refit that falls by more is worth a calibration
@@ -31,6 +34,7 @@ ROUGH = 0.5  # chi2 per variable at which a refit of a diagnosis, which compares
 # left, falls that differ by less than a fifth decide nothing (`optics.diagnosis.thresholds.MARGIN`).
 COARSE = 0.01
 AS_PROMISED = 0.7  # of the promised fall: a calibration that falls by more has not ended in another minimum
+REACH = 3 * CLEAR  # of the best: a refit that stays farther behind, however priors count, is no rival
 FEW = 12  # iterations of a refit that continues one: chord steps have brought it near
 
 
@@ -44,11 +48,14 @@ class Refits:
         self, model: SceneModel, setup: Setup, base: Fit, tested: Sequence[Effect], folder: Path | None = None
     ):
         self.model, self.setup, self.base, self.folder = model, setup, base, folder
+        self.tested = tested
         self.known = {v.name for v in base.variables}
         curved = [v for e in tested if e.onset != "tangent" for v in effect_variables(model, e, base.variables)]
         self.steps = {v.name: v.parameter.plausible for v in curved}  # of variables without a slope at neutral
         self.chords: dict[tuple[str, ...], Fit] = {}
         self.results: dict[tuple[str, ...], Fit] = {}
+        # of refits with priors that counted more, which kept them from wherever a wrong base goes
+        self.starts: dict[tuple[str, ...], Fit] = {}
 
     def foresee(self, sets: Sequence[Sequence[Variable]], say: Callable[[str, int, int], None]) -> None:
         """Chord steps of each set of variables, so that the best is known before any is calibrated."""
@@ -56,7 +63,8 @@ class Refits:
             return
         for n, extra in enumerate(sets):
             say("chord steps", n, len(sets))
-            if self.curved(extra) < 2 and self.taken_up(extra) is None:
+            known = tuple(v.name for v in extra) in self.starts or self.taken_up(extra) is not None
+            if self.curved(extra) < 2 and not known:
                 self.chord(extra)
         say("chord steps", len(sets), len(sets))
 
@@ -69,15 +77,25 @@ class Refits:
         names = tuple(over)
         found = self.taken_up(extra)  # a diagnosis asks again from another start, which chord steps do not use
         if found is None:
-            if self.curved(extra) < 2:
+            found = self.resumed(variables, names, frames)
+            if found is None and self.curved(extra) < 2:
                 found = self.calibrated(variables, extra, frames)
-            else:  # a chord per parameter misses their products
+            elif found is None:  # a chord per parameter misses their products
                 found = calibrate.fit_over_starts(
                     model, variables, start, frames, tolerance=ROUGH, over=over, negligible=COARSE
                 )
             self.results[names] = found
             self.keep(found, extra)
         return found
+
+    def resumed(self, variables: Sequence[Variable], names: tuple[str, ...], frames: Sequence[int]) -> Fit | None:
+        """The fit from where one with priors that counted more had come; None where there is none, or it fails."""
+        if names not in self.starts:
+            return None
+        found = calibrate.fit(
+            self.model, variables, self.starts[names].values, frames, tolerance=ROUGH, negligible=COARSE
+        )
+        return found if self.fall(found) > 0 else None
 
     def by_chords(self) -> bool:
         """Whether chord steps are worth it: readings of a table are predicted in milliseconds."""
@@ -121,6 +139,52 @@ class Refits:
         afresh = fit_base(self.model, variables, frames, values, tolerance=ROUGH, negligible=COARSE)
         return min((best, afresh), key=self.minimised)
 
+    def cooler(self, refits: Sequence[Fit]) -> Cooled | None:
+        """What a diagnosis begins again from, given its refits, the best first: the base with priors that count as the
+        best one asks, where that leaves little more than noise; None where it does not, where they count no less then,
+        and where it makes no difference.
+
+        A base that misses images by ten times their noise lets priors count a thousand times (optics.fit.tempering).
+        So does each refit: a dial that stood half a degree off what is written down, as dials do, is held there beside
+        the right effect as beside a wrong one, and what is left then is called misfit."""
+        now = self.base.tempering
+        if not self.by_chords() or now == 1.0 or not refits:
+            return None
+        best, *others = [(self._least(fit), fit) for fit in refits]
+        (least, gain), leader = best
+        if least > MISSTATED * leader.dof or (gain < CLEAR and all(o > least + REACH for (o, _), _ in others)):
+            return None
+        found = cooled(self.model, leader)
+        if found.tempering > now / COOLER or found.chi2 > MISSTATED * found.dof:
+            return None
+        variables = tempered(self.base.variables, found.tempering)
+        base = calibrate.fit(self.model, variables, self.base.values, self.base.frames)
+        again = Refits(self.model, self.setup, base, self.tested, self.folder)
+        again.results[self._extra(leader)] = found
+        near = PROMISING * self.fall(leader)
+        again.starts = {self._extra(fit): fit for fit in refits[1:] if self.fall(fit) > near}
+        remark = (
+            f"what is known counted {now:.3g} times in the base, as that misses the images; the best explanation misses "
+            f"them so little that it counts {found.tempering:.3g} times: the base was calibrated again for this "
+            "diagnosis, and its figures are those of that calibration"
+        )
+        return Cooled(base, again.of, again.foresee, remark)
+
+    def _extra(self, found: Fit) -> tuple[str, ...]:
+        """Names of a refit's variables that the base has not."""
+        return tuple(v.name for v in found.variables if v.name not in self.known)
+
+    def _least(self, found: Fit) -> tuple[float, float]:
+        """(what a fit expects to minimise to where priors count once, by its last linearisation; by how much that is
+        less than where it stands)."""
+        once = tempered(found.variables, 1.0)
+        here = found.chi2 + prior_terms(self.model, once, found.values)[2]
+        if found.normal is None:
+            return here, 0.0
+        normal = with_priors(found.normal, self.model, found.values, found.variables, once)
+        step = np.linalg.lstsq(normal.a, normal.b, rcond=None)[0]  # gauges have no curvature
+        return here - float(normal.b @ step), float(normal.b @ step)
+
     def fall(self, found: Fit) -> float:
         """Of what is minimised, chi2 and priors: where each frame has its own angle, these may hold most of it."""
         return self.minimised(self.base) - self.minimised(found)
@@ -141,11 +205,12 @@ class Refits:
         return self.results.get(names)
 
     def file_of(self, names: Sequence[str]) -> Path:
-        """Where a refit of these variables is kept: it belongs to the base's values, to the user's own plugins and to
-        the program's version."""
+        """Where a refit of these variables is kept: it belongs to the base's values, to how often its priors count, to
+        the user's own plugins and to the program's version."""
         assert self.folder is not None
         own = own_plugins(self.model.scene.registry)
-        whole = json.dumps([names, [float(e) for e in self.base.estimate], self.base.frames, own, __version__])
+        at = [float(e) for e in self.base.estimate], self.base.tempering
+        whole = json.dumps([names, *at, self.base.frames, own, __version__])
         return self.folder / f"{hashlib.sha256(whole.encode()).hexdigest()[:16]}.json"
 
     def keep(self, found: Fit, extra: Sequence[Variable]) -> None:
