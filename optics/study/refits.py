@@ -164,9 +164,9 @@ class Refits:
         near = PROMISING * self.fall(leader)
         again.starts = {self._extra(fit): fit for fit in refits[1:] if self.fall(fit) > near}
         remark = (
-            f"what is known counted {now:.3g} times in the base, as that misses the images; the best explanation misses "
-            f"them so little that it counts {found.tempering:.3g} times: the base was calibrated again for this "
-            "diagnosis, and its figures are those of that calibration"
+            f"what is known counted {now:.3g} times in the base, which misses the images by much; the best explanation "
+            f"misses them by so little that it counts {found.tempering:.3g} times. The base was calibrated again with "
+            "that weight, and the figures of this diagnosis are those of that calibration"
         )
         return Cooled(base, again.of, again.foresee, remark)
 
