@@ -25,7 +25,7 @@ from optics.diagnosis import fingerprints as prints
 from optics.diagnosis import held_out as held
 from optics.diagnosis import statistics as st
 from optics.diagnosis.decide import Findings, decide
-from optics.diagnosis.evidence import Candidate, Evidence, Progress, silent
+from optics.diagnosis.evidence import Candidate, Progress, silent
 from optics.diagnosis.explanations import Outcome
 from optics.diagnosis.findings import basis_of, findings_of, subject_of
 from optics.diagnosis.laws import other_laws
@@ -161,7 +161,7 @@ def diagnose(
     remarks.write_limits(case, best if word == "CLAIM" else None, basis)
     remarks.write_verdicts(table, word, subject, outcome, splits)
     rows, names = [c.row for c in table.order], [c.effect.name for c in chosen]
-    gaps, correct = _gaps(evidence, chosen)
+    gaps, correct = _gaps(case, outcome, chosen)
     ambiguous = list(dict.fromkeys(name for e in told if e.possible for name in e.effects))
     kinds = [[e.name for e in kind] for kind in kinds_of(told)]
     if findings.fragile and findings.fragile not in ambiguous:  # by other weights or masks it is the best
@@ -277,18 +277,26 @@ def _excess(basis: Basis) -> float:
     return basis.chi2 - basis.dof if basis.excess_sd > EXCESS else 0.0
 
 
-def _gaps(evidence: Evidence, chosen: Sequence[Candidate]) -> tuple[list[list[float]], list[list[float]]]:
-    """(D[a][b], P(correct)): expected chi2 of a over b when a is true as found, probability of deciding rightly."""
+def _gaps(case: Case, outcome: Outcome, chosen: Sequence[Candidate]) -> tuple[list[list[float]], list[list[float]]]:
+    """(D[a][b], P(correct)): expected chi2 of a over b when a is true as found, probability of deciding rightly.
+
+    By derivative images, D is what b leaves of a's; but where strengths are large, b may come nearer than its tangent
+    says. Where both were refitted, b leaves no more than the difference of the two predictions, and of what is
+    known."""
+    evidence = case.evidence
     first, information = len(evidence.base), evidence.projected.information
-    gaps = [
-        [
-            0.0
-            if a is b
-            else st.gap(information, np.array(a.columns) - first, a.direction, np.array(b.columns) - first, b.cone)
-            for b in chosen
-        ]
-        for a in chosen
-    ]
+    fits = {c.effect.name: t for t in outcome.trials if len(t.members) == 1 for c in t.members}
+
+    def expected(a: Candidate, b: Candidate) -> float:
+        if a is b:
+            return 0.0
+        own, other = np.array(a.columns) - first, np.array(b.columns) - first
+        found = st.gap(information, own, a.direction, other, b.cone)
+        if a.effect.name in fits and b.effect.name in fits:
+            found = min(found, max(explanations.apart(case, fits[a.effect.name], fits[b.effect.name]), 0.0))
+        return found
+
+    gaps = [[expected(a, b) for b in chosen] for a in chosen]
     return gaps, [[st.probability_correct(d) for d in line] for line in gaps]
 
 

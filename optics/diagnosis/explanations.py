@@ -213,12 +213,22 @@ class Outcome:
         first: list[Trial] = []
         for t in sorted((t for t in [*self.survivors, *self.larger] if t.members), key=self.trials.index):
             for o in first:
-                if sum(float(np.sum((a - b).astype(float) ** 2)) for a, b in zip(t.images, o.images)) < ALIKE:
+                if _distance(t, o) < ALIKE:
                     found[t.names] = " with ".join(c.effect.name for c in o.members)
                     break
             else:
                 first.append(t)
         return found
+
+
+def _distance(one: Trial, other: Trial) -> float:
+    """chi2 between the predictions of two explanations, of all values."""
+    return sum(float(np.sum((a - b).astype(float) ** 2)) for a, b in zip(one.images, other.images))
+
+
+def apart(case: Case, true: Trial, other: Trial) -> float:
+    """chi2, with what is known, by which another explanation as it was found misses data of the true one."""
+    return _distance(true, other) + case.known_chi2(other.fit.values) - case.known_chi2(true.fit.values)
 
 
 # -- what an explanation costs ---------------------------------------------------------------------------------------

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from optics.diagnosis import explanations, laws, score
+from optics.diagnosis import diagnose, explanations, laws, score
 from optics.diagnosis import statistics as st
 from optics.diagnosis.correlation import Readings
 from optics.scene import registry
@@ -315,3 +315,25 @@ def test_a_narrow_field_may_fall_off_by_a_tenth():
     """cos^(4 v) at 2.5 degrees off the axis."""
     (vignetting,) = registry.default().find_effect("lens vignetting").parameters
     assert np.cos(np.radians(2.5)) ** (4 * vignetting.bounds[1]) < 0.9
+
+
+def test_effects_that_predict_the_same_are_not_told_apart_whatever_their_slopes_say(monkeypatch):
+    """By slopes 400 of chi2 tell a from b; but b, as it was found, predicts what a does but for 1.5, and needs a dial
+    that stands off by 2 more of chi2. Of c, which was not refitted, only slopes are known."""
+    monkeypatch.setattr(st, "gap", lambda *of: 400.0)
+
+    def effect(name):
+        return SimpleNamespace(effect=SimpleNamespace(name=name), columns=[0], direction=np.ones(1), cone=None)
+
+    def trial(c, images, known):
+        return SimpleNamespace(members=[c], images=[images], fit=SimpleNamespace(values=known))
+
+    a, b, c = map(effect, "abc")
+    outcome = SimpleNamespace(
+        trials=[trial(a, np.zeros(6), 0.0), trial(b, np.full(6, 0.5), 2.0), SimpleNamespace(members=[])]
+    )
+    evidence = SimpleNamespace(base=[], projected=SimpleNamespace(information=np.eye(1)))
+    case = SimpleNamespace(evidence=evidence, known_chi2=lambda known: known)
+    gaps, correct = diagnose._gaps(case, outcome, [a, b, c])
+    assert gaps == [[0.0, pytest.approx(3.5), 400.0], [0.0, 0.0, 400.0], [400.0, 400.0, 0.0]]
+    assert correct[0][1] == pytest.approx(st.probability_correct(3.5)) and correct[1][0] == 0.5
