@@ -2,7 +2,6 @@
 the images by much, what is written down of dials counts many times; beside the right effect it counts once."""
 
 import numpy as np
-import pytest
 from PIL import Image
 
 from optics.study import loop
