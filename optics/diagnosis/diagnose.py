@@ -249,7 +249,7 @@ def _split(case: Case, outcome: Outcome, subject: Candidate | None, basis: Basis
         if not case.evidence.is_table and trial.fall < SHARE * _excess(basis):
             continue  # too little for a claim, and a split takes as long as a score
         beside = [v for c in trial.members if c is not main for v in c.variables]
-        own, p, clutter = homogeneity.split(
+        own, p, clutter, noise = homogeneity.split(
             case.model,
             case.evidence,
             case.places or [],
@@ -264,10 +264,13 @@ def _split(case: Case, outcome: Outcome, subject: Candidate | None, basis: Basis
             explanations.noise_of(case, outcome, trial) if case.evidence.is_table else None,
         )
         splits += own
+        trial.fit = homogeneity.with_errors(trial.fit, main.variables, noise)
         # of readings, noise that neighbours share and errors of dials have been rivals, by their likelihood
         p = math.nan if case.evidence.is_table else case.table.family.p(p)
         chance = p if main is subject else chance
         if len(trial.members) == 1 and main.row.refit is not None:
+            sd = dict(zip((v.name for v in trial.fit.variables), trial.fit.sd))
+            main.row.refit = replace(main.row.refit, sd=[float(sd[v.name]) for v in main.variables])
             main.row.refit = homogeneity.scattered(main.row.refitted, p, clutter)
     return splits, chance
 

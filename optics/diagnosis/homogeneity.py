@@ -71,7 +71,7 @@ def split(
     net: float,
     beside: Sequence[Variable] = (),
     noise: Correlation | None = None,
-) -> tuple[list[Split], float, np.ndarray]:
+) -> tuple[list[Split], float, np.ndarray, np.ndarray]:
     """Whether a fitted effect has the same strength in every part of the data, and `scatter` of its strength.
 
     With the effect in the base, the image e by which it differs from the model without it is cut into parts e 1{part},
@@ -104,7 +104,7 @@ def split(
         return max(HAIR, min(EVEN if s.chance < LEVEL else UNEVEN, SAME_PLACE * excess / max(net, 1e-9)))
 
     results = [replace(s, limit=most(s), holds=s.h <= most(s)) for s in results]
-    return results, *scatter(added.own, added.calibrated, added.effect, added.change, places)
+    return results, *scatter(added.own, added.calibrated, added.effect, added.change, places, net)
 
 
 def _cuts(added: Added, parts: dict[str, tuple[list[str], list[np.ndarray]]], places: list[dict]) -> list[Split]:
@@ -257,14 +257,36 @@ def scattered(refit: Refit, chance: float, clutter: np.ndarray) -> Refit:
     )
 
 
+def with_errors(found: Fit, variables: Sequence[Variable], noise: np.ndarray) -> Fit:
+    """A fit with the covariance of noise (k, k) of some variables where it ended, if that is larger: chord steps, whose
+    derivative images are those of the base, do not know that a leak's size is hard to tell from the power of the lamp
+    that only shows through it."""
+    names = [v.name for v in found.variables]
+    own = [names.index(v.name) for v in variables]
+    covariance = np.array(found.covariance, float)
+    if np.trace(noise) <= np.trace(covariance[np.ix_(own, own)]) or not np.isfinite(noise).all():
+        return found
+    covariance[np.ix_(own, own)] = noise
+    return replace(found, covariance=covariance)
+
+
 def scatter(
-    own: Evidence, calibrated: Sequence[int], effect: Sequence[int], change: np.ndarray, places: list[dict]
-) -> tuple[float, np.ndarray]:
-    """(p, covariance) of a strength by its scatter between parts of the sensor or session.
+    own: Evidence,
+    calibrated: Sequence[int],
+    effect: Sequence[int],
+    change: np.ndarray,
+    places: list[dict],
+    fall: float = 0.0,
+) -> tuple[float, np.ndarray, np.ndarray]:
+    """(p, covariance that clutter adds, covariance of noise) of a strength by its scatter between parts of the sensor
+    or session.
+
+    fall       of chi2 with it: what says more than its distance from none over its error where that error belongs to
+               what it multiplies, such as the power of a lamp that only shows through a leak
 
     p          does not assume independent noise, as neighbours share clutter (`by_clutter`); NaN for too few parts
-    covariance (k, k) V^-1 (B - V) V^-1 that clutter adds to that of noise, with B of `variances`, of the map in which
-               it is larger; zero for too few parts
+    clutter    (k, k) V^-1 (B - V) V^-1, with B of `variances`, of the map in which it is larger; zero for too few parts
+    noise      (k, k) V^-1 at the values that were found
     """
     projected, clutter = own.project(own.thinned(), calibrated, effect, own.thinning), np.zeros((len(effect),) * 2)
     white = st.root(projected.information, st.VISIBLE)
@@ -278,7 +300,11 @@ def scatter(
                 covariance @ (b - projected.information) @ covariance,
                 key=lambda c: float(np.trace(c @ projected.information)),
             )
-    return by_clutter(projected.information @ change, projected.information, found), clutter
+    score = projected.information @ change
+    square = float(score @ change)
+    if 0 < square < fall:
+        score = score * math.sqrt(fall / square)
+    return by_clutter(score, projected.information, found), clutter, covariance
 
 
 def _off_base(

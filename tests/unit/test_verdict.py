@@ -406,7 +406,7 @@ def test_a_strength_is_held_against_what_neighbours_share():
         own = measure(model, fit.values, variables, [], [0], 10**6, 0, lambda *a: None)
         own.precision, own.pull = own.precision[:1], own.pull[:1]  # the slope stands behind the base
         slope = fit.values.common["lamp.slope"]
-        p, clutter = homogeneity.scatter(own, [0], [1], np.array([slope]), [{"place": place}])
+        p, clutter, _ = homogeneity.scatter(own, [0], [1], np.array([slope]), [{"place": place}])
         ps.append(p)
         pulls.append(slope / math.sqrt(fit.sd[1] ** 2 + max(clutter[0, 0], 0.0)))
         naive.append((slope / fit.sd[1]) ** 2 > 6.63)
@@ -505,7 +505,7 @@ def test_what_splits_a_strength_is_held_against_clutter_too(proxy):
         left = SimpleNamespace(complete=False, excess_sd=100.0, structure_p=0.0)
         places = [{"place": place, "quadrant": quadrant, "channel": np.zeros(1024)}]
         fall = (fit.values.common["lamp.slope"] / fit.sd[1]) ** 2
-        splits, _, _ = homogeneity.split(model, base, places, 10**6, 0, lambda *a: None, c, fit, left, fall)
+        splits, *_ = homogeneity.split(model, base, places, 10**6, 0, lambda *a: None, c, fit, left, fall)
         own = next(s for s in splits if s.by == "quadrant")
         uneven.append(own.chance < 0.01)
         naive.append(own.p < 0.01)
