@@ -32,6 +32,7 @@ MANY = 3  # effects of one explanation
 DIALS = "dials known"  # of an effect with a strength per frame
 RIVALS = "rivals calibrated"  # of pairs of effects of images, which are dear
 LAW = "no other law"  # of an effect that the model has already
+CLUTTER = "beyond clutter"  # of the strength, which parts of the data tell
 CURVE = "a curve explains it"  # name of the condition that a curve must meet for UNKNOWN
 
 
@@ -194,10 +195,11 @@ def _word_of_winner(f: Findings, failed: set[str]) -> str:
     """The word for the winner, given the names of its conditions that failed; '' where it decides nothing."""
     if not failed:
         return "CLAIM"
-    if failed & {"significant", "strength"} and not f.structured and not f.weighed:
-        # The refit did not bring the fall that the score promised, or the base's own calibration brought it.
+    if failed & {"significant", "strength", CLUTTER} and not f.structured and not f.weighed:
+        # The refit did not bring the fall that the score promised, or the base's own calibration brought it; or the
+        # strength scatters as much between parts of the data.
         return "NOTHING"
-    bars = {"share", "beyond clutter", "near"}  # what is no tie between causes
+    bars = {"share", CLUTTER, "near"}  # what is no tie between causes
     if not f.shared:  # where it is, noise is one of those that tie: that an effect gains little over it is no bar
         bars.add("significant")
     if f.curve_lead > TOLD:
@@ -344,7 +346,7 @@ def _of_the_strength(f: Findings) -> list[Condition]:
             + (f"; {IMPOSSIBLE:g} allowed" if f.at_end or (f.ran and not f.complete) else ""),
         ),
         Condition(
-            "beyond clutter",
+            CLUTTER,
             f.chance,
             LEVEL,
             not f.chance >= LEVEL,

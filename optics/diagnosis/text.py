@@ -170,8 +170,10 @@ def _nothing(f: Findings, tested: int) -> str:
         how = f"family-wise p {p_text(f.p_family)}"
     elif not f.p_winner < LEVEL:
         how = f"after refit, family-wise p {p_text(f.p_winner)}"
-    else:
+    elif not f.chance > LEVEL:
         how = f"after refit, the best, {f.winner}, has a strength of {f.clear:.2g} sd"
+    else:
+        how = f"the best, {f.winner}, scatters as much between parts of the data, p {p_text(f.chance)}"
     tail = (
         f"{wander_text(f)}, as of a lamp that wanders, explains the rest (structure beside it: p {p_text(f.wander_p)})"
         if is_structured(f.structure_p, f.excess_sd) or f.weighed

@@ -285,6 +285,7 @@ GOOD = Findings(
         ({"p_winner": 0.5}, "CANNOT_TELL"),
         ({"p_winner": 0.5, "structure_p": 0.5, "excess_sd": 1.0}, "NOTHING"),
         ({"clear": 0.3, "structure_p": 0.5, "excess_sd": 1.0}, "NOTHING"),
+        ({"chance": 0.3, "structure_p": 0.5, "excess_sd": 1.0}, "NOTHING"),
         ({"clear": 0.3}, "CANNOT_TELL"),
         ({"chance": 0.02}, "CANNOT_TELL"),
         ({"chance": 0.02, "common": False, "survivors": 2}, "CANNOT_TELL"),
