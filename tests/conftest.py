@@ -9,7 +9,6 @@ import gc
 import os
 import re
 import tempfile
-from functools import lru_cache
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -365,8 +364,20 @@ def load_bench(mitsuba, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def benches(load_bench):
-    """`load_bench`, each bench loaded once for a file of tests."""
-    return lru_cache(None)(load_bench)
+    """`load_bench`, which keeps the bench it loaded last: tests of one bench that follow each other share it.
+
+    One alone, since Dr.Jit records the code of every part that is alive for each call of a part: with thirteen benches
+    alive the contract tests took three times as long."""
+    kept = {}
+
+    def load(name, slot=None):
+        if (name, slot) not in kept:
+            kept.clear()
+            gc.collect()  # a scene and its parts hold each other
+            kept[name, slot] = load_bench(name, slot)
+        return kept[name, slot]
+
+    return load
 
 
 @pytest.fixture

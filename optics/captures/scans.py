@@ -25,7 +25,6 @@ from __future__ import annotations
 
 import math
 import re
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -69,6 +68,9 @@ THICKNESS = 4.0  # mm of the gel
 # Of a ball's radius, the pitch of the mesh and of the maps of its dent. Flanks of balls are off by .7 % of the light
 # (rms, against 32 and 60) with these, by 1.1 % with 12 and 20, by 3 % with 8 and 12.
 MESH, MAP = 16, 30
+# Of a ball's radius: circles drawn twice around one ball are no farther apart. Circles of measured plates miss a square
+# grid by .009 to .012 (rms), two of them differ by sqrt 2 times that: this is six times as much.
+SAME = 0.1
 ALIKE = 0.01  # relative: scales that differ by more are a contradiction
 POSE = ("gel.press_x", "gel.press_y", "gel.press_depth", "gel.press_rx", "gel.press_ry", "gel.press_rz")
 
@@ -86,6 +88,7 @@ class Scan:
     radius: float
     spacing: float
     mm_per_pixel: float
+    remarks: Sequence[str] = ()
 
 
 @dataclass(frozen=True)
@@ -150,12 +153,6 @@ def read_scan(folder: Path) -> Scan:
         for k, a in enumerate(marks)
         if _of(a, "type") == "GridCircle"
     ]
-    at = [(gx, gy) for *_, gx, gy in circles]
-    if len(set(at)) < len(at):
-        twice = next(place for place, count in Counter(at).items() if count > 1)
-        raise BadCapture(
-            f"{file}: annotations: two circles at gx, gy = {twice[0]:g}, {twice[1]:g}; allowed: one a ball"
-        )
     if not circles:
         return Scan(folder.name, labels, np.stack(images), np.zeros((0, 4)), 0.0, 0.0, 0.0)
     radius, spacing, scale = (
@@ -172,7 +169,8 @@ def read_scan(folder: Path) -> Scan:
             f"{file}: calibspacing = {spacing:g} mm between balls of calibradius = {radius:g} mm; allowed: more than "
             "their radius"
         )
-    return Scan(folder.name, labels, np.stack(images), np.array(circles, float), radius, spacing, scale)
+    one_a_ball, remarks = _merged(np.array(circles, float), radius / scale, f"{file}: annotations", folder.name)
+    return Scan(folder.name, labels, np.stack(images), one_a_ball, radius, spacing, scale, remarks)
 
 
 def _of(table: Any, key: str) -> Any:
@@ -183,6 +181,36 @@ def _circle(table: Any, where: str, size: tuple[int, int]) -> list[float]:
     """x, y in px, of which a ball at the edge may stand beyond the image; gx, gy."""
     place = [yaml_checks.number(table, key, where, -n, 2.0 * n) for key, n in zip("xy", size)]
     return [*place, *(yaml_checks.number(table, key, where, -1e4, 1e4) for key in ("gx", "gy"))]
+
+
+def _merged(circles: np.ndarray, radius: float, where: str, scan: str) -> tuple[np.ndarray, list[str]]:
+    """(one circle a ball: the mean of those that were drawn around it, remarks); circles (B, 4) and radius in px.
+
+    Raises BadCapture where circles of one place in the grid lie apart, or circles of two places on one ball."""
+    from scipy.spatial import cKDTree
+
+    apart = SAME * radius
+    places, ball = np.unique(circles[:, 2:], axis=0, return_inverse=True)
+    members = [circles[ball.ravel() == k, :2] for k in range(len(places))]
+    merged = np.column_stack([[m.mean(0) for m in members], places])
+    for drawn, (gx, gy) in zip(members, places):
+        widest = max(math.dist(a, b) for a in drawn for b in drawn)
+        if widest > apart:
+            raise BadCapture(
+                f"{where}: {len(drawn)} circles at gx, gy = {gx:g}, {gy:g} lie {widest:.3g} px apart; allowed: one a "
+                f"ball, or several within {apart:.3g} px ({SAME:g} of a ball's radius), which are averaged"
+            )
+    distance, other = cKDTree(merged[:, :2]).query(merged[:, :2], k=min(2, len(merged)))
+    if len(merged) > 1 and distance[:, 1].min() <= apart:
+        first = int(np.argmin(distance[:, 1]))
+        a, b = (f"{gx:g}, {gy:g}" for gx, gy in places[[first, other[first, 1]]])
+        raise BadCapture(
+            f"{where}: the circles at gx, gy = {a} and {b} lie {distance[first, 1]:.3g} px apart; allowed: one place "
+            "in the grid for each ball"
+        )
+    again = sum(len(m) > 1 for m in members)
+    balls = f"{again} ball{'s' if again > 1 else ''}"
+    return merged, [f"{scan}: {balls} annotated more than once: the mean of the circles is used"] * bool(again)
 
 
 def scans_in(source: Path) -> tuple[list[Scan], Scan, list[str]]:
@@ -359,7 +387,7 @@ def import_scans(
     plates, cut, settings, motions = [], [], [], {}
     for done, scan in enumerate(scans, 1):
         plate = plate_of(scan)
-        warnings += _contradictions(scan, plate, first)
+        warnings += [*scan.remarks, *_contradictions(scan, plate, first)]
         plates.append(plate)
         cut.append(np.stack([filled(i, bin, saturation, black)[..., 0] for i in scan.images]))
         pose = dict(zip(POSE, (plate.x, plate.y, 0.0, 0.0, 0.0, plate.turn)))

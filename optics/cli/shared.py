@@ -42,6 +42,14 @@ app = typer.Typer(
 EVERY = 10.0  # seconds between lines of progress where there is no terminal
 
 
+def say(text: str) -> None:
+    """A line on stderr. Where stderr takes none, as on a full disk, it and what follows are lost; the work goes on."""
+    try:
+        print(text, file=sys.stderr, flush=True)
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stderr.fileno())
+
+
 class Terminal:
     """The terminal of a command: `note` writes remarks to stderr, `progress` draws a bar there. Results are printed."""
 
@@ -51,7 +59,7 @@ class Terminal:
 
     def note(self, text: str) -> None:
         if not self.quiet:
-            print(text, file=sys.stderr)
+            say(text)
 
     @contextmanager
     def progress(self) -> Iterator[Callable[[str, int, int], None] | None]:
@@ -98,7 +106,7 @@ class Terminal:
                 nonlocal last
                 if time.monotonic() - last >= EVERY:
                     last = time.monotonic()
-                    print(", ".join(f"{title} {text}" for title, text in cells.items()), file=sys.stderr, flush=True)
+                    say(", ".join(f"{title} {text}" for title, text in cells.items()))
 
             yield line
             return
@@ -123,7 +131,7 @@ def _lines() -> Callable[[str, int, int], None]:
         nonlocal last
         if time.monotonic() - last >= EVERY:
             last = time.monotonic()
-            print(f"{what}: {done} of {total}", file=sys.stderr, flush=True)
+            say(f"{what}: {done} of {total}")
 
     return show
 
@@ -296,7 +304,7 @@ def _interrupted(*what: object) -> int:
     """Say once that the program was interrupted; returns its exit code."""
     if not terminal.interrupted:
         terminal.interrupted = True
-        print(": ".join(["interrupted", *map(str, what)]), file=sys.stderr)
+        say(": ".join(["interrupted", *map(str, what)]))
     return INTERRUPTED
 
 
@@ -328,12 +336,9 @@ def _report(error: Exception) -> int:
         error, "format_message"
     )
     if terminal.debug or not expected:
-        traceback.print_exception(error, file=sys.stderr)
+        say("".join(traceback.format_exception(type(error), error, error.__traceback__)).rstrip("\n"))
     text = _usage(error) if hasattr(error, "format_message") else _text(error)
-    print(
-        f"error: {one_line(text)}" + ("" if expected else " (a bug: please report it with the lines above)"),
-        file=sys.stderr,
-    )
+    say(f"error: {one_line(text)}" + ("" if expected else " (a bug: please report it with the lines above)"))
     return 2
 
 
@@ -493,7 +498,7 @@ def agree(files: Sequence[Path], where: str) -> bool:
     )
     if sys.stdin.readline().strip().lower() not in ("y", "yes"):
         return False
-    print(f"trusted from now on: {names} (remembered in {store()})", file=sys.stderr)
+    say(f"trusted from now on: {names} (remembered in {store()})")
     return True
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -335,44 +336,65 @@ SHIPPED = [n for n in shipped_scenes() if 'type="clear"' not in find(n).read_tex
 LAST = {"colour_bench": None, "particle_gel": "interface"}
 
 
+def kinds_for(thing, name=""):
+    """The kinds of parts with which a kind, or an effect, and its parameter `name` are seen; its own comes first."""
+    kinds = (thing.part, *thing.requires) if isinstance(thing, Effect) else (thing,)
+    part = REGISTRY.parts[kinds[0]]
+    for effect in REGISTRY.effects.values():  # what an effect brings to a part is seen where the effect is
+        brought = [p.name for p in (*effect.parameters, *effect.shape) if not isinstance(p, str)]
+        if effect.part == part.kind and name in brought:
+            kinds += effect.requires
+    if any(p.name == name and p.role == "light turn" for p in part.parameters):
+        kinds += ("board",)
+    return kinds
+
+
+@lru_cache(None)
+def scenes_for(kinds):
+    """(scene, own kinds of the first part there) for each shipped scene with parts of these kinds, the best first.
+
+    Those with the kinds themselves come before those where others play their roles."""
+    order = sorted(
+        shipped_scenes(),
+        key=lambda n: (
+            n != "gelsight",
+            n.startswith("polari") and n != "polarizer_bench",
+            LAST.get(n, "") in (None, kinds[0]),
+            n,
+        ),
+    )
+    texts = {name: find(name).read_text(encoding="utf-8") for name in order}
+    return [
+        (name, meant(kinds[0]))
+        for meant in (lambda kind: (kind,), REGISTRY.kinds)
+        for name, text in texts.items()
+        if 'type="clear"' not in text and all(any(f'type="{k}"' in text for k in meant(kind)) for kind in kinds)
+    ]
+
+
+TAKEN = {}  # (scene, kinds, name of a parameter) -> whether it does anything there; what is known needs no scene
+
+
 @pytest.fixture
 def bench_of(benches, mitsuba):
     """The bench on which a kind of part, or an effect, is seen; its parameters are put back afterwards."""
-    from optics.scene import loader as scene
-
     used = []
 
-    def find(thing, name=""):
-        kinds = (thing.part, *thing.requires) if isinstance(thing, Effect) else (thing,)
+    def takes(scene, own, name):
+        if (scene, own, name) not in TAKEN:
+            holders = [p for p in benches(scene).scene.parts.values() if p.kind in own]
+            for n in {name, *(p.name for kind in own for p in REGISTRY.parameters_of(kind))}:
+                TAKEN[scene, own, n] = any(p.takes(n) for p in holders)
+        return TAKEN[scene, own, name]
+
+    def seen_on(thing, name=""):
+        kinds = kinds_for(thing, name)
+        named = thing.parameter_names if isinstance(thing, Effect) else (name,) if name else ()
+        for scene, own in scenes_for(kinds):
+            if all(takes(scene, own, n) for n in named):
+                used.append(benches(scene))
+                return used[-1]
         part = REGISTRY.parts[kinds[0]]
-        for effect in REGISTRY.effects.values():  # what an effect brings to a part is seen where the effect is
-            brought = [p.name for p in (*effect.parameters, *effect.shape) if not isinstance(p, str)]
-            if effect.part == part.kind and name in brought:
-                kinds += effect.requires
-        if any(p.name == name and p.role == "light turn" for p in part.parameters):
-            kinds += ("board",)
-        order = sorted(
-            scene.shipped_scenes(),
-            key=lambda n: (
-                n != "gelsight",
-                n.startswith("polari") and n != "polarizer_bench",
-                LAST.get(n, "") in (None, kinds[0]),
-                n,
-            ),
-        )
-        # scenes with these kinds, then those where others play their roles
-        for meant in (lambda kind: (kind,), REGISTRY.kinds):
-            for shipped_scene in order:
-                text = scene.find(shipped_scene).read_text(encoding="utf-8")
-                present = [any(f'type="{k}"' in text for k in meant(kind)) for kind in kinds]
-                if 'type="clear"' in text or not all(present):
-                    continue
-                bench = benches(shipped_scene)
-                named = thing.parameter_names if isinstance(thing, Effect) else (name,) if name else ()
-                holders = [p for p in bench.scene.parts.values() if p.kind in meant(kinds[0])]
-                if all(any(p.takes(n) for p in holders) for n in named):
-                    used.append(bench)
-                    return bench
         if part.mueller is not None:
             used.append(benches("polarizer_bench", slot=part.kind))
             return used[-1]
@@ -380,9 +402,22 @@ def bench_of(benches, mitsuba):
             return Material(mitsuba, part.kind)
         pytest.fail(f"no shipped scene has parts of the kinds {', '.join(kinds)}; what they declare cannot be tested")
 
-    yield find
+    yield seen_on
     for bench in used:
         bench.scene.set(bench.values)
+
+
+def bench_asked(fixtures, values):
+    """By which `conftest.py` orders the tests, from a test's fixtures and parameters: (the scene that it loads, what it
+    tests there); the scene is "" for none, "~" (after all others) for one of its own."""
+    if not {"bench", "benches", "bench_of"} & set(fixtures):
+        return ("~" if "load_bench" in fixtures else "", "")
+    if "bench_of" not in fixtures:
+        return ("gelsight" if "bench" in fixtures else values.get("name", "polarizer_bench"), "")
+    kind, name = values.get("kind", "markers"), values.get("name", "")
+    thing = values.get("effect") or REGISTRY.effects.get(values.get("key")) or kind
+    found = scenes_for(kinds_for(thing, name))
+    return (found[0][0] if found else "polarizer_bench", getattr(thing, "key", f"{kind}.{name}"))
 
 
 def keys(bench, kind, name):

@@ -506,6 +506,12 @@ ENDS = {  # words of a shell -> (exit code, what stderr says)
     "{optics} scenes >&-": (0, ""),
     "{optics} scenes 2>&- >/dev/null": (0, ""),
     "{optics} scenes --json >/dev/full": (2, "error: standard output: No space left on device"),
+    # the image is written, whatever becomes of the remark how long it took
+    "{optics} render gelsight -D width=16 -D height=12 -o a.exr 2>/dev/full >/dev/null && test -s a.exr": (
+        0,
+        "",
+    ),
+    "{optics} render nothing 2>/dev/full": (2, ""),
     "mkdir gone && cd gone && rmdir ../gone && {optics} params gelsight": (
         2,
         "error: the current folder is gone; change",

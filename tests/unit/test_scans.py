@@ -47,13 +47,17 @@ def shaded(balls, azimuth, rng, spots=()):
     return np.clip(np.round(signal + np.sqrt(GAIN * signal) * rng.standard_normal(signal.shape)), 0, 255)
 
 
+def circle(x, y, gx, gy):
+    return {"type": "GridCircle", "gx": gx, "gy": gy, "x": x, "y": y}
+
+
 def write_scan(folder, balls, rng, annotated=True, spots=(), **changed):
     folder.mkdir(parents=True)
     for label, azimuth in AZIMUTHS.items():
         picture = shaded(list(balls.values()), azimuth, rng, spots)
         Image.fromarray(picture.astype(np.uint8)).save(folder / f"image{label}.png")
     at = {k: (float(a / SCALE + WIDTH / 2 - 0.5), float(b / SCALE + HEIGHT / 2 - 0.5)) for k, (a, b) in balls.items()}
-    circles = [{"type": "GridCircle", "gx": i, "gy": j, "x": x, "y": y} for (i, j), (x, y) in at.items()]
+    circles = [circle(x, y, i, j) for (i, j), (x, y) in at.items()]
     table = {
         "images": [f"image{label}.png" for label in AZIMUTHS],
         "calibradius": RADIUS if annotated else 0,
@@ -143,8 +147,12 @@ def test_the_scene_shows_the_balls_where_they_are(imported):
             "annotations[0]: x = 1e+300; allowed: a number from -512 to 1024",
         ),
         (
-            {"annotations": 2 * [{"type": "GridCircle", "x": 1, "y": 2, "gx": 0, "gy": 0}]},
-            "two circles at gx, gy = 0, 0; allowed: one a ball",
+            {"annotations": [circle(100, 200, 0, 0), circle(104, 200, 0, 0)]},
+            "2 circles at gx, gy = 0, 0 lie 4 px apart; allowed: one a ball, or several within 2.08 px",
+        ),
+        (
+            {"annotations": [circle(100, 200, 0, 0), circle(101, 200, 1, 0), circle(200, 200, 2, 0)]},
+            "the circles at gx, gy = 0, 0 and 1, 0 lie 1 px apart; allowed: one place in the grid for each ball",
         ),
     ],
 )
@@ -153,6 +161,24 @@ def test_a_bad_scan_is_refused(tmp_path, spoil, message):
     with pytest.raises(BadCapture) as error:
         scans.import_scans(tmp_path, tmp_path / "out")
     assert message in str(error.value) and "scan.yaml" in str(error.value)
+
+
+def test_circles_drawn_twice_are_averaged(tmp_path):
+    """A ball annotated three times within a tenth of its radius of 21 px counts once, at the mean."""
+    balls = middles(0, 0, 0)
+    write_scan(tmp_path / "one", balls, np.random.default_rng(1))
+    file = tmp_path / "one" / "scan.yaml"
+    table = yaml.safe_load(file.read_text())
+    (again,) = (a for a in table["annotations"] if (a.get("gx"), a.get("gy")) == (1, 0))
+    table["annotations"] += [circle(again["x"] + 1.5, again["y"], 1, 0), circle(again["x"], again["y"] - 1.2, 1, 0)]
+    file.write_text(yaml.safe_dump(table))
+    scan = scans.read_scan(tmp_path / "one")
+    assert len(scan.circles) == len(balls)
+    (found,) = scan.circles[(scan.circles[:, 2:] == (1, 0)).all(1)]
+    assert found[:2] == pytest.approx((again["x"] + 0.5, again["y"] - 0.4), abs=1e-9)
+    assert scan.remarks == ["one: 1 ball annotated more than once: the mean of the circles is used"]
+    with pytest.raises(BadCapture, match="no flat field"):  # what is missing, and not the circles
+        scans.import_scans(tmp_path, tmp_path / "out")
 
 
 BOMB = "a0: &a0 [x, x, x, x, x, x, x, x, x]\n" + "".join(
