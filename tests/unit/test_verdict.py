@@ -5,7 +5,7 @@ import io
 import math
 import re
 import sys
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
@@ -362,6 +362,12 @@ def test_what_survives_overturns_nothing():
     assert table.fragile("a") == ""
 
 
+@dataclass(frozen=True)
+class SimpleFit:
+    variables: list
+    covariance: np.ndarray
+
+
 class Slope(Exact):
     """An even image, and a slope of its brightness across it."""
 
@@ -414,6 +420,30 @@ def test_a_strength_is_held_against_what_neighbours_share():
     assert np.mean(naive) > 0.3
     assert abs(np.mean(np.array(ps) < 0.05) - 0.05) < 0.038 and np.mean(np.array(ps) < 0.01) < 0.028
     assert abs(np.mean(np.abs(pulls) < 2) - 0.92) < 0.047
+
+
+def test_errors_are_those_of_where_a_strength_was_found():
+    """Chord steps know the image of a leak at the base's lamp alone; where it was found, only the product with the
+    lamp's power shows, and its error is ten times as large. A smaller one changes nothing."""
+    parameter = next(iter(Slope.parameters.values()))
+    power, leak = (Variable(name, (name,), parameter) for name in ("power", "leak"))
+    found = SimpleFit(variables=[power, leak], covariance=np.diag([4.0, 0.01]))
+    assert homogeneity.with_errors(found, [leak], np.array([[1.0]])).covariance.tolist() == [[4.0, 0.0], [0.0, 1.0]]
+    assert homogeneity.with_errors(found, [leak], np.array([[0.001]])) is found
+
+
+@pytest.mark.parametrize("fall, lower", [(0.0, False), (500.0, True)])
+def test_a_fall_says_more_than_a_strength_whose_error_is_its_factors(fall, lower):
+    """A strength three errors from none by the images where it was found, with a fall of 500."""
+    rng = np.random.default_rng(4)
+    place = np.add.outer(4 * (np.arange(32) // 8), np.arange(32) // 8).astype(float).ravel()
+    variables = [Variable(key, (key,), p) for key, p in Slope.parameters.items()]
+    model = Slope(Slope.noise.expose(np.full((32, 32, 1), 464.0), rng))
+    fit = mock_fit(model, variables, Values(), [0])
+    own = measure(model, fit.values, variables, [], [0], 10**6, 0, lambda *a: None)
+    own.precision, own.pull = own.precision[:1], own.pull[:1]
+    p = homogeneity.scatter(own, [0], [1], np.array([3 * fit.sd[1]]), [{"place": place}], fall)[0]
+    assert (p < 1e-6) is lower and (lower or p > 1e-3)
 
 
 def test_a_lamp_that_wanders_does_not_pass_for_a_tone_of_the_session():
