@@ -9,6 +9,7 @@ import gc
 import os
 import re
 import tempfile
+import time
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -22,6 +23,7 @@ os.environ["XDG_CONFIG_HOME"] = tempfile.mkdtemp(prefix="optics-tests-config-")
 import numpy as np
 import pytest
 
+LONG = 0.3  # s of processor time, of a test that may leave scenes behind
 WIDTH, HEIGHT = 80, 60  # px: small enough to be quick, large enough for shadows and rims
 FULL_SCALE = 255.0  # DN
 
@@ -63,13 +65,16 @@ def pytest_collection_modifyitems(items):
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_teardown(item, nextitem):
-    """Let the scenes of a file of tests go with it; a scene and its parts hold each other, so that nothing else does.
+    """Let the scenes of a test go with it; a scene and its parts hold each other, so that nothing else does.
 
     Dr.Jit records the code of every part that is alive for each call of a part, whichever scene a kernel traces:
-    thirteen benches alive cost test_touch_hidden.py 52 s of processor time in place of 16."""
+    thirteen benches alive cost test_touch_hidden.py 52 s of processor time in place of 16. To look for them takes some
+    .02 s: after a test that took long, and after a file."""
     result = yield
-    if nextitem is None or nextitem.path != item.path:
+    spent = time.process_time() - getattr(item.session, "processor_time", 0.0)
+    if nextitem is None or nextitem.path != item.path or spent > LONG:
         gc.collect()
+    item.session.processor_time = time.process_time()
     return result
 
 

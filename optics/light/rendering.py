@@ -262,7 +262,7 @@ class RenderJob:
             vectors = [pick(mean, s) for s in range(4)]
             components = range(4) if self.stokes else range(1)
             channels = self._radiance_channels(np.stack([vectors[s] for s in components], -1), now)
-            if self.bands:
+            if self.bands and variance:  # of one pass none is known
                 scatter = exr.spectral_channels(self.bands, np.stack([pick(variance, s) for s in range(4)], -1))
                 variance = {n: image for n, image in scatter.items() if n in channels}
         else:
