@@ -490,8 +490,15 @@ def _whole(path: Path, defines: Mapping[str, str]):
 
     config = mi.parser.ParserConfig(mi.variant())
     config.parallel = config.merge_equivalent = config.merge_meshes = False
-    state = mi.parser.parse_file(config, str(path), **{k: str(v) for k, v in defines.items()})
-    if ROBUST not in state.root.props:
-        state.root.props[ROBUST] = True
-    mi.parser.transform_all(config, state)
-    return mi.parser.instantiate(config, state)
+    before = mi.file_resolver()
+    beside = mi.FileResolver(before)
+    beside.append(str(path.parent))  # files that a scene names are beside it
+    mi.set_file_resolver(beside)
+    try:
+        state = mi.parser.parse_file(config, str(path), **{k: str(v) for k, v in defines.items()})
+        if ROBUST not in state.root.props:
+            state.root.props[ROBUST] = True
+        mi.parser.transform_all(config, state)
+        return mi.parser.instantiate(config, state)
+    finally:
+        mi.set_file_resolver(before)

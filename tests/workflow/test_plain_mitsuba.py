@@ -32,8 +32,9 @@ DRAWN = ("grid_bench", "magictac")
 SEEDS = 8
 # Mitsuba sums a smooth mesh's vertex normals in parallel, in an order that changes from load to load: a normal, and
 # with
-# it an image, is known to some roundings of a float32 (6e-8 each; up to 5e-9 of the largest value was seen).
-ROUNDING = 1e-6
+# it an image, is known to some roundings of a float32 (6e-8 each; up to 5e-9 of the largest value was seen). Our loader
+# asks for intersections that no ray slips through, which round otherwise: 5e-6 was seen at the rims of beads.
+ROUNDING = 1e-5
 
 
 @pytest.fixture(scope="module")
