@@ -36,6 +36,7 @@ from optics.fit import calibrate, descent
 from optics.fit.compare import led_label
 from optics.fit.model import value_of
 from optics.pages.drawing import DIVERGING, MASKED, SIGMA_RANGE, colour_bar, ramp
+from optics.pages.mosaics import filled
 from optics.scene.parameter import Values, Variable
 from optics.scene.trust import Named
 from optics.study import loop
@@ -264,8 +265,11 @@ class View:
         return (index, *((n, v) for n, v in changes.items() if self.sliders[n].variable.holds_in(index)))
 
     def capture(self, index: int) -> tuple[np.ndarray, np.ndarray]:
-        """(H, W, C) DN measured, and what is usable of it."""
-        return self.kept.get(("capture", index)) or self._do(lambda: self._capture(index))
+        """(H, W, C) DN measured, and what is usable of it; pixels behind a filter of one colour have the others of
+        their cell, for the eye alone."""
+        image, use = self.kept.get(("capture", index)) or self._do(lambda: self._capture(index))
+        pattern = self.model.captures.cfa
+        return (image if pattern is None else filled(image, pattern)), use
 
     def _capture(self, index: int) -> tuple:
         return self.kept.get(("capture", index)) or self.kept.put(

@@ -6,7 +6,7 @@ import pytest
 from optics.captures.capture_set import cfa_channel
 from optics.fit.compare import Comparison
 from optics.pages import scoreboard
-from optics.pages.mosaics import Eye, unwoven
+from optics.pages.mosaics import Eye, filled, unwoven
 from optics.study.board import Images
 from optics.study.shown import Fingerprint, Shown
 
@@ -90,3 +90,17 @@ def test_the_scoreboard_says_how_it_shows_a_frame(mosaic, said):
     found = scoreboard.images(board)
     assert said in found["note"] and bool(found["note"]) == bool(mosaic)
     assert found["size"] == ((30, 23) if "cfa" in mosaic else (60, 46) if mosaic else (W, H))
+
+
+def test_the_live_page_shows_a_mosaic_in_colour():
+    """An even light of (3, 5, 7), and one red pixel brighter: each pixel has what its cell measured, odd rows stay."""
+    channel = cfa_channel((5, 4), "RGGB")
+    image = np.where(channel[..., None] == np.arange(3), np.array([3.0, 5.0, 7.0]), 0.0)
+    image[2, 2, 0] = 9.0
+    found = filled(image, "RGGB")
+    expected = np.broadcast_to([3.0, 5.0, 7.0], (5, 4, 3)).copy()
+    expected[2:4, 2:4, 0] = 9.0
+    expected[4] = image[4]
+    assert np.array_equal(found, expected)
+    measured = channel[..., None] == np.arange(3)
+    assert np.array_equal(found[measured], image[measured])
