@@ -17,7 +17,7 @@ from optics.diagnosis.refit import Cooled
 from optics.diagnosis.thresholds import CLEAR, MISSTATED
 from optics.files.output import write_text
 from optics.fit import calibrate
-from optics.fit.descent import prior_terms, with_priors
+from optics.fit.descent import normal_equations, prior_terms, with_priors
 from optics.fit.result import Fit
 from optics.fit.scene_model import SceneModel
 from optics.fit.tempering import tempered
@@ -179,9 +179,10 @@ class Refits:
         less than where it stands)."""
         once = tempered(found.variables, 1.0)
         here = found.chi2 + prior_terms(self.model, once, found.values)[2]
-        if found.normal is None:
-            return here, 0.0
-        normal = with_priors(found.normal, self.model, found.values, found.variables, once)
+        if found.normal is None:  # kept by a diagnosis that was stopped
+            normal = normal_equations(self.model, once, found.values, found.frames)
+        else:
+            normal = with_priors(found.normal, self.model, found.values, found.variables, once)
         step = np.linalg.lstsq(normal.a, normal.b, rcond=None)[0]  # gauges have no curvature
         return here - float(normal.b @ step), float(normal.b @ step)
 
