@@ -73,8 +73,8 @@ def diagnose(
     held_out      frames that were not fitted; only what each frame has for itself is fitted there
     refit         `optics.fit.calibrate.fit` unless given; called as refit(model, variables, start, frames=[...])
     foresee       called before the refits, with the variables of each effect that is refitted
-    cooler        called with the refits, the best first; what to begin again from, where priors of the base counted
-                  more than that one asks, and it matters
+    cooler        called with the refits, the best first. Where that one asks that priors count less than they did in the
+                  base, and that may change the verdict, it returns what the diagnosis begins again from; else None
     rows_max      values (pixel x channel) that curves, splits and alternative weights may use
     seed          of the simulations and of derivative images; the same seed gives the same table
     top           how many of the best effects are refitted, besides those that cannot be told from the best
@@ -264,7 +264,8 @@ def _split(case: Case, outcome: Outcome, subject: Candidate | None, basis: Basis
             explanations.noise_of(case, outcome, trial) if case.evidence.is_table else None,
         )
         splits += own
-        trial.fit = homogeneity.with_errors(trial.fit, main.variables, noise)
+        if not case.evidence.is_table:  # refits of readings are linearised where they end
+            trial.fit = homogeneity.with_errors(trial.fit, main.variables, noise)
         # of readings, noise that neighbours share and errors of dials have been rivals, by their likelihood
         p = math.nan if case.evidence.is_table else case.table.family.p(p)
         chance = p if main is subject else chance

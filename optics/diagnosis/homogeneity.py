@@ -263,8 +263,8 @@ def with_errors(found: Fit, variables: Sequence[Variable], noise: np.ndarray) ->
     that only shows through it."""
     names = [v.name for v in found.variables]
     own = [names.index(v.name) for v in variables]
-    covariance = np.array(found.covariance, float)
-    if np.trace(noise) <= np.trace(covariance[np.ix_(own, own)]) or not np.isfinite(noise).all():
+    covariance, larger = np.array(found.covariance, float), np.diag(noise)
+    if not (np.isfinite(noise).all() and (larger > 0).all() and (larger > np.diag(covariance)[own]).any()):
         return found
     covariance[np.ix_(own, own)] = noise
     return replace(found, covariance=covariance)
@@ -281,8 +281,8 @@ def scatter(
     """(p, covariance that clutter adds, covariance of noise) of a strength by its scatter between parts of the sensor
     or session.
 
-    fall       of chi2 with it: what says more than its distance from none over its error where that error belongs to
-               what it multiplies, such as the power of a lamp that only shows through a leak
+    fall       of chi2 with it. It counts where it is more than the square of the strength over its error: that error
+               may be one of what it multiplies, such as the power of a lamp that only shows through a leak
 
     p          does not assume independent noise, as neighbours share clutter (`by_clutter`); NaN for too few parts
     clutter    (k, k) V^-1 (B - V) V^-1, with B of `variances`, of the map in which it is larger; zero for too few parts

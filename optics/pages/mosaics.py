@@ -25,19 +25,6 @@ def unwoven(image: np.ndarray, cell: tuple[int, int]) -> np.ndarray:
     return cut.swapaxes(0, 1).swapaxes(2, 3).reshape(height * rows, width * columns, *image.shape[2:])
 
 
-def filled(image: np.ndarray, pattern: str) -> np.ndarray:
-    """(H, W, 3) of a raw mosaic -> the same, with the colours that a pixel has no filter for: the mean of those in its
-    cell of 2 x 2 px. What was measured stays; a row or column that fills no cell stays as well."""
-    found = np.array(image)
-    height, width = (n // 2 * 2 for n in image.shape[:2])
-    channel = cfa_channel((2, 2), pattern)
-    for k in range(3):
-        own = [image[i:height:2, j:width:2, k] for i, j in np.argwhere(channel == k)]
-        for i, j in np.argwhere(channel != k):
-            found[i:height:2, j:width:2, k] = np.mean(own, axis=0)
-    return found
-
-
 class Eye:
     """How the frames of a study are shown.
 
@@ -101,3 +88,14 @@ class Eye:
             places = np.argwhere(channel == k)
             found.append(of(np.stack([image[i:height:2, j:width:2, k] for i, j in places], -1), axis=-1))
         return np.stack(found, -1)
+
+
+def filled(image: np.ndarray, pattern: str) -> np.ndarray:
+    """(H, W, 3) of a raw mosaic -> the same, with the colours that a pixel has no filter for: the mean of those in its
+    cell of 2 x 2 px. What was measured stays; a row or column that fills no cell stays as well."""
+    found = np.array(image)
+    cells = Eye({"cfa": pattern}).whole(image).repeat(2, axis=0).repeat(2, axis=1)
+    inside = found[: cells.shape[0], : cells.shape[1]]
+    measured = cfa_channel(cells.shape, pattern)[..., None] == np.arange(3)
+    np.copyto(inside, cells, where=~measured, casting="same_kind")
+    return found

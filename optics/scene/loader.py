@@ -33,6 +33,7 @@ from optics.spectra.curve import Curve
 
 NAME = r"[^/\\\x00-\x1f\x7f]{1,100}"  # of a part
 PIXELS_MOST = 50_000_000  # of a camera: a render keeps some hundred bytes for each
+ROBUST = "embree_use_robust_intersections"  # of a Mitsuba scene: no ray slips between two triangles
 KEEPS = "use 'interface', 'rough_interface' or 'sheet', which keep it"
 DEPOLARIZERS = {  # stock materials without a Mueller matrix, by the name that Mitsuba prints
     "ThinDielectric": KEEPS,
@@ -92,9 +93,6 @@ def load(
         code = [file for file in code if not any(file.resolve().is_relative_to(p.resolve()) for p in given)]
     trust.admit_files(code, "that Mitsuba would load")
     return Scene(path, dict(defines or {}), variant, known(*trust.once(more, found)))
-
-
-ROBUST = "embree_use_robust_intersections"
 
 
 class Scene:

@@ -150,9 +150,9 @@ class Refits:
         now = self.base.tempering
         if not self.by_chords() or now == 1.0 or not refits:
             return None
-        best, *others = [(self._least(fit), fit) for fit in refits]
-        (least, gain), leader = best
-        if least > MISSTATED * leader.dof or (gain < CLEAR and all(o > least + REACH for (o, _), _ in others)):
+        leader = refits[0]
+        (least, gain), *others = map(self._least, refits)
+        if least > MISSTATED * leader.dof or (gain < CLEAR and all(other > least + REACH for other, _ in others)):
             return None
         found = cooled(self.model, leader)
         if found.tempering > now / COOLER or found.chi2 > MISSTATED * found.dof:
@@ -163,10 +163,11 @@ class Refits:
         again.results[self._extra(leader)] = found
         near = PROMISING * self.fall(leader)
         again.starts = {self._extra(fit): fit for fit in refits[1:] if self.fall(fit) > near}
+        often = "once" if found.tempering == 1.0 else f"{found.tempering:.3g} times"
         remark = (
             f"what is known counted {now:.3g} times in the base, which misses the images by much; the best explanation "
-            f"misses them by so little that it counts {found.tempering:.3g} times. The base was calibrated again with "
-            "that weight, and the figures of this diagnosis are those of that calibration"
+            f"misses them by so little that it counts {often}. The base was calibrated again with that weight, and the "
+            "figures of this diagnosis are those of that calibration"
         )
         return Cooled(base, again.of, again.foresee, remark)
 
@@ -175,8 +176,8 @@ class Refits:
         return tuple(v.name for v in found.variables if v.name not in self.known)
 
     def _least(self, found: Fit) -> tuple[float, float]:
-        """(what a fit expects to minimise to where priors count once, by its last linearisation; by how much that is
-        less than where it stands)."""
+        """(chi2 and priors, each counted once, at the minimum that a fit's last linearisation expects; by how much that
+        is below where the fit stands)."""
         once = tempered(found.variables, 1.0)
         here = found.chi2 + prior_terms(self.model, once, found.values)[2]
         if found.normal is None:  # kept by a diagnosis that was stopped
@@ -210,8 +211,8 @@ class Refits:
         the user's own plugins and to the program's version."""
         assert self.folder is not None
         own = own_plugins(self.model.scene.registry)
-        at = [float(e) for e in self.base.estimate], self.base.tempering
-        whole = json.dumps([names, *at, self.base.frames, own, __version__])
+        estimate, tempering = [float(e) for e in self.base.estimate], self.base.tempering
+        whole = json.dumps([names, estimate, tempering, self.base.frames, own, __version__])
         return self.folder / f"{hashlib.sha256(whole.encode()).hexdigest()[:16]}.json"
 
     def keep(self, found: Fit, extra: Sequence[Variable]) -> None:

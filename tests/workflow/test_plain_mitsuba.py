@@ -31,10 +31,10 @@ CASES = {  # every shipped scene: what replaces its <default>s, at rest and pres
 DRAWN = ("grid_bench", "magictac")
 SEEDS = 8
 # Mitsuba sums a smooth mesh's vertex normals in parallel, in an order that changes from load to load: a normal, and
-# with
-# it an image, is known to some roundings of a float32 (6e-8 each; up to 5e-9 of the largest value was seen). Our loader
-# asks for intersections that no ray slips through, which round otherwise: 5e-6 was seen at the rims of beads.
-ROUNDING = 1e-5
+# with it an image, is known to some roundings of a float32 (6e-8 each; up to 5e-9 of the largest value was seen).
+ROUNDING = 1e-6
+# Our loader asks for intersections that no ray slips through, which round otherwise: 5e-6 at the rims of beads.
+RIMS = {"particle_gel": 1e-5}
 
 
 @pytest.fixture(scope="module")
@@ -95,7 +95,7 @@ def test_load_file_gives_what_our_loader_gives(name, pressed, mi):
         found, expected = image(mi, plain), image(mi, ours.mitsuba)
         assert expected.max() > 0
         # Mitsuba also joins rectangles of one material to one mesh: their places differ in the last bit of a float32
-        assert np.abs(found - expected).max() <= ROUNDING * expected.max()
+        assert np.abs(found - expected).max() <= RIMS.get(name, ROUNDING) * expected.max()
         return
     exact, _ = both(mi, name, CASES[name][pressed], optimize=False)
     expected = image(mi, ours.mitsuba)
