@@ -73,7 +73,7 @@ def diagnose(
     held_out      frames that were not fitted; only what each frame has for itself is fitted there
     refit         `optics.fit.calibrate.fit` unless given; called as refit(model, variables, start, frames=[...])
     foresee       called before the refits, with the variables of each effect that is refitted
-    cooler        called with the refits, the best first. Where that one asks that priors count less than they did in the
+    cooler        called with the refits, the best first. Where that one asks that priors count less than in the
                   base, and that may change the verdict, it returns what the diagnosis begins again from; else None
     rows_max      values (pixel x channel) that curves, splits and alternative weights may use
     seed          of the simulations and of derivative images; the same seed gives the same table
