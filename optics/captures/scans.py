@@ -55,6 +55,7 @@ FILE = "scan.yaml"
 LEDS = 64  # images of one scan
 SMALLEST, ACROSS = 5.0, 200  # px of a ball's radius at least, and how many of them are across an image at most
 DISTANCE = 30.0  # mm from the middle of the face to a light, where no better is known
+CENTRED = 3.0  # mm: a holder puts the lights around the camera's axis, closer than a third of the pictured face
 CAMERA = 200.0  # mm: nearly telecentric, as lenses for inspection are
 CONTACT = 0.85  # of the ball's radius: touched, where nothing tells
 BALL, NEAR = 0.7, 1.8  # of the ball's radius: of it within, of the level face beyond
@@ -554,7 +555,7 @@ def _facts(
             "per_group": ["gel.press_[xy]"],
             "flat_field": "multiplicative",
             "priors": {
-                "board.[xy]": [None, 0.7 * DISTANCE],
+                "board.[xy]": [None, CENTRED],
                 "board.z": [None, 0.7 * DISTANCE],
                 "board.scale": [None, 0.7],
                 "led_*.turn": [None, 30.0],

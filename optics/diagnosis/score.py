@@ -17,6 +17,7 @@ from optics.diagnosis.result import Row
 from optics.diagnosis.thresholds import CLEAR, EXCESS, JUDGED, LEVEL
 from optics.errors import Underdetermined
 from optics.fit import gauges
+from optics.fit.curvature import own_curvature
 from optics.fit.model import Model, value_of
 from optics.fit.result import Fit
 from optics.scene.declare import Effect
@@ -68,7 +69,7 @@ def score(
     base, dropped = base_variables(model, fit, fitted)
     candidates, not_tested = candidates_of(model, fit, effects, variables_of, fitted)
     evidence = measure(model, fit.values, base, candidates, fitted, rows_max, seed, progress or silent)
-    unsettled = _require_convergence(evidence, fit)
+    unsettled = _require_convergence(model, evidence, fit)
     return Scored(evidence, _rank(evidence, candidates, seed), dropped, not_tested, unsettled)
 
 
@@ -136,7 +137,7 @@ def _fewest(model: Model, variables: Sequence[Variable]) -> float:
     return min(sum(int(model.usable(f).sum()) for f in v.frames or ()) for v in variables)
 
 
-def _require_convergence(evidence: Evidence, fit: Fit) -> str:
+def _require_convergence(model: Model, evidence: Evidence, fit: Fit) -> str:
     """Refuse a base that is not calibrated: |Q'r|^2 would be chi2 of a parameter, not of a missing effect.
 
     Allowed is 1 per parameter or, where the misfit exceeds noise, SETTLED of that excess. Of a tempered fit of images,
@@ -145,22 +146,36 @@ def _require_convergence(evidence: Evidence, fit: Fit) -> str:
     rank = max(evidence.projected.rank, 1)
     excess = max(evidence.projected.chi2 - (evidence.normal.count - rank), 0.0)
     allowed = max(1.0, SETTLED * excess / rank)
-    if allowed <= evidence.gradient < MOVING * excess / rank and fit.tempering > 1:
+    promised = evidence.projected.absorbed
+    if promised >= allowed * rank:  # at a turning point of an angle the linearisation promises what no step brings
+        promised = min(promised, _promised(model, evidence))
+    gradient = promised / rank
+    if allowed <= gradient < MOVING * excess / rank and fit.tempering > 1:
         return (
-            f"the base may still absorb {evidence.projected.absorbed / excess:.1%} of its misfit (chi2 by "
-            f"{evidence.projected.absorbed:.3g}, most of all {some(_off(evidence))}): what explains less than that may "
+            f"the base may still absorb {promised / excess:.1%} of its misfit (chi2 by "
+            f"{promised:.3g}, most of all {some(_off(evidence))}): what explains less than that may "
             "be the base's own"
         )
-    if evidence.gradient >= allowed:
+    if gradient >= allowed:
         how = "" if fit.converged else f" (it stopped: {fit.reason})"
         raise Underdetermined(
             f"diagnose: the base model is not calibrated to convergence{how}: moving its {rank} "
-            f"parameters would lower chi2 by {evidence.projected.absorbed:.3g}, {evidence.gradient:.3g} per parameter "
+            f"parameters would lower chi2 by {promised:.3g}, {gradient:.3g} per parameter "
             f"(most of all {some(_off(evidence))}); allowed: below {allowed:.3g}; calibrate again from there, without "
             "robust weights, or hold parameters that the captures hardly tell apart: leave them out of --free, or "
             "give them a --prior"
         )
     return ""
+
+
+def _promised(model: Model, evidence: Evidence) -> float:
+    """The fall of chi2 that a step of the base's parameters would bring, with what the residual adds to its
+    curvature."""
+    base = evidence.base
+    bend = own_curvature(model, [evidence.columns[c] for c in base], evidence.values, evidence.frames)
+    u = evidence.normal.score[base] + evidence.pull
+    gram = evidence.normal.gram[np.ix_(base, base)] + np.diag(evidence.precision + bend)
+    return float(u @ st.inverse(gram, evidence.normal.truncation(base))[0] @ u)
 
 
 def _off(evidence: Evidence) -> list[str]:

@@ -302,7 +302,8 @@ def _descend(
             normal = descent.linearise(tick)
         history.append(normal.total)
         promise, excess = descent.promised, max(normal.chi2 - sum(normal.frame_n) + count, 0.0)
-        if promise < max(accuracy, negligible * excess):
+        enough = max(accuracy, negligible * excess)
+        if promise < enough:
             return history, _converged(len(history))
         if normal.total - promise > asked:
             return history, f"not followed: the linear model promised a fall of {promise:.3g}, and more was asked for"
@@ -316,10 +317,10 @@ def _descend(
             stuck = len(history) > 1 and history[-2] - promise / 4 < history[-1]
             if (tries > TRIES and stuck) or (tries > 1 and best[0] < count / 2):
                 break
-        gained = descent.chord(STEPS_NEAR if near else STEPS, WORTH * accuracy, NEAR * count if near else 0.0, PART)
+        gained = descent.chord(STEPS_NEAR if near else STEPS, WORTH * enough, NEAR * count if near else 0.0, PART)
         if negligible > NEGLIGIBLE and gained < negligible * excess:
             return history, f"converged to {negligible:.2g} of the misfit after {iteration + 1} linearisations"
-        if gained < accuracy and not near:
+        if gained < enough and not near:
             return history, f"no lower misfit within reach; the linear model still promised {promise:.3g}"
     else:
         return history, f"stopped after {max_iterations} linearisations without converging; allow more or start nearer"

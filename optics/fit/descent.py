@@ -15,17 +15,21 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import lsq_linear
 
+from optics.fit.curvature import own_curvature
 from optics.fit.model import Model, value_of
 from optics.scene.parameter import Values, Variable
 
 REACH = 4.0  # plausible sizes that one step may change a nonlinear parameter: beyond, a light may pass the sensor's rim
-# Times REACH, where no damping brings a gain: what the residual's own curvature holds back, as an angle at which its
-# image stands still, is not damped by what its image is worth.
+# Times REACH, where no damping brings a gain: what the residual's own curvature holds back, as the zero of a dial at which
+# images stand still, is not damped by what its image is worth.
 SHORT_OF = (0.1, 0.01)
 LITTLE = 0.01  # of what is promised: a gain that is as good as none
 MOST_TRUST = 1e3  # times REACH: where steps keep bringing what they promise, the reach no longer matters
 POOR = 0.25  # of the promised gain: a step that brings less has followed the linearisation too far
 GOOD = 0.5  # of the promised gain: a step that brings more may be followed by one twice as long
+# Of the promised gain, which is half of the slope times the step: a step that brings more shows that chi2 bends less
+# than the images say, as along the valleys of a wrong model, and is made longer at once.
+BETTER = 1.5
 # eigenvalues of the scaled normal matrix below this share of the largest are rounding of double precision: undetermined
 TRUNCATION = 1e-12
 ONSET = 1e-3  # plausible sizes: a squared parameter starts no lower, as its derivative is 0 at 0
@@ -204,6 +208,7 @@ class Descent:
     theta, values   where it stands: (p,) numbers, and the same put into the values of the model
     here            normal equations at theta, on the derivative images of the last `linearise`
     at              theta at which those images were made
+    curved          what the residual adds there to the diagonal of A (optics.fit.curvature)
     damping         of the next step; trust: its reach, in units of REACH
     """
 
@@ -227,6 +232,7 @@ class Descent:
         self.values, self.damping = self.moved(values, self.theta), damping
         self.here: Normal
         self.at: np.ndarray
+        self.curved: np.ndarray
         self.slope: np.ndarray  # d theta / d coordinate at `at`
         self.trust, self.bent = 1.0, False
         self.powers = [i for i, v in enumerate(self.variables) if model.linear_in(v)]
@@ -246,6 +252,7 @@ class Descent:
     def take(self, normal: Normal) -> None:
         """Go on from normal equations at theta."""
         self.here, self.at = normal, self.theta
+        self.curved = own_curvature(self.model, self.variables, self.values, self.frames)
         self.slope = np.array([v.parameter.per_coordinate(t) for v, t in zip(self.variables, self.theta)])
 
     def step(self, damping: float) -> tuple[np.ndarray, float]:
@@ -257,7 +264,8 @@ class Descent:
         reach = self.trust * self.reach if damping else np.inf
         box = (self.theta, np.maximum(self.lowest, self.theta - reach), np.minimum(self.high, self.theta + reach))
         u, low, high = (np.array([v.parameter.coordinate(t) for v, t in zip(self.variables, values)]) for values in box)
-        a, b = self.here.a * np.outer(self.slope, self.slope), self.here.b * self.slope
+        a = (self.here.a + np.diag(self.curved)) * np.outer(self.slope, self.slope)
+        b = self.here.b * self.slope
         step = solve(a, b, low - u, high - u, damping)
         fall = float(2 * b @ step - step @ a @ step)
         moved = np.array([v.parameter.stepped(t, d, self.bent) for v, t, d in zip(self.variables, self.theta, step)])
@@ -356,7 +364,8 @@ class Descent:
         expected, under increasing damping, or of the best of `most`.
 
         A gain that is a poor part of the promise is beaten by a shorter step on the same images, for one prediction
-        more; accepting it would spend a linearisation on a hundredth of the promise.
+        more; accepting it would spend a linearisation on a hundredth of the promise. A gain that is more than was promised
+        is followed by steps twice as long, while these bring half as much again.
 
         worst   a step must gain more than this; negative where chi2 is rough, where any such step is accepted
         """
@@ -378,12 +387,22 @@ class Descent:
                 break
             self.damping, self.trust = max(self.damping * EASING, FIRST_DAMPING), max(self.trust / 2, 1.0)
         assert best is not None  # `most` is 1 or more
-        for trust in SHORT_OF if not best[1] > max(worst, LITTLE * self.promised) else ():
+        ahead = best[2]
+        while tried < most and best[1] > BETTER * ahead > 0:
+            target = np.clip(2 * best[0][0] - self.theta, self.lowest, self.high)
+            tried, found = tried + 1, self._at(target)
+            gain, ahead = self.here.total - found[2].total, best[1]
+            if gain > best[1]:
+                best = found, gain, best[2]
+        if best[1] > max(worst, LITTLE * self.promised):
+            return *best, tried
+        before = self.trust, self.damping
+        for trust in SHORT_OF:
             tried, self.trust, self.damping = tried + 1, trust, FIRST_DAMPING
             target, expected = self.step(self.damping)
             found = self._at(target)
             gain = self.here.total - found[2].total
             if gain > max(best[1], 0.0):
-                best = found, gain, expected
-                break
+                return found, gain, expected, tried
+        self.trust, self.damping = before
         return *best, tried

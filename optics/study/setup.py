@@ -75,7 +75,8 @@ class Setup:
 def setup_for(captures: str | Path, **given: object) -> Setup:
     """The setup of the given fields; what an imported set advises stands for None and empty.
 
-    An importer writes its advice to import.json. Where `free` or `per_group` is given, the advised priors belong to
+    An importer writes its advice to import.json. A prior or value that is given of one parameter leaves those of others as
+    advised. Where `free` or `per_group` is given, the advised priors belong to
     other parameters and are left out. Raises BadCapture for advice that is none: a file of data names no code.
     """
     advised = _advised(Path(captures) / "import.json")
@@ -85,6 +86,9 @@ def setup_for(captures: str | Path, **given: object) -> Setup:
         advised = {name: value for name, value in advised.items() if name in ("flat_field", "region")}
     if own.get("region", ALL) not in REGIONS:
         raise UnknownKey(str(own["region"]), REGIONS, "region", "--region")
+    for name in ("priors", "values"):  # what is given of one parameter leaves the others as advised
+        if name in advised and name in own:
+            own[name] = {**advised[name], **own[name]}
     return recorded({**advised, **own, "captures": str(captures)})
 
 

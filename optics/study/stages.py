@@ -24,6 +24,7 @@ TOGETHER = 0.05  # chi2 per variable: a twentieth of what noise alone makes of e
 SETTLING = 2  # fits after which weights that follow the slopes of readings change little
 UNSETTLED, STILL = 12, 0.3  # such fits at most; standard deviations by which the last one may move off its weights
 COOLINGS, COOLER = 4, 1.5  # fits at most, each with priors that count less than a part of those before
+SAME = 2e-4  # of the excess of chi2 of images: fits from different starts end within a thousandth of each other
 OFF = 0.1  # plausible sizes off neutral from which an effect is followed
 
 
@@ -82,8 +83,8 @@ def fit_base(
         variables,
         start,
         fitted,
-        tolerance=enough(tolerance),
-        negligible=negligible,
+        tolerance=tolerance,
+        negligible=SAME if tempering and negligible is None else negligible,
         robust=robust,
         progress=progress,
     )
@@ -129,7 +130,8 @@ def cooled(model: SceneModel, found: Fit, robust: bool = False, progress: Progre
             tempered(found.variables, weight),
             found.values,
             found.frames,
-            tolerance=TOGETHER * weight,
+            tolerance=TOGETHER,
+            negligible=SAME,
             robust=robust,
             progress=progress,
         )

@@ -13,6 +13,7 @@ from optics.captures import capture_set, scans
 from optics.errors import BadCapture
 from optics.light.rendering import RenderJob
 from optics.scene import loader
+from optics.study.setup import setup_for
 
 HEIGHT, WIDTH, SCALE = 384, 512, 0.012  # px, px, mm/px
 RADIUS, SPACING = 0.25, 1.0
@@ -239,3 +240,18 @@ def test_measured_scans_are_read(tmp_path):
     for plate in found.facts["scans"].values():
         assert plate["spacing_mm"] == pytest.approx(1, abs=2e-3) and plate["circles_off_rms_mm"] < 5e-3
     assert any("not used: groove" in w for w in found.warnings)
+
+
+def test_a_prior_of_the_user_leaves_the_other_advised_ones(tmp_path):
+    advised = {"board.[xy]": [None, 3.0], "board.scale": [None, 0.7]}
+    (tmp_path / "import.json").write_text(
+        json.dumps({"setup": {"free": ["board.[xy]", "board.scale"], "priors": advised, "values": {"gel.n": 1.4}}})
+    )
+    setup = setup_for(tmp_path, priors={"board.x": [None, 1.0]}, values={"gel.press_depth": 0.1})
+    assert list(setup.priors.items()) == [
+        ("board.[xy]", (None, 3.0)),
+        ("board.scale", (None, 0.7)),
+        ("board.x", (None, 1.0)),
+    ]
+    assert setup.values == {"gel.n": 1.4, "gel.press_depth": 0.1}
+    assert setup_for(tmp_path, free=["board.x"]).priors == {}
