@@ -55,6 +55,7 @@ FILE = "scan.yaml"
 LEDS = 64  # images of one scan
 SMALLEST, ACROSS = 5.0, 200  # px of a ball's radius at least, and how many of them are across an image at most
 DISTANCE = 30.0  # mm from the middle of the face to a light, where no better is known
+ANNOTATED = 1.5  # px of the whole picture: how well the circles say together where a plate stands
 CENTRED = 3.0  # mm: a holder puts the lights around the camera's axis, closer than a third of the pictured face
 CAMERA = 200.0  # mm: nearly telecentric, as lenses for inspection are
 CONTACT = 0.85  # of the ball's radius: touched, where nothing tells
@@ -559,7 +560,7 @@ def _facts(
                 "board.z": [None, 0.7 * DISTANCE],
                 "board.scale": [None, 0.7],
                 "led_*.turn": [None, 30.0],
-                "gel.press_[xy]": [None, 0.01],  # circles and shading agree to 0.003 mm; a lens or camera may shift one
+                "gel.press_[xy]": [None, ANNOTATED * scans[0].mm_per_pixel],
             },
         },
         "warnings": warnings,

@@ -2,10 +2,10 @@
 
     d2 chi2 / d angle2  =  2 ( J'WJ - sum of W r d2f/d angle2 )
 
-Gauss-Newton keeps the first term. At an extinction or a turning point the image f of a film stands still as the film
-turns: the first term vanishes there, and a step by it alone is tens of degrees too long and promises a fall that no step
-brings. The second term is found from predictions at both sides of the angle. An angle that is known with an error of its
-own in every frame acts in that frame alone, so that all frames are moved at once."""
+Gauss-Newton keeps the first term. Where a film stands crossed or parallel, its image f stands still as it turns: the
+first term vanishes, and a step by it alone is many degrees too long and promises a fall that no step brings. The second
+term is found from predictions on both sides of the angle. An angle with an error of its own in every frame acts in that
+frame alone, so that all frames are moved at once."""
 
 from __future__ import annotations
 

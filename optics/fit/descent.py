@@ -20,8 +20,8 @@ from optics.fit.model import Model, value_of
 from optics.scene.parameter import Values, Variable
 
 REACH = 4.0  # plausible sizes that one step may change a nonlinear parameter: beyond, a light may pass the sensor's rim
-# Times REACH, where no damping brings a gain: what the residual's own curvature holds back, as the zero of a dial at which
-# images stand still, is not damped by what its image is worth.
+# Times REACH, where no damping brings a gain: what the residual's own curvature holds back, as the zero of a dial at
+# which images stand still, is not damped by what its image is worth.
 SHORT_OF = (0.1, 0.01)
 LITTLE = 0.01  # of what is promised: a gain that is as good as none
 MOST_TRUST = 1e3  # times REACH: where steps keep bringing what they promise, the reach no longer matters
@@ -364,8 +364,8 @@ class Descent:
         expected, under increasing damping, or of the best of `most`.
 
         A gain that is a poor part of the promise is beaten by a shorter step on the same images, for one prediction
-        more; accepting it would spend a linearisation on a hundredth of the promise. A gain that is more than was promised
-        is followed by steps twice as long, while these bring half as much again.
+        more; accepting it would spend a linearisation on a hundredth of the promise. A gain that is more than was
+        promised is followed by steps twice as long, while these bring half as much again.
 
         worst   a step must gain more than this; negative where chi2 is rough, where any such step is accepted
         """

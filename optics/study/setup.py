@@ -75,9 +75,9 @@ class Setup:
 def setup_for(captures: str | Path, **given: object) -> Setup:
     """The setup of the given fields; what an imported set advises stands for None and empty.
 
-    An importer writes its advice to import.json. A prior or value that is given of one parameter leaves those of others as
-    advised. Where `free` or `per_group` is given, the advised priors belong to
-    other parameters and are left out. Raises BadCapture for advice that is none: a file of data names no code.
+    An importer writes its advice to import.json. A prior or value that is given of one parameter leaves those of
+    others as advised. Where `free` or `per_group` is given, the advised priors belong to other parameters and are left
+    out. Raises BadCapture for advice that is none: a file of data names no code.
     """
     advised = _advised(Path(captures) / "import.json")
     kept = ("per_group", "held_out", "plugins")  # of which an empty list says something

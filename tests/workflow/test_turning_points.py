@@ -73,8 +73,8 @@ def test_curvature_of_angles_against_chi2(mitsuba, tmp_path):
 
 
 def test_what_is_promised_there_is_what_steps_bring(mitsuba, tmp_path):
-    """A sheet turned between films under a lamp that drifts and a camera whose curve bends: with J'WJ alone the sheet is
-    asked to turn by 5.5 deg for a fall of 108, no step brings any of it, and the base is refused."""
+    """A sheet turned between films under a lamp that drifts and a camera whose curve bends: with J'WJ alone the sheet
+    is asked to turn by 5.5 deg for a fall of 108, no step brings any of it, and the base is refused."""
     rig = RIGS["photographs"]()
     cell = Cell("photographs", "library", ("camera gamma",), 0.0, 0.0, "other", "", 3003, 0.79)
     rig.make(tmp_path / "set", cell)

@@ -24,7 +24,8 @@ def photographs(folder, seed=3):
         f'[uncertainty]\n"polarizer.angle" = {DIAL}\n"analyzer.angle" = {DIAL}',
     ]
     for i, angle in enumerate(np.arange(0.0, 180.0, 20.0)):
-        apart = 90.0 if i % 3 else 45.0  # crossed, and a third of them not: what tells the lamp's power
+        # crossed, and a third of them halfway, on either side: what tells the lamp's power, and the way the zero is off
+        apart = 90.0 if i % 3 else 45.0 + 90.0 * (i % 2)
         between = apart + OFF + DIAL * (rng.standard_normal() - rng.standard_normal())
         light = 50000.0 * (np.cos(np.radians(between)) ** 2 + 2e-4)
         electrons = rng.poisson(light / GAIN, SIZE)
