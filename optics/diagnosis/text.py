@@ -177,7 +177,8 @@ def _nothing(f: Findings, tested: int) -> str:
     else:
         how = f"the best, {f.winner}, scatters as much between parts of the data, p {p_text(f.chance)}"
     tail = (
-        f"{wander_text(f)}, as from a lamp whose power wanders, explains the rest (structure left: p {p_text(f.wander_p)})"
+        f"{wander_text(f)}, as from a lamp whose power wanders, explains the rest "
+        f"(structure left: p {p_text(f.wander_p)})"
         if is_structured(f.structure_p, f.excess_sd) or f.weighed
         else f"no excess misfit is left ({f.excess_sd:.2g} sd)"
         if math.isnan(f.structure_p)
