@@ -212,8 +212,8 @@ def load(path: str | Path, outside: bool = False) -> Captures:
 def _mosaic(rows: object, cfa: str | None, where: str) -> Mosaic:
     if cfa is not None:
         raise BadCapture(
-            f"{where}: both cfa and mosaic are given; allowed: one of them; for a colour polarization camera, write the "
-            "pixels of one colour as images of their own"
+            f"{where}: both cfa and mosaic are given; allowed: one of them; for a colour polarization camera, write "
+            "the pixels of one colour as images of their own"
         )
     try:
         return mosaics.checked(rows)
