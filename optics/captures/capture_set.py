@@ -156,7 +156,7 @@ def load(path: str | Path, outside: bool = False) -> Captures:
     common = checks.settings(data.get("parameters", {}), f"{where}: [parameters]")
     if ("frames" in data) == ("table" in data):
         raise BadCapture(
-            f"{where}: {'both [[frames]] and [table] stand' if 'frames' in data else 'zero frames'}; allowed: "
+            f"{where}: {'both [[frames]] and [table] are given' if 'frames' in data else 'zero frames'}; allowed: "
             "one [[frames]] or more, or one [table] of point readings"
         )
     mosaic = _mosaic(data["mosaic"], cfa, where) if "mosaic" in data else None
@@ -212,8 +212,8 @@ def load(path: str | Path, outside: bool = False) -> Captures:
 def _mosaic(rows: object, cfa: str | None, where: str) -> Mosaic:
     if cfa is not None:
         raise BadCapture(
-            f"{where}: both cfa and mosaic stand; allowed: one of them; of a colour polarization camera, write the "
-            "pixels of one colour as images of their own"
+            f"{where}: both cfa and mosaic are given; allowed: one of them; for a colour polarization camera, write "
+            "the pixels of one colour as images of their own"
         )
     try:
         return mosaics.checked(rows)
@@ -549,7 +549,7 @@ def check(captures: Captures, parameters: Mapping[str, Parameter]) -> None:
                     "`optics params SCENE` lists them"
                     + (
                         f'; rename = {{ "{key}" = "KEY" }} under [table] of {FILE} gives a column its key, '
-                        f'ignore = ["{key}"] passes over it'
+                        f'ignore = ["{key}"] ignores it'
                         if captures.table is not None and settings is not captures.parameters
                         else ""
                     ),
@@ -576,7 +576,7 @@ def _check_uncertainties(captures: Captures, parameters: Mapping[str, Parameter]
             if key not in stated:
                 raise BadCapture(
                     f"{where}: {key} has an uncertainty, and nothing sets it; allowed: keys that [parameters] or "
-                    "frames set; what is known of a free parameter beforehand is a prior (--prior)"
+                    "frames set; for a free parameter give a prior (--prior)"
                 )
 
 

@@ -246,7 +246,7 @@ def read_envi(file: Path) -> Cube:
         raise BadCapture(f"{file}: {len(nm)} wavelengths and {len(fwhm)} fwhm of {count} bands; allowed: one a band")
     if nm.max() * scale < 30:
         raise BadCapture(
-            f"{file}: wavelengths up to {nm.max():g} nm are none of light; allowed: wavelength units = micrometers, "
+            f"{file}: wavelengths up to {nm.max():g} nm are not light; allowed: wavelength units = micrometers, "
             "where they are such"
         )
     data = next((f for s in RAW if (f := file.with_suffix(s)).is_file()), None)

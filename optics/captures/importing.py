@@ -748,8 +748,8 @@ def contradictions(
         )
     if second is not None and abs(second / facts["mm_per_pixel"] - 1) > 0.01:
         texts.append(
-            f"the scale disagrees by two routes: {facts['mm_per_pixel']:.4g} mm/px and {second:.4g} mm/px, "
-            f"{second / facts['mm_per_pixel'] - 1:+.1%}; lengths are known no better"
+            f"two ways to find the scale disagree: {facts['mm_per_pixel']:.4g} mm/px and {second:.4g} mm/px, "
+            f"{second / facts['mm_per_pixel'] - 1:+.1%}; all lengths are uncertain by that"
         )
     scatter = noise.sd(median.mean((0, 1)))
     if given is not None:

@@ -234,7 +234,7 @@ def estimate(
         saturation = next(((2**n - 1) * step for n in (8, 10, 12, 14, 16) if (2**n - 1) * step >= top), None)
         if not saturation:
             raise Underdetermined(
-                f"{here}: noise: values to {top:g} DN, step {step:g} DN, fit no converter; give saturation in DN"
+                f"{here}: noise: values to {top:g} DN, step {step:g} DN, fit no A/D converter; give saturation in DN"
             )
     if black_level is None:
         if not any(dark):
@@ -264,7 +264,7 @@ def estimate(
     if floor - step**2 / 12 < -3 * floor_sd:
         raise Underdetermined(
             f"{here}: noise: variance {floor:.3g} DN^2 at black level {black_level:g} DN: the black level is too low "
-            "or the response is bent; give the black level, and raw frames"
+            "or the response is not linear; give the black level, and raw frames"
         )
     noise = Noise(float(gain), math.sqrt(max(floor - step**2 / 12, 0.0)), black_level, saturation, 0.0, step)
     # to the next pixel of the same colour, or behind the same analyser

@@ -120,7 +120,7 @@ def named(source: Path, suffixes: Sequence[str]) -> list[tuple[Path, dict[str, s
             if not sign:
                 continue
             if name.strip() in own:
-                raise BadCapture(f"{file}: '{name.strip()}' stands twice in the file's name; name it once")
+                raise BadCapture(f"{file}: '{name.strip()}' appears twice in the file's name; name it once")
             own[name.strip()] = value.strip()
         found.append((file, own))
     return found

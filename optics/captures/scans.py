@@ -126,7 +126,7 @@ def read_scan(folder: Path) -> Scan:
     labels = [Path(n).stem.removeprefix("image") for n in names]
     for name, label in zip(names, labels):
         if names.count(name) > 1 or labels.count(label) > 1:
-            raise BadCapture(f"{file}: images: {short(name)} stands twice; allowed: one image for each LED")
+            raise BadCapture(f"{file}: images: {short(name)} appears twice; allowed: one image for each LED")
         if not re.fullmatch(r"[\w-]+", label, re.ASCII):
             raise BadCapture(
                 f"{file}: images: {short(name)}: names of files name the LEDs; allowed: letters, digits, - and _, such "

@@ -36,8 +36,8 @@ if TYPE_CHECKING:
 
 @app.command(
     "import",
-    help="Read a measured data set of ball presses, a calibration folder of 9DTact, scans under one LED at a time, raw "
-    "frames of a polarization camera, or hyperspectral images, into a capture folder.",
+    help="Import a measured data set into a capture folder.\n\nA data set is: ball presses, a calibration folder of "
+    "9DTact, scans under one LED at a time, raw frames of a polarization camera, or hyperspectral images.",
 )
 def import_(
     source: Annotated[
@@ -52,25 +52,27 @@ def import_(
     circles: Annotated[
         Path | None,
         typer.Option(
-            "--circles", metavar="CSV", help="For a folder: file, center_x_px, center_y_px, contact_radius_px."
+            "--circles",
+            metavar="CSV",
+            help="For a folder: a table with the columns file, center_x_px, center_y_px, contact_radius_px.",
         ),
     ] = None,
     ball_radius: Annotated[float | None, typer.Option("--ball-radius", help="mm")] = None,
     mm_per_pixel: Annotated[
-        float | None, typer.Option("--mm-per-pixel", help="Scale of the images as they are.")
+        float | None, typer.Option("--mm-per-pixel", help="Scale of the images before --bin.")
     ] = None,
     untouched: Annotated[
         Path | None,
         typer.Option(
             "--untouched",
             metavar="IMAGE",
-            help="For a folder: the sensor without contact; without it the median of the presses.",
+            help="For a folder: an image of the sensor without contact. Without it: the median of the presses.",
         ),
     ] = None,
     leds: Annotated[
         int | None, typer.Option("--leds", help="LEDs of the scene to start from: 3 or 6.", show_default="3")
     ] = None,
-    bin: Annotated[int, typer.Option("--bin", min=1, help="Average this many pixels each way.")] = 1,
+    bin: Annotated[int, typer.Option("--bin", min=1, help="Average blocks of this many pixels each way.")] = 1,
     every: Annotated[
         int | None, typer.Option("--every", min=1, help="Take every n-th press.", show_default="1")
     ] = None,
@@ -87,30 +89,36 @@ def import_(
         typer.Option(
             "--settings",
             metavar="CSV",
-            help="Of raw frames and cubes: file, and a column per setting; without it file names say them, "
-            "angle=30__2.tif.",
+            help="For raw frames and cubes: a table with the column file and one column per setting. Without it the "
+            "settings are read from the file names, angle=30__2.tif.",
         ),
     ] = None,
     rename: Annotated[
         list[str] | None,
         typer.Option(
-            "--rename", metavar="NAME=KEY", help="Key of a setting's name: angle=polarizer.angle. Repeatable."
+            "--rename",
+            metavar="NAME=KEY",
+            help="Key that a setting's name stands for: angle=polarizer.angle. Repeatable.",
         ),
     ] = None,
     scene: Annotated[
         str | None,
         typer.Option(
-            "--scene", help="Scene of raw frames, or of cubes.", show_default="polarization_camera, or of cubes digit"
+            "--scene",
+            help="Scene for raw frames, or for cubes.",
+            show_default="polarization_camera, or for cubes digit",
         ),
     ] = None,
     bands: Annotated[
         str | None,
-        typer.Option("--bands", metavar="400:700:10", help="Of cubes: join bands, nm.", show_default="as they are"),
+        typer.Option("--bands", metavar="400:700:10", help="For cubes: join bands, nm.", show_default="as they are"),
     ] = None,
-    bits: Annotated[int | None, typer.Option("--bits", help="Of raw frames and cubes; without it, derived.")] = None,
-    black_level: Annotated[float | None, typer.Option("--black-level", help="Of raw frames and cubes, DN.")] = None,
-    system_gain: Annotated[float | None, typer.Option("--system-gain", help="Of these, DN per electron.")] = None,
-    dark_noise: Annotated[float | None, typer.Option("--dark-noise", help="Of these, DN, rms.")] = None,
+    bits: Annotated[int | None, typer.Option("--bits", help="For raw frames and cubes. Without it: derived.")] = None,
+    black_level: Annotated[float | None, typer.Option("--black-level", help="For raw frames and cubes, DN.")] = None,
+    system_gain: Annotated[
+        float | None, typer.Option("--system-gain", help="For raw frames and cubes, DN per electron.")
+    ] = None,
+    dark_noise: Annotated[float | None, typer.Option("--dark-noise", help="For raw frames and cubes, DN, rms.")] = None,
     force: Force = False,
     quiet: Quiet = False,
     debug: Debug = False,
@@ -249,11 +257,14 @@ def design(
     effects: Annotated[
         str | None,
         typer.Option(
-            "--effects", metavar="A,B,...", help="Which may be missing.", show_default="all that the scene can express"
+            "--effects",
+            metavar="A,B,...",
+            help="Effects that may be missing.",
+            show_default="all that the scene can express",
         ),
     ] = None,
     strength: Annotated[
-        float, typer.Option("--strength", metavar="X", help="Of every effect, in plausible sizes.")
+        float, typer.Option("--strength", metavar="X", help="Strength of every effect, in plausible sizes.")
     ] = 0.1,
     fixed_exposure: Annotated[
         bool, typer.Option("--fixed-exposure", help="Leave the exposure as the scene has it.")
@@ -269,7 +280,9 @@ def design(
     saturation: Annotated[float | None, typer.Option(help="DN.", show_default="255")] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Plan a capture session: the frames that tell a scene's effects apart, and the effects that no frames can."""
+    """Plan a capture session that separates effects.
+
+    Lists the frames that separate the effects of a scene, and the effects that no frame separates."""
     from optics.files.output import check_new_folder
     from optics.study import design as planning
 
@@ -305,7 +318,7 @@ def compare(
         typer.Option(
             "--hold-out",
             metavar="GROUP",
-            help="Groups of frames that the fit has not seen, reported apart. Repeatable.",
+            help="Groups of frames that the fit did not use, reported separately. Repeatable.",
             show_default="those that the fit held out",
         ),
     ] = None,
@@ -317,7 +330,9 @@ def compare(
     outside: Outside = False,
     as_json: AsJson = False,
 ) -> None:
-    """Compare a scene with captures: misfit by frame, LED, region and channel."""
+    """Compare a scene with captures.
+
+    Prints the misfit by frame, LED, region and channel."""
     from optics import facade
     from optics.files.output import check_new_folder, new_folder
     from optics.study.record import SHOWN_MAX

@@ -35,7 +35,9 @@ def force_tables(
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
-    """Tables 1 and 2, Figures 5 and 6 of the particle sensor, beside the printed numbers.
+    """Reproduce tables and figures of the particle sensor.
+
+    Prints Tables 1 and 2 and the numbers of Figures 5 and 6, beside the published numbers.
 
     The smallest force that moves a bead of a layout by half a pixel, the condition number of the reconstruction of a
     force, and its error where the motions have noise (Sensors 19 (2019) 928, section 3). Exit code 1 where a threshold
@@ -70,11 +72,14 @@ def force_tables(
 @command
 def force_features(
     job: Annotated[Path, typer.Argument(metavar="JOB.toml", help="The job of `optics batch`, of a scene with beads.")],
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="FOLDER", help="Gets dense-40.npz and so on.")],
+    output: Annotated[
+        Path, typer.Option("-o", "--output", metavar="FOLDER", help="Folder for dense-40.npz and so on.")
+    ],
     project: Annotated[
         bool,
         typer.Option(
-            "--project", help="By the motion that the scene gives its beads, without images; else by optical flow."
+            "--project",
+            help="Take the motion that the scene gives its beads, without images. Else: optical flow in images.",
         ),
     ] = False,
     flow: Annotated[
@@ -91,7 +96,7 @@ def force_features(
             "--bead-seeds",
             min=1,
             max=1000,
-            help="With --project: draw the beads anew for so many layouts, of which each press takes one.",
+            help="With --project: draw this many layouts of beads; each press takes one of them.",
             show_default="the job's own layout",
         ),
     ] = None,
@@ -99,9 +104,10 @@ def force_features(
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
-    """Motion of beads in bins of the image, for each press of a job: what forces are learnt from.
+    """Write the motion of beads in bins of the image.
 
-    From the images that `optics batch` has made of the job so far, or with --project from the job alone."""
+    Forces are learnt from it. It is taken for each press of a job, from the images that `optics batch` has made so far,
+    or with --project from the job alone."""
     from optics.files.output import claim
     from optics.study import force_data
 
@@ -137,11 +143,14 @@ def force_train(
         typer.Option("--kind", help="scaled (ours), published (the source's network) or linear (pseudo-inverse)."),
     ] = "scaled",
     bins: Bins = 9,
-    seed: Annotated[int, typer.Option("--seed", min=0, max=2**31, help="Of everything random.")] = 0,
-    epochs: Annotated[int, typer.Option("--epochs", min=1, help="At most.")] = 1000,
-    patience: Annotated[int, typer.Option("--patience", min=1, help="Epochs without gain after which it ends.")] = 50,
+    seed: Annotated[int, typer.Option("--seed", min=0, max=2**31, help="Seed of all random numbers.")] = 0,
+    epochs: Annotated[int, typer.Option("--epochs", min=1, help="Largest number of epochs.")] = 1000,
+    patience: Annotated[
+        int, typer.Option("--patience", min=1, help="Stop after this many epochs without improvement.")
+    ] = 50,
     noise: Annotated[
-        float, typer.Option("--noise", min=0, help="px rms added to each bin's motion in training; for scaled.")
+        float,
+        typer.Option("--noise", min=0, help="Noise added to the motion of each bin in training, px rms; for scaled."),
     ] = 0.02,
     width: Annotated[
         int | None,
@@ -150,7 +159,7 @@ def force_train(
             min=1,
             max=10_000,
             help="Units of each hidden layer.",
-            show_default="1600 of published, 512 of scaled",
+            show_default="1600 for published, 512 for scaled",
         ),
     ] = None,
     start: Annotated[
@@ -160,7 +169,7 @@ def force_train(
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
-    """Learn a map from the motion of beads to the forces in bins of the face.
+    """Learn a map from bead motion to forces.
 
     May be stopped at any moment; the same command goes on, from MODEL.npz.part. Networks need PyTorch: `pip install
     tactile-optics[learn]`."""
@@ -193,7 +202,9 @@ def force_test(
     features: Annotated[list[Path], typer.Argument(metavar="FEATURES.npz...", help="Made by `optics force-features`.")],
     as_json: AsJson = False,
 ) -> None:
-    """Hold a learnt map to presses of known forces: aRMSE (13), d_loc (16), RMSE_mc (17), and its time."""
+    """Test a learnt map on presses of known forces.
+
+    Prints aRMSE (13), d_loc (16), RMSE_mc (17), and its time."""
     from optics.readers.force_learning import FeatureSet, ForceModel
 
     _told(ForceModel.read(model), {str(file): FeatureSet.read(file) for file in features}, as_json)

@@ -42,31 +42,31 @@ def render(
     define: Defines = None,
     sets: Settings = None,
     png: Annotated[
-        bool, typer.Option("--png", help="Also FILE.png: the camera's digital numbers, free of noise.")
+        bool, typer.Option("--png", help="Also write FILE.png: the camera's digital numbers, without noise.")
     ] = False,
     stokes: Annotated[
         bool,
         typer.Option(
             "--stokes",
-            help="Also FILE.dolp.png and FILE.aolp.png: degree and angle of linear polarization per band; S0 to S3 in "
-            "the EXR, which scenes with layers have anyway.",
+            help="Also write FILE.dolp.png and FILE.aolp.png (degree and angle of linear polarization per band), and "
+            "S0 to S3 into the EXR. Scenes with layers always have S0 to S3.",
         ),
     ] = False,
     spp: Annotated[
         int | None,
         typer.Option(
             "--spp",
-            help="Monte Carlo with so many samples per pixel, and variances; "
-            "without it a sensor is rendered LED by LED, free of noise.",
+            help="Render by Monte Carlo with this many samples per pixel, with variances. "
+            "Without it a sensor is rendered LED by LED, without noise.",
         ),
     ] = None,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Of everything random.")] = 0,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of all random numbers.")] = 0,
     look: Annotated[
         bool | None,
         typer.Option(
             "--look/--no-look",
-            help="What you set stands above the scene's first look (`optics scenes`: a press, lights by colour), or "
-            "above its file alone.",
+            help="--look: begin from the scene's first look (`optics scenes`: a press, lights by colour) and apply "
+            "your settings to it. --no-look: begin from the scene file alone.",
             show_default="--look where a shipped scene is named and nothing is set",
         ),
     ] = None,
@@ -75,8 +75,8 @@ def render(
         typer.Option(
             "--labels",
             metavar="NAMES",
-            help="Labels for learners, by commas: force, pressure, displacement, height, pose, markers; or all that "
-            "the scene has. Channels in the EXR, numbers in FILE.json, arrays in FILE.npz.",
+            help="Labels for learning, separated by commas: force, pressure, displacement, height, pose, markers; or "
+            "all (that the scene has). They are channels of the EXR, numbers in FILE.json, arrays in FILE.npz.",
         ),
     ] = None,
     plugins: Plugins = None,
@@ -84,10 +84,10 @@ def render(
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
-    """Render one image: an EXR with all that is known of it, and its provenance.
+    """Render one image to an EXR file, with its provenance.
 
-    The channels are radiance (with layers: Stokes vectors) per band, depth, normals, contact, one image per LED,
-    variances; optics.light.rendering lists them."""
+    The EXR has radiance per band (with layers: Stokes vectors), depth, normals, contact, one image per LED, and
+    variances; optics.light.rendering lists its channels."""
     from optics.files.output import claim, together, write_json
     from optics.light import labels as labelling
     from optics.light.rendering import RenderJob
@@ -152,36 +152,39 @@ def batch(
     ],
     on: Annotated[
         str,
-        typer.Option("--on", metavar="ENGINE", help="Where: local, slurm (submitit) or ray. The images are the same."),
+        typer.Option(
+            "--on", metavar="ENGINE", help="Where it runs: local, slurm (submitit) or ray. The images are the same."
+        ),
     ] = "local",
     workers: Annotated[
         int | None,
         typer.Option(
             "--workers",
-            help="Processes of one thread at a time.",
+            help="Number of processes, of one thread each.",
             show_default="one per core; 16 tasks on Slurm; all CPUs of a Ray cluster",
         ),
     ] = None,
     recycle: Annotated[
-        int, typer.Option("--recycle", metavar="N", help="Samples of a worker before a fresh one takes its place.")
+        int, typer.Option("--recycle", metavar="N", help="Samples that a worker makes before a new one replaces it.")
     ] = 1000,
     engine: Annotated[
         list[str] | None,
         typer.Option(
             "--engine",
             metavar="KEY=VALUE",
-            help="Of submitit.AutoExecutor (slurm_partition=cpu, timeout_min=240) or ray.init (address=auto). "
+            help="Option of submitit.AutoExecutor (slurm_partition=cpu, timeout_min=240) or ray.init (address=auto). "
             "Repeatable.",
         ),
     ] = None,
     shard: Annotated[
-        str, typer.Option("--shard", metavar="K/N", help="Make only every N-th block of samples, from the K-th on.")
+        str,
+        typer.Option("--shard", metavar="K/N", help="Make only every N-th block of samples, beginning with the K-th."),
     ] = "1/1",
     check_files: Annotated[
         bool,
         typer.Option(
             "--check-files",
-            help="Read every image that is there and compare its hash, also those that nobody wrote to since.",
+            help="Read every existing image and compare its hash, even if the file was not changed since.",
         ),
     ] = False,
     fit: FitFile = None,
@@ -189,10 +192,10 @@ def batch(
     plugins: Plugins = None,
     as_json: AsJson = False,
 ) -> None:
-    """Make many images from a job file. May be stopped at any moment; the same command goes on.
+    """Make many images from a job file. You may stop it at any moment; the same command continues.
 
-    Ctrl-C ends workers of this machine and of Ray, and cancels running and queued tasks of Slurm. A killed command
-    takes its own processes along; Slurm's tasks go on without it, and the next command counts what they made.
+    Ctrl-C ends the workers of this machine and of Ray, and cancels running and queued tasks of Slurm. If the command is
+    killed, its own processes end too. Slurm's tasks continue without it, and the next command counts their images.
     """
     from optics.study import batch as work
 
@@ -229,7 +232,11 @@ def batch(
         )
     print(
         f"{result.folder}: {result.own} of {result.total} samples, {result.made} of them made now"
-        + (", all complete: manifest.csv" if result.complete else ", others are still to come, or being made elsewhere")
+        + (
+            ", all complete: manifest.csv"
+            if result.complete
+            else ", others are not made yet, or are being made elsewhere"
+        )
     )
 
 
@@ -252,11 +259,13 @@ def export(
         list[str] | None,
         typer.Option("--array", metavar="NAME", help="Take this array. Repeatable.", show_default="all"),
     ] = None,
-    per_file: Annotated[int, typer.Option("--per-file", metavar="N", help="Samples of a file.")] = 1000,
-    licence: Annotated[str, typer.Option("--licence", help="Of the data, as the card states it.")] = "",
+    per_file: Annotated[int, typer.Option("--per-file", metavar="N", help="Samples per file.")] = 1000,
+    licence: Annotated[str, typer.Option("--licence", help="Licence of the data, for the data card.")] = "",
     as_json: AsJson = False,
 ) -> None:
-    """Write a finished batch as a data set for learning, with a data card. May be stopped; the same command goes on."""
+    """Write a finished batch as a data set for learning.
+
+    Adds a data card. You may stop it; the same command continues."""
     from optics.study.export import export as write
 
     with terminal.progress() as progress:
@@ -307,7 +316,9 @@ def _first_look(scene: str | None, fit: Path | None, look: bool | None, unset: b
     return FirstLook(
         [word for option, word in taken if option == "-D"],
         [word for option, word in taken if option == "--set"],
-        "" if look or not taken else f"nothing was set: this is its first look, {shown}; as its file has it: --no-look",
+        ""
+        if look or not taken
+        else f"nothing was set, so this is the first look: {shown}. For the scene as its file says: --no-look",
     )
 
 

@@ -21,7 +21,9 @@ def demo(
         str, typer.Option("--sensor", help="gelsight (six white LEDs), digit (red, green, blue) or polarizer_bench.")
     ] = "gelsight",
 ) -> None:
-    """Simulate a sensor with a hidden effect, by another path than the model, and find what is missing."""
+    """Simulate a sensor with a hidden effect, and find it.
+
+    The simulation takes another path than the model."""
     from optics.errors import UnknownKey
     from optics.proof import demo as story
 

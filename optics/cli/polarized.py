@@ -57,7 +57,7 @@ def mueller(
     """Show what the layers on a camera ray do to polarization.
 
     The Mueller matrix of each layer, their product, and what it means. Axes: x right, y up in the image, angles from x
-    to y. Layers are named from the camera on: the last one is the first that light meets."""
+    to y. Layers are listed from the camera on: the last one is the first that light meets."""
     from optics.light import paths, polarimetry
 
     sensor = load_sensor(scene, fit, frame, define, plugins, variant)
@@ -206,14 +206,12 @@ def sweep(
     captures: Annotated[
         Path | None,
         typer.Option(
-            "--captures", metavar="CAPTURES", help="Measured readings to hold beside it: a folder with captures.toml."
+            "--captures", metavar="CAPTURES", help="Measured readings to compare with: a folder with captures.toml."
         ),
     ] = None,
     fit: FitFile = None,
     frame: FrameName = None,
-    radiance: Annotated[
-        bool, typer.Option("--radiance", help="Radiance per band in place of the camera's DN.")
-    ] = False,
+    radiance: Annotated[bool, typer.Option("--radiance", help="Radiance per band instead of the camera's DN.")] = False,
     define: Defines = None,
     sets: Settings = None,
     plugins: Plugins = None,
@@ -222,7 +220,7 @@ def sweep(
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
-    """Predict a reading against an angle, or any other parameter.
+    """Predict a reading against an angle or other parameter.
 
     Prints what a pixel or a photodiode reads, the extinction ratio, and the departure from Malus' cos^2; -o draws the
     curves.

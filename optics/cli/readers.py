@@ -79,7 +79,7 @@ def read(
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
-    """Read images as a robot would: markers and their motion, how near a thing is, a printed grid's state, likeness.
+    """Read images as a robot would.
 
     markers: Vi2TaP's; proximity: its metric r and the distance; grid: MagicTac's Algorithms 1 to 3; ssim: structural
     similarity, mean absolute difference (of full scale) and PSNR. Columns are px, mm, bit and dB."""

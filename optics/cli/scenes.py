@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 @command
 def scenes(as_json: AsJson = False) -> None:
-    """List the scenes that ship with the program, and a command worth a first look for each."""
+    """List the shipped scenes, and a first command for each."""
     from optics.scene import loader as scene
 
     rows: list[dict[str, str]] = []
@@ -55,7 +55,9 @@ def params(
     variant: Variant = None,
     as_json: AsJson = False,
 ) -> None:
-    """List the parameters of a scene: value, unit, bounds, neutral value, derivative, meaning."""
+    """List the parameters of a scene.
+
+    Prints key, value, unit, bounds, neutral value, derivative and meaning."""
     from optics.errors import UnknownKey
     from optics.light import spectra
 
@@ -95,7 +97,9 @@ def plot_spectra(
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
-    """Draw the light of a scene, its losses and the camera's sensitivities over the wavelength, over each other."""
+    """Plot the spectra of a scene over the wavelength.
+
+    Shows light, losses and the camera's sensitivities in one figure."""
     from optics.files.output import claim, replacing
     from optics.light import spectra
 
@@ -222,27 +226,29 @@ def effects(
         ),
     ] = None,
     new_name: Annotated[
-        str | None, typer.Argument(metavar="[NEW]", help="Of `effects new NAME`: the new effect's name.")
+        str | None, typer.Argument(metavar="[NEW]", help="With `effects new NAME`: the name of the new effect.")
     ] = None,
     stage: Annotated[
         str | None, typer.Option("--stage", help="new: where it acts (lens, sensor, response, emission, segment ...).")
     ] = None,
-    part: Annotated[str | None, typer.Option("--part", help="new: on camera, led, gel or membrane.")] = None,
+    part: Annotated[
+        str | None, typer.Option("--part", help="new: the part it acts on: camera, led, gel or membrane.")
+    ] = None,
     study: Annotated[
-        Path | None, typer.Option("--from", metavar="STUDY", help="new: with a curve of this study's last diagnosis.")
+        Path | None, typer.Option("--from", metavar="STUDY", help="new: use a curve of this study's last diagnosis.")
     ] = None,
     along: Annotated[
         str | None, typer.Option("--along", metavar="COORDINATE", help="new: the coordinate of the curve.")
     ] = None,
     output: Annotated[
-        Path | None, typer.Option("-o", "--output", metavar="DIR", help="new: folder of plugins.")
+        Path | None, typer.Option("-o", "--output", metavar="DIR", help="new: folder for the plugin.")
     ] = None,
     plugins: Plugins = None,
     as_json: AsJson = False,
 ) -> None:
-    """List the physical effects that can be added to a model, show one's page, or write a new one (`optics effects new
-    NAME`).
+    """List the effects, show the page of one, or write one.
 
+    An effect can be added to a model. `optics effects NAME` shows its page; `optics effects new NAME` writes a new one.
     Parts have pages too: `optics effects led` shows the LED's law, its parameters, and the effects that act on it.
     """
     from optics.errors import UnknownKey

@@ -35,7 +35,7 @@ app = typer.Typer(
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110},
-    help="Optical models of camera-based touch sensors that can be held against a measurement.",
+    help="Optical models of camera-based touch sensors, compared with measurements.",
 )
 
 
@@ -138,9 +138,9 @@ def _lines() -> Callable[[str, int, int], None]:
 
 terminal = Terminal()
 
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no remarks.")]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print no progress and no remarks.")]
 Debug = Annotated[bool, typer.Option("--debug", help="Show where in the program an error came from.")]
-AsJson = Annotated[bool, typer.Option("--json", help="The result for programs.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 SceneName = Annotated[
     str, typer.Argument(metavar="SCENE", help="A shipped scene's name (`optics scenes`) or an XML file.")
 ]
@@ -172,15 +172,13 @@ Plugins = Annotated[
     typer.Option(
         "--plugins",
         metavar="PATH",
-        help="Run the plugins of this folder, or this file. Repeatable. 'none': none but those that ship. Without it, "
-        "plugins that lie beside scene or captures run once you have agreed.",
+        help="Run the plugins of this folder, or this file. Repeatable. 'none': only the shipped ones. Without this "
+        "option, plugins beside the scene or the captures run once you have agreed.",
     ),
 ]
 CapturesNow = Annotated[
     Path | None,
-    typer.Option(
-        "--captures", metavar="DIR", help="Where the study's captures are now, if they are not found where they were."
-    ),
+    typer.Option("--captures", metavar="DIR", help="Where the study's captures are now, if they were moved."),
 ]
 Outside = Annotated[
     bool, typer.Option("--allow-outside", help="Let captures.toml name images and tables outside its folder.")
@@ -196,7 +194,7 @@ FrameName = Annotated[
     typer.Option(
         "--frame",
         metavar="NAME",
-        help="With --fit: with what was set and found in this frame of its captures.",
+        help="With --fit: use the settings of this frame of its captures, and the values found in it.",
         show_default="the values that all frames share",
     ),
 ]
@@ -222,8 +220,8 @@ Region = Annotated[
     typer.Option(
         "--region",
         metavar="all|known",
-        help="What is fitted and judged: all of each image, or where the shape is known: the contact, and the level "
-        "face far from it.",
+        help="Which pixels are fitted and tested. all: the whole image; known: only where the shape is known, in the "
+        "contact and on the level face far from it.",
         show_default="all, or what an import advises",
     ),
 ]

@@ -37,8 +37,8 @@ StartFit = Annotated[
     typer.Option(
         "--fit",
         metavar="FIT",
-        help="Start from a calibrated sensor: a study's folder (its last step), or a fit.toml of it. Effects that it "
-        "has stay at their strengths.",
+        help="Start from a calibrated sensor: a study's folder (its last step), or a fit.toml of it. Its effects keep "
+        "their strengths.",
     ),
 ]
 
@@ -46,13 +46,13 @@ StartFit = Annotated[
 @command
 def locate(
     captures: CaptureSet,
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="FILE.csv", help="Table of places, mm.")],
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="FILE.csv", help="Table of positions, mm.")],
     free: Annotated[
         list[str] | None,
         typer.Option(
             "--free",
             metavar="PATTERN",
-            help="Parameters to solve for with the places. Repeatable. Without it: the powers of the lights.",
+            help="Parameters to solve for with the positions. Repeatable. Without it: the powers of the lights.",
         ),
     ] = None,
     define: Defines = None,
@@ -62,16 +62,17 @@ def locate(
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
-    """Find beads whose places nobody knows, and fit all places in all frames, with a few parameters of the scene.
+    """Find beads whose positions are unknown.
 
-    Depths come from the size and light of each bead, and from its motion under presses: give frames at rest and under
-    several. The table goes into a calibration by `-D places=FILE.csv`; FILE.json beside it has the errors."""
+    Fits all positions in all frames, with a few parameters of the scene. Depths follow from the size and brightness of
+    each bead and from its motion under presses, so give frames at rest and under several presses. Use the table in a
+    calibration with `-D places=FILE.csv`; FILE.json beside it has the errors."""
     from optics.files.output import claim
     from optics.study.located import locate as find
     from optics.study.setup import Setup
 
     if output.suffix.lower() != ".csv":
-        raise ValueError(f"-o {output}: a table of places; allowed: a name ending in .csv")
+        raise ValueError(f"-o {output}: a table of positions; allowed: a name ending in .csv")
     claim([output, output.with_suffix(".json")], force)
     setup = Setup(
         captures=str(captures),
@@ -104,20 +105,22 @@ def calibrate(
         typer.Option(
             "--per-group",
             metavar="PATTERN",
-            help="Parameters with a value per group of frames. Repeatable. Without it: place and depth of each press. "
-            "'none': none.",
+            help="Parameters with a value per group of frames. Repeatable. Without it: position and depth of each "
+            "press. 'none': none.",
         ),
     ] = None,
     prior: Annotated[
         list[str] | None,
-        typer.Option("--prior", metavar="PATTERN=MEAN+-SD", help="What is known beforehand. Repeatable."),
+        typer.Option(
+            "--prior", metavar="PATTERN=MEAN+-SD", help="Prior knowledge: mean and standard deviation. Repeatable."
+        ),
     ] = None,
     hold_out: Annotated[
         list[str] | None,
         typer.Option(
             "--hold-out",
             metavar="GROUP",
-            help="Groups of frames to test on and not to fit. Repeatable. Without it: one in four. 'none': none.",
+            help="Groups of frames to hold out for tests. Repeatable. Without it: one in four. 'none': none.",
         ),
     ] = None,
     define: Defines = None,
@@ -127,14 +130,16 @@ def calibrate(
     plugins: Plugins = None,
     outside: Outside = False,
     robust: Annotated[
-        bool, typer.Option("--robust", help="Let residuals beyond three sigmas count less (Huber).")
+        bool, typer.Option("--robust", help="Give residuals beyond three sigmas less weight (Huber).")
     ] = False,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Of everything random.")] = 0,
-    title: Annotated[str, typer.Option("--title", help="Of the study's report.")] = "",
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of all random numbers.")] = 0,
+    title: Annotated[str, typer.Option("--title", help="Title of the study's report.")] = "",
     resume: Annotated[bool, typer.Option("--resume", help="Continue this study.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Start a study: solve for the free parameters of the base model, and test it on frames that were held out."""
+    """Start a study: calibrate the base model.
+
+    Solves for the free parameters and tests the result on held-out frames."""
     from optics import facade
 
     with terminal.progress() as progress:
@@ -202,8 +207,9 @@ def diagnose(
     as_json: AsJson = False,
     csv: Annotated[Path | None, typer.Option("--csv", metavar="FILE", help="Write the table of effects here.")] = None,
 ) -> None:
-    """Ask what the last step of a study lacks: every effect is scored, the best ones are added and refitted, and one of
-    six verdicts is given.
+    """Find which effect the last step of a study lacks.
+
+    Scores every effect, adds and refits the best ones, and gives one of six verdicts.
 
     The exit code is 1 where the verdict is UNKNOWN or CANNOT TELL, else 0.
     """
@@ -229,12 +235,14 @@ def diagnose(
 @command
 def add(
     study: StudyFolder,
-    effect: Annotated[str, typer.Argument(metavar="EFFECT", help="Its name (`optics effects`).")],
+    effect: Annotated[str, typer.Argument(metavar="EFFECT", help="Name of the effect (`optics effects`).")],
     plugins: Plugins = None,
     captures: CapturesNow = None,
     as_json: AsJson = False,
 ) -> None:
-    """Free an effect, calibrate everything again, and record it as the next step of the study."""
+    """Add an effect to a study and calibrate again.
+
+    Frees the effect, calibrates everything again, and records the result as the next step."""
     from optics.facade import Study
 
     found = Study.open(study, plugins=plugins, captures=captures)
@@ -251,7 +259,7 @@ def report(
     ] = None,
     force: Force = False,
 ) -> None:
-    """Write a study as one HTML page: images, ranking, ladder."""
+    """Write a study as one HTML page: images, ranking, steps."""
     from optics.facade import Study
 
     print(Study.open(study).report(output, overwrite=force))
@@ -261,11 +269,13 @@ def report(
 def values(
     study: StudyFolder,
     patterns: Annotated[
-        list[str] | None, typer.Argument(metavar="[PATTERN]...", help="Of parameters, such as 'led_*.x'.")
+        list[str] | None, typer.Argument(metavar="[PATTERN]...", help="Parameters to list, such as 'led_*.x'.")
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """List what a study's last step found: value, standard deviation and unit, by parameter."""
+    """List the values that the last step of a study found.
+
+    Prints value, standard deviation and unit of each parameter."""
     from fnmatch import fnmatch
 
     from optics.errors import UnknownKey
@@ -290,7 +300,7 @@ def values(
 def scoreboard(
     output: Annotated[
         Path,
-        typer.Option("-o", "--output", metavar="FOLDER", help="Gets scoreboard.html and scoreboard.json."),
+        typer.Option("-o", "--output", metavar="FOLDER", help="Folder for scoreboard.html and scoreboard.json."),
     ],
     captures: Annotated[
         list[str] | None,
@@ -301,7 +311,7 @@ def scoreboard(
         typer.Option(
             "--study",
             metavar="STUDY",
-            help="A study, all of whose steps are scored; it says what is held out. Repeatable.",
+            help="A study. All its steps are scored, on the frames that it holds out. Repeatable.",
         ),
     ] = None,
     hold_out: Annotated[
@@ -309,8 +319,8 @@ def scoreboard(
         typer.Option(
             "--hold-out",
             metavar="GROUP",
-            help="Groups to test on, of captures without a study. Repeatable. Without it: one in four, the last of two "
-            "or three.",
+            help="Groups to hold out, for captures without a study. Repeatable. Without it: one in four, the last of "
+            "two or three.",
         ),
     ] = None,
     presses: Annotated[
@@ -320,7 +330,9 @@ def scoreboard(
     as_json: AsJson = False,
     force: Force = False,
 ) -> None:
-    """Score studies, tables without physics and other photographs on the same held-out images, as a table and a page.
+    """Compare studies with models without physics.
+
+    Scores studies, tables without physics and other photographs on the same held-out images, as a table and a page.
 
     The exit code is 1 where a study is beaten by a model without physics in the contact, else 0.
     """
@@ -351,14 +363,16 @@ def view(
         int | None, typer.Option("--step", metavar="N", help="Begin from this step.", show_default="the last one")
     ] = None,
     port: Annotated[
-        int, typer.Option("--port", min=0, max=65535, help="Of the page, on this machine alone.", show_default="any")
+        int,
+        typer.Option("--port", min=0, max=65535, help="Port of the page, on this machine only.", show_default="any"),
     ] = 0,
     browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the page in the browser.")] = True,
     plugins: Plugins = None,
     captures: CapturesNow = None,
 ) -> None:
-    """Open a page to switch effects and slide parameters, while prediction, residual and misfit follow. Ctrl-C ends
-    it."""
+    """Open a live page: switch effects, move parameters.
+
+    Prediction, residual and misfit follow. Ctrl-C ends it."""
     from optics.facade import Study
 
     def ready(url: str) -> None:
@@ -386,7 +400,10 @@ def rehearse(
     captures: CapturesNow = None,
     as_json: AsJson = False,
 ) -> None:
-    """Report which effects would be found if they were hidden in these captures, and what each would be taken for."""
+    """Report which hidden effects would be found.
+
+    Hides each effect in these captures in turn. Says whether it would be found, and which effect it would be mistaken
+    for."""
     from optics.facade import Study
 
     found = Study.open(study, plugins=plugins, captures=captures)
@@ -400,12 +417,13 @@ def imitate(
     study: StudyFolder,
     output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="A new capture folder.")],
     sets: Settings = None,
-    seed: Annotated[int, typer.Option(help="Of the noise.")] = 1,
+    seed: Annotated[int, typer.Option(help="Seed of the noise.")] = 1,
     plugins: Plugins = None,
     captures: CapturesNow = None,
 ) -> None:
-    """Write captures as the study's model would take them, with an effect put in: --set camera.vignetting=0.3 shows
-    what that would look like."""
+    """Write captures as the study's model would take them.
+
+    With --set camera.vignetting=0.3, for example, they show what this effect would look like."""
     from optics.facade import Study
     from optics.files.output import check_new_folder
 

@@ -247,7 +247,7 @@ def _against_effects(f: Findings) -> list[Condition]:
             f.common and f.lead > f.needed and not f.shared,
             f"{f.lead:.3g} ahead of {f.against or 'no effect'}, {f.needed:.3g} needed"
             if f.common
-            else f"{f.survivors} explanations are not told apart, and no effect is part of all",
+            else f"the data do not decide between {f.survivors} explanations, and no effect is part of all",
         ),
         Condition(
             "robust",

@@ -375,7 +375,7 @@ def fixed_text(share: float, best: float) -> str:
         return ""
     return (
         f"one gain for each pixel, the same in every frame, explains {min(share, 1.0):.0%} of the excess: dirt, "
-        "a scratch or the sensor's own pattern lies fixed in the image, whatever curve it resembles."
+        "a scratch or the sensor's own pattern is fixed in the image, whatever curve it resembles."
     )
 
 
@@ -388,7 +388,7 @@ def unexplained(found: Sequence[Fingerprint], best_effect: float, excess: float)
         return ""
     effect, curve = (min(max(x / excess, 0.0), 1.0) for x in (best_effect, found[0].net))
     return (
-        f"Of the excess misfit the best effect explains {effect:.0%}, so {1 - effect:.0%} is unexplained by the "
-        f"library; the best curve, along '{found[0].coordinate}', explains {curve:.0%}; "
-        f"{1 - max(effect, curve):.0%} neither does."
+        f"The best effect explains {effect:.0%} of the excess misfit, so the library leaves {1 - effect:.0%} "
+        f"unexplained. The best curve, along '{found[0].coordinate}', explains {curve:.0%}. Neither of them explains "
+        f"{1 - max(effect, curve):.0%}."
     )

@@ -156,7 +156,7 @@ def warnings_of(
     if model.captures is not None:
         texts += [w for w in camera_noise.warnings_of(model.noise, model.captures) if w not in texts]
     if dropped:
-        texts.append(f"at a bound and taken as known: {', '.join(dropped)}")
+        texts.append(f"at a bound, and therefore held fixed: {', '.join(dropped)}")
     if evidence.not_finite:
         texts.append(f"{evidence.not_finite} values left out because prediction or derivative is not finite")
     if evidence.render_noise > RENDER_NOISE:
@@ -188,12 +188,12 @@ def warnings_of(
     if outcome.correlation.share > 0:
         texts.append(
             f"neighbouring readings share {outcome.correlation.share:.0%} of their noise, over some "
-            f"{outcome.correlation.length:.2g} readings: falls of chi2 count for less by that"
+            f"{outcome.correlation.length:.2g} readings: falls of chi2 are reduced accordingly"
         )
     moved = [s for s in shifts if s.warn]
     if winner is not None and moved and word in NAMED:
         texts.append(
-            f"with {winner.effect.name}, what had been calibrated moves by more than 3 sd or out of its prior: "
+            f"with {winner.effect.name}, calibrated parameters move by more than 3 sd or out of their priors: "
             + some([moved_by(s) for s in moved], 3)
         )
     return texts
@@ -220,14 +220,14 @@ def hints_of(
         hints += [f"{c.effect.name} needs: {c.effect.needs}" for c in members if c.effect.needs and c not in single]
         if findings.shared:
             hints.append(
-                "take the settings in a shuffled order, or return to one of them again and again: what wanders with "
-                "the session then no longer follows the settings"
+                "take the settings in a shuffled order, or return to one of them again and again: a drift during the "
+                "session then no longer follows the settings"
             )
     if "spread" in failed:
-        hints.append(f"repeat {findings.carried_by}: nearly all that would be explained lies there")
+        hints.append(f"repeat {findings.carried_by}: nearly all of the fall of chi2 comes from it")
     if "held out" in failed and word != "NOTHING":
         hints.append(
-            "hold out frames that the fit has not seen (other presses or places), or find why they do not improve"
+            "hold out other frames (other presses or positions), or find why the held-out frames do not improve"
         )
     if "near" in failed:
         hints.append(f"no effect brings the model near its images: check {AT_FAULT}")
@@ -259,7 +259,7 @@ def _for_a_tie(members: Sequence[Candidate], gaps: Sequence[Sequence[float]], na
     more = math.ceil(CLEAR / d) if d > 0 else 0
     if d >= CLEAR:
         hints = [
-            pair + "noise would allow a decision, but not the misfit that both leave",
+            pair + "the noise would allow a decision, but the misfit that both leave does not",
             "add each of them in a copy of the study, diagnose again, and keep the one that leaves the least: further "
             "missing effects hide which of them it is",
         ]

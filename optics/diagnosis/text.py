@@ -117,7 +117,9 @@ def advice_lines(advice: Sequence[Advice]) -> list[str]:
     lines = [f"next: {advice_text(plans['together'])}"] if "together" in plans else []
     if lines and (p := plans["together"].hardest).after < LEAST:
         # a shot that changes nothing is no advice
-        return [f"next: no shot that was tried tells {p.effect} from {p.rival}: what does is another setting or part"]
+        return [
+            f"next: none of the simulated frames separates {p.effect} from {p.rival}; another setting or part would"
+        ]
     if "more of the same" in plans:
         lines.append(f"      (more of the same instead: {advice_text(plans['more of the same'])})")
     known = {a.shot for a in plans.values()}
@@ -149,9 +151,9 @@ def sentence(
         return _ambiguous(f, explanations)
     if word == "UNKNOWN" and f.another_law:
         return (
-            f"structure is left that another law of {f.law} explains: its strength changes along it, and that is "
-            f"{-f.law_lead:.3g} ahead of what any effect of the library does. It is in the model, by another law than "
-            "this sensor follows."
+            f"structure is left that another law of {f.law} explains. With a strength that changes along it, this law "
+            f"is {-f.law_lead:.3g} ahead of every effect of the library. The effect is in the model, but this sensor "
+            "follows another law."
         )
     if word == "UNKNOWN":
         return _unknown(f, next(c for c in fingerprints if c.coordinate == f.coordinate), basis)
@@ -175,13 +177,14 @@ def _nothing(f: Findings, tested: int) -> str:
     else:
         how = f"the best, {f.winner}, scatters as much between parts of the data, p {p_text(f.chance)}"
     tail = (
-        f"{wander_text(f)}, as of a lamp that wanders, explains the rest (structure beside it: p {p_text(f.wander_p)})"
+        f"{wander_text(f)}, as from a lamp whose power wanders, explains the rest "
+        f"(structure left: p {p_text(f.wander_p)})"
         if is_structured(f.structure_p, f.excess_sd) or f.weighed
         else f"no excess misfit is left ({f.excess_sd:.2g} sd)"
         if math.isnan(f.structure_p)
         else f"no low-frequency structure is left (p {p_text(f.structure_p)})"
     )
-    return f"none of {tested} effects stands out ({how}) and {tail}. The upper limits say what can still hide."
+    return f"none of {tested} effects is significant ({how}) and {tail}. The upper limits say what may still be there."
 
 
 def _claim(
@@ -208,7 +211,7 @@ def _claim(
     )
     others = [] if leaves_misfit(best.excess_sd, basis) else [r for r in rows if r is not row and limits(r)]
     if others:
-        text += " Not " + ", not ".join(limit_text(r) for r in others[:3]) + "."
+        text += " Upper limits of other effects: " + ", ".join(limit_text(r) for r in others[:3]) + "."
     moved = [s for s in shifts if s.warn][:2]
     if moved:
         text += " Without it, " + " and ".join(moved_by(s).replace(" by ", " was off by ", 1) for s in moved) + "."
@@ -221,7 +224,7 @@ def _claim(
         "left: add it, calibrate and diagnose again."
     )
     return text + (
-        " Falling held-out error verifies the prediction, not the identity; the identity rests on the lead "
+        " A lower held-out error verifies the prediction, not the cause. The cause rests on the lead "
         f"({f.lead:.3g} in chi2, over {f.against or 'no effect'}), the homogeneity and the absence of a better curve."
     )
 
@@ -244,23 +247,24 @@ def _ambiguous(f: Findings, explanations: Sequence[Explanation]) -> str:
         other += f" By its score {f.untried[0]} may explain more, and was not calibrated."
     if f.shared:
         return (
-            "noise that neighbours in the session share, such as a lamp that wanders, is not told apart from "
-            f"{'this explanation' if count == 1 else f'these {count} explanations'} (fall of chi2): {names}.{other}"
+            "the data do not decide between noise that neighbours in the session share, such as a lamp whose power "
+            f"wanders, and {'this explanation' if count == 1 else f'{count} explanations'} (fall of chi2): "
+            f"{names}.{other}"
         )
     if f.unset:
         return (
-            f"errors of {f.unset}, which nobody states, act on every frame as a strength of each does; not told apart "
-            f"from them: {names}.{other}"
+            f"the captures state no error of {f.unset}. Such errors act on each frame, as one strength per frame "
+            f"does, and the data do not decide between them and: {names}.{other}"
         )
     if f.law_lead <= SURE:
         return (
-            f"{'this explanation is' if count == 1 else f'{count} explanations are'} not told apart (fall of chi2) "
-            f"from another law of {f.law}, which is in the model: {names}.{other}"
+            f"the data do not decide between another law of {f.law}, which is in the model, and "
+            f"{'this explanation' if count == 1 else f'{count} explanations'} (fall of chi2): {names}.{other}"
         )
     if count > 1:
         return (
-            f"{count} explanations are not told apart (fall of chi2): {names}. All others are behind by more than "
-            f"noise and misfit allow.{other}"
+            f"the data do not decide between {count} explanations (fall of chi2): {names}. All others are ruled "
+            f"out.{other}"
         )
     if len(kinds[0]) > 1:
         return f"one law explains the residual, under {len(kinds[0])} names (fall of chi2): {names}.{other}"
@@ -273,7 +277,7 @@ def _kind(kind: Sequence[Explanation]) -> str:
         return f"{kind[0].name} ({kind[0].fall:.4g})"
     names = ", ".join(e.name for e in kind[:-1]) + f" or {kind[-1].name}"
     return (
-        f"{names} ({kind[0].fall:.4g}; the same values under {len(kind)} names, which other settings alone tell apart)"
+        f"{names} ({kind[0].fall:.4g}; the same values under {len(kind)} names, which only other settings can separate)"
     )
 
 
@@ -285,7 +289,7 @@ def _partial(f: Findings, winner: Row, failing: Sequence[Condition]) -> str:
     part = f"{share_text(f.share)} of the excess" if f.weighed else "part of the residual"
     return (
         f"{winner.name} would explain {part}, but not with one strength ({uneven.text}): another "
-        "cause makes it up, or acts besides."
+        "cause produces it, or acts as well."
     )
 
 
@@ -301,8 +305,8 @@ def _unknown(f: Findings, curve: Fingerprint, basis: Basis) -> str:
     )
     if (beyond := math.sqrt(max(basis.misfit**2 - basis.noise**2, 0.0))) < CLUTTERED:
         text += (
-            f" It is faint: misfit beyond noise is {percent(beyond)} of the signal; mottle of a coating or a fixed "
-            "pattern of the sensor makes as much."
+            f" It is faint: misfit beyond noise is {percent(beyond)} of the signal. Mottle of a coating or a fixed "
+            "pattern of the sensor has about this size."
         )
     return text
 
@@ -411,7 +415,7 @@ def _explanation_lines(d: Diagnosis) -> list[str]:
     for e in [*alive[:6], *others[:5]]:
         blocks = "-" if math.isnan(e.ahead) else f"{e.ahead:+.4g}"
         behind, needed = ("-", "-") if e in alive[:1] else (f"{e.lead:.3g}", f"{e.needed:.3g}")
-        more = "the same with more, and likelier" if e.larger else "the same with more"
+        more = "contains a survivor, and is likelier" if e.larger else "contains a survivor"
         mark = "survives" if e.survives else more if e.larger or not e.lead > e.needed else ""
         lines.append((e.name, f"{e.fall:.4g}", f"{e.cost:.3g}", f"{e.excess_sd:.2g} sd", behind, needed, blocks, mark))
     return [

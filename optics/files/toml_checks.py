@@ -23,7 +23,7 @@ def parse(file: Path) -> dict:
     try:
         return tomllib.loads(file.read_text(encoding="utf-8-sig"))
     except (ValueError, RecursionError) as error:  # TOMLDecodeError, UnicodeDecodeError, a number too long
-        raise BadCapture(f"{file}: not valid TOML: {error}; correct this line (text stands in quotes)") from error
+        raise BadCapture(f"{file}: not valid TOML: {error}; correct this line (text needs quotes)") from error
 
 
 def keys(table: object, known: Sequence[str], where: str) -> None:
@@ -67,7 +67,7 @@ def settings(table: Any, where: str) -> dict[str, float | str]:
     for key, value in table.items():
         if isinstance(value, Mapping):
             raise BadCapture(
-                f'{where}: {key} is a table; a key with a dot stands in quotes: "{key}.{next(iter(value), "")}"'
+                f'{where}: {key} is a table; a key with a dot needs quotes: "{key}.{next(iter(value), "")}"'
             )
     return {
         key: value if isinstance(value, str) else number(value, f'"{key}"', "", where) for key, value in table.items()

@@ -38,7 +38,7 @@ def _loader() -> type:
             for key, _ in node.value:
                 name = (key.tag, key.value) if isinstance(key, yaml.ScalarNode) else None
                 if name and name in seen and key.tag != "tag:yaml.org,2002:merge":
-                    raise yaml.YAMLError(f"line {key.start_mark.line + 1}: {key.value} stands twice in one table")
+                    raise yaml.YAMLError(f"line {key.start_mark.line + 1}: {key.value} appears twice in one table")
                 seen.add(name)
             return super().construct_mapping(node, deep)
 

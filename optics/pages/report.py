@@ -1217,7 +1217,7 @@ def _explanations(d: Mapping) -> list[dict]:
             "lead": "–" if e in alive[:1] else _text(as_float(e.get("lead")), "{:.3g}"),
             "needed": "–" if e in alive[:1] else _text(as_float(e.get("needed")), "{:.3g}"),
             "survives": possible(e),
-            "why": "" if as_float(e.get("lead")) > as_float(e.get("needed")) else "the same with more",
+            "why": "" if as_float(e.get("lead")) > as_float(e.get("needed")) else "contains a survivor",
         }
         for e in [*alive[:8], *others[:4]]
     ]

@@ -596,11 +596,11 @@ class Handler(BaseHTTPRequestHandler):
             # A page of another site may send its visitor's browser here under a name of its own, or post what needs no
             # leave.
             if self.headers.get("Host") not in self.server.hosts:
-                return self._error(HTTPStatus.FORBIDDEN, f"this page is at {HOST} and nowhere else")
+                return self._error(HTTPStatus.FORBIDDEN, f"this page is only at {HOST}")
             begin = f"/{self.server.token}"
             if not hmac.compare_digest(self.path[: len(begin)].encode(), begin.encode()):
                 return self._error(
-                    HTTPStatus.FORBIDDEN, "the address lacks its token; `optics view` printed the whole of it"
+                    HTTPStatus.FORBIDDEN, "the address lacks its token; `optics view` printed the complete address"
                 )
             place = self.path.removeprefix(begin)
             if place not in routes:

@@ -77,6 +77,6 @@ def _arrays(points, other) -> tuple[np.ndarray, np.ndarray]:
 def _in_front(points: np.ndarray, distance: float) -> None:
     if len(points) and points[:, 2].max() >= distance:
         raise ValueError(
-            f"a bead is {points[:, 2].max():g} mm deep, and the optical centre stands {distance:g} mm below the face; "
+            f"a bead is {points[:, 2].max():g} mm deep, and the optical centre is {distance:g} mm below the face; "
             "allowed: beads in front of the camera"
         )

@@ -442,5 +442,5 @@ def _check_levels(black_level: float, saturation: float) -> None:
     if not (math.isfinite(black_level) and math.isfinite(saturation) and saturation > black_level):
         raise ValueError(
             f"black_level = {black_level:g} DN, saturation = {saturation:g} DN; allowed: finite, saturation above "
-            "the black level; both stand in the camera's EMVA 1288 sheet"
+            "the black level; both are in the camera's EMVA 1288 sheet"
         )

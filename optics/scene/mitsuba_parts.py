@@ -179,8 +179,7 @@ def _once_wired(method: Callable) -> Callable:
             return _nan(answer)
         if any(shape.bsdf() is self for shape in scene.shapes()):
             raise BadScene(
-                f"{self._waits}, and this scene's parts have not been told of one another; the integrator 'tactile' "
-                "does "
+                f"{self._waits}, and the parts of this scene are not connected yet; the integrator 'tactile' does "
                 "that at its first image; call optics.wire(scene) before you render with another integrator"
             )
         return answer  # Dr.Jit traces every material alive, those of other scenes as well

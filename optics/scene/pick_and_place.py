@@ -60,7 +60,7 @@ def placed(named: str, folders: Sequence[str | Path] = ()) -> tuple[float, float
         raise ValueError(f"{file}: no part '{_short(designator)}'; it has {_few(there) or 'no parts'}")
     if len(set(found.values())) > 1:
         raise ValueError(
-            f"{file}: '{designator}' stands at several places, in lines {', '.join(map(str, found))}; allowed: one; "
+            f"{file}: '{designator}' appears several times, in lines {', '.join(map(str, found))}; allowed: one; "
             "name parts of several boards apart"
         )
     return next(iter(found.values()))
@@ -116,7 +116,7 @@ def _head(lines: Sequence[tuple[int, str]], file: Path) -> tuple[tuple[int, str,
         )
     raise ValueError(
         f"{file}: no pick-and-place table; needed: a head with a column for the designator "
-        f"({', '.join(HEADS['designator'])}), for x and for y, parted by commas, semicolons, tabs or blanks"
+        f"({', '.join(HEADS['designator'])}), for x and for y, separated by commas, semicolons, tabs or blanks"
     )
 
 

@@ -115,7 +115,7 @@ def read_table(
     if short is not None:
         raise BadScene(
             f"{say}: rows of {file.name} differ in length, or have no value, such as '{' '.join(short)}'; allowed: a "
-            "wavelength and values, as many in every row and parted alike"
+            "wavelength and values, as many in every row, separated in the same way"
         )
     try:
         data = np.array([[float(cell) for cell in row] for row in rows])
@@ -168,7 +168,7 @@ def checked(nm: np.ndarray, values: np.ndarray, kind: str, source: str, say: str
         )
     if nm[-1] < MICROMETRES:
         raise BadScene(
-            f"{say}: wavelengths of {nm[0]:g} to {nm[-1]:g} nm are none of light; allowed: nm, or a header that names "
+            f"{say}: wavelengths of {nm[0]:g} to {nm[-1]:g} nm are not light; allowed: nm, or a header that names "
             "another unit, such as 'wavelength (um)'"
         )
     if high == 1.0 and values.max() > 1.0:

@@ -120,7 +120,7 @@ class Job(Strict):
     @classmethod
     def _once(cls, names):
         if len(set(names)) != len(names):
-            raise ValueError("a name stands twice; allowed: each once")
+            raise ValueError("a name appears twice; allowed: each once")
         return names
 
     @model_validator(mode="after")
@@ -203,8 +203,7 @@ def read(file: str | Path, fit: str | Path | None = None, frame: str | None = No
                 and any(isinstance(v, (dict, float, int)) for v in value.values())
             ):
                 raise BadJob(
-                    f"{file}: [{name}]: {key} is a table; a key with a dot stands in quotes: "
-                    f'"{key}.{next(iter(value))}"'
+                    f'{file}: [{name}]: {key} is a table; a key with a dot needs quotes: "{key}.{next(iter(value))}"'
                 )
     try:
         job = Job.model_validate(data)

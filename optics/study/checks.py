@@ -41,8 +41,8 @@ def of_captures(model: SceneModel) -> list[str]:
     if model.cut_off:
         count = sum(int((f.image == 0).sum()) for f in model.frames)
         texts.append(
-            f"{count} readings are 0 and none is negative: the instrument shows nothing below 0, and these are left "
-            "out, as they say no more than that there was less"
+            f"{count} readings are 0 and none is negative: the instrument shows nothing below 0. These readings are "
+            "only upper limits, and are left out"
         )
     images_through_layers = model.renderer.layered and model.captures.table is None
     if images_through_layers and (what := veiled(model.renderer, model.at(Values(), 0))):
@@ -69,9 +69,9 @@ def after_calibration(model: SceneModel, found: Fit, level: Row | None) -> list[
         texts.append(f"the model {what}, too far for a missing effect: check {AT_FAULT}")
     if (misfit := weight_of(found.variables)) > 1:
         texts.append(
-            "the model misses the images by more than their noise; errors count this misfit, "
-            f"{misfit**0.5:.3g} times those of noise alone, and priors weigh as much more: what is known "
-            "stays near its prior until the missing effect is found"
+            "the model misses the images by more than their noise. Errors include this misfit: they are "
+            f"{misfit**0.5:.3g} times those of noise alone. The priors weigh as much more, so that parameters stay "
+            "near them until the missing effect is found"
         )
     texts += _far_lights(model, found)
     known = [(v, value_of(model, found.values, v), v.prior) for v in found.variables if v.prior is not None]
@@ -106,8 +106,8 @@ def _far_lights(model: SceneModel, found: Fit) -> list[str]:
             name = led if board is None else board.name
             texts[name] = (
                 f"{name} ran to {after:.3g} mm from {before:.3g} mm: over the {max(across):.3g} mm of the face it acts "
-                "like collimated light. Light that fills shadows and slopes makes a model do that where it is missing: "
-                "ask for 'light returned by the window', 'ambient light' and 'interreflection'"
+                "like collimated light. A model does that if light that fills shadows and slopes is missing: test "
+                "'light returned by the window', 'ambient light' and 'interreflection'"
             )
     return list(texts.values())
 

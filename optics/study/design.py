@@ -159,7 +159,7 @@ class Plan:
         lines.append(table(rows))
         alike = [c for c in self.confused if not c["weak"]]
         if alike:
-            lines += ["", f"not told apart (D below {CLEAR:g}):"]
+            lines += ["", f"not separated (D below {CLEAR:g}):"]
             lines += [f"  {c['effect']} from {c['rival']}: D {c['d']:.3g}; {c['why']}" for c in alike[:20]]
             if len(alike) > 20:
                 lines.append(f"  and {len(alike) - 20} more (--json lists all)")

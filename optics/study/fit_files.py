@@ -85,7 +85,7 @@ class Posterior:
         for what, names in (("variables", read.variables), ("keys", [key for keys in read.keys for key in keys])):
             if len(set(names)) < len(names):
                 twice = next(name for name in names if names.count(name) > 1)
-                raise ValueError(f"{where}: {what}: '{twice}' stands twice; allowed: each once; {AGAIN}")
+                raise ValueError(f"{where}: {what}: '{twice}' appears twice; allowed: each once; {AGAIN}")
         lower = np.zeros((count, count))
         for i, row in enumerate(read.correlation):
             if len(row) != i + 1:

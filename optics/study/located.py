@@ -71,8 +71,8 @@ class Located:
         ]
         if fit.chi2 > AMISS * fit.dof:
             lines.append(
-                "warning: the images are not explained; some places are wrong, or the scene is: give more presses, or "
-                "parameters by --free, and compare the images"
+                "warning: the fit does not explain the images. Some positions or the scene are wrong: give more "
+                "presses, free parameters (--free), and compare the images"
             )
         lines += [
             f"{v.name:30s} {fit.values.common[v.name]:.5g} +- {sd:.2g} {v.parameter.unit}"

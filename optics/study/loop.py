@@ -397,8 +397,8 @@ def examine_in_cells(
     )
     k = cells.k
     remark = (
-        f"images of {cells.width} x {cells.height} px were diagnosed in cells of {k} x {k} px, and images and "
-        "pixels of this diagnosis are theirs: what is finer, as a blur or the rim of a shadow, shows less"
+        f"images of {cells.width} x {cells.height} px were diagnosed in cells of {k} x {k} px; each cell counts as one "
+        "pixel of this diagnosis. Finer structure, such as a blur or the rim of a shadow, shows less"
     )
     result = examine(record, coarse, own, found, progress, advised, without, ranked, remark)
     result.fits = {name: replace(fit, values=cells.values_back(fit.values)) for name, fit in result.fits.items()}
@@ -501,7 +501,7 @@ def _extended(
     if after > before:
         best.warnings.append(
             f"held-out chi2/dof rises from {before:.4g} to {after:.4g} with {effect.name}: it does not predict the "
-            "frames that it was not fitted to, so it is not the cause, or not by itself"
+            "held-out frames, so it is not the cause, or not the only one"
         )
     return best, comparison
 

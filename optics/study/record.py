@@ -188,7 +188,7 @@ class Record:
             record["shown"] = [f["name"] for f in record["steps"][0]["frames"]]
         if not record["steps"] and not empty:
             raise ValueError(
-                f"{folder}: the study has no step yet, its calibration was cut off; "
+                f"{folder}: the study has no step yet, its calibration was interrupted; "
                 f"`optics calibrate {record['captures']} -o {folder} --resume` finishes it"
             )
         return cls(folder, record)

@@ -313,7 +313,7 @@ def variables_of_base(model: SceneModel, setup: Setup, frames: Sequence[int]) ->
     twice = _twice(model, setup.free, setup.per_group or ())
     if twice:
         raise ValueError(
-            f"{some(twice, 4)}: free for all frames and for each group at once, which no frame can tell apart; "
+            f"{some(twice, 4)}: free for all frames and for each group at once, which no frame can separate; "
             "allowed: one of --free and --per-group"
         )
     variables = calibrate.variables_from(model, setup.free or default_free(model), per_group, None, frames)
@@ -321,8 +321,7 @@ def variables_of_base(model: SceneModel, setup: Setup, frames: Sequence[int]) ->
     if swept:
         raise ValueError(
             f"{some(sorted(swept), 4)}: set anew in the readings of a group, so that a group has no one value; "
-            "allowed: per group what the table does not set; what is known of a setting's error stands under "
-            "[uncertainty]"
+            "allowed: per group what the table does not set; give the error of a setting under [uncertainty]"
         )
     if setup.per_group is None:
         variables = [v for v in variables if v.frames is None or not _untouched(model, v.frames)]

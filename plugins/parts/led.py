@@ -196,8 +196,8 @@ def build():
             own = mi.Point3f(self.x, self.y, self.z)
             if self.board is None and self.board_name:
                 raise BadScene(
-                    f"led '{self.name}' stands on the board '{self.board_name}', and this scene's parts have not been "
-                    "told of one another; call optics.wire(scene) before you render with another integrator"
+                    f"led '{self.name}' stands on the board '{self.board_name}', and the parts of this scene are not "
+                    "connected yet; call optics.wire(scene) before you render with another integrator"
                 )
             return own if self.board is None else self.board.place(own, self.turned_by())
 

@@ -70,7 +70,7 @@ HEAD = "Ref,PosX,PosY\n"
         (HEAD + "D1,2,1e300\n", "board.csv:D1", r"line 2: y = 1e\+300 mm; allowed: -10000 to 10000 mm; check its unit"),
         (HEAD + "D1,2,3ft\n", "board.csv:D1", "line 2: y = '3ft'"),
         ("Ref,PosX(ft),PosY(ft)\nD1,2,3\n", "board.csv:D1", r"unit 'ft' of the column 'PosX\(ft\)'; allowed: mm"),
-        (HEAD + "D2,1,1\nD1,1,2\nD1,3,4\n", "board.csv:D1", "'D1' stands at several places, in lines 3, 4"),
+        (HEAD + "D2,1,1\nD1,1,2\nD1,3,4\n", "board.csv:D1", "'D1' appears several times, in lines 3, 4"),
         (HEAD + "D1,2\n", "board.csv:D1", "line 2: 2 columns of 3; needed: D1's x and y"),
         (HEAD + '"D1,2,3\nD2,1,2\n', "board.csv:D1", "no part 'D1'; it has D1,2,3, D2"),
         (HEAD + 20_000 * "D,1,2\n", "board.csv:D1", "over 10000 rows"),

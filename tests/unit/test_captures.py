@@ -341,7 +341,7 @@ BAD = {
         frames('[frames.parameters]\n"led.power" = [1.0]\n'),
         r'frame 0 .*"led.power" = \[1.0\]; allowed',
     ),
-    "key without quotes": (frames("[frames.parameters]\nled_red.power = 1.0\n"), 'stands in quotes: "led_red.power"'),
+    "key without quotes": (frames("[frames.parameters]\nled_red.power = 1.0\n"), 'needs quotes: "led_red.power"'),
     "zero frames": ('scene = "bench"\nframes = []\n', "zero frames; allowed: one"),
     "no frames at all": ('scene = "bench"\n' + NOISE, "zero frames; allowed: one"),
     "frames no list": ('scene = "bench"\n[frames]\nimage = "frames/000.png"\n', "zero frames; allowed: one"),

@@ -308,7 +308,7 @@ def test_the_first_image_of_a_scene_is_its_first_look(optics, tmp_path):
         ("own", [shutil.copy(scene.find("gelsight"), tmp_path / "own.xml")]),
     ):
         code, _, err = optics("render", *words, "-o", tmp_path / f"{name}.exr")
-        assert code == 0 and ("nothing was set: this is its first look, -D depth=" in err) == (name == "bare"), err
+        assert code == 0 and ("nothing was set, so this is the first look: -D depth=" in err) == (name == "bare"), err
         made[name] = exr.read(tmp_path / f"{name}.exr")[0], json.loads((tmp_path / f"{name}.json").read_text())
     touched = {name: bool(channels["contact.Y"].max() > 0) for name, (channels, _) in made.items()}
     assert touched == {"bare": True, "look": True, "plain": False, "set": False, "own": False}

@@ -228,7 +228,7 @@ def test_a_packs_folder_says_its_own_scale(large, tmp_path):
     assert found.facts["ball_radius_mm"] == 2.0 and found.facts["background"] == "median"
     text = "\n".join(found.warnings)
     assert "does not say the ball's radius" in text and "names has 13 entries for 12 images" in text
-    assert "JPEG" in text and "two routes" not in text
+    assert "JPEG" in text and "two ways to find the scale" not in text
     # the same presses as in the small pack, but for where pixel centres lie
     first = captures.load(found.folder).frames[0]
     assert first.name == "000" and first.image.shape == (H, W, 3)

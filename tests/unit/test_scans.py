@@ -132,7 +132,7 @@ def test_the_scene_shows_the_balls_where_they_are(imported):
     [
         ({"images": "image07.png"}, "images = 'image07.png'; allowed: a list of file names"),
         ({"images": ["image07.png", "../two/image08.png"]}, "no file '../two/image08.png'"),
-        ({"images": ["image07.png", "image07.png"]}, "'image07.png' stands twice"),
+        ({"images": ["image07.png", "image07.png"]}, "'image07.png' appears twice"),
         ({"images": ["image0.7.png"]}, "names of files name the LEDs; allowed: letters, digits"),
         ({"calibradius": "a"}, "calibradius = 'a'; allowed: a number"),
         ({"calibradius": 0.001}, "are 0.0833 px; allowed: balls of 5 to 192 px radius in images of 512 x 384 px"),
@@ -194,7 +194,7 @@ BOMB = "a0: &a0 [x, x, x, x, x, x, x, x, x]\n" + "".join(
         ("", "images = None; allowed"),
         (
             "images: [a.png]\ncalibradius: 1\ncalibradius: 2\n",
-            "no YAML (line 3: calibradius stands twice in one table)",
+            "no YAML (line 3: calibradius appears twice in one table)",
         ),
         ("images: " + 5000 * "[", "nested too deep"),
         ("images: !!python/object/apply:os.getcwd []", "no YAML (could not determine a constructor"),

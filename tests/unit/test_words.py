@@ -243,4 +243,4 @@ def test_a_claim_beside_much_misfit_rules_nothing_out(left, told):
     levels = [SimpleNamespace(held_out=0.05), SimpleNamespace(held_out=0.02)]
     f = SimpleNamespace(lead=100.0, against="leak")
     text = _claim(f, claimed, [claimed, other], [best], levels, [], basis)
-    assert ("Not leak" in text) is told
+    assert ("Upper limits of other effects: leak" in text) is told

@@ -328,9 +328,9 @@ CASES = [
     ("batch fixed.toml", r"fixed\.toml: \[parameters\]: unknown parameter 'gel\.press_z'"),
     (
         "batch unquoted.toml",
-        r"unquoted\.toml: \[parameters\]: gel is a table; a key with a dot stands in quotes: \"gel\.press_x\"",
+        r"unquoted\.toml: \[parameters\]: gel is a table; a key with a dot needs quotes: \"gel\.press_x\"",
     ),
-    ("batch unquoted_sample.toml", r"\[sample\]: gel is a table; a key with a dot stands in quotes: \"gel\.press_x\""),
+    ("batch unquoted_sample.toml", r"\[sample\]: gel is a table; a key with a dot needs quotes: \"gel\.press_x\""),
     ("batch both.toml", r"both\.toml: gel\.press_x stands in \[parameters\] and in \[sample\]"),
     ("batch sample.toml", r"sample\.toml: \[sample\]: unknown parameter 'gel\.press_z'"),
     ("batch shape.toml", r"shape\.toml: \[sample\].*'unifrom'; did you mean 'uniform'"),

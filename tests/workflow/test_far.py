@@ -149,8 +149,8 @@ def test_an_effect_that_does_not_predict_is_reported_as_no_cause(monkeypatch):
     effect = SimpleNamespace(name="row curve", file="", requires=(), part="camera")
     found, _ = loop.extend(study, model, SimpleNamespace(robust=False), SimpleNamespace(variables=[]), effect, Values())
     assert found.warnings == [
-        "held-out chi2/dof rises from 1.5 to 1.6 with row curve: it does not predict the frames that "
-        "it was not fitted to, so it is not the cause, or not by itself"
+        "held-out chi2/dof rises from 1.5 to 1.6 with row curve: it does not predict the "
+        "held-out frames, so it is not the cause, or not the only one"
     ]
 
 

@@ -149,7 +149,7 @@ def test_other_series_of_a_table_are_passed_over(tmp_path):
     write(tmp_path / "captures", {"analyzer.angle": TURN, "other": TURN}, noisy(malus(TURN)))
     file = tmp_path / "captures" / "captures.toml"
     text = file.read_text(encoding="utf-8")
-    with pytest.raises(KeyError, match='ignore = \\["other"\\] passes over it'):
+    with pytest.raises(KeyError, match='ignore = \\["other"\\] ignores it'):
         loop.begin(setup_for(tmp_path / "captures"), tmp_path / "study")
     file.write_text(text + 'ignore = ["other"]\n', encoding="utf-8")
     _, model, fit = loop.begin(setup_for(tmp_path / "captures"), tmp_path / "study")
