@@ -320,7 +320,7 @@ def _descend(
         gained = descent.chord(STEPS_NEAR if near else STEPS, WORTH * enough, NEAR * count if near else 0.0, PART)
         if negligible > NEGLIGIBLE and gained < negligible * excess:
             return history, f"converged to {negligible:.2g} of the misfit after {iteration + 1} linearisations"
-        if gained < enough and not near:
+        if gained < accuracy and not near:
             return history, f"no lower misfit within reach; the linear model still promised {promise:.3g}"
     else:
         return history, f"stopped after {max_iterations} linearisations without converging; allow more or start nearer"
