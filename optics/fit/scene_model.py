@@ -7,11 +7,13 @@ from __future__ import annotations
 import copy
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
+from scipy import ndimage
 
 from optics.captures.capture_set import Captures, Frame, cfa_channel, sweeps, with_lasting_settings
 from optics.captures.noise import Noise
@@ -28,6 +30,7 @@ if TYPE_CHECKING:
 
 CUT_OFF = 3  # readings of 0, and none below, that tell of an instrument that shows no negative numbers
 KEPT = 4  # points in parameter space, for each frame, at which the variance that settings bring is remembered
+BESIDE = 2  # px: a lens that blurs by 0.7 px, or shifts by two, brings no light from farther
 FLAT_FIELDS = ("multiplicative", "additive", "none")
 
 
@@ -78,6 +81,8 @@ class SceneModel:
         self.monte_carlo = (
             self.renderer.monte_carlo
         )  # whether predictions are Monte Carlo estimates, whose error `variance` holds
+        self.sparing = False  # whether pixels that no frame of a press uses do without finer samples
+        self._needed_kept: dict[int, np.ndarray | None] = {}
         self._edges_kept: dict[int, np.ndarray] = {}
         self._dialled_kept: OrderedDict[tuple, np.ndarray] = OrderedDict()
         # Values at which slopes turn errors of settings into errors of readings; None: the present ones. While a fit
@@ -186,6 +191,7 @@ class SceneModel:
         )
         twin.base = {**self.base, **dict.fromkeys(twin.driven - self.driven, 1.0)}
         twin.companions, twin._edges_kept = twin._companions(), dict(self._edges_kept)
+        twin._needed_kept = {}
         twin._dialled_kept = OrderedDict()
         return twin
 
@@ -289,9 +295,35 @@ class SceneModel:
         return [self._predict(self._turn_to(values, i), i, seed) for i in self._indices(frames)]
 
     def _turn_to(self, values: Values, index: int) -> dict:
-        """A frame's values; tells the renderer which other LEDs will be asked for in the same geometry."""
+        """A frame's values; tells the renderer which other LEDs will be asked for in the same geometry, and of which
+        pixels."""
         self.renderer.together = self.companions[index]
+        self.renderer.wanted = self._needed(index) if self.sparing else None
         return self.at(values, index)
+
+    @contextmanager
+    def where_used(self) -> Iterator[None]:
+        """Within it, predictions take finer samples only at the pixels that a frame of the same press uses, and beside
+        them: of a mask that leaves a part of the image, a fit need not know the rest well."""
+        before, self.sparing = self.sparing, True
+        try:
+            yield
+        finally:
+            self.sparing, self.renderer.wanted = before, None
+
+    def _needed(self, index: int) -> np.ndarray | None:
+        """(H, W) pixels that frames of the same press use, and those within BESIDE of them, whose light a lens may
+        bring there; None: all. One array for all frames of a press, as they share its images."""
+        if index not in self._needed_kept:
+            press = [i for i, own in enumerate(self.companions) if own is self.companions[index]]
+            needed = None
+            if self.captures.table is None and not (self.renderer.layered or self.renderer.crowded):
+                self.renderer.wanted = None  # masks may look at images themselves
+                used = np.any([self.usable(i).any(-1) for i in press], axis=0)
+                needed = ndimage.binary_dilation(used, np.ones((2 * BESIDE + 1, 2 * BESIDE + 1), bool))
+                needed = None if needed.all() else needed
+            self._needed_kept.update(dict.fromkeys(press, needed))
+        return self._needed_kept[index]
 
     def _develop(self, now: Mapping, index: int, seed: int) -> np.ndarray:
         return self.developer.develop(self.radiance(now, index, seed), now)

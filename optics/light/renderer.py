@@ -144,6 +144,7 @@ class Renderer:
         self._still = {k: scene.parameters[k].neutral for k in self.ambient_keys}
         self._tangents: OrderedDict = OrderedDict()
         self.together: set[str] = set()  # LEDs whose images are wanted of the same geometry
+        self.wanted: np.ndarray | None = None  # (H, W) pixels that take finer samples where they need them; None: all
 
     def kind(self, key: str) -> str:
         part = self.scene.parts.get(key.rsplit(".", 1)[0])
@@ -299,6 +300,7 @@ class Renderer:
             tuple(values[k] for k in self.shading_keys),
             tuple(values[k] for k in self.led_keys[led]),
             seed if self.crowded else 0,
+            None if self.wanted is None else id(self.wanted),
         )
 
     def led(self, values: Mapping, led: str, seed: int = 0) -> LedImage:
@@ -378,6 +380,8 @@ class Renderer:
         visible = self._unshaded(hits, part)
         rim = self._joint_rim(hits) if self.layered else self._rim(hits, visible)
         share = np.where(self._joint_rim(hits) if self.crowded else rim, 1.0, hits.bent)
+        if self.wanted is not None:
+            share = np.where(self.wanted, share, 0.0)
         index = np.flatnonzero(share)
         # of a light of many points, an edge in the shadow of one is small
         few = ~(hits.edges if self.crowded or len(part.places()) > SOFT else rim)

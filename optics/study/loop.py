@@ -54,6 +54,7 @@ from optics.study.setup import (
 )
 from optics.study.shown import fingerprints_of, mosaic_of, shown_frames
 from optics.study.stages import (
+    SAME,
     TOGETHER,
     Progress,
     background_of,
@@ -124,7 +125,8 @@ def begin(
     with record.alone():
         try:
             start = Values(dict(setup.values))
-            found = fit_base(model, variables, fitted, start, progress, robust=setup.robust, tempering=True)
+            with model.where_used():
+                found = fit_base(model, variables, fitted, start, progress, robust=setup.robust, tempering=True)
             write_step(record, model, "base", None, found, held, time.perf_counter() - clock)
         except BaseException:
             record.discard()
@@ -200,9 +202,10 @@ def restore(record: Record, model: SceneModel, index: int = -1) -> Fit:
     if model.dialled:
         model.weighed_at = values.copy()
     enough = TOGETHER * weight_of(variables)
-    found = calibrate.fit(model, variables, values, fitted, max_iterations=most, tolerance=enough)
-    if record.steps[index]["converged"] and not found.converged:  # on another machine, the last digits differ
-        found = calibrate.fit(model, variables, found.values, fitted, max_iterations=FURTHER, tolerance=enough)
+    with model.where_used():
+        found = calibrate.fit(model, variables, values, fitted, max_iterations=most, tolerance=enough)
+        if record.steps[index]["converged"] and not found.converged:  # on another machine, the last digits differ
+            found = calibrate.fit(model, variables, found.values, fitted, max_iterations=FURTHER, tolerance=enough)
     return found
 
 
@@ -321,7 +324,7 @@ def examine(
 
     Raises OutputExists where another process works on the study.
     """
-    with record.alone():
+    with record.alone(), model.where_used():
         return _examined(record, model, setup, found, progress, advised, without, ranked, remark)
 
 
@@ -392,9 +395,10 @@ def examine_in_cells(
     start = cells.values_into(values)
     # a diagnosis calls a base settled that promises less than SETTLED of its excess; four times as well leaves room
     enough = SETTLED / 4
-    found = calibrate.fit(
-        coarse, variables, start, fitted, max_iterations=FURTHER, negligible=enough, progress=progress
-    )
+    with coarse.where_used():
+        found = calibrate.fit(
+            coarse, variables, start, fitted, max_iterations=FURTHER, negligible=enough, progress=progress
+        )
     k = cells.k
     remark = (
         f"images of {cells.width} x {cells.height} px were diagnosed in cells of {k} x {k} px; each cell counts as one "
@@ -478,19 +482,22 @@ def _extended(
         seek(model, found.values, [effect], fitted)
         start = off_neutral(model, found.values, extra)
     clock = time.perf_counter()
-    best = calibrate.fit_over_starts(
-        model,
-        variables,
-        start,
-        fitted,
-        tolerance=TOGETHER * weight_of(variables),
-        robust=setup.robust,
-        progress=progress,
-        over=[v.name for v in extra],
-    )
-    if model.captures.table is None:
-        best = cooled(model, best, setup.robust, progress)
-    best = settled(model, best, setup.robust, progress)
+    images = model.captures.table is None
+    with model.where_used():
+        best = calibrate.fit_over_starts(
+            model,
+            variables,
+            start,
+            fitted,
+            tolerance=TOGETHER,
+            negligible=SAME if images else None,
+            robust=setup.robust,
+            progress=progress,
+            over=[v.name for v in extra],
+        )
+        if images:
+            best = cooled(model, best, setup.robust, progress)
+        best = settled(model, best, setup.robust, progress)
     if effect.file:  # a draft is written after the study began
         own = places.own_plugins(model.scene.registry)
         file = Path(effect.file).resolve()
@@ -516,7 +523,8 @@ def write_step(
     seconds: float,
 ) -> Comparison:
     """Record a calibrated model as the next step of the study; returns how it compares with all frames."""
-    values, extra = held_out_values(model, found, held)
+    with model.where_used():
+        values, extra = held_out_values(model, found, held)
     comparison = comparison_of(model, values, held, len(found.variables), extra)
     found.warnings += checks.after_calibration(model, found, comparison.fitted)
     # A study that was taken up again brings the held-out poses of the step before: those found now replace them.
