@@ -36,8 +36,8 @@ def test_values_that_are_used_stay(bench, blur):
     assert np.abs(sparing - whole)[mask].max() < (0.01 if blur else 1e-6 * scale)
     for key in keys:
         left = np.abs(own[key] - slopes[key])[mask].max() / np.abs(slopes[key]).max()
-        # a blur far below a pixel rings: of the slope three pixels beside it brings 2 V/9 of V = .16 px^2, a few per cent,
-        # of which finer samples change a part
+        # a blur far below a pixel rings: of the slope three pixels beside it brings 2 V/9 of V = .16 px^2, a few per
+        # cent, of which finer samples change a part
         assert left < (5e-3 if blur else 1e-6), key
     assert np.array_equal(again, whole)  # outside of the context, all is as before
     assert np.abs(sparing - whole)[far].max() > 1e-4 * scale  # and within it something was left out
