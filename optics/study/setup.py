@@ -88,7 +88,7 @@ def setup_for(captures: str | Path, **given: object) -> Setup:
         raise UnknownKey(str(own["region"]), REGIONS, "region", "--region")
     for name in ("priors", "values"):  # what is given of one parameter leaves the others as advised
         if name in advised and name in own:
-            own[name] = {**advised[name], **own[name]}
+            own[name] = advised[name] | own[name]  # type: ignore[operator]
     return recorded({**advised, **own, "captures": str(captures)})
 
 
