@@ -50,6 +50,13 @@ def test_a_bad_table_gets_one_error(text, tmp_path):
     assert BAD[text] in str(error.value) and "\n" not in str(error.value)
 
 
+@pytest.mark.parametrize("encoding", ["latin-1", "utf-16"])  # as spectrometers and spreadsheets save them
+def test_a_table_in_another_encoding_gets_one_error(encoding, tmp_path):
+    (tmp_path / "own.csv").write_text("wavelength (\u00b5m),T\n0.4,0.1\n0.5,0.2\n", encoding=encoding)
+    with pytest.raises(BadScene, match=r"camera.filter = 'own.csv': own.csv is not text in UTF-8; allowed"):
+        read_curve("own.csv", "transmittance", [tmp_path], "camera.filter")
+
+
 def test_bands_that_are_no_light_ask_for_the_unit():
     from optics.spectra.bands import parse
 
