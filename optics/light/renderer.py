@@ -1,10 +1,11 @@
 """Prediction: what a scene says that a capture set should look like, frame by frame, and how that changes.
 
 Light is linear in every LED, so each LED is rendered once per geometry at power 1 and kept; powers, exposure, colour
-and response act on the kept images. One sample per pixel is exact away from edges: pixels at the rim of a shadow or of
-the gel are sampled 128 times; where the face bends, and in the penumbra of a light of many points, 16 times. Derivative
-images come from Dr.Jit in forward mode through the shading, with the primary hits and shadows kept; at rims, where that
-misses the moving edge, and for everything that moves geometry they are central differences with common samples
+and response act on the kept images. One sample per pixel does away from edges (on `digit` its middle is up to 0.1 %
+from its mean where pixels are 0.5 mm wide, 0.01 % where they are 0.05 mm): pixels at the rim of a shadow or of the gel
+are sampled 128 times; where the face bends, and in the penumbra of a light of many points, 16 times. Derivative images
+come from Dr.Jit in forward mode through the shading, with the primary hits and shadows kept; at rims, where that misses
+the moving edge, and for everything that moves geometry they are central differences with common samples
 (`Parameter.how`)."""
 
 from __future__ import annotations

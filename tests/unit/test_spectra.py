@@ -114,7 +114,8 @@ OF_MITSUBA = {  # a spectrum of Mitsuba's in a scene: the same by a text of ours
     'type="uniform"><float name="value" value="0.5"/>': 0.5,
     'type="blackbody"><float name="temperature" value="3000"/>': "blackbody(3000)",
     'type="d65"': "CIE D65",
-    'type="irregular"><string name="wavelengths" value="400,550,700"/><string name="values" value="0.1,0.8,0.2"/>': PAIRS,
+    'type="irregular"><string name="wavelengths" value="400,550,700"/>'
+    '<string name="values" value="0.1,0.8,0.2"/>': PAIRS,
 }
 
 
