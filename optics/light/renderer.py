@@ -1,10 +1,11 @@
 """Prediction: what a scene says that a capture set should look like, frame by frame, and how that changes.
 
 Light is linear in every LED, so each LED is rendered once per geometry at power 1 and kept; powers, exposure, colour
-and response act on the kept images. One sample per pixel is exact away from edges: pixels at the rim of a shadow or of
-the gel are sampled 128 times; where the face bends, and in the penumbra of a light of many points, 16 times. Derivative
-images come from Dr.Jit in forward mode through the shading, with the primary hits and shadows kept; at rims, where that
-misses the moving edge, and for everything that moves geometry they are central differences with common samples
+and response act on the kept images. One sample per pixel does away from edges (on `digit` its middle is up to 0.1 %
+from its mean where pixels are 0.5 mm wide, 0.01 % where they are 0.05 mm): pixels at the rim of a shadow or of the gel
+are sampled 128 times; where the face bends, and in the penumbra of a light of many points, 16 times. Derivative images
+come from Dr.Jit in forward mode through the shading, with the primary hits and shadows kept; at rims, where that misses
+the moving edge, and for everything that moves geometry they are central differences with common samples
 (`Parameter.how`)."""
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from __future__ import annotations
 import copy
 import math
 from collections import OrderedDict
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import NamedTuple
@@ -442,12 +443,25 @@ class Renderer:
             plain = self.led(values, light, seed).radiance if plain is None else plain
             return plain if component == 0 else np.zeros_like(plain)
         image = self.led(values, light)
-        seen = [
-            None if r is None or w is None else r * w for r, w in zip(image.raw, self.weights(values, image, component))
-        ]
-        for add in self._glows(values, image, component):
+        pairs = zip(image.raw, self.weights(values, image, component))
+        glows = list(self._glows(values, image, component))
+        if not glows:
+            return self._layered(image, pairs, self._own(light))
+        seen = [None if r is None or w is None else r * w for r, w in pairs]
+        for add in glows:
             seen = [s if s is None else s + a for s, a in zip(seen, add)]
         return self._mix(image, seen)
+
+    def _layered(self, image: LedImage, pairs: Iterable[tuple], own: np.ndarray) -> np.ndarray:
+        """(H, W, B) of light that is dark but in its own bands, which lie beside each other, behind layers; pairs of
+        what it makes before them and of what they leave."""
+        inside = slice(own.min(), own.max() + 1) if len(own) else slice(0, 1)
+        lit = self._mix(image, [None if r is None or w is None else r[:, inside] * w[:, inside] for r, w in pairs])
+        if lit.shape[-1] == self.bands:
+            return lit
+        found = np.zeros((*lit.shape[:2], self.bands), lit.dtype)
+        found[..., inside] = lit
+        return found
 
     def _glows(self, values: Mapping, image: LedImage, component: int) -> Iterator[tuple]:
         """What boundaries send to the camera by themselves while one light is on (stage `glow`): at centres, at finer
@@ -644,11 +658,8 @@ class Renderer:
         result = raw[0] * weights[0] if self.layered else raw[0].copy()
         if len(image.index):
             result[image.index] += image.share * (image.finer.mean(raw[1] * weights[1]) - result[image.index])
-        return (
-            result.reshape(-1, self.width, self.bands)
-            if len(result) != self.height * self.width
-            else result.reshape(self.height, self.width, self.bands)
-        )
+        height = self.height if len(result) == self.height * self.width else -1
+        return result.reshape(height, self.width, result.shape[-1])
 
     def _bands(self, spectrum, count: int | None = None) -> np.ndarray:
         import drjit as dr
@@ -862,7 +873,8 @@ class Renderer:
                 .astype(float)
             )
         image = self.glow(values)
-        return self._mix(image, image.raw, self.weights(values, image, component))
+        own = np.arange(self.bands) if self.integral is None else np.flatnonzero(self.integral.white)
+        return self._layered(image, zip(image.raw, self.weights(values, image, component)), own)
 
     def glow(self, values: Mapping) -> LedImage:
         """The image of light that no LED made, in a scene with layers, before these; the latest is kept."""

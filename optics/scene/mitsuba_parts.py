@@ -321,12 +321,16 @@ class Declared:
         return found_file(self._folders, name)
 
     def read_spectrum(self, props, name: str, kind: str) -> Curve | None:
-        """The curve that an attribute names (optics.spectra.reading), kept in `curves`; None without it."""
+        """The curve that an attribute names (optics.spectra.reading), or a spectrum of Mitsuba's, kept in `curves`;
+        None without it."""
+        from optics.scene.surfaces import curve_of
         from optics.spectra.reading import read_curve
 
-        text = str(props.get(name, "")).strip()
-        if text:
-            self.curves[name] = read_curve(text, kind, self._folders, f"{self.name}.{name}")
+        given, where = props.get(name) if name in props else "", f"{self.name}.{name}"
+        if not isinstance(given, str):
+            self.curves[name] = curve_of(given, kind, where)
+        elif given.strip():
+            self.curves[name] = read_curve(given, kind, self._folders, where)
         return self.curves.get(name)
 
     def read_sensitivities(self, text: str, name: str) -> tuple[Curve, ...]:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
+from optics.errors import BadScene
 from optics.scene.mitsuba_parts import Declared
 from optics.spectra.curve import VISIBLE
 
@@ -77,6 +78,33 @@ def texture_of(curve, band: float | None = None):
             "values": ", ".join(f"{v:.8g}" for v in curve(nm)),
         }
     )
+
+
+def curve_of(value, kind: str, where: str):
+    """The curve of a spectrum of Mitsuba's: the pairs or the file of a `<spectrum>`, constant over the visible where it
+    is one number; any other of its spectra (`blackbody`, `regular`, `d65`) read in steps of 1 nm over the visible.
+
+    kind    one of optics.spectra.curve.KINDS;   where   what asks for it, for errors: 'led_red.spectrum'
+    Raises BadScene, of a texture over a surface and in a mono variant, where Mitsuba's spectra are one number.
+    """
+    import mitsuba as mi
+    import numpy as np
+
+    from optics.spectra.reading import ALLOWED, checked
+
+    if hasattr(value, "is_uniform"):  # what Mitsuba reads of a <spectrum> without a type
+        nm, values = np.asarray(value.wavelengths, float), np.asarray(value.values, float)
+        nm, values = (np.array(VISIBLE), np.repeat(values, 2)) if value.is_uniform() else (nm, values)
+        return checked(nm, values, kind, "a spectrum of Mitsuba's", where)
+    if not isinstance(value, mi.Texture) or value.is_spatially_varying():
+        raise BadScene(f"{where}: {type(value).__name__} is no spectrum; allowed: Mitsuba's spectra, or {ALLOWED}")
+    if not mi.is_spectral:
+        raise BadScene(f"{where}: {value.class_name()} has one value in the variant {mi.variant()}; allowed: {ALLOWED}")
+    nm = np.arange(VISIBLE[0], VISIBLE[1] + 1)
+    si = mi.SurfaceInteraction3f()
+    si.wavelengths = mi.UnpolarizedSpectrum(mi.Float(nm.astype(np.float32)))
+    values = np.array(value.eval(si)[0], float)
+    return checked(nm, np.broadcast_to(values, nm.shape), kind, f"Mitsuba's {value.class_name()}", where)
 
 
 def unpolarized(value):

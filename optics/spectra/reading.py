@@ -101,7 +101,13 @@ def read_table(
     """The curves in the columns of a file, which share its wavelengths, and the file."""
     file = find_file(name, folders, where)
     say = f"{where + ' = ' if where else ''}'{name}'"
-    lines = [line for line in file.read_text(encoding="utf-8-sig").splitlines() if line.strip()]
+    try:
+        text = file.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError:
+        raise BadScene(
+            f"{say}: {file.name} is not text in UTF-8; allowed: a table of text; save it as CSV UTF-8"
+        ) from None
+    lines = [line for line in text.splitlines() if line.strip()]
     source = "; ".join(line.strip("# ").strip() for line in lines if line.lower().lstrip("# ").startswith("source"))
     lines = [line for line in lines if not line.lstrip().startswith(("#", "%", "//"))]
     if not lines:

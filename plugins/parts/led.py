@@ -24,8 +24,8 @@ XML
     target point, (0, 0, 0): what the axis looks at, mm: its nominal direction is from the position to here
     board string: id of the part `board` that it stands on; position, target and axis are then in the board's frame
     placed string: FILE:DESIGNATOR of a pick-and-place file, for x and y on the board, mm
-    spectrum string: measured power over the wavelength, in place of the Gaussian: a file, a name or a law (see
-        "Spectra" in the guide); relative to its peak, of channels as integrals to its area
+    spectrum string: measured power over the wavelength, in place of the Gaussian: a file, a name, a law, or a spectrum
+        of Mitsuba's (see "Spectra" in the guide); relative to its peak, of channels as integrals to its area
 """
 
 import math

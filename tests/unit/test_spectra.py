@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from optics.errors import BadScene, UnknownKey
+from optics.scene import loader
+from optics.scene.surfaces import curve_of
 from optics.spectra.colours import illuminant, linear_srgb, xyz
 from optics.spectra.curve import Curve
 from optics.spectra.quadrature import gauss_nodes, lagrange, widths
@@ -48,6 +50,13 @@ def test_a_bad_table_gets_one_error(text, tmp_path):
     with pytest.raises(BadScene, match="filter = 'bad.csv'.*" + BAD[text].split()[0].replace("(", r"\(")) as error:
         read_curve("bad.csv", "transmittance", [tmp_path], "camera.filter")
     assert BAD[text] in str(error.value) and "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("encoding", ["latin-1", "utf-16"])  # as spectrometers and spreadsheets save them
+def test_a_table_in_another_encoding_gets_one_error(encoding, tmp_path):
+    (tmp_path / "own.csv").write_text("wavelength (\u00b5m),T\n0.4,0.1\n0.5,0.2\n", encoding=encoding)
+    with pytest.raises(BadScene, match=r"camera.filter = 'own.csv': own.csv is not text in UTF-8; allowed"):
+        read_curve("own.csv", "transmittance", [tmp_path], "camera.filter")
 
 
 def test_bands_that_are_no_light_ask_for_the_unit():
@@ -94,6 +103,52 @@ def test_a_curve_has_one_value_in_all_arithmetics(mitsuba):
     light = Curve(curve.nm, curve.values, "power")
     lanes = light(mitsuba.UnpolarizedSpectrum(390.0, 450.0, 600.0, 800.0))
     assert [lanes[i][0] for i in range(4)] == pytest.approx([0.0, 0.3, 0.35, 0.0], rel=1e-6)
+
+
+NM = np.arange(400.0, 701.0, 7.0)
+PAIRS = "400:0.1, 550:0.8, 700:0.2"
+OF_MITSUBA = {  # a spectrum of Mitsuba's in a scene: the same by a text of ours, or a number
+    f'value="{PAIRS}"': PAIRS,
+    'filename="own.spd"': PAIRS,
+    'value="0.5"': 0.5,
+    'type="uniform"><float name="value" value="0.5"/>': 0.5,
+    'type="blackbody"><float name="temperature" value="3000"/>': "blackbody(3000)",
+    'type="d65"': "CIE D65",
+    'type="irregular"><string name="wavelengths" value="400,550,700"/>'
+    '<string name="values" value="0.1,0.8,0.2"/>': PAIRS,
+}
+
+
+@pytest.mark.parametrize("text", OF_MITSUBA)
+def test_spectra_of_mitsuba_are_read(mitsuba, text, tmp_path):
+    """Form alone: Mitsuba's own have units of their own. D65 is tabulated in steps of 5 nm there, 1 nm here, and
+    multiplied in single precision."""
+    (tmp_path / "own.spd").write_text(TABLES["lamp.spd"].replace("500 0.5", "550 0.8"), encoding="utf-8")
+    inside = f"<spectrum name='spectrum' {text}{'</spectrum>' if '><' in text else '/>'}"
+    scene = tmp_path / "scene.xml"
+    scene.write_text(
+        f"""<scene version="3.0.0"><integrator type="tactile" id="integrator"><string name="bands" value="auto"/>
+        </integrator><sensor type="camera" id="camera"><string name="sensitivity" value="Nikon 5100 (NPL)"/></sensor>
+        <shape type="rectangle" id="floor"><bsdf type="membrane" id="paint"/></shape>
+        <emitter type="led" id="led">{inside}</emitter></scene>""",
+        encoding="utf-8",
+    )
+    found = loader.load(scene).leds["led"].curves["spectrum"](NM)
+    same = OF_MITSUBA[text]
+    expected = read_curve(same, "power")(NM) if isinstance(same, str) else np.ones(len(NM))
+    assert found / found.sum() == pytest.approx(expected / expected.sum(), rel=1e-3)
+    if isinstance(same, float):
+        assert found == pytest.approx(same)
+
+
+def test_a_texture_is_no_spectrum(mitsuba):
+    image = mitsuba.load_dict({"type": "checkerboard"})
+    for given in (image, mitsuba.ScalarColor3f(1, 0.5, 0.2)):
+        with pytest.raises(BadScene, match="^led.spectrum: .* is no spectrum; allowed: Mitsuba's spectra, or a file"):
+            curve_of(given, "power", "led.spectrum")
+    dark = mitsuba.load_dict({"type": "uniform", "value": 1.5})
+    with pytest.raises(BadScene, match="camera.filter: a transmittance of 1.5; allowed: 0 to 1"):
+        curve_of(dark, "transmittance", "camera.filter")
 
 
 def test_nodes_of_a_gaussian_are_those_of_gauss_and_hermite():
