@@ -1,6 +1,7 @@
 """What every command shares: the terminal, common options, reading arguments, and how errors are reported."""
 
 import atexit
+import enum
 import functools
 import inspect
 import json
@@ -64,8 +65,13 @@ class Terminal:
             say(text)
 
     def stop(self, number: int, frame: FrameType | None) -> None:
-        """What Ctrl-C does."""
+        """What Ctrl-C does; a moment later where nanobind makes an enumeration, in C++ that ends the program by abort
+        when an exception comes through."""
         self.stopped = True
+        if frame is not None and frame.f_code.co_filename == enum.__file__:
+            signal.signal(signal.SIGALRM, self.stop)
+            signal.setitimer(signal.ITIMER_REAL, 0.01)
+            return
         signal.default_int_handler(number, frame)
 
     def go_on(self) -> None:

@@ -171,11 +171,27 @@ def imports():
     return []
 
 loader.shipped_scenes = imports
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background ignores it
 sys.argv = ["optics", "scenes"]
 sys.exit(main())
 """
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120)
     assert (done.returncode, done.stderr, done.stdout) == (130, "interrupted\n", "")
+
+
+def test_ctrl_c_waits_while_an_enumeration_is_made():
+    """An exception there would end the program by SIGABRT."""
+    program = """
+import enum, signal, sys, time
+from types import SimpleNamespace
+from optics.cli import terminal
+terminal.stop(signal.SIGINT, SimpleNamespace(f_code=SimpleNamespace(co_filename=enum.__file__)))
+try:
+    time.sleep(20)
+except KeyboardInterrupt:
+    sys.exit(7)
+"""
+    assert subprocess.run([sys.executable, "-c", program], timeout=120).returncode == 7
 
 
 @pytest.mark.parametrize("moment", np.linspace(0.1, 1.0, 8), ids=lambda m: f"{m:.2f}")
