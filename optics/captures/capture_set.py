@@ -226,7 +226,7 @@ def _noise(table: object, where: str, readings_: bool) -> Noise:
     checks.keys(table, NOISE_KEYS, where)
     assert isinstance(table, Mapping)
     usual = {"system_gain": 0.0, "black_level": 0.0, "saturation": math.inf, "prnu": 0.0} if readings_ else {}
-    missing = [f"{key} ({UNITS[key]})" for key in NOISE_KEYS if key not in table and key not in usual]
+    missing = [f"{key} ({UNITS[key].strip('()')})" for key in NOISE_KEYS if key not in table and key not in usual]
     if missing:
         raise BadCapture(
             f"{where}: {', '.join(missing)} missing; give "

@@ -217,7 +217,7 @@ def read_taxim(pack: str | Path) -> Presses:
         raise BadCapture(f"{path}: no such file; give the dataPack .npz of a Taxim calibration")
     wanted = ("imgs", "touch_center", "touch_radius")
     try:
-        with np.load(path, allow_pickle=False) as data:
+        with open(path, "rb") as raw, np.load(raw, allow_pickle=False) as data:
             missing = [key for key in wanted if key not in data.files]
             if missing:
                 raise BadCapture(

@@ -289,11 +289,14 @@ def design(
     given = {"system_gain": system_gain, "dark_noise": dark_noise, "black_level": black_level, "saturation": saturation}
     if output is not None:
         check_new_folder(output)
+    named = [e.strip() for e in (effects or "").split(",") if e.strip()]
+    if effects is not None and not named:
+        raise ValueError("--effects names none; allowed: names with commas between them; leave it out for all")
     with terminal.progress() as progress:
         result = planning.session(
             subject,
             frames,
-            [e.strip() for e in (effects or "").split(",") if e.strip()],
+            named,
             pairs(defines, "-D"),
             plugins,
             {k: v for k, v in given.items() if v is not None},

@@ -1,6 +1,7 @@
 """What every command shares: the terminal, common options, reading arguments, and how errors are reported."""
 
 import atexit
+import enum
 import functools
 import inspect
 import json
@@ -16,6 +17,7 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -55,16 +57,32 @@ class Terminal:
 
     quiet = False
     debug = False
+    stopped = False  # whether Ctrl-C came: a package may swallow it, as trimesh does where it imports its own parts
     interrupted = False  # whether that was said
 
     def note(self, text: str) -> None:
         if not self.quiet:
             say(text)
 
+    def stop(self, number: int, frame: FrameType | None) -> None:
+        """What Ctrl-C does; a moment later where nanobind makes an enumeration, in C++ that ends the program by abort
+        when an exception comes through."""
+        self.stopped = True
+        if frame is not None and frame.f_code.co_filename == enum.__file__:
+            signal.signal(signal.SIGALRM, self.stop)
+            signal.setitimer(signal.ITIMER_REAL, 0.01)
+            return
+        signal.default_int_handler(number, frame)
+
+    def go_on(self) -> None:
+        """Raises KeyboardInterrupt after Ctrl-C."""
+        if self.stopped:
+            raise KeyboardInterrupt
+
     @contextmanager
     def progress(self) -> Iterator[Callable[[str, int, int], None] | None]:
         """A function (what, done, total) that draws a bar, or, where stderr is no terminal, writes a line now and then;
-        None with --quiet."""
+        None with --quiet. It raises a Ctrl-C that was swallowed."""
         if self.quiet:
             yield None
             return
@@ -85,6 +103,7 @@ class Terminal:
         tasks: dict[str, Any] = {}
 
         def show(what: str, done: int, total: int) -> None:
+            self.go_on()
             if what not in tasks:
                 tasks[what] = bars.add_task(what, total=total)
             bars.update(tasks[what], completed=done, total=total)
@@ -129,6 +148,7 @@ def _lines() -> Callable[[str, int, int], None]:
 
     def show(what: str, done: int, total: int) -> None:
         nonlocal last
+        terminal.go_on()
         if time.monotonic() - last >= EVERY:
             last = time.monotonic()
             say(f"{what}: {done} of {total}")
@@ -283,6 +303,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if getattr(sys, name) is None:  # closed by who started the program
             setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115  for as long as the program runs
     if arguments is None:
+        if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # else it is ignored, as behind nohup
+            signal.signal(signal.SIGINT, terminal.stop)
         try:
             code = _run(sys.argv[1:])
         except KeyboardInterrupt:
@@ -316,7 +338,7 @@ def _run(arguments: Sequence[str]) -> int:
                 code = int(app(args=arguments, prog_name="optics", standalone_mode=False) or 0)
             return _interrupted() if code == INTERRUPTED else code  # typer says nothing of one outside a command
         except Exception as error:
-            return _report(error)
+            return _interrupted() if terminal.stopped else _report(error)
 
 
 def _ctrl_c(error: BaseException | None) -> KeyboardInterrupt | None:

@@ -274,6 +274,8 @@ def _chance(evidence: Evidence, fall: float, dof: int, free: int, chi2: float) -
 def _unit_of(model: Model, coordinate: str) -> str:
     if coordinate in model.parameters:
         return model.parameters[coordinate].unit
+    if coordinate == "intensity":  # of the light, before the camera makes DN of it
+        return ""
     return "mm" if coordinate.endswith(".distance") else UNITS.get(coordinate, "")
 
 

@@ -55,6 +55,7 @@ UNITS = {
     "laplacian": "DN/px^2",
 }
 FAR = ("far field", "far", "far_field")
+SITES_MAX = 4  # analysers of a mosaic up to which each has a curve of its own
 SIDE_MIN_SSIM = 3  # px; the smallest window that has a variance
 
 
@@ -98,7 +99,7 @@ class Row:
 class Curve:
     """Mean residual in sigmas, with its standard error, in bins of one coordinate.
 
-    channel  "all" or one channel
+    channel  "all", one channel, or of a mosaic one analyser ("45 deg")
     centre   mean coordinate in each bin; labels: names instead of numbers, for frame and channel
     se       sample standard deviation / sqrt(n), 1 where n is 1: it takes neighbouring pixels as independent
     rms      root mean square residual in sigmas: 1 is noise
@@ -253,6 +254,7 @@ def compare(
     bins: int = 16,
     black_level: float = 0.0,
     units: Mapping[str, str] | None = None,
+    cell: tuple[int, int] = (1, 1),
 ) -> Comparison:
     """Compare frames (H, W) or (H, W, C) in DN with their predictions; all lists have one entry per frame.
 
@@ -266,6 +268,8 @@ def compare(
     held_out     indices of the frames that the calibration did not see
     parameters   fitted with the other frames; held_out_parameters: poses that were fitted on the held-out ones
     full_scale   DN of 1.0 in l1, ssim and psnr; black_level: DN without light
+    cell         rows and columns that a raw mosaic repeats: curves along `row` and `column` take whole cells, as rows
+                 of one cell look through other filters. With a coordinate `site` (deg) each analyser has its own curves
 
     Raises ValueError when lists or shapes disagree, Underdetermined when no value is usable.
     """
@@ -315,7 +319,8 @@ def compare(
 
     whitened = [np.where(use, (y - f) / np.where(use, s, 1.0), np.nan) for y, f, s, use in data]
     rms_map, mean_map = _maps(whitened)
-    curves = _curves(whitened, data, planes, info["frame"], channels, bins, {**UNITS, **(units or {})})
+    whole = [_whole_cells(p, cell) for p in planes]
+    curves = _curves(whitened, data, whole, info["frame"], channels, bins, {**UNITS, **(units or {})})
     about = [{**{k: v[i] for k, v in info.items()}, "settings": varied[i]} for i in range(frames)]
     return Comparison(rows, curves, about, channels, similarity, float(full_scale), rms_map, mean_map)
 
@@ -542,9 +547,23 @@ def _maps(whitened: list[np.ndarray]) -> tuple[np.ndarray | None, np.ndarray | N
     return np.sqrt(second / seen).astype(np.float32), (first / seen).astype(np.float32)
 
 
+def _whole_cells(planes: dict[str, np.ndarray], cell: tuple[int, int]) -> dict[str, np.ndarray]:
+    """`row` and `column` of a pixel (px, centres at +0.5) replaced by those of the centre of its cell; NaN where the
+    edge of the image cuts the cell."""
+    found = dict(planes)
+    for axis, (name, size) in enumerate(zip(("row", "column"), cell)):
+        if name in planes and size > 1:
+            at = planes[name]
+            found[name] = np.where(at < at.shape[axis] // size * size, (at // size + 0.5) * size, np.nan)
+    return found
+
+
 def _curves(whitened, data, coordinates, names, channels, bins, units) -> list[Curve]:
     """Residual in sigmas against every number-valued coordinate, and against intensity, channel and frame."""
     z = np.concatenate([w.reshape(-1, w.shape[2]) for w in whitened])
+    site = _gathered("site", whitened, data, coordinates)[:, 0]
+    angles = np.unique(site[np.isfinite(site)])
+    angles = angles if 1 < len(angles) <= SITES_MAX and len(channels) == 1 else angles[:0]
     given = list(
         dict.fromkeys(
             n
@@ -555,12 +574,7 @@ def _curves(whitened, data, coordinates, names, channels, bins, units) -> list[C
     )
     curves = []
     for name in given + ["intensity"]:
-        x = np.concatenate(
-            [
-                np.broadcast_to(_plane(name, planes, d), w.shape).reshape(-1, w.shape[2])
-                for planes, d, w in zip(coordinates, data, whitened)
-            ]
-        )
+        x = _gathered(name, whitened, data, coordinates)
         edges = _edges(x[np.isfinite(z) & np.isfinite(x)], bins)
         if edges is None:
             continue
@@ -568,6 +582,9 @@ def _curves(whitened, data, coordinates, names, channels, bins, units) -> list[C
         curves.append(_binned(name, unit, "all", x.ravel(), z.ravel(), edges))
         if len(channels) > 1:
             curves += [_binned(name, unit, label, x[:, c], z[:, c], edges) for c, label in enumerate(channels)]
+        for angle in angles if name != "site" else ():
+            own = site == angle
+            curves.append(_binned(name, unit, f"{angle:g} deg", x[own, 0], z[own, 0], edges))
     frame = np.concatenate([np.full(w.shape[0] * w.shape[1], i) for i, w in enumerate(whitened)])
     for name, index, labels in (
         ("channel", np.broadcast_to(np.arange(len(channels)), z.shape), channels),
@@ -577,6 +594,16 @@ def _curves(whitened, data, coordinates, names, channels, bins, units) -> list[C
             edges = np.arange(len(labels) + 1) - 0.5
             curves.append(_binned(name, "", "all", index.ravel(), z.ravel(), edges, tuple(labels)))
     return curves
+
+
+def _gathered(name: str, whitened, data, coordinates) -> np.ndarray:
+    """(values, C): a coordinate of all frames, NaN where a frame has none."""
+    return np.concatenate(
+        [
+            np.broadcast_to(_plane(name, planes, d), w.shape).reshape(-1, w.shape[2])
+            for planes, d, w in zip(coordinates, data, whitened)
+        ]
+    )
 
 
 def _plane(name: str, planes: dict, frame: tuple) -> np.ndarray:

@@ -7,6 +7,7 @@ What is shown beside one another stays comparable: residuals keep a standard dev
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 
@@ -16,13 +17,21 @@ from optics.captures.capture_set import cfa_channel
 from optics.fit.compare import Comparison
 from optics.study.shown import Fingerprint, Shown
 
+SEAM = 48  # of an image's longer side: the part that lies between the images of two analysers
+
 
 def unwoven(image: np.ndarray, cell: tuple[int, int]) -> np.ndarray:
-    """(H, W, ...) -> the same, less what fills no cell: the pixels at each place of the cell together, as an image of
-    their own at that place. `cell`: rows and columns."""
+    """(H, W, ...) -> about the same, less what fills no cell: the pixels at each place of the cell together, as an
+    image of their own at that place, with a seam of NaN (False, 0) between them. `cell`: rows and columns."""
     (rows, columns), height, width = cell, image.shape[0] // cell[0], image.shape[1] // cell[1]
-    cut = image[: height * rows, : width * columns].reshape(height, rows, width, columns, *image.shape[2:])
-    return cut.swapaxes(0, 1).swapaxes(2, 3).reshape(height * rows, width * columns, *image.shape[2:])
+    seam = math.ceil(max(image.shape[:2]) / SEAM)
+    shape = rows * (height + seam) - seam, columns * (width + seam) - seam, *image.shape[2:]
+    nothing = np.nan if image.dtype.kind == "f" else 0
+    found = np.full(shape, nothing, image.dtype)
+    for i, j in np.ndindex(rows, columns):
+        top, left = i * (height + seam), j * (width + seam)
+        found[top : top + height, left : left + width] = image[i::rows, j::columns][:height, :width]
+    return found
 
 
 class Eye:

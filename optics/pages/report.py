@@ -87,6 +87,7 @@ def estimated(v: Mapping) -> str:
 
 
 CHANNEL_STYLE = {"R": "red", "G": "green", "B": "blue"}
+SITE_STYLES = ("red", "green", "blue", "ochre")  # of the analysers of a mosaic, by angle
 
 
 def report(study_folder: str | Path, out: str | Path, *, overwrite: bool = False) -> Path:
@@ -152,6 +153,7 @@ def render(study: Record) -> str:
         fingerprints=[[] if points else fingerprint_images(own) for own in prints],
         readings=[] if viewer["frames"] or points else reading_charts(comparisons),
         curves=residual_curves(comparisons, points),
+        channel_key=channel_key(comparisons[0]),
         maps=map_images(seen, study.steps) if points is None else [],
         pages=residual_maps.pages(seen, shown, study.steps) if points is None else [],
         coordinates=[residual_maps.coordinates(told(study.diagnosis(i), points)) for i in range(len(study.steps))],
@@ -795,7 +797,7 @@ def ladder_chart(study: Record, width: int, height: int, nouns: Mapping[str, str
 
 
 def residual_curves(comparisons: list[Comparison], points: Readings | None = None) -> list[dict]:
-    """One small chart per coordinate: the first step's curve, in colour channels too, and the last step's."""
+    """One small chart per coordinate: the first step's curve, of each colour or analyser too, and the last step's."""
     first, final = comparisons[0].curves, comparisons[-1].curves
     if points is not None:
         first, final = (
@@ -810,19 +812,40 @@ def residual_curves(comparisons: list[Comparison], points: Readings | None = Non
             for curves in (first, final)
         )
     last = {c.coordinate: c for c in final if c.channel == "all"}
-    out = []
+    styles, out = channel_styles(comparisons[0]), []
     for curve in (c for c in first if c.channel == "all"):
-        channels = [c for c in first if c.coordinate == curve.coordinate and c.channel in CHANNEL_STYLE]
+        channels = [c for c in first if c.coordinate == curve.coordinate and c.channel in styles]
         after = last.get(curve.coordinate) if len(comparisons) > 1 else None
-        own = [c for c in final if c.coordinate == curve.coordinate and c.channel in CHANNEL_STYLE]
-        out.append(
-            {"svg": curve_chart(curve, channels, after), "alone": curve_chart(after, own) if after is not None else ""}
-        )
+        own = [c for c in final if c.coordinate == curve.coordinate and c.channel in styles]
+        alone = curve_chart(after, own, styles=styles) if after is not None else ""
+        out.append({"svg": curve_chart(curve, channels, after, styles), "alone": alone})
     return out
 
 
+def channel_styles(c: Comparison) -> dict[str, str]:
+    """Channel of a curve -> class of its colour: of a colour camera's channels, or of the analysers of a mosaic."""
+    sites = list(dict.fromkeys(curve.channel for curve in c.curves if curve.channel.endswith(" deg")))
+    return {**CHANNEL_STYLE, **dict(zip(sites, SITE_STYLES))}
+
+
+def channel_key(c: Comparison) -> list[tuple[str, str]]:
+    """(class of its colour, name) of the lines of channels in `residual_curves`."""
+    if len(c.channels) == 3:
+        return [("red", "its red"), ("green", "green"), ("blue", "blue")]
+    sites = {name: style for name, style in channel_styles(c).items() if name not in CHANNEL_STYLE}
+    return [
+        (style, f"{'' if k else 'analyser '}{name.removesuffix(' deg')}\N{DEGREE SIGN}")
+        for k, (name, style) in enumerate(sites.items())
+    ]
+
+
 def curve_chart(
-    curve: Curve, channels: Sequence[Curve] = (), after: Curve | None = None, width: int = 340, height: int = 210
+    curve: Curve,
+    channels: Sequence[Curve] = (),
+    after: Curve | None = None,
+    styles: Mapping[str, str] = CHANNEL_STYLE,
+    width: int = 340,
+    height: int = 210,
 ) -> str:
     """SVG: mean residual in sigmas +- standard error against a coordinate."""
     left, right, top, bottom = 42, 12, 12, 38
@@ -867,7 +890,7 @@ def curve_chart(
     for c in channels:
         good = np.isfinite(c.centre) & np.isfinite(c.mean)
         points = " ".join(f"{x(a):.1f},{y(b):.1f}" for a, b in zip(c.centre[good], c.mean[good]))
-        parts.append(f'<polyline class="channel {CHANNEL_STYLE[c.channel]}" points="{points}"/>')
+        parts.append(f'<polyline class="channel {styles[c.channel]}" points="{points}"/>')
     for c, style in ((curve, "before"), (after, "after")):
         if c is None:
             continue
@@ -1182,9 +1205,11 @@ def _draft(f: Mapping) -> dict:
     elif len(curve) == len(centres) == len(sd):
         one = np.ones(len(curve))
         labels = tuple(f.get("labels") or ()) or None
-        chart = curve_chart(
-            Curve(name, f.get("unit") or UNITS.get(name, ""), "all", centres, curve, sd, one, one, labels)
-        )
+        # the gain of a bin that holds next to no light is known so badly that its bar would flatten the curve
+        told = ~(sd > 10 * np.nanmedian(sd)) | (np.abs(curve) > 3 * sd) if np.isfinite(sd).any() else one > 0
+        curve = np.where(told, curve, np.nan)
+        unit = f["unit"] if "unit" in f else UNITS.get(name, "")
+        chart = curve_chart(Curve(name, unit or "", "all", centres, curve, sd, one, one, labels))
     return {
         "name": prose(name),
         "family": str(f.get("family") or ""),

@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from types import SimpleNamespace
 
-from optics.errors import BadScene
+from optics.errors import BadCapture, BadScene
 from optics.polarization.layers import Crossing, Texture, evaluate
 from optics.polarization.mueller import real, where
 from optics.scene.declare import Part
@@ -37,18 +37,25 @@ class PatternImage:
 
         import numpy as np
 
+        from optics.files.images import read_array
+
         path = Path(path)
         if not path.is_file():
             raise BadScene(f"{path}: no such file; allowed: an image of a pattern, (H, W, 2), as .npy or .exr")
-        if path.suffix == ".npy":
-            values = np.load(path)
-        else:
-            from optics.files.images import read_image
-
-            values, _ = read_image(path, str(path))
-        if values.ndim != 3 or values.shape[2] < 2 or not np.isfinite(values).all():
+        try:
+            values = read_array(path, str(path))
+        except BadCapture as error:
+            raise BadScene(str(error)) from error
+        if (
+            values.ndim != 3
+            or values.shape[2] < 2
+            or 0 in values.shape
+            or values.dtype.kind not in "uif"
+            or not np.isfinite(values).all()
+        ):
             raise BadScene(
-                f"{path}: shape {values.shape}; allowed: (H, W, 2 or more), all finite: s_xx - s_yy and 2 s_xy"
+                f"{path}: shape {values.shape}, type {values.dtype}; allowed: (H, W, 2 or more), all finite: "
+                "s_xx - s_yy and 2 s_xy"
             )
         self.values = np.asarray(values[..., :2], float)
         self.texture = Texture(self.values)

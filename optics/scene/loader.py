@@ -33,6 +33,8 @@ from optics.spectra.curve import Curve
 
 NAME = r"[^/\\\x00-\x1f\x7f]{1,100}"  # of a part
 PIXELS_MOST = 50_000_000  # of a camera: a render keeps some hundred bytes for each
+# what Mitsuba says before words of a mesh or curve file, which a stranger's scene may have named: /etc/passwd has some
+QUOTING = "unknown token|unknown version number|unknown format type|[Cc]ould not parse line|value for field"
 ROBUST = "embree_use_robust_intersections"  # of a Mitsuba scene: no ray slips between two triangles
 KEEPS = "use 'interface', 'rough_interface' or 'sheet', which keep it"
 DEPOLARIZERS = {  # stock materials without a Mueller matrix, by the name that Mitsuba prints
@@ -464,6 +466,7 @@ def _reason(error: Exception, path: Path, registry: Registry) -> str:
         text = before + (raised[-1] if raised else trace)
     text = re.sub(r"(^|[:;] )(\[[^\]]*\]\s*)+", r"\1", " ".join(text.split()))
     text = re.sub(rf'(At|(?:Error w|W)hile loading) "?{re.escape(str(path))}"? \((line[^)]*)\)', r"\2", text)
+    text = re.sub(rf"({QUOTING}) .*", r"\1; words of the file are not shown", text)
     parts = registry.parts
     if (unknown := re.search(r'Plugin "([^"]+)" not found', text)) is not None:
         near = difflib.get_close_matches(unknown[1], parts, n=1)

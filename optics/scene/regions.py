@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
 
-from optics.errors import BadScene
+from optics.errors import BadCapture, BadScene
 from optics.polarization.mueller import real, where
 
 LARGEST = 7
@@ -75,18 +75,14 @@ def read_regions(path: Path):
     """(H, W) whole numbers of an image of regions; raises BadScene with the file and what is allowed."""
     import numpy as np
 
+    from optics.files.images import read_array
+
     if not path.is_file():
         raise BadScene(f"{path}: no such file; {ALLOWED}")
     try:
-        if path.suffix == ".npy":
-            values = np.load(path, allow_pickle=False)
-        else:
-            from optics.files.images import read_image
-
-            values, _ = read_image(path, str(path))
-    except (OSError, ValueError) as error:
-        raise BadScene(f"{path}: unreadable: {error}; {ALLOWED}") from error
-    values = np.squeeze(values)
+        values = np.squeeze(read_array(path, str(path)))
+    except BadCapture as error:
+        raise BadScene(f"{error}; {ALLOWED}") from error
     if values.ndim != 2 or values.dtype.kind not in "buif" or not np.isfinite(values).all():
         raise BadScene(f"{path}: shape {values.shape}, type {values.dtype}; {ALLOWED}")
     if set(np.unique(values)) == {0, 255}:

@@ -610,7 +610,7 @@ def _mesh_samples(path, stamp, rotation, extent, pitch, slope):
         triangles = np.asarray(loaded.triangles, float)
     except Exception as error:  # trimesh raises whatever its readers raise
         raise ValueError(f"indenter mesh {path}: cannot be read ({type(error).__name__}: {error})") from error
-    if not len(triangles) or not np.isfinite(triangles).all():
+    if not len(triangles) or triangles.shape[1:] != (3, 3) or not np.isfinite(triangles).all():
         raise ValueError(f"indenter mesh {path}: no triangles with finite corners; export a triangle mesh in mm")
     triangles = triangles @ rotation_matrix(*rotation).T
     triangles[..., 2] -= triangles[..., 2].min()

@@ -210,7 +210,7 @@ def _table(file: Path, form: type[BaseModel]) -> dict[str, Any]:
 def _arrays(file: Path, kind: str, images: str) -> dict[str, np.ndarray]:
     """What one file of a sample gives, name -> array."""
     if file.suffix == ".npz":
-        with np.load(file, allow_pickle=False) as arrays:
+        with open(file, "rb") as raw, np.load(raw, allow_pickle=False) as arrays:
             return {NODES + name: arrays[name] for name in arrays.files}
     if file.suffix == ".npy":
         return {kind: np.load(file, allow_pickle=False)}

@@ -24,6 +24,7 @@ import dataclasses
 import json
 import math
 import shutil
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
@@ -46,6 +47,17 @@ from optics.study.shown import Fingerprint, Shown
 
 FORMAT = 1
 SHOWN_MAX = 8  # frames whose images a step keeps
+DAMAGED = (  # what numpy and zipfile raise on an archive that was changed
+    ValueError,
+    KeyError,
+    EOFError,
+    OSError,
+    NotImplementedError,
+    RuntimeError,
+    zipfile.BadZipFile,
+    zlib.error,
+    tokenize.TokenError,
+)
 LOCK = ".lock"  # held by the process that writes
 SETTING = "setting "  # begins the names of a sweep's settings in its file
 
@@ -492,9 +504,9 @@ def _read(file: Path) -> dict:
 def _arrays(file: Path) -> Iterator[Any]:
     """The arrays of a step's file. Raises ValueError, which names it."""
     try:
-        with np.load(file, allow_pickle=False) as arrays:
+        with open(file, "rb") as raw, np.load(raw, allow_pickle=False) as arrays:  # by name numpy leaves bad files open
             yield arrays
-    except (ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+    except DAMAGED as error:
         raise ValueError(f"{file}: damaged or cut off ({error}); restore it, or start a new study") from error
 
 

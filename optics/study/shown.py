@@ -68,6 +68,14 @@ def mosaic_of(model: SceneModel) -> dict[str, Any]:
     return {} if model.captures.cfa is None else {"cfa": model.captures.cfa}
 
 
+def cell_of(model: SceneModel) -> tuple[int, int]:
+    """Rows and columns that a raw mosaic repeats; (1, 1) without one."""
+    found = mosaic_of(model)
+    if "mosaic" in found:
+        return len(found["mosaic"]), len(found["mosaic"][0])
+    return (2, 2) if found else (1, 1)
+
+
 def shown_frames(
     model: SceneModel, values: Values, held_out: Sequence[int] = (), frames: Sequence[int] | None = None
 ) -> list[Shown]:

@@ -14,6 +14,7 @@ from optics.fit.result import Fit
 from optics.fit.scene_model import SceneModel
 from optics.fit.tempering import temperature, tempered, weight_of
 from optics.scene.parameter import Values, Variable
+from optics.study.shown import cell_of
 
 Progress = Callable[[str, int, int], None]
 
@@ -174,6 +175,7 @@ def comparison_of(
         held_out=held,
         parameters=parameters,
         held_out_parameters=held_parameters,
+        cell=cell_of(model),
     )
 
 

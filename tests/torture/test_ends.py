@@ -152,6 +152,48 @@ def test_ctrl_c_is_one_line_and_130(place, start, whole, name, moment):
         assert not (place / "out" / "study" / "ladder.json").exists() or (place / "out/study/steps/00-base").is_dir()
 
 
+@pytest.mark.parametrize("then", ["None | object()", "show('work', 1, 2)"])
+def test_ctrl_c_that_a_package_swallows(then):
+    """trimesh catches all where it imports its own parts, and goes on with what it lacks; or the work goes on."""
+    program = f"""
+import os, signal, sys, time
+from optics.cli import main, terminal
+from optics.scene import loader
+
+def imports():
+    with terminal.progress() as show:
+        try:
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(5)
+        except BaseException:
+            pass
+        {then}
+    return []
+
+loader.shipped_scenes = imports
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background ignores it
+sys.argv = ["optics", "scenes"]
+sys.exit(main())
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120)
+    assert (done.returncode, done.stderr, done.stdout) == (130, "interrupted\n", "")
+
+
+def test_ctrl_c_waits_while_an_enumeration_is_made():
+    """An exception there would end the program by SIGABRT."""
+    program = """
+import enum, signal, sys, time
+from types import SimpleNamespace
+from optics.cli import terminal
+terminal.stop(signal.SIGINT, SimpleNamespace(f_code=SimpleNamespace(co_filename=enum.__file__)))
+try:
+    time.sleep(20)
+except KeyboardInterrupt:
+    sys.exit(7)
+"""
+    assert subprocess.run([sys.executable, "-c", program], timeout=120).returncode == 7
+
+
 @pytest.mark.parametrize("moment", np.linspace(0.1, 1.0, 8), ids=lambda m: f"{m:.2f}")
 def test_a_killed_study_is_whole_absent_or_said_to_be_cut_off(place, met, start, whole, monkeypatch, moment):
     monkeypatch.chdir(place)

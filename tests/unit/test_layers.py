@@ -86,7 +86,7 @@ def test_a_pattern_that_is_changed_changes_the_image(tmp_path):
 @pytest.mark.parametrize(
     "name, array, text",
     [
-        ("flat.npy", np.zeros((4, 4)), r"flat.npy: shape \(4, 4\); allowed: \(H, W, 2 or more\)"),
+        ("flat.npy", np.zeros((4, 4)), r"flat.npy: shape \(4, 4\), type float64; allowed: \(H, W, 2 or more\)"),
         ("hole.npy", np.full((4, 4, 2), np.nan), "all finite"),
         ("none.npy", None, "no such file"),
     ],

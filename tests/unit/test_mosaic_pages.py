@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from optics.captures.capture_set import cfa_channel
-from optics.fit.compare import Comparison
+from optics.fit.compare import Comparison, compare
 from optics.pages import scoreboard
 from optics.pages.mosaics import Eye, filled, unwoven
+from optics.pages.report import channel_styles
 from optics.study.board import Images
 from optics.study.shown import Fingerprint, Shown
 
@@ -25,15 +26,17 @@ def test_each_analyser_is_an_image_of_its_own():
     level = np.tile(CELL, (H // 2, W // 2 + 1))[:H, :W, None]
     ramp = np.arange(H)[:, None, None] // 2 * 1000.0
     image = unwoven(level + ramp, (2, 2))
-    assert image.shape == (H, W - 1, 1)
+    assert image.shape == (H + 2, W + 1, 1)  # a seam of 61 / 48 px, rounded up; the last column is left out
     for i, j in np.ndindex(2, 2):
-        quarter = image[i * 23 : i * 23 + 23, j * 30 : j * 30 + 30, 0]
+        quarter = image[i * 25 : i * 25 + 23, j * 32 : j * 32 + 30, 0]
         np.testing.assert_array_equal(quarter, CELL[i][j] + 1000.0 * np.arange(23)[:, None] + 0 * np.arange(30))
+    assert np.isnan(image[23:25]).all() and np.isnan(image[:, 30:32]).all()
+    assert np.isfinite(image).sum() == H * (W - 1)
 
 
 def test_cells_that_are_no_squares():
     level = np.tile([[1, 2, 3]], (4, 2))
-    np.testing.assert_array_equal(unwoven(level, (1, 3)), np.repeat([[1, 1, 2, 2, 3, 3]], 4, 0))
+    np.testing.assert_array_equal(unwoven(level, (1, 3)), np.repeat([[1, 1, 0, 2, 2, 0, 3, 3]], 4, 0))
 
 
 def test_a_study_without_a_mosaic_is_shown_as_it_is():
@@ -89,7 +92,32 @@ def test_the_scoreboard_says_how_it_shows_a_frame(mosaic, said):
     board.images = Images("a", raw, {"m": raw + 1}, whole, whole[..., 0], mosaic)
     found = scoreboard.images(board)
     assert said in found["note"] and bool(found["note"]) == bool(mosaic)
-    assert found["size"] == ((30, 23) if "cfa" in mosaic else (60, 46) if mosaic else (W, H))
+    assert found["size"] == ((30, 23) if "cfa" in mosaic else (62, 48) if mosaic else (W, H))
+
+
+def test_curves_of_a_mosaic_take_whole_cells_and_each_analyser():
+    """Analysers that are 0.5 and 1 sd too bright and a slope over rows: along rows the slope alone is left, without a
+    zigzag, and each analyser has it beside its own level. Of one frame of 47 rows in 16 bins, single rows would mix
+    in other shares from bin to bin."""
+    rows, site = np.arange(47)[:, None] + 0.5 + np.zeros(60), np.tile(CELL, (24, 30))[:47]
+    level = {0.0: 0.0, 45.0: 0.5, 90.0: 1.0, 135.0: 0.0}
+    z = np.vectorize(level.get)(site) + 0.02 * (rows // 2 * 2 + 1)
+    coordinates = {"row": rows, "column": np.arange(60) + 0.5 + np.zeros((47, 1)), "site": site}
+    whole = np.ones(z.shape, bool)
+
+    def along_rows(cell):
+        found = compare([100 + z], [0 * z + 100], [whole * 1.0], [whole], [coordinates], cell=cell)
+        return {c.channel: c for c in found.curves if c.coordinate == "row"}
+
+    found = along_rows((2, 2))
+    assert found["all"].n.sum() == 46 * 60  # row 46 fills no cell
+    for name, shift in {"all": 0.375, "0 deg": 0.0, "45 deg": 0.5, "90 deg": 1.0, "135 deg": 0.0}.items():
+        c = found[name]
+        np.testing.assert_allclose(c.mean, shift + 0.02 * c.centre, atol=1e-9)
+    single = along_rows((1, 1))["all"]
+    assert np.abs(single.mean - 0.375 - 0.02 * single.centre).max() > 0.1
+    styles = channel_styles(Comparison([], list(found.values()), [], ["L"], {}, 255.0))
+    assert sorted(styles) == ["0 deg", "135 deg", "45 deg", "90 deg", "B", "G", "R"]
 
 
 def test_the_live_page_shows_a_mosaic_in_colour():

@@ -235,6 +235,7 @@ RENDER = "render small.xml -o new.exr"
 CALIBRATE = "calibrate captures/{} -o study"
 CASES = [
     # scenes
+    ("design gelsight -n 2 --effects=", r"--effects names none; allowed: names with commas between them"),
     ("params torn.xml", r"torn\.xml.*tags mismatch \(line \d+"),
     ("params prose.xml", r"prose\.xml.*failed"),
     ("params empty.xml", r"empty\.xml.*failed"),

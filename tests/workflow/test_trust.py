@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import optics as package
-from optics.errors import BadCapture, Untrusted
+from optics.errors import BadCapture, BadScene, Untrusted
 from optics.scene import loader, trust
 
 PLUGIN = """'''Marked: leaves a mark when it runs.'''
@@ -240,3 +240,27 @@ def test_a_draft_takes_no_code_from_a_record(tmp_path):
         plausible=1.0,
     )
     assert text.count('"""') == 4  # of the module's docstring and of `act`
+
+
+@pytest.mark.parametrize(
+    ("shape", "text"),
+    [
+        ("ply", "SECRET\n"),
+        ("ply", "ply\nformat ascii SECRET\n"),
+        ("ply", "ply\nformat ascii 1.0\nelement vertex 1\nproperty SECRET x\nend_header\n"),
+        ("ply", "ply\nformat ascii 1.0\nelement vertex 1\nproperty float SECRET\nend_header\nx\n"),
+        ("obj", "v SECRET 1 2\n"),
+        ("linearcurve", 'SECRET "1" 2 3\n'),
+        ("bsplinecurve", "SECRET 1 2 3\n"),
+    ],
+)
+def test_errors_show_no_word_of_a_file_that_a_scene_names(tmp_path, shape, text):
+    """A stranger's scene may name any file of whoever opens it, and an error may be sent back."""
+    (tmp_path / "words").write_text(text)
+    scene = tmp_path / "scene.xml"
+    scene.write_text(
+        f'<scene version="3.0.0"><shape type="{shape}"><string name="filename" value="words"/></shape></scene>'
+    )
+    with pytest.raises(BadScene, match="words of the file are not shown") as raised:
+        loader.load(scene)
+    assert "SECRET" not in str(raised.value) and '"words"' in str(raised.value)
