@@ -303,6 +303,7 @@ def _descend(
         history.append(normal.total)
         promise, excess = descent.promised, max(normal.chi2 - sum(normal.frame_n) + count, 0.0)
         enough = max(accuracy, negligible * excess)
+        least = enough if negligible < NEGLIGIBLE else accuracy
         if promise < enough:
             return history, _converged(len(history))
         if normal.total - promise > asked:
@@ -317,7 +318,7 @@ def _descend(
             stuck = len(history) > 1 and history[-2] - promise / 4 < history[-1]
             if (tries > TRIES and stuck) or (tries > 1 and best[0] < count / 2):
                 break
-        gained = descent.chord(STEPS_NEAR if near else STEPS, WORTH * enough, NEAR * count if near else 0.0, PART)
+        gained = descent.chord(STEPS_NEAR if near else STEPS, WORTH * least, NEAR * count if near else 0.0, PART)
         if negligible > NEGLIGIBLE and gained < negligible * excess:
             return history, f"converged to {negligible:.2g} of the misfit after {iteration + 1} linearisations"
         if gained < accuracy and not near:

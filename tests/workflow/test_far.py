@@ -145,7 +145,7 @@ def test_an_effect_that_does_not_predict_is_reported_as_no_cause(monkeypatch):
     monkeypatch.setattr(loop.calibrate, "fit_over_starts", lambda *_, **__: SimpleNamespace(warnings=[]))
     captures = SimpleNamespace(absent=[], exclude={}, folder="captures", table=object())
     scene = SimpleNamespace(can_express=lambda effect: True, keys_of=lambda effect: {})
-    model = SimpleNamespace(scene=scene, captures=captures, dialled=False, frames=[])
+    model = SimpleNamespace(scene=scene, captures=captures, dialled=False, frames=[], where_used=nullcontext)
     effect = SimpleNamespace(name="row curve", file="", requires=(), part="camera")
     found, _ = loop.extend(study, model, SimpleNamespace(robust=False), SimpleNamespace(variables=[]), effect, Values())
     assert found.warnings == [
