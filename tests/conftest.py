@@ -421,3 +421,32 @@ def measures():
         return float(np.linalg.norm((a - b)[keep]) / max(np.linalg.norm(b[keep]), 1e-300))
 
     return SimpleNamespace(largest=largest, relative=relative)
+
+
+@pytest.fixture
+def between_films():
+    """Writes 16-bit photographs of an even panel between two films: (folder, [(light in DN, settings)], lines of the
+    head of captures.toml, random numbers) -> folder."""
+    gain, floor, black = 4.0, 20.0, 500.0  # DN per electron, DN, DN
+
+    def write(folder, frames, head, rng, size=(6, 6)):
+        from PIL import Image
+
+        (folder / "frames").mkdir(parents=True)
+        text = [
+            'scene = "polarizer_bench"',
+            'absent = ["middle", "sample"]',
+            f"[noise]\nsystem_gain = {gain}\ndark_noise = {floor}\nblack_level = {black}",
+            "saturation = 65535\nprnu = 0.0",
+            *head,
+        ]
+        for i, (light, settings) in enumerate(frames):
+            image = black + gain * rng.poisson(light / gain, size) + floor * rng.standard_normal(size)
+            name = f"frames/{i:02d}.png"
+            Image.fromarray(np.round(image).astype(np.uint16)).save(folder / name)
+            text += [f'[[frames]]\nimage = "{name}"\n[frames.parameters]']
+            text += [f'"{key}" = {value}' for key, value in settings.items()]
+        (folder / "captures.toml").write_text("\n".join(text) + "\n")
+        return folder
+
+    return write

@@ -25,9 +25,9 @@ def test_values_that_are_used_stay(bench, blur):
         whole, slopes = next(iter(model.derivatives(values, variables)))
         with model.where_used():
             sparing, own = next(iter(model.derivatives(values, variables)))
-            assert not model._needed(0).all()
+            assert not model._needed(0).mask.all()
         again = model.predict(values)[0]
-        far = ~model._needed(0)
+        far = ~model._needed(0).mask
     finally:
         model.frames[0] = frame
         model._needed_kept.clear()

@@ -3,7 +3,6 @@ whose power changes from frame to frame: a linearisation sees next to nothing of
 steps that no angle can make."""
 
 import numpy as np
-from PIL import Image
 
 from optics.fit.curvature import own_curvature
 from optics.fit.descent import Descent, normal_equations
@@ -14,49 +13,36 @@ from optics.study import loop
 
 DIAL = 0.7  # deg: how well dials are set
 DRIFT = 0.03  # of the lamp, from frame to frame
-SIZE = (6, 6)
-GAIN, FLOOR, BLACK = 4.0, 20.0, 500.0  # DN per electron, DN
 
 
-def photographs(folder, seed=5):
-    """16-bit images of an even panel: cos^2 of the angle between two films."""
-    rng = np.random.default_rng(seed)
-    (folder / "frames").mkdir(parents=True)
-    text = [
-        'scene = "polarizer_bench"',
-        'absent = ["middle", "sample"]',
-        f"[noise]\nsystem_gain = {GAIN}\ndark_noise = {FLOOR}\nblack_level = {BLACK}\nsaturation = 65535\nprnu = 0.0",
-        '[parameters]\n"camera.x_fov" = 4.0\n"polarizer.angle" = 0.0',
-        f'[uncertainty]\n"analyzer.angle" = {DIAL}',
-    ]
-    for i, apart in enumerate([0.0, 90.0, 45.0] * 4):
+def frames(rng):
+    """(light, settings): cos^2 of the angle between two films, the second of which turns."""
+    for apart in [0.0, 90.0, 45.0] * 4:
         between = apart + DIAL * rng.standard_normal()
         light = 50000.0 * (1 + DRIFT * rng.standard_normal()) * (np.cos(np.radians(between)) ** 2 + 2e-4)
-        electrons = rng.poisson(light / GAIN, SIZE)
-        image = BLACK + GAIN * electrons + FLOOR * rng.standard_normal(SIZE)
-        name = f"frames/{i:02d}.png"
-        Image.fromarray(np.round(image).astype(np.uint16)).save(folder / name)
-        text += [f'[[frames]]\nimage = "{name}"\n[frames.parameters]\n"analyzer.angle" = {apart}']
-    (folder / "captures.toml").write_text("\n".join(text) + "\n")
-    return folder
+        yield light, {"analyzer.angle": apart}
 
 
-def test_curvature_of_angles_against_chi2(mitsuba, tmp_path):
-    setup = loop.Setup(captures=str(photographs(tmp_path / "set")), free=["source.power"])
+HEAD = ('[parameters]\n"camera.x_fov" = 4.0\n"polarizer.angle" = 0.0', f'[uncertainty]\n"analyzer.angle" = {DIAL}')
+
+
+def test_curvature_of_angles_against_chi2(mitsuba, between_films, tmp_path):
+    rng = np.random.default_rng(5)
+    setup = loop.Setup(captures=str(between_films(tmp_path / "set", frames(rng), HEAD, rng)), free=["source.power"])
     _, model, fit = loop.begin(setup, tmp_path / "study")
     assert fit.converged, fit.reason
     angles = [i for i, v in enumerate(fit.variables) if v.keys == ("analyzer.angle",)]
     assert angles
-    frames = list(fit.frames)
-    bend = own_curvature(model, fit.variables, fit.values, frames)
+    fitted = list(fit.frames)
+    bend = own_curvature(model, fit.variables, fit.values, fitted)
     assert (bend[angles] > 0).any() and not np.delete(bend, angles).any()
 
     # against chi2 itself, with the weights held: J'WJ + bend is half its second difference
-    normal = normal_equations(model, fit.variables, fit.values, frames)
-    weight = {f: 1 / model.variance(fit.values, f, p) for f, p in zip(frames, model.predict(fit.values, frames))}
+    normal = normal_equations(model, fit.variables, fit.values, fitted)
+    weight = {f: 1 / model.variance(fit.values, f, p) for f, p in zip(fitted, model.predict(fit.values, fitted))}
 
     def misfit(values):
-        pairs = zip(frames, model.predict(values, frames))
+        pairs = zip(fitted, model.predict(values, fitted))
         return sum(float(np.sum(((model.frames[f].image - p) ** 2 * weight[f])[model.usable(f)])) for f, p in pairs)
 
     for i in angles:

@@ -2,44 +2,32 @@
 the images by much, what is written down of dials counts many times; beside the right effect it counts once."""
 
 import numpy as np
-from PIL import Image
 
 from optics.study import loop
 
 OFF, DIAL = -7.5, 0.7  # deg: the analyser's zero, and how well dials are set
-SIZE = (6, 6)
 FIELD = 4.0  # deg, across
-GAIN, FLOOR, BLACK = 4.0, 20.0, 500.0  # DN per electron, DN
 
 
-def photographs(folder, seed=3):
-    """16-bit images of an even panel: cos^2 of the angle between the films, which stand where no dial says."""
-    rng = np.random.default_rng(seed)
-    (folder / "frames").mkdir(parents=True)
-    text = [
-        'scene = "polarizer_bench"',
-        'absent = ["middle", "sample"]',
-        f"[noise]\nsystem_gain = {GAIN}\ndark_noise = {FLOOR}\nblack_level = {BLACK}\nsaturation = 65535\nprnu = 0.0",
-        f'[parameters]\n"camera.x_fov" = {FIELD}',
-        f'[uncertainty]\n"polarizer.angle" = {DIAL}\n"analyzer.angle" = {DIAL}',
-    ]
+def frames(rng):
+    """(light, settings): cos^2 of the angle between the films, which stand where no dial says."""
     for i, angle in enumerate(np.arange(0.0, 180.0, 20.0)):
         # crossed, and a third of them halfway, on either side: what tells the lamp's power, and the way the zero is off
         apart = 90.0 if i % 3 else 45.0 + 90.0 * (i % 2)
         between = apart + OFF + DIAL * (rng.standard_normal() - rng.standard_normal())
         light = 50000.0 * (np.cos(np.radians(between)) ** 2 + 2e-4)
-        electrons = rng.poisson(light / GAIN, SIZE)
-        image = BLACK + GAIN * electrons + FLOOR * rng.standard_normal(SIZE)
-        name = f"frames/{i:02d}.png"
-        Image.fromarray(np.round(image).astype(np.uint16)).save(folder / name)
-        text += [f'[[frames]]\nimage = "{name}"']
-        text += [f'[frames.parameters]\n"polarizer.angle" = {angle}\n"analyzer.angle" = {angle + apart}']
-    (folder / "captures.toml").write_text("\n".join(text) + "\n")
-    return folder
+        yield light, {"polarizer.angle": angle, "analyzer.angle": angle + apart}
 
 
-def test_dials_stand_off_by_what_is_known_of_them(mitsuba, tmp_path):
-    setup = loop.Setup(captures=str(photographs(tmp_path / "set")), free=["source.power"])
+HEAD = (
+    f'[parameters]\n"camera.x_fov" = {FIELD}',
+    f'[uncertainty]\n"polarizer.angle" = {DIAL}\n"analyzer.angle" = {DIAL}',
+)
+
+
+def test_dials_stand_off_by_what_is_known_of_them(mitsuba, between_films, tmp_path):
+    rng = np.random.default_rng(3)
+    setup = loop.Setup(captures=str(between_films(tmp_path / "set", frames(rng), HEAD, rng)), free=["source.power"])
     record, model, fit = loop.begin(setup, tmp_path / "study")
     assert fit.tempering > 100  # the base misses the images by many times their noise
     found = loop.examine(record, model, setup, fit, advised=False)
