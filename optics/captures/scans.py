@@ -55,8 +55,10 @@ FILE = "scan.yaml"
 LEDS = 64  # images of one scan
 SMALLEST, ACROSS = 5.0, 200  # px of a ball's radius at least, and how many of them are across an image at most
 DISTANCE = 30.0  # mm from the middle of the face to a light, where no better is known
-ANNOTATED = 1.5  # px of the whole picture: how well the circles say together where a plate stands
-CENTRED = 3.0  # mm: a holder puts the lights around the camera's axis, closer than a third of the pictured face
+# Standard deviations of priors, by judgement. Circles are annotated to a pixel, and together they fix where a plate is,
+# but for a shift of camera or lens; a holder centres the lights on the camera's axis within a few mm.
+ANNOTATED = 1.5  # px of the whole picture
+CENTRED = 3.0  # mm
 CAMERA = 200.0  # mm: nearly telecentric, as lenses for inspection are
 CONTACT = 0.85  # of the ball's radius: touched, where nothing tells
 BALL, NEAR = 0.7, 1.8  # of the ball's radius: of it within, of the level face beyond

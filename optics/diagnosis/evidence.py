@@ -232,9 +232,10 @@ class Evidence:
         """|Q'r|^2 per parameter of the base: below 1 it is calibrated."""
         return self.projected.absorbed / max(self.projected.rank, 1)
 
-    def inverse(self, base: Sequence[int]) -> np.ndarray:
-        """(p, p) inverse of the Gram matrix of base columns, with the priors of the first of them."""
-        gram = self.normal.gram[np.ix_(base, base)] + np.diag(_padded(self.precision, base))
+    def inverse(self, base: Sequence[int], bend: np.ndarray | float = 0.0) -> np.ndarray:
+        """(p, p) inverse of the Gram matrix of base columns, with the priors of the first of them; `bend` is added to
+        its diagonal (optics.fit.curvature)."""
+        gram = self.normal.gram[np.ix_(base, base)] + np.diag(_padded(self.precision, base) + bend)
         return st.inverse(gram, self.normal.truncation(base))[0]
 
     def structure(

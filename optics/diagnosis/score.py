@@ -174,8 +174,7 @@ def _promised(model: Model, evidence: Evidence) -> float:
     base = evidence.base
     bend = own_curvature(model, [evidence.columns[c] for c in base], evidence.values, evidence.frames)
     u = evidence.normal.score[base] + evidence.pull
-    gram = evidence.normal.gram[np.ix_(base, base)] + np.diag(evidence.precision + bend)
-    return float(u @ st.inverse(gram, evidence.normal.truncation(base))[0] @ u)
+    return float(u @ evidence.inverse(base, bend) @ u)
 
 
 def _off(evidence: Evidence) -> list[str]:

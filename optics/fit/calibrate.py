@@ -303,7 +303,7 @@ def _descend(
         history.append(normal.total)
         promise, excess = descent.promised, max(normal.chi2 - sum(normal.frame_n) + count, 0.0)
         enough = max(accuracy, negligible * excess)
-        least = enough if negligible < NEGLIGIBLE else accuracy
+        least = enough if negligible < NEGLIGIBLE else accuracy  # a fit that goes further takes larger steps to it
         if promise < enough:
             return history, _converged(len(history))
         if normal.total - promise > asked:

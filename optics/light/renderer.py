@@ -14,7 +14,8 @@ import copy
 import math
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import replace
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 from typing import NamedTuple
 
@@ -62,6 +63,23 @@ CROWDED_BOUNCE_RAYS = 2**20
 BOUNCE_NUMBERS = 10  # of a direction: a place in the cell, a technique, two directions, a point of the light
 ROUGHLY = 4  # times fewer directions suffice for how second reflections change: with the same ones on both sides
 BOUNCE_CELL = 2  # px each way of a cell; 1 in a crowded scene, whose pixels differ
+
+
+@dataclass(frozen=True, eq=False)
+class Pixels:
+    """Pixels (H, W) of an image, the same only as themselves: part of the keys of images that are kept."""
+
+    mask: np.ndarray
+
+
+@contextmanager
+def everywhere(renderer) -> Iterator[None]:
+    """Within it all pixels take finer samples: for the gel at rest, which frames with other masks share."""
+    wanted, renderer.wanted = renderer.wanted, None
+    try:
+        yield
+    finally:
+        renderer.wanted = wanted
 
 
 class Renderer:
@@ -145,7 +163,7 @@ class Renderer:
         self._still = {k: scene.parameters[k].neutral for k in self.ambient_keys}
         self._tangents: OrderedDict = OrderedDict()
         self.together: set[str] = set()  # LEDs whose images are wanted of the same geometry
-        self.wanted: np.ndarray | None = None  # (H, W) pixels that take finer samples where they need them; None: all
+        self.wanted: Pixels | None = None  # those that take finer samples where they need them; None: all
 
     def kind(self, key: str) -> str:
         part = self.scene.parts.get(key.rsplit(".", 1)[0])
@@ -301,15 +319,17 @@ class Renderer:
             tuple(values[k] for k in self.shading_keys),
             tuple(values[k] for k in self.led_keys[led]),
             seed if self.crowded else 0,
-            None if self.wanted is None else id(self.wanted),
         )
+
+    def _image_key(self, values: Mapping, led: str, seed: int = 0) -> tuple:
+        return (*self._led_key(values, led, seed), self.wanted)
 
     def led(self, values: Mapping, led: str, seed: int = 0) -> LedImage:
         """The image that one LED makes at power 1 by direct light, kept with what its derivatives need.
 
         seed   of the finer samples of a crowded scene, whose errors in most pixels add up to more than a fit ignores:
                derivatives by other samples than the prediction's do not follow them"""
-        key = self._led_key(values, led, seed)
+        key = self._image_key(values, led, seed)
         if key in self._images:
             self._images.move_to_end(key)
             return self._images[key]
@@ -322,7 +342,7 @@ class Renderer:
         for other in self.together - {
             led
         }:  # moving the geometry costs more than an image: make what will be asked for next
-            key = self._led_key(values, other, seed)
+            key = self._image_key(values, other, seed)
             if key not in self._images and key not in self._plain:
                 self._keep(key, self._render_led(hits, other, seed))
         return image
@@ -382,7 +402,7 @@ class Renderer:
         rim = self._joint_rim(hits) if self.layered else self._rim(hits, visible)
         share = np.where(self._joint_rim(hits) if self.crowded else rim, 1.0, hits.bent)
         if self.wanted is not None:
-            share = np.where(self.wanted, share, 0.0)
+            share = np.where(self.wanted.mask, share, 0.0)
         index = np.flatnonzero(share)
         # of a light of many points, an edge in the shadow of one is small
         few = ~(hits.edges if self.crowded or len(part.places()) > SOFT else rim)
@@ -439,7 +459,7 @@ class Renderer:
                    prefers a polarization (stage `detector`)
         """
         if not self.layered:
-            plain = self._plain.get(self._led_key(values, light, seed))
+            plain = self._plain.get(self._image_key(values, light, seed))
             plain = self.led(values, light, seed).radiance if plain is None else plain
             return plain if component == 0 else np.zeros_like(plain)
         image = self.led(values, light)
@@ -738,7 +758,8 @@ class Renderer:
         """`led_tangent`, kept: all frames share the gel at rest."""
         known = (key, component, *self._led_key(values, led, seed), *(values[k] for k in self.layer_order))
         if known not in self._tangents:
-            self._tangents[known] = self.led_tangent(values, led, key, component, seed).astype(np.float32)
+            with everywhere(self):
+                self._tangents[known] = self.led_tangent(values, led, key, component, seed).astype(np.float32)
             while len(self._tangents) > 8 * len(self.scene.lights):
                 self._tangents.popitem(last=False)
         return self._tangents[known]
