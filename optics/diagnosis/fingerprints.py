@@ -123,6 +123,19 @@ def settings(model: Model, evidence: Evidence) -> dict[str, list[float]]:
     return turned
 
 
+def _own_of_frames(model: Model, evidence: Evidence) -> set[str]:
+    """Settings of which each value has a bin and that nobody turned: what the fit solves for frame by frame, such as
+    the place of a press, and a gain that every frame has for itself."""
+    solved = {key for i in evidence.base for key in evidence.columns[i].keys if evidence.columns[i].frames is not None}
+    gains = {key for key, p in model.parameters.items() if p.how == "image" and p.multiplies}
+    found = set()
+    for key, numbers in settings(model, evidence).items():
+        different = len({v for v in numbers if math.isfinite(v)})
+        if different <= st.BINS and (key in solved or (key in gains and different == len(numbers))):
+            found.add(key)
+    return found
+
+
 # -- curves ----------------------------------------------------------------------------------------------------------
 def fingerprints(
     model: Model, evidence: Evidence, found: list[dict], reference: float, say: Progress
@@ -137,7 +150,7 @@ def fingerprints(
     """
     k = evidence.thinning
     names = sorted(set.intersection(*[set(p) for p in found]) - NOT_A_COORDINATE)
-    named = _named(evidence, model)
+    named, own_of_frames = _named(evidence, model), _own_of_frames(model, evidence)
     plain_normal = evidence.thinned(extra=2 * max(LINES, *named.values()))
     carriers = _carriers(model, evidence)
     lit = sum(float(np.sum(np.square(gain))) for gain, _ in carriers)
@@ -188,6 +201,7 @@ def fingerprints(
                 net / excess if weighed else math.nan,
                 _unit_of(model, name),
                 math.sqrt(max(fall, 0.0) / max(lit, 1e-12)),
+                name in own_of_frames,
             )
         )
     say("fingerprints", len(names), len(names))
@@ -309,7 +323,7 @@ def families(found: Sequence[Fingerprint]) -> list[Family]:
     A map of the sensor mimics every curve that does not move, and a number per frame every setting: such a curve stands
     for its family, and its family comes first, only where no other curve is nearly as good."""
     own: dict[str, list[Fingerprint]] = {}
-    for f in found:
+    for f in (f for f in found if not f.solved):
         own.setdefault(f.family, []).append(f)
     best = ordered([ordered(curves)[0] for curves in own.values()])
     return [

@@ -162,6 +162,7 @@ class Renderer:
         }  # of stock plugins, some shade and none is slow to set
         self._still = {k: scene.parameters[k].neutral for k in self.ambient_keys}
         self._tangents: OrderedDict = OrderedDict()
+        self._rays = 0.0  # camera rays that are kept, at most
         self.together: set[str] = set()  # LEDs whose images are wanted of the same geometry
         self.wanted: Pixels | None = None  # those that take finer samples where they need them; None: all
 
@@ -245,7 +246,7 @@ class Renderer:
         self._hits[key] = hits
         while len(self._hits) > self.remember:
             self._hits.popitem(last=False)
-        self._make_room(hits)
+        self._make_room(hits, hits.valid.size)
         return hits
 
     def _eye(self) -> np.ndarray:
@@ -260,8 +261,13 @@ class Renderer:
         hits = self.hits({k: v.real if isinstance(v, complex) else v for k, v in values.items()})
         return np.where(hits.valid, np.linalg.norm(hits.position - hits.eye, axis=-1), np.inf)
 
-    def _make_room(self, latest: Hits) -> None:
-        """Forget the oldest geometries while what is kept is larger than MEMORY: large images with many rims."""
+    def _make_room(self, latest: Hits, added: int) -> None:
+        """Forget the oldest geometries while what is kept is larger than MEMORY: large images with many rims.
+
+        added   camera rays that were kept since; all are counted again only where there may be too many"""
+        self._rays += added
+        if PER_RAY * self._rays <= MEMORY:
+            return
         images = self._images.values()
         rays: dict[Hits, dict[int, int]] = {}  # geometry -> ends of camera rays by the samples that hold them
         for hits in (*(i.hits for i in images), *self._hits.values()):
@@ -276,10 +282,11 @@ class Renderer:
             dr.flush_malloc_cache()  # Dr.Jit keeps what is released, in sizes that the next geometry does not ask for
         for old in [hits for hits in size if hits is not latest]:
             if total <= MEMORY:
-                return
+                break
             total -= size[old]
             self._hits = OrderedDict((k, h) for k, h in self._hits.items() if h is not old)
             self._images = OrderedDict((k, i) for k, i in self._images.items() if i.hits is not old)
+        self._rays = total / PER_RAY
 
     def forget_hits(self) -> None:
         """Release the kept hits: a search over many geometries returns to none of them."""
@@ -376,7 +383,7 @@ class Renderer:
         self._images[key] = image
         while len(self._images) > self.remember * len(self.scene.lights):
             self._images.popitem(last=False)
-        self._make_room(image.hits)
+        self._make_room(image.hits, image.finer.size)
         if image.radiance is not None:
             self._keep_plain(key, image.radiance)
         return image

@@ -164,6 +164,24 @@ def test_what_the_library_lacks_is_unknown_and_named_by_its_coordinate(name, coo
     assert best.ratio > 1.25 and len(best.curve) == len(best.sd) == len(best.centres) and best.p < 1e-6
 
 
+def test_what_the_fit_solves_for_frame_by_frame_is_no_coordinate_of_its_own():
+    """An import notes where each press is, and the fit finds it again: a free number for each of these places is one
+    for each frame, and is told as that."""
+    model, fit = calibrated({"red_drift": [0.01, -0.02, 0.015, 0.0, 0.01, -0.01]}, seed=2)
+    places = {name: [fit.values.frame[f][name] for f in FITTED] for name in ("gel.press_x", "gel.press_depth")}
+    for name, numbers in places.items():
+        for f, number in zip(FITTED, numbers):
+            model.frames[f].parameters[name] = number
+    for f in FITTED:
+        model.frames[f].parameters["sensor.angle"] = 15.0 * f  # a dial that somebody turned
+    d = judge(model, fit, library("flicker", "gamma", "crosstalk"))
+    curves = {f.coordinate: f for f in d.fingerprints}
+    assert {name for name, curve in curves.items() if curve.solved} == set(places)
+    assert curves["gel.press_x"].net == pytest.approx(curves["frame"].net, rel=1e-6)
+    assert not {f.coordinate for f in d.families} & set(places)
+    assert "gel.press_x" not in d.text() and "sensor.angle" in d.text()
+
+
 @pytest.mark.parametrize("height_gain, faint", [(0.04, False), (0.025, True)])
 def test_what_a_good_sensors_own_mottle_makes_as_well_is_called_faint(height_gain, faint):
     d = judge(
