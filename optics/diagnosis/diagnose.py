@@ -317,7 +317,8 @@ def _unexplained(
     share = prints.fixed_pattern(case.model, case.evidence, _excess(basis))
     fixed = prints.fixed_text(share, max([f.share for f in fingerprints], default=0.0))
     parts = [fixed, text[0].upper() + text[1:] if fixed else text]
-    if word == "UNKNOWN":
+    if word == "UNKNOWN" or findings.fall < SHARE * _excess(basis):
         parts.append(prints.unexplained(fingerprints, findings.fall, _excess(basis)))
+    if word == "UNKNOWN":
         parts.append("" if fixed else prints.goes_with(families))
     return " ".join(filter(None, parts)), bool(fixed)

@@ -229,6 +229,11 @@ def hints_of(
         hints.append(
             "hold out other frames (other presses or positions), or find why the held-out frames do not improve"
         )
+    if "even" in failed:
+        hints.append(
+            "look at the parts of the data between which its strength differs most (optics report draws what is left "
+            "of each frame): what sets them apart is not in the model, or was noted wrongly"
+        )
     if "near" in failed:
         hints.append(f"no effect brings the model near its images: check {AT_FAULT}")
     if CURVE in failed:

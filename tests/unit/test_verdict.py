@@ -204,6 +204,7 @@ def test_a_proxy_is_uneven():
     assert d.word in ("PARTIAL", "UNKNOWN") and "uneven" in d.row("flicker").flags
     split = next(s for s in d.splits if s.by == "channel")
     assert not split.holds and split.h > 0.1 and split.strength[0] > 2 > 0.5 > abs(split.strength[1])
+    assert any("between which its strength differs most" in h for h in d.hints)
 
 
 def test_what_the_data_cannot_tell_apart_is_a_set():
@@ -217,6 +218,7 @@ def test_what_the_data_cannot_tell_apart_is_a_set():
 def test_clutter_alone_is_not_an_effect():
     d = judge(*calibrated(clutter=0.5), library("vignetting", "LED lobe", "crosstalk", "gamma", "albedo gradient"))
     assert d.word in ("UNKNOWN", "CANNOT_TELL") and d.basis.excess_sd > 20
+    assert "The best effect explains" in d.sentence  # and how much nobody does
     assert min(r.p_family for r in d.rows) < 0.01  # significance alone would have cried wolf
 
 
