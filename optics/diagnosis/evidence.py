@@ -385,10 +385,9 @@ def measure(
             noisy = {c for c in first if c not in again or not np.array_equal(first[c], again[c], equal_nan=True)}
             second = again if noisy else {}
             if own is not None and other is not None and not np.array_equal(own, other):
-                two = own, other
                 if model.sampled:  # those that come with derivative images are rough
-                    two = tuple(model.predict(values, [frame], s)[0] for s in seeds)
-                evidence.render_noise = _between(*two, model.noise.variance(prediction), model.usable(frame))
+                    own, other = (model.predict(values, [frame], s)[0] for s in seeds)
+                evidence.render_noise = _between(own, other, model.noise.variance(prediction), model.usable(frame))
         elif noisy:
             _, second = layout.images(model, values, frame, seeds[1], noisy)
         binned = prediction if own is None else own

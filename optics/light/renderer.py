@@ -64,7 +64,7 @@ BOUNCE_RAYS = 2**19
 CROWDED_BOUNCE_RAYS = 2**20
 BOUNCE_NUMBERS = 10  # of a direction: a place in the cell, a technique, two directions, a point of the light
 # Times fewer directions suffice for how second reflections change, with the same ones on both sides, and times fewer
-# samples of a pixel for how a crowded scene changes. With 64 of them errors are 11 % of the square of a derivative
+# samples of a pixel for how a crowded scene changes. With 64 of them errors are 29 % of the square of a derivative
 # image by a finite layer, 6 % by the distortion, 1 % or less by the camera, the size of beads and how far they sank
 ROUGHLY = 4
 ROUGH_SAMPLES = 64  # of a pixel, below which no fewer are taken
