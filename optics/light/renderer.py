@@ -162,6 +162,7 @@ class Renderer:
         self.shading_keys = [
             k for k in own if k not in self.geometry_keys and k != self.bounce_key and k not in self.ambient_keys
         ]
+        self._clocks = {k: told for k in self.shading_keys if (told := self._told_by(k))}
         self.led_keys = {
             n: [k for k in led_keys if k.rsplit(".", 1)[0] in (n, _board(light)) and k not in self.power_keys]
             for n, light in scene.lights.items()
@@ -173,6 +174,28 @@ class Renderer:
         self._tangents: OrderedDict = OrderedDict()
         self.together: set[str] = set()  # LEDs whose images are wanted of the same geometry
         self.wanted: Pixels | None = None  # those that take finer samples where they need them; None: all
+
+    def _told_by(self, key: str) -> list[str]:
+        """Of a clock, the keys of the parameters that show through it and nothing else; empty of others, and of a clock
+        that something else reads."""
+        name, _, clock = key.rpartition(".")
+        part = self.scene.parts.get(name)
+        if part is None or self.scene.parameters[key].role != "clock":
+            return []
+        own = [e for e in self.scene.registry.effects.values() if part.kind in self.scene.registry.kinds(e.part)]
+        if any(clock in e.reads for e in own):
+            return []
+        return [k for k, p in self.scene.parameters.items() if p.through == clock and k.rpartition(".")[0] == name]
+
+    def _shading(self, values: Mapping) -> tuple:
+        """What the shading of surfaces depends on; without clocks that nothing shows through: a press that is made
+        again later has the same images."""
+        idle = {
+            clock
+            for clock, keys in self._clocks.items()
+            if all(values[k] == self.scene.parameters[k].neutral for k in keys)
+        }
+        return tuple(None if k in idle else values[k] for k in self.shading_keys)
 
     def kind(self, key: str) -> str:
         part = self.scene.parts.get(key.rsplit(".", 1)[0])
@@ -330,7 +353,7 @@ class Renderer:
         return (
             led,
             self.geometry(values),
-            tuple(values[k] for k in self.shading_keys),
+            self._shading(values),
             tuple(values[k] for k in self.led_keys[led]),
             (seed, self.rough) if self.crowded else 0,
         )
@@ -781,7 +804,8 @@ class Renderer:
 
     def led_tangent_at_rest(self, values: Mapping, led: str, key: str, component: int = 0, seed: int = 0) -> np.ndarray:
         """`led_tangent`, kept: all frames share the gel at rest."""
-        known = (key, component, *self._led_key(values, led, seed), *(values[k] for k in self.layer_order))
+        now = tuple(values[k] for k in self.shading_keys)  # also clocks, through which a derivative shows
+        known = (key, component, now, *self._led_key(values, led, seed), *(values[k] for k in self.layer_order))
         if known not in self._tangents:
             with everywhere(self):
                 self._tangents[known] = self.led_tangent(values, led, key, component, seed).astype(np.float32)

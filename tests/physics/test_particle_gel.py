@@ -201,3 +201,22 @@ def test_a_derivative_image_is_made_once(load, monkeypatch):
     assert np.array_equal(plain, model.predict(Values(), [0])[0])
     with pytest.raises(ZeroDivisionError):
         image(Values({"camera.z": 0.1}))
+
+
+def test_a_press_that_is_made_again_later_has_the_same_images(load, monkeypatch):
+    """While nothing bleaches the clock changes no image, and none is made again; with bleaching it does, and the
+    derivative by it at none is -time times the fluorescence."""
+    from optics.light.renderer import Renderer
+
+    renderer = Renderer(load(**SMALL))
+    values = renderer.scene.values()
+    early, late = ({**values, "dye.time": time} for time in (1.0, 3.0))
+    first = renderer.radiance(early)
+    slopes = [renderer.led_tangent(now, "inner_ring", "dye.bleaching") for now in (early, late)]
+    assert np.abs(slopes[0]).max() > 0
+    np.testing.assert_allclose(slopes[1], 3 * slopes[0], rtol=1e-5, atol=1e-7 * np.abs(slopes[1]).max())
+    left = renderer.radiance({**late, "dye.bleaching": 0.1})
+    assert left[..., 1].sum() < 0.9 * first[..., 1].sum()  # exp(-0.3) of the green, which is all fluorescence
+    monkeypatch.setattr(renderer, "_render_led", None)
+    monkeypatch.setattr(renderer, "_shaded_again", None)
+    assert np.array_equal(first, renderer.radiance(late))
