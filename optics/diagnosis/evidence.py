@@ -16,7 +16,7 @@ from optics.captures.capture_set import Frame
 from optics.diagnosis import statistics as st
 from optics.diagnosis.result import Row
 from optics.errors import Underdetermined
-from optics.fit.model import Model, value_of, values_in
+from optics.fit.model import Model, seeds_apart, value_of, values_in
 from optics.scene.declare import Effect
 from optics.scene.parameter import Values, Variable
 
@@ -371,7 +371,7 @@ def measure(
     Raises Underdetermined when no value is usable, ValueError when more than NOT_FINITE of them are not finite.
     """
     layout = Layout.of(base, candidates)
-    seeds = (2 * seed + 1001, 2 * seed + 1002)  # apart from the seed of predictions, and for every seed another pair
+    seeds = seeds_apart(seed)
     evidence, total = _empty(model, values, layout, len(base), frames, rows_max, seeds[0])
     noisy: set[int] = set()
     signal = variance = 0.0
@@ -385,9 +385,9 @@ def measure(
             noisy = {c for c in first if c not in again or not np.array_equal(first[c], again[c], equal_nan=True)}
             second = again if noisy else {}
             if own is not None and other is not None and not np.array_equal(own, other):
-                usable = model.usable(frame)
-                sample = (np.asarray(own, float) - other)[usable] ** 2 / 2 / model.noise.variance(prediction)[usable]
-                evidence.render_noise = float(np.mean(sample[np.isfinite(sample)]))
+                if model.sampled:  # those that come with derivative images are rough
+                    own, other = (model.predict(values, [frame], s)[0] for s in seeds)
+                evidence.render_noise = _between(own, other, model.noise.variance(prediction), model.usable(frame))
         elif noisy:
             _, second = layout.images(model, values, frame, seeds[1], noisy)
         binned = prediction if own is None else own
@@ -405,6 +405,12 @@ def measure(
         evidence.normal, evidence.base, evidence.rest, noisy=not noisy.isdisjoint(evidence.base)
     )
     return evidence
+
+
+def _between(one: np.ndarray, two: np.ndarray, variance: np.ndarray, usable: np.ndarray) -> float:
+    """Mean of half the square of the difference of two predictions, over the camera's variance."""
+    sample = (np.asarray(one, float) - two)[usable] ** 2 / 2 / variance[usable]
+    return float(np.mean(sample[np.isfinite(sample)]))
 
 
 def _empty(

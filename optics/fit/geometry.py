@@ -67,9 +67,9 @@ def _light(model: SceneModel, now: Mapping, hits: Hits) -> tuple[np.ndarray, np.
     for led, power in model.lit(now).items():
         if led in model.scene.sources:
             continue
-        image = model.renderer.led(now, led)
-        shadow |= ~image.lit & hits.valid
-        rim |= image.rim
+        around, lit = model.renderer.shadows(now, led)
+        shadow |= ~lit & hits.valid
+        rim |= around
         to = places[led] - hits.position
         strength = (power * model.renderer.image(now, led)).sum(-1)
         brightest = strength > best

@@ -75,6 +75,11 @@ class Model(Protocol):
         """Whether predictions are Monte Carlo estimates, whose own error `variance` includes."""
         ...
 
+    @property
+    def sampled(self) -> bool:
+        """Whether predictions have errors of samples that matter beside the camera's noise, others for other seeds."""
+        ...
+
     def at(self, values: Values, index: int) -> dict[str, Any]:
         """Every parameter's value in a frame: base <- fitted in all frames <- set in this frame <- fitted in it."""
         ...
@@ -84,7 +89,7 @@ class Model(Protocol):
         ...
 
     def predict(self, values: Values, frames: Sequence[int] | None = None, seed: int = 0) -> list[np.ndarray]:
-        """Noise-free (H, W, C) in DN of each frame; None: of all. The seed matters to Monte Carlo estimates only."""
+        """Noise-free (H, W, C) in DN of each frame; None: of all. The seed matters where there is sampling error."""
         ...
 
     def derivatives(
@@ -136,6 +141,11 @@ class Model(Protocol):
     def imagine(self, frames: Sequence[Frame]) -> Model:
         """The same model with further frames: measurements that could be made."""
         ...
+
+
+def seeds_apart(seed: int = 0) -> tuple[int, int]:
+    """Two seeds of derivative images: apart from that of predictions, 0, and for every seed another pair."""
+    return 2 * seed + 1001, 2 * seed + 1002
 
 
 def values_in(model: Model, frames: Sequence[int]) -> float:

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from optics.light.monte_carlo import MonteCarloRenderer
 
 CUT_OFF = 3  # readings of 0, and none below, that tell of an instrument that shows no negative numbers
+DERIVATIVES = 2e8  # bytes of derivative images that are kept: the refits of a diagnosis begin with those of its scores
 KEPT = 4  # points in parameter space, for each frame, at which the variance that settings bring is remembered
 BESIDE = 2  # px: with a blur of 0.4 px, what is left out beyond changes used values by 1e-5 of the image
 FLAT_FIELDS = ("multiplicative", "additive", "none")
@@ -82,10 +83,12 @@ class SceneModel:
         self.monte_carlo = (
             self.renderer.monte_carlo
         )  # whether predictions are Monte Carlo estimates, whose error `variance` holds
+        self.sampled = self.renderer.crowded
         self.sparing = False  # whether pixels that no frame of a press uses do without finer samples
         self._needed_kept: dict[int, Pixels | None] = {}
         self._edges_kept: dict[int, np.ndarray] = {}
         self._dialled_kept: OrderedDict[tuple, np.ndarray] = OrderedDict()
+        self._derived: OrderedDict[tuple, np.ndarray | None] = OrderedDict()
         # Values at which slopes turn errors of settings into errors of readings; None: the present ones. While a fit
         # moves, slopes that moved with it would change its weights, and it could circle without an end.
         self.weighed_at: Values | None = None
@@ -193,7 +196,7 @@ class SceneModel:
         twin.base = {**self.base, **dict.fromkeys(twin.driven - self.driven, 1.0)}
         twin.companions, twin._edges_kept = twin._companions(), dict(self._edges_kept)
         twin._needed_kept = {}
-        twin._dialled_kept = OrderedDict()
+        twin._dialled_kept, twin._derived = OrderedDict(), OrderedDict()
         return twin
 
     # -- values -------------------------------------------------------------------------------------------------------
@@ -386,10 +389,18 @@ class SceneModel:
         """Per frame: prediction (H, W, C) in DN and {variable's name: d prediction / d value}, float32.
 
         `secant` gives, by name, a finite step to take from the present value in place of the tangent. Variables that do
-        nothing in a frame are left out of its dictionary."""
+        nothing in a frame are left out of its dictionary. Of a crowded scene, the images of another seed than the
+        predictions' are made of fewer samples, and so is the prediction that comes with them."""
         self.check_variables(variables)
         for index in self._indices(frames):
-            yield self._differentiate(values, [v for v in variables if v.holds_in(index)], secant or {}, seed, index)
+            self.renderer.rough = seed != 0
+            try:
+                found = self._differentiate(
+                    values, [v for v in variables if v.holds_in(index)], secant or {}, seed, index
+                )
+            finally:
+                self.renderer.rough = False
+            yield found
 
     def _differentiate(
         self, values: Values, variables: Sequence[Variable], secant: Mapping[str, float], seed: int, index: int
@@ -412,11 +423,16 @@ class SceneModel:
         images: dict[str, np.ndarray] = {}
         image: Any
         at_once = self._light_at_once(values, now, variables, secant, index, seed)
+        at = self._place_of(now, index, seed)
         for variable in variables:
             acts = self._acts(values, variable, index)
             if not acts:
                 continue
-            if variable.name in secant:
+            key = None if at is None else (secant.get(variable.name), variable.frames, *acts.items(), *at)
+            if key in self._derived:
+                self._derived.move_to_end(key)
+                image = self._derived[key]
+            elif variable.name in secant:
                 image = self._secant(values, variable, index, secant[variable.name], prediction, seed, at_once)
             elif variable.name in at_once:
                 image = linear.of_image(at_once[variable.name])
@@ -432,8 +448,25 @@ class SceneModel:
                             stepped = {**now, **{k: now[k] + 1j * STEP for k in acts}}
                             image = image + gained * background * (self.gains(stepped).imag / STEP)
             if image is not None:
-                images[variable.name] = np.broadcast_to(image.astype(np.float32), self.frames[index].image.shape)
+                image = image.astype(np.float32, copy=False)
+                images[variable.name] = np.broadcast_to(image, self.frames[index].image.shape)
+            if key is not None:
+                self._keep_derived(key, image)
         return prediction, images
+
+    def _place_of(self, now: Mapping, index: int, seed: int) -> tuple | None:
+        """What a derivative image of a frame depends on besides its variable; None: images of readings are not kept."""
+        if self.captures.table is not None:
+            return None
+        crowds = self.renderer.geometry(now) if self.renderer.crowded else ()  # bodies may have been put elsewhere
+        return index, seed, self.renderer.wanted, *crowds, *sorted(now.items())
+
+    def _keep_derived(self, key: tuple, image: np.ndarray | None) -> None:
+        """Keep a derivative image; None where nothing depends on the variable."""
+        self._derived[key] = image
+        size = max(self.frames[0].image.size * np.dtype(np.float32).itemsize, 1)
+        while len(self._derived) > max(DERIVATIVES / size, 1):
+            self._derived.popitem(last=False)
 
     def _secant(
         self,
@@ -539,7 +572,11 @@ class SceneModel:
             )
         if key == self.renderer.bounce_key:
             return (
-                factor * sum(power * self.renderer.bounced(now, led, seed, component) for led, power in lit.items())
+                factor
+                * sum(
+                    power * self.renderer.bounced(now, led, seed, component, self.renderer.roughly)
+                    for led, power in lit.items()
+                )
                 if lit
                 else None
             )

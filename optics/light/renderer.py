@@ -37,6 +37,9 @@ CROWDED_SAMPLES = 16  # of a crowded scene, whose pixels nearly all have rims
 # as 0.92 +- 0.03
 BEHIND_PUPIL = 4
 LAYERED_RIM_SAMPLES = 32  # in scenes with layers, whose matrices are multiplied for every sample
+# mm^2: the step by which a pupil's image is made. By 0.5 mm^2 beads 4 px wide change by less than the errors of 64
+# samples: the square of these is six times that of the image. By 2 mm^2 it is 0.4 times that
+CROWDED_PUPIL = 2.0
 PAINTED = 0.05  # of the largest reflectance of a texture: a step from pixel to pixel that needs finer samples
 # difference of a pixel's mean normal from that at its middle, above which finer samples are taken: a fifth of a grey
 # level in 200
@@ -52,7 +55,6 @@ MEMORY = 2e9  # bytes of hits, with what images need for their derivatives, that
 IMAGES = 5e8  # bytes of images that are kept without them, of a renderer that remembers REMEMBER geometries
 REMEMBER = 24
 PER_RAY = 250  # bytes of a camera ray's end and its light, by the memory of processes that held ten million of them
-FAINT = 0.05  # of the largest irradiance in a crowded scene: shadows that take less need no finer samples
 BOUNCE_SAMPLES = 32  # directions per cell for the second bounce, at least
 # of these, an image has at least so many: few of a face meet a lit flank. On a plate of balls, whose second reflections
 # are 6 % of the direct light, 128 per cell of an image of 153 x 128 px leave .5 % of it, rms
@@ -61,7 +63,11 @@ BOUNCE_RAYS = 2**19
 # and lets a fit find the second reflections too weak (by a fifth with 256 per pixel, where powers absorb half of them)
 CROWDED_BOUNCE_RAYS = 2**20
 BOUNCE_NUMBERS = 10  # of a direction: a place in the cell, a technique, two directions, a point of the light
-ROUGHLY = 4  # times fewer directions suffice for how second reflections change: with the same ones on both sides
+# Times fewer directions suffice for how second reflections change, with the same ones on both sides, and times fewer
+# samples of a pixel for how a crowded scene changes. With 64 of them errors are 29 % of the square of a derivative
+# image by a finite layer, 6 % by the distortion, 1 % or less by the camera, the size of beads and how far they sank
+ROUGHLY = 4
+ROUGH_SAMPLES = 64  # of a pixel, below which no fewer are taken
 BOUNCE_CELL = 2  # px each way of a cell; 1 in a crowded scene, whose pixels differ
 
 
@@ -114,6 +120,9 @@ class Renderer:
             for name in (scene.camera.named("pupil"), scene.camera.named("focus")):
                 key = f"{scene.camera.name}.{name}"
                 scene.parameters[key] = replace(scene.parameters[key], how="difference", step=1.0)
+            key = f"{scene.camera.name}.{scene.camera.named('pupil')}"
+            scene.parameters[key] = replace(scene.parameters[key], plausible=CROWDED_PUPIL)
+        self.rough = False  # whether a crowded scene is sampled ROUGHLY: for derivatives
         self.rim_samples = LAYERED_RIM_SAMPLES if self.layered else RIM_SAMPLES
         cells = -(-self.height // BOUNCE_CELL) * -(-self.width // BOUNCE_CELL)
         self.bent_side, self.bounce = BENT_SIDE, (BOUNCE_CELL, _power_of_two(max(BOUNCE_SAMPLES, BOUNCE_RAYS / cells)))
@@ -153,6 +162,7 @@ class Renderer:
         self.shading_keys = [
             k for k in own if k not in self.geometry_keys and k != self.bounce_key and k not in self.ambient_keys
         ]
+        self._clocks = {k: told for k in self.shading_keys if (told := self._told_by(k))}
         self.led_keys = {
             n: [k for k in led_keys if k.rsplit(".", 1)[0] in (n, _board(light)) and k not in self.power_keys]
             for n, light in scene.lights.items()
@@ -166,11 +176,38 @@ class Renderer:
         self.together: set[str] = set()  # LEDs whose images are wanted of the same geometry
         self.wanted: Pixels | None = None  # those that take finer samples where they need them; None: all
 
+    def _told_by(self, key: str) -> list[str]:
+        """Of a clock, the keys of the parameters that show through it and nothing else; empty of others, and of a clock
+        that something else reads."""
+        name, _, clock = key.rpartition(".")
+        part = self.scene.parts.get(name)
+        if part is None or self.scene.parameters[key].role != "clock":
+            return []
+        own = [e for e in self.scene.registry.effects.values() if part.kind in self.scene.registry.kinds(e.part)]
+        if any(clock in e.reads for e in own):
+            return []
+        return [k for k, p in self.scene.parameters.items() if p.through == clock and k.rpartition(".")[0] == name]
+
+    def _shading(self, values: Mapping) -> tuple:
+        """What the shading of surfaces depends on; without clocks that nothing shows through: a press that is made
+        again later has the same images."""
+        idle = {
+            clock
+            for clock, keys in self._clocks.items()
+            if all(values[k] == self.scene.parameters[k].neutral for k in keys)
+        }
+        return tuple(None if k in idle else values[k] for k in self.shading_keys)
+
     def kind(self, key: str) -> str:
         part = self.scene.parts.get(key.rsplit(".", 1)[0])
         return part.kind if part is not None else ""
 
     # -- geometry -----------------------------------------------------------------------------------------------------
+    @property
+    def roughly(self) -> bool:
+        """Whether images are made of fewer samples now."""
+        return self.crowded and self.rough
+
     def geometry(self, values: Mapping) -> tuple:
         own = tuple(values[k] for k in self.geometry_keys)
         return (*own, *(c.part.version for c in self.scene.traced.crowds)) if self.crowded else own
@@ -323,9 +360,9 @@ class Renderer:
         return (
             led,
             self.geometry(values),
-            tuple(values[k] for k in self.shading_keys),
+            self._shading(values),
             tuple(values[k] for k in self.led_keys[led]),
-            seed if self.crowded else 0,
+            (seed, self.rough) if self.crowded else 0,
         )
 
     def _image_key(self, values: Mapping, led: str, seed: int = 0) -> tuple:
@@ -404,16 +441,18 @@ class Renderer:
             own[:, self._own(led)] = 1.0
             image.raw = (own, own)
             return image
+        if self.crowded:
+            return self._render_crowded(hits, led, seed)
         part = self.scene.leds[led]
         visible = self._unshaded(hits, part)
         rim = self._joint_rim(hits) if self.layered else self._rim(hits, visible)
-        share = np.where(self._joint_rim(hits) if self.crowded else rim, 1.0, hits.bent)
+        share = np.where(rim, 1.0, hits.bent)
         if self.wanted is not None:
             share = np.where(self.wanted.mask, share, 0.0)
         index = np.flatnonzero(share)
         # of a light of many points, an edge in the shadow of one is small
-        few = ~(hits.edges if self.crowded or len(part.places()) > SOFT else rim)
-        finer = self._finer(hits, index, np.flatnonzero(few.ravel()[index]), seed if self.crowded else 0)
+        few = ~(hits.edges if len(part.places()) > SOFT else rim)
+        finer = self._finer(hits, index, np.flatnonzero(few.ravel()[index]))
         rim_visible = self._visible(finer.sample.si, part) if len(index) else None
         image = LedImage(led, hits, rim, index, finer, visible, rim_visible, self._seen(visible).mean(0) > 0.5)
         image.share = share.reshape(-1, 1)[index]
@@ -421,6 +460,26 @@ class Renderer:
         if not self.layered:
             image.radiance = self._mix(image, image.raw)
         return image
+
+    def _render_crowded(self, hits: Hits, led: str, seed: int) -> LedImage:
+        """The image of one LED in a crowded scene: finer samples in all pixels, few where no outline is."""
+        index = np.arange(hits.valid.size)
+        finer = self._finer(hits, index, np.flatnonzero(~hits.edges.ravel()), seed)
+        visible = self._visible(finer.sample.si, self.scene.leds[led])
+        image = LedImage(led, hits, None, index, finer, None, visible, None)
+        image.raw = self._direct(image)
+        image.radiance = self._mix(image, image.raw)
+        return image
+
+    def shadows(self, values: Mapping, led: str) -> tuple[np.ndarray, np.ndarray]:
+        """(H, W), (H, W) bool: pixels at a rim of a shadow or a body, and those whose middle most of a light's points
+        reach."""
+        image = self.led(values, led)
+        if not self.crowded:
+            return image.rim, image.lit
+        self.apply(values)
+        visible = self._unshaded(image.hits, self.scene.leds[led])
+        return self._rim(image.hits, visible), self._seen(visible).mean(0) > 0.5
 
     def _seen(self, visible) -> np.ndarray:
         """(points of the source, H, W)"""
@@ -430,26 +489,11 @@ class Renderer:
         return np.logical_or.reduce([_edges(s & hits.valid) for s in self._seen(visible)]) | hits.edges
 
     def _joint_rim(self, hits: Hits) -> np.ndarray:
-        """Pixels at a rim for any light: in scenes with layers, and in crowded ones, one set of finer samples serves
-        all."""
+        """Pixels at a rim for any light: in scenes with layers one set of finer samples serves all."""
         if hits.joint is None:
-            rim = self._cast if self.crowded else lambda h, part: self._rim(h, self._unshaded(h, part))
-            hits.joint = np.logical_or.reduce([hits.edges, *(rim(hits, part) for part in self.scene.leds.values())])
+            rims = (self._rim(hits, self._unshaded(hits, part)) for part in self.scene.leds.values())
+            hits.joint = np.logical_or.reduce([hits.edges, *rims])
         return hits.joint
-
-    def _cast(self, hits: Hits, part) -> np.ndarray:
-        """Pixels at a rim of a shadow that a light's points cast, where it takes more than FAINT of the largest
-        irradiance, cos/d^2 of each point. What the surfaces and the light are made of does not enter: the same pixels
-        are sampled finely whatever image of a geometry is made first."""
-        import drjit as dr
-
-        si = hits.si
-        step, total = np.zeros(hits.shape), np.zeros(hits.shape)
-        for point, own in zip(self.scene.integrator.spots(part), self._seen(self._unshaded(hits, part))):
-            to = dr.detach(point) - si.p
-            light = hits.image(dr.maximum(dr.dot(si.sh_frame.n, to), 0) / dr.norm(to) ** 3) * hits.valid
-            step, total = step + _edges(own) * light, total + own * light
-        return step > FAINT * np.max(total)
 
     def _unshaded(self, hits: Hits, part):
         """`_visible` at pixel centres, kept for as long as the light stands where it does."""
@@ -560,7 +604,7 @@ class Renderer:
         """(H, W, B) what one light makes at its power, by one reflection and by two."""
         image = self.image(values, light, component, seed)
         if self.bounce_key and values[self.bounce_key]:
-            image = image + values[self.bounce_key] * self.bounced(values, light, seed, component)
+            image = image + values[self.bounce_key] * self.bounced(values, light, seed, component, self.roughly)
         return self.powers(values, light) * image
 
     def radiance(self, values: Mapping, seed: int = 0, component: int = 0) -> np.ndarray:
@@ -576,7 +620,7 @@ class Renderer:
 
     def _finer(self, hits: Hits, index: np.ndarray, bent: np.ndarray | tuple = (), seed: int = 0) -> Finer:
         """Finer samples of the pixels `index`; of `bent` among them, where no edge is, fewer."""
-        key = (index.tobytes(), np.asarray(bent).tobytes(), seed)
+        key = (index.tobytes(), np.asarray(bent).tobytes(), seed, self.roughly)
         if key not in hits.rims:  # only the latest is kept
             hits.rims = {key: self._in_pixels(index, np.isin(np.arange(len(index)), bent), seed)}
         return hits.rims[key]
@@ -587,7 +631,8 @@ class Renderer:
         the middles of a square grid. Behind a pupil each sample has a place on it as well. Another seed shifts the
         sets by another amount."""
         pupil = self.crowded and self.scene.camera.number(self.scene.camera.named("pupil")) > PINHOLE
-        samples = self.rim_samples * BEHIND_PUPIL if pupil else self.rim_samples
+        fewer = max(self.rim_samples // ROUGHLY, min(self.rim_samples, ROUGH_SAMPLES))
+        samples = (fewer if self.roughly else self.rim_samples) * (BEHIND_PUPIL if pupil else 1)
         counts = np.where(bent, self.bent_side**2, samples)
         starts = np.cumsum(counts) - counts
         u, v = np.empty((2, counts.sum()), np.float32)
@@ -676,8 +721,11 @@ class Renderer:
         return total / len(shares)
 
     def _raw(self, image: LedImage, centre: Callable, rim: Callable) -> tuple:
-        """Shading at pixel centres (H W, B) and at the finer samples (N, B), None without any."""
+        """Shading at pixel centres (H W, B) and at the finer samples (N, B), None without any; of a crowded scene at
+        the finer ones alone, which all its pixels have."""
         fine = self._each_band(rim, image.led) if len(image.index) else None
+        if self.crowded:
+            return np.zeros((self.height * self.width, self.bands)), fine
         return self._each_band(centre, image.led).reshape(self.height * self.width, self.bands), fine
 
     def _mix(self, image: LedImage, raw: tuple, weights: tuple = (1.0, 1.0)) -> np.ndarray:
@@ -763,7 +811,8 @@ class Renderer:
 
     def led_tangent_at_rest(self, values: Mapping, led: str, key: str, component: int = 0, seed: int = 0) -> np.ndarray:
         """`led_tangent`, kept: all frames share the gel at rest."""
-        known = (key, component, *self._led_key(values, led, seed), *(values[k] for k in self.layer_order))
+        now = tuple(values[k] for k in self.shading_keys)  # also clocks, through which a derivative shows
+        known = (key, component, now, *self._led_key(values, led, seed), *(values[k] for k in self.layer_order))
         if known not in self._tangents:
             with everywhere(self):
                 self._tangents[known] = self.led_tangent(values, led, key, component, seed).astype(np.float32)

@@ -55,6 +55,7 @@ PARAMETERS = (
         neutral=0.0,
         plausible=0.05,
         how="difference",
+        step=0.4,
     ),
     Parameter(
         "settling",

@@ -91,6 +91,7 @@ PARAMETERS = (
         neutral=0.0,
         plausible=0.5,
         how="difference",
+        step=0.4,  # a shorter one moves outlines by less than samples are apart
     ),
     Parameter("poisson", "1", 0.5, (0.0, 0.5), "Poisson's ratio", plausible=0.02, how="difference"),
     Parameter("young", "MPa", 0.12, (1e-4, 100.0), "Young's modulus", plausible=0.02, how="difference"),

@@ -491,7 +491,7 @@ def calm(bench, key, values, base):
     for value in values:
         now = {**base, key: value}
         for led in bench.model.lit(now):
-            rim |= bench.renderer.led(now, led).rim
+            rim |= bench.renderer.shadows(now, led)[0]
     return ~rim
 
 

@@ -140,3 +140,83 @@ def test_an_image_does_not_depend_on_those_before_it(load):
     after = Renderer(scene)
     after.radiance({**bleached, "dye.bleaching": 0.0, "gel.dye": 2.0})
     np.testing.assert_array_equal(after.radiance(bleached), alone)
+
+
+SMALL = {"width": 12, "height": 12, "x_fov": 20, "beads": 12, "field": 6, "diameter": 1.2, "top": 0.65, "bottom": 3.85}
+
+
+def test_derivatives_have_fewer_samples(load):
+    """A quarter of those at an outline, but no fewer than 64, four times as many behind a pupil; others stay four. The
+    image is the same within what samples err: 256 of a step err by less than 1/64 of it, 64 by less than 1/16."""
+    from optics.light.renderer import Renderer
+
+    renderer = Renderer(load(**SMALL, fine=5))
+    values = renderer.scene.values()
+    found, images = {}, {}
+    for rough in (False, True):
+        renderer.rough = rough
+        for area in (0.0, 1.0):
+            now = {**values, "camera.pupil_area": area}
+            image = renderer.led(now, "inner_ring", 1)
+            found[rough, area], images[rough, area] = set(np.unique(image.finer.counts)), image.radiance
+    assert found == {
+        (False, 0.0): {4, 256},
+        (False, 1.0): {4, 1024},
+        (True, 0.0): {4, 64},
+        (True, 1.0): {4, 256},
+    }
+    fine, rough = images[False, 0.0], images[True, 0.0]
+    assert not np.array_equal(fine, rough) and np.abs(fine - rough).max() < (1 / 16 + 1 / 64) * fine.max()
+    assert Renderer(load(**SMALL)).rim_samples == 16  # of which a quarter would be too few
+    few = Renderer(load(**SMALL))
+    few.rough = True
+    assert few.led(values, "inner_ring", 1).finer.counts.max() == 16
+
+
+def test_a_derivative_image_is_made_once(load, monkeypatch):
+    """A diagnosis scores effects by the images with which its refits begin; other values, seeds and steps have images
+    of their own, and a seed of its own does not change the prediction."""
+    from pathlib import Path
+
+    from optics.captures.capture_set import Captures, Frame
+    from optics.captures.noise import Noise
+    from optics.fit.scene_model import SceneModel
+    from optics.scene.parameter import Values, Variable
+
+    noise = Noise(system_gain=0.1, dark_noise=1.0, black_level=0.0, saturation=255.0, prnu=0.0)
+    frames = [Frame("f", np.zeros((12, 12, 3), np.float32))]
+    model = SceneModel(
+        load(**SMALL), Captures(Path("."), "particle_gel", frames, {}, noise, None, None, "DN", None, [])
+    )
+    z = Variable("camera.z", ("camera.z",), model.parameters["camera.z"])
+
+    def image(values=None, seed=5, secant=None):
+        return next(iter(model.derivatives(values or Values(), [z], [0], secant, seed)))[1]["camera.z"]
+
+    plain, first = model.predict(Values(), [0])[0], image()
+    assert not np.array_equal(first, image(seed=6)) and not np.array_equal(first, image(secant={"camera.z": 0.3}))
+    traced = []
+    monkeypatch.setattr(model.renderer, "_trace", lambda *a: traced.append(a) or 1 / 0)
+    assert np.array_equal(first, image()) and not traced
+    assert np.array_equal(plain, model.predict(Values(), [0])[0])
+    with pytest.raises(ZeroDivisionError):
+        image(Values({"camera.z": 0.1}))
+
+
+def test_a_press_that_is_made_again_later_has_the_same_images(load, monkeypatch):
+    """While nothing bleaches the clock changes no image, and none is made again; with bleaching it does, and the
+    derivative by it at none is -time times the fluorescence."""
+    from optics.light.renderer import Renderer
+
+    renderer = Renderer(load(**SMALL))
+    values = renderer.scene.values()
+    early, late = ({**values, "dye.time": time} for time in (1.0, 3.0))
+    first = renderer.radiance(early)
+    slopes = [renderer.led_tangent(now, "inner_ring", "dye.bleaching") for now in (early, late)]
+    assert np.abs(slopes[0]).max() > 0
+    np.testing.assert_allclose(slopes[1], 3 * slopes[0], rtol=1e-5, atol=1e-7 * np.abs(slopes[1]).max())
+    left = renderer.radiance({**late, "dye.bleaching": 0.1})
+    assert left[..., 1].sum() < 0.9 * first[..., 1].sum()  # exp(-0.3) of the green, which is all fluorescence
+    monkeypatch.setattr(renderer, "_render_led", None)
+    monkeypatch.setattr(renderer, "_shaded_again", None)
+    assert np.array_equal(first, renderer.radiance(late))

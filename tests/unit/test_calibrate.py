@@ -293,6 +293,55 @@ def test_an_effect_may_do_nothing_in_a_dark_frame():
     assert [len(where) for where, *_ in base.normal.rows] == [1, 1, 1, 0] and more.converged and more.chi2 < base.chi2
 
 
+class Sampled(Exact):
+    """One frame, y = level + a (0.2 g) + e(seed) where a > 0, with the same errors e, 0.085 rms, at every a: rays that
+    cross a pupil. The data are without them, and without noise; values have a noise of 1."""
+
+    level = Parameter("level", "1", 10.0, plausible=0.1)
+    area = Parameter("area", "mm^2", 0.0, (0.0, 100.0), neutral=0.0, plausible=0.5)
+
+    def __init__(self):
+        self.shape = (100, 200, 1)
+        self.noise = Noise(system_gain=0.02, dark_noise=1.0, black_level=0.0, saturation=4095.0, prnu=0.0)
+        self.parameters = {"lamp.level": self.level, "lens.area": self.area}
+        self.base = {"lamp.level": 10.0, "lens.area": 0.0}
+        self.pattern = 0.2 * np.random.default_rng([0, 1]).normal(size=self.shape)
+        self.frames = [Frame("f", 10 + 1.4 * self.pattern)]
+
+    def image(self, level, area, seed):
+        error = 0.085 * np.random.default_rng(seed).normal(size=self.shape) if area > 0 else 0.0
+        return level + area * self.pattern + error
+
+    def predict(self, values, frames=None, seed=0):
+        now = self.at(values, 0)
+        return [self.image(now["lamp.level"], now["lens.area"], seed)]
+
+    def variance(self, values, index, prediction):
+        return np.ones(self.shape)
+
+    def derivatives(self, values, variables, frames=None, secant=None, seed=0):
+        here, now = self.predict(values, frames, seed)[0], self.at(values, 0)
+        found = {}
+        for v in variables:
+            step = (secant or {}).get(v.name, 0.1)
+            there = {**now, v.keys[0]: now[v.keys[0]] + step}
+            found[v.name] = (self.image(there["lamp.level"], there["lens.area"], seed) - here) / step
+        yield here, found
+
+
+def test_chord_steps_do_not_follow_the_errors_that_predictions_share_with_their_images():
+    """By images of the predictions' own samples the root of J'Wr lies at 1.04, as errors are worth as much as the
+    pattern there: -e'e/(0.5 g'g) = -0.36. By others it is at 1.4 but for products of independent errors, which are
+    0.02 each of g'g = 800. The error that is told is 1/|g|, not that of an image with the square of its errors."""
+    model = Sampled()
+    level, area = (Variable(k, (k,), p) for k, p in model.parameters.items())
+    base = fit(model, [level])
+    found = extended(model, base, [area], {"lens.area": 0.5}, steps=40)
+    assert found.estimate[1] == pytest.approx(1.4, abs=0.08)  # four times 0.02
+    # products of errors with the pattern and with each other are 0.02 of g'g
+    assert found.sd[1] == pytest.approx(1 / np.linalg.norm(model.pattern), rel=0.05)
+
+
 def test_priors_go_along_to_other_frames_where_they_say_something_about_them():
     model = Exact()
     model.frames = [

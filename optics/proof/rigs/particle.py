@@ -6,9 +6,11 @@ import numpy as np
 
 from optics.captures import capture_set as capture_files
 from optics.proof.cells import Cell
-from optics.proof.makers.particle import CAMERA, MAKERS, ParticleMaker
+from optics.proof.makers.particle import CAMERA, MAKERS, SIDE, ParticleMaker
 from optics.proof.rigs.base import ImageRig, Mean
 from optics.scene import loader as scenes
+
+FEW = 2  # rays of a pixel each way where strengths are chosen, which takes only the settings of the frames
 
 
 class ParticleGel(ImageRig):
@@ -53,7 +55,8 @@ class ParticleGel(ImageRig):
     def captures(self, cell: Cell, truth, unknown, *, mean: bool = False) -> capture_files.Captures:
         scene = self.scene()
         noise = Mean(CAMERA) if mean else CAMERA
-        maker = ParticleMaker(scene, self.built(scene, cell.seed), truth, noise, 1000 + cell.seed)
+        side = FEW if mean else SIDE
+        maker = ParticleMaker(scene, self.built(scene, cell.seed), truth, noise, 1000 + cell.seed, side)
         found = maker.captures(self.presses)
         found.noise = CAMERA
         return found
