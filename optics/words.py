@@ -53,7 +53,8 @@ def _across(widths: Sequence[int], between: int) -> int:
 
 
 def _laid_out(rows: Sequence[Sequence[str]], left: Collection[int] | None = None) -> list[list[str]]:
-    """The lines of each row of a table."""
+    """The lines of each row of a table; names of files may hold what would break a line."""
+    rows = [[_CONTROL.sub("?", cell) for cell in row] for row in rows]
     widths, width = [max(len(cell) for cell in column) for column in zip(*rows)], _room.get()
     limits, between = widths, 2
     if width is not None and _across(widths, between) > width:
@@ -150,6 +151,7 @@ def _broken(line: str) -> list[str]:
     )
 
 
+_CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]")
 _NUMBER = re.compile(r"[-+]?[\d.]\S*( \S{1,3})?")  # with its unit
 
 

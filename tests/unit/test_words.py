@@ -156,6 +156,11 @@ def test_prose_stands_under_its_row_where_the_line_is_narrow():
         assert words.annotated(rows, short, notes) == words.table(rows)
 
 
+def test_what_would_break_a_row_is_no_part_of_it():
+    lines = words.table([("file", "ssim"), ("a\nb\x1b[31m.png", "1")]).split("\n")
+    assert lines == ["file          ssim", "a?b?[31m.png  1"]
+
+
 def test_rows_with_notes_fit_the_line():
     """83 columns with two spaces between them: one space is enough. 40: the long cells go over several lines."""
     row = ("a_part_of_a_scene.a_parameter", "-0.000123456", "1/mm^2", "-1000 .. 1000", "0.123456789", "word " * 20)
