@@ -698,8 +698,10 @@ def _folder_row(name: str, folder: str, consequence: str) -> Row:
     return Row(name, f"{folder} ({size / 2**20:.1f} MiB)")
 
 
-def report_table(rows: list[Row], width: int = 100) -> str:
-    """Lay out a report as text: name, value, and beneath it the next step."""
+def report_table(rows: list[Row], width: int | None = None) -> str:
+    """Lay out a report as text: name, value, and beneath it the next step; `width` None: as the terminal, 100 at
+    most."""
+    width = width or min(100, shutil.get_terminal_size((100, 24)).columns if sys.stdout.isatty() else 100)
     column = max(len(row.name) for row in rows) + 2
     marks = {"ok": " ", "warn": "!", "fail": "x"}
     lines = []

@@ -10,10 +10,12 @@ from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
+from itertools import zip_longest
 from typing import Any
 
 NARROWEST = 7  # characters of a column that is broken over lines
 PROSE = 30  # characters of a line of prose in a table: what is narrower is hard to read
+FILLED = 90  # characters from which on a line of a page, of at most 120, goes on in the next
 UNBROKEN = 14  # characters of a word or number that stays whole, where the line has room for all of these
 
 
@@ -36,22 +38,37 @@ def table(rows: Sequence[Sequence[str]], left: Collection[int] | None = None) ->
 
     Where there is a terminal (`fitting`), cells of the widest columns go over several lines, so that a row fits; where
     one space between columns leaves more words whole, it is one."""
+    return "\n".join(line for row in _laid_out(rows, left) for line in row)
+
+
+def fits(rows: Sequence[Sequence[str]]) -> bool:
+    """Whether a table fits the terminal with all of its cells on one line."""
+    width = _room.get()
+    return width is None or _across([max(map(len, column)) for column in zip(*rows)], 2) <= width
+
+
+def _across(widths: Sequence[int], between: int) -> int:
+    """Characters of a row of columns."""
+    return sum(widths) + between * (len(widths) - 1)
+
+
+def _laid_out(rows: Sequence[Sequence[str]], left: Collection[int] | None = None) -> list[list[str]]:
+    """The lines of each row of a table; names of files may hold what would break a line."""
+    rows = [[_CONTROL.sub("?", cell) for cell in row] for row in rows]
     widths, width = [max(len(cell) for cell in column) for column in zip(*rows)], _room.get()
-    between = 2
-    if width is not None and sum(widths) + between * (len(widths) - 1) > width:
+    limits, between = widths, 2
+    if width is not None and _across(widths, between) > width:
         limits, between = _limits(rows, widths, width)
-        lines = [[textwrap.wrap(cell, most) or [""] for cell, most in zip(row, limits)] for row in rows]
-        rows = [[cell[i] if i < len(cell) else "" for cell in row] for row in lines for i in range(max(map(len, row)))]
-        widths = [max(len(cell) for cell in column) for column in zip(*rows)]
-    return "\n".join(
-        (" " * between)
-        .join(
-            cell.ljust(w) if left is None or i in left else cell.rjust(w)
-            for i, (cell, w) in enumerate(zip(row, widths))
+    broken = [[textwrap.wrap(c, m) or [""] if len(c) > m else [c] for c, m in zip(row, limits)] for row in rows]
+    widths = [max(len(line) for row in broken for line in row[i]) for i in range(len(widths))]
+
+    def line(cells: Sequence[str]) -> str:
+        placed = (
+            c.ljust(w) if left is None or i in left else c.rjust(w) for i, (c, w) in enumerate(zip(cells, widths))
         )
-        .rstrip()
-        for row in rows
-    )
+        return (" " * between).join(placed).rstrip()
+
+    return [[line(cells) for cells in zip_longest(*row, fillvalue="")] for row in broken]
 
 
 def _limits(rows: Sequence[Sequence[str]], widths: Sequence[int], width: int) -> tuple[list[int], int]:
@@ -63,12 +80,12 @@ def _limits(rows: Sequence[Sequence[str]], widths: Sequence[int], width: int) ->
         return min(max(map(len, parts), default=0), UNBROKEN)
 
     floors, narrowest = [max(map(whole, column)) for column in zip(*rows)], [NARROWEST] * len(widths)
-    for least, between in ((floors, 2), (floors, 1), (narrowest, 2)):
+    for least, between in ((floors, 2), (floors, 1), (narrowest, 2), (narrowest, 1)):
         for cap in range(max(widths), 0, -1):
             limits = [max(cap, floor) for floor in least]
-            if sum(map(min, widths, limits)) + between * (len(widths) - 1) <= width:
+            if _across([*map(min, widths, limits)], between) <= width:
                 return limits, between
-    return narrowest, 2
+    return narrowest, 1
 
 
 def annotated(rows: Sequence[Sequence[str]], short: Sequence[Sequence[str]], notes: Sequence[str]) -> str:
@@ -78,13 +95,63 @@ def annotated(rows: Sequence[Sequence[str]], short: Sequence[Sequence[str]], not
     others = [max(len(cell) for cell in column) for column in list(zip(*rows))[:-1]]
     if width is None or sum(others) + 2 * len(others) + PROSE <= width:
         return table(rows)
-    with fitting(None):  # a row is a line, whose note can follow it
-        lines = table(short).splitlines()
     indent = " " * 4
     below = [textwrap.wrap(note, max(width, PROSE), initial_indent=indent, subsequent_indent=indent) for note in notes]
-    return "\n".join(text for line, note in zip(lines, below) for text in (line, *note))
+    return "\n".join(text for row, note in zip(_laid_out(short), below) for text in (*row, *note))
 
 
+def wrapped(text: str) -> str:
+    """Text whose lines are broken between words where the terminal ends (`fitting`), and go on below where they began;
+    without one, as it is."""
+    return "\n".join(part for line in text.split("\n") for part in _broken(line))
+
+
+def reflowed(page: str) -> str:
+    """A page of prose and formulas for the terminal: paragraphs are filled anew, lines with columns are broken."""
+    width = _room.get()
+    if width is None:
+        return page
+    source, lines = page.split("\n"), [""]
+    for before, line, after in zip(["", *source], source, [*source[1:], ""]):
+        heads = _indent(after) > _indent(line)
+        if _goes_on(before) and _is_prose(line) and not heads and _indent(line) == _indent(before):
+            lines[-1] += f" {line.strip()}"
+        else:
+            lines.append(line)
+    return wrapped("\n".join(lines[1:]))
+
+
+def _goes_on(line: str) -> bool:
+    """Whether its writer broke this line of prose because it was full."""
+    return _is_prose(line) and len(line) >= FILLED
+
+
+def _is_prose(line: str) -> bool:
+    """Whether a line has words, and neither columns nor the mark of a list."""
+    text = line.strip()
+    return bool(text) and "   " not in text and not re.match(r"[-*|#=~+]|\d+\.", text)
+
+
+def _indent(line: str) -> int:
+    return len(line) - len(line.lstrip())
+
+
+def _broken(line: str) -> list[str]:
+    width = _room.get()
+    if width is None or len(line) <= width:
+        return [line]
+    indent = " " * min(_indent(line), width // 2)
+    return textwrap.wrap(
+        line.strip(),
+        width,
+        initial_indent=indent,
+        subsequent_indent=indent if _is_prose(line) else f"{indent}    ",
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
+
+
+_CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]")
 _NUMBER = re.compile(r"[-+]?[\d.]\S*( \S{1,3})?")  # with its unit
 
 

@@ -4,7 +4,6 @@ channel."""
 from __future__ import annotations
 
 import csv
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,6 +15,7 @@ from optics.errors import BadCapture, UnknownKey
 DELIMITERS = (",", ";", "\t", " ")  # a blank stands for any run of blanks
 DECIMALS = (".", ",")
 NAMES = {",": "commas", ";": "semicolons", "\t": 'tabs ("\\t")', " ": 'blanks (" ")'}
+LARGEST = float(np.finfo(np.float32).max)  # of a cell: readings are single precision
 FINEST = 7  # decimal places: what readings of single precision hold
 
 
@@ -200,14 +200,14 @@ def _cell(text: str, column: str, number: bool, decimal: str, where: str) -> flo
     if decimal == ",":
         plain = text.replace(",", ".") if "." not in text else text.replace(",", "?")
     try:
-        value = float(plain)
+        value = float(plain.replace("_", "?"))  # Python reads 1_0 as 10
     except ValueError:
         if not number and text:
             return text  # a choice, such as the name of an indenter
         other = "," if decimal == "." else "."
         hint = f'; decimal = "{other}" under [table] reads it' if _reads(text, other) else "; correct the row"
         raise BadCapture(f"{where}: {column} = '{text}' is no number; allowed: finite numbers{hint}") from None
-    if not math.isfinite(value):
+    if not abs(value) <= LARGEST:
         raise BadCapture(f"{where}: {column} = {text}; allowed: finite numbers; correct the row or remove it")
     return value
 

@@ -29,6 +29,7 @@ from optics.cli.shared import (
     show,
     terminal,
 )
+from optics.words import wrapped
 
 if TYPE_CHECKING:
     from optics.study.shown import Shown
@@ -306,7 +307,7 @@ def design(
         )
     if output is not None:
         terminal.note(f"to fill in: {planning.write(result, output) / 'captures.toml'}")
-    show(result.json()) if as_json else print(result.text())
+    show(result.json()) if as_json else print(wrapped(result.text()))
 
 
 @command
@@ -363,7 +364,7 @@ def compare(
             (folder / "comparison.json").write_text(comparison.to_json() + "\n", encoding="utf-8")
             for shown in found.frames(comparison.worst()[:SHOWN_MAX]):
                 _write_frame(folder, shown, found.model.noise.saturation)
-    print(comparison.to_json() if as_json else comparison.text())
+    print(comparison.to_json() if as_json else wrapped(comparison.text()))
     if output is not None:
         terminal.note(f"{output}: the same numbers as text, CSV and JSON, and the worst frames")
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from optics.cli.shared import AsJson, Force, Plugins, command, show, terminal
-from optics.words import table
+from optics.words import table, wrapped
 
 if TYPE_CHECKING:
     from optics.readers.force_learning import FeatureSet, ForceModel
@@ -62,7 +62,7 @@ def force_tables(
     if as_json:
         show({**found.record(), "files": [str(output)] if output else []})
     else:
-        print(found.text())
+        print(wrapped(found.text()))
         if output is not None:
             print(output)
     if not found.agrees:

@@ -26,7 +26,7 @@ from optics.cli.shared import (
     show,
     terminal,
 )
-from optics.words import number, spaced, table
+from optics.words import fits, number, spaced, table, wrapped
 
 if TYPE_CHECKING:
     from optics.light.polarimetry import Sweep
@@ -94,10 +94,8 @@ def mueller(
                 "product": record(whole),
             }
         )
-    print(
-        f"the ray through {u:g},{v:g} passes, from the camera on: {', '.join(ray.names)}; "
-        + (f"it ends on {ray.end}" if ray.end else "it meets nothing")
-    )
+    end = f"it ends on {ray.end}" if ray.end else "it meets nothing"
+    print(wrapped(f"the ray through {u:g},{v:g} passes, from the camera on: {', '.join(ray.names)}; {end}"))
     for name, own in shown:
         title = name if name != "product" else f"product: {' '.join(names)}"
         print(f"\n{title}\n" + _matrices(own, bands))
@@ -146,22 +144,7 @@ def _meanings(shown: Sequence[tuple[str, Any]], bands: Sequence[float]) -> str:
             "" if math.isnan(ellipticity) or abs(ellipticity) < 0.05 else f" ({ellipticity:+.1f})"
         )
 
-    lines = [
-        (
-            "",
-            "",
-            "T",
-            "T max",
-            "T min",
-            "diattenuation",
-            "axis",
-            "retardance",
-            "fast axis",
-            "depolarization",
-            "index",
-            "physical",
-        )
-    ]
+    lines = []
     for name, own in shown:
         for band, matrix in _alike(own, bands):
             d = decompose(matrix)
@@ -181,12 +164,24 @@ def _meanings(shown: Sequence[tuple[str, Any]], bands: Sequence[float]) -> str:
                     "no" if d.realisable < -1e-9 else "yes",
                 )
             )
+    rows = [MEANINGS, *lines] if fits([MEANINGS, *lines]) else [SHORT_MEANINGS, *lines]
     return (
-        table(lines)
-        + "\nT: transmittance of unpolarized light. Axes and retardance in deg, an ellipticity (+-45: circular) in "
-        "brackets. Depolarization: 0 none;\nindex: 1 none. '-': no meaning here, such as the retardance of a perfect "
-        "polarizer."
+        table(rows)
+        + "\n"
+        + wrapped(
+            "T: transmittance of unpolarized light. D: diattenuation. R: retardance. Axes and retardance in deg, an "
+            "ellipticity (+-45: circular) in brackets. Depolarization: 0 none; index: 1 none. '-': no meaning here, "
+            "such as the retardance of a perfect polarizer."
+        )
     )
+
+
+TRANSMITTANCES = ("T", "T max", "T min")
+MEANINGS = (
+    *("", "", *TRANSMITTANCES, "diattenuation", "axis", "retardance", "fast axis"),
+    *("depolarization", "index", "physical"),
+)
+SHORT_MEANINGS = ("", "", *TRANSMITTANCES, "D", "axis", "R", "fast", "depol", "index", "phys")
 
 
 @command

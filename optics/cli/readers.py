@@ -143,7 +143,7 @@ def _matrix(text: str | None) -> tuple[int, int] | None:
         return None
     match = re.fullmatch(r"(\d{1,3})x(\d{1,3})", text.strip())
     if match is None or min(int(match[1]), int(match[2])) < 2:
-        raise ValueError(f"--matrix {text}: allowed: COLUMNSxROWS, 2x2 at least, such as 5x4")
+        raise ValueError(f"--matrix {text}: allowed: COLUMNSxROWS, 2x2 to 999x999, such as 5x4")
     return int(match[1]), int(match[2])
 
 

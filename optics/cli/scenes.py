@@ -21,7 +21,7 @@ from optics.cli.shared import (
     show,
     terminal,
 )
-from optics.words import annotated, key_of, number, table
+from optics.words import annotated, key_of, number, reflowed, table, wrapped
 
 if TYPE_CHECKING:
     from optics.scene.declare import Effect
@@ -79,7 +79,7 @@ def params(
             "\n" + table([("spectrum", "kind", "nm", "mean", "source"), *map(_spectrum_line, spectra.records(loaded))])
         )
     if not patterns and loaded.integral is not None:
-        print("\n" + loaded.integral.describe())
+        print("\n" + wrapped(loaded.integral.describe()))
 
 
 def _spectrum_line(r: Mapping[str, Any]) -> tuple[str, ...]:
@@ -276,7 +276,9 @@ def effects(
         (r["key"], r["part"], ", ".join(p["name"] for p in r["parameters"]), r["onset"], r["needs"] or "-")
         for r in records
     ]
-    print(f"{table([head, *lines])}\n\nparts, each with a page too: {', '.join(sorted(found.parts))}")
+    notes = [f"needs: {line[-1]}" for line in lines]
+    print(annotated([head, *lines], [head[:-1], *(line[:-1] for line in lines)], ["", *notes]))
+    print("\n" + wrapped(f"parts, each with a page too: {', '.join(sorted(found.parts))}"))
 
 
 def _effect_record(found: "Registry", e: "Effect") -> dict[str, Any]:
@@ -323,7 +325,8 @@ def _effect_page(found: "Registry", e: "Effect", as_json: bool) -> None:
         (p["name"], p["unit"], f"{p['neutral']:g}", f"{p['bounds'][0]:g} .. {p['bounds'][1]:g}", p["meaning"])
         for p in r["parameters"]
     ]
-    print(f"{r['page'].strip()}\n\n{r['name']}: `{r['key']}`, {r['file']}")
+    print(reflowed(r["page"].strip()))
+    print("\n" + wrapped(f"{r['name']}: `{r['key']}`, {r['file']}"))
     print(table(facts))
     print("\n" + table([("parameter", "unit", "neutral", "bounds", "meaning"), *lines]))
 
@@ -355,10 +358,9 @@ def _part_page(found: "Registry", kind: str, as_json: bool) -> None:
                 "page": part.doc,
             }
         )
-    print(
-        f"{part.doc.strip()}\n\n{kind}: {part.category}, {part.file}\n"
-        f"effects that act on it: {', '.join(acting) or 'none'}\n"
-    )
+    print(reflowed(part.doc.strip()))
+    facts = f"{kind}: {part.category}, {part.file}\neffects that act on it: {', '.join(acting) or 'none'}"
+    print("\n" + wrapped(facts) + "\n")
     print(
         table(
             [

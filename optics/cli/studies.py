@@ -27,6 +27,7 @@ from optics.cli.shared import (
     show,
     terminal,
 )
+from optics.words import wrapped
 
 if TYPE_CHECKING:
     from optics.facade import Study
@@ -83,7 +84,7 @@ def locate(
     )
     with terminal.progress() as progress:
         found = find(setup, output, free or (), progress=progress)
-    show(found.record()) if as_json else print(f"{found.text()}\n{output}")
+    show(found.record()) if as_json else print(f"{wrapped(found.text())}\n{output}")
 
 
 @command
@@ -167,7 +168,7 @@ def calibrate(
     for text in study.warnings:
         terminal.note(f"warning: {one_line(text)}")
     show({"study": str(study.folder), **study.record.steps[0]}) if as_json else print(
-        f"{study.fit.table()}\n\n{study.table()}\n{null_text(study)}{study.folder}"
+        wrapped(f"{study.fit.table()}\n\n{study.table()}\n{null_text(study)}") + str(study.folder)
     )
     if not study.fit.converged:
         raise typer.Exit(1)
@@ -227,7 +228,7 @@ def diagnose(
         )
     if csv is not None:
         write_text(csv, result.to_csv())
-    print(result.to_json() if as_json else result.text())
+    print(result.to_json() if as_json else wrapped(result.text()))
     if result.word in ("UNKNOWN", "CANNOT_TELL"):
         raise typer.Exit(1)
 
@@ -248,7 +249,8 @@ def add(
     found = Study.open(study, plugins=plugins, captures=captures)
     with terminal.progress() as progress:
         fit = found.add(effect, progress=progress)
-    show(found.record.steps[-1]) if as_json else print(f"{fit.table()}\n\n{found.table()}{null_text(found)}")
+    told = wrapped(f"{fit.table()}\n\n{found.table()}{null_text(found)}")
+    show(found.record.steps[-1]) if as_json else print(told)
 
 
 @command
@@ -351,7 +353,7 @@ def scoreboard(
     with together(files):
         for file, content in zip(files, (render(boards), record)):
             write_text(file, content)
-    print(record if as_json else f"{text(boards)}\n\n{files[0]}")
+    print(record if as_json else f"{wrapped(text(boards))}\n\n{files[0]}")
     if any(board.beaten for board in boards):
         raise typer.Exit(1)
 
@@ -409,7 +411,7 @@ def rehearse(
     found = Study.open(study, plugins=plugins, captures=captures)
     with terminal.progress() as progress:
         result = found.rehearse(change / 100, progress=progress)
-    print(result.to_json() if as_json else result.text(), end="")
+    print(result.to_json() if as_json else wrapped(result.text()), end="")
 
 
 @command

@@ -80,7 +80,8 @@ def write(
 def read(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, str | float]]:
     """Read (channels as float32 (H, W) by name, header attributes that are text or numbers).
 
-    Raises FileNotFoundError, and ValueError for a file that is no EXR, is damaged or has several parts.
+    Raises FileNotFoundError, and ValueError for a file that is no EXR, is damaged, has several parts, or whose pixels
+    do not fill the image (its data window is not its display window).
     """
     import OpenEXR
 
@@ -94,6 +95,12 @@ def read(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, str | float
         channels = {name: np.ascontiguousarray(channel.pixels, np.float32) for name, channel in file.channels().items()}
         if len(file.parts) != 1:
             raise ValueError(f"it has {len(file.parts)} parts; allowed: 1; split it")
+        data, display = (file.header().get(name) for name in ("dataWindow", "displayWindow"))
+        if not np.array_equal(data, display):
+            raise ValueError(
+                f"its pixels are those of {_window(data)}, its image that of {_window(display)}; allowed: the same; "
+                "crop or fill it"
+            )
     except (RuntimeError, ValueError, TypeError) as error:
         raise ValueError(f"{path}: unreadable as EXR ({error})") from error
     header = {
@@ -102,6 +109,11 @@ def read(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, str | float
         if key not in RESERVED and isinstance(value, (str, int, float))
     }
     return channels, header
+
+
+def _window(corners: Sequence[np.ndarray]) -> str:
+    """Corners of a window as (first column, first row) to (last column, last row)."""
+    return " to ".join(f"({x}, {y})" for x, y in corners)
 
 
 def _narrowed(values: np.ndarray, dtype: type, where: str) -> np.ndarray:

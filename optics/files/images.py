@@ -65,6 +65,10 @@ def read_array(file: Path, where: str) -> np.ndarray:
     if reader is None:
         hint = "; JPEG alters every pixel: record PNG or raw" if file.suffix.lower() in (".jpg", ".jpeg") else ""
         raise BadCapture(f"{where}: '{file.suffix}' files are not read; allowed: {', '.join(SUFFIXES)}{hint}")
+    if not file.exists():
+        raise BadCapture(f"{where}: no such file; correct the name or add the file")
+    if not file.is_file():  # a pipe or a device would be waited for, or never end
+        raise BadCapture(f"{where}: a folder, a pipe or a device; allowed: a file; save the image as one")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # Pillow's about large images: the limit here is stated
@@ -116,6 +120,8 @@ def _png(file: Path, where: str) -> np.ndarray:
             raise BadCapture(
                 f"{where}: has a palette or {depth} bit; allowed: 8 or 16 bit gray or RGB; save it as such"
             )
+        if getattr(image, "n_frames", 1) != 1:
+            raise BadCapture(f"{where}: {image.n_frames} images in one file; allowed: one; one file per reading")
         if (depth, colour) != (16, 2):
             image.load()
             return np.asarray(image).astype({1: bool, 8: np.uint8, 16: np.uint16}[depth])

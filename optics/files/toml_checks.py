@@ -6,6 +6,7 @@ from __future__ import annotations
 import difflib
 import math
 import sys
+import unicodedata
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -79,22 +80,39 @@ def existing(folder: Path, name: str, where: str) -> Path:
     if "\0" in name:
         raise BadCapture(f"{where} = {name!r}: has a zero byte; allowed: the path of a file")
     file = folder / name
-    if not file.is_file():
-        there = [Path(name).with_name(p.name).as_posix() for p in (folder / Path(name).parent).glob("*")]
-        near = difflib.get_close_matches(name, there, n=1)
-        raise BadCapture(
-            f"{where} = '{name}': no such file in {folder}; allowed: a path relative to {folder.name}"
-            + (f"; did you mean '{near[0]}'?" if near else "; correct the path or add the file")
+    if file.is_file():
+        return file
+    if file.exists():
+        raise BadCapture(f"{where} = '{name}': a folder, a pipe or a device in {folder}; allowed: a file; name one")
+    raise BadCapture(
+        f"{where} = '{name}': no such file in {folder}; allowed: a path relative to {folder.name}; "
+        + _instead(folder, name)
+    )
+
+
+def _instead(folder: Path, name: str) -> str:
+    """What to write in place of a name that no file has."""
+    if "\\" in name and (folder / name.replace("\\", "/")).is_file():
+        return f"write / between folders: '{name.replace(chr(92), '/')}'"
+    there = [Path(name).with_name(p.name).as_posix() for p in (folder / Path(name).parent).glob("*")]
+    if same := [n for n in there if unicodedata.normalize("NFC", n) == unicodedata.normalize("NFC", name)]:
+        return (
+            f"the file's name has its accents in another form of Unicode: copy '{same[0]}' from a listing of the folder"
         )
-    return file
+    near = [n for n in there if n.casefold() == name.casefold()] or difflib.get_close_matches(name, there, n=1)
+    return f"did you mean '{near[0]}'?" if near else "correct the path or add the file"
 
 
 def inside(folder: Path, name: str, where: str) -> Path:
     """As `existing`, of a file that lies in `folder` when all links are followed; another one is refused unread."""
     file = folder / name if "\0" not in name else existing(folder, name, where)
-    if not file.resolve().is_relative_to(folder.resolve()):
+    try:
+        target = file.resolve()
+    except (RuntimeError, OSError) as error:  # the class changed with Python 3.13
+        raise BadCapture(f"{where} = '{name}': a link that leads back to itself; allowed: a file; name one") from error
+    if not target.is_relative_to(folder.resolve()):
         raise BadCapture(
-            f"{where} = '{name}': lies outside {folder}, at {file.resolve()}; allowed: files of the capture folder, or "
+            f"{where} = '{name}': lies outside {folder}, at {target}; allowed: files of the capture folder, or "
             "any with '--allow-outside' (in Python: outside=True), where you know who wrote the file"
         )
     return existing(folder, name, where)

@@ -36,13 +36,14 @@ from optics.fit import calibrate, descent
 from optics.fit.compare import led_label
 from optics.fit.model import value_of
 from optics.pages.drawing import DIVERGING, MASKED, SIGMA_RANGE, colour_bar, ramp
-from optics.pages.mosaics import filled
+from optics.pages.mosaics import Eye, filled, unwoven
 from optics.scene.parameter import Values, Variable
 from optics.scene.trust import Named
 from optics.study import loop
 from optics.study.calibrated import origin_toml
 from optics.study.fit_files import END, WHOLE
 from optics.study.setup import effect_variables
+from optics.study.shown import cell_of, mosaic_of
 from optics.words import spaced
 
 HOST = "127.0.0.1"
@@ -175,7 +176,10 @@ class View:
             "scene": Path(self.study.ladder["scene"]).stem,
             "step": self.step["index"],
             "steps": [s["name"] for s in self.study.steps],
-            "shape": list(self.model.shape) if self.model.captures.table is None else None,
+            "shape": list(self.model.shape) if self.images else None,
+            "shown": list(self.places().shape) if self.images else None,
+            "mosaic": self.mosaic.get("mosaic"),
+            "mosaic_note": Eye(self.mosaic).note if "mosaic" in self.mosaic else "",
             "channels": self.comparison.channels,
             "black": self.model.noise.black_level,
             "ramp": ramp(DIVERGING, 256),
@@ -228,6 +232,23 @@ class View:
             "frames": v.frames,
             "effect": s.effect,
         }
+
+    @property
+    def images(self) -> bool:
+        """Whether frames are images, and not readings of points."""
+        return self.model.captures.table is None
+
+    @property
+    def mosaic(self) -> dict:
+        """What raw frames are behind (optics.study.shown.mosaic_of)."""
+        return mosaic_of(self.model)
+
+    def places(self) -> np.ndarray:
+        """(H, W) for each pixel that the page shows the number of the frame's pixel, counted along rows; -1 for none.
+        Those behind one analyser of a mosaic lie together."""
+        numbers = np.arange(math.prod(self.model.shape[:2])).reshape(self.model.shape[:2])
+        cell = cell_of(self.model) if "mosaic" in self.mosaic else (1, 1)
+        return unwoven(numbers + 1, cell) - 1
 
     # -- questions ----------------------------------------------------------------------------------------------------
     def frame(self, index) -> int:
@@ -539,14 +560,19 @@ class Server(ThreadingHTTPServer):
 
 
 class Handler(BaseHTTPRequestHandler):
-    """GET / and /study; POST questions as JSON, answered by float32 or JSON; all behind the server's token. There are
-    no other places, and no files are served."""
+    """GET /, /study and /places; POST questions as JSON, answered by float32 or JSON; all behind the server's token.
+    There are no other places, and no files are served."""
 
     protocol_version = "HTTP/1.1"
     server: Server
 
     def do_GET(self) -> None:
-        self._answer({"/": self._page, "/study": lambda: self._json(self.server.view.record())})
+        view = self.server.view
+
+        def places() -> None:
+            self._send(HTTPStatus.OK, np.ascontiguousarray(view.places(), "<i4").tobytes())
+
+        self._answer({"/": self._page, "/study": lambda: self._json(view.record()), "/places": places})
 
     def do_POST(self) -> None:
         view = self.server.view

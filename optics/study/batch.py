@@ -43,7 +43,7 @@ import os
 import time
 import uuid
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -59,12 +59,12 @@ from optics.light import labels as labelling
 from optics.light.labels import LABELS
 from optics.light.rendering import LAYERS, RenderJob
 from optics.scene import loader as scenes
-from optics.scene.mitsuba_parts import DEFAULT_VARIANT
+from optics.scene.mitsuba_parts import DEFAULT_VARIANT, use_variant
 from optics.scene.trust import Named
 from optics.study.blocks import Block, Blocks, DiskFull, SampleFailed
 from optics.study.calibrated import Calibrated, calibrated
 from optics.study.draws import BadJob, Distribution, Drawn, Draws, Finite, Strict, Value, stream
-from optics.study.engines import ENGINES, Status, cores, for_workers, work_through
+from optics.study.engines import ENGINES, Local, Status, cores, for_workers, work_through
 
 Progress = Callable[[str, int, int], None]
 
@@ -586,25 +586,28 @@ def run(
     job = read(file, fit, frame)
     folder = folder_of(job, file)
     check_folder(folder)
-    maker = Maker(job, file, plugins)
-    maker.check()
-    _open_folder(folder, maker.identity())
-    if not _is_table(folder / "parameters.json"):
-        write_json(folder / "parameters.json", maker.described())
-    blocks = Blocks(folder, job.total, shard, uuid.uuid4().hex[:8])
-    blocks.verify(progress, check_files)
-    blocks.sweep()
-    before = blocks.counts().recorded
-    if before < blocks.own:
-        try:
-            if on == "local" and (workers or cores()) == 1:
-                _here(blocks, maker, watch)
-            else:
-                life = Life(job, file, plugins, shard, blocks.run)
-                with for_workers():
-                    work_through(ENGINES[on](workers, options or {}, folder), life, blocks, recycle, watch)
-        finally:
-            blocks.sweep()
+    here = on == "local" and (workers or cores()) == 1
+    with _workers_loading(job, folder, workers, options) if on == "local" and not here else nullcontext() as local:
+        maker = Maker(job, file, plugins)
+        maker.check()
+        _open_folder(folder, maker.identity())
+        if not _is_table(folder / "parameters.json"):
+            write_json(folder / "parameters.json", maker.described())
+        blocks = Blocks(folder, job.total, shard, uuid.uuid4().hex[:8])
+        blocks.verify(progress, check_files)
+        blocks.sweep()
+        before = blocks.counts().recorded
+        if before < blocks.own:
+            try:
+                if here:
+                    _here(blocks, maker, watch)
+                else:
+                    life = Life(job, file, plugins, shard, blocks.run)
+                    with for_workers():
+                        engine = local or ENGINES[on](workers, options or {}, folder)
+                        work_through(engine, life, blocks, recycle, watch)
+            finally:
+                blocks.sweep()
     made = blocks.counts().recorded - before
     complete = finish(job, blocks)
     failures = {} if complete else blocks.failures()
@@ -612,6 +615,20 @@ def run(
         index, why = next(iter(failures.items()))
         raise failed(job, index, why, len(failures) - 1)
     return Result(folder, job.total, blocks.own, made, complete, maker.notes)
+
+
+@contextmanager
+def _workers_loading(job: Job, folder: Path, workers: int | None, options: Mapping[str, str] | None) -> Iterator[Local]:
+    """The engine of this machine, whose first workers load the program while the caller checks the job; not for a batch
+    that is finished, which needs none."""
+    local = Local(workers, options or {}, folder)
+    try:
+        if not (folder / "manifest.jsonl").is_file():
+            with for_workers():
+                local.warm(job.total, use_variant, job.variant)
+        yield local
+    finally:
+        local.stop()
 
 
 def _here(blocks: Blocks, maker: Maker, watch: Callable[[Status], None] | None) -> None:

@@ -74,17 +74,34 @@ class Local:
         self.context = get_context("spawn")
         self.reader, self.writer = self.context.Pipe(duplex=False)  # nothing is sent: its end is the message
         self.threads = ThreadPoolExecutor(self.workers)
+        self.ready: list[ProcessPoolExecutor] = []  # processes that wait for their first life
+
+    def warm(self, count: int, begin: Callable[..., None], *given: Any) -> None:
+        """Start the processes of the first workers, up to `count`, and have them run `begin`: they load the program
+        while the caller checks the job, and not after it."""
+        self.ready = [self._process() for _ in range(min(self.workers, count))]
+        for process in self.ready:
+            process.submit(begin, *given)
+
+    def _process(self) -> ProcessPoolExecutor:
+        return ProcessPoolExecutor(1, self.context, initializer=_tied, initargs=(self.reader,))
 
     def start(self, lives: Lives) -> list[Future]:
         return [self.threads.submit(self._live, life) for life in lives]
 
     def _live(self, life: Callable[[], int]) -> int:
-        with ProcessPoolExecutor(1, self.context, initializer=_tied, initargs=(self.reader,)) as process:
+        try:
+            own = self.ready.pop()
+        except IndexError:
+            own = self._process()
+        with own as process:
             return process.submit(life).result()
 
     def stop(self) -> None:
         self.writer.close()
         self.threads.shutdown(cancel_futures=True)
+        for process in self.ready:
+            process.shutdown(cancel_futures=True)
         self.reader.close()
 
 

@@ -116,6 +116,8 @@ class Batch:
             prefix = f"{light}." if light else ""
             if kind == "png" and self.saturation > 255:
                 continue  # a preview of 8 bits, and not the DN of this camera
+            if _is_read(file, images):
+                _as_recorded(file, entry)
             for name, values in _arrays(file, kind, images).items():
                 item.arrays[prefix + name] = values
                 if values.dtype == np.uint8 and file.suffix == ".png":
@@ -143,6 +145,22 @@ class Batch:
 
 
 AGAIN = "run `optics batch` again, which makes what is missing or damaged, then export it"
+
+
+def _is_read(file: Path, images: str) -> bool:
+    """Whether an export of `images` takes anything from a file; labels always."""
+    return {".png": images == "camera", ".exr": images == "float"}.get(file.suffix, True)
+
+
+def _as_recorded(file: Path, entry: Mapping) -> None:
+    """Raises ValueError for a file that is not the one of its sample: one of another would have wrong labels."""
+    if not file.is_file():
+        raise ValueError(f"{file}: no such file; {AGAIN}")
+    if file.stat().st_size != entry["size"] or file_hash(file) != entry["hash"]:
+        raise ValueError(
+            f"{file}: not the file that was recorded when its sample was made; allowed: the same content; "
+            "run `optics batch --check-files` again, which makes it anew, then export it"
+        )
 
 
 def _loaded(text: str | bytes) -> Any:

@@ -143,7 +143,8 @@ def grid(
             image, depth = read_image(file, name)
             bits.add(depth)
             if len(bits) > 1:
-                raise BadCapture(f"{name}: {depth} bit beside {min(b or 0 for b in bits)}; allowed: all of one depth")
+                others = ", ".join(_depth(b) for b in bits - {depth})
+                raise BadCapture(f"{name}: {_depth(depth)} beside {others}; allowed: all of one depth")
             if image.shape[2] != 3:
                 raise BadCapture(f"{name}: {image.shape[2]} channels; allowed: R, G, B, as the channels are compared")
             yield image
@@ -185,8 +186,7 @@ def likeness(files: Mapping[str, Path], reference: Path, progress: Progress | No
         image, depth = read_image(file, name)
         if image.shape != wanted.shape or depth != bits:
             raise BadCapture(
-                f"{name}: {image.shape}, {depth or 'float'} bit; allowed: {wanted.shape}, {bits or 'float'} bit, as "
-                f"{reference}"
+                f"{name}: {image.shape}, {_depth(depth)}; allowed: {wanted.shape}, {_depth(bits)}, as {reference}"
             )
         a, b = image / full, wanted / full
         use = np.ones(a.shape[:2], bool)
@@ -203,6 +203,10 @@ def likeness(files: Mapping[str, Path], reference: Path, progress: Progress | No
 def _numbers(**values: float | np.ndarray) -> Row:
     """Numbers for JSON: None where there is none."""
     return {name: float(value) if np.isfinite(value) else None for name, value in values.items()}
+
+
+def _depth(bits: int | None) -> str:
+    return "float" if bits is None else f"{bits} bit"
 
 
 def curve_of(file: Path) -> list[tuple[float, float]]:
@@ -225,4 +229,8 @@ def curve_of(file: Path) -> list[tuple[float, float]]:
                 raise ValueError(
                     f"{file}, line {number}: {row['r']}, {row['distance']}; allowed: two numbers"
                 ) from None
+    try:
+        proximity_reader.distance(1.0, *np.reshape(rows, (-1, 2)).T)
+    except ValueError as error:
+        raise ValueError(f"{file}: {error}") from None
     return rows

@@ -1,9 +1,11 @@
 """A capture set is read exactly, and everything that is wrong with one is said before anything is rendered."""
 
 import math
+import os
 import re
 
 import numpy as np
+import OpenEXR
 import pytest
 import tifffile
 from PIL import Image
@@ -59,6 +61,16 @@ def folder(tmp_path):
     ):
         np.save(frames / f"{name}.npy", array)
     tifffile.imwrite(frames / "pages.tif", np.stack([gray, gray]), photometric="minisblack")
+    Image.fromarray(gray).save(
+        frames / "animated.png", save_all=True, append_images=[Image.fromarray(gray + 1)], duration=100
+    )
+    os.mkfifo(frames / "pipe.png")
+    (frames / "turn.png").symlink_to("turn.png")
+    save("caf\u00e9.png", gray)
+    box = {"dataWindow": [[5, 5], [12, 10]], "displayWindow": [[0, 0], [15, 11]]}
+    corners = {k: tuple(np.array(corner, np.int32) for corner in v) for k, v in box.items()}
+    header = {"type": OpenEXR.scanlineimage, "compression": OpenEXR.NO_COMPRESSION, **corners}
+    OpenEXR.File(header, {"Y": gray.astype(np.float32)}).write(str(frames / "part.exr"))
     exr.write(frames / "depth.exr", {"depth.Z": np.ones((6, 8)), "Y": np.ones((6, 8))})
     (tmp_path / "malus.csv").write_text("angle (rad),reading\n0.0,100\n0.7853981634,50.5\n1.5707963268,1\n")
     (tmp_path / "bad.csv").write_text("analyzer.angle,reading\n0,1\n10,nan\n20,dark\n30\n")
@@ -348,7 +360,20 @@ BAD = {
     "frames and table": (BENCH + FRAME, r"both \[\[frames\]\] and \[table\]"),
     "no image key": ('scene = "bench"\n[[frames]]\ngroup = "a"\n', "frame 0: image is missing"),
     "image missing": (frames(image="frames/00.png"), "frame 0 .*no such file.*did you mean 'frames/00"),
-    "image a folder": (frames(image="frames"), "no such file"),
+    "image a folder": (frames(image="frames"), "image = .*a folder, a pipe or a device in .*; allowed: a file"),
+    "image a pipe": (frames(image="frames/pipe.png"), "a folder, a pipe or a device in .*; allowed: a file"),
+    "image a link to itself": (frames(image="frames/turn.png"), "a link that leads back to itself; allowed: a file"),
+    "backslash": (frames(image=r"frames\\000.png"), r"no such file.*write / between folders: 'frames/000.png'"),
+    "another form of Unicode": (
+        frames(image="frames/cafe\u0301.png"),
+        "another form of Unicode: copy 'frames/caf\u00e9.png'",
+    ),
+    "capital letters": (frames(image="frames/000.PNG"), "no such file.*did you mean 'frames/000.png'"),
+    "animation": (frames(image="frames/animated.png"), "2 images in one file; allowed: one"),
+    "EXR of a part of an image": (
+        frames(image="frames/part.exr"),
+        r"its pixels are those of \(5, 5\) to \(12, 10\), its image that of \(0, 0\) to \(15, 11\); allowed: the same",
+    ),
     "image twice": (frames('[[frames]]\nimage = "./frames/000.png"\n'), "frame 1 .*used twice .first by frame 0"),
     "repeat is the image": (frames('repeats = ["frames/000.png"]\n'), "used twice"),
     "repeats a text": (frames('repeats = "frames/001.png"\n'), "repeats = 'frames/001.png'; allowed: a list"),
@@ -483,6 +508,8 @@ def test_bad_input_is_refused_in_words(folder, kind):
         ("a.b,reading\n0\n", r"1 cells \['0'\]; allowed: 2"),
         ("a.b,reading\n", "zero frames"),
         ("a.b,reading\n,3\n", "a.b = '' is no number"),
+        ("a.b,reading\n0,1e300\n", "reading = 1e300; allowed: finite numbers"),
+        ("a.b,reading\n0,1_0\n", "reading = '1_0' is no number"),
         ("a.b;reading\n0;1\n", "separated by .;., not by commas; allowed: delimiter = .;. under"),
         ("a.b\treading\n0\t1\n", r'allowed: delimiter = "\\t" under'),
         ('a.b,reading\n0,"1,5"\n', "reading = '1,5' is no number.*decimal = \",\" under"),

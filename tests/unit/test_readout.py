@@ -115,6 +115,7 @@ def test_likeness_is_scikit_images(tmp_path, capsys):
         ("ssim a.png --reference small.png", "allowed: (10, 10, 1), 8 bit, as small.png"),
         ("grid a.png --reference a.png", "1 channels; allowed: R, G, B"),
         ("proximity a.png --reference b.png --curve bad.csv", "columns x; allowed: r and distance"),
+        ("proximity a.png --reference b.png --curve turns.csv", "turns.csv: reference curve: r = 1 at 2 mm and 1"),
     ],
 )
 def test_what_cannot_be_read_is_named(tmp_path, capsys, monkeypatch, words, message):
@@ -123,6 +124,7 @@ def test_what_cannot_be_read_is_named(tmp_path, capsys, monkeypatch, words, mess
     for name in ("a.png", "b.png"):
         save(tmp_path / name, noisy(disc(60, 45, 20, 160, 60), 0))
     save(tmp_path / "small.png", np.zeros((10, 10), np.uint8))
+    (tmp_path / "turns.csv").write_text("r,distance\n1,2\n1,3\n")
     (tmp_path / "bad.csv").write_text("x\n1\n")
     assert main(["read", *words.split()]) == 2
     assert message in capsys.readouterr().err

@@ -156,6 +156,48 @@ def test_prose_stands_under_its_row_where_the_line_is_narrow():
         assert words.annotated(rows, short, notes) == words.table(rows)
 
 
+def test_what_would_break_a_row_is_no_part_of_it():
+    lines = words.table([("file", "ssim"), ("a\nb\x1b[31m.png", "1")]).split("\n")
+    assert lines == ["file          ssim", "a?b?[31m.png  1"]
+
+
+def test_rows_with_notes_fit_the_line():
+    """83 columns with two spaces between them: one space is enough. 40: the long cells go over several lines."""
+    row = ("a_part_of_a_scene.a_parameter", "-0.000123456", "1/mm^2", "-1000 .. 1000", "0.123456789", "word " * 20)
+    rows = [("key", "value", "unit", "bounds", "neutral", "meaning"), row]
+    short, notes = [r[:5] for r in rows], ["", row[-1]]
+    for width, lines in ((80, 2), (60, 3)):
+        with words.fitting(width):
+            text = words.annotated(rows, short, notes).splitlines()
+        assert max(map(len, text)) <= width
+        assert len([line for line in text if not line.startswith("    word")]) >= lines
+        for cell in row[:5]:
+            assert cell.replace(" ", "") in "".join("".join(text).split()) or width < 80
+
+
+PAGE = """A gel.
+
+Definition
+    D0 = clip(press_depth + z0 - m - h, 0, thickness)          h(x, y): height of the indenter over its lowest point
+and the skin that lies beside the contact falls off as an exponential of the distance, before it is smoothed by a
+Gaussian.
+This is a line that its writer filled to the end of the line of the file, and below it there stands a heading
+Validity
+    pitch: mm, of the mesh
+    extent: mm, of the map"""
+
+
+def test_a_page_is_filled_anew_for_the_terminal():
+    assert words.reflowed(PAGE) == PAGE and words.wrapped(PAGE) == PAGE  # to a file or a program
+    with words.fitting(60):
+        lines = words.reflowed(PAGE).split("\n")
+    assert max(map(len, lines)) <= 60 and "".join("".join(lines).split()) == "".join(PAGE.split())
+    start = lines.index("    D0 = clip(press_depth + z0 - m - h, 0, thickness)")
+    assert lines[start + 1].startswith("        h(x, y)")  # goes on to the right of where it began
+    assert "it is smoothed by a Gaussian." in " ".join(lines) and len(lines[start + 3]) > 45  # one paragraph, filled
+    assert {"Definition", "Validity", "    pitch: mm, of the mesh", "    extent: mm, of the map"} <= set(lines)
+
+
 def test_words_and_numbers_of_a_table_stay_whole():
     head = ("by frame", "values", "used", "chi2/dof", "bias DN", "rms DN", "noise DN", "L1", "PSNR dB", "SSIM")
     row = ("reading 3", "1152", "100.0 %", "42.612", "-10.260", "14.093", "2.104", "0.0487", "24.87", "0.5209")

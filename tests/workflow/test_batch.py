@@ -4,6 +4,7 @@ import csv
 import dataclasses
 import hashlib
 import json
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -535,6 +536,29 @@ def test_workers_are_recycled(whole, job):
     assert result.complete and content(result.folder) == content(whole)
     assert [s.done for s in states] == sorted(s.done for s in states) and states[-1].done == TOTAL
     assert max(s.workers for s in states) == 2 and {s.died for s in states} == {0}
+
+
+def test_workers_load_while_the_job_is_checked(tmp_path):
+    """The first lives are lived by the processes that were started before; those that nobody needs end with it."""
+    engine = Local(2, {}, tmp_path)
+    engine.warm(5, time.sleep, 0)
+    begun = {pid for process in engine.ready for pid in process._processes}
+    assert len(begun) == 2 and {work.result() for work in engine.start([os.getpid, os.getpid])} == begun
+    assert engine.start([os.getpid])[0].result() not in begun  # a life has a process of its own
+    engine.stop()
+    idle = Local(2, {}, tmp_path)
+    idle.warm(1, time.sleep, 600)
+    (process,) = idle.ready
+    (child,) = process._processes.values()
+    idle.stop()
+    assert child.exitcode is not None
+
+
+def test_no_process_outlives_a_job_that_is_refused(job):
+    job.write_text(job.read_text().replace("[sample]", '[sample]\n"led_2.power" = { choice = [-5.0] }'))
+    with pytest.raises(OutOfBounds):
+        batch.run(job, workers=2)
+    assert not multiprocessing.active_children()
 
 
 def test_workers_that_cannot_start_are_reported(job, monkeypatch):

@@ -299,6 +299,17 @@ def test_the_card_says_where_the_data_come_from(made, tmp_path):
     assert "CC-BY-4.0" in page and "| gel.press_x | mm | uniform [-4.0, 4.0] |" in page and "sphere (" in page
 
 
+def test_an_image_of_another_sample_is_refused(made, tmp_path):
+    """Of the same size in pixels, so that nothing but the hash tells it: its labels would be wrong."""
+    own = shutil.copytree(made, tmp_path / "batch")
+    shutil.copy(own / "images" / "000001.png", own / "images" / "000000.png")
+    with pytest.raises(ValueError, match=r"000000\.png: not the file that was recorded.*--check-files"):
+        export.export(own, tmp_path / "out", "hdf5")
+    (own / "images" / "000000.png").unlink()
+    with pytest.raises(ValueError, match=r"000000\.png: no such file; run `optics batch` again"):
+        export.export(own, tmp_path / "out2", "hdf5")
+
+
 def test_what_cannot_be_exported_is_said(made, tmp_path, capsys):
     def said(*words):
         assert main(["export", *map(str, words)]) != 0

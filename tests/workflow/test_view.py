@@ -913,3 +913,54 @@ def test_point_readings_are_drawn_as_points(chromium, mitsuba, tmp_path):
         found.server_close()
         found.view.close()
     assert chromium.errors == []
+
+
+def test_each_analyser_of_a_mosaic_is_an_image_of_its_own(chromium, mitsuba, tmp_path):
+    """The page shows the pixels of each analyser together, and counts, predicts and reads out as before."""
+    loaded = scene.load("polarization_camera", {"width": "50", "height": "36"})
+    rng, noise, frames = np.random.default_rng(4), Noise(0.05, 1.0, 8.0, 4095.0, 0.0), []
+    for name, q in (("a", 0.6), ("b", -0.4), ("c", 0.2)):
+        values = {"panel.dop_q": q, "panel.dop_u_1": 0.3}
+        made = RenderJob(loaded, black=8.0).take({**values, "camera.exposure": 8.0})
+        frames.append(capture_files.Frame(name, noise.expose(made.camera, rng).astype(np.float32), parameters=values))
+    sensor = {"width": "50", "height": "36"}
+    own = capture_files.Captures(
+        Path("."), "polarization_camera", frames, {"camera.exposure": 8.0}, noise, mosaic=loaded.camera.mosaic
+    )
+    capture_files.write(own, tmp_path / "captures", bits=16)
+    loop.begin(loop.Setup(captures=str(tmp_path / "captures"), defines=sensor), tmp_path / "study")
+    found = Server()
+    found.view = View(tmp_path / "study")
+    thread = threading.Thread(target=found.serve_forever, kwargs={"poll_interval": 0.02})
+    thread.start()
+    chromium.errors.clear()
+    try:
+        chromium.open(found.url)
+        image, _ = found.view.capture(0)
+        rows, columns = np.array(loaded.camera.mosaic).shape
+        chromium.key("1")
+        chromium.drawn()
+        seen = np.array(chromium.run("Array.from(context.getImageData(0, 0, canvas.width, canvas.height).data)"))
+        seen = seen.reshape(*found.view.record()["shown"], 4)
+        white = chromium.run("ranges(0).white")
+        height, width = 36 // rows, 50 // columns
+        for i, j in np.ndindex(rows, columns):  # a seam of 50 / 48 px, rounded up, between two
+            own = seen[i * (height + 2) : i * (height + 2) + height, j * (width + 2) : j * (width + 2) + width]
+            expected = np.clip(image[i::rows, j::columns, 0] * 255 / white, 0, 255)
+            assert np.abs(own[..., 0] - expected).max() <= 1 and (own[..., 3] == 255).all()  # whole numbers
+        assert (seen[height : height + 2, :, 3] == 0).all() and (seen[:, width : width + 2, 3] == 0).all()
+        assert chromium.run("at('mosaic').textContent").startswith("each analyser of the mosaic is an image of its own")
+        chromium.run(
+            "(() => { const box = at('panel-image').getBoundingClientRect(); at('panel-image').dispatchEvent(new "
+            "PointerEvent('pointermove', { clientX: box.right - 1, clientY: box.top + 1, bubbles: true })); })()"
+        )
+        said = chromium.run("at('readout').textContent")
+        angle = loaded.camera.mosaic[0][-1]
+        assert said.startswith(f"row 0, column {50 - 1}, {angle:g}\u00b0: {image[0, 49, 0]:.0f} DN")
+        assert chromium.numbers("chi")[0] < 2
+    finally:
+        found.shutdown()
+        thread.join()
+        found.server_close()
+        found.view.close()
+    assert chromium.errors == []
