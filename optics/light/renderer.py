@@ -172,7 +172,7 @@ class Renderer:
         }  # of stock plugins, some shade and none is slow to set
         self._still = {k: scene.parameters[k].neutral for k in self.ambient_keys}
         self._tangents: OrderedDict = OrderedDict()
-        self._rays = 0.0  # camera rays that are kept, at most
+        self._kept_rays = 0.0  # camera rays that are kept, at most
         self.together: set[str] = set()  # LEDs whose images are wanted of the same geometry
         self.wanted: Pixels | None = None  # those that take finer samples where they need them; None: all
 
@@ -302,8 +302,8 @@ class Renderer:
         """Forget the oldest geometries while what is kept is larger than MEMORY: large images with many rims.
 
         added   camera rays that were kept since; all are counted again only where there may be too many"""
-        self._rays += added
-        if PER_RAY * self._rays <= MEMORY:
+        self._kept_rays += added
+        if PER_RAY * self._kept_rays <= MEMORY:
             return
         images = self._images.values()
         rays: dict[Hits, dict[int, int]] = {}  # geometry -> ends of camera rays by the samples that hold them
@@ -323,7 +323,7 @@ class Renderer:
             total -= size[old]
             self._hits = OrderedDict((k, h) for k, h in self._hits.items() if h is not old)
             self._images = OrderedDict((k, i) for k, i in self._images.items() if i.hits is not old)
-        self._rays = total / PER_RAY
+        self._kept_rays = total / PER_RAY
 
     def forget_hits(self) -> None:
         """Release the kept hits: a search over many geometries returns to none of them."""

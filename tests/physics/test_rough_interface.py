@@ -159,12 +159,25 @@ def walter(mi, kind, index, alpha, wi, wo):
     return matrix * scale[:, None, None]
 
 
-def off(found, expected):
-    """Largest difference of any element, relative to the intensity; pairs below 1e-6 of the brightest are left out."""
+def off(found, expected, weight=1.0):
+    """Largest difference of any element, relative to the intensity, times the weight of the pair; pairs below 1e-6 of
+    the brightest are left out."""
     size = expected[:, 0, 0]
     bright = size > 1e-6 * size.max()
     assert bright.mean() > 0.3
-    return (np.abs(found - expected)[bright].max(axis=(1, 2)) / size[bright]).max()
+    return (weight * np.abs(found - expected).max(axis=(1, 2)) / np.where(bright, size, 1.0))[bright].max()
+
+
+def surely_refracted(index, wi, wo):
+    """(n,) 1, and less where rounding matters more than CLOSE: behind a facet that is near total reflection the cosine
+    is the root of a small difference, so that a rounding e of single precision becomes e n^2/cos^2 of the light, and
+    four of them add up."""
+    inside = wi[:, 2] < 0  # in the medium of the given index
+    n = np.where(inside, index, 1 / index)
+    half = n[:, None] * wi + wo
+    cos = (wo * half).sum(1) / np.linalg.norm(half, axis=1)
+    lost = 4 * np.finfo(np.float32).eps * np.maximum(n, 1 / n) ** 2 / np.maximum(cos**2, 1e-12)
+    return np.where(wi[:, 2] * wo[:, 2] < 0, np.minimum(1.0, CLOSE / lost), 1.0)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -174,7 +187,9 @@ def test_every_element_is_walters_formula_with_fresnels_amplitudes(mitsuba, kind
     bsdf = boundary(mi, index, alpha, kind)
     wi, wo = pairs(mi, bsdf, index, RNG(1), 4000)
     value = bsdf.eval(context(mi), surface(mi, wi), vectors(mi, wo), True)
-    assert off(matrices(mi, value, len(wi)), walter(mi, kind, index, alpha, wi, wo)) <= CLOSE
+    weight = surely_refracted(index, wi, wo)
+    assert (weight == 1).mean() > 0.9
+    assert off(matrices(mi, value, len(wi)), walter(mi, kind, index, alpha, wi, wo), weight) <= CLOSE
 
 
 @pytest.mark.parametrize("kind", KINDS)
