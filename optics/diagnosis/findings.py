@@ -102,7 +102,7 @@ def findings_of(
         return replace(own, rival=True, ratio=swings.ratio, coordinate=swings.coordinate, curve_share=swings.share)
     whole = {f.coordinate: f.net for f in fingerprints}
     followed = _followed(case, subject, best.fit, best.fall - best.expectation, fingerprints)
-    fingerprints = [f for f in fingerprints if not f.solved]
+    fingerprints = [f for f in fingerprints if not f.per_frame]
     # a curve is no better than effects while any set of them does as well: the leader, not the simplest beside it
     leader = outcome.leader if subject else outcome.base
     complete = bool(leader.members) and leader.complete

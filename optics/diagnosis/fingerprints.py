@@ -323,7 +323,7 @@ def families(found: Sequence[Fingerprint]) -> list[Family]:
     A map of the sensor mimics every curve that does not move, and a number per frame every setting: such a curve stands
     for its family, and its family comes first, only where no other curve is nearly as good."""
     own: dict[str, list[Fingerprint]] = {}
-    for f in (f for f in found if not f.solved):
+    for f in (f for f in found if not f.per_frame):
         own.setdefault(f.family, []).append(f)
     best = ordered([ordered(curves)[0] for curves in own.values()])
     return [
@@ -400,11 +400,12 @@ def unexplained(found: Sequence[Fingerprint], best_effect: float, excess: float)
 
     best_effect   net fall of chi2 with it;   excess: chi2 less its degrees of freedom
     """
-    if not excess > 0 or not found:
+    best = next((f for f in found if not f.per_frame), None)
+    if not excess > 0 or best is None:
         return ""
-    effect, curve = (min(max(x / excess, 0.0), 1.0) for x in (best_effect, found[0].net))
+    effect, curve = (min(max(x / excess, 0.0), 1.0) for x in (best_effect, best.net))
     return (
         f"The best effect explains {effect:.0%} of the excess misfit, so the library leaves {1 - effect:.0%} "
-        f"unexplained. The best curve, along '{found[0].coordinate}', explains {curve:.0%}. Neither of them explains "
+        f"unexplained. The best curve, along '{best.coordinate}', explains {curve:.0%}. Neither of them explains "
         f"{1 - max(effect, curve):.0%}."
     )

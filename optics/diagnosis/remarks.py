@@ -231,8 +231,8 @@ def hints_of(
         )
     if "even" in failed:
         hints.append(
-            "look at the parts of the data between which its strength differs most (optics report draws what is left "
-            "of each frame): what sets them apart is not in the model, or was noted wrongly"
+            "look at the parts of the data between which its strength differs most (optics view shows what is left of "
+            "every frame): what sets them apart is not in the model, or was noted wrongly"
         )
     if "near" in failed:
         hints.append(f"no effect brings the model near its images: check {AT_FAULT}")

@@ -250,7 +250,7 @@ class Fingerprint:
     family      what the coordinate belongs to (`optics.diagnosis.fingerprints`)
     share       of the excess misfit, NaN within noise
     size        rms change that it makes, over the rms signal
-    solved      whether nobody set the coordinate: the fit solves for it frame by frame, or it is a gain of each frame.
+    per_frame   whether nobody set the coordinate: the fit solves for it frame by frame, or it is a gain of each frame.
                 With a bin for each of its values the curve is that along 'frame' by another name
     """
 
@@ -269,7 +269,7 @@ class Fingerprint:
     share: float = math.nan
     unit: str = ""
     size: float = 0.0
-    solved: bool = False
+    per_frame: bool = False
 
     @property
     def cost(self) -> float:

@@ -45,7 +45,7 @@ def plot(diagnosis: Diagnosis) -> Figure:
 
     rows = [r for r in diagnosis.rows if r.net > 0 or r.refit is not None]
     rows = sorted(rows, key=lambda r: -(r.refit.fall if r.refit else r.fall))[:SHOWN_MOST][::-1]
-    curves = [f for f in diagnosis.fingerprints if f.net > 0 and not f.solved][:SHOWN_MOST][::-1]
+    curves = [f for f in diagnosis.fingerprints if f.net > 0 and not f.per_frame][:SHOWN_MOST][::-1]
     figure, axes = chart(11 if curves else 7, height_for(max(len(rows), len(curves), 6)), 2 if curves else 1)
     left = axes[0] if curves else axes
     at = range(len(rows))

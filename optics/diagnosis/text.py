@@ -470,7 +470,7 @@ def _curve_lines(d: Diagnosis) -> list[str]:
         f"  {f.coordinate:<18} {f.net:10.4g}  R {f.ratio:8.3g}  p {p_text(f.p)}"
         + (f"  {f.family:<8}" if f.family else "")
         + (f"  {share_text(f.share)} of the excess" if math.isfinite(f.share) else "")
-        for f in [f for f in d.fingerprints if not f.solved][:8]
+        for f in [f for f in d.fingerprints if not f.per_frame][:8]
     ]
     if d.families:
         best = ", ".join(f"{f.family} {f.coordinate} {f.of_best:.2f}" for f in d.families)

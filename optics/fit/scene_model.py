@@ -393,7 +393,7 @@ class SceneModel:
         predictions' are made of fewer samples, and so is the prediction that comes with them."""
         self.check_variables(variables)
         for index in self._indices(frames):
-            self.renderer.rough = seed != 0
+            self.renderer.rough = self.sampled and seed != 0
             try:
                 found = self._differentiate(
                     values, [v for v in variables if v.holds_in(index)], secant or {}, seed, index
@@ -574,7 +574,7 @@ class SceneModel:
             return (
                 factor
                 * sum(
-                    power * self.renderer.bounced(now, led, seed, component, self.renderer.roughly)
+                    power * self.renderer.bounced(now, led, seed, component, self.renderer.rough)
                     for led, power in lit.items()
                 )
                 if lit

@@ -203,11 +203,6 @@ class Renderer:
         return part.kind if part is not None else ""
 
     # -- geometry -----------------------------------------------------------------------------------------------------
-    @property
-    def roughly(self) -> bool:
-        """Whether images are made of fewer samples now."""
-        return self.crowded and self.rough
-
     def geometry(self, values: Mapping) -> tuple:
         own = tuple(values[k] for k in self.geometry_keys)
         return (*own, *(c.part.version for c in self.scene.traced.crowds)) if self.crowded else own
@@ -604,7 +599,7 @@ class Renderer:
         """(H, W, B) what one light makes at its power, by one reflection and by two."""
         image = self.image(values, light, component, seed)
         if self.bounce_key and values[self.bounce_key]:
-            image = image + values[self.bounce_key] * self.bounced(values, light, seed, component, self.roughly)
+            image = image + values[self.bounce_key] * self.bounced(values, light, seed, component, self.rough)
         return self.powers(values, light) * image
 
     def radiance(self, values: Mapping, seed: int = 0, component: int = 0) -> np.ndarray:
@@ -620,7 +615,7 @@ class Renderer:
 
     def _finer(self, hits: Hits, index: np.ndarray, bent: np.ndarray | tuple = (), seed: int = 0) -> Finer:
         """Finer samples of the pixels `index`; of `bent` among them, where no edge is, fewer."""
-        key = (index.tobytes(), np.asarray(bent).tobytes(), seed, self.roughly)
+        key = (index.tobytes(), np.asarray(bent).tobytes(), seed, self.rough)
         if key not in hits.rims:  # only the latest is kept
             hits.rims = {key: self._in_pixels(index, np.isin(np.arange(len(index)), bent), seed)}
         return hits.rims[key]
@@ -632,7 +627,7 @@ class Renderer:
         sets by another amount."""
         pupil = self.crowded and self.scene.camera.number(self.scene.camera.named("pupil")) > PINHOLE
         fewer = max(self.rim_samples // ROUGHLY, min(self.rim_samples, ROUGH_SAMPLES))
-        samples = (fewer if self.roughly else self.rim_samples) * (BEHIND_PUPIL if pupil else 1)
+        samples = (fewer if self.rough else self.rim_samples) * (BEHIND_PUPIL if pupil else 1)
         counts = np.where(bent, self.bent_side**2, samples)
         starts = np.cumsum(counts) - counts
         u, v = np.empty((2, counts.sum()), np.float32)

@@ -1068,7 +1068,7 @@ def verdict(diagnosis: Mapping | None) -> dict | None:
         if any(r["cells"][key] not in ("", "–") for r in shown)
     ]
     curves = [f for f in d.get("fingerprints") or () if as_float(f.get("net")) > 0 and f.get("curve")]
-    curves = [f for f in curves if not f.get("solved")]
+    curves = [f for f in curves if not f.get("per_frame")]
     return {
         "word": str(d["word"]).replace("_", " "),
         "sentence": (text := prose(d.get("sentence")))[:1].upper() + text[1:],

@@ -170,8 +170,8 @@ def off(found, expected, weight=1.0):
 
 def surely_refracted(index, wi, wo):
     """(n,) 1, and less where rounding matters more than CLOSE: behind a facet that is near total reflection the cosine
-    is the root of a small difference, so that a rounding e of single precision becomes e n^2/cos^2 of the light, and
-    four of them add up."""
+    is the root of a small difference, so that a rounding e of single precision becomes e n^2/cos^2 of the light. Four
+    add up: those of three products and a norm."""
     inside = wi[:, 2] < 0  # in the medium of the given index
     n = np.where(inside, index, 1 / index)
     half = n[:, None] * wi + wo

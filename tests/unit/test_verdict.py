@@ -176,10 +176,13 @@ def test_what_the_fit_solves_for_frame_by_frame_is_no_coordinate_of_its_own():
         model.frames[f].parameters["sensor.angle"] = 15.0 * f  # a dial that somebody turned
     d = judge(model, fit, library("flicker", "gamma", "crosstalk"))
     curves = {f.coordinate: f for f in d.fingerprints}
-    assert {name for name, curve in curves.items() if curve.solved} == set(places)
+    assert {name for name, curve in curves.items() if curve.per_frame} == set(places)
     assert curves["gel.press_x"].net == pytest.approx(curves["frame"].net, rel=1e-6)
     assert not {f.coordinate for f in d.families} & set(places)
     assert "gel.press_x" not in d.text() and "sensor.angle" in d.text()
+    # nor as the best curve in a sentence
+    ahead = sorted(d.fingerprints, key=lambda f: not f.per_frame)
+    assert ahead[0].per_frame and "along 'gel." not in fingerprints.unexplained(ahead, 1.0, 1e4)
 
 
 @pytest.mark.parametrize("height_gain, faint", [(0.04, False), (0.025, True)])

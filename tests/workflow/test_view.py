@@ -16,6 +16,7 @@ import sys
 import threading
 import time
 from concurrent.futures import CancelledError, ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -863,6 +864,25 @@ def test_everything_has_a_name_and_fits(page):
     page.idle()
 
 
+@contextmanager
+def opened(chromium, folder):
+    """The page of a study in the browser, without an error in the end; gives its server."""
+    found = Server()
+    found.view = View(folder)
+    thread = threading.Thread(target=found.serve_forever, kwargs={"poll_interval": 0.02})
+    thread.start()
+    chromium.errors.clear()
+    try:
+        chromium.open(found.url)
+        yield found
+    finally:
+        found.shutdown()
+        thread.join()
+        found.server_close()
+        found.view.close()
+    assert chromium.errors == []
+
+
 def test_point_readings_are_drawn_as_points(chromium, mitsuba, tmp_path):
     """A bench with a leak: its linear prediction in the page is the server's, and the points move."""
     from optics.proof.makers import bench as jones
@@ -878,13 +898,7 @@ def test_point_readings_are_drawn_as_points(chromium, mitsuba, tmp_path):
     ]
     jones.write(tmp_path / "captures", truth, settings, Noise(0.05, 2.0, 64.0, 4095.0, 0.0), 3)
     loop.begin(loop.Setup(captures=str(tmp_path / "captures")), tmp_path / "study")
-    found = Server()
-    found.view = View(tmp_path / "study")
-    thread = threading.Thread(target=found.serve_forever, kwargs={"poll_interval": 0.02})
-    thread.start()
-    chromium.errors.clear()
-    try:
-        chromium.open(found.url)
+    with opened(chromium, tmp_path / "study") as found:
         assert chromium.run("S.shape === null && canvas.width > 300") and chromium.text("state") == [
             "rendered: the study’s values"
         ]
@@ -907,12 +921,6 @@ def test_point_readings_are_drawn_as_points(chromium, mitsuba, tmp_path):
         for key in "12345":
             chromium.key(key)
             chromium.drawn()
-    finally:
-        found.shutdown()
-        thread.join()
-        found.server_close()
-        found.view.close()
-    assert chromium.errors == []
 
 
 def test_each_analyser_of_a_mosaic_is_an_image_of_its_own(chromium, mitsuba, tmp_path):
@@ -929,13 +937,7 @@ def test_each_analyser_of_a_mosaic_is_an_image_of_its_own(chromium, mitsuba, tmp
     )
     capture_files.write(own, tmp_path / "captures", bits=16)
     loop.begin(loop.Setup(captures=str(tmp_path / "captures"), defines=sensor), tmp_path / "study")
-    found = Server()
-    found.view = View(tmp_path / "study")
-    thread = threading.Thread(target=found.serve_forever, kwargs={"poll_interval": 0.02})
-    thread.start()
-    chromium.errors.clear()
-    try:
-        chromium.open(found.url)
+    with opened(chromium, tmp_path / "study") as found:
         image, _ = found.view.capture(0)
         rows, columns = np.array(loaded.camera.mosaic).shape
         chromium.key("1")
@@ -958,9 +960,3 @@ def test_each_analyser_of_a_mosaic_is_an_image_of_its_own(chromium, mitsuba, tmp
         angle = loaded.camera.mosaic[0][-1]
         assert said.startswith(f"row 0, column {50 - 1}, {angle:g}\u00b0: {image[0, 49, 0]:.0f} DN")
         assert chromium.numbers("chi")[0] < 2
-    finally:
-        found.shutdown()
-        thread.join()
-        found.server_close()
-        found.view.close()
-    assert chromium.errors == []
