@@ -38,7 +38,7 @@ CROWDED_SAMPLES = 16  # of a crowded scene, whose pixels nearly all have rims
 BEHIND_PUPIL = 4
 LAYERED_RIM_SAMPLES = 32  # in scenes with layers, whose matrices are multiplied for every sample
 # mm^2: the step by which a pupil's image is made. By 0.5 mm^2 beads 4 px wide change by less than the errors of 64
-# samples: the square of these is six times that of the image. By 2 mm^2 it is 0.4 times that
+# samples: the square of these is six times that of the image. By 2 mm^2 it is less than that
 CROWDED_PUPIL = 2.0
 PAINTED = 0.05  # of the largest reflectance of a texture: a step from pixel to pixel that needs finer samples
 # difference of a pixel's mean normal from that at its middle, above which finer samples are taken: a fifth of a grey
