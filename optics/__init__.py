@@ -20,6 +20,7 @@ from optics.version import __version__
 if TYPE_CHECKING:
     from optics.diagnosis.result import Diagnosis
     from optics.facade import Study, calibrate, compare, load
+    from optics.fit.crew import use_processes
     from optics.fit.result import Fit
     from optics.scene.declare import Effect, Part
     from optics.scene.loader import Scene
@@ -31,6 +32,7 @@ _HOME = {
     "calibrate": "optics.facade",
     "compare": "optics.facade",
     "load": "optics.facade",
+    "use_processes": "optics.fit.crew",
     "register": "optics.scene.mitsuba_parts",
     "Diagnosis": "optics.diagnosis.result",
     "Effect": "optics.scene.declare",
@@ -55,6 +57,7 @@ __all__ = [
     "compare",
     "load",
     "register",
+    "use_processes",
     "wire",
 ]
 

@@ -17,6 +17,8 @@ from types import SimpleNamespace
 # from Dr.Jit or from the other worker (test_lattice.py: 13 s of processor time in place of 24).
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+os.environ.setdefault("OPTICS_PROCESSES", "1")  # commands that tests run in this process begin no others
+
 # What a test trusts is nobody's: the user's own list of trusted plugins is neither read nor written.
 os.environ["XDG_CONFIG_HOME"] = tempfile.mkdtemp(prefix="optics-tests-config-")
 

@@ -7,7 +7,7 @@ take every usable pixel; curves, splits and alternative weights use a thinned la
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -331,24 +331,27 @@ class Layout:
         return self.tangent + self.secant
 
     def images(
-        self, model: Model, values: Values, frame: int, seed: int, wanted: set[int] | None = None
-    ) -> tuple[np.ndarray | None, dict[int, np.ndarray]]:
-        """(prediction, column -> derivative image (H, W, C)) of a frame; `wanted`: these columns only. The prediction
-        is None where no column acts in the frame."""
-        found: dict[int, np.ndarray] = {}
-        prediction = None
+        self, model: Model, values: Values, frames: Sequence[int], seed: int, wanted: set[int] | None = None
+    ) -> Iterator[tuple[np.ndarray | None, dict[int, np.ndarray]]]:
+        """(prediction, column -> derivative image (H, W, C)) of each frame; `wanted`: these columns only. The
+        prediction is None where there are none."""
+        passes = []
         for first, variables, steps in ((0, self.tangent, None), (len(self.tangent), self.secant, self.steps)):
-            here: dict[str, list[int]] = {}  # two effects may free the same variable
+            places: dict[str, list[int]] = {}  # two effects may free the same variable
             for i, v in enumerate(variables):
-                if v.holds_in(frame) and (wanted is None or first + i in wanted):
-                    here.setdefault(v.name, []).append(first + i)
-            if not here:
+                if wanted is None or first + i in wanted:
+                    places.setdefault(v.name, []).append(first + i)
+            if not places:
                 continue
-            asked = list({v.name: v for v in variables if v.name in here}.values())
+            asked = list({v.name: v for v in variables if v.name in places}.values())
             secant = None if steps is None else {v.name: steps[v.name] for v in asked}
-            prediction, named = next(iter(model.derivatives(values, asked, [frame], secant=secant, seed=seed)))
-            found.update({i: np.asarray(image) for name, image in named.items() for i in here.get(name, ())})
-        return prediction, found
+            passes.append((places, iter(model.derivatives(values, asked, frames, secant=secant, seed=seed))))
+        for _ in frames:
+            prediction, found = None, {}
+            for places, images in passes:
+                prediction, named = next(images)
+                found.update({i: np.asarray(image) for name, image in named.items() for i in places[name]})
+            yield prediction, found
 
 
 def measure(
@@ -374,22 +377,24 @@ def measure(
     seeds = seeds_apart(seed)
     evidence, total = _empty(model, values, layout, len(base), frames, rows_max, seeds[0])
     noisy: set[int] = set()
+    seconds: Iterator[tuple[np.ndarray | None, dict[int, np.ndarray]]] = iter(())
     signal = variance = 0.0
-    for n, frame in enumerate(frames):
+    firsts = layout.images(model, values, frames, seeds[0])
+    for n, (frame, plain, (own, first)) in enumerate(zip(frames, model.predict(values, frames), firsts)):
         say(what, n, len(frames))
-        prediction = np.asarray(model.predict(values, [frame])[0], float)
-        own, first = layout.images(model, values, frame, seeds[0])
+        prediction = np.asarray(plain, float)
         second: dict[int, np.ndarray] = {}
         if n == 0:
-            other, again = layout.images(model, values, frame, seeds[1])
+            ((other, again),) = layout.images(model, values, [frame], seeds[1])
             noisy = {c for c in first if c not in again or not np.array_equal(first[c], again[c], equal_nan=True)}
             second = again if noisy else {}
+            seconds = layout.images(model, values, frames[1:], seeds[1], noisy)
             if own is not None and other is not None and not np.array_equal(own, other):
                 if model.sampled:  # those that come with derivative images are rough
                     own, other = (model.predict(values, [frame], s)[0] for s in seeds)
                 evidence.render_noise = _between(own, other, model.noise.variance(prediction), model.usable(frame))
         elif noisy:
-            _, second = layout.images(model, values, frame, seeds[1], noisy)
+            _, second = next(seconds)
         binned = prediction if own is None else own
         _add_frame(evidence, model, frame, n, prediction, binned, first, second, noisy, candidates, len(base))
         use, sigma = evidence.use[-1], evidence.sigma[-1]

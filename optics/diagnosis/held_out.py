@@ -87,10 +87,9 @@ def _crossed(
     With images X and residuals r of a half at the optimum of both, (G - G_h) step = -X'r moves it to that of the other
     half. Halves are a chessboard of SQUARES x SQUARES fields, of readings the first and the second half."""
     found = []
-    for f, prediction, use, sd in zip(frames, predictions, masks, sds):
-        here = [v for v in free if v.holds_in(f)]
-        ((_, images),) = case.model.derivatives(values, here, [f], seed=case.seed)
-        acting = [np.asarray(images[v.name], float) for v in here if v.name in images]
+    derivatives = case.model.derivatives(values, free, frames, seed=case.seed)
+    for f, prediction, use, sd, (_, images) in zip(frames, predictions, masks, sds, derivatives):
+        acting = [np.asarray(images[v.name], float) for v in free if v.name in images]
         residual = np.where(use, (np.asarray(case.model.frames[f].image, float) - prediction) / sd, 0.0)
         residual = np.where(np.isfinite(residual), residual, 0.0)
         x = np.stack([np.where(use, image / sd, 0.0) for image in acting], -1) if acting else np.zeros((*use.shape, 0))
@@ -116,7 +115,7 @@ def _predicted(case: Case, values: Values, free: list[Variable]) -> tuple[list[n
     """Predictions of the held-out frames after fitting what is `free` there, and the values."""
     if free:
         values = case.refit(case.model, free, values, frames=list(case.held_out)).values
-    return [np.asarray(case.model.predict(values, [f])[0], float) for f in case.held_out], values
+    return [np.asarray(image, float) for image in case.model.predict(values, case.held_out)], values
 
 
 def _level(

@@ -478,12 +478,17 @@ def _twice(
     """Per frame, derivative images by name of two seeds; the same images twice once those of a frame are found not to
     depend on the seed."""
 
-    def images(frame: int, seed: int) -> dict[str, np.ndarray]:
-        return next(iter(model.derivatives(values, variables, [frame], secant=secant, seed=seed)))[1]
+    def images(frames: Sequence[int], seed: int) -> Iterator[dict[str, np.ndarray]]:
+        return (own for _, own in model.derivatives(values, variables, frames, secant=secant, seed=seed))
 
     exact = False
-    for frame in frames:
-        one = images(frame, seeds[0])
-        other = one if exact else images(frame, seeds[1])
-        exact = exact or bool(one) and all(np.array_equal(one[k], other[k], equal_nan=True) for k in one)
+    others: Iterator[dict[str, np.ndarray]] = iter(())
+    for n, one in enumerate(images(frames, seeds[0])):
+        if exact:
+            yield one, one
+            continue
+        if n < 2:  # of the first frame alone: it may tell that the others need none
+            others = images(frames[:1] if n == 0 else frames[1:], seeds[1])
+        other = next(others)
+        exact = bool(one) and all(np.array_equal(one[k], other[k], equal_nan=True) for k in one)
         yield one, other

@@ -6,9 +6,10 @@ from __future__ import annotations
 
 import copy
 from collections import OrderedDict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, cast
 
@@ -19,6 +20,7 @@ from optics.captures.capture_set import Captures, Frame, cfa_channel, sweeps, wi
 from optics.captures.noise import Noise
 from optics.errors import BadScene, UnknownKey
 from optics.fit import geometry
+from optics.fit.crew import Hands
 from optics.fit.known_shape import ALL, KNOWN, REGIONS, known_shape
 from optics.fit.model import value_of
 from optics.light.development import STEP, Developer
@@ -108,7 +110,10 @@ class SceneModel:
         scene.set({k: v for k, v in self.base.items() if self.parameters[k].role in ("regions", "region")})
         for frame in self.frames:
             scene.check(frame.parameters, f"{frame.file or captures.folder}: frame {frame.name}")
-        self.companions = self._companions()
+        self.recipe: Callable[[], SceneModel] | None = None  # opens the same model in another process
+        self.hands = Hands()
+        self.presses, self.charge = self._presses(), frozenset(range(len(self.frames)))
+        self.companions = self._companions(self.charge)
         # A power that frames set is a drive level: what a calibration finds is the LED's power at drive 1.
         self.driven = set(scene.powers.values()) & {k for f in self.frames for k in (*f.parameters, *f.readings)}
         self.base.update(dict.fromkeys(self.driven, 1.0))
@@ -194,7 +199,9 @@ class SceneModel:
             set(self.scene.powers.values()) & {k for f in frames for k in (*f.parameters, *f.readings)}
         )
         twin.base = {**self.base, **dict.fromkeys(twin.driven - self.driven, 1.0)}
-        twin.companions, twin._edges_kept = twin._companions(), dict(self._edges_kept)
+        twin.recipe, twin.hands = None, Hands()
+        twin.presses, twin.charge = twin._presses(), frozenset(range(len(twin.frames)))
+        twin.companions, twin._edges_kept = twin._companions(twin.charge), dict(self._edges_kept)
         twin._needed_kept = {}
         twin._dialled_kept, twin._derived = OrderedDict(), OrderedDict()
         return twin
@@ -225,18 +232,28 @@ class SceneModel:
             return {k: values.common.get(k, self.base[k]) if k in self.drives else 1.0 for k in variable.keys}
         return {k: own.get(k, 1.0) for k in variable.keys if k not in own or k in self.driven}
 
-    def _companions(self) -> list[set[str]]:
-        """For each frame, the LEDs that are lit in any frame of the same press: these share its geometry."""
-        presses: dict[tuple, set[str]] = {}
-        keys = []
+    def _presses(self) -> list[int]:
+        """A number for each frame: frames of one press, which share its geometry, have the same."""
+        numbers: dict[tuple, int] = {}
+        found = []
         for frame in self.frames:
             own = {**self.base, **frame.parameters, **frame.readings}
             key = (frame.group, *(own[k] for k in self.renderer.geometry_keys))
-            presses.setdefault(key, set()).update(
-                n for n, power in self.scene.powers.items() if np.any(own[power] != 0)
-            )
-            keys.append(key)
-        return [presses[key] for key in keys]
+            found.append(numbers.setdefault(key, len(numbers)))
+        return found
+
+    def _companions(self, mine: Iterable[int]) -> list[set[str]]:
+        """For each frame, the LEDs that are lit in any frame of the same press that this process makes."""
+        lit: dict[int, set[str]] = {press: set() for press in self.presses}
+        for i in mine:
+            own = {**self.base, **self.frames[i].parameters, **self.frames[i].readings}
+            lit[self.presses[i]].update(n for n, power in self.scene.powers.items() if np.any(own[power] != 0))
+        return [lit[press] for press in self.presses]
+
+    def take_charge(self, frames: frozenset[int]) -> None:
+        """Make the images of these frames; other processes make those of others."""
+        if frames != self.charge:
+            self.charge, self.companions = frames, self._companions(frames)
 
     def linear_in(self, variable: Variable) -> bool:
         """Whether predictions are linear in a variable together with all others of which this holds: the LEDs'
@@ -301,7 +318,11 @@ class SceneModel:
             multiplicative   black + g (B - black) (P - black)/(P0 - black)
             additive         black + g (B - black) + P - P0             (light adds up: exact for a linear response)
         """
-        return [self._predict(self._turn_to(values, i), i, seed) for i in self._indices(frames)]
+        return list(self._made(frames, _predicted, values=values, seed=seed))
+
+    def _made(self, frames: Sequence[int] | None, make: Callable, **given: Any) -> Iterator[Any]:
+        """What `make` makes of the model and each frame, in this process or in another that has the same model."""
+        return self.hands.work(self, self._indices(frames), partial(make, sparing=self.sparing, **given))
 
     def _turn_to(self, values: Values, index: int) -> dict:
         """A frame's values; tells the renderer which other LEDs will be asked for in the same geometry, and of which
@@ -326,7 +347,7 @@ class SceneModel:
 
         A lens that shifts by more than BESIDE brings the value of a pixel's middle to the edge of a mask."""
         if index not in self._needed_kept:
-            press = [i for i, own in enumerate(self.companions) if own is self.companions[index]]
+            press = [i for i, own in enumerate(self.presses) if own == self.presses[index]]
             needed: Pixels | None = None
             if self.captures.table is None and not (self.renderer.layered or self.renderer.crowded):
                 self.renderer.wanted = None  # masks may look at images themselves
@@ -392,15 +413,9 @@ class SceneModel:
         nothing in a frame are left out of its dictionary. Of a crowded scene, the images of another seed than the
         predictions' are made of fewer samples, and so is the prediction that comes with them."""
         self.check_variables(variables)
-        for index in self._indices(frames):
-            self.renderer.rough = self.sampled and seed != 0
-            try:
-                found = self._differentiate(
-                    values, [v for v in variables if v.holds_in(index)], secant or {}, seed, index
-                )
-            finally:
-                self.renderer.rough = False
-            yield found
+        yield from self._made(
+            frames, _differentiated, values=values, variables=variables, secant=secant or {}, seed=seed
+        )
 
     def _differentiate(
         self, values: Values, variables: Sequence[Variable], secant: Mapping[str, float], seed: int, index: int
@@ -808,6 +823,37 @@ class SceneModel:
             return "camera"
         name = key.rpartition(".")[0]
         return self.scene.declaration(name).family if name in self.scene.parts else ""
+
+
+def _predicted(model: SceneModel, index: int, sparing: bool, values: Values, seed: int) -> np.ndarray:
+    model.sparing = sparing
+    return model._predict(model._turn_to(values, index), index, seed)
+
+
+def _differentiated(
+    model: SceneModel,
+    index: int,
+    sparing: bool,
+    values: Values,
+    variables: Sequence[Variable],
+    secant: Mapping[str, float],
+    seed: int,
+) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    model.sparing = sparing
+    own = [v for v in variables if v.holds_in(index)]
+    tangents = {
+        k
+        for v in own
+        if v.name not in secant
+        for k in model._acts(values, v, index)
+        if model.parameters[k].how == "ad" and not model._is_power(k)
+    }
+    model.renderer.rough = model.sampled and seed != 0
+    try:
+        with model.renderer.asking(tangents):
+            return model._differentiate(values, own, secant, seed, index)
+    finally:
+        model.renderer.rough = False
 
 
 def _behind(now: Mapping, states: Sequence[Mapping]) -> dict[str, Any]:

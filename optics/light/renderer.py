@@ -13,9 +13,10 @@ from __future__ import annotations
 import copy
 import math
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from itertools import repeat
 from types import SimpleNamespace
 from typing import NamedTuple
 
@@ -54,6 +55,7 @@ FLAT_FIELDS = ("multiplicative", "additive", "none")
 MEMORY = 2e9  # bytes of hits, with what images need for their derivatives, that are kept
 IMAGES = 5e8  # bytes of images that are kept without them, of a renderer that remembers REMEMBER geometries
 REMEMBER = 24
+AT_ONCE = 4_000_000  # ends of camera rays times parameters whose tangents are made together
 PER_RAY = 250  # bytes of a camera ray's end and its light, by the memory of processes that held ten million of them
 BOUNCE_SAMPLES = 32  # directions per cell for the second bounce, at least
 # of these, an image has at least so many: few of a face meet a lit flank. On a plate of balls, whose second reflections
@@ -174,6 +176,8 @@ class Renderer:
         self._tangents: OrderedDict = OrderedDict()
         self._kept_rays = 0.0  # camera rays that are kept, at most
         self.together: set[str] = set()  # LEDs whose images are wanted of the same geometry
+        self.asked: set[str] = set()  # parameters whose tangents will be asked for, see `asking`
+        self._slopes: dict[tuple, tuple[LedImage, dict[str, tuple]]] = {}  # those that were made with others
         self.wanted: Pixels | None = None  # those that take finer samples where they need them; None: all
 
     def _told_by(self, key: str) -> list[str]:
@@ -699,21 +703,26 @@ class Renderer:
             dr.eval(share[-1])
         return share[0] if len(share) == 1 else share
 
-    def _shade(self, sample: Sample, part, visible, take: Callable = lambda light: light):
-        """Direct radiance per band at hits, an UnpolarizedSpectrum; or the mean of what `take` makes of the light of
-        each point of the source, while it is attached to whatever carries gradients.
+    def _shade(self, sample: Sample, part, visible):
+        """Direct radiance per band at hits, an UnpolarizedSpectrum."""
+        return self._shade_each(sample, part, visible, lambda light: [light])[0]
+
+    def _shade_each(self, sample: Sample, part, visible, take: Callable) -> list:
+        """The means of what `take` makes, as a list, of the direct radiance that each point of the source sends, while
+        this is attached to whatever carries gradients.
 
         A point is evaluated before the next begins: all share a kernel, which would otherwise grow with their number.
         """
         import drjit as dr
 
         self._tune(sample.si)
-        shares, total = visible if isinstance(visible, list) else [visible], 0.0
+        shares, totals = visible if isinstance(visible, list) else [visible], []
         for point, seen in zip(self.scene.integrator.spots(part), shares):
-            total += take(self.scene.integrator.direct(self._world(), *sample[:3], part, seen, point))
+            own = take(self.scene.integrator.direct(self._world(), *sample[:3], part, seen, point))
+            totals = [total + new for total, new in zip(totals, own)] if totals else own
             if len(shares) > 1:
-                dr.eval(total)
-        return total / len(shares)
+                dr.eval(totals)
+        return [total / len(shares) for total in totals]
 
     def _raw(self, image: LedImage, centre: Callable, rim: Callable) -> tuple:
         """Shading at pixel centres (H W, B) and at the finer samples (N, B), None without any; of a crowded scene at
@@ -731,11 +740,12 @@ class Renderer:
         height = self.height if len(result) == self.height * self.width else -1
         return result.reshape(height, self.width, result.shape[-1])
 
-    def _bands(self, spectrum, count: int | None = None) -> np.ndarray:
+    def _bands(self, spectra: Sequence, count: int | None = None) -> list[np.ndarray]:
         import drjit as dr
 
-        dr.eval(spectrum)  # lane by lane: one array of all lanes would carry its size into the kernel
-        return np.stack([np.array(spectrum[i]) for i in range(self.bands if count is None else count)], -1)
+        dr.eval(spectra)  # lane by lane: one array of all lanes would carry its size into the kernel
+        lanes = range(self.bands if count is None else count)
+        return [np.stack([np.array(spectrum[i]) for i in lanes], -1) for spectrum in spectra]
 
     def _own(self, led: str) -> np.ndarray:
         """Numbers of the bands in which a light is rendered; of no light, all."""
@@ -744,11 +754,15 @@ class Renderer:
         return self.integral.bands_of(led)
 
     def _each_band(self, shade: Callable, led: str = "") -> np.ndarray:
-        """(N, B) of what `shade` gives per lane; of channels that are integrals in as many passes as the light's bands
-        take, 0 in the bands of others."""
+        """(N, B) of what `shade` gives per lane."""
+        return self._each_band_of(lambda: [shade()], led)[0]
+
+    def _each_band_of(self, shade: Callable, led: str = "") -> list[np.ndarray]:
+        """(N, B) of each spectrum in the list that `shade` gives per lane; of channels that are integrals in as many
+        passes as the light's bands take, 0 in the bands of others."""
         if self.integral is None:
             return self._bands(shade())
-        found = np.zeros((1, self.bands))
+        found: list[np.ndarray] = []
         own, lanes = self._own(led), self.scene.integrator.lanes
         seen = len(own) > 0
         own = own if seen else np.zeros(1, int)  # a light that no channel sees
@@ -761,8 +775,9 @@ class Renderer:
                 here, self._lanes = self._lanes, None
                 self._light_lanes("")
             if not start:
-                found = np.zeros((len(raw), self.bands), raw.dtype)
-            found[:, here] = raw * seen
+                found = [np.zeros((len(image), self.bands), image.dtype) for image in raw]
+            for image, lanes_of_it in zip(found, raw):
+                image[:, here] = lanes_of_it * seen
         return found
 
     def _light_lanes(self, led: str) -> None:
@@ -818,53 +833,100 @@ class Renderer:
     def led_tangent(self, values: Mapping, led: str, key: str, component: int = 0, seed: int = 0) -> np.ndarray:
         """d / d parameter of one LED's image (of a component of the Stokes vectors), forward mode; rims by central
         differences where the LED moves."""
+        image = self.led(values, led, seed)
+        found = self._slopes.setdefault((led, id(image)), (image, {}))[1]
+        if key not in found:
+            lamp = self.scene.leds[led]
+            others = [k for k in sorted(self.asked - found.keys()) if self._shapes(k, lamp) and k != key]
+            at_once = max(int(AT_ONCE / max(image.finer.size, image.hits.valid.size)), 1)
+            found.update(self._tangents_of(values, image, [key, *others[: at_once - 1]]))
+            if not self.asked:
+                self._slopes.clear()
+        if component and not self.layered:
+            return np.zeros((self.height, self.width, self.bands))
+        return self._mix(image, found[key], self.weights(values, image, component) if self.layered else (1.0, 1.0))
+
+    @contextmanager
+    def asking(self, keys: Iterable[str]) -> Iterator[None]:
+        """Within it, tangents of these parameters will be asked for: of one LED they are made together, as they share
+        all that its light is made of."""
+        self.asked = set(keys)
+        try:
+            yield
+        finally:
+            self.asked = set()
+            self._slopes.clear()
+
+    def _shapes(self, key: str, lamp) -> bool:
+        """Whether a parameter is that of this light, of its board, or of no light."""
+        name = key.rsplit(".", 1)[0]
+        return name in (lamp.name, _board(lamp)) or name not in self.scene.leds and name not in self.scene.boards
+
+    def _moves(self, key: str, lamp) -> bool:
+        """Whether a parameter moves this light."""
+        name, parameter = key.rsplit(".", 1)
+        part = self.scene.parts[name]
+        return name == _board(lamp) or (part is lamp and part.numbers[parameter].role in MOVES)
+
+    def _tangents_of(self, values: Mapping, image: LedImage, keys: Sequence[str]) -> dict[str, tuple]:
+        """key -> `_raw` of the derivative of an LED's image."""
         import drjit as dr
         import mitsuba as mi
 
-        image = self.led(values, led, seed)
-        name, parameter = key.rsplit(".", 1)
-        part, lamp = self.scene.parts[name], self.scene.leds[led]
-        moves = name == _board(lamp) or (part is lamp and part.numbers[parameter].role in MOVES)
-        self.apply(values, move=moves and len(image.index) > 0)
-        value = getattr(part, parameter)
+        lamp = self.scene.leds[image.led]
+        moving = [k for k in keys if self._moves(k, lamp) and len(image.index)]
+        self.apply(values, move=bool(moving))
+        places = {k: (self.scene.parts[k.rsplit(".", 1)[0]], k.rsplit(".", 1)[1]) for k in keys}
 
-        def forward(attached):
+        def tangents(sample, visible, own):
+            before = {k: getattr(*places[k]) for k in own}
+            attached = {k: mi.Float(dr.detach(value)) for k, value in before.items()}
+
             def take(light):
-                dr.set_grad(attached, 1.0)
-                return dr.forward_to(light, flags=dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
+                found = []
+                for value in attached.values():
+                    dr.set_grad(value, 1.0)
+                    found.append(dr.forward_to(light, flags=dr.ADFlag.ClearVertices | dr.ADFlag.AllowNoGrad))
+                    dr.clear_grad(value)
+                    dr.clear_grad(light)
+                return found
 
-            return take
-
-        def tangent(sample, visible):
-            attached = mi.Float(dr.detach(value))
-            dr.enable_grad(attached)
-            setattr(part, parameter, attached)
+            for k, value in attached.items():
+                dr.enable_grad(value)
+                setattr(*places[k], value)
             try:
-                return self._shade(sample, lamp, visible, forward(attached))
+                return self._shade_each(sample, lamp, visible, take)
             finally:
-                setattr(part, parameter, value)
+                for k, value in before.items():
+                    setattr(*places[k], value)
 
-        def moved_rim():
-            step = part.numbers[parameter].step * part.numbers[parameter].plausible
+        def moved(key):
+            part, parameter = places[key]
+            value, number = getattr(part, parameter), part.numbers[parameter]
+            step = number.step * number.plausible
             sides = []
             for sign in (1, -1):
                 setattr(part, parameter, dr.opaque(mi.Float, float(value[0]) + sign * step))
                 try:
-                    finer = image.finer
-                    seen = self._visible(finer.sample.si, lamp)
-                    sides.append(self._shade(finer.sample, lamp, seen))
+                    sample = image.finer.sample
+                    sides.append(self._shade(sample, lamp, self._visible(sample.si, lamp)))
                 finally:
                     setattr(part, parameter, value)
             return (sides[0] - sides[1]) / (2 * step)
 
-        raw = self._raw(
-            image,
-            lambda: tangent(image.hits.sample, image.visible),
-            moved_rim if moves else lambda: tangent(image.finer.sample, image.rim_visible),
-        )
-        if component and not self.layered:
-            return np.zeros((self.height, self.width, self.bands))
-        return self._mix(image, raw, self.weights(values, image, component) if self.layered else (1.0, 1.0))
+        def rims():
+            still = [k for k in keys if k not in moving]
+            found = dict(zip(still, tangents(image.finer.sample, image.rim_visible, still))) if still else {}
+            return [found[k] if k in found else moved(k) for k in keys]
+
+        centres: Iterable[np.ndarray] = repeat(np.zeros((self.height * self.width, self.bands)))
+        if not self.crowded:
+            made = self._each_band_of(lambda: tangents(image.hits.sample, image.visible, keys), image.led)
+            centres = [np.broadcast_to(m, (self.height * self.width, self.bands)) for m in made]
+        fine: Iterable[np.ndarray | None] = repeat(None)
+        if len(image.index):
+            fine = [np.broadcast_to(m, (image.finer.size, self.bands)) for m in self._each_band_of(rims, image.led)]
+        return dict(zip(keys, zip(centres, fine)))
 
     def bounced(
         self, values: Mapping, led: str, seed: int = 0, component: int = 0, roughly: bool = False

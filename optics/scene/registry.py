@@ -87,6 +87,12 @@ class Registry:
         made.check()
         return made
 
+    @property
+    def own_files(self) -> list[Path]:
+        """The plugin files that do not ship."""
+        home = shipped("plugins").resolve()
+        return [file for file in self.files if not file.is_relative_to(home)]
+
     def name_of(self, file: Path) -> str:
         """A plugin file's path relative to the folder that it was found in; of a file that was named, its name."""
         home = next((folder for folder in self.folders if folder in file.parents), file.parent)

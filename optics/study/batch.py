@@ -58,13 +58,14 @@ from optics.files.output import FULL, alone, check_folder, file_hash, replacing,
 from optics.light import labels as labelling
 from optics.light.labels import LABELS
 from optics.light.rendering import LAYERS, RenderJob
+from optics.processes import cores, for_workers
 from optics.scene import loader as scenes
 from optics.scene.mitsuba_parts import DEFAULT_VARIANT, use_variant
 from optics.scene.trust import Named
 from optics.study.blocks import Block, Blocks, DiskFull, SampleFailed
 from optics.study.calibrated import Calibrated, calibrated
 from optics.study.draws import BadJob, Distribution, Drawn, Draws, Finite, Strict, Value, stream
-from optics.study.engines import ENGINES, Local, Status, cores, for_workers, work_through
+from optics.study.engines import ENGINES, Local, Status, work_through
 
 Progress = Callable[[str, int, int], None]
 

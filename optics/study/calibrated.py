@@ -53,7 +53,7 @@ def origin_of(
     captures, noise = model.captures, model.noise
     held_groups = [name for name, own in capture_files.groups(captures).items() if own[0] in set(held)]
     scene: dict[str, Any] = {"scene": str(captures.scene), "scene_hash": file_hash(model.scene.path)}
-    own = places.own_files(model.scene.registry)
+    own = model.scene.registry.own_files
     if own:
         scene["plugins"] = list(dict.fromkeys(str(file.parent) for file in own))
         scene["plugin_files"] = {

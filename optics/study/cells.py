@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 from optics.captures.cells import in_cells
@@ -121,4 +122,10 @@ def open_in_cells(setup: Setup, cells: Cells) -> tuple[SceneModel, Setup]:
     loaded.parameters = {k: replace(p, unit=IN_CELLS.get(p.unit, p.unit)) for k, p in loaded.parameters.items()}
     model = type(whole)(loaded, captures, captures.noise, whole.flat_field, whole.region)
     model.assumed_errors = dict(whole.assumed_errors)
+    if whole.recipe is not None:
+        model.recipe = partial(_open_again, whole.recipe, setup, cells.k)
     return model, replace(setup, values=cells.all_into(setup.values))
+
+
+def _open_again(whole: Callable[[], SceneModel], setup: Setup, k: int) -> SceneModel:
+    return open_in_cells(setup, Cells(whole(), k))[0]

@@ -8,7 +8,6 @@ that it was at. `work_through` starts workers until every sample is recorded or 
 from __future__ import annotations
 
 import os
-import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
@@ -17,19 +16,13 @@ from dataclasses import dataclass, replace
 from importlib import import_module
 from importlib.util import find_spec
 from multiprocessing import get_context
-from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, Protocol
 
 from optics.errors import UnknownKey
+from optics.processes import ENVIRONMENT, cores, tied
 from optics.study.blocks import TRIES, Blocks, DiskFull
 
-# Libraries of arrays use one thread, and no module is taken from the folder in which the command was given, where
-# captures may lie (from Python 3.11 on; 3.10 has no such switch, and its local workers look there first).
-ENVIRONMENT = {
-    **dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"),
-    "PYTHONSAFEPATH": "1",
-}
 GLANCE = 0.2  # seconds between two looks at the folder; ten times that on a cluster, whose file server others use too
 Lives = Sequence[Callable[[], int]]
 
@@ -58,10 +51,6 @@ class Engine(Protocol):
 
 
 # -- this machine ----------------------------------------------------------------------------------------------------
-def cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
 class Local:
     """Processes of this machine. Each life has a fresh one, which ends when this process ends, however it does."""
 
@@ -84,7 +73,7 @@ class Local:
             process.submit(begin, *given)
 
     def _process(self) -> ProcessPoolExecutor:
-        return ProcessPoolExecutor(1, self.context, initializer=_tied, initargs=(self.reader,))
+        return ProcessPoolExecutor(1, self.context, initializer=tied, initargs=(self.reader,))
 
     def start(self, lives: Lives) -> list[Future]:
         return [self.threads.submit(self._live, life) for life in lives]
@@ -103,19 +92,6 @@ class Local:
         for process in self.ready:
             process.shutdown(cancel_futures=True)
         self.reader.close()
-
-
-def _tied(reader: Connection) -> None:
-    """End this process as soon as the one that started it closes the other end of the pipe, or dies."""
-    import signal
-
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the one that started it decides
-
-    def wait() -> None:
-        reader.poll(None)
-        os._exit(1)
-
-    threading.Thread(target=wait, daemon=True).start()
 
 
 # -- Slurm -----------------------------------------------------------------------------------------------------------
@@ -333,15 +309,3 @@ def _error(worker: Work) -> BaseException | None:
         return worker.exception()
     except Exception as error:  # submitit raises what it cannot read
         return error
-
-
-@contextmanager
-def for_workers() -> Iterator[None]:
-    """Processes that are started within have ENVIRONMENT; what the user set stays."""
-    added = {name: value for name, value in ENVIRONMENT.items() if name not in os.environ}
-    os.environ.update(added)
-    try:
-        yield
-    finally:
-        for name in added:
-            os.environ.pop(name, None)

@@ -118,7 +118,7 @@ def begin(
         },
         prints=identity.sketch_of(model.captures),
     )
-    trust.remember(places.own_files(model.scene.registry))  # named, or agreed to: the study goes on with them
+    trust.remember(model.scene.registry.own_files)  # named, or agreed to: the study goes on with them
     if record.steps:
         return record, model, restore(record, model)
     clock = time.perf_counter()

@@ -49,15 +49,9 @@ def inputs_of(model: SceneModel) -> dict[str, str]:
 def own_plugins(registry: Registry) -> dict[str, str]:
     """The hash of every plugin file of a registry that does not ship."""
     found: dict[str, str] = {}
-    for file in own_files(registry):
+    for file in registry.own_files:
         found[_free(OWN + registry.name_of(file), found)] = file_hash(file)
     return found
-
-
-def own_files(registry: Registry) -> list[Path]:
-    """The plugin files of a registry that do not ship."""
-    home = shipped("plugins").resolve()
-    return [file for file in registry.files if not file.is_relative_to(home)]
 
 
 def _free(name: str, taken: Mapping[str, str]) -> str:

@@ -8,6 +8,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatch
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -221,6 +222,7 @@ def open_model(
         options["region"] = setup.region
     model = model_class(loaded, found, noise.in_scale_of(fitted), **options)
     model.assumed_errors = dict(setup.uncertainty or {})
+    model.recipe = partial(open_model, setup, model_class, fitted, loaded.registry.own_files)
     return model
 
 

@@ -271,7 +271,7 @@ def unshadowed(renderer, values):
     image = renderer.led(values, "strip")
     part = renderer.scene.leds["strip"]
     shaded = renderer._shade(image.hits.sample, part, [dr.ones(type(v), 1) for v in image.visible])
-    return POWER * renderer._bands(shaded).reshape(renderer.height, renderer.width)
+    return POWER * renderer._bands([shaded])[0].reshape(renderer.height, renderer.width)
 
 
 def least_p(images, other, error):

@@ -1,0 +1,230 @@
+"""`Crew`: further processes that make images of a model, frame by frame.
+
+Most of the time that a fit of images takes is spent in recording kernels, which is done on one core. A model that can
+be opened again (`SceneModel.recipe`) is opened in further processes once a fit has taken START seconds, and each of
+them then makes the images of frames of its own: all frames of a press where there are presses enough, as they share
+what was traced. Every number is the same as that of one process.
+
+Off until `use_processes` is called, as the command line does: Python starts a process by importing the caller's script
+again, and a script must be written for that (`if __name__ == "__main__":`)."""
+
+from __future__ import annotations
+
+import os
+import time
+import weakref
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from multiprocessing import get_context
+from typing import TYPE_CHECKING, Any
+
+from optics.processes import cores, for_workers, free_memory, tied
+
+if TYPE_CHECKING:
+    from optics.fit.scene_model import SceneModel
+
+START = 10.0  # seconds of images before further processes are worth their own start of about five
+MEMORY = 4e9  # bytes that a process may come to need: what a renderer keeps, twice
+AHEAD = 2  # frames that may wait until they are asked for, of each process
+UNEVEN = 1.25  # of the longest share of presses over the mean, beyond which the frames of a press are shared as well
+VARIABLE = "OPTICS_PROCESSES"  # of the environment: how many processes at most
+
+Task = Callable[["SceneModel", int], Any]
+
+_allowed = 1
+
+
+def use_processes(count: int | None = None) -> None:
+    """Let fits and diagnoses of images make these in up to so many processes, this one among them.
+
+    None: as many as the environment variable OPTICS_PROCESSES says, or else one for each core. A script that calls this
+    keeps its work under `if __name__ == "__main__":`, as each process imports it. Raises ValueError."""
+    global _allowed
+    if count is None:
+        given = os.environ.get(VARIABLE, "").strip()
+        if given and not (given.isascii() and given.isdecimal() and int(given) > 0):
+            raise ValueError(f"{VARIABLE} = {given!r}; allowed: a whole number from 1 on, of processes")
+        count = int(given) if given else cores()
+    if count < 1:
+        raise ValueError(f"count = {count}; allowed: whole numbers from 1 on")
+    _allowed = count
+
+
+def allowed() -> int:
+    """How many processes a model may use now, this one among them: what was allowed, and what memory there is for."""
+    return min(_allowed, 1 + int(min(free_memory(), 1e15) // MEMORY))
+
+
+class Crew:
+    """The processes that share the frames of a model with this one.
+
+    recipe   opens the model; it is sent to the other processes
+    presses  of each frame, the number of its press
+    count    of processes, this one among them
+    charge   frame -> the process that makes it, 0: this one
+    """
+
+    def __init__(self, recipe: Callable[[], SceneModel], presses: Sequence[int], count: int):
+        self.presses, self.count = list(presses), count
+        self.charge: dict[int, int] = {}
+        context = get_context("spawn")
+        reader, writer = context.Pipe(duplex=False)
+        threads = max(cores() // count, 1)
+        with for_workers():
+            self.others = [
+                ProcessPoolExecutor(1, context, initializer=tied, initargs=(reader,)) for _ in range(count - 1)
+            ]
+            self.begun = [other.submit(_begin, recipe, threads) for other in self.others]
+        self.end = weakref.finalize(self, _end, writer, self.others)
+        self.working = False
+
+    def ready(self) -> bool:
+        """Whether all processes have opened the model. Raises what one of them met."""
+        if not self.working and all(begun.done() for begun in self.begun):
+            for begun in self.begun:
+                begun.result()
+            self.working = True
+            _use_threads(max(cores() // self.count, 1))
+        return self.working
+
+    def share(self, frames: Sequence[int]) -> None:
+        """Put somebody in charge of frames of which nobody is, so that all have about as many of these frames. A frame
+        stays where it is: there is what its images share."""
+        load = [sum(self.charge.get(f) == k for f in frames) for k in range(self.count)]
+        new = [f for f in frames if f not in self.charge]
+        presses: dict[int, list[int]] = {}
+        for f in new:
+            presses.setdefault(self.presses[f], []).append(f)
+        own = sorted(presses.values(), key=len, reverse=True)
+        if _longest(load, own) > UNEVEN * len(frames) / self.count:
+            own = [[f] for f in new]
+        for together in own:
+            k = min(range(self.count), key=load.__getitem__)
+            load[k] += len(together)
+            self.charge.update(dict.fromkeys(together, k))
+
+    def run(self, model: SceneModel, frames: Sequence[int], task: Task) -> Iterator[Any]:
+        """What a task makes of each frame, in their order. Raises BrokenProcessPool where a process has died."""
+        self.share(frames)
+        charges = [frozenset(f for f, own in self.charge.items() if own == k) for k in range(self.count)]
+        model.take_charge(charges[0])
+        waiting = [deque(f for f in frames if self.charge[f] == k) for k in range(self.count)]
+        sent: dict[int, Future] = {}
+        made: dict[int, Any] = {}
+
+        def send(k: int) -> None:
+            if waiting[k]:
+                f = waiting[k].popleft()
+                sent[f] = self.others[k - 1].submit(_do, task, f, charges[k])
+
+        for k in range(1, self.count):
+            for _ in range(AHEAD):
+                send(k)
+        for f in frames:
+            k = self.charge[f]
+            while f not in made and waiting[0] and (k == 0 or len(made) < AHEAD and not sent[f].done()):
+                own = waiting[0].popleft()
+                made[own] = task(model, own)
+            if k:
+                made[f] = sent.pop(f).result()
+                send(k)
+            yield made.pop(f)
+
+
+def _longest(load: Sequence[int], presses: Sequence[Sequence[int]]) -> int:
+    """The longest share when presses, the largest first, go to whoever has least."""
+    found = list(load)
+    for own in presses:
+        found[found.index(min(found))] += len(own)
+    return max(found)
+
+
+# -- in the other processes ------------------------------------------------------------------------------------------
+_model: SceneModel | None = None
+
+
+def _begin(recipe: Callable[[], SceneModel], threads: int) -> None:
+    global _model
+    _model = recipe()
+    _use_threads(threads)
+
+
+def _do(task: Task, frame: int, charge: frozenset[int]) -> Any:
+    assert _model is not None
+    _model.take_charge(charge)
+    return task(_model, frame)
+
+
+def _use_threads(count: int) -> None:
+    import drjit as dr
+
+    dr.set_thread_count(count)
+
+
+def _end(writer: Any, others: Sequence[ProcessPoolExecutor]) -> None:
+    """End the processes at once: by the pipe that ties them to this one."""
+    writer.close()
+    for other in others:
+        other.shutdown(wait=False, cancel_futures=True)
+
+
+# -- when --------------------------------------------------------------------------------------------------------
+class Hands:
+    """Who makes the images of a model: this process, and others as soon as that is worth while."""
+
+    def __init__(self) -> None:
+        self.spent, self.alone = 0.0, False  # seconds of images so far; whether no other process is to be asked again
+        self.crew: Crew | None = None
+
+    def work(self, model: SceneModel, frames: Sequence[int], task: Task) -> Iterator[Any]:
+        """What a task makes of each frame of a model, in their order."""
+        done = 0
+        crew = self._crew(model, len(frames))
+        if crew is not None:
+            try:
+                for made in crew.run(model, frames, task):
+                    yield made
+                    done += 1
+            except BrokenProcessPool:  # killed, as for lack of memory
+                self.give_up(model)
+        for frame in frames[done:]:
+            began = time.perf_counter()
+            made = task(model, frame)
+            self.spent += time.perf_counter() - began
+            yield made
+
+    def _crew(self, model: SceneModel, count: int) -> Crew | None:
+        """The crew where it is at work; begun where it is time to, and where several frames are asked for."""
+        if self.crew is None and count > 1 and self.spent > START and not self.alone:
+            processes = min(allowed(), count)
+            if processes < 2 or not _shares(model):
+                return None
+            self.crew = Crew(model.recipe, model.presses, processes)
+        try:
+            if self.crew is None or not self.crew.ready():
+                return None
+        except Exception:  # the files may be gone
+            self.give_up(model)
+        return self.crew
+
+    def give_up(self, model: SceneModel) -> None:
+        """Go on alone."""
+        self.alone = True
+        if self.crew is not None:
+            self.crew.end()
+            self.crew = None
+        model.take_charge(frozenset(range(len(model.frames))))
+
+
+def _shares(model: SceneModel) -> bool:
+    """Whether other processes can make a model's images: not where it cannot be opened again as it is, nor readings,
+    which are quick, nor estimates by many rays, which keep all cores busy, nor bodies that may have been put
+    elsewhere."""
+    return (
+        model.recipe is not None
+        and model.captures.table is None
+        and not model.monte_carlo
+        and not model.renderer.crowded
+    )
