@@ -40,6 +40,7 @@ def hold(found, close=CLOSE):
                 assert abs(a - b) <= max(close * abs(a), SMALL), f"the page says: {said}\nthe program: {printed}"
 
 
+@pytest.mark.slow
 def test_the_bench_part_runs_as_it_stands(mitsuba, tmp_path):
     found = tour.walk(tmp_path)
     hold(found)

@@ -58,6 +58,7 @@ def test_pixels_add_up_to_the_force_and_the_drag():
     assert 0 < told["dent_difference"] < 0.1  # mm: a skirt of smoothing is no elastic one
 
 
+@pytest.mark.slow
 def test_markers_are_where_a_robot_finds_them():
     """Positions and motion of the labels against the centres that the reader finds in the rendered images."""
     names = ("markers", "force")

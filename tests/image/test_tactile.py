@@ -275,6 +275,7 @@ def test_led_by_led_is_what_the_integrator_renders(mitsuba, tmp_path):
     assert abs(images.mean() / led.mean() - 1) < 5e-4  # over all pixels these average out
 
 
+@pytest.mark.slow
 def test_all_leds_and_two_bounces_are_what_the_integrator_renders(mitsuba, tmp_path):
     """The prediction's linear image (six LEDs, powers, interreflection, absorption) against mi.render with
     `tactile`."""

@@ -1018,7 +1018,7 @@ def generic(scene):
     return values
 
 
-@BOTH
+@pytest.mark.parametrize("variant", [MONO, pytest.param(SPECTRAL, marks=pytest.mark.slow)], indirect=True)
 def test_derivatives_by_a_complex_step_are_those_of_differences(variant):
     """Every parameter of films, sheet and lamp, in intensity and polarization."""
     scene, renderer = bench(variant, width=3, height=3, x_fov=8, **({"bands": "610"} if variant == MONO else {}))

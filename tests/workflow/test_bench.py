@@ -156,6 +156,8 @@ DEAR = (
     *(
         "drift",
         "misalignment",
+        "misalignment and leak",
+        "retardance",
         "depolarization",
         "depolarization and drift",
         "dark offset",

@@ -78,6 +78,7 @@ def test_what_every_explanation_holds_is_claimed(tmp_path):
     assert "analyzer.offset - polarizer.offset = 2.0" in told or "analyzer.offset - polarizer.offset = 1.9" in told
 
 
+@pytest.mark.slow
 def test_less_than_dark_is_no_stray_light(tmp_path):
     """A meter whose zero is too low: light past the films can only add."""
     d = judged(tmp_path, noisy(malus(MALUS, stray=-0.02)))

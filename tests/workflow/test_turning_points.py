@@ -3,6 +3,7 @@ whose power changes from frame to frame: a linearisation sees next to nothing of
 steps that no angle can make."""
 
 import numpy as np
+import pytest
 
 from optics.fit.curvature import own_curvature
 from optics.fit.descent import Descent, normal_equations
@@ -58,6 +59,7 @@ def test_curvature_of_angles_against_chi2(mitsuba, between_films, tmp_path):
         assert np.isclose(bend[i], max(known, 0.0), atol=2e-3 * abs(second)), (v.name, bend[i], known)
 
 
+@pytest.mark.slow
 def test_what_is_promised_there_is_what_steps_bring(mitsuba, tmp_path):
     """A sheet turned between films under a lamp that drifts and a camera whose curve bends: with J'WJ alone the sheet
     is asked to turn by 5.5 deg for a fall of 108, no step brings any of it, and the base is refused."""

@@ -2,6 +2,7 @@
 the images by much, what is written down of dials counts many times; beside the right effect it counts once."""
 
 import numpy as np
+import pytest
 
 from optics.study import loop
 
@@ -25,6 +26,7 @@ HEAD = (
 )
 
 
+@pytest.mark.slow
 def test_dials_stand_off_by_what_is_known_of_them(mitsuba, between_films, tmp_path):
     rng = np.random.default_rng(3)
     setup = loop.Setup(captures=str(between_films(tmp_path / "set", frames(rng), HEAD, rng)), free=["source.power"])
