@@ -836,8 +836,9 @@ class Renderer:
         image = self.led(values, led, seed)
         found = self._slopes.setdefault((led, id(image)), (image, {}))[1]
         if key not in found:
-            lamp = self.scene.leds[led]
-            others = [k for k in sorted(self.asked - found.keys()) if self._shapes(k, lamp) and k != key]
+            # what a surface holds enters by a call of its own, which a graph that is gone through again cannot follow
+            own = self.led_keys[led]
+            others = [k for k in own if k in self.asked and k != key and k not in found] if key in own else []
             at_once = max(int(AT_ONCE / max(image.finer.size, image.hits.valid.size)), 1)
             found.update(self._tangents_of(values, image, [key, *others[: at_once - 1]]))
             if not self.asked:
@@ -856,11 +857,6 @@ class Renderer:
         finally:
             self.asked = set()
             self._slopes.clear()
-
-    def _shapes(self, key: str, lamp) -> bool:
-        """Whether a parameter is that of this light, of its board, or of no light."""
-        name = key.rsplit(".", 1)[0]
-        return name in (lamp.name, _board(lamp)) or name not in self.scene.leds and name not in self.scene.boards
 
     def _moves(self, key: str, lamp) -> bool:
         """Whether a parameter moves this light."""
