@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -43,10 +44,22 @@ def for_workers() -> Iterator[None]:
             os.environ.pop(name, None)
 
 
+@contextmanager
+def without_ctrl_c() -> Iterator[None]:
+    """Processes that are started within ignore Ctrl-C from their first moment on, in which Python would answer it with
+    a traceback: whoever started them ends them. In the main thread; elsewhere nothing changes."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before or signal.SIG_DFL)
+
+
 def tied(reader: Connection) -> None:
     """End this process as soon as the one that started it closes the other end of the pipe, or dies."""
-    import signal
-
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the one that started it decides
 
     def wait() -> None:

@@ -20,7 +20,7 @@ from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import get_context
 from typing import TYPE_CHECKING, Any
 
-from optics.processes import cores, for_workers, free_memory, tied
+from optics.processes import cores, for_workers, free_memory, tied, without_ctrl_c
 
 if TYPE_CHECKING:
     from optics.fit.scene_model import SceneModel
@@ -72,7 +72,7 @@ class Crew:
         context = get_context("spawn")
         reader, writer = context.Pipe(duplex=False)
         threads = max(cores() // count, 1)
-        with for_workers():
+        with for_workers(), without_ctrl_c():
             self.others = [
                 ProcessPoolExecutor(1, context, initializer=tied, initargs=(reader,)) for _ in range(count - 1)
             ]
