@@ -198,10 +198,10 @@ class Hands:
     def _crew(self, model: SceneModel, count: int) -> Crew | None:
         """The crew where it is at work; begun where it is time to, and where several frames are asked for."""
         if self.crew is None and count > 1 and self.spent > START and not self.alone:
-            processes = min(allowed(), count)
-            if processes < 2 or not _shares(model):
+            processes, recipe = min(allowed(), count), model.recipe
+            if processes < 2 or recipe is None or not _shares(model):
                 return None
-            self.crew = Crew(model.recipe, model.presses, processes)
+            self.crew = Crew(recipe, model.presses, processes)
         try:
             if self.crew is None or not self.crew.ready():
                 return None
@@ -219,12 +219,6 @@ class Hands:
 
 
 def _shares(model: SceneModel) -> bool:
-    """Whether other processes can make a model's images: not where it cannot be opened again as it is, nor readings,
-    which are quick, nor estimates by many rays, which keep all cores busy, nor bodies that may have been put
-    elsewhere."""
-    return (
-        model.recipe is not None
-        and model.captures.table is None
-        and not model.monte_carlo
-        and not model.renderer.crowded
-    )
+    """Whether other processes can make a model's images: not readings, which are quick, nor estimates by many rays,
+    which keep all cores busy, nor images of bodies that may have been put elsewhere."""
+    return model.captures.table is None and not model.monte_carlo and not model.renderer.crowded
