@@ -235,9 +235,8 @@ def beside_shared_noise(
         if not 0 < dof < before.free:
             continue
         fall = reached - after.deviance(scale)
-        judged.append(
-            replace(f, fall=fall, dof=dof, p=_chance(evidence, fall, dof, before.free, reached), net=fall - dof)
-        )
+        p, plain = _chance(evidence, fall, dof, before.free, reached), (before.white - after.white) / scale
+        judged.append(replace(f, fall=fall, dof=dof, p=p, net=fall - dof, plain=plain))
     return judged
 
 

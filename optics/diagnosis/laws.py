@@ -28,6 +28,8 @@ ORDERS = (2, 4, 8)  # cosines of a law, the first that score best
 PER_NUMBER = 4  # values per number that is fitted, at least
 ALWAYS = ("intensity", "channel")  # coordinates of readings that every law may run along, besides the settings
 
+Judge = Callable[[Sequence[np.ndarray]], tuple[float, int, float]]
+
 
 def other_laws(
     model: Model,
@@ -58,9 +60,9 @@ def other_laws(
             x = np.concatenate([p[coordinate] for p in places])
             laws = []
             for images in _strengths(evidence, own, x):
-                fall, dof = judge(images)
+                fall, dof, plain = judge(images)
                 if dof:
-                    laws.append(Law(effect.name, coordinate, fall, dof, float(chdtrc(dof, max(fall, 0.0)))))
+                    laws.append(Law(effect.name, coordinate, fall, dof, float(chdtrc(dof, max(fall, 0.0))), plain))
             found += [max(laws, key=lambda law: law.score)] if laws else []
     return sorted(found, key=lambda law: -law.score)
 
@@ -82,10 +84,10 @@ def _strengths(evidence: Evidence, own: Sequence[int], x: np.ndarray) -> Iterato
         ]
 
 
-def _fall_of_images(evidence: Evidence) -> Callable[[Sequence[np.ndarray]], tuple[float, int]]:
-    """(fall of chi2, dof) of further images of each block."""
+def _fall_of_images(evidence: Evidence) -> Judge:
+    """(fall of chi2, dof, the same fall) of further images of each block."""
 
-    def fall_of(images: Sequence[np.ndarray]) -> tuple[float, int]:
+    def fall_of(images: Sequence[np.ndarray]) -> tuple[float, int, float]:
         count, first = images[0].shape[1], len(evidence.columns)
         normal = evidence.thinned(extra=count)
         for block, own in zip(evidence.blocks, images):
@@ -93,22 +95,23 @@ def _fall_of_images(evidence: Evidence) -> Callable[[Sequence[np.ndarray]], tupl
         rest = list(range(first, first + count))
         projected = evidence.project(normal, evidence.base, rest, evidence.thinning)
         fall, dof, *_ = st.joint(projected, np.diag(normal.gram)[rest])
-        return fall * evidence.thinning, dof
+        return fall * evidence.thinning, dof, fall * evidence.thinning
 
     return fall_of
 
 
-def _fall_of_readings(
-    evidence: Evidence, session: Session | Frames, scale: float
-) -> Callable[[Sequence[np.ndarray]], tuple[float, int]]:
-    """The same beside noise that neighbours share, in units of the scale; from where the base stands, as effects fall:
-    both are judged by other weights than those that it was fitted by."""
+def _fall_of_readings(evidence: Evidence, session: Session | Frames, scale: float) -> Judge:
+    """(fall of deviance, dof, fall of chi2 as if neighbours shared nothing), in units of the scale; the deviance from
+    where the base stands, as effects fall: both are judged by other weights than those that it was fitted by."""
     base, r = evidence.dense(evidence.base), np.concatenate([block.r for block in evidence.blocks])
-    rank, before = st.orthonormal(base).shape[1], session.about(r, base).standing(scale)
+    rank, before = st.orthonormal(base).shape[1], session.about(r, base)
 
-    def fall_of(images: Sequence[np.ndarray]) -> tuple[float, int]:
+    def fall_of(images: Sequence[np.ndarray]) -> tuple[float, int, float]:
         whole = np.hstack([base, np.concatenate(images)])
         dof = st.orthonormal(whole).shape[1] - rank
-        return before - session.about(r, whole).deviance(scale) if dof else 0.0, dof
+        if not dof:
+            return 0.0, 0, 0.0
+        after = session.about(r, whole)
+        return before.standing(scale) - after.deviance(scale), dof, (before.white - after.white) / scale
 
     return fall_of

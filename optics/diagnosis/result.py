@@ -239,6 +239,12 @@ class Split:
     holds: bool
 
 
+def occam(dof: int, *falls: float) -> float:
+    """dof ln(1 + fall/dof), by the largest of the falls: what so many numbers could have fitted, with a prior as wide
+    as what they did fit."""
+    return dof * math.log1p(max(0.0, *falls) / dof)
+
+
 @dataclass(frozen=True)
 class Fingerprint:
     """The residual as a curve along one coordinate, after projecting off what a calibration absorbs.
@@ -250,6 +256,7 @@ class Fingerprint:
     family      what the coordinate belongs to (`optics.diagnosis.fingerprints`)
     share       of the excess misfit, NaN within noise
     size        rms change that it makes, over the rms signal
+    plain       fall of chi2 as if neighbours shared no noise, where `fall` is of deviance
     per_frame   whether nobody set the coordinate: the fit solves for it frame by frame, or it is a gain of each frame.
                 With a bin for each of its values the curve is that along 'frame' by another name
     """
@@ -270,14 +277,17 @@ class Fingerprint:
     unit: str = ""
     size: float = 0.0
     per_frame: bool = False
+    plain: float = 0.0
 
     @property
     def cost(self) -> float:
         """dof ln(1 + fall/dof) + 3 ln(1 + (size/USUAL)^2/2) + EACH: what so many bins could have fitted, whatever the
         data are, with a prior as wide as the curve that was found; how far that width is from usual; and the odds that
-        an unknown cause acts. The same three costs as of an effect (`optics.diagnosis.explanations`)."""
-        bins = self.dof * math.log1p(max(self.fall, 0.0) / self.dof)
-        return bins + 3 * math.log1p((self.size / USUAL) ** 2 / 2) + EACH
+        an unknown cause acts. The same three costs as of an effect (`optics.diagnosis.explanations`).
+
+        The fall is that of `plain` where that is larger: where the curve is the cause there is no noise that wanders,
+        and the data know its numbers as well as they know the strength of an effect."""
+        return occam(self.dof, self.fall, self.plain) + 3 * math.log1p((self.size / USUAL) ** 2 / 2) + EACH
 
 
 @dataclass(frozen=True)
@@ -286,6 +296,7 @@ class Law:
 
     fall, dof   with so many further strengths, of chi2 or, of readings, of deviance (optics.diagnosis.correlation)
     p           of that fall in noise
+    plain       as of `Fingerprint`
     """
 
     effect: str
@@ -293,11 +304,12 @@ class Law:
     fall: float
     dof: int
     p: float
+    plain: float = 0.0
 
     @property
     def cost(self) -> float:
-        """As of `Fingerprint`."""
-        return self.dof * math.log1p(max(self.fall, 0.0) / self.dof)
+        """As of `Fingerprint`: what so many numbers could have fitted."""
+        return occam(self.dof, self.fall, self.plain)
 
     @property
     def score(self) -> float:

@@ -1,5 +1,6 @@
 """What tells explanations apart: the form of an image, what is known of dials, predictions of blocks left out."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -8,6 +9,8 @@ import pytest
 from optics.diagnosis import diagnose, explanations, laws, score
 from optics.diagnosis import statistics as st
 from optics.diagnosis.correlation import Readings
+from optics.diagnosis.result import Fingerprint, Law
+from optics.diagnosis.thresholds import TOLD
 from optics.scene import registry
 
 
@@ -194,12 +197,24 @@ def test_a_law_falls_from_where_effects_fall():
 
     blocks = [SimpleNamespace(r=r)]
     evidence = SimpleNamespace(dense=lambda columns: base, base=[0], blocks=blocks)
-    fall, dof = laws._fall_of_readings(evidence, SimpleNamespace(about=about), 1.0)([image])
+    fall, dof, plain = laws._fall_of_readings(evidence, SimpleNamespace(about=about), 1.0)([image])
     whole = np.hstack([base, image])
     left = r - whole @ np.linalg.lstsq(whole, r, rcond=None)[0]
     effect = about(r, base).standing(1.0) - about(left, whole).standing(1.0)
     assert about(r, base).standing(1.0) - about(r, base).deviance(1.0) == pytest.approx(count, rel=0.5)
     assert (fall, dof) == (pytest.approx(effect, rel=1e-9), 1)
+    assert plain == pytest.approx(about(r, base).white - about(left, whole).white, rel=1e-9)
+
+
+def test_numbers_that_take_the_place_of_a_wander_cost_what_they_could_have_fitted():
+    """Of a bench: a tone curve of one strength lowers chi2 by 10190 and deviance by 129.5, as a lamp that wanders without
+    bound would explain most of it; so do eight cosines by 10222 and 149.5. Where cosines are the cause no lamp wanders,
+    and each is known to a hundredth of its size: they cost 57 and not 24, and the tone curve (19.4) is ahead."""
+    law = Law("extinction leak", "analyzer.angle", 149.5, 8, 0.0, 10222.0)
+    assert law.cost == pytest.approx(57.2, abs=0.1) and law.score < 129.5 - 19.4 - TOLD
+    assert replace(law, plain=0.0).score > 129.5 - 19.4 + TOLD
+    curve = Fingerprint("signal", 149.5, 8, 0.0, 141.5, 1.0, "gain", [], [], [], [], plain=10222.0)
+    assert curve.cost - replace(curve, plain=0.0).cost == pytest.approx(57.2 - 23.8, abs=0.1)
 
 
 def candidate(name):
