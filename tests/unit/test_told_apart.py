@@ -207,9 +207,9 @@ def test_a_law_falls_from_where_effects_fall():
 
 
 def test_numbers_that_take_the_place_of_a_wander_cost_what_they_could_have_fitted():
-    """Of a bench: a tone curve of one strength lowers chi2 by 10190 and deviance by 129.5, as a lamp that wanders without
-    bound would explain most of it; so do eight cosines by 10222 and 149.5. Where cosines are the cause no lamp wanders,
-    and each is known to a hundredth of its size: they cost 57 and not 24, and the tone curve (19.4) is ahead."""
+    """Of a bench: a tone curve of one strength lowers chi2 by 10190, and deviance by 129.5, as a lamp that wanders
+    without bound would explain most of it. Eight cosines lower them by 10222 and 149.5. Where cosines are the cause no
+    lamp wanders, and each is known to a hundredth of its size: they cost 57, not 24, and the curve (19.4) is ahead."""
     law = Law("extinction leak", "analyzer.angle", 149.5, 8, 0.0, 10222.0)
     assert law.cost == pytest.approx(57.2, abs=0.1) and law.score < 129.5 - 19.4 - TOLD
     assert replace(law, plain=0.0).score > 129.5 - 19.4 + TOLD
