@@ -21,14 +21,20 @@ Source of the deformation: the GelSight-type supplement, S1.2 (depth kept within
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
+from threading import RLock
+from typing import Any, TypeVar
 
 import numpy as np
+from cachetools import LRUCache, cached
 
 from optics.errors import UnknownKey
 from optics.files.heights import SUFFIXES as MAP_FILES
+
+F = TypeVar("F", bound=Callable)
 
 # the numbers of a skin that state J - 1 = s + sx x + sy y + sxx x^2 + sxy x y + syy y^2, in this order
 STRETCH = ("stretch", "stretch_x", "stretch_y", "stretch_xx", "stretch_xy", "stretch_yy")
@@ -40,6 +46,14 @@ STEPS = (10, 24)  # directions from which a parallel face is found: towards the 
 HALVINGS = 40  # of a quarter turn: 1e-12 rad
 NEWTON = 20  # steps to a contact line: from the steepest place six are enough for skirts of a tenth of the radius
 DETACHING = 0.3  # the weight of contact fades while the smoothed skin goes from 1 to 1.3 times the indenter's depth
+
+
+KEPT = 2e8  # bytes of maps that each function below keeps: a plate of balls has maps of 10 MB, and many of them
+
+
+def kept(size: Callable[[Any], int]) -> Callable[[F], F]:
+    """Keep the latest results of a function, at least one; `size`: the bytes of one, with what it works out later."""
+    return cached(LRUCache(KEPT, getsizeof=lambda made: min(size(made), KEPT)), lock=RLock())
 
 
 # -- Maps ------------------------------------------------------------------------------------------------------------
@@ -398,7 +412,7 @@ def indenter_profile(
     return _through_coat(_profile(shape, stamp, *numbers), float(coat))
 
 
-@lru_cache(maxsize=32)
+@kept(lambda made: 3 * made.height.nbytes)
 def _profile(shape, stamp, size, rx, ry, rz, extent, pitch, steepest, spacing, tall=1.0) -> Profile:
     from optics.skin import patterns
 
@@ -424,14 +438,14 @@ def _profile(shape, stamp, size, rx, ry, rz, extent, pitch, steepest, spacing, t
     return Profile(height, envelope, pitch, found.get(shape))
 
 
-@lru_cache(maxsize=4)  # of maps of up to 40 MB
+@kept(lambda made: 3 * made.height.nbytes)
 def _over(profile: Profile, face: RestFace) -> Profile:
     z0 = face.around(profile.axis[None, :], profile.axis[:, None])
     balls = None if profile.balls is None else replace(profile.balls, face=face)
     return Profile(profile.height - z0, profile.envelope - z0, profile.pitch, balls)
 
 
-@lru_cache(maxsize=16)
+@kept(lambda made: 3 * made.height.nbytes)
 def _through_coat(profile: Profile, coat: float) -> Profile:
     if coat == 0:
         return profile
@@ -693,7 +707,7 @@ def cone_envelope(height: np.ndarray, rise: float) -> np.ndarray:
 
 
 # -- Deformation -----------------------------------------------------------------------------------------------------
-@lru_cache(maxsize=16)
+@kept(lambda made: sum(2 * one.values.nbytes for one in made))
 def displacement(
     profile: Profile,
     depth: float,
@@ -801,7 +815,7 @@ def bridged(profile: Profile, d0: np.ndarray, depth: float, thickness: float, ra
     return profile.balls.bridged(*np.meshgrid(profile.axis, profile.axis), depth, radius)
 
 
-@lru_cache(maxsize=16)
+@kept(lambda made: 2 * made.values.nbytes)
 def ring_bulge(pressed: LocalMap, contact: LocalMap, spread: float) -> LocalMap:
     """Ring that an incompressible gel raises around a contact, b(u, v) >= 0 in mm away from the camera (+z).
 

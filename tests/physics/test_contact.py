@@ -525,3 +525,26 @@ def test_normals_of_a_sphere_and_a_plane():
     assert errors[2] < 3e-4
     tilted = grid_normals(x, x, 0.1 * u - 0.2 * v)
     np.testing.assert_allclose(tilted - np.array([0.1, -0.2, -1]) / math.sqrt(1.05), 0, atol=1e-12)
+
+
+def test_maps_that_are_kept_stay_within_their_memory():
+    """Of many depths of a plate whose maps hold 3 MB; the latest is kept, and the same when it is asked for again. A
+    map that is larger than all that may be kept is kept until the next."""
+    from optics.skin import contact
+
+    def held(cache):
+        return sum(2 * one.values.nbytes for made in cache.values() for one in made)
+
+    plate = indenter_profile("balls", 0.2, extent=6.0, pitch=0.02, spacing=1.0)
+    one, _ = displacement(plate, 0.1, GEL, 0.0)
+    each = 4 * one.values.nbytes
+    assert each == 4 * 8 * 601**2
+    for depth in np.linspace(0.11, 0.13, int(contact.KEPT / each) + 5):
+        latest, _ = displacement(plate, depth, GEL, 0.0)
+    assert contact.KEPT - each < held(displacement.cache) <= contact.KEPT
+    assert displacement(plate, 0.13, GEL, 0.0)[0] is latest
+    assert displacement(plate, 0.1, GEL, 0.0)[0] is not one
+
+    large = contact.kept(lambda made: 2 * contact.KEPT)(lambda number: [number])
+    assert large(1) is large(1) and len(large.cache) == 1
+    assert large(2) is large(2) and len(large.cache) == 1
