@@ -16,7 +16,11 @@ def _leave(number: int, frame: FrameType | None) -> None:
     os._exit(128 + number)
 
 
-_first = threading.current_thread() is threading.main_thread()
+# in the process of a command; in one that it starts, Ctrl-C is ignored, as behind nohup
+_first = (
+    threading.current_thread() is threading.main_thread()
+    and signal.getsignal(signal.SIGINT) is signal.default_int_handler
+)
 _before = signal.signal(signal.SIGINT, _leave) if _first else None
 
 from optics.cli import scenes  # noqa: E402  # isort: skip
