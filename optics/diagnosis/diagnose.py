@@ -29,11 +29,11 @@ from optics.diagnosis.evidence import Candidate, Progress, silent
 from optics.diagnosis.explanations import Outcome
 from optics.diagnosis.findings import basis_of, findings_of, subject_of
 from optics.diagnosis.laws import other_laws
-from optics.diagnosis.refit import Case, Cooled, refit_each
+from optics.diagnosis.refit import Case, Cooled, Expected, after_at, refit_each
 from optics.diagnosis.result import Basis, Diagnosis, Family, Fingerprint, Row, Split, kinds_of
 from optics.diagnosis.score import score
 from optics.diagnosis.text import sentence
-from optics.diagnosis.thresholds import EXCESS, LEVEL, MAX_SPLIT, SHARE, close
+from optics.diagnosis.thresholds import CLEAR, EXCESS, LEVEL, MAX_SPLIT, SHARE, close
 from optics.errors import Underdetermined
 from optics.fit import calibrate
 from optics.fit.model import Model
@@ -64,6 +64,7 @@ def diagnose(
     excluded: Mapping[str, str] | None = None,
     added: Sequence[Effect] = (),
     asked: Collection[str] = (),
+    expected: Sequence[Expected] = (),
 ) -> Diagnosis:
     """Score, refit and judge: which effect a calibrated model lacks.
 
@@ -83,6 +84,7 @@ def diagnose(
 
     added         effects that the model has already, whose laws may differ from the library's (optics.diagnosis.laws)
     asked         names of effects that are refitted, whatever their score
+    expected      what an earlier diagnosis of the study found beside effects that were added since
 
     Raises Underdetermined when the base is not calibrated to convergence, or black level or saturation are unknown;
     ValueError when frames are fitted and held out at once, or none is fitted.
@@ -110,11 +112,16 @@ def diagnose(
         say,
         foresee=foresee,
     )
+    known = {c.effect.name for c in table.order}
+    near = [e for e in expected if e.names <= known]
+    case.expected = [e for e in near if after_at(case, e.values) < case.before - CLEAR]
     if isinstance(evidence.spectrum, st.Sweeps) and evidence.thinning == 1:
         evidence.spectrum.apart = case.session.apart
     basis = basis_of(model, evidence, evidence.structure(evidence.whitened, evidence.base))
     case.places = places = prints.places(model, fit.values, evidence)
     chosen = _choose(case, top, asked)
+    due = {name for e in case.expected if len(e.names) == 1 for name in e.names} - {c.effect.name for c in chosen}
+    chosen += [c for c in table.order if c.effect.name in due]
     fits = refit_each(case, chosen)
     if cooler is not None and (cooled := cooler(_best_first(case, fits))):
         try:
@@ -135,6 +142,7 @@ def diagnose(
                 excluded=excluded,
                 added=added,
                 asked=fits,
+                expected=expected,
             )
         except Underdetermined:  # with priors that count less the base has no end
             pass

@@ -40,7 +40,7 @@ from optics.diagnosis import homogeneity, pairs
 from optics.diagnosis import statistics as st
 from optics.diagnosis.correlation import NOTICED, SHORTEST, Correlation, Readings
 from optics.diagnosis.evidence import Candidate, at_bound, measure, priors, silent
-from optics.diagnosis.refit import FAILURES, START, Case, excess_of, known_of, weighed, with_effects
+from optics.diagnosis.refit import FAILURES, START, Case, excess_of, from_there, known_of, weighed, with_effects
 from optics.diagnosis.result import Explanation, leaves_nothing
 from optics.diagnosis.score import solve
 from optics.diagnosis.session import Frames
@@ -203,6 +203,7 @@ class Outcome:
                     told={c.effect.name: known_of(t.fit, c) for c in t.members if t in self.survivors},
                     same_as=same.get(t.names, ""),
                     larger=t in self.larger,
+                    values=_values(t.fit) if len(t.members) > 1 and t in [*self.survivors, *self.larger] else {},
                 )
             )
         return found
@@ -219,6 +220,10 @@ class Outcome:
             else:
                 first.append(t)
         return found
+
+
+def _values(found: Fit) -> dict[str, dict]:
+    return {"common": dict(found.values.common), "frame": {i: dict(own) for i, own in found.values.frame.items()}}
 
 
 def _distance(one: Trial, other: Trial) -> float:
@@ -294,6 +299,7 @@ def search(case: Case, chosen: Sequence[Candidate], fits: dict[str, Fit]) -> Out
     chosen   effects that were refitted one by one; fits: their fits
     """
     trials = _singly(case, chosen, fits)
+    _expected(case, trials)
     if not case.evidence.is_table:
         untried = _joined(case, trials)
         return replace(compete(case, list(trials.values())), untried=untried)
@@ -314,6 +320,17 @@ def _singly(case: Case, chosen: Sequence[Candidate], fits: dict[str, Fit]) -> di
         if c.effect.name in fits:
             trials[frozenset([c.effect.name])] = _trial(case, [c], fits[c.effect.name])
     return trials
+
+
+def _expected(case: Case, trials: dict[frozenset[str], Trial]) -> None:
+    """Refit the sets that an earlier diagnosis found, from where it left them."""
+    for e in case.expected:
+        members = [_original(case, c) for c in case.table.order if c.effect.name in e.names]
+        if e.names in trials or len(members) < 2 or not _fits_in(case, members):
+            continue
+        found = from_there(case, members, e)
+        if found is not None:
+            trials[e.names] = _trial(case, members, found)
 
 
 def _nothing(case: Case) -> Trial:

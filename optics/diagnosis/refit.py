@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from optics.diagnosis.result import Refit
 from optics.diagnosis.score import Table
 from optics.diagnosis.session import FEWEST_FRAMES, Frames, Session
 from optics.diagnosis.thresholds import CLEAR, JUDGED
-from optics.fit import gauges
+from optics.fit import calibrate, gauges
 from optics.fit.model import Model, value_of
 from optics.fit.result import Fit
 from optics.scene.declare import Effect
@@ -31,6 +31,11 @@ LEFT = 0.1  # of the way to a bound that the base keeps from it, for the same re
 GUIDED = 3.0  # plausible sizes that a start moves the base: beyond, the linearisation is no guide
 LOOKS = 3  # at an effect's image, to find the strength at which it was taken
 SEEN_AT = 0.25  # relative change of the strength below which its image needs no further look
+ROUGH = 0.5  # chi2 per variable at which a refit of a diagnosis, which compares falls far above 1, may stop
+# Of what a refit leaves beyond noise: a promised fall below it is not worth another linearisation. Where misfit is
+# left, falls that differ by less than a fifth decide nothing (`optics.diagnosis.thresholds.MARGIN`).
+COARSE = 0.01
+FEW = 12  # iterations of a refit of images that continues one: it has been brought near
 FAILURES = (ValueError, ArithmeticError, np.linalg.LinAlgError)  # by which a refit says that it has no result
 
 
@@ -47,6 +52,15 @@ class Cooled:
     refit: Callable[..., Fit]
     foresee: Callable[[Sequence[Sequence[Variable]], Progress], None]
     remark: str
+
+
+@dataclass(frozen=True)
+class Expected:
+    """Effects that an earlier diagnosis of the study found beside one that was added since, and where: the values of
+    the fit with all of them. A base that lacks them may have moved to where none of them shows."""
+
+    names: frozenset[str]
+    values: Values
 
 
 @dataclass
@@ -66,6 +80,7 @@ class Case:
     say: Progress
     places: list[dict[str, np.ndarray]] | None = None
     foresee: Callable[[Sequence[Sequence[Variable]], Progress], None] | None = None
+    expected: Sequence[Expected] = ()
 
     @cached_property
     def session(self) -> Session:
@@ -160,7 +175,30 @@ def _best_attempt(case: Case, c: Candidate, predicted: float, linear: np.ndarray
         found = weighed(case, refitted)
         if math.isfinite(found.after) and (best is None or found.fall > best.fall):
             best = found
+    for e in case.expected:
+        if e.names == {c.effect.name} and (best is None or after_at(case, e.values) < best.after - CLEAR):
+            there = from_there(case, [c], e)
+            again = None if there is None else weighed(case, there)
+            if again is not None and math.isfinite(again.after) and (best is None or again.fall > best.fall):
+                best = again
     return best
+
+
+def after_at(case: Case, values: Values) -> float:
+    """chi2 at values, by the base's weights, priors included."""
+    return chi2(case, values)[0] + case.prior_chi2(values)
+
+
+def from_there(case: Case, members: Sequence[Candidate], expected: Expected) -> Fit | None:
+    """The refit of effects from where an earlier diagnosis left them; None without a result."""
+    variables = [*case.base, *(v for c in members for v in c.variables)]
+    again = calibrate.fit  # of readings, to its end
+    if not case.evidence.is_table:
+        again = partial(calibrate.fit, max_iterations=FEW, tolerance=ROUGH, negligible=COARSE)
+    try:
+        return again(case.model, variables, expected.values, list(case.fitted))
+    except FAILURES:
+        return None
 
 
 def with_effects(case: Case, effects: Sequence[tuple[Candidate, np.ndarray]], fraction: float) -> Fit:

@@ -105,6 +105,8 @@ class Explanation:
     same_as      name of a better one that survives and predicts the same values, under another name: no value of these
                  captures can tell the two apart, however often it is taken again; '' for none
     larger       whether it contains one that survives, and has a better score: likelier, but not shown to be needed
+    values       {"common": ..., "frame": ...} of its fit, where it is possible and has several effects: once one of
+                 them is added, the next diagnosis looks for the others there
     """
 
     effects: list[str]
@@ -123,6 +125,7 @@ class Explanation:
     told: dict[str, str] = field(default_factory=dict)
     same_as: str = ""
     larger: bool = False
+    values: dict[str, dict] = field(default_factory=dict, repr=False)
 
     @property
     def possible(self) -> bool:

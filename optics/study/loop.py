@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,7 @@ import numpy as np
 from optics.captures import capture_set as capture_files
 from optics.captures import identity
 from optics.diagnosis.dials import Width, unstated, width_of
+from optics.diagnosis.refit import Expected
 from optics.diagnosis.result import Diagnosis, Row
 from optics.diagnosis.score import SETTLED
 from optics.errors import BadCapture, Underdetermined, UnknownKey
@@ -312,7 +313,7 @@ def examine(
     advised: bool = True,
     without: Sequence[str] = (),
     ranked: Callable[[list[Row]], None] | None = None,
-    remark: str = "",
+    cells: Cells | None = None,
 ) -> Diagnosis:
     """Diagnose the last step, and add the diagnosis with the best effects' fingerprints to its folder. The ranking by
     score is there before anything is refitted.
@@ -320,12 +321,12 @@ def examine(
     without     effects that are not tested
     ranked      called with the rows of that ranking
     advised     where effects tie, also advise what to measure next, which renders frames that nobody has taken yet
-    remark      a warning that the diagnosis gets
+    cells       in which the model is; None: in pixels. What is recorded is in pixels
 
     Raises OutputExists where another process works on the study.
     """
     with record.alone(), model.where_used():
-        return _examined(record, model, setup, found, progress, advised, without, ranked, remark)
+        return _examined(record, model, setup, found, progress, advised, without, ranked, cells)
 
 
 def _examined(
@@ -337,7 +338,7 @@ def _examined(
     advised: bool,
     without: Sequence[str],
     ranked: Callable[[list[Row]], None] | None,
-    remark: str,
+    cells: Cells | None,
 ) -> Diagnosis:
     from optics.diagnosis.advice import advise
     from optics.diagnosis.diagnose import diagnose
@@ -369,9 +370,19 @@ def _examined(
         ranked=keep,
         added=effects_of(record, model.scene.registry),
         excluded=ruled_out,
+        expected=_expected(record, model, cells),
     )
     result.advice = advise(model, result, _freed_as_in(model, found.variables), setup.seed, progress) if advised else []
-    result.warnings += [remark] if remark else []
+    if cells is not None:
+        result.fits = {name: replace(fit, values=cells.values_back(fit.values)) for name, fit in result.fits.items()}
+        for e in result.explanations:
+            if e.values:
+                e.values = _recorded(cells.values_back(_values(e.values)))
+        result.warnings.append(
+            f"images of {cells.width} x {cells.height} px were diagnosed in cells of {cells.k} x {cells.k} px; each "
+            "cell counts as one pixel of this diagnosis. Finer structure, such as a blur or the rim of a shadow, shows "
+            "less"
+        )
     if result.advice:
         result.hints = [hint for hint in result.hints if hint != USUALLY]
     worst = int(np.argmax(np.array(found.frame_chi2) / np.maximum(found.frame_n, 1)))
@@ -399,14 +410,30 @@ def examine_in_cells(
         found = calibrate.fit(
             coarse, variables, start, fitted, max_iterations=FURTHER, negligible=enough, progress=progress
         )
-    k = cells.k
-    remark = (
-        f"images of {cells.width} x {cells.height} px were diagnosed in cells of {k} x {k} px; each cell counts as one "
-        "pixel of this diagnosis. Finer structure, such as a blur or the rim of a shadow, shows less"
-    )
-    result = examine(record, coarse, own, found, progress, advised, without, ranked, remark)
-    result.fits = {name: replace(fit, values=cells.values_back(fit.values)) for name, fit in result.fits.items()}
-    return result
+    return examine(record, coarse, own, found, progress, advised, without, ranked, cells)
+
+
+def _expected(record: Record, model: SceneModel, cells: Cells | None) -> list[Expected]:
+    """What the diagnosis of the step before found beside the effect that this step added."""
+    earlier = record.diagnosis(len(record.steps) - 2) if len(record.steps) > 1 else None
+    if earlier is None or not record.steps[-1]["effect"]:
+        return []
+    added = model.scene.registry.find_effect(record.steps[-1]["effect"]).name
+    found = []
+    for e in earlier.get("explanations", ()):
+        if e.get("values") and added in e["effects"]:
+            values = _values(e["values"])
+            others = frozenset(e["effects"]) - {added}
+            found.append(Expected(others, values if cells is None else cells.values_into(values)))
+    return found
+
+
+def _values(kept: Mapping[str, dict]) -> Values:
+    return Values(dict(kept["common"]), {int(i): dict(own) for i, own in kept["frame"].items()})
+
+
+def _recorded(values: Values) -> dict[str, dict]:
+    return {"common": values.common, "frame": values.frame}
 
 
 def cells_of(record: Record, model: SceneModel) -> Cells | None:

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from optics.diagnosis.refit import Cooled
+from optics.diagnosis.refit import COARSE, FEW, ROUGH, Cooled
 from optics.diagnosis.thresholds import CLEAR, MISSTATED
 from optics.files.output import write_text
 from optics.fit import calibrate
@@ -29,13 +29,8 @@ from optics.study.stages import COOLER, cooled, fit_base, off_neutral
 from optics.version import __version__
 
 PROMISING = 0.7  # of the best fall of chi2: an unconverged refit that falls by more is worth a calibration
-ROUGH = 0.5  # chi2 per variable at which a refit of a diagnosis, which compares falls far above 1, may stop
-# Of what a refit leaves beyond noise: a promised fall below it is not worth another linearisation. Where misfit is
-# left, falls that differ by less than a fifth decide nothing (`optics.diagnosis.thresholds.MARGIN`).
-COARSE = 0.01
 AS_PROMISED = 0.7  # of the promised fall: a calibration that falls by more has not ended in another minimum
 REACH = 3 * CLEAR  # of the best: a refit that stays farther behind, however priors count, is no rival
-FEW = 12  # iterations of a refit that continues one: chord steps have brought it near
 
 
 class Refits:

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from optics.diagnosis import diagnose, explanations, laws, score
+from optics.diagnosis import diagnose, explanations, laws, refit, score
 from optics.diagnosis import statistics as st
 from optics.diagnosis.correlation import Readings
 from optics.diagnosis.result import Fingerprint, Law
@@ -215,6 +215,22 @@ def test_numbers_that_take_the_place_of_a_wander_cost_what_they_could_have_fitte
     assert replace(law, plain=0.0).score > 129.5 - 19.4 + TOLD
     curve = Fingerprint("signal", 149.5, 8, 0.0, 141.5, 1.0, "gain", [], [], [], [], plain=10222.0)
     assert curve.cost - replace(curve, plain=0.0).cost == pytest.approx(57.2 - 23.8, abs=0.1)
+
+
+@pytest.mark.parametrize(("there", "wins"), [(100.0, True), (895.0, False)])
+def test_a_refit_begins_where_an_earlier_diagnosis_had_the_effect(monkeypatch, there, wins):
+    """From the base's own images a refit comes to chi2 = 900. It is tried where the effect had been if that is clearly
+    better already."""
+    asked = []
+    case = SimpleNamespace(expected=[refit.Expected(frozenset(["b"]), "earlier")], before=1000.0)
+    c = SimpleNamespace(effect=SimpleNamespace(name="b"), form="tangent", row=SimpleNamespace(flags=[]))
+    monkeypatch.setattr(refit, "with_effects", lambda *_: "from the base")
+    monkeypatch.setattr(refit, "from_there", lambda *_: asked.append(1) or "from there")
+    monkeypatch.setattr(refit, "after_at", lambda case, values: there)
+    after = {"from the base": 900.0, "from there": 50.0}
+    monkeypatch.setattr(refit, "weighed", lambda case, fit: refit.Attempt(fit, 1000 - after[fit], after[fit], 50.0, []))
+    best = refit._best_attempt(case, c, 100.0, np.array([1.0]))
+    assert (best.fit == "from there") is wins and len(asked) == wins
 
 
 def candidate(name):

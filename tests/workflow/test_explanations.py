@@ -10,10 +10,11 @@ import pytest
 from optics.diagnosis.evidence import Candidate
 from optics.diagnosis.explanations import implausible
 from optics.diagnosis.thresholds import CLEAR, EACH
+from optics.fit.model import value_of
 from optics.scene.declare import Effect
 from optics.scene.parameter import Parameter, Variable
 from optics.study import loop
-from optics.study.setup import setup_for
+from optics.study.setup import effect_variables, setup_for
 
 MALUS = np.arange(-90.0, 91.0, 5.0)
 NOISE = 0.004  # of a reading between parallel films
@@ -76,6 +77,31 @@ def test_what_every_explanation_holds_is_claimed(tmp_path):
     assert "retardance" in d.not_tested and "does not show" in d.sentence
     told = d.survivors[0].told["polarizer misalignment"]
     assert "analyzer.offset - polarizer.offset = 2.0" in told or "analyzer.offset - polarizer.offset = 1.9" in told
+
+
+def test_what_was_found_beside_an_effect_is_looked_for_again_once_that_is_added(tmp_path):
+    """With the leak alone in the model, its base stands elsewhere; the study knows where the misalignment had been."""
+    write(tmp_path / "captures", {"analyzer.angle": MALUS}, noisy(malus(MALUS, offset=2.0, leak=0.02)))
+    setup = setup_for(tmp_path / "captures")
+    record, model, fit = loop.begin(setup, tmp_path / "study")
+    first = loop.examine(record, model, setup, fit, advised=False)
+    pairs = [e for e in first.survivors if "extinction leak" in e.effects]
+    assert pairs and all(len(e.effects) == 2 and e.values["common"] for e in pairs)
+    assert not loop._expected(record, model, None)  # nothing was added yet
+    leak = model.scene.registry.find_effect("extinction leak")
+    fit, _ = loop.extend(record, model, setup, fit, leak)
+    record, model, setup = loop.take_up(tmp_path / "study")  # by another command
+    expected = loop._expected(record, model, None)
+    assert [e.names for e in expected] == [frozenset(e.effects) - {"extinction leak"} for e in pairs]
+    variables = {v.name: v for pair in pairs for e in pair.effects for v in _freed(model, e)}
+    for e, pair in zip(expected, pairs):
+        assert [value_of(model, e.values, variables[n]) for n in pair.variables] == pytest.approx(pair.strength)
+    second = loop.examine(record, model, setup, loop.restore(record, model), advised=False)
+    assert {"polarizer misalignment"} in [set(e.effects) for e in second.survivors], second.sentence
+
+
+def _freed(model, effect):
+    return effect_variables(model, model.scene.registry.find_effect(effect))
 
 
 @pytest.mark.slow
