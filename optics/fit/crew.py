@@ -15,12 +15,13 @@ import time
 import weakref
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from multiprocessing import get_context
+from multiprocessing.connection import Connection
 from typing import TYPE_CHECKING, Any
 
-from optics.processes import cores, for_workers, free_memory, tied, without_ctrl_c
+from optics.processes import cores, for_workers, free_memory, without_ctrl_c
 
 if TYPE_CHECKING:
     from optics.fit.scene_model import SceneModel
@@ -57,6 +58,53 @@ def allowed() -> int:
     return min(_allowed, 1 + int(min(free_memory(), 1e15) // MEMORY))
 
 
+class Gone(RuntimeError):
+    """Another process has died, as for lack of memory."""
+
+
+class Failed(RuntimeError):
+    """Another process met an error, which this one will meet as well."""
+
+
+class Helper:
+    """Another process that has opened the model, and a thread that waits for its answers.
+
+    Each end of their pipe is open in one process alone, so that one sees at once when the other is gone, whatever it
+    was doing."""
+
+    def __init__(self, recipe: Callable[[], SceneModel], count: int):
+        context = get_context("spawn")
+        self.pipe, other = context.Pipe()
+        self.process = context.Process(target=_serve, args=(other, recipe, count), daemon=True)
+        self.process.start()
+        other.close()
+        self.thread = ThreadPoolExecutor(1)
+        self.begun = self.thread.submit(self._answer)
+
+    def make(self, task: Task, frame: int, charge: frozenset[int]) -> Future:
+        return self.thread.submit(self._ask, task, frame, charge)
+
+    def _ask(self, *job: Any) -> Any:
+        try:
+            self.pipe.send(job)
+        except OSError as error:
+            raise Gone from error
+        return self._answer()
+
+    def _answer(self) -> Any:
+        try:
+            made, failed = self.pipe.recv()
+        except (EOFError, OSError) as error:
+            raise Gone from error
+        if failed:
+            raise Failed
+        return made
+
+    def end(self) -> None:
+        self.process.kill()
+        self.thread.shutdown(wait=False, cancel_futures=True)
+
+
 class Crew:
     """The processes that share the frames of a model with this one.
 
@@ -69,24 +117,18 @@ class Crew:
     def __init__(self, recipe: Callable[[], SceneModel], presses: Sequence[int], count: int):
         self.presses, self.count = list(presses), count
         self.charge: dict[int, int] = {}
-        context = get_context("spawn")
-        reader, writer = context.Pipe(duplex=False)
-        threads = max(cores() // count, 1)
         with for_workers(), without_ctrl_c():
-            self.others = [
-                ProcessPoolExecutor(1, context, initializer=tied, initargs=(reader,)) for _ in range(count - 1)
-            ]
-            self.begun = [other.submit(_begin, recipe, threads) for other in self.others]
-        self.end = weakref.finalize(self, _end, writer, self.others)
+            self.others = [Helper(recipe, count) for _ in range(count - 1)]
+        self.end = weakref.finalize(self, _end, self.others)
         self.working = False
 
-    def ready(self) -> bool:
-        """Whether all processes have opened the model. Raises what one of them met."""
-        if not self.working and all(begun.done() for begun in self.begun):
-            for begun in self.begun:
-                begun.result()
+    def ready(self, model: SceneModel) -> bool:
+        """Whether all processes have opened the model. Raises Gone or Failed where one could not."""
+        if not self.working and all(other.begun.done() for other in self.others):
+            for other in self.others:
+                other.begun.result()
             self.working = True
-            _use_threads(max(cores() // self.count, 1))
+            _take_part(model, self.count)
         return self.working
 
     def share(self, frames: Sequence[int]) -> None:
@@ -106,7 +148,7 @@ class Crew:
             self.charge.update(dict.fromkeys(together, k))
 
     def run(self, model: SceneModel, frames: Sequence[int], task: Task) -> Iterator[Any]:
-        """What a task makes of each frame, in their order. Raises BrokenProcessPool where a process has died."""
+        """What a task makes of each frame, in their order. Raises Gone."""
         self.share(frames)
         charges = [frozenset(f for f, own in self.charge.items() if own == k) for k in range(self.count)]
         model.take_charge(charges[0])
@@ -117,7 +159,7 @@ class Crew:
         def send(k: int) -> None:
             if waiting[k]:
                 f = waiting[k].popleft()
-                sent[f] = self.others[k - 1].submit(_do, task, f, charges[k])
+                sent[f] = self.others[k - 1].make(task, f, charges[k])
 
         for k in range(1, self.count):
             for _ in range(AHEAD):
@@ -128,7 +170,10 @@ class Crew:
                 own = waiting[0].popleft()
                 made[own] = task(model, own)
             if k:
-                made[f] = sent.pop(f).result()
+                try:
+                    made[f] = sent.pop(f).result()
+                except Failed:
+                    made[f] = task(model, f)
                 send(k)
             yield made.pop(f)
 
@@ -142,32 +187,38 @@ def _longest(load: Sequence[int], presses: Sequence[Sequence[int]]) -> int:
 
 
 # -- in the other processes ------------------------------------------------------------------------------------------
-_model: SceneModel | None = None
+def _serve(pipe: Connection, recipe: Callable[[], SceneModel], count: int) -> None:
+    """Answer (what was made, whether that failed) until nobody asks any more. Not every error can be sent as it is."""
+    with suppress(EOFError, OSError):  # the other end is gone
+        try:
+            model = recipe()
+            _take_part(model, count)
+        except Exception:
+            pipe.send((None, True))
+            return
+        pipe.send((None, False))
+        while True:
+            task, frame, charge = pipe.recv()
+            made, failed = None, False
+            try:
+                model.take_charge(charge)
+                made = task(model, frame)
+            except Exception:
+                failed = True
+            pipe.send((made, failed))
 
 
-def _begin(recipe: Callable[[], SceneModel], threads: int) -> None:
-    global _model
-    _model = recipe()
-    _use_threads(threads)
-
-
-def _do(task: Task, frame: int, charge: frozenset[int]) -> Any:
-    assert _model is not None
-    _model.take_charge(charge)
-    return task(_model, frame)
-
-
-def _use_threads(count: int) -> None:
+def _take_part(model: SceneModel, count: int) -> None:
+    """Use as many threads, and as much memory, as one of so many processes may."""
     import drjit as dr
 
-    dr.set_thread_count(count)
+    dr.set_thread_count(max(cores() // count, 1))
+    model.renderer.share_memory(count)
 
 
-def _end(writer: Any, others: Sequence[ProcessPoolExecutor]) -> None:
-    """End the processes at once: by the pipe that ties them to this one."""
-    writer.close()
+def _end(others: Sequence[Helper]) -> None:
     for other in others:
-        other.shutdown(wait=False, cancel_futures=True)
+        other.end()
 
 
 # -- when --------------------------------------------------------------------------------------------------------
@@ -187,7 +238,7 @@ class Hands:
                 for made in crew.run(model, frames, task):
                     yield made
                     done += 1
-            except BrokenProcessPool:  # killed, as for lack of memory
+            except Gone:
                 self.give_up(model)
         for frame in frames[done:]:
             began = time.perf_counter()
@@ -203,9 +254,9 @@ class Hands:
                 return None
             self.crew = Crew(recipe, model.presses, processes)
         try:
-            if self.crew is None or not self.crew.ready():
+            if self.crew is None or not self.crew.ready(model):
                 return None
-        except Exception:  # the files may be gone
+        except (Gone, Failed):
             self.give_up(model)
         return self.crew
 
@@ -215,6 +266,7 @@ class Hands:
         if self.crew is not None:
             self.crew.end()
             self.crew = None
+        _take_part(model, 1)
         model.take_charge(frozenset(range(len(model.frames))))
 
 

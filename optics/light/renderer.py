@@ -24,6 +24,7 @@ import numpy as np
 
 from optics.errors import BadScene
 from optics.light import paths
+from optics.processes import return_memory
 from optics.scene.loader import Scene
 from optics.scene.mitsuba_parts import DEFAULT_VARIANT
 
@@ -175,6 +176,7 @@ class Renderer:
         self._still = {k: scene.parameters[k].neutral for k in self.ambient_keys}
         self._tangents: OrderedDict = OrderedDict()
         self._kept_rays = 0.0  # camera rays that are kept, at most
+        self.memory = MEMORY  # bytes; less of it where several processes share the frames
         self.together: set[str] = set()  # LEDs whose images are wanted of the same geometry
         self.asked: set[str] = set()  # parameters whose tangents will be asked for, see `asking`
         self._slopes: dict[tuple, tuple[LedImage, dict[str, tuple]]] = {}  # those that were made with others
@@ -298,11 +300,11 @@ class Renderer:
         return np.where(hits.valid, np.linalg.norm(hits.position - hits.eye, axis=-1), np.inf)
 
     def _make_room(self, latest: Hits, added: int) -> None:
-        """Forget the oldest geometries while what is kept is larger than MEMORY: large images with many rims.
+        """Forget the oldest geometries while what is kept is larger than `memory`: large images with many rims.
 
         added   camera rays that were kept since; all are counted again only where there may be too many"""
         self._kept_rays += added
-        if PER_RAY * self._kept_rays <= MEMORY:
+        if PER_RAY * self._kept_rays <= self.memory:
             return
         images = self._images.values()
         rays: dict[Hits, dict[int, int]] = {}  # geometry -> ends of camera rays by the samples that hold them
@@ -312,17 +314,22 @@ class Renderer:
             rays[image.hits][id(image.finer)] = image.finer.size
         size = {hits: PER_RAY * sum(own.values()) for hits, own in rays.items()}
         total = sum(size.values())
-        if total > MEMORY:
+        if total > self.memory:
             import drjit as dr
 
             dr.flush_malloc_cache()  # Dr.Jit keeps what is released, in sizes that the next geometry does not ask for
+            return_memory()
         for old in [hits for hits in size if hits is not latest]:
-            if total <= MEMORY:
+            if total <= self.memory:
                 break
             total -= size[old]
             self._hits = OrderedDict((k, h) for k, h in self._hits.items() if h is not old)
             self._images = OrderedDict((k, i) for k, i in self._images.items() if i.hits is not old)
         self._kept_rays = total / PER_RAY
+
+    def share_memory(self, count: int) -> None:
+        """Keep a part of what a renderer keeps, as one of so many processes that share the frames."""
+        self.memory = MEMORY / count
 
     def forget_hits(self) -> None:
         """Release the kept hits: a search over many geometries returns to none of them."""

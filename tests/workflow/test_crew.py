@@ -131,8 +131,7 @@ def test_the_numbers_are_those_of_one_process(setup, at_work):
     with two.where_used():
         assert all(np.allclose(a, b, rtol=1e-6) for a, b in zip(one.predict(values), two.predict(values)))
 
-    (process,) = two.hands.crew.others[0]._processes.values()
-    os.kill(process.pid, signal.SIGKILL)
+    os.kill(two.hands.crew.others[0].process.pid, signal.SIGKILL)
     assert all(np.allclose(a, b, rtol=1e-6) for a, b in zip(one.predict(values), two.predict(values)))
     assert two.hands.alone and two.hands.crew is None
     assert two.companions == one.companions
