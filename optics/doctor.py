@@ -35,7 +35,7 @@ PROBE_SECONDS = 60.0  # a trial takes a quarter of a second; a cold disk or a lo
 PINS = {"mitsuba": "3.9.1", "drjit": "1.5.0"}
 PACKAGES = (
     *PINS, "numpy", "scipy", "trimesh", "OpenEXR", "colour-science", "scikit-image", "pillow", "tifffile", "rich",
-    "typer", "pydantic", "matplotlib", "tomlkit", "jinja2", "pyyaml",
+    "typer", "pydantic", "matplotlib", "tomlkit", "jinja2", "pyyaml", "cachetools",
 )  # fmt: skip
 
 

@@ -235,8 +235,9 @@ def beside_shared_noise(
         if not 0 < dof < before.free:
             continue
         fall = reached - after.deviance(scale)
-        p, plain = _chance(evidence, fall, dof, before.free, reached), (before.white - after.white) / scale
-        judged.append(replace(f, fall=fall, dof=dof, p=p, net=fall - dof, plain=plain))
+        judged.append(
+            replace(f, fall=fall, dof=dof, p=_chance(evidence, fall, dof, before.free, reached), net=fall - dof)
+        )
     return judged
 
 

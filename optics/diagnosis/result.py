@@ -259,7 +259,6 @@ class Fingerprint:
     family      what the coordinate belongs to (`optics.diagnosis.fingerprints`)
     share       of the excess misfit, NaN within noise
     size        rms change that it makes, over the rms signal
-    plain       fall of chi2 as if neighbours shared no noise, where `fall` is of deviance
     per_frame   whether nobody set the coordinate: the fit solves for it frame by frame, or it is a gain of each frame.
                 With a bin for each of its values the curve is that along 'frame' by another name
     """
@@ -280,17 +279,13 @@ class Fingerprint:
     unit: str = ""
     size: float = 0.0
     per_frame: bool = False
-    plain: float = 0.0
 
     @property
     def cost(self) -> float:
         """dof ln(1 + fall/dof) + 3 ln(1 + (size/USUAL)^2/2) + EACH: what so many bins could have fitted, whatever the
         data are, with a prior as wide as the curve that was found; how far that width is from usual; and the odds that
-        an unknown cause acts. The same three costs as of an effect (`optics.diagnosis.explanations`).
-
-        The fall is that of `plain` where that is larger: where the curve is the cause there is no noise that wanders,
-        and the data know its numbers as well as they know the strength of an effect."""
-        return occam(self.dof, self.fall, self.plain) + 3 * math.log1p((self.size / USUAL) ** 2 / 2) + EACH
+        an unknown cause acts. The same three costs as of an effect (`optics.diagnosis.explanations`)."""
+        return occam(self.dof, self.fall) + 3 * math.log1p((self.size / USUAL) ** 2 / 2) + EACH
 
 
 @dataclass(frozen=True)
@@ -299,7 +294,7 @@ class Law:
 
     fall, dof   with so many further strengths, of chi2 or, of readings, of deviance (optics.diagnosis.correlation)
     p           of that fall in noise
-    plain       as of `Fingerprint`
+    plain       fall of chi2 as if neighbours shared no noise, where `fall` is of deviance
     """
 
     effect: str
@@ -311,7 +306,9 @@ class Law:
 
     @property
     def cost(self) -> float:
-        """As of `Fingerprint`: what so many numbers could have fitted."""
+        """What so many numbers could have fitted. By the larger fall: where the law is the cause no lamp wanders, and
+        the data know its numbers as well as they know the strength of an effect. Curves of unknown causes pay less, by
+        their fall beside a lamp that wanders: an effect must not win over one by the curve's price alone."""
         return occam(self.dof, self.fall, self.plain)
 
     @property

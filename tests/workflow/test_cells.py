@@ -73,7 +73,7 @@ def test_a_refit_is_taken_up_again(tmp_path, monkeypatch):
     base.normal = object()  # chord steps are possible
     plugin = tmp_path / "mine.py"
     plugin.write_text("one law")
-    registry = SimpleNamespace(files=[plugin], name_of=lambda file: file.name)
+    registry = SimpleNamespace(files=[plugin], own_files=[plugin], name_of=lambda file: file.name)
     model = SimpleNamespace(captures=SimpleNamespace(table=None), scene=SimpleNamespace(registry=registry))
     first = Refits(model, Setup("captures"), base, [], tmp_path / "refits")
     made = Fit(
