@@ -3,7 +3,7 @@
 Most of the time that a fit of images takes is spent in recording kernels, which is done on one core. A model that can
 be opened again (`SceneModel.recipe`) is opened in further processes once a fit has taken START seconds, and each of
 them then makes the images of frames of its own: all frames of a press where there are presses enough, as they share
-what was traced. Every number is the same as that of one process.
+what was traced. The numbers are those of one process, to rounding.
 
 Off until `use_processes` is called, as the command line does: Python starts a process by importing the caller's script
 again, and a script must be written for that (`if __name__ == "__main__":`)."""
