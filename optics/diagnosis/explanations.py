@@ -203,7 +203,7 @@ class Outcome:
                     told={c.effect.name: known_of(t.fit, c) for c in t.members if t in self.survivors},
                     same_as=same.get(t.names, ""),
                     larger=t in self.larger,
-                    values=_values(t.fit) if len(t.members) > 1 and t in [*self.survivors, *self.larger] else {},
+                    values=t.fit.values.record() if len(t.members) > 1 and t in [*self.survivors, *self.larger] else {},
                 )
             )
         return found
@@ -220,10 +220,6 @@ class Outcome:
             else:
                 first.append(t)
         return found
-
-
-def _values(found: Fit) -> dict[str, dict]:
-    return {"common": dict(found.values.common), "frame": {i: dict(own) for i, own in found.values.frame.items()}}
 
 
 def _distance(one: Trial, other: Trial) -> float:
@@ -325,7 +321,7 @@ def _singly(case: Case, chosen: Sequence[Candidate], fits: dict[str, Fit]) -> di
 def _expected(case: Case, trials: dict[frozenset[str], Trial]) -> None:
     """Refit the sets that an earlier diagnosis found, from where it left them."""
     for e in case.expected:
-        members = [_original(case, c) for c in case.table.order if c.effect.name in e.names]
+        members = [c for c in case.table.order if c.effect.name in e.names]
         if e.names in trials or len(members) < 2 or not _fits_in(case, members):
             continue
         found = from_there(case, members, e)

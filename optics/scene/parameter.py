@@ -283,5 +283,13 @@ class Values:
             for index in variable.frames:
                 self.frame.setdefault(index, {}).update({key: float(value) for key in variable.keys})
 
+    def record(self) -> dict[str, dict]:
+        """As JSON keeps them, for `of_record`."""
+        return {"common": dict(self.common), "frame": {str(i): dict(own) for i, own in self.frame.items()}}
+
+    @classmethod
+    def of_record(cls, kept: Mapping[str, Any]) -> Values:
+        return cls(dict(kept["common"]), {int(i): dict(own) for i, own in kept["frame"].items()})
+
     def copy(self) -> Values:
         return Values(dict(self.common), {index: dict(own) for index, own in self.frame.items()})

@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 import os
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -377,7 +377,7 @@ def _examined(
         result.fits = {name: replace(fit, values=cells.values_back(fit.values)) for name, fit in result.fits.items()}
         for e in result.explanations:
             if e.values:
-                e.values = _recorded(cells.values_back(_values(e.values)))
+                e.values = cells.values_back(Values.of_record(e.values)).record()
         result.warnings.append(
             f"images of {cells.width} x {cells.height} px were diagnosed in cells of {cells.k} x {cells.k} px; each "
             "cell counts as one pixel of this diagnosis. Finer structure, such as a blur or the rim of a shadow, shows "
@@ -422,18 +422,10 @@ def _expected(record: Record, model: SceneModel, cells: Cells | None) -> list[Ex
     found = []
     for e in earlier.get("explanations", ()):
         if e.get("values") and added in e["effects"]:
-            values = _values(e["values"])
+            values = Values.of_record(e["values"])
             others = frozenset(e["effects"]) - {added}
             found.append(Expected(others, values if cells is None else cells.values_into(values)))
     return found
-
-
-def _values(kept: Mapping[str, dict]) -> Values:
-    return Values(dict(kept["common"]), {int(i): dict(own) for i, own in kept["frame"].items()})
-
-
-def _recorded(values: Values) -> dict[str, dict]:
-    return {"common": values.common, "frame": values.frame}
 
 
 def cells_of(record: Record, model: SceneModel) -> Cells | None:

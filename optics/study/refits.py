@@ -219,8 +219,7 @@ class Refits:
             "variables": [v.name for v in found.variables],
             "estimate": [float(e) for e in found.estimate],
             "covariance": [[float(c) for c in row] for row in found.covariance],
-            "common": found.values.common,
-            "frame": {str(i): own for i, own in found.values.frame.items()},
+            **found.values.record(),
             **{k: getattr(found, k) for k in ("chi2", "dof", "frame_chi2", "frame_n", "converged", "reason")},
         }
         write_text(self.file_of([v.name for v in extra]), json.dumps(record))
@@ -231,7 +230,7 @@ class Refits:
         try:
             record = json.loads(file.read_text(encoding="utf-8"))
             return Fit(
-                Values(dict(record["common"]), {int(i): dict(own) for i, own in record["frame"].items()}),
+                Values.of_record(record),
                 [variables[name] for name in record["variables"]],
                 np.array(record["estimate"], float),
                 np.array(record["covariance"], float),
