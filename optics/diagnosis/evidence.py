@@ -379,9 +379,9 @@ def measure(
     noisy: set[int] = set()
     seconds: Iterator[tuple[np.ndarray | None, dict[int, np.ndarray]]] = iter(())
     signal = variance = 0.0
+    say(what, 0, len(frames))
     firsts = layout.images(model, values, frames, seeds[0])
     for n, (frame, plain, (own, first)) in enumerate(zip(frames, model.predict(values, frames), firsts)):
-        say(what, n, len(frames))
         prediction = np.asarray(plain, float)
         second: dict[int, np.ndarray] = {}
         if n == 0:
@@ -400,7 +400,7 @@ def measure(
         use, sigma = evidence.use[-1], evidence.sigma[-1]
         signal += float(prediction[use].sum())
         variance += float((sigma[use].astype(float) ** 2).sum())
-    say(what, len(frames), len(frames))
+        say(what, n + 1, len(frames))
     _require_values(evidence)
     count = evidence.normal.count
     evidence.signal = signal / count - float(model.noise.black_level)
