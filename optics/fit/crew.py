@@ -1,7 +1,7 @@
 """`Crew`: further processes that make images of a model, frame by frame.
 
-Most of the time that a fit of images takes is spent in recording kernels, which is done on one core. A model that can
-be opened again (`SceneModel.recipe`) is opened in further processes once a fit has taken START seconds, and each of
+A fit of images keeps little more than one core busy, as Python records what Dr.Jit then runs. A model that can be
+opened again (`SceneModel.recipe`) is opened in further processes once a fit has taken START seconds, and each of
 them then makes the images of frames of its own: all frames of a press where there are presses enough, as they share
 what was traced. The numbers are those of one process, to rounding.
 

@@ -76,7 +76,7 @@ def test_the_environment_says_how_many(monkeypatch):
 
 @pytest.fixture(scope="module")
 def setup(tmp_path_factory, mitsuba):
-    """Three presses, each under two of the LEDs and under the others; the second has more frames than the others."""
+    """Three presses of one to three frames, each frame under two of the six LEDs."""
     rng = np.random.default_rng(5)
     frames = []
     for press, count in ((0, 2), (1, 3), (2, 1)):
@@ -112,7 +112,8 @@ def at_work(monkeypatch):
 
 
 def test_the_numbers_are_those_of_one_process(setup, at_work):
-    """Fits within a mask, predictions, secants; a process that dies leaves its frames to the other."""
+    """Normal equations, secants, predictions; a process that dies leaves its frames to the other. Tolerances are of
+    single precision: threads of another number sum in another order, and a secant divides a difference."""
     one, two = open_model(setup), at_work(open_model(setup))
     frames = list(range(len(one.frames)))
     variables = variables_of_base(one, setup, frames)
