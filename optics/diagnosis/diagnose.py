@@ -149,7 +149,7 @@ def diagnose(
         else:
             again.warnings.append(cooled.remark)
             return again
-    outcome = explanations.search(case, chosen, fits)
+    outcome, levels = held.judge(case, explanations.search(case, chosen, fits))
     subject, best = subject_of(outcome), outcome.best
 
     reference = best.fall - best.expectation if subject else max([c.row.net for c in table.order], default=0.0)
@@ -158,8 +158,6 @@ def diagnose(
     beside = case.session if evidence.is_table else None if best.by_frame else case.lamp
     laws = other_laws(model, evidence, places, added, variables_of, outcome.scale, beside)
     splits, chance = _split(case, outcome, subject, basis)
-    wander = 0.0 if case.evidence.is_table else explanations.wander_of(case, outcome, best)
-    levels = held.levels(case, best.members, best.fit, wander)
     shifts = held.shifts(case, best.members, best.fit) if subject else []
 
     findings = findings_of(case, outcome, fingerprints, laws, splits, chance, levels, basis)

@@ -135,6 +135,7 @@ class Outcome:
     shared       whether noise that neighbouring readings share explains it as well as the best does
     wander       rms of such noise over that of the signal, where nothing else explains it
     untried      pairs of effects of images that may do better than the best by their scores, and were not refitted
+    refuted      explanations that would survive, but for the frames that were held out (`optics.diagnosis.held_out`)
     """
 
     leader: Trial
@@ -148,6 +149,7 @@ class Outcome:
     wander: float = 0.0
     larger: list[Trial] = field(default_factory=list)
     untried: list[frozenset[str]] = field(default_factory=list)
+    refuted: list[Trial] = field(default_factory=list)
 
     @property
     def core(self) -> list[str]:
@@ -177,10 +179,10 @@ class Outcome:
         return trial.fall - self.without(trial, name).fall
 
     def told(self) -> list[Explanation]:
-        """All trials as records, best first."""
+        """All trials as records, the best first and those that were refuted last."""
         found: list[Explanation] = []
         same = self._same_as()
-        for t in self.trials:
+        for t in [*self.trials, *self.refuted]:
             sd = {v.name: float(s) for v, s in zip(t.fit.variables, t.fit.sd)}
             variables = [v for c in t.members for v in c.variables]
             estimates = {v.name: float(e) for v, e in zip(t.fit.variables, t.fit.estimate)}
@@ -203,6 +205,7 @@ class Outcome:
                     told={c.effect.name: known_of(t.fit, c) for c in t.members if t in self.survivors},
                     same_as=same.get(t.names, ""),
                     larger=t in self.larger,
+                    refuted=t in self.refuted,
                     values=t.fit.values.record() if len(t.members) > 1 and t in [*self.survivors, *self.larger] else {},
                 )
             )
@@ -676,6 +679,16 @@ def compete(case: Case, trials: list[Trial]) -> Outcome:
         if t is not leader:
             outcome.leads[t.names] = _lead(case, outcome, leader, t)
     return _with_survivors(case, outcome)
+
+
+def beside_refuted(case: Case, outcome: Outcome, refuted: Sequence[Trial]) -> Outcome:
+    """The competition of all other explanations; those that held-out frames refute stay in its record."""
+    gone = [*outcome.refuted, *refuted]
+    rest = compete(case, [t for t in outcome.trials if t not in gone])
+    rest = _weighed_by_blocks(case, rest) if case.evidence.is_table else replace(rest, untried=outcome.untried)
+    rest.leads.update({t.names: _lead(case, rest, rest.leader, t) for t in gone})
+    rest.refuted = gone
+    return rest
 
 
 def wander_of(case: Case, outcome: Outcome, trial: Trial) -> float:

@@ -13,15 +13,45 @@ import numpy as np
 
 from optics.diagnosis import statistics as st
 from optics.diagnosis.evidence import Candidate
+from optics.diagnosis.explanations import Outcome, Trial, beside_refuted, wander_of
 from optics.diagnosis.refit import Case, chi2
 from optics.diagnosis.result import Level, Shift
+from optics.diagnosis.thresholds import TOLD
 from optics.fit.calibrate import for_frames
 from optics.fit.model import Model, value_of
 from optics.fit.result import Fit
 from optics.scene.parameter import Values, Variable
 
 SQUARES = 4  # fields per side of a held-out frame that is judged in halves
+ASKED = 6  # explanations, the best first, that must predict the held-out frames: each costs a fit of their poses
 MOVED = 3.0  # standard deviations, of the fit or of the prior, that a parameter must have moved to be reported
+
+
+def judge(case: Case, outcome: Outcome) -> tuple[Outcome, list[Level]]:
+    """The competition when explanations must predict the frames that were held out, and the levels of its best.
+
+    Of explanations that the fitted frames do not tell apart, one is refuted where held-out frames are predicted worse
+    with it than without anything, by TOLD (chi2 in units of what the best explanation leaves) and in most of them,
+    while another one predicts them better: a dial that is thought to be eccentric fits three angles, and misses the
+    fourth."""
+    found: dict[frozenset[str], list[Level]] = {}
+
+    def levels_of(t: Trial) -> list[Level]:
+        if t.names not in found:
+            wander = 0.0 if case.evidence.is_table else wander_of(case, outcome, t)
+            found[t.names] = levels(case, t.members, t.fit, wander)
+        return found[t.names]
+
+    while case.held_out and len(outcome.survivors) > 1:
+        last = [(t, levels_of(t)[-1]) for t in outcome.survivors[:ASKED] if t.members]
+        kept = [t for t, level in last if level.fall > 0]
+        refuted = [
+            t for t, level in last if level.fall < -TOLD * outcome.scale and 2 * level.frames_better < level.frames
+        ]
+        if not (kept and refuted):
+            break
+        outcome = beside_refuted(case, outcome, refuted)
+    return outcome, levels_of(outcome.best)
 
 
 def levels(case: Case, members: Sequence[Candidate], with_them: Fit, wander: float = 0.0) -> list[Level]:

@@ -410,6 +410,7 @@ def _explanation_lines(d: Diagnosis) -> list[str]:
         return []
     alive = [e for e in d.explanations if e.possible]
     others = [e for e in d.explanations if e.effects and not e.possible]
+    others.sort(key=lambda e: not e.refuted)
     head = ("explanation", "fall", "cost", "excess left", "behind", "needed", "blocks left out", "")
     lines = []
     for e in [*alive[:6], *others[:5]]:
@@ -417,6 +418,7 @@ def _explanation_lines(d: Diagnosis) -> list[str]:
         behind, needed = ("-", "-") if e in alive[:1] else (f"{e.lead:.3g}", f"{e.needed:.3g}")
         more = "contains a survivor, and is likelier" if e.larger else "contains a survivor"
         mark = "survives" if e.survives else more if e.larger or not e.lead > e.needed else ""
+        mark = "held-out frames refute it" if e.refuted else mark
         lines.append((e.name, f"{e.fall:.4g}", f"{e.cost:.3g}", f"{e.excess_sd:.2g} sd", behind, needed, blocks, mark))
     return [
         "",

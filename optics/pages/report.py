@@ -1234,6 +1234,7 @@ def _explanations(d: Mapping) -> list[dict]:
         return bool(e.get("survives") or e.get("larger"))
 
     alive, others = ([e for e in sets if possible(e) == wanted] for wanted in (True, False))
+    others.sort(key=lambda e: not e.get("refuted"))  # the reason is not in the other columns
     return [
         {
             "name": " + ".join(e["effects"]),
@@ -1243,10 +1244,17 @@ def _explanations(d: Mapping) -> list[dict]:
             "lead": "–" if e in alive[:1] else _text(as_float(e.get("lead")), "{:.3g}"),
             "needed": "–" if e in alive[:1] else _text(as_float(e.get("needed")), "{:.3g}"),
             "survives": possible(e),
-            "why": "" if as_float(e.get("lead")) > as_float(e.get("needed")) else "contains a survivor",
+            "why": _why_not(e),
         }
         for e in [*alive[:8], *others[:4]]
     ]
+
+
+def _why_not(e: Mapping) -> str:
+    """Why a set of effects does not survive, where its score does not say so."""
+    if e.get("refuted"):
+        return "held-out frames refute it"
+    return "" if as_float(e.get("lead")) > as_float(e.get("needed")) else "contains a survivor"
 
 
 def _pairs(d: Mapping) -> dict | None:

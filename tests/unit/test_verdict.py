@@ -218,6 +218,40 @@ def test_what_the_data_cannot_tell_apart_is_a_set():
     assert any("needs" in h for h in d.hints) and any("radius" in h for h in d.hints)
 
 
+class Twins(MockModel):
+    """A fall-off that is vignetting in the frames that are fitted, and its opposite in those that are held out."""
+
+    key = "sensor.red_drift"
+
+    def __init__(self, *args):
+        super().__init__(*args)
+        self.parameters[self.key] = replace(self.parameters["sensor.vignetting"], name="red_drift", bounds=(-1.0, 1.0))
+
+    def _at(self, values, frame):
+        return {**super()._at(values, frame), "sign": 1 if frame in FITTED else -1}
+
+    def _image(self, v):
+        falls_off = v["sensor.vignetting"] + v["sign"] * v[self.key]
+        return super()._image({**v, self.key: 0.0, "sensor.vignetting": falls_off})
+
+
+@pytest.mark.parametrize("true, word, told", [(0.1, "CLAIM", ["twin"]), (0.0, "AMBIGUOUS", [])])
+def test_held_out_frames_rule_out_what_they_refute(true, word, told):
+    """Fitted frames do not tell the two apart; held-out frames do, if they miss one of them as well as predict the other:
+    those without any fall-off are predicted better without either."""
+    model = Twins(PRESSES, 22)
+    truth = [0.1] * len(FITTED) + [true] * len(HELD)
+    values = simulate(model, np.random.default_rng(1), {"vignetting": truth})
+    fit = mock_fit(model, model.base_variables(FITTED), values, FITTED)
+    twin = Effect("twin", "camera", ("red_drift",), acts=("radius",))
+    d = judge(model, fit, (*library("vignetting", "gamma"), twin))
+    assert d.word == word and [e.name for e in d.explanations if e.refuted] == told
+    if told:
+        assert d.claimed == "vignetting" and "held-out frames refute it" in d.text()
+    else:
+        assert {"vignetting", "twin"} <= set(d.ambiguous) and d.levels[-1].fall < 0
+
+
 def test_clutter_alone_is_not_an_effect():
     d = judge(*calibrated(clutter=0.5), library("vignetting", "LED lobe", "crosstalk", "gamma", "albedo gradient"))
     assert d.word in ("UNKNOWN", "CANNOT_TELL") and d.basis.excess_sd > 20
