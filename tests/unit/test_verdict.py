@@ -237,8 +237,8 @@ class Twins(MockModel):
 
 @pytest.mark.parametrize("true, word, told", [(0.1, "CLAIM", ["twin"]), (0.0, "AMBIGUOUS", [])])
 def test_held_out_frames_rule_out_what_they_refute(true, word, told):
-    """Fitted frames do not tell the two apart; held-out frames do, if they miss one of them as well as predict the other:
-    those without any fall-off are predicted better without either."""
+    """Fitted frames do not tell the two apart. Held-out frames do if one predicts them and the other misses them; where
+    they have no fall-off at all, both miss them."""
     model = Twins(PRESSES, 22)
     truth = [0.1] * len(FITTED) + [true] * len(HELD)
     values = simulate(model, np.random.default_rng(1), {"vignetting": truth})
