@@ -36,6 +36,8 @@ ROUGH = 0.5  # chi2 per variable at which a refit of a diagnosis, which compares
 # left, falls that differ by less than a fifth decide nothing (`optics.diagnosis.thresholds.MARGIN`).
 COARSE = 0.01
 FEW = 12  # iterations of a refit of images that continues one: it has been brought near
+# A calibration that continues another one of images, for a diagnosis
+further = partial(calibrate.fit, max_iterations=FEW, tolerance=ROUGH, negligible=COARSE)
 FAILURES = (ValueError, ArithmeticError, np.linalg.LinAlgError)  # by which a refit says that it has no result
 
 
@@ -192,9 +194,7 @@ def after_at(case: Case, values: Values) -> float:
 def from_there(case: Case, members: Sequence[Candidate], expected: Expected) -> Fit | None:
     """The refit of effects from where an earlier diagnosis left them; None without a result."""
     variables = [*case.base, *(v for c in members for v in c.variables)]
-    again = calibrate.fit  # of readings, to its end
-    if not case.evidence.is_table:
-        again = partial(calibrate.fit, max_iterations=FEW, tolerance=ROUGH, negligible=COARSE)
+    again = calibrate.fit if case.evidence.is_table else further  # of readings, to its end
     try:
         return again(case.model, variables, expected.values, list(case.fitted))
     except FAILURES:

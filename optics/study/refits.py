@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from optics.diagnosis.refit import COARSE, FEW, ROUGH, Cooled
+from optics.diagnosis.refit import COARSE, ROUGH, Cooled, further
 from optics.diagnosis.thresholds import CLEAR, MISSTATED
 from optics.files.output import write_text
 from optics.fit import calibrate
@@ -117,17 +117,7 @@ class Refits:
         if quick.converged or not max(self.fall(quick), quick.promised) > PROMISING * leader:
             return quick
         asked = self.minimised(self.base) - PROMISING * leader
-        further = calibrate.fit(
-            self.model,
-            variables,
-            quick.values,
-            frames,
-            max_iterations=FEW,
-            tolerance=ROUGH,
-            negligible=COARSE,
-            asked=asked,
-        )
-        best = min((further, quick), key=self.minimised)
+        best = min((further(self.model, variables, quick.values, frames, asked=asked), quick), key=self.minimised)
         if self.fall(best) > AS_PROMISED * quick.promised or self.minimised(best) > asked:
             return best
         values = off_neutral(self.model, Values(dict(self.setup.values)), extra)

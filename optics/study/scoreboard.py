@@ -127,6 +127,7 @@ def _jobs(
     captures: Sequence[str | Path], studies: Sequence[str | Path], plugins: Named
 ) -> list[tuple[Path, list[Ladder]]]:
     """Each capture folder with its studies; twice, where studies of it hold out different groups."""
+    studies = list({os.path.realpath(s): s for s in reversed(studies)}.values())[::-1]  # one that is named twice, once
     names = [Path(os.path.abspath(s)).name for s in studies]
     found: dict[tuple[Path, tuple[int, ...]], list[Ladder]] = {}
     for folder, name in zip(map(Path, studies), names):
