@@ -13,7 +13,8 @@ Derived, not measured, and said so in these files:
     depth      from a touched radius a = contact_share times the circle's radius: skirt a/sqrt(R^2 - a^2) + R - sqrt(R^2
                - a^2)
     gain       of every frame and channel: median of frame over background, beyond three circle radii
-    background per-pixel median of all presses, or a given image
+    background per-pixel median of all presses; or of each press the mean of those next to it, if the untouched sensor
+               changes during the session (`optics.captures.backgrounds`); or a given image
     noise      variance against signal of half the squared differences of successive frames beyond three circle radii
     black      values that are cut off below (`corrections.black_levels`): masked, of blocks the whole block
     lights     per channel the direction l of the least-squares fit I - B = l.(n - n0) on the labelled balls, at 16 mm
@@ -33,6 +34,7 @@ from pathlib import Path
 
 import numpy as np
 
+from optics.captures import backgrounds
 from optics.captures import capture_set as capture_sets
 from optics.captures.capture_set import Captures, Frame
 from optics.captures.corrections import at_black, black_levels, black_text, correction, drift_text, sentences
@@ -65,8 +67,9 @@ PRIORS = {
     "gel.press_[xy]": 0.4,
     "gel.press_depth": 0.5,
 }  # sd about the imported value, in the parameter's unit
+BEHIND = {"median": " of the presses, per pixel", "near": ": of each press, the mean of those before and after it"}
 EXTRAS = ("scene.xml", "import.json", "README.txt")
-BACKGROUNDS = ("median", "given")
+BACKGROUNDS = ("median", "near", "given")
 
 
 @dataclass
@@ -111,7 +114,8 @@ def import_taxim(
     ball_radius   mm; None: 2, half the diameter that its authors give
     mm_per_pixel  None: `sensor: pixmm` of the params.json beside the pack; without one, for images SMALL px wide, the
                   authors' 0.1245 mm/px, held against 4 x 0.03 mm/px as a second route to the same scale
-    background    None: the median, but f0 where presses crowd over half of the images and a median would show them
+    background    None: f0 where presses crowd over half of the images and a median would show them, else as in
+                  `import_presses`
     Options as in `import_presses`. Raises BadCapture."""
     path = pack_of(Path(pack))
     presses = read_taxim(path)
@@ -131,7 +135,7 @@ def import_taxim(
     if background is None:
         crowd = _covered(presses)
         crowded = presses.given is not None and (crowd > CROWDED or len(presses.images) < MEDIAN_OF)
-        background = "given" if crowded else "median"
+        background = "given" if crowded else None
         if crowded:
             remarks.append(
                 f"{crowd:.0%} of the presses lie over one pixel: their median would show the contact, so that f0 is "
@@ -162,7 +166,7 @@ def import_circles(
     """Import a folder of images and a CSV file of circles with the columns file, center_x_px, center_y_px,
     contact_radius_px.
 
-    untouched  an image of the sensor without contact; None: the per-pixel median of the presses is the background
+    untouched  an image of the sensor without contact; None: the background comes from the presses
     Options as in `import_presses`. Raises BadCapture.
     """
     presses = read_circles(images, circles)
@@ -327,7 +331,7 @@ def import_presses(
     gel_thickness: float = 4.0,
     skirt: float = 0.8,
     contact_share: float = 0.85,
-    background: str = "median",
+    background: str | None = None,
     leds: int = 3,
     bin: int = 1,
     every: int = 1,
@@ -341,7 +345,8 @@ def import_presses(
     mm_per_pixel_check  mm/px by a second route, or None; a disagreement above 1 % is a warning
     camera_distance     mm from the face to the camera's centre of projection
     skirt               mm, start of `gel.skirt`;   contact_share  start of touched over labelled radius
-    background          'median' of the presses or 'given' (the image of the untouched sensor)
+    background          'median' of the presses, 'near' (of the presses before and after each) or 'given' (the image of
+                        the untouched sensor); None: 'near' where it leaves clearly less than the median
     leds                3: one per channel; 6: shared by the channels, each with a power per channel
     bin                 pixels per side that are averaged into one; a block with a saturated pixel stays saturated
     every               take every n-th press; background and noise come from all of them
@@ -364,17 +369,28 @@ def import_presses(
     images, given, circles = _binned_presses(presses, bin, saturation, black)
     masks = _masks(images, black)
     median = np.median(images, 0)
-    flat = median if background == "median" else given
+    flat = given if background == "given" else median
     far = (_distances(images.shape[1:3], circles) > FAR) & ~at_black(images, black).any(-1)
     gains = np.array([_gain(image, flat, beyond) for image, beyond in zip(images, far)])
     tick("import", 1, 4)
-    noise, levels = far_noise(images / gains[:, None, None], far, saturation, 1.0 if bin == 1 else 0.0)
+    even = images / gains[:, None, None]
+    noise, levels = far_noise(even, far, saturation, 1.0 if bin == 1 else 0.0)
+    of_each, count = backgrounds.near(even, far, median)
+    rest = {"median": backgrounds.left(even, median, far, noise), "near": backgrounds.left(even, of_each, far, noise)}
+    if background is None:
+        background = "near" if np.mean(rest["near"]) < backgrounds.BETTER * np.mean(rest["median"]) else "median"
+    if background == "near":
+        noise = backgrounds.with_background(noise, count, far)
     tick("import", 2, 4)
     touched = np.minimum(contact_share * circles[:, 2] * scale, STEEPEST * ball_radius)
     taken = slice(None, None, every)
     depths = [depth_of(a, ball_radius, skirt) for a in touched[taken]]
     frames = _frames(presses.names[taken], images[taken], circles[taken], gains[taken], depths, scale, masks[taken])
-    directions = light_directions(images, flat * gains[:, None, None], circles, ball_radius / scale)
+    if background == "near":
+        for frame, own in zip(frames, of_each[taken]):
+            frame.flat_field = own.astype(np.float32)
+    behind = (of_each if background == "near" else flat) * gains[:, None, None]
+    directions = light_directions(images, behind, circles, ball_radius / scale)
     facts = {
         "source": presses.source,
         "presses": len(frames),
@@ -389,6 +405,7 @@ def import_presses(
         "skirt_mm": skirt,
         "contact_share": contact_share,
         "background": background,
+        "background_left": {name: values.tolist() for name, values in rest.items()},
         **_derived(circles[:, 2] * scale, circles[taken], gains, noise, levels, directions),
         # ball, scale or labels are wrong where a circle is larger than the ball: the images decide
         "setup": _setup(leds, free_ball=bool(np.any(circles[taken, 2] * scale > ball_radius))),
@@ -397,21 +414,24 @@ def import_presses(
         presses, facts, images, median, given, gains, noise, saturation, mm_per_pixel_check
     )
     facts["corrections"] = _corrections(images, gains, black, bin, saturation)
+    if background == "near":
+        facts["corrections"].append(_of_each_press(rest))
     if any(level is not None for level in black):
         facts["warnings"].append(black_text(black, at_black(images, black).mean((0, 1, 2)).tolist())[0])
     tick("import", 3, 4)
     xml = _scene_xml(facts, gel_thickness, touched.max() + 5 * skirt, led_elements(directions, leds, flat.mean((0, 1))))
-    path = write_set(Path(folder), frames, noise, flat, xml, facts, bits=8 if bin == 1 else None, overwrite=overwrite)
+    one = None if background == "near" else flat
+    path = write_set(Path(folder), frames, noise, one, xml, facts, bits=8 if bin == 1 else None, overwrite=overwrite)
     tick("import", 4, 4)
     return Imported(path, facts["warnings"], facts)
 
 
-def _check_options(presses: Presses, lengths: dict[str, float], background: str, every: int, leds: int) -> None:
+def _check_options(presses: Presses, lengths: dict[str, float], background: str | None, every: int, leds: int) -> None:
     """Raises BadCapture, or UnknownKey, for an option that is out of range or contradicts the presses."""
     for name, value in lengths.items():
         if not (math.isfinite(value) and value > 0):
             raise BadCapture(f"{presses.source}: {name} = {value:g}; allowed: above 0")
-    if background not in BACKGROUNDS:
+    if background is not None and background not in BACKGROUNDS:
         raise UnknownKey(background, BACKGROUNDS, "background")
     if background == "given" and presses.given is None:
         raise BadCapture(
@@ -423,7 +443,7 @@ def _check_options(presses: Presses, lengths: dict[str, float], background: str,
         )
     if leds not in (3, 6):
         raise BadCapture(f"{presses.source}: leds = {leds}; allowed: 3 (one per channel) or 6 (shared)")
-    if background == "median" and len(presses.images) < MEDIAN_OF:
+    if background != "given" and len(presses.images) < MEDIAN_OF:
         raise BadCapture(
             f"{presses.source}: {len(presses.images)} presses; a per-pixel median needs {MEDIAN_OF} or more, else give "
             "an image of the untouched sensor"
@@ -465,6 +485,17 @@ def _corrections(images, gains, black: Sequence[float | None], bin: int, saturat
     if any(level is not None for level in black):
         found.append(black_text(black, at_black(images, black).mean((0, 1, 2)).tolist())[1])
     return found
+
+
+def _of_each_press(rest: dict[str, np.ndarray]) -> dict[str, str]:
+    """What it took that the untouched sensor changes."""
+    median, near = (_rgb(np.sqrt(rest[name])) for name in ("median", "near"))
+    return correction(
+        "the untouched sensor changes during the session: each press has a background of its own, from the presses next "
+        "to it",
+        f"beyond {FAR:g} circle radii a median of all leaves {median} of the noise (rms, R / G / B), these {near}",
+        "every frame",
+    )
 
 
 def _frames(names, images, circles, gains, depths, scale: float, masks) -> list[Frame]:
@@ -844,8 +875,7 @@ def readme(facts: dict) -> str:
         f"- labelled radii {facts['labelled_radius_mm'][0]:.2f} to {facts['labelled_radius_mm'][1]:.2f} mm; the "
         "touched radius "
         f"starts at {facts['contact_share']:g} of that",
-        f"- background: {facts['background']}"
-        + (" of the presses, per pixel" if facts["background"] == "median" else ""),
+        f"- background: {facts['background']}{BEHIND.get(facts['background'], '')}",
         f"- gain of frames: sd {_rgb(100 * np.array(facts['frame_gain_sd']))} %",
         f"- noise (sd, R / G / B): {_rgb([level['sd'] for level in levels])} DN at "
         f"{_rgb([level['signal'] for level in levels])} DN; {facts['noise']['how']}",
@@ -853,6 +883,12 @@ def readme(facts: dict) -> str:
         "",
     ]
     return "\n".join(lines)
+
+
+def has_circles(captures: Captures) -> bool:
+    """Whether a set was imported with labelled circles."""
+    path = captures.folder / "import.json"
+    return path.is_file() and "circles_px" in json.loads(path.read_text(encoding="utf-8"))
 
 
 def circles_of(captures: Captures) -> np.ndarray:

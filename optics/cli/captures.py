@@ -67,7 +67,16 @@ def import_(
         typer.Option(
             "--untouched",
             metavar="IMAGE",
-            help="For a folder: an image of the sensor without contact. Without it: the median of the presses.",
+            help="For a folder: an image of the sensor without contact. Without it: --background.",
+        ),
+    ] = None,
+    background: Annotated[
+        str | None,
+        typer.Option(
+            "--background",
+            help="What the untouched sensor shows: median (of all presses), near (of those before and after each), or "
+            "given (--untouched, or the pack's).",
+            show_default="given, or else near where that leaves clearly less than median",
         ),
     ] = None,
     leds: Annotated[
@@ -151,6 +160,7 @@ def import_(
         "--leds": leds,
         "--every": every,
         "--untouched": untouched,
+        "--background": background,
     }
     of_presses = [name for name, value in presses.items() if value is not None]
     shared: dict[str, Any] = {
@@ -202,7 +212,8 @@ def import_(
             "--leds": leds,
             "--every": every,
         }
-        if given := [name for name, value in {**own, "--untouched": untouched}.items() if value is not None]:
+        own = {**own, "--untouched": untouched, "--background": background}
+        if given := [name for name, value in own.items() if value is not None]:
             raise ValueError(f"{', '.join(given)}: scan.yaml says so; leave these out")
         with terminal.progress() as progress:
             found = scans.import_scans(source, output, bin=bin, overwrite=force, progress=progress)
@@ -211,6 +222,7 @@ def import_(
     stated: dict[str, Any] = {name: value for name, value in lengths.items() if value is not None}
     if translucent.is_translucent_source(source):
         unused = {"--circles": circles, "--untouched": untouched, "--leds": leds, "--every": every}
+        unused["--background"] = background
         if given := [name for name, value in unused.items() if value is not None]:
             raise ValueError(f"{', '.join(given)}: the folder's images say so; leave these out")
         with terminal.progress() as progress:
@@ -220,6 +232,8 @@ def import_(
         _tell(found.folder, found.warnings, found.facts["corrections"])
         return
     options: dict[str, Any] = {"leds": leds or 3, "bin": bin, "every": every or 1, "overwrite": force, **stated}
+    if background is not None:
+        options["background"] = background
     if source.suffix == ".npz" or importing.is_pack(source):
         if given := [name for name, value in {"--circles": circles, "--untouched": untouched}.items() if value]:
             raise ValueError(f"{', '.join(given)}: the pack holds circles and background; leave these out")

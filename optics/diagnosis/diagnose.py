@@ -20,7 +20,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from optics.diagnosis import explanations, homogeneity, remarks
+from optics.diagnosis import explanations, homogeneity, patterns, remarks
 from optics.diagnosis import fingerprints as prints
 from optics.diagnosis import held_out as held
 from optics.diagnosis import statistics as st
@@ -42,6 +42,10 @@ from optics.scene.declare import Effect
 from optics.scene.parameter import Variable
 
 MAX_REFITS = 10  # besides the winners of other weights: each costs a calibration
+DRIFT_HINT = (
+    "give each frame a flat_field of its own, taken just before or after it; `optics import --background near` makes one "
+    "from the presses next to each"
+)
 FIXED_HINT = "divide the pattern out with a flat_field, mask what is dirt, or note the sensor's own as [noise] prnu"
 
 
@@ -176,8 +180,8 @@ def diagnose(
     hints = remarks.hints_of(word, conditions, outcome, findings, gaps, names)
     text = sentence(word, conditions, findings, rows, told, fingerprints, levels, shifts, basis)
     if word in ("UNKNOWN", "CANNOT_TELL"):
-        text, fixed = _unexplained(case, word, text, fingerprints, families, findings, basis)
-        hints = [FIXED_HINT, *hints] if fixed else hints
+        text, first = _unexplained(case, word, text, fingerprints, families, findings, basis)
+        hints = [*first, *hints]
     return Diagnosis(
         word=word,
         sentence=text,
@@ -318,13 +322,16 @@ def _unexplained(
     families: Sequence[Family],
     findings: Findings,
     basis: Basis,
-) -> tuple[str, bool]:
-    """(sentence, whether a fixed pattern lies in the images) where no effect explains the residual."""
-    share = prints.fixed_pattern(case.model, case.evidence, _excess(basis))
-    fixed = prints.fixed_text(share, max([f.share for f in fingerprints], default=0.0))
-    parts = [fixed, text[0].upper() + text[1:] if fixed else text]
-    if word == "UNKNOWN" or findings.fall < SHARE * _excess(basis):
-        parts.append(prints.unexplained(fingerprints, findings.fall, _excess(basis)))
-    if word == "UNKNOWN":
-        parts.append("" if fixed else prints.goes_with(families))
-    return " ".join(filter(None, parts)), bool(fixed)
+) -> tuple[str, list[str]]:
+    """(sentence, what to do about patterns of the image) where no effect explains the residual."""
+    excess, best = _excess(basis), max([f.share for f in fingerprints], default=0.0)
+    fixed = patterns.fixed_text(patterns.fixed_pattern(case.model, case.evidence, excess), best)
+    drift = patterns.drifting_pattern(case.model, case.fit.values, case.evidence, excess, case.seed)
+    drifting = patterns.drifting_text(drift)
+    found = [part[0].upper() + part[1:] for part in (fixed, drifting) if part]
+    parts = [*found, text[0].upper() + text[1:] if found else text]
+    if word == "UNKNOWN" or findings.fall < SHARE * excess:
+        parts.append(prints.unexplained(fingerprints, findings.fall, excess))
+    if word == "UNKNOWN" and not fixed and not drift.share > best:
+        parts.append(prints.goes_with(families))
+    return " ".join(filter(None, parts)), [DRIFT_HINT] * bool(drifting) + [FIXED_HINT] * bool(fixed)

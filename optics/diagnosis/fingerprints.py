@@ -19,7 +19,7 @@ from optics.diagnosis.decide import ordered
 from optics.diagnosis.evidence import Evidence, Progress
 from optics.diagnosis.result import Family, Fingerprint
 from optics.diagnosis.session import Frames, Session
-from optics.diagnosis.thresholds import AS_GOOD, EXCESS, LEVEL, MIMICS, SHARE
+from optics.diagnosis.thresholds import AS_GOOD, EXCESS, LEVEL, MIMICS
 from optics.fit.compare import UNITS, led_label
 from optics.fit.model import Model
 from optics.scene.parameter import Values, keys_with
@@ -29,7 +29,6 @@ NOT_A_COORDINATE = {"far", "quadrant"}  # regions that others make up
 YES_NO = ("contact", "shadow", "rim")
 PER_BIN = 4  # readings per bin, at least: a gain and an offset are fitted to them
 LINES = 64  # bins of 'row', 'column' and 'reading': a shutter, a read-out or an unsteady lamp acts on single rows
-REPEATED = 3  # frames that show a pixel, for a pattern to be called fixed
 # Share of a curve's direction that calibration must leave for it to be drawn; the rest (a level, a slope) is unknown.
 SEEN = 0.01
 
@@ -357,42 +356,6 @@ def goes_with(found: Sequence[Family]) -> str:
         else "a curve along it explains of what the best curve does"
     )
     return f"{text}; in brackets the best coordinate of each and how much {how}."
-
-
-def fixed_pattern(model: Model, evidence: Evidence, excess: float) -> float:
-    """Share of the excess misfit that one gain for each pixel, the same in all frames, explains: dirt, scratches, the
-    sensor's own pattern.
-
-    Of pixels that REPEATED frames or more show, less the number of gains, which noise explains; NaN where there are no
-    such pixels, no excess, or readings of a table.
-    excess   chi2 less its degrees of freedom
-    """
-    if isinstance(evidence.spectrum, st.Sweeps):
-        return math.nan
-    black, size = (
-        float(model.noise.black_level),
-        max((int(b.index.max(initial=0)) for b in evidence.blocks), default=0) // evidence.channels + 1,
-    )
-    shown, along, length = np.zeros(size), np.zeros(size), np.zeros(size)
-    for block in evidence.blocks:
-        pixel, g = block.index // evidence.channels, (block.prediction - black) / block.sigma
-        shown += np.bincount(np.unique(pixel), minlength=size)
-        along += np.bincount(pixel, g * block.r, size)
-        length += np.bincount(pixel, g * g, size)
-    use = (shown >= REPEATED) & (length > 0)
-    if not use.any() or not excess > 0:
-        return math.nan
-    return float(np.sum(along[use] ** 2 / length[use]) - use.sum()) * evidence.thinning / excess
-
-
-def fixed_text(share: float, best: float) -> str:
-    """One sentence where a fixed pattern explains much more than the best curve does; '' where not."""
-    if not share > max(SHARE, 2 * best):
-        return ""
-    return (
-        f"one gain for each pixel, the same in every frame, explains {min(share, 1.0):.0%} of the excess: dirt, "
-        "a scratch or the sensor's own pattern is fixed in the image, whatever curve it resembles."
-    )
 
 
 def unexplained(found: Sequence[Fingerprint], best_effect: float, excess: float) -> str:

@@ -353,6 +353,16 @@ class Level:
 
 
 @dataclass(frozen=True)
+class Drift:
+    """A pattern far from the contacts that successive frames share and distant ones do not
+    (`optics.diagnosis.patterns.drifting_pattern`): its share of the excess misfit, and the probability of as much in a
+    random order of the frames; NaN where they are unknown."""
+
+    share: float = math.nan
+    p: float = math.nan
+
+
+@dataclass(frozen=True)
 class Shift:
     """How far a calibrated parameter had moved to hide an effect: its value with the effect less that without."""
 

@@ -486,7 +486,7 @@ class Bench:
             self.kept[index, pose] = tilt_of(self.model, now).astype(np.float32)
             self.model.renderer.forget_hits()
         now = self.model.at(self.base, index)
-        flat = self.model.noise.black_level + self.model.flat * self.model.gains(now)
+        flat = self.model.noise.black_level + self.model.flat_of(index) * self.model.gains(now)
         return Shape(flat, self.kept[index, pose].astype(float), self.x, self.y)
 
     def misfit(self, null: Null, index: int, pose: Sequence[float]) -> float:
@@ -553,7 +553,7 @@ def compare(
     rounds    Gauss-Newton steps by which a null's own poses are refined, on each split
     Needs a model with a flat field. Raises ValueError when a frame is on both sides of the split.
     """
-    if model.flat is None:
+    if any(model.flat_of(i) is None for i in (*fitted, *held_out)):
         raise ValueError("nulls are departures from a background: the model needs a flat field")
     if set(fitted) & set(held_out) or not fitted or not held_out:
         raise ValueError(
@@ -600,8 +600,6 @@ def compare(
     directional = min((found[Additive], found[Multiplicative]), key=lambda s: np.square(s[0].rms_near).sum())
     for pair in (found[Background], directional, found[Linear]):
         scores += pair
-    noise = [
-        float(np.sqrt(np.mean(model.noise.of_channel(c).variance(model.flat[..., c] + model.noise.black_level))))
-        for c in range(model.shape[2])
-    ]
+    flats = np.stack([model.flat_of(i) for i in fitted]) + model.noise.black_level
+    noise = [float(np.sqrt(np.mean(model.noise.of_channel(c).variance(flats[..., c])))) for c in range(model.shape[2])]
     return NullTable(scores, noise, [model.frames[i].name for i in fitted], [model.frames[i].name for i in held_out])

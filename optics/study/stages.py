@@ -180,12 +180,12 @@ def comparison_of(
 
 
 def null_models(model: SceneModel, values: Values, fitted: Sequence[int], held: Sequence[int]) -> dict | None:
-    """An imported set's model beside models without physics (optics.fit.null_models); None without held-out frames or a
-    background."""
+    """An imported set's model beside models without physics (optics.fit.null_models); None without held-out frames,
+    backgrounds or labelled circles."""
     from optics.captures import importing
     from optics.fit import null_models as nulls
 
-    if model.flat is None or not held or not (model.captures.folder / "import.json").is_file():
+    if not held or any(model.flat_of(i) is None for i in (*fitted, *held)) or not importing.has_circles(model.captures):
         return None
     return nulls.compare(model, values, fitted, held, importing.circles_of(model.captures)).json()
 

@@ -19,12 +19,11 @@ from optics.diagnosis.fingerprints import (
     families,
     family_of,
     fingerprints,
-    fixed_pattern,
-    fixed_text,
     goes_with,
     places,
     unexplained,
 )
+from optics.diagnosis.patterns import drifting_pattern, drifting_text, fixed_pattern, fixed_text
 from optics.diagnosis.result import Basis, Family, Fingerprint
 from optics.diagnosis.statistics import Sweeps
 from optics.errors import OutputExists, UnknownKey
@@ -115,6 +114,47 @@ def test_a_pattern_fixed_in_the_image_is_told_from_a_curve(pattern):
         replace(evidence, spectrum=Sweeps()),
     )  # a table has no image
     assert all(np.isnan(fixed_pattern(model, *given)) for given in ((few, excess), (swept, excess), (evidence, 0.0)))
+
+
+def of_a_session(pattern, presses=12, side=20):
+    """(model, fit, evidence, excess) of presses with a pattern of 3 % that fades within three frames, that stays, or
+    that is new in each frame; or with a lamp that wanders by 2 % as slowly."""
+    rng = np.random.default_rng(4)
+    model = MockModel(presses, side)
+    start = simulate(model, rng)
+    fields = rng.standard_normal((presses, side, side))
+    slow = [fields[0]]
+    for field in fields[1:]:
+        slow.append(0.7 * slow[-1] + np.sqrt(1 - 0.7**2) * field)
+    gains = {
+        "fades": 0.03 * np.array(slow),
+        "stays": 0.03 * np.repeat(fields[:1], presses, 0),
+        "is new": 0.03 * fields,
+        "lamp": 0.02 * np.array([s[0, 0] for s in slow])[:, None, None] * np.ones((side, side)),
+    }[pattern]
+    black = model.noise.black_level
+    for frame, gain in zip(model.frames, gains):
+        frame.image = (black + (frame.image - black) * (1 + gain[..., None])).astype(np.float32)
+    fitted = tuple(range(presses))
+    fit = mock_fit(model, model.base_variables(fitted), start, fitted)
+    evidence = measure(model, fit.values, fit.variables, [], fitted, 400_000, 0, lambda *a: None)
+    return model, fit, evidence, evidence.projected.chi2 - (evidence.normal.count - evidence.projected.rank)
+
+
+def test_a_pattern_that_successive_frames_share_is_a_sensor_that_changes():
+    """Neighbours keep .7 of the pattern, frames four apart .24, and half of the pixels lie far from the contacts."""
+    model, fit, evidence, excess = of_a_session("fades")
+    drift = drifting_pattern(model, fit.values, evidence, excess)
+    assert drift.p < 0.01 and 0.15 < drift.share < 0.7
+    assert "the untouched sensor changes during the session" in drifting_text(drift)
+    assert np.isnan(drifting_pattern(model, fit.values, replace(evidence, frames=(0, 1, 2)), excess).share)
+    assert np.isnan(drifting_pattern(model, fit.values, replace(evidence, spectrum=Sweeps()), excess).share)
+
+
+@pytest.mark.parametrize("pattern", ["stays", "is new", "lamp"])
+def test_what_frames_share_in_any_order_and_a_lamp_are_no_sensor_that_changes(pattern):
+    model, fit, evidence, excess = of_a_session(pattern)
+    assert not drifting_text(drifting_pattern(model, fit.values, evidence, excess))
 
 
 def test_in_noise_no_curve_is_significant_and_none_has_a_share():

@@ -9,7 +9,7 @@ import pytest
 
 from optics.captures import capture_set as captures
 from optics.captures import importing
-from optics.errors import BadCapture, OutputExists
+from optics.errors import BadCapture, OutputExists, UnknownKey
 
 H, W, R = 48, 64, 8  # px
 PACKAGE = importlib.util.find_spec("taxim")  # holds packs of 480 x 640 px; never imported
@@ -56,10 +56,49 @@ def test_presses_become_captures_with_a_scene_and_numbers(presses, tmp_path):
     assert first.parameters["gel.press_depth"] == pytest.approx(0.8 * a / root + 2 - root, abs=1e-5)
     # medians over 1000 pixels of 2 % scatter each: 0.1 %
     assert loaded.frames[5].parameters["camera.gain_g"] == pytest.approx(1.04, abs=4e-3)
+    assert found.facts["background"] == "median"  # which has less noise, as nothing changes
     assert loaded.noise.sd(100.0) == pytest.approx(2.02, rel=0.15)  # 2 DN and the rounding; twelve levels per channel
     assert np.abs(loaded.flat_field - (90 + 0.5 * np.arange(W)[:, None])).mean() < 1.0
     assert json.loads((found.folder / "import.json").read_text())["presses"] == 12
     assert importing.circles_of(loaded)[3] == pytest.approx([*(presses.circles[3, :2] + 0.5), R / 3], abs=1e-3)
+
+
+@pytest.fixture
+def wrinkled(presses):
+    """The same with a pattern of stripes (4 DN rms) that turns into another one within six presses."""
+    stripes = 4 * np.sqrt(2) * np.sin(0.5 * np.arange(H))[:, None, None] * np.ones((W, 3))
+    crossed = 4 * np.sqrt(2) * np.sin(0.4 * np.arange(W))[:, None] * np.ones((H, W, 3))
+    turn = np.arange(12)[:, None, None, None] * np.pi / 12
+    presses.images = np.round(presses.images + np.cos(turn) * stripes + np.sin(turn) * crossed)
+    return presses
+
+
+def test_where_the_untouched_sensor_changes_each_press_has_a_background_of_its_own(wrinkled, tmp_path):
+    found = importing.import_presses(wrinkled, tmp_path / "set", **OPTIONS)
+    loaded = captures.load(found.folder)
+    assert found.facts["background"] == "near" and loaded.flat_field is None
+    rest = found.facts["background_left"]
+    assert min(rest["median"]) > 2.5  # 16 DN^2 of stripes over 4 of noise; a median follows half of them
+    said = next(c for c in found.facts["corrections"] if "untouched sensor changes" in c["what"])
+    assert "a background of its own" in said["what"] and said["what"] in (found.folder / "README.txt").read_text()
+    # what is left far from the circles is noise: that of the image, and that of the mean of some three others
+    distances = importing._distances((H, W), importing.circles_of(loaded))
+    square = []
+    for frame, far in zip(loaded.frames, distances > importing.FAR):
+        gain = np.array([frame.parameters[f"camera.gain_{c}"] for c in "rgb"])
+        expected = frame.flat_field * gain
+        square.append(((frame.image - expected) ** 2 / loaded.noise.variance(expected))[far].mean())
+    # 9000 values; what is left of the stripes over two presses adds a few per cent, which the noise law has seen too
+    assert np.mean(square) == pytest.approx(1.0, abs=0.1)
+    assert max(square) < 1.6  # at the ends of the session all neighbours are on one side
+
+
+def test_any_background_may_be_asked_for(wrinkled, tmp_path):
+    asked = importing.import_presses(wrinkled, tmp_path / "median", background="median", **OPTIONS)
+    assert asked.facts["background"] == "median" and captures.load(asked.folder).flat_field is not None
+    assert not any("untouched" in c["what"] for c in asked.facts["corrections"])
+    with pytest.raises(UnknownKey, match="background"):
+        importing.import_presses(wrinkled, tmp_path / "none", background="nearest", **OPTIONS)
 
 
 def test_contradictions_are_said_with_their_numbers(presses, tmp_path):
