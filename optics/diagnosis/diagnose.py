@@ -43,8 +43,8 @@ from optics.scene.parameter import Variable
 
 MAX_REFITS = 10  # besides the winners of other weights: each costs a calibration
 DRIFT_HINT = (
-    "give each frame a flat_field of its own, taken just before or after it; `optics import --background near` makes one "
-    "from the presses next to each"
+    "give each frame a flat_field of its own, taken just before or after it; `optics import --background near` makes "
+    "one from the presses next to each"
 )
 FIXED_HINT = "divide the pattern out with a flat_field, mask what is dirt, or note the sensor's own as [noise] prnu"
 

@@ -34,12 +34,16 @@ def test_the_gelsight_pack_contradicts_itself_and_says_so(tmp_path):
     assert "0.1245 mm/px and 0.12 mm/px, -3.6%" in text
     assert "not the background of these presses" in text
     assert not list(tmp_path.glob(".*"))
+    # its coating's wrinkles change within some frames; those of the DIGIT below stay for all of its session
+    rest = {name: np.mean(found.facts["background_left"][name]) for name in ("median", "near")}
+    assert found.facts["background"] == "near" and rest["median"] > 2.0 and rest["near"] < 1.6
 
 
 def test_the_digit_set_is_imported_with_one_group_per_press(tmp_path):
     found = importing.import_circles(DIGIT / "images", DIGIT / "labels.csv", tmp_path / "set", **example.DIGIT)
     loaded = captures.load(found.folder)
     assert loaded.frames[0].image.shape == (80, 60, 3) and len(captures.groups(loaded)) == 14
+    assert found.facts["background"] == "median"
     # frame gains of 1 to 2 % are in the data; the median background makes their mean 1
     gains = np.array(found.facts["frame_gain"])
     assert 0.002 < gains.std() < 0.03 and abs(gains.mean() - 1) < 0.01
