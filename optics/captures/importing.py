@@ -491,8 +491,8 @@ def _of_each_press(rest: dict[str, np.ndarray]) -> dict[str, str]:
     """What it took that the untouched sensor changes."""
     median, near = (_rgb(np.sqrt(rest[name])) for name in ("median", "near"))
     return correction(
-        "the untouched sensor changes during the session: each press has a background of its own, from the presses next "
-        "to it",
+        "the untouched sensor changes during the session: each press has a background of its own, from the presses "
+        "next to it",
         f"beyond {FAR:g} circle radii a median of all leaves {median} of the noise (rms, R / G / B), these {near}",
         "every frame",
     )
