@@ -153,7 +153,7 @@ def import_(
         "--system-gain": system_gain,
         "--dark-noise": dark_noise,
     }
-    presses = {
+    presses: dict[str, Any] = {
         "--circles": circles,
         "--ball-radius": ball_radius,
         "--mm-per-pixel": mm_per_pixel,
@@ -205,25 +205,15 @@ def import_(
         _tell(read.folder, read.warnings)
         return
     if scans.is_scan_source(source):
-        own = {
-            "--circles": circles,
-            "--ball-radius": ball_radius,
-            "--mm-per-pixel": mm_per_pixel,
-            "--leds": leds,
-            "--every": every,
-        }
-        own = {**own, "--untouched": untouched, "--background": background}
-        if given := [name for name, value in own.items() if value is not None]:
-            raise ValueError(f"{', '.join(given)}: scan.yaml says so; leave these out")
+        if of_presses:
+            raise ValueError(f"{', '.join(of_presses)}: scan.yaml says so; leave these out")
         with terminal.progress() as progress:
             found = scans.import_scans(source, output, bin=bin, overwrite=force, progress=progress)
         _tell(found.folder, found.warnings, found.facts["corrections"])
         return
     stated: dict[str, Any] = {name: value for name, value in lengths.items() if value is not None}
     if translucent.is_translucent_source(source):
-        unused = {"--circles": circles, "--untouched": untouched, "--leds": leds, "--every": every}
-        unused["--background"] = background
-        if given := [name for name, value in unused.items() if value is not None]:
+        if given := [name for name in of_presses if name not in ("--ball-radius", "--mm-per-pixel")]:
             raise ValueError(f"{', '.join(given)}: the folder's images say so; leave these out")
         with terminal.progress() as progress:
             found = translucent.import_translucent(
@@ -235,7 +225,7 @@ def import_(
     if background is not None:
         options["background"] = background
     if source.suffix == ".npz" or importing.is_pack(source):
-        if given := [name for name, value in {"--circles": circles, "--untouched": untouched}.items() if value]:
+        if given := [name for name in of_presses if name in ("--circles", "--untouched")]:
             raise ValueError(f"{', '.join(given)}: the pack holds circles and background; leave these out")
         found = importing.import_taxim(source, output, **options)
     else:

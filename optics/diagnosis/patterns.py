@@ -112,8 +112,8 @@ def drifting_pattern(model: Model, values: Values, evidence: Evidence, excess: f
     chance = 0
     for _ in range(ORDERS):
         order = np.arange(len(frames))
-        for own in places.values():
-            order[own] = rng.permutation(own)
+        for place in places.values():
+            order[place] = rng.permutation(place)
         chance += mean(order[near]) >= found
     share = (found - far) * float(np.trace(count)) / excess
     return Drift(float(share), (1 + chance) / (1 + ORDERS))
