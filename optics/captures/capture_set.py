@@ -60,7 +60,8 @@ TABLE_KEYS = (
     "uncertainty",
     "ignore",
 )
-NOISE_KEYS = tuple(name for name in UNITS if name != "quantisation")  # the step is read off the images
+UNASKED = "correlation"  # of the noise, which images of single pixels do not have
+NOISE_KEYS = tuple(name for name in UNITS if name not in ("quantisation", UNASKED))  # the step is read off the images
 UNMOVED = 8  # readings in a row at one setting, on average, from which its error is solved for and not weighed
 SUNK = 5.0  # sd of the dark noise that the median of a frame may lie below the black level
 Find = Callable[[str, str], Path]  # (name, where it stands) -> the file, or BadCapture
@@ -223,7 +224,8 @@ def _mosaic(rows: object, cfa: str | None, where: str) -> Mosaic:
 
 def _noise(table: object, where: str, readings_: bool) -> Noise:
     """The noise model; of a table of readings only the standard deviation of a reading must be given."""
-    checks.keys(table, NOISE_KEYS, where)
+    known = NOISE_KEYS if readings_ else (*NOISE_KEYS, UNASKED)
+    checks.keys(table, known, where)
     assert isinstance(table, Mapping)
     usual = {"system_gain": 0.0, "black_level": 0.0, "saturation": math.inf, "prnu": 0.0} if readings_ else {}
     missing = [f"{key} ({UNITS[key].strip('()')})" for key in NOISE_KEYS if key not in table and key not in usual]
@@ -237,7 +239,7 @@ def _noise(table: object, where: str, readings_: bool) -> Noise:
                 else f"all of {', '.join(NOISE_KEYS)}, or leave [noise] out to have it estimated from repeats"
             )
         )
-    numbers = {key: _noise_number(table[key], key, where, readings_) for key in NOISE_KEYS if key in table}
+    numbers = {key: _noise_number(table[key], key, where, readings_) for key in known if key in table}
     try:
         return Noise(**{**usual, **numbers}, signed=readings_, ends="saturation" in numbers or not readings_)
     except ValueError as error:
@@ -827,8 +829,8 @@ def _fill(captures: Captures, folder: Path, final: Path, bits: int | None) -> No
         document["mosaic"] = [list(row) for row in captures.mosaic]
     if captures.noise:
         document["noise"] = tomlkit.table()
-        for key in NOISE_KEYS:
-            if key != "saturation" or captures.noise.ends:
+        for key in (*NOISE_KEYS, UNASKED):
+            if (key != "saturation" or captures.noise.ends) and (key != UNASKED or np.any(captures.noise.correlation)):
                 document["noise"].add(key, tomlkit.item(captures.noise.written(key)).comment(UNITS[key]))
     for name, content in (
         ("parameters", _plain(captures.parameters)),

@@ -47,18 +47,8 @@ def in_cells(captures: Captures, noise: Noise, k: int) -> Captures:
         captures,
         frames=[cells(f) for f in captures.frames],
         flat_field=field(captures.flat_field),
-        noise=noise_of_cells(noise, k),
+        noise=noise.in_cells(k),
     )
-
-
-def noise_of_cells(noise: Noise, k: int) -> Noise:
-    """The noise of the mean of k x k independent pixels: variances over k^2. So is that of the step where noise dithers
-    it (EMVA 1288)."""
-    gain, dark = (
-        tuple(v / by for v in own) if isinstance(own, tuple) else own / by
-        for own, by in ((noise.system_gain, k**2), (noise.dark_noise, k))
-    )
-    return replace(noise, system_gain=gain, dark_noise=dark, quantisation=noise.quantisation / k, prnu=noise.prnu / k)
 
 
 def _blocks(image: np.ndarray, k: int) -> np.ndarray:

@@ -50,6 +50,7 @@ COLUMNS = ("file", "center_x_px", "center_y_px", "contact_radius_px")
 FAR = 3.0  # circle radii beyond which a press leaves the image alone, but for a skirt of a few per mille
 LED_DISTANCE = 16.0  # mm from the middle of the face, where no better is known
 ALIKE = 0.15  # relative: channels whose standard deviations one law misses by more have laws of their own
+MOST_SHARED = 0.95  # correlation of neighbours: beyond, a law of single pixels says nothing
 LEAST = 0.01  # of the mean variance: what gain and dark noise have at least
 STEEPEST = 0.93  # of the ball's radius: largest touched radius, where the flank is 68 deg steep and the depth finite
 MEDIAN_OF = 5  # presses, from which on a per-pixel median is free of the ones that cover a pixel
@@ -375,12 +376,14 @@ def import_presses(
     tick("import", 1, 4)
     even = images / gains[:, None, None]
     noise, levels = far_noise(even, far, saturation, 1.0 if bin == 1 else 0.0)
+    noise = replace(noise, correlation=shared_by_neighbours(even, far))
     of_each, count = backgrounds.near(even, far, median)
     rest = {"median": backgrounds.left(even, median, far, noise), "near": backgrounds.left(even, of_each, far, noise)}
     if background is None:
         background = "near" if np.mean(rest["near"]) < backgrounds.BETTER * np.mean(rest["median"]) else "median"
     if background == "near":
         noise = backgrounds.with_background(noise, count, far)
+        gains = np.array([_gain(image, own, beyond) for image, own, beyond in zip(images, of_each, far)])
     tick("import", 2, 4)
     touched = np.minimum(contact_share * circles[:, 2] * scale, STEEPEST * ball_radius)
     taken = slice(None, None, every)
@@ -526,6 +529,7 @@ def _derived(radii, circles, gains, noise: Noise, levels: list[dict], directions
         "noise": {
             "system_gain": noise.written("system_gain"),
             "dark_noise": noise.written("dark_noise"),
+            "correlation": noise.written("correlation"),
             "levels": levels,
             "how": "half the squared differences of successive frames beyond three circle radii, after their gains: "
             "temporal noise, banding and drift together",
@@ -677,6 +681,21 @@ def far_noise(images: np.ndarray, far: np.ndarray, saturation: float, step: floa
             {"channel": "rgb"[c], "signal": float(mean[:, c].mean()), "sd": float(np.sqrt(square[:, c].mean()))}
         )
     return noise_of_channels(laws, channel, saturation, step), channel
+
+
+def shared_by_neighbours(images: np.ndarray, far: np.ndarray) -> tuple[float, ...]:
+    """The correlation of the noise of neighbouring pixels, of each channel: of the difference of successive frames where
+    neither is pressed, along rows and columns. Without a difference there is none."""
+    products, squares = np.zeros(images.shape[-1]), np.zeros(images.shape[-1])
+    for a, b, use in zip(images, images[1:], far[1:] & far[:-1]):
+        difference = a - b
+        for one, other in ((np.s_[1:], np.s_[:-1]), (np.s_[:, 1:], np.s_[:, :-1])):
+            both = use[one] & use[other]
+            x, y = difference[one][both], difference[other][both]
+            products += np.sum(x * y, 0)
+            squares += np.sum(x**2 + y**2, 0) / 2
+    found = products / np.maximum(squares, 1e-12)
+    return tuple(np.round(np.clip(found, 0.0, MOST_SHARED), 3).tolist())
 
 
 def noise_of_channels(
@@ -879,6 +898,7 @@ def readme(facts: dict) -> str:
         f"- gain of frames: sd {_rgb(100 * np.array(facts['frame_gain_sd']))} %",
         f"- noise (sd, R / G / B): {_rgb([level['sd'] for level in levels])} DN at "
         f"{_rgb([level['signal'] for level in levels])} DN; {facts['noise']['how']}",
+        f"- correlation of the noise of neighbouring pixels: {_rgb(facts['noise']['correlation'])}",
         "- lights in scene.xml: directions from the contacts' shading, distance assumed; calibrate them",
         "",
     ]

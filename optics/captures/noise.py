@@ -5,6 +5,11 @@
 S signal (DN), K system gain (DN per electron), b black level (DN), d dark noise (DN rms), n frames averaged, q step of
 the quantisation (DN), p photo-response non-uniformity (relative rms). Source: EMVA 1288, linear camera model and photon
 transfer; p is a fixed pattern, the same in every image, so that averaging frames leaves it.
+
+Demosaicing, resizing and JPEG make neighbours share their noise. A pixel and its neighbour along a row or a column then
+have the correlation rho, pixels (m, n) apart rho^(m + n), and a mean of k x k pixels has the variance of a pixel times
+
+    [1 + 2 sum over d < k of (1 - d/k) rho^d]^2 / k^2
 """
 
 from __future__ import annotations
@@ -27,7 +32,7 @@ SATURATED = (
 DITHERED = (
     0.25  # temporal variance per step^2 from which the step acts as noise q^2/12 to 2.5 % (at 0.09: only to 45 %)
 )
-PER_CHANNEL = ("system_gain", "dark_noise")  # what may be a number for each channel
+PER_CHANNEL = ("system_gain", "dark_noise", "correlation")  # what may be a number for each channel
 UNITS = {
     "system_gain": "DN per electron",
     "dark_noise": "DN, rms",
@@ -35,6 +40,7 @@ UNITS = {
     "saturation": "DN",
     "prnu": "(relative, rms)",
     "quantisation": "DN",
+    "correlation": "(of neighbouring pixels)",
 }
 DEMOSAICED = (
     "3 channels and no cfa: if these are demosaiced, neighbouring pixels share their noise and a diagnosis raises "
@@ -54,6 +60,7 @@ class Noise:
 
     system_gain, dark_noise   a number, or one for each channel: of the last axis of a signal (H, W, C). A signal whose
              last axis is no list of the channels has the mean of the gains and the rms of the dark noises
+    correlation   of the noise of neighbouring pixels, 0 to 1; a number, or one for each channel
     signed   whether a value below 0 is a reading like any other, as of a volt meter, and not cut off there
     ends     whether values end at `saturation`; else it only sets the scale of what a camera makes of light
     """
@@ -66,17 +73,19 @@ class Noise:
     quantisation: float = 1.0
     signed: bool = False
     ends: bool = True
+    correlation: float | tuple[float, ...] = 0.0
 
     def __post_init__(self):
         rules = {"black_level": "finite"} if self.signed else {"black_level": "finite", "system_gain": "> 0"}
         for name in PER_CHANNEL:
             if isinstance(values := getattr(self, name), (list, tuple)):
                 object.__setattr__(self, name, tuple(float(v) for v in values))
-        if len({len(v) for v in (self.system_gain, self.dark_noise) if isinstance(v, tuple)} | {3}) > 1:
-            raise ValueError(
-                f"system_gain = {self.system_gain}, dark_noise = {self.dark_noise}; allowed: a number, or three of "
-                "them, for R, G and B"
-            )
+        lists = {name: v for name in PER_CHANNEL if isinstance(v := getattr(self, name), tuple)}
+        if {len(v) for v in lists.values()} - {3}:
+            given = ", ".join(f"{name} = {v}" for name, v in lists.items())
+            raise ValueError(f"{given}; allowed: a number, or three of them, for R, G and B")
+        if not all(v < 1 for v in np.atleast_1d(self.correlation)):
+            raise ValueError(f"correlation = {self.correlation}; allowed: 0 or more, below 1, of neighbouring pixels")
         for name, unit in UNITS.items():
             own, allowed = getattr(self, name), rules.get(name, ">= 0")
             if name == "saturation" and not self.ends and own == math.inf:
@@ -122,6 +131,28 @@ class Noise:
     def sd(self, signal: np.ndarray, frames_averaged: int = 1) -> np.ndarray:
         """Standard deviation in DN: the root of `variance`."""
         return np.sqrt(self.variance(signal, frames_averaged))
+
+    def in_cells(self, k: int) -> Noise:
+        """The noise of the mean of k x k pixels, as if such means were independent of each other. That of the step is a
+        mean too, where noise dithers it (EMVA 1288)."""
+
+        def over(value: float | tuple[float, ...], by: int, power: float) -> float | tuple[float, ...]:
+            rho = np.broadcast_to(self.correlation, (3,) if isinstance(value, tuple) else ())
+            shared = 1 + 2 * sum((1 - d / k) * rho**d for d in range(1, k))
+            found = np.asarray(value, float) / by * shared**power
+            return tuple(found.tolist()) if isinstance(value, tuple) else float(found)
+
+        gain, dark = self.system_gain, self.dark_noise
+        if isinstance(self.correlation, tuple):
+            gain, dark = (v if isinstance(v, tuple) else (v,) * 3 for v in (gain, dark))
+        return replace(
+            self,
+            system_gain=over(gain, k**2, 2.0),
+            dark_noise=over(dark, k, 1.0),
+            quantisation=self.quantisation / k,
+            prnu=self.prnu / k,
+            correlation=0.0,
+        )
 
     def summed(self, frames: int) -> Noise:
         """Noise of the sum of `frames` frames (DN add up), stated as that of one frame, as [noise] asks for.

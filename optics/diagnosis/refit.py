@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 
 import numpy as np
 
@@ -36,8 +36,6 @@ ROUGH = 0.5  # chi2 per variable at which a refit of a diagnosis, which compares
 # left, falls that differ by less than a fifth decide nothing (`optics.diagnosis.thresholds.MARGIN`).
 COARSE = 0.01
 FEW = 12  # iterations of a refit of images that continues one: it has been brought near
-# A calibration that continues another one of images, for a diagnosis
-further = partial(calibrate.fit, max_iterations=FEW, tolerance=ROUGH, negligible=COARSE)
 FAILURES = (ValueError, ArithmeticError, np.linalg.LinAlgError)  # by which a refit says that it has no result
 
 
@@ -189,6 +187,13 @@ def _best_attempt(case: Case, c: Candidate, predicted: float, linear: np.ndarray
 def after_at(case: Case, values: Values) -> float:
     """chi2 at values, by the base's weights, priors included."""
     return chi2(case, values)[0] + case.prior_chi2(values)
+
+
+def further(model: Model, variables: Sequence[Variable], start: Values, frames: list[int], **options) -> Fit:
+    """A calibration of images that continues another one, as far as a diagnosis needs it."""
+    return calibrate.fit(
+        model, variables, start, frames, max_iterations=FEW, tolerance=ROUGH, negligible=COARSE, **options
+    )
 
 
 def from_there(case: Case, members: Sequence[Candidate], expected: Expected) -> Fit | None:

@@ -56,6 +56,7 @@ def test_presses_become_captures_with_a_scene_and_numbers(presses, tmp_path):
     assert first.parameters["gel.press_depth"] == pytest.approx(0.8 * a / root + 2 - root, abs=1e-5)
     # medians over 1000 pixels of 2 % scatter each: 0.1 %
     assert loaded.frames[5].parameters["camera.gain_g"] == pytest.approx(1.04, abs=4e-3)
+    assert max(loaded.noise.correlation) < 0.05  # of some 25,000 products: 0 +- .01
     assert found.facts["background"] == "median"  # which has less noise, as nothing changes
     assert loaded.noise.sd(100.0) == pytest.approx(2.02, rel=0.15)  # 2 DN and the rounding; twelve levels per channel
     assert np.abs(loaded.flat_field - (90 + 0.5 * np.arange(W)[:, None])).mean() < 1.0
@@ -71,6 +72,16 @@ def wrinkled(presses):
     turn = np.arange(12)[:, None, None, None] * np.pi / 12
     presses.images = np.round(presses.images + np.cos(turn) * stripes + np.sin(turn) * crossed)
     return presses
+
+
+def test_noise_that_neighbours_share_is_measured_and_written(presses, tmp_path):
+    """Each pixel is the mean of itself and three neighbours, round the edges: the next one shares two of the four. The
+    noise of such means is 1 DN, to which the step adds 1/12 DN^2 that nobody shares."""
+    for image in presses.images:
+        image[:] = np.round(sum(np.roll(image, shift, (0, 1)) for shift in ((0, 0), (0, 1), (1, 0), (1, 1))) / 4)
+    found = importing.import_presses(presses, tmp_path / "set", **OPTIONS)
+    assert captures.load(found.folder).noise.correlation == pytest.approx([0.5 / (1 + 1 / 12)] * 3, abs=0.03)
+    assert "- correlation of the noise of neighbouring pixels: 0.4" in (found.folder / "README.txt").read_text()
 
 
 def test_where_the_untouched_sensor_changes_each_press_has_a_background_of_its_own(wrinkled, tmp_path):

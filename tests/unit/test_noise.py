@@ -82,6 +82,9 @@ def test_exposures_are_whole_and_clipped():
         ("black_level", float("inf"), "allowed: finite"),
         ("saturation", 8.0, "allowed: > black_level = 8 DN"),
         ("quantisation", -1.0, "allowed: >= 0"),
+        ("correlation", -0.1, "correlation = -0.1 .of neighbouring pixels.; allowed: >= 0"),
+        ("correlation", (0.2, 1.0, 0.2), "allowed: 0 or more, below 1"),
+        ("correlation", float("nan"), "allowed: 0 or more, below 1"),
     ],
 )
 def test_impossible_numbers_are_refused(name, value, text):

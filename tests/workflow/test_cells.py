@@ -9,7 +9,7 @@ import pytest
 from optics import facade
 from optics.captures import capture_set
 from optics.captures.capture_set import Captures, Frame
-from optics.captures.cells import in_cells, noise_of_cells
+from optics.captures.cells import in_cells
 from optics.captures.noise import Noise
 from optics.fit import calibrate
 from optics.fit.result import Fit
@@ -37,9 +37,29 @@ def test_cells_have_the_noise_of_means(tmp_path):
     cells = found.frames[0]
     assert cells.image.shape == (100, 200, 1) and np.argwhere(~cells.mask).tolist() == [[3, 3], [33, 100]]
     spread = float(np.var(cells.image[cells.mask]))
-    assert spread == pytest.approx(float(noise_of_cells(noise, 3).variance(np.array(500.0))), rel=0.04)
+    assert spread == pytest.approx(float(noise.in_cells(3).variance(np.array(500.0))), rel=0.04)
     with pytest.raises(ValueError, match="raw mosaics have no cells"):
         in_cells(replace(captures, cfa="RGGB"), noise, 2)
+
+
+@pytest.mark.parametrize("k", [1, 2, 3])
+def test_means_of_neighbours_that_share_their_noise_scatter_more(k):
+    """Noise that falls off by .8 and .5 per pixel, in two directions alike, from a recursive filter; 7000 independent
+    areas tell a variance to 2 %."""
+    from scipy.signal import lfilter
+
+    rho = np.array([0.8, 0.5, 0.0])
+    rng = np.random.default_rng(2)
+    image = rng.standard_normal((600, 600, 3))
+    for c, r in enumerate(rho):
+        for axis in (0, 1):
+            image[..., c] = lfilter([np.sqrt(1 - r**2)], [1, -r], image[..., c], axis)
+    image = 100.0 + 3.0 * image[60:, 60:]
+    noise = Noise(1e-9, 3.0, 0.0, 255.0, 0.0, 0.0, correlation=tuple(rho))
+    means = image.reshape(540 // k, k, 540 // k, k, 3).mean((1, 3))
+    assert means.var((0, 1)) == pytest.approx(noise.in_cells(k).variance(np.full(3, 100.0)), rel=0.08)
+    one = Noise(1e-9, 3.0, 0.0, 255.0, 0.0, 0.0, correlation=0.5)
+    assert means[..., 1].var() == pytest.approx(float(one.in_cells(k).variance(np.array(100.0))), rel=0.08)
 
 
 @pytest.mark.parametrize("size", [(84, 60), (85, 61)])
