@@ -684,8 +684,8 @@ def far_noise(images: np.ndarray, far: np.ndarray, saturation: float, step: floa
 
 
 def shared_by_neighbours(images: np.ndarray, far: np.ndarray) -> tuple[float, ...]:
-    """The correlation of the noise of neighbouring pixels, for each channel: that of the difference of successive frames
-    where neither is pressed, along rows and columns. Without a difference there is none."""
+    """The correlation of the noise of neighbouring pixels, for each channel: that of the difference of successive
+    frames where neither is pressed, along rows and columns. Without a difference there is none."""
     products, squares = np.zeros(images.shape[-1]), np.zeros(images.shape[-1])
     for a, b, use in zip(images, images[1:], far[1:] & far[:-1]):
         difference = a - b
