@@ -22,6 +22,7 @@ from optics.diagnosis.session import Frames, Session
 from optics.diagnosis.thresholds import AS_GOOD, EXCESS, LEVEL, MIMICS
 from optics.fit.compare import UNITS, led_label
 from optics.fit.model import Model
+from optics.fit.scene_model import SceneModel
 from optics.scene.parameter import Values, keys_with
 
 SIDE = 4  # cells per side of the coordinate 'place': a finer map would fit any clutter and forbid every claim
@@ -29,6 +30,7 @@ NOT_A_COORDINATE = {"far", "quadrant"}  # regions that others make up
 YES_NO = ("contact", "shadow", "rim")
 PER_BIN = 4  # readings per bin, at least: a gain and an offset are fitted to them
 LINES = 64  # bins of 'row', 'column' and 'reading': a shutter, a read-out or an unsteady lamp acts on single rows
+GRAIN = 2.0  # px: width of the Gaussian that takes the noise off a measured background
 # Share of a curve's direction that calibration must leave for it to be drawn; the rest (a level, a slope) is unknown.
 SEEN = 0.01
 
@@ -73,7 +75,8 @@ def places(model: Model, values: Values, evidence: Evidence) -> list[dict[str, n
         known = {"signal": block.prediction.astype(np.float32)}
         planes = {**model.coordinates(values, block.frame, evidence.seed), **model.lit_geometry(values, block.frame)}
         if min(shape[:2]) >= 2 * SIDE:
-            planes.update(_texture(np.asarray(model.predict(values, [block.frame], evidence.seed)[0], float)))
+            prediction = np.asarray(model.predict(values, [block.frame], evidence.seed)[0], float)
+            planes.update(_texture(without_grain(model, values, block.frame, prediction)))
         for name, plane in planes.items():
             plane = np.asarray(plane)
             if plane.ndim not in (2, 3):
@@ -96,6 +99,19 @@ def places(model: Model, values: Values, evidence: Evidence) -> list[dict[str, n
             known["place"] = (row * SIDE // shape[0] * SIDE + column * SIDE // shape[1]).astype(np.float32)
         found.append(known)
     return found
+
+
+def without_grain(model: Model, values: Values, frame: int, prediction: np.ndarray) -> np.ndarray:
+    """A predicted image whose measured background is smoothed: that is an image with noise of its own. Where it was
+    brighter by chance, the prediction has a peak, and the measurement seems to lack it."""
+    from scipy.ndimage import gaussian_filter
+
+    if not isinstance(model, SceneModel) or (background := model.flat_of(frame)) is None:
+        return prediction
+    flat = background * model.gains(model.at(values, frame))
+    black = float(model.noise.black_level)
+    share = 1.0 if model.flat_field == "additive" else (prediction - black) / flat
+    return prediction + share * (gaussian_filter(flat, (GRAIN, GRAIN, 0), mode="nearest") - flat)
 
 
 def _texture(prediction: np.ndarray) -> dict[str, np.ndarray]:

@@ -1,5 +1,6 @@
 """A measured background enters a prediction by name, and every derivative follows it."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -108,3 +109,28 @@ def test_the_gel_acts_on_light_from_all_sides_too(models):
     fading = model.renderer.radiance({**now, "gel.absorption": 0.05}) / plain
     middle = fading[HEIGHT // 2, WIDTH // 2]
     np.testing.assert_allclose(middle, np.exp(-0.05 * now["gel.thickness"]), rtol=0.03)  # at a slant, and pressed
+
+
+@pytest.mark.parametrize("mode", ["multiplicative", "additive"])
+def test_noise_of_a_background_is_no_texture_of_the_scene(models, mode):
+    """A background with 2 DN of noise: the laplacian of what is predicted for the untouched sensor is 9 DN of it, and
+    that of the smoothed one below a thirtieth. Rims of the dent, which the scene makes, stay."""
+    from scipy.ndimage import laplace
+
+    from optics.diagnosis.fingerprints import without_grain
+    from optics.fit.scene_model import SceneModel
+
+    model = models[mode]
+    noisy = model.captures.flat_field + 2 * np.random.default_rng(1).standard_normal((HEIGHT, WIDTH, 3))
+    grainy = SceneModel(model.scene, replace(model.captures, flat_field=noisy.astype(np.float32)), flat_field=mode)
+    for depth, low, high in ((0.0, 0.0, 0.3), (0.4, 0.7, 1.4)):
+        values = Values(frame={0: {"gel.press_depth": depth, "camera.gain": 1.1}})
+        (prediction,) = (np.asarray(image, float) for image in grainy.predict(values))
+        smooth = without_grain(grainy, values, 0, prediction)
+        edges = [laplace(image[..., 0])[3:-3, 3:-3] for image in (prediction, smooth)]
+        clean = laplace(np.asarray(model.predict(values)[0], float)[..., 0])[3:-3, 3:-3]
+        if depth:
+            assert low < edges[1].std() / clean.std() < high
+        else:
+            assert edges[0].std() > 7 and edges[1].std() < high
+    assert without_grain(models[None], values, 0, prediction) is prediction
