@@ -182,7 +182,7 @@ def fit(
         nonlocal done
         done += 1
         if progress:
-            progress("calibrate", done, max_iterations * len(frames))
+            progress("calibrate", done, (max_iterations + SCALINGS) * len(frames))
 
     share = NEGLIGIBLE if negligible is None else negligible
     history, reason = _descend(descent, max_iterations, tolerance * max(len(variables), 1), share, asked, tick)
