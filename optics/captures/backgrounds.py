@@ -10,13 +10,11 @@ any."""
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from optics.captures.noise import Noise
 
-REACH = 2  # presses on either side
+REACH = 2  # presses on either side: fewer have more noise, and more blur a pattern that fades within some presses
 BETTER = 0.9  # of what the median leaves: a background of each press must leave less, to be worth its noise
 
 
@@ -44,13 +42,4 @@ def left(images: np.ndarray, backgrounds: np.ndarray, far: np.ndarray, noise: No
 
 def with_background(noise: Noise, count: np.ndarray, far: np.ndarray) -> Noise:
     """The noise of a frame less a background that is the mean of `count` frames: (1 + 1/n) of its variance."""
-    more = 1 + float(np.mean(1 / count[far]))
-
-    def times(value: float | tuple[float, ...], factor: float) -> float | tuple[float, ...]:
-        return tuple(v * factor for v in value) if isinstance(value, tuple) else value * factor
-
-    return replace(
-        noise,
-        system_gain=times(noise.system_gain, more),
-        dark_noise=times(noise.dark_noise, more**0.5),
-    )
+    return noise.times(1 + float(np.mean(1 / count[far])))

@@ -60,8 +60,10 @@ TABLE_KEYS = (
     "uncertainty",
     "ignore",
 )
-UNASKED = "correlation"  # of the noise, which images of single pixels do not have
-NOISE_KEYS = tuple(name for name in UNITS if name not in ("quantisation", UNASKED))  # the step is read off the images
+OPTIONAL_NOISE_KEYS = ("correlation",)  # of images
+NOISE_KEYS = tuple(  # the step is read off the images
+    name for name in UNITS if name not in ("quantisation", *OPTIONAL_NOISE_KEYS)
+)
 UNMOVED = 8  # readings in a row at one setting, on average, from which its error is solved for and not weighed
 SUNK = 5.0  # sd of the dark noise that the median of a frame may lie below the black level
 Find = Callable[[str, str], Path]  # (name, where it stands) -> the file, or BadCapture
@@ -224,7 +226,7 @@ def _mosaic(rows: object, cfa: str | None, where: str) -> Mosaic:
 
 def _noise(table: object, where: str, readings_: bool) -> Noise:
     """The noise model; of a table of readings only the standard deviation of a reading must be given."""
-    known = NOISE_KEYS if readings_ else (*NOISE_KEYS, UNASKED)
+    known = NOISE_KEYS if readings_ else (*NOISE_KEYS, *OPTIONAL_NOISE_KEYS)
     checks.keys(table, known, where)
     assert isinstance(table, Mapping)
     usual = {"system_gain": 0.0, "black_level": 0.0, "saturation": math.inf, "prnu": 0.0} if readings_ else {}
@@ -244,6 +246,18 @@ def _noise(table: object, where: str, readings_: bool) -> Noise:
         return Noise(**{**usual, **numbers}, signed=readings_, ends="saturation" in numbers or not readings_)
     except ValueError as error:
         raise BadCapture(f"{where}: {error}") from error
+
+
+def noise_table(noise: Noise) -> Any:
+    """[noise] as `_noise` reads it, with units: a table of tomlkit."""
+    import tomlkit
+
+    written = [key for key in NOISE_KEYS if key != "saturation" or noise.ends]
+    written += [key for key in OPTIONAL_NOISE_KEYS if np.any(getattr(noise, key))]
+    table = tomlkit.table()
+    for key in written:
+        table.add(key, tomlkit.item(noise.written(key)).comment(UNITS[key]))
+    return table
 
 
 def _noise_number(value: object, key: str, where: str, readings_: bool) -> Any:
@@ -828,10 +842,7 @@ def _fill(captures: Captures, folder: Path, final: Path, bits: int | None) -> No
     if captures.mosaic:
         document["mosaic"] = [list(row) for row in captures.mosaic]
     if captures.noise:
-        document["noise"] = tomlkit.table()
-        for key in (*NOISE_KEYS, UNASKED):
-            if (key != "saturation" or captures.noise.ends) and (key != UNASKED or np.any(captures.noise.correlation)):
-                document["noise"].add(key, tomlkit.item(captures.noise.written(key)).comment(UNITS[key]))
+        document["noise"] = noise_table(captures.noise)
     for name, content in (
         ("parameters", _plain(captures.parameters)),
         ("uncertainty", _plain(captures.uncertainty)),

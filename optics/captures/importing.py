@@ -68,7 +68,10 @@ PRIORS = {
     "gel.press_[xy]": 0.4,
     "gel.press_depth": 0.5,
 }  # sd about the imported value, in the parameter's unit
-BEHIND = {"median": " of the presses, per pixel", "near": ": of each press, the mean of those before and after it"}
+BEHIND = {
+    "median": " of the presses, per pixel",
+    "near": ": of each press, the mean of those before and after it; its noise is part of the stated one",
+}
 EXTRAS = ("scene.xml", "import.json", "README.txt")
 BACKGROUNDS = ("median", "near", "given")
 

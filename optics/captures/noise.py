@@ -132,26 +132,21 @@ class Noise:
         """Standard deviation in DN: the root of `variance`."""
         return np.sqrt(self.variance(signal, frames_averaged))
 
+    def times(self, factor: float | np.ndarray) -> Noise:
+        """Noise of so many times the temporal variance: a number, or one for each channel."""
+
+        def of(value: float | tuple[float, ...], by: float | np.ndarray) -> float | tuple[float, ...]:
+            found = np.multiply(value, by)
+            return tuple(found.tolist()) if found.ndim else float(found)
+
+        return replace(self, system_gain=of(self.system_gain, factor), dark_noise=of(self.dark_noise, np.sqrt(factor)))
+
     def in_cells(self, k: int) -> Noise:
         """The noise of the mean of k x k pixels, as if such means were independent of each other. That of the step is a
         mean too, where noise dithers it (EMVA 1288)."""
-
-        def over(value: float | tuple[float, ...], by: int, power: float) -> float | tuple[float, ...]:
-            rho = np.broadcast_to(self.correlation, (3,) if isinstance(value, tuple) else ())
-            shared = 1 + 2 * sum((1 - d / k) * rho**d for d in range(1, k))
-            found = np.asarray(value, float) / by * shared**power
-            return tuple(found.tolist()) if isinstance(value, tuple) else float(found)
-
-        gain, dark = self.system_gain, self.dark_noise
-        if isinstance(self.correlation, tuple):
-            gain, dark = (v if isinstance(v, tuple) else (v,) * 3 for v in (gain, dark))
+        shared = 1 + 2 * sum(((1 - d / k) * np.array(self.correlation) ** d for d in range(1, k)), np.zeros(()))
         return replace(
-            self,
-            system_gain=over(gain, k**2, 2.0),
-            dark_noise=over(dark, k, 1.0),
-            quantisation=self.quantisation / k,
-            prnu=self.prnu / k,
-            correlation=0.0,
+            self.times((shared / k) ** 2), quantisation=self.quantisation / k, prnu=self.prnu / k, correlation=0.0
         )
 
     def summed(self, frames: int) -> Noise:

@@ -332,6 +332,6 @@ def _unexplained(
     parts = [*found, text[0].upper() + text[1:] if found else text]
     if word == "UNKNOWN" or findings.fall < SHARE * excess:
         parts.append(prints.unexplained(fingerprints, findings.fall, excess))
-    if word == "UNKNOWN" and not fixed and not drift.share > best:
+    if word == "UNKNOWN" and not fixed and not (drifting and drift.share > best):
         parts.append(prints.goes_with(families))
     return " ".join(filter(None, parts)), [DRIFT_HINT] * bool(drifting) + [FIXED_HINT] * bool(fixed)

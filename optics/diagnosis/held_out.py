@@ -32,8 +32,8 @@ def judge(case: Case, outcome: Outcome) -> tuple[Outcome, list[Level]]:
 
     Of explanations that the fitted frames do not tell apart, one is refuted where held-out frames are predicted worse
     with it than without anything, by TOLD (chi2 in units of what the best explanation leaves) and in most of them,
-    while another one predicts them better: a dial that is thought to be eccentric fits three angles, and misses the
-    fourth."""
+    while another one predicts them better: a few angles may not tell an analyser that wobbles from a lamp that drifts,
+    where a further angle does."""
     found: dict[frozenset[str], list[Level]] = {}
 
     def levels_of(t: Trial) -> list[Level]:

@@ -25,8 +25,8 @@ from typing import Any
 import numpy as np
 
 from optics.captures import readings
-from optics.captures.capture_set import FILE, NOISE_KEYS, Captures, Frame, Table
-from optics.captures.noise import UNITS, Noise
+from optics.captures.capture_set import FILE, Captures, Frame, Table, noise_table
+from optics.captures.noise import Noise
 from optics.diagnosis import advice as advise
 from optics.diagnosis import statistics as st
 from optics.diagnosis.evidence import Candidate, Evidence, Progress, measure
@@ -678,10 +678,7 @@ def write(planned: Plan, folder: str | Path) -> Path:
     )
     document.add(tomlkit.comment("and put your camera's numbers under [noise]."))
     document["scene"] = planned.scene
-    document["noise"] = tomlkit.table()
-    for key in NOISE_KEYS:
-        if key != "saturation" or planned.noise.ends:
-            document["noise"].add(key, tomlkit.item(planned.noise.written(key)).comment(UNITS[key]))
+    document["noise"] = noise_table(planned.noise)
     if planned.size == (1, 1):
         document["table"] = {"file": "readings.csv", "values": ["reading"]}
     else:

@@ -22,7 +22,13 @@ def test_every_key_of_captures_toml_has_its_row():
     from optics.captures import capture_set as captures
 
     known = rows(page("captures"))
-    every = {*captures.KEYS, *captures.FRAME_KEYS, *captures.NOISE_KEYS, captures.UNASKED, *captures.TABLE_KEYS}
+    every = {
+        *captures.KEYS,
+        *captures.FRAME_KEYS,
+        *captures.NOISE_KEYS,
+        *captures.OPTIONAL_NOISE_KEYS,
+        *captures.TABLE_KEYS,
+    }
     assert [key for key in every if key not in known] == []
     headings = {"key", "---"}
     assert [row for row in known if row not in every | headings] == [], "a row of a key that is not read"

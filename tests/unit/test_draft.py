@@ -116,7 +116,7 @@ def test_a_pattern_fixed_in_the_image_is_told_from_a_curve(pattern):
     assert all(np.isnan(fixed_pattern(model, *given)) for given in ((few, excess), (swept, excess), (evidence, 0.0)))
 
 
-def of_a_session(pattern, presses=12, side=20):
+def of_a_session(pattern, presses=18, side=20):
     """(model, fit, evidence, excess) of presses with a pattern of 3 % that fades within three frames, that stays, or
     that is new in each frame; or with a lamp that wanders by 2 % as slowly."""
     rng = np.random.default_rng(4)
@@ -142,10 +142,11 @@ def of_a_session(pattern, presses=12, side=20):
 
 
 def test_a_pattern_that_successive_frames_share_is_a_sensor_that_changes():
-    """Neighbours keep .7 of the pattern, frames four apart .24, and half of the pixels lie far from the contacts."""
+    """Neighbours keep .7 of the pattern, frames six apart .12, and .26 of the values lie far from the contacts: about
+    .16 of the excess. One session of 18 presses scatters about that."""
     model, fit, evidence, excess = of_a_session("fades")
     drift = drifting_pattern(model, fit.values, evidence, excess)
-    assert drift.p < 0.01 and 0.15 < drift.share < 0.7
+    assert drift.p < 0.01 and 0.15 < drift.share < 0.25
     assert "the untouched sensor changes during the session" in drifting_text(drift)
     assert np.isnan(drifting_pattern(model, fit.values, replace(evidence, frames=(0, 1, 2)), excess).share)
     assert np.isnan(drifting_pattern(model, fit.values, replace(evidence, spectrum=Sweeps()), excess).share)
