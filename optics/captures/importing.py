@@ -441,7 +441,8 @@ def _check_options(presses: Presses, lengths: dict[str, float], background: str 
         raise UnknownKey(background, BACKGROUNDS, "background")
     if background == "given" and presses.given is None:
         raise BadCapture(
-            f"{presses.source}: background = 'given', but there is no image of the untouched sensor; take 'median'"
+            f"{presses.source}: background = 'given', but there is no image of the untouched sensor; give "
+            "one, or take 'median' or 'near'"
         )
     if not 1 <= every <= len(presses.images):
         raise BadCapture(
