@@ -277,7 +277,7 @@ def _split(case: Case, outcome: Outcome, subject: Candidate | None, basis: Basis
         if not case.evidence.is_table:  # refits of readings are linearised where they end
             trial.fit = homogeneity.with_errors(trial.fit, main.variables, noise)
         # of readings, noise that neighbours share and errors of dials have been rivals, by their likelihood
-        p = math.nan if case.evidence.is_table else case.table.family.p(p)
+        p = math.nan if case.evidence.is_table else case.table.family.bounded(p)
         chance = p if main is subject else chance
         if len(trial.members) == 1 and main.row.refit is not None:
             sd = dict(zip((v.name for v in trial.fit.variables), trial.fit.sd))

@@ -23,8 +23,9 @@ from optics.fit import geometry
 from optics.fit.crew import Hands
 from optics.fit.known_shape import ALL, KNOWN, REGIONS, known_shape
 from optics.fit.model import value_of
-from optics.light.development import STEP, Developer
+from optics.light.development import STEP, Developer, Linear
 from optics.light.renderer import Pixels, everywhere
+from optics.scene.images import SIDE
 from optics.scene.loader import Scene
 from optics.scene.parameter import Parameter, Values, Variable
 
@@ -282,11 +283,26 @@ class SceneModel:
     def radiance(self, now: Mapping, index: int = 0, seed: int = 0) -> np.ndarray:
         """(H, W, B): linear image of a frame at these values; of readings (N, 1, B), also where nothing is lit or
         nothing differs between them: all images have one size, sweeps of readings have each their own. Stokes vectors
-        (3, H, W, B) for a mosaic of analysers."""
+        (3, H, W, B) for a mosaic of analysers. In parts of pixels where the renderer is asked for them."""
         if self.developer.site is not None:
             return np.stack([self.renderer.radiance(now, seed, component) for component in range(3)])
-        image = self.renderer.radiance(now, seed)
-        return np.broadcast_to(image, (*self.frames[index].image.shape[:2], image.shape[2]))
+        image, side = self.renderer.radiance(now, seed), self.renderer.side
+        return np.broadcast_to(image, (*(side * n for n in self.frames[index].image.shape[:2]), image.shape[2]))
+
+    def _side(self, now: Mapping) -> int:
+        """How many values of a pixel each way the lens wants to act on at these values."""
+        return 1 if self.captures.table is not None else self.developer.side(now)
+
+    def _linear(self, now: Mapping, index: int, seed: int, light: Callable | None = None) -> Linear:
+        """The camera linearised about the image of a frame; `light`: gives the image in place of `radiance`."""
+        light, side = light or self.radiance, self._side(now)
+
+        def parted(side: int = SIDE) -> np.ndarray:
+            with self.renderer.splitting(side):
+                return light(now, index, seed)
+
+        whole = side == 1 and self.captures.table is None and not self.monte_carlo
+        return self.developer.linearise(parted(side), now, parted if whole else None)
 
     def intensity(self, now: Mapping, index: int = 0, seed: int = 0) -> np.ndarray:
         """(H, W) radiance that a pixel sees, behind its analyser where it has one; mean of the bands."""
@@ -357,8 +373,9 @@ class SceneModel:
             self._needed_kept.update(dict.fromkeys(press, needed))
         return self._needed_kept[index]
 
-    def _develop(self, now: Mapping, index: int, seed: int) -> np.ndarray:
-        return self.developer.develop(self.radiance(now, index, seed), now)
+    def _develop(self, now: Mapping, index: int, seed: int, light: Callable | None = None) -> np.ndarray:
+        with self.renderer.splitting(self._side(now)):
+            return self.developer.develop((light or self.radiance)(now, index, seed), now)
 
     def _predict(self, now: Mapping, index: int, seed: int = 0) -> np.ndarray:
         image = self._develop(now, index, seed)
@@ -368,7 +385,7 @@ class SceneModel:
         black = self.noise.black_level
         flat = background * self.gains(now)
         at_rest = self.untouched(now)
-        rest = self.developer.develop(self._at_rest(at_rest, index, seed), at_rest)
+        rest = self._develop(at_rest, index, seed, self._at_rest)
         if self.flat_field == "additive":
             return black + flat + image - rest
         return black + (image - black) * flat / np.maximum(rest - black, 1e-6)
@@ -422,12 +439,12 @@ class SceneModel:
     ):
         now = self._turn_to(values, index)
         black = self.noise.black_level
-        linear = self.developer.linearise(self.radiance(now, index, seed), now)
+        linear = self._linear(now, index, seed)
         prediction = linear.image
         background = self.flat_of(index)
         if background is not None:
             at_rest = self.untouched(now)
-            rest = self.developer.linearise(self._at_rest(at_rest, index, seed), at_rest)
+            rest = self._linear(at_rest, index, seed, self._at_rest)
             flat = background * self.gains(now)
             if self.flat_field == "additive":
                 prediction, scale, share, gained = black + flat + linear.image - rest.image, 1.0, 1.0, 1.0
@@ -452,11 +469,12 @@ class SceneModel:
             elif variable.name in at_once:
                 image = linear.of_image(at_once[variable.name])
             else:
-                image = self._tangent(linear, now, acts, seed)
+                with self.renderer.splitting(self._side(now)):
+                    image = self._tangent(linear, now, acts, seed)
                 if background is not None:
-                    still = self._tangent(
-                        rest, at_rest, {k: f for k, f in acts.items() if not self._rests(k)}, seed, True
-                    )
+                    own = {k: f for k, f in acts.items() if not self._rests(k)}
+                    with self.renderer.splitting(self._side(at_rest)):
+                        still = self._tangent(rest, at_rest, own, seed, True)
                     if image is not None or still is not None:
                         image = scale * ((0 if image is None else image) - share * (0 if still is None else still))
                         if any(self.parameters[k].how == "image" for k in acts):
@@ -782,7 +800,7 @@ class SceneModel:
         """key -> factor d prediction / d setting in a frame, (N, 1, C) DN per unit; without those that change
         nothing."""
         now = self._turn_to(values, index)
-        linear = self.developer.linearise(self.radiance(now, index), now)
+        linear = self._linear(now, index, 0)
         found = {key: self._tangent(linear, now, {key: factor}, 0) for key, factor in factors.items()}
         return {key: slope for key, slope in found.items() if slope is not None}
 

@@ -9,20 +9,24 @@
 with the weights w = 1/2 (1, cos 2a, sin 2a) of the Stokes vector in a pixel whose analyser stands at the angle a,
 counterclockwise in the image from its right, and the effects of the stage `site` on them.
 
+Where an effect brings light from pixel to pixel (`Effect.finer`), the lens acts on parts of pixels: images per band are
+then (side H, side W, B), and what a pixel records is the mean of its parts.
+
 All of it is numpy arithmetic, analytic in the image and in every camera parameter, so that derivatives come from a
 complex step: f'(x) v = Im f(x + i h v)/h with h = 1e-30, exact to rounding (Squire & Trapp, SIAM Rev. 40, 110, 1998).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 
 from optics.errors import BadScene
-from optics.scene.declare import IMAGE_STAGES
+from optics.scene.declare import IMAGE_STAGES, Effect
+from optics.scene.images import SIDE, of_pixels
 from optics.spectra.reading import FILES, read_channels
 
 STEP = 1e-30  # of the complex step; far below rounding, far above underflow
@@ -93,8 +97,9 @@ class Developer:
         """What an image function sees as `camera`: every parameter of the camera, and the geometry of its pixels.
 
         u, v (H, W) px; x, y (H, W) normalised coordinates; tan (H, W) tangent of the field angle; focal (px); width,
-        height (px); astray() (H, W) px by which a ray off the pupil's middle misses the chief ray, per mm off it, at
-        the distance that the pixel sees; bands (nm);
+        height (px); side, parts of a pixel each way that the image has, for effects that are `finer`; astray() (H, W)
+        px by which a ray off the pupil's middle misses the chief ray, per mm off it, at the distance that the pixel
+        sees; bands (nm);
         white (B,) radiance per band of white light of radiance 1; settings: all values by key, those of
         other parts too, (N, 1, 1) where readings were swept."""
         own = {n: values[f"{self.name}.{n}"] for n in self.names}
@@ -118,6 +123,7 @@ class Developer:
             focal=focal,
             width=self.width,
             height=self.height,
+            side=1,
             astray=astray,
             bands=np.array(self.bands),
             white=np.ones(len(self.bands)) if self.integral is None else self.integral.white,
@@ -125,7 +131,17 @@ class Developer:
             settings=values,
         )
 
+    def side(self, values: Mapping[str, complex]) -> int:
+        """How many values of a pixel each way the lens wants to act on."""
+        own = (n for e in self.effects["lens"] if e.finer for n in e.parameter_names)
+        return SIDE if any(values[f"{self.name}.{n}"] != self.neutral[n] for n in own) else 1
+
     def _stage(self, stage: str, image, view):
+        for effect in self._active(stage, view):
+            image = effect.stages[stage](image, view)
+        return image
+
+    def _active(self, stage: str, view) -> Iterator[Effect]:
         for effect in self.effects[stage]:
             if all(getattr(view, n) == self.neutral[n] for n in effect.parameter_names):
                 continue  # at neutral an effect is the identity; the contract tests hold every effect to that
@@ -135,12 +151,30 @@ class Developer:
                 and self.camera.named("pupil") in effect.parameter_names
             ):
                 continue  # rays started all over the pupil
-            image = effect.stages[stage](image, view)
+            yield effect
+
+    def _lens(self, image, view):
+        """(H, W, B) behind the lens, of an image as large or in parts of pixels. An effect that does not know of parts
+        changes all parts of a pixel as it changes the pixel."""
+        side = np.shape(image)[-3] // self.height
+        if side <= 1 or np.shape(image)[-3:-1] != (side * self.height, side * self.width):
+            return self._stage("lens", image, view)
+        active, finer = list(self._active("lens", view)), SimpleNamespace(**{**vars(view), "side": side})
+        first = max((k + 1 for k, effect in enumerate(active) if effect.finer), default=0)
+        for effect in active[:first]:
+            if effect.finer:
+                image = effect.stages["lens"](image, finer)
+            else:
+                whole = of_pixels(image, side)
+                image = image + (effect.stages["lens"](whole, view) - whole).repeat(side, 0).repeat(side, 1)
+        image = of_pixels(image, side)
+        for effect in active[first:]:
+            image = effect.stages["lens"](image, view)
         return image
 
     def channels(self, image, view):
-        """Irradiance per channel, 1 = full scale, of an image per band (H, W, B)."""
-        image = self._stage("lens", image, view) if self.site is None else self.behind_analysers(image, view)
+        """Irradiance per channel, 1 = full scale, of an image per band (H, W, B), or in parts of pixels."""
+        image = self._lens(image, view) if self.site is None else self.behind_analysers(image, view)
         image = image @ self.mixing(view).T
         return self._stage("sensor", image * self.scale(view), view)
 
@@ -165,11 +199,11 @@ class Developer:
         """Irradiance per band (H, W, B) behind the analyser of each pixel, of Stokes vectors (3, H, W, B).
 
         A lens treats all polarizations alike; what it adds to darkness is unpolarized."""
-        dark = self._stage("lens", np.zeros(np.shape(stokes)[1:]), view)
+        dark = self._lens(np.zeros(np.shape(stokes)[1:]), view)
         weights = self.weights(view)
         total: Any = 0.0
         for j, component in enumerate(stokes):
-            total = total + weights[..., j, None] * (self._stage("lens", component, view) - (dark if j else 0.0))
+            total = total + weights[..., j, None] * (self._lens(component, view) - (dark if j else 0.0))
         return total
 
     def weights(self, view) -> np.ndarray:
@@ -193,20 +227,30 @@ class Developer:
 
     def develop(self, image: np.ndarray, values: Mapping[str, complex]) -> np.ndarray:
         """DN (H, W, C), noise-free and not clipped, of radiance per band (H, W, B), of Stokes
-        vectors (3, H, W, B) for a mosaic of analysers."""
+        vectors (3, H, W, B) for a mosaic of analysers; or these in parts of pixels."""
         view = self.view(values)
         return self.respond(self.channels(image, view), view)
 
-    def linearise(self, image: np.ndarray, values: Mapping[str, float]) -> Linear:
-        """Prediction and derivatives about an image and camera values."""
-        return Linear(self, image, values)
+    def linearise(
+        self, image: np.ndarray, values: Mapping[str, float], parted: Callable[[], np.ndarray] | None = None
+    ) -> Linear:
+        """Prediction and derivatives about an image and camera values; `parted` gives the image in parts of pixels, for
+        derivatives by what acts on them and is at neutral."""
+        return Linear(self, image, values, parted)
 
 
 class Linear:
     """The camera linearised about one image: `image` in DN, tangents of images and of camera parameters."""
 
-    def __init__(self, developer: Developer, bands: np.ndarray, values: Mapping[str, float]):
-        self.developer, self.bands, self.values = developer, np.asarray(bands, float), values
+    def __init__(
+        self,
+        developer: Developer,
+        bands: np.ndarray,
+        values: Mapping[str, float],
+        parted: Callable[[], np.ndarray] | None = None,
+    ):
+        self.developer, self.bands, self.values, self.parted = developer, np.asarray(bands, float), values, parted
+        self._parts: np.ndarray | None = None
         self.view = developer.view(values)
         channels = developer.channels(self.bands, self.view)
         stepped = developer.respond(channels + 1j * STEP, self.view)
@@ -223,7 +267,10 @@ class Linear:
         stepped = dict(self.values)
         for key in keys:
             stepped[key] = stepped[key] + 1j * STEP
-        return self.developer.develop(self.bands.astype(complex), stepped).imag / STEP
+        bands = self.bands
+        if self.parted is not None and self.developer.side(stepped) > 1:
+            bands = self._parts = self.parted() if self._parts is None else self._parts
+        return self.developer.develop(np.asarray(bands, complex), stepped).imag / STEP
 
     def at(self, keys: tuple[str, ...], value: float) -> np.ndarray:
         """DN at another value of camera parameters (for finite steps)."""

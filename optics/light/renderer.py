@@ -25,6 +25,7 @@ import numpy as np
 from optics.errors import BadScene
 from optics.light import paths
 from optics.processes import return_memory
+from optics.scene.images import finer_of, in_parts
 from optics.scene.loader import Scene
 from optics.scene.mitsuba_parts import DEFAULT_VARIANT
 
@@ -181,6 +182,23 @@ class Renderer:
         self.asked: set[str] = set()  # parameters whose tangents will be asked for, see `asking`
         self._slopes: dict[tuple, tuple[LedImage, dict[str, tuple]]] = {}  # those that were made with others
         self.wanted: Pixels | None = None  # those that take finer samples where they need them; None: all
+        self.side = 1  # values of a pixel each way, see `splitting`
+
+    @contextmanager
+    def splitting(self, side: int) -> Iterator[None]:
+        """Within it, images (H, W, B) are (side H, side W, B), with a value for each part of a pixel: for a lens that
+        brings light from pixel to pixel. The mean of a pixel's parts is its value.
+
+        Finer samples are sorted into the parts. A pixel without any varies by the slope of the pixels about it."""
+        before, self.side = self.side, 1 if self.monte_carlo else side
+        try:
+            yield
+        finally:
+            self.side = before
+
+    def _parts_of(self, image: np.ndarray) -> np.ndarray:
+        """An image of what varies slowly, as fine as images are wanted."""
+        return image if self.side == 1 or image.shape[:2] != (self.height, self.width) else finer_of(image, self.side)
 
     def _told_by(self, key: str) -> list[str]:
         """Of a clock, the keys of the parameters that show through it and nothing else; empty of others, and of a clock
@@ -516,8 +534,14 @@ class Renderer:
                    prefers a polarization (stage `detector`)
         """
         if not self.layered:
-            plain = self._plain.get(self._image_key(values, light, seed))
-            plain = self.led(values, light, seed).radiance if plain is None else plain
+            key = self._image_key(values, light, seed)
+            key = key if self.side == 1 else (*key, self.side)
+            plain = self._plain.get(key)
+            if plain is None:
+                lit = self.led(values, light, seed)
+                plain = (
+                    lit.radiance if self.side == 1 else self._keep_plain(key, self._mix(lit, lit.raw, side=self.side))
+                )
             return plain if component == 0 else np.zeros_like(plain)
         image = self.led(values, light)
         pairs = zip(image.raw, self.weights(values, image, component))
@@ -527,13 +551,14 @@ class Renderer:
         seen = [None if r is None or w is None else r * w for r, w in pairs]
         for add in glows:
             seen = [s if s is None else s + a for s, a in zip(seen, add)]
-        return self._mix(image, seen)
+        return self._mix(image, seen, side=self.side)
 
     def _layered(self, image: LedImage, pairs: Iterable[tuple], own: np.ndarray) -> np.ndarray:
         """(H, W, B) of light that is dark but in its own bands, which lie beside each other, behind layers; pairs of
         what it makes before them and of what they leave."""
         inside = slice(own.min(), own.max() + 1) if len(own) else slice(0, 1)
-        lit = self._mix(image, [None if r is None or w is None else r[:, inside] * w[:, inside] for r, w in pairs])
+        seen = [None if r is None or w is None else r[:, inside] * w[:, inside] for r, w in pairs]
+        lit = self._mix(image, seen, side=self.side)
         if lit.shape[-1] == self.bands:
             return lit
         found = np.zeros((*lit.shape[:2], self.bands), lit.dtype)
@@ -650,7 +675,7 @@ class Renderer:
         if pupil:
             lens = np.full((2, counts.sum()), 0.5, np.float32)
             lens[:, rim] = _places_on_lens(samples, index[~bent], _shift(seed)[2:])
-        return Finer(counts, self._trace(u, v, lens) if len(index) else None)
+        return Finer(counts, self._trace(u, v, lens) if len(index) else None, (u, v))
 
     def _parted(self, values: Mapping) -> np.ndarray:
         """Pixels in whose corners and middle not one body is seen: also those of bodies that no middle sees. And
@@ -739,13 +764,34 @@ class Renderer:
             return np.zeros((self.height * self.width, self.bands)), fine
         return self._each_band(centre, image.led).reshape(self.height * self.width, self.bands), fine
 
-    def _mix(self, image: LedImage, raw: tuple, weights: tuple = (1.0, 1.0)) -> np.ndarray:
-        """(H, W, B) from pixel centres and, where the rim is, from the mean of the finer samples, by its share."""
+    def _mix(self, image: LedImage, raw: Sequence, weights: tuple = (1.0, 1.0), side: int = 1) -> np.ndarray:
+        """(H, W, B) from pixel centres and, where the rim is, from the mean of the finer samples, by its share; of
+        `side` parts of a pixel each way (side H, side W, B)."""
         result = raw[0] * weights[0] if self.layered else raw[0].copy()
-        if len(image.index):
-            result[image.index] += image.share * (image.finer.mean(raw[1] * weights[1]) - result[image.index])
+        centres = result.copy() if side > 1 else result
+        fine = raw[1] * weights[1] if len(image.index) else None
+        if fine is not None:
+            result[image.index] += image.share * (image.finer.mean(fine) - result[image.index])
         height = self.height if len(result) == self.height * self.width else -1
-        return result.reshape(height, self.width, result.shape[-1])
+        result = result.reshape(height, self.width, result.shape[-1])
+        if side == 1 or height < 0:
+            return result
+        return self._in_parts(image, result, centres.reshape(result.shape), fine, side)
+
+    def _in_parts(
+        self, image: LedImage, result: np.ndarray, centres: np.ndarray, fine: np.ndarray | None, side: int
+    ) -> np.ndarray:
+        """(side H, side W, B): pixels `result` (H, W, B) in parts, whose mean they are. They differ as the middles
+        `centres` of the pixels about them do, and where finer samples are, as these."""
+        found = in_parts(finer_of(centres, side) - np.repeat(np.repeat(centres, side, 0), side, 1), side)
+        found = found.reshape(-1, side**2, result.shape[-1])
+        if fine is not None:
+            apart = image.finer.in_parts(fine, side, image.index, self.width)
+            share = image.share if np.ndim(image.share) == 0 else np.asarray(image.share)[..., None]
+            found[image.index] += share * (apart - apart.mean(1, keepdims=True) - found[image.index])
+        found += result.reshape(-1, 1, result.shape[-1])
+        rows = found.reshape(self.height, self.width, side, side, -1).transpose(0, 2, 1, 3, 4)
+        return rows.reshape(self.height * side, self.width * side, -1)
 
     def _bands(self, spectra: Sequence, count: int | None = None) -> list[np.ndarray]:
         import drjit as dr
@@ -829,7 +875,14 @@ class Renderer:
     def led_tangent_at_rest(self, values: Mapping, led: str, key: str, component: int = 0, seed: int = 0) -> np.ndarray:
         """`led_tangent`, kept: all frames share the gel at rest."""
         now = tuple(values[k] for k in self.shading_keys)  # also clocks, through which a derivative shows
-        known = (key, component, now, *self._led_key(values, led, seed), *(values[k] for k in self.layer_order))
+        known = (
+            key,
+            component,
+            now,
+            *self._led_key(values, led, seed),
+            *(values[k] for k in self.layer_order),
+            self.side,
+        )
         if known not in self._tangents:
             with everywhere(self):
                 self._tangents[known] = self.led_tangent(values, led, key, component, seed).astype(np.float32)
@@ -851,8 +904,12 @@ class Renderer:
             if not self.asked:
                 self._slopes.clear()
         if component and not self.layered:
-            return np.zeros((self.height, self.width, self.bands))
-        return self._mix(image, found[key], self.weights(values, image, component) if self.layered else (1.0, 1.0))
+            return self._dark()
+        weights = self.weights(values, image, component) if self.layered else (1.0, 1.0)
+        return self._mix(image, found[key], weights, self.side)
+
+    def _dark(self) -> np.ndarray:
+        return np.zeros((self.side * self.height, self.side * self.width, self.bands))
 
     @contextmanager
     def asking(self, keys: Iterable[str]) -> Iterator[None]:
@@ -991,9 +1048,9 @@ class Renderer:
     def _bounced(self, values: Mapping, led: str, image: np.ndarray, component: int) -> np.ndarray:
         """A bounced image behind the layers."""
         if not self.layered:
-            return image if component == 0 else np.zeros_like(image)
+            return self._parts_of(image if component == 0 else np.zeros_like(image))
         weight = self._weight(values, led, self.hits(values).path, component, ())
-        return image * weight.reshape(-1, self.width, self.bands)
+        return self._parts_of(image * weight.reshape(-1, self.width, self.bands))
 
     def glows(self, values: Mapping) -> bool:
         """Whether there is light that no LED made."""
@@ -1002,9 +1059,9 @@ class Renderer:
     def ambient(self, values: Mapping, component: int = 0) -> np.ndarray:
         """(H, W, B): radiance of the membranes that no LED made."""
         if not self.glows(values) or component and not self.layered:
-            return np.zeros((self.height, self.width, self.bands))
+            return self._dark()
         if not self.layered:
-            return (
+            return self._parts_of(
                 np.broadcast_to(self._shone(values, self.hits(values).sample), (self.height * self.width, self.bands))
                 .reshape(self.height, self.width, self.bands)
                 .astype(float)
@@ -1105,17 +1162,36 @@ class Hits:
 class Finer:
     """Finer samples of some pixels, those of a pixel behind each other.
 
-    counts   (n,) of each pixel;   sample   their ends, N in all; None where no pixel has any
+    counts   (n,) of each pixel;   sample   their ends, N in all; None where no pixel has any;   at   their places u, v
+             in px, (N,) each
     """
 
-    def __init__(self, counts: np.ndarray, sample: Sample | None):
-        self.counts, self.sample = counts, sample
+    def __init__(self, counts: np.ndarray, sample: Sample | None, at: tuple[np.ndarray, np.ndarray]):
+        self.counts, self.sample, self.at = counts, sample, at
         self.size = int(counts.sum())
         self._starts = np.cumsum(counts) - counts
+        self._sorted: dict = {}  # side -> which samples lie in which part of a pixel, as weights of their mean
 
     def mean(self, values: np.ndarray) -> np.ndarray:
         """(n, B) mean in each pixel of values (N, B)."""
         return np.add.reduceat(values, self._starts) / self.counts[:, None]
+
+    def in_parts(self, values: np.ndarray, side: int, index: np.ndarray, width: int) -> np.ndarray:
+        """(n, side^2, B) mean of values (N, B) in each part of the pixels `index`, row by row; in a part without a
+        sample the pixel's mean."""
+        from scipy.sparse import coo_array
+
+        if side not in self._sorted:
+            pixel = np.repeat(np.arange(len(self.counts)), self.counts)
+            corner = (index % width)[pixel], (index // width)[pixel]
+            column, row = (np.clip(((a - c) * side).astype(int), 0, side - 1) for a, c in zip(self.at, corner))
+            part = pixel * side**2 + row * side + column
+            count = np.bincount(part, minlength=len(self.counts) * side**2)
+            weights = coo_array((1 / count[part], (part, np.arange(self.size))), (len(count), self.size)).tocsr()
+            self._sorted[side] = weights, count.reshape(-1, side**2, 1) == 0
+        weights, empty = self._sorted[side]
+        found = (weights @ values).reshape(len(self.counts), side**2, -1)
+        return np.where(empty, self.mean(values)[:, None], found) if empty.any() else found
 
     def span(self, values: np.ndarray) -> np.ndarray:
         """(n, B) largest less smallest of values (N, B) in each pixel."""

@@ -231,6 +231,10 @@ class RenderJob:
             channels.update({f"variance.{name}": image for name, image in scatter.items() if name in channels})
         header = exr.spectral_header(renderer.layered, UNITS if self.integral is None else UNITS + ".nm^-1")
         header = header if self.bands and not self.auto else {}
+        side = self.developer.side(now)
+        if side > 1:
+            with renderer.splitting(side):
+                totals = [renderer.radiance(arriving, seed, component) for component in range(len(totals))]
         self.scene.set(now)  # the renderer leaves the LEDs at power 1
         return Rendering(channels, header, self._developed(totals, now))
 

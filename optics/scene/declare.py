@@ -148,6 +148,8 @@ class Effect:
     reads       names of the part's own parameters that the functions read besides: of the kinds that play the part's
                 role, those that lack one do not carry the effect
     mixes_pixels  True where it mixes the pixels of an image: point readings cannot have it
+    finer       True where its function of the lens acts on parts of pixels, `camera.side` each way: what is narrower
+                than a pixel is moved or smeared before the pixel takes its mean
     acts        coordinates that it acts through: radius, height, slope, led, channel, frame, intensity ...
     needs       what a capture set must vary for it to be seen, in words
     seek        where an effect has a place that no derivative leads to: f(model, values, frames) -> {key: value} of
@@ -170,6 +172,7 @@ class Effect:
     requires: tuple[str, ...] = ()
     reads: tuple[str, ...] = ()
     mixes_pixels: bool = False
+    finer: bool = False
     acts: tuple[str, ...] = ()
     needs: str = ""
     seek: Callable | None = None

@@ -1,12 +1,38 @@
 """What effects of a lens do to images: blur by a Gaussian, and a change of size about the optical axis.
 
-Both are linear in the image and analytic in their strength, for derivatives by complex step."""
+Both are linear in the image and analytic in their strength, for derivatives by complex step. They act on parts of
+pixels, where there are some: an edge is narrower than a pixel, and the mean of a pixel does not say where it is."""
 
 from __future__ import annotations
 
 from functools import cache
 
 import numpy as np
+
+SIDE = 2  # parts of a pixel each way that a lens which brings light from pixel to pixel acts on
+
+
+def finer_of(image: np.ndarray, side: int) -> np.ndarray:
+    """(side H, side W, B) of an image (H, W, B) that varies slowly, by the slopes that it has from pixel to pixel; the
+    mean of a pixel's parts is the pixel."""
+    for axis in (0, 1):
+        slope = np.gradient(image, axis=axis) if image.shape[axis] > 1 else np.zeros_like(image)
+        away = (np.arange(side) + 0.5) / side - 0.5
+        parts = np.stack([image + a * slope for a in away], axis + 1)
+        image = parts.reshape(*image.shape[:axis], -1, *image.shape[axis + 1 :])
+    return image
+
+
+def in_parts(image: np.ndarray, side: int) -> np.ndarray:
+    """(H, W, side, side, B): an image (side H, side W, B) by pixels."""
+    height, width = (n // side for n in image.shape[:2])
+    return image.reshape(height, side, width, side, -1).transpose(0, 2, 1, 3, 4)
+
+
+def of_pixels(image: np.ndarray, side: int) -> np.ndarray:
+    """(..., H, W, B): mean of the parts of each pixel of an image (..., side H, side W, B)."""
+    *more, rows, columns, bands = image.shape
+    return image.reshape(*more, rows // side, side, columns // side, side, bands).mean((-4, -2))
 
 
 def blurred(image: np.ndarray, variance) -> np.ndarray:

@@ -10,7 +10,8 @@ Fingerprint
     acts where the image is curved: at shadow rims and at the rim of the contact. LED size blurs shadow rims only,
     smoothing of the gel only the dent.
 Validity
-    the same blur over the whole field; wider tails than a Gaussian are glare or halo.
+    the same blur over the whole field; wider tails than a Gaussian are glare or halo. Halves of pixels are blurred, and
+    rims that are narrower are as wide as these.
 References
     Goodman, Introduction to Fourier Optics, ch. 6.
 """
@@ -26,7 +27,7 @@ from optics.scene.parameter import Parameter
 
 
 def smear(image, camera):
-    return blurred(image, camera.blur)
+    return blurred(image, camera.blur * camera.side**2)
 
 
 def check_point_spread():
@@ -35,15 +36,15 @@ def check_point_spread():
     image[30, 40] = 1.0
     v, u = np.mgrid[:60, :80]
     for variance in (0.5, 2.0, 9.0):
-        spread = smear(image, SimpleNamespace(blur=variance))
+        spread = smear(image, SimpleNamespace(blur=variance, side=1))
         agree(spread.sum(), 1.0, 1e-5)  # but for the ringing of its band limit beyond the borders
         assert spread.min() > -2e-3  # band-limited: below half a pixel of width it rings a little
         for axis, middle in ((v, 30), (u, 40)):
             # exp(-V w^2/2) has the second moment V; the sampled kernel has it but for what its tails leave at the
             # borders
             agree(((axis - middle) ** 2 * spread[..., 0]).sum(), variance, 1e-3)
-    twice = smear(smear(image, SimpleNamespace(blur=1.5)), SimpleNamespace(blur=0.5))
-    agree(twice, smear(image, SimpleNamespace(blur=2.0)), 0, 1e-6)  # as above
+    twice = smear(smear(image, SimpleNamespace(blur=1.5, side=1)), SimpleNamespace(blur=0.5, side=1))
+    agree(twice, smear(image, SimpleNamespace(blur=2.0, side=1)), 0, 1e-6)  # as above
 
 
 effect = Effect(
@@ -52,6 +53,7 @@ effect = Effect(
     stages={"lens": smear},
     onset="both",
     mixes_pixels=True,
+    finer=True,
     parameters=(
         Parameter("blur", "px^2", 0.0, (0.0, 400.0), "variance V of the blur", neutral=0.0, plausible=1.0, how="image"),
     ),

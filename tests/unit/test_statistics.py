@@ -441,3 +441,17 @@ def test_a_bound_strength_that_a_free_one_imitates_adds_nothing(ratio):
     assert np.mean(cone.p(falls) < 0.05) == pytest.approx(0.05, abs=0.015)  # three sd of 2000
     fall, _ = cone.solve(scores[0])
     assert fall == pytest.approx(falls[0], rel=1e-6)
+
+
+def test_a_p_by_scatter_is_no_more_than_the_sum_over_all_candidates():
+    """Where products of noisy images are no covariance: two strengths of each effect are nearly one, yet differ in what
+    they share with other effects. Scores drawn without negative eigenvalues then say little of a small p; three
+    candidates bring it three times at most. Of a covariance, nothing changes but for the simulation's error."""
+    v = np.kron(np.eye(3), [[1, 0.999], [0.999, 1]]) + np.kron(1 - np.eye(3), [[0.6, -0.1], [-0.1, 0.6]])
+    assert np.linalg.eigvalsh(v).min() < -0.5
+    family = st.Family(v, candidates_of(v, (2, 2, 2), (0,) * 6), seed=1)
+    assert family.p(1e-6) > 0.1
+    assert family.bounded(1e-6) == pytest.approx(3e-6)
+    assert family.bounded(0.9) == family.p(0.9) and np.isnan(family.bounded(np.nan))
+    strangers = st.Family(np.eye(2), candidates_of(np.eye(2), (1, 1), (0, 0)))
+    assert strangers.bounded(0.01) == pytest.approx(strangers.p(0.01), rel=0.2)  # 2 sd of 400 draws

@@ -184,6 +184,7 @@ class ParticleMaker:
         pixel = np.arange(width * height).repeat(n)
         across, down = ((k * step + own) % 1.0 for step, own in zip((0.7548776662466927, 0.5698402909980532), shift))
         row, column = pixel // width, pixel % width
+        self.places = across.reshape(height, width, n), down.reshape(height, width, n)  # of rays in their pixels
         focal = width / 2 / np.radians(v["camera.x_fov"] / 2)
         x = (column + across - width / 2 - v["camera.principal_x"]) / focal
         y = (row + down - height / 2 - v["camera.principal_y"]) / focal
@@ -349,7 +350,8 @@ class ParticleMaker:
                 more = self.bounced(ring, p, normal, number, centres, face, seen, excited)
                 images = [i + self.effects["interreflection"] * m for i, m in zip(images, more)]
             found[ring] = tuple(
-                (fall[:, None] * image).reshape(height, width, -1, len(self.bands)).mean(2) for image in images
+                self.behind_lens((fall[:, None] * image).reshape(height, width, -1, len(self.bands)))
+                for image in images
             )
         return found
 
@@ -386,16 +388,35 @@ class ParticleMaker:
         return mirrored, shone
 
     # -- camera -------------------------------------------------------------------------------------------------------
+    def behind_lens(self, light: np.ndarray) -> np.ndarray:
+        """(H, W, B) of the light (H, W, N, B) of all rays. A blur spreads each by a Gaussian about its place: a pixel
+        gets differences of two error functions of it. Beyond the borders the image is mirrored."""
+        from scipy.special import ndtr
+
+        if "lens blur" not in self.effects:
+            return light.mean(2)
+        sd, (width, height) = np.sqrt(self.effects["lens blur"]), self.size
+        reach = int(np.ceil(6 * sd)) + 1
+        around = ((reach, reach), (reach, reach), (0, 0))
+        light = np.pad(light, (*around, (0, 0)), "symmetric")
+        x, y = (np.pad(place, around, "symmetric") for place in self.places)
+        for side in (slice(None, reach), slice(-reach, None)):
+            x[:, side], y[side] = 1 - x[:, side], 1 - y[side]
+        steps = np.arange(-reach, reach + 1)  # to pixels that a ray's light falls on
+        total = np.zeros((height + 4 * reach, width + 4 * reach, light.shape[-1]))
+        for row in range(len(light)):
+            right = ndtr((steps + 1 - x[row][..., None]) / sd) - ndtr((steps - x[row][..., None]) / sd)
+            down = ndtr((steps + 1 - y[row][..., None]) / sd) - ndtr((steps - y[row][..., None]) / sd)
+            sent = (light[row][:, :, None] * right[..., None]).reshape(*right.shape[:2], -1)
+            fallen = (down.swapaxes(1, 2) @ sent).reshape(-1, len(steps), len(steps), light.shape[-1]) / right.shape[1]
+            for i in range(len(steps)):
+                for j in range(len(steps)):
+                    total[row + i, j : j + len(fallen)] += fallen[:, i, j]
+        return total[2 * reach : -2 * reach, 2 * reach : -2 * reach]
+
     def photograph(self, radiance: np.ndarray, rng) -> np.ndarray:
         """(H, W, B) noisy, quantised DN."""
-        from scipy.ndimage import gaussian_filter
-
         n, image = self.noise, radiance
-        if "lens blur" in self.effects:
-            sd = np.sqrt(self.effects["lens blur"])
-            image = np.stack(
-                [gaussian_filter(b, sd, mode="reflect", truncate=6) for b in np.moveaxis(image, -1, 0)], -1
-            )
         if "excitation leak" in self.effects:
             image = image.copy()
             image[..., 1] += self.effects["excitation leak"] * image[..., 2]

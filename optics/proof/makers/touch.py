@@ -12,7 +12,8 @@ How far the model's images are from these, as a share of the noise: with 16 fram
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -24,8 +25,8 @@ from optics.proof.makers import in_variant
 from optics.scene.loader import Scene
 
 VARIANT = "llvm_ad_mono"
-FINE = 9  # samples of a pixel each way, on which blur acts; odd, so that one of them is its middle
-AROUND = 12  # pixels beyond the borders that blur brings light from
+FINE = 8  # parts of a pixel each way, on which blur acts: what a pixel has is the mean of what falls on it
+AROUND = 6  # pixels beyond the borders that blur brings light from
 CAMERA = Noise(system_gain=0.04, dark_noise=0.8, black_level=8.0, saturation=255.0, prnu=0.0)
 MAKERS = (
     "lens vignetting",
@@ -56,18 +57,6 @@ def presses(count: int, seed: int, width: float = 7.0, length: float = 5.0, dept
     return np.column_stack(
         [(cube[:, 0] - 0.5) * width, (cube[:, 1] - 0.5) * length, depth[0] + cube[:, 2] * (depth[1] - depth[0])]
     )
-
-
-def smeared(image: np.ndarray, spread: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-    """An image (H, W, C) after a blur that acts on FINE samples of a pixel each way of the cubic spline through it: a
-    kernel sampled once a pixel has the variance asked for only if that is wide (0.013 px^2 in place of 0.1). Light
-    comes in from AROUND pixels beyond the borders, where the image goes on with its slope."""
-    from scipy.ndimage import zoom
-
-    wide = np.pad(image, ((AROUND, AROUND), (AROUND, AROUND), (0, 0)), "reflect", reflect_type="odd")
-    planes = (zoom(wide[..., c], FINE, order=3, mode="reflect", grid_mode=True) for c in range(image.shape[2]))
-    inside = slice(FINE * AROUND + FINE // 2, -FINE * AROUND, FINE)
-    return np.stack([spread(plane)[inside, inside] for plane in planes], -1)
 
 
 class Maker:
@@ -101,7 +90,7 @@ class Maker:
         if unknown:
             raise ValueError(f"no independent way to make {', '.join(sorted(unknown))}; known: {', '.join(MAKERS)}")
         self.noise, self.seed, self.spp, self.frames_summed = noise, seed, spp, frames
-        self.count = 0
+        self.count, self.wide = 0, False
         self.camera_z = float(scene.camera.columns[3].z[0])
         self.bands = np.array(scene.integrator.bands)
         self.matrix = sensitivities(
@@ -282,6 +271,41 @@ class Maker:
                 images["ambient"] = self.traced(self.scene(mesh, sky, 2), 1.0)[..., None] * np.array(rho)
             return images
 
+    @contextmanager
+    def widened(self, fine: int, around: int) -> Iterator[None]:
+        """Within it, images have `fine` parts of a pixel each way and show `around` pixels more at each border, by as
+        many samples of a pixel."""
+        size, spp, v, fov = self.size, self.spp, self.values, f"{self.camera}.x_fov"
+        wide = [n + 2 * around for n in size]
+        half = np.tan(np.radians(v[fov]) / 2) * wide[0] / size[0]
+        self.values = {**v, fov: 2 * float(np.degrees(np.arctan(half)))}
+        self.size, self.spp, self.wide = (fine * wide[0], fine * wide[1]), max(spp // fine**2, 1), True
+        try:
+            yield
+        finally:
+            self.values, self.size, self.spp, self.wide = v, size, spp, False
+
+    def smeared(self, press: Sequence[float]) -> dict[str, np.ndarray]:
+        """`light` behind a lens that blurs: before pixels take their means, as they do not say where in them a rim
+        is."""
+        if "lens blur" not in self.effects:
+            return self.light(press)
+        with self.widened(FINE, AROUND):
+            light = self.light(press)
+        width, height = self.size
+        found = {}
+        for name, image in light.items():
+            soft = np.stack([self.spread(image[..., c]) for c in range(image.shape[2])], -1)
+            parts = soft.reshape(height + 2 * AROUND, FINE, width + 2 * AROUND, FINE, -1)
+            found[name] = parts.mean((1, 3))[AROUND:-AROUND, AROUND:-AROUND]
+        return found
+
+    def spread(self, plane: np.ndarray) -> np.ndarray:
+        """A plane of parts of pixels behind the lens."""
+        from scipy.ndimage import gaussian_filter
+
+        return gaussian_filter(plane, FINE * np.sqrt(self.effects["lens blur"]), mode="nearest", truncate=6)
+
     def through_gel(self, image: np.ndarray, led: str, press) -> np.ndarray:
         """Beer-Lambert and single scattering in numpy, on the analytic view of the dented plane (pixel centres)."""
         v = self.values
@@ -338,7 +362,7 @@ class Maker:
     # -- camera -------------------------------------------------------------------------------------------------------
     def photograph(self, radiance: np.ndarray, rng, frame: int) -> np.ndarray:
         """Noisy, quantised DN of a radiance (H, W, 3); the camera's effects by scipy."""
-        from scipy.ndimage import gaussian_filter, map_coordinates
+        from scipy.ndimage import map_coordinates
 
         v, e, cam = self.values, self.effects, self.camera
         width, height = self.size
@@ -355,9 +379,6 @@ class Maker:
             image = np.stack([map_coordinates(image[..., c], at, order=3, mode="nearest") for c in range(3)], -1)
         if "lens vignetting" in e:
             image = image * (np.cos(np.arctan(np.hypot(x, y))) ** (4 * e["lens vignetting"]))[..., None]
-        if "lens blur" in e:
-            sd = FINE * np.sqrt(e["lens blur"])
-            image = smeared(image, lambda plane: gaussian_filter(plane, sd, mode="reflect", truncate=6))
         if "veiling glare" in e:
             image = image + e["veiling glare"] * (image.mean((0, 1)) - image)
         signal = image @ self.matrix.T * v[f"{cam}.exposure"]
@@ -393,7 +414,7 @@ class Maker:
         with in_variant(VARIANT):
             lights = []
             for press in at:
-                lights.append(self.light(press))
+                lights.append(self.smeared(press))
                 if progress:
                     progress("captures", len(lights), len(at))
         for k, (press, light) in enumerate(zip(at, lights)):

@@ -12,6 +12,7 @@ from __future__ import annotations
 import re
 import zlib
 from collections.abc import Mapping
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -173,18 +174,14 @@ class WildColour(Wild):
     def light(self, press) -> dict[str, np.ndarray]:
         v, hidden, other = self.values, self.hidden, self.bent
         whole = {f"{self.membrane}.rho_{c}": 1.0 for c in "rgb"}
-        size, spp, fov = self.size, self.spp, f"{self.camera}.x_fov"
-        self.values = {**v, **whole}
-        if set(colour.BENT_BY_LENS) & set(hidden):
-            wide = [n + 2 * colour.AROUND for n in size]
-            half = np.tan(np.radians(v[fov]) / 2) * wide[0] / size[0]
-            self.values[fov] = 2 * float(np.degrees(np.arctan(half)))
-            self.size, self.spp = (colour.FINE * wide[0], colour.FINE * wide[1]), spp // colour.FINE**2
+        moved = bool(set(colour.BENT_BY_LENS) & set(hidden))
         try:
-            grey = {led: image[..., 0] for led, image in super().light(press).items()}
-            ways = {led: self._way(led, press) for led in grey} if "gel yellowing" in hidden else {}
+            self.values = {**v, **whole}
+            with self.widened(colour.FINE, colour.AROUND) if moved else nullcontext():
+                grey = {led: image[..., 0] for led, image in super().light(press).items()}
+                ways = {led: self._way(led, press) for led in grey} if "gel yellowing" in hidden else {}
         finally:
-            self.values, self.size, self.spp = v, size, spp
+            self.values = v
         quantum = colour.sensitivities(SENSOR, hidden, other)
         quantum = quantum * colour.reflectance([v[f"{self.membrane}.rho_{c}"] for c in "rgb"], hidden, other)
         x, y = self._tangents()

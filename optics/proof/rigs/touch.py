@@ -172,12 +172,14 @@ class Wild(Workshop, synthetic.Maker):
             tuple(np.round(press, 9)),
             tuple(sorted((n, s) for n, s in self.effects.items() if n not in IN_CAMERA)),
         )
-        if key not in self.kept:
-            while len(self.kept) > 60:
-                self.kept.pop(next(iter(self.kept)))
+        light = dict(self.kept.get(key, {}))
+        if not light:
             self.count = 0
-            self.kept[key] = super().light(press)
-        light = dict(self.kept[key])
+            light = super().light(press)
+            if not self.wide:  # in parts of pixels, those of sixty presses would take a gigabyte
+                while len(self.kept) > 60:
+                    self.kept.pop(next(iter(self.kept)))
+                self.kept[key] = dict(light)
         if self.other and "ambient" in light:
             x, _ = self._tangents()
             light["ambient"] = light["ambient"] * (1 + 0.5 * x / x.max())[..., None]
@@ -242,7 +244,6 @@ class Wild(Workshop, synthetic.Maker):
 
     def lens(self, image):
         from scipy.ndimage import gaussian_filter, map_coordinates
-        from scipy.signal import fftconvolve
 
         e = self.effects
         x, y = self._tangents()
@@ -259,18 +260,19 @@ class Wild(Workshop, synthetic.Maker):
             image = np.stack([map_coordinates(image[..., c], at, order=3, mode="nearest") for c in range(3)], -1)
         if "lens vignetting" in e:
             image = image * (1 - 2 * e["lens vignetting"] * t2 * (1 + 0.6 * t2 / t2.max()))[..., None]
-        if "lens blur" in e:
-            # the variance of a disc of radius R is R^2/4 along a line
-            disc = _disc(synthetic.FINE * np.sqrt(4 * e["lens blur"]))
-
-            def mirrored(plane):
-                return fftconvolve(np.pad(plane, disc.shape[0] // 2, "symmetric"), disc, mode="valid")
-
-            image = synthetic.smeared(image, mirrored)
         if "veiling glare" in e:
             wide = np.stack([gaussian_filter(image[..., c], width / 5, mode="reflect") for c in range(3)], -1)
             image = image + e["veiling glare"] * (wide - image)
         return image
+
+    def spread(self, plane):
+        from scipy.signal import fftconvolve
+
+        if not self.other:
+            return super().spread(plane)
+        # the variance of a disc of radius R is R^2/4 along a line
+        disc = _disc(synthetic.FINE * np.sqrt(4 * self.effects["lens blur"]))
+        return fftconvolve(np.pad(plane, disc.shape[0] // 2, "edge"), disc, mode="valid")
 
     def sensed(self, signal, frame: int):
         e = self.effects
@@ -315,7 +317,7 @@ class Wild(Workshop, synthetic.Maker):
         rng = np.random.default_rng([self.seed, 3])
         frames = []
         with in_variant(synthetic.VARIANT):
-            lights = [self.light(shot.press) for shot in shots]
+            lights = [self.smeared(shot.press) for shot in shots]
         for number, (shot, light) in enumerate(zip(shots, lights)):
             radiance = sum(p * self.values[f"{led}.power"] * light[led] for led, p in shot.drive.items() if p)
             radiance = radiance + light.get("ambient", 0.0) + np.zeros((*self.size[::-1], 3))
