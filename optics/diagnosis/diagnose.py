@@ -271,7 +271,7 @@ def _split(case: Case, outcome: Outcome, subject: Candidate | None, basis: Basis
             left[trial.names],
             net,
             beside,
-            explanations.noise_of(case, outcome, trial) if case.evidence.is_table else None,
+            explanations.noise_of(case, outcome, trial),
         )
         splits += own
         if not case.evidence.is_table:  # refits of readings are linearised where they end

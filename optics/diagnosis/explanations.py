@@ -718,9 +718,18 @@ def beside_noise(case: Case, outcome: Outcome) -> tuple[Correlation, float]:
     return noise, min(left.p, jump)
 
 
-def noise_of(case: Case, outcome: Outcome, trial: Trial) -> Correlation:
-    """What neighbouring readings share about an explanation of a table."""
-    return _readings(case, trial).noise(outcome.scale)
+def noise_of(case: Case, outcome: Outcome, trial: Trial) -> Correlation | None:
+    """What neighbouring readings, or the pixels of a frame, share about an explanation; None of images that are too few
+    to tell, or where each frame has a strength. A lamp that swings by more than NOTICED is no noise of images."""
+    if case.evidence.is_table:
+        return _readings(case, trial).noise(outcome.scale)
+    if case.lamp is None or trial.by_frame:
+        return None
+    readings = _of_frames(case, case.lamp, trial)
+    readings.most = min(case.lamp.most, NOTICED)
+    found = readings.noise(outcome.scale)
+    readings.most = case.lamp.most
+    return found
 
 
 def _with_survivors(case: Case, outcome: Outcome) -> Outcome:

@@ -600,6 +600,54 @@ def test_what_splits_a_strength_is_held_against_clutter_too(proxy):
     assert np.mean(naive) > 0.9 and (np.mean(uneven) > 0.9 if proxy else np.mean(uneven) < 0.15), np.mean(uneven)
 
 
+class Slopes(Slope):
+    """The same in several frames, the slope from one side on: with a strength in each frame it takes up part of what a
+    lamp does there."""
+
+    def __init__(self, count):
+        self.frames = [Frame(f"frame-{n}", np.zeros(self.shape)) for n in range(count)]
+        self.across = np.linspace(0, 1, 32)[None, :, None] + np.zeros(self.shape)
+
+    def predict(self, values, frames=None, seed=0):
+        return super().predict(values) * len(self.frames if frames is None else frames)
+
+    def derivatives(self, values, variables, frames=None, secant=None, seed=0):
+        for _ in frames:
+            yield from super().derivatives(values, variables)
+
+
+@pytest.mark.parametrize("proxy", [False, True])
+def test_a_lamp_that_wanders_splits_no_strength_by_frame(proxy):
+    """Twelve frames under a lamp that wanders by 1 %, 16 sd of the mean of a frame, and a slope of 10 %, or of 5 and
+    15 % in turn. By noise of pixels alone both have a strength for each frame."""
+    from optics.diagnosis.session import Frames
+
+    rng, effect, count = np.random.default_rng(8), Effect("slope", "lamp", ("slope",)), 12
+    power, slope = (Variable(key, (key,), p) for key, p in Slope.parameters.items())
+    model = Slopes(count)
+    for n, frame in enumerate(model.frames):
+        strength = 0.1 + proxy * (0.05 if n % 2 else -0.05)
+        lamp = 1 + 0.01 * rng.standard_normal()
+        frame.image = Slope.noise.expose(64 + 400 * lamp * (1 + strength * model.across), rng)
+    frames = list(range(count))
+    fit = mock_fit(model, [power, slope], Values(), frames)
+    c = Candidate.at(model, Values(), effect, [slope])
+    base = measure(model, fit.values, [power], [c], frames, 10**6, 0, lambda *a: None)
+    images = base.dense([*base.base, *c.forms["tangent"]])
+    noise = Frames(model, base).about(np.concatenate([b.r for b in base.blocks]), images).noise(1.0)
+    assert noise.kind == "lamp"
+    left = SimpleNamespace(complete=True, excess_sd=0.0, structure_p=0.5)
+    places = [{"place": np.arange(1024.0) // 64, "frame": np.full(1024, n), "channel": np.zeros(1024)} for n in frames]
+    fall = (fit.values.common["lamp.slope"] / fit.sd[1]) ** 2
+
+    def by_frame(noise):
+        own = homogeneity.split(model, base, places, 10**6, 0, lambda *a: None, c, fit, left, fall, noise=noise)[0]
+        return next(s for s in own if s.by == "frame")
+
+    assert not by_frame(None).holds
+    assert by_frame(noise).holds is not proxy
+
+
 # -- views -----------------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize("name", ["null", "vignetting", "flicker", "drift"])
 def test_json_brings_everything_back(name):
