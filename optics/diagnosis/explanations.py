@@ -558,7 +558,7 @@ def _joined(case: Case, trials: dict[frozenset[str], Trial]) -> list[frozenset[s
             ranked,
             lambda net, both: net / scale + _expected_gain(case, both, scale) - sum(map(expected_cost, both)),
         ),
-        _Ranking(lambda t: _score(t, 1.0), ranked, lambda net, both: net - sum(map(expected_cost, both))),
+        _Ranking(lambda t: _score(t, 1.0), ranked, lambda net, both: net - sum(map(expected_cost, both)), False),
     ]
     tried = set(trials)
     for n in range(pairs.REFITTED):
@@ -567,7 +567,7 @@ def _joined(case: Case, trials: dict[frozenset[str], Trial]) -> list[frozenset[s
             break
         case.say("refit of pairs", n, pairs.REFITTED)
         a, b, linear = wanted[0]
-        tried.add(names := frozenset([a.effect.name, b.effect.name]))
+        tried.add(names := _names(wanted[0]))
         try:
             found = with_effects(case, [(a, linear[: len(a.columns)]), (b, linear[len(a.columns) :])], START)
         except FAILURES:
@@ -576,43 +576,54 @@ def _joined(case: Case, trials: dict[frozenset[str], Trial]) -> list[frozenset[s
         if math.isfinite(made.after):
             trials[names] = made
     case.say("refit of pairs", pairs.REFITTED, pairs.REFITTED)
-    return [frozenset(c.effect.name for c in pair[:2]) for pair in _next(rankings, trials.values(), tried)]
+    return [_names(pair) for pair in _next(rankings, trials.values(), tried)]
 
 
 Pair = tuple[Candidate, Candidate, np.ndarray]  # two effects, and coefficients of both
 
 
 class _Ranking:
-    """Pairs by what is expected of them, and the trials that they are held against by `score_of`."""
+    """Pairs by what is expected of them, and the trials that they are held against by `score_of`.
+
+    beside   whether what a lamp may have done to whole frames is counted. If not, a pair that contains an effect which
+             leaves nothing but that lamp is not asked for
+    """
 
     def __init__(
         self,
         score_of: Callable[[Trial], float],
         ranked: Sequence[tuple[float, Candidate, Candidate, np.ndarray]],
         expected_of: Callable[[float, list[Candidate]], float],
+        beside: bool = True,
     ):
-        self.score_of = score_of
+        self.score_of, self.beside = score_of, beside
         expected = [(expected_of(net - pairs.shortfall([a, b]), [a, b]), (a, b, x)) for net, a, b, x in ranked]
         self.expected = sorted(expected, key=lambda e: -e[0])
 
     def wanted(self, trials: Iterable[Trial]) -> list[Pair]:
-        """The pairs that are expected to do better than the best trial, best first."""
+        """The pairs that are expected to do better than the best trial, best first: than its refit, or than was
+        expected of it where that was less. What images promised too little of one pair they may of others."""
         top, best = max(((self.score_of(t), t) for t in trials), key=lambda s: s[0])
+        promised = next((e for e, pair in self.expected if _names(pair) == best.names), top)
         found = []
         for expected, pair in self.expected:
-            nested = best.names <= frozenset(c.effect.name for c in pair[:2])
-            if nested and (not best.members or best.complete):
+            nested = best.names <= _names(pair)
+            if nested and (not best.members or (best.complete and not self.beside)):
                 continue
             needed = max(CLEAR, pairs.LEAD * best.fall) if nested else -CLEAR
-            if expected - top >= needed:
+            if expected - min(top, promised) >= needed:
                 found.append(pair)
         return found
+
+
+def _names(pair: Pair) -> frozenset[str]:
+    return frozenset(c.effect.name for c in pair[:2])
 
 
 def _next(rankings: Sequence[_Ranking], trials: Iterable[Trial], tried: set[frozenset[str]]) -> list[Pair]:
     """The pairs that any ranking wants and that were not tried, the best of each ranking in turn."""
     turns = zip_longest(*(r.wanted(trials) for r in rankings))
-    found = {frozenset(c.effect.name for c in pair[:2]): pair for turn in turns for pair in turn if pair}
+    found = {_names(pair): pair for turn in turns for pair in turn if pair}
     return [pair for names, pair in found.items() if names not in tried]
 
 

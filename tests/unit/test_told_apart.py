@@ -243,7 +243,7 @@ def trial(members, fall, excess):
         members=members,
         names=names,
         fall=fall,
-        cost=10.0,
+        cost=10.0 * len(members),
         after=1e4 - fall,
         excess_sd=excess,
         keys=names,
@@ -296,15 +296,35 @@ def test_pairs_are_refitted_until_none_may_win_or_nobody_can_wait(search_of_pair
     names = "abcdef"
     effects = [candidate(n) for n in names]
     trials = [trial([], 0.0, 70.0), *(trial([c], 5000.0, 35.0) for c in effects)]
-    ranked = [(9900.0 - 10 * i, effects[0], c, np.zeros(2)) for i, c in enumerate(effects[1:])]
+    ranked = [(9900.0 - 20 * i, effects[0], c, np.zeros(2)) for i, c in enumerate(effects[1:])]
     ranked.append((7000.0, effects[1], effects[2], np.zeros(2)))
     monkeypatch.setattr(explanations.pairs, "REFITTED", 3)
-    # within CLEAR of what was reached, the second may still be better
-    tried, untried = search_of_pairs(trials, ranked, lambda names: 9889.0 + explanations.CLEAR)
+    # within CLEAR of what was reached, the second might still be better
+    tried, untried = search_of_pairs(trials, ranked, lambda names: 9881.0 + 1.5 * explanations.CLEAR)
     assert tried == [{"a", "b"}] and not untried
     tried, untried = search_of_pairs(trials, ranked, lambda names: 6000.0)
     assert tried == [{"a", "b"}, {"a", "c"}, {"a", "d"}]
     assert untried == [{"a", "e"}, {"a", "f"}, {"b", "c"}]
+
+
+def test_what_seems_to_leave_nothing_is_tried_beside_what_may_lower_it(search_of_pairs):
+    """Where noise is stated too large, one of two causes leaves less than noise; the other is expected to lower that by
+    1000 all the same. Beside a lamp that wanders, it is not asked what it takes up of that lamp."""
+    a, b = candidate("a"), candidate("b")
+    trials = [trial([], 0.0, 20.0), trial([a], 8500.0, -1.0), trial([b], 8000.0, 1.0)]
+    trials[1].complete = trials[2].complete = True
+    pair = [(9500.0, a, b, np.zeros(2))]
+    assert search_of_pairs(trials, pair, lambda names: 9600.0) == ([{"a", "b"}], [])
+    assert search_of_pairs(trials, pair, lambda names: 9600.0, lamp=1400.0) == ([], [])
+
+
+def test_what_was_promised_is_held_against_what_was_promised(search_of_pairs):
+    """Images promised 200 too little of a pair; of another that they promise 5 less, they may as well."""
+    a, b, c = (candidate(n) for n in "abc")
+    trials = [trial([], 0.0, 70.0), *(trial([e], 6000.0, 30.0) for e in (a, b, c))]
+    ranked = [(9000.0, a, b, np.zeros(2)), (8995.0, a, c, np.zeros(2)), (8900.0, b, c, np.zeros(2))]
+    tried, untried = search_of_pairs(trials, ranked, lambda names: 9200.0 if "b" in names else 9210.0)
+    assert tried == [{"a", "b"}, {"a", "c"}] and not untried
 
 
 @pytest.mark.parametrize(

@@ -419,6 +419,24 @@ def test_what_survives_overturns_nothing():
     assert table.fragile("a") == ""
 
 
+def test_more_of_what_is_missing_overturns_nothing():
+    """Other weights prefer a coloured leak to stray light, by itself: it contains the leak that is missing beside stray
+    light."""
+
+    def candidate(name, inner=""):
+        return SimpleNamespace(
+            effect=SimpleNamespace(name=name),
+            row=SimpleNamespace(net=100.0, fall=100.0, refit=None),
+            contains=lambda other: other.effect.name == inner,
+        )
+
+    candidates = [candidate("stray light"), candidate("leak"), candidate("coloured leak", "leak")]
+    nets = {"stray light": 50.0, "leak": 400.0, "coloured leak": 500.0}
+    table = Table(candidates, np.zeros((0, 0)), None, 0.0, nets, {})
+    assert table.fragile("stray light") == "coloured leak"
+    assert table.fragile("stray light", ["stray light", "leak"]) == ""
+
+
 @dataclass(frozen=True)
 class SimpleFit:
     variables: list
