@@ -154,7 +154,7 @@ def diagnose(
             again.warnings.append(cooled.remark)
             return again
     outcome, levels = held.judge(case, explanations.search(case, chosen, fits))
-    subject, best = subject_of(outcome), outcome.best
+    subject, best = subject_of(case, outcome), outcome.best
 
     reference = best.fall - best.expectation if subject else max([c.row.net for c in table.order], default=0.0)
     fingerprints = prints.fingerprints(model, evidence, places, max(reference, 1.0), say)

@@ -859,7 +859,8 @@ def _lead(case: Case, outcome: Outcome, best: Trial, other: Trial) -> tuple[floa
     cost, is_table = other.cost - best.cost, case.evidence.is_table
     data = other.deviance - best.deviance
     shared = other.gain - best.gain
-    if best.by_frame and not is_table:  # a lamp that wanders is no rival of a gain of each frame, but the same
+    if best.by_frame and not is_table and not other.bare:
+        # a lamp that swings as nobody would let it is no rival of a gain of each frame, but the same
         data, shared = data + other.gain, 0.0
     if not is_table:
         data = _less_alike(case, outcome, outcome.scale * data, best, other)

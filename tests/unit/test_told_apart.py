@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from optics.diagnosis import diagnose, explanations, laws, refit, score
+from optics.diagnosis import diagnose, explanations, findings, laws, refit, score
 from optics.diagnosis import statistics as st
 from optics.diagnosis.correlation import Readings
 from optics.diagnosis.result import Law
@@ -174,6 +174,7 @@ def test_a_lamp_rules_out_nothing_that_leaves_less_where_misfit_is_left(monkeypa
             fit=fit,
             by_frame=False,
             complete=False,
+            bare=False,
             left=lambda dof: 0.0,
         )
 
@@ -183,6 +184,48 @@ def test_a_lamp_rules_out_nothing_that_leaves_less_where_misfit_is_left(monkeypa
     monkeypatch.setattr(explanations, "_design_effect", lambda *a: 1.0)
     lead, needed = explanations._lead(case, SimpleNamespace(scale=scale), best, other)
     assert (lead > needed) is ruled_out
+
+
+@pytest.mark.parametrize("bare, ruled_out", [(True, False), (False, True)])
+def test_what_leaves_an_unnoticed_lamp_is_a_rival_of_gains_of_each_frame(monkeypatch, bare, ruled_out):
+    """A gain of each frame leads a polarized detector by 3 in score; without the lamp that wanders beside the detector,
+    by 1000. A lamp that nobody notices is noise, one that swings is the same as those gains."""
+
+    def trial(name, deviance, gain, by_frame):
+        values = {"keys": {name}, "deviance": deviance, "gain": gain, "by_frame": by_frame, "fall": 5000.0 - deviance}
+        return SimpleNamespace(**values, cost=20.0, complete=True, bare=bare, fit=SimpleNamespace(values=0.0))
+
+    best, other = trial("gains", 1000.0, 0.0, True), trial("detector", 1003.0, 997.0, False)
+    case = SimpleNamespace(
+        evidence=SimpleNamespace(is_table=False), prior_chi2=lambda values: 0.0, known_chi2=lambda values: 0.0
+    )
+    monkeypatch.setattr(explanations, "_design_effect", lambda *a: 1.0)
+    lead, needed = explanations._lead(case, SimpleNamespace(scale=1.0), best, other)
+    assert (lead > needed) is ruled_out
+
+
+@pytest.mark.parametrize("unset, subject", [("", "gains"), ("analyzer.angle", "vignetting")])
+def test_what_errors_of_dials_stand_against_waits_for_the_others(monkeypatch, unset, subject):
+    """Gains of each frame bring most, and vignetting is missing beside them, whatever unknown errors of a dial did."""
+    gains, vignetting = (SimpleNamespace(effect=SimpleNamespace(name=name)) for name in ("gains", "vignetting"))
+    outcome = SimpleNamespace(
+        best=SimpleNamespace(members=[gains, vignetting]),
+        core=["gains", "vignetting"],
+        own_fall=lambda trial, name: {"gains": 1000.0, "vignetting": 500.0}[name],
+    )
+    monkeypatch.setattr(findings, "_unset", lambda case, c: unset if c is gains else "")
+    assert findings.subject_of(None, outcome).effect.name == subject
+
+
+@pytest.mark.parametrize("by_frame, lead", [(True, 700.0), (False, -19300.0)])
+def test_another_law_falls_from_where_the_best_explanation_does(monkeypatch, by_frame, lead):
+    """A law whose score is 1300, and an explanation of 2000 in score, that has 20000 less beside a lamp. A law beside
+    gains of each frame is judged without that lamp, as these are."""
+    best = SimpleNamespace(by_frame=by_frame)
+    scores = {id(best): 2000.0, "base": 20000.0}
+    outcome = SimpleNamespace(best=best, base="base", score=lambda t: scores.get(id(t), scores["base"]))
+    case = SimpleNamespace(evidence=SimpleNamespace(is_table=False))
+    assert findings.law_lead(case, outcome, 1300.0) == lead
 
 
 def test_a_law_falls_from_where_effects_fall():
