@@ -729,6 +729,11 @@ def beside_noise(case: Case, outcome: Outcome) -> tuple[Correlation, float]:
     return noise, min(left.p, jump)
 
 
+def fall_beside(outcome: Outcome, trial: Trial, name: str) -> float:
+    """What an effect adds to the others of a trial, of chi2 beside the noise that each of both shares."""
+    return outcome.scale * (outcome.without(trial, name).deviance - trial.deviance)
+
+
 def noise_of(case: Case, outcome: Outcome, trial: Trial) -> Correlation | None:
     """What neighbouring readings, or the pixels of a frame, share about an explanation; None of images that are too few
     to tell, or where each frame has a strength. A lamp that swings by more than NOTICED is no noise of images."""
@@ -861,7 +866,8 @@ def _lead(case: Case, outcome: Outcome, best: Trial, other: Trial) -> tuple[floa
     shared = other.gain - best.gain
     if best.by_frame and not is_table and not other.bare:
         # a lamp that swings as nobody would let it is no rival of a gain of each frame, but the same
-        data, shared = data + other.gain, 0.0
+        data, shared = data + shared, 0.0
+    lamp = shared
     if not is_table:
         data = _less_alike(case, outcome, outcome.scale * data, best, other)
     lead, needed = data + cost, TOLD if data > TOLD else CLEAR  # what is plausible decides alone only where it is clear
@@ -876,10 +882,10 @@ def _lead(case: Case, outcome: Outcome, best: Trial, other: Trial) -> tuple[floa
     if best.complete or (is_table and outcome.scale < MISSTATED):
         return lead, needed
     # of images, less what a lamp did to whole frames: that lies in no direction of an effect
-    shared = 0.0 if is_table else outcome.scale
-    fall = best.fall - other.fall + shared * (best.gain - other.gain)
+    scale = 0.0 if is_table else outcome.scale
+    fall = best.fall - other.fall - scale * lamp
     dof = max(case.evidence.normal.count - case.evidence.projected.rank, 1)
-    misfit = min(HALF * max(best.left(dof) - shared * best.gain, 0.0), MARGIN * best.fall)
+    misfit = min(HALF * max(best.left(dof) - scale * best.gain, 0.0), MARGIN * best.fall)
     if misfit and fall + cost * outcome.scale < misfit:
         return lead, max(needed, lead + misfit - fall)
     return lead, needed

@@ -71,6 +71,7 @@ def split(
     net: float,
     beside: Sequence[Variable] = (),
     noise: Correlation | None = None,
+    over_noise: float = 0.0,
 ) -> tuple[list[Split], float, np.ndarray, np.ndarray]:
     """Whether a fitted effect has the same strength in every part of the data, and `scatter` of its strength.
 
@@ -82,15 +83,16 @@ def split(
     beside   variables of what was added together with it
     noise    what neighbouring readings, or the pixels of a frame, share of it: a lamp that wanders differs from frame
              to frame, and so would a strength that takes up what the lamp did
+    over_noise   net fall of chi2 beside that noise, of images
     """
     added = _added(model, evidence, rows_max, seed, say, c, found, net, beside)
     dof = max(evidence.normal.count - evidence.projected.rank, 1)
-    table = evidence.is_table
+    table, lamp = evidence.is_table, noise is not None and not evidence.is_table
     if not table and left.structure_p >= LEVEL:
         added.scale = max(1 + left.excess_sd * math.sqrt(2 / dof), 1.0)
     parts = _parts(model, added.own, places)
     whole = added
-    if noise is not None and not table:
+    if noise is not None and lamp:
         added = _of_independent_frames(model, added, noise)
     results = _cuts(added, parts, places)
     if noise is not None and table:  # how sure a split is depends on what neighbours share, its share of the fall not
@@ -110,7 +112,17 @@ def split(
 
     results = [replace(s, limit=most(s), holds=s.h <= most(s)) for s in results]
     told = added if table else whole
-    return results, *scatter(told.own, told.calibrated, told.effect, told.change, places, net)
+    chance, clutter, errors = scatter(told.own, told.calibrated, told.effect, told.change, places, net)
+    if lamp:  # its errors are those of a fit that knows no lamp; whether it is there is asked beside that lamp
+        chance, *_ = scatter(added.own, added.calibrated, added.effect, _at_optimum(added), places, over_noise)
+    return results, chance, clutter, errors
+
+
+def _at_optimum(added: Added) -> np.ndarray:
+    """(k,) change of an effect's strengths by the weights of its evidence, which may not be those of the fit."""
+    own = added.own
+    projected = own.project(own.thinned(), added.calibrated, added.effect, own.thinning)
+    return added.change + st.inverse(projected.information, st.VISIBLE)[0] @ projected.score
 
 
 def _cuts(added: Added, parts: dict[str, tuple[list[str], list[np.ndarray]]], places: list[dict]) -> list[Split]:

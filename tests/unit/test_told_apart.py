@@ -204,6 +204,25 @@ def test_what_leaves_an_unnoticed_lamp_is_a_rival_of_gains_of_each_frame(monkeyp
     assert (lead > needed) is ruled_out
 
 
+def test_misfit_that_is_left_beside_gains_of_each_frame_is_counted_without_a_lamp(monkeypatch):
+    """Gains of each frame bring 2900 and leave 320, as of noise that is stated too small. Without them a lamp that
+    swings makes up for all but 70: that lamp is those gains, and the 70 are no measure of what they bring."""
+
+    def trial(deviance, gain, fall, by_frame, keys):
+        own = {"deviance": deviance, "gain": gain, "fall": fall, "by_frame": by_frame, "keys": keys, "bare": False}
+        fit = SimpleNamespace(values=0.0)
+        return SimpleNamespace(**own, cost=40.0 * by_frame, complete=False, fit=fit, left=lambda dof: 320.0)
+
+    best = trial(1130.0, 0.0, 2900.0, True, {"gains", "offset"})
+    other = trial(1180.0, 2070.0, 0.0, False, {"offset"})
+    evidence = SimpleNamespace(is_table=False, normal=SimpleNamespace(count=1000), projected=SimpleNamespace(rank=20))
+    case = SimpleNamespace(evidence=evidence, prior_chi2=lambda values: 0.0, known_chi2=lambda values: 0.0)
+    monkeypatch.setattr(explanations, "_design_effect", lambda *a: 1.0)
+    monkeypatch.setattr(explanations, "_significant", lambda *a: 20.0)
+    lead, needed = explanations._lead(case, SimpleNamespace(scale=1.37), best, other)
+    assert lead > needed
+
+
 @pytest.mark.parametrize("unset, subject", [("", "gains"), ("analyzer.angle", "vignetting")])
 def test_what_errors_of_dials_stand_against_waits_for_the_others(monkeypatch, unset, subject):
     """Gains of each frame bring most, and vignetting is missing beside them, whatever unknown errors of a dial did."""
