@@ -154,7 +154,7 @@ def diagnose(
             again.warnings.append(cooled.remark)
             return again
     outcome, levels = held.judge(case, explanations.search(case, chosen, fits))
-    subject, best = subject_of(outcome), outcome.best
+    subject, best = subject_of(case, outcome), outcome.best
 
     reference = best.fall - best.expectation if subject else max([c.row.net for c in table.order], default=0.0)
     fingerprints = prints.fingerprints(model, evidence, places, max(reference, 1.0), say)
@@ -271,7 +271,8 @@ def _split(case: Case, outcome: Outcome, subject: Candidate | None, basis: Basis
             left[trial.names],
             net,
             beside,
-            explanations.noise_of(case, outcome, trial) if case.evidence.is_table else None,
+            explanations.noise_of(case, outcome, trial),
+            explanations.fall_beside(outcome, trial, main.effect.name) - main.cone.expectation,
         )
         splits += own
         if not case.evidence.is_table:  # refits of readings are linearised where they end

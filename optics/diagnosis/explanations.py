@@ -558,7 +558,7 @@ def _joined(case: Case, trials: dict[frozenset[str], Trial]) -> list[frozenset[s
             ranked,
             lambda net, both: net / scale + _expected_gain(case, both, scale) - sum(map(expected_cost, both)),
         ),
-        _Ranking(lambda t: _score(t, 1.0), ranked, lambda net, both: net - sum(map(expected_cost, both))),
+        _Ranking(lambda t: _score(t, 1.0), ranked, lambda net, both: net - sum(map(expected_cost, both)), False),
     ]
     tried = set(trials)
     for n in range(pairs.REFITTED):
@@ -567,7 +567,7 @@ def _joined(case: Case, trials: dict[frozenset[str], Trial]) -> list[frozenset[s
             break
         case.say("refit of pairs", n, pairs.REFITTED)
         a, b, linear = wanted[0]
-        tried.add(names := frozenset([a.effect.name, b.effect.name]))
+        tried.add(names := _names(wanted[0]))
         try:
             found = with_effects(case, [(a, linear[: len(a.columns)]), (b, linear[len(a.columns) :])], START)
         except FAILURES:
@@ -576,43 +576,54 @@ def _joined(case: Case, trials: dict[frozenset[str], Trial]) -> list[frozenset[s
         if math.isfinite(made.after):
             trials[names] = made
     case.say("refit of pairs", pairs.REFITTED, pairs.REFITTED)
-    return [frozenset(c.effect.name for c in pair[:2]) for pair in _next(rankings, trials.values(), tried)]
+    return [_names(pair) for pair in _next(rankings, trials.values(), tried)]
 
 
 Pair = tuple[Candidate, Candidate, np.ndarray]  # two effects, and coefficients of both
 
 
 class _Ranking:
-    """Pairs by what is expected of them, and the trials that they are held against by `score_of`."""
+    """Pairs by what is expected of them, and the trials that they are held against by `score_of`.
+
+    beside   whether what a lamp may have done to whole frames is counted. If not, a pair that contains an effect which
+             leaves nothing but that lamp is not asked for
+    """
 
     def __init__(
         self,
         score_of: Callable[[Trial], float],
         ranked: Sequence[tuple[float, Candidate, Candidate, np.ndarray]],
         expected_of: Callable[[float, list[Candidate]], float],
+        beside: bool = True,
     ):
-        self.score_of = score_of
+        self.score_of, self.beside = score_of, beside
         expected = [(expected_of(net - pairs.shortfall([a, b]), [a, b]), (a, b, x)) for net, a, b, x in ranked]
         self.expected = sorted(expected, key=lambda e: -e[0])
 
     def wanted(self, trials: Iterable[Trial]) -> list[Pair]:
-        """The pairs that are expected to do better than the best trial, best first."""
+        """The pairs that are expected to do better than the best trial, best first: than its refit, or than was
+        expected of it where that was less. What images promised too little of one pair they may of others."""
         top, best = max(((self.score_of(t), t) for t in trials), key=lambda s: s[0])
+        promised = next((e for e, pair in self.expected if _names(pair) == best.names), top)
         found = []
         for expected, pair in self.expected:
-            nested = best.names <= frozenset(c.effect.name for c in pair[:2])
-            if nested and (not best.members or best.complete):
+            nested = best.names <= _names(pair)
+            if nested and (not best.members or (best.complete and not self.beside)):
                 continue
             needed = max(CLEAR, pairs.LEAD * best.fall) if nested else -CLEAR
-            if expected - top >= needed:
+            if expected - min(top, promised) >= needed:
                 found.append(pair)
         return found
+
+
+def _names(pair: Pair) -> frozenset[str]:
+    return frozenset(c.effect.name for c in pair[:2])
 
 
 def _next(rankings: Sequence[_Ranking], trials: Iterable[Trial], tried: set[frozenset[str]]) -> list[Pair]:
     """The pairs that any ranking wants and that were not tried, the best of each ranking in turn."""
     turns = zip_longest(*(r.wanted(trials) for r in rankings))
-    found = {frozenset(c.effect.name for c in pair[:2]): pair for turn in turns for pair in turn if pair}
+    found = {_names(pair): pair for turn in turns for pair in turn if pair}
     return [pair for names, pair in found.items() if names not in tried]
 
 
@@ -718,9 +729,23 @@ def beside_noise(case: Case, outcome: Outcome) -> tuple[Correlation, float]:
     return noise, min(left.p, jump)
 
 
-def noise_of(case: Case, outcome: Outcome, trial: Trial) -> Correlation:
-    """What neighbouring readings share about an explanation of a table."""
-    return _readings(case, trial).noise(outcome.scale)
+def fall_beside(outcome: Outcome, trial: Trial, name: str) -> float:
+    """What an effect adds to the others of a trial, of chi2 beside the noise that each of both shares."""
+    return outcome.scale * (outcome.without(trial, name).deviance - trial.deviance)
+
+
+def noise_of(case: Case, outcome: Outcome, trial: Trial) -> Correlation | None:
+    """What neighbouring readings, or the pixels of a frame, share about an explanation; None of images that are too few
+    to tell, or where each frame has a strength. A lamp that swings by more than NOTICED is no noise of images."""
+    if case.evidence.is_table:
+        return _readings(case, trial).noise(outcome.scale)
+    if case.lamp is None or trial.by_frame:
+        return None
+    readings = _of_frames(case, case.lamp, trial)
+    readings.most = min(case.lamp.most, NOTICED)
+    found = readings.noise(outcome.scale)
+    readings.most = case.lamp.most
+    return found
 
 
 def _with_survivors(case: Case, outcome: Outcome) -> Outcome:
@@ -839,8 +864,10 @@ def _lead(case: Case, outcome: Outcome, best: Trial, other: Trial) -> tuple[floa
     cost, is_table = other.cost - best.cost, case.evidence.is_table
     data = other.deviance - best.deviance
     shared = other.gain - best.gain
-    if best.by_frame and not is_table:  # a lamp that wanders is no rival of a gain of each frame, but the same
-        data, shared = data + other.gain, 0.0
+    if best.by_frame and not is_table and not other.bare:
+        # a lamp that swings as nobody would let it is no rival of a gain of each frame, but the same
+        data, shared = data + shared, 0.0
+    lamp = shared
     if not is_table:
         data = _less_alike(case, outcome, outcome.scale * data, best, other)
     lead, needed = data + cost, TOLD if data > TOLD else CLEAR  # what is plausible decides alone only where it is clear
@@ -855,10 +882,10 @@ def _lead(case: Case, outcome: Outcome, best: Trial, other: Trial) -> tuple[floa
     if best.complete or (is_table and outcome.scale < MISSTATED):
         return lead, needed
     # of images, less what a lamp did to whole frames: that lies in no direction of an effect
-    shared = 0.0 if is_table else outcome.scale
-    fall = best.fall - other.fall + shared * (best.gain - other.gain)
+    scale = 0.0 if is_table else outcome.scale
+    fall = best.fall - other.fall - scale * lamp
     dof = max(case.evidence.normal.count - case.evidence.projected.rank, 1)
-    misfit = min(HALF * max(best.left(dof) - shared * best.gain, 0.0), MARGIN * best.fall)
+    misfit = min(HALF * max(best.left(dof) - scale * best.gain, 0.0), MARGIN * best.fall)
     if misfit and fall + cost * outcome.scale < misfit:
         return lead, max(needed, lead + misfit - fall)
     return lead, needed

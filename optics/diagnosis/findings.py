@@ -57,11 +57,13 @@ def basis_of(model: Model, evidence: Evidence, structure: st.Structure) -> Basis
     )
 
 
-def subject_of(outcome: Outcome) -> Candidate | None:
+def subject_of(case: Case, outcome: Outcome) -> Candidate | None:
     """The effect that a verdict may name: of those that every survivor has, or else of the best explanation, the one
-    without which most is lost; None where nothing is told apart from no effect at all."""
+    without which most is lost; None where nothing is told apart from no effect at all. One that errors of dials stand
+    against waits for the others: these are missing whatever the dials did."""
     best = outcome.best
     able = [c for c in best.members if c.effect.name in outcome.core] or best.members
+    able = [c for c in able if not _unset(case, c)] or able
     return max(able, key=lambda c: outcome.own_fall(best, c.effect.name), default=None)
 
 
@@ -80,7 +82,7 @@ def findings_of(
     laws     of the effects that the model has already, best first
     splits   of the survivors' main effects; chance: p of the subject's strength by scatter
     """
-    table, subject, best = case.table, subject_of(outcome), outcome.best
+    table, subject, best = case.table, subject_of(case, outcome), outcome.best
     measured = case.measured
     misstated = basis.structure_p >= LEVEL and basis.phi < MISSTATED and not (measured or case.evidence.is_table)
     if subject is None:
@@ -93,8 +95,7 @@ def findings_of(
         own = _of_subject(case, outcome, subject, splits, chance, levels, basis)
     own = replace(own, measured=measured, misstated=misstated)
     if laws and laws[0].p < LEVEL:
-        # a law falls from what noise that neighbours share leaves without any effect
-        lead = outcome.score(best) - outcome.score(outcome.base) - laws[0].score
+        lead = law_lead(case, outcome, laws[0].score)
         own = replace(own, law=f"{laws[0].effect} along {laws[0].coordinate}", law_lead=lead)
     if not fingerprints:
         return own
@@ -140,6 +141,13 @@ def findings_of(
         coordinate=best_curve.coordinate,
         curve_share=best_curve.share,
     )
+
+
+def law_lead(case: Case, outcome: Outcome, score: float) -> float:
+    """Lead of the best explanation over another law: a law falls from what noise that neighbours share leaves without
+    any effect; beside gains of each frame, which are that noise, from the whole misfit."""
+    without_lamp = outcome.best.by_frame and not case.evidence.is_table
+    return outcome.score(outcome.best) - (0.0 if without_lamp else outcome.score(outcome.base)) - score
 
 
 def _swings(outcome: Outcome, fingerprints: Sequence[Fingerprint], basis: Basis) -> Fingerprint | None:

@@ -16,7 +16,7 @@ from optics.diagnosis import statistics as st
 from optics.diagnosis.correlation import Correlation
 from optics.diagnosis.evidence import Block, Candidate, Evidence, Progress, at_bound, measure
 from optics.diagnosis.result import Explanation, Refit, Split
-from optics.diagnosis.session import Session
+from optics.diagnosis.session import Frames, Session
 from optics.diagnosis.thresholds import LEVEL, MAPS, UNEVEN
 from optics.fit.compare import led_label
 from optics.fit.model import Model, value_of
@@ -71,6 +71,7 @@ def split(
     net: float,
     beside: Sequence[Variable] = (),
     noise: Correlation | None = None,
+    over_noise: float = 0.0,
 ) -> tuple[list[Split], float, np.ndarray, np.ndarray]:
     """Whether a fitted effect has the same strength in every part of the data, and `scatter` of its strength.
 
@@ -80,15 +81,21 @@ def split(
     places   coordinates of every kept value (`optics.diagnosis.fingerprints.places`)
     found    the fit with the effect; left: what is left with it; net: its fall
     beside   variables of what was added together with it
-    noise    of readings: what neighbours share of it
+    noise    what neighbouring readings, or the pixels of a frame, share of it: a lamp that wanders differs from frame
+             to frame, and so would a strength that takes up what the lamp did
+    over_noise   net fall of chi2 beside that noise, of images
     """
     added = _added(model, evidence, rows_max, seed, say, c, found, net, beside)
     dof = max(evidence.normal.count - evidence.projected.rank, 1)
-    if noise is None and left.structure_p >= LEVEL:
+    table, lamp = evidence.is_table, noise is not None and not evidence.is_table
+    if not table and left.structure_p >= LEVEL:
         added.scale = max(1 + left.excess_sd * math.sqrt(2 / dof), 1.0)
     parts = _parts(model, added.own, places)
+    whole = added
+    if noise is not None and lamp:
+        added = _of_independent_frames(model, added, noise)
     results = _cuts(added, parts, places)
-    if noise is not None:  # how sure a split is depends on what neighbours share, its share of the fall does not
+    if noise is not None and table:  # how sure a split is depends on what neighbours share, its share of the fall not
         added = _of_independent_readings(model, added, noise)
         sure = {s.by: s for s in _cuts(added, parts, places)}
         results = [replace(sure[s.by], fall=s.fall, h=s.h) for s in results if s.by in sure]
@@ -104,7 +111,18 @@ def split(
         return max(HAIR, min(EVEN if s.chance < LEVEL else UNEVEN, SAME_PLACE * excess / max(net, 1e-9)))
 
     results = [replace(s, limit=most(s), holds=s.h <= most(s)) for s in results]
-    return results, *scatter(added.own, added.calibrated, added.effect, added.change, places, net)
+    told = added if table else whole
+    chance, clutter, errors = scatter(told.own, told.calibrated, told.effect, told.change, places, net)
+    if lamp:  # its errors are those of a fit that knows no lamp; whether it is there is asked beside that lamp
+        chance, *_ = scatter(added.own, added.calibrated, added.effect, _at_optimum(added), places, over_noise)
+    return results, chance, clutter, errors
+
+
+def _at_optimum(added: Added) -> np.ndarray:
+    """(k,) change of an effect's strengths by the weights of its evidence, which may not be those of the fit."""
+    own = added.own
+    projected = own.project(own.thinned(), added.calibrated, added.effect, own.thinning)
+    return added.change + st.inverse(projected.information, st.VISIBLE)[0] @ projected.score
 
 
 def _cuts(added: Added, parts: dict[str, tuple[list[str], list[np.ndarray]]], places: list[dict]) -> list[Split]:
@@ -167,6 +185,23 @@ def _of_independent_readings(model: Model, added: Added, noise: Correlation) -> 
     blocks = [
         replace(block, where=everything, a=part[:, :-1], b=None, r=part[:, -1])
         for block, part in zip(own.blocks, whole)
+    ]
+    return replace(added, own=replace(own, blocks=blocks), apart=apart)
+
+
+def _of_independent_frames(model: Model, added: Added, noise: Correlation) -> Added:
+    """The same with columns and residuals of images as if a lamp did nothing to whole frames."""
+    own, lamp = added.own, Frames(model, added.own)
+
+    def apart(columns: np.ndarray) -> np.ndarray:
+        return np.concatenate(lamp.independent(_dealt(columns, own.blocks), noise))
+
+    a = lamp.independent([block.a for block in own.blocks], noise)
+    b = lamp.independent([block.a if block.b is None else block.b for block in own.blocks], noise)
+    r = lamp.independent([block.r for block in own.blocks], noise)
+    blocks = [
+        replace(block, a=one, b=None if block.b is None else other, r=left)
+        for block, one, other, left in zip(own.blocks, a, b, r)
     ]
     return replace(added, own=replace(own, blocks=blocks), apart=apart)
 

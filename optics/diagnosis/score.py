@@ -215,9 +215,10 @@ class Table:
         beside   effects that are missing as well
         """
         own = {c.effect.name: c for c in self.order}
+        missing = {effect, *beside} & set(own)
         for net in (self.uniform, self.dilated):
             for name in sorted(net, key=lambda n: -net[n]):
-                if name == effect or name in beside or own[name].contains(own[effect]) or effect not in net:
+                if name in missing or any(own[name].contains(own[m]) for m in missing) or effect not in net:
                     continue
                 tried = own[name].row.refit
                 if tried is not None and tried.fall < REALISED * own[name].row.fall:

@@ -114,11 +114,14 @@ class Frames:
         return Readings(along[:, -1], along[:, :-1], order, self.loads, across, more, APART, self.most, own)
 
     def independent(self, columns: Sequence[np.ndarray], noise: Correlation) -> list[np.ndarray]:
-        """Of each frame, (n,) values in units of the noise, with what its lamp may have done weighed down: as of frames
-        that share nothing with each other."""
+        """Of each frame, (n,) or (n, k) values in units of the noise, with what its lamp may have done weighed down: as
+        of frames that share nothing with each other."""
         bright = float(np.mean(np.square(self.loads["lamp"]))) if len(self.signal) else 1.0
         shared = noise.power * np.square(self.loads["lamp"]) / max(bright, 1e-300)
-        return [c - (1 - 1 / math.sqrt(1 + p)) * (g @ c) * g for c, g, p in zip(columns, self.signal, shared)]
+        return [
+            c - (1 - 1 / math.sqrt(1 + p)) * np.multiply.outer(g, g @ c)
+            for c, g, p in zip(columns, self.signal, shared)
+        ]
 
 
 def _shared_errors(model: Model, evidence: Evidence) -> list[tuple[np.ndarray, np.ndarray]]:

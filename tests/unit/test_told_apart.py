@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from optics.diagnosis import diagnose, explanations, laws, refit, score
+from optics.diagnosis import diagnose, explanations, findings, laws, refit, score
 from optics.diagnosis import statistics as st
 from optics.diagnosis.correlation import Readings
 from optics.diagnosis.result import Law
@@ -174,6 +174,7 @@ def test_a_lamp_rules_out_nothing_that_leaves_less_where_misfit_is_left(monkeypa
             fit=fit,
             by_frame=False,
             complete=False,
+            bare=False,
             left=lambda dof: 0.0,
         )
 
@@ -183,6 +184,67 @@ def test_a_lamp_rules_out_nothing_that_leaves_less_where_misfit_is_left(monkeypa
     monkeypatch.setattr(explanations, "_design_effect", lambda *a: 1.0)
     lead, needed = explanations._lead(case, SimpleNamespace(scale=scale), best, other)
     assert (lead > needed) is ruled_out
+
+
+@pytest.mark.parametrize("bare, ruled_out", [(True, False), (False, True)])
+def test_what_leaves_an_unnoticed_lamp_is_a_rival_of_gains_of_each_frame(monkeypatch, bare, ruled_out):
+    """A gain of each frame leads a polarized detector by 3 in score; without the lamp that wanders beside the detector,
+    by 1000. A lamp that nobody notices is noise, one that swings is the same as those gains."""
+
+    def trial(name, deviance, gain, by_frame):
+        values = {"keys": {name}, "deviance": deviance, "gain": gain, "by_frame": by_frame, "fall": 5000.0 - deviance}
+        return SimpleNamespace(**values, cost=20.0, complete=True, bare=bare, fit=SimpleNamespace(values=0.0))
+
+    best, other = trial("gains", 1000.0, 0.0, True), trial("detector", 1003.0, 997.0, False)
+    case = SimpleNamespace(
+        evidence=SimpleNamespace(is_table=False), prior_chi2=lambda values: 0.0, known_chi2=lambda values: 0.0
+    )
+    monkeypatch.setattr(explanations, "_design_effect", lambda *a: 1.0)
+    lead, needed = explanations._lead(case, SimpleNamespace(scale=1.0), best, other)
+    assert (lead > needed) is ruled_out
+
+
+def test_misfit_that_is_left_beside_gains_of_each_frame_is_counted_without_a_lamp(monkeypatch):
+    """Gains of each frame bring 2900 and leave 320, as of noise that is stated too small. Without them a lamp that
+    swings makes up for all but 70: that lamp is those gains, and the 70 are no measure of what they bring."""
+
+    def trial(deviance, gain, fall, by_frame, keys):
+        own = {"deviance": deviance, "gain": gain, "fall": fall, "by_frame": by_frame, "keys": keys, "bare": False}
+        fit = SimpleNamespace(values=0.0)
+        return SimpleNamespace(**own, cost=40.0 * by_frame, complete=False, fit=fit, left=lambda dof: 320.0)
+
+    best = trial(1130.0, 0.0, 2900.0, True, {"gains", "offset"})
+    other = trial(1180.0, 2070.0, 0.0, False, {"offset"})
+    evidence = SimpleNamespace(is_table=False, normal=SimpleNamespace(count=1000), projected=SimpleNamespace(rank=20))
+    case = SimpleNamespace(evidence=evidence, prior_chi2=lambda values: 0.0, known_chi2=lambda values: 0.0)
+    monkeypatch.setattr(explanations, "_design_effect", lambda *a: 1.0)
+    monkeypatch.setattr(explanations, "_significant", lambda *a: 20.0)
+    lead, needed = explanations._lead(case, SimpleNamespace(scale=1.37), best, other)
+    assert lead > needed
+
+
+@pytest.mark.parametrize("unset, subject", [("", "gains"), ("analyzer.angle", "vignetting")])
+def test_what_errors_of_dials_stand_against_waits_for_the_others(monkeypatch, unset, subject):
+    """Gains of each frame bring most, and vignetting is missing beside them, whatever unknown errors of a dial did."""
+    gains, vignetting = (SimpleNamespace(effect=SimpleNamespace(name=name)) for name in ("gains", "vignetting"))
+    outcome = SimpleNamespace(
+        best=SimpleNamespace(members=[gains, vignetting]),
+        core=["gains", "vignetting"],
+        own_fall=lambda trial, name: {"gains": 1000.0, "vignetting": 500.0}[name],
+    )
+    monkeypatch.setattr(findings, "_unset", lambda case, c: unset if c is gains else "")
+    assert findings.subject_of(None, outcome).effect.name == subject
+
+
+@pytest.mark.parametrize("by_frame, lead", [(True, 700.0), (False, -19300.0)])
+def test_another_law_falls_from_where_the_best_explanation_does(monkeypatch, by_frame, lead):
+    """A law whose score is 1300, and an explanation of 2000 in score, that has 20000 less beside a lamp. A law beside
+    gains of each frame is judged without that lamp, as these are."""
+    best = SimpleNamespace(by_frame=by_frame)
+    scores = {id(best): 2000.0, "base": 20000.0}
+    outcome = SimpleNamespace(best=best, base="base", score=lambda t: scores.get(id(t), scores["base"]))
+    case = SimpleNamespace(evidence=SimpleNamespace(is_table=False))
+    assert findings.law_lead(case, outcome, 1300.0) == lead
 
 
 def test_a_law_falls_from_where_effects_fall():
@@ -243,7 +305,7 @@ def trial(members, fall, excess):
         members=members,
         names=names,
         fall=fall,
-        cost=10.0,
+        cost=10.0 * len(members),
         after=1e4 - fall,
         excess_sd=excess,
         keys=names,
@@ -296,15 +358,35 @@ def test_pairs_are_refitted_until_none_may_win_or_nobody_can_wait(search_of_pair
     names = "abcdef"
     effects = [candidate(n) for n in names]
     trials = [trial([], 0.0, 70.0), *(trial([c], 5000.0, 35.0) for c in effects)]
-    ranked = [(9900.0 - 10 * i, effects[0], c, np.zeros(2)) for i, c in enumerate(effects[1:])]
+    ranked = [(9900.0 - 20 * i, effects[0], c, np.zeros(2)) for i, c in enumerate(effects[1:])]
     ranked.append((7000.0, effects[1], effects[2], np.zeros(2)))
     monkeypatch.setattr(explanations.pairs, "REFITTED", 3)
-    # within CLEAR of what was reached, the second may still be better
-    tried, untried = search_of_pairs(trials, ranked, lambda names: 9889.0 + explanations.CLEAR)
+    # within CLEAR of what was reached, the second might still be better
+    tried, untried = search_of_pairs(trials, ranked, lambda names: 9881.0 + 1.5 * explanations.CLEAR)
     assert tried == [{"a", "b"}] and not untried
     tried, untried = search_of_pairs(trials, ranked, lambda names: 6000.0)
     assert tried == [{"a", "b"}, {"a", "c"}, {"a", "d"}]
     assert untried == [{"a", "e"}, {"a", "f"}, {"b", "c"}]
+
+
+def test_what_seems_to_leave_nothing_is_tried_beside_what_may_lower_it(search_of_pairs):
+    """Where noise is stated too large, one of two causes leaves less than noise; the other is expected to lower that by
+    1000 all the same. Beside a lamp that wanders, it is not asked what it takes up of that lamp."""
+    a, b = candidate("a"), candidate("b")
+    trials = [trial([], 0.0, 20.0), trial([a], 8500.0, -1.0), trial([b], 8000.0, 1.0)]
+    trials[1].complete = trials[2].complete = True
+    pair = [(9500.0, a, b, np.zeros(2))]
+    assert search_of_pairs(trials, pair, lambda names: 9600.0) == ([{"a", "b"}], [])
+    assert search_of_pairs(trials, pair, lambda names: 9600.0, lamp=1400.0) == ([], [])
+
+
+def test_what_was_promised_is_held_against_what_was_promised(search_of_pairs):
+    """Images promised 200 too little of a pair; of another that they promise 5 less, they may as well."""
+    a, b, c = (candidate(n) for n in "abc")
+    trials = [trial([], 0.0, 70.0), *(trial([e], 6000.0, 30.0) for e in (a, b, c))]
+    ranked = [(9000.0, a, b, np.zeros(2)), (8995.0, a, c, np.zeros(2)), (8900.0, b, c, np.zeros(2))]
+    tried, untried = search_of_pairs(trials, ranked, lambda names: 9200.0 if "b" in names else 9210.0)
+    assert tried == [{"a", "b"}, {"a", "c"}] and not untried
 
 
 @pytest.mark.parametrize(

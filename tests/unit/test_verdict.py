@@ -419,6 +419,24 @@ def test_what_survives_overturns_nothing():
     assert table.fragile("a") == ""
 
 
+def test_more_of_what_is_missing_overturns_nothing():
+    """Other weights prefer a coloured leak to stray light, by itself: it contains the leak that is missing beside stray
+    light."""
+
+    def candidate(name, inner=""):
+        return SimpleNamespace(
+            effect=SimpleNamespace(name=name),
+            row=SimpleNamespace(net=100.0, fall=100.0, refit=None),
+            contains=lambda other: other.effect.name == inner,
+        )
+
+    candidates = [candidate("stray light"), candidate("leak"), candidate("coloured leak", "leak")]
+    nets = {"stray light": 50.0, "leak": 400.0, "coloured leak": 500.0}
+    table = Table(candidates, np.zeros((0, 0)), None, 0.0, nets, {})
+    assert table.fragile("stray light") == "coloured leak"
+    assert table.fragile("stray light", ["stray light", "leak"]) == ""
+
+
 @dataclass(frozen=True)
 class SimpleFit:
     variables: list
@@ -598,6 +616,81 @@ def test_what_splits_a_strength_is_held_against_clutter_too(proxy):
         uneven.append(own.chance < 0.01)
         naive.append(own.p < 0.01)
     assert np.mean(naive) > 0.9 and (np.mean(uneven) > 0.9 if proxy else np.mean(uneven) < 0.15), np.mean(uneven)
+
+
+class Slopes(Slope):
+    """The same in several frames, the slope from one side on: with a strength in each frame it takes up part of what a
+    lamp does there. `lift` is added to the slope in every second frame, and taken off in the others."""
+
+    def __init__(self, count, lift=0.0):
+        self.frames = [Frame(f"frame-{n}", np.zeros(self.shape)) for n in range(count)]
+        across = np.linspace(0, 1, 32)[None, :, None] + np.zeros(self.shape)
+        self.image = [across + (lift if n % 2 else -lift) for n in range(count)]
+
+    def predict(self, values, frames=None, seed=0):
+        power, slope = (values.common.get(key, p.default) for key, p in self.parameters.items())
+        return [
+            64 + 400 * (power + slope * self.image[n]) for n in (range(len(self.frames)) if frames is None else frames)
+        ]
+
+    def derivatives(self, values, variables, frames=None, secant=None, seed=0):
+        for n, prediction in zip(frames, self.predict(values, frames)):
+            yield (
+                prediction,
+                {v.name: 400 * (self.image[n] if "slope" in v.name else np.ones(self.shape)) for v in variables},
+            )
+
+
+def under_a_lamp(strengths, rng, lift=0.0):
+    """(model, base evidence, candidate, fit, noise) of frames with a slope of these strengths, under a lamp that
+    wanders by 1 %, 16 sd of the mean of a frame."""
+    from optics.diagnosis.session import Frames
+
+    power, slope = (Variable(key, (key,), p) for key, p in Slope.parameters.items())
+    model = Slopes(len(strengths), lift)
+    for frame, strength, image in zip(model.frames, strengths, model.image):
+        lamp = 1 + 0.01 * rng.standard_normal()
+        frame.image = Slope.noise.expose(64 + 400 * lamp * (1 + strength * image), rng)
+    frames = list(range(len(strengths)))
+    fit = mock_fit(model, [power, slope], Values(), frames)
+    c = Candidate.at(model, Values(), Effect("slope", "lamp", ("slope",)), [slope])
+    base = measure(model, fit.values, [power], [c], frames, 10**6, 0, lambda *a: None)
+    images = base.dense([*base.base, *c.forms["tangent"]])
+    noise = Frames(model, base).about(np.concatenate([b.r for b in base.blocks]), images).noise(1.0)
+    assert noise.kind == "lamp"
+    return model, base, c, fit, noise
+
+
+def split_under_a_lamp(made, noise, fall):
+    """(the split by frame, p of the strength by its scatter), with the noise that frames share or without."""
+    model, base, c, fit, _ = made
+    left = SimpleNamespace(complete=True, excess_sd=0.0, structure_p=0.5)
+    count = len(model.frames)
+    places = [
+        {"place": np.arange(1024.0) // 64, "frame": np.full(1024, n), "channel": np.zeros(1024)} for n in range(count)
+    ]
+    splits, p, *_ = homogeneity.split(
+        model, base, places, 10**6, 0, lambda *a: None, c, fit, left, fall, noise=noise, over_noise=fall
+    )
+    return next(s for s in splits if s.by == "frame"), p
+
+
+@pytest.mark.parametrize("proxy", [False, True])
+def test_a_lamp_that_wanders_splits_no_strength_by_frame(proxy):
+    """A slope of 10 %, or of 5 and 15 % in turn. By noise of pixels alone both have a strength for each frame."""
+    made = under_a_lamp([0.1 + proxy * (0.05 if n % 2 else -0.05) for n in range(12)], np.random.default_rng(8))
+    fall = (made[3].values.common["lamp.slope"] / made[3].sd[1]) ** 2
+    assert not split_under_a_lamp(made, None, fall)[0].holds
+    assert split_under_a_lamp(made, made[-1], fall)[0].holds is not proxy
+
+
+@pytest.mark.parametrize("strength, seen", [(0.004, True), (0.0, False)])
+def test_a_lamp_that_wanders_is_no_scatter_of_a_strength(strength, seen):
+    """A slope of 0.4 % that is brighter in every second frame. The lamp makes it scatter from frame to frame by more;
+    within the frames it is the same in all."""
+    made = under_a_lamp([strength] * 12, np.random.default_rng(8), lift=0.5)
+    assert split_under_a_lamp(made, None, 0.0)[1] > 0.01
+    assert (split_under_a_lamp(made, made[-1], 0.0)[1] < 0.01) is seen
 
 
 # -- views -----------------------------------------------------------------------------------------------------------
