@@ -55,6 +55,7 @@ VIEW = (
     "site",
     "width",
     "height",
+    "side",
     "bands",
     "white",
     "settings",
