@@ -195,9 +195,10 @@ def _word_of_winner(f: Findings, failed: set[str]) -> str:
     """The word for the winner, given the names of its conditions that failed; '' where it decides nothing."""
     if not failed:
         return "CLAIM"
-    if failed & {"significant", "strength", CLUTTER} and not f.structured and not f.weighed:
+    refuted = {"held out"} if f.held_out <= 0 else set()
+    if failed & {"significant", "strength", CLUTTER, *refuted} and not f.structured and not f.weighed:
         # The refit did not bring the fall that the score promised, or the base's own calibration brought it; or the
-        # strength scatters as much between parts of the data.
+        # strength scatters as much between parts of the data; or frames that took no part do not know of it.
         return "NOTHING"
     bars = {"share", CLUTTER, "near"}  # what is no tie between causes
     if not f.shared:  # where it is, noise is one of those that tie: that an effect gains little over it is no bar

@@ -22,7 +22,7 @@ from optics.diagnosis.result import (
     Shift,
     kinds_of,
 )
-from optics.diagnosis.thresholds import CLEAR, CLUTTERED, LEVEL, MARGIN, MISSTATED, SURE, is_structured
+from optics.diagnosis.thresholds import CLEAR, CLUTTERED, LEVEL, MARGIN, MISSTATED, STRENGTH, SURE, is_structured
 from optics.words import (
     ANYWHERE,
     NO_LIMIT,
@@ -172,6 +172,8 @@ def _nothing(f: Findings, tested: int) -> str:
         how = f"family-wise p {p_text(f.p_family)}"
     elif not f.p_winner < LEVEL:
         how = f"after refit, family-wise p {p_text(f.p_winner)}"
+    elif f.held_out <= 0 and not (f.clear < STRENGTH or f.chance >= LEVEL):
+        how = f"the best, {f.winner}, raises chi2 of the held-out frames by {-f.held_out:.2g}"
     elif not f.chance > LEVEL:
         how = f"after refit, the best, {f.winner}, has a strength of {f.clear:.2g} sd"
     else:

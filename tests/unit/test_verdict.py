@@ -24,6 +24,7 @@ from optics.diagnosis.evidence import Candidate, measure
 from optics.diagnosis.explanations import Outcome
 from optics.diagnosis.result import WORDS, Diagnosis, Fingerprint
 from optics.diagnosis.score import Table, score
+from optics.diagnosis.text import sentence
 from optics.diagnosis.thresholds import CLUTTERED, SURE, TOLD
 from optics.errors import Underdetermined
 from optics.fit.model import value_of
@@ -336,6 +337,10 @@ GOOD = Findings(
         ({"rival": True, "ratio": 2.0, "common": False, "survivors": 2}, "UNKNOWN"),
         ({"rival": True, "ratio": 2.0, "structure_p": 0.5}, "CANNOT_TELL"),
         ({"held_out": -3.0}, "CANNOT_TELL"),
+        ({"held_out": -3.0, "structure_p": 0.5, "excess_sd": 1.0}, "NOTHING"),  # noise, fitted
+        ({"held_out": -3.0, "structure_p": 0.5, "excess_sd": 1.0, "measured": True}, "NOTHING"),
+        ({"held_out": -3.0, "structure_p": 0.5, "excess_sd": 27.0, "measured": True}, "CANNOT_TELL"),
+        ({"held_out": math.nan, "structure_p": 0.5, "excess_sd": 1.0}, "CANNOT_TELL"),
         ({"held_out": math.nan}, "CANNOT_TELL"),
         ({"held_out": math.nan, "ahead": 200.0}, "CLAIM"),  # of readings, blocks were left out in turn
         ({"held_out": math.nan, "ahead": -1.0}, "CANNOT_TELL"),
@@ -381,6 +386,23 @@ def test_the_rule(changes, word):
     assert all(c.text for c in conditions)
     if word not in ("CLAIM", "NOTHING", "UNKNOWN") and "winner" not in changes:
         assert any(not c.holds for c in conditions)
+
+
+@pytest.mark.parametrize(
+    "changes, why",
+    [
+        ({"p_family": 0.02}, "family-wise p 0.02"),
+        ({"p_winner": 0.5}, "after refit, family-wise p 0.5"),
+        ({"clear": 0.3}, "after refit, the best, a, has a strength of 0.3 sd"),
+        ({"chance": 0.3}, "the best, a, scatters as much between parts of the data, p 0.3"),
+        ({"held_out": -3.0, "clear": 5.0, "chance": 1e-5}, "the best, a, raises chi2 of the held-out frames by 3"),
+    ],
+)
+def test_nothing_says_what_spoke_against_the_best_effect(changes, why):
+    found = replace(GOOD, structure_p=0.5, excess_sd=1.0, **changes)
+    word, conditions = decide(found)
+    said = sentence(word, conditions, found, [None] * 38, (), (), (), (), None)
+    assert word == "NOTHING" and said.startswith(f"none of 38 effects is significant ({why})")
 
 
 def test_every_condition_is_needed_for_a_claim():
