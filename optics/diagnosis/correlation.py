@@ -127,13 +127,14 @@ class Readings:
         fitted again."""
         return self.reached / scale - self.noise(scale).gain
 
-    def noise(self, scale: float) -> Correlation:
-        """The shared noise of least deviance; `gain` is what it lowers the deviance by."""
+    def noise(self, scale: float, most: float = math.inf) -> Correlation:
+        """The shared noise of least deviance, no more of the signal than `most`; `gain` is what it lowers the deviance
+        by."""
         best = Correlation(scale)
         if not self.shared:
             return best
         x2 = self.power * scale / max(self.bright, 1e-12) / WANDER**2
-        x2 = np.where(x2 > (self.most / WANDER) ** 2, math.inf, x2)
+        x2 = np.where(x2 > (min(self.most, most) / WANDER) ** 2, math.inf, x2)
         for kind, left, logs, _ in self.shared:
             gains = self.white / scale - (left / scale + logs + x2)
             i = int(np.argmax(gains))

@@ -741,11 +741,7 @@ def noise_of(case: Case, outcome: Outcome, trial: Trial) -> Correlation | None:
         return _readings(case, trial).noise(outcome.scale)
     if case.lamp is None or trial.by_frame:
         return None
-    readings = _of_frames(case, case.lamp, trial)
-    readings.most = min(case.lamp.most, NOTICED)
-    found = readings.noise(outcome.scale)
-    readings.most = case.lamp.most
-    return found
+    return _of_frames(case, case.lamp, trial).noise(outcome.scale, NOTICED)
 
 
 def _with_survivors(case: Case, outcome: Outcome) -> Outcome:

@@ -87,12 +87,12 @@ def split(
     """
     added = _added(model, evidence, rows_max, seed, say, c, found, net, beside)
     dof = max(evidence.normal.count - evidence.projected.rank, 1)
-    table, lamp = evidence.is_table, noise is not None and not evidence.is_table
+    table = evidence.is_table
     if not table and left.structure_p >= LEVEL:
         added.scale = max(1 + left.excess_sd * math.sqrt(2 / dof), 1.0)
     parts = _parts(model, added.own, places)
     whole = added
-    if noise is not None and lamp:
+    if noise is not None and not table:
         added = _of_independent_frames(model, added, noise)
     results = _cuts(added, parts, places)
     if noise is not None and table:  # how sure a split is depends on what neighbours share, its share of the fall not
@@ -113,7 +113,7 @@ def split(
     results = [replace(s, limit=most(s), holds=s.h <= most(s)) for s in results]
     told = added if table else whole
     chance, clutter, errors = scatter(told.own, told.calibrated, told.effect, told.change, places, net)
-    if lamp:  # its errors are those of a fit that knows no lamp; whether it is there is asked beside that lamp
+    if added is not told:  # errors are those of a fit without a lamp; whether it is there is asked beside that lamp
         chance, *_ = scatter(added.own, added.calibrated, added.effect, _at_optimum(added), places, over_noise)
     return results, chance, clutter, errors
 

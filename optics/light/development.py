@@ -26,7 +26,7 @@ import numpy as np
 
 from optics.errors import BadScene
 from optics.scene.declare import IMAGE_STAGES, Effect
-from optics.scene.images import SIDE, of_pixels
+from optics.scene.images import SIDE, of_pixels, repeated
 from optics.spectra.reading import FILES, read_channels
 
 STEP = 1e-30  # of the complex step; far below rounding, far above underflow
@@ -166,7 +166,7 @@ class Developer:
                 image = effect.stages["lens"](image, finer)
             else:
                 whole = of_pixels(image, side)
-                image = image + (effect.stages["lens"](whole, view) - whole).repeat(side, 0).repeat(side, 1)
+                image = image + repeated(effect.stages["lens"](whole, view) - whole, side)
         image = of_pixels(image, side)
         for effect in active[first:]:
             image = effect.stages["lens"](image, view)

@@ -25,7 +25,7 @@ import numpy as np
 from optics.errors import BadScene
 from optics.light import paths
 from optics.processes import return_memory
-from optics.scene.images import finer_of, in_parts
+from optics.scene.images import finer_of, from_parts, in_parts, repeated
 from optics.scene.loader import Scene
 from optics.scene.mitsuba_parts import DEFAULT_VARIANT
 
@@ -783,15 +783,14 @@ class Renderer:
     ) -> np.ndarray:
         """(side H, side W, B): pixels `result` (H, W, B) in parts, whose mean they are. They differ as the middles
         `centres` of the pixels about them do, and where finer samples are, as these."""
-        found = in_parts(finer_of(centres, side) - np.repeat(np.repeat(centres, side, 0), side, 1), side)
+        found = in_parts(finer_of(centres, side) - repeated(centres, side), side)
         found = found.reshape(-1, side**2, result.shape[-1])
         if fine is not None:
             apart = image.finer.in_parts(fine, side, image.index, self.width)
             share = image.share if np.ndim(image.share) == 0 else np.asarray(image.share)[..., None]
             found[image.index] += share * (apart - apart.mean(1, keepdims=True) - found[image.index])
         found += result.reshape(-1, 1, result.shape[-1])
-        rows = found.reshape(self.height, self.width, side, side, -1).transpose(0, 2, 1, 3, 4)
-        return rows.reshape(self.height * side, self.width * side, -1)
+        return from_parts(found.reshape(self.height, self.width, side, side, -1))
 
     def _bands(self, spectra: Sequence, count: int | None = None) -> list[np.ndarray]:
         import drjit as dr

@@ -29,6 +29,17 @@ def in_parts(image: np.ndarray, side: int) -> np.ndarray:
     return image.reshape(height, side, width, side, -1).transpose(0, 2, 1, 3, 4)
 
 
+def from_parts(parts: np.ndarray) -> np.ndarray:
+    """(side H, side W, B) of an image by pixels (H, W, side, side, B): what `in_parts` undoes."""
+    height, width, side, _, bands = parts.shape
+    return parts.transpose(0, 2, 1, 3, 4).reshape(height * side, width * side, bands)
+
+
+def repeated(image: np.ndarray, side: int) -> np.ndarray:
+    """(side H, side W, B): what a pixel of an image (H, W, B) has, in each of its parts."""
+    return image.repeat(side, 0).repeat(side, 1)
+
+
 def of_pixels(image: np.ndarray, side: int) -> np.ndarray:
     """(..., H, W, B): mean of the parts of each pixel of an image (..., side H, side W, B)."""
     *more, rows, columns, bands = image.shape
