@@ -54,7 +54,12 @@ def use_processes(count: int | None = None) -> None:
 
 
 def allowed() -> int:
-    """How many processes a model may use now, this one among them: what was allowed, and what memory there is for."""
+    """How many processes a model may use now, this one among them: what was allowed, and what memory there is for. One
+    where a graphics processor makes the images: it is not cores that are short there."""
+    import mitsuba as mi
+
+    if (mi.variant() or "").startswith("cuda"):
+        return 1
     return min(_allowed, 1 + int(min(free_memory(), 1e15) // MEMORY))
 
 

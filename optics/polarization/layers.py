@@ -118,6 +118,9 @@ class Texture:
 
         if mi.variant() not in self.made:
             self.made[mi.variant()] = mi.Texture2f(
-                mi.TensorXf(self.values.astype("float32")), wrap_mode=dr.WrapMode.Clamp
+                # the texture units of graphics processors interpolate with weights of eight bits
+                mi.TensorXf(self.values.astype("float32")),
+                use_accel=False,
+                wrap_mode=dr.WrapMode.Clamp,
             )
         return self.made[mi.variant()].eval(mi.Point2f(s, t))

@@ -11,10 +11,13 @@ spectra      a new press in auto bands over the same in the scene's fixed ones, 
              a wall under a white LED by auto bands and by stock `path` with wavelengths by Monte Carlo: time at equal
              noise
 ranking      every effect scored on 16 frames of 160 x 120, presses solved for as well
+processors   the new press and the ranking by LLVM and, where there is an NVIDIA device, by CUDA
 """
 
 from __future__ import annotations
 
+import os
+import subprocess
 import sys
 import tempfile
 import time
@@ -343,24 +346,41 @@ def ranking() -> None:
         )
         effects = [e for e in model.scene.registry.effects.values() if model.scene.can_express(e)]
         start = time.perf_counter()
-        diagnosis.diagnose(
+        found = diagnosis.diagnose(
             model, fit, effects, lambda e: loop.effect_variables(model, e), fitted=list(range(16)), top=0
         )
         row(
             f"ranking {len(effects)} effects, 16 frames 160x120",
             f"{time.perf_counter() - start:.0f} s",
-            f"{len(fit.variables)} parameters in the base; target below 60 s",
+            f"{len(fit.variables)} parameters in the base; first: {found.rows[0].name}; target below 60 s",
         )
 
 
-def presses() -> None:
+def press_of_ours():
+    """What `new_press` gives, and the s that its images take."""
     renderer, values, press = new_press(320, 240)
-    scene = renderer.scene
     ours = timed(press, 9)
     row("new press, six LEDs, 320x240 (ours)", f"{ours * 1e3:.0f} ms", "target 66 ms on two quiet cores")
     cpu = time.process_time()
     press()
     row("the same, of a processor", f"{(time.process_time() - cpu) * 1e3:.0f} ms")
+    return renderer, values, press, ours
+
+
+def processors() -> None:
+    from optics.scene.mitsuba_parts import VARIABLE
+
+    for variant in ("llvm_ad_spectral_polarized", "cuda_ad_spectral_polarized"):
+        print(variant, flush=True)
+        command = [sys.executable, "-m", "optics.proof.speed", "press", "ranking"]
+        done = subprocess.run(command, env={**os.environ, VARIABLE: variant}, stderr=subprocess.PIPE, text=True)
+        if done.returncode:
+            row("not measured", "", (done.stderr.strip().splitlines() or ["no reason given"])[-1])
+
+
+def presses() -> None:
+    renderer, values, press, ours = press_of_ours()
+    scene = renderer.scene
     beside_taxim()
 
     now = {**values, "gel.press_depth": 0.61}
@@ -373,19 +393,27 @@ def presses() -> None:
     against_stock(renderer, now, ours)
 
 
-PARTS = {"presses": presses, "grid": printed_grid, "spectra": spectra, "ranking": ranking}
+PARTS = {
+    "presses": presses,
+    "grid": printed_grid,
+    "spectra": spectra,
+    "ranking": ranking,
+    "processors": processors,
+}
+OF_A_PROCESSOR = {"press": press_of_ours, "ranking": ranking}  # what `processors` runs by each variant
 
 
 def main(names: Sequence[str]) -> int:
     """Measure the named parts; none named: all."""
-    if unknown := set(names) - set(PARTS):
+    parts = {**OF_A_PROCESSOR, **PARTS}
+    if unknown := set(names) - set(parts):
         print(f"no part {', '.join(sorted(unknown))}; there are {', '.join(PARTS)}", file=sys.stderr)
         return 2
     from optics.scene.mitsuba_parts import use_variant
 
     for name in names or PARTS:
         use_variant()  # a part may leave another
-        PARTS[name]()
+        parts[name]()
     return 0
 
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 import math
+import os
 import sys
 import weakref
 from collections.abc import Callable, Iterator, Mapping
@@ -13,6 +14,7 @@ from contextvars import ContextVar
 from functools import wraps
 from pathlib import Path
 
+from optics.doctor import PlatformError
 from optics.errors import BadPlugin, BadScene, UnknownKey
 from optics.scene.declare import IMAGE_STAGES, Part
 from optics.scene.line import EDGES
@@ -21,7 +23,8 @@ from optics.scene.regions import found_file
 from optics.scene.registry import Registry, default, include
 from optics.spectra.curve import Curve
 
-DEFAULT_VARIANT = "llvm_ad_spectral_polarized"
+VARIABLE = "OPTICS_VARIANT"  # of the environment: the variant where none is named
+DEFAULT_VARIANT = os.environ.get(VARIABLE, "").strip() or "llvm_ad_spectral_polarized"
 _loading: ContextVar[Registry | None] = ContextVar("registry", default=None)  # of the scene that is being loaded
 _coarseness: ContextVar[int] = ContextVar("coarseness", default=1)  # of the meshes that are being made
 _registered: dict[str, dict[str, str]] = {}  # variant -> kind -> category that Mitsuba knows it in
@@ -32,7 +35,8 @@ _made = itertools.count()  # numbers the parts in the order in which they were m
 def use_variant(variant: str = DEFAULT_VARIANT, registry: Registry | None = None) -> None:
     """Set the Mitsuba variant and register the plugins of a registry for it (None: those that every scene knows).
 
-    Scalar variants are refused: Python plugins run 30-120 times slower in them and emitters fail.
+    Scalar variants are refused: Python plugins run 30-120 times slower in them and emitters fail. Raises PlatformError
+    where the machine cannot run the variant.
     """
     from optics.doctor import require_llvm
 
@@ -44,9 +48,22 @@ def use_variant(variant: str = DEFAULT_VARIANT, registry: Registry | None = None
     if variant not in mi.variants():
         raise UnknownKey(variant, [v for v in mi.variants() if not v.startswith("scalar")], "variant")
     if mi.variant() != variant:
-        mi.set_variant(variant)
+        try:
+            mi.set_variant(variant)
+        except ImportError as error:
+            raise _unusable(variant) from error
         mi.set_log_level(mi.LogLevel.Error)
     _prepare(registry or default(), variant)
+
+
+def _unusable(variant: str) -> PlatformError:
+    """Where Mitsuba has a variant that this machine cannot run."""
+    if variant.startswith("cuda"):
+        return PlatformError(
+            f"variant {variant}: Dr.Jit finds no NVIDIA driver here; allowed: variants that begin with llvm; "
+            f"next: see whether `nvidia-smi` lists a device, or leave {VARIABLE} and --variant away"
+        )
+    return PlatformError(f"variant {variant} does not start on this machine; next: optics doctor")
 
 
 def register(plugins: str | Path | list[str | Path] | None = None) -> None:

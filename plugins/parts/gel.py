@@ -516,7 +516,10 @@ def build():
                 self.seen_touch = touch
                 values = np.ascontiguousarray(touch.values[..., None], np.float32)
                 self.touch_texture = mi.Texture2f(
-                    mi.TensorXf(values), filter_mode=dr.FilterMode.Linear, wrap_mode=dr.WrapMode.Clamp
+                    mi.TensorXf(values),
+                    use_accel=False,  # of texture units, whose weights have eight bits
+                    filter_mode=dr.FilterMode.Linear,
+                    wrap_mode=dr.WrapMode.Clamp,
                 )
             count, pitch = len(touch.values), touch.pitch
             u, v = (((x - n(key)) / pitch + count / 2) / count for x, key in ((p.x, "press_x"), (p.y, "press_y")))
