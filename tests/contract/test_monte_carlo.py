@@ -111,6 +111,7 @@ def test_an_effect_at_neutral_is_not_there(key, bench):
     np.testing.assert_allclose(other, one, rtol=0, atol=1e-5 * one.max())  # atomic sums in float32, in another order
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("key", [k if k in QUICK else pytest.param(k, marks=pytest.mark.slow) for k in KEYS])
 def test_derivatives_against_differences(key, bench):
     """The renderer's own against differences over a plausible change, both as means over seeds with common random
@@ -155,6 +156,7 @@ SLAB = """<scene version="3.0.0">
 </scene>"""  # noqa: E501
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "key, factor",
     [

@@ -15,6 +15,7 @@ def code():
     return re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
 
 
+@pytest.mark.slow
 def test_the_code_of_the_page_runs():
     """All blocks in order, in a fresh process; the press shows, and so does the turned film."""
     *before, last = code()

@@ -25,6 +25,7 @@ def compared(bench, key):
     return [np.sqrt(np.mean((x - wanted)[smooth] ** 2)) / scale for x in (alone, found)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("key", KEYS)
 def test_derivatives_with_a_second_reflection(key, bench, monkeypatch):
     """With the directions of the prediction. What is left is the curvature over half a step: at most 1.6e-4 of the

@@ -84,6 +84,7 @@ def test_markers_are_where_a_robot_finds_them():
     assert pressed.labels.numbers["force"][0] > 0
 
 
+@pytest.mark.slow
 def test_an_elastic_dent_is_the_skin_that_forces_are_of():
     """What is rendered, what is carried and what labels say are one skin; a geometric dent says how far it is off."""
     names = ("force", "displacement", "markers")

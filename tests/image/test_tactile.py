@@ -315,6 +315,7 @@ def test_all_leds_and_two_bounces_are_what_the_integrator_renders(mitsuba, tmp_p
     assert second.mean() == pytest.approx(more.mean(), abs=4 * error)
 
 
+@pytest.mark.slow
 def test_second_directions_leave_no_common_error(mitsuba, tmp_path):
     """What the directions of one seed miss is noise of single cells: the mean over the face misses nearly nothing, and
     single cells miss less than with directions by the surface's law alone."""

@@ -9,6 +9,7 @@ from optics.scene import loader
 SMALL = {"width": "32", "height": "24"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["gelsight", "digit", "gelsight_bench", "vi2tap", "particle_gel"])
 def test_together_as_one_by_one(mitsuba, name):
     """Every parameter of a light and of its board, away from where effects vanish: beside other effects too."""

@@ -136,6 +136,7 @@ def test_a_bead_lights_another_as_a_lambert_sphere(mitsuba):
     assert arrived == pytest.approx(expected, rel=0.03)
 
 
+@pytest.mark.slow
 def test_light_that_beads_scatter_into_one_another_is_a_stock_path_tracers(tmp_path, mitsuba):
     """White beads without a dye over a grey cover, in one band: LED by LED, light after two reflections against what
     stock `path` adds when it may follow one bounce more. Without the base's face, which ends its shadow rays."""
@@ -206,6 +207,7 @@ def test_another_seed_has_other_errors_at_outlines(errors):
     assert abs(np.mean(one * other)) < 0.2 * np.std(one) * np.std(other)  # of 576 pixels, nearly all at rims: 0.04
 
 
+@pytest.mark.slow
 def test_behind_a_pupil_outlines_are_sampled_as_well_as_without(errors):
     """A circle of confusion of a third of a pixel: errors no larger than a sharp image's, by more than a third; with as
     many samples they would be twice as large."""

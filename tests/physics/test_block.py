@@ -141,6 +141,7 @@ def volume_of(corner):
     return (a * np.cross(b, c)).sum() / 6
 
 
+@pytest.mark.slow
 def test_a_cell_that_was_not_filled(load):
     """Where it is the only one, as if the filling were air; half filled, half of what makes it differ; and the
     derivative by the filling's absorption, of what is left of it."""
@@ -169,6 +170,7 @@ def test_a_cell_that_was_not_filled(load):
         Transport(scene)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scattering", [pytest.param(0.0, marks=pytest.mark.slow), 0.5])
 def test_a_pressed_grid_by_two_routes(load, scattering):
     """Maps against rays that find the lamp by themselves, in contact: the target's light and the cells' (z, and the

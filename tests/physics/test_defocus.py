@@ -41,6 +41,7 @@ def test_rays_through_the_pupil_miss_by_the_circle_of_confusion(kind, mitsuba):
         assert np.sqrt(along * across) == pytest.approx(0.8 / (4 * np.pi) * spread**2, rel=0.015)
 
 
+@pytest.mark.slow
 def test_the_blur_is_that_of_rays_through_the_pupil(mitsuba):
     """Beads before and behind the focus, by the effect and by mi.render; without it the two differ three times as
     much."""

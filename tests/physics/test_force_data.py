@@ -132,6 +132,7 @@ def test_layouts_are_drawn_anew_for_presses_of_every_depth(job):
     np.testing.assert_array_equal(one.force, two.force)
 
 
+@pytest.mark.slow
 def test_from_a_job_to_metrics_on_the_command_line(job, optics, tmp_path, monkeypatch):
     """Images of a batch, their flow, a map trained on projected presses, its metrics; then what is refused."""
     pytest.importorskip("cv2")

@@ -360,6 +360,7 @@ def contact(elastic, shape, depth, face, moved):
     raise AssertionError("no contact found")
 
 
+@pytest.mark.slow
 def test_sphere_presses_as_on_finite_elements():
     """8 mm, 0.2 and 0.4 mm deep in 3 mm: elements with nodes every 0.2 mm under the sphere, good to 1 %."""
     across, along = 4.5 * np.linspace(0, 1, 8) ** 1.5, -3 * np.linspace(1, 0, 6) ** 1.4
@@ -472,6 +473,7 @@ def energies(factor, count=200):
             return np.array(found), (skin.mass[..., None] * v**2).sum() / 2
 
 
+@pytest.mark.slow
 def test_energy_is_kept_to_second_order():
     """Verlet's error swings about 0 with dt^2 and does not grow."""
     wrong = []
@@ -733,6 +735,7 @@ def test_says_what_is_wrong(call, text):
         call()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("find", [balance, settle])
 def test_cells_turned_inside_out_are_an_error(find):
     with pytest.raises(ValueError, match="inside out at a depth of 2 mm; press less deep"):

@@ -79,6 +79,7 @@ def test_beads_follow_a_dented_gel_of_any_kind(mitsuba):
     np.testing.assert_allclose(carried_points(gel, points), exact, atol=0.01)
 
 
+@pytest.mark.slow
 def test_a_path_tracer_sees_the_same_light(load):
     """Light by light with few samples in each pixel, and mi.render with many, through an absorbing gel."""
     from optics.light.rendering import RenderJob

@@ -1018,6 +1018,7 @@ def generic(scene):
     return values
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("variant", [MONO, pytest.param(SPECTRAL, marks=pytest.mark.slow)], indirect=True)
 def test_derivatives_by_a_complex_step_are_those_of_differences(variant):
     """Every parameter of films, sheet and lamp, in intensity and polarization."""
@@ -1155,6 +1156,7 @@ def test_stokes_vectors_of_many_readings_are_those_of_each(variant, tmp_path):
     np.testing.assert_allclose(found, np.stack(each, 1), rtol=0, atol=1e-15)
 
 
+@pytest.mark.slow
 def test_light_that_is_reflected_twice_has_its_derivative_by_a_layer(finger):
     """Of the share of two reflections alone: the derivative with it less the one without."""
     key, step = "film.angle", 1e-4

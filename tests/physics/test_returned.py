@@ -19,6 +19,7 @@ def test_reflectances_that_the_page_gives():
     assert reflectance(1.41) == pytest.approx(0.536, abs=5e-4) and reflectance(1.5) == pytest.approx(0.596, abs=5e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("variant", ["llvm_ad_mono"], indirect=True)
 @pytest.mark.parametrize("index, slope, limit", [(1.41, 0, 0.0), (1.5, 0, 0.0), (1.41, 45, 0.02), (1.5, 45, 0.05)])
 def test_a_wide_face_under_a_window(variant, index, slope, limit):

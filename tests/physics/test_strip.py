@@ -176,6 +176,7 @@ def stock(mi, scene, name):
     return np.array([np.array(mi.render(made, spp=SPP, seed=k), float)[..., 0] for k in range(SEEDS)])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("variant", ["llvm_ad_mono"], indirect=True)
 @pytest.mark.parametrize("name", ["strip", "panel"])
 def test_soft_shadows_are_those_of_stock_mitsuba(name, variant, load):
@@ -206,6 +207,7 @@ def test_soft_shadows_are_those_of_stock_mitsuba(name, variant, load):
     assert least_p(images, ours.mean(0), ours.std(0, ddof=1) / SEEDS**0.5) > SIGNIFICANCE
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("more", [{"gel.haze": 0.1}, {"membrane.rho_r": 3.0, "integrator.interreflection": 1.0}])
 @pytest.mark.parametrize("variant", ["llvm_ad_mono"], indirect=True)
 def test_haze_and_a_second_bounce_are_in_both_renders(more, variant, load):

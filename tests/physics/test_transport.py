@@ -108,6 +108,7 @@ def test_tilted_plates_hand_polarization_on(tmp_path, mitsuba):
     near(found.radiance[0], found.error[0], both.mean())
 
 
+@pytest.mark.slow
 def test_a_wave_plate_between_tilted_plates(tmp_path, mitsuba):
     """The plates above, turned by 45 degrees, and between them a body that neither reflects nor absorbs, birefringent
     along x: T = ((T_s + T_p)^2 + (T_s - T_p)^2 cos delta)/4, delta = 2 pi dn d/lambda, for three wavelengths."""
@@ -337,6 +338,7 @@ def followed(t, p, d, steps, x=None, group=(0, 1, 2)):
     return np.array(log).reshape(steps, count, width).astype(float)
 
 
+@pytest.mark.slow
 def test_one_cell_ray_by_ray(tmp_path, mitsuba):
     """Every stretch of many rays through one cell in a block against (23), (24) and (29): direction, absorption, and
     what the faces leave of two crossed linear polarizations, followed as fields."""
@@ -622,6 +624,7 @@ def little_grid(scattering=0.0, roughness=0.0):
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scattering, roughness", [(0.0, 0.0), (0.3, 0.0), (0.1, 0.15)])
 def test_maps_and_paths_agree(tmp_path, mitsuba, scattering, roughness):
     """Pixel by pixel: z has the spread of noise, and no mean; the maps' resolution stays below."""
@@ -667,6 +670,7 @@ def stock(folder, roughness, alpha_wall=0.05, alpha_fill=0.1, fill=1.4):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("roughness", [0.0, pytest.param(0.15, marks=pytest.mark.slow)])
 def test_stock_volpath_sees_the_same(tmp_path, mitsuba, roughness):
     """The same grid by Mitsuba's own dielectrics, media and integrator, pixel by pixel: z has no mean and the spread of
@@ -720,6 +724,7 @@ def test_what_is_nested_wrongly_is_refused(tmp_path, mitsuba):
         load(tmp_path, bodies)
 
 
+@pytest.mark.slow
 def test_the_stated_error_is_that_between_seeds(mitsuba):
     """Variance of eight images, pixel by pixel, over the mean of the squares of their stated errors: 1, and .01 by
     Monte Carlo (measured over six sets; pixels share maps). Generators that start beside one another gave 1.4."""

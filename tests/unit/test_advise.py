@@ -463,6 +463,7 @@ def tie():
     raise AssertionError("none of 12 sessions is a tie")
 
 
+@pytest.mark.slow
 def test_a_tie_gets_advice_that_is_written_and_read():
     model, found = tie()
     found.advice = advise.advise(model, found, variables_of)

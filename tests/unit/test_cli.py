@@ -521,6 +521,7 @@ ENDS = {  # words of a shell -> (exit code, what stderr says)
 }
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs bash and /dev/full")
 @pytest.mark.parametrize("words", ENDS)
 def test_odd_ends_of_a_pipe_and_odd_folders(tmp_path, words):

@@ -152,6 +152,7 @@ def test_a_pattern_that_successive_frames_share_is_a_sensor_that_changes():
     assert np.isnan(drifting_pattern(model, fit.values, replace(evidence, spectrum=Sweeps()), excess).share)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pattern", ["stays", "is new", "lamp"])
 def test_what_frames_share_in_any_order_and_a_lamp_are_no_sensor_that_changes(pattern):
     model, fit, evidence, excess = of_a_session(pattern)

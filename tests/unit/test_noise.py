@@ -134,6 +134,7 @@ def test_masks_follow_data_and_noise_per_channel():
 
 
 # -- Estimation ------------------------------------------------------------------------------------------------------
+@pytest.mark.slow
 @pytest.mark.parametrize("slope", [0.0, 0.5])
 @pytest.mark.parametrize(
     "noise",

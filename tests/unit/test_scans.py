@@ -218,6 +218,7 @@ def test_circles_of_another_plate_are_refused(tmp_path):
         scans.import_scans(tmp_path, tmp_path / "out")
 
 
+@pytest.mark.slow
 def test_scans_without_a_flat_field_or_of_another_scale(tmp_path, source):
     rng = np.random.default_rng(2)
     write_scan(tmp_path / "one", middles(0, 0, 0), rng)
@@ -231,6 +232,7 @@ def test_scans_without_a_flat_field_or_of_another_scale(tmp_path, source):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not SHARED.is_dir(), reason="the measured scans are not here")
 def test_measured_scans_are_read(tmp_path):
     """LEDs on a regular ring, by the shading alone; circles within 5 um of a grid of 1 mm; the groove is left out."""

@@ -549,6 +549,7 @@ def test_what_is_stated_in_every_frame_does_not_vary(mitsuba, tmp_path):
     assert "a" not in capture_files.stated(Captures(Path("."), "s", frames))
 
 
+@pytest.mark.slow
 def test_effects_left_out_on_request_are_said_with_the_reasons(mitsuba, tmp_path):
     """The whole loop on readings with a leak: what leaks is found, unless it is ruled out or left out on request."""
     import optics
@@ -568,6 +569,7 @@ def test_effects_left_out_on_request_are_said_with_the_reasons(mitsuba, tmp_path
     assert "extinction leak" in [row.name for row in study.diagnose(advised=False).rows]
 
 
+@pytest.mark.slow
 def test_without_on_the_command_line(mitsuba, tmp_path, capsys):
     from optics.cli import main
 

@@ -83,6 +83,7 @@ def test_a_skin_at_rest_is_not_stretched():
     assert np.abs(found.extremes()).max() < 0.005
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", ["no grain", "grain of another skin", "no room between the contacts"])
 def test_nothing_is_stated_where_nothing_is_known(case):
     rng = np.random.default_rng(5)
@@ -93,6 +94,7 @@ def test_nothing_is_stated_where_nothing_is_known(case):
     assert skin_motion(flat, pressed, balls(), SPACING, radius, SCALE) is None
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not SCANS.is_dir(), reason="measured scans are not here")
 def test_two_presses_of_a_real_skin_stretch_it_alike(tmp_path):
     """Plates that two scans press in at different places stretch the same gel: by 3 to 6 % in the middle, more towards

@@ -121,6 +121,7 @@ def test_an_effect_with_a_strength_per_frame_is_claimed():
     assert found - found.mean() == pytest.approx(np.array([0.01, -0.02, 0.015, 0.0]) - 0.00125, abs=0.002)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("follows", [True, False])
 def test_a_number_per_frame_that_follows_a_setting_is_no_drift(follows):
     """A gain that goes with what was set in each frame is not named after the frames, as one that goes its own way
@@ -543,6 +544,7 @@ def test_a_fall_says_more_than_a_strength_whose_error_is_its_factors(fall, lower
     assert (p < 1e-6) is lower and (lower or p > 1e-3)
 
 
+@pytest.mark.slow
 def test_a_lamp_that_wanders_does_not_pass_for_a_tone_of_the_session():
     """600 readings, a wander that 50 neighbours share, as strong as noise, and a tone of 240 readings, as of a second
     dial. By noise most sets would show it, by the scatter between 16 parts 4 % do at .01 (2000 sets), 7 % between 64.
@@ -850,6 +852,7 @@ def test_a_base_parameter_at_its_bound_is_taken_as_known():
     assert d.basis.rank == len(fit.variables) - 1 and any("led1.z" in w for w in d.warnings)
 
 
+@pytest.mark.slow
 def test_priors_are_rows_of_the_base():
     d = judge(*calibrated({"crosstalk": 0.03}, priors=True), library("crosstalk", "glare", "gamma"))
     free = judge(*calibrated({"crosstalk": 0.03}), library("crosstalk", "glare", "gamma"))
@@ -857,6 +860,7 @@ def test_priors_are_rows_of_the_base():
     assert d.row("gamma").survival > free.row("gamma").survival  # what is known cannot absorb
 
 
+@pytest.mark.slow
 def test_thinning_is_stated_and_changes_neither_ranking_nor_verdict():
     model, fit = calibrated({"crosstalk": 0.03})
     effects = library("crosstalk", "glare", "gamma", "LED lobe")
@@ -868,6 +872,7 @@ def test_thinning_is_stated_and_changes_neither_ranking_nor_verdict():
         assert b.net == pytest.approx(a.net, rel=0.5)  # scaled up to all pixels
 
 
+@pytest.mark.slow
 def test_noisy_derivatives_are_rendered_twice_with_seeds_of_their_own():
     """R8: strength within 5 % at kappa = 0.1, kappa reported, seeds of derivatives differ and are not the prediction's
     0."""

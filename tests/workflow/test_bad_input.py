@@ -436,6 +436,7 @@ CASES = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("arguments", "expected"), CASES, ids=[c[0] for c in CASES])
 def test_one_line_and_nothing_written(place, monkeypatch, capsys, arguments, expected):
     monkeypatch.chdir(place)

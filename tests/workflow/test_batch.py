@@ -294,6 +294,7 @@ def held(out, index):
 in_proc = pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks at processes in /proc")
 
 
+@pytest.mark.slow
 @in_proc
 def test_killed_in_the_middle_and_resumed(whole, job, start):
     """The test holds the lock of the last sample until the kill, so that the command cannot end before, however fast
@@ -319,6 +320,7 @@ def test_killed_in_the_middle_and_resumed(whole, job, start):
     assert content(out) == content(whole)
 
 
+@pytest.mark.slow
 @in_proc
 def test_interrupted_says_how_to_go_on(whole, job, start):
     process = stopped_at(start, job, 4)
@@ -477,6 +479,7 @@ def test_a_full_disk_ends_the_run_at_once(whole, job, monkeypatch):
     assert batch.run(job, workers=1).made == TOTAL - 2 and content(job.parent / "out") == content(whole)
 
 
+@pytest.mark.slow
 @in_proc
 def test_commands_at_once_share_the_work(whole, job, start):
     """A block that another worker is at is left to it, and is made where that one dies."""
@@ -513,6 +516,7 @@ def test_two_commands_that_finish_at_once_without_locks(job, monkeypatch, other)
             batch.run(job, workers=1)
 
 
+@pytest.mark.slow
 @in_proc
 def test_a_worker_that_is_killed_is_replaced(whole, job, start):
     """While the test holds the lock of the last sample the command cannot end, and while the command is stopped it
@@ -530,6 +534,7 @@ def test_a_worker_that_is_killed_is_replaced(whole, job, start):
     assert content(out) == content(whole)
 
 
+@pytest.mark.slow
 def test_workers_are_recycled(whole, job):
     states = []
     result = batch.run(job, workers=2, recycle=3, watch=states.append)
@@ -561,6 +566,7 @@ def test_no_process_outlives_a_job_that_is_refused(job):
     assert not multiprocessing.active_children()
 
 
+@pytest.mark.slow
 def test_workers_that_cannot_start_are_reported(job, monkeypatch):
     batch.run(job, (1, 4), workers=1)
     note = job.parent / "out" / "job.json"

@@ -199,6 +199,7 @@ def test_a_hidden_effect_is_found(name, tmp_path):
     assert loop.examine(study, model, setup, fit).word == "NOTHING"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(5))
 def test_a_perfect_bench_lacks_nothing(seed, tmp_path):
     setup, study, model, fit = study_of(Case(Truth(**lamp()), ()), tmp_path, seed)

@@ -115,6 +115,7 @@ def test_an_unknown_zero_of_a_dial_is_found_in_any_quadrant(mitsuba, tmp_path, z
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("delta", "axis"), [(30.0, 20.0), (200.0, -70.0), (420.0, 20.0), (640.0, 75.0)])
 def test_a_plate_of_any_order_is_found(mitsuba, tmp_path, delta, axis):
     """In three colours, by its retardance at 540 nm; on linear light between polarizers its sign does not show."""
@@ -143,6 +144,7 @@ def test_a_parameter_without_slope_at_its_start_is_not_called_unseen(mitsuba, tm
     assert np.hypot(*fit.estimate) == pytest.approx(60.0, abs=1.0)
 
 
+@pytest.mark.slow
 def test_a_refit_finds_the_order_of_an_effect(mitsuba, tmp_path):
     """420 deg, where the score knows a plate of 10: what a diagnosis asks for is the best refit."""
     a, b = np.tile(np.arange(0.0, 180.0, 10.0), 2), np.repeat([0.0, 45.0], 18)
@@ -182,6 +184,7 @@ def test_effects_free_what_the_captures_can_show(mitsuba, tmp_path):
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("free", ["polarizer.offset", "middle.offset", "analyzer.offset"])
 def test_one_free_dial_does_not_remove_an_effect(mitsuba, tmp_path, free):
     """Three films, the middle one 1 deg off: with any one offset in the base, the others are tested and added."""

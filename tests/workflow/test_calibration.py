@@ -53,6 +53,7 @@ def solved():
     return model, truth, calibrate.fit(model, calibrate.variables_from(model, FREE), displaced(truth, rng))
 
 
+@pytest.mark.slow
 def test_the_truth_is_found_from_two_millimetres_and_thirty_per_cent_off(solved):
     model, truth, fit = solved
     assert fit.converged, fit.reason
@@ -63,6 +64,7 @@ def test_the_truth_is_found_from_two_millimetres_and_thirty_per_cent_off(solved)
     assert max(abs(e) / truth[n] for n, e in error.items() if n.endswith((".mu", ".sigma"))) < 0.06
 
 
+@pytest.mark.slow
 def test_errors_are_honest(solved):
     _, truth, fit = solved
     pulls = (fit.estimate - [truth[v.keys[0]] for v in fit.variables]) / fit.sd
@@ -71,6 +73,7 @@ def test_errors_are_honest(solved):
     assert abs(fit.chi2_per_dof - 1) < 0.01  # 1.38 million values: the noise model's own sd is 0.0012
 
 
+@pytest.mark.slow
 def test_power_and_reflectance_are_reported_as_one(solved):
     model, truth, fit = solved
     start = Values({v.keys[0]: float(e) for v, e in zip(fit.variables, fit.estimate)})
@@ -79,6 +82,7 @@ def test_power_and_reflectance_are_reported_as_one(solved):
     assert any("cannot tell apart" in w and "power" in w and "rho" in w for w in both.warnings), both.warnings
 
 
+@pytest.mark.slow
 def test_robust_weights_shrug_off_glints(solved):
     """A glint of 60 DN in one pixel of a hundred: Huber's weights leave less than a quarter of its bias."""
     model, _, fit = solved

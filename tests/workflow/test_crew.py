@@ -111,6 +111,7 @@ def at_work(monkeypatch):
         model.hands.give_up(model)
 
 
+@pytest.mark.slow
 def test_the_numbers_are_those_of_one_process(setup, at_work):
     """Normal equations, secants, predictions; a process that dies leaves its frames to the other. Tolerances are of
     single precision: threads of another number sum in another order, and a secant divides a difference."""
@@ -138,6 +139,7 @@ def test_the_numbers_are_those_of_one_process(setup, at_work):
     assert two.companions == one.companions
 
 
+@pytest.mark.slow
 def test_a_model_in_cells_is_opened_again(setup, at_work):
     whole = open_model(setup)
     coarse, _ = cells_of_studies.open_in_cells(setup, cells_of_studies.Cells(whole, 2))
@@ -146,6 +148,7 @@ def test_a_model_in_cells_is_opened_again(setup, at_work):
     assert shared[0].shape == (12, 16, 3) and all(np.allclose(a, b, rtol=1e-6) for a, b in zip(alone, shared))
 
 
+@pytest.mark.slow
 def test_a_mistake_in_another_process_is_raised_here(setup, at_work):
     model = at_work(open_model(setup))
     model.predict(Values())
@@ -154,6 +157,7 @@ def test_a_mistake_in_another_process_is_raised_here(setup, at_work):
         model.predict(Values({}, {other: {"gel.press_depth": "deep"}}))
 
 
+@pytest.mark.slow
 def test_a_script_without_a_guard_stays_alone(setup, tmp_path):
     """Nothing begins a process unless it is asked for: a script would run again in it."""
     script = tmp_path / "script.py"

@@ -43,6 +43,7 @@ def drawn(tmp_path_factory, mitsuba):
     return study.folder, draft.write(text, plugins, "lamp ripple")
 
 
+@pytest.mark.slow
 def test_the_same_data_do_not_test_a_draft(drawn, tmp_path):
     study, file = drawn
     again = package.Study.open(study).diagnose(advised=False)
@@ -64,6 +65,7 @@ def test_the_same_data_do_not_test_a_draft(drawn, tmp_path):
     assert "lamp-ripple" not in {e.key for e in part.candidates()}
 
 
+@pytest.mark.slow
 def test_other_data_test_it_and_adding_stays_allowed(drawn, tmp_path):
     study, file = drawn
     others = package.calibrate(bench(tmp_path / "others", 2), tmp_path / "study", plugins=file.parent)

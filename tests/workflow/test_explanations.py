@@ -57,6 +57,7 @@ def noisy(values, seed=1, sd=NOISE):
     return values + sd * np.random.default_rng(seed).standard_normal(np.shape(values))
 
 
+@pytest.mark.slow
 def test_two_simple_effects_tie_with_one_of_two_strengths(tmp_path):
     """A film that is 2 degrees off and a leak of 1 % are, between two films, exactly a plate in between: cos(2t) and
     sin(2t) with a constant. No claim of the plate, although it is one effect with as many strengths."""
@@ -68,6 +69,7 @@ def test_two_simple_effects_tie_with_one_of_two_strengths(tmp_path):
     assert np.ptp(falls) < 0.01 * max(falls)  # as large: it is the number of effects and their sizes that differ
 
 
+@pytest.mark.slow
 def test_what_every_explanation_holds_is_claimed(tmp_path):
     """Without a sample the plate is ruled out: each explanation that is left has the misalignment, with one of four
     that the session cannot tell apart."""
@@ -79,6 +81,7 @@ def test_what_every_explanation_holds_is_claimed(tmp_path):
     assert "analyzer.offset - polarizer.offset = 2.0" in told or "analyzer.offset - polarizer.offset = 1.9" in told
 
 
+@pytest.mark.slow
 def test_what_was_found_beside_an_effect_is_looked_for_again_once_that_is_added(tmp_path):
     """With the leak alone in the model, its base stands elsewhere; the study knows where the misalignment had been."""
     write(tmp_path / "captures", {"analyzer.angle": MALUS}, noisy(malus(MALUS, offset=2.0, leak=0.02)))
@@ -138,6 +141,7 @@ def test_a_lamp_that_wanders_is_no_effect(tmp_path):
     assert claims == 0 and stood_out >= 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_one_thing_swept_is_enough_for_a_claim(seed, tmp_path):
     """Along the only setting a free curve explains as much as any effect: its bins cost what they could have fitted.
@@ -149,6 +153,7 @@ def test_one_thing_swept_is_enough_for_a_claim(seed, tmp_path):
     assert curve.ratio > 0.9
 
 
+@pytest.mark.slow
 def test_freedom_of_colour_breaks_no_tie(tmp_path):
     """A haze whose strength has a colour: `coloured leak` fits it, `depolarization` has no slope to offer. The leak
     within the coloured one is not told from a haze, so neither is the coloured one."""
@@ -160,6 +165,7 @@ def test_freedom_of_colour_breaks_no_tie(tmp_path):
     assert any("depolarization" in e.effects for e in d.survivors), [e.effects for e in d.survivors]
 
 
+@pytest.mark.slow
 def test_a_tone_along_the_session_is_not_nothing(tmp_path):
     """31.5 cycles of a flickering lamp: beyond the eight lowest cosines, and no effect of the library."""
     psi = np.arange(-180.0, 180.0, 2.0)
@@ -170,6 +176,7 @@ def test_a_tone_along_the_session_is_not_nothing(tmp_path):
     assert plain.word == "NOTHING" and d.word not in ("NOTHING", "CLAIM"), d.sentence
 
 
+@pytest.mark.slow
 def test_a_contained_effect_does_not_come_back_by_its_score(tmp_path):
     """`coloured leak` holds the leak and does no better: it is no rival by the fall that its score promised."""
     d = judged(tmp_path, noisy(malus(MALUS, leak=0.03)), head='absent = ["sample"]')
@@ -178,6 +185,7 @@ def test_a_contained_effect_does_not_come_back_by_its_score(tmp_path):
     assert {"extinction leak"} in [set(e.effects) for e in d.survivors]
 
 
+@pytest.mark.slow
 def test_what_shows_only_beside_another_effect_is_found_with_it(tmp_path):
     """A plate of 40 degrees at 540 nm whose birefringence falls with the wavelength, at two angles between films:
     without the plate its dispersion changes nothing, so that no score of the base can rank it.
@@ -202,6 +210,7 @@ def turned_by_hand(sd, seed=3):
     return MALUS + sd * np.random.default_rng(seed).standard_normal(len(MALUS))
 
 
+@pytest.mark.slow
 def test_errors_of_dials_that_nobody_states_are_found_and_kept(tmp_path):
     """Half a degree is more than the meter's noise nearly everywhere; by stated noise alone anything would stand out.
     What the study takes is in its setup, its warnings and its values, and a comparison finds the same numbers."""
@@ -219,6 +228,7 @@ def test_errors_of_dials_that_nobody_states_are_found_and_kept(tmp_path):
     assert again.comparison.held_out.chi2_per_dof == pytest.approx(step["held_out"]["chi2_per_dof"], rel=1e-6)
 
 
+@pytest.mark.slow
 def test_an_effect_is_found_behind_errors_of_dials(tmp_path):
     """A wobble of 15 % along a whole turn, where unstated errors make three times the meter's noise."""
     dial = np.arange(-180.0, 180.0, 5.0)

@@ -77,6 +77,7 @@ def study_of(folder, effects, seed=5, built=None, views=SCENES, **defines):
     return (setup, *loop.begin(setup, folder / "study"))
 
 
+@pytest.mark.slow
 def test_the_maker_and_the_model_are_two_accounts_of_one_finger():
     """At the true values, without a fit: what differs is noise, and two per cent of its variance for the edges."""
     from optics.fit.scene_model import SceneModel

@@ -80,6 +80,7 @@ def studied(request):
 
 
 # -- one number ------------------------------------------------------------------------------------------------------
+@pytest.mark.slow
 def test_ladder_compare_view_and_report_give_one_held_out_number(studied, optics):
     """The poses that were found in held-out frames are used, and count, wherever the number is given."""
     record = Record.open(studied)
@@ -275,6 +276,7 @@ def test_a_sweep_starts_from_the_values_of_a_fit(read, optics):
     assert light * 0.5 == pytest.approx(less * read_fit(read)["parameters"]["source.power"], rel=1e-5)
 
 
+@pytest.mark.slow
 def test_no_share_of_values_is_negative(tmp_path, mitsuba):
     """Sweeps differ in length: of 49 readings the held-out ones are the shorter ones, and nothing is masked."""
     settings = [{"polarizer.angle": 0.0, "analyzer.angle": 3.6 * i, "source.power": 1.0} for i in range(49)]

@@ -77,6 +77,7 @@ def test_differences_by_the_dispersion_are_seen_beside_their_own_noise(mitsuba):
     assert noise < 1.5**2 * signal
 
 
+@pytest.mark.slow
 def test_frames_are_lit_by_one_panel_each_and_as_noisy_as_they_say():
     made = small().captures([2.5, 6.0])
     assert [f.group for f in made.frames] == 3 * ["distance-00"] + 3 * ["distance-01"]
@@ -97,6 +98,7 @@ def test_frames_are_lit_by_one_panel_each_and_as_noisy_as_they_say():
     assert maker.shares == 200 * [0.0]
 
 
+@pytest.mark.slow
 def test_the_makers_error_falls_with_its_samples():
     shares = []
     for spp in (64, 1024):

@@ -141,6 +141,7 @@ def test_the_same_cause_by_its_proof():
     assert set(rigs.SAME) == {"coloured leak", "stress birefringence", "site misalignment", *film}
 
 
+@pytest.mark.slow
 def test_leak_haze_and_offset_are_one_cosine_of_two_films_and_not_of_two_powers():
     """(1 + c cos 2 theta) with a free power: one number, four causes; at another power of the lamp an offset differs,
     at another exposure room light does."""
@@ -225,6 +226,7 @@ def test_a_meter_shows_whole_steps_of_its_range_and_no_light_below_nothing():
     assert (volts.shown(np.zeros((400, 1)), np.random.default_rng(1)) < 0).any()  # noise on both sides of the dark
 
 
+@pytest.mark.slow
 def test_noise_of_a_reading_is_that_of_the_instrument_and_of_its_dial():
     one = two_films()
     rough = session.Session(one.settings, one.fixed, one.meter, dial_sd=0.5)
@@ -264,6 +266,7 @@ def seed_of(cell):
     return zlib.crc32(cell.name.encode())
 
 
+@pytest.mark.slow
 def test_photographs_load_and_are_what_the_library_sees_with_the_true_numbers(tmp_path):
     """Each pixel along its own ray, a plate beside bare light: to 0.12 DN, as the library lets a ray that is 2.5
     degrees off see 0.1 % more of a plate's 400 degrees, and the maker does not: 0.4 deg, 0.0035 of half of 247 DN."""
@@ -341,6 +344,7 @@ def test_rounds_hide_every_cause_once_and_nothing_and_two(rig):
     assert all(cells.Cell.of(json.loads(json.dumps(c.json()))) == c for c in everything[:50])
 
 
+@pytest.mark.slow
 def test_what_is_hidden_is_as_strong_as_is_asked():
     rig = rigs.Motor()
     for cell in (
@@ -351,6 +355,7 @@ def test_what_is_hidden_is_as_strong_as_is_asked():
         assert 0.5 <= facts["correct"] <= 1 and facts["readings"] > 50
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [n for n, c in causes.CAUSES.items() if c.other])
 def test_another_law_is_another_shape_of_the_same_cause(name):
     """Of size 0 it is nothing; of another size it is not what the usual law makes at any strength."""
@@ -435,6 +440,7 @@ def test_two_hidden_are_found_one_by_one_or_in_a_set_with_both():
     assert elsewhere.elsewhere(records).sizes["two hidden"] == (2.0, 1)
 
 
+@pytest.mark.slow
 def test_a_crash_is_counted_whatever_it_is_and_told_with_its_place(monkeypatch):
     rig = rigs.Student()
     cell = next(c for c in next(rig.rounds(1)) if c.kind == "none")
@@ -446,6 +452,7 @@ def test_a_crash_is_counted_whatever_it_is_and_told_with_its_place(monkeypatch):
     assert list(elsewhere.wrong([found]))[0].startswith("crash: IndexError at test_laboratory.py")
 
 
+@pytest.mark.slow
 def test_the_loop_runs_on_a_bench_of_another_laboratory():
     """A polarized lamp behind one film: the detector could be polarized as well, to the last bit. The diagnosis names
     both, and its record is counted."""

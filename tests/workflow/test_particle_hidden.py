@@ -57,6 +57,7 @@ def test_the_makers_skin_moves_as_the_models(rig, mitsuba):
     np.testing.assert_allclose(moved, expected, atol=1e-3 * np.abs(expected).max())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("effect", [None, *(pytest.param(e, marks=pytest.mark.slow) for e in EFFECTS)])
 def test_maker_and_model_agree(rig, made, effect):
     """The second frame of a press, with and without each effect; the change by it is the model's to 0.3."""

@@ -80,6 +80,7 @@ LONG = ("magictac", "grid_bench")  # Monte Carlo: among the slow tests, but for 
 PRESSED = ("gelsight", "vi2tap")  # the other sensors are slow ones when something presses them
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name, pressed",
     [
@@ -265,6 +266,7 @@ def test_register_says_what_to_do(code, told):
     assert done.returncode == 1 and told in done.stderr
 
 
+@pytest.mark.slow
 def test_register_follows_the_variant_and_knows_a_users_folder(tmp_path):
     (tmp_path / "glass.py").write_text(
         '"""Glass: a boundary of another name."""\n'

@@ -152,6 +152,7 @@ def test_where_nothing_stands_out_the_set_is_that_of_the_scores(bench):
     assert 1 < len(step["set"]) < 12 and set(step["set"]) & set(step["score"]) >= {"source drift"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [3, pytest.param(41, marks=pytest.mark.slow)])
 def test_a_film_that_is_smeared_at_one_angle_is_no_polarized_source(bench, seed):
     """Five angles of the polarizer, a lamp that wanders: a polarized source, whose light goes with that angle too,

@@ -66,6 +66,7 @@ def at_the_noise(chi2_per_dof, count):
     return abs(chi2_per_dof - 1) < 5 * np.sqrt(2 / count)  # five standard deviations of the mean, 1
 
 
+@pytest.mark.slow
 def test_a_calibration_finds_the_index_from_brewsters_minimum(tmp_path):
     setup, study, model, fit = study_of(tmp_path)
     found = {v.name: (value_of(model, fit.values, v), sd) for v, sd in zip(fit.variables, fit.sd)}
@@ -75,6 +76,7 @@ def test_a_calibration_finds_the_index_from_brewsters_minimum(tmp_path):
     assert loop.examine(study, model, setup, fit, advised=False).word == "NOTHING"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "effect, hidden, key, strength",
     [

@@ -58,6 +58,7 @@ def study(mitsuba, tmp_path_factory):
     return facade.calibrate(path / "captures", path / "study", fit=path / "first-study", **choices)
 
 
+@pytest.mark.slow
 def test_tables_that_are_right_reach_the_noise(of_plates):
     """Within 0.65 radii the far light sees all of the balls: Lambert and linear in the normal are exactly right."""
     assert of_plates.held_out == ["two"] and of_plates.fitted == ["one"] and of_plates.frames == 3
@@ -72,6 +73,7 @@ def test_tables_that_are_right_reach_the_noise(of_plates):
     assert not of_plates.beaten and of_plates.best(boards.STEP) is None
 
 
+@pytest.mark.slow
 def test_background_and_photographs_are_worse_than_the_truth(of_plates):
     truth = of_plates.entry("linear in the normal")
     for name in (BACKGROUND, PHOTOGRAPH):
@@ -84,6 +86,7 @@ def test_background_and_photographs_are_worse_than_the_truth(of_plates):
     assert of_plates.entry(PHOTOGRAPH).numbers is None and of_plates.entry(BACKGROUND).numbers == 0
 
 
+@pytest.mark.slow
 def test_numbers_are_counted_and_split_by_lamp(of_plates):
     linear = of_plates.entry("linear in the normal, with position")
     assert linear.numbers == 3 * 12 and linear.each == 12
@@ -97,6 +100,7 @@ def test_numbers_are_counted_and_split_by_lamp(of_plates):
     assert sum(c["n"] for c in cells) == linear.contact.n
 
 
+@pytest.mark.slow
 def test_the_directional_table_finds_the_lights(of_plates):
     """A degree: as the import's own estimate from the same balls (test_scans)."""
     found = {led.removeprefix("led_"): azimuth for led, azimuth in of_plates.rivals_azimuths.items()}
@@ -116,6 +120,7 @@ def test_the_error_against_the_number_of_presses(study):
     assert again[-1]["ratio"] == pytest.approx(own.contact.ratio, rel=0.02)
 
 
+@pytest.mark.slow
 def test_a_model_that_is_right_reaches_the_noise_and_beats_every_rival(study):
     (found,) = scoreboard([study.setup.captures], [study.folder, study.folder])  # named twice, scored once
     (own,) = found.of(boards.STEP)
@@ -132,6 +137,7 @@ def test_a_model_that_is_right_reaches_the_noise_and_beats_every_rival(study):
     assert ring.off == pytest.approx(0.0, abs=1e-6)  # three points lie on a circle
 
 
+@pytest.mark.slow
 def test_the_command_writes_a_page_and_a_record_and_overwrites_nothing(optics, study, tmp_path):
     code, out, _ = optics("scoreboard", study.setup.captures, "--study", study.folder, "-o", tmp_path / "page")
     assert code == 0 and "study: base" in out and "linear in the normal" in out and "Table S1" in out
@@ -173,6 +179,7 @@ def test_a_set_without_a_flat_field_is_scored_in_dn(mitsuba, tmp_path):
     assert found.channels == ["R", "G", "B"] and len(mean.cells) == 3
 
 
+@pytest.mark.slow
 def test_what_cannot_be_scored_is_refused(mitsuba, tmp_path, plates):
     with pytest.raises(ValueError, match="nothing to score"):
         scoreboard()

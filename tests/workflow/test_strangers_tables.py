@@ -57,6 +57,7 @@ def cycling(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_weights_of_a_base_that_cannot_settle_are_those_of_its_values(cycling, tmp_path):
     """The study is taken up with the fit that it kept, and the plate is found."""
     free = ["source.power_r", "source.power_g", "source.power_b", "analyzer.offset"]
@@ -73,6 +74,7 @@ def test_weights_of_a_base_that_cannot_settle_are_those_of_its_values(cycling, t
     assert "retardance" in {*found.ambiguous, found.claimed}, found.sentence
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_channels_that_share_the_error_of_a_dial_are_no_structure(seed, tmp_path):
     """Three colours move together where a film stops off its scale. Of structure that is not there, p is below 0.001 in
@@ -112,6 +114,7 @@ def put(folder, columns, values, group, noise):
     )
 
 
+@pytest.mark.slow
 def test_a_run_that_alone_knows_a_direction_is_not_predicted_along_it(tmp_path):
     """One run in four is held out, one of the three left is the only one downwards: others do not know its lag."""
     put(tmp_path / "captures", *runs(np.random.default_rng(2), lag=4.0, scale=0.99, wander=0.008), 0.002)
@@ -120,6 +123,7 @@ def test_a_run_that_alone_knows_a_direction_is_not_predicted_along_it(tmp_path):
     assert found.word == "CLAIM" and found.claimed in ("servo backlash", "servo scale"), found.sentence
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(2))
 def test_a_lamp_that_wanders_and_nothing_else_is_nothing(seed, tmp_path):
     """Structure along the session, and no effect that explains it as well as a lamp that wanders by half a percent."""
@@ -128,6 +132,7 @@ def test_a_lamp_that_wanders_and_nothing_else_is_nothing(seed, tmp_path):
     assert found.word == "NOTHING", found.sentence
 
 
+@pytest.mark.slow
 def test_a_zero_is_found_by_the_short_way(tmp_path):
     """A film that stands crossed or parallel only shows a misalignment by its square: no slope tells how far. Half
     a turn more is the same film, and no reason to call 6 degrees implausible."""
@@ -137,6 +142,7 @@ def test_a_zero_is_found_by_the_short_way(tmp_path):
     assert max(map(abs, own.strength)) < 7.0 and own.survives, found.sentence
 
 
+@pytest.mark.slow
 def test_names_of_one_law_are_told_as_one(tmp_path):
     """One exposure of one lamp: light past the films and an offset of the meter are the same readings."""
     found = judged(tmp_path, noisy(malus(TURN, stray=0.03)), {"analyzer.angle": TURN}, 'absent = ["sample"]')

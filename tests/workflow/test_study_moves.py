@@ -233,6 +233,7 @@ def test_nothing_writes_over_a_record(project, tmp_path, optics):
 
 
 # -- a full disk -----------------------------------------------------------------------------------------------------
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="limits of file sizes end processes elsewhere")
 @pytest.mark.parametrize(
     "words",
