@@ -286,19 +286,43 @@ class Maker:
             self.values, self.size, self.spp, self.wide = v, size, spp, False
 
     def smeared(self, press: Sequence[float]) -> dict[str, np.ndarray]:
-        """`light` behind a lens that blurs: before pixels take their means, as they do not say where in them a rim
-        is."""
-        if "lens blur" not in self.effects:
+        """`light` behind a lens that bends or blurs: before pixels take their means, as they do not say where in them a
+        rim is."""
+        if not {"radial distortion", "lens blur"} & set(self.effects):
             return self.light(press)
         with self.widened(FINE, AROUND):
             light = self.light(press)
         width, height = self.size
         found = {}
         for name, image in light.items():
-            soft = np.stack([self.spread(image[..., c]) for c in range(image.shape[2])], -1)
-            parts = soft.reshape(height + 2 * AROUND, FINE, width + 2 * AROUND, FINE, -1)
+            planes = np.moveaxis(image, -1, 0)
+            if "radial distortion" in self.effects:
+                planes = [self.bent(plane) for plane in planes]
+            if "lens blur" in self.effects:
+                planes = [self.spread(plane) for plane in planes]
+            parts = np.stack(planes, -1).reshape(height + 2 * AROUND, FINE, width + 2 * AROUND, FINE, -1)
             found[name] = parts.mean((1, 3))[AROUND:-AROUND, AROUND:-AROUND]
         return found
+
+    def bent(self, plane: np.ndarray) -> np.ndarray:
+        """A plane of parts of pixels behind a lens that distorts."""
+        from scipy.ndimage import map_coordinates
+
+        focal = FINE * self.size[0] / 2 / np.tan(np.radians(self.values[f"{self.camera}.x_fov"]) / 2)
+        height, width = plane.shape
+        y, x = np.mgrid[:height, :width] + 0.5
+        x, y = self.undistorted((x - width / 2) / focal, (y - height / 2) / focal)
+        return map_coordinates(
+            plane, [y * focal + height / 2 - 0.5, x * focal + width / 2 - 0.5], order=3, mode="nearest"
+        )
+
+    def undistorted(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Tangents that a distorted point came from: x_d = x (1 + k1 r^2)."""
+        xs, ys = x, y
+        for _ in range(20):
+            stretch = 1 + self.effects["radial distortion"] * (xs**2 + ys**2)
+            xs, ys = x / stretch, y / stretch
+        return xs, ys
 
     def spread(self, plane: np.ndarray) -> np.ndarray:
         """A plane of parts of pixels behind the lens."""
@@ -362,21 +386,12 @@ class Maker:
     # -- camera -------------------------------------------------------------------------------------------------------
     def photograph(self, radiance: np.ndarray, rng, frame: int) -> np.ndarray:
         """Noisy, quantised DN of a radiance (H, W, 3); the camera's effects by scipy."""
-        from scipy.ndimage import map_coordinates
-
         v, e, cam = self.values, self.effects, self.camera
         width, height = self.size
         focal = width / 2 / np.tan(np.radians(v[f"{cam}.x_fov"]) / 2)
         y, x = np.mgrid[:height, :width] + 0.5
         x, y = (x - width / 2) / focal, (y - height / 2) / focal
         image = radiance.astype(float)
-        if "radial distortion" in e:
-            xs, ys = x, y  # where a distorted pixel came from
-            for _ in range(20):
-                r2 = xs**2 + ys**2
-                xs, ys = x / (1 + e["radial distortion"] * r2), y / (1 + e["radial distortion"] * r2)
-            at = [ys * focal + height / 2 - 0.5, xs * focal + width / 2 - 0.5]
-            image = np.stack([map_coordinates(image[..., c], at, order=3, mode="nearest") for c in range(3)], -1)
         if "lens vignetting" in e:
             image = image * (np.cos(np.arctan(np.hypot(x, y))) ** (4 * e["lens vignetting"]))[..., None]
         if "veiling glare" in e:

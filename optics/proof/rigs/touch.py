@@ -243,27 +243,29 @@ class Wild(Workshop, synthetic.Maker):
             self.values = values
 
     def lens(self, image):
-        from scipy.ndimage import gaussian_filter, map_coordinates
+        from scipy.ndimage import gaussian_filter
 
         e = self.effects
         x, y = self._tangents()
         t2 = x**2 + y**2
-        width, height = self.size
-        if "radial distortion" in e:
-            focal = width / 2 / np.tan(np.radians(self.values[f"{self.camera}.x_fov"]) / 2)
-            xs, ys = x, y
-            for _ in range(20):
-                r2 = xs**2 + ys**2
-                s = 1 + e["radial distortion"] * (r2 + r2**2 / t2.max()) / 2
-                xs, ys = x / s, y / s
-            at = [ys * focal + height / 2 - 0.5, xs * focal + width / 2 - 0.5]
-            image = np.stack([map_coordinates(image[..., c], at, order=3, mode="nearest") for c in range(3)], -1)
+        width, _ = self.size
         if "lens vignetting" in e:
             image = image * (1 - 2 * e["lens vignetting"] * t2 * (1 + 0.6 * t2 / t2.max()))[..., None]
         if "veiling glare" in e:
             wide = np.stack([gaussian_filter(image[..., c], width / 5, mode="reflect") for c in range(3)], -1)
             image = image + e["veiling glare"] * (wide - image)
         return image
+
+    def undistorted(self, x, y):
+        if not self.other:
+            return super().undistorted(x, y)
+        own_x, own_y = self._tangents()
+        farthest, (xs, ys) = (own_x**2 + own_y**2).max(), (x, y)
+        for _ in range(20):
+            r2 = xs**2 + ys**2
+            stretch = 1 + self.effects["radial distortion"] * (r2 + r2**2 / farthest) / 2
+            xs, ys = x / stretch, y / stretch
+        return xs, ys
 
     def spread(self, plane):
         from scipy.signal import fftconvolve
