@@ -209,7 +209,7 @@ class Parameter:
         except (TypeError, ValueError):
             raise ValueError(
                 f"{where + ': ' if where else ''}{key} = {value!r} is not a "
-                f"number{f' in {self.unit}' if spaced(self.unit) else ''}; allowed: a number, without quotes"
+                f"number{f' in {self.unit}' if spaced(self.unit) else ''}; allowed: a number, without quotes or unit"
             ) from None
         if not math.isfinite(number):
             raise ValueError(f"{where + ': ' if where else ''}{key} = {number}{spaced(self.unit)} is not finite")

@@ -29,6 +29,7 @@ from pydantic import BaseModel, Field, RootModel, ValidationError, model_validat
 
 from optics.errors import OutputExists, UnknownKey
 from optics.files import exr
+from optics.files.archives import opened
 from optics.files.images import read_array
 from optics.files.output import check_folder, file_hash, replacing, write_json, write_text
 from optics.light import labels as labelling
@@ -228,7 +229,7 @@ def _table(file: Path, form: type[BaseModel]) -> dict[str, Any]:
 def _arrays(file: Path, kind: str, images: str) -> dict[str, np.ndarray]:
     """What one file of a sample gives, name -> array."""
     if file.suffix == ".npz":
-        with open(file, "rb") as raw, np.load(raw, allow_pickle=False) as arrays:
+        with opened(file) as arrays:
             return {NODES + name: arrays[name] for name in arrays.files}
     if file.suffix == ".npy":
         return {kind: np.load(file, allow_pickle=False)}

@@ -39,7 +39,7 @@ BASE = {
     "calibrate": "readings -o out/study",
     "locate": "images -o out/beads.csv",
     "diagnose": "study",
-    "add": "study vignetting",
+    "add": "study extinction-leak",
     "report": "study -o out/page.html",
     "values": "study",
     "plot-spectra": "digit -o out/spectra.png",
@@ -272,7 +272,7 @@ WRITING = [
     "design small.xml -n 2 -o out/plan",
     "report study -o out/page.html",
     "diagnose study",
-    "add study vignetting",
+    "add study extinction-leak",
     "effects new ripple -o out/own",
     "effects new ripple --from study --along signal",
 ]
