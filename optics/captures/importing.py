@@ -309,9 +309,13 @@ def read_circles(images: str | Path, circles: str | Path) -> Presses:
             raise BadCapture(
                 f"{where}: no image '{name}' in {folder}; allowed: {', '.join(SUFFIXES)} files of that folder"
             )
+        if not file.resolve().is_relative_to(folder.resolve()):
+            raise BadCapture(f"{where}: '{name}' lies outside {folder}; allowed: files of that folder; copy it there")
         images_read.append(_colour_image(file, f"{where}: {name}", images_read[0].shape if images_read else None))
-        names.append(Path(name).stem)
+        names.append(name)
         found.append(numbers)
+    stems = [Path(name).stem for name in names]
+    names = stems if len(set(stems)) == len(stems) else [f"{i:03d}" for i in range(len(stems))]
     return Presses(f"{folder} with {table}", names, np.stack(images_read), np.array(found))
 
 

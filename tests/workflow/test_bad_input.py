@@ -221,6 +221,7 @@ def place(tmp_path_factory):
             (own / f"{table}.csv").write_text(rows)
         shutil.copy(own / "a.png", own / "b.jpg")
         np.save(own / "nan.npy", np.full((SIZE[1], SIZE[0], 3), np.nan, np.float32))
+    (folder / "far.obj").write_text("v 0 0 0\nv 1e30 0 1\nv 0 1e30 1\nf 1 2 3\n")
     (folder / "fit.toml").write_text('[parameters]\n"led_9.x" = 1.0\n')
     (folder / "fit_frame.toml").write_text('[parameters]\n[frames.z]\n"gel.press_x" = 1.0\n')
     (folder / "fit_torn.toml").write_text("[parameters\n")
@@ -285,6 +286,7 @@ CASES = [
     ("params small.xml --variant scalar_rgb", r"scalar variants are not supported; use llvm"),
     ("params small.xml --variant llvm_ad_rbg", r"unknown variant 'llvm_ad_rbg'; did you mean 'llvm_ad_rgb'"),
     ("read markers captures/good/small.png", r"good/small\.png: 10 x 10 pixels; allowed: 15 each way or more"),
+    (f"{RENDER} -D indenter=far.obj", r"indenter mesh .*far\.obj: a corner 1e\+30 mm from its origin; allowed: up to"),
     (f"{RENDER} --set gel.press_z=1", r"--set: unknown parameter 'gel\.press_z'; did you mean 'gel\.press_"),
     (f"{RENDER} --set gel.press_x", r"--set gel\.press_x: no '='"),
     (f"{RENDER} --set gel.press_depth=0.5mm", r"--set: gel\.press_depth = '0\.5mm' is not a number in mm"),
