@@ -381,6 +381,7 @@ class Maker:
         return {
             **{key: {"unit": p.unit, "doc": p.doc} for key, p in found.items()},
             **{f"labels.{name}": told for name, told in labels.items()},
+            **({"unit": {"unit": "", "doc": "number of the sensor in the series"}} if self.draws.serial else {}),
         }
 
     def make(self, index: int) -> dict:
@@ -518,7 +519,8 @@ def _write_table(job: Job, blocks: Blocks) -> None:
         told: list[str] = []
         roles: list[str] = []
         for record in blocks.records():
-            values = {**job.parameters, **record["sample"]}
+            unit = {"unit": record["unit"]} if "unit" in record else {}
+            values = {**unit, **job.parameters, **record["sample"]}
             labels = labelling.flat(record.get("labels", {}))
             files = record["files"]
             if not keys:

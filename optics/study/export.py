@@ -835,9 +835,13 @@ def _episode(batch: Batch) -> int:
 # -- the card --------------------------------------------------------------------------------------------------------
 def _card(plan: Plan, identity: Mapping, moments: Moments, pattern: str, licence: str) -> dict[str, Any]:
     made, job = plan.batch.made, plan.batch.job
+    named = {**job["sample"], **job.get("unit", {})}
+    jointly = [f"the effect {name}" for name in named if "." not in name]  # which stands for its parameters
+    jointly += ["the posterior of the calibration"] * bool(job.get("posterior"))
+    sampled = next(plan.batch.records())["sample"]
     values = {}
     for key in plan.first.values:
-        drawn = job["sample"].get(key) or job.get("unit", {}).get(key)
+        drawn = named.get(key) or ({"with": " or ".join(jointly)} if key in sampled and jointly else None)
         values[key] = {
             **described(plan.batch, key),
             "drawn": {k: v for k, v in drawn.items() if v is not None} if drawn else None,

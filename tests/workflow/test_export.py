@@ -325,6 +325,22 @@ def test_the_card_says_where_the_data_come_from(made, tmp_path):
     assert "CC-BY-4.0" in page and "| gel.press_x | mm | uniform [-4.0, 4.0] |" in page and "sphere (" in page
 
 
+def test_a_series_of_sensors_is_told_in_table_and_card(tmp_path):
+    """Who splits a set by sensors needs their numbers; what an effect draws is not 'fixed'."""
+    (tmp_path / "job.toml").write_text(
+        'scene = "gelsight"\nout = "out"\ncount = 4\nper_unit = 2\noutputs = ["png"]\n'
+        '[defines]\nwidth = 20\nheight = 16\n[unit]\n"lens vignetting" = { plausible = 1 }\n'
+    )
+    made = batch.run(tmp_path / "job.toml", workers=1).folder
+    rows = [line.split(",") for line in (made / "manifest.csv").read_text().splitlines()]
+    assert rows[0][:3] == ["index", "unit", "camera.vignetting"]
+    assert [row[1] for row in rows[1:]] == ["0", "0", "1", "1"] and rows[1][2] == rows[2][2] != rows[3][2]
+    export.export(made, tmp_path / "x", "hdf5")
+    card = (tmp_path / "x" / "card.md").read_text()
+    assert "| camera.vignetting | 1 | with the effect lens vignetting |" in card, card
+    assert "| unit |  | fixed, or a label | 0 to 1, mean 0.5 | number of the sensor in the series |" in card
+
+
 def test_an_image_of_another_sample_is_refused(made, tmp_path):
     """Of the same size in pixels, so that nothing but the hash tells it: its labels would be wrong."""
     own = shutil.copytree(made, tmp_path / "batch")
