@@ -423,10 +423,7 @@ class Maker:
         from optics.files.images import write_image
 
         frame = self.exposed(image.camera, self.job.rng(index, f"noise {stem.name}"))
-        path = stem.with_name(stem.name + "-dn.png")
-        with replacing(path) as temporary:
-            write_image(temporary.with_name(temporary.stem), frame, 8 if self.noise.saturation <= 255 else 16)
-        return path
+        return write_image(stem.with_name(stem.name + "-dn"), frame, 8 if self.noise.saturation <= 255 else 16)
 
     def exposed(self, camera: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """(H, W, C) whole DN of what the camera makes of an image, with noise and its fixed pattern."""
